@@ -27,8 +27,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
     """
     Yield a path next to `path`; a file there replaces `path` if the block succeeds.
 
-    The new file or directory is synced to disk before the exchange, so that a power cut leaves
-    the old or the new one. It is removed when the block fails.
+    It is synced to disk before the exchange, so that a power cut leaves the old or the new one.
     """
     target = Path(path)
     folder = ''
@@ -65,11 +64,7 @@ def write_bytes(path: str | os.PathLike, data: bytes) -> None:
 
 
 def remove_unfinished(folder: str | os.PathLike, name: str) -> None:
-    """
-    Remove the unfinished files of writers that were killed.
-
-    A file that another process is writing is locked, and stays.
-    """
+    """Remove the unfinished files of writers that were killed; those of others are locked."""
     for unfinished in Path(folder).glob(f'.{escape(name)}*{_SUFFIX}'):
         with suppress(OSError), _locked(unfinished):
             shutil.rmtree(unfinished, ignore_errors=True)
@@ -143,9 +138,7 @@ def release_written(file: BinaryIO) -> None:
     """
     Give back the page cache of what was written, but for the newest 256 MB.
 
-    The system writes it to the disk and uses the same memory for what follows. Without this, a
-    file of 13 GB pushes out what other programs have in the cache. Where memory is virtual, its
-    first use takes most of the time of writing.
+    Without this, a file of 13 GB pushes out what other programs have in the cache.
     """
     end = file.tell() - _KEPT_BYTES
     if end > 0:

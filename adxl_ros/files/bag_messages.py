@@ -1,20 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The messages of a rosbag2 recording, in any storage and compression, read by the library rosbags.
-
-A killed recorder leaves a folder without metadata.yaml: its files are then read one by one.
-"""
+"""The messages of a rosbag2 recording, in any storage and compression, by the library rosbags."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, ExitStack
-from dataclasses import dataclass
 import os
 from pathlib import Path
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import mcap_file
@@ -130,24 +125,13 @@ def _files(path: Path) -> list[Path]:
         [int(number) for number in re.findall(r'\d+', file.stem)], file.name))
 
 
-IMU = 'sensor_msgs/msg/Imu'
-"""Type of the sensor's output."""
-
-JOINT_STATE = 'sensor_msgs/msg/JointState'
-"""Type of the positions and commands of the stage."""
-
+IMU, JOINT_STATE = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/JointState'
+TEMPERATURE, BATTERY_STATE = 'sensor_msgs/msg/Temperature', 'sensor_msgs/msg/BatteryState'
 DIAGNOSTIC_STATUS = 'diagnostic_msgs/msg/DiagnosticStatus'
 """Type of `sensor_info`."""
 
-TEMPERATURE = 'sensor_msgs/msg/Temperature'
-"""Type of the temperature."""
 
-BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
-"""Type of the supply."""
-
-
-@dataclass(frozen=True)
-class Topics:
+class Topics(NamedTuple):
     """Full names of the topics in a bag; None where the bag does not hold it."""
 
     imu: str  # The sensor's output
@@ -156,11 +140,6 @@ class Topics:
     temperature: str | None = None
     supply: str | None = None
     command: str | None = None  # Commands of the stage
-
-    def sampled(self) -> list[str]:
-        """Return the topics to read sample by sample."""
-        return [topic for topic in (self.imu, self.joints, self.temperature, self.supply,
-                                    self.command) if topic]
 
 
 def find_topics(bag: Bag, topic: str = '') -> Topics:

@@ -36,10 +36,8 @@ FRAME = 'imu_link'
 
 _ROWS_AT_ONCE = 65536
 """Samples that are made into messages at a time (chosen: some 20 MB)."""
-
 _END_OF_TIME_NS = (1 << 31) * 1_000_000_000
 """First stamp that is too late, ns: builtin_interfaces/Time has 32 bits of signed seconds."""
-
 _LONGEST_NS = (1 << 63) - 1
 """Largest duration of ROS, ns: a QoS without a deadline."""
 
@@ -104,12 +102,13 @@ def recording_bag(path: str | os.PathLike, sensor: Sensor
     """
     Open a new bag, and yield a function that appends samples of a recording.
 
-    Each sample becomes a message of `imu/data_raw`. Sampled references become messages of
-    `stage/joint_states`, `temperature` and `supply` with the same stamp; the voltage of
-    sensor_msgs/BatteryState is float32. A command becomes a message of `stage/command` where it
-    changes, and once every 65536 samples. Columns with other names are left out.
+    References get the stamps of their samples. A command becomes a message where it changes, and
+    once every 65536 samples. Columns with other names are left out.
     """
-    imu = _imu_form(_noise_covariance(sensor))
+    variance = np.full(3, UNMEASURED_VARIANCE)
+    noise = sample_std_v(sensor) / sensor.nominal_scale_v_per_g * G0_MPS2
+    variance[:len(sensor.axes)] = noise ** 2
+    imu = _imu_form(np.diag(variance).ravel())
     with _new_bag(path) as bag:
         def append(recording: Recording) -> None:
             if not bag.connections:
@@ -177,20 +176,8 @@ def _changes(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
             for name in COMMANDS.values() if name in columns}
 
 
-def _noise_covariance(sensor: Sensor) -> np.ndarray:
-    """Return the covariance of the noise of one sample by rows, (m/s²)², (9,)."""
-    variance = np.full(3, UNMEASURED_VARIANCE)
-    noise = sample_std_v(sensor) / sensor.nominal_scale_v_per_g * G0_MPS2
-    variance[:len(sensor.axes)] = noise ** 2
-    return np.diag(variance).ravel()
-
-
 def _imu_form(covariance: np.ndarray) -> Form:
-    """
-    Return the form of an Imu without orientation and angular velocity.
-
-    covariance: that of the acceleration by rows, (m/s²)², (9,).
-    """
+    """Return the form of an Imu without orientation and rate, by its covariance, (9,)."""
     absent = [-1.0, *[0.0] * 8]
     return Form(IMU, cdr.imu, cdr.message(FRAME, [0.0, 0.0, 0.0, 1.0], absent, np.zeros(3), absent,
                                           np.zeros(3), covariance))
@@ -210,10 +197,6 @@ _SCALARS = {
 """Topic, field and form of references that are one number, by column."""
 
 
-_VECTOR = 'geometry_msgs/msg/Vector3Stamped'
-"""Type of the tilt."""
-
-
 @contextmanager
 def tilt_bag(path: str | os.PathLike) -> Iterator[Callable[..., None]]:
     """
@@ -223,7 +206,8 @@ def tilt_bag(path: str | os.PathLike) -> Iterator[Callable[..., None]]:
     and roll, pitch and inclination, rad, (n, 3).
     """
     forms = {'/imu/data': _imu_form(np.zeros(9)),
-             '/tilt': Form(_VECTOR, cdr.vector3_stamped, cdr.message(FRAME, np.zeros(3)))}
+             '/tilt': Form('geometry_msgs/msg/Vector3Stamped', cdr.vector3_stamped,
+                           cdr.message(FRAME, np.zeros(3)))}
     with _new_bag(path) as bag:
         for topic, form in forms.items():
             bag.connection(topic, form.kind)
@@ -243,10 +227,9 @@ _FLUSH_NS = 500_000_000
 
 class LiveBag:
     """
-    Writes serialized messages of any topics into a rosbag2 directory, as they come.
+    Writes serialized messages into a rosbag2 directory as they come, from any thread.
 
-    A reader, or a kill, finds all messages but those of the last half second. Threads may share
-    it. Unlike other bags, it appears under its name at once.
+    A reader, or a kill, finds all messages but those of the last half second.
     """
 
     def __init__(self, path: Path) -> None:

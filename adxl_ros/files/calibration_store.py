@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The calibration store: a folder with one folder for each unit, and in it one file by id.
+The calibration store: a folder for each unit, and in it a parameter file for each calibration.
 
-An id is serial number, date (UTC) and the beginning of the data's SHA-256, such as
-`17-20261121T143000Z-5f3a09c1`. It names the file, so that the files of a unit sort by date. The
-files are parameter files, written as a whole and never changed. Files that people add count by
-the date inside.
-
-A file of its own beside them has the population of a fleet.
+Its name is serial number, date (UTC) and the beginning of the data's SHA-256, such as
+`17-20261121T143000Z-5f3a09c1`, so that the files of a unit sort by date. Files that people add
+count by the date inside. The population of a fleet is a file of its own.
 """
 
 from __future__ import annotations
@@ -34,27 +31,21 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import package_version
 import yaml
 
-_DATE = '%Y%m%dT%H%M%SZ'
-"""Date in file names, ISO 8601 basic format."""
-
+_DATE, _DATE_LETTERS = '%Y%m%dT%H%M%SZ', 16
+"""Date in file names, ISO 8601 basic format, and its length."""
 _OLDEST = datetime.min.replace(tzinfo=timezone.utc)
 """Date of a calibration without a date, which sorts first."""
-
 _HASH_DIGITS = 8
 """Digits of the data's SHA-256 in an id (chosen: enough for calibrations of one second)."""
-
 _MAX_NAME = 120
 """Characters of a serial number in a file name (chosen: file systems permit 255 bytes)."""
-
-_DATE_LETTERS = 16
-"""Letters of such a date."""
 
 
 class StoredCalibration(NamedTuple):
     """One calibration of a unit."""
 
-    path: Path  # Its file
-    sensor: Sensor  # The fitted sensor
+    path: Path
+    sensor: Sensor
 
 
 class UnitHistory(NamedTuple):
@@ -73,8 +64,7 @@ class Choice(NamedTuple):
 
 def default_folder() -> Path:
     """Return $ROS_HOME/adxl_ros/calibrations; $ROS_HOME is ~/.ros where it is not set."""
-    home = os.environ.get('ROS_HOME') or os.path.join(os.path.expanduser('~'), '.ros')
-    return Path(home) / 'adxl_ros' / 'calibrations'
+    return Path(os.environ.get('ROS_HOME') or '~/.ros').expanduser() / 'adxl_ros' / 'calibrations'
 
 
 def calibration_id(sensor: Sensor) -> str:
@@ -91,7 +81,7 @@ def _version(sensor: Sensor) -> str:
 
 
 def date_of(sensor: Sensor) -> datetime | None:
-    """Return the date of a calibration, UTC; None where its file states none."""
+    """Return the date of a calibration, UTC; None without one."""
     return date_in(sensor.provenance.get('date', ''))
 
 
@@ -164,49 +154,37 @@ def newest(folder: str | os.PathLike, serial: str, check: Callable[[Sensor], Non
 
 
 def newer(folder: str | os.PathLike, sensor: Sensor) -> Path | None:
-    """
-    Return the newest file of a unit if its name has a later date than a calibration.
-
-    This is quick, because no file is read: files that people add count at the next start.
-    """
+    """Return the newest file of a unit if its name has a later date; no file is read."""
     begin = f'{_name(sensor.serial)}-'
-    names = [path.name for path in unit_folder(folder, sensor.serial).glob('*.yaml')
+    files = [path for path in unit_folder(folder, sensor.serial).glob('*.yaml')
              if re.match(r'\d{8}T\d{6}Z', path.name.removeprefix(begin))]
-    last = max(names, default='').removeprefix(begin)
-    date = date_of(sensor)
-    is_newer = bool(last) and (not date or last[:_DATE_LETTERS] > f'{date:{_DATE}}')
-    return unit_folder(folder, sensor.serial) / f'{begin}{last}' if is_newer else None
-
-
-_READ_BYTES = 1 << 20
-"""Bytes that are read at a time (chosen: bounds the memory for files of any size)."""
+    last, date = max(files, default=None), date_of(sensor)
+    is_newer = last and (not date or last.name.removeprefix(begin)[:_DATE_LETTERS]
+                         > f'{date:{_DATE}}')
+    return last if is_newer else None
 
 
 def sha256(paths: Sequence[str | os.PathLike]) -> str:
     """
     Return the SHA-256 of recordings, hexadecimal; for one file, that of `sha256sum`.
 
-    For several files it is the SHA-256 of their own checksums, one a line, in the given order.
-    The files of a bag's directory are in the order of their names. Paths do not enter.
+    For several files, those of a directory by name, it is that of their checksums, one a line.
     """
     files: list[Path] = []
     for path in map(Path, paths):
         files += sorted(p for p in path.rglob('*') if p.is_file()) if path.is_dir() else [path]
-    checksums = [_file_sha256(path) for path in files]
-    if len(checksums) == 1:
-        return checksums[0]
-    return hashlib.sha256(''.join(f'{line}\n' for line in checksums).encode()).hexdigest()
-
-
-def _file_sha256(path: Path) -> str:
-    try:
-        with open(path, 'rb') as file:
-            checksum = hashlib.sha256()
-            while block := file.read(_READ_BYTES):
-                checksum.update(block)
-    except OSError as error:
-        raise UserError(f'{path}: cannot be read: {error.strerror}') from None
-    return checksum.hexdigest()
+    checksums = []
+    for path in files:
+        checksum = hashlib.sha256()
+        try:
+            with open(path, 'rb') as file:
+                while block := file.read(1 << 20):
+                    checksum.update(block)
+        except OSError as error:
+            raise UserError(f'{path}: cannot be read: {error.strerror}') from None
+        checksums.append(checksum.hexdigest())
+    return checksums[0] if len(checksums) == 1 else \
+        hashlib.sha256(''.join(f'{line}\n' for line in checksums).encode()).hexdigest()
 
 
 FORMAT = 1

@@ -3,15 +3,14 @@
 """
 ROS messages in CDR, the wire format of DDS (OMG DDSI-RTPS, section 10), as arrays.
 
-Messages of one topic usually have the same strings and array lengths, and thus the same layout.
-The first message determines the offsets. All messages with its strings and lengths are read, or
-written, as one table of bytes.
+Messages with the same strings and array lengths have the same layout. They are read, or written,
+as one table of bytes, whose offsets the first one shows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import struct
 
 import numpy as np
@@ -133,11 +132,7 @@ battery_state = _one_field('voltage', 'f4')
 
 
 def message(stamped_frame: str, *parts: str | int | Sequence[float] | np.ndarray) -> bytes:
-    """
-    Return a message at the stamp 0, little-endian.
-
-    parts: what follows its header: strings, lengths of sequences, and numbers in their own type.
-    """
+    """Return a message at the stamp 0 with strings, lengths and numbers behind its header."""
     data = bytearray(b'\0\1\0\0')
     for part in (np.zeros(2, np.int32), stamped_frame, *parts):
         if isinstance(part, str):
@@ -158,7 +153,7 @@ class Table:
 
     rows: np.ndarray  # Their indices among the messages that were given, (n,)
     data: np.ndarray  # Their bytes, (n, size)
-    layout: Layout  # Where their fields are
+    layout: Layout
 
     def numbers(self, name: str) -> np.ndarray:
         """Return a field of all messages as float64, (n, count)."""
@@ -174,48 +169,26 @@ class Table:
 
 
 def tables(raws: Sequence[bytes] | np.ndarray, find: Callable[[bytes], Layout]) -> Iterator[Table]:
-    """Group messages by layout."""
-    if isinstance(raws, np.ndarray):
-        yield from _tables_of_rows(np.arange(len(raws)), raws, find)
-        return
-    sizes = np.array([len(raw) for raw in raws])
+    """Group messages by layout; an array has one of equal length in each row."""
+    sizes = np.full(len(raws), raws.shape[1]) if isinstance(raws, np.ndarray) else \
+        np.array([len(raw) for raw in raws])
     for size in dict.fromkeys(sizes.tolist()):
         rows = np.flatnonzero(sizes == size)
-        data = np.frombuffer(b''.join([raws[i] for i in rows.tolist()]), np.uint8)
-        yield from _tables_of_rows(rows, data.reshape(len(rows), size), find)
-
-
-def _tables_of_rows(rows: np.ndarray, data: np.ndarray, find: Callable[[bytes], Layout]
-                    ) -> Iterator[Table]:
-    """Group messages of one length, (n, size), by layout; `rows` are their indices, (n,)."""
-    while len(rows):
-        layout = find(data[0].tobytes())
-        differs = (data[:, layout.fixed] != data[0, layout.fixed]).any(axis=1)
-        if not differs.any():
-            yield Table(rows, data, layout)
-            return
-        yield Table(rows[~differs], data[~differs], layout)
-        rows, data = rows[differs], data[differs]
-
-
-def joined_tables(parts: Sequence[Sequence[bytes] | np.ndarray],
-                  find: Callable[[bytes], Layout]) -> Iterator[Table]:
-    """Group messages by layout, part by part."""
-    begin = 0
-    for raws in parts:
-        for table in tables(raws, find):
-            yield replace(table, rows=table.rows + begin)
-        begin += len(raws)
+        data = raws if isinstance(raws, np.ndarray) else np.frombuffer(
+            b''.join([raws[i] for i in rows.tolist()]), np.uint8).reshape(len(rows), size)
+        while len(rows):
+            layout = find(data[0].tobytes())
+            differs = (data[:, layout.fixed] != data[0, layout.fixed]).any(axis=1)
+            if not differs.any():
+                yield Table(rows, data, layout)
+                break
+            yield Table(rows[~differs], data[~differs], layout)
+            rows, data = rows[differs], data[differs]
 
 
 def fill(template: bytes, find: Callable[[bytes], Layout], stamp_ns: np.ndarray,
          fields: Mapping[str, np.ndarray]) -> np.ndarray:
-    """
-    Return one message for each stamp.
-
-    find: finds the fields of a message; stamp_ns: stamps, ns, (n,); fields: values by field,
-    (n, count); returns: the bytes of the messages, (n, size), each as long as the template.
-    """
+    """Return the bytes, (n, size), of messages with stamps, ns, (n,), and fields, (n, count)."""
     layout = find(template)
     sec, nanosec = np.divmod(stamp_ns, 1_000_000_000)
     values = {'sec': sec, 'nanosec': nanosec, **fields}

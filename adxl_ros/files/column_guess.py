@@ -61,9 +61,6 @@ _REFERENCES = {
 }
 """Names of references by role."""
 
-_EPOCHS = ((1e9, 'ns'), (1e6, 'us'), (1e3, 'ms'), (1.0, 'epoch'))
-"""Counts of a second of each unit."""
-
 _EPOCH_S = (9e8, 4e9)
 """Bounds of times since 1970, s: 1998 to 2096."""
 
@@ -90,8 +87,9 @@ _SIGN_GAP = (24576, 40960)
 def describe(table: Table) -> tuple[str, str]:
     """Describe the columns of a table, and the options that most likely read it."""
     seen = f'the columns are {listed(table.names)}'
+    sample = next((block.columns for block in table.blocks(table.names, ())), {})
     values = {name: np.where(np.abs(column) < _LARGEST, column, np.nan)
-              for name, column in table.sample().items() if np.isfinite(column).any()}
+              for name, column in sample.items() if np.isfinite(column).any()}
     time = _time_column(table, values)
     outputs = _outputs(table, [name for name in values if name != time], values)
     readings = np.column_stack([values[name] for name in outputs]) if outputs else np.zeros((0, 1))
@@ -126,10 +124,9 @@ def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[s
     if not len(readings):
         return '', 0.0, 0.0
     unit = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
-    is_whole = bool((readings == np.rint(readings)).all())
     middle = (readings > _SIGN_GAP[0]) & (readings < _SIGN_GAP[1])
-    if unit in (None, LSB) and is_whole and readings.min() >= 0 and not middle.any() and \
-            _SIGN_GAP[1] < readings.max() < 1 << 16:
+    if unit in (None, LSB) and (readings == np.rint(readings)).all() and readings.min() >= 0 \
+            and not middle.any() and _SIGN_GAP[1] < readings.max() < 1 << 16:
         unit, readings = UNSIGNED, signed(readings)
     low, spread = readings.min(axis=0), np.ptp(readings, axis=0)
     zero = 0.0
@@ -168,16 +165,14 @@ def _stamp_options(values: np.ndarray, source: Source) -> str:
 
 def _time_column(table: Table, values: Mapping[str, np.ndarray]) -> str | None:
     """Return the column that is a time: it hardly ever decreases, and is no count of samples."""
-    rising = [name for name, column in values.items() if _is_rising(column)]
+    rising = []
+    for name, column in values.items():
+        steps = np.diff(column[np.isfinite(column)])
+        if len(steps) > 2 and np.mean(steps >= 0) > 0.99 and np.mean(steps > 0) > 0.05:
+            rising.append(name)
     named = [name for name in rising if table.has_names and _TIME_NAMES.fullmatch(name)]
     others = [name for name in rising if not (np.diff(values[name]) == 1).all()]
     return next(iter([*named, *others]), None)
-
-
-def _is_rising(values: np.ndarray) -> bool:
-    """Return whether values hardly ever decrease, and change."""
-    steps = np.diff(values[np.isfinite(values)])
-    return len(steps) > 2 and bool(np.mean(steps >= 0) > 0.99 and np.mean(steps > 0) > 0.05)
 
 
 def _time_source(table: Table, name: str, values: np.ndarray) -> tuple[Source, str]:
@@ -185,12 +180,14 @@ def _time_source(table: Table, name: str, values: np.ndarray) -> tuple[Source, s
     finite = values[np.isfinite(values)]
     steps = np.diff(finite)
     step = float(np.median(steps[steps > 0]))
+    divisors = {unit: each.divisor for unit, each in UNITS[Quantity.TIME].items()}
     stated = table.units.get(name) or unit_in_name(name, Quantity.TIME)
     # A unit in the name counts unless no sensor has samples at such steps.
-    if stated and is_sensor_step(step / UNITS[Quantity.TIME][stated].divisor, False):
+    if stated and is_sensor_step(step / divisors[stated], False):
         return Source(name, stated), f'{name} has steps of {step:.4g} {stated}'
-    for second, unit in _EPOCHS:
-        if _EPOCH_S[0] < finite[0] / second < _EPOCH_S[1] and is_sensor_step(step / second, False):
+    for unit in ('ns', 'us', 'ms', 'epoch'):
+        if _EPOCH_S[0] < finite[0] / divisors[unit] < _EPOCH_S[1] and \
+                is_sensor_step(step / divisors[unit], False):
             return Source(name, unit), f'{name} counts from 1970'
     unit = time_unit_of_step(step, bool((finite == np.rint(finite)).all()))
     return Source(name, unit), f'{name} has steps of {step:.4g}, so {unit}'
@@ -204,33 +201,29 @@ def _outputs(table: Table, names: list[str], values: Mapping[str, np.ndarray]) -
         groups = [stated, *([name for name in own if pattern.search(name)]
                             for pattern in _ACCEL_NAMES)]
         return next(filter(None, map(_by_axis, groups)), [])
-    triples = [names[i:i + 3] for i in range(len(names) - 2)]
-    scatter = []
-    for triple in triples:
+
+    def scatter(triple: list[str]) -> float:
         length = np.linalg.norm([values[name] for name in triple], axis=0)
         median = np.nanmedian(length)
-        scatter.append(np.nanmedian(np.abs(length - median)) / max(median, 1e-12))
-    best = int(np.argmin([*scatter, _CONSTANT]))
-    return [*triples, []][best]
+        return float(np.nanmedian(np.abs(length - median)) / max(median, 1e-12))
+
+    return min((names[i:i + 3] for i in range(len(names) - 2)), key=scatter, default=[])
 
 
 def _by_axis(names: Sequence[str]) -> list[str]:
     """Return the names of x, y and z in this order, as far as there are any; or acc[0] ..."""
-    by_letter = {_axis(name): name for name in reversed(names)}
-    axes = [by_letter[axis] for axis in AXES if axis in by_letter]
-    if axes:
-        return axes if set(AXES[:len(axes)]) <= set(by_letter) else []
+    by_letter: dict[str, str] = {}
+    for name in names:
+        bare = re.sub(r'[(\[{].*?[)\]}]', '', name).strip()
+        words = re.split(r'[_\W]+|(?<=[a-z])(?=[A-Z])', bare)
+        matches = list(filter(None, map(_AXIS_WORD.fullmatch, words)))
+        if matches:
+            by_letter.setdefault((matches[-1][1] or matches[-1][2]).lower(), name)
+    if by_letter:
+        axes = AXES[:len(by_letter)]
+        return [by_letter[axis] for axis in axes] if set(axes) == set(by_letter) else []
     numbered = [name for name in names if re.search(r'(?<!\d)[0-3]\]?$', name)]
     return numbered[:len(AXES)] if len(numbered) >= len(AXES) else []
-
-
-def _axis(name: str) -> str | None:
-    """Return the axis that a name states; None without one."""
-    bare = re.sub(r'[(\[{].*?[)\]}]', '', name).strip()
-    words = [word for word in re.split(r'[_\W]+|(?<=[a-z])(?=[A-Z])', bare) if word]
-    axes = [(match[1] or match[2]).lower() for match in map(_AXIS_WORD.fullmatch, reversed(words))
-            if match]
-    return axes[0] if axes else None
 
 
 def _references(values: Mapping[str, np.ndarray], used: set[str | None]) -> dict[str, Source]:

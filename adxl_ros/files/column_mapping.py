@@ -10,9 +10,10 @@ from enum import Enum
 from pathlib import Path
 import re
 import shlex
+from typing import NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.constants import AXES, G0_MPS2, MEASURED_AXES
 import numpy as np
 
 _EXAMPLE = 'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg'
@@ -39,7 +40,7 @@ class TableBlock:
 class Table:
     """A file with columns."""
 
-    path: str  # The file
+    path: str
     names: tuple[str, ...]  # Its columns, each once
     # Yields the rows of some columns, in the order of the file. In a column of the second
     # argument, a cell that is no number is an error; another such column is left out.
@@ -59,13 +60,13 @@ class Table:
         """Return file and line of the names for messages."""
         return f'{self.path}:{self.header_line}' if self.header_line else self.path
 
-    def sample(self) -> Mapping[str, np.ndarray]:
-        """Return the first rows of all columns of numbers."""
-        return next((block.columns for block in self.blocks(self.names, ())), {})
+    def read(self, names: Collection[str]) -> dict[str, np.ndarray]:
+        """Return all rows of columns that must hold numbers."""
+        blocks = list(self.blocks(names, names))
+        return {name: np.concatenate([block.columns[name] for block in blocks]) for name in names}
 
 
-@dataclass(frozen=True)
-class Source:
+class Source(NamedTuple):
     """Where a quantity comes from."""
 
     column: str  # Name of the column, or its number from 1
@@ -81,8 +82,8 @@ class ColumnMapping:
 
     def __str__(self) -> str:
         """Return the text that states the mapping."""
-        return ','.join(f'{role}={_quoted(source.column)}{":" * bool(source.unit)}{source.unit}'
-                        for role, source in self.sources.items())
+        return ','.join(f'{role}={_quoted(column)}{":" * bool(unit)}{unit}'
+                        for role, (column, unit) in self.sources.items())
 
 
 def _quoted(column: str) -> str:
@@ -96,7 +97,12 @@ def parse_mapping(text: str) -> ColumnMapping:
     """Parse a mapping, or the file that holds it."""
     where = '--columns'
     if '=' not in text:
-        where, text = f'--columns {text}', _content(text)
+        where = f'--columns {text}'
+        try:
+            text = re.sub('#.*', '', Path(text).read_text(encoding='utf-8'))
+        except (OSError, UnicodeDecodeError):
+            raise UserError(f'{where}: is neither a mapping nor a file that can be read; '
+                            f'write for example {_EXAMPLE}') from None
     sources: dict[str, Source] = {}
     text = text.strip().rstrip(',')
     while text:
@@ -106,7 +112,7 @@ def parse_mapping(text: str) -> ColumnMapping:
                             f'write for example {_EXAMPLE}')
         text = text[entry.end():]
         role, *columns, unit = entry.groups(default='')
-        column = next(filter(None, columns), '').strip()
+        column = ''.join(columns).strip()
         if role not in ROLES:
             raise UserError(f'{where}: no role {role!r}; the roles are {", ".join(ROLES)}')
         if role in sources or not column:
@@ -117,66 +123,34 @@ def parse_mapping(text: str) -> ColumnMapping:
                             f'of {", ".join(UNITS[ROLES[role]])}, or quote a name that has a '
                             'colon')
         sources[role] = Source(column, name)
-    _check_roles(where, sources)
-    return ColumnMapping(sources, where)
-
-
-def _content(path: str) -> str:
-    """Return the text of a mapping file without comments."""
-    try:
-        text = re.sub('#.*', '', Path(path).read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError):
-        raise UserError(f'--columns {path}: is neither a mapping nor a file that can be read; '
-                        f'write for example {_EXAMPLE}') from None
-    return text
-
-
-def _check_roles(where: str, sources: Mapping[str, Source]) -> None:
-    """Refuse roles that contradict each other, and missing axes."""
     axes = ''.join(axis for axis in AXES if axis in sources)
-    if not axes or axes != AXES[:len(axes)]:
+    if axes not in MEASURED_AXES:
         raise UserError(f'{where}: names the axes {axes or "none"}, expected x, x and y, or x, y '
                         f'and z; write for example {_EXAMPLE}')
     given = {'roll', 'pitch', 'alpha', 'beta'} & set(sources)
     if given & {'roll', 'pitch'} and given != {'roll', 'pitch'}:
         raise UserError(f'{where}: {", ".join(sorted(given))} are no reference; name roll and '
                         'pitch, or alpha and beta')
+    return ColumnMapping(sources, where)
 
 
-@dataclass(frozen=True)
-class Mounting:
-    """How the axes of a file are the axes of the sensor frame."""
-
-    columns: tuple[int, ...]  # For each axis of the frame, the index of the axis in the file
-    signs: tuple[int, ...]  # For each axis of the frame, 1 or −1
-
-    def turn(self, values: np.ndarray) -> np.ndarray:
-        """Return outputs about zero, (n, m), along the axes of the frame."""
-        return values[:, list(self.columns)] * np.array(self.signs, float)
+Mounting = tuple[tuple[int, int], ...]
+"""For each axis of the sensor frame, the index of an axis of the file, and its sign, 1 or −1."""
 
 
 def parse_mounting(text: str) -> Mounting:
     """Parse a documented mounting, as in `x=-y,y=x,z=z`: x of the frame is −y of the file."""
-    entries: dict[str, tuple[int, int]] = {}
-    for entry in text.split(','):
-        match = re.fullmatch(r'\s*([xyz])\s*=\s*([-+]?)\s*([xyz])\s*', entry)
-        if match:
-            entries[match[1]] = AXES.index(match[3]), -1 if match[2] == '-' else 1
-    axes = AXES[:len(entries)]
-    if set(entries) != set(axes) or text.count(',') + 1 != len(axes) or \
-            sorted(index for index, _ in entries.values()) != list(range(len(axes))):
+    entries = re.findall(r'(?:^|,)\s*([xyz])\s*=\s*([-+]?)\s*([xyz])\s*(?=,|$)', text)
+    axes = AXES[:text.count(',') + 1]
+    mounting = {axis: (AXES.index(of), -1 if sign == '-' else 1) for axis, sign, of in entries}
+    if set(mounting) != set(axes) or {AXES[index] for index, _ in mounting.values()} != set(axes):
         raise UserError(f'--axes {text}: each axis of the sensor must stand once on both sides; '
                         'write for example x=-y,y=x,z=z')
-    return Mounting(tuple(entries[axis][0] for axis in axes),
-                    tuple(entries[axis][1] for axis in axes))
+    return tuple(mounting[axis] for axis in axes)
 
 
 class Quantity(Enum):
-    """
-    What a column measures.
-
-    The value names the unit of the package, as `--columns` writes it.
-    """
+    """What a column measures; the value names the unit of the package."""
 
     TIME = 's'
     OUTPUT = 'mps2'
@@ -196,11 +170,8 @@ ROLES: Mapping[str, Quantity] = {
 }
 """Quantity of each role that a column can have."""
 
-LSB = 'lsb'
-"""Unit of counts, which need the counts of 1 g."""
-
-UNSIGNED = 'u16'
-"""Unit of counts of 16 bits whose sign was lost: 65535 is −1."""
+LSB, UNSIGNED = 'lsb', 'u16'
+"""Units of counts, which need the counts of 1 g: the second lost its sign, so that 65535 is −1."""
 
 
 def signed(values: np.ndarray) -> np.ndarray:
@@ -284,34 +255,24 @@ def unit_in_name(column: str, quantity: Quantity) -> str | None:
 class ReadingOptions:
     """How a recording is to be read."""
 
-    # Topic of the samples in a bag, or message of a ULog file; empty for the only one
-    topic: str = ''
+    topic: str = ''  # Samples in a bag, or message of a ULog file; empty for the only one
     mapping: ColumnMapping | None = None  # Columns of a table; None for those of the package
-    # Counts of 1 g by axis, for columns in LSB: one for all axes, or one each
-    lsb_per_g: tuple[float, ...] = ()
-    lsb_at_0g: tuple[float, ...] = ()  # Counts at 0 g by axis, for columns in LSB; none for 0
+    lsb_per_g: tuple[float, ...] = ()  # Counts of 1 g: one for all axes, or one each
+    lsb_at_0g: tuple[float, ...] = ()  # Counts at 0 g by axis; none for 0
     rate_hz: float | None = None  # Sample rate, Hz, that replaces the stamps; None keeps them
     drop_bad_stamps: bool = False  # Whether samples are left out whose stamp does not increase
-    # How the axes of the file are those of the sensor frame; None where they are
-    mounting: Mounting | None = None
+    mounting: Mounting | None = None  # How the axes of the file are those of the sensor frame
 
 
 AS_IT_IS = ReadingOptions()
-"""Nothing is replaced."""
 
 
 _LISTED_NAMES = 12
 """Largest number of columns that a message names (chosen: some lines of a terminal)."""
-
 _NEAR = 0.25
-"""Largest logarithm of the ratio of a length to that of gravity in its unit (chosen: bias and
-scale errors are smaller, and the units are further apart)."""
-
-_SHORTEST_STEP_S = 5e-5
-"""Shortest step of stamps, s. Chosen: twice the rate of the fastest sensor."""
-
-_LONGEST_STEP_S = 1.05
-"""Longest step of stamps, s. Chosen: 1 Hz, the slowest rate of the package, with jitter."""
+"""Largest logarithm of the ratio of a length to gravity (chosen: above bias and scale errors)."""
+_SHORTEST_STEP_S, _LONGEST_STEP_S = 5e-5, 1.05
+"""Bounds of steps of stamps, s. Chosen: twice the fastest rate; 1 Hz, the slowest, with jitter."""
 
 
 def listed(names: Sequence[str]) -> str:

@@ -3,9 +3,9 @@
 """
 Text tables of any delimiter, decimal mark and header, read in blocks; and CSV files, written.
 
-The first lines show the form of a file, and each block of lines is rewritten to commas and decimal
-points. Pandas parses a block. A block that it refuses is read a second time, field by field, which
-accepts text and quotes, and finds the line and column to name in a message.
+The first lines show the form of a file; blocks of lines are rewritten with commas and decimal
+points. Pandas parses a block. One that it refuses is read again, field by field, which accepts
+text and quotes, and finds the line and column to name in a message.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from contextlib import contextmanager
 import csv
 from dataclasses import dataclass
 from io import BytesIO
-from itertools import islice
 import os
 import re
 from typing import Any, BinaryIO
@@ -28,14 +27,11 @@ import numpy as np
 
 _CHUNK_BYTES = 1 << 22
 """Bytes that are read at a time (chosen: bounds the memory, and large enough for pandas)."""
-_LONGEST_LINE_BYTES = 1 << 20
-"""Longer lines are refused, bytes (chosen: no recording has them; a file without newlines must
-not fill the memory)."""
 _PANDAS_BYTES = 1 << 20
 """Bytes of a block from which pandas parses it (chosen: its import takes 0.4 s, in which Python
 parses 2 MB)."""
-_HEAD_LINES = 200
-"""Lines that show the form of a file (chosen: more than any preamble seen)."""
+_HEAD_BYTES, _HEAD_LINES = 1 << 20, 200
+"""Beginning that shows the form of a file (chosen: more than any preamble seen)."""
 _FEWEST_NUMBERS = 2
 """Fewest numbers of a line of samples with text (chosen: `rate, 100` is in a preamble)."""
 _DELIMITERS = ('\t', ';', ',', ' ')
@@ -86,20 +82,6 @@ class Form:
         return data.replace(self.delimiter.encode(), b',')
 
 
-@dataclass(frozen=True)
-class _Lines:
-    """Lines of samples, with commas and decimal points."""
-
-    path: str  # The file
-    data: bytes  # The lines, each with a newline
-    numbers: Sequence[int]  # Their numbers in the file, from 1
-    done: float  # Fraction of the file that has been read at their end
-
-    def where(self, row: int, index: int) -> str:
-        """Return the place of a field for messages."""
-        return f'{self.path}:{self.numbers[row]}:{index + 1}'
-
-
 def read_blocks(path: str, form: Form, names: Collection[str], required: Collection[str]
                 ) -> Iterator[TableBlock]:
     """
@@ -110,40 +92,36 @@ def read_blocks(path: str, form: Form, names: Collection[str], required: Collect
     """
     used = [name for name in form.names if name in names]
     info: dict[str, str] = {}
-    for lines in _read_lines(path, form, info):
-        columns = _by_pandas(lines, form.names, used) if len(lines.data) >= _PANDAS_BYTES else None
-        columns = columns or _field_by_field(lines, form, used, required)
-        used = list(columns)
-
-        def where(row: int, column: str, lines: _Lines = lines) -> str:
-            return f'{lines.where(row, form.names.index(column))}: {column}'
-
-        yield TableBlock(columns, where, dict(info), lines.done)
-
-
-def _read_lines(path: str, form: Form, info: dict[str, str]) -> Iterator[_Lines]:
-    """Yield the lines of samples; keys and values of comments are added to `info`."""
+    last = 0
     with _opened(path) as file:
         size = max(os.fstat(file.fileno()).st_size, 1)
-        last = 0
-        for data in _whole_lines(path, file):
-            data = data.replace(b'\r\n', b'\n') if b'\r' in data else data
-            data += b'\n' * (not data.endswith(b'\n'))
-            *preamble, data = data.split(b'\n', max(form.first_line - 1 - last, 0))
-            for line in preamble:
-                _add_info(line, info)
+        while data := _in_utf_8(file.read(_CHUNK_BYTES) + file.readline()):
+            numbers: Sequence[int] = range(last + 1, last + 1 + data.count(b'\n'))
+            last = numbers[-1]
             marks = data.translate(None, _NO_MARKS)
-            first = last + len(preamble) + 1
-            last = first + marks.count(b'\n') - 1
-            numbers: Sequence[int] = range(first, last + 1)
             # An empty line, or one field, follows the end of a line.
-            if b'#' in marks or b'\n\n' in marks or marks.startswith(b'\n'):
+            if numbers[0] < form.first_line or b'#' in marks or b'\n\n' in marks \
+                    or marks.startswith(b'\n'):
                 rows = [(line, number) for line, number in zip(data.split(b'\n'), numbers)
-                        if line.strip() and not _add_info(line, info)]
+                        if line.strip() and not _add_info(line, info)
+                        and number >= form.first_line]
                 data = b''.join(line + b'\n' for line, _ in rows)
                 numbers = [number for _, number in rows]
-            if data:
-                yield _Lines(path, form.rewritten(data), numbers, file.tell() / size)
+            if not data:
+                continue
+            data = form.rewritten(data)
+
+            def place(row: int, index: int, numbers: Sequence[int] = numbers) -> str:
+                return f'{path}:{numbers[row]}:{index + 1}'
+
+            def where(row: int, name: str, place: Callable[[int, int], str] = place) -> str:
+                return f'{place(row, form.names.index(name))}: {name}'
+
+            columns = _by_pandas(data, len(numbers), form.names, used)
+            if columns is None:
+                columns = _field_by_field(data, form, used, required, place)
+            used = list(columns)
+            yield TableBlock(columns, where, dict(info), file.tell() / size)
 
 
 def _add_info(line: bytes, info: dict[str, str]) -> bool:
@@ -163,36 +141,23 @@ def _opened(path: str) -> Iterator[BinaryIO]:
         raise UserError(f'{path}: cannot read: {error.strerror or error}') from None
 
 
-def _whole_lines(path: str, file: BinaryIO) -> Iterator[bytes]:
-    """
-    Yield a file in UTF-8, without its mark, in parts that end with a line.
-
-    What is not UTF-8 is taken as Windows-1252.
-    """
-    mark = file.read(3)
-    if mark[:2] in (b'\xff\xfe', b'\xfe\xff'):
-        raise UserError(f'{path}:1:1: is UTF-16; save the file as UTF-8')
-    file.seek(3 if mark == b'\xef\xbb\xbf' else 0)
-    while data := file.read(_CHUNK_BYTES):
-        if not data.endswith(b'\n'):
-            data += file.readline(_LONGEST_LINE_BYTES + 1)
-        if len(data) > _CHUNK_BYTES + _LONGEST_LINE_BYTES:
-            raise UserError(f'{path}: a line is longer than {_LONGEST_LINE_BYTES} bytes; '
-                            'this is no CSV recording')
-        if not data.isascii():
-            try:
-                data.decode()
-            except UnicodeDecodeError:
-                data = data.decode('cp1252', errors='replace').encode()
-        yield data
+def _in_utf_8(data: bytes) -> bytes:
+    """Return lines in UTF-8 that end with a newline; what is not UTF-8 is Windows-1252."""
+    if not data.isascii():
+        try:
+            data = data.decode('utf-8-sig').encode()
+        except UnicodeDecodeError:
+            data = data.decode('cp1252', errors='replace').encode()
+    data = data.replace(b'\r\n', b'\n')
+    return data + b'\n' if data and not data.endswith(b'\n') else data
 
 
-def _by_pandas(lines: _Lines, names: Sequence[str], used: Sequence[str]
+def _by_pandas(data: bytes, rows: int, names: Sequence[str], used: Sequence[str]
                ) -> dict[str, np.ndarray] | None:
-    """Parse all lines at once; None where one of them must be parsed field by field."""
+    """Parse many lines at once; None where one of them must be parsed field by field."""
     # Pandas would fill a short line, and cut a long one.
-    marks = lines.data.translate(None, _NO_MARKS)
-    if marks != (b',' * (len(names) - 1) + b'\n') * len(lines.numbers):
+    if len(data) < _PANDAS_BYTES or \
+            data.translate(None, _NO_MARKS) != (b',' * (len(names) - 1) + b'\n') * rows:
         return None
     import pandas
     # Newer versions always round correctly, and warn of the option.
@@ -201,27 +166,27 @@ def _by_pandas(lines: _Lines, names: Sequence[str], used: Sequence[str]
     indices = [names.index(name) for name in used]
     try:
         frame = pandas.read_csv(
-            BytesIO(lines.data), header=None, names=list(range(len(names))), usecols=indices,
+            BytesIO(data), header=None, names=list(range(len(names))), usecols=indices,
             index_col=False, dtype=float, keep_default_na=False, na_values=[''],
             low_memory=False, **options)
     except (ValueError, OverflowError):
         return None
-    if len(frame) != len(lines.numbers):
+    if len(frame) != rows:
         return None
     return {name: frame[index].to_numpy() for name, index in zip(used, indices)}
 
 
-def _field_by_field(lines: _Lines, form: Form, used: Sequence[str], required: Collection[str]
-                    ) -> dict[str, np.ndarray]:
+def _field_by_field(data: bytes, form: Form, used: Sequence[str], required: Collection[str],
+                    place: Callable[[int, int], str]) -> dict[str, np.ndarray]:
     """Parse with Python; refuse a field that is no number, and drop other columns with text."""
-    rows = [_fields(line, ',') for line in lines.data.decode().split('\n')[:len(lines.numbers)]]
+    rows = [_fields(line, ',') for line in data.decode().split('\n')[:-1]]
     expected = len(form.names)
     if not required:
         rows = [row for row in rows if len(row) == expected]
     for i, row in enumerate(rows):
         if len(row) != expected:
             source = 'the header' if form.header_line else 'the first line'
-            raise UserError(f'{lines.where(i, min(len(row), expected))}: {len(row)} fields, '
+            raise UserError(f'{place(i, min(len(row), expected))}: {len(row)} fields, '
                             f'but {source} has {expected}')
     columns = {}
     for name in used:
@@ -231,7 +196,7 @@ def _field_by_field(lines: _Lines, form: Form, used: Sequence[str], required: Co
         if wrong is None:
             columns[name] = np.array([float(cell or 'nan') for cell in cells])
         elif name in required:
-            raise UserError(f'{lines.where(wrong, index)}: {name} is {cells[wrong][:24]!r}, not a '
+            raise UserError(f'{place(wrong, index)}: {name} is {cells[wrong][:24]!r}, not a '
                             'number')
     return columns
 
@@ -245,9 +210,12 @@ def find_form(path: str) -> Form:
     nearest before them.
     """
     with _opened(path) as file:
-        lines = [line.decode() for line in islice(
-            (line for data in _whole_lines(path, file) for line in data.splitlines()),
-            _HEAD_LINES)]
+        head = file.read(_HEAD_BYTES)
+    if head[:2] in (b'\xff\xfe', b'\xfe\xff'):
+        raise UserError(f'{path}:1:1: is UTF-16; save the file as UTF-8')
+    if len(head) == _HEAD_BYTES:
+        head = head.rpartition(b'\n')[0] or head  # The last line may be cut
+    lines = _in_utf_8(head).decode().split('\n')[:_HEAD_LINES]
     written = [line for line in lines if line.strip() and not line.lstrip().startswith('#')]
     if not written:
         raise UserError(f'{path}: is empty')
@@ -263,10 +231,9 @@ def find_form(path: str) -> Form:
             if count >= _FEWEST_NUMBERS or (count and count == sum(map(bool, fields))):
                 numbers[len(fields)] += count
                 first.setdefault(len(fields), index)
-        size = max(numbers, key=lambda size: numbers[size], default=0)
-        if size and (numbers[size], -size) > best:
-            best = numbers[size], -size
-            form = _form(lines, plain, first[size], delimiter)
+        size, most = max(numbers.items(), key=lambda item: item[1], default=(0, 0))
+        if (most, -size) > best:
+            best, form = (most, -size), _form(lines, plain, first[size], delimiter)
     if 'time_s' in _fields(written[0], ',') and not (form and form.header_line):
         number = lines.index(written[0]) + 1  # a recording of the package without good samples
         return _named(_fields(written[0], ','), number, number + 1, ',', False)
@@ -374,8 +341,7 @@ def csv_writer(path: str | os.PathLike, digits: int | None = None) -> Iterator[A
     """
     Open a new CSV file, and yield a function that appends rows to it.
 
-    The file appears under its name when the block ends without an error. Numbers have all the
-    digits that bring back the same float64, or all but those of the first column are rounded to
+    Numbers have all the digits that bring back the same float64, or those behind the first column
     some significant digits. NaN is written empty.
     """
     with atomic_path(path) as fresh, open(fresh, 'wb') as file:

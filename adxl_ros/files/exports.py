@@ -3,8 +3,7 @@
 """
 A sensor in the formats of estimators and simulators.
 
-A format states which parts of the sensor it holds, with their places in the file; the head of each
-file lists them next to what it cannot hold.
+The head of each file lists the parts of the sensor: where it holds them, or that it cannot.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from dataclasses import asdict, dataclass, fields
 from functools import partial
 import json
 import re
-from textwrap import wrap
+from textwrap import fill, indent, wrap
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import install_hint, UserError
@@ -22,6 +21,7 @@ from adxl_ros.files import parameter_file
 from adxl_ros.files.parameter_file import float_text
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.noise import ONE_SIDED
@@ -29,15 +29,8 @@ from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.process import package_version
 import numpy as np
 
-WHITE_NOISE = 'white noise'
-"""Name of the part: noise of one sample before the ADC."""
-FILTER = 'RC filter'
-"""Name of the part: the low-pass of the output."""
-STEPS = 'ADC steps'
-"""Name of the part: rounding of the ADC."""
-
-_NO_AXIS_VARIANCE = 1e6
-"""Variance of an axis that the sensor does not have, (m/s²)², as the driver publishes it."""
+WHITE_NOISE, FILTER, STEPS = 'white noise', 'RC filter', 'ADC steps'
+"""Names of parts: noise of a sample before the ADC, low-pass of the output, and rounding."""
 _COLUMNS = 75
 """Columns of the head without the signs of a comment; chosen: 79 with them."""
 _NOT_HELD = 'not held'
@@ -54,8 +47,7 @@ class Export:
 
     sensor: Sensor  # The unit
     source: str  # Name of its parameter file
-    # Place in the file by name of the part that it holds
-    holds: Mapping[str, str]
+    holds: Mapping[str, str]  # Place in the file by name of the part that it holds
     # Rms of what each part of the sensor changes, mg, by its name: effects but those of the stage,
     # and the constants above
     sizes_mg: Mapping[str, float]
@@ -153,12 +145,9 @@ def _head(export: Export, software: str, prefix: str = '# ') -> str:
               'shaking, warming and a step of the supply), by simulation.',
               'All that is not held, but for noise and steps: '
               f'{size_text(export.remaining_mg)} mg rms.']
-    text = _prefixed(lines, prefix)
+    text = indent('\n'.join(lines), prefix, lambda line: True)
+    text = '\n'.join(map(str.rstrip, text.split('\n')))
     return text if prefix.startswith('#') else _without_double_dashes(text)
-
-
-def _prefixed(lines: list[str], prefix: str) -> str:
-    return '\n'.join(f'{prefix}{line}'.rstrip() for line in lines)
 
 
 def _without_double_dashes(text: str) -> str:
@@ -180,14 +169,14 @@ def _flat_noise(sensor: Sensor, prefix: str = '# ') -> str:
     """
     Return how much quieter white noise is than filtered noise of the same rms at low frequency.
 
-    Filtered noise is an AR(1) sequence with a = exp(−dt/RC). At low frequency its density is
-    √((1 + a)/(1 − a)) times that of white noise of the same variance.
+    Filtered noise is AR(1) with a = exp(−dt/RC), whose density there is √((1 + a)/(1 − a)) times
+    that of white noise.
     """
     rc_s = float(noise.electronics(sensor).rc_s.max())
     if not rc_s:
         return ''
     ratio = np.tanh(0.5 / (sensor.rate_hz * rc_s)) ** -0.5
-    return _prefixed(wrap(
+    return indent(fill(
         'White noise is not filtered here: its spectrum is flat up to half the rate. Its density '
         f'is {ratio:.3g} times too small below the corner of the filter, '
         f'{0.5 / (np.pi * rc_s):.3g} Hz.', _COLUMNS), prefix)
@@ -205,12 +194,7 @@ def size_text(size_mg: float) -> str:
 
 
 def _json(export: Export) -> str:
-    """
-    JSON: all values with units, and the sizes of all parts.
-
-    Its model is the linear response at 0 g, 25 °C and the nominal supply, with filter, noise and
-    steps. The parameters of all effects are in it, but not their functions.
-    """
+    """Return all values with units: the linear response, and the parameters of all effects."""
     sensor = export.sensor
     effects: dict[str, dict[str, Any]] = {}
     for effect in sensor.effects:
@@ -281,7 +265,7 @@ def text(name: str, export: Export) -> str:
         raise UserError(f'--to {name} needs jinja2: {install_hint("jinja2")}') from None
     sensor = export.sensor
     values = {field.name: by_axis(sensor, field.name) for field in fields(Axis)[1:]}
-    variance = [v if axis in sensor.axes else _NO_AXIS_VARIANCE
+    variance = [v if axis in sensor.axes else UNMEASURED_VARIANCE
                 for axis, v in zip(AXES, values['sample_variance'])]
     coupling = np.eye(3)
     coupling[[AXES.index(axis) for axis in sensor.axes]] = gain(sensor)
@@ -303,59 +287,47 @@ def text(name: str, export: Export) -> str:
         covariance=np.diag(variance).ravel().tolist())
 
 
-_SAMPLE = (WHITE_NOISE, 'noise_excess', STEPS, 'quantisation')
+def _at(place: str, *parts: str) -> dict[str, str]:
+    return dict.fromkeys(parts, place)
+
+
+_NOISE = (WHITE_NOISE, 'noise_excess')
+_ROUNDING = (STEPS, 'quantisation')
+_SAMPLE = (*_NOISE, *_ROUNDING)
 """Parts in the variance of one sample."""
-
-_STD = {WHITE_NOISE: 'std', 'noise_excess': 'std', 'bias': 'mean'}
+_GAUSSIAN = {**_at('std', *_NOISE), 'bias': 'mean'}
 """Places of the parts in Gaussian noise."""
-
 
 FORMATS = {
     'broadcaster': Format(
-        'parameters of imu_sensor_broadcaster (ros2_controllers)',
-        dict.fromkeys(_SAMPLE, 'covariance')),
-    'fusioncore': Format(
-        'parameters of FusionCore 0.3',
-        {**dict.fromkeys(_SAMPLE, 'imu.accel_noise'), 'bias_walk': 'ukf.q_accel_bias',
-         'lever_arm': 'imu.lever_arm_x, _y, _z'}),
-    'json': Format(
-        'all values with units, for any program',
-        {WHITE_NOISE: 'axes.noise_std_mps2', 'noise_excess': 'axes.noise_std_mps2',
-         'bias': 'axes.zero_g_mps2', 'scale_factor': 'gain', 'misalignment': 'gain',
-         'bias_walk': 'axes.walk_density', 'lever_arm': 'position_m', STEPS: 'axes.step_mps2',
-         'quantisation': 'axes.step_mps2', FILTER: 'filter_s', 'bandwidth': 'filter_s'}),
-    'kalibr': Format(
-        'the part of the accelerometer in imu.yaml of Kalibr',
-        {WHITE_NOISE: 'accelerometer_noise_density',
-         'noise_excess': 'accelerometer_noise_density', 'bias_walk': 'accelerometer_random_walk'}),
-    'okvis2': Format(
-        'the part of the accelerometer in the configuration of OKVIS2',
-        {WHITE_NOISE: 'sigma_a_c', 'noise_excess': 'sigma_a_c', 'bias': 'a0',
-         'bias_walk': 'sigma_aw_c', 'saturation': 'a_max'}),
-    'point_lio': Format(
-        'the part of the accelerometer in the configuration of Point-LIO',
-        {**dict.fromkeys(_SAMPLE, 'imu_meas_acc_cov'), 'bias_walk': 'b_acc_cov',
-         'saturation': 'satu_acc'}),
-    'genesis': Format(
-        'Python module with options of an IMU of Genesis 0.4 to 1.4',
-        {WHITE_NOISE: 'acc_noise', 'noise_excess': 'acc_noise', 'bias': 'acc_bias',
-         'bias_walk': 'acc_random_walk', 'scale_factor': 'CROSS_AXIS_COUPLING',
-         'misalignment': 'CROSS_AXIS_COUPLING', 'lever_arm': 'pos_offset',
-         STEPS: 'acc_resolution', 'quantisation': 'acc_resolution', 'time_offset': 'delay'}),
-    'isaaclab': Format(
-        'Python module with configurations of Isaac Lab, 2.x and 3.0',
-        {**_STD, 'lever_arm': 'pos'}),
-    'mjlab': Format(
-        'Python module with configurations of mjlab 1.x',
-        {**_STD, 'lever_arm': 'POS'}),
-    'mujoco': Format(
-        'site and accelerometer of MuJoCo (MJCF)',
-        {'lever_arm': 'pos of the site', WHITE_NOISE: 'noise (MuJoCo does not add it)',
-         'noise_excess': 'noise (MuJoCo does not add it)'}),
-    'sdf': Format(
-        'imu of gz-sensors, Gazebo (SDFormat)',
-        {WHITE_NOISE: '<stddev>', 'noise_excess': '<stddev>', 'bias': '<mean>',
-         'bias_walk': '<dynamic_bias_stddev>', 'lever_arm': '<pose>', STEPS: '<precision>',
-         'quantisation': '<precision>'}),
+        'parameters of imu_sensor_broadcaster (ros2_controllers)', _at('covariance', *_SAMPLE)),
+    'fusioncore': Format('parameters of FusionCore 0.3', {
+        **_at('imu.accel_noise', *_SAMPLE), 'bias_walk': 'ukf.q_accel_bias',
+        'lever_arm': 'imu.lever_arm_x, _y, _z'}),
+    'json': Format('all values with units, for any program', {
+        **_at('axes.noise_std_mps2', *_NOISE), 'bias': 'axes.zero_g_mps2',
+        **_at('gain', 'scale_factor', 'misalignment'), 'bias_walk': 'axes.walk_density',
+        'lever_arm': 'position_m', **_at('axes.step_mps2', *_ROUNDING),
+        **_at('filter_s', FILTER, 'bandwidth')}),
+    'kalibr': Format('the part of the accelerometer in imu.yaml of Kalibr', {
+        **_at('accelerometer_noise_density', *_NOISE), 'bias_walk': 'accelerometer_random_walk'}),
+    'okvis2': Format('the part of the accelerometer in the configuration of OKVIS2', {
+        **_at('sigma_a_c', *_NOISE), 'bias': 'a0', 'bias_walk': 'sigma_aw_c',
+        'saturation': 'a_max'}),
+    'point_lio': Format('the part of the accelerometer in the configuration of Point-LIO', {
+        **_at('imu_meas_acc_cov', *_SAMPLE), 'bias_walk': 'b_acc_cov', 'saturation': 'satu_acc'}),
+    'genesis': Format('Python module with options of an IMU of Genesis 0.4 to 1.4', {
+        **_at('acc_noise', *_NOISE), 'bias': 'acc_bias', 'bias_walk': 'acc_random_walk',
+        **_at('CROSS_AXIS_COUPLING', 'scale_factor', 'misalignment'), 'lever_arm': 'pos_offset',
+        **_at('acc_resolution', *_ROUNDING), 'time_offset': 'delay'}),
+    'isaaclab': Format('Python module with configurations of Isaac Lab, 2.x and 3.0', {
+        **_GAUSSIAN, 'lever_arm': 'pos'}),
+    'mjlab': Format('Python module with configurations of mjlab 1.x', {
+        **_GAUSSIAN, 'lever_arm': 'POS'}),
+    'mujoco': Format('site and accelerometer of MuJoCo (MJCF)', {
+        'lever_arm': 'pos of the site', **_at('noise (MuJoCo does not add it)', *_NOISE)}),
+    'sdf': Format('imu of gz-sensors, Gazebo (SDFormat)', {
+        **_at('<stddev>', *_NOISE), 'bias': '<mean>', 'bias_walk': '<dynamic_bias_stddev>',
+        'lever_arm': '<pose>', **_at('<precision>', *_ROUNDING)}),
 }
 """Formats by name."""

@@ -3,9 +3,7 @@
 """
 Serialized sensor_msgs/Imu messages, read and corrected one by one.
 
-A corrected message differs from the raw one in some numbers only, so that these are replaced in
-its bytes. That takes a tenth of the time of a conversion to a message object and back. Byte order
-and header stay.
+Numbers are replaced in the bytes, in a tenth of the time of a conversion to an object and back.
 """
 
 from __future__ import annotations
@@ -16,19 +14,13 @@ import struct
 from adxl_ros.files import cdr
 from adxl_ros.model.kinematics import Mounting
 
-_STAMP_OFFSET = 4
-"""Offset of the header's stamp, bytes."""
-
-_FRAME_LENGTH = slice(12, 16)
-"""Bytes with the length of the frame's name, which follows the stamp."""
-
+_STAMP_OFFSET, _FRAME_LENGTH = 4, slice(12, 16)
+"""Bytes of the header's stamp, and of the length of the frame's name."""
 _ANGULAR_VELOCITY, _ACCELERATION, _END = 13 * 8, 25 * 8, 37 * 8
 """Offsets behind the header, bytes: first come a quaternion and its covariance, then each vector
 with its covariance, all float64."""
-
 _QUATERNION = 4
 """Numbers of a quaternion, which stand before the orientation's covariance."""
-
 _UNSET = (0.0, 0.0, 0.0, 1.0, *[0.0] * 9)
 """Quaternion and covariance of an orientation that nobody has set."""
 
@@ -55,10 +47,9 @@ def read(raw: bytes) -> tuple[float, Sequence[float]]:
 
 def has_orientation(raw: bytes) -> bool:
     """
-    Return whether a sensor_msgs/Imu, serialized, that `read` accepted, states an orientation.
+    Return whether an Imu that `read` accepted states an orientation.
 
-    It states none where the first covariance is -1 (REP-145), and where nobody has set it: the
-    default of the message is the identity with covariances of 0.
+    It states none where the first covariance is -1 (REP-145), nor by the default of the message.
     """
     order, begin = _numbers_begin(raw)
     values = struct.unpack_from(order + '13d', raw, begin)
@@ -75,11 +66,7 @@ def with_frame(raw: bytes, frame_id: str) -> bytes:
 
 
 def turned(raw: bytes, mounting: Mounting) -> bytes:
-    """
-    Return an Imu with angular velocity and orientation in the frame of the robot.
-
-    A part that is not there (its first covariance is -1) stays as it is.
-    """
+    """Return an Imu with angular velocity and orientation, if any, in the frame of the robot."""
     order, begin = _numbers_begin(raw)
     message = bytearray(raw)
     if has_orientation(raw):
@@ -93,7 +80,7 @@ def turned(raw: bytes, mounting: Mounting) -> bytes:
 
 
 def orientation(raw: bytes) -> tuple[float, ...]:
-    """Return the quaternion x, y, z, w of a sensor_msgs/Imu, serialized, that `read` accepted."""
+    """Return the quaternion x, y, z, w of an Imu that `read` accepted."""
     order, begin = _numbers_begin(raw)
     return struct.unpack_from(order + '4d', raw, begin)
 
@@ -101,10 +88,9 @@ def orientation(raw: bytes) -> tuple[float, ...]:
 def corrected(raw: bytes, orientation: Sequence[float] | None, acceleration: Sequence[float]
               ) -> bytes:
     """
-    Return an Imu with another orientation and acceleration.
+    Return an Imu with another orientation, if any, and acceleration.
 
-    orientation: quaternion x, y, z, w and the covariance by rows, rad², (13,); None keeps that of
-    `raw`; acceleration: x, y, z, m/s², and the covariance by rows, (m/s²)², (12,).
+    Each is followed by its covariance by rows, rad² and (m/s²)²: (13,) and (12,).
     """
     order, begin = _numbers_begin(raw)
     message = bytearray(raw)
@@ -115,11 +101,7 @@ def corrected(raw: bytes, orientation: Sequence[float] | None, acceleration: Seq
 
 
 def vector3_stamped(raw: bytes, vector: Sequence[float]) -> bytes:
-    """
-    Return a geometry_msgs/Vector3Stamped with the header of an Imu.
-
-    vector: x, y, z, (3,).
-    """
+    """Return a geometry_msgs/Vector3Stamped with the header of an Imu."""
     order, begin = _numbers_begin(raw)
     # In both messages, numbers of eight bytes follow the header.
     return raw[:begin] + struct.pack(order + '3d', *vector)

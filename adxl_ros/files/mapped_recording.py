@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping
-from dataclasses import dataclass
+from collections.abc import Generator
 import re
 
 from adxl_ros.errors import UserError
@@ -47,37 +46,20 @@ import numpy as np
 
 _TIME_LIMIT_S = 9e9
 """Largest magnitude of a time, s: in nanoseconds it fits into 64 bits (9.2e18)."""
-
 _EPOCH_S = 1e8
 """First time from which times count from 1970, s: three years (chosen: no sensor runs so long)."""
-
 _LENGTHS_G = (0.5, 2.0)
-"""Bounds of the median length of the readings, g, within which their unit is right (chosen: a
-sensor is mostly near 1 g)."""
-
+"""Bounds of the median length of readings in the right unit, g (chosen: most are near 1 g)."""
 _TURN_RAD = 2 * np.pi
 """Largest roll and pitch, rad."""
-
 _FEWEST_STAMPS = 8
 """Stamps whose steps show their unit. Chosen: a lost sample hides no median."""
-
 _WHOLE = 1e-3
 """Largest distance of a stamp from a whole number by rounding, in its unit."""
 
 _NATIVE = {TIME: 'time', **{column: joint for joint, column in JOINTS.items()},
            'temperature_c': 'temperature', 'supply_v': 'supply'}
 """Role of the package's columns besides those of the sensor."""
-
-
-@dataclass(frozen=True)
-class _Column:
-    """A column that is read."""
-
-    name: str  # Its name in the table
-    unit: Unit  # Its unit
-    unit_name: str  # Name of the unit
-    # Whether mapping, name or format state the unit; else it is that of the package
-    is_stated: bool
 
 
 class NotNativeError(UserError):
@@ -112,9 +94,8 @@ def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
         outputs = output or sensor_columns(names, table.header)
     except UserError as error:
         raise NotNativeError(str(error)) from None
-    native = {role: name for name, role in _NATIVE.items() if name in names}
-    return ColumnMapping({role: Source(name, name.rpartition('_')[2]) for role, name in {
-        **native, **dict(zip(AXES, outputs))}.items()}, table.path)
+    return ColumnMapping({role: Source(name, name.rpartition('_')[2]) for name, role in {
+        **_NATIVE, **dict(zip(outputs, AXES))}.items() if name in names}, table.path)
 
 
 def blocks(table: Table, mapping: ColumnMapping | None, reading: ReadingOptions, rows: int,
@@ -124,95 +105,94 @@ def blocks(table: Table, mapping: ColumnMapping | None, reading: ReadingOptions,
 
     Without a mapping it must have the columns of the package, and further ones are kept, too.
     """
-    stated = mapping or native_mapping(table, output)
-    columns = _resolved(table, stated, reading)
-    converter = _Converter(table, columns, stated, reading, mapping is None)
-    names = list(dict.fromkeys(column.name for column in columns.values()))
-    count = 0
+    converter = _Converter(table, mapping or native_mapping(table, output), reading,
+                           mapping is None)
+    names = list(dict.fromkeys(source.column for source in converter.sources.values()))
     for block in table.blocks(table.names if mapping is None else names, names):
         recording = converter.convert(block)
         for start in range(0, len(recording), rows):
             yield recording.rows(start, start + rows)
-        count += len(recording)
-    if not count:
+    if not converter.count:
         raise UserError(f'{table.path}: has a header, but no samples')
-
-
-def _resolved(table: Table, mapping: ColumnMapping, reading: ReadingOptions
-              ) -> dict[str, _Column]:
-    """Return the column of each role."""
-    if 'time' not in mapping.sources and reading.rate_hz is None:
-        raise UserError(f'{mapping.where}: has no time; add time=COLUMN:UNIT, or give --rate HZ '
-                        'to stamp by index')
-    columns = {role: _column(table, mapping, role) for role in mapping.sources}
-    outputs = [columns[axis] for axis in AXES if axis in columns]
-    if len({column.unit.is_volts for column in outputs}) > 1:
-        raise UserError(f'{mapping.where}: some axes are in volts and others are not; state one '
-                        'kind')
-    counts = [column.name for column in outputs if column.unit_name in (LSB, UNSIGNED)]
-    if bool(counts) != bool(reading.lsb_per_g):
-        raise UserError(f'{mapping.where}: {counts[0]} is in LSB; add --lsb-per-g with the counts '
-                        'of 1 g, as in the datasheet' if counts else
-                        '--lsb-per-g: no column is in LSB; write for example '
-                        f'x={outputs[0].name}:lsb')
-    if not {len(reading.lsb_per_g), len(reading.lsb_at_0g)} <= {0, 1, len(outputs)}:
-        raise UserError(f'--lsb-per-g, --lsb-at-0g: write one value for all {len(outputs)} axes, '
-                        'or one for each')
-    return columns
-
-
-def _column(table: Table, mapping: ColumnMapping, role: str) -> _Column:
-    """Return the column of a role, by its name or number."""
-    source = mapping.sources[role]
-    name = source.column
-    if name not in table.names:
-        if not name.isdecimal() or not 1 <= int(name) <= len(table.names):
-            raise UserError(f'{mapping.where}: {table.path} has no column {name!r} for {role}; '
-                            f'the columns are {listed(table.names)}')
-        name = table.names[int(name) - 1]
-    stated = source.unit or table.units.get(name) or unit_in_name(name, ROLES[role])
-    unit = stated or ROLES[role].value
-    return _Column(name, UNITS[ROLES[role]][unit], unit, bool(stated))
 
 
 class _Converter:
     """Converts the blocks of one table; the arguments are those of `blocks`."""
 
-    def __init__(self, table: Table, columns: Mapping[str, _Column], mapping: ColumnMapping,
-                 reading: ReadingOptions, is_native: bool) -> None:
-        self._path = table.path
-        self._columns, self._mapping, self._reading = columns, mapping, reading
-        self._axes = [columns[axis] for axis in AXES if axis in columns]
+    def __init__(self, table: Table, mapping: ColumnMapping, reading: ReadingOptions,
+                 is_native: bool) -> None:
+        self.count = 0  # Samples so far
+        self._path, self._where, self._reading = table.path, mapping.where, reading
         self._is_native = is_native  # Whether the columns are those of the package
+        if 'time' not in mapping.sources and reading.rate_hz is None:
+            raise UserError(f'{mapping.where}: has no time; add time=COLUMN:UNIT, or give '
+                            '--rate HZ to stamp by index')
+        self._assumed: list[str] = []  # Columns whose unit nothing states
+        # Column and unit by role
+        self.sources = {role: self._source(table, role, source)
+                        for role, source in mapping.sources.items()}
+        self._axes = [self.sources[axis] for axis in AXES if axis in self.sources]
+        self._is_volts = self._unit(AXES[0]).is_volts
+        self._check_axes()
         self._stamps = StampCheck(table.path, reading.drop_bad_stamps)
         self._remarks: list[str] = []
         self._epoch_ns: int | None = None
         self._begin = 0.0  # Origin of the times in the unit of the stamps
-        self._count = 0  # Samples so far
         self._empty = 0  # Rows without a reading
         self._last_beta_rad = 0.0
+
+    def _source(self, table: Table, role: str, source: Source) -> Source:
+        """Return the column of a role, by its name or number, and its unit."""
+        name, names = source.column, table.names
+        if name not in names:
+            if not name.isdecimal() or not 1 <= int(name) <= len(names):
+                raise UserError(f'{self._where}: {table.path} has no column {name!r} for {role}; '
+                                f'the columns are {listed(names)}')
+            name = names[int(name) - 1]
+        unit = source.unit or table.units.get(name) or unit_in_name(name, ROLES[role])
+        if not unit:
+            unit = ROLES[role].value
+            self._assumed.append(f'{name} in {unit}')
+        return Source(name, unit)
+
+    def _unit(self, role: str) -> Unit:
+        return UNITS[ROLES[role]][self.sources[role].unit]
+
+    def _check_axes(self) -> None:
+        """Refuse units of the axes that do not fit each other, or the options."""
+        if any(self._unit(axis).is_volts != self._is_volts for axis in AXES[:len(self._axes)]):
+            raise UserError(f'{self._where}: some axes are in volts and others are not; state one '
+                            'kind')
+        counts = [axis.column for axis in self._axes if axis.unit in (LSB, UNSIGNED)]
+        per_g, at_0g = self._reading.lsb_per_g, self._reading.lsb_at_0g
+        if bool(counts) != bool(per_g):
+            raise UserError(f'{self._where}: {counts[0]} is in LSB; add --lsb-per-g with the '
+                            'counts of 1 g, as in the datasheet' if counts else
+                            '--lsb-per-g: no column is in LSB; write for example '
+                            f'x={self._axes[0].column}:lsb')
+        if not {len(per_g), len(at_0g)} <= {0, 1, len(self._axes)}:
+            raise UserError(f'--lsb-per-g, --lsb-at-0g: write one value for all '
+                            f'{len(self._axes)} axes, or one for each')
 
     def convert(self, block: TableBlock) -> Recording:
         """Return the samples of a block."""
         outputs = self._outputs(block)
-        # In the package's own recordings, every line is a sample.
-        is_sample = ~np.isnan(outputs).all(axis=1) | (
-            self._is_native and not self._reading.drop_bad_stamps)
+        is_sample = ~np.isnan(outputs).all(axis=1)
         self._empty += int((~is_sample).sum())
-        for column, values in zip(self._axes, outputs.T):
-            _refuse(block, column, is_sample & ~(np.abs(values) <= LIMIT),
-                    f'no reading of a sensor in {column.unit_name}', 'every sample needs it')
+        for source, values in zip(self._axes, outputs.T):
+            _refuse(block, source, is_sample & ~(np.abs(values) <= LIMIT),
+                    f'no reading of a sensor in {source.unit}', 'every sample needs it')
         time_s, is_kept = self._times(block, is_sample)
-        columns = dict(zip(VOLTS if self._axes[0].unit.is_volts else ACCEL, outputs.T))
+        columns = dict(zip(VOLTS if self._is_volts else ACCEL, outputs.T))
         columns |= self._references(block)
         if self._is_native:
-            columns |= {name: values for name, values in block.columns.items()
-                        if name not in columns and name != TIME}
+            columns = {**block.columns, **columns}
+            del columns[TIME]
         columns = {name: np.ascontiguousarray(values[is_kept])
                    for name, values in columns.items()}
-        if not self._count and is_kept.any():
+        if not self.count and is_kept.any():
             self._look_at_first(outputs[is_kept], time_s[is_kept])
-        self._count += int(is_kept.sum())
+        self.count += int(is_kept.sum())
         info = {key: text for key, text in block.info.items() if key != 'epoch_ns'}
         left_out = f'{self._path}: left out, lines without a reading of the sensor: {self._empty}'
         return Recording(self._path, time_s[is_kept], columns, info, cut=block.cut,
@@ -226,77 +206,65 @@ class _Converter:
         per_g = np.broadcast_to(np.array(self._reading.lsb_per_g or 1.0), count)
         zero = np.broadcast_to(np.array(self._reading.lsb_at_0g or 0.0), count)
         outputs = []
-        for index, column in enumerate(self._axes):
-            values = block.columns[column.name]
-            if column.unit_name == UNSIGNED:
-                values = signed(values)
-            if column.unit_name in (LSB, UNSIGNED):
-                values = (values - zero[index]) / per_g[index]
-            outputs.append(column.unit.convert(values))
+        for axis, source, scale, offset in zip(AXES, self._axes, per_g, zero):
+            values = block.columns[source.column]
+            if source.unit in (LSB, UNSIGNED):
+                values = ((signed(values) if source.unit == UNSIGNED else values) - offset) / scale
+            outputs.append(self._unit(axis).convert(values))
         return np.column_stack(outputs)
 
     def _references(self, block: TableBlock) -> dict[str, np.ndarray]:
         """Return the columns of references by name, (n,) each; NaN where not sampled."""
         values = {}
-        for role, column in self._columns.items():
+        for role, source in self.sources.items():
             if role == 'time' or role in AXES:
                 continue
-            stated = block.columns[column.name]
-            is_tilt = role in ('roll', 'pitch') and column.unit_name == 'rad'
-            _refuse(block, column, np.abs(stated) > (_TURN_RAD if is_tilt else LIMIT),
-                    f'no {role} in {column.unit_name}')
-            values[role] = column.unit.convert(stated)
+            stated = block.columns[source.column]
+            is_tilt = role in ('roll', 'pitch') and source.unit == 'rad'
+            _refuse(block, source, np.abs(stated) > (_TURN_RAD if is_tilt else LIMIT),
+                    f'no {role} in {source.unit}')
+            values[role] = self._unit(role).convert(stated)
         if 'roll' in values:
             values['alpha'], beta_rad = stage_angles(values['roll'], values['pitch'])
-            values['beta'] = self._unwrapped(beta_rad)
+            # Without steps of a turn; rows without an angle stay NaN.
+            known = np.isfinite(beta_rad)
+            turned = np.unwrap(np.concatenate([[self._last_beta_rad], beta_rad[known]]))
+            beta_rad[known], self._last_beta_rad = turned[1:], float(turned[-1])
+            values['beta'] = beta_rad
         return {name: values[role] for name, role in _NATIVE.items() if role in values}
-
-    def _unwrapped(self, beta_rad: np.ndarray) -> np.ndarray:
-        """Return beta without steps of a turn, rad, (n,); rows without it stay NaN."""
-        sampled = np.isfinite(beta_rad)
-        turned = beta_rad.copy()
-        turned[sampled] = np.unwrap(np.concatenate([[self._last_beta_rad], beta_rad[sampled]]))[1:]
-        if sampled.any():
-            self._last_beta_rad = float(turned[sampled][-1])
-        return turned
 
     def _times(self, block: TableBlock, is_sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return stamps, s, (n,), and which rows are kept, (n,)."""
         if self._reading.rate_hz is not None:
-            number = self._count + np.cumsum(is_sample) - 1
+            number = self.count + np.cumsum(is_sample) - 1
             return number / self._reading.rate_hz, is_sample
-        column = self._columns['time']
-        stamps = block.columns[column.name]
-        _refuse(block, column, is_sample & ~(np.abs(column.unit.convert(stamps)) < _TIME_LIMIT_S),
-                f'no time in {column.unit_name} (200 years at most)',
+        source, unit = self.sources['time'], self._unit('time')
+        stamps = block.columns[source.column]
+        _refuse(block, source, is_sample & ~(np.abs(unit.convert(stamps)) < _TIME_LIMIT_S),
+                f'no time in {source.unit} (200 years at most)',
                 'every sample needs a time: delete the line, or give --rate HZ to stamp by index')
         if self._epoch_ns is None and is_sample.any():
-            self._find_epoch(block, float(column.unit.convert(stamps[is_sample][:1])[0]))
-        time_s = column.unit.convert(stamps - self._begin)
+            text = block.info.get('epoch_ns', '0')
+            if not re.fullmatch(r'-?\d{1,18}|-?[1-8]\d{18}', text):
+                raise UserError(f'{self._path}: epoch_ns is {text!r}, expected whole nanoseconds')
+            self._epoch_ns = int(text)
+            first_s = float(unit.convert(stamps[is_sample][:1])[0])
+            if first_s > _EPOCH_S and not self._is_native and not self._epoch_ns:
+                self._epoch_ns = int(first_s) * 1_000_000_000
+                self._begin = int(first_s) * unit.divisor
+        time_s = unit.convert(stamps - self._begin)
         return time_s, self._stamps.increasing(time_s, is_sample,
-                                               lambda row: block.where(row, column.name))
-
-    def _find_epoch(self, block: TableBlock, first_s: float) -> None:
-        """Find the origin of the times: as comments state it, or near the first one."""
-        text = block.info.get('epoch_ns', '0')
-        if not re.fullmatch(r'-?\d{1,18}|-?[1-8]\d{18}', text):
-            raise UserError(f'{self._path}: epoch_ns is {text!r}, expected whole nanoseconds')
-        self._epoch_ns = int(text)
-        if first_s > _EPOCH_S and not self._is_native and not self._epoch_ns:
-            self._epoch_ns = int(first_s) * 1_000_000_000
-            self._begin = int(first_s) * self._columns['time'].unit.divisor
+                                               lambda row: block.where(row, source.column))
 
     def _look_at_first(self, outputs: np.ndarray, time_s: np.ndarray) -> None:
         """Note what is assumed; refuse readings and stamps that are in another unit."""
         if len(time_s) > _FEWEST_STAMPS and self._reading.rate_hz is None:
             self._check_step(time_s)
-        if len(self._axes) == len(AXES) and not self._axes[0].unit.is_volts:
+        if len(self._axes) == len(AXES) and not self._is_volts:
             self._check_length(outputs)
-        assumed = [f'{column.name} in {column.unit_name}' for column in self._columns.values()
-                   if not column.is_stated]
-        if assumed:
+        if self._assumed:
             self._remarks.append(f'{self._path}: columns without a unit are read as '
-                                 f'{", ".join(assumed)}')
+                                 f'{", ".join(self._assumed)}')
         bursts = describe_bursts(time_s) if len(time_s) > _FEWEST_STAMPS else ''
         if bursts:
             self._remarks.append(f'{self._path}: {bursts.removeprefix("; ")}; this rate is '
@@ -304,39 +272,38 @@ class _Converter:
 
     def _check_step(self, time_s: np.ndarray) -> None:
         """Refuse stamps whose steps no sensor has."""
-        column = self._columns['time']
+        source, divisor = self.sources['time'], self._unit('time').divisor
         rate_hz = stamped_rate_hz(time_s)
-        stamps, step = time_s * column.unit.divisor, column.unit.divisor / rate_hz
+        stamps, step = time_s * divisor, divisor / rate_hz
         is_whole = bool((np.abs(stamps - np.rint(stamps)) < _WHOLE).all())
         if not is_sensor_step(1 / rate_hz, is_whole):
             unit = time_unit_of_step(step, is_whole)
-            fitting = {**self._mapping.sources, 'time': Source(column.name, unit)}
+            fitting = ColumnMapping({**self.sources, 'time': Source(source.column, unit)})
             raise UserError(
-                f'{self._path}: {column.name} has steps of {step:.4g}, which as '
-                f'{column.unit_name} are {rate_hz:.3g} Hz; if that is right, give --rate '
+                f'{self._path}: {source.column} has steps of {step:.4g}, which as '
+                f'{source.unit} are {rate_hz:.3g} Hz; if that is right, give --rate '
                 f'{rate_hz:.3g}, and if they are {unit}:',
-                f'--columns {shell_quoted(str(ColumnMapping(fitting)))}')
+                f'--columns {shell_quoted(str(fitting))}')
 
     def _check_length(self, outputs: np.ndarray) -> None:
         """Compare the length of the readings with gravity: a wrong unit shows in it."""
         first = self._axes[0]
         length_g = float(np.median(np.linalg.norm(outputs, axis=1))) / G0_MPS2
         if not _LENGTHS_G[0] < length_g < _LENGTHS_G[1]:
-            names = ', '.join(column.name for column in self._axes)
-            text = f'{self._path}: {names} have a length of {length_g:.3g} g in ' \
-                   f'{first.unit_name}, where gravity has 1 g'
-            if not first.is_stated:
-                raise UserError(f'{text}; state their unit, for example x={first.name}:'
+            text = (f'{self._path}: {", ".join(axis.column for axis in self._axes)} have a length '
+                    f'of {length_g:.3g} g in {first.unit}, where gravity has 1 g')
+            if f'{first.column} in {first.unit}' in self._assumed:
+                raise UserError(f'{text}; state their unit, for example x={first.column}:'
                                 f'{likely_unit(length_g * G0_MPS2) or "UNIT"}')
             self._remarks.append(f'{text}: check the unit')
 
 
-def _refuse(block: TableBlock, column: _Column, wrong: np.ndarray, reason: str,
+def _refuse(block: TableBlock, source: Source, wrong: np.ndarray, reason: str,
             reason_of_none: str = '') -> None:
     """Refuse cells of a column, (n,): for a reason, or for another one where they are empty."""
     if wrong.any():
         row = int(wrong.argmax())
-        value = block.columns[column.name][row]
+        value = block.columns[source.column][row]
         text = f'empty or NaN; {reason_of_none}' if np.isnan(value) else \
             f'{value:g}, {reason}; delete the line, or correct the unit'
-        raise UserError(f'{block.where(row, column.name)} is {text}')
+        raise UserError(f'{block.where(row, source.column)} is {text}')

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-MCAP files: whole ones chunk by chunk, and those without an end from the front.
+MCAP files (https://mcap.dev/spec): whole ones by chunk, and those without an end from the front.
 
-A chunk is followed by the places of its messages (https://mcap.dev/spec, "Message Index").
-Messages of one length are therefore taken from it, and put into it, as the rows of one array.
-
-A killed recorder or a full disk leaves a file without an end, where the index is. It is read up to
-its last whole record, as a file that is still written is.
+A chunk is followed by the places of its messages, so that those of one length are taken from it,
+and put into it, as the rows of one array. A killed recorder leaves a file without its index, which
+is read up to the last whole record.
 """
 
 from __future__ import annotations
@@ -25,37 +23,27 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 _MESSAGE, _MESSAGE_INDEX = 5, 7
 """Operation codes of records (specification, "Records")."""
-
 _RECORD_HEAD = struct.Struct('<BQ')
 """Operation code and length of a record."""
-
 _CHUNK_HEAD = struct.Struct('<QQQII')
 """First and last time of a chunk, its size, CRC-32, and the length of its compression's name; the
 name and the 8 bytes of the length of its records follow."""
-
 _MESSAGE_HEAD = np.dtype([('code', 'u1'), ('size', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
                           ('log_ns', '<u8'), ('publish_ns', '<u8')])
 """Beginning of a message record; the CDR follows."""
-
 _INDEX_HEAD = struct.Struct('<BQHI')
 """Code and size of a message index record, its channel and the size of its entries, bytes."""
-
 _INDEX_ENTRY = np.dtype([('log_ns', '<u8'), ('offset', '<u8')])
 """Log time of a message, and where its record begins in the chunk."""
-
 _INDEX_OFFSET = struct.Struct('<HQ')
 """A channel, and where its message index begins in the file."""
-
 _INDEX_BYTE = 32
 """Place of the length of the message index offsets in a chunk index record. They follow, and the
 size of the message indices."""
-
 _CHUNK_BYTES = 1 << 20
 """Size that a chunk hardly exceeds, bytes; that of rosbags."""
-
 _LARGE_BYTES = 2 << 30
 """Size from which a file that is read leaves the cache (chosen): smaller ones are read again."""
-
 _PIECE_MESSAGES = 4096
 """Messages that are collected to a piece (chosen: some MB)."""
 
@@ -150,11 +138,7 @@ class Batch(NamedTuple):
 
 
 def write_messages(writer: Any, batches: Sequence[Batch]) -> None:
-    """
-    Append messages to an MCAP file by rosbags' writer, in chunks of their own.
-
-    The first batch has all stamps that occur.
-    """
+    """Append messages in chunks of their own; the first batch has all stamps that occur."""
     if writer.storage.chunk.msgs:
         writer.storage.close_chunk()
     size = sum(batch.data.shape[1] + _MESSAGE_HEAD.itemsize for batch in batches)

@@ -31,7 +31,7 @@ UNITS = 'V, V/g, 1/g, rad'
 
 SENSOR_FIELDS: dict[str, Field[Any]] = {
     field.metadata['key']: field for field in fields(Sensor) if field.metadata}
-"""Fields of `Sensor` by their keys; the metadata hold unit, bounds and meaning."""
+"""Fields of `Sensor` by key; the metadata hold unit, bounds and meaning."""
 
 ENVELOPE = {
     'temperature_c': 'lowest and highest temperature of the poses, degC',
@@ -72,20 +72,14 @@ MakeError = Callable[[str, str], Exception]
 """Makes the exception to raise from a key and a reason."""
 
 
-_NOMINAL_FILE = 'adxl203.yaml'
-"""Parameter file in `params/` of the default sensor; no other place in the code names a sensor."""
-_ANY_IMU_FILE = 'any_imu.yaml'
-"""Parameter file in `params/` of a digital accelerometer of which only the unit is known."""
-
-
 def nominal_path() -> Path:
-    """Return the installed parameter file of the nominal sensor, the default everywhere."""
-    return _params_folder() / _NOMINAL_FILE
+    """Return the installed file of the default sensor; no other place in the code names one."""
+    return _params_folder() / 'adxl203.yaml'
 
 
 def any_imu_path() -> Path:
-    """Return the installed parameter file of a stream in m/s² that states nothing of itself."""
-    return _params_folder() / _ANY_IMU_FILE
+    """Return the installed file of a stream in m/s² that states nothing of itself."""
+    return _params_folder() / 'any_imu.yaml'
 
 
 def _params_folder() -> Path:
@@ -132,12 +126,7 @@ def load(path: str | os.PathLike, may_measure: bool = False) -> Sensor:
 
 def from_flat(flat: Mapping[str, Any], make_error: MakeError, may_measure: bool = False
               ) -> Sensor:
-    """
-    Make a `Sensor` of flat parameters by dotted key (`sensor.serial`), and check all of them.
-
-    Keys of other nodes may be among them. `make_error` makes the exception to raise from a key
-    and a reason.
-    """
+    """Make a `Sensor` of flat parameters by dotted key, which keys of nodes may be among."""
     if flat.get('format') != FORMAT:
         raise make_error('format', f'version {flat.get("format")!r}, but this package reads '
                          f'version {FORMAT}; fit the calibration again, or update the package')
@@ -177,11 +166,7 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
 
 
 def save(path: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) -> None:
-    """
-    Write a parameter file, whole or not at all. Reading it gives the same floats.
-
-    comments: lines for people, before the parameters.
-    """
+    """Write a parameter file, with comments for people; reading it gives the same floats."""
     write_text(path, as_text(sensor, comments))
 
 
@@ -214,11 +199,7 @@ _Dumper.add_representer(float, lambda dumper, value: dumper.represent_scalar(
 
 
 def compose(path: str | os.PathLike) -> yaml.Node | None:
-    """
-    Read a YAML file as a tree of nodes, which know their places; None for an empty file.
-
-    An error names line and column.
-    """
+    """Read a YAML file as a tree of nodes, which know their places; None for an empty file."""
     try:
         return yaml.compose(Path(path).read_text(encoding='utf-8'), Loader=yaml.SafeLoader)
     except (OSError, UnicodeDecodeError) as error:
@@ -297,13 +278,12 @@ class _FlatReader:
         effects = self._names('effects')
         coefficients = {name: self._coefficients(name, axes) for name in effects}
         covariance, covariance_names = self._covariance(effects, axes)
-        datasheet_name = str(self.flat.get('datasheet.name', '')) \
-            if 'datasheet.figures' in self.flat else ''
         return Sensor(**values, effects=effects, values=coefficients, covariance=covariance,
                       covariance_names=covariance_names, envelope=self._envelope(),
                       provenance={key: str(value)
                                   for key, value in self._below('provenance.').items()},
-                      datasheet_name=datasheet_name, datasheet=self._datasheet(),
+                      datasheet_name=str(self.flat.get('datasheet.name', '')),
+                      datasheet=self._datasheet(),
                       link=self._below(_LINK),
                       unstated=tuple(field.name for field in unstated))
 
@@ -450,8 +430,7 @@ class _FlatReader:
         for key in ('datasheet.typical', 'datasheet.maximum') if names else ():
             values = self._numbers(key, self.flat.get(key, []))
             self._require(len(values) == len(names) and (values >= 0).all(), key,
-                          f'{len(values)} values, but {len(names)} names need as many, of 0 or '
-                          'more')
+                          f'expected {len(names)} values of 0 or more, one for each name')
             departures.append(values.tolist())
         return dict(zip(map(Coefficient.parse, names), zip(*departures)))
 

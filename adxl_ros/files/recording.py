@@ -101,21 +101,22 @@ def _table_blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions
 
 def _mounted(blocks: Iterator[Recording], mounting: Mounting) -> Generator[Recording, None, None]:
     """Turn the blocks of a recording."""
+    columns, signs = map(list, zip(*mounting))
     for block in blocks:
         names = block.sensor_columns
-        if len(names) != len(mounting.signs):
-            raise UserError(f'--axes: names the axes {AXES[:len(mounting.signs)]}, but '
-                            f'{block.path} has {block.axes}')
+        if len(names) != len(mounting):
+            raise UserError(f'--axes: names the axes {AXES[:len(mounting)]}, but {block.path} has '
+                            f'{block.axes}')
         zero = np.zeros(1)
-        if names[0] in VOLTS and min(mounting.signs) < 0:
+        if names[0] in VOLTS and min(signs) < 0:
             zero = block.stream_info.nominal_values(block.axes).get('nominal_zero_g_v', np.ones(0))
             if len(set(zero)) != 1:
                 raise UserError(f'--axes: inverts an axis of {block.path} in volts about an '
                                 'unknown zero; write a line "# nominal_zero_g_v: ..." with the '
                                 'same value for each axis')
-        turned = mounting.turn(np.column_stack([block.columns[name] for name in names]) - zero)
-        yield replace(block, columns={**block.columns,
-                                      **dict(zip(names, (turned + zero).T.copy()))})
+        outputs = np.column_stack([block.columns[name] for name in names]) - zero
+        turned = (outputs[:, columns] * signs + zero).T.copy()
+        yield replace(block, columns={**block.columns, **dict(zip(names, turned))})
 
 
 def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> Recording:

@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-What a recording holds: samples by named column, their stamps, and references.
-
-What a stream states of its unit, as `sensor_info` and lines `# key: value` have it.
-"""
+"""What a recording holds: samples by column, stamps, references, what it states of its unit."""
 
 from __future__ import annotations
 
@@ -34,23 +30,19 @@ _HIGHEST_RATE_HZ = 1e6
 
 @dataclass(frozen=True)
 class StreamInfo:
-    """
-    What a stream or recording states about its sensor. Every key may be missing.
-
-    Values are checked when they are asked for: a wrong one matters only where it is needed.
-    """
+    """What a stream states of its sensor; values are checked when they are asked for."""
 
     texts: Mapping[str, str]  # Values by key, as text
     where: str  # The file or topic, for messages
 
     @property
     def format_version(self) -> str:
-        """Return the version of the recording format."""
+        """Version of the recording format."""
         return self.texts.get('format', FORMAT)
 
     @property
     def serial(self) -> str:
-        """Return the serial number of the unit; `NO_UNIT` where none is stated."""
+        """Serial number of the unit; `NO_UNIT` where none is stated."""
         return self.texts.get('serial', NO_UNIT)
 
     @property
@@ -70,11 +62,7 @@ class StreamInfo:
         return float(rate_hz[0])
 
     def nominal_values(self, axes: str) -> dict[str, np.ndarray]:
-        """
-        Return the nominal zero-g, V, and scale factor, V/g, as far as they are stated.
-
-        returns: arrays (m,) by the name of the field of `Sensor`.
-        """
+        """Return the stated nominal values, (m,), by the name of the field of `Sensor`."""
         values = {}
         for key in NOMINAL_KEYS:
             if key in self.texts:
@@ -97,18 +85,9 @@ def _numbers(text: str) -> np.ndarray:
 def sensor_info(sensor: Sensor) -> dict[str, str]:
     """Return the keys and values that a stream of `sensor` states."""
     return {
-        'serial': sensor.serial,
-        'axes': sensor.axes,
-        'nominal_zero_g_v': _listed(sensor.nominal_zero_g_v),
-        'nominal_scale_v_per_g': _listed(sensor.nominal_scale_v_per_g),
-        'rate_hz': repr(float(sensor.rate_hz)),
-        'format': FORMAT,
-    }
-
-
-def _listed(values: np.ndarray) -> str:
-    """Return numbers as text, each with all its digits."""
-    return ', '.join(map(repr, np.asarray(values, dtype=float).tolist()))
+        'serial': sensor.serial, 'axes': sensor.axes,
+        **{key: ', '.join(map(repr, getattr(sensor, key).tolist())) for key in NOMINAL_KEYS},
+        'rate_hz': repr(float(sensor.rate_hz)), 'format': FORMAT}
 
 
 def converted_info(texts: Mapping[str, str], sensor: Sensor) -> dict[str, str]:
@@ -118,20 +97,13 @@ def converted_info(texts: Mapping[str, str], sensor: Sensor) -> dict[str, str]:
 
 
 TIME = 'time_s'
-"""Column of the stamps, s."""
-
 VOLTS = ('x_v', 'y_v', 'z_v')
-"""Columns of the ADC volts by axis, V."""
-
+"""Columns of the ADC volts by axis."""
 ACCEL = ('ax_mps2', 'ay_mps2', 'az_mps2')
-"""Columns of the specific force by axis after the nominal conversion, m/s²."""
-
+"""Columns of the specific force by axis after the nominal conversion."""
 JOINTS = {'alpha': 'alpha_rad', 'beta': 'beta_rad', 'shift': 'shift_m'}
-"""Columns of the encoders by joint, rad and m."""
-
+"""Columns of the encoders by joint."""
 REFERENCES = (*JOINTS.values(), 'temperature_c', 'supply_v')
-"""Columns of all references."""
-
 COMMANDS = {'alpha': 'alpha_command_rad', 'beta': 'beta_command_rad'}
 """Columns of the commands of a stage, rad: no references, but they show when a joint moves."""
 
@@ -193,12 +165,12 @@ class Recording:
 
     @property
     def sensor_columns(self) -> tuple[str, ...]:
-        """Names of the columns with the sensor's output, in the order of the axes."""
+        """Columns of the sensor's output, in the order of the axes."""
         return sensor_columns(self.columns, self.path)
 
     @property
     def axes(self) -> str:
-        """Measured axes: x, xy or xyz."""
+        """The measured axes: x, xy or xyz."""
         return AXES[:len(self.sensor_columns)]
 
     @property
@@ -229,10 +201,9 @@ class Recording:
 
     def volts(self, sensor: Sensor) -> np.ndarray:
         """
-        Return the ADC volts of the axes of `sensor`, V, (n, m).
+        Return the ADC volts of the axes of `sensor`, (n, m).
 
-        Specific force is converted back by the nominal values that the recording states, and by
-        those of `sensor` where it states none.
+        Specific force is converted by the nominal values that the recording, or `sensor`, states.
         """
         names, data = self._output(sensor)
         return data if names[0] in VOLTS else to_volts(data, self._nominal(sensor))
@@ -276,11 +247,7 @@ def sensor_columns(names: Iterable[str], where: str) -> tuple[str, ...]:
 
 
 def concatenate(parts: Iterable[Recording]) -> Recording:
-    """
-    Join the blocks of one recording; info, alignments and cut are those of the last block.
-
-    A column that is missing in the last block (text further down in a CSV column) is left out.
-    """
+    """Join the blocks of a recording; its columns, info and cut are those of the last one."""
     blocks = list(parts)
     last = blocks[-1]
     columns = {name: np.concatenate([block.columns[name] for block in blocks])
@@ -290,34 +257,27 @@ def concatenate(parts: Iterable[Recording]) -> Recording:
 
 
 _LONG_QUANTILE = 0.985
-"""Quantile of the steps that is a step between bursts, if there are any (chosen: a burst has at
-most 64 samples)."""
+"""Quantile of the steps that is one between bursts (chosen: a burst has at most 64 samples)."""
 _SHORT = 0.1
-"""Steps within a burst are shorter than this share of those between bursts (chosen: jitter and
-lost samples give no such steps)."""
+"""Longest step within a burst, as a share of one between bursts (chosen: beyond jitter)."""
 _SHORT_SHARE = 0.45
 """Smallest share of such steps among all (chosen: bursts of two samples have 0.5)."""
 _EVEN = 0.25
 """A median step from this share of the mean step shows stamps without bursts."""
 _EVEN_STEPS = 0.02
-"""Largest median deviation of even steps from their median, as a share of it (chosen: the median
-of 50 steps then is right to 0.5 %)."""
+"""Largest median deviation of even steps, as a share of them (chosen: rate right to 0.5 %)."""
 _LAG = 64
-"""Most samples, or bursts, over which the rate of uneven stamps is taken (chosen: a jitter of a
-whole period then is 2 % of a step)."""
+"""Most samples or bursts over which an uneven rate is taken (chosen: 2 % by a jitter of one)."""
 
 
 def burst_ends(time_s: np.ndarray) -> np.ndarray:
     """Return the samples, (k,), that end a burst of stamps, s, (n,): all where none is seen."""
     steps_s = np.diff(time_s)
-    every = np.arange(len(time_s))
-    if len(steps_s) < 8 or np.median(steps_s) >= _EVEN * steps_s.mean():
-        return every
-    long_s = np.quantile(steps_s, _LONG_QUANTILE)
-    is_short = steps_s < _SHORT * long_s
-    if is_short.mean() < _SHORT_SHARE or long_s <= 0:
-        return every
-    return every[:-1][~is_short]
+    if len(steps_s) >= 8 and np.median(steps_s) < _EVEN * steps_s.mean():
+        is_short = steps_s < _SHORT * np.quantile(steps_s, _LONG_QUANTILE)
+        if is_short.mean() >= _SHORT_SHARE:
+            return np.flatnonzero(~is_short)
+    return np.arange(len(time_s))
 
 
 def burst_samples(time_s: np.ndarray) -> int:
@@ -336,8 +296,8 @@ def period_s(time_s: np.ndarray) -> float:
     """
     Return the period of two or more stamps, s, (n,); 0 where they stand.
 
-    It is the median of many steps: over one sample, or over a quarter of few stamps where they
-    jitter or come in bursts. So gaps and lost samples do not change it.
+    It is the median over one sample, or over up to 64 where stamps jitter or come in bursts, so
+    that gaps do not change it.
     """
     last = burst_ends(time_s)
     if len(last) < 2:
@@ -400,19 +360,14 @@ class StampCheck:
 
 
 def check_unit(info: StreamInfo, axes: str, sensor: Sensor) -> None:
-    """
-    Refuse samples of another unit than the one that `sensor` describes.
-
-    What `info` does not state is not checked.
-    """
+    """Refuse samples that state another unit than the one that `sensor` describes."""
     if info.format_version != FORMAT:
         raise UserError(f'{info.where}: format version {info.format_version}, but this package '
                         f'reads version {FORMAT}; update the package')
     _check_serial(info, sensor)
     if axes != sensor.axes:
         raise UserError(f'{info.where}: samples of the axes {axes}, but the parameters of '
-                        f'{sensor.serial} are for {sensor.axes}; name the parameter file of this '
-                        'sensor')
+                        f'{sensor.serial} are for {sensor.axes}; name the file of this sensor')
     for key, stated in info.nominal_values(axes).items():
         expected = getattr(sensor, key)
         if not np.array_equal(stated, expected):

@@ -80,10 +80,7 @@ def _from_table(path: str) -> Readings:
               if name.endswith(('_rad', '_m')) and not name.startswith('base_')}
     base = [f'base_{name}' for name in _BASE]
     base = base if set(base) <= set(table.names) else []
-    names = ['time_s', *joints, *base]
-    blocks = list(table.blocks(names, names))
-    columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in names}
-
+    columns = table.read(['time_s', *joints, *base])
     times = columns['time_s']
     return Readings(path, {joint: _track(times, columns[name]) for name, joint in joints.items()},
                     _track(times, np.column_stack([columns[name] for name in base]))
@@ -106,9 +103,9 @@ def _topic(bag: Bag, topic: str) -> str:
 def _joints(bag: Bag, topic: str, epoch_ns: int) -> dict[str, Track]:
     """Return the readings of all joints of a topic."""
     readings: dict[str, tuple[list[np.ndarray], list[np.ndarray]]] = {}
-    parts = [piece.messages[topic] for piece in bag.pieces([topic])]
     try:
-        for table in cdr.joined_tables(parts, cdr.joint_state):
+        for table in (table for piece in bag.pieces([topic])
+                      for table in cdr.tables(piece.messages[topic], cdr.joint_state)):
             names = [text for key, text in table.layout.texts.items() if key != 'frame_id']
             if 'position' not in table.layout.fields:
                 continue

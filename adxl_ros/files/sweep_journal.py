@@ -27,23 +27,18 @@ class PoseRecord:
     """One accepted pose: the mean output at rest and the joint angles."""
 
     pose: int  # Number of the pose in the pose plan, or of the rest of a hand-held sensor, from 0
-    # alpha_rad, beta_rad: Joint angles, rad; NaN without a stage
-    alpha_rad: float = math.nan
+    alpha_rad: float = math.nan  # Joint angles, rad; NaN without a stage
     beta_rad: float = math.nan
-    # alpha_setting, beta_setting: Numbers of the settings of the joints; None without a stage and
-    # in earlier journals
+    # Numbers of the settings of the joints; None without a stage and in earlier journals
     alpha_setting: int | None = None
     beta_setting: int | None = None
     check: bool = False  # Whether the pose is kept out of the fit
-    # start_ns, stop_ns: Stamps of the first and the last sample, ns
-    start_ns: int
+    start_ns: int  # Stamps of the first and the last sample, ns
     stop_ns: int
     samples: int  # Number of samples
-    # mean_v, std_v: Mean output of each axis and the standard deviation of that mean, V, (m,)
-    mean_v: tuple[float, ...]
+    mean_v: tuple[float, ...]  # Mean output of each axis, and its standard deviation, V, (m,)
     std_v: tuple[float, ...]
-    # temperature_c, supply_v: Means over the rest, °C and V; NaN where there are no readings
-    temperature_c: float = math.nan
+    temperature_c: float = math.nan  # Means over the rest, °C and V; NaN without readings
     supply_v: float = math.nan
 
     def to_json(self) -> dict[str, Any]:
@@ -64,14 +59,14 @@ class PoseRecord:
 class PoseDropped:
     """A pose that does not count any more, because it is taken again."""
 
-    pose: int  # Number of the pose
+    pose: int
 
 
 @dataclass(frozen=True)
 class PoseSkipped:
     """A pose that the operator leaves out."""
 
-    pose: int  # Number of the pose
+    pose: int
 
 
 @dataclass(frozen=True)
@@ -125,8 +120,10 @@ def _entry(line: Mapping[str, Any]) -> JournalEntry:
 class JournalContents(NamedTuple):
     """What a journal holds."""
 
-    head: dict[str, Any]  # What must be the same for poses to belong together, by key
+    head: dict[str, Any]  # What must be the same for poses to belong together; empty without one
     entries: list[JournalEntry]  # All entries, in the order in which they were written
+    size: int  # Size of the lines, bytes, without one that a crash has cut
+    damage: str  # Which line is none of a journal, and why; empty if all are
 
     def is_over(self, head: Mapping[str, Any]) -> bool:
         """
@@ -146,22 +143,8 @@ class Unfinished(NamedTuple):
     obstacle: str
 
 
-class NotJournalError(UserError):
-    """A line does not belong to a journal."""
-
-    def __init__(self, path: Path, line_number: int, reason: object,
-                 entries: list[JournalEntry]) -> None:
-        self.obstacle = f'line {line_number} is not of a journal ({reason})'
-        self.entries = entries
-        super().__init__(f'{path}:{line_number}: not a journal: {reason}')
-
-
 class Journal:
-    """
-    An append-only file of JSON lines: a head that says what is calibrated, then entries.
-
-    The file is locked while it is open, so that two calibrations cannot share it.
-    """
+    """An append-only file of JSON lines, locked while it is open: a head, then entries."""
 
     def __init__(self, path: str | os.PathLike, head: Mapping[str, Any],
                  start_over: bool = False) -> None:
@@ -201,56 +184,51 @@ class Journal:
 
     def _resume(self, head: dict[str, Any], start_over: bool) -> list[JournalEntry]:
         """Return the entries of an interrupted calibration, or begin a new file with the head."""
-        try:
-            contents, size = _parse(self.path)
-            is_kept = contents is not None and (start_over or contents.is_over(head))
-        except NotJournalError as error:
-            if not start_over:
-                raise UserError(
-                    f'{error}; {len(accepted_poses(error.entries))} poses before it can be read; '
-                    'name another journal, or begin again with resume:=anew (this file is kept)'
-                ) from None
-            contents, size, is_kept = None, 0, True
-        if is_kept:
+        found = _parse(self.path)
+        if found.damage and not start_over:
+            raise UserError(
+                f'{self.path}: {found.damage}; {len(accepted_poses(found.entries))} poses before '
+                'it can be read; name another journal, or begin again with resume:=anew (this '
+                'file is kept)')
+        is_new = not found.head and not found.damage
+        if not is_new and (start_over or found.is_over(head)):
             # A finished journal is kept until the next one is finished, others for ever.
-            last = contents.entries[-1] if contents and contents.entries else None
-            name = 'previous' if isinstance(last, Fitted) and last.done else \
+            last = found.entries[-1] if found.entries else None
+            name = 'previous' if isinstance(last, Fitted) and last.done and not found.damage else \
                 datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
             with atomic_path(self.path.with_name(f'{self.path.name}.{name}')) as copy:
                 shutil.copyfile(self.path, copy)
-        if contents is None or is_kept:
+            is_new = True
+        if is_new:
             self._file.truncate(0)
             self._append_line(head)
             sync(self.path.parent)
             return []
-        if changed := differences(contents.head, head):
+        if changed := differences(found.head, head):
             raise UserError(f'{self.path}: holds an unfinished calibration of another kind: '
                             f'{changed}; go back, or begin again with resume:=anew (it is kept)')
-        self._file.truncate(size)
-        return contents.entries
+        self._file.truncate(found.size)
+        return found.entries
 
 
 def read(path: str | os.PathLike) -> JournalContents:
     """Read the head and the entries of a journal."""
-    contents, _ = _parse(Path(path))
-    if contents is None:
-        raise UserError(f'{path}: an empty journal')
-    return contents
+    found = _parse(Path(path))
+    if found.damage or not found.head:
+        raise UserError(f'{path}: {found.damage or "an empty journal"}')
+    return found
 
 
 def unfinished(path: str | os.PathLike, head: Mapping[str, Any]) -> Unfinished | None:
     """Look for an interrupted calibration, without a lock."""
     if not Path(path).exists():
         return None
-    try:
-        contents, _ = _parse(Path(path))
-    except NotJournalError as error:
-        return Unfinished(len(accepted_poses(error.entries)), error.obstacle)
-    new_head = _as_read(head)
-    poses = len(accepted_poses(contents.entries)) if contents else 0
-    if contents is None or not poses or contents.is_over(new_head):
-        return None
-    return Unfinished(poses, differences(contents.head, new_head))
+    found, new_head = _parse(Path(path)), _as_read(head)
+    poses = len(accepted_poses(found.entries))
+    if found.damage:
+        return Unfinished(poses, found.damage)
+    return Unfinished(poses, differences(found.head, new_head)) \
+        if poses and not found.is_over(new_head) else None
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
@@ -291,20 +269,21 @@ def poses_to_fit(entries: Sequence[JournalEntry]) -> list[PoseRecord]:
     return accepted_poses(entries)
 
 
-def _parse(path: Path) -> tuple[JournalContents | None, int]:
-    """Return the contents, None without a head, and the size of the complete lines, bytes."""
+def _parse(path: Path) -> JournalContents:
+    """Return the contents up to the end, or to a damaged line."""
     try:
         data = path.read_bytes()
     except OSError as error:
         raise UserError(f'{path}: cannot be read: {error.strerror}') from None
-    # A crash may have left the beginning of the head, or its length without its bytes.
-    if b'\n' not in data and data.strip(b'\0') and not data.startswith(b'{'):
-        raise NotJournalError(path, 1, 'it does not begin with {', [])
-    # The text after the last newline is a line that a crash has cut.
-    lines = data.split(b'\n')[:-1]
     head: dict[str, Any] = {}
     entries: list[JournalEntry] = []
-    for number, raw in enumerate(lines, 1):
+    # A crash may have left the beginning of the head, or its length without its bytes.
+    if b'\n' not in data and data.strip(b'\0') and not data.startswith(b'{'):
+        return JournalContents(head, entries, 0,
+                               'line 1 is not of a journal (it does not begin with {)')
+    size = 0
+    # The text after the last newline is a line that a crash has cut.
+    for number, raw in enumerate(data.split(b'\n')[:-1], 1):
         try:
             line = json.loads(raw)
             if not isinstance(line, dict):
@@ -317,9 +296,10 @@ def _parse(path: Path) -> tuple[JournalContents | None, int]:
                 raise ValueError(f'format {line.get("format")!r}, but this package reads version '
                                  f'{FORMAT}')
         except (ValueError, TypeError, KeyError) as error:
-            raise NotJournalError(path, number, error, entries) from None
-    return (JournalContents(head, entries) if lines else None,
-            sum(len(raw) + 1 for raw in lines))
+            return JournalContents(head, entries, size, f'line {number} is not of a journal '
+                                   f'({error})')
+        size += len(raw) + 1
+    return JournalContents(head, entries, size, '')
 
 
 def _as_read(head: Mapping[str, Any]) -> dict[str, Any]:

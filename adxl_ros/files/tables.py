@@ -7,13 +7,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
-from dataclasses import dataclass
 from functools import partial
 from io import StringIO
 import os
 from pathlib import Path
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files.column_mapping import Quantity, Table, TableBlock, unit_in_name, UNITS
@@ -29,10 +28,8 @@ _MAPPINGS = {
     'sensor_combined': 'time=timestamp:us,x=accelerometer_m_s2[0]:mps2,'
                        'y=accelerometer_m_s2[1]:mps2,z=accelerometer_m_s2[2]:mps2',
     'vehicle_acceleration': 'time={time}:us,x=xyz[0]:mps2,y=xyz[1]:mps2,z=xyz[2]:mps2',
-    'vehicle_imu': '',
 }
-"""Columns and units of messages by the definitions of PX4 (msg/*.msg), the raw readings first. A
-vehicle_imu has changes of velocity, so that it is only named."""
+"""Columns and units of messages by the definitions of PX4 (msg/*.msg), the raw readings first."""
 
 
 def open_table(path: str | os.PathLike, topic: str = '') -> Table:
@@ -43,10 +40,8 @@ def open_table(path: str | os.PathLike, topic: str = '') -> Table:
         return _open_ulog(path, topic)
     if topic:
         raise UserError(f'--topic {topic}: {path} is no bag; leave --topic out')
-    return _FORMATS.get(ending, _open_text)(path)
-
-
-def _open_text(path: str) -> Table:
+    if ending in _FORMATS:
+        return _FORMATS[ending](path)
     form = find_form(path)
     return Table(path, form.names, partial(read_blocks, path, form),
                  header_line=form.header_line, repeated=form.repeated)
@@ -89,25 +84,18 @@ def _open_npz(path: str) -> Table:
     columns: dict[str, np.ndarray] = {}
     with _library(path, '.npz of plain arrays', 'numpy'), \
             np.load(path, allow_pickle=False) as arrays:
-        for name in arrays.files:
-            columns |= _array_columns(name, arrays[name])
+        for name, values in arrays.items():
+            if values.dtype.kind in 'iuf' and values.ndim in (1, 2) and values.size > 1:
+                series = np.atleast_2d(values)
+                if series.shape[0] > series.shape[1]:
+                    series = series.T  # MATLAB and others keep a vector as a row
+                columns |= {f'{name}[{i}]' if len(series) > 1 else name: each
+                            for i, each in enumerate(series)}
     if not columns:
         raise UserError(f'{path}: holds no array of numbers with several rows')
     rows = Counter(map(len, columns.values())).most_common(1)[0][0]
     return _in_memory(path, {name: values for name, values in columns.items()
                              if len(values) == rows})
-
-
-def _array_columns(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the columns of an array, `acc[0]` the first of (n, k); none where it is no table."""
-    if values.dtype.kind not in 'iuf' or values.ndim not in (1, 2) or values.size < 2:
-        return {}
-    values = np.atleast_2d(values)
-    if values.shape[0] < values.shape[1]:
-        values = values.T  # MATLAB and others keep a vector as a row
-    if values.shape[1] == 1:
-        return {name: values[:, 0]}
-    return {f'{name}[{i}]': values[:, i] for i in range(values.shape[1])}
 
 
 def _open_parquet(path: str) -> Table:
@@ -150,7 +138,7 @@ def _open_ulog(path: str, topic: str) -> Table:
     messages = {f'{data.name}_{data.multi_id}' if data.multi_id else str(data.name): data
                 for data in log.data_list}
     accelerations = [name for kind in _MAPPINGS for name in messages
-                     if messages[name].name == kind and _MAPPINGS[kind]]
+                     if messages[name].name == kind]
     raw = [each for each in accelerations
            if messages[each].name == messages[accelerations[0]].name]
     name = topic.removesuffix('_0') or ', '.join(raw)
@@ -185,8 +173,7 @@ _LEVEL_RAD = 1e-9
 """Largest sine of alpha at which beta does not matter."""
 
 
-@dataclass(frozen=True)
-class PoseTable:
+class PoseTable(NamedTuple):
     """Angles of k poses."""
 
     path: str  # The file, for messages
@@ -215,9 +202,14 @@ def read_pose_table(path: str | os.PathLike) -> PoseTable:
     choices: tuple[tuple[str, ...], ...] = (('start_s', 'stop_s'), ('time_s', 'time_s'), ())
     times = next(names for names in choices if set(names) <= set(table.names))
     names = list(dict.fromkeys([columns[role] for role in pair] + [*times]))
-    blocks = list(table.blocks(names, names))
-    values = {name: np.concatenate([block.columns[name] for block in blocks]) for name in names}
-    angles = [_radians(table.path, columns[role], values[columns[role]]) for role in pair]
+    values = table.read(names)
+    angles = []
+    for name in (columns[role] for role in pair):
+        unit = unit_in_name(name, Quantity.ANGLE)
+        if unit is None:
+            raise UserError(f'{path}: column {name} states no unit; name it {name}_deg or '
+                            f'{name}_rad')
+        angles.append(UNITS[Quantity.ANGLE][unit].convert(values[name]))
     if pair == ('roll', 'pitch'):
         angles = list(stage_angles(*angles))
     # At alpha 0 and 180 degrees beta does not matter, and people leave its cell empty.
@@ -225,11 +217,3 @@ def read_pose_table(path: str | os.PathLike) -> PoseTable:
                          angles[1])
     return PoseTable(table.path, np.column_stack(angles),
                      np.column_stack([values[name] for name in times]) if times else None)
-
-
-def _radians(path: str, name: str, values: np.ndarray) -> np.ndarray:
-    """Return a column of angles in radians, by the unit in its name."""
-    unit = unit_in_name(name, Quantity.ANGLE)
-    if unit is None:
-        raise UserError(f'{path}: column {name} states no unit; name it {name}_deg or {name}_rad')
-    return UNITS[Quantity.ANGLE][unit].convert(values)

@@ -310,6 +310,4 @@ def _rms_interval(squares: np.ndarray) -> Interval:
 def _aligned(at_ns: np.ndarray, values: np.ndarray, stamps_ns: np.ndarray,
              longest_ns: float = np.inf) -> np.ndarray:
     """Return readings, (k,), at the stamps of samples, ns, (n,); NaN where they are unknown."""
-    track = Track('the reference', longest_ns)
-    track.add(at_ns, values)
-    return track.interpolate(stamps_ns)
+    return Track('the reference', at_ns, values, longest_ns).interpolate(stamps_ns)

@@ -140,7 +140,7 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     assert offline.covariance_names[:both] == live.covariance_names
     np.testing.assert_allclose(offline.covariance[:both, :both], live.covariance, rtol=1e-5)
 
-    _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
+    entries = sweep_journal.read(tmp_path / 'unit.yaml.journal').entries
     assert entries[-1].done
     assert sum(entry.check for entry in entries[-1].rests) == 6
     assert all(entry.samples == 200 for entry in entries[-1].rests)

@@ -125,7 +125,7 @@ class Sweeps:
             self.broken.append(f'kill {self.kills}: {error}')
 
     def _check_poses(self, acknowledged):
-        _, entries = sweep_journal.read(self.folder / 'unit.yaml.journal')
+        entries = sweep_journal.read(self.folder / 'unit.yaml.journal').entries
         kept = {entry.pose: json.dumps(entry.to_json())
                 for entry in sweep_journal.accepted_poses(entries)}
         missing = [n for n in {*self._kept_poses, *acknowledged} if n not in kept]
