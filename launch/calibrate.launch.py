@@ -21,8 +21,8 @@ launch with an error.
 from typing import Any
 
 from adxl_ros.nodes import launch_nodes
+from adxl_ros.nodes.calibration import CalibrationSettings
 from adxl_ros.nodes.launch_nodes import arguments, given_anywhere, LINK, make_node, STAGE, text
-from adxl_ros.nodes.settings import CalibrationSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 from launch.actions import LogInfo

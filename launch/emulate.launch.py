@@ -14,8 +14,8 @@ started again. The launch ends with an error when the driver refuses to start th
 """
 
 from adxl_ros.nodes import launch_nodes
+from adxl_ros.nodes.driver import DriverSettings
 from adxl_ros.nodes.launch_nodes import arguments, text
-from adxl_ros.nodes.settings import DriverSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 

@@ -14,8 +14,8 @@ investigation: status 0 with a verdict, else 1. Ctrl-C leaves the stage at rest.
 """
 
 from adxl_ros.nodes import launch_nodes
+from adxl_ros.nodes.investigate import InvestigateSettings
 from adxl_ros.nodes.launch_nodes import arguments, given_parameters, make_node, text
-from adxl_ros.nodes.settings import InvestigateSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 

@@ -20,8 +20,8 @@ times, or once without `respawn`.
 
 from adxl_ros.errors import UserError
 from adxl_ros.nodes import launch_nodes
+from adxl_ros.nodes.compensation import CompensationSettings
 from adxl_ros.nodes.launch_nodes import arguments, LINK, text
-from adxl_ros.nodes.settings import CompensationSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 

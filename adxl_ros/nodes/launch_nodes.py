@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.links.support.base import link_names
-from adxl_ros.nodes import settings
-from adxl_ros.nodes.parameters import given_text, has_section, Spec, specs_of
+from adxl_ros.nodes import driver, stage
+from adxl_ros.nodes.parameters import given_text, has_section, link_specs, Spec, specs_of
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutdown
 from launch.events.process import ProcessExited
@@ -48,9 +48,10 @@ class Argument(NamedTuple):
         """Return the value of the parameter."""
         default = self.spec.default
         # A list of numbers has a unit; names with commas stay one text.
-        kind = str if default == () and not self.spec.unit else type(default)
+        convert = _numbers if default == () and self.spec.unit else \
+            type(default) if isinstance(default, int | float) else str
         try:
-            return _CONVERSIONS.get(kind, str)(text)
+            return convert(text)
         except ValueError:
             raise UserError(f'{self.name}:={text}: expected a number, or numbers with commas '
                             'where it is a list') from None
@@ -60,10 +61,6 @@ def _numbers(text: str) -> list[float]:
     return [float(part) for part in text.strip('[]').split(',')]
 
 
-_CONVERSIONS: dict[type, Callable[[str], Any]] = {int: int, float: float, tuple: _numbers}
-"""Conversions of an argument by the type of the default."""
-
-
 def arguments(own: type, *parameters: str, **renamed: str) -> tuple[Argument, ...]:
     """
     Return arguments for parameters of a dataclass; those of the driver may be of any link.
@@ -71,20 +68,20 @@ def arguments(own: type, *parameters: str, **renamed: str) -> tuple[Argument, ..
     Dots in the name of a parameter become underscores, unless it is renamed.
     """
     specs = {spec.name: spec for spec in specs_of(own)}
-    if own is settings.DriverSettings:
+    if own is driver.DriverSettings:
         for link in link_names():
-            specs = {spec.name: spec for spec in settings.link_specs(link)} | specs
+            specs = {spec.name: spec for spec in link_specs(link)} | specs
     names = {parameter.replace('.', '_'): parameter for parameter in parameters} | renamed
     return tuple(Argument(name, specs[parameter]) for name, parameter in names.items())
 
 
-LINK = arguments(settings.DriverSettings, 'frame_id', 'link.type', 'link.port', 'link.baud',
+LINK = arguments(driver.DriverSettings, 'frame_id', 'link.type', 'link.port', 'link.baud',
                  'link.uri', 'link.device', 'link.channels', 'link.recording')
 """Arguments of the link, and of the frame of its samples."""
-STAGE = (*arguments(settings.StageSettings, 'stage.type'), *arguments(
-    settings.BridgeSettings, *(spec.name for spec in specs_of(settings.BridgeSettings))))
+STAGE = (*arguments(stage.StageSettings, 'stage.type'), *arguments(
+    stage.BridgeSettings, *(spec.name for spec in specs_of(stage.BridgeSettings))))
 """Arguments of the stage."""
-SPEED = arguments(settings.DriverSettings, speed='link.speed')
+SPEED = arguments(driver.DriverSettings, speed='link.speed')
 """Speed of a simulated sensor."""
 
 
@@ -155,7 +152,7 @@ def static_transform(context: LaunchContext) -> list[Action]:
     base_frame, executable = text(context, 'base_frame'), 'static_transform_publisher'
     if not base_frame:
         return []
-    frame_id = given_anywhere(context, 'frame_id', 'driver') or settings.DEFAULT_FRAME
+    frame_id = given_anywhere(context, 'frame_id', 'driver') or driver.DEFAULT_FRAME
     values = (*three_numbers(context, 'mounting_xyz_m'),
               *three_numbers(context, 'mounting_rpy_rad'), base_frame, frame_id)
     options = zip(('--x', '--y', '--z', '--roll', '--pitch', '--yaw', '--frame-id',
