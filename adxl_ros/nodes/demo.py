@@ -30,12 +30,10 @@ from adxl_ros.process import ended_by_closed_output
 from adxl_ros.report.screen import coloured
 import numpy as np
 
-_FIT_S = 600.0
-"""Longest time of a fit, s; chosen: far above the seconds that a fit takes."""
+_LONGEST_S = 600.0
+"""Longest time of a step, s; chosen: far above what sweep and fit take."""
 _POLL_S = 0.2
 """Time between two looks at the progress, s."""
-_LONGEST = 4.0
-"""Longest real time of the sweep, by its planned one; chosen: a busy machine may be slow."""
 _SPEED = 40.0
 """Sensor time per real time; chosen: two cores can follow, and a slower machine takes longer."""
 _RATE_HZ = 250.0
@@ -88,15 +86,14 @@ def _command(name: str, params_file: Path, parameters: Mapping[str, object]) -> 
     return command
 
 
-def _wait(finished: Callable[[], bool], processes: Sequence[subprocess.Popen], longest_s: float,
-          log: Path) -> None:
-    """Wait until a condition holds; a node that ends and a longer time are errors."""
-    end_s = time.monotonic() + longest_s
+def _wait(finished: Callable[[], bool], processes: Sequence[subprocess.Popen], log: Path) -> None:
+    """Wait until a condition holds; a node that ends, and a time that is too long, are errors."""
+    end_s = time.monotonic() + _LONGEST_S
     while not finished():
         time.sleep(_POLL_S)
         ended = [name for name, process in zip(_STARTED, processes) if process.poll() is not None]
         if ended or time.monotonic() > end_s:
-            what = f'the node {ended[0]} has ended' if ended else f'no end after {longest_s:.0f} s'
+            what = f'the node {ended[0]} has ended' if ended else f'no end in {_LONGEST_S:.0f} s'
             raise UserError(f'{what}; see {log}')
 
 
@@ -165,13 +162,13 @@ def _run_sweep(folder: Path) -> None:
                 count, _ = _poses(journal)
                 step.show(f'{count} of {total} poses', count)
                 return count == total
-            _wait(swept, nodes, _LONGEST * planned_s, log)
+            _wait(swept, nodes, log)
         fitting = f'{total - _CHECK_POSES} poses'
         with jobs.Step('2/3 fit', fitting) as step:
-            _wait(output.exists, nodes, _FIT_S, log)
+            _wait(output.exists, nodes, log)
             step.show(f'{fitting}, {parameter_file.load(output).model} model')
         with jobs.Step('3/3 check', f'{_CHECK_POSES} poses that the fit has not seen'):
-            _wait(lambda: bool(_poses(journal)[1]), nodes, _FIT_S, log)
+            _wait(lambda: bool(_poses(journal)[1]), nodes, log)
     poses = Poses.from_records(_poses(journal)[1])
     fitted = parameter_file.load(output)
     _print('', *screen_table(_held_out_errors(sensor, fitted, poses)), '',
