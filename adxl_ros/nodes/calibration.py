@@ -46,47 +46,46 @@ from std_srvs.srv import Trigger
 class CalibrationSettings:
     """The guided calibration."""
 
-    mode: str = parameter('mode', 'stage', 'what the reference is',
+    mode: str = parameter('stage', 'what the reference is',
                           choices=('stage', 'gravity', 'thermal'))
-    autostart: bool = parameter('autostart', False, 'start without a call of ~/start')
-    resume: str = parameter('resume', 'ask', 'go on with an interrupted calibration; without a '
-                            'screen, ask is continue', choices=('ask', 'continue', 'anew'))
-    exit_when_done: bool = parameter('exit_when_done', False, 'end the node after a calibration: '
-                                     'status 0 where it wrote its file, else 1')
-    screen: bool = parameter('screen', True, 'show a screen, where the node runs in a terminal')
-    output: str = parameter('output', 'calibration.yaml', 'parameter file to write')
-    journal: str = parameter('journal', '', 'file of accepted poses; empty: beside the output')
-    report: str = parameter('report', '', 'directory for the report; empty: none')
-    store: str = parameter('store', str(calibration_store.default_folder()),
-                           'folder of calibrations that gets a copy; empty: none')
-    dwell_s: float = parameter('sweep.dwell_s', 5.0, 'time at rest a pose', 's', 0.5, 3600.0)
+    autostart: bool = parameter(False, 'start without a call of ~/start')
+    resume: str = parameter('ask', 'go on with an interrupted calibration; without a screen, ask '
+                            'is continue', choices=('ask', 'continue', 'anew'))
+    exit_when_done: bool = parameter(False, 'end the node after a calibration: status 0 where it '
+                                     'wrote its file, else 1')
+    screen: bool = parameter(True, 'show a screen, where the node runs in a terminal')
+    output: str = parameter('calibration.yaml', 'parameter file to write')
+    journal: str = parameter('', 'file of accepted poses; empty: beside the output')
+    report: str = parameter('', 'directory for the report; empty: none')
+    store: str = parameter(str(calibration_store.default_folder()), 'folder of calibrations that '
+                           'gets a copy; empty: none')
+    dwell_s: float = parameter(5.0, 'time at rest a pose', 's', 0.5, 3600.0, name='sweep.dwell_s')
     # A stage of 5 arcmin arrives within this default.
-    tolerance_rad: float = parameter('stage.tolerance_rad', float(np.radians(0.2)),
-                                     'arrived within this', 'rad', 1e-6, 0.2)
-    timeout_s: float = parameter('stage.timeout_s', 60.0, 'time after which a pose is late', 's',
-                                 1.0, 86400.0)
-    stage_mode: str = parameter(
-        'stage.mode', 'commanded', 'commanded turns itself, encoder and manual are turned by hand',
-        choices=('commanded', 'encoder', 'manual'))
-    near_deg: float = parameter('stage.near_deg', 2.0, 'a stage turned by hand is captured within '
-                                'this of the pose', 'deg', 0.01, 30.0)
-    temperature_span_c: float = parameter('sweep.temperature_span_c', 3.0, 'largest change of the '
-                                          'temperature since the first pose', 'degC', 0.1, 1000.0)
-    plan: str = parameter(
-        'sweep.plan', 'auto', 'full (planes, 25 minutes), quick (about 38 poses), or auto: quick '
-        'where a stage is turned by hand without planes', choices=('auto', 'full', 'quick'))
-    planes_deg: Any = parameter('sweep.planes_deg', (), 'planes alpha of the plan full; empty: 30 '
-                                'to 150, or 0 to 180 for a sensor with a z axis', 'deg')
-    step_deg: float = parameter('sweep.step_deg', 30.0, 'step of beta of the plan full', 'deg',
-                                0.5, 90.0)
-    check_poses: int = parameter('sweep.check_poses', -1, 'poses kept out of the fit for the '
-                                 'verdict; -1: 16, or 8 in the plan quick', '', -1, 1000)
-    tilt_error_deg: float = parameter('sweep.tilt_error_deg', 0.1, 'rms tilt error that the plan '
-                                      'quick is to reach', 'deg', 1e-3, 10.0)
-    range_c: Any = parameter('thermal.range_c', (), 'lowest and highest temperature that mode '
-                             'thermal is to cover; empty: 0 to 50', 'degC')
-    block_s: float = parameter('thermal.block_s', 10.0, 'length of a block of samples in mode '
-                               'thermal', 's', 0.5, 600.0)
+    tolerance_rad: float = parameter(float(np.radians(0.2)), 'arrived within this', 'rad', 1e-6,
+                                     0.2, name='stage.tolerance_rad')
+    timeout_s: float = parameter(60.0, 'time after which a pose is late', 's', 1.0, 86400.0,
+                                 name='stage.timeout_s')
+    stage_mode: str = parameter('commanded', 'commanded turns itself, the others by hand',
+                                name='stage.mode', choices=('commanded', 'encoder', 'manual'))
+    near_deg: float = parameter(2.0, 'a stage turned by hand is captured within this of the pose',
+                                'deg', 0.01, 30.0, name='stage.near_deg')
+    temperature_span_c: float = parameter(3.0, 'largest temperature change since the first pose',
+                                          'degC', 0.1, 1000.0, name='sweep.temperature_span_c')
+    plan: str = parameter('auto', 'full (planes, 25 minutes), quick (about 38 poses), or auto: '
+                          'quick where a stage is turned by hand without planes',
+                          name='sweep.plan', choices=('auto', 'full', 'quick'))
+    planes_deg: Any = parameter((), 'planes alpha of the plan full; empty: 30 to 150, or 0 to 180 '
+                                'for a sensor with a z axis', 'deg', name='sweep.planes_deg')
+    step_deg: float = parameter(30.0, 'step of beta of the plan full', 'deg', 0.5, 90.0,
+                                name='sweep.step_deg')
+    check_poses: int = parameter(-1, 'poses kept out of the fit for the verdict; -1: 16, or 8 in '
+                                 'the plan quick', '', -1, 1000, name='sweep.check_poses')
+    tilt_error_deg: float = parameter(0.1, 'rms tilt error that the plan quick is to reach', 'deg',
+                                      1e-3, 10.0, name='sweep.tilt_error_deg')
+    range_c: Any = parameter((), 'lowest and highest temperature that mode thermal is to cover; '
+                             'empty: 0 to 50', 'degC', name='thermal.range_c')
+    block_s: float = parameter(10.0, 'length of a block of samples in mode thermal', 's', 0.5,
+                               600.0, name='thermal.block_s')
 
 
 _SCREEN_END_S = 5.0
@@ -509,9 +508,9 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
     planes_rad = tuple(np.radians(parameters.numbers('sweep.planes_deg', own.planes_deg or [],
                                                      '[30.0, 60.0, 90.0]')).tolist())
     step_rad = float(np.radians(own.step_deg))
-    capture = screen_contents.CaptureSettings(own.dwell_s, own.tolerance_rad, own.timeout_s,
-                              StageMode(own.stage_mode), float(np.radians(own.near_deg)),
-                              own.temperature_span_c)
+    capture = screen_contents.CaptureSettings(
+        own.dwell_s, own.tolerance_rad, own.timeout_s, StageMode(own.stage_mode),
+        float(np.radians(own.near_deg)), own.temperature_span_c)
     kind = own.plan
     if kind == 'auto':
         by_hand = capture.stage_mode is not StageMode.COMMANDED

@@ -44,26 +44,24 @@ from std_srvs.srv import Trigger
 class CompensationSettings:
     """The compensation."""
 
-    calibration: str = parameter('calibration', '', 'parameter file to use; setting it loads the '
-                                 'whole file or nothing of it', live=True)
-    inverse: str = parameter('inverse', 'exact', "inverse of the model: exact, or the paper's "
-                             'approximation', choices=('exact', 'paper'))
-    undo_filter: bool = parameter('undo_filter', False, 'take the RC filter out; a sample is '
-                                  f'published {HALF} samples late, with its own stamp')
-    orientation: str = parameter('orientation', 'keep', 'of a sample that states one: keep it, or '
-                                 'that of the tilt', choices=('keep', 'tilt'))
-    store: str = parameter('store', str(calibration_store.default_folder()), 'folder of '
-                           'calibrations, whose newest of the unit is used where none is named; '
-                           'empty: none')
-    output_rate_hz: float = parameter(
-        'output_rate_hz', 0.0, 'one sample of so many is published as it is, so that vibration '
-        'above half of this rate folds into it; 0: every sample', 'Hz', 0.0, 1e5)
-    free_acceleration: bool = parameter('free_acceleration', False, 'publish imu/linear_'
-                                        'acceleration_free of samples that state an orientation')
-    rpy_rad: Any = parameter('mounting.rpy_rad', [0.0, 0.0, 0.0], 'roll, pitch and yaw of the '
-                             'case on the robot, as in a URDF joint', 'rad', live=True)
-    mounting_frame_id: str = parameter('mounting.frame_id', 'base_link', 'frame of the robot, in '
-                                       'the header where the case is turned')
+    calibration: str = parameter('', 'parameter file to use; setting it loads the whole file or '
+                                 'nothing of it', live=True)
+    inverse: str = parameter('exact', "inverse of the model: exact, or the paper's approximation",
+                             choices=('exact', 'paper'))
+    undo_filter: bool = parameter(False, f'take the RC filter out; a sample is published {HALF} '
+                                  'samples late, with its own stamp')
+    orientation: str = parameter('keep', 'of a sample that states one: keep it, or that of the '
+                                 'tilt', choices=('keep', 'tilt'))
+    store: str = parameter(str(calibration_store.default_folder()), 'folder of calibrations, '
+                           'whose newest of the unit is used where none is named; empty: none')
+    output_rate_hz: float = parameter(0.0, 'single samples are published at this rate, so that '
+                                      'faster vibration folds; 0: all', 'Hz', 0.0, 1e5)
+    free_acceleration: bool = parameter(False, 'publish imu/linear_acceleration_free of samples '
+                                        'that state an orientation')
+    rpy_rad: Any = parameter([0.0, 0.0, 0.0], 'roll, pitch and yaw of the case on the robot, as '
+                             'in a URDF joint', 'rad', name='mounting.rpy_rad', live=True)
+    mounting_frame_id: str = parameter('base_link', 'frame of the robot, in the header where the '
+                                       'case is turned', name='mounting.frame_id')
 
 
 _RPY = 'mounting.rpy_rad'

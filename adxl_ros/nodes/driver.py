@@ -29,14 +29,14 @@ DEFAULT_FRAME = 'imu_link'
 class DriverSettings:
     """The driver."""
 
-    link: str = parameter(f'{LINK}type', base.DEFAULT_LINK, 'where the samples come from',
+    link: str = parameter(base.DEFAULT_LINK, 'where the samples come from', name=f'{LINK}type',
                           choices=base.link_names())
-    stamp_offset_s: float = parameter(
-        'stamp_offset', 0.0, 'delay of the sensor, such as that of its RC filter, by which the '
-        'stamps are earlier', 's', -10.0, 10.0)
-    frame_id: str = parameter('frame_id', '', 'frame of the case; empty: imu_link, or as a '
-                              'simulator states it')
-    autostart: bool = parameter('autostart', True, 'configure and activate at the start')
+    stamp_offset_s: float = parameter(0.0, 'delay of the sensor, such as that of its RC filter, '
+                                      'by which the stamps are earlier', 's', -10.0, 10.0,
+                                      name='stamp_offset')
+    frame_id: str = parameter('', 'frame of the case; empty: imu_link, or as a simulator states '
+                              'it')
+    autostart: bool = parameter(True, 'configure and activate at the start')
 
 
 _SIMULATED = f'SIMULATED sensor (link.type: {base.DEFAULT_LINK})'

@@ -40,16 +40,17 @@ from std_srvs.srv import Trigger
 class InvestigateSettings:
     """The investigation."""
 
-    output: str = parameter('output', 'investigation', 'folder of bag, report and parameters; a '
-                            'number is added where it has a diagnosis')
-    alpha_deg: Any = parameter('limits.alpha_deg', (), 'range of alpha; empty: 0 to 180', 'deg')
-    beta_deg: Any = parameter('limits.beta_deg', (), 'range of beta; empty: 0 to 360', 'deg')
+    output: str = parameter('investigation', 'folder of bag, report and parameters; a number is '
+                            'added where it has a diagnosis')
+    alpha_deg: Any = parameter((), 'range of alpha; empty: 0 to 180', 'deg',
+                               name='limits.alpha_deg')
+    beta_deg: Any = parameter((), 'range of beta; empty: 0 to 360', 'deg', name='limits.beta_deg')
     # The default is that of the bridge, 0.3 rad/s.
-    rate_deg_s: float = parameter('limits.rate_deg_s', 17.0, 'largest rate of each joint', 'deg/s',
-                                  0.1, 180.0)
-    minutes: float = parameter('limits.minutes', 15.0, 'largest time of all manoeuvres together',
-                               'min', 0.5, 240.0)
-    seed: int = parameter('seed', 0, 'seed of the diagnosis', '', *SEEDS)
+    rate_deg_s: float = parameter(17.0, 'largest rate of each joint', 'deg/s', 0.1, 180.0,
+                                  name='limits.rate_deg_s')
+    minutes: float = parameter(15.0, 'largest time of all manoeuvres together', 'min', 0.5, 240.0,
+                               name='limits.minutes')
+    seed: int = parameter(0, 'seed of the diagnosis', '', *SEEDS)
 
 
 _INDENT = 11 * ' '

@@ -32,26 +32,25 @@ from std_srvs.srv import Trigger
 class MonitorSettings:
     """The monitor."""
 
-    reference: str = parameter(
-        'reference', 'stage', 'what the sensor is compared with: the joints of a stage, the '
-        'ideal Imu of a simulator, or the joints of a robot', choices=('stage', 'imu', 'robot'))
-    reference_topic: str = parameter('reference_topic', '', 'topic of the reference; empty: '
-                                     'stage/joint_states, imu/ideal, or joint_states')
-    urdf: str = parameter('urdf', '', 'file of the robot; its base rests')
-    frame: str = parameter('frame', 'imu_link', 'frame of the robot that carries the sensor')
-    window_s: float = parameter('window_s', 60.0, 'time over which gap and floor are taken', 's',
-                                5.0, 3600.0)
-    false_alarms_per_day: float = parameter('false_alarms_per_day', 0.0333, 'largest rate of '
-                                            'reported changes that are none', '1/day', 1e-5, 10.0)
-    history_s: float = parameter('history_s', 600.0, 'time that is kept for a diagnosis', 's',
-                                 60.0, 3600.0)
-    wait_s: float = parameter('diagnose.wait_s', 120.0, 'time of samples that an automatic '
-                              'diagnosis needs', 's', 20.0, 3600.0)
-    output: str = parameter('output', str(calibration_store.default_folder().with_name('monitor')),
+    reference: str = parameter('stage', 'what the sensor is compared with: the joints of a stage, '
+                               'the ideal Imu of a simulator, or the joints of a robot',
+                               choices=('stage', 'imu', 'robot'))
+    reference_topic: str = parameter('', 'topic of the reference; empty: stage/joint_states, '
+                                     'imu/ideal, or joint_states')
+    urdf: str = parameter('', 'file of the robot; its base rests')
+    frame: str = parameter('imu_link', 'frame of the robot that carries the sensor')
+    window_s: float = parameter(60.0, 'time over which gap and floor are taken', 's', 5.0, 3600.0)
+    false_alarms_per_day: float = parameter(0.0333, 'largest rate of reported changes that are '
+                                            'none', '1/day', 1e-5, 10.0)
+    history_s: float = parameter(600.0, 'time that is kept for a diagnosis', 's', 60.0, 3600.0)
+    wait_s: float = parameter(120.0, 'time of samples that an automatic diagnosis needs', 's',
+                              20.0, 3600.0, name='diagnose.wait_s')
+    output: str = parameter(str(calibration_store.default_folder().with_name('monitor')),
                             'folder of the record of changes and of the diagnoses')
-    automatic: bool = parameter('diagnose.automatic', True, 'diagnose a change, or an open gap')
-    budget_s: float = parameter('diagnose.budget_s', 300.0, 'longest time of a diagnosis', 's',
-                                1.0, 3600.0)
+    automatic: bool = parameter(True, 'diagnose a change, or an open gap',
+                                name='diagnose.automatic')
+    budget_s: float = parameter(300.0, 'longest time of a diagnosis', 's', 1.0, 3600.0,
+                                name='diagnose.budget_s')
 
 
 def gap_status(live: LiveGap, likely: DiagnosisResult | None, window_s: float) -> Status:

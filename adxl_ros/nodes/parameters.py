@@ -91,14 +91,15 @@ class Spec(NamedTuple):
         return '' if self.lower is None else f'{self.lower:.10g} to {self.upper:.10g}'
 
 
-def parameter(*spec: Any, **options: Any) -> Any:
-    """Declare one field of a dataclass of parameters; the arguments are those of `Spec`."""
-    return field(metadata={'spec': Spec(*spec, **options)})
+def parameter(*spec: Any, name: str = '', **options: Any) -> Any:
+    """Declare a parameter as `Spec` has it by a field of a dataclass, which gives it its name."""
+    return field(metadata={'spec': Spec(name, *spec, **options)})
 
 
 def specs_of(settings: Any) -> list[Spec]:
     """Return the parameters of a dataclass."""
-    return [f.metadata['spec'] for f in fields(settings) if 'spec' in f.metadata]
+    return [spec._replace(name=spec.name or f.name) for f in fields(settings)
+            if (spec := f.metadata.get('spec'))]
 
 
 def node_specs(module: ModuleType) -> list[Spec]:
@@ -157,8 +158,7 @@ def check_given(node: Node) -> None:
 
 def declare_all(node: Node, settings: type[T]) -> T:
     """Declare the parameters of a dataclass, and return it with their values."""
-    return settings(**{f.name: declare(node, f.metadata['spec'])
-                       for f in fields(settings)})  # type: ignore[arg-type]
+    return settings(*(declare(node, spec) for spec in specs_of(settings)))
 
 
 def declare(node: Node, spec: Spec) -> Any:

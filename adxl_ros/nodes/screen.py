@@ -35,8 +35,8 @@ from std_srvs.srv import Trigger
 class ScreenSettings:
     """The screen."""
 
-    node: str = parameter('node', 'calibration', 'name of the calibration node')
-    node_pid: int = parameter('node_pid', 0, 'process of the node that has started this screen')
+    node: str = parameter('calibration', 'name of the calibration node')
+    node_pid: int = parameter(0, 'process of the node that has started this screen')
 
 
 Styled = tuple[str, str]

@@ -30,44 +30,42 @@ _RESOLUTION = SENSOR_FIELDS['stage.resolution_rad'].metadata
 class StageSettings:
     """The choice of the stage."""
 
-    kind: str = parameter(
-        'stage.type', 'simulated', 'the simulated stage, or the bridge to a controller that takes '
-        'joint states or trajectories', choices=('simulated', 'joint_state', 'trajectory'))
+    kind: str = parameter('simulated', 'the simulated stage, or the bridge to a controller that '
+                          'takes joint states or trajectories', name='stage.type',
+                          choices=('simulated', 'joint_state', 'trajectory'))
 
 
 @dataclass(frozen=True)
 class SimulatedStageSettings:
     """The simulated stage."""
 
-    resolution_rad: float = parameter(
-        'stage.resolution_rad', float(np.radians(5 / 60)), _RESOLUTION['doc'],
-        _RESOLUTION['unit'], _RESOLUTION['lower'], _RESOLUTION['upper'])
-    delay_s: float = parameter('delay_s', 0.1, 'time from a command to its effect', 's', 0.02, 1.0)
-    slew_rate_rad_s: float = parameter('slew_rate_rad_s', 0.5, 'largest speed of a turn', 'rad/s',
-                                       1e-6, 100.0)
-    slew_rate_m_s: float = parameter('slew_rate_m_s', 0.01, 'largest speed of a shift', 'm/s',
-                                     1e-9, 10.0)
-    settling_time_s: float = parameter('settling_time_s', 0.3, 'settling time of a step, to 1 %',
-                                       's', 0.01, 60.0)
-    alpha_rad: float = parameter('alpha_rad', 0.0, 'position at the start', 'rad', -100.0, 100.0)
-    beta_rad: float = parameter('beta_rad', 0.0, 'position at the start', 'rad', -100.0, 100.0)
-    shift_m: float = parameter('shift_m', 0.0, 'position at the start', 'm', -10.0, 10.0)
-    seed: int = parameter('seed', 0, "seed of the positions within an encoder's step", '',
+    resolution_rad: float = parameter(float(np.radians(5 / 60)), _RESOLUTION['doc'],
+                                      _RESOLUTION['unit'], _RESOLUTION['lower'],
+                                      _RESOLUTION['upper'], name='stage.resolution_rad')
+    delay_s: float = parameter(0.1, 'time from a command to its effect', 's', 0.02, 1.0)
+    slew_rate_rad_s: float = parameter(0.5, 'largest speed of a turn', 'rad/s', 1e-6, 100.0)
+    slew_rate_m_s: float = parameter(0.01, 'largest speed of a shift', 'm/s', 1e-9, 10.0)
+    settling_time_s: float = parameter(0.3, 'settling time of a step, to 1 %', 's', 0.01, 60.0)
+    alpha_rad: float = parameter(0.0, 'position at the start', 'rad', -100.0, 100.0)
+    beta_rad: float = parameter(0.0, 'position at the start', 'rad', -100.0, 100.0)
+    shift_m: float = parameter(0.0, 'position at the start', 'm', -10.0, 10.0)
+    seed: int = parameter(0, "seed of the positions within an encoder's step", '',
                           *parameters.SEEDS)
 
 
 def _joint(name: str) -> Any:
-    return parameter(f'bridge.{name}.joint', parameters.Kind.STRING,
-                     f"the controller's name of {name}")
+    return parameter(parameters.Kind.STRING, f"the controller's name of {name}",
+                     name=f'bridge.{name}.joint')
 
 
 def _sign(name: str) -> Any:
-    return parameter(f'bridge.{name}.sign', 1, 'direction in which it turns: 1 or -1', '', -1, 1)
+    return parameter(1, 'direction in which it turns: 1 or -1', '', -1, 1,
+                     name=f'bridge.{name}.sign')
 
 
 def _offset(name: str) -> Any:
-    return parameter(f'bridge.{name}.offset_rad', 0.0, f"{name} where the controller's joint is "
-                     'at 0', 'rad', -100.0, 100.0)
+    return parameter(0.0, f"{name} where the controller's joint is at 0", 'rad', -100.0, 100.0,
+                     name=f'bridge.{name}.offset_rad')
 
 
 @dataclass(frozen=True)
@@ -80,12 +78,13 @@ class BridgeSettings:
     beta_joint: str = _joint('beta')
     beta_sign: int = _sign('beta')
     beta_offset_rad: float = _offset('beta')
-    joint_states: str = parameter('bridge.joint_states', '/joint_states',
-                                  "topic of the controller's joint states")
-    command: str = parameter('bridge.command', '', 'topic on which the controller listens; empty: '
-                             '/joint_commands, or /joint_trajectory_controller/joint_trajectory')
-    speed_rad_s: float = parameter('bridge.speed_rad_s', 0.3, 'speed of a trajectory', 'rad/s',
-                                   1e-4, 10.0)
+    joint_states: str = parameter('/joint_states', "topic of the controller's joint states",
+                                  name='bridge.joint_states')
+    command: str = parameter('', 'topic on which the controller listens; empty: /joint_commands, '
+                             'or /joint_trajectory_controller/joint_trajectory',
+                             name='bridge.command')
+    speed_rad_s: float = parameter(0.3, 'speed of a trajectory', 'rad/s', 1e-4, 10.0,
+                                   name='bridge.speed_rad_s')
 
 
 _STEP_NS = 10_000_000
