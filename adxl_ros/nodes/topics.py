@@ -277,13 +277,11 @@ class Inbox:
 
     def silence(self) -> str:
         """Return why or for how long nothing has come; '' while messages come."""
-        if fault := self.fault():
-            return fault
         silent_s = time.monotonic() - self.heard_s
-        publishers = '' if self._node.count_publishers(self._topic) else \
-            ', and nobody publishes it'
-        return f'nothing on {self._topic} for {silent_s:.0f} s{publishers}' \
-            if silent_s > _SILENT_S else ''
+        if (fault := self.fault()) or silent_s < _SILENT_S:
+            return fault
+        nobody = '' if self._node.count_publishers(self._topic) else ', and nobody publishes it'
+        return f'nothing on {self._topic} for {silent_s:.0f} s{nobody}'
 
     def fault(self) -> str:
         """Return that several nodes publish on the topic, so that nothing is taken, or ''."""
