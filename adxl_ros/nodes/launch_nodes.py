@@ -118,8 +118,12 @@ def describe(arguments: Sequence[DeclareLaunchArgument],
 
 
 def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, Any],
-              params_file: str = '', **options: Any) -> Node:
-    """Make a node of this package with the parameter file of the launch."""
+              params_file: str = '', respawn: bool = True, **options: Any) -> Node:
+    """
+    Make a node of this package with the parameter file of the launch.
+
+    Without an `on_exit` of its own it is started again when it ends, unless `respawn` is false.
+    """
     path = params_file or text(context, 'params_file')
     name = full_name(context, executable)
     is_named = has_section(path, name)
@@ -131,6 +135,9 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
     given = {key: ParameterValue(value, value_type=str) if isinstance(value, str) else value
              for key, value in {**given_parameters(context, link), **overrides}.items()}
     options.setdefault('output', 'screen')
+    if 'on_exit' not in options:
+        most_refusals = _MOST_REFUSALS if respawn else 1
+        options |= {'respawn': respawn, 'respawn_delay': 2.0, 'on_exit': give_up(most_refusals)}
     # The nominal sensor is what a node without a file has; a file would name it for any stream.
     is_named &= path != str(parameter_file.nominal_path())
     # With its name a node gets the parameters in a section of its own, which counts before others.
@@ -203,7 +210,7 @@ def simulated_link(context: LaunchContext, speed: Mapping[str, Any]) -> dict[str
     return {'link.type': link or 'sim', **speed} if speed else {}
 
 
-def give_up(most_refusals: int = _MOST_REFUSALS) -> Callable[[ProcessExited, LaunchContext], None]:
+def give_up(most_refusals: int) -> Callable[[ProcessExited, LaunchContext], None]:
     """Return a function that ends a launch when a node refuses to start again and again."""
     refusals_s: list[float] = []
 
