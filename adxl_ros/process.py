@@ -12,8 +12,8 @@ import select
 import signal
 import sys
 
-_NODES = ('driver', 'stage', 'calibration', 'compensation', 'investigate', 'monitor', 'screen')
-"""Executables that set a handler of SIGINT of their own once they have loaded."""
+NODES = ('driver', 'stage', 'calibration', 'compensation', 'investigate', 'monitor', 'screen')
+"""The nodes, which set a handler of SIGINT of their own once they have loaded."""
 
 
 def package_version() -> str:
@@ -43,7 +43,7 @@ def use_one_thread() -> None:
 def end_silently_while_loading() -> None:
     """Let SIGINT end a node that loads without a traceback; others keep their handler."""
     path = Path(sys.argv[0])
-    is_node = path.name in _NODES and path.parent.parts[-2:] == ('lib', 'adxl_ros')
+    is_node = path.name in NODES and path.parent.parts[-2:] == ('lib', 'adxl_ros')
     if is_node and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 

@@ -37,30 +37,58 @@ NODES = ('driver', 'compensation', 'calibration', 'stage', 'monitor', 'investiga
 PICTURED = {'stuck': '`rate_hz` = 1, `duration_s` = 0.2', 'saturation': '`limit_g` = 0.9',
             'clock_skew': '`ratio` = 0.001', 'mount_resonance': '`frequency_hz` = 25'}
 """Values of parameters in the pictures, where the typical one would not show."""
-TOPICS = {
-    'imu/data_raw': 'samples by the nominal conversion, m/s²; an absent axis has variance 1e6',
-    'imu/data': 'corrected specific force, m/s², and orientation, with covariance',
-    'tilt': 'roll, pitch, inclination, rad: three angles, which tf2 must not turn',
-    'imu/linear_acceleration_free': 'without gravity, m/s²; only with `free_acceleration`',
-    'sensor_info': 'serial, axes, nominal zero-g and scale factor, rate, format; latched',
-    'temperature': 'temperature of the sensor, °C, where the link measures it',
-    'supply': 'supply voltage, V, where the link measures it',
-    'stage/command': 'where the stage shall go: names alpha and beta, rad, with the largest speed',
-    'stage/joint_states': 'what the encoders show: alpha, beta, rad, and shift, m',
-    'stage/true_joint_states': 'true position of the simulated stage, for the simulated sensor',
-    'calibration/next_pose': 'the next pose in words and numbers; latched',
-    'calibration/display': 'what the screen shows, as JSON; latched',
-    'gap': 'gap, noise floor and changes, mg; once a second',
-    'diagnostics': 'state of each node, once a second and at each change',
-    'imu/ideal': 'ideal samples of your simulator, for the link `topic`'}
-"""Meaning of the topics."""
-FURTHER = [('driver', 'publishes', name) for name in ('sensor_info', 'temperature', 'supply')] + [
-    ('driver', 'publishes', 'stage/joint_states'), ('driver', 'subscribes', 'imu/ideal'),
-    ('compensation', 'publishes', 'imu/linear_acceleration_free'),
-    ('screen', 'subscribes', 'calibration/display')]
-"""Ends of topics that a node makes only with some parameters, links or recordings."""
-KINDS = {'imu/linear_acceleration_free': 'geometry_msgs/Vector3Stamped',
-         'imu/ideal': 'sensor_msgs/Imu'}
+SERVED = 'compensation, calibration, monitor, investigate'
+TOPICS = [
+    ('imu/data_raw', 'sensor_msgs/Imu',
+     'samples by the nominal conversion, m/s²; an absent axis has variance 1e6',
+     'driver', SERVED),
+    ('imu/data', 'sensor_msgs/Imu',
+     'corrected specific force, m/s², and orientation, with covariance',
+     'compensation', 'you'),
+    ('tilt', 'geometry_msgs/Vector3Stamped',
+     'roll, pitch, inclination, rad: three angles, which tf2 must not turn',
+     'compensation', 'you'),
+    ('imu/linear_acceleration_free', 'geometry_msgs/Vector3Stamped',
+     'without gravity, m/s²; only with `free_acceleration`',
+     'compensation', 'you'),
+    ('sensor_info', 'diagnostic_msgs/DiagnosticStatus',
+     'serial, axes, nominal zero-g and scale factor, rate, format; latched',
+     'driver', SERVED),
+    ('temperature', 'sensor_msgs/Temperature',
+     'temperature of the sensor, °C, where the link measures it',
+     'driver', SERVED),
+    ('supply', 'sensor_msgs/BatteryState',
+     'supply voltage, V, where the link measures it',
+     'driver', SERVED),
+    ('stage/command', 'sensor_msgs/JointState',
+     'where the stage shall go: names alpha and beta, rad, with the largest speed',
+     'calibration, investigate', 'calibration, stage, investigate'),
+    ('stage/joint_states', 'sensor_msgs/JointState',
+     'what the encoders show: alpha, beta, rad, and shift, m',
+     'stage, driver', 'calibration, monitor, investigate'),
+    ('stage/true_joint_states', 'sensor_msgs/JointState',
+     'true position of the simulated stage, for the simulated sensor',
+     'stage', 'driver'),
+    ('calibration/next_pose', 'diagnostic_msgs/DiagnosticStatus',
+     'the next pose in words and numbers; latched',
+     'calibration', 'you'),
+    ('calibration/display', 'std_msgs/String',
+     'what the screen shows, as JSON; latched',
+     'calibration', 'screen'),
+    ('gap', 'diagnostic_msgs/DiagnosticArray',
+     'gap, noise floor and changes, mg; once a second',
+     'monitor', 'you'),
+    ('diagnostics', 'diagnostic_msgs/DiagnosticArray',
+     'state of each node, once a second and at each change',
+     'driver, compensation, calibration, stage, monitor, investigate', 'you'),
+    ('imu/ideal', 'sensor_msgs/Imu',
+     'ideal samples of your simulator, for the link `topic`',
+     'you', 'driver')]
+"""Topics: name, type, content, from, to."""
+SERVICES = {
+    'calibration': 'start, resume, start_over, capture, redo, skip, finish, abort',
+    'compensation': 'level', 'monitor': 'diagnose', 'investigate': 'abort'}
+"""Services (std_srvs/Trigger) by node."""
 LIBRARY = ('adxl_ros.simulate.sensor_model:SensorModel', 'adxl_ros.model.effects.base:Effect',
            'adxl_ros.model.effects.base:Parameter', 'adxl_ros.links.support.base:Link',
            'adxl_ros.diagnose.diagnosis:diagnose')
@@ -166,34 +194,22 @@ def tools() -> Iterator[str]:
 
 
 def nodes() -> Iterator[str]:
-    """Describe topics and nodes by the nodes' own help."""
-    texts = {name: help_of(name) for name in NODES}
-    ends: dict[str, dict[str, list[str]]] = {
-        topic: {'publishes': [], 'subscribes': []} for topic in TOPICS}
-    kinds = dict(KINDS)
-    for name, text in texts.items():
-        for end in ('publishes', 'subscribes'):
-            found = re.search(rf'^{end}\n((?:  .*\n)*)', text, re.MULTILINE)
-            for line in (found[1] if found else '').splitlines():
-                topic, kind = line.split()
-                ends.setdefault(topic, {'publishes': [], 'subscribes': []})[end].append(name)
-                kinds[topic] = kind
-    for name, end, topic in FURTHER:
-        if name not in ends[topic][end]:
-            ends[topic][end].append(name)
-    yield from ['# Nodes', '', 'Topics with both ends, then each node as its `--help` states it: '
-                'parameters, topics and services. Names without a leading `/` are in the '
+    """Describe topics and services, and nodes by their own help."""
+    yield from ['# Nodes', '', 'Topics with both ends, then each node as its `--help` states it. '
+                'Names without a leading `/` are in the '
                 'namespace of the node. Publishers are reliable and subscribers best effort, so '
                 'that they hear both kinds; `qos_overrides.*` changes it. "ros2 launch adxl_ros '
                 'robot.launch.py -s" lists the arguments of a launch file.', '', '## Topics']
     yield from table('topic (type) | content | from | to', (
-        (f'`{topic}` ({kinds[topic]})', TOPICS.get(topic, ''),
-         *(', '.join(names) or 'you' for names in both.values())) for topic, both in ends.items()))
+        (f'`{topic}` ({kind})', content, *ends) for topic, kind, content, *ends in TOPICS))
     sensor = ''
-    for name, text in texts.items():
-        found = re.search(r'\n(parameters of the sensor.*?)(?=\n\n)', text, re.DOTALL)
+    for name in NODES:
+        text = help_of(name)
+        found = re.search(r'\n(parameters of the sensor.*?)(?=\n\n\w)', text, re.DOTALL)
         sensor = sensor or (found[1] if found else '')
-        yield from [f'## {name}', *block(without(text, 'parameters of the sensor')), '']
+        services = ', '.join(f'`~/{part}`' for part in SERVICES.get(name, '').split(', ') if part)
+        yield from [f'## {name}', *block(without(text, 'parameters of the sensor')),
+                    f'Services (std_srvs/Trigger): {services}.' if services else '', '']
     yield from ['## Parameters of the sensor', '', 'Each node that knows the sensor has these, '
                 'usually from its [parameter file](parameter_file.md).', *block(sensor)]
 

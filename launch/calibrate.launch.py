@@ -21,8 +21,8 @@ launch with an error.
 from typing import Any
 
 from adxl_ros.nodes import launch_nodes
+from adxl_ros.nodes.calibration import CalibrationSettings
 from adxl_ros.nodes.launch_nodes import arguments, given_anywhere, LINK, make_node, STAGE, text
-from adxl_ros.nodes.settings import CalibrationSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 from launch.actions import LogInfo
@@ -51,9 +51,8 @@ def make_nodes(context: LaunchContext) -> list[Action]:
     shows_screen = text(context, 'screen') == 'true'
     # A line on the terminal would tear the screen.
     log = {'output': 'log'} if shows_screen else {}
-    respawn = {'respawn': True, 'respawn_delay': 2.0, **log}
     stage = [make_node(context, 'stage', sim_time | launch_nodes.given_parameters(context, STAGE),
-                       **respawn, on_exit=launch_nodes.give_up())] if has_stage(context) else []
+                       **log)] if has_stage(context) else []
     output, report = text(context, 'output'), text(context, 'report')
     files = ' and '.join(filter(None, (output, report and f'{report}/report.html')))
     success = f'wrote {files}; next: ros2 launch adxl_ros robot.launch.py params_file:={output}'
@@ -61,7 +60,7 @@ def make_nodes(context: LaunchContext) -> list[Action]:
     return [
         show_screen(context, shows_screen),
         make_node(context, 'driver', launch_nodes.simulated_link(context, speed) | sim_time,
-                  **respawn, on_exit=launch_nodes.give_up()),
+                  **log),
         *stage,
         make_node(context, 'calibration', {
             **sim_time, **sweep, 'autostart': True, 'exit_when_done': True, 'screen': False,

@@ -14,8 +14,8 @@ started again. The launch ends with an error when the driver refuses to start th
 """
 
 from adxl_ros.nodes import launch_nodes
+from adxl_ros.nodes.driver import DriverSettings
 from adxl_ros.nodes.launch_nodes import arguments, text
-from adxl_ros.nodes.settings import DriverSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 
@@ -41,5 +41,4 @@ def make_nodes(context: LaunchContext) -> list[Action]:
         context, 'driver', {
             'link.type': 'topic', **rotation, **launch_nodes.given_parameters(context, LINK),
             'use_sim_time': text(context, 'use_sim_time') == 'true'},
-        remappings=[('imu/data_raw', text(context, 'out_topic'))], respawn=True,
-        respawn_delay=2.0, on_exit=launch_nodes.give_up())]
+        remappings=[('imu/data_raw', text(context, 'out_topic'))])]

@@ -14,8 +14,8 @@ investigation: status 0 with a verdict, else 1. Ctrl-C leaves the stage at rest.
 """
 
 from adxl_ros.nodes import launch_nodes
+from adxl_ros.nodes.investigate import InvestigateSettings
 from adxl_ros.nodes.launch_nodes import arguments, given_parameters, make_node, text
-from adxl_ros.nodes.settings import InvestigateSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 
@@ -36,14 +36,11 @@ def make_nodes(context: LaunchContext) -> list[Action]:
     """Return the nodes."""
     speed = given_parameters(context, launch_nodes.SPEED)
     sim_time = {'use_sim_time': True} if speed else {}
-    respawn = {'respawn': True, 'respawn_delay': 2.0}
     launch_nodes.refuse_simulated_stage(context)
     return [
         make_node(context, 'driver', launch_nodes.simulated_link(context, speed) | sim_time,
-                  params_file=text(context, 'unit_file'), **respawn,
-                  on_exit=launch_nodes.give_up()),
-        make_node(context, 'stage', sim_time | given_parameters(context, launch_nodes.STAGE),
-                  **respawn, on_exit=launch_nodes.give_up()),
+                  params_file=text(context, 'unit_file')),
+        make_node(context, 'stage', sim_time | given_parameters(context, launch_nodes.STAGE)),
         make_node(context, 'investigate',
                   sim_time | loses_nothing(context) | given_parameters(context, INVESTIGATION),
                   on_exit=launch_nodes.end_with(RESULT, RESULT))]

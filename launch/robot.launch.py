@@ -20,8 +20,8 @@ times, or once without `respawn`.
 
 from adxl_ros.errors import UserError
 from adxl_ros.nodes import launch_nodes
+from adxl_ros.nodes.compensation import CompensationSettings
 from adxl_ros.nodes.launch_nodes import arguments, LINK, text
-from adxl_ros.nodes.settings import CompensationSettings
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 
@@ -50,7 +50,6 @@ def make_nodes(context: LaunchContext) -> list[Action]:
     sim_time = {'use_sim_time': True} if text(context, 'use_sim_time') == 'true' else {}
     return [*launch_nodes.static_transform(context), *(
         launch_nodes.make_node(
-            context, executable, parameters | sim_time, respawn=respawn, respawn_delay=2.0,
-            remappings=[('imu/data_raw', imu_topic)] if imu_topic else [],
-            on_exit=launch_nodes.give_up() if respawn else launch_nodes.give_up(1))
+            context, executable, parameters | sim_time, respawn=respawn,
+            remappings=[('imu/data_raw', imu_topic)] if imu_topic else [])
         for executable, parameters in nodes.items())]

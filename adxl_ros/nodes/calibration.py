@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 import math
 import os
@@ -15,27 +15,23 @@ import signal
 import subprocess
 import sys
 import termios
+import time
+from typing import Any
 
-from adxl_ros.calibrate.guided import controller, pose_plan
+from adxl_ros.calibrate.guided import controller, pose_plan, screen_contents
 from adxl_ros.calibrate.guided.controller import Answer, Controller, ControllerState, IDLE_TEXT
 from adxl_ros.calibrate.guided.guide import NextPose
 from adxl_ros.calibrate.guided.rest_guides import ThermalSettings
-from adxl_ros.calibrate.guided.screen_contents import (
-    CaptureSettings,
-    KeyAction,
-    Phase,
-    ScreenContents,
-    StageMode,
-)
+from adxl_ros.calibrate.guided.screen_contents import KeyAction, Phase, StageMode
 from adxl_ros.calibrate.guided.session import SessionSettings
 from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
-from adxl_ros.files import cdr
+from adxl_ros.files import calibration_store, cdr
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.jobs import executable, held_output
+from adxl_ros.nodes.parameters import parameter
 from adxl_ros.nodes.run_node import run
-from adxl_ros.nodes.settings import CalibrationSettings, check_given_parameters, given_link
-from adxl_ros.nodes.topics import create_publisher, Level, stamp, Status, status_message, STEADY
+from adxl_ros.nodes.topics import create_publisher, Level, Status, status_message, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -44,6 +40,53 @@ from rclpy.task import Future
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """The guided calibration."""
+
+    mode: str = parameter('stage', 'what the reference is',
+                          choices=('stage', 'gravity', 'thermal'))
+    autostart: bool = parameter(False, 'start without a call of ~/start')
+    resume: str = parameter('ask', 'go on with an interrupted calibration; without a screen, ask '
+                            'is continue', choices=('ask', 'continue', 'anew'))
+    exit_when_done: bool = parameter(False, 'end the node after a calibration: status 0 where it '
+                                     'wrote its file, else 1')
+    screen: bool = parameter(True, 'show a screen, where the node runs in a terminal')
+    output: str = parameter('calibration.yaml', 'parameter file to write')
+    journal: str = parameter('', 'file of accepted poses; empty: beside the output')
+    report: str = parameter('', 'directory for the report; empty: none')
+    store: str = parameter(str(calibration_store.default_folder()), 'folder of calibrations that '
+                           'gets a copy; empty: none')
+    dwell_s: float = parameter(5.0, 'time at rest a pose', 's', 0.5, 3600.0, name='sweep.dwell_s')
+    # A stage of 5 arcmin arrives within this default.
+    tolerance_rad: float = parameter(float(np.radians(0.2)), 'arrived within this', 'rad', 1e-6,
+                                     0.2, name='stage.tolerance_rad')
+    timeout_s: float = parameter(60.0, 'time after which a pose is late', 's', 1.0, 86400.0,
+                                 name='stage.timeout_s')
+    stage_mode: str = parameter('commanded', 'commanded turns itself, the others by hand',
+                                name='stage.mode', choices=('commanded', 'encoder', 'manual'))
+    near_deg: float = parameter(2.0, 'a stage turned by hand is captured within this of the pose',
+                                'deg', 0.01, 30.0, name='stage.near_deg')
+    temperature_span_c: float = parameter(3.0, 'largest temperature change since the first pose',
+                                          'degC', 0.1, 1000.0, name='sweep.temperature_span_c')
+    plan: str = parameter('auto', 'full (planes, 25 minutes), quick (about 38 poses), or auto: '
+                          'quick where a stage is turned by hand without planes',
+                          name='sweep.plan', choices=('auto', 'full', 'quick'))
+    planes_deg: Any = parameter((), 'planes alpha of the plan full; empty: 30 to 150, or 0 to 180 '
+                                'for a sensor with a z axis', 'deg', name='sweep.planes_deg')
+    step_deg: float = parameter(30.0, 'step of beta of the plan full', 'deg', 0.5, 90.0,
+                                name='sweep.step_deg')
+    check_poses: int = parameter(-1, 'poses kept out of the fit for the verdict; -1: 16, or 8 in '
+                                 'the plan quick', '', -1, 1000, name='sweep.check_poses')
+    tilt_error_deg: float = parameter(0.1, 'rms tilt error that the plan quick is to reach', 'deg',
+                                      1e-3, 10.0, name='sweep.tilt_error_deg')
+    range_c: Any = parameter((), 'lowest and highest temperature that mode thermal is to cover; '
+                             'empty: 0 to 50', 'degC', name='thermal.range_c')
+    block_s: float = parameter(10.0, 'length of a block of samples in mode thermal', 's', 0.5,
+                               600.0, name='thermal.block_s')
+
 
 _SCREEN_END_S = 5.0
 """Longest wait for the end of the screen, s; chosen: far above its usual end."""
@@ -120,23 +163,22 @@ class Announcer:
         self._command = create_publisher(node, JointState, 'stage/command', _COMMAND_QUEUE) \
             if has_stage else None
         self._next = create_publisher(node, DiagnosticStatus, '~/next_pose', 1, latched=True)
-        self._announced = ''
-        self._commanded, self._commanded_ns = '', 0
+        self._announced, self._commanded_ns = '', 0
 
     def announce(self, pose: NextPose) -> None:
         """Announce a pose if it is new, and command the stage if it turns itself."""
         if pose.text != self._announced:
             self._node.get_logger().info(pose.text)
             self._publish(pose.text, pose.values)
-        self._announced = pose.text
+            self._announced, self._commanded_ns = pose.text, 0
         now_ns = STEADY.now().nanoseconds
-        if self._command and pose.command_rad is not None and (
-                pose.text != self._commanded or now_ns - self._commanded_ns >= _REPEAT_NS):
-            self._commanded, self._commanded_ns = pose.text, now_ns
+        if self._command and pose.command_rad is not None \
+                and now_ns - self._commanded_ns >= _REPEAT_NS:
+            self._commanded_ns = now_ns
             command = JointState(name=['alpha', 'beta'], position=list(pose.command_rad))
             # The clock of a simulation may lag behind samples that have come.
-            stamp_ns = max(self._node.get_clock().now().nanoseconds, pose.newest_ns)
-            command.header.stamp = stamp(stamp_ns)
+            command.header.stamp = topics.stamp(
+                max(self._node.get_clock().now().nanoseconds, pose.newest_ns))
             self._command.publish(command)
 
     def withdraw(self, reason: str) -> None:
@@ -217,7 +259,7 @@ class DisplayPublisher:
             live = session.newest.reading(session.guide.stillness(session.newest))
         else:
             live = None if newest is None else newest.reading(newest.stillness())
-        self._publisher.publish(String(data=ScreenContents(
+        self._publisher.publish(String(data=screen_contents.ScreenContents(
             phase=phase.value, text=text, unit=f'{unit.serial} ({unit.axes})' if unit else '',
             output=str(controller.settings.output), keys=keys, live=live,
             progress=None if session is None else session.guide.progress(),
@@ -246,8 +288,6 @@ _SAMPLES = 'imu/data_raw'
 """Topic of the samples, relative to the namespace of the node."""
 _YAW_VARIANCE = 8
 """Place of the variance of yaw in an orientation's covariance of 9 numbers, from 0."""
-_SILENT_S = 3.0
-"""Time without samples after which the stream is silent, s; chosen."""
 _INFO_NS = 1_000_000_000
 """Time that samples wait for `sensor_info`, ns; chosen: a latched message comes within it, also
 where the samples of seconds come within a tenth of it."""
@@ -263,13 +303,13 @@ class Samples:
         self._raw: list[bytes] = []
         self._begun_ns = 0  # Steady time of the first sample, ns; 0 before it
         self.fault = ''  # Why the newest samples cannot be used, or ''
-        self.restart_silence()
-        self._subscription = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
-        self.mixture = self._subscription.fault  # That several nodes publish the samples, or ''
+        self._inbox = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
+        self.silence = self._inbox.silence  # Why or for how long no sample has come
+        self.mixture = self._inbox.fault  # That several nodes publish the samples, or ''
 
     def restart_silence(self) -> None:
         """Restart the time without samples."""
-        self._heard_ns = STEADY.now().nanoseconds
+        self._inbox.heard_s = time.monotonic()
 
     def keep_newest(self, count: int = _SAMPLES_QUEUE) -> None:
         """Forget all samples but the newest, as many as the queue holds."""
@@ -308,11 +348,9 @@ class Samples:
 
     def _receive(self) -> None:
         """Take the messages that have come since the last call."""
-        new = self._subscription.take()
-        self._raw += new
-        if new:
-            self.restart_silence()
-            self._begun_ns = self._begun_ns or self._heard_ns
+        self._raw += self._inbox.take()
+        if self._raw:
+            self._begun_ns = self._begun_ns or STEADY.now().nanoseconds
 
     def _fault(self, is_raw: bool, finite: np.ndarray, unit: Sensor) -> str:
         """Return why samples with these finite values, (n, m), cannot be used, or ''."""
@@ -327,13 +365,6 @@ class Samples:
         return f'{dead or "one axis or another"} is not a number in all samples; check its ' \
                'wiring and the driver'
 
-    def silence(self) -> str:
-        """Return in words why or for how long no sample has come; '' while samples come."""
-        if mixture := self.mixture():
-            return mixture
-        silent_s = (STEADY.now().nanoseconds - self._heard_ns) * 1e-9
-        return '' if silent_s < _SILENT_S else topics.silence(self._node, _SAMPLES, silent_s)
-
 
 class Calibration(Node):
     """
@@ -344,8 +375,8 @@ class Calibration(Node):
 
     def __init__(self) -> None:
         super().__init__('calibration')
-        check_given_parameters(self)
-        flat, link = parameters.declare_sensor(self), given_link(self)
+        parameters.check_given(self)
+        flat, link = parameters.declare_sensor(self), parameters.given_link(self)
         sensor = replace(parameters.make_sensor(flat, may_measure=True), link=link)
         anonymous = replace(parameters.anonymous_sensor(self, flat), link=link)
         self._own = own = parameters.declare_all(self, CalibrationSettings)
@@ -361,8 +392,7 @@ class Calibration(Node):
         if own.autostart:
             self._controller.start()
         self._connect()
-        self._has_run = False
-        self._idle_since_ns: int | None = None
+        self._has_run, self._busy_ns = False, 0
         self._display = DisplayPublisher(self, self._controller, own.screen)
         self.show_fit = self._display.show_fit
 
@@ -404,36 +434,29 @@ class Calibration(Node):
         self.create_service(Trigger, '~/capture', self._on_capture,
                             callback_group=ReentrantCallbackGroup())
         self.create_timer(_POLL_S, self._poll, clock=STEADY)
-        self.create_timer(_NOTICE_S, lambda: self._diagnostics.notice(
-            self._level(self._controller.status().late)), clock=STEADY)
+        self.create_timer(_NOTICE_S, lambda: self._diagnostics.notice(self._level()),
+                          clock=STEADY)
 
     def _poll(self) -> None:
         self._read_stage()
         # A poll may begin a calibration and end it at once.
         self._has_run |= self._controller.state is not ControllerState.IDLE
         self._controller.poll()
-        if self._own.exit_when_done:
-            self._exit_when_done()
-
-    def _exit_when_done(self) -> None:
-        """End the node after a calibration, when its last report has been received."""
         now_ns = STEADY.now().nanoseconds
-        if self._controller.state is not ControllerState.IDLE:
-            self._idle_since_ns = None
-        elif self._has_run and self._idle_since_ns is None:
-            self._idle_since_ns = now_ns
-        elif self._idle_since_ns is not None and now_ns - self._idle_since_ns > _FAREWELL_NS:
+        if self._controller.state is not ControllerState.IDLE or not self._has_run:
+            self._busy_ns = now_ns
+        elif self._own.exit_when_done and now_ns - self._busy_ns > _FAREWELL_NS:
+            # The last report has been received.
             raise SystemExit(0 if self._controller.outcome else 1)
 
     def _status(self) -> Status:
         report = self._controller.report()
-        return Status(self._level(report.status.late), report.status.text, report.serial,
-                      report.values)
+        return Status(self._level(), report.status.text, report.serial, report.values)
 
-    def _level(self, late: bool) -> Level:
+    def _level(self) -> Level:
         if self._samples.mixture():
             return Level.ERROR
-        return Level.WARN if late else Level.OK
+        return Level.WARN if self._controller.status().late else Level.OK
 
     def _on_info(self, message: DiagnosticStatus) -> None:
         self._controller.read_sensor_info(topics.stream_info(message, 'sensor_info'))
@@ -485,9 +508,9 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
     planes_rad = tuple(np.radians(parameters.numbers('sweep.planes_deg', own.planes_deg or [],
                                                      '[30.0, 60.0, 90.0]')).tolist())
     step_rad = float(np.radians(own.step_deg))
-    capture = CaptureSettings(own.dwell_s, own.tolerance_rad, own.timeout_s,
-                              StageMode(own.stage_mode), float(np.radians(own.near_deg)),
-                              own.temperature_span_c)
+    capture = screen_contents.CaptureSettings(
+        own.dwell_s, own.tolerance_rad, own.timeout_s, StageMode(own.stage_mode),
+        float(np.radians(own.near_deg)), own.temperature_span_c)
     kind = own.plan
     if kind == 'auto':
         by_hand = capture.stage_mode is not StageMode.COMMANDED

@@ -10,21 +10,23 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import isfinite
+from typing import Any
 
-from adxl_ros.compensate import inversions
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State
+from adxl_ros.compensate.inversions import HALF
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
-from adxl_ros.files import imu_message, parameter_file
+from adxl_ros.files import calibration_store, imu_message, parameter_file
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import Mounting
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import parameters, topics
+from adxl_ros.nodes.parameters import parameter
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.sample_output import SampleAges
-from adxl_ros.nodes.settings import check_given_parameters, CompensationSettings
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.signals.recorded_sensor import unit_of_stream
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -36,6 +38,31 @@ from rclpy.parameter import Parameter
 from rclpy.task import Future
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
+
+
+@dataclass(frozen=True)
+class CompensationSettings:
+    """The compensation."""
+
+    calibration: str = parameter('', 'parameter file to use; setting it loads the whole file or '
+                                 'nothing of it', live=True)
+    inverse: str = parameter('exact', "inverse of the model: exact, or the paper's approximation",
+                             choices=('exact', 'paper'))
+    undo_filter: bool = parameter(False, f'take the RC filter out; a sample is published {HALF} '
+                                  'samples late, with its own stamp')
+    orientation: str = parameter('keep', 'of a sample that states one: keep it, or that of the '
+                                 'tilt', choices=('keep', 'tilt'))
+    store: str = parameter(str(calibration_store.default_folder()), 'folder of calibrations, '
+                           'whose newest of the unit is used where none is named; empty: none')
+    output_rate_hz: float = parameter(0.0, 'single samples are published at this rate, so that '
+                                      'faster vibration folds; 0: all', 'Hz', 0.0, 1e5)
+    free_acceleration: bool = parameter(False, 'publish imu/linear_acceleration_free of samples '
+                                        'that state an orientation')
+    rpy_rad: Any = parameter([0.0, 0.0, 0.0], 'roll, pitch and yaw of the case on the robot, as '
+                             'in a URDF joint', 'rad', name='mounting.rpy_rad', live=True)
+    mounting_frame_id: str = parameter('base_link', 'frame of the robot, in the header where the '
+                                       'case is turned', name='mounting.frame_id')
+
 
 _RPY = 'mounting.rpy_rad'
 """Parameter of the rotation."""
@@ -55,7 +82,7 @@ class MountingParameters:
     def __init__(self, node: Node, stream: LiveStream, settings: CompensationSettings) -> None:
         self._node, self._stream = node, stream
         self._frame_id = settings.mounting_frame_id
-        self._waiting: Future | None = None
+        self._is_averaging = False
         self._mount(_mounting(settings.rpy_rad))
         parameters.on_change(node, _RPY, _mounting, self._mount)
         # The answer comes after a second of samples, which the node takes meanwhile.
@@ -67,15 +94,15 @@ class MountingParameters:
         self._stream.mount(mounting, self._frame_id)
 
     async def _on_level(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._waiting is not None:
+        if self._is_averaging:
             response.message = 'a rest is being averaged; wait for its answer'
             return response
-        self._waiting = waiting = Future()
+        self._is_averaging, over = True, Future()
         self._stream.collect()
-        timer = self._node.create_timer(_LEVEL_S, lambda: waiting.set_result(True), clock=STEADY)
-        await waiting
+        timer = self._node.create_timer(_LEVEL_S, lambda: over.set_result(True), clock=STEADY)
+        await over
         self._node.destroy_timer(timer)
-        forces_mps2, self._waiting = self._stream.collected(), None
+        forces_mps2, self._is_averaging = self._stream.collected(), False
         try:
             levelled = level(self._mounting, forces_mps2, self._stream.sensor)
         except UserError as error:
@@ -84,8 +111,8 @@ class MountingParameters:
         rpy_rad = [round(angle, 6) for angle in levelled.rpy_rad]
         self._node.set_parameters([Parameter(_RPY, value=rpy_rad)])
         response.success = True
-        response.message = (f"level, until this node ends; to keep it, start it with -p '{_RPY}:="
-                            f"[{', '.join(f'{angle:.6f}' for angle in rpy_rad)}]'")
+        response.message = ("level, until this node ends; to keep it, start it with -p '"
+                            f"{_RPY}:={rpy_rad}'")
         self._node.get_logger().info(response.message)
         return response
 
@@ -144,7 +171,7 @@ class Compensation(Node):
 
     def __init__(self) -> None:
         super().__init__('compensation')
-        check_given_parameters(self)
+        parameters.check_given(self)
         self._settings = settings = parameters.declare_all(self, CompensationSettings)
         paper = settings.inverse == 'paper'
         self._heard_ns: dict[str, int] = {}
@@ -289,7 +316,7 @@ class Compensation(Node):
             self._obstacle if self._stream.unknown is not None else '')
         newer = self._policy.newer()
         state, text = self._policy.status(interval, newer, self._calibration())
-        late = inversions.HALF if self._settings.undo_filter else 0
+        late = HALF if self._settings.undo_filter else 0
         values = {'rate_in_hz': round(counts['received'] / duration_s, 1),
                   'rate_out_hz': round(counts['published'] / duration_s, 1), **totals,
                   'delay_s': late / self._policy.rate_hz, **self._ages.report(),

@@ -5,18 +5,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 import traceback
+from typing import Any
 
 from adxl_ros.errors import one_line, UserError
+from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.links.support import base
+from adxl_ros.nodes import parameters
 from adxl_ros.nodes.link_reader import LinkReader
-from adxl_ros.nodes.parameters import declare_sensor, make_sensor
+from adxl_ros.nodes.parameters import LINK, parameter, parameter_error
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.sample_output import SampleOutput, Tally
-from adxl_ros.nodes.settings import check_given_parameters, declare_driver, DEFAULT_FRAME
 from adxl_ros.nodes.topics import DiagnosticsReporter, Level, Status, STEADY
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+DEFAULT_FRAME = 'imu_link'
+"""Frame of the case, unless a parameter or a simulator states it."""
+
+
+@dataclass(frozen=True)
+class DriverSettings:
+    """The driver."""
+
+    link: str = parameter(base.DEFAULT_LINK, 'where the samples come from', name=f'{LINK}type',
+                          choices=base.link_names())
+    stamp_offset_s: float = parameter(0.0, 'delay of the sensor, such as that of its RC filter, '
+                                      'by which the stamps are earlier', 's', -10.0, 10.0,
+                                      name='stamp_offset')
+    frame_id: str = parameter('', 'frame of the case; empty: imu_link, or as a simulator states '
+                              'it')
+    autostart: bool = parameter(True, 'configure and activate at the start')
+
 
 _SIMULATED = f'SIMULATED sensor (link.type: {base.DEFAULT_LINK})'
 """Words of log and diagnostics where no sensor is read."""
@@ -52,11 +73,13 @@ class Driver(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__('driver')
-        check_given_parameters(self)
-        self._sensor = make_sensor(declare_sensor(self))
-        own, self._module, self._settings = declare_driver(self, self._sensor.serial)
-        self._delay_ns = round(1e9 * own.stamp_offset_s)
-        settings, self._link = self._settings, own.link
+        parameters.check_given(self)
+        self._sensor = parameters.make_sensor(parameters.declare_sensor(self))
+        self._refuse_silent_simulation()
+        own = parameters.declare_all(self, DriverSettings)
+        self._delay_ns, self._link = round(1e9 * own.stamp_offset_s), own.link
+        self._module = base.link_module(own.link)
+        self._settings = settings = self._declare_link()
         has_frame = isinstance(settings, base.SimulatorSettings)
         self._frame_id = own.frame_id or ('' if has_frame else DEFAULT_FRAME)
         paced = isinstance(settings, base.PacedSettings)
@@ -81,6 +104,28 @@ class Driver(LifecycleNode):
         if self._fault:
             raise UserError(self._fault)
         self._announces = True
+
+    def _refuse_silent_simulation(self) -> None:
+        """Refuse a driver of a real unit without a link: no real unit gets simulated data."""
+        given, serial = [*parameters.given_link(self)], self._sensor.serial
+        reason = f'{LINK}{given[0]} is given' if given else \
+            f'the sensor is the unit {serial}' if serial != NO_UNIT else ''
+        if reason and 'type' not in given:
+            devices = [name for name in base.link_names() if name != base.DEFAULT_LINK]
+            raise parameter_error('link.type', f'is not set, but {reason}; set it to '
+                                  f'{", ".join(devices)}, or to {base.DEFAULT_LINK} for a '
+                                  'simulated sensor')
+
+    def _declare_link(self) -> Any:
+        """Declare the parameters of the link; refuse those of another one."""
+        specs = {spec.name.removeprefix(LINK): spec for spec in parameters.link_specs(self._link)}
+        for name in parameters.given_link(self):
+            if name not in ('type', *specs):
+                raise parameter_error(f'{LINK}{name}', f'the link {self._link} has no such '
+                                      'parameter; it has link.type, '
+                                      f'{", ".join(spec.name for spec in specs.values())}')
+        return self._module.Settings(**{name: parameters.declare(self, spec)
+                                        for name, spec in specs.items()})
 
     def configure(self) -> None:
         """Create the topics."""

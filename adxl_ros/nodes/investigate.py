@@ -5,30 +5,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 import shlex
 import signal
 from textwrap import wrap
+import time
+from typing import Any
 
 from adxl_ros.files.bag_writer import LiveBag
-from adxl_ros.investigate.investigation import (
-    Answer,
-    BackgroundDiagnoser,
-    hypothesis_text,
-    Investigation,
-    listed,
-    Outcome,
-    OutputFolder,
-    State,
-)
+from adxl_ros.investigate import investigation
+from adxl_ros.investigate.investigation import Answer, Investigation, OutputFolder, State
 from adxl_ros.investigate.manoeuvres import CATALOGUE, Pose, StageLimits
 from adxl_ros.links.support.base import Watchdog
-from adxl_ros.nodes import topics
+from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.jobs import LiveLine
-from adxl_ros.nodes.parameters import declare_all, declare_sensor, low_and_high, make_sensor
+from adxl_ros.nodes.parameters import low_and_high, parameter, SEEDS
 from adxl_ros.nodes.run_node import run
-from adxl_ros.nodes.settings import check_given_parameters, InvestigateSettings
 from adxl_ros.nodes.topics import Level, Status
 from adxl_ros.report.quantities import percent
 from adxl_ros.report.screen import COLUMNS, end_lines
@@ -41,6 +35,24 @@ from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
+
+@dataclass(frozen=True)
+class InvestigateSettings:
+    """The investigation."""
+
+    output: str = parameter('investigation', 'folder of bag, report and parameters; a number is '
+                            'added where it has a diagnosis')
+    alpha_deg: Any = parameter((), 'range of alpha; empty: 0 to 180', 'deg',
+                               name='limits.alpha_deg')
+    beta_deg: Any = parameter((), 'range of beta; empty: 0 to 360', 'deg', name='limits.beta_deg')
+    # The default is that of the bridge, 0.3 rad/s.
+    rate_deg_s: float = parameter(17.0, 'largest rate of each joint', 'deg/s', 0.1, 180.0,
+                                  name='limits.rate_deg_s')
+    minutes: float = parameter(15.0, 'largest time of all manoeuvres together', 'min', 0.5, 240.0,
+                               name='limits.minutes')
+    seed: int = parameter(0, 'seed of the diagnosis', '', *SEEDS)
+
+
 _INDENT = 11 * ' '
 """Spaces in place of the time at the beginning of a line."""
 _MOST_NAMED = 3
@@ -49,28 +61,28 @@ _MOST_NAMED = 3
 
 def answer_lines(minutes: float, answer: Answer) -> list[str]:
     """Return the probabilities after a diagnosis, and what follows."""
-    named = '  '.join(f'{hypothesis_text(h.effects)} {percent(h.probability)}'
+    named = '  '.join(f'{investigation.hypothesis_text(h.effects)} {percent(h.probability)}'
                       for h in answer.hypotheses[:_MOST_NAMED])
     lines = wrap(f'{minutes:5.1f} min  {named}', COLUMNS, subsequent_indent=_INDENT)
-    if answer.outcome is Outcome.GO_ON:
+    if answer.outcome is investigation.Outcome.GO_ON:
         lines += wrap(f'next: {CATALOGUE[answer.manoeuvre].text}', COLUMNS,
                       initial_indent=_INDENT, subsequent_indent=_INDENT)
     return lines
 
 
-def closing_lines(investigation: Investigation, folder: OutputFolder) -> list[str]:
+def closing_lines(ended: Investigation, folder: OutputFolder) -> list[str]:
     """Return the result, where the files are, and what to do next."""
     bag, baseline, gap, parameters = (shlex.quote(str(path)) for path in (
         folder.bag, folder.baseline, folder.path / 'gap', folder.parameters))
     files = [str(path) for path in (folder.report, folder.parameters, folder.bag) if path.exists()]
-    if investigation.state is State.STOPPED:
-        result = [f'Stopped without a verdict: {investigation.reason}']
-        following = f'diagnose {bag} --params {baseline} -o {gap}' if investigation.moved_s else ''
+    if ended.state is State.STOPPED:
+        result = [f'Stopped without a verdict: {ended.reason}']
+        following = f'diagnose {bag} --params {baseline} -o {gap}' if ended.moved_s else ''
     else:
-        answer = investigation.answers[-1][1]
+        answer = ended.answers[-1][1]
         result = [answer.sentence]
         if answer.hidden:
-            result.append(f'It cannot show {listed(answer.hidden)}.')
+            result.append(f'It cannot show {investigation.listed(answer.hidden)}.')
         following = f'simulate rich --params {parameters} -o sim.csv'
     return ['', *end_lines(result, files, following and f'ros2 run adxl_ros {following}')]
 
@@ -134,9 +146,10 @@ class BagRecorder:
 
     def _write(self, topic: str, data: bytes) -> None:
         if self.bag is not None:
-            package, _, name = topics.type_name(_KINDS.get(topic, Imu)).partition('/')
-            self.bag.write(self._node.resolve_topic_name(topic), f'{package}/msg/{name}', data,
-                           self._system.now().nanoseconds)
+            kind = _KINDS.get(topic, Imu)
+            package = kind.__module__.partition('.')[0]
+            self.bag.write(self._node.resolve_topic_name(topic), f'{package}/msg/{kind.__name__}',
+                           data, self._system.now().nanoseconds)
         elif topic == 'sensor_info':
             self._info = data
 
@@ -166,9 +179,9 @@ class Investigate(Node):
 
     def __init__(self) -> None:
         super().__init__('investigate')
-        check_given_parameters(self)
-        self._sensor = make_sensor(declare_sensor(self))
-        self._settings = own = declare_all(self, InvestigateSettings)
+        parameters.check_given(self)
+        self._sensor = parameters.make_sensor(parameters.declare_sensor(self))
+        self._settings = own = parameters.declare_all(self, InvestigateSettings)
         alpha_deg = low_and_high('limits.alpha_deg', own.alpha_deg, (0.0, 180.0))
         beta_deg = low_and_high('limits.beta_deg', own.beta_deg, (0.0, 360.0))
         alpha_rad, beta_rad = np.radians([alpha_deg, beta_deg]).tolist()
@@ -185,11 +198,11 @@ class Investigate(Node):
         self._folder = OutputFolder.free(Path(own.output))
         self._investigation = Investigation(
             limits, own.minutes,
-            BackgroundDiagnoser(self._folder, limits, own.seed),
+            investigation.BackgroundDiagnoser(self._folder, limits, own.seed),
             lambda minutes, answer: self._print(answer_lines(minutes, answer)),
             self._recorder.flush)
         self._screen: LiveLine | None = None
-        self._ended_ns: int | None = None
+        self._busy_s = time.monotonic()
         self._request = ''
 
     def request_stop(self, name: str, *_: object) -> None:
@@ -220,50 +233,45 @@ class Investigate(Node):
             self._screen.add(*lines)
 
     def _poll(self) -> None:
-        investigation = self._investigation
+        run = self._investigation
         if self._request:
-            investigation.stop(self._request)
-        if not investigation.has_ended:
-            self._check_streams(investigation)
-        now_s = self.get_clock().now().nanoseconds * 1e-9
-        command = investigation.step(now_s, self._pose) if now_s else None
+            run.stop(self._request)
+        if not run.has_ended:
+            self._check_streams(run)
+        now = self.get_clock().now()
+        command = run.step(now.nanoseconds * 1e-9, self._pose) if now.nanoseconds else None
         if command is not None:
             self._commands.publish(JointState(
-                header=Header(stamp=self.get_clock().now().to_msg()), name=['alpha', 'beta'],
-                position=list(command), velocity=list(investigation.speed or ())))
+                header=Header(stamp=now.to_msg()), name=['alpha', 'beta'], position=list(command),
+                velocity=list(run.speed or ())))
         if self._screen is not None:
-            status = investigation.status()
+            status = run.status()
             left = f', {status.remaining_s:.0f} s left' if status.state is State.MOVING else ''
             self._screen.show(f'{status.minutes:5.1f} min{left}  {status.text}'[:COLUMNS])
-        if investigation.has_ended:
-            self._end(investigation)
-
-    def _end(self, investigation: Investigation) -> None:
-        """End the node when the stage has its last command."""
-        now_ns = topics.STEADY.now().nanoseconds
-        if self._ended_ns is None:
-            self._ended_ns = now_ns
-        elif now_ns - self._ended_ns > _FAREWELL_S * 1e9:
+        now_s = time.monotonic()
+        if not run.has_ended:
+            self._busy_s = now_s
+        elif now_s - self._busy_s > _FAREWELL_S:
+            # The stage has its last command.
             self.close()
-            self._print(closing_lines(investigation, self._folder))
-            raise SystemExit(0 if investigation.has_verdict else 1)
+            self._print(closing_lines(run, self._folder))
+            raise SystemExit(0 if run.has_verdict else 1)
 
-    def _check_streams(self, investigation: Investigation) -> None:
+    def _check_streams(self, run: Investigation) -> None:
         """Stop where sensor or stage is silent; wait for both at the beginning."""
-        if investigation.state is State.RECORDING:
+        if run.state is State.RECORDING:
             if not self._recorder.has_samples:
                 self._pose = None
             elif self._pose is not None and self._recorder.bag is None:
                 self._folder.make(self._sensor)
                 self._recorder.start(self._folder.bag)
             return
-        if fault := self._recorder.samples.fault():
-            investigation.stop(f'{fault}; the stage holds its pose')
-        for topic, watchdog in self._watchdogs.items():
-            silent_s = watchdog.check()
-            if silent_s > _SILENT_S:
-                investigation.stop(f'nothing on {self.resolve_topic_name(topic)} for '
-                                   f'{silent_s:.0f} s; the stage holds its pose')
+        faults = [self._recorder.samples.fault(), *(
+            f'nothing on {self.resolve_topic_name(topic)} for {silent_s:.0f} s'
+            for topic, watchdog in self._watchdogs.items()
+            if (silent_s := watchdog.check()) > _SILENT_S)]
+        for fault in filter(None, faults):
+            run.stop(f'{fault}; the stage holds its pose')
 
     def _on_stage(self, message: JointState) -> None:
         angles_rad = dict(zip(message.name, message.position))

@@ -14,6 +14,7 @@ import subprocess
 import sys
 from tempfile import TemporaryFile
 import time
+from typing import IO
 
 from adxl_ros.report.screen import bar
 
@@ -37,24 +38,20 @@ def executable(name: str) -> str:
 
 
 @contextmanager
-def running(commands: Sequence[Sequence[str]]) -> Iterator[list[subprocess.Popen]]:
-    """Yield the processes of commands, without their error output, and stop them at the end."""
-    processes = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for command in commands]
+def running(commands: Sequence[Sequence[str]], errors: int | IO[bytes] = subprocess.DEVNULL
+            ) -> Iterator[list[subprocess.Popen]]:
+    """Yield the processes of commands, and end them: interrupt, and kill what stays for 10 s."""
+    processes = [subprocess.Popen(command, stderr=errors) for command in commands]
     try:
         yield processes
     finally:
-        stop(processes)
-
-
-def stop(processes: Sequence[subprocess.Popen]) -> None:
-    """Interrupt processes, and kill those that do not end within 10 s."""
-    for process in processes:
-        process.send_signal(signal.SIGINT)
-    for process in processes:
-        try:
-            process.wait(_KILL_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
+        for process in processes:
+            process.send_signal(signal.SIGINT)
+        for process in processes:
+            try:
+                process.wait(_KILL_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
 
 
 def cpu_time_s(pid: int) -> float:
@@ -141,7 +138,8 @@ class Step(LiveLine):
     def __init__(self, name: str, text: str, total: int = 0) -> None:
         columns = (_BAR_WIDTH, '{task.percentage:3.0f} %') if total else ()
         super().__init__(*columns, '{task.elapsed:4.0f} s', total=total)
-        self._name, self._total, self._begin_s = name, total, time.monotonic()
+        self._name, self._begin_s = name, time.monotonic()
+        self._width = _TEXT_WIDTH if total else _LINE_WIDTH - _NAME_WIDTH - 2
         self.show(text)
 
     def __enter__(self) -> Step:
@@ -149,14 +147,11 @@ class Step(LiveLine):
 
     def show(self, text: str, done: int = 0) -> None:
         """Show how far the step is."""
-        width = _TEXT_WIDTH if self._total else _LINE_WIDTH - _NAME_WIDTH - 2
-        share = f' {100 * done / self._total:3.0f} %' if self._total else ''
-        line = f' {self._name:{_NAME_WIDTH}} {text:{width}}'
-        self._plain = line + share
-        super().show(line, done)
+        self._line = f' {self._name:{_NAME_WIDTH}} {text:{self._width}}'
+        super().show(self._line, done)
 
     def __exit__(self, kind: object, *_: object) -> None:
         """Stop drawing; a step that has failed leaves no line."""
         if kind is None and self._progress is None:
-            print(f'{self._plain} {time.monotonic() - self._begin_s:4.0f} s', flush=True)
+            print(f'{self._line} {time.monotonic() - self._begin_s:4.0f} s', flush=True)
         self.close()

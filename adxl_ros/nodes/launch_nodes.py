@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.links.support.base import link_names
-from adxl_ros.nodes import settings
-from adxl_ros.nodes.parameters import given_text, has_section, Spec, specs_of
+from adxl_ros.nodes import driver, stage
+from adxl_ros.nodes.parameters import given_text, has_section, link_specs, Spec, specs_of
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutdown
 from launch.events.process import ProcessExited
@@ -48,9 +48,10 @@ class Argument(NamedTuple):
         """Return the value of the parameter."""
         default = self.spec.default
         # A list of numbers has a unit; names with commas stay one text.
-        kind = str if default == () and not self.spec.unit else type(default)
+        convert = _numbers if default == () and self.spec.unit else \
+            type(default) if isinstance(default, int | float) else str
         try:
-            return _CONVERSIONS.get(kind, str)(text)
+            return convert(text)
         except ValueError:
             raise UserError(f'{self.name}:={text}: expected a number, or numbers with commas '
                             'where it is a list') from None
@@ -60,10 +61,6 @@ def _numbers(text: str) -> list[float]:
     return [float(part) for part in text.strip('[]').split(',')]
 
 
-_CONVERSIONS: dict[type, Callable[[str], Any]] = {int: int, float: float, tuple: _numbers}
-"""Conversions of an argument by the type of the default."""
-
-
 def arguments(own: type, *parameters: str, **renamed: str) -> tuple[Argument, ...]:
     """
     Return arguments for parameters of a dataclass; those of the driver may be of any link.
@@ -71,20 +68,20 @@ def arguments(own: type, *parameters: str, **renamed: str) -> tuple[Argument, ..
     Dots in the name of a parameter become underscores, unless it is renamed.
     """
     specs = {spec.name: spec for spec in specs_of(own)}
-    if own is settings.DriverSettings:
+    if own is driver.DriverSettings:
         for link in link_names():
-            specs = {spec.name: spec for spec in settings.link_specs(link)} | specs
+            specs = {spec.name: spec for spec in link_specs(link)} | specs
     names = {parameter.replace('.', '_'): parameter for parameter in parameters} | renamed
     return tuple(Argument(name, specs[parameter]) for name, parameter in names.items())
 
 
-LINK = arguments(settings.DriverSettings, 'frame_id', 'link.type', 'link.port', 'link.baud',
+LINK = arguments(driver.DriverSettings, 'frame_id', 'link.type', 'link.port', 'link.baud',
                  'link.uri', 'link.device', 'link.channels', 'link.recording')
 """Arguments of the link, and of the frame of its samples."""
-STAGE = (*arguments(settings.StageSettings, 'stage.type'), *arguments(
-    settings.BridgeSettings, *(spec.name for spec in specs_of(settings.BridgeSettings))))
+STAGE = (*arguments(stage.StageSettings, 'stage.type'), *arguments(
+    stage.BridgeSettings, *(spec.name for spec in specs_of(stage.BridgeSettings))))
 """Arguments of the stage."""
-SPEED = arguments(settings.DriverSettings, speed='link.speed')
+SPEED = arguments(driver.DriverSettings, speed='link.speed')
 """Speed of a simulated sensor."""
 
 
@@ -121,8 +118,12 @@ def describe(arguments: Sequence[DeclareLaunchArgument],
 
 
 def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, Any],
-              params_file: str = '', **options: Any) -> Node:
-    """Make a node of this package with the parameter file of the launch."""
+              params_file: str = '', respawn: bool = True, **options: Any) -> Node:
+    """
+    Make a node of this package with the parameter file of the launch.
+
+    Without an `on_exit` of its own it is started again when it ends, unless `respawn` is false.
+    """
     path = params_file or text(context, 'params_file')
     name = full_name(context, executable)
     is_named = has_section(path, name)
@@ -134,6 +135,9 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
     given = {key: ParameterValue(value, value_type=str) if isinstance(value, str) else value
              for key, value in {**given_parameters(context, link), **overrides}.items()}
     options.setdefault('output', 'screen')
+    if 'on_exit' not in options:
+        most_refusals = _MOST_REFUSALS if respawn else 1
+        options |= {'respawn': respawn, 'respawn_delay': 2.0, 'on_exit': give_up(most_refusals)}
     # The nominal sensor is what a node without a file has; a file would name it for any stream.
     is_named &= path != str(parameter_file.nominal_path())
     # With its name a node gets the parameters in a section of its own, which counts before others.
@@ -155,7 +159,7 @@ def static_transform(context: LaunchContext) -> list[Action]:
     base_frame, executable = text(context, 'base_frame'), 'static_transform_publisher'
     if not base_frame:
         return []
-    frame_id = given_anywhere(context, 'frame_id', 'driver') or settings.DEFAULT_FRAME
+    frame_id = given_anywhere(context, 'frame_id', 'driver') or driver.DEFAULT_FRAME
     values = (*three_numbers(context, 'mounting_xyz_m'),
               *three_numbers(context, 'mounting_rpy_rad'), base_frame, frame_id)
     options = zip(('--x', '--y', '--z', '--roll', '--pitch', '--yaw', '--frame-id',
@@ -206,7 +210,7 @@ def simulated_link(context: LaunchContext, speed: Mapping[str, Any]) -> dict[str
     return {'link.type': link or 'sim', **speed} if speed else {}
 
 
-def give_up(most_refusals: int = _MOST_REFUSALS) -> Callable[[ProcessExited, LaunchContext], None]:
+def give_up(most_refusals: int) -> Callable[[ProcessExited, LaunchContext], None]:
     """Return a function that ends a launch when a node refuses to start again and again."""
     refusals_s: list[float] = []
 

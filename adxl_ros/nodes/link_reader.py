@@ -84,7 +84,7 @@ each other within it."""
 _QUEUE = 5000
 """Messages of the stage that are kept between two reads."""
 _LOG_INTERVAL_S = 1.0
-"""Shortest time between two log lines about the state of a link, s; chosen."""
+"""Shortest time between two logs of the state of a link, s; chosen."""
 
 
 class LinkReader:
@@ -112,8 +112,9 @@ class LinkReader:
             self._references = References(node, output.frame_id, link.references)
             on_close.callback(self._references.destroy)
             status = link.status()
-            self._level = status.level
-            self._log = StatusLog(node, status.text)
+            self._level, self._text = status.level, status.text
+            self._logged_s = -_LOG_INTERVAL_S
+            self._counts: dict[str, int] = {}
             if link.sensor is not None:
                 output.use(link.sensor)
             if isinstance(link, StageLink):
@@ -134,9 +135,21 @@ class LinkReader:
             return LinkStatus(Level.OK, 'waiting for a subscriber of imu/data_raw')
         status = self._link.status()
         if self._link.live:
-            # A long read holds the thread up, but not the log.
             self._log(status)
         return status
+
+    def _log(self, status: LinkStatus) -> None:
+        """Log the text of a live link or an event that is new, once a second at most."""
+        now_s = time.monotonic()
+        if now_s - self._logged_s < _LOG_INTERVAL_S:
+            return
+        for event in status.events:
+            if event.count > self._counts.get(event.message, 0):
+                topics.log(self._node, 'WARN', event.message)
+                self._counts[event.message], self._logged_s = event.count, now_s
+        if status.text != self._text:
+            self._text, self._logged_s = status.text, now_s
+            topics.log(self._node, status.level.name, status.text)
 
     def _live_turn(self) -> None:
         """Publish what a device sends; the link waits for it."""
@@ -153,13 +166,12 @@ class LinkReader:
             self._output.tally.begin(samples.until_ns)
         self._now_ns = samples.until_ns
         self._output.publish(samples, self._references)
-        status = self._link.status()
-        self._log(status)
-        if samples.missing and status.level is Level.OK:
+        level = self._link.status().level
+        if samples.missing and level is Level.OK:
             self._on_level(Level.WARN)
-        elif status.level is not self._level:
-            self._on_level(status.level)
-        self._level = status.level
+        elif level is not self._level:
+            self._on_level(level)
+        self._level = level
 
     def _paced_turn(self) -> None:
         """Wait until samples are due, and publish them."""
@@ -245,25 +257,3 @@ class LinkReader:
         assert isinstance(self._link, StageLink), 'only a link on the stage takes its motion'
         for reading in topics.joint_readings(self._stage.take()):
             self._link.sense_stage(*reading)
-
-
-class StatusLog:
-    """Logs the status of a link when its text or an event is new, once a second at most."""
-
-    def __init__(self, node: Node, text: str) -> None:
-        self._node, self._text = node, text
-        self._logged_s = -_LOG_INTERVAL_S
-        self._counts: dict[str, int] = {}
-
-    def __call__(self, status: LinkStatus) -> None:
-        """Log a status where it is new."""
-        now_s = time.monotonic()
-        if now_s - self._logged_s < _LOG_INTERVAL_S:
-            return
-        for event in status.events:
-            if event.count > self._counts.get(event.message, 0):
-                topics.log(self._node, 'WARN', event.message)
-                self._counts[event.message], self._logged_s = event.count, now_s
-        if status.text != self._text:
-            self._text, self._logged_s = status.text, now_s
-            topics.log(self._node, status.level.name, status.text)

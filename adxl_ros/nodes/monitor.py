@@ -4,30 +4,53 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime, UTC
 from pathlib import Path
 import time
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import cdr
+from adxl_ros.files import calibration_store, cdr
 from adxl_ros.files.recording_columns import check_unit, NO_UNIT, StreamInfo, unit_of
 from adxl_ros.monitor import changes
 from adxl_ros.monitor.changes import DiagnosisResult, DiagnosisRun, iso_time
 from adxl_ros.monitor.live_gap import AxisGap, GapSettings, LiveGap
 from adxl_ros.monitor.reference_stream import ReferenceKind, ReferenceStream, RobotForce
-from adxl_ros.nodes import topics
-from adxl_ros.nodes.parameters import declare_all, declare_sensor, make_sensor
-from adxl_ros.nodes.rclpy_internals import NotForExecutors, take_request
+from adxl_ros.nodes import parameters, topics
+from adxl_ros.nodes.parameters import parameter
 from adxl_ros.nodes.run_node import run
-from adxl_ros.nodes.settings import check_given_parameters, MonitorSettings
-from adxl_ros.nodes.topics import Inbox, Level, Status
+from adxl_ros.nodes.topics import Inbox, Level, NotForExecutors, Status, take_request
 from adxl_ros.report.quantities import percent
 from adxl_ros.simulate.robot import Robot
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_srvs.srv import Trigger
+
+
+@dataclass(frozen=True)
+class MonitorSettings:
+    """The monitor."""
+
+    reference: str = parameter('stage', 'what the sensor is compared with: the joints of a stage, '
+                               'the ideal Imu of a simulator, or the joints of a robot',
+                               choices=('stage', 'imu', 'robot'))
+    reference_topic: str = parameter('', 'topic of the reference; empty: stage/joint_states, '
+                                     'imu/ideal, or joint_states')
+    urdf: str = parameter('', 'file of the robot; its base rests')
+    frame: str = parameter('imu_link', 'frame of the robot that carries the sensor')
+    window_s: float = parameter(60.0, 'time over which gap and floor are taken', 's', 5.0, 3600.0)
+    false_alarms_per_day: float = parameter(0.0333, 'largest rate of reported changes that are '
+                                            'none', '1/day', 1e-5, 10.0)
+    history_s: float = parameter(600.0, 'time that is kept for a diagnosis', 's', 60.0, 3600.0)
+    wait_s: float = parameter(120.0, 'time of samples that an automatic diagnosis needs', 's',
+                              20.0, 3600.0, name='diagnose.wait_s')
+    output: str = parameter(str(calibration_store.default_folder().with_name('monitor')),
+                            'folder of the record of changes and of the diagnoses')
+    automatic: bool = parameter(True, 'diagnose a change, or an open gap',
+                                name='diagnose.automatic')
+    budget_s: float = parameter(300.0, 'longest time of a diagnosis', 's', 1.0, 3600.0,
+                                name='diagnose.budget_s')
 
 
 def gap_status(live: LiveGap, likely: DiagnosisResult | None, window_s: float) -> Status:
@@ -76,23 +99,19 @@ class MonitorStreams:
                  robot: RobotForce | None) -> None:
         self._kind, self._robot = kind, robot
         reference = Imu if kind is ReferenceKind.IMU else JointState
-        self.samples, self._reference, self._temperature, self._supply = (
+        self.samples, self.reference, self._temperature, self._supply = (
             Inbox(node, message, topic, _INPUT_QUEUE) for message, topic in (
                 (Imu, 'imu/data_raw'), (reference, reference_topic),
                 (Temperature, 'temperature'), (BatteryState, 'supply')))
 
-    def fault(self) -> str:
-        """Return that several nodes publish samples or reference, so that none count, or ''."""
-        return self.samples.fault() or self._reference.fault()
-
-    def take_others(self, reference: ReferenceStream) -> int:
-        """Add reference and surroundings that wait; return how many messages of it came."""
+    def take_others(self, reference: ReferenceStream) -> None:
+        """Add reference and surroundings that wait."""
         for name, field, inbox, layout in (
                 ('temperature_c', 'temperature', self._temperature, cdr.temperature),
                 ('supply_v', 'voltage', self._supply, cdr.battery_state)):
             stamps_ns, fields = topics.decoded(inbox.take(), layout, **{field: 1})
             reference.add_surroundings(name, stamps_ns, fields[field])
-        messages = self._reference.take()
+        messages = self.reference.take()
         if self._kind is ReferenceKind.IMU:
             reference.add_readings(*topics.imu_samples(messages))
         else:
@@ -102,7 +121,6 @@ class MonitorStreams:
                 [reading.position for reading in readings])
         if self._robot:
             self._robot.send(reference)
-        return len(messages)
 
 
 _TOPICS = {ReferenceKind.STAGE: 'stage/joint_states', ReferenceKind.IMU: 'imu/ideal',
@@ -116,8 +134,6 @@ _QUEUE = 10
 """Messages that are kept for a slow subscriber; chosen: 10 s."""
 _INFO_S = 3.0
 """Time that samples wait for `sensor_info`, s; chosen: a latched message comes within 1 s."""
-_SILENT_S = 3.0
-"""Time without messages after which a topic is silent, s; chosen."""
 _SHORTEST_S = 20.0
 """Shortest time of samples that is diagnosed, s; chosen: `diagnose` needs some rests or moves."""
 _PAUSE_S = 600.0
@@ -138,9 +154,9 @@ class Monitor(Node):
 
     def __init__(self) -> None:
         super().__init__('monitor')
-        check_given_parameters(self)
-        self._file_sensor = make_sensor(declare_sensor(self))
-        self._own = own = declare_all(self, MonitorSettings)
+        parameters.check_given(self)
+        self._file_sensor = parameters.make_sensor(parameters.declare_sensor(self))
+        self._own = own = parameters.declare_all(self, MonitorSettings)
         self._kind = ReferenceKind(own.reference)
         self._reference_topic = own.reference_topic or _TOPICS[self._kind]
         robot = RobotForce(Robot(own.urdf, own.frame), self._file_sensor.local_gravity_mps2) \
@@ -156,7 +172,7 @@ class Monitor(Node):
         self._headers: list[object] = []
         self._changed_ns = 0  # Begin of a change that is not diagnosed yet, ns; 0 without one
         self._diagnosed_s = -_PAUSE_S
-        self._begun_s = self._sampled_s = self._referenced_s = 0.0
+        self._begun_s = 0.0
         self._streams = MonitorStreams(self, self._kind, self._reference_topic, robot)
         self._publisher = topics.create_publisher(self, DiagnosticArray, 'gap', _QUEUE)
         self._service = self.create_service(Trigger, '~/diagnose', lambda _, answer: answer,
@@ -204,13 +220,11 @@ class Monitor(Node):
         stamps_ns, accel_mps2 = topics.imu_samples(self._streams.samples.take())
         if len(stamps_ns):
             self._begun_s = self._begun_s or now_s
-            self._sampled_s = now_s
         if self._info is None and self._begun_s and now_s - self._begun_s > _INFO_S:
             self._compare_by(StreamInfo({}, self._info_topic))
         if self._info is not None and not self._refusal:
             self._live.add_samples(stamps_ns, accel_mps2)
-            if self._streams.take_others(self._live.reference):
-                self._referenced_s = now_s
+            self._streams.take_others(self._live.reference)
             self._advance()
         self._serve()
 
@@ -268,16 +282,11 @@ class Monitor(Node):
 
     def _obstacle(self) -> str:
         """Return why nothing is compared; empty where samples are."""
-        now_s = time.monotonic()
-        if fault := self._refusal or self._streams.fault():
-            return fault
-        if now_s - self._sampled_s > _SILENT_S:
-            return topics.silence(self, 'imu/data_raw')
-        if self._info is None:
-            return 'waiting for sensor_info'
-        if now_s - self._referenced_s > _SILENT_S:
-            return f'{topics.silence(self, self._reference_topic)}: no reference'
-        return self._live.obstacle
+        silence = self._refusal or self._streams.samples.silence()
+        if silence or self._info is None:
+            return silence or 'waiting for sensor_info'
+        silence = self._streams.reference.silence()
+        return f'{silence}: no reference' if silence else self._live.obstacle
 
     def _state(self) -> tuple[Status, dict[str, Status]]:
         """Return what is known now: a summary, and the gap by axis unless nothing is compared."""
@@ -303,7 +312,8 @@ class Monitor(Node):
                                        for key, value in status.values.items()}}
         values |= {**self._live.counts, 'diagnosis_runs': self._run is not None,
                    'false_alarms_per_day': self._settings.false_alarms_per_day}
-        level = Level.ERROR if self._refusal or self._streams.fault() else summary.level
+        faults = self._refusal, self._streams.samples.fault(), self._streams.reference.fault()
+        level = Level.ERROR if any(faults) else summary.level
         return replace(summary, level=level, values=values)
 
 

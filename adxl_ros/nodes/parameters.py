@@ -1,29 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Parameters of nodes: each is described once, by a `Spec`.
+Parameters of nodes: each is declared once, and stands beside what it is for.
 
-Descriptors, `--help`, launch arguments and the known names all come from it. `settings.py` has
-the parameters of each node, `links` those of each link, and `sensor_specs` those of a sensor,
-which are those of its parameter file.
+Descriptors, `--help`, launch arguments and the known names all come from its `Spec`: a field of a
+dataclass in the node's file or, for a link, in its module in `links`. `sensor_specs` are those of
+a sensor, which are those of its parameter file.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import field, fields
-from itertools import pairwise
+from dataclasses import field, fields, is_dataclass
+from difflib import get_close_matches
+from importlib import import_module
+from itertools import chain, pairwise
 from pathlib import Path
 import re
 import sys
+from types import ModuleType
 from typing import Any, NamedTuple, TypeVar
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file
+from adxl_ros.links.support import base
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes.rclpy_internals import given_parameters, store_empty
+from adxl_ros.process import NODES
 import numpy as np
 from rcl_interfaces import msg
 from rclpy.exceptions import ParameterException
@@ -34,6 +38,14 @@ import yaml
 T = TypeVar('T')
 Kind = Parameter.Type
 """Types of ROS parameters."""
+LINK = 'link.'
+"""Begin of the names of all parameters of a link; the driver alone has them."""
+SEEDS = (0, 2 ** 31 - 1)
+"""Range of seeds."""
+_ANY_NODE = ('use_sim_time', 'start_type_description_service')
+"""Parameters of every node of rclpy."""
+_FREE_PREFIXES = ('provenance.', 'qos_overrides.', LINK)
+"""Prefixes whose names are not known here: free keys, topics, and what the driver checks."""
 _FILE_FLAG = '--params-file'
 """Argument of rcl before a parameter file."""
 _RULE_FLAGS = ('-p', '--param')
@@ -79,20 +91,74 @@ class Spec(NamedTuple):
         return '' if self.lower is None else f'{self.lower:.10g} to {self.upper:.10g}'
 
 
-def parameter(*spec: Any, **options: Any) -> Any:
-    """Declare one field of a dataclass of parameters; the arguments are those of `Spec`."""
-    return field(metadata={'spec': Spec(*spec, **options)})
+def parameter(*spec: Any, name: str = '', **options: Any) -> Any:
+    """Declare a parameter as `Spec` has it by a field of a dataclass, which gives it its name."""
+    return field(metadata={'spec': Spec(name, *spec, **options)})
 
 
-def specs_of(settings: type) -> list[Spec]:
+def specs_of(settings: Any) -> list[Spec]:
     """Return the parameters of a dataclass."""
-    return [f.metadata['spec'] for f in fields(settings)]
+    return [spec._replace(name=spec.name or f.name) for f in fields(settings)
+            if (spec := f.metadata.get('spec'))]
+
+
+def node_specs(module: ModuleType) -> list[Spec]:
+    """Return the parameters that the dataclasses of a node's file declare."""
+    return [spec for value in vars(module).values() if is_dataclass(value)
+            for spec in specs_of(value)]
+
+
+def all_specs() -> Iterator[Spec]:
+    """Yield the parameters of all nodes, without those of sensor and link."""
+    return chain.from_iterable(
+        node_specs(import_module(f'adxl_ros.nodes.{name}')) for name in NODES)
+
+
+def link_specs(link: str) -> list[Spec]:
+    """Return the parameters of a link, `link.type` aside."""
+    return [Spec(f'{LINK}{option.name}', option.default, **option.metadata)
+            for option in fields(base.link_module(link).Settings)]
+
+
+def given_parameters(node: Node) -> dict[str, Any]:
+    """
+    Return all parameters that a node is started with.
+
+    rclpy shows a given parameter only once it is declared. The keys of a provenance are free, so
+    that no declaration can know their names.
+    """
+    return {name: given.value for name, given in node._parameter_overrides.items()}
+
+
+def given_link(node: Node) -> dict[str, Any]:
+    """Return the given parameters of the link by name, for a file that carries them."""
+    return {name.removeprefix(LINK): value for name, value in given_parameters(node).items()
+            if name.startswith(LINK)}
+
+
+def check_given(node: Node) -> None:
+    """Refuse parameters that no node of this package has, and files that name other nodes."""
+    name = node.get_fully_qualified_name()
+    for path in _paths():
+        sections = dict.fromkeys(section for section, _, _ in _entries(path))
+        if sections and not any(_matches(section, name) for section in sections):
+            raise UserError(f'{path}: has parameters of {", ".join(sections)}, but none of the '
+                            f'node {name}; begin the file with /**: or {name}:')
+    known = {*_ANY_NODE, *(spec.name for spec in (
+        *sensor_specs(), *node_specs(sys.modules[type(node).__module__])))}
+    for name in given_parameters(node):
+        if name in known or name.startswith(_FREE_PREFIXES):
+            continue
+        # One file may serve all nodes: a node ignores what another one has.
+        known |= {spec.name for spec in all_specs()}
+        if name not in known:
+            raise parameter_error(name, 'no node has a parameter of this name; did you mean '
+                                  f'{get_close_matches(name, sorted(known), 1, 0.0)[0]}?')
 
 
 def declare_all(node: Node, settings: type[T]) -> T:
     """Declare the parameters of a dataclass, and return it with their values."""
-    return settings(**{f.name: declare(node, f.metadata['spec'])
-                       for f in fields(settings)})  # type: ignore[arg-type]
+    return settings(*(declare(node, spec) for spec in specs_of(settings)))
 
 
 def declare(node: Node, spec: Spec) -> Any:
@@ -113,12 +179,16 @@ def declare(node: Node, spec: Spec) -> Any:
         value = node.declare_parameter(
             name, '' if spec.default == () else spec.default, descriptor).value
     except ParameterException:
-        given = dict(given_parameters(node)).get(name)
+        given = given_parameters(node).get(name)
         expected = ', '.join(filter(None, (kind.name, spec.limits, spec.unit)))
         hint = f'; write {given}.0' if kind == Kind.DOUBLE and isinstance(given, int) else ''
         raise parameter_error(name, f'{given!r} is refused; expected {expected}{hint}') from None
     if value is None:
-        store_empty(node, name, kind, spec.empty)
+        # rclpy answers a request for several parameters with nothing when one of them has no
+        # value, and takes an empty list as a list of bytes when it declares a parameter.
+        empty: dict[Kind, Any] = {Kind.STRING: '', Kind.INTEGER: round(spec.empty),
+                                  Kind.DOUBLE: float(spec.empty)}
+        node._parameters[name] = Parameter(name, kind, empty.get(kind, []))
     elif spec.choices and value not in spec.choices:
         raise parameter_error(name, f'{value!r} is not {spec.limits}')
     return value
@@ -200,15 +270,6 @@ def given_text(path: str, node_name: str, key: str) -> str:
                  if name == key and _matches(section, node_name)), '')
 
 
-def refuse_files_of_others(node_name: str) -> None:
-    """Refuse a file whose sections name other nodes only: the node would run without it."""
-    for path in _paths():
-        sections = dict.fromkeys(section for section, _, _ in _entries(path))
-        if sections and not any(_matches(section, node_name) for section in sections):
-            raise UserError(f'{path}: has parameters of {", ".join(sections)}, but none of the '
-                            f'node {node_name}; begin the file with /**: or {node_name}:')
-
-
 def _matches(pattern: str, node_name: str) -> bool:
     """Return whether a pattern means a node; * is one part of a name, and ** any number."""
     wild = {'*': r'/[^/]+', '**': r'(/[^/]+)*'}
@@ -243,12 +304,7 @@ def nominal_specs() -> list[Spec]:
 
 def is_from_file(node: Node) -> bool:
     """Return whether the given parameters are those of a parameter file, which has a format."""
-    return any(name == 'format' for name, _ in given_parameters(node))
-
-
-def sensor_keys() -> set[str]:
-    """Return the names of all parameters that `declare_sensor` declares."""
-    return {spec.name for spec in sensor_specs()}
+    return 'format' in given_parameters(node)
 
 
 def sensor_specs() -> Iterator[Spec]:
@@ -290,14 +346,15 @@ def anonymous_sensor(node: Node, flat: Mapping[str, Any]) -> Sensor:
     if is_from_file(node):
         return make_sensor(flat, may_measure=True)
     any_imu = parameter_file.load(parameter_file.any_imu_path(), may_measure=True)
-    given = {name: flat[name] for name, _ in given_parameters(node) if name in flat}
+    given = {name: flat[name] for name in given_parameters(node) if name in flat}
     return make_sensor(parameter_file.to_flat(any_imu) | given, may_measure=True)
 
 
 def given_sensor(node: Node) -> dict[str, Any]:
     """Declare what a parameter file holds; return what is given, its provenance among it."""
     # The keys of a provenance are free, so that they cannot be declared.
-    return declare_sensor(node) | {name: str(value) for name, value in given_parameters(node)
+    return declare_sensor(node) | {name: str(value)
+                                   for name, value in given_parameters(node).items()
                                    if name.startswith('provenance.')}
 
 

@@ -58,11 +58,10 @@ class Tally:
     """
 
     def __init__(self, steady_ns: int) -> None:
-        # Sensor time up to which samples have been read, ns; None before the first one
-        self.now_ns: int | None = None
+        self.now_ns: int | None = None  # Sensor time up to which samples have been read, ns
         self.counts: Counter[str] = Counter()  # By the names above
         self.ages = SampleAges()  # Ages of the samples on publication
-        self._newest_ns: int | None = None
+        self.newest_ns: int | None = None  # Stamp of the newest sample, ns
         # Times and counts at the last report
         self._reported = Counter(steady_ns=steady_ns)
 
@@ -70,21 +69,11 @@ class Tally:
         """Let the next report count sensor time from `now_ns`, ns."""
         self._reported['sensor_ns'] = now_ns
 
-    def count(self, stamps_ns: np.ndarray, **counts: int) -> None:
-        """
-        Add samples.
-
-        stamps_ns: stamps of the published ones, ns, (n,); counts: numbers of others by name.
-        """
-        self.counts.update(samples=len(stamps_ns), **counts)
-        if len(stamps_ns):
-            self._newest_ns = int(stamps_ns[-1])
-
     def report(self, steady_ns: int, sensor_ns: int) -> tuple[dict[str, Any], str]:
         """Report what has been counted since the last report."""
         totals = Counter({**self.counts, 'steady_ns': steady_ns, 'sensor_ns': sensor_ns})
-        new = totals.copy()
-        new.subtract(self._reported)
+        new = {name: totals[name] - self._reported[name] for name in (
+            'samples', 'missing', 'saturated', 'steady_ns', 'sensor_ns')}
         self._reported = totals
         elapsed_ns = max(new['sensor_ns'], 0)
         values: dict[str, Any] = {
@@ -92,24 +81,24 @@ class Tally:
             'saturated': totals['saturated'], 'samples': totals['samples'],
             'rate_hz': round(new['samples'] / elapsed_ns * 1e9, 3) if elapsed_ns else 0.0,
             'speed': round(elapsed_ns / new['steady_ns'], 3)}
-        if self._newest_ns is not None:
-            values['age_s'] = round((sensor_ns - self._newest_ns) * 1e-9, 6)
+        if self.newest_ns is not None:
+            values['age_s'] = round((sensor_ns - self.newest_ns) * 1e-9, 6)
         return values | self.ages.report(), ', '.join(
             f'{new[name]} samples {name}' for name in ('missing', 'saturated') if new[name])
 
 
 _REFERENCE_QUEUE = 1000
 """References that are kept for a slow subscriber: 10 s of stage angles."""
-_STAGE_PERIOD_NS = 10_000_000
-"""Longest time between two messages with the same stage angles, ns; chosen: 100 Hz, as a stage's
-controller sends."""
-_SCALAR_PERIOD_NS = 1_000_000_000
-"""Longest time between two messages with the same temperature or supply, ns; chosen."""
-
 _STAGE = 'stage/joint_states'
 """Topic of the stage angles, which have several columns."""
-_SCALARS = {'temperature': ('temperature_c', Temperature), 'supply': ('supply_v', BatteryState)}
-"""Column of a recording and message type of what has one value a sample, by topic."""
+_COLUMNS = {_STAGE: tuple(JOINTS.values()), 'temperature': ('temperature_c',),
+            'supply': ('supply_v',)}
+"""Columns of a recording by topic."""
+_KINDS = {_STAGE: JointState, 'temperature': Temperature, 'supply': BatteryState}
+"""Type of each topic."""
+_PERIODS_NS = {_STAGE: 10_000_000, 'temperature': 1_000_000_000, 'supply': 1_000_000_000}
+"""Longest time between two messages with the same values, ns; chosen: 100 Hz, as a stage's
+controller sends."""
 
 
 class References:
@@ -117,16 +106,14 @@ class References:
 
     def __init__(self, node: Node, frame_id: str, columns: tuple[str, ...]) -> None:
         self._node, self._frame_id = node, frame_id
-        self._joints = {column: joint for joint, column in JOINTS.items() if column in columns}
-        # Columns by topic
-        self._columns = {_STAGE: [*self._joints]} if self._joints else {}
-        self._columns |= {topic: [column] for topic, (column, _) in _SCALARS.items()
-                          if column in columns}
-        self._published = {topic: (-1, np.full(len(of_topic), np.inf))
-                           for topic, of_topic in self._columns.items()}
+        of_topics = {topic: [name for name in names if name in columns]
+                     for topic, names in _COLUMNS.items()}
+        self._columns = {topic: names for topic, names in of_topics.items() if names}
+        # Period and values of the last message by topic
+        self._published = {topic: (-1, np.full(len(names), np.inf))
+                           for topic, names in self._columns.items()}
         self._publishers = {topic: topics.create_publisher(
-            node, JointState if topic == _STAGE else _SCALARS[topic][1], topic, _REFERENCE_QUEUE)
-            for topic in self._columns}
+            node, _KINDS[topic], topic, _REFERENCE_QUEUE) for topic in self._columns}
 
     def destroy(self) -> None:
         """Remove the topics."""
@@ -135,39 +122,33 @@ class References:
 
     def publish(self, stamps_ns: np.ndarray, columns: Mapping[str, np.ndarray]) -> None:
         """
-        Publish values that have changed, and others once in a period.
+        Publish values that differ from those before, and others once in a period.
 
         stamps_ns: stamps, ns, (n,); columns: values by column, (n,); NaN where there is none.
         """
-        if not len(stamps_ns):
-            return
-        for topic, publisher in self._publishers.items():
-            values = np.column_stack([columns[column] for column in self._columns[topic]])
-            for i in self._new_rows(topic, stamps_ns, values):
-                message = self._message(topic, values[i].tolist())
-                message.header.stamp = topics.stamp(stamps_ns[i])
-                publisher.publish(message)
+        for topic, names in self._columns.items() if len(stamps_ns) else ():
+            values = np.column_stack([columns[name] for name in names])
+            rows = np.flatnonzero(np.isfinite(values).any(axis=1))
+            if not len(rows):
+                continue
+            values, periods = values[rows], stamps_ns[rows] // _PERIODS_NS[topic]
+            last_period, last = self._published[topic]
+            is_new = (np.diff(values, axis=0, prepend=last[None]) != 0).any(axis=1) \
+                | (np.diff(periods, prepend=last_period) != 0)
+            self._published[topic] = int(periods[-1]), values[-1]
+            for row, of_row in zip(rows[is_new], values[is_new].tolist()):
+                message = self._message(topic, dict(zip(names, of_row)))
+                message.header.stamp = topics.stamp(stamps_ns[row])
+                self._publishers[topic].publish(message)
 
-    def _new_rows(self, topic: str, stamps_ns: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the rows of values, (n, k), that differ from the row before or begin a period."""
-        rows = np.flatnonzero(np.isfinite(values).any(axis=1))
-        if not len(rows):
-            return rows
-        period_ns = _STAGE_PERIOD_NS if topic == _STAGE else _SCALAR_PERIOD_NS
-        values, period = values[rows], stamps_ns[rows] // period_ns
-        last_period, last = self._published[topic]
-        changed = (np.diff(values, axis=0, prepend=last[None]) != 0).any(axis=1)
-        self._published[topic] = int(period[-1]), values[-1]
-        return rows[changed | (np.diff(period, prepend=last_period) != 0)]
-
-    def _message(self, topic: str, values: list[float]) -> Any:
+    def _message(self, topic: str, values: Mapping[str, float]) -> Any:
         """Make the message of the joints that have a value, or of a temperature or supply."""
         if topic == _STAGE:
-            angles = {joint: value for joint, value in zip(self._joints.values(), values)
-                      if math.isfinite(value)}
+            angles = {joint: values[column] for joint, column in JOINTS.items()
+                      if math.isfinite(values.get(column, math.nan))}
             return JointState(name=list(angles), position=list(angles.values()))
-        message = Temperature(temperature=values[0]) if topic == 'temperature' else \
-            BatteryState(voltage=values[0], present=True)
+        message = Temperature(temperature=values['temperature_c']) if topic == 'temperature' \
+            else BatteryState(voltage=values['supply_v'], present=True)
         message.header.frame_id = self._frame_id
         return message
 
@@ -264,9 +245,11 @@ class SampleOutput:
         now_ns = samples.until_ns if self.is_clock else self._stamp_clock.now().nanoseconds
         references.publish(samples.stamp_ns, samples.references)
         self.tally.ages.add(((now_ns - published_ns) * 1e-9).tolist())
-        self.tally.count(
-            finite.stamp_ns, missing=finite.missing, estimated=finite.estimated,
+        self.tally.counts.update(
+            samples=len(published_ns), missing=finite.missing, estimated=finite.estimated,
             saturated=int(self.sensor.saturated(finite.volts).any(axis=1).sum()))
+        if len(published_ns):
+            self.tally.newest_ns = int(finite.stamp_ns[-1])
         self.tally.now_ns = samples.until_ns
         if self._clock is not None:
             self._clock.publish(Clock(clock=topics.stamp(samples.until_ns)))

@@ -8,7 +8,7 @@ import asyncio
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import os
 import signal
 import sys
@@ -20,9 +20,8 @@ from adxl_ros.calibrate.guided import screen_contents as screen
 from adxl_ros.calibrate.guided.screen_contents import ScreenContents
 from adxl_ros.errors import UserError
 from adxl_ros.nodes.jobs import held_output
-from adxl_ros.nodes.parameters import declare_all
+from adxl_ros.nodes.parameters import check_given, declare_all, parameter
 from adxl_ros.nodes.run_node import run
-from adxl_ros.nodes.settings import check_given_parameters, ScreenSettings
 from adxl_ros.nodes.topics import create_subscription
 from rcl_interfaces.msg import Log
 import rclpy
@@ -31,8 +30,19 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-Line = list[tuple[str, str]]
-"""A line of the screen: styles of prompt_toolkit, each with its text."""
+
+@dataclass(frozen=True)
+class ScreenSettings:
+    """The screen."""
+
+    node: str = parameter('calibration', 'name of the calibration node')
+    node_pid: int = parameter(0, 'process of the node that has started this screen')
+
+
+Styled = tuple[str, str]
+"""A style of prompt_toolkit and its text."""
+Line = list[Styled]
+"""A line of the screen."""
 Row = tuple[str, str, str]
 """Label, text and style of a row."""
 
@@ -60,33 +70,35 @@ _FEW_LINES = 3
 """Largest number of lines of the log, and of a text with a label."""
 
 
-def draw(contents: screen.ScreenContents, log: Iterable[tuple[str, str]], columns: int, rows: int
-         ) -> list[Line]:
+def draw(contents: ScreenContents, log: Iterable[Styled], columns: int, rows: int) -> list[Line]:
     """Lay contents and log, styles and messages, out in the lines of a terminal."""
     width = max(columns - 1, _LEAST_WIDTH)
     task = f' of {contents.unit or "no sensor yet"} into {contents.output}'
     title = f' calibration{task if contents.output else ""}'
-    top = [('reverse', f'{title:{width}}'),
-           *((_COLOURS.get(contents.phase, 'bold'), line)
-             for line in wrap(contents.text, width)[:_TEXT_LINES])]
+    body = [('reverse', f'{title:{width}}'), *_styled(
+        _COLOURS.get(contents.phase, 'bold'), wrap(contents.text, width)[:_TEXT_LINES])]
     for label, text, style in (*_readings(contents.progress, contents.live),
                                *_progress(contents.progress, contents.estimate)):
-        top += [(style, line) for line in wrap(
-            text, width, initial_indent=f'{label:{_LABEL_WIDTH}}',
-            subsequent_indent=_LABEL_WIDTH * ' ')[:_FEW_LINES]]
-    coefficients = contents.estimate.coefficients if contents.estimate else ()
-    # A line of the outcome that fits keeps its spaces.
-    middle = [line for text in contents.outcome
-              for line in ([text] if len(text) <= width else wrap(text, width))
-              ] or _coefficients(coefficients, width)
-    messages = [(style, line) for style, text in log for line in wrap(text, width)][-_FEW_LINES:]
+        body += _styled(style, wrap(text, width, initial_indent=f'{label:{_LABEL_WIDTH}}',
+                                    subsequent_indent=_LABEL_WIDTH * ' ')[:_FEW_LINES])
+    for text in contents.outcome:
+        # A line that fits keeps its spaces.
+        body += _styled('', [text] if len(text) <= width else wrap(text, width))
+    if contents.estimate is not None and not contents.outcome:
+        body += _styled('', _coefficients(contents.estimate.coefficients, width))
+    messages = [line for style, text in log for line in _styled(style, wrap(text, width))]
+    messages = messages[-_FEW_LINES:]
     # A small terminal keeps the keys and the first lines, which say what to do.
     room = max(rows - len(messages) - 1, _LEAST_LINES)
-    body = [*top, *(('', line) for line in middle), *[('', '')] * room][:room]
+    body = [*body, *[('', '')] * room][:room]
     keys = [(key.key, key.action) for key in contents.keys] + [('q', 'quit')]
     return [*([(style, line[:width])] for style, line in (*body, *messages)),
             [part for key, action in keys
              for part in (('reverse', f' {key} '), ('', f' {action}  '))]]
+
+
+def _styled(style: str, lines: Iterable[str]) -> list[Styled]:
+    return [(style, line) for line in lines]
 
 
 def _readings(progress: screen.Progress | None, live: screen.LiveReading | None) -> Iterator[Row]:
@@ -103,11 +115,11 @@ def _readings(progress: screen.Progress | None, live: screen.LiveReading | None)
     rate = '' if live.rate_hz is None else f'  {live.rate_hz:.0f} Hz'
     yield 'reads', f'{axes} m/s²{rate}', ''
     if (rest := live.rest) is not None:
-        share = rest.value_mps2 / rest.limit_mps2 if rest.limit_mps2 else 1.0
+        bar = _bar(rest.value_mps2 / rest.limit_mps2 if rest.limit_mps2 else 1.0)
         motion = 'at rest' if rest.at_rest else _MOTIONS[rest.quantity]
-        yield 'rest', (
-            f'{_bar(share)} {motion}: {rest.value_mps2:.2g} m/s² {rest.quantity} on {rest.axis}, '
-            f'must be below {rest.limit_mps2:.2g}'), 'green' if rest.at_rest else 'yellow'
+        yield 'rest', (f'{bar} {motion}: {rest.value_mps2:.2g} m/s² {rest.quantity} on '
+                       f'{rest.axis}, must be below {rest.limit_mps2:.2g}'), \
+            'green' if rest.at_rest else 'yellow'
     if progress is not None and progress.dwell_s is not None and progress.dwelt_s is not None:
         bar = _bar(progress.dwelt_s / progress.dwell_s)
         yield 'dwell', f'{bar} {progress.dwelt_s:.1f} of {progress.dwell_s:g} s', ''
@@ -124,8 +136,8 @@ def _progress(progress: screen.Progress | None, estimate: screen.Estimate | None
     yield 'parts' if estimate.range_error else 'poses', (
         f'{_bar(closed / progress.total)} {progress.accepted} done, {skipped}'
         f'{max(progress.total - closed, 0)} left{time}'), ''
-    covered = ', '.join(f'{row.group} {row.accepted}/{row.total}' for row in estimate.coverage)
-    yield 'coverage', covered, ''
+    yield 'coverage', ', '.join(f'{row.group} {row.accepted}/{row.total}'
+                                for row in estimate.coverage), ''
     if estimate.range_error:
         yield 'error', estimate.range_error, ''
     elif estimate.tilt_error_deg is None:
@@ -140,8 +152,8 @@ def _coefficients(rows: Sequence[screen.CoefficientRow], width: int) -> list[str
     """Return a row for each coefficient: name without unit, bar and intervals."""
     texts = {row.name.split(',')[0]: f'{_bar(row.determined, _COEFFICIENT_BAR_WIDTH)} '
              + ' '.join(row.intervals).replace(' ± ', '±') for row in rows}
-    room = max(min(max(map(len, texts), default=0),
-                   width - 1 - max(map(len, texts.values()), default=0)), _SHORTEST_NAME)
+    longest = max(map(len, texts.values()), default=0)
+    room = max(min(max(map(len, texts), default=0), width - 1 - longest), _SHORTEST_NAME)
     return [f'{name[:room]:{room}} {text}' for name, text in texts.items()]
 
 
@@ -222,7 +234,7 @@ class Screen(Node):
 
     def __init__(self) -> None:
         super().__init__('screen')
-        check_given_parameters(self)
+        check_given(self)
         own = declare_all(self, ScreenSettings)
         name, self._node_pid = own.node, own.node_pid
         self._target = self.resolve_topic_name(name)

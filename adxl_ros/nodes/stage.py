@@ -5,11 +5,14 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
+from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.nodes import settings, topics
-from adxl_ros.nodes.parameters import declare_all, parameter_error
+from adxl_ros.files.parameter_file import SENSOR_FIELDS
+from adxl_ros.nodes import parameters, topics
+from adxl_ros.nodes.parameters import declare_all, parameter, parameter_error
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.simulate.motion import JOINTS, SimulatedStage
@@ -18,6 +21,71 @@ import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+_RESOLUTION = SENSOR_FIELDS['stage.resolution_rad'].metadata
+"""Description of the resolution of the encoders."""
+
+
+@dataclass(frozen=True)
+class StageSettings:
+    """The choice of the stage."""
+
+    kind: str = parameter('simulated', 'the simulated stage, or the bridge to a controller that '
+                          'takes joint states or trajectories', name='stage.type',
+                          choices=('simulated', 'joint_state', 'trajectory'))
+
+
+@dataclass(frozen=True)
+class SimulatedStageSettings:
+    """The simulated stage."""
+
+    resolution_rad: float = parameter(float(np.radians(5 / 60)), _RESOLUTION['doc'],
+                                      _RESOLUTION['unit'], _RESOLUTION['lower'],
+                                      _RESOLUTION['upper'], name='stage.resolution_rad')
+    delay_s: float = parameter(0.1, 'time from a command to its effect', 's', 0.02, 1.0)
+    slew_rate_rad_s: float = parameter(0.5, 'largest speed of a turn', 'rad/s', 1e-6, 100.0)
+    slew_rate_m_s: float = parameter(0.01, 'largest speed of a shift', 'm/s', 1e-9, 10.0)
+    settling_time_s: float = parameter(0.3, 'settling time of a step, to 1 %', 's', 0.01, 60.0)
+    alpha_rad: float = parameter(0.0, 'position at the start', 'rad', -100.0, 100.0)
+    beta_rad: float = parameter(0.0, 'position at the start', 'rad', -100.0, 100.0)
+    shift_m: float = parameter(0.0, 'position at the start', 'm', -10.0, 10.0)
+    seed: int = parameter(0, "seed of the positions within an encoder's step", '',
+                          *parameters.SEEDS)
+
+
+def _joint(name: str) -> Any:
+    return parameter(parameters.Kind.STRING, f"the controller's name of {name}",
+                     name=f'bridge.{name}.joint')
+
+
+def _sign(name: str) -> Any:
+    return parameter(1, 'direction in which it turns: 1 or -1', '', -1, 1,
+                     name=f'bridge.{name}.sign')
+
+
+def _offset(name: str) -> Any:
+    return parameter(0.0, f"{name} where the controller's joint is at 0", 'rad', -100.0, 100.0,
+                     name=f'bridge.{name}.offset_rad')
+
+
+@dataclass(frozen=True)
+class BridgeSettings:
+    """The bridge to a real stage."""
+
+    alpha_joint: str = _joint('alpha')
+    alpha_sign: int = _sign('alpha')
+    alpha_offset_rad: float = _offset('alpha')
+    beta_joint: str = _joint('beta')
+    beta_sign: int = _sign('beta')
+    beta_offset_rad: float = _offset('beta')
+    joint_states: str = parameter('/joint_states', "topic of the controller's joint states",
+                                  name='bridge.joint_states')
+    command: str = parameter('', 'topic on which the controller listens; empty: /joint_commands, '
+                             'or /joint_trajectory_controller/joint_trajectory',
+                             name='bridge.command')
+    speed_rad_s: float = parameter(0.3, 'speed of a trajectory', 'rad/s', 1e-4, 10.0,
+                                   name='bridge.speed_rad_s')
+
 
 _STEP_NS = 10_000_000
 """Step of the simulation, ns; chosen: 100 poses a second, as a controller of a stage sends."""
@@ -39,7 +107,7 @@ class SimulatedStageNode:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        own = declare_all(node, settings.SimulatedStageSettings)
+        own = declare_all(node, SimulatedStageSettings)
         self._stage = SimulatedStage(
             np.array([own.alpha_rad, own.beta_rad, own.shift_m]),
             np.array([own.slew_rate_rad_s, own.slew_rate_rad_s, own.slew_rate_m_s]),
@@ -141,7 +209,7 @@ class StageBridge:
 
     def __init__(self, node: Node, kind: str) -> None:
         self._node, self._kind = node, kind
-        own = declare_all(node, settings.BridgeSettings)
+        own = declare_all(node, BridgeSettings)
         self._names = [own.alpha_joint, own.beta_joint]
         self._signs = np.array([own.alpha_sign, own.beta_sign])
         self._offsets_rad = np.array([own.alpha_offset_rad, own.beta_offset_rad])
@@ -262,8 +330,8 @@ class Stage(Node):
 
     def __init__(self) -> None:
         super().__init__('stage')
-        settings.check_given_parameters(self)
-        kind = declare_all(self, settings.StageSettings).kind
+        parameters.check_given(self)
+        kind = declare_all(self, StageSettings).kind
         self._stage = SimulatedStageNode(self) if kind == 'simulated' else StageBridge(self, kind)
 
 

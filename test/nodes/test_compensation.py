@@ -162,6 +162,7 @@ def test_corrected_stream(robot: Robot, start: Start, tmp_path: Path) -> None:
     for beta in np.linspace(0, 1, 20):
         robot.answer(output_of(sensor, pose(0.7, beta)))
     robot.level(DiagnosticStatus.OK, 'compensating')
+    robot.graph.spin_until(lambda: robot.graph.value(NODE, 'received') == '21', 5, 'all samples')
     status = robot.graph.diagnostics[NODE]
     assert status.hardware_id == '17'
     assert {pair.key: pair.value for pair in status.values}.items() >= {

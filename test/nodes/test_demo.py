@@ -29,7 +29,7 @@ def test_steps_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UserError), jobs.Step('3/3 check', '16 poses'):
         raise UserError('it fails')
     lines = out.getvalue().splitlines()
-    assert lines[0].split() == ['1/2', 'sweep', '146', 'of', '146', 'poses', '100', '%', '0', 's']
+    assert lines[0].split() == ['1/2', 'sweep', '146', 'of', '146', 'poses', '0', 's']
     assert lines[1].split() == ['2/2', 'fit', '130', 'poses,', 'full', 'model', '0', 's']
     assert len(lines) == 2 and max(map(len, lines)) <= 79
     assert '\x1b' not in out.getvalue()
@@ -46,7 +46,7 @@ def suspend_calibration(demo_pid: int) -> None:
 
 def test_live(ros_env, tmp_path) -> None:
     """No line wraps; no sample is lost although the calibration stops for 20 s of sensor time."""
-    terminal = Terminal([executable('demo'), '--speed', '40'], ros_env, tmp_path, lines=60,
+    terminal = Terminal([executable('demo')], ros_env, tmp_path, lines=60,
                         columns=80)
     try:
         terminal.wait_for('1/3 sweep', 'of 146 poses', '━', timeout_s=60.0)

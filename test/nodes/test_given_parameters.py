@@ -2,11 +2,12 @@
 
 """What nodes are started with: no silent simulation, no unknown parameter, no lost file."""
 
+from importlib import import_module
 from pathlib import Path
 
 from adxl_ros.files import parameter_file
-from adxl_ros.nodes.parameters import has_section, sensor_keys, specs_of
-from adxl_ros.nodes.settings import NODES
+from adxl_ros.nodes.parameters import has_section, node_specs, sensor_specs
+from adxl_ros.process import NODES
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph
 from lifecycle_msgs.msg import Transition
@@ -18,8 +19,8 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from sensor_msgs.msg import Imu
 from units import NOMINAL, nominal
 
-OWN_PARAMETERS = {node: [spec.name for part in parts for spec in specs_of(part)]
-                  for node, parts in NODES.items() if node != 'screen'}
+OWN_PARAMETERS = {node: [spec.name for spec in node_specs(import_module(f'adxl_ros.nodes.{node}'))]
+                  for node in NODES if node != 'screen'}
 ROS = '--ros-args'
 SIMULATED = 'SIMULATED sensor (link.type: sim)'
 CHOICES = 'set it to iio, replay, serial, topic, or to sim for a simulated sensor'
@@ -164,7 +165,8 @@ def test_all_nodes_with_one_file(start, tmp_path):
 
 def own_parameters(names: list[str]) -> list[str]:
     """Return the parameters that are neither of the sensor nor of all nodes."""
-    ignored = sensor_keys() | {'use_sim_time', 'start_type_description_service'}
+    ignored = {'use_sim_time', 'start_type_description_service',
+               *(spec.name for spec in sensor_specs())}
     return [name for name in names
             if name not in ignored and not name.startswith('qos_overrides.')]
 
