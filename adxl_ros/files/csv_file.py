@@ -214,7 +214,10 @@ def find_form(path: str) -> Form:
     if head[:2] in (b'\xff\xfe', b'\xfe\xff'):
         raise UserError(f'{path}:1:1: is UTF-16; save the file as UTF-8')
     if len(head) == _HEAD_BYTES:
-        head = head.rpartition(b'\n')[0] or head  # The last line may be cut
+        if b'\n' not in head:
+            raise UserError(f'{path}: a line is longer than {_HEAD_BYTES} bytes; this is no CSV '
+                            'recording')
+        head = head.rpartition(b'\n')[0]  # The last line may be cut
     lines = _in_utf_8(head).decode().split('\n')[:_HEAD_LINES]
     written = [line for line in lines if line.strip() and not line.lstrip().startswith('#')]
     if not written:
