@@ -7,7 +7,8 @@ The points of an Allan deviation are correlated, so a line through them has no s
 The fit therefore takes the cosine transform of the means of short cells. There a random walk and
 white noise have independent coefficients of known variance, and 1/f noise nearly so. The fit
 maximises the likelihood of the coefficients. The intervals are those of the profile likelihood.
-Frequencies from which on a filter, a fan or mains show are left out.
+Frequencies from which on a filter, a fan or mains show are left out. A walk that ends in bounds is
+a Gauss-Markov process (IEEE Std 952, annex B).
 """
 
 from __future__ import annotations
@@ -47,6 +48,14 @@ searched. Chosen: it changes the likelihood of no recording."""
 _OCTAVE_PROBABILITY = 1e-3
 """Probability by chance, below which an octave shows a filter or a line. Chosen: with ten octaves
 one healthy recording in a hundred."""
+_BOUND_PROBABILITY = 1e-2
+"""Probability by chance, below which a walk has bounds. Chosen: one healthy recording in a
+hundred; where bounds are missed, the interval of K is too low."""
+_BOUND_STEP = 2 ** 0.5
+"""Ratio of correlation times that are tried. Chosen: the likelihood changes little between."""
+_SHORTEST_BOUND = 10.0
+"""Shortest correlation time, by that of the highest frequency. Chosen: a shorter one is taken for
+a filter of white noise."""
 _MARGIN_OCTAVES = 2
 """Octaves below a filter's effect that are left out. Chosen: the effect falls by 16 in power."""
 _FEWEST = 32
@@ -83,7 +92,11 @@ class NoiseFit:
     # White noise N, u/√Hz: the density over positive and negative frequencies is N²
     white: Estimate
     instability: Estimate  # Bias instability B, u: the density is B²/(2π·f)
-    walk: Estimate  # Random walk K, u/√s: the density is K²/(2π·f)²
+    # Random walk K, u/√s: the density is K²/(2π·f)², or K²/((2π·f)² + 1/T²) with bounds
+    walk: Estimate
+    # Correlation time T of a bounded walk (first-order Gauss-Markov), s, whose standard deviation
+    # is K·√(T/2); inf where no bounds show
+    bound_s: float
     highest: int  # Number of cosine coefficients of the fit, from the lowest
     highest_hz: float  # Frequency of the last one, Hz
 
@@ -115,9 +128,14 @@ class NoiseFit:
 
     def lines(self, tau_s: np.ndarray) -> np.ndarray:
         """Return the Allan deviations of N, B and K at times, s, (k,), in u, (3, k)."""
+        # IEEE Std 952, equation C.19; for short times its terms cancel.
+        time_s = min(self.bound_s, 1e4 * tau_s.max())
+        x = tau_s / time_s
+        terms = np.abs(1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x))
+        walk = np.where(x > 1e-3, time_s * np.sqrt(terms / tau_s), np.sqrt(tau_s / 3))
         return np.stack([self.white.value / np.sqrt(tau_s),
                          np.full(len(tau_s), FLOOR * self.instability.value),
-                         self.walk.value * np.sqrt(tau_s / 3)])
+                         self.walk.value * walk])
 
 
 @dataclass(frozen=True)
@@ -136,6 +154,12 @@ class _Groups:
     def below(self, stop: int) -> _Groups:
         """Return the groups that end before coefficient number `stop`."""
         return self.where(self.first + self.count <= stop)
+
+    def bounded(self, time_s: float, span_s: float) -> _Groups:
+        """Return the groups with a walk of this correlation time, in recordings of `span_s`."""
+        cycle = np.pi * time_s / span_s * (self.first + (self.count - 1) / 2)
+        return replace(self, shapes=self.shapes * np.column_stack(
+            [np.ones((len(cycle), 2)), 1 / (1 + cycle ** -2.0)]))
 
 
 def coefficients(means: np.ndarray) -> np.ndarray:
@@ -179,11 +203,31 @@ def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = N
     if variances is None:
         variances = coefficient_variances(len(means), step_s)
     groups = _grouped(np.square(coefficients(means)), variances)
-    highest = _highest(groups, len(means))
-    used = groups.below(highest)
-    theta, likelihood = _fit(used)
-    white, instability, walk = (_interval(used, theta, likelihood, term) for term in range(3))
-    return NoiseFit(white, instability, walk, highest, highest / (2 * len(means) * step_s))
+    span_s = len(means) * step_s
+    highest = _highest(groups, len(means), span_s)
+    models, bound_s = _walks(groups.below(highest), span_s, highest)
+    theta, likelihood = _best(models)
+    white, instability, walk = (_interval(models, theta, likelihood, term) for term in range(3))
+    return NoiseFit(white, instability, walk, bound_s, highest, highest / (2 * span_s))
+
+
+def _walks(groups: _Groups, span_s: float, highest: int) -> tuple[list[_Groups], float]:
+    """Return the groups with each bound of the walk that is likely, and the likeliest bound, s."""
+    count = int(np.log(highest / _SHORTEST_BOUND) / np.log(_BOUND_STEP))
+    times_s = span_s * _BOUND_STEP ** np.arange(-count, 5.0)
+    models = [groups.bounded(time_s, span_s) for time_s in times_s]
+    likelihoods = np.array([_fit(model)[1] for model in models])
+    best = likelihoods.max()
+    if 2 * (best - _fit(groups)[1]) < scipy.stats.chi2.isf(_BOUND_PROBABILITY, 1):
+        return [groups], np.inf
+    likely = 2 * (best - likelihoods) < _DROP
+    return [models[i] for i in np.flatnonzero(likely)], float(times_s[likelihoods.argmax()])
+
+
+def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0
+          ) -> tuple[np.ndarray, float]:
+    """Return the most likely fit of several models; see `_fit`."""
+    return max((_fit(model, fixed, value) for model in models), key=lambda fit: fit[1])
 
 
 def _grouped(power: np.ndarray, variances: np.ndarray) -> _Groups:
@@ -237,13 +281,14 @@ def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0
     return theta, likelihood
 
 
-def _interval(groups: _Groups, theta: np.ndarray, likelihood: float, term: int) -> Estimate:
+def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term: int) -> Estimate:
     """Return a term with the ends of its interval by the profile likelihood."""
     def excess(logarithm: float) -> float:
         """Return twice the drop of the profile likelihood, minus its limit."""
-        return 2 * (likelihood - _fit(groups, term, np.exp(logarithm))[1]) - _DROP
+        return 2 * (likelihood - _best(models, term, np.exp(logarithm))[1]) - _DROP
 
-    scale = float(np.min(groups.shapes @ theta / groups.shapes[:, term]))
+    shapes = models[0].shapes
+    scale = float(np.min(shapes @ theta / shapes[:, term]))
     best = float(theta[term])
     begin = np.log(best if best > 0 else scale * _SMALLEST)
 
@@ -254,18 +299,22 @@ def _interval(groups: _Groups, theta: np.ndarray, likelihood: float, term: int) 
             beyond += step
         return float(np.exp(scipy.optimize.brentq(excess, beyond - step, beyond, xtol=1e-6)))
 
-    is_seen = best > 0 and 2 * (likelihood - _fit(groups, term, 0.0)[1]) > _DROP
+    is_seen = best > 0 and 2 * (likelihood - _best(models, term, 0.0)[1]) > _DROP
     low, high = end(-1.0) if is_seen else 0.0, end(1.0)
     return Estimate(*(float(np.sqrt(square)) for square in (best, low, high)))
 
 
-def _highest(groups: _Groups, count: int) -> int:
-    """Return the number of the coefficient at which the fit stops: where a filter shows."""
+def _highest(groups: _Groups, count: int, span_s: float) -> int:
+    """Return at which coefficient the fit stops: where a filter or a line shows."""
     stop = count
     while stop > 2 * _FEWEST:
         lower = groups.below(max(stop // 2, _FEWEST))
-        octave = groups.where((groups.first >= stop // 2) & (groups.first + groups.count <= stop))
-        if _is_expected(octave, lower, _fit(lower)[0]):
+        bound_s = _walks(lower, span_s, stop // 2)[1]
+        used, lower = (part.bounded(bound_s, span_s) for part in (groups.below(stop), lower))
+        theta = _fit(lower)[0]
+        chances = scipy.stats.chi2.sf(used.count * used.power / (used.shapes @ theta), used.count)
+        if (_is_expected(used.where(used.first >= stop // 2), lower, theta)
+                and chances.min() * len(chances) > _OCTAVE_PROBABILITY):
             break
         stop //= 2
     return max(stop >> _MARGIN_OCTAVES, min(count, _FEWEST))
@@ -417,6 +466,9 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
         values.pop(effect, None)
         if sizes.any():
             values[effect] = {name: sizes}
+    if 'bias_walk' in values:
+        values['bias_walk']['return_per_s'] = np.array(
+            [1 / noise.fit.bound_s for noise in noises])
     kept = [name for name in sensor.effects if name in values]
     changed: dict[str, Any] = {
         'effects': (*kept, *(name for name in values if name not in kept)), 'values': values,
