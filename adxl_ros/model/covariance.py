@@ -29,12 +29,9 @@ from adxl_ros.model.sensor import get, parameter_of, put, Sensor
 from adxl_ros.model.signal_chain import ANALOG, analog_response, static_chain
 import numpy as np
 
-UNMEASURED_VARIANCE = 1e6
-"""Variance of an axis that the sensor does not have, (m/s²)²; chosen: far above any force."""
-_FORCE2_FLOOR = 1e-30
-"""Square of a negligible force, (m/s²)²; chosen: below any noise, it keeps divisors from 0."""
-_OVERHANG_MPS2 = -0.5
-"""Lowest z of a sensor that is stated to be upright, m/s²; chosen: it may lean over by 3°."""
+UNMEASURED_VARIANCE = 1e6  # Of an axis that is not there, (m/s²)²; chosen: above any force
+_FORCE2_FLOOR = 1e-30  # Negligible force, (m/s²)²; chosen: below noise, keeps divisors from 0
+_OVERHANG_MPS2 = -0.5  # Lowest z of an upright sensor, m/s²; chosen: 3° over
 _ROOT_MEAN = 1.25
 """Factor of the term that keeps the divisor of derived z from 0 where the in-plane force is g.
 Derived: there z² = 2·σ·g·n for normal noise n > 0, and the variance of z is 0.8·σ·g = σ·g/1.25."""
@@ -231,9 +228,7 @@ def derived_z_covariance(force: Components, measured: tuple[Value, Value, Value]
             xz + by_zz[0], yy + slope[1] * (2 * yz + by_zz[1]), yz + by_zz[1], zz)
 
 
-_RELATIVE_STEP = 1e-3
-"""Step of the central differences by coefficients, in typical sizes; chosen: the chain is smooth
-and nearly linear in them."""
+_RELATIVE_STEP = 1e-3  # Step by coefficients, typical sizes; chosen: nearly linear
 
 
 def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:

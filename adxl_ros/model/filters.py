@@ -10,14 +10,10 @@ from typing import Any
 
 import numpy as np
 
-ORDER = 6
-"""Number of newest samples that the polynomial interpolates; chosen: the error is of order 6."""
-_QUADRATURE_NODES = 24
-"""Nodes of the Gauss-Legendre quadrature; chosen: exact to rounding for |z| < `_STIFF`."""
-_FEW_INPUTS = 512
-"""Most inputs that are filtered one by one; chosen: it takes 50 µs, a block of 50 ms at 10 kHz."""
-_STIFF = 8.0
-"""|z| from which the weights are integrated by parts; chosen: that is stable for large z only."""
+ORDER = 6  # Newest samples of the polynomial; chosen: an error of order 6
+_QUADRATURE_NODES = 24  # Nodes of Gauss-Legendre; chosen: exact for |z| < `_STIFF`
+_FEW_INPUTS = 512  # Most inputs that are filtered one by one; chosen: 50 µs
+_STIFF = 8.0  # |z| from which weights are integrated by parts; chosen: stable there only
 
 
 def low_pass(x: np.ndarray, tau_s: float, dt_s: float, memory: dict[str, Any]) -> np.ndarray:
@@ -120,8 +116,7 @@ def _weights(z: complex) -> np.ndarray:
     return np.array([np.dot(c[::-1], moments) for c in lagrange])
 
 
-_THRESHOLDS = (0.25, 0.5, 0.75, 1.0)
-"""Thresholds of the stop operators, divided by the reach; chosen: four of equal weight."""
+_THRESHOLDS = (0.25, 0.5, 0.75, 1.0)  # Of stop operators, by the reach; chosen: four equal
 
 
 def stop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:

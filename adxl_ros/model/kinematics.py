@@ -18,8 +18,7 @@ from adxl_ros.model.effects.base import ARRAYS, Components, Joint, Maths, Value
 import numpy as np
 import scipy
 
-UPRIGHT = (0.0, 0.0, 1.0)
-"""The vertical in the frame of a level base, a unit vector."""
+UPRIGHT = (0.0, 0.0, 1.0)  # The vertical in the frame of a level base, a unit vector
 
 
 def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
@@ -123,17 +122,14 @@ def cross_product(a: Components, b: Components) -> Components:
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
-UNOBSERVABLE_RAD2 = 1.0
-"""Variance from which an angle counts as not shown, rad²; chosen: a guess has 1.8 rad rms."""
+UNOBSERVABLE_RAD2 = 1.0  # Variance of an angle that is not shown, rad²; a guess has 1.8²
 UNKNOWN_ANGLE_RAD2 = 1e6
 """Variance of an angle that is not known, rad²; yaw is never known.
 
 π²/3, that of a uniform angle, would let a filter that fuses 1000 samples a second believe in
 yaw = 0 before long. 1e6, as for an axis that is not there, never counts."""
-INFINITE = float('inf')
-"""Variance of an angle that the force does not determine, rad²."""
-_FORCE2_FLOOR = 1e-30
-"""Square of a negligible force, (m/s²)²; chosen: far below any noise, it keeps divisors from 0."""
+INFINITE = float('inf')  # Variance of an angle that the force does not determine, rad²
+_FORCE2_FLOOR = 1e-30  # Negligible force, (m/s²)²; chosen: below noise, keeps divisors from 0
 
 
 @dataclass(frozen=True)
@@ -249,8 +245,7 @@ def quaternion(roll_rad: Value, pitch_rad: Value, maths: Maths) -> tuple[Value, 
     return sr * cp, cr * sp, -sr * sp, cr * cp
 
 
-Vector = tuple[float, float, float]
-"""Three components."""
+Vector = tuple[float, float, float]  # Three components
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ ONE_SIDED = float(np.sqrt(2))
 """Noise density of a datasheet, over positive frequencies alone, divided by the same over both
 signs: N of IEEE Std 952 and `accelerometer_noise_density` of Kalibr, whose sample has the variance
 N²·rate (ethz-asl/kalibr, wiki/IMU-Noise-Model)."""
-_HARMONICS = 50
-"""Harmonics of the sawtooth of rounding that are summed. Chosen: the others hold 1 %."""
+_HARMONICS = 50  # Harmonics of rounding that are summed. Chosen: the others hold 1 %
 
 
 class Rounding(NamedTuple):

@@ -19,8 +19,7 @@ MODELS = ('nominal', 'linear', 'physical', 'full', 'gravity')
 MARGIN_K = 2.0
 """Distance from the temperatures of the poses that counts as inside, K; chosen: by the datasheet
 it is 0.2 mg, below the noise of a sample. No thermometer is at the element."""
-STRETCH = 1.1
-"""Factor of the poses' forces at which h_max is taken, too; chosen: see `Envelope`."""
+STRETCH = 1.1  # Factor of the poses' forces at which h_max is taken, too; chosen: see `Envelope`
 MARGIN_MPS2 = 2.0
 """Distance from the forces of the poses that counts as inside, m/s²; chosen: planes from 30° on
 leave 1.3 m/s² to level, and nearby forces share one result."""

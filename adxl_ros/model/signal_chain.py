@@ -32,27 +32,18 @@ from adxl_ros.model.effects.base import (
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-ANALOG = (Place.MOUNTING, Place.ELEMENT, Place.ELECTRONICS)
-"""Places between the specific force and the filter."""
-_TOLERANCE_MPS2 = 1e-10
-"""Newton step below which the inverse has converged, m/s²; chosen: near rounding."""
+ANALOG = (Place.MOUNTING, Place.ELEMENT, Place.ELECTRONICS)  # From force to filter
+_TOLERANCE_MPS2 = 1e-10  # Newton step of a converged inverse, m/s²; chosen: near rounding
 _UNSOLVED_MPS2 = 1e-6
 """Last Newton step from which a sample has no solution, m/s²; chosen: near alpha = ±90°, the z of
 equation 5 is a root of 0, and rounding moves it by up to this."""
-_MAX_ITERATIONS = 60
-"""Largest number of iterations of either inverse; chosen: samples with a solution need far
-fewer."""
+_MAX_ITERATIONS = 60  # Most iterations of an inverse; chosen: far more than needed
 _CHORD_STEPS = 8
 """Steps with the tangent at rest without gravity before Newton's method; chosen: each leaves a few
 percent of the error of a real sensor, and takes a seventh of the time of a Newton step."""
-_CLEAR_Z_MPS2 = 1.0
-"""Magnitude of a derived z, m/s², from which |f| = g determines it well; chosen: 6° from alpha =
-±90°, far beyond any noise."""
-_SETTLED_V = 1e-13
-"""Change below which the inverse of the ADC's effects has converged, V; chosen: near rounding."""
-_DIFFERENCE_MPS2 = 1e-3
-"""Half step of the central differences by force, m/s²; chosen: the chain is smooth and nearly
-linear, so that a wide step loses nothing."""
+_CLEAR_Z_MPS2 = 1.0  # |z| that |f| = g determines well, m/s²; chosen: 6° from ±90°
+_SETTLED_V = 1e-13  # Change of a converged ADC inverse, V; chosen: near rounding
+_DIFFERENCE_MPS2 = 1e-3  # Half step by force, m/s²; chosen: the chain is nearly linear
 
 
 class RunningEffect:

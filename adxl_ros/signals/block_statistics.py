@@ -16,14 +16,10 @@ from adxl_ros.model.constants import MAD_TO_STD
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-BLOCK_S = 0.05
-"""Length of a block, s. Chosen: well below a rest, and above the sample period of most sensors."""
-_GAP_S = 0.1
-"""Smallest time without a sample that ends a block, s. Chosen: two blocks."""
-_GAP_PERIODS = 5
-"""Smallest gap in sample periods. Chosen: at low rates a few lost samples are no gap."""
-_CHUNK = 1 << 13
-"""Rows processed at once. Chosen: they fit into the cache, whatever the length of a recording."""
+BLOCK_S = 0.05  # Length of a block, s. Chosen: far below a rest, above most sample periods
+_GAP_S = 0.1  # Smallest time without a sample that ends a block, s. Chosen: two blocks
+_GAP_PERIODS = 5  # Smallest gap, sample periods. Chosen: a few lost samples are none
+_CHUNK = 1 << 13  # Rows that are processed at once. Chosen: they fit into the cache
 
 
 def gap_s(rate_hz: float) -> float:
@@ -155,30 +151,18 @@ def true_runs(mask: np.ndarray, group: np.ndarray | None = None) -> list[tuple[i
     return [(int(first), int(stop)) for first, stop in pairwise(edges) if mask[first]]
 
 
-_WINDOW_S = 0.25
-"""Length of the window of a variance, s. Chosen: under half of the shortest rest."""
-_WINDOW_SAMPLES = 8
-"""Smallest number of samples in that window. Chosen: fewer do not show a variance."""
-_HALF_S = 0.5
-"""Shortest length of the neighbouring halves whose means are compared, s. Chosen: two windows."""
-DRIFT_OCTAVES = 4
-"""Number of lengths of halves: 0.5, 1, 2 and 4 s. Chosen: beyond, a sensor's flicker dominates."""
-MIN_VARIANCE_RATIO = 2.25
-"""Smallest limit of a variance, relative to that of the noise: 1.5 times its rms."""
-_MAX_VARIANCE_RATIO = 9.0
-"""Largest limit of a variance, relative to that of the noise: 3 times its rms."""
-_QUIETEST_SHARE = 0.05
-"""Quantile of the windows' variances at which the search for the variance of noise begins."""
-_QUIET_RATIO = 3.0
-"""Largest variance of a quiet window, relative to that of the noise."""
-_QUIET_STEPS = 50
-"""Largest number of steps of that search."""
-_QUIET_DEVIATIONS = 5.0
-"""Distance of a variance's limit from the noise, standard deviations of ln(variance)."""
-_ROUNDING = 1e-9
-"""Relative rounding error of samples without noise."""
-_TINY_VARIANCE = 1e-300
-"""Lower bound of a variance, in squares of any unit, so that its logarithm is finite."""
+_WINDOW_S = 0.25  # Length of the window of a variance, s. Chosen: under half of the shortest rest
+_WINDOW_SAMPLES = 8  # Fewest samples of that window. Chosen: fewer show no variance
+_HALF_S = 0.5  # Shortest halves whose means are compared, s. Chosen: two windows
+DRIFT_OCTAVES = 4  # Lengths of halves: 0.5, 1, 2, 4 s. Chosen: beyond, flicker dominates
+MIN_VARIANCE_RATIO = 2.25  # Smallest limit of a variance, by that of noise: 1.5 times its rms
+_MAX_VARIANCE_RATIO = 9.0  # Largest limit of a variance, by that of noise: 3 times its rms
+_QUIETEST_SHARE = 0.05  # Quantile of variances at which the search for noise begins
+_QUIET_RATIO = 3.0  # Largest variance of a quiet window, relative to that of the noise
+_QUIET_STEPS = 50  # Largest number of steps of that search
+_QUIET_DEVIATIONS = 5.0  # Distance of the limit from the noise, stds of ln(variance)
+_ROUNDING = 1e-9  # Relative rounding error of samples without noise
+_TINY_VARIANCE = 1e-300  # Lower bound of a variance, for its logarithm
 
 
 class Spans:

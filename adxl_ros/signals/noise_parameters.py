@@ -28,44 +28,28 @@ from adxl_ros.signals.recorded_sensor import load_sensor, RESISTANCE_OHM
 import numpy as np
 import scipy
 
-_DROP = 2.705543454095404
-"""Twice the drop of the log likelihood at the ends of a 90 % interval: the quantile of χ² with
-one degree of freedom."""
-_SINGLE = 64
-"""Coefficients of the lowest frequencies that are fitted one by one. Chosen: the terms change
-little between the further ones."""
-_WIDTH = 1.03
-"""Ratio of the frequencies of a group of further coefficients. Chosen: a term changes by 6 %."""
-_ROUNDS = 60
-"""Largest number of rounds of a fit. Chosen: usual are ten."""
-_HALVINGS = 20
-"""Largest number of halvings of a step that does not raise the likelihood."""
-_CONVERGED = 1e-9
-"""Change of twice the log likelihood at which a fit ends."""
+_DROP = 2.705543454095404  # Twice log likelihood at the ends of a 90 % interval: χ², 1 degree
+_SINGLE = 64  # Lowest coefficients that are fitted one by one; further terms change little. Chosen
+_WIDTH = 1.03  # Ratio of frequencies of further groups. Chosen: a term changes by 6 %
+_ROUNDS = 60  # Largest number of rounds of a fit. Chosen: usual are ten
+_HALVINGS = 20  # Largest number of halvings of a step that does not raise the likelihood
+_CONVERGED = 1e-9  # Change of twice the log likelihood at which a fit ends
 _SMALLEST = 1e-4
 """Square of a term, by the square at which it would dominate, from which an upper limit is
 searched. Chosen: it changes the likelihood of no recording."""
 _OCTAVE_PROBABILITY = 1e-3
 """Probability by chance, below which an octave shows a filter or a line. Chosen: with ten octaves
 one healthy recording in a hundred."""
-_BOUND_PROBABILITY = 1e-2
-"""Probability by chance, below which a walk has bounds. Chosen: one healthy recording in a
-hundred; where bounds are missed, the interval of K is too low."""
-_BOUND_STEP = 2 ** 0.5
-"""Ratio of correlation times that are tried. Chosen: the likelihood changes little between."""
+_BOUND_PROBABILITY = 1e-2  # Chance from which a walk has bounds. Chosen: 1 of 100 healthy logs
+_BOUND_STEP = 2 ** 0.5  # Ratio of tried correlation times. Chosen: the likelihood changes little
 _SHORTEST_BOUND = 10.0
 """Shortest correlation time, by that of the highest frequency. Chosen: a shorter one is taken for
 a filter of white noise."""
-_MARGIN_OCTAVES = 2
-"""Octaves below a filter's effect that are left out. Chosen: the effect falls by 16 in power."""
-_FEWEST = 32
-"""Fewest coefficients of a fit. Chosen: white noise is then known within 20 %."""
-_SEEN = 2.0
-"""Standard deviations of its square by which a term must differ from 0 to be seen. Chosen: it
-gives the rate at which 90 % intervals exclude 0."""
+_MARGIN_OCTAVES = 2  # Octaves left out below a filter. Chosen: its power falls by 16
+_FEWEST = 32  # Fewest coefficients of a fit. Chosen: white noise is then known within 20 %
+_SEEN = 2.0  # Standard deviations of a square that is seen. Chosen: as 90 % intervals exclude 0
 
-FLOOR = float(np.sqrt(2 * np.log(2) / np.pi))
-"""Allan deviation of bias instability divided by B: 0.664 (IEEE Std 952, equation C.15)."""
+FLOOR = float(np.sqrt(2 * np.log(2) / np.pi))  # Allan deviation of B / B (IEEE Std 952, C.15)
 
 
 class Estimate(NamedTuple):
@@ -339,8 +323,7 @@ Chosen: a filter at a third of the sample rate."""
 _DITHERED_STEPS = 0.6
 """Noise from which rounding adds step²/12, steps. Chosen: exact within 0.4 % by the first harmonic
 of the rounding error (Widrow and Kollár 2008, section 4.4)."""
-_DENSITY = 'noise_density_g_per_rthz'
-"""Field of a sensor that holds its white noise."""
+_DENSITY = 'noise_density_g_per_rthz'  # Field of a sensor that holds its white noise
 
 
 @dataclass(frozen=True)
@@ -496,8 +479,7 @@ def _filter_s(noises: list[AxisNoise], rate_hz: float) -> float:
     return white / (2 * variance) if variance < _UNFILTERED * white * rate_hz else 0.0
 
 
-_PX4_HZ = 100.0
-"""Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000."""
+_PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000
 
 
 Setting = tuple[str, list[float], str]

@@ -34,30 +34,17 @@ far below the step of an encoder."""
 _HAND_HELD_S = 1.4
 """Shortest rest of a hand-held sensor, s, without its margins of 0.3 s. Chosen: shorter rests are
 pauses of the hand."""
-_STAGE_S = 0.6
-"""Shortest rest on a stage, s, without its margins of 0.3 s. Chosen: stages dwell for longer."""
-_KNOCK_S = 1.0
-"""Longest disturbance or gap within a rest, s. Chosen: a knock decays within a second."""
-_PART_S = 3600.0
-"""Time after which only the newest blocks of a recording are kept, s. It bounds the memory."""
-_BATCHES = 20
-"""Largest number of batches of a rest whose scatter shows the error of its mean. Chosen: the usual
-number of batch means."""
-_MIN_BATCH_BLOCKS = 2
-"""Smallest length of such a batch, blocks: 0.1 s."""
-_DRIFT_SIGMAS = 5.0
-"""Smallest drift that counts, standard deviations. Chosen: one false alarm in hours."""
-_SETTLE_TAUS = 8.0
-"""Settling time after a motion, in time constants of the filter. Chosen: the remainder of a step,
-0.03 %, is below the noise of a rest's mean."""
-_ANGLES = (JOINTS['alpha'], JOINTS['beta'])
-"""Columns of the encoder angles."""
-_FALSE_ALARM = 1e-6
-"""Probability that the variance of noise exceeds its limit."""
-_QUARTILE_TO_STD = 0.3186
-"""First quartile of a normal deviate's magnitude, relative to its standard deviation."""
-_END_SIGMAS = 3.5
-"""Difference of an end of a rest from its middle beyond which it is cut, standard deviations."""
+_STAGE_S = 0.6  # Shortest rest on a stage, s, without these margins. Chosen: dwells are longer
+_KNOCK_S = 1.0  # Longest disturbance within a rest, s. Chosen: a knock has decayed
+_PART_S = 3600.0  # Time after which old blocks are forgotten, s; it bounds the memory
+_BATCHES = 20  # Most batches that show the error of a mean. Chosen: the usual number
+_MIN_BATCH_BLOCKS = 2  # Smallest length of such a batch, blocks: 0.1 s
+_DRIFT_SIGMAS = 5.0  # Smallest drift, stds. Chosen: one false alarm in hours
+_SETTLE_TAUS = 8.0  # Settling time, RC. Chosen: 0.03 % of a step is below the noise of a mean
+_ANGLES = (JOINTS['alpha'], JOINTS['beta'])  # Columns of the encoder angles
+_FALSE_ALARM = 1e-6  # Probability that the variance of noise exceeds its limit
+_QUARTILE_TO_STD = 0.3186  # First quartile of |normal deviate|, stds
+_END_SIGMAS = 3.5  # Difference of an end of a rest that is cut, stds
 
 
 @dataclass(frozen=True)

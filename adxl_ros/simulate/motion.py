@@ -108,8 +108,7 @@ def encoder_reading(angle_rad: np.ndarray, resolution_rad: float) -> np.ndarray:
     return np.rint(angle_rad / resolution_rad) * resolution_rad
 
 
-POINTS = 6
-"""Points of the polynomial between the steps of a grid; chosen: as exact as the filters."""
+POINTS = 6  # Points of the polynomial between the steps of a grid; chosen: as exact as the filters
 
 
 def lagrange_weights(position: np.ndarray) -> np.ndarray:
@@ -139,14 +138,11 @@ def check_needs(sensor: Sensor, motion: Motion) -> None:
                                 'effect out')
 
 
-JOINTS = ('alpha', 'beta', 'shift')
-"""Names of the joints, in the order of all arrays."""
+JOINTS = ('alpha', 'beta', 'shift')  # Names of the joints, in the order of all arrays
 _REACH = {'alpha': 100.0, 'beta': 100.0, 'shift': 10.0}
 """Largest position of each joint, rad or m. Chosen: 16 turns, and more than a laboratory."""
-_SETTLED = 6.638
-"""Solution of (1 + x)·exp(−x) = 0.01: a critically damped step response is within 1 % there."""
-_MIN_MOVE = 1e-9
-"""Distance from the goal, rad or m, below which a joint without an encoder step is at rest."""
+_SETTLED = 6.638  # Root of (1 + x)·exp(−x) = 0.01: a critically damped step is within 1 %
+_MIN_MOVE = 1e-9  # Distance at rest without encoder step, rad or m
 
 
 class SimulatedStage:

@@ -34,24 +34,18 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
-_HIGHEST_RATE_HZ = 1000.0
-"""Highest rate at which the kinematics are evaluated, Hz. Chosen: the rate of the simulator."""
-_PER_READING = 2
-"""Evaluations of the kinematics for each reading of a joint. Chosen: splines join them."""
+_HIGHEST_RATE_HZ = 1000.0  # Highest rate of the kinematics, Hz. Chosen: that of the simulator
+_PER_READING = 2  # Evaluations of the kinematics a reading. Chosen: splines join them
 _KNOT_READINGS = 4
 """Largest distance of the knots of a joint's spline, in readings. Chosen: jerks of a move then
 show, and the penalty still averages over the steps of an encoder."""
-_SMALLEST_STEP = 1e-9
-"""Step of an encoder, rad or m, that is exact. Chosen: rounding of floats in a log."""
+_SMALLEST_STEP = 1e-9  # Step of an exact encoder, rad or m. Chosen: rounding in a log
 _LONGEST_GAP_S, _USUAL_GAPS = 0.1, 5.0
 """Longest time without a reading of a joint, s, and in usual gaps. Chosen: a robot moves within
 it, and a message may be late."""
-_AROUND_S = 0.3
-"""Time around which the error of the force is taken, s. Chosen: a part of a move."""
-_OFFSET_RAD = 1e-4
-"""Offset of a joint whose effect on the force is taken, rad. Chosen: linear to 1e-4."""
-_COMPLIANCE_S2 = 1e-5
-"""Compliance of the links whose effect is taken, s². Chosen: a resonance of 50 Hz."""
+_AROUND_S = 0.3  # Time around which the error of the force is taken, s. Chosen: a part of a move
+_OFFSET_RAD = 1e-4  # Offset of a joint whose effect is taken, rad. Chosen: linear to 1e-4
+_COMPLIANCE_S2 = 1e-5  # Compliance whose effect is taken, s². Chosen: a resonance of 50 Hz
 
 
 class Robot:
