@@ -165,11 +165,7 @@ def shortest_rest_s(rate_hz: float) -> float:
 
 def longest_rest(read: Callable[[], Iterable[Recording]], unit: Sensor, first: Recording
                  ) -> StillStretch:
-    """
-    Find the longest rest of a recording, which is read twice; the memory is bounded.
-
-    first: its first block.
-    """
+    """Find the longest rest of a recording, which is read twice; the memory is bounded."""
     if len(first) < 2:
         raise UserError(f'{first.path}: {len(first)} samples; record longer')
     survey, first_s = RecordedRests(unit, first), float(first.time_s[0])

@@ -74,12 +74,7 @@ class BlockCutter:
 
     def feed(self, time_s: np.ndarray, samples: np.ndarray,
              angles_rad: np.ndarray | None = None) -> Blocks:
-        """
-        Add the next rows of the stream.
-
-        time_s: time of each row, s, (n,); samples: rows of the stream, (n, m), all finite;
-        angles_rad: encoder angles, rad, (n, a), NaN where not sampled.
-        """
+        """Add finite samples, (n, m), and encoder angles, (n, a), NaN where not sampled."""
         columns = [time_s[:, None], samples] + ([] if angles_rad is None else [angles_rad])
         return Blocks.join([self.none()] + [
             self._cut(np.concatenate([part[i:i + _CHUNK].T for part in columns]))
@@ -140,12 +135,7 @@ def angle_bounds(blocks: Blocks) -> np.ndarray:
 
 
 def true_runs(mask: np.ndarray, group: np.ndarray | None = None) -> list[tuple[int, int]]:
-    """
-    List the runs of True in a mask.
-
-    mask: booleans, (k,); group: numbers, not negative, (k,). A run ends where the number changes.
-    None for one group.
-    """
+    """List the runs of True in a mask, (k,); a run ends where the number of its group changes."""
     number = np.where(mask, 0 if group is None else group, -1)
     edges = np.flatnonzero(np.diff(number, prepend=-2, append=-2))
     return [(int(first), int(stop)) for first, stop in pairwise(edges) if mask[first]]
@@ -185,9 +175,8 @@ def quiet_variance(blocks: Blocks, windows: np.ndarray,
     """
     Learn the variance that the quietest windows have in common, and its limit, (m,) each.
 
-    Noise below the ADC's step, (m,), makes at most two neighbouring codes equally frequent: a
-    variance of a quarter of the squared step. Samples without any noise still have a rounding
-    error.
+    Noise below the ADC's step, (m,), makes at most two codes equally frequent: a variance of
+    step²/4. Samples without any noise still have a rounding error.
     """
     middle = np.median(np.abs(blocks.mean), axis=0)
     smallest = step ** 2 / 4 + (_ROUNDING * middle) ** 2 + _TINY_VARIANCE

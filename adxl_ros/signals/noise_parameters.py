@@ -179,11 +179,7 @@ def coefficient_variances(count: int, step_s: float) -> np.ndarray:
 
 
 def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = None) -> NoiseFit:
-    """
-    Fit white noise, bias instability and random walk to the means of neighbouring cells, u, (n,).
-
-    variances: those of `coefficient_variances`, which axes of one recording share.
-    """
+    """Fit the terms to means of neighbouring cells, (n,), by their `coefficient_variances`."""
     if variances is None:
         variances = coefficient_variances(len(means), step_s)
     groups = _grouped(np.square(coefficients(means)), variances)
@@ -397,9 +393,6 @@ def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: flo
 
     Above 0.6 steps of noise, rounding adds independent noise of the variance step²/12. Less noise
     is hidden: it may be anything up to that, and codes that do not change show less.
-
-    std: standard deviation of a sample within some seconds, m/s²; resolution: smallest change of a
-    sample, m/s².
     """
     if not _is_coarse(std, resolution):
         return replace(fit, white=Estimate(*(float(np.sqrt(max(value ** 2 - rounding ** 2, 0.0)))

@@ -88,8 +88,6 @@ def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = 
     Fill in what a parameter file leaves out; return the unit, and what is measured, for people.
 
     The noise is that of the quietest quarter seconds, so that the samples may hold motion.
-
-    time_s: stamps, s, (n,); volts: samples, V, (n, m); where: begin of messages.
     """
     scale_v_per_g, spans = unit.nominal_scale_v_per_g, Spans(unit.rate_hz)
     blocks = stats.BlockCutter(unit.rate_hz, len(unit.axes)).feed(time_s, volts)
@@ -145,10 +143,9 @@ def _filter_s(rests: list[np.ndarray], rate_hz: float, step_v: float) -> float:
 def unit_of_stream(sensor: Sensor, stamps_ns: np.ndarray, accel_mps2: np.ndarray
                    ) -> tuple[Sensor, list[str]]:
     """
-    Return the unit of a live stream that states nothing of itself.
+    Return the unit of a live stream that states nothing of itself, and what was measured.
 
-    stamps_ns: stamps, ns, (n,); accel_mps2: specific force, m/s², (n, 3); an axis that is always 0
-    is not measured.
+    An axis of the specific force, (n, 3), that is always 0 is not measured.
     """
     steps_s = np.diff(stamps_ns) * 1e-9
     if steps_s.sum() < SHORTEST_S:
@@ -205,11 +202,7 @@ class FilterNoise:
 
 def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, lsb_v: float
                     ) -> FilterNoise | None:
-    """
-    Estimate the time constant of one axis by the likelihood of its periodogram (Whittle).
-
-    rests: volts of each rest without gaps, (n,) each.
-    """
+    """Estimate the RC of one axis by the likelihood of the periodogram of its rests (Whittle)."""
     # scipy.signal takes 0.3 s to import, which a calibration needs only at its end.
     from scipy.signal.windows import hann
     size = max(_MIN_SEGMENT_SAMPLES, round(_SEGMENT_S * rate_hz))
@@ -311,9 +304,8 @@ def find_polarity_fault(correlation: np.ndarray, references: list[int],
     """
     Find the first axis that is inverted or follows the reference of another axis.
 
-    correlation: correlation of m measured axes with r reference axes, (m, r). NaN where an axis is
-    constant.; references: index of the reference of each measured axis, (m,). An axis whose own
-    correlation is NaN is skipped.
+    correlation: of m measured axes with r reference axes, (m, r), NaN where an axis is constant;
+    references: index of the reference of each measured axis, (m,).
     """
     for axis, (row, reference) in enumerate(zip(correlation, references)):
         if not np.isfinite(row[reference]):

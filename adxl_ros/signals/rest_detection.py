@@ -112,11 +112,7 @@ def stated_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
 
 def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
                    spans: Spans) -> NoiseLimits | None:
-    """
-    Learn the limits from the quietest windows; None while the stream is too short.
-
-    windows: `window_variance` of the blocks; step: step of the ADC, (m,).
-    """
+    """Learn the limits from the quietest windows; None while the stream is too short."""
     if len(blocks) < max(spans.window, 2 * spans.half):
         return None
     variance, limit = stats.quiet_variance(blocks, windows, step)
@@ -180,12 +176,10 @@ def differing_start(means: np.ndarray, longest: int, white: np.ndarray, flicker:
 class Rest:
     """A rest of a stream."""
 
-    # start, stop: First row of the rest and the row after its last
-    start: int
-    stop: int
-    # time_start_s, time_stop_s: Times of the first and the last row, s
-    time_start_s: float
-    time_stop_s: float
+    start: int  # Its first row
+    stop: int  # The row after its last
+    time_start_s: float  # Time of its first row
+    time_stop_s: float  # Time of its last row
     # Times between which it was disturbed, or has no samples, s
     disturbed_s: tuple[tuple[float, float], ...] = ()
 
@@ -217,11 +211,7 @@ class Stillness:
 
 
 class RestFinder:
-    """
-    Finds the rests in a stream while it runs.
-
-    axes: number of measured axes, m.
-    """
+    """Finds the rests in a stream while it runs."""
 
     def __init__(self, rate_hz: float, axes: int, noise: Noise | None = None,
                  learn: bool | None = None, angle_tolerance_rad: float | None = None):
@@ -241,12 +231,7 @@ class RestFinder:
 
     def feed(self, time_s: np.ndarray, samples: np.ndarray,
              angles_rad: np.ndarray | None = None) -> None:
-        """
-        Add the next rows of the stream.
-
-        time_s: time of each row, s, (n,); samples: rows of the stream, (n, m); angles_rad: encoder
-        angles, rad, (n, 2), if the stream has them.
-        """
+        """Add samples, (n, m), and encoder angles, rad, (n, 2), if the stream has them."""
         self._parts.append(self._cutter.feed(time_s, samples, angles_rad))
 
     def blocks(self) -> Blocks:
@@ -450,12 +435,7 @@ class RecordedRests:
 def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,
                angles_rad: np.ndarray | None = None, noise: Noise | None = None,
                learn: bool | None = None, angle_tolerance_rad: float | None = None) -> list[Rest]:
-    """
-    Find the rests of a recording.
-
-    time_s, samples, angles_rad: time s (n,), samples (n, m) in any unit, encoder angles rad (n,
-    2).
-    """
+    """Find the rests of a recording by samples, (n, m), in any unit, and encoder angles."""
     finder = RestFinder(rate_hz, samples.shape[1], noise, learn, angle_tolerance_rad)
     finder.feed(time_s, samples, angles_rad)
     return finder.rests()
@@ -464,11 +444,9 @@ def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,
 def rest_means(time_s: np.ndarray, samples: np.ndarray, rests: list[Rest], rate_hz: float,
                noise: Noise | None = None) -> tuple[np.ndarray, np.ndarray]:
     """
-    Average the rests of a recording, with the same results as `RestFinder.means`.
+    Average the rests of a recording, as `RestFinder.means` does: mean and std, (k, m) each.
 
-    time_s, samples: time s (n,), samples (n, m); returns: mean and its standard deviation, (k, m)
-    each, in the unit of the samples. The standard deviation is that by the scatter between parts
-    of the rest, and at least that of the given noise.
+    The std is that by the scatter between parts of the rest, and at least that of the noise.
     """
     parts = [stats.BlockCutter(rate_hz, samples.shape[1]).feed(
         time_s[rest.start:rest.stop], samples[rest.start:rest.stop]) for rest in rests]

@@ -78,12 +78,7 @@ class Response:
         self._last_s = begin_s
 
     def __call__(self, stamps_s: np.ndarray) -> np.ndarray:
-        """
-        Advance to the next samples.
-
-        stamps_s: stamps of the samples, s, (n,), ascending and later than those of the last call;
-        returns: volts of the ADC, V, (n, m).
-        """
+        """Advance to the next samples, (n,), which are later; return volts, (n, m)."""
         if not len(stamps_s):
             return np.zeros((0, len(self.sensor.axes)))
         steps = (stamps_s - self._begin_s) / self._step_s
@@ -100,12 +95,7 @@ class Response:
         return self._chain.convert(signals)
 
     def whole(self, stamps_s: np.ndarray, memo: ChainMemo) -> np.ndarray:
-        """
-        Simulate a whole recording.
-
-        stamps_s: stamps of all samples, s, (n,), ascending; returns: volts of the ADC, V, (n, m).
-        Nothing can follow.
-        """
+        """Simulate all samples of a recording as `__call__` does; nothing can follow."""
         steps = ceil((float(stamps_s[-1]) - self._begin_s) / self._step_s) + POINTS
         if steps > _WHOLE_STEPS:
             return self(stamps_s)
@@ -280,10 +270,9 @@ class ChainMemo:
 
 def simulate(sensor: Sensor, motion: Motion, seed: int) -> Columns:
     """
-    Simulate a whole recording.
+    Simulate a whole recording: columns by canonical name, (n,) each.
 
-    returns: columns by canonical name, (n,) each: `time_s`, volts by axis, readings of the
-    encoders, and temperature and supply if the manoeuvre has them.
+    They are `time_s`, volts by axis, encoders, and temperature and supply if they change.
     """
     parts = list(simulate_blocks(sensor, motion, seed))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

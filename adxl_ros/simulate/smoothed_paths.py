@@ -79,11 +79,9 @@ class SmoothedPath:
     def __init__(self, time_s: np.ndarray, reading: np.ndarray, step: float,
                  degree: int = _DEGREE, is_seen: bool = False, knot_s: float = KNOT_S) -> None:
         """
-        Prepare for the readings of an encoder.
+        Prepare for the readings of an encoder at ascending times, NaN where there is none.
 
-        time_s: ascending times, s, (n,); reading: readings, rad or m, (n,); NaN where there is
-        none; is_seen: whether the step is that of the readings, and not stated; knot_s: distance
-        of the knots, s.
+        is_seen: whether the step is that of the readings, and not stated.
         """
         sampled = np.isfinite(reading)
         self._time_s, self._reading = time_s[sampled], reading[sampled]
@@ -117,8 +115,6 @@ class SmoothedPath:
         changes quickly, because many readings bound the path within the time that the spline
         averages over. Its corner is 1/(2π·h·s^(1/6)) with the distance h of the knots and the
         matched strength s.
-
-        time_s: times, s, (n,).
         """
         if not self._step or len(self._time_s) <= 2 * _DEGREE:
             return None
@@ -162,10 +158,9 @@ def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, s
                      degree: int = _DEGREE, knot_s: float = KNOT_S, is_bounded: bool = True
                      ) -> scipy.interpolate.BSpline:
     """
-    Fit the smoothing spline of one window; see `SmoothedPath`.
+    Fit the smoothing spline of one window to finite readings; see `SmoothedPath`.
 
-    time_s: ascending times, s, (n,); reading: readings, rad or m, (n,), all finite; is_bounded:
-    whether no reading is off by more than half a step, as by an encoder and not by other noise.
+    is_bounded: whether no reading is off by more than half a step, as by an encoder.
     """
     if len(time_s) <= 2 * _DEGREE or np.ptp(reading) == 0:
         return scipy.interpolate.make_interp_spline(time_s, reading, k=1) if len(time_s) > 1 else \
@@ -188,8 +183,6 @@ def visible_step(reading: np.ndarray, step: float) -> float:
     the steps, are those of a finer reference. The noise is taken from fifth differences, because
     motion hardly shows in them. Where lines connect the readings of a slow encoder, it is taken
     at the distance of these readings: there is no noise on a line.
-
-    reading: readings, rad or m, (n,), all finite.
     """
     if not _is_interpolated(reading, step):
         return step
@@ -243,11 +236,7 @@ def noise_step(reading: np.ndarray, smallest: float, time_s: np.ndarray | None =
 
 def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float,
                      knot_s: float = KNOT_S) -> float:
-    """
-    Find the largest strength whose deviation is at most that of an encoder.
-
-    time_s: ascending times, s, (n,); reading: readings, rad or m, (n,), all finite.
-    """
+    """Find the largest strength whose deviation is at most that of an encoder."""
     moving = _moving(reading)
     if not step or moving.sum() < _MIN_MOVING:
         return 0.0
@@ -293,10 +282,8 @@ class _Window:
         Return the coefficients whose spline deviates from no reading by more than a bound.
 
         They are found by alternating directions (Boyd et al. 2011, section 5.2). Where no spline
-        fits the bounds, the deviation becomes as small as it can.
-
-        weights: weight of the squared deviation of each reading, beside the bounds, (n,); returns:
-        coefficients, (k,).
+        fits the bounds, the deviation becomes as small as it can. Readings have weights, (n,),
+        of their squared deviations beside the bounds.
         """
         transposed = self.design.T.tocsr()
         weighted = self.design.multiply(1 + weights[:, None]).tocsr()
@@ -341,12 +328,7 @@ class ForcePath:
     """Force at `time_s` per unit of each error of a robot, (n, 3)."""
 
     def __init__(self, time_s: np.ndarray, columns: np.ndarray) -> None:
-        """
-        Interpolate samples.
-
-        time_s: ascending times, s, (n,); columns: specific force in the case frame, m/s², in the
-        first three of them, (n, k).
-        """
+        """Interpolate columns, (n, k), the first three of them specific force of the case."""
         self.time_s = time_s  # Times of the samples, s, (n,)
         self._columns = columns
         self._spline = scipy.interpolate.CubicSpline(time_s, columns)

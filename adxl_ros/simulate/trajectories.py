@@ -98,11 +98,7 @@ class Script:
         self._knot(0.0, 0.0)
 
     def go(self, alpha: float, beta: float) -> None:
-        """
-        Move to a pose by minimum jerk, whose velocity peaks at the slew rate.
-
-        alpha, beta: angles of the pose, rad.
-        """
+        """Move to a pose by minimum jerk, whose velocity peaks at the slew rate."""
         distance = max(abs(alpha - self.alpha), abs(beta - self.beta))
         self._knot(0.0, 0.0)
         self.now += _JERK_PEAK * distance / self.slew_rad_s
@@ -110,11 +106,7 @@ class Script:
         self._knot(0.0, 0.0)
 
     def run(self, joint: str, to: float, speed: float) -> None:
-        """
-        Turn one joint at a constant velocity, between a run-up and a stop.
-
-        to: angle at the end, rad; speed: magnitude of the velocity, rad/s.
-        """
+        """Turn one joint to an angle at a constant speed, between a run-up and a stop."""
         distance = to - getattr(self, joint)
         rate = np.copysign(speed, distance)
         run_up = rate * RUN_UP_S / 2
@@ -260,11 +252,7 @@ _MIN_FORCE_SAMPLES = 4  # Fewest samples of specific force; a cubic spline needs
 
 
 def motion_from_force(ideal: Recording, resampled: bool) -> tuple[Motion, float]:
-    """
-    Make a motion from the specific force of another simulator, in the case frame.
-
-    returns: the motion, and the time at which it begins, s.
-    """
+    """Make a motion from the specific force of another simulator; return its begin, s, too."""
     time_s = ideal.time_s
     force_mps2 = np.column_stack([ideal.columns[name] for name in ACCEL])
     if len(time_s) < _MIN_FORCE_SAMPLES:
