@@ -44,8 +44,7 @@ _SAME_POSE_G = 0.1  # Distance of the means of two rests of one orientation, g. 
 _MOST_POSES = 200  # Orientations that are counted at most. Chosen: more than a sweep has
 _CLIPPED_SAMPLES = 3  # Equal samples at an extreme that are clipped. Chosen: noise repeats fewer
 _CLIPPED_STEP_G = 0.05  # Change before or after them, g. Chosen: a sensor at rest has none
-_CLIPPED_WINDOW_S = 0.1
-"""Longest time before or after them in which it changes, s. Chosen: within a motion of a hand."""
+_CLIPPED_WINDOW_S = 0.1  # Longest time beside them in which it moves, s. Chosen: a hand is faster
 _CLIPPED_CODES = 20
 """Change, in steps of the resolution, that a smooth peak does not reach within the time that it
 stays at its top. Chosen: a parabola reaches nine."""

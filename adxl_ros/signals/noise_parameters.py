@@ -34,17 +34,11 @@ _WIDTH = 1.03  # Ratio of frequencies of further groups. Chosen: a term changes 
 _ROUNDS = 60  # Largest number of rounds of a fit. Chosen: usual are ten
 _HALVINGS = 20  # Largest number of halvings of a step that does not raise the likelihood
 _CONVERGED = 1e-9  # Change of twice the log likelihood at which a fit ends
-_SMALLEST = 1e-4
-"""Square of a term, by the square at which it would dominate, from which an upper limit is
-searched. Chosen: it changes the likelihood of no recording."""
-_OCTAVE_PROBABILITY = 1e-3
-"""Probability by chance, below which an octave shows a filter or a line. Chosen: with ten octaves
-one healthy recording in a hundred."""
+_SMALLEST = 1e-4  # Square, by a dominant one, from which a limit is searched. Chosen: never seen
+_OCTAVE_PROBABILITY = 1e-3  # Chance from which a filter or line shows. Chosen: 1 % of logs
 _BOUND_PROBABILITY = 1e-2  # Chance from which a walk has bounds. Chosen: 1 of 100 healthy logs
 _BOUND_STEP = 2 ** 0.5  # Ratio of tried correlation times. Chosen: the likelihood changes little
-_SHORTEST_BOUND = 10.0
-"""Shortest correlation time, by that of the highest frequency. Chosen: a shorter one is taken for
-a filter of white noise."""
+_SHORTEST_BOUND = 10.0  # Shortest T, by the highest frequency. Chosen: below, it is a filter
 _MARGIN_OCTAVES = 2  # Octaves left out below a filter. Chosen: its power falls by 16
 _FEWEST = 32  # Fewest coefficients of a fit. Chosen: white noise is then known within 20 %
 _SEEN = 2.0  # Standard deviations of a square that is seen. Chosen: as 90 % intervals exclude 0
@@ -313,9 +307,7 @@ def _is_expected(octave: _Groups, lower: _Groups, theta: np.ndarray) -> bool:
     return bool(scipy.stats.chi2.sf(excess ** 2 / variance, 1) > _OCTAVE_PROBABILITY)
 
 
-_UNFILTERED = 0.8
-"""Variance of a sample, divided by that of unfiltered white noise, from which there is no filter.
-Chosen: a filter at a third of the sample rate."""
+_UNFILTERED = 0.8  # Share of white variance without a filter. Chosen: one at rate/3
 _DITHERED_STEPS = 0.6
 """Noise from which rounding adds step²/12, steps. Chosen: exact within 0.4 % by the first harmonic
 of the rounding error (Widrow and Kollár 2008, section 4.4)."""

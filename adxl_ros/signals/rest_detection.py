@@ -31,9 +31,7 @@ SAME_ANGLE_RAD = 1e-5
 """Angles that differ by less are equal, rad. Chosen: above the rounding of angles in a file, and
 far below the step of an encoder."""
 
-_HAND_HELD_S = 1.4
-"""Shortest rest of a hand-held sensor, s, without its margins of 0.3 s. Chosen: shorter rests are
-pauses of the hand."""
+_HAND_HELD_S = 1.4  # Shortest rest by hand, s, without 0.3 s of margins. Chosen: beyond pauses
 _STAGE_S = 0.6  # Shortest rest on a stage, s, without these margins. Chosen: dwells are longer
 _KNOCK_S = 1.0  # Longest disturbance within a rest, s. Chosen: a knock has decayed
 _PART_S = 3600.0  # Time after which old blocks are forgotten, s; it bounds the memory

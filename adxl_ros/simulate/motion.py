@@ -129,8 +129,7 @@ def check_needs(sensor: Sensor, motion: Motion) -> None:
 
 
 JOINTS = ('alpha', 'beta', 'shift')  # Names of the joints, in the order of all arrays
-_REACH = {'alpha': 100.0, 'beta': 100.0, 'shift': 10.0}
-"""Largest position of each joint, rad or m. Chosen: 16 turns, and more than a laboratory."""
+_REACH = {'alpha': 100.0, 'beta': 100.0, 'shift': 10.0}  # Largest positions. Chosen: 16 turns
 _SETTLED = 6.638  # Root of (1 + x)·exp(−x) = 0.01: a critically damped step is within 1 %
 _MIN_MOVE = 1e-9  # Distance at rest without encoder step, rad or m
 

@@ -40,8 +40,7 @@ _ERROR_FACTOR = 2.0
 """Error in motion, times readings per second, divided by step and corner frequency; measured on
 the same manoeuvres: 0.3 to 2."""
 _RIDGE = 1e-12  # Relative addition to the diagonal; chosen: for empty coefficients only
-_STRENGTHS = (10.0 ** np.arange(-12, 13, 0.5)).tolist()
-"""Strengths of the penalty that are tried; chosen: half a decade hardly changes a spline."""
+_STRENGTHS = (10.0 ** np.arange(-12, 13, 0.5)).tolist()  # Tried strengths; chosen: half decades
 _REST_GAP = 8  # Median gaps and samples between changes at rest; chosen: above a slow move
 _SMALLEST_CHANGE = 1e-6  # Change in steps that is a rounding error; chosen: above floats
 _WHOLE = 0.05  # Deviation from whole steps; chosen: 5 steps of 0.083° for 1/12°
