@@ -355,14 +355,9 @@ def _has_wide_gaps(contents: RecordingContents) -> bool:
 
 
 def _stamp_faults(contents: RecordingContents) -> list[str]:
-    faults = []
-    duplicates, backward = contents.bad_stamps
-    if duplicates:
-        faults.append(f'samples with the stamp of the one before: {duplicates}; --drop-bad-stamps '
-                      'leaves them out')
-    if backward:
-        faults.append(f'samples whose stamp steps back: {backward}; --drop-bad-stamps leaves them '
-                      'out')
+    which = 'with the stamp of the one before', 'whose stamp steps back'
+    faults = [f'samples {text}: {count}; --drop-bad-stamps leaves them out'
+              for text, count in zip(which, contents.bad_stamps) if count]
     if _has_wide_gaps(contents):
         faults.append(f'{_missing(contents)}; record again, or use the parts')
     period_s = 1 / contents.rate_hz
