@@ -113,9 +113,11 @@ def main() -> int:
     parser = program_parser('demo', __doc__, _EXAMPLES)
     parser.add_argument('-o', dest='output', metavar='DIR', default='demo_output', type=Path,
                         help='folder of pages and calibrations (default demo_output)')
-    parser.add_argument('--seed', type=int, choices=range(2 ** 31), metavar='N', default=_SEED,
+    parser.add_argument('--seed', type=int, metavar='N', default=_SEED,
                         help=f'seed of the simulated unit and its stage (default {_SEED})')
     options = parser.parse_args()
+    if not 0 <= options.seed < 2 ** 31:
+        parser.error(f'--seed: {options.seed} is not between 0 and {2 ** 31 - 1}')
     jobs.use_own_graph()
     try:
         try:
