@@ -3,10 +3,8 @@
 """Constants that the whole package shares."""
 G0_MPS2 = 9.80665
 """Standard gravity, m/s², exact (ISO 80000-3); the g of every coefficient in V/g or 1/g."""
-AXES = 'xyz'
-"""Axis letters in the order of every array."""
-MEASURED_AXES = ('x', 'xy', 'xyz')
-"""The axes that a sensor may measure."""
+AXES = 'xyz'  # Axis letters in the order of every array
+MEASURED_AXES = ('x', 'xy', 'xyz')  # The axes that a sensor may measure
 Z_90 = 1.6449
 """Half of a 90 % interval in standard deviations: the 95 % quantile of the normal distribution."""
 MAD_TO_STD = 1.4826

@@ -29,12 +29,9 @@ from adxl_ros.model.sensor import get, parameter_of, put, Sensor
 from adxl_ros.model.signal_chain import ANALOG, analog_response, static_chain
 import numpy as np
 
-UNMEASURED_VARIANCE = 1e6
-"""Variance of an axis that the sensor does not have, (m/s²)²; chosen: far above any force."""
-_FORCE2_FLOOR = 1e-30
-"""Square of a negligible force, (m/s²)²; chosen: below any noise, it keeps divisors from 0."""
-_OVERHANG_MPS2 = -0.5
-"""Lowest z of a sensor that is stated to be upright, m/s²; chosen: it may lean over by 3°."""
+UNMEASURED_VARIANCE = 1e6  # Of an axis that is not there, (m/s²)²; chosen: above any force
+_FORCE2_FLOOR = 1e-30  # Negligible force, (m/s²)²; chosen: below noise, keeps divisors from 0
+_OVERHANG_MPS2 = -0.5  # Lowest z of an upright sensor, m/s²; chosen: 3° over
 _ROOT_MEAN = 1.25
 """Factor of the term that keeps the divisor of derived z from 0 where the in-plane force is g.
 Derived: there z² = 2·σ·g·n for normal noise n > 0, and the variance of z is 0.8·σ·g = σ·g/1.25."""
@@ -47,24 +44,8 @@ def force_covariance(sensor: Sensor, force: Components,
     Return the covariance of the specific force that `signal_chain.inverse` estimates.
 
     Noise and covariance of the coefficients go through the tangent of the inverse. The z of an
-    x/y sensor is derived from |f| = g; see `derived_z_covariance`.
-
-    Parameters
-    ----------
-    sensor
-        Calibrated unit with the covariance of its coefficients.
-    force
-        Specific force in the case frame, m/s², three components (n,).
-    sample_variance_v2
-        Variance of the volts by axis, V², (m,); that of the noise of one sample unless given.
-    environment
-        Surroundings of the samples.
-
-    Returns
-    -------
-    ndarray
-        Covariance, (m/s²)², (3, 3, n).
-
+    x/y sensor is derived from |f| = g; see `derived_z_covariance`. The variance of the volts is
+    that of one sample unless given, V², (m,). Returned in (m/s²)², (3, 3, n).
     """
     return prepared_covariance(sensor, sample_variance_v2)(force, environment)[0]
 
@@ -105,8 +86,7 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
     """
     Prepare the covariance of the measured axes, given the others; see `force_covariance`.
 
-    returns: maps specific force, m/s², three components (n,) or floats, and an `Environment` (the
-    nominal one unless given) to a `MeasuredCovariance`.
+    It maps specific force and an `Environment` (nominal unless given) to `MeasuredCovariance`.
     """
     if sample_variance_v2 is None:
         sample_variance_v2 = noise.sample_std_v(sensor) ** 2
@@ -142,13 +122,7 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
 
 
 def _coefficient_variance(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """
-    Propagate the covariance of coefficients to the volts.
-
-    slope: derivatives of the volts by the coefficients, (m, k), or (m, k, n) for arrays;
-    covariance: covariance of the coefficients, (k, k); returns: covariance of the volts, V², (m,
-    m, n).
-    """
+    """Propagate the covariance of coefficients by slopes, (m, k, n), to volts, (m, m, n)."""
     m, k = slope.shape[:2]
     columns = np.ascontiguousarray(np.swapaxes(slope, 0, 1)).reshape(k, m, -1)
     spread = (covariance @ columns.reshape(k, -1)).reshape(columns.shape)
@@ -160,13 +134,7 @@ def _coefficient_variance(slope: np.ndarray, covariance: np.ndarray) -> np.ndarr
 
 
 def _propagated(back: list[Components], volts: np.ndarray) -> np.ndarray:
-    """
-    Propagate a covariance of the volts to the force.
-
-    back: derivatives of the force by the volts, m rows of m components, arrays (n,) or floats;
-    volts: covariance of the volts, V², (m, m, n); returns: covariance of the force, (m/s²)², (m,
-    m, n).
-    """
+    """Propagate a covariance of the volts, (m, m, n), by `Tangent.back` to the force."""
     m = len(back)
     half = [[sum(back[i][a] * volts[a, b] for a in range(m)) for b in range(m)] for i in range(m)]
     covariance = np.empty_like(volts)
@@ -178,12 +146,7 @@ def _propagated(back: list[Components], volts: np.ndarray) -> np.ndarray:
 
 
 def leverage(sensor: Sensor) -> Callable[[Components], np.ndarray]:
-    """
-    Prepare the leverage of forces: the trace of their covariance by the coefficients alone.
-
-    returns: maps specific force, m/s², three components (n,) or floats, to the trace over the
-    measured axes in the nominal environment, (m/s²)², (n,); 0 without a covariance.
-    """
+    """Prepare the leverage of forces: the trace of their covariance by coefficients alone."""
     respond = analog_response(sensor)
     by_coefficient = coefficient_tangent(sensor)
 
@@ -208,10 +171,8 @@ def derived_z_covariance(force: Components, measured: tuple[Value, Value, Value]
     z − 2·divisor/(1 + s²). Where that is upright, too, either may be true, so that half the
     square of their distance is added.
 
-    force: specific force, m/s², three components; measured: variances xx, xy and yy of the force
-    given z, (m/s²)²; slope: derivative s of the estimates of x and y by z; see
-    `signal_chain.Tangent`; maths: functions for arrays or for floats; returns: xx, xy, xz, yy, yz
-    and zz, (m/s²)².
+    measured: variances xx, xy and yy of the force given z; slope: derivative s of the estimates
+    of x and y by z; returns: xx, xy, xz, yy, yz and zz, (m/s²)².
     """
     x, y, z = force
     xx, xy, yy = measured
@@ -231,9 +192,7 @@ def derived_z_covariance(force: Components, measured: tuple[Value, Value, Value]
             xz + by_zz[0], yy + slope[1] * (2 * yz + by_zz[1]), yz + by_zz[1], zz)
 
 
-_RELATIVE_STEP = 1e-3
-"""Step of the central differences by coefficients, in typical sizes; chosen: the chain is smooth
-and nearly linear in them."""
+_RELATIVE_STEP = 1e-3  # Step by coefficients, typical sizes; chosen: nearly linear
 
 
 def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
@@ -242,10 +201,7 @@ def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
 
     They are central differences. Each begins at the place of its effect: up to there, the chain
     is the same for all. Coefficients of one parameter that act on their own axes share one.
-
-    returns: maps specific force, m/s², three components (n,) or floats, and an `Environment` (the
-    nominal one unless given) to derivatives by axis and coefficient, V by the unit of the
-    coefficient, (m, k, n).
+    They map a force and an `Environment` (nominal unless given) to derivatives, (m, k, n).
     """
     chain = static_chain(sensor)
     names = sensor.covariance_names

@@ -10,25 +10,17 @@ from typing import Any
 
 import numpy as np
 
-ORDER = 6
-"""Number of newest samples that the polynomial interpolates; chosen: the error is of order 6."""
-_QUADRATURE_NODES = 24
-"""Nodes of the Gauss-Legendre quadrature; chosen: exact to rounding for |z| < `_STIFF`."""
-_FEW_INPUTS = 512
-"""Most inputs that are filtered one by one; chosen: it takes 50 µs, a block of 50 ms at 10 kHz."""
-_STIFF = 8.0
-"""|z| from which the weights are integrated by parts; chosen: that is stable for large z only."""
+ORDER = 6  # Newest samples of the polynomial; chosen: an error of order 6
+_QUADRATURE_NODES = 24  # Nodes of Gauss-Legendre; chosen: exact for |z| < `_STIFF`
+_FEW_INPUTS = 512  # Most inputs that are filtered one by one; chosen: 50 µs
+_STIFF = 8.0  # |z| from which weights are integrated by parts; chosen: stable there only
 
 
 def low_pass(x: np.ndarray, tau_s: float, dt_s: float, memory: dict[str, Any]) -> np.ndarray:
     """
-    Filter by 1/(1 + τ·s).
+    Filter inputs, (n,), by 1/(1 + τ·s); τ = 0 passes them on.
 
-    Before the first block the filter is at rest at its first input.
-
-    x: input, (n,); tau_s: time constant τ, s; 0 passes the input on; dt_s: time between samples,
-    s; memory: state that the filter keeps from one block to the next; empty before the first;
-    returns: output, (n,), in the unit of the input.
+    Before the first block, with an empty memory, the filter is at rest at its first input.
     """
     if not tau_s:
         return x
@@ -38,14 +30,9 @@ def low_pass(x: np.ndarray, tau_s: float, dt_s: float, memory: dict[str, Any]) -
 def resonator(x: np.ndarray, frequency_hz: float, damping_ratio: float, dt_s: float,
               memory: dict[str, Any]) -> np.ndarray:
     """
-    Filter by ω²/(s² + 2·ζ·ω·s + ω²), ζ < 1, by partial fractions.
+    Filter inputs, (n,), by ω²/(s² + 2·ζ·ω·s + ω²), ζ < 1, by partial fractions.
 
-    Before the first block the filter is at rest at its first input.
-
-    x: input, (n,); frequency_hz: undamped natural frequency ω/2π, Hz; damping_ratio: ζ, damping
-    divided by the critical one; dt_s: time between samples, s; memory: state that the filter keeps
-    from one block to the next; empty before the first; returns: output, (n,), in the unit of the
-    input.
+    Before the first block, with an empty memory, the filter is at rest at its first input.
     """
     omega = 2 * np.pi * frequency_hz
     damped = omega * np.sqrt(1 - damping_ratio ** 2)
@@ -59,12 +46,8 @@ def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> n
 
     The error is of order (ω·dt)^6 for an input of angular frequency ω. This is an exponential
     Adams-Moulton method (Hochbruck and Ostermann 2010, section 2.6). The polynomial uses past
-    samples only, so that the filter does not look ahead.
-
-    x: input, (n,), or (n, k) for k independent filters; rate: the pole, 1/s; its real part is
-    negative; dt_s: time between samples, s; memory: keeps the newest inputs and the last w. It is
-    empty before the first block, when w is at rest at the first input; returns: w at the samples,
-    in the shape of the input and its unit times s; complex for a complex rate.
+    samples only, so that the filter does not look ahead. Inputs are (n,), or (n, k) for k filters;
+    the real part of the rate is negative. With an empty memory w is at rest at the first input.
     """
     if not len(x):
         return x
@@ -120,8 +103,7 @@ def _weights(z: complex) -> np.ndarray:
     return np.array([np.dot(c[::-1], moments) for c in lagrange])
 
 
-_THRESHOLDS = (0.25, 0.5, 0.75, 1.0)
-"""Thresholds of the stop operators, divided by the reach; chosen: four of equal weight."""
+_THRESHOLDS = (0.25, 0.5, 0.75, 1.0)  # Of stop operators, by the reach; chosen: four equal
 
 
 def stop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:
@@ -157,23 +139,9 @@ def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray
     Follow the input with a dead band: yₙ = max(xₙ − r, min(xₙ + r, yₙ₋₁)).
 
     A step clamps the output between xₙ − r and xₙ + r. Consecutive clamps combine to one clamp.
-    The input is therefore split into stretches, which run in parallel and are joined afterwards.
-
-    Parameters
-    ----------
-    x
-        Input, (n,), or (n, k) for k independent operators.
-    half_width
-        r, in the unit of the input.
-    memory
-        Keeps the last output from one block to the next. It is empty before the first block,
-        when the output is in the middle of its dead band.
-
-    Returns
-    -------
-    ndarray
-        Output, in the shape of the input.
-
+    The input, (n,), or (n, k) for k operators, is therefore split into stretches, which run in
+    parallel and are joined afterwards. With an empty memory the output is in the middle of its
+    dead band.
     """
     if not half_width or not len(x):
         return x

@@ -46,26 +46,9 @@ def gauss_newton(linearise: Callable[[np.ndarray], State], start: np.ndarray,
     `linearise`. `scipy.optimize.least_squares` needs residuals with independent errors. Fits of
     this package have correlated errors or maximise an evidence, and stop after few evaluations.
 
-    Parameters
-    ----------
-    linearise
-        Maps coefficients, (p,), to an iterate.
-    start
-        First values, (p,).
-    has_converged
-        Takes the first iterate, the previous one (None at the first) and the present one.
-    max_evaluations
-        Largest count of calls of `linearise`, those of halved steps included.
-    max_halvings
-        How often a step that raises the cost is halved.
-    cost_tolerance
-        A step may raise the cost by this.
-
-    Returns
-    -------
-    Solution
-        The last accepted iterate, and whether the iteration has converged.
-
+    has_converged: takes the first iterate, the previous one (None at the first) and the present
+    one; max_halvings: how often a step is halved that raises the cost by more than
+    `cost_tolerance`. Halved steps count as evaluations, too.
     """
     first = present = linearise(start)
     previous, evaluations = None, 1
@@ -91,12 +74,7 @@ def gauss_newton(linearise: Callable[[np.ndarray], State], start: np.ndarray,
 
 def halve_until(attempt: Callable[[float], Trial], accept: Callable[[Trial], bool],
                 max_halvings: int) -> tuple[Trial, bool, int]:
-    """
-    Attempt a step, its half, its quarter and so on, until an attempt is accepted.
-
-    attempt: maps the share of the step, at most 1, to a result; returns: the last result, whether
-    it was accepted, and the count of attempts.
-    """
+    """Attempt a share of 1, 1/2, 1/4 ...; return the result, if it is accepted, and the count."""
     share = 1.0
     result = attempt(share)
     for count in range(1, max_halvings + 1):

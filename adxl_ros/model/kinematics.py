@@ -18,8 +18,7 @@ from adxl_ros.model.effects.base import ARRAYS, Components, Joint, Maths, Value
 import numpy as np
 import scipy
 
-UPRIGHT = (0.0, 0.0, 1.0)
-"""The vertical in the frame of a level base, a unit vector."""
+UPRIGHT = (0.0, 0.0, 1.0)  # The vertical in the frame of a level base, a unit vector
 
 
 def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
@@ -29,24 +28,8 @@ def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
     Specific force in the case frame of a sensor on the stage, m/s².
 
     At rest f = g·[sin α·cos β, −sin α·sin β, cos α]; a displacement along the sensor's x adds
-    its second derivative.
-
-    Parameters
-    ----------
-    alpha_rad, beta_rad
-        Joint angles, rad, arrays or floats of one shape.
-    gravity_mps2
-        Local gravity, m/s².
-    shift_acceleration_mps2
-        Second derivative of the `shift` joint, m/s².
-    up
-        The vertical in the frame of the stage's base; its y is the axis of alpha.
-
-    Returns
-    -------
-    list
-        The three components, each in the shape of the angles.
-
+    its second derivative. Angles are arrays or floats; `up` is the vertical in the frame of the
+    stage's base, whose y is the axis of alpha.
     """
     x, y, z = (gravity_mps2 * u for u in up)
     sin_alpha, cos_alpha = np.sin(alpha_rad), np.cos(alpha_rad)
@@ -58,12 +41,7 @@ def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
 
 
 def stage_angles(roll_rad: np.ndarray, pitch_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Return the stage angles that hold the sensor at a tilt, rad, (n,).
-
-    roll_rad, pitch_rad: tilt by REP-103: roll = atan2(fy, fz), pitch = atan2(−fx, hypot(fy, fz));
-    returns: alpha from 0 to π, beta from −π to π, 0 where alpha is 0.
-    """
+    """Return alpha, 0 to π, and beta, −π to π, of a tilt; beta is 0 where alpha is 0."""
     x = -np.sin(pitch_rad)
     y = np.sin(roll_rad) * np.cos(pitch_rad)
     z = np.cos(roll_rad) * np.cos(pitch_rad)
@@ -95,9 +73,6 @@ def angular_motion(alpha: Joint, beta: Joint) -> tuple[Components, Components]:
 
     ω = β̇·[0 0 1] − α̇·[sin β, cos β, 0]. A fixed vertical then moves as in `specific_force`:
     ḟ = −ω × f.
-
-    alpha, beta: joints with their derivatives, rad, arrays or floats of one shape; returns:
-    angular velocity, rad/s, and angular acceleration, rad/s², three components each.
     """
     sin_beta, cos_beta = np.sin(beta.position), np.cos(beta.position)
     along, across = sin_beta * alpha.velocity, cos_beta * alpha.velocity
@@ -108,12 +83,7 @@ def angular_motion(alpha: Joint, beta: Joint) -> tuple[Components, Components]:
 
 
 def carried_acceleration(omega: Components, omega_dot: Components, r: Components) -> Components:
-    """
-    Acceleration, m/s², of a point that a turning body carries: ω × (ω × r) + ω̇ × r.
-
-    omega, omega_dot: angular velocity, rad/s, and acceleration, rad/s², in the frame of the body;
-    r: vector from the axis to the point, m.
-    """
+    """Acceleration of a point r that a turning body carries: ω × (ω × r) + ω̇ × r."""
     centripetal = cross_product(omega, cross_product(omega, r))
     return [c + t for c, t in zip(centripetal, cross_product(omega_dot, r))]
 
@@ -123,17 +93,14 @@ def cross_product(a: Components, b: Components) -> Components:
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
-UNOBSERVABLE_RAD2 = 1.0
-"""Variance from which an angle counts as not shown, rad²; chosen: a guess has 1.8 rad rms."""
+UNOBSERVABLE_RAD2 = 1.0  # Variance of an angle that is not shown, rad²; a guess has 1.8²
 UNKNOWN_ANGLE_RAD2 = 1e6
 """Variance of an angle that is not known, rad²; yaw is never known.
 
 π²/3, that of a uniform angle, would let a filter that fuses 1000 samples a second believe in
 yaw = 0 before long. 1e6, as for an axis that is not there, never counts."""
-INFINITE = float('inf')
-"""Variance of an angle that the force does not determine, rad²."""
-_FORCE2_FLOOR = 1e-30
-"""Square of a negligible force, (m/s²)²; chosen: far below any noise, it keeps divisors from 0."""
+INFINITE = float('inf')  # Variance of an angle that the force does not determine, rad²
+_FORCE2_FLOOR = 1e-30  # Negligible force, (m/s²)²; chosen: below noise, keeps divisors from 0
 
 
 @dataclass(frozen=True)
@@ -150,8 +117,7 @@ class Tilt:
     inclination: np.ndarray  # atan2(hypot(a_x, a_y), a_z), rad, (n,)
     alpha: np.ndarray  # Angle of the stage: the inclination, rad, (n,)
     beta: np.ndarray  # Angle of the stage: atan2(−a_y, a_x), rad, (n,)
-    # roll_std, pitch_std, inclination_std, alpha_std, beta_std: Standard deviations of the angles,
-    # rad, (n,)
+    # Standard deviations of the angles, rad, (n,)
     roll_std: np.ndarray
     pitch_std: np.ndarray
     inclination_std: np.ndarray
@@ -160,24 +126,7 @@ class Tilt:
 
 
 def tilt(force: Components, covariance: np.ndarray, measures_z: bool = True) -> Tilt:
-    """
-    Return the angles of samples with first-order standard deviations.
-
-    Parameters
-    ----------
-    force
-        Specific force at rest in the case frame, m/s², three components (n,).
-    covariance
-        Covariance of the force, (m/s²)², (3, 3, n).
-    measures_z
-        Whether the sensor has a z axis.
-
-    Returns
-    -------
-    Tilt
-        Angles of the n samples.
-
-    """
+    """Return the angles of forces at rest, (n,), with a covariance, (m/s²)², (3, 3, n)."""
     force = [np.asarray(f, float) for f in force]
     components = tuple(covariance[i, j] for i in range(3) for j in range(i, 3))
     with np.errstate(over='ignore', invalid='ignore'):
@@ -202,11 +151,7 @@ def angles(force: Components, covariance: tuple[Value, ...],
 
     Where noise exceeds the part of the force that shows roll or beta, the angle can be anything:
     its variance is infinite. Pitch and inclination are then the length of a small vector of any
-    direction.
-
-    force: specific force at rest in the case frame, m/s², three components; covariance: covariance
-    of the force, (m/s²)²: xx, xy, xz, yy, yz, zz; maths: functions for arrays or for floats;
-    returns: angle, rad, and variance, rad², of roll, pitch, inclination and beta.
+    direction. The force is that at rest, its covariance xx, xy, xz, yy, yz, zz.
     """
     x, y, z = force
     xx, xy, xz, yy, yz, zz = covariance
@@ -249,8 +194,7 @@ def quaternion(roll_rad: Value, pitch_rad: Value, maths: Maths) -> tuple[Value, 
     return sr * cp, cr * sp, -sr * sp, cr * cp
 
 
-Vector = tuple[float, float, float]
-"""Three components."""
+Vector = tuple[float, float, float]  # Three components
 
 
 @dataclass(frozen=True)
@@ -300,10 +244,6 @@ class Mounting:
         return tuple((case * self.rotation.inv()).as_quat().tolist())
 
     def levelled(self, force_mps2: Sequence[float]) -> Mounting:
-        """
-        Return the mounting that makes a force at rest vertical, with the yaw of this one.
-
-        force_mps2: mean specific force in the frame of the case, on level ground, m/s², (3,).
-        """
+        """Return the mounting that makes a force at rest vertical, with the yaw of this one."""
         x, y, z = force_mps2
         return Mounting((atan2(y, z), atan2(-x, hypot(y, z)), self.rpy_rad[2]))

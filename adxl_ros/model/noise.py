@@ -15,8 +15,7 @@ ONE_SIDED = float(np.sqrt(2))
 """Noise density of a datasheet, over positive frequencies alone, divided by the same over both
 signs: N of IEEE Std 952 and `accelerometer_noise_density` of Kalibr, whose sample has the variance
 N²·rate (ethz-asl/kalibr, wiki/IMU-Noise-Model)."""
-_HARMONICS = 50
-"""Harmonics of the sawtooth of rounding that are summed. Chosen: the others hold 1 %."""
+_HARMONICS = 50  # Harmonics of rounding that are summed. Chosen: the others hold 1 %
 
 
 class Rounding(NamedTuple):
@@ -71,8 +70,6 @@ def rounding(sensor: Sensor, axis: int) -> Rounding:
     Noise of standard deviation σ makes the rounding random. The part that depends on the mean
     output alone is a sawtooth, whose k-th harmonic has the variance LSB²/(2π²k²)·exp(−(2πkσ/LSB)²)
     (Widrow and Kollár 2008, section 4.4). Above half a step of noise nothing of it is left.
-
-    sensor: the unit; axis: index of the measured axis; returns: both parts.
     """
     total_v2 = sensor.lsb_v ** 2 / 12
     if not total_v2:
@@ -86,23 +83,10 @@ def rounding(sensor: Sensor, axis: int) -> Rounding:
 
 def density_v2_per_hz(sensor: Sensor, frequency_hz: np.ndarray) -> np.ndarray:
     """
-    Return the one-sided spectral density of the samples' noise.
+    Return the one-sided spectral density of the samples' noise at frequencies, (k,): (k, m).
 
     The noise is the sum of an AR(1) sequence (Percival and Walden 1993, section 9.2) and of the
     ADC's quantisation, which is white.
-
-    Parameters
-    ----------
-    sensor
-        The unit, sampled at its rate.
-    frequency_hz
-        Frequencies up to half the sample rate, Hz, (k,).
-
-    Returns
-    -------
-    ndarray
-        Density by frequency and axis, V²/Hz, (k, m).
-
     """
     rc_s = electronics(sensor).rc_s
     decay = np.where(rc_s > 0, np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1.0))), 0.0)
@@ -118,21 +102,6 @@ def effective_samples(count: int | np.ndarray, dt_s: float, rc_s: float) -> np.n
     Noise behind a first-order filter is an AR(1) sequence with a = exp(−dt/RC). The variance of
     the mean of N samples is exactly σ²/N·[1 + 2·Σ (1 − k/N)·aᵏ]. 5000 samples at 1 kHz behind
     32 kΩ and 0.33 µF are 237.
-
-    Parameters
-    ----------
-    count
-        Number of samples in the mean, N.
-    dt_s
-        Time between samples, s.
-    rc_s
-        Time constant of the filter, s; 0 for none.
-
-    Returns
-    -------
-    ndarray
-        Number of independent samples, in the shape of `count`.
-
     """
     n = np.asarray(count, float)
     if rc_s <= 0:

@@ -19,10 +19,8 @@ from adxl_ros.model.sensor import get, put, Sensor, with_neutral
 import numpy as np
 import scipy
 
-STRANGER_CHANCE = 1e-3
-"""Probability that a unit of the population counts as a stranger. Chosen: one fit in 1000."""
-_EFFECTS = ('bias', 'scale_factor')
-"""Effects of the coefficients that a population can have."""
+STRANGER_CHANCE = 1e-3  # Probability of a false stranger. Chosen: one fit in 1000
+_EFFECTS = ('bias', 'scale_factor')  # Effects of the coefficients that a population can have
 
 
 @dataclass(frozen=True)

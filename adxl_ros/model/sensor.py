@@ -19,8 +19,7 @@ MODELS = ('nominal', 'linear', 'physical', 'full', 'gravity')
 MARGIN_K = 2.0
 """Distance from the temperatures of the poses that counts as inside, K; chosen: by the datasheet
 it is 0.2 mg, below the noise of a sample. No thermometer is at the element."""
-STRETCH = 1.1
-"""Factor of the poses' forces at which h_max is taken, too; chosen: see `Envelope`."""
+STRETCH = 1.1  # Factor of the poses' forces at which h_max is taken, too; chosen: see `Envelope`
 MARGIN_MPS2 = 2.0
 """Distance from the forces of the poses that counts as inside, m/s²; chosen: planes from 30° on
 leave 1.3 m/s² to level, and nearby forces share one result."""
@@ -241,9 +240,6 @@ def with_axes(sensor: Sensor, axes: str) -> Sensor:
     Give a nominal sensor the axes of a stream.
 
     Axes are removed from the end, or added with the values that all axes share.
-
-    sensor: A sensor without effects, unless it has these axes; axes: axes of the stream: x, xy or
-    xyz; returns: the sensor with the axes.
     """
     if axes == sensor.axes:
         return sensor
@@ -265,22 +261,12 @@ def with_axes(sensor: Sensor, axes: str) -> Sensor:
 
 
 def to_volts(accel_mps2: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """
-    Undo the nominal conversion, which is affine and exact.
-
-    accel_mps2: nominally converted specific force, m/s², (n, m); sensor: the sensor with its
-    nominal zero-g and scale factor; returns: volts of the ADC, V, (n, m).
-    """
+    """Undo the nominal conversion, which is affine and exact: volts, (n, m)."""
     return sensor.nominal_zero_g_v + accel_mps2 / G0_MPS2 * sensor.nominal_scale_v_per_g
 
 
 def to_nominal_mps2(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
-    """
-    Convert volts by the nominal zero-g and scale factor (equation 3).
-
-    volts: volts of the ADC, V, (n, m); sensor: the sensor with its nominal zero-g and scale
-    factor; returns: nominally converted specific force, m/s², (n, m).
-    """
+    """Convert volts, (n, m), by the nominal zero-g and scale factor (equation 3)."""
     return (volts - sensor.nominal_zero_g_v) / sensor.nominal_scale_v_per_g * G0_MPS2
 
 
@@ -313,11 +299,7 @@ def neutral(effect: Effect, axes: str) -> dict[str, np.ndarray]:
 
 
 def typical(effect: Effect, axes: str) -> dict[str, np.ndarray]:
-    """
-    Return the typical values of an effect by parameter, (m,) or (), each in its unit.
-
-    Axes that a parameter does not have keep the neutral value.
-    """
+    """Return the typical values of an effect as `neutral` does; other axes stay neutral."""
     values = neutral(effect, axes)
     for p in effect.parameters:
         has_axis = [a in p.axes for a in axes] if p.axes else ()
@@ -340,11 +322,7 @@ def get(sensor: Sensor, names: Sequence[Coefficient]) -> np.ndarray:
 
 def put(sensor: Sensor, names: Sequence[Coefficient],
         coefficients: Sequence[float] | np.ndarray) -> Sensor:
-    """
-    Return the sensor with other values of some coefficients, (k,), each in its unit.
-
-    It is a copy with arrays of its own for the parameters that change.
-    """
+    """Return a copy of the sensor with other values of some coefficients, (k,)."""
     values = {effect: dict(by_parameter) for effect, by_parameter in sensor.values.items()}
     copied = set()
     for name, value in zip(names, coefficients):

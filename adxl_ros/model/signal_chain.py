@@ -32,27 +32,18 @@ from adxl_ros.model.effects.base import (
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-ANALOG = (Place.MOUNTING, Place.ELEMENT, Place.ELECTRONICS)
-"""Places between the specific force and the filter."""
-_TOLERANCE_MPS2 = 1e-10
-"""Newton step below which the inverse has converged, m/s²; chosen: near rounding."""
+ANALOG = (Place.MOUNTING, Place.ELEMENT, Place.ELECTRONICS)  # From force to filter
+_TOLERANCE_MPS2 = 1e-10  # Newton step of a converged inverse, m/s²; chosen: near rounding
 _UNSOLVED_MPS2 = 1e-6
 """Last Newton step from which a sample has no solution, m/s²; chosen: near alpha = ±90°, the z of
 equation 5 is a root of 0, and rounding moves it by up to this."""
-_MAX_ITERATIONS = 60
-"""Largest number of iterations of either inverse; chosen: samples with a solution need far
-fewer."""
+_MAX_ITERATIONS = 60  # Most iterations of an inverse; chosen: far more than needed
 _CHORD_STEPS = 8
 """Steps with the tangent at rest without gravity before Newton's method; chosen: each leaves a few
 percent of the error of a real sensor, and takes a seventh of the time of a Newton step."""
-_CLEAR_Z_MPS2 = 1.0
-"""Magnitude of a derived z, m/s², from which |f| = g determines it well; chosen: 6° from alpha =
-±90°, far beyond any noise."""
-_SETTLED_V = 1e-13
-"""Change below which the inverse of the ADC's effects has converged, V; chosen: near rounding."""
-_DIFFERENCE_MPS2 = 1e-3
-"""Half step of the central differences by force, m/s²; chosen: the chain is smooth and nearly
-linear, so that a wide step loses nothing."""
+_CLEAR_Z_MPS2 = 1.0  # |z| that |f| = g determines well, m/s²; chosen: 6° from ±90°
+_SETTLED_V = 1e-13  # Change of a converged ADC inverse, V; chosen: near rounding
+_DIFFERENCE_MPS2 = 1e-3  # Half step by force, m/s²; chosen: the chain is nearly linear
 
 
 class RunningEffect:
@@ -190,11 +181,8 @@ def static_response(sensor: Sensor) -> Callable[..., Components]:
     """
     Prepare the chain from specific force to volts at rest, by its invertible effects.
 
-    `simulate.response` adds filter, noise, quantisation, stage, and effects with a memory.
-
-    returns: maps the three components of specific force in the case frame, m/s² (arrays of one
-    shape, or floats), and an `Environment` of that shape (the nominal one unless given) to the
-    volts of each measured axis.
+    `simulate.response` adds filter, noise, quantisation, stage, and effects with a memory. It maps
+    specific force and an `Environment` (nominal unless given) to volts by measured axis.
     """
     chain = static_chain(sensor)
     return lambda force, environment=NOMINAL_ENVIRONMENT: chain.through_adc(chain.volts(
@@ -238,13 +226,7 @@ def gravity_mps2(sensor: Sensor) -> float:
 
 def jacobian(respond: Callable[..., Components], force: Components,
              environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
-    """
-    Differentiate volts by specific force, by central differences.
-
-    respond: from `analog_response`; force: specific force in the case frame, m/s², three
-    components (n,) or floats; environment: surroundings in the shape of the force; returns:
-    derivatives, V/(m/s²), (m, 3), or (m, 3, n) for arrays.
-    """
+    """Differentiate the volts of `analog_response` by force: (m, 3), or (m, 3, n) for arrays."""
     columns = []
     for c in range(3):
         above, below = list(force), list(force)
@@ -296,8 +278,8 @@ def newton_step(axes: str, gravity_mps2: float, maths: Maths) -> Callable[..., C
     """
     Prepare one Newton step of the inverse for measured axes, with |f| at rest for equation 5.
 
-    returns: maps volts minus the response to a force, V, that force, m/s², a `Tangent` near it,
-    and the sign of a derived z to the next force, m/s².
+    It maps volts minus the response to a force, that force, a `Tangent` near it, and the sign of
+    a derived z to the next force.
     """
     measured = [AXES.index(a) for a in axes]
 
@@ -330,19 +312,9 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., C
     noise puts the in-plane force beyond g, the z of the smallest |f| is taken: there is no jump
     and no NaN at alpha = ±90°. A sensor of one axis gets 0 for the others.
 
-    Parameters
-    ----------
-    sensor
-        The unit with the effects to undo.
-    z_sign
-        Sign of z by sample, (n,), where it is known better than by `sensor.z_sign`.
-
-    Returns
-    -------
-    callable
-        Maps the volts of each axis, arrays (n,) or floats, and an `Environment` (the nominal one
-        unless given) to three components, m/s². Samples without a solution are NaN.
-
+    z_sign: sign of z by sample, (n,), where it is known better than by `sensor.z_sign`; returns:
+    maps the volts of each axis, arrays (n,) or floats, and an `Environment` (nominal unless given)
+    to three components, m/s². Samples without a solution are NaN.
     """
     search = _Search(sensor)
     undo_adc = adc_inverse(sensor)
@@ -372,11 +344,7 @@ class _Search:
 
     def __call__(self, input_v: np.ndarray, environment: Environment, signs: np.ndarray
                  ) -> np.ndarray:
-        """
-        Return forces, m/s², (3, n), with NaN where there is none.
-
-        input_v: volts to reach, (m, n); signs: sign of a derived z, (n,).
-        """
+        """Return the forces, (3, n), of volts, (m, n); NaN where there is none."""
         # Steps with the tangent at rest cost one response each, and mostly suffice.
         at_rest = tangent(self._respond, self._axes, [np.zeros(1)] * 3)
         force, change = self._steps(input_v, environment, signs, _CHORD_STEPS, at_rest)
@@ -397,11 +365,7 @@ class _Search:
 
     def _steps(self, input_v: np.ndarray, environment: Environment, signs: np.ndarray, limit: int,
                common: Tangent | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Take steps from no force, with a tangent of each sample or a common one.
-
-        returns: last forces, m/s², (3, n), and the size of their last steps, (n,).
-        """
+        """Take steps from no force; return the last forces, (3, n), and steps, (n,)."""
         count = input_v.shape[1]
         force, last_change = np.zeros((3, count)), np.full(count, np.inf)
         active = np.arange(count)

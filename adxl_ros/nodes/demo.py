@@ -50,7 +50,7 @@ _STEP_DEG = 30.0
 _CHECK_POSES = 16
 """Number of poses that are kept out of the fit."""
 _SEED = 203
-"""Seed of the demonstrated unit and its stage; chosen."""
+"""Default seed of the demonstrated unit and its stage; chosen."""
 _STARTED = ('driver', 'stage', 'calibration')
 """Nodes of the demonstration in the order of their start."""
 _UNIT_EFFECTS = {'bias': 0.5, 'scale_factor': 0.5, 'misalignment': 0.7, 'cross_axis': 0.7,
@@ -113,14 +113,18 @@ def main() -> int:
     parser = program_parser('demo', __doc__, _EXAMPLES)
     parser.add_argument('-o', dest='output', metavar='DIR', default='demo_output', type=Path,
                         help='folder of pages and calibrations (default demo_output)')
+    parser.add_argument('--seed', type=int, metavar='N', default=_SEED,
+                        help=f'seed of the simulated unit and its stage (default {_SEED})')
     options = parser.parse_args()
+    if not 0 <= options.seed < 2 ** 31:
+        parser.error(f'--seed: {options.seed} is not between 0 and {2 ** 31 - 1}')
     jobs.use_own_graph()
     try:
         try:
             options.output.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(f'{options.output}: {error.strerror}') from None
-        _run_sweep(options.output)
+        _run_sweep(options.output, options.seed)
         _print('', *file_lines({'Next': f'your own sensor: {NEXT_PAGE}'}))
     except UserError as error:
         print(f'demo: {error}', file=sys.stderr)
@@ -130,12 +134,12 @@ def main() -> int:
     return 0
 
 
-def _run_sweep(folder: Path) -> None:
+def _run_sweep(folder: Path, seed: int) -> None:
     """Sweep a simulated sensor whose coefficients are drawn at datasheet spread."""
     unit, nominal = folder / 'simulated_unit.yaml', folder / 'nominal.yaml'
     sensor = replace(parameter_file.load(parameter_file.nominal_path()), serial='demo',
                      rate_hz=_RATE_HZ)
-    truth = _draw_unit(sensor)
+    truth = _draw_unit(sensor, seed)
     parameter_file.save(nominal, sensor)
     parameter_file.save(unit, truth, ['The truth of the simulated unit.'])
     name = parameter_file.nominal_path().stem
@@ -149,7 +153,7 @@ def _run_sweep(folder: Path) -> None:
         path.unlink(missing_ok=True)
     commands = [
         _command('driver', unit, _KEEPING | {'link.type': 'sim', 'link.speed': _SPEED}),
-        _command('stage', nominal, {'delay_s': _DELAY_S, 'seed': _SEED}),
+        _command('stage', nominal, {'delay_s': _DELAY_S, 'seed': seed}),
         _command('calibration', nominal, {
             **_UNATTENDED, 'output': output, 'store': folder / 'calibrations', 'report': report,
             'sweep.planes_deg': _PLANES_DEG, 'sweep.step_deg': _STEP_DEG,
@@ -176,13 +180,13 @@ def _run_sweep(folder: Path) -> None:
            *file_lines({'Page': report / 'report.html', 'Calibration': output}))
 
 
-def _draw_unit(sensor: Sensor) -> Sensor:
+def _draw_unit(sensor: Sensor, seed: int) -> Sensor:
     """
     Draw the coefficients of a unit: 0.5 to 1.5 times a multiple of their typical values.
 
     The linear cross-axis terms are part of the misalignment, as in the fits.
     """
-    rng = np.random.default_rng(_SEED)
+    rng = np.random.default_rng(seed)
     values = {name: {p.name: np.array([
         multiple * p.scale * rng.choice((-1, 1)) * rng.uniform(*_SPREAD)
         * (p.name != 'linear') if axis in p.axes else 0.0

@@ -20,10 +20,8 @@ _LONGEST = 1 << 20
 _MOST_CELLS = 1 << 17
 """Cells of a stream at most; then neighbours are joined. Chosen: 24 h at 1 kHz are cells of 1 s.
 """
-_AT_ONCE = 1 << 13
-"""Samples that are added at a time. Chosen: they stay in the cache of a core."""
-_FEWEST_AVERAGES = 3
-"""Averages side by side at the longest time. Chosen: two differences."""
+_AT_ONCE = 1 << 13  # Samples that are added at a time. Chosen: they stay in the cache of a core
+_FEWEST_AVERAGES = 3  # Averages side by side at the longest time. Chosen: two differences
 
 
 @dataclass(frozen=True)
@@ -130,16 +128,10 @@ def _from_cells(cells: CellMeans, size: int) -> np.ndarray:
     return (differences ** 2).mean(axis=0)
 
 
-_WINDOW_S = 2.0
-"""Shortest window of the standard deviation of a sample, s. Chosen: noise at low frequency is
-slower."""
-_LARGEST_END_S = 0.2
-"""Longest time before the first rest or after the last that is no motion, s. Chosen: rests are
-found in blocks of 0.05 s, of which one is left out."""
-_FEWEST_SAMPLES = 512
-"""Fewest samples at rest. Chosen: fewer do not show white noise within 10 %."""
-SHORTEST_S = 10.0
-"""Shortest rest, s. Chosen: fewer seconds hold no average of one second."""
+_WINDOW_S = 2.0  # Shortest window of the std of a sample, s. Chosen: slow noise is slower
+_LARGEST_END_S = 0.2  # Longest end without a rest that is no motion, s. Chosen: some blocks
+_FEWEST_SAMPLES = 512  # Fewest samples at rest. Chosen: fewer do not show white noise within 10 %
+SHORTEST_S = 10.0  # Shortest rest, s. Chosen: fewer seconds hold no average of one second
 
 
 @dataclass(frozen=True)
@@ -173,11 +165,7 @@ def shortest_rest_s(rate_hz: float) -> float:
 
 def longest_rest(read: Callable[[], Iterable[Recording]], unit: Sensor, first: Recording
                  ) -> StillStretch:
-    """
-    Find the longest rest of a recording, which is read twice; the memory is bounded.
-
-    first: its first block.
-    """
+    """Find the longest rest of a recording, which is read twice; the memory is bounded."""
     if len(first) < 2:
         raise UserError(f'{first.path}: {len(first)} samples; record longer')
     survey, first_s = RecordedRests(unit, first), float(first.time_s[0])

@@ -16,14 +16,10 @@ from adxl_ros.model.constants import MAD_TO_STD
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-BLOCK_S = 0.05
-"""Length of a block, s. Chosen: well below a rest, and above the sample period of most sensors."""
-_GAP_S = 0.1
-"""Smallest time without a sample that ends a block, s. Chosen: two blocks."""
-_GAP_PERIODS = 5
-"""Smallest gap in sample periods. Chosen: at low rates a few lost samples are no gap."""
-_CHUNK = 1 << 13
-"""Rows processed at once. Chosen: they fit into the cache, whatever the length of a recording."""
+BLOCK_S = 0.05  # Length of a block, s. Chosen: far below a rest, above most sample periods
+_GAP_S = 0.1  # Smallest time without a sample that ends a block, s. Chosen: two blocks
+_GAP_PERIODS = 5  # Smallest gap, sample periods. Chosen: a few lost samples are none
+_CHUNK = 1 << 13  # Rows that are processed at once. Chosen: they fit into the cache
 
 
 def gap_s(rate_hz: float) -> float:
@@ -78,12 +74,7 @@ class BlockCutter:
 
     def feed(self, time_s: np.ndarray, samples: np.ndarray,
              angles_rad: np.ndarray | None = None) -> Blocks:
-        """
-        Add the next rows of the stream.
-
-        time_s: time of each row, s, (n,); samples: rows of the stream, (n, m), all finite;
-        angles_rad: encoder angles, rad, (n, a), NaN where not sampled.
-        """
+        """Add finite samples, (n, m), and encoder angles, (n, a), NaN where not sampled."""
         columns = [time_s[:, None], samples] + ([] if angles_rad is None else [angles_rad])
         return Blocks.join([self.none()] + [
             self._cut(np.concatenate([part[i:i + _CHUNK].T for part in columns]))
@@ -144,41 +135,24 @@ def angle_bounds(blocks: Blocks) -> np.ndarray:
 
 
 def true_runs(mask: np.ndarray, group: np.ndarray | None = None) -> list[tuple[int, int]]:
-    """
-    List the runs of True in a mask.
-
-    mask: booleans, (k,); group: numbers, not negative, (k,). A run ends where the number changes.
-    None for one group.
-    """
+    """List the runs of True in a mask, (k,); a run ends where the number of its group changes."""
     number = np.where(mask, 0 if group is None else group, -1)
     edges = np.flatnonzero(np.diff(number, prepend=-2, append=-2))
     return [(int(first), int(stop)) for first, stop in pairwise(edges) if mask[first]]
 
 
-_WINDOW_S = 0.25
-"""Length of the window of a variance, s. Chosen: under half of the shortest rest."""
-_WINDOW_SAMPLES = 8
-"""Smallest number of samples in that window. Chosen: fewer do not show a variance."""
-_HALF_S = 0.5
-"""Shortest length of the neighbouring halves whose means are compared, s. Chosen: two windows."""
-DRIFT_OCTAVES = 4
-"""Number of lengths of halves: 0.5, 1, 2 and 4 s. Chosen: beyond, a sensor's flicker dominates."""
-MIN_VARIANCE_RATIO = 2.25
-"""Smallest limit of a variance, relative to that of the noise: 1.5 times its rms."""
-_MAX_VARIANCE_RATIO = 9.0
-"""Largest limit of a variance, relative to that of the noise: 3 times its rms."""
-_QUIETEST_SHARE = 0.05
-"""Quantile of the windows' variances at which the search for the variance of noise begins."""
-_QUIET_RATIO = 3.0
-"""Largest variance of a quiet window, relative to that of the noise."""
-_QUIET_STEPS = 50
-"""Largest number of steps of that search."""
-_QUIET_DEVIATIONS = 5.0
-"""Distance of a variance's limit from the noise, standard deviations of ln(variance)."""
-_ROUNDING = 1e-9
-"""Relative rounding error of samples without noise."""
-_TINY_VARIANCE = 1e-300
-"""Lower bound of a variance, in squares of any unit, so that its logarithm is finite."""
+_WINDOW_S = 0.25  # Length of the window of a variance, s. Chosen: under half of the shortest rest
+_WINDOW_SAMPLES = 8  # Fewest samples of that window. Chosen: fewer show no variance
+_HALF_S = 0.5  # Shortest halves whose means are compared, s. Chosen: two windows
+DRIFT_OCTAVES = 4  # Lengths of halves: 0.5, 1, 2, 4 s. Chosen: beyond, flicker dominates
+MIN_VARIANCE_RATIO = 2.25  # Smallest limit of a variance, by that of noise: 1.5 times its rms
+_MAX_VARIANCE_RATIO = 9.0  # Largest limit of a variance, by that of noise: 3 times its rms
+_QUIETEST_SHARE = 0.05  # Quantile of variances at which the search for noise begins
+_QUIET_RATIO = 3.0  # Largest variance of a quiet window, relative to that of the noise
+_QUIET_STEPS = 50  # Largest number of steps of that search
+_QUIET_DEVIATIONS = 5.0  # Distance of the limit from the noise, stds of ln(variance)
+_ROUNDING = 1e-9  # Relative rounding error of samples without noise
+_TINY_VARIANCE = 1e-300  # Lower bound of a variance, for its logarithm
 
 
 class Spans:
@@ -201,9 +175,8 @@ def quiet_variance(blocks: Blocks, windows: np.ndarray,
     """
     Learn the variance that the quietest windows have in common, and its limit, (m,) each.
 
-    Noise below the ADC's step, (m,), makes at most two neighbouring codes equally frequent: a
-    variance of a quarter of the squared step. Samples without any noise still have a rounding
-    error.
+    Noise below the ADC's step, (m,), makes at most two codes equally frequent: a variance of
+    step²/4. Samples without any noise still have a rounding error.
     """
     middle = np.median(np.abs(blocks.mean), axis=0)
     smallest = step ** 2 / 4 + (_ROUNDING * middle) ** 2 + _TINY_VARIANCE

@@ -33,39 +33,27 @@ from adxl_ros.signals.recorded_sensor import load_sensor
 from adxl_ros.signals.rest_detection import RecordedRests
 import numpy as np
 
-_SCATTER_QUANTILE = 0.9
-"""Quantile of the deviations of steps that is their scatter. Chosen: one of ten may be a gap."""
-_LARGE_SCATTER = 0.25
-"""Scatter in periods from which the mean step is the period, not the median. Chosen."""
+_SCATTER_QUANTILE = 0.9  # Quantile of step deviations: their scatter. Chosen: 1 of 10 may be a gap
+_LARGE_SCATTER = 0.25  # Scatter, periods, from which the period is the mean step. Chosen
 _LONG_STEPS = (1.25, 1.5)
 """Steps beyond the first number of periods, plus the second one times the scatter, are gaps.
 Chosen: a sample that is missing among stamps rounded to a seventh of a period is found."""
-_SHORTEST_GAP = 1.5
-"""Shortest gap, periods. Chosen: halfway to two."""
-_OUTLYING_STEP = 5.0
-"""Steps beyond this number of medians are not part of the mean step."""
-_SAME_POSE_G = 0.1
-"""Distance of the means of two rests of one orientation, g. Chosen: 6° of tilt."""
-_MOST_POSES = 200
-"""Orientations that are counted at most. Chosen: more than a sweep has."""
-_CLIPPED_SAMPLES = 3
-"""Equal samples in a row at an extreme value that are clipped. Chosen: noise hardly repeats it."""
-_CLIPPED_STEP_G = 0.05
-"""Change before or after them, g. Chosen: a sensor at rest has none."""
-_CLIPPED_WINDOW_S = 0.1
-"""Longest time before or after them in which it changes, s. Chosen: within a motion of a hand."""
+_SHORTEST_GAP = 1.5  # Shortest gap, periods. Chosen: halfway to two
+_OUTLYING_STEP = 5.0  # Steps beyond this number of medians are not part of the mean step
+_SAME_POSE_G = 0.1  # Distance of the means of two rests of one orientation, g. Chosen: 6° of tilt
+_MOST_POSES = 200  # Orientations that are counted at most. Chosen: more than a sweep has
+_CLIPPED_SAMPLES = 3  # Equal samples at an extreme that are clipped. Chosen: noise repeats fewer
+_CLIPPED_STEP_G = 0.05  # Change before or after them, g. Chosen: a sensor at rest has none
+_CLIPPED_WINDOW_S = 0.1  # Longest time beside them in which it moves, s. Chosen: a hand is faster
 _CLIPPED_CODES = 20
 """Change, in steps of the resolution, that a smooth peak does not reach within the time that it
 stays at its top. Chosen: a parabola reaches nine."""
-_HELD_S = 1.0
-"""Shortest time without any change that is reported, s. Chosen: noise changes samples sooner."""
+_HELD_S = 1.0  # Shortest reported time without any change, s. Chosen: noise is faster
 _STUCK_S = 5.0
 """Shortest time without any change of one axis alone that is reported, s. Chosen: a coarse axis
 may rest for some seconds between two codes."""
-_HELD_SAMPLES = 20
-"""Fewest samples of such a time. Chosen: a slow sensor repeats a few."""
-_CHANGING = 0.5
-"""Share of samples that usually change. Chosen: a coarse sensor at rest changes less."""
+_HELD_SAMPLES = 20  # Fewest samples of such a time. Chosen: a slow sensor repeats a few
+_CHANGING = 0.5  # Share of samples that change. Chosen: fewer of a coarse sensor at rest
 
 
 @dataclass(frozen=True)
@@ -303,35 +291,21 @@ def _count_poses(means_mps2: Sequence[np.ndarray]) -> int:
     return len(poses)
 
 
-_LARGEST_MISSING = 0.01
-"""Share of missing samples of a sound recording. Chosen: a lossy link loses less."""
-_LONGEST_GAP_S = 1.0
-"""Longest gap of a sound recording, s. Chosen: a pose or a turn may be in a longer one."""
-_LARGEST_JITTER = 0.3
-"""Jitter of the stamps of a sound recording, periods. Chosen: they still show the samples."""
-_FEWEST_CLIPPED = 3
-"""Times at the end of the range from which a recording is not sound. Chosen: once may be a knock.
-"""
-_LENGTHS_G = (0.8, 1.25)
-"""Bounds of the length of gravity, g. Chosen: zero-g and scale errors stay within them."""
-_LARGEST_DELAY_S = 0.1
-"""Delay of the log time that is mentioned, s. Chosen: a usual recorder is faster."""
-_LARGEST_SPREAD_S = 1.0
-"""Spread of this delay that is mentioned, s. Chosen: a step of the clock is larger."""
-_LARGEST_DRIFT_PPM = 200.0
-"""Drift of this delay that is mentioned, 10⁻⁶. Chosen: twice that of a usual quartz."""
-_MOVED_RAD = 0.01
-"""Range of a stage angle from which the stage moves, rad. Chosen: beyond jitter of encoders."""
+_LARGEST_MISSING = 0.01  # Share of missing samples of a sound log. Chosen: a lossy link loses less
+_LONGEST_GAP_S = 1.0  # Longest gap of a sound log, s. Chosen: a longer one may hide a turn
+_LARGEST_JITTER = 0.3  # Jitter of a sound log, periods. Chosen: samples still show
+_FEWEST_CLIPPED = 3  # Clippings from which a log is not sound. Chosen: one may be a knock
+_LENGTHS_G = (0.8, 1.25)  # Bounds of gravity, g. Chosen: zero-g and scale stay within
+_LARGEST_DELAY_S = 0.1  # Mentioned delay of the log time, s. Chosen: recorders are faster
+_LARGEST_SPREAD_S = 1.0  # Mentioned spread of it, s. Chosen: a step of the clock is larger
+_LARGEST_DRIFT_PPM = 200.0  # Mentioned drift of it, 10⁻⁶. Chosen: twice that of a quartz
+_MOVED_RAD = 0.01  # Range from which a stage moves, rad. Chosen: beyond jitter of encoders
 _FOLLOWED = {'temperature_c': ('temperature', 1.0), 'supply_v': ('supply', 0.1)}
 """Name of a reference and its smallest range, °C and V, that shows effects at rest. Chosen: a
 typical drift of the zero-g is then 0.1 mg."""
-FEWEST_GRAVITY_POSES = 10
-"""Orientations that a fit against gravity needs: one more than zero-g, scale factors and
-misalignments have values."""
-SHORTEST_MOTION_S = 30.0
-"""Shortest recording on a moving stage that `diagnose` compares, s."""
-_FEWEST_STAGE_POSES = 4
-"""Orientations on a stage that a linear fit needs. Chosen: both ends of two axes."""
+FEWEST_GRAVITY_POSES = 10  # Orientations of a fit against gravity: one more than coefficients
+SHORTEST_MOTION_S = 30.0  # Shortest recording on a moving stage that `diagnose` compares, s
+_FEWEST_STAGE_POSES = 4  # Orientations of a linear fit. Chosen: both ends of two axes
 
 
 @dataclass(frozen=True)
@@ -381,14 +355,9 @@ def _has_wide_gaps(contents: RecordingContents) -> bool:
 
 
 def _stamp_faults(contents: RecordingContents) -> list[str]:
-    faults = []
-    duplicates, backward = contents.bad_stamps
-    if duplicates:
-        faults.append(f'samples with the stamp of the one before: {duplicates}; --drop-bad-stamps '
-                      'leaves them out')
-    if backward:
-        faults.append(f'samples whose stamp steps back: {backward}; --drop-bad-stamps leaves them '
-                      'out')
+    which = 'with the stamp of the one before', 'whose stamp steps back'
+    faults = [f'samples {text}: {count}; --drop-bad-stamps leaves them out'
+              for text, count in zip(which, contents.bad_stamps) if count]
     if _has_wide_gaps(contents):
         faults.append(f'{_missing(contents)}; record again, or use the parts')
     period_s = 1 / contents.rate_hz
@@ -490,8 +459,7 @@ def _noise(contents: RecordingContents) -> Ability:
                    f'rests for {longest_s:.4g} s, needs {shortest_s:.3g} s')
 
 
-BLOCK_ROWS = 65536
-"""Samples that are read at a time (chosen: some MB)."""
+BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 
 
 def check_recording(path: str, params: str | None, reading: ReadingOptions,

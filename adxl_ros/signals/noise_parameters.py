@@ -7,7 +7,8 @@ The points of an Allan deviation are correlated, so a line through them has no s
 The fit therefore takes the cosine transform of the means of short cells. There a random walk and
 white noise have independent coefficients of known variance, and 1/f noise nearly so. The fit
 maximises the likelihood of the coefficients. The intervals are those of the profile likelihood.
-Frequencies from which on a filter, a fan or mains show are left out.
+Frequencies from which on a filter, a fan or mains show are left out. A walk that ends in bounds is
+a Gauss-Markov process (IEEE Std 952, annex B).
 """
 
 from __future__ import annotations
@@ -27,36 +28,22 @@ from adxl_ros.signals.recorded_sensor import load_sensor, RESISTANCE_OHM
 import numpy as np
 import scipy
 
-_DROP = 2.705543454095404
-"""Twice the drop of the log likelihood at the ends of a 90 % interval: the quantile of χ² with
-one degree of freedom."""
-_SINGLE = 64
-"""Coefficients of the lowest frequencies that are fitted one by one. Chosen: the terms change
-little between the further ones."""
-_WIDTH = 1.03
-"""Ratio of the frequencies of a group of further coefficients. Chosen: a term changes by 6 %."""
-_ROUNDS = 60
-"""Largest number of rounds of a fit. Chosen: usual are ten."""
-_HALVINGS = 20
-"""Largest number of halvings of a step that does not raise the likelihood."""
-_CONVERGED = 1e-9
-"""Change of twice the log likelihood at which a fit ends."""
-_SMALLEST = 1e-4
-"""Square of a term, by the square at which it would dominate, from which an upper limit is
-searched. Chosen: it changes the likelihood of no recording."""
-_OCTAVE_PROBABILITY = 1e-3
-"""Probability by chance, below which an octave shows a filter or a line. Chosen: with ten octaves
-one healthy recording in a hundred."""
-_MARGIN_OCTAVES = 2
-"""Octaves below a filter's effect that are left out. Chosen: the effect falls by 16 in power."""
-_FEWEST = 32
-"""Fewest coefficients of a fit. Chosen: white noise is then known within 20 %."""
-_SEEN = 2.0
-"""Standard deviations of its square by which a term must differ from 0 to be seen. Chosen: it
-gives the rate at which 90 % intervals exclude 0."""
+_DROP = 2.705543454095404  # Twice log likelihood at the ends of a 90 % interval: χ², 1 degree
+_SINGLE = 64  # Lowest coefficients that are fitted one by one; further terms change little. Chosen
+_WIDTH = 1.03  # Ratio of frequencies of further groups. Chosen: a term changes by 6 %
+_ROUNDS = 60  # Largest number of rounds of a fit. Chosen: usual are ten
+_HALVINGS = 20  # Largest number of halvings of a step that does not raise the likelihood
+_CONVERGED = 1e-9  # Change of twice the log likelihood at which a fit ends
+_SMALLEST = 1e-4  # Square, by a dominant one, from which a limit is searched. Chosen: never seen
+_OCTAVE_PROBABILITY = 1e-3  # Chance from which a filter or line shows. Chosen: 1 % of logs
+_BOUND_PROBABILITY = 1e-2  # Chance from which a walk has bounds. Chosen: 1 of 100 healthy logs
+_BOUND_STEP = 2 ** 0.5  # Ratio of tried correlation times. Chosen: the likelihood changes little
+_SHORTEST_BOUND = 10.0  # Shortest T, by the highest frequency. Chosen: below, it is a filter
+_MARGIN_OCTAVES = 2  # Octaves left out below a filter. Chosen: its power falls by 16
+_FEWEST = 32  # Fewest coefficients of a fit. Chosen: white noise is then known within 20 %
+_SEEN = 2.0  # Standard deviations of a square that is seen. Chosen: as 90 % intervals exclude 0
 
-FLOOR = float(np.sqrt(2 * np.log(2) / np.pi))
-"""Allan deviation of bias instability divided by B: 0.664 (IEEE Std 952, equation C.15)."""
+FLOOR = float(np.sqrt(2 * np.log(2) / np.pi))  # Allan deviation of B / B (IEEE Std 952, C.15)
 
 
 class Estimate(NamedTuple):
@@ -83,7 +70,11 @@ class NoiseFit:
     # White noise N, u/√Hz: the density over positive and negative frequencies is N²
     white: Estimate
     instability: Estimate  # Bias instability B, u: the density is B²/(2π·f)
-    walk: Estimate  # Random walk K, u/√s: the density is K²/(2π·f)²
+    # Random walk K, u/√s: the density is K²/(2π·f)², or K²/((2π·f)² + 1/T²) with bounds
+    walk: Estimate
+    # Correlation time T of a bounded walk (first-order Gauss-Markov), s, whose standard deviation
+    # is K·√(T/2); inf where no bounds show
+    bound_s: float
     highest: int  # Number of cosine coefficients of the fit, from the lowest
     highest_hz: float  # Frequency of the last one, Hz
 
@@ -115,9 +106,14 @@ class NoiseFit:
 
     def lines(self, tau_s: np.ndarray) -> np.ndarray:
         """Return the Allan deviations of N, B and K at times, s, (k,), in u, (3, k)."""
+        # IEEE Std 952, equation C.19; for short times its terms cancel.
+        time_s = min(self.bound_s, 1e4 * tau_s.max())
+        x = tau_s / time_s
+        terms = np.abs(1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x))
+        walk = np.where(x > 1e-3, time_s * np.sqrt(terms / tau_s), np.sqrt(tau_s / 3))
         return np.stack([self.white.value / np.sqrt(tau_s),
                          np.full(len(tau_s), FLOOR * self.instability.value),
-                         self.walk.value * np.sqrt(tau_s / 3)])
+                         self.walk.value * walk])
 
 
 @dataclass(frozen=True)
@@ -136,6 +132,12 @@ class _Groups:
     def below(self, stop: int) -> _Groups:
         """Return the groups that end before coefficient number `stop`."""
         return self.where(self.first + self.count <= stop)
+
+    def bounded(self, time_s: float, span_s: float) -> _Groups:
+        """Return the groups with a walk of this correlation time, in recordings of `span_s`."""
+        cycle = np.pi * time_s / span_s * (self.first + (self.count - 1) / 2)
+        return replace(self, shapes=self.shapes * np.column_stack(
+            [np.ones((len(cycle), 2)), 1 / (1 + cycle ** -2.0)]))
 
 
 def coefficients(means: np.ndarray) -> np.ndarray:
@@ -171,19 +173,35 @@ def coefficient_variances(count: int, step_s: float) -> np.ndarray:
 
 
 def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = None) -> NoiseFit:
-    """
-    Fit white noise, bias instability and random walk to the means of neighbouring cells, u, (n,).
-
-    variances: those of `coefficient_variances`, which axes of one recording share.
-    """
+    """Fit the terms to means of neighbouring cells, (n,), by their `coefficient_variances`."""
     if variances is None:
         variances = coefficient_variances(len(means), step_s)
     groups = _grouped(np.square(coefficients(means)), variances)
-    highest = _highest(groups, len(means))
-    used = groups.below(highest)
-    theta, likelihood = _fit(used)
-    white, instability, walk = (_interval(used, theta, likelihood, term) for term in range(3))
-    return NoiseFit(white, instability, walk, highest, highest / (2 * len(means) * step_s))
+    span_s = len(means) * step_s
+    highest = _highest(groups, len(means), span_s)
+    models, bound_s = _walks(groups.below(highest), span_s, highest)
+    theta, likelihood = _best(models)
+    white, instability, walk = (_interval(models, theta, likelihood, term) for term in range(3))
+    return NoiseFit(white, instability, walk, bound_s, highest, highest / (2 * span_s))
+
+
+def _walks(groups: _Groups, span_s: float, highest: int) -> tuple[list[_Groups], float]:
+    """Return the groups with each bound of the walk that is likely, and the likeliest bound, s."""
+    count = int(np.log(highest / _SHORTEST_BOUND) / np.log(_BOUND_STEP))
+    times_s = span_s * _BOUND_STEP ** np.arange(-count, 5.0)
+    models = [groups.bounded(time_s, span_s) for time_s in times_s]
+    likelihoods = np.array([_fit(model)[1] for model in models])
+    best = likelihoods.max()
+    if 2 * (best - _fit(groups)[1]) < scipy.stats.chi2.isf(_BOUND_PROBABILITY, 1):
+        return [groups], np.inf
+    likely = 2 * (best - likelihoods) < _DROP
+    return [models[i] for i in np.flatnonzero(likely)], float(times_s[likelihoods.argmax()])
+
+
+def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0
+          ) -> tuple[np.ndarray, float]:
+    """Return the most likely fit of several models; see `_fit`."""
+    return max((_fit(model, fixed, value) for model in models), key=lambda fit: fit[1])
 
 
 def _grouped(power: np.ndarray, variances: np.ndarray) -> _Groups:
@@ -237,13 +255,14 @@ def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0
     return theta, likelihood
 
 
-def _interval(groups: _Groups, theta: np.ndarray, likelihood: float, term: int) -> Estimate:
+def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term: int) -> Estimate:
     """Return a term with the ends of its interval by the profile likelihood."""
     def excess(logarithm: float) -> float:
         """Return twice the drop of the profile likelihood, minus its limit."""
-        return 2 * (likelihood - _fit(groups, term, np.exp(logarithm))[1]) - _DROP
+        return 2 * (likelihood - _best(models, term, np.exp(logarithm))[1]) - _DROP
 
-    scale = float(np.min(groups.shapes @ theta / groups.shapes[:, term]))
+    shapes = models[0].shapes
+    scale = float(np.min(shapes @ theta / shapes[:, term]))
     best = float(theta[term])
     begin = np.log(best if best > 0 else scale * _SMALLEST)
 
@@ -254,18 +273,22 @@ def _interval(groups: _Groups, theta: np.ndarray, likelihood: float, term: int) 
             beyond += step
         return float(np.exp(scipy.optimize.brentq(excess, beyond - step, beyond, xtol=1e-6)))
 
-    is_seen = best > 0 and 2 * (likelihood - _fit(groups, term, 0.0)[1]) > _DROP
+    is_seen = best > 0 and 2 * (likelihood - _best(models, term, 0.0)[1]) > _DROP
     low, high = end(-1.0) if is_seen else 0.0, end(1.0)
     return Estimate(*(float(np.sqrt(square)) for square in (best, low, high)))
 
 
-def _highest(groups: _Groups, count: int) -> int:
-    """Return the number of the coefficient at which the fit stops: where a filter shows."""
+def _highest(groups: _Groups, count: int, span_s: float) -> int:
+    """Return at which coefficient the fit stops: where a filter or a line shows."""
     stop = count
     while stop > 2 * _FEWEST:
         lower = groups.below(max(stop // 2, _FEWEST))
-        octave = groups.where((groups.first >= stop // 2) & (groups.first + groups.count <= stop))
-        if _is_expected(octave, lower, _fit(lower)[0]):
+        bound_s = _walks(lower, span_s, stop // 2)[1]
+        used, lower = (part.bounded(bound_s, span_s) for part in (groups.below(stop), lower))
+        theta = _fit(lower)[0]
+        chances = scipy.stats.chi2.sf(used.count * used.power / (used.shapes @ theta), used.count)
+        if (_is_expected(used.where(used.first >= stop // 2), lower, theta)
+                and chances.min() * len(chances) > _OCTAVE_PROBABILITY):
             break
         stop //= 2
     return max(stop >> _MARGIN_OCTAVES, min(count, _FEWEST))
@@ -284,14 +307,11 @@ def _is_expected(octave: _Groups, lower: _Groups, theta: np.ndarray) -> bool:
     return bool(scipy.stats.chi2.sf(excess ** 2 / variance, 1) > _OCTAVE_PROBABILITY)
 
 
-_UNFILTERED = 0.8
-"""Variance of a sample, divided by that of unfiltered white noise, from which there is no filter.
-Chosen: a filter at a third of the sample rate."""
+_UNFILTERED = 0.8  # Share of white variance without a filter. Chosen: one at rate/3
 _DITHERED_STEPS = 0.6
 """Noise from which rounding adds step²/12, steps. Chosen: exact within 0.4 % by the first harmonic
 of the rounding error (Widrow and Kollár 2008, section 4.4)."""
-_DENSITY = 'noise_density_g_per_rthz'
-"""Field of a sensor that holds its white noise."""
+_DENSITY = 'noise_density_g_per_rthz'  # Field of a sensor that holds its white noise
 
 
 @dataclass(frozen=True)
@@ -365,9 +385,6 @@ def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: flo
 
     Above 0.6 steps of noise, rounding adds independent noise of the variance step²/12. Less noise
     is hidden: it may be anything up to that, and codes that do not change show less.
-
-    std: standard deviation of a sample within some seconds, m/s²; resolution: smallest change of a
-    sample, m/s².
     """
     if not _is_coarse(std, resolution):
         return replace(fit, white=Estimate(*(float(np.sqrt(max(value ** 2 - rounding ** 2, 0.0)))
@@ -417,6 +434,9 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
         values.pop(effect, None)
         if sizes.any():
             values[effect] = {name: sizes}
+    if 'bias_walk' in values:
+        values['bias_walk']['return_per_s'] = np.array(
+            [1 / noise.fit.bound_s for noise in noises])
     kept = [name for name in sensor.effects if name in values]
     changed: dict[str, Any] = {
         'effects': (*kept, *(name for name in values if name not in kept)), 'values': values,
@@ -444,8 +464,7 @@ def _filter_s(noises: list[AxisNoise], rate_hz: float) -> float:
     return white / (2 * variance) if variance < _UNFILTERED * white * rate_hz else 0.0
 
 
-_PX4_HZ = 100.0
-"""Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000."""
+_PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000
 
 
 Setting = tuple[str, list[float], str]

@@ -74,19 +74,12 @@ class BeyondRange:
                 f'(largest reading {self._largest_g:.3g} g); check sensor.range_g')
 
 
-SHORTEST_S = 2.0
-"""Shortest time that shows the noise of a sensor, s. Chosen: some windows of a quarter second."""
-_FEWEST_SAMPLES = 64
-"""Smallest number of samples that shows it. Chosen: the variance then scatters by a fifth."""
-_SMALLEST_RANGE_G = 2.0
-"""Smallest measuring range that is taken, g: the smallest one of common digital sensors."""
-_FILTER_START_SAMPLES = 2.0
-"""Time constant with which the search for a filter begins, sample periods. Chosen: a filter that
-is much faster does not show, and one that is slower is reached from there."""
-_MAX_NOISE_G_PER_RTHZ = 0.1
-"""Largest density of a parameter file, g/√Hz."""
-RESISTANCE_OHM = 1.0e4
-"""Resistor that a measured filter is written with, Ω: only its product with C has a meaning."""
+SHORTEST_S = 2.0  # Shortest time that shows noise, s. Chosen: some windows of 0.25 s
+_FEWEST_SAMPLES = 64  # Fewest samples that show it. Chosen: the variance is within a fifth
+_SMALLEST_RANGE_G = 2.0  # Smallest range that is taken, g: of common digital sensors
+_FILTER_START_SAMPLES = 2.0  # First RC of the search, periods. Chosen: slower ones are reached
+_MAX_NOISE_G_PER_RTHZ = 0.1  # Largest density of a parameter file, g/√Hz
+RESISTANCE_OHM = 1.0e4  # Resistor of a measured filter, Ω: only R·C has a meaning
 
 
 def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = ''
@@ -95,8 +88,6 @@ def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = 
     Fill in what a parameter file leaves out; return the unit, and what is measured, for people.
 
     The noise is that of the quietest quarter seconds, so that the samples may hold motion.
-
-    time_s: stamps, s, (n,); volts: samples, V, (n, m); where: begin of messages.
     """
     scale_v_per_g, spans = unit.nominal_scale_v_per_g, Spans(unit.rate_hz)
     blocks = stats.BlockCutter(unit.rate_hz, len(unit.axes)).feed(time_s, volts)
@@ -152,10 +143,9 @@ def _filter_s(rests: list[np.ndarray], rate_hz: float, step_v: float) -> float:
 def unit_of_stream(sensor: Sensor, stamps_ns: np.ndarray, accel_mps2: np.ndarray
                    ) -> tuple[Sensor, list[str]]:
     """
-    Return the unit of a live stream that states nothing of itself.
+    Return the unit of a live stream that states nothing of itself, and what was measured.
 
-    stamps_ns: stamps, ns, (n,); accel_mps2: specific force, m/s², (n, 3); an axis that is always 0
-    is not measured.
+    An axis of the specific force, (n, 3), that is always 0 is not measured.
     """
     steps_s = np.diff(stamps_ns) * 1e-9
     if steps_s.sum() < SHORTEST_S:
@@ -179,37 +169,20 @@ def _by_axis(sensor: Sensor, values_g: np.ndarray) -> str:
     return ', '.join(f'{axis} {value * 1e3:.2g} mg' for axis, value in zip(sensor.axes, values_g))
 
 
-_SEGMENT_S = 1.0
-"""Length of a segment of the periodogram, s. Chosen: several fit into a rest."""
-_MIN_SEGMENT_SAMPLES = 16
-"""Smallest number of samples in a segment. Chosen: fewer ordinates do not show a filter."""
-_LOWEST_BINS = 2
-"""Highest bin that is left out: mean, drift and flicker dominate in bins 0 to 2."""
-_INDEPENDENT_SEGMENTS = 0.95
-"""Independent periodograms per segment, for a Hann window that overlaps by half."""
-_CORRELATED_ORDINATES = 35 / 18
-"""Ordinates per degree of freedom: neighbours are correlated behind a Hann window."""
-_ADC_NOISE_PRIOR_STD = 0.7
-"""Prior standard deviation of the logarithm of the ADC's noise variance about LSB²/12. Chosen:
-a factor of two."""
-_MIN_VARIANCE_V2 = 1e-18
-"""Lower bound of the start value of the noise variance, V²."""
-_MIN_LSB_V = 1e-9
-"""Lower bound of the ADC's step, V, for samples without rounding."""
-_LOG_STEP = 1e-4
-"""Step of the central differences, in the logarithm of a parameter."""
-_MAX_LOG = 80.0
-"""Largest magnitude of a parameter's logarithm, so that its exponential stays finite."""
-_MIN_EXPECTED_V2 = 1e-300
-"""Lower bound of an expected ordinate, V², so that its logarithm is finite."""
-_MAX_CONDITION = 1e12
-"""Largest condition number of the information matrix that can be inverted."""
-_MAX_RATIO_STD = 0.1
-"""Largest relative standard deviation of a credible estimate. Chosen: well below the ±25 % of the
-datasheet."""
-_MAX_SCATTER = 2.0
-"""Largest scatter of the ordinates, relative to that of filtered white noise. Chosen: flicker and
-hum exceed it."""
+_SEGMENT_S = 1.0  # Length of a segment of the periodogram, s. Chosen: several fit into a rest
+_MIN_SEGMENT_SAMPLES = 16  # Fewest samples of a segment. Chosen: fewer show no filter
+_LOWEST_BINS = 2  # Highest bin that is left out: mean, drift and flicker dominate in bins 0 to 2
+_INDEPENDENT_SEGMENTS = 0.95  # Independent periodograms a segment: Hann, half overlap
+_CORRELATED_ORDINATES = 35 / 18  # Ordinates a degree of freedom behind a Hann window
+_ADC_NOISE_PRIOR_STD = 0.7  # Prior std of ln(ADC variance / (LSB²/12)). Chosen: factor 2
+_MIN_VARIANCE_V2 = 1e-18  # Lower bound of the start value of the noise variance, V²
+_MIN_LSB_V = 1e-9  # Lower bound of the ADC's step, V, for samples without rounding
+_LOG_STEP = 1e-4  # Step of the central differences, in the logarithm of a parameter
+_MAX_LOG = 80.0  # Largest |ln| of a parameter, so that exp stays finite
+_MIN_EXPECTED_V2 = 1e-300  # Lower bound of an ordinate, V², for its logarithm
+_MAX_CONDITION = 1e12  # Largest condition number of the information matrix that can be inverted
+_MAX_RATIO_STD = 0.1  # Largest relative std of a credible RC. Chosen: below the ±25 % of R
+_MAX_SCATTER = 2.0  # Largest relative scatter. Chosen: flicker and hum exceed it
 
 
 @dataclass(frozen=True)
@@ -229,11 +202,7 @@ class FilterNoise:
 
 def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, lsb_v: float
                     ) -> FilterNoise | None:
-    """
-    Estimate the time constant of one axis by the likelihood of its periodogram (Whittle).
-
-    rests: volts of each rest without gaps, (n,) each.
-    """
+    """Estimate the RC of one axis by the likelihood of the periodogram of its rests (Whittle)."""
     # scipy.signal takes 0.3 s to import, which a calibration needs only at its end.
     from scipy.signal.windows import hann
     size = max(_MIN_SEGMENT_SAMPLES, round(_SEGMENT_S * rate_hz))
@@ -309,9 +278,7 @@ def with_filter(fitted: Sensor, estimates: Sequence[Sequence[FilterNoise | None]
                    covariance_names=(*fitted.covariance_names, *names)), []
 
 
-CERTAIN_CORRELATION = 0.9
-"""Correlation with the reference from which an axis is identified. Chosen: noise, misalignment and
-cross-axis terms of real sensors lower the correlation by a few percent only."""
+CERTAIN_CORRELATION = 0.9  # Correlation that identifies an axis. Chosen: errors cost few percent
 
 
 @dataclass(frozen=True)
@@ -337,9 +304,8 @@ def find_polarity_fault(correlation: np.ndarray, references: list[int],
     """
     Find the first axis that is inverted or follows the reference of another axis.
 
-    correlation: correlation of m measured axes with r reference axes, (m, r). NaN where an axis is
-    constant.; references: index of the reference of each measured axis, (m,). An axis whose own
-    correlation is NaN is skipped.
+    correlation: of m measured axes with r reference axes, (m, r), NaN where an axis is constant;
+    references: index of the reference of each measured axis, (m,).
     """
     for axis, (row, reference) in enumerate(zip(correlation, references)):
         if not np.isfinite(row[reference]):

@@ -31,33 +31,18 @@ SAME_ANGLE_RAD = 1e-5
 """Angles that differ by less are equal, rad. Chosen: above the rounding of angles in a file, and
 far below the step of an encoder."""
 
-_HAND_HELD_S = 1.4
-"""Shortest rest of a hand-held sensor, s, without its margins of 0.3 s. Chosen: shorter rests are
-pauses of the hand."""
-_STAGE_S = 0.6
-"""Shortest rest on a stage, s, without its margins of 0.3 s. Chosen: stages dwell for longer."""
-_KNOCK_S = 1.0
-"""Longest disturbance or gap within a rest, s. Chosen: a knock decays within a second."""
-_PART_S = 3600.0
-"""Time after which only the newest blocks of a recording are kept, s. It bounds the memory."""
-_BATCHES = 20
-"""Largest number of batches of a rest whose scatter shows the error of its mean. Chosen: the usual
-number of batch means."""
-_MIN_BATCH_BLOCKS = 2
-"""Smallest length of such a batch, blocks: 0.1 s."""
-_DRIFT_SIGMAS = 5.0
-"""Smallest drift that counts, standard deviations. Chosen: one false alarm in hours."""
-_SETTLE_TAUS = 8.0
-"""Settling time after a motion, in time constants of the filter. Chosen: the remainder of a step,
-0.03 %, is below the noise of a rest's mean."""
-_ANGLES = (JOINTS['alpha'], JOINTS['beta'])
-"""Columns of the encoder angles."""
-_FALSE_ALARM = 1e-6
-"""Probability that the variance of noise exceeds its limit."""
-_QUARTILE_TO_STD = 0.3186
-"""First quartile of a normal deviate's magnitude, relative to its standard deviation."""
-_END_SIGMAS = 3.5
-"""Difference of an end of a rest from its middle beyond which it is cut, standard deviations."""
+_HAND_HELD_S = 1.4  # Shortest rest by hand, s, without 0.3 s of margins. Chosen: beyond pauses
+_STAGE_S = 0.6  # Shortest rest on a stage, s, without these margins. Chosen: dwells are longer
+_KNOCK_S = 1.0  # Longest disturbance within a rest, s. Chosen: a knock has decayed
+_PART_S = 3600.0  # Time after which old blocks are forgotten, s; it bounds the memory
+_BATCHES = 20  # Most batches that show the error of a mean. Chosen: the usual number
+_MIN_BATCH_BLOCKS = 2  # Smallest length of such a batch, blocks: 0.1 s
+_DRIFT_SIGMAS = 5.0  # Smallest drift, stds. Chosen: one false alarm in hours
+_SETTLE_TAUS = 8.0  # Settling time, RC. Chosen: 0.03 % of a step is below the noise of a mean
+_ANGLES = (JOINTS['alpha'], JOINTS['beta'])  # Columns of the encoder angles
+_FALSE_ALARM = 1e-6  # Probability that the variance of noise exceeds its limit
+_QUARTILE_TO_STD = 0.3186  # First quartile of |normal deviate|, stds
+_END_SIGMAS = 3.5  # Difference of an end of a rest that is cut, stds
 
 
 @dataclass(frozen=True)
@@ -125,11 +110,7 @@ def stated_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
 
 def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
                    spans: Spans) -> NoiseLimits | None:
-    """
-    Learn the limits from the quietest windows; None while the stream is too short.
-
-    windows: `window_variance` of the blocks; step: step of the ADC, (m,).
-    """
+    """Learn the limits from the quietest windows; None while the stream is too short."""
     if len(blocks) < max(spans.window, 2 * spans.half):
         return None
     variance, limit = stats.quiet_variance(blocks, windows, step)
@@ -193,12 +174,10 @@ def differing_start(means: np.ndarray, longest: int, white: np.ndarray, flicker:
 class Rest:
     """A rest of a stream."""
 
-    # start, stop: First row of the rest and the row after its last
-    start: int
-    stop: int
-    # time_start_s, time_stop_s: Times of the first and the last row, s
-    time_start_s: float
-    time_stop_s: float
+    start: int  # Its first row
+    stop: int  # The row after its last
+    time_start_s: float  # Time of its first row
+    time_stop_s: float  # Time of its last row
     # Times between which it was disturbed, or has no samples, s
     disturbed_s: tuple[tuple[float, float], ...] = ()
 
@@ -230,11 +209,7 @@ class Stillness:
 
 
 class RestFinder:
-    """
-    Finds the rests in a stream while it runs.
-
-    axes: number of measured axes, m.
-    """
+    """Finds the rests in a stream while it runs."""
 
     def __init__(self, rate_hz: float, axes: int, noise: Noise | None = None,
                  learn: bool | None = None, angle_tolerance_rad: float | None = None):
@@ -254,12 +229,7 @@ class RestFinder:
 
     def feed(self, time_s: np.ndarray, samples: np.ndarray,
              angles_rad: np.ndarray | None = None) -> None:
-        """
-        Add the next rows of the stream.
-
-        time_s: time of each row, s, (n,); samples: rows of the stream, (n, m); angles_rad: encoder
-        angles, rad, (n, 2), if the stream has them.
-        """
+        """Add samples, (n, m), and encoder angles, rad, (n, 2), if the stream has them."""
         self._parts.append(self._cutter.feed(time_s, samples, angles_rad))
 
     def blocks(self) -> Blocks:
@@ -463,12 +433,7 @@ class RecordedRests:
 def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,
                angles_rad: np.ndarray | None = None, noise: Noise | None = None,
                learn: bool | None = None, angle_tolerance_rad: float | None = None) -> list[Rest]:
-    """
-    Find the rests of a recording.
-
-    time_s, samples, angles_rad: time s (n,), samples (n, m) in any unit, encoder angles rad (n,
-    2).
-    """
+    """Find the rests of a recording by samples, (n, m), in any unit, and encoder angles."""
     finder = RestFinder(rate_hz, samples.shape[1], noise, learn, angle_tolerance_rad)
     finder.feed(time_s, samples, angles_rad)
     return finder.rests()
@@ -477,11 +442,9 @@ def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,
 def rest_means(time_s: np.ndarray, samples: np.ndarray, rests: list[Rest], rate_hz: float,
                noise: Noise | None = None) -> tuple[np.ndarray, np.ndarray]:
     """
-    Average the rests of a recording, with the same results as `RestFinder.means`.
+    Average the rests of a recording, as `RestFinder.means` does: mean and std, (k, m) each.
 
-    time_s, samples: time s (n,), samples (n, m); returns: mean and its standard deviation, (k, m)
-    each, in the unit of the samples. The standard deviation is that by the scatter between parts
-    of the rest, and at least that of the given noise.
+    The std is that by the scatter between parts of the rest, and at least that of the noise.
     """
     parts = [stats.BlockCutter(rate_hz, samples.shape[1]).feed(
         time_s[rest.start:rest.stop], samples[rest.start:rest.stop]) for rest in rests]

@@ -26,12 +26,7 @@ class Path(Protocol):
     """A quantity over time with its derivatives."""
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """
-        Return a derivative of the quantity.
-
-        time_s: times, s, (n,). Outside of its own range the quantity is at rest.; returns:
-        derivative, (n,).
-        """
+        """Return a derivative at times, s, (n,); outside of its own range it is at rest."""
 
 
 @dataclass(frozen=True)
@@ -55,12 +50,7 @@ class Knots:
     def __init__(self, time_s: Sequence[float] | np.ndarray,
                  position: Sequence[float] | np.ndarray,
                  velocity: Sequence[float] | np.ndarray | None = None) -> None:
-        """
-        Interpolate knots.
-
-        time_s: ascending times of the knots, s, (k,); position: values at the knots, (k,);
-        velocity: first derivatives at the knots, (k,); 0 unless given. The second are 0.
-        """
+        """Interpolate ascending knots, (k,); second derivatives there are 0."""
         rates = np.zeros(len(time_s)) if velocity is None else np.asarray(velocity, float)
         derivatives = np.column_stack([position, rates, np.zeros(len(time_s))])
         pieces = scipy.interpolate.PPoly.from_bernstein_basis(
@@ -108,8 +98,7 @@ def encoder_reading(angle_rad: np.ndarray, resolution_rad: float) -> np.ndarray:
     return np.rint(angle_rad / resolution_rad) * resolution_rad
 
 
-POINTS = 6
-"""Points of the polynomial between the steps of a grid; chosen: as exact as the filters."""
+POINTS = 6  # Points of the polynomial between the steps of a grid; chosen: as exact as the filters
 
 
 def lagrange_weights(position: np.ndarray) -> np.ndarray:
@@ -139,14 +128,10 @@ def check_needs(sensor: Sensor, motion: Motion) -> None:
                                 'effect out')
 
 
-JOINTS = ('alpha', 'beta', 'shift')
-"""Names of the joints, in the order of all arrays."""
-_REACH = {'alpha': 100.0, 'beta': 100.0, 'shift': 10.0}
-"""Largest position of each joint, rad or m. Chosen: 16 turns, and more than a laboratory."""
-_SETTLED = 6.638
-"""Solution of (1 + x)·exp(−x) = 0.01: a critically damped step response is within 1 % there."""
-_MIN_MOVE = 1e-9
-"""Distance from the goal, rad or m, below which a joint without an encoder step is at rest."""
+JOINTS = ('alpha', 'beta', 'shift')  # Names of the joints, in the order of all arrays
+_REACH = {'alpha': 100.0, 'beta': 100.0, 'shift': 10.0}  # Largest positions. Chosen: 16 turns
+_SETTLED = 6.638  # Root of (1 + x)·exp(−x) = 0.01: a critically damped step is within 1 %
+_MIN_MOVE = 1e-9  # Distance at rest without encoder step, rad or m
 
 
 class SimulatedStage:
@@ -161,12 +146,7 @@ class SimulatedStage:
 
     def __init__(self, pose: np.ndarray, slew: np.ndarray, settling_s: float,
                  resolution: np.ndarray, seed: int) -> None:
-        """
-        Rest at a pose.
-
-        pose: initial position, rad, rad, m, (3,); slew: largest velocity, rad/s, rad/s, m/s, (3,);
-        resolution: steps of the encoders, rad, rad, m, (3,); 0 for none.
-        """
+        """Rest at a pose; `slew` is the largest velocity, and a resolution of 0 is exact."""
         self._slew = slew
         self._speed = np.array(slew, float)
         self._omega = _SETTLED / settling_s

@@ -37,22 +37,13 @@ from adxl_ros.simulate.motion import (
 from adxl_ros.simulate.smoothed_paths import ForcePath
 import numpy as np
 
-Columns = dict[str, np.ndarray]
-"""Columns of a recording by canonical name, (n,) each."""
-_BLOCK_ROWS = 32768
-"""Samples of a block; chosen: its arrays stay smaller than the internal grid."""
-_BLOCK_STEPS = 65536
-"""Steps of the internal grid in memory at once; chosen: some 10 MB of signals."""
-_WHOLE_STEPS = 300_000
-"""Largest number of steps that are simulated at once and kept; chosen: 20 minutes at 250 Hz, some
-200 MB."""
-_ALIGNED_STEPS = 1e-4
-"""Largest distance of a sample on a step from it, in steps; chosen: far above rounding."""
-_ROUNDING = 1e-9
-"""Rounding error of a ratio of two rates."""
-_NOISE_MEMORY = 50
-"""Time constants of the filter over which the noise of missing samples is drawn; chosen: the state
-of the filter has then decayed to e⁻⁵⁰."""
+Columns = dict[str, np.ndarray]  # Columns of a recording by canonical name, (n,) each
+_BLOCK_ROWS = 32768  # Samples of a block; chosen: its arrays stay smaller than the internal grid
+_BLOCK_STEPS = 65536  # Steps of the internal grid in memory at once; chosen: some 10 MB of signals
+_WHOLE_STEPS = 300_000  # Most steps that are kept at once; chosen: 20 min at 250 Hz, 200 MB
+_ALIGNED_STEPS = 1e-4  # Distance of an aligned sample, steps; chosen: above rounding
+_ROUNDING = 1e-9  # Rounding error of a ratio of two rates
+_NOISE_MEMORY = 50  # RC over which missing noise is drawn; chosen: e⁻⁵⁰ is left
 
 
 class Response:
@@ -87,12 +78,7 @@ class Response:
         self._last_s = begin_s
 
     def __call__(self, stamps_s: np.ndarray) -> np.ndarray:
-        """
-        Advance to the next samples.
-
-        stamps_s: stamps of the samples, s, (n,), ascending and later than those of the last call;
-        returns: volts of the ADC, V, (n, m).
-        """
+        """Advance to the next samples, (n,), which are later; return volts, (n, m)."""
         if not len(stamps_s):
             return np.zeros((0, len(self.sensor.axes)))
         steps = (stamps_s - self._begin_s) / self._step_s
@@ -109,12 +95,7 @@ class Response:
         return self._chain.convert(signals)
 
     def whole(self, stamps_s: np.ndarray, memo: ChainMemo) -> np.ndarray:
-        """
-        Simulate a whole recording.
-
-        stamps_s: stamps of all samples, s, (n,), ascending; returns: volts of the ADC, V, (n, m).
-        Nothing can follow.
-        """
+        """Simulate all samples of a recording as `__call__` does; nothing can follow."""
         steps = ceil((float(stamps_s[-1]) - self._begin_s) / self._step_s) + POINTS
         if steps > _WHOLE_STEPS:
             return self(stamps_s)
@@ -266,9 +247,7 @@ def _computed(_part: str, _key: Hashable, compute: Callable[[], Any]) -> Any:
     return compute()
 
 
-_KEPT = 3
-"""Number of results of each part that are kept. Chosen: the baseline, the present hypothesis and
-one more; a recording of ten minutes then needs below 100 MB."""
+_KEPT = 3  # Results kept of each part. Chosen: baseline, hypothesis, one more; 100 MB for 10 min
 
 _Result = TypeVar('_Result')
 
@@ -291,10 +270,9 @@ class ChainMemo:
 
 def simulate(sensor: Sensor, motion: Motion, seed: int) -> Columns:
     """
-    Simulate a whole recording.
+    Simulate a whole recording: columns by canonical name, (n,) each.
 
-    returns: columns by canonical name, (n,) each: `time_s`, volts by axis, readings of the
-    encoders, and temperature and supply if the manoeuvre has them.
+    They are `time_s`, volts by axis, encoders, and temperature and supply if they change.
     """
     parts = list(simulate_blocks(sensor, motion, seed))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -340,17 +318,11 @@ def _references(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:
     return columns | {name: path(time_s) for name, path in motion.environment.items()}
 
 
-_SEED = 0
-"""Seed of noise-like effects in a comparison."""
-_QUIET = 1e-9
-"""Factor of the white noise in a comparison; chosen: invisible, but not 0, which effects on the
-noise refuse."""
-_FINE_BITS = 32
-"""Resolution of the ADC in a comparison, bit; chosen: its steps are invisible."""
-_RATE_HZ = 250.0
-"""Largest sample rate of the comparison, Hz; chosen: above twice the bandwidth of the motion."""
-_SHORT_RC_S = 1e-9
-"""Time constant of a filter that does nothing, s; chosen: not 0, which `bandwidth` refuses."""
+_SEED = 0  # Seed of noise-like effects in a comparison
+_QUIET = 1e-9  # Factor of white noise in a comparison; chosen: invisible, but not 0
+_FINE_BITS = 32  # Resolution of the ADC in a comparison, bit; chosen: its steps are invisible
+_RATE_HZ = 250.0  # Largest rate there, Hz; chosen: twice the bandwidth of the motion
+_SHORT_RC_S = 1e-9  # RC of a filter that does nothing, s; chosen: not 0
 
 
 class PartSizes:

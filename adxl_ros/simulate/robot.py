@@ -34,36 +34,25 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
-_HIGHEST_RATE_HZ = 1000.0
-"""Highest rate at which the kinematics are evaluated, Hz. Chosen: the rate of the simulator."""
-_PER_READING = 2
-"""Evaluations of the kinematics for each reading of a joint. Chosen: splines join them."""
+_HIGHEST_RATE_HZ = 1000.0  # Highest rate of the kinematics, Hz. Chosen: that of the simulator
+_PER_READING = 2  # Evaluations of the kinematics a reading. Chosen: splines join them
 _KNOT_READINGS = 4
 """Largest distance of the knots of a joint's spline, in readings. Chosen: jerks of a move then
 show, and the penalty still averages over the steps of an encoder."""
-_SMALLEST_STEP = 1e-9
-"""Step of an encoder, rad or m, that is exact. Chosen: rounding of floats in a log."""
+_SMALLEST_STEP = 1e-9  # Step of an exact encoder, rad or m. Chosen: rounding in a log
 _LONGEST_GAP_S, _USUAL_GAPS = 0.1, 5.0
 """Longest time without a reading of a joint, s, and in usual gaps. Chosen: a robot moves within
 it, and a message may be late."""
-_AROUND_S = 0.3
-"""Time around which the error of the force is taken, s. Chosen: a part of a move."""
-_OFFSET_RAD = 1e-4
-"""Offset of a joint whose effect on the force is taken, rad. Chosen: linear to 1e-4."""
-_COMPLIANCE_S2 = 1e-5
-"""Compliance of the links whose effect is taken, s². Chosen: a resonance of 50 Hz."""
+_AROUND_S = 0.3  # Time around which the error of the force is taken, s. Chosen: a part of a move
+_OFFSET_RAD = 1e-4  # Offset of a joint whose effect is taken, rad. Chosen: linear to 1e-4
+_COMPLIANCE_S2 = 1e-5  # Compliance whose effect is taken, s². Chosen: a resonance of 50 Hz
 
 
 class Robot:
     """The kinematics of a robot, from its joints to one frame."""
 
     def __init__(self, urdf: str | os.PathLike, frame: str, moves: bool = False) -> None:
-        """
-        Read a URDF.
-
-        urdf: the file; frame: name of the link, or frame, that carries the sensor; moves: whether
-        the base moves in the world.
-        """
+        """Read a URDF; `frame` is a link or frame, and a base that moves is a free joint."""
         try:
             import pinocchio
         except ImportError:
@@ -100,10 +89,9 @@ class Robot:
         """
         Return the motion of the frame.
 
-        joints: position, rate and acceleration of the joints, rad or m and s, (3, n, j); base: the
-        same of the pose of the base, x, y, z and quaternion x, y, z, w, (3, n, 7); gravity_mps2:
-        local gravity, m/s²; returns: in the frame: specific force, m/s², angular rate, rad/s,
-        angular acceleration, rad/s², and the unit vector upward, (4, n, 3).
+        joints: position, rate and acceleration, (3, n, j); base: the same of its x, y, z and
+        quaternion x, y, z, w, (3, n, 7); returns: in the frame: specific force, angular rate,
+        angular acceleration, and the unit vector upward, (4, n, 3).
         """
         pin, model, data = self._pin, self._model, self._data
         q, v, a = (np.zeros((joints.shape[1], size)) for size in (model.nq, model.nv, model.nv))
@@ -150,12 +138,7 @@ class RobotPath(ForcePath):
 
     def __init__(self, robot: Robot, readings: Readings, gravity_mps2: float = G0_MPS2,
                  since_s: float = -np.inf) -> None:
-        """
-        Smooth the readings, and run the kinematics.
-
-        robot: the kinematics; readings: readings of its joints, and of its base; gravity_mps2:
-        local gravity, m/s²; since_s: time from which the force is needed, s.
-        """
+        """Smooth the readings, and run the kinematics from a time on, s."""
         self._robot, self._gravity_mps2 = robot, gravity_mps2
         self._tracks = _tracks(robot, readings)
         self._steps = [noise_step(values, _SMALLEST_STEP, times)
@@ -333,13 +316,7 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
 
 def robot_path(urdf: str | os.PathLike, frame: str, path: str, epoch_ns: int,
                gravity_mps2: float = G0_MPS2, topic: str = '') -> RobotPath:
-    """
-    Return the specific force in a frame of a robot, by a recording of its joints.
-
-    urdf, frame: the robot, and the frame that carries the sensor; path: the recording; see
-    `robot_readings.read`; epoch_ns: stamp of time 0, ns; gravity_mps2: local gravity, m/s²; topic:
-    topic of the joints; empty for the only one; returns: the force, with its errors.
-    """
+    """Return the specific force in a frame of a robot, by `robot_readings.read` of a recording."""
     robot = Robot(urdf, frame)
     readings = robot_readings.read(path, epoch_ns, topic, robot.root, bool(robot.joints))
     if readings.base is not None:

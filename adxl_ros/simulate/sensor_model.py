@@ -36,9 +36,7 @@ from adxl_ros.simulate.motion import check_needs, lagrange_weights, Motion, POIN
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-_STDS_OF_MAXIMUM = 3.0
-"""Standard deviations in the largest departure of a datasheet that states no typical one. Chosen:
-one part in 370 of a normal distribution is beyond."""
+_STDS_OF_MAXIMUM = 3.0  # Stds in a maximum without typical value. Chosen: 1 part in 370 beyond
 
 
 @dataclass(frozen=True)
@@ -104,8 +102,7 @@ def _datasheet(sensor: Sensor) -> tuple[list[Coefficient], np.ndarray, np.ndarra
     return names, np.array(std), np.array(limit)
 
 
-_SAME_STEP = 1e-6
-"""Largest relative change of the time step; chosen: far above rounding of a simulator's clock."""
+_SAME_STEP = 1e-6  # Relative change of equal time steps; chosen: above rounding
 
 
 class SensorModel:

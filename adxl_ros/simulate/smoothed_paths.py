@@ -16,8 +16,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 import scipy
 
-_DEGREE = 5
-"""Degree of the splines of joints; chosen: quintic, so that the acceleration is smooth."""
+_DEGREE = 5  # Degree of the splines of joints; chosen: quintic, so that the acceleration is smooth
 BAND_LIMITED_DEGREE = 11
 """Degree of the spline through exact readings of a motion that is nearly as fast as its sampling;
 chosen: the acceleration of 40 Hz, sampled at 100 Hz, is exact to 0.1 %, by quintic splines to
@@ -25,45 +24,27 @@ chosen: the acceleration of 40 Hz, sampled at 100 Hz, is exact to 0.1 %, by quin
 _MAX_UNEVENNESS = 3.0
 """Longest interval of readings, divided by the median, that splines of a higher degree bridge;
 chosen: they overshoot in longer ones."""
-KNOT_S = 0.03
-"""Distance of the knots, s; chosen: motion slower than 10 Hz is free, the penalty smooths it."""
-_WINDOW_S = 60.0
-"""Length of a window, s; chosen: its normal equations are small."""
-_MARGIN_S = 3.0
-"""Overlap of the windows on each side, s; chosen: far beyond the range of the spline's penalty."""
-_PROBES = 12
-"""Windows that the strength of the penalty is matched to; chosen: enough for a median."""
-_MIN_MOVING = 100
-"""Fewest readings in motion that determine a strength; chosen: their rms is then within 7 %."""
-_USUAL_STRENGTH = 1.0
-"""Strength where too few readings move to determine one; chosen: that of quick moves."""
+KNOT_S = 0.03  # Distance of the knots, s; chosen: below 10 Hz motion is free
+_WINDOW_S = 60.0  # Length of a window, s; chosen: its normal equations are small
+_MARGIN_S = 3.0  # Overlap of windows, s; chosen: beyond the range of the penalty
+_PROBES = 12  # Windows that the strength of the penalty is matched to; chosen: enough for a median
+_MIN_MOVING = 100  # Fewest readings in motion for a strength; chosen: rms within 7 %
+_USUAL_STRENGTH = 1.0  # Strength where too few move; chosen: of quick moves
 _BOUNDED_SHARE = 0.03
 """Strength of the penalty within bounds, divided by the matched one. Tuned, with `_REST_WEIGHT`,
 on manoeuvres of the package from 25 to 250 Hz behind encoders of 0.083 and 0.01°: 0.01 to 1
 differ by 10 %."""
-_REST_WEIGHT = 0.1
-"""Weight of a reading at rest beside its bounds; tuned as `_BOUNDED_SHARE`."""
-_BOUND_ROUNDS = 40
-"""Iterations over the bounds; chosen: 100 change the error in motion by 5 %."""
+_REST_WEIGHT = 0.1  # Weight of a reading at rest beside its bounds; tuned as `_BOUNDED_SHARE`
+_BOUND_ROUNDS = 40  # Iterations over the bounds; chosen: 100 change the error in motion by 5 %
 _ERROR_FACTOR = 2.0
 """Error in motion, times readings per second, divided by step and corner frequency; measured on
 the same manoeuvres: 0.3 to 2."""
-_RIDGE = 1e-12
-"""Addition to the diagonal of the normal matrix, divided by its largest element; chosen: it
-matters only for coefficients without samples and penalty."""
-_STRENGTHS = (10.0 ** np.arange(-12, 13, 0.5)).tolist()
-"""Strengths of the penalty that are tried; chosen: half a decade hardly changes a spline."""
-_REST_GAP = 8
-"""Gap between changes of a reading, in median gaps and in samples, above which it rests; chosen:
-above the gaps of a slow move."""
-_SMALLEST_CHANGE = 1e-6
-"""Change of a reading, in stated steps, that is a rounding error; chosen: above that of floats."""
-_WHOLE = 0.05
-"""Deviation of a change from whole steps, in steps, by an inexact step; chosen: five steps of
-0.083° in place of 1/12°."""
-_FINER = 0.03
-"""Largest step of a finer reference, in stated steps; chosen: readings between which an encoder
-was interpolated have 0.08."""
+_RIDGE = 1e-12  # Relative addition to the diagonal; chosen: for empty coefficients only
+_STRENGTHS = (10.0 ** np.arange(-12, 13, 0.5)).tolist()  # Tried strengths; chosen: half decades
+_REST_GAP = 8  # Median gaps and samples between changes at rest; chosen: above a slow move
+_SMALLEST_CHANGE = 1e-6  # Change in steps that is a rounding error; chosen: above floats
+_WHOLE = 0.05  # Deviation from whole steps; chosen: 5 steps of 0.083° for 1/12°
+_FINER = 0.03  # Largest step of a finer reference, steps; interpolated readings have 0.08
 _READING_QUANTILE = 0.9
 """Quantile of the distances between bends that is the distance of two readings. Chosen: a reading
 between two samples bends the line at both of them, so that half of the distances are 1."""
@@ -97,11 +78,9 @@ class SmoothedPath:
     def __init__(self, time_s: np.ndarray, reading: np.ndarray, step: float,
                  degree: int = _DEGREE, is_seen: bool = False, knot_s: float = KNOT_S) -> None:
         """
-        Prepare for the readings of an encoder.
+        Prepare for the readings of an encoder at ascending times, NaN where there is none.
 
-        time_s: ascending times, s, (n,); reading: readings, rad or m, (n,); NaN where there is
-        none; is_seen: whether the step is that of the readings, and not stated; knot_s: distance
-        of the knots, s.
+        is_seen: whether the step is that of the readings, and not stated.
         """
         sampled = np.isfinite(reading)
         self._time_s, self._reading = time_s[sampled], reading[sampled]
@@ -135,8 +114,6 @@ class SmoothedPath:
         changes quickly, because many readings bound the path within the time that the spline
         averages over. Its corner is 1/(2π·h·s^(1/6)) with the distance h of the knots and the
         matched strength s.
-
-        time_s: times, s, (n,).
         """
         if not self._step or len(self._time_s) <= 2 * _DEGREE:
             return None
@@ -180,10 +157,9 @@ def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, s
                      degree: int = _DEGREE, knot_s: float = KNOT_S, is_bounded: bool = True
                      ) -> scipy.interpolate.BSpline:
     """
-    Fit the smoothing spline of one window; see `SmoothedPath`.
+    Fit the smoothing spline of one window to finite readings; see `SmoothedPath`.
 
-    time_s: ascending times, s, (n,); reading: readings, rad or m, (n,), all finite; is_bounded:
-    whether no reading is off by more than half a step, as by an encoder and not by other noise.
+    is_bounded: whether no reading is off by more than half a step, as by an encoder.
     """
     if len(time_s) <= 2 * _DEGREE or np.ptp(reading) == 0:
         return scipy.interpolate.make_interp_spline(time_s, reading, k=1) if len(time_s) > 1 else \
@@ -206,8 +182,6 @@ def visible_step(reading: np.ndarray, step: float) -> float:
     the steps, are those of a finer reference. The noise is taken from fifth differences, because
     motion hardly shows in them. Where lines connect the readings of a slow encoder, it is taken
     at the distance of these readings: there is no noise on a line.
-
-    reading: readings, rad or m, (n,), all finite.
     """
     if not _is_interpolated(reading, step):
         return step
@@ -261,11 +235,7 @@ def noise_step(reading: np.ndarray, smallest: float, time_s: np.ndarray | None =
 
 def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float,
                      knot_s: float = KNOT_S) -> float:
-    """
-    Find the largest strength whose deviation is at most that of an encoder.
-
-    time_s: ascending times, s, (n,); reading: readings, rad or m, (n,), all finite.
-    """
+    """Find the largest strength whose deviation is at most that of an encoder."""
     moving = _moving(reading)
     if not step or moving.sum() < _MIN_MOVING:
         return 0.0
@@ -311,10 +281,8 @@ class _Window:
         Return the coefficients whose spline deviates from no reading by more than a bound.
 
         They are found by alternating directions (Boyd et al. 2011, section 5.2). Where no spline
-        fits the bounds, the deviation becomes as small as it can.
-
-        weights: weight of the squared deviation of each reading, beside the bounds, (n,); returns:
-        coefficients, (k,).
+        fits the bounds, the deviation becomes as small as it can. Readings have weights, (n,),
+        of their squared deviations beside the bounds.
         """
         transposed = self.design.T.tocsr()
         weighted = self.design.multiply(1 + weights[:, None]).tocsr()
@@ -359,12 +327,7 @@ class ForcePath:
     """Force at `time_s` per unit of each error of a robot, (n, 3)."""
 
     def __init__(self, time_s: np.ndarray, columns: np.ndarray) -> None:
-        """
-        Interpolate samples.
-
-        time_s: ascending times, s, (n,); columns: specific force in the case frame, m/s², in the
-        first three of them, (n, k).
-        """
+        """Interpolate columns, (n, k), the first three of them specific force of the case."""
         self.time_s = time_s  # Times of the samples, s, (n,)
         self._columns = columns
         self._spline = scipy.interpolate.CubicSpline(time_s, columns)

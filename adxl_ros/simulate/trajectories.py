@@ -16,27 +16,16 @@ from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Knots, Motion, Path
 from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath, SmoothedPath
 import numpy as np
 
-SLEW_RAD_S = np.pi / 4
-"""Largest angular velocity of the stage between poses, rad/s; chosen: 30° take 1.25 s."""
-DWELL_S = 5.0
-"""Dwell of a pose, s: the time over which the paper averages."""
-SETTLE_S = 0.2
-"""Time to settle before a dwell, s; chosen: 20 time constants of the RC filter."""
-_JERK_PEAK = 1.875
-"""Peak velocity of the motion of minimum jerk, divided by its mean: 15/8."""
-RUN_UP_S = 1.0
-"""Time in which a joint reaches a constant velocity, s; chosen: 60° per second squared at most."""
-_SHAKE_LOW_HZ = 2.0
-"""Lowest frequency of the shaker, Hz; chosen: its stroke is 13 mm."""
-_SHAKE_HIGH_HZ = 40.0
-"""Highest frequency of the shaker, Hz; chosen: near the bandwidth of the sensor."""
-_SHAKE_MPS2 = 1.0
-"""Amplitude of the shaker, m/s²; chosen: a tenth of gravity."""
-_SHAKE_S = 40.0
-"""Duration of the shaker, s; chosen: some 9 s for each octave."""
-_FADE_S = 2.0
-"""Time over which the shaker fades in and out, s; chosen: four periods of its lowest
-frequency."""
+SLEW_RAD_S = np.pi / 4  # Largest rate between poses, rad/s; chosen: 30° take 1.25 s
+DWELL_S = 5.0  # Dwell of a pose, s: the time over which the paper averages
+SETTLE_S = 0.2  # Time to settle before a dwell, s; chosen: 20 time constants of the RC filter
+_JERK_PEAK = 1.875  # Peak velocity of the motion of minimum jerk, divided by its mean: 15/8
+RUN_UP_S = 1.0  # Time to a constant velocity, s; chosen: 60°/s² at most
+_SHAKE_LOW_HZ = 2.0  # Lowest frequency of the shaker, Hz; chosen: its stroke is 13 mm
+_SHAKE_HIGH_HZ = 40.0  # Highest frequency, Hz; chosen: near the bandwidth
+_SHAKE_MPS2 = 1.0  # Amplitude of the shaker, m/s²; chosen: a tenth of gravity
+_SHAKE_S = 40.0  # Duration of the shaker, s; chosen: some 9 s for each octave
+_FADE_S = 2.0  # Fade in and out, s; chosen: four of the longest periods
 
 
 class SweptSine:
@@ -109,11 +98,7 @@ class Script:
         self._knot(0.0, 0.0)
 
     def go(self, alpha: float, beta: float) -> None:
-        """
-        Move to a pose by minimum jerk, whose velocity peaks at the slew rate.
-
-        alpha, beta: angles of the pose, rad.
-        """
+        """Move to a pose by minimum jerk, whose velocity peaks at the slew rate."""
         distance = max(abs(alpha - self.alpha), abs(beta - self.beta))
         self._knot(0.0, 0.0)
         self.now += _JERK_PEAK * distance / self.slew_rad_s
@@ -121,11 +106,7 @@ class Script:
         self._knot(0.0, 0.0)
 
     def run(self, joint: str, to: float, speed: float) -> None:
-        """
-        Turn one joint at a constant velocity, between a run-up and a stop.
-
-        to: angle at the end, rad; speed: magnitude of the velocity, rad/s.
-        """
+        """Turn one joint to an angle at a constant speed, between a run-up and a stop."""
         distance = to - getattr(self, joint)
         rate = np.copysign(speed, distance)
         run_up = rate * RUN_UP_S / 2
@@ -266,18 +247,12 @@ TRAJECTORIES: dict[str, Callable[[np.random.Generator], Motion]] = {
 """Manoeuvres by name; each takes a random generator."""
 
 
-_MAX_SPEED_RAD_S = 100.0
-"""Largest angular velocity of a stage, rad/s; chosen: a faster change is a jump of the reading."""
-_MIN_FORCE_SAMPLES = 4
-"""Fewest samples of specific force; a cubic spline needs them."""
+_MAX_SPEED_RAD_S = 100.0  # Largest rate of a stage, rad/s; chosen: faster is a jump
+_MIN_FORCE_SAMPLES = 4  # Fewest samples of specific force; a cubic spline needs them
 
 
 def motion_from_force(ideal: Recording, resampled: bool) -> tuple[Motion, float]:
-    """
-    Make a motion from the specific force of another simulator, in the case frame.
-
-    returns: the motion, and the time at which it begins, s.
-    """
+    """Make a motion from the specific force of another simulator; return its begin, s, too."""
     time_s = ideal.time_s
     force_mps2 = np.column_stack([ideal.columns[name] for name in ACCEL])
     if len(time_s) < _MIN_FORCE_SAMPLES:

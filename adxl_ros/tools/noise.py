@@ -54,7 +54,8 @@ def _tables(result: RecordingNoise) -> list[str]:
     rows = [row((' axis', *_NAMES), wide),
             row(('', 'µg/√Hz (90 %)', 'µg (90 %)', 'µg/√s (90 %)'), wide),
             *(row((f' {noise.axis}', *_micro_g_intervals(noise)), wide) for noise in result.axes),
-            '', row(('', 'N', 'B', 'K', 'N by sample', 'K by sample', 'datasheet'), narrow),
+            *_walk_lines(result), '',
+            row(('', 'N', 'B', 'K', 'N by sample', 'K by sample', 'datasheet'), narrow),
             row((' axis', 'm/s²/√Hz', 'm/s²', 'm/s²/√s', 'm/s²', 'm/s²', 'µg/√Hz'), narrow)]
     rate = np.sqrt(result.rest.rate_hz)
     for noise in result.axes:
@@ -63,6 +64,20 @@ def _tables(result: RecordingNoise) -> list[str]:
                  white.scaled(1e6 * ONE_SIDED / G0_MPS2))
         rows.append(row((f' {noise.axis}', *(f'{e.value:.3g}' if e.is_seen else f'< {e.high:.3g}'
                                              for e in shown)), narrow))
+    return rows
+
+
+def _walk_lines(result: RecordingNoise) -> list[str]:
+    """Return the bounds of the walks, and for which times K holds."""
+    rows = []
+    for noise in result.axes:
+        time_s, k = noise.fit.bound_s, MICRO_G * noise.fit.walk.value
+        if np.isfinite(time_s):
+            rows.append(f' {noise.axis}: the walk has bounds, {k * np.sqrt(time_s / 2):.3g} µg '
+                        f'rms; correlation time {time_s:.3g} s')
+    if any(noise.fit.walk.is_seen for noise in result.axes):
+        rows.append(f' K holds for times up to {duration(result.rest.span_s)}, those of the '
+                    'recording.')
     return rows
 
 
@@ -146,7 +161,9 @@ def _axis_json(noise: AxisNoise) -> dict[str, Any]:
     terms = {name: {'value': estimate.value if estimate.is_seen else None,
                     'ci': [estimate.low, estimate.high], 'unit': unit}
              for (name, unit), estimate in zip(_UNITS.items(), noise.estimates)}
-    return {**terms, 'rounding': noise.rounding,
+    bound_s = noise.fit.bound_s
+    return {**terms, 'correlation_s': bound_s if np.isfinite(bound_s) else None,
+            'rounding': noise.rounding,
             'density_g_per_rthz': noise_parameters.density_g_per_rthz(noise),
             'sample_std_mps2': noise.sample_std, 'resolution_mps2': noise.resolution,
             'lowest': {'tau_s': noise.lowest_s, 'deviation_mps2': noise.lowest},

@@ -5,6 +5,7 @@
 from adxl_ros.signals.noise_parameters import coefficient_variances, fit_noise
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from still_noise import still_samples
 
 N, B, K = 1e-3, 2e-4, 1e-5
@@ -39,3 +40,28 @@ def test_the_fitted_curve_is_the_allan_deviation_of_the_terms() -> None:
     assert walk[1] == pytest.approx(fit.walk.value)
     assert fit.allan_deviation(np.array([1.0]))[0] ** 2 == pytest.approx(
         white[0] ** 2 + floor[0] ** 2 + walk[0] ** 2)
+
+
+def test_a_walk_with_bounds() -> None:
+    """Its density is known, where a walk without bounds would fall short of it."""
+    rng, k, bound_s = np.random.default_rng(10), 1e-4, 100.0
+    decay = np.exp(-STEP_S / bound_s)
+    fits = []
+    for _ in range(10):
+        walk = lfilter([1.0], [1.0, -decay], rng.standard_normal(8000))[800:]
+        walk *= k * np.sqrt(bound_s / 2 * (1 - decay ** 2))
+        fits.append(fit_noise(walk + rng.standard_normal(7200) * N, STEP_S))
+    assert all(50.0 < fit.bound_s < 200.0 for fit in fits)
+    assert sum(fit.walk.low <= k <= fit.walk.high for fit in fits) >= 7
+    flat = fits[0].lines(np.array([1000.0, 10000.0]))[2]
+    assert flat[0] / flat[1] > 2
+
+
+@pytest.mark.parametrize('amplitude', [0.6, 2.0])
+def test_a_line_leaves_the_truth_in_the_interval(amplitude: float) -> None:
+    """It is left out with what is above, so that two windows of one log agree."""
+    for seed in range(6):
+        rng, time_s = np.random.default_rng(seed), np.arange(6000) * 0.1
+        line = amplitude * np.sin(2 * np.pi * 0.55 * time_s + seed)
+        white = fit_noise(N * (rng.standard_normal(6000) / 0.1 ** 0.5 + line), 0.1).white
+        assert 0.98 * white.low <= N <= 1.02 * white.high

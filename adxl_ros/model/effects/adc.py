@@ -115,8 +115,7 @@ def spikes(signals: Signals, p: Parameters) -> None:
         signals.volts[d] = signals.volts[d] + np.where(hit[..., d], amplitude * sign[..., d], 0.0)
 
 
-_NEVER = -2 ** 40
-"""Index of a start that lies before any recording; chosen: far below 0."""
+_NEVER = -2 ** 40  # Index of a start that lies before any recording; chosen: far below 0
 
 
 @effect(Place.CODE,
@@ -193,14 +192,12 @@ def noise_excess(signals: Signals, p: Parameters) -> None:
         signals.noise_ratio[d] = signals.noise_ratio[d] * (1 + ratio)
 
 
-_LOWEST_HZ = 1e-5
-"""Lowest corner, Hz; chosen: the density is 1/f from ten times this."""
+_LOWEST_HZ = 1e-5  # Lowest corner, Hz; chosen: the density is 1/f from ten times this
 _HIGHEST_RATIO = 10 ** -0.5
 """Highest corner divided by the sample rate; chosen: aliasing replaces the missing corners."""
 _PER_DECADE = 2
 """Corners per decade; chosen: the sum is 1/f within 2 % up to a fifth of the sample rate."""
-_BISECTIONS = 60
-"""Bisections between two poles on a logarithmic axis; chosen: as fine as float64."""
+_BISECTIONS = 60  # Bisections between two poles on a logarithmic axis; chosen: as fine as float64
 
 
 class _Shaping(NamedTuple):

@@ -34,20 +34,13 @@ class DriftSpectrum(Enum):
 
 
 class Detector(Enum):
-    """
-    Statistic of the noise that shows an effect.
+    """Statistic of the noise that shows an effect, which has all parameters that it estimates."""
 
-    An effect with a detector has all parameters that the detector estimates. REPEATED_SAMPLES
-    estimates `rate_hz` and `duration_s`, ISOLATED_SAMPLES `rate_hz` and `amplitude_v`,
-    COARSE_CODES `lost_bits` and `axis_lost_bits`, MAINS_LINE `amplitude_v`, `frequency_hz` and
-    `phase_rad`, NOISE_LEVEL `ratio`.
-    """
-
-    REPEATED_SAMPLES = auto()
-    ISOLATED_SAMPLES = auto()
-    COARSE_CODES = auto()
-    MAINS_LINE = auto()
-    NOISE_LEVEL = auto()
+    REPEATED_SAMPLES = auto()  # Estimates rate_hz and duration_s
+    ISOLATED_SAMPLES = auto()  # Estimates rate_hz and amplitude_v
+    COARSE_CODES = auto()  # Estimates lost_bits and axis_lost_bits
+    MAINS_LINE = auto()  # Estimates amplitude_v, frequency_hz and phase_rad
+    NOISE_LEVEL = auto()  # Estimates ratio
 
 
 class Manoeuvre(Enum):
@@ -69,42 +62,24 @@ class FormDimension(Enum):
     The values are the names of the flexible dimensions of the diagnosis.
     """
 
-    FORCE = 'force'
-    """Specific force along the axis."""
-    CROSS_FORCE = 'cross_force'
-    """Specific force across the axis."""
-    DIRECTION = 'direction'
-    """Direction of the last change of joints and force: the branch of a loop."""
-    RATE = 'rate'
-    """Rates of the joints."""
+    FORCE = 'force'  # Specific force along the axis
+    CROSS_FORCE = 'cross_force'  # Specific force across the axis
+    DIRECTION = 'direction'  # Of the last change of joints and force: the branch of a loop
+    RATE = 'rate'  # Rates of the joints
     ALPHA = 'alpha_rad'
-    """Angle alpha."""
     BETA = 'beta_rad'
-    """Angle beta."""
     TEMPERATURE = 'temperature_c'
-    """Temperature of the sensor."""
-    WARMING = 'warming'
-    """Recent history of the temperature: the branch of a loop."""
+    WARMING = 'warming'  # Recent history of the temperature: the branch of a loop
     SUPPLY = 'supply_v'
-    """Supply voltage."""
     TIME = 'time_s'
-    """Time."""
-    AGEING = 'ageing'
-    """Force times a slow function of time: a scale factor that changes."""
-    SINCE_MOVE = 'since_move_s'
-    """Time since the last move."""
-    CODE = 'code'
-    """Code of the ADC."""
-    LAG = 'lag'
-    """Recent history of the specific force along the axis."""
+    AGEING = 'ageing'  # Force times a slow function of time: a scale factor that changes
+    SINCE_MOVE = 'since_move_s'  # Time since the last move
+    CODE = 'code'  # Code of the ADC
+    LAG = 'lag'  # Recent history of the specific force along the axis
 
 
 class ProofVariable(Enum):
-    """
-    Variable over which a plot shows that an effect is there.
-
-    The values name the variable and its unit for people.
-    """
+    """Variable over which a plot shows that an effect is there, with its unit, for people."""
 
     OWN_FORCE = 'specific force along the axis, g'
     CROSS_FORCE = 'specific force along the other axis, g'
@@ -121,10 +96,8 @@ class ProofVariable(Enum):
     SUPPLY = 'supply, V'
     TIME = 'time, s'
     OUTPUT = 'output, V'
-    FREQUENCY = 'frequency, Hz'
-    """The plot shows spectra."""
-    STEP = 'change from one sample to the next, mg'
-    """No plot: the report compares counts and sizes, recorded and simulated."""
+    FREQUENCY = 'frequency, Hz'  # The plot shows spectra
+    STEP = 'change from one sample to the next, mg'  # No plot, but counts and sizes
 
 
 @dataclass(frozen=True)
@@ -183,13 +156,11 @@ Components = list[Value]
 class Maths(NamedTuple):
     """Elementary functions of values; a formula that takes them serves arrays and floats alike."""
 
-    # sqrt, sin, cos: Square root, and sine and cosine of an angle, rad
     sqrt: Callable[[Value], Value]
     sin: Callable[[Value], Value]
     cos: Callable[[Value], Value]
-    atan2: Callable[[Value, Value], Value]  # Angle of the point (second, first value), rad
-    maximum: Callable[[Value, Value], Value]  # The larger of two values
-    # The second value where the first is true, otherwise the third
+    atan2: Callable[[Value, Value], Value]
+    maximum: Callable[[Value, Value], Value]
     where: Callable[[Value, Value, Value], Value]
 
 
@@ -242,7 +213,6 @@ class Joint(NamedTuple):
     """Motion of one joint of the stage."""
 
     position: Value = 0.0  # Angle, rad, or shift, m
-    # velocity, acceleration: First and second derivative of the position by time
     velocity: Value = 0.0
     acceleration: Value = 0.0
 
@@ -255,8 +225,7 @@ class Signals:
     # CLOCK: stamps, s, which effects turn into the instants of the samples. REFERENCE: the same of
     # all samples of the reference.
     time_s: Value = 0.0
-    # alpha, beta, shift: STAGE: joints as the encoders read them, which effects turn into the true
-    # ones
+    # STAGE: joints as the encoders read them, which effects turn into the true ones
     alpha: Joint = Joint()
     beta: Joint = Joint()
     shift: Joint = Joint()
@@ -277,7 +246,7 @@ class Signals:
     # ELEMENT: output of the sensing element, g; it begins as `sensed`. Effects read `sensed` and
     # add to `output`, so that their order does not matter.
     output: Components = field(default_factory=list)
-    # zero_g_v, scale_v_per_g: ELECTRONICS: zero-g, V, and scale factor, V/g, by measured axis
+    # ELECTRONICS: zero-g, V, and scale factor, V/g, by measured axis
     zero_g_v: Components = field(default_factory=list)
     scale_v_per_g: Components = field(default_factory=list)
     # ELECTRONICS: time constant of the RC filter by measured axis, s
@@ -303,16 +272,11 @@ class Signals:
 
 @dataclass(frozen=True, order=True)
 class Coefficient:
-    """
-    Name of one coefficient: a parameter of an effect, for one axis.
+    """A parameter of an effect, for one axis; as text it is `effect.parameter.axis`."""
 
-    Files, messages and reports show it as text: `effect.parameter.axis`.
-    """
-
-    effect: str  # Name of the effect
-    parameter: str  # Name of the parameter
-    # x, y or z; empty for a parameter without axes, and for all axes of a parameter
-    axis: str = ''
+    effect: str
+    parameter: str
+    axis: str = ''  # Empty for a parameter without axes, and for all axes of a parameter
 
     @classmethod
     def parse(cls, text: str) -> Coefficient:
@@ -331,42 +295,32 @@ class Coefficient:
 class Role(Enum):
     """Role of a parameter in its effect; fits and the diagnosis treat each role differently."""
 
-    SIZE = auto()
-    """Strength of the effect, which does nothing at the neutral value."""
-    OPTIONAL = auto()
-    """A size that is usually neutral: fits leave it out, and files may do so."""
-    SHAPE = auto()
-    """A frequency, time constant or the like, without influence where the sizes are neutral."""
-    LIMIT = auto()
-    """A bound of the signal, without influence where no sample reaches it."""
+    SIZE = auto()  # Strength of the effect, which does nothing at the neutral value
+    OPTIONAL = auto()  # A size that is usually neutral: fits leave it out, and files may do so
+    SHAPE = auto()  # A frequency, time or the like, without influence where sizes are neutral
+    LIMIT = auto()  # A bound of the signal, without influence where no sample reaches it
 
 
 class ActsOn(Enum):
     """Property of the output in which an effect shows."""
 
     MEAN = 'mean'
-    """The mean of the output."""
-    NOISE = 'noise'
-    """The statistics of the noise only."""
+    NOISE = 'noise'  # The statistics of the noise only
 
 
 class Concern(Enum):
     """What an effect is an error of: a verdict names it."""
 
-    REFERENCE = 'reference'
-    """The other instrument or simulator that states the specific force."""
-    STAGE = 'stage'
-    """The stage, its encoders and its site."""
-    SENSOR = 'sensor'
-    """The sensor with its mount, its link and its stamps."""
+    REFERENCE = 'reference'  # The other instrument or simulator that states the specific force
+    STAGE = 'stage'  # The stage, its encoders and its site
+    SENSOR = 'sensor'  # The sensor with its mount, its link and its stamps
 
 
 class Need(Enum):
     """Part of the chain without which an effect has nothing to act on."""
 
     STAGE = 'stage'
-    ROTATION = 'rotation'
-    """Of a stage, or of the frame of a robot."""
+    ROTATION = 'rotation'  # Of a stage, or of the frame of a robot
     ROBOT = 'robot'
     FILTER = 'filter'
     ADC = 'adc'
@@ -377,9 +331,8 @@ class Need(Enum):
 class Parameter:
     """One parameter of an effect, a departure from the nominal chain."""
 
-    name: str  # Name, which ends in its unit where it has one
-    unit: str  # Unit, as messages show it
-    # lower, upper: Bounds
+    name: str  # It ends in its unit where it has one
+    unit: str  # As messages show it
     lower: float
     upper: float
     scale: float  # Typical magnitude
@@ -412,9 +365,9 @@ class Parameter:
 class Effect:
     """One effect of a real sensor, as the simulator, the inverse and the fits use it."""
 
-    name: str  # Name, which is unique in the library
-    place: Place  # Place in the chain
-    parameters: tuple[Parameter, ...]  # Its parameters
+    name: str  # It is unique in the library
+    place: Place
+    parameters: tuple[Parameter, ...]
     # The function of the effect. It takes arrays, and floats too if the effect is invertible.
     apply: Apply
     cause: str  # Sentence for a report: the cause, and what to do about it
@@ -454,9 +407,5 @@ class Effect:
 
 def effect(place: Place, *parameters: Parameter, cause: str, **properties: Any
            ) -> Callable[[Apply], Effect]:
-    """
-    Turn a function into the effect of its name, with the properties of `Effect`.
-
-    The file of an effect of this library is then its parameters and its function.
-    """
+    """Turn a function into the effect of its name, with the properties of `Effect`."""
     return lambda apply: Effect(apply.__name__, place, parameters, apply, cause, **properties)

@@ -118,8 +118,7 @@ def stage_eccentricity(signals: Signals, p: Parameters) -> None:
                 acceleration + slope * acceleration + bend * velocity * velocity))
 
 
-_ROUNDING = 1e-9
-"""Relative rounding error of a dead band; chosen: far above that of float64."""
+_ROUNDING = 1e-9  # Relative rounding error of a dead band; chosen: far above that of float64
 
 
 @effect(Place.STAGE,
