@@ -227,34 +227,27 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
     motion, reference = _motion(recording, sensor, volts, sim)
     if reference is not Reference.NONE:
         motion = replace(motion, internal_rate_hz=min(
-            max(_LOWEST_INTERNAL_RATE_HZ, sensor.rate_hz), INTERNAL_RATE_HZ, _most_hz(time_s)))
+            max(_LOWEST_INTERNAL_RATE_HZ, sensor.rate_hz), INTERNAL_RATE_HZ,
+            _MOST_STEPS / max(float(np.ptp(time_s)), 1.0)))
     at_rest = _at_rest(motion, time_s, reference, volts)
-    used = np.ones(len(recording), bool)
-    if reference is Reference.SIMULATOR:
-        # Where another simulator moves from its first sample on, the filter has not settled.
-        used = at_rest | (time_s > time_s[0] + SETTLING_S)
+    # Where another simulator moves from its first sample on, the filter has not settled.
+    used = at_rest | (time_s > time_s[0] + SETTLING_S) | (reference is not Reference.SIMULATOR)
     return BaselineComparison(recording.path, time_s, volts, motion, sensor, reference, at_rest,
                               used)
 
 
-def _most_hz(time_s: np.ndarray) -> float:
-    """Return the internal rate at which a recording has the largest number of steps, Hz."""
-    return _MOST_STEPS / max(float(time_s[-1] - time_s[0]), 1.0)
-
-
 def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
     """Return every k-th sample of a recording, for the search."""
-    rate_wanted_hz = min(SEARCH_RATE_HZ, SEARCH_SAMPLES / max(comparison.span_s, 1.0))
-    every = max(1, round(comparison.sensor.rate_hz / rate_wanted_hz))
-    part, motion = slice(None, None, every), comparison.motion
+    span_s, rate_hz = max(comparison.span_s, 1.0), comparison.sensor.rate_hz
+    motion = comparison.motion
+    every = max(1, round(rate_hz / min(SEARCH_RATE_HZ, SEARCH_SAMPLES / span_s)))
     if comparison.reference is not Reference.NONE:
         motion = replace(motion, internal_rate_hz=min(_LOWEST_INTERNAL_RATE_HZ,
-                                                      _most_hz(comparison.time_s)))
-    return replace(
-        comparison, time_s=comparison.time_s[part], volts=comparison.volts[part],
-        motion=motion, sensor=replace(comparison.sensor,
-                                      rate_hz=comparison.sensor.rate_hz / every),
-        at_rest=comparison.at_rest[part], used=comparison.used[part], memo=ChainMemo())
+                                                      _MOST_STEPS / span_s))
+    return replace(comparison, motion=motion, memo=ChainMemo(), sensor=replace(
+        comparison.sensor, rate_hz=rate_hz / every), **{
+            name: getattr(comparison, name)[::every]
+            for name in ('time_s', 'volts', 'at_rest', 'used')})
 
 
 def _motion(recording: Recording, sensor: Sensor, volts: np.ndarray, sim: Motion | None
@@ -264,13 +257,10 @@ def _motion(recording: Recording, sensor: Sensor, volts: np.ndarray, sim: Motion
                              **environment_paths(recording)}
     if sim is not None:
         return replace(sim, **paths), Reference.SIMULATOR
-    ranges = {}
-    for joint, name in JOINTS.items():
-        values = recording.columns.get(name, np.array([np.nan]))
-        if np.isfinite(values).any():
-            ranges[joint] = np.nanmax(values) - np.nanmin(values)
-    if {'alpha', 'beta'} <= set(ranges) and any(
-            ranges[joint] > _SMALLEST_MOVES[joint] for joint in ranges):
+    read = {joint: values[np.isfinite(values)] for joint, name in JOINTS.items()
+            if np.isfinite(values := recording.columns.get(name, np.zeros(0))).any()}
+    if {'alpha', 'beta'} <= {*read} and any(
+            np.ptp(values) > _SMALLEST_MOVES[joint] for joint, values in read.items()):
         return motion_from_references(recording, sensor), Reference.STAGE
     # The median output stands for the unknown pose, and the simulator runs at the samples' rate.
     force = signal_chain.inverse(sensor)([float(v) for v in np.nanmedian(volts, axis=0)])
@@ -313,7 +303,7 @@ def code_step_v(volts: np.ndarray) -> np.ndarray:
     """Return the smallest change of an output on each axis, V; 0 where it never changes."""
     changes_v = np.abs(np.diff(volts, axis=0))
     smallest = np.min(changes_v, axis=0, initial=np.inf, where=changes_v > 0)
-    return np.where(np.isfinite(smallest), smallest, 0.0)
+    return np.nan_to_num(smallest, posinf=0.0)
 
 
 def gravity_slopes(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
@@ -362,7 +352,7 @@ def without_gaps(comparison: BaselineComparison) -> BaselineComparison:
             unknown |= (time_s >= time_s[begin] - _BEFORE_S) \
                 & (time_s <= time_s[end - 1] + _AFTER_S)
     return leave_out(comparison, unknown,
-                      f'no reading of {force.name} for more than {limit_s:.3g} s')
+                     f'no reading of {force.name} for more than {limit_s:.3g} s')
 
 
 def stated_poses(recording: Recording, sensor: Sensor

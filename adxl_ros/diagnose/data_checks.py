@@ -162,10 +162,9 @@ def _align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: b
     if not covered.any():
         advice = f'its motion fits, but is {shift.text}; use --align' if shift is not None else \
             'no shift makes its motion fit; give that of this recording'
-        raise DataFault('no_overlap', f'{force.name} does not overlap the recording in '
-                        f'time: {basename(recording.path)} is from {recording.time_s[0]:.6g} '
-                        f'to {recording.time_s[-1]:.6g} s, {force.name} from {begin_s:.6g} to '
-                        f'{end_s:.6g} s; {advice}')
+        raise DataFault('no_overlap', f'{force.name} does not overlap the recording in time: it '
+                        f'is from {begin_s:.6g} to {end_s:.6g} s, {basename(recording.path)} from '
+                        f'{recording.time_s[0]:.6g} to {recording.time_s[-1]:.6g} s; {advice}')
     if shift is not None and not may_shift:
         raise DataFault('time_misaligned', f'{force.name} is {shift.text}; use --align, or '
                         f'shift its stamps by {-shift.late_s:+.6g} s')
@@ -456,13 +455,10 @@ def check_length(comparisons: Sequence[BaselineComparison]) -> None:
     """Refuse recordings that are too short together; one at rest may have any length."""
     span_s = sum(c.span_s for c in comparisons)
     used_s = sum(c.span_s * float(c.used.mean()) for c in comparisons)
-    if used_s >= SHORTEST_S or all(c.reference is Reference.NONE for c in comparisons):
-        return
-    raise DataFault('too_short', (
-        f'{span_s:.3g} s in all are too short for a verdict; record at least one minute'
-        if span_s < SHORTEST_S else f'{used_s:.3g} of {span_s:.3g} s have a usable reference, '
-        'which is too short for a verdict; the note says why'), 'insufficient',
-        tuple(comparisons))
+    if used_s < SHORTEST_S and any(c.reference is not Reference.NONE for c in comparisons):
+        raise DataFault('too_short', f'{used_s:.3g} of {span_s:.3g} s have a usable reference, '
+                        'which is too short for a verdict; record at least one minute, or see the '
+                        'note on what is left out', 'insufficient', tuple(comparisons))
 
 
 def _check_samples(comparison: BaselineComparison, search_comparison: BaselineComparison) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import json
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, NamedTuple
@@ -108,6 +109,11 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
             'menu': [{'manoeuvre': w.name, 'minutes': w.minutes, 'nats_per_minute': w.per_minute}
                      for w in proposal.menu]},
         'summary': summary(diagnosis)})
+
+
+def as_text(values: dict[str, Any]) -> str:
+    """Return values as JSON."""
+    return json.dumps(values, indent=1, allow_nan=False) + '\n'
 
 
 def notes(diagnosis: Diagnosis) -> list[str]:

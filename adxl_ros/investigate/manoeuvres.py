@@ -180,8 +180,6 @@ CATALOGUE = {
         'long rests', 'rest for a minute in two opposite poses',
         [('rest', 90, 45, _LONG_REST_S), ('rest', 90, 225, _LONG_REST_S)])}
 """Manoeuvres by name."""
-KIND_OF = {name: manoeuvre.kind for name, manoeuvre in CATALOGUE.items()}
-"""Kind of each manoeuvre."""
 
 
 @dataclass(frozen=True)
