@@ -148,8 +148,8 @@ def _align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: b
     """
     force, notes = sim.force, []
     assert isinstance(force, ForcePath)
-    shift = _find_shift(recording, replace(sensor, rate_hz=recording.rate_hz), force)
-    if shift is not None and may_shift:
+    shift = _find_shift(recording, sensor, force)
+    if shift and may_shift:
         force = force.shifted(-shift.late_s)
         notes = [f'--align: {force.name} was {shift.text}, and is shifted by '
                  f'{-shift.late_s:+.6g} s; a latency of the sensor is a part of that and cannot '
@@ -160,12 +160,12 @@ def _align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: b
     begin_s, end_s = force.time_s[0], force.time_s[-1]
     covered = (recording.time_s >= begin_s) & (recording.time_s <= end_s)
     if not covered.any():
-        advice = f'its motion fits, but is {shift.text}; use --align' if shift is not None else \
+        advice = f'its motion fits, but is {shift.text}; use --align' if shift else \
             'no shift makes its motion fit; give that of this recording'
         raise DataFault('no_overlap', f'{force.name} does not overlap the recording in time: it '
                         f'is from {begin_s:.6g} to {end_s:.6g} s, {basename(recording.path)} from '
                         f'{recording.time_s[0]:.6g} to {recording.time_s[-1]:.6g} s; {advice}')
-    if shift is not None and not may_shift:
+    if shift and not may_shift:
         raise DataFault('time_misaligned', f'{force.name} is {shift.text}; use --align, or '
                         f'shift its stamps by {-shift.late_s:+.6g} s')
     if not covered.all():
@@ -372,8 +372,8 @@ def _check_encoder(recording: Recording, sensor: Sensor) -> None:
 
     def unexplained(factors: Sequence[float]) -> float:
         """Return the share of the variance that angles times factors do not explain."""
-        return float(np.sum(np.var(measured_g - force_g(factors), axis=0))
-                     / np.sum(np.var(measured_g, axis=0)))
+        return float(np.var(measured_g - force_g(factors), axis=0).sum()
+                     / np.var(measured_g, axis=0).sum())
 
     recorded, largest = unexplained((1.0, 1.0)), np.abs(angles_rad).max(axis=0)
     # The fewest changes come first, and of equal ones the first is the best.

@@ -353,7 +353,8 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
 
     filters: whitening filters of each channel, where not all are tried.
     """
-    filters = filters or [f for c in comparisons for f in evidence.whiteners(c)]
+    filters = filters or [evidence.whiteners(c, axis) for c in comparisons
+                          for axis in range(len(c.sensor.axes))]
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
     # The same variant of several recordings, by the number of the recording.
     every: dict[tuple, dict[int, Variant]] = {}

@@ -38,7 +38,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import Coefficient, Concern, Detector, Effect, Manoeuvre
+from adxl_ros.model.effects.base import Coefficient, Concern, Detector, Manoeuvre
 from adxl_ros.model.sensor import parameter_of, Sensor, with_neutral
 from adxl_ros.report.quantities import listed
 from adxl_ros.simulate import trajectories
@@ -391,20 +391,18 @@ def _experiment(manoeuvre: Manoeuvre, why: str, no_stage: bool) -> NextExperimen
     if no_stage:
         return NextExperiment(described.text, why, _OTHER_REFERENCE, beside_simulator=True)
     if described.remounted:
-        effect = _remounting_effect()
-        option = f' --effect {effect.name}:{effect.diagnosis.half_turn}={np.pi:.6f}'
+        option = f' --effect {":".join(_half_turn())}={np.pi:.6f}'
     return NextExperiment(described.text, why, f'ros2 run adxl_ros simulate '
                           f'{described.trajectory}{option} -o next.csv')
 
 
-def _remounting_effect() -> Effect:
-    """Return the effect that turns the sensor on its stage."""
-    return next(e for e in library().values() if e.diagnosis.half_turn)
+def _half_turn() -> tuple[str, str]:
+    """Return effect and parameter, an angle, that turn the sensor on its stage."""
+    return next((e.name, hint) for e in library().values() if (hint := e.diagnosis.half_turn))
 
 
 def _remounted(sensor: Sensor) -> Sensor:
     """Turn the sensor on its stage by half a turn: the encoder's zero changes by π."""
-    name, parameter = (effect := _remounting_effect()).name, effect.diagnosis.half_turn
+    name, parameter = _half_turn()
     turned = with_neutral(sensor, [name])
-    return with_values(turned, name, {parameter: np.asarray(
-        turned.values[name][parameter]) + np.pi})
+    return with_values(turned, name, {parameter: turned.values[name][parameter] + np.pi})

@@ -308,16 +308,15 @@ def _stacked(panels: Sequence[tuple[dict[str, Any], Sequence[Figure]]], height: 
              margin: dict[str, int], xaxis: dict[str, Any]) -> Figure:
     """Put panels, an axis with its lines each, below each other; all zoom together."""
     traces: list[Figure] = []
-    layout, count = {}, len(panels)
-    part = (1 + 0.08) / count - 0.08
-    for i, (axis, lines) in enumerate(panels, 1):
-        top = 1 - (i - 1) * (part + 0.08)
-        layout[plots.axis_number('yaxis', i)] = {'domain': [max(top - part, 0.0), top], **axis}
-        traces += [{**drawn, 'xaxis': 'x', 'yaxis': plots.axis_number('y', i),
+    layout = {'xaxis': {'anchor': plots.axis_number('y', len(panels)), **xaxis}}
+    part = 1.08 / len(panels)
+    for i, (axis, lines) in enumerate(panels):
+        layout[plots.axis_number('yaxis', i + 1)] = {
+            'domain': [max(1.08 - (i + 1) * part, 0.0), 1 - i * part], **axis}
+        traces += [{**drawn, 'xaxis': 'x', 'yaxis': plots.axis_number('y', i + 1),
                     'legendgroup': drawn['name'], 'showlegend': not any(
                         t['name'] == drawn['name'] for t in traces)} for drawn in lines]
-    return figure(traces, height, margin=margin,
-                  xaxis={'anchor': plots.axis_number('y', count), **xaxis}, **layout)
+    return figure(traces, height, margin=margin, **layout)
 
 
 def signals(comparison: BaselineComparison, after: Sensor) -> Figure:

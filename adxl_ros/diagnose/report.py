@@ -21,6 +21,7 @@ from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern
 from adxl_ros.model.sensor import fitted_of, get, parameter_of
 from adxl_ros.report.quantities import (
     amplitude_text,
+    counted,
     Interval,
     listed,
     mg_text,
@@ -206,17 +207,16 @@ def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> d
         # The density of a drift is chosen with the noise, on a grid.
         return {_key(name): {'value': float(get(sensor, [name])[0]),
                              'unit': parameter_of(name).unit} for name in names}
-    parameters: dict[str, dict[str, Any]] = {}
-    for name in names:
-        if hypothesis is None or name not in hypothesis.names:
-            continue
-        place = hypothesis.names.index(name)
-        value, half = float(get(hypothesis.sensor, [name])[0]), Z_90 * hypothesis.std[place]
-        known = not hypothesis.undetermined[place]
-        parameters[_key(name)] = {
-            'value': value if known else None,
-            'ci': (value - half, value + half) if known else None,
-            'unit': parameter_of(name).unit, 'determined': known}
+    if hypothesis is None:
+        return {}
+    parameters, values = dict[str, dict[str, Any]](), get(hypothesis.sensor, hypothesis.names)
+    for name, value, std, is_open in zip(hypothesis.names, values.tolist(), hypothesis.std,
+                                         hypothesis.undetermined):
+        if name in names:
+            ci = value - Z_90 * std, value + Z_90 * std
+            parameters[_key(name)] = {
+                'value': None if is_open else value, 'ci': None if is_open else ci,
+                'unit': parameter_of(name).unit, 'determined': not is_open}
     return parameters
 
 
@@ -231,14 +231,13 @@ def badge(diagnosis: Diagnosis) -> str:
         assert diagnosis.fault is not None
         return 'BAD DATA' if diagnosis.fault.status == 'bad_data' else 'TOO LITTLE DATA'
     verdict = diagnosis.report.verdict
-    count = len(verdict.effects)
     if verdict.status == 'explained' and concern(verdict) == Concern.REFERENCE.value:
         return 'ERROR OF THE REFERENCE'
     return {'no_gap': f'NO GAP above {mg_text(verdict.upper_limit_mps2)}',
             'insufficient': 'TOO LITTLE DATA', 'unknown': 'UNKNOWN CAUSE',
             'inseparable': 'CAUSES NOT SEPARATED',
             'partly': f'PARTLY EXPLAINED, {percent(verdict.explained_share)}',
-            'explained': f'GAP EXPLAINED by {count} effect{"" if count == 1 else "s"}',
+            'explained': f'GAP EXPLAINED by {counted(len(verdict.effects), "effect")}',
             }[verdict.status]
 
 

@@ -340,16 +340,6 @@ class State(Enum):
     STOPPED = 'stopped'
 
 
-@dataclass(frozen=True)
-class Status:
-    """What an investigation does."""
-
-    state: State  # Its state
-    text: str  # What happens, for people
-    minutes: float  # Time since its beginning, min
-    remaining_s: float  # Time to the end of a manoeuvre, s; 0 in other states
-
-
 class Investigation:
     """The state machine."""
 
@@ -389,14 +379,23 @@ class Investigation:
         """Return the speed on the way to the newest command, rad/s; None at its end."""
         return None if self._stream is None or self._stream.is_done else self._stream.speed
 
-    def status(self) -> Status:
-        """Return what it does."""
-        texts = {State.RECORDING: 'waiting for samples and stage',
-                 State.DIAGNOSING: 'diagnosing the samples so far; the stage rests',
-                 State.MOVING: CATALOGUE[self._manoeuvre].text if self._manoeuvre else '',
-                 State.FINISHED: 'finished', State.STOPPED: f'stopped: {self.reason}'}
-        remaining_s = self._stream.remaining_s if self._stream else 0.0
-        return Status(self.state, texts[self.state], self._minutes(), remaining_s)
+    @property
+    def text(self) -> str:
+        """Return what it does, for people."""
+        return {State.RECORDING: 'waiting for samples and stage',
+                State.DIAGNOSING: 'diagnosing the samples so far; the stage rests',
+                State.MOVING: CATALOGUE[self._manoeuvre].text if self._manoeuvre else '',
+                State.FINISHED: 'finished', State.STOPPED: f'stopped: {self.reason}'}[self.state]
+
+    @property
+    def minutes(self) -> float:
+        """Return the time since its beginning, min."""
+        return 0.0 if self._begin_s is None else (self._now_s - self._begin_s) / 60
+
+    @property
+    def remaining_s(self) -> float:
+        """Return the time to the end of a manoeuvre, s; 0 in other states."""
+        return self._stream.remaining_s if self._stream else 0.0
 
     def step(self, now_s: float, pose: Pose | None) -> Pose | None:
         """Go on."""
@@ -420,9 +419,6 @@ class Investigation:
             self._hold()
         return self._command
 
-    def _minutes(self) -> float:
-        return 0.0 if self._begin_s is None else (self._now_s - self._begin_s) / 60
-
     def _hold(self) -> None:
         """Command the present pose, if the stage has been commanded before."""
         self._stream = None
@@ -444,7 +440,7 @@ class Investigation:
         """Ask for a diagnosis of the samples so far."""
         assert self._begin_s is not None
         self.state, self._stream = State.DIAGNOSING, None
-        self._asked_minutes = self._minutes()
+        self._asked_minutes = self.minutes
         self._flush()
         self._diagnoser.ask(Question(
             self._command or self._limits.nearest(*pose), self._asked_minutes,
