@@ -453,12 +453,12 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording:
 
 def check_length(comparisons: Sequence[BaselineComparison]) -> None:
     """Refuse recordings that are too short together; one at rest may have any length."""
-    span_s = sum(c.span_s for c in comparisons)
     used_s = sum(c.span_s * float(c.used.mean()) for c in comparisons)
     if used_s < SHORTEST_S and any(c.reference is not Reference.NONE for c in comparisons):
-        raise DataFault('too_short', f'{used_s:.3g} of {span_s:.3g} s have a usable reference, '
-                        'which is too short for a verdict; record at least one minute, or see the '
-                        'note on what is left out', 'insufficient', tuple(comparisons))
+        raise DataFault('too_short', f'{used_s:.3g} of {sum(c.span_s for c in comparisons):.3g} s '
+                        'have a usable reference, which is too short for a verdict; record at '
+                        'least one minute, or see the note on what is left out', 'insufficient',
+                        tuple(comparisons))
 
 
 def _check_samples(comparison: BaselineComparison, search_comparison: BaselineComparison) -> None:

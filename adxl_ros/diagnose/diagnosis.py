@@ -151,7 +151,11 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         evidence, lambda effects, drift: rule.reproducible_rest(fits[effects][drift], bases),
         [d.effect for d in detections])
     show_progress('5/5 report', 0.9)
-    if verdict.status == 'no_gap' and not any(map(_could_show, model.comparisons)):
+    if verdict.status == 'no_gap' and not any(
+            c.reference is Reference.SIMULATOR or (c.joints and not c.at_rest.all()) or any(
+                np.ptp(values) > _SMALLEST_RANGES[name]
+                for name, values in c.surroundings.items()) for c in model.comparisons):
+        # Neither the sensor moves, nor does its temperature or supply change.
         verdict = replace(verdict, status='insufficient')
     report = _report(checked, model, search, verdict, detections, floor, evidence,
                      fits[verdict.best], seed)
@@ -221,14 +225,6 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline:
         detections += [d for d in found if d.effect in {o.effect for o in of_baseline}]
     material = [d for d in detections if d.power_mps2 > smallest_mps2 ** 2]
     return list({d.effect: d for d in sorted(material, key=lambda d: d.power_mps2)}.values())
-
-
-def _could_show(comparison: BaselineComparison) -> bool:
-    """Determine whether the sensor moves, or its temperature or supply changes."""
-    moves = comparison.reference is Reference.SIMULATOR or (
-        comparison.joints is not None and not comparison.at_rest.all())
-    return moves or any(np.ptp(values) > _SMALLEST_RANGES[name]
-                        for name, values in comparison.surroundings.items())
 
 
 def _named_sensor(verdict: Verdict, best: Hypothesis, detections: Sequence[Detection],

@@ -68,11 +68,6 @@ class CouldShow(NamedTuple):
     share: float = 1.0
 
     @property
-    def effect(self) -> str:
-        """Return the name of the effect."""
-        return self.name.effect
-
-    @property
     def shows(self) -> bool:
         """Return whether the smallest size is one that the parameter can have."""
         p = parameter_of(self.name)
@@ -117,11 +112,11 @@ def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.n
             if hints.nuisance:
                 size = np.hypot(size, 3 * model.tolerance(model.names[k]))
             rows.append(CouldShow(model.names[k], float(size), share))
-    seen = {r.effect for r in rows} | {v.effect for v in model.variants if v.limit_start}
+    seen = {r.name.effect for r in rows} | {v.effect for v in model.variants if v.limit_start}
     rows += [CouldShow(Coefficient(e.name, e.parameters[0].name), np.inf, 0.0)
              for e in linear.candidates() if e.name not in seen]
     # The coefficient of each effect that shows best, by smallest over typical size.
-    best = {r.effect: r for r in sorted(rows, reverse=True, key=lambda r: (
+    best = {r.name.effect: r for r in sorted(rows, reverse=True, key=lambda r: (
         r.smallest / parameter_of(r.name).scale, r.name))}
     return [best[effect] for effect in sorted(best)]
 

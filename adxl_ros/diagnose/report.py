@@ -97,7 +97,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
                   for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
         'not_covered': report.not_covered, 'notes': notes(diagnosis),
         'could_show': [
-            {'effect': r.effect, 'parameter': r.name.parameter, 'axis': r.name.axis or None,
+            {'effect': r.name.effect, 'parameter': r.name.parameter, 'axis': r.name.axis or None,
              'unit': parameter_of(r.name).unit, 'smallest': r.smallest, 'could_show': r.shows}
             for r in report.could_show],
         'candidates': _candidates(report),
@@ -168,7 +168,7 @@ def shares_of_gap(report: Report) -> dict[str, float]:
 
 def _candidates(report: Report) -> list[dict[str, Any]]:
     """Return the effects of all hypotheses and detections, the most probable first."""
-    verdict, shown = report.verdict, {row.effect: row for row in report.could_show}
+    verdict, shown = report.verdict, {row.name.effect: row for row in report.could_show}
     detected, shares = {d.effect: d for d in report.detections}, shares_of_gap(report)
     out = []
     for name, effect in library().items():
@@ -350,11 +350,12 @@ def closes(report: Report) -> bool:
 
 def shown_row(row: CouldShow, scale_v_per_g: float) -> list[str]:
     """Return effect, parameter, smallest and typical size, and the manoeuvre that shows it."""
-    p, revealed_by = parameter_of(row.name), effect_named(row.effect).diagnosis.revealed_by
+    p, revealed_by = parameter_of(row.name), effect_named(row.name.effect).diagnosis.revealed_by
     smallest, typical = (parameter_text({'value': v, 'unit': p.unit}, scale_v_per_g, 2)
                          for v in (row.smallest, p.scale))
-    return [row.effect, parameter_label(p.name, False), smallest if row.shows else 'cannot show',
-            typical, MENU[revealed_by].text if revealed_by else '']
+    return [row.name.effect, parameter_label(p.name, False),
+            smallest if row.shows else 'cannot show', typical,
+            MENU[revealed_by].text if revealed_by else '']
 
 
 def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]:
@@ -397,7 +398,7 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     elif is_only_noise(report):
         lines += wrapped(NOISE_STAYS)
     shown = report.could_show
-    hidden = ', '.join(row.effect for row in shown if not row.shows)
+    hidden = ', '.join(row.name.effect for row in shown if not row.shows)
     return [*lines, *_effect_table(report, objects), '', *_labelled([
         ('figures', '; '.join(f'{row.label} {row.text}' for row in rows[2 + closes(report):])),
         *(('noise', f'{row.label}: {row.text}') for row in remainder_rows(report)),

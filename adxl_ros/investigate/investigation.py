@@ -429,7 +429,7 @@ class Investigation:
         """Wait until the stage has been there for a while; refuse a stage outside its limits."""
         if now_s - self._since_s < _FIRST_REST_S:
             return
-        if self._limits.excess_rad(pose) > _OUTSIDE_RAD:
+        if np.abs(np.subtract(pose, self._limits.nearest(*pose))).max() > _OUTSIDE_RAD:
             self.stop(f'the stage is at {_text(pose)}, outside of its limits; move it, or set '
                       'limits.alpha_deg and limits.beta_deg')
             return

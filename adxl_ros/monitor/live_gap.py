@@ -108,9 +108,12 @@ class LiveGap:
         self._blocks: deque[Block] = deque(
             maxlen=max(round(settings.window_s * 1e9 / BLOCK_NS), _FEWEST_BLOCKS))
         self._ends_ns: deque[int] = deque(maxlen=_MEMORY)
+        # Random walk of a healthy unit, or of its file if that is larger.
+        walk_g = float(np.max(sensor.values.get('bias_walk', {}).get('density_g_per_rts', ()),
+                              initial=effect_named('bias_walk').diagnosis.healthy_density))
         count = len(sensor.axes)
         self._test = ChangeTest(2 * count, settings.false_alarms_per_day, BLOCK_NS * 1e-9,
-                                (_healthy_walk(sensor),) * count + (np.inf,) * count)
+                                (G0_MPS2 * walk_g,) * count + (np.inf,) * count)
         self._changed_ns: dict[str, int] = {}
         self._prediction = reference_stream.Prediction(sensor, self.reference)
         self.left_out = self._prediction.left_out  # Effects that the reference cannot drive
@@ -287,13 +290,6 @@ class LiveGap:
                 datasheet ** 2 - floor.value ** 2), 0.0, 1.0))
         offset_mg = float(np.mean([block.mean_mps2[d] for block in blocks])) / _MG
         return AxisGap(axis, gap, floor, source, offset_mg, explained)
-
-
-def _healthy_walk(sensor: Sensor) -> float:
-    """Return the random walk of a healthy unit, or of its file if that is larger, m/s²/√s."""
-    healthy = effect_named('bias_walk').diagnosis.healthy_density
-    walks = sensor.values.get('bias_walk', {}).get('density_g_per_rts', ())
-    return G0_MPS2 * float(np.max(walks, initial=healthy))
 
 
 def _rms_interval(squares: np.ndarray) -> Interval:

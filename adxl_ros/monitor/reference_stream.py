@@ -178,17 +178,14 @@ class ReferenceStream:
         self._paths = [SmoothedPath(time_s, values, step)
                        for values, step in zip(readings.T, (step_rad, step_rad, 0.0))]
         largest = max(_STILL_STEPS * step_rad, _STILL_RAD)
-        return bool((changes > largest).any()), self._encoder_error_mps2(np.linspace(
-            (begin_ns - self._origin_ns) * 1e-9, (end_ns - self._origin_ns) * 1e-9, 3))
-
-    def _encoder_error_mps2(self, time_s: np.ndarray) -> np.ndarray:
-        """Return what the steps of the encoder make of the force at some times, m/s², (3,)."""
+        time_s = (np.linspace(begin_ns, end_ns, 3) - self._origin_ns) * 1e-9
         alpha, beta = (path(time_s) for path in self._paths[:2])
         stds = [errors.std if isinstance(path, SmoothedPath) and (errors := path.errors(time_s))
                 else 0.0 for path in self._paths[:2]]
-        slopes = gravity_slopes(alpha, beta)
-        squares = sum((slope * std) ** 2 for slope, std in zip(slopes, stds))
-        return np.asarray(self._sensor.local_gravity_mps2 * np.sqrt(squares.mean(axis=1)))
+        squares = np.sum([(slope * std) ** 2 for slope, std in zip(
+            gravity_slopes(alpha, beta), stds)], axis=0)
+        return bool((changes > largest).any()), \
+            self._sensor.local_gravity_mps2 * np.sqrt(squares.mean(axis=1))
 
     def _joint(self, number: int, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         return self._paths[number](time_s, order)

@@ -78,7 +78,7 @@ def test_it_diagnoses_and_moves_in_turn_until_a_hypothesis_is_certain():
     assert [q.has_samples for q in diagnoser.questions] == [False, True, True]
     assert diagnoser.questions[1].minutes > diagnoser.questions[0].minutes
     assert diagnoser.questions[1].remaining_minutes < 10
-    assert max(LIMITS.excess_rad(c) for c in stage.commands) == 0
+    assert all(LIMITS.nearest(*c) == c for c in stage.commands)
 
 
 def test_a_stop_holds_the_pose_of_the_stage():
