@@ -119,8 +119,7 @@ def as_text(values: dict[str, Any]) -> str:
 
 def notes(diagnosis: Diagnosis) -> list[str]:
     """Return what was corrected or left out, with the file where there are several."""
-    several = len(diagnosis.comparisons) > 1
-    return [f'{Path(c.name).name}: {note}' if several else note
+    return [f'{Path(c.name).name}: {note}' if len(diagnosis.comparisons) > 1 else note
             for c in diagnosis.comparisons for note in c.notes]
 
 

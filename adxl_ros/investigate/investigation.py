@@ -269,9 +269,8 @@ class OutputFolder:
 def _write_diagnosis(folder: OutputFolder, diagnosis: Diagnosis, recording: Recording,
                      with_page: bool) -> None:
     """Write report and parameters of a diagnosis."""
-    subject = (f'{folder.bag.name} ({recording.time_s[-1] - recording.time_s[0]:.0f} s, '
-               f'{recording.rate_hz:.4g} Hz, {" ".join(recording.axes)})  minus  simulation of '
-               f'{folder.baseline.name}')
+    subject = (f'{folder.bag.name} ({np.ptp(recording.time_s):.0f} s, {recording.rate_hz:.4g} Hz, '
+               f'{" ".join(recording.axes)})  minus  simulation of {folder.baseline.name}')
     lines = screen_lines(diagnosis, subject) if diagnosis.report is not None else []
     steps = [('simulate with these parameters', 'ros2 run adxl_ros simulate rich --params '
               f'{folder.parameters} -o sim.csv')] if lines else []

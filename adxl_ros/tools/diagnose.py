@@ -106,15 +106,15 @@ def diagnose(options: argparse.Namespace) -> int:
                                         lambda stage, done: show(done, stage), options.align,
                                         options.material)
         subject = _subject(recordings, sensor, options.sim or options.urdf)
-        lines = [*screen_lines(diagnosis, subject), *prior_lines]
-        if options.self_check and diagnosis.report is not None:
+        lines, found, gap = screen_lines(diagnosis, subject), diagnosis.report, None
+        lines += prior_lines
+        if options.self_check and found:
             lines += ['', ' ' + self_check(diagnosis, recordings, sim, options.self_check,
                                            options.seed,
                                            lambda done: show(done, 'self-check'))]
-        gap = gap_in(unit, diagnosis.full_rate, diagnosis.report.baseline,
-                     diagnosis.report.sensor, options.seed) \
-            if unit is not None and diagnosis.report is not None else None
-        lines += ['', f' in      {gap.text}'] if gap else []
+        if unit and found:
+            gap = gap_in(unit, diagnosis.full_rate, found.baseline, found.sensor, options.seed)
+            lines += ['', f' in      {gap.text}']
         report = _write(options, diagnosis, subject, lines, gap)
     if options.json:
         print(as_text(report), end='')
