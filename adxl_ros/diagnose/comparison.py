@@ -15,7 +15,6 @@ from functools import cached_property
 from typing import Any
 
 from adxl_ros.files.recording_columns import JOINTS, Recording
-from adxl_ros.files.reference_alignment import LONGEST_MOVE_NS, USUAL_GAPS
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
@@ -23,7 +22,6 @@ from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import true_runs
-from adxl_ros.signals.rest_detection import find_rests
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import ChainMemo, Response
 from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath
@@ -50,9 +48,9 @@ SETTLING_S = 0.3
 has settled."""
 _LONGEST_S = 1e3
 """Time since the last move where there was none, s. Chosen: beyond any creep."""
-_LONGEST_BRIDGE_S, _SLOWEST_S = LONGEST_MOVE_NS / 1e9, 1.0
-"""Longest time without a reading that is bridged, s: of a joint as between messages of a bag, and
-of a slow encoder, whose readings are a move apart at most."""
+_LONGEST_BRIDGE_S, _SLOWEST_S, _USUAL_GAPS = 0.1, 1.0, 3.0
+"""Longest time without a reading that is bridged, s: of a joint, and of a slow encoder, whose
+readings are a move apart at most; and the same in usual gaps. Those of messages of a bag."""
 _BEFORE_S, _AFTER_S = 0.1, 0.3
 """Times that are left out beside a gap, s. Chosen: the spline is uncertain before it, and an RC
 filter of 15 Hz has settled after it."""
@@ -227,34 +225,27 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
     motion, reference = _motion(recording, sensor, volts, sim)
     if reference is not Reference.NONE:
         motion = replace(motion, internal_rate_hz=min(
-            max(_LOWEST_INTERNAL_RATE_HZ, sensor.rate_hz), INTERNAL_RATE_HZ, _most_hz(time_s)))
+            max(_LOWEST_INTERNAL_RATE_HZ, sensor.rate_hz), INTERNAL_RATE_HZ,
+            _MOST_STEPS / max(float(np.ptp(time_s)), 1.0)))
     at_rest = _at_rest(motion, time_s, reference, volts)
-    used = np.ones(len(recording), bool)
-    if reference is Reference.SIMULATOR:
-        # Where another simulator moves from its first sample on, the filter has not settled.
-        used = at_rest | (time_s > time_s[0] + SETTLING_S)
+    # Where another simulator moves from its first sample on, the filter has not settled.
+    used = at_rest | (time_s > time_s[0] + SETTLING_S) | (reference is not Reference.SIMULATOR)
     return BaselineComparison(recording.path, time_s, volts, motion, sensor, reference, at_rest,
                               used)
 
 
-def _most_hz(time_s: np.ndarray) -> float:
-    """Return the internal rate at which a recording has the largest number of steps, Hz."""
-    return _MOST_STEPS / max(float(time_s[-1] - time_s[0]), 1.0)
-
-
 def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
     """Return every k-th sample of a recording, for the search."""
-    rate_wanted_hz = min(SEARCH_RATE_HZ, SEARCH_SAMPLES / max(comparison.span_s, 1.0))
-    every = max(1, round(comparison.sensor.rate_hz / rate_wanted_hz))
-    part, motion = slice(None, None, every), comparison.motion
+    span_s, rate_hz = max(comparison.span_s, 1.0), comparison.sensor.rate_hz
+    motion = comparison.motion
+    every = max(1, round(rate_hz / min(SEARCH_RATE_HZ, SEARCH_SAMPLES / span_s)))
     if comparison.reference is not Reference.NONE:
         motion = replace(motion, internal_rate_hz=min(_LOWEST_INTERNAL_RATE_HZ,
-                                                      _most_hz(comparison.time_s)))
-    return replace(
-        comparison, time_s=comparison.time_s[part], volts=comparison.volts[part],
-        motion=motion, sensor=replace(comparison.sensor,
-                                      rate_hz=comparison.sensor.rate_hz / every),
-        at_rest=comparison.at_rest[part], used=comparison.used[part], memo=ChainMemo())
+                                                      _MOST_STEPS / span_s))
+    return replace(comparison, motion=motion, memo=ChainMemo(), sensor=replace(
+        comparison.sensor, rate_hz=rate_hz / every), **{
+            name: getattr(comparison, name)[::every]
+            for name in ('time_s', 'volts', 'at_rest', 'used')})
 
 
 def _motion(recording: Recording, sensor: Sensor, volts: np.ndarray, sim: Motion | None
@@ -264,13 +255,10 @@ def _motion(recording: Recording, sensor: Sensor, volts: np.ndarray, sim: Motion
                              **environment_paths(recording)}
     if sim is not None:
         return replace(sim, **paths), Reference.SIMULATOR
-    ranges = {}
-    for joint, name in JOINTS.items():
-        values = recording.columns.get(name, np.array([np.nan]))
-        if np.isfinite(values).any():
-            ranges[joint] = np.nanmax(values) - np.nanmin(values)
-    if {'alpha', 'beta'} <= set(ranges) and any(
-            ranges[joint] > _SMALLEST_MOVES[joint] for joint in ranges):
+    read = {joint: values[np.isfinite(values)] for joint, name in JOINTS.items()
+            if np.isfinite(values := recording.columns.get(name, np.zeros(0))).any()}
+    if {'alpha', 'beta'} <= {*read} and any(
+            np.ptp(values) > _SMALLEST_MOVES[joint] for joint, values in read.items()):
         return motion_from_references(recording, sensor), Reference.STAGE
     # The median output stands for the unknown pose, and the simulator runs at the samples' rate.
     force = signal_chain.inverse(sensor)([float(v) for v in np.nanmedian(volts, axis=0)])
@@ -285,6 +273,7 @@ def _at_rest(motion: Motion, time_s: np.ndarray, reference: Reference, volts: np
     if reference is Reference.NONE:
         return np.ones(len(time_s), bool)
     if reference is Reference.SIMULATOR:
+        from adxl_ros.signals.rest_detection import find_rests
         # The force of another simulator may be noisy, so that the sensor itself shows its rests.
         finite, at_rest = np.isfinite(volts).all(axis=1), np.zeros(len(time_s), bool)
         for rest in find_rests(time_s[finite], volts[finite],
@@ -313,7 +302,7 @@ def code_step_v(volts: np.ndarray) -> np.ndarray:
     """Return the smallest change of an output on each axis, V; 0 where it never changes."""
     changes_v = np.abs(np.diff(volts, axis=0))
     smallest = np.min(changes_v, axis=0, initial=np.inf, where=changes_v > 0)
-    return np.where(np.isfinite(smallest), smallest, 0.0)
+    return np.nan_to_num(smallest, posinf=0.0)
 
 
 def gravity_slopes(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
@@ -355,14 +344,14 @@ def without_gaps(comparison: BaselineComparison) -> BaselineComparison:
     time_s, force = comparison.time_s, comparison.motion.force
     if not isinstance(force, ForcePath):
         return comparison
-    limit_s = max(_LONGEST_BRIDGE_S, USUAL_GAPS * float(np.median(np.diff(force.time_s))))
+    limit_s = max(_LONGEST_BRIDGE_S, _USUAL_GAPS * float(np.median(np.diff(force.time_s))))
     unknown = np.zeros(len(time_s), bool)
     for begin, end in _in_gaps(time_s, force.time_s, limit_s):
         if end > begin:
             unknown |= (time_s >= time_s[begin] - _BEFORE_S) \
                 & (time_s <= time_s[end - 1] + _AFTER_S)
     return leave_out(comparison, unknown,
-                      f'no reading of {force.name} for more than {limit_s:.3g} s')
+                     f'no reading of {force.name} for more than {limit_s:.3g} s')
 
 
 def stated_poses(recording: Recording, sensor: Sensor
@@ -383,7 +372,7 @@ def stated_poses(recording: Recording, sensor: Sensor
             continue
         step = 0.0 if joint == 'shift' else sensor.stage_resolution_rad
         filled = np.interp(time_s, time_s[read], values[read])
-        limit_s = max(_LONGEST_BRIDGE_S, min(USUAL_GAPS * float(np.median(np.diff(
+        limit_s = max(_LONGEST_BRIDGE_S, min(_USUAL_GAPS * float(np.median(np.diff(
             time_s[read]))), _SLOWEST_S))
         unknown, columns[name] = np.zeros(len(time_s), bool), values.copy()
         for begin, end in _in_gaps(time_s, time_s[read], _LONGEST_BRIDGE_S):

@@ -148,8 +148,8 @@ def _align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: b
     """
     force, notes = sim.force, []
     assert isinstance(force, ForcePath)
-    shift = _find_shift(recording, replace(sensor, rate_hz=recording.rate_hz), force)
-    if shift is not None and may_shift:
+    shift = _find_shift(recording, sensor, force)
+    if shift and may_shift:
         force = force.shifted(-shift.late_s)
         notes = [f'--align: {force.name} was {shift.text}, and is shifted by '
                  f'{-shift.late_s:+.6g} s; a latency of the sensor is a part of that and cannot '
@@ -160,13 +160,12 @@ def _align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: b
     begin_s, end_s = force.time_s[0], force.time_s[-1]
     covered = (recording.time_s >= begin_s) & (recording.time_s <= end_s)
     if not covered.any():
-        advice = f'its motion fits, but is {shift.text}; use --align' if shift is not None else \
+        advice = f'its motion fits, but is {shift.text}; use --align' if shift else \
             'no shift makes its motion fit; give that of this recording'
-        raise DataFault('no_overlap', f'{force.name} does not overlap the recording in '
-                        f'time: {basename(recording.path)} is from {recording.time_s[0]:.6g} '
-                        f'to {recording.time_s[-1]:.6g} s, {force.name} from {begin_s:.6g} to '
-                        f'{end_s:.6g} s; {advice}')
-    if shift is not None and not may_shift:
+        raise DataFault('no_overlap', f'{force.name} does not overlap the recording in time: it '
+                        f'is from {begin_s:.6g} to {end_s:.6g} s, {basename(recording.path)} from '
+                        f'{recording.time_s[0]:.6g} to {recording.time_s[-1]:.6g} s; {advice}')
+    if shift and not may_shift:
         raise DataFault('time_misaligned', f'{force.name} is {shift.text}; use --align, or '
                         f'shift its stamps by {-shift.late_s:+.6g} s')
     if not covered.all():
@@ -373,8 +372,8 @@ def _check_encoder(recording: Recording, sensor: Sensor) -> None:
 
     def unexplained(factors: Sequence[float]) -> float:
         """Return the share of the variance that angles times factors do not explain."""
-        return float(np.sum(np.var(measured_g - force_g(factors), axis=0))
-                     / np.sum(np.var(measured_g, axis=0)))
+        return float(np.var(measured_g - force_g(factors), axis=0).sum()
+                     / np.var(measured_g, axis=0).sum())
 
     recorded, largest = unexplained((1.0, 1.0)), np.abs(angles_rad).max(axis=0)
     # The fewest changes come first, and of equal ones the first is the best.
@@ -454,15 +453,12 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording:
 
 def check_length(comparisons: Sequence[BaselineComparison]) -> None:
     """Refuse recordings that are too short together; one at rest may have any length."""
-    span_s = sum(c.span_s for c in comparisons)
     used_s = sum(c.span_s * float(c.used.mean()) for c in comparisons)
-    if used_s >= SHORTEST_S or all(c.reference is Reference.NONE for c in comparisons):
-        return
-    raise DataFault('too_short', (
-        f'{span_s:.3g} s in all are too short for a verdict; record at least one minute'
-        if span_s < SHORTEST_S else f'{used_s:.3g} of {span_s:.3g} s have a usable reference, '
-        'which is too short for a verdict; the note says why'), 'insufficient',
-        tuple(comparisons))
+    if used_s < SHORTEST_S and any(c.reference is not Reference.NONE for c in comparisons):
+        raise DataFault('too_short', f'{used_s:.3g} of {sum(c.span_s for c in comparisons):.3g} s '
+                        'have a usable reference, which is too short for a verdict; record at '
+                        'least one minute, or see the note on what is left out', 'insufficient',
+                        tuple(comparisons))
 
 
 def _check_samples(comparison: BaselineComparison, search_comparison: BaselineComparison) -> None:

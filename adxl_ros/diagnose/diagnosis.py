@@ -12,32 +12,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from adxl_ros.diagnose import (
-    data_checks,
-    next_experiment,
-    noise_effects,
-    verdict as rule,
-)
+from adxl_ros.diagnose import data_checks, next_experiment, noise_effects, verdict as rule
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
-from adxl_ros.diagnose.data_checks import CheckedRecording, compare_checked, DataFault
+from adxl_ros.diagnose.data_checks import CheckedRecording, DataFault
 from adxl_ros.diagnose.evidence import drifts_among, estimate_floor, NoiseFloor, used_by_block
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
 from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemainder
-from adxl_ros.diagnose.residual_map import (
-    flexible_bases,
-    not_covered,
-    residual_map,
-    ResidualCell,
-)
+from adxl_ros.diagnose.residual_map import flexible_bases, not_covered, residual_map, ResidualCell
 from adxl_ros.diagnose.search import Hypothesis, linearise, Search
-from adxl_ros.diagnose.verdict import (
-    HEALTHY,
-    HeldOutFits,
-    MATERIAL_MG,
-    reproducible_rest,
-    Verdict,
-)
+from adxl_ros.diagnose.verdict import HEALTHY, HeldOutFits, MATERIAL_MG, Verdict
 from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, Z_90
@@ -164,10 +148,14 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     detections = _detections(checked, search.best, model.baseline, smallest_mps2)
     bases = [b for c, v in zip(compared, model.baseline_v) for b in flexible_bases(c, v)]
     verdict = rule.decide(
-        evidence, lambda effects, drift: reproducible_rest(fits[effects][drift], bases),
+        evidence, lambda effects, drift: rule.reproducible_rest(fits[effects][drift], bases),
         [d.effect for d in detections])
     show_progress('5/5 report', 0.9)
-    if verdict.status == 'no_gap' and not any(map(_could_show, model.comparisons)):
+    if verdict.status == 'no_gap' and not any(
+            c.reference is Reference.SIMULATOR or (c.joints and not c.at_rest.all()) or any(
+                np.ptp(values) > _SMALLEST_RANGES[name]
+                for name, values in c.surroundings.items()) for c in model.comparisons):
+        # Neither the sensor moves, nor does its temperature or supply change.
         verdict = replace(verdict, status='insufficient')
     report = _report(checked, model, search, verdict, detections, floor, evidence,
                      fits[verdict.best], seed)
@@ -180,10 +168,9 @@ def check(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = 
     """Put recordings beside their simulation; raise DataFault for the first fault."""
     if not sensor.effects:
         sensor = with_axes(sensor, recordings[0].axes)
-    compared: list[BaselineComparison] = []
     for recording in recordings:
         check_unit(recording.stream_info, recording.axes, sensor)
-        compared.append(compare_checked(recording, sensor, sim, align))
+    compared = [data_checks.compare_checked(r, sensor, sim, align) for r in recordings]
     data_checks.check_length(compared)
     return [data_checks.check_recording(comparison) for comparison in compared]
 
@@ -240,14 +227,6 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline:
     return list({d.effect: d for d in sorted(material, key=lambda d: d.power_mps2)}.values())
 
 
-def _could_show(comparison: BaselineComparison) -> bool:
-    """Determine whether the sensor moves, or its temperature or supply changes."""
-    moves = comparison.reference is Reference.SIMULATOR or (
-        comparison.joints is not None and not comparison.at_rest.all())
-    return moves or any(np.ptp(values) > _SMALLEST_RANGES[name]
-                        for name, values in comparison.surroundings.items())
-
-
 def _named_sensor(verdict: Verdict, best: Hypothesis, detections: Sequence[Detection],
                   baseline: Sensor, fits: dict[str, HeldOutFits]) -> Sensor:
     """
@@ -293,9 +272,8 @@ def _closure(verdict: Verdict, evidence: rule.Evidence, floor: NoiseFloor,
     stated = noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2)
     stated_mps2 = float(np.sqrt(np.mean(stated ** 2)))
     draws = floor.draws_mps2(seed, len(before) - 1)
-    floors = np.full(len(before), floor.rms_mps2)
-    if draws is not None:
-        floors[1:] = draws
+    floors = np.append(floor.rms_mps2, np.full(len(before) - 1, floor.rms_mps2)
+                       if draws is None else draws)
     lowest = np.array([noise_effects.floor_without(min(f, np.sqrt(a)), remainders, stated_mps2)
                        for f, a in zip(floors, after)])
     with np.errstate(all='ignore'):

@@ -301,12 +301,8 @@ def _angle_errors(comparison: BaselineComparison, axis: int
         yield (v_per_mps2 * errors.std) ** 2, np.exp(-errors.forgetting_per_s * comparison.dt_s)
 
 
-def whiteners(comparison: BaselineComparison) -> list[list[Whitener]]:
-    """Return the filters that are tried for the noise of each axis of a recording."""
-    return [_whiteners(comparison, axis) for axis in range(len(comparison.sensor.axes))]
-
-
-def _whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
+def whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
+    """Return the filters that are tried for the noise of an axis of a recording."""
     sensor, dt_s = comparison.sensor, comparison.dt_s
     scale, rc_s = float(sensor.scale_v_per_g[axis]), float(noise.electronics(sensor).rc_s[axis])
     # Pole of the RC filter, and standard deviation of the analog noise.

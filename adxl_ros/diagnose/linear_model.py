@@ -353,13 +353,17 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
 
     filters: whitening filters of each channel, where not all are tried.
     """
-    filters = filters or [f for c in comparisons for f in evidence.whiteners(c)]
+    filters = filters or [evidence.whiteners(c, axis) for c in comparisons
+                          for axis in range(len(c.sensor.axes))]
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
     # The same variant of several recordings, by the number of the recording.
     every: dict[tuple, dict[int, Variant]] = {}
+    fades = any(c.fading_hz is not None for c in comparisons)
+    # What shows in the fast motion that a smooth reference lacks would be found in that.
     effects = [e for e in candidates() if (
         only is None or e.name in only or e.diagnosis.nuisance) and not (
-        any(c.fading_hz is not None for c in comparisons) and _shows_in_lost_motion(e))]
+        fades and e.diagnosis.revealed_by is Manoeuvre.SHAKE and not e.exact
+        and e.concern is not Concern.REFERENCE)]
     for i, (comparison, output_v) in enumerate(zip(comparisons, baseline_v)):
         for k, effect in enumerate(effects):
             for variant in variants(comparison, effect, output_v):
@@ -396,12 +400,6 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     return LinearModel(list(comparisons), baseline_v, kept, column_ids, names,
                        np.array(prior_std), channels, list(filters), by_channel, nuisance_columns,
                        parts)
-
-
-def _shows_in_lost_motion(effect: Effect) -> bool:
-    """Determine whether an effect shows in the fast motion that a smooth reference lacks."""
-    return effect.diagnosis.revealed_by is Manoeuvre.SHAKE and not effect.exact \
-        and effect.concern is not Concern.REFERENCE
 
 
 def filters_for(filters: Sequence[list[Whitener]], effects: Sequence[str]

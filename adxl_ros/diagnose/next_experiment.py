@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import combinations
 from typing import NamedTuple
 
 from adxl_ros.diagnose import linear_model as linear, noise_effects
@@ -30,14 +31,14 @@ from adxl_ros.diagnose.comparison import (
     Reference,
     with_values,
 )
-from adxl_ros.diagnose.evidence import expected_drift_g
+from adxl_ros.diagnose.evidence import expected_drift_g, LinearFit
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import Coefficient, Concern, Detector, Effect, Manoeuvre
+from adxl_ros.model.effects.base import Coefficient, Concern, Detector, Manoeuvre
 from adxl_ros.model.sensor import parameter_of, Sensor, with_neutral
 from adxl_ros.report.quantities import listed
 from adxl_ros.simulate import trajectories
@@ -65,11 +66,6 @@ class CouldShow(NamedTuple):
     smallest: float  # The size; infinite where nothing of the effect reaches the output
     # Share of the effect's signal that zero-g, scale factor and latency cannot imitate
     share: float = 1.0
-
-    @property
-    def effect(self) -> str:
-        """Return the name of the effect."""
-        return self.name.effect
 
     @property
     def shows(self) -> bool:
@@ -116,11 +112,11 @@ def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.n
             if hints.nuisance:
                 size = np.hypot(size, 3 * model.tolerance(model.names[k]))
             rows.append(CouldShow(model.names[k], float(size), share))
-    seen = {r.effect for r in rows} | {v.effect for v in model.variants if v.limit_start}
+    seen = {r.name.effect for r in rows} | {v.effect for v in model.variants if v.limit_start}
     rows += [CouldShow(Coefficient(e.name, e.parameters[0].name), np.inf, 0.0)
              for e in linear.candidates() if e.name not in seen]
     # The coefficient of each effect that shows best, by smallest over typical size.
-    best = {r.effect: r for r in sorted(rows, reverse=True, key=lambda r: (
+    best = {r.name.effect: r for r in sorted(rows, reverse=True, key=lambda r: (
         r.smallest / parameter_of(r.name).scale, r.name))}
     return [best[effect] for effect in sorted(best)]
 
@@ -158,14 +154,7 @@ class Belief(NamedTuple):
     """What a hypothesis knows of k coefficients."""
 
     mean: np.ndarray  # Mean, (k,)
-    root: np.ndarray  # Square root of the covariance, S = root·rootᵀ, (k, r)
-
-
-def _eigen(gram: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return eigenvalues and vectors of a covariance in units of the noise."""
-    products = root.T @ gram @ root
-    values, vectors = np.linalg.eigh((products + products.T) / 2)
-    return np.maximum(values, 0.0), vectors
+    covariance: np.ndarray  # Covariance, (k, k)
 
 
 def expected_information(gram: np.ndarray, probabilities: Sequence[float],
@@ -176,19 +165,21 @@ def expected_information(gram: np.ndarray, probabilities: Sequence[float],
     gram: products of the sensitivities, in units of the noise, (k, k).
     """
     weights = np.asarray(probabilities, float)
+    size = np.max([np.abs(b.mean) + np.sqrt(np.diag(b.covariance)) for b in beliefs], axis=0)
+    kept = np.flatnonzero(size)
+    values, vectors = np.linalg.eigh(gram[np.ix_(kept, kept)] * np.outer(size[kept], size[kept]))
+    # A root of G, because all sensitivities with the same products respond alike.
+    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T / size[kept]
+    means = [root @ b.mean[kept] for b in beliefs]
+    covariances = [np.eye(len(kept)) + root @ b.covariance[np.ix_(kept, kept)] @ root.T
+                   for b in beliefs]
+    log_dets = np.linalg.slogdet(covariances)[1]
     overlap = np.eye(len(weights))
-    log_dets = [float(np.log1p(_eigen(gram, b.root)[0]).sum()) for b in beliefs]
-    for i, first in enumerate(beliefs):
-        for j, second in enumerate(beliefs[:i]):
-            both = np.hstack([first.root, second.root]) / np.sqrt(2)
-            values, vectors = _eigen(gram, both)
-            difference = first.mean - second.mean
-            across = vectors.T @ (both.T @ gram @ difference)
-            # Woodbury: (1 + J·S·Jᵀ)⁻¹ within the span of J.
-            square = float(difference @ gram @ difference - np.sum(across ** 2 / (1 + values)))
-            distance = max(square, 0.0) / 8 + 0.5 * float(np.log1p(values).sum()) \
-                - 0.25 * (log_dets[i] + log_dets[j])
-            overlap[i, j] = overlap[j, i] = np.exp(-max(factor * distance, 0.0))
+    for i, j in combinations(range(len(weights)), 2):
+        both, difference = (covariances[i] + covariances[j]) / 2, means[i] - means[j]
+        distance = difference @ np.linalg.solve(both, difference) / 8 \
+            + np.linalg.slogdet(both)[1] / 2 - (log_dets[i] + log_dets[j]) / 4
+        overlap[i, j] = overlap[j, i] = np.exp(-max(factor * distance, 0.0))
     positive = weights > 0
     return max(float(-weights[positive] @ np.log((overlap @ weights)[positive])), 0.0)
 
@@ -206,17 +197,13 @@ class ManoeuvreWorth(NamedTuple):
         return self.information / self.minutes
 
 
-Key = tuple
-"""Variant and coefficient of a column."""
-
-
 class PredictedResponse(NamedTuple):
     """Products of the sensitivities of one manoeuvre."""
 
     name: str
     minutes: float  # Duration, min
     linear_model: LinearModel  # Its variants are those that the manoeuvre excites
-    places: dict[Key, int]  # Place of each column
+    places: dict[tuple, int]  # Place of each column by its key
     gram: np.ndarray  # Products, in units of the noise, (k, k)
 
 
@@ -250,8 +237,8 @@ def predict(name: str, motion: Motion, begin_s: float, sensor: Sensor, effects: 
     return PredictedResponse(name, motion.duration_s / 60, model, places, gram)
 
 
-def _keys(model: LinearModel) -> dict[int, Key]:
-    """Return the key of each column of a linear model by its number."""
+def _keys(model: LinearModel) -> dict[int, tuple]:
+    """Return variant and coefficient of each column of a linear model by its number."""
     return {number: (v.key, model.names[number])
             for v, ids in zip(model.variants, model.column_ids) if not v.limit_start
             for number in ids}
@@ -261,20 +248,21 @@ def rank_responses(responses: Sequence[PredictedResponse],
                    hypotheses: Sequence[WeightedHypothesis], model: LinearModel | None
                    ) -> tuple[ManoeuvreWorth, ...]:
     """Rank manoeuvres by their expected information per minute."""
-    leaders = leading(hypotheses)
-
-    # The variant of each effect that fits the samples best.
-    seen = {} if model is None else {effect: max(
-        numbers, key=lambda i: model.fit_variants([i], model.null_fit).log_evidence)
-        for effect in {e for h in leaders for e in h.effects}
-        if (numbers := _variants_of(model, effect))}
-    posteriors = [(_fitted(model, [seen[e] for e in h.effects if e in seen]),
-                   {*h.effects} - {*seen}) for h in leaders]
+    leaders, seen = leading(hypotheses), dict[str, int]()
+    keys, fits = dict[int, tuple](), list[LinearFit | None]([None] * len(leaders))
+    if model is not None:
+        # The variant of each effect that fits the samples best.
+        seen = {effect: max(
+            numbers, key=lambda i: model.fit_variants([i], model.null_fit).log_evidence)
+            for effect in {e for h in leaders for e in h.effects}
+            if (numbers := _variants_of(model, effect))}
+        keys, fits = _keys(model), [model.fit_variants(
+            [seen[e] for e in h.effects if e in seen], model.null_fit) for h in leaders]
     total = sum(h.probability for h in leaders)
-    probabilities = [h.probability / total for h in leaders]
     worth = [ManoeuvreWorth(r.name, r.minutes, expected_information(
-        r.gram, probabilities, [_belief(r, *p) for p in posteriors], _EVIDENCE_FACTOR))
-        for r in responses]
+        r.gram, [h.probability / total for h in leaders],
+        [_belief(r, keys, fit, {*h.effects} - {*seen}) for h, fit in zip(leaders, fits)],
+        _EVIDENCE_FACTOR)) for r in responses]
     return tuple(sorted(worth, key=lambda w: -w.per_minute))
 
 
@@ -283,44 +271,30 @@ def _variants_of(model: LinearModel, effect: str) -> list[int]:
     return [i for i, v in enumerate(model.variants) if v.effect == effect and not v.limit_start]
 
 
-_Fitted = tuple[Sequence[Key], np.ndarray, np.ndarray]
-"""Columns of k coefficients, their means, (k,), and their covariance, (k, k)."""
-
-
-def _fitted(model: LinearModel | None, chosen: list[int]) -> _Fitted:
-    """Return what the samples so far say of the coefficients of variants."""
-    if model is None:
-        return (), np.zeros(0), np.zeros((0, 0))
-    fit, keys = model.fit_variants(chosen, model.null_fit), _keys(model)
-    return [keys[int(i)] for i in fit.column_ids], fit.values, fit.covariance
-
-
-def _belief(response: PredictedResponse, fitted: _Fitted, unseen: Collection[str]) -> Belief:
+def _belief(response: PredictedResponse, fitted_keys: dict[int, tuple], fit: LinearFit | None,
+            unseen: Collection[str]) -> Belief:
     """
     Return what a hypothesis knows of the columns of a manoeuvre.
 
-    Of `unseen` effects only the prior is known.
+    fit: what the samples so far say of columns with some keys, None before there are samples. Of
+    `unseen` effects only the prior is known.
     """
     places, model, keys = response.places, response.linear_model, _keys(response.linear_model)
-    columns, means, covariance = fitted
-    kept = [i for i, key in enumerate(columns) if key in places]
-    at = [places[columns[i]] for i in kept]
-    mean, root = np.zeros(len(places)), np.zeros((len(places), len(kept)))
-    mean[at] = means[kept]
-    # A square root of a covariance whose units may differ by orders.
-    covariance = covariance[np.ix_(kept, kept)]
-    std = np.sqrt(np.diag(covariance))
-    values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
-    root[at] = std[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    # Prior standard deviations of what the samples do not determine; the middle one of the shapes
-    # of an effect stands for all.
+    # The middle one of the shapes of an effect stands for all.
     chosen = [numbers[len(numbers) // 2] for effect in unseen
               if (numbers := _variants_of(model, effect))]
-    prior_std = model.prior(chosen)
-    ids = {k for i in chosen for k in model.column_ids[i]} | set(model.nuisance_ids)
-    stds = {places[keys[k]]: float(prior_std[k]) for k in ids if keys[k] in places}
-    more = np.diag([stds.get(place, 0.0) * (place not in at) for place in range(len(places))])
-    return Belief(mean, np.hstack([root, more[:, more.any(axis=0)]]))
+    prior_std, mean, variance = model.prior(chosen), np.zeros(len(places)), np.zeros(len(places))
+    for k in {k for i in chosen for k in model.column_ids[i]}.union(model.nuisance_ids):
+        variance[places[keys[k]]] = prior_std[k] ** 2
+    covariance = np.diag(variance)
+    if fit is not None:
+        columns = [fitted_keys[int(k)] for k in fit.column_ids]
+        kept = [i for i, key in enumerate(columns) if key in places]
+        at = [places[columns[i]] for i in kept]
+        mean[at] = fit.values[kept]
+        covariance[at] = 0.0
+        covariance[np.ix_(at, at)] = fit.covariance[np.ix_(kept, kept)]
+    return Belief(mean, covariance)
 
 
 class ManoeuvreDescription(NamedTuple):
@@ -412,20 +386,18 @@ def _experiment(manoeuvre: Manoeuvre, why: str, no_stage: bool) -> NextExperimen
     if no_stage:
         return NextExperiment(described.text, why, _OTHER_REFERENCE, beside_simulator=True)
     if described.remounted:
-        effect = _remounting_effect()
-        option = f' --effect {effect.name}:{effect.diagnosis.half_turn}={np.pi:.6f}'
+        option = f' --effect {":".join(_half_turn())}={np.pi:.6f}'
     return NextExperiment(described.text, why, f'ros2 run adxl_ros simulate '
                           f'{described.trajectory}{option} -o next.csv')
 
 
-def _remounting_effect() -> Effect:
-    """Return the effect that turns the sensor on its stage."""
-    return next(e for e in library().values() if e.diagnosis.half_turn)
+def _half_turn() -> tuple[str, str]:
+    """Return effect and parameter, an angle, that turn the sensor on its stage."""
+    return next((e.name, hint) for e in library().values() if (hint := e.diagnosis.half_turn))
 
 
 def _remounted(sensor: Sensor) -> Sensor:
     """Turn the sensor on its stage by half a turn: the encoder's zero changes by π."""
-    name, parameter = (effect := _remounting_effect()).name, effect.diagnosis.half_turn
+    name, parameter = _half_turn()
     turned = with_neutral(sensor, [name])
-    return with_values(turned, name, {parameter: np.asarray(
-        turned.values[name][parameter]) + np.pi})
+    return with_values(turned, name, {parameter: turned.values[name][parameter] + np.pi})

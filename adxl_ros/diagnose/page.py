@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-The diagnosis as one HTML page that opens offline, with its figures and proofs.
+The files of a diagnosis, and its HTML page that opens offline, with its figures and proofs.
 
 The proof of an effect is the recording minus a simulation with all other effects, over the
 effect's own variable, or spectra with and without it.
@@ -17,6 +17,7 @@ from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.evidence import bridged
 from adxl_ros.diagnose.residual_map import BLOCK_S, ResidualCell, SIGNIFICANT_P
+from adxl_ros.files import parameter_file
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.effects import effect_named
@@ -69,20 +70,33 @@ class Run:
     subject: str
     parameter_file: str
     steps: Sequence[tuple[str, str]]
-    parameters_text: str = ''
     command: str = ''
 
 
-def page(diagnosis: Diagnosis, run: Run) -> str:
+def documents(diagnosis: Diagnosis, report: dict[str, Any], comments: Sequence[str],
+              run: Run | None) -> dict[str, str]:
+    """
+    Return the files of a diagnosis by name.
+
+    report: its JSON; comments: head of the parameters, which a fault leaves out; run: what the
+    page says of the run, None without a page.
+    """
+    texts = {'report.json': words.as_text(report)}
+    if diagnosis.report is not None:
+        texts['params.yaml'] = parameter_file.as_text(diagnosis.report.sensor, comments)
+    if run is not None:
+        texts['report.html'] = _page(diagnosis, report, run, texts.get('params.yaml', ''))
+    return texts
+
+
+def _page(diagnosis: Diagnosis, objects: dict[str, Any], run: Run, parameters: str) -> str:
     """Lay out the page; raise UserError where Plotly or jinja2 is not installed."""
-    html_page.check_libraries()
-    objects = words.as_json(diagnosis)
     values: dict[str, Any] = {
         'title': run.subject, 'about': [f'parameter file {run.parameter_file}'],
         'badge': {'colour': _COLOURS[objects['verdict']['status']],
                   'word': words.badge(diagnosis), 'sentence': words.headline(diagnosis)},
         'notes': words.notes(diagnosis), 'figures': {}, 'has_verdict': False,
-        'download': run.parameters_text and html_page.download_url(run.parameters_text)}
+        'download': parameters and html_page.download_url(parameters)}
     if run.command:
         values['command'] = run.command
     if diagnosis.report is not None:
@@ -294,16 +308,15 @@ def _stacked(panels: Sequence[tuple[dict[str, Any], Sequence[Figure]]], height: 
              margin: dict[str, int], xaxis: dict[str, Any]) -> Figure:
     """Put panels, an axis with its lines each, below each other; all zoom together."""
     traces: list[Figure] = []
-    layout, count = {}, len(panels)
-    part = (1 + 0.08) / count - 0.08
-    for i, (axis, lines) in enumerate(panels, 1):
-        top = 1 - (i - 1) * (part + 0.08)
-        layout[plots.axis_number('yaxis', i)] = {'domain': [max(top - part, 0.0), top], **axis}
-        traces += [{**drawn, 'xaxis': 'x', 'yaxis': plots.axis_number('y', i),
+    layout = {'xaxis': {'anchor': plots.axis_number('y', len(panels)), **xaxis}}
+    part = 1.08 / len(panels)
+    for i, (axis, lines) in enumerate(panels):
+        layout[plots.axis_number('yaxis', i + 1)] = {
+            'domain': [max(1.08 - (i + 1) * part, 0.0), 1 - i * part], **axis}
+        traces += [{**drawn, 'xaxis': 'x', 'yaxis': plots.axis_number('y', i + 1),
                     'legendgroup': drawn['name'], 'showlegend': not any(
                         t['name'] == drawn['name'] for t in traces)} for drawn in lines]
-    return figure(traces, height, margin=margin,
-                  xaxis={'anchor': plots.axis_number('y', count), **xaxis}, **layout)
+    return figure(traces, height, margin=margin, **layout)
 
 
 def signals(comparison: BaselineComparison, after: Sensor) -> Figure:

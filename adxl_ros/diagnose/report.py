@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import json
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, NamedTuple
@@ -20,6 +21,7 @@ from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern
 from adxl_ros.model.sensor import fitted_of, get, parameter_of
 from adxl_ros.report.quantities import (
     amplitude_text,
+    counted,
     Interval,
     listed,
     mg_text,
@@ -95,7 +97,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
                   for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
         'not_covered': report.not_covered, 'notes': notes(diagnosis),
         'could_show': [
-            {'effect': r.effect, 'parameter': r.name.parameter, 'axis': r.name.axis or None,
+            {'effect': r.name.effect, 'parameter': r.name.parameter, 'axis': r.name.axis or None,
              'unit': parameter_of(r.name).unit, 'smallest': r.smallest, 'could_show': r.shows}
             for r in report.could_show],
         'candidates': _candidates(report),
@@ -110,10 +112,14 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
         'summary': summary(diagnosis)})
 
 
+def as_text(values: dict[str, Any]) -> str:
+    """Return values as JSON."""
+    return json.dumps(values, indent=1, allow_nan=False) + '\n'
+
+
 def notes(diagnosis: Diagnosis) -> list[str]:
     """Return what was corrected or left out, with the file where there are several."""
-    several = len(diagnosis.comparisons) > 1
-    return [f'{Path(c.name).name}: {note}' if several else note
+    return [f'{Path(c.name).name}: {note}' if len(diagnosis.comparisons) > 1 else note
             for c in diagnosis.comparisons for note in c.notes]
 
 
@@ -161,7 +167,7 @@ def shares_of_gap(report: Report) -> dict[str, float]:
 
 def _candidates(report: Report) -> list[dict[str, Any]]:
     """Return the effects of all hypotheses and detections, the most probable first."""
-    verdict, shown = report.verdict, {row.effect: row for row in report.could_show}
+    verdict, shown = report.verdict, {row.name.effect: row for row in report.could_show}
     detected, shares = {d.effect: d for d in report.detections}, shares_of_gap(report)
     out = []
     for name, effect in library().items():
@@ -200,17 +206,16 @@ def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> d
         # The density of a drift is chosen with the noise, on a grid.
         return {_key(name): {'value': float(get(sensor, [name])[0]),
                              'unit': parameter_of(name).unit} for name in names}
-    parameters: dict[str, dict[str, Any]] = {}
-    for name in names:
-        if hypothesis is None or name not in hypothesis.names:
-            continue
-        place = hypothesis.names.index(name)
-        value, half = float(get(hypothesis.sensor, [name])[0]), Z_90 * hypothesis.std[place]
-        known = not hypothesis.undetermined[place]
-        parameters[_key(name)] = {
-            'value': value if known else None,
-            'ci': (value - half, value + half) if known else None,
-            'unit': parameter_of(name).unit, 'determined': known}
+    if hypothesis is None:
+        return {}
+    parameters, values = dict[str, dict[str, Any]](), get(hypothesis.sensor, hypothesis.names)
+    for name, value, std, is_open in zip(hypothesis.names, values.tolist(), hypothesis.std,
+                                         hypothesis.undetermined):
+        if name in names:
+            ci = value - Z_90 * std, value + Z_90 * std
+            parameters[_key(name)] = {
+                'value': None if is_open else value, 'ci': None if is_open else ci,
+                'unit': parameter_of(name).unit, 'determined': not is_open}
     return parameters
 
 
@@ -225,14 +230,13 @@ def badge(diagnosis: Diagnosis) -> str:
         assert diagnosis.fault is not None
         return 'BAD DATA' if diagnosis.fault.status == 'bad_data' else 'TOO LITTLE DATA'
     verdict = diagnosis.report.verdict
-    count = len(verdict.effects)
     if verdict.status == 'explained' and concern(verdict) == Concern.REFERENCE.value:
         return 'ERROR OF THE REFERENCE'
     return {'no_gap': f'NO GAP above {mg_text(verdict.upper_limit_mps2)}',
             'insufficient': 'TOO LITTLE DATA', 'unknown': 'UNKNOWN CAUSE',
             'inseparable': 'CAUSES NOT SEPARATED',
             'partly': f'PARTLY EXPLAINED, {percent(verdict.explained_share)}',
-            'explained': f'GAP EXPLAINED by {count} effect{"" if count == 1 else "s"}',
+            'explained': f'GAP EXPLAINED by {counted(len(verdict.effects), "effect")}',
             }[verdict.status]
 
 
@@ -345,11 +349,12 @@ def closes(report: Report) -> bool:
 
 def shown_row(row: CouldShow, scale_v_per_g: float) -> list[str]:
     """Return effect, parameter, smallest and typical size, and the manoeuvre that shows it."""
-    p, revealed_by = parameter_of(row.name), effect_named(row.effect).diagnosis.revealed_by
+    p, revealed_by = parameter_of(row.name), effect_named(row.name.effect).diagnosis.revealed_by
     smallest, typical = (parameter_text({'value': v, 'unit': p.unit}, scale_v_per_g, 2)
                          for v in (row.smallest, p.scale))
-    return [row.effect, parameter_label(p.name, False), smallest if row.shows else 'cannot show',
-            typical, MENU[revealed_by].text if revealed_by else '']
+    return [row.name.effect, parameter_label(p.name, False),
+            smallest if row.shows else 'cannot show', typical,
+            MENU[revealed_by].text if revealed_by else '']
 
 
 def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]:
@@ -392,7 +397,7 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     elif is_only_noise(report):
         lines += wrapped(NOISE_STAYS)
     shown = report.could_show
-    hidden = ', '.join(row.effect for row in shown if not row.shows)
+    hidden = ', '.join(row.name.effect for row in shown if not row.shows)
     return [*lines, *_effect_table(report, objects), '', *_labelled([
         ('figures', '; '.join(f'{row.label} {row.text}' for row in rows[2 + closes(report):])),
         *(('noise', f'{row.label}: {row.text}') for row in remainder_rows(report)),

@@ -352,27 +352,7 @@ _QUANTITIES = {'tilt': Quantity('tilt', 'deg', tilt_deg),
 
 
 def quantity(text: str) -> Quantity:
-    """
-    Return the quantity that an option names.
-
-    Parameters
-    ----------
-    text
-        tilt, velocity, or MODULE:FUNCTION for a function of times, s, (n,), recorded and
-        simulated acceleration, m/s², (n, 3), that returns a number; its attribute `unit` is
-        shown.
-
-    Returns
-    -------
-    Quantity
-        Name, unit and function.
-
-    Raises
-    ------
-    UserError
-        There is no such quantity or function.
-
-    """
+    """Return tilt, velocity, or that of MODULE:FUNCTION, whose attribute `unit` is shown."""
     if text in _QUANTITIES:
         return _QUANTITIES[text]
     module, _, name = text.partition(':')

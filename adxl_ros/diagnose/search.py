@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, linear_model as linear
 from adxl_ros.diagnose.evidence import LinearFit, LinearisedHypothesis, Whitener
-from adxl_ros.diagnose.linear_model import LinearModel, Variant
+from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named
@@ -336,9 +336,11 @@ class Search:
             start |= {name: value - (0.0 if parameter_of(name).is_size
                                      else parameter_of(name).scale)
                       for name, value in variant.limit_start.items()}
+            # An effect that is far from linear stays near the sizes at which it was simulated.
             start |= {name: float(np.clip(start.get(name, size), size / _NEAR_START,
                                           size * _NEAR_START))
-                      for name, size in _stepped(variant).items()}
+                      for name in variant.names if (p := parameter_of(name)).starts and p.is_size
+                      for size in (variant.step * p.scale,)}
             shapes |= {Coefficient(variant.effect, p): v for p, v in variant.shape.items()}
         self._add(effects, start, shapes)
 
@@ -381,9 +383,3 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
                    for c in model.comparisons]
     return linear.build_linear_model(comparisons, filters=[
         [f[i]] for f, i in zip(best.linearised.filters, best.fit.filter_indices)])
-
-
-def _stepped(variant: Variant) -> dict[Coefficient, float]:
-    """Return the sizes at which an effect that is far from linear was simulated."""
-    return {name: variant.step * p.scale for name in variant.names
-            if (p := parameter_of(name)).starts and p.is_size}

@@ -355,7 +355,6 @@ class _Job:
         """Compare the recording with its simulation."""
         from adxl_ros.diagnose import page
         from adxl_ros.diagnose.diagnosis import diagnose
-        from adxl_ros.diagnose.documents import documents
         from adxl_ros.diagnose.report import as_json
         read = self._recording
         sensor, _ = measure_unstated(load_sensor(self._params, read), read)
@@ -365,7 +364,7 @@ class _Job:
         params = ['--params', self._parameters.name] if self._params else []
         again = ['ros2', 'run', 'adxl_ros', 'diagnose', self._source.url, *params, '-o', 'gap']
         run = page.Run(self._source.url, self._parameters.name, [], command=shlex.join(again))
-        self.files |= {name: text.encode() for name, text in documents(
+        self.files |= {name: text.encode() for name, text in page.documents(
             diagnosis, report, [report['summary']],
             run if report['verdict']['status'] in _PAGES else None).items()}
 

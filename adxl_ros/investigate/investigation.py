@@ -28,9 +28,8 @@ import shutil
 
 from adxl_ros.diagnose import next_experiment
 from adxl_ros.diagnose.diagnosis import diagnose, Diagnosis
-from adxl_ros.diagnose.documents import documents
 from adxl_ros.diagnose.linear_model import candidates
-from adxl_ros.diagnose.page import Run
+from adxl_ros.diagnose.page import documents, Run
 from adxl_ros.diagnose.report import as_json, screen_lines
 from adxl_ros.diagnose.verdict import normalised, UNKNOWN, WeightedHypothesis
 from adxl_ros.errors import one_line, UserError
@@ -40,7 +39,6 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.investigate.manoeuvres import (
     CATALOGUE,
     CommandStream,
-    KIND_OF,
     plan,
     plan_all,
     PlannedManoeuvre,
@@ -112,6 +110,10 @@ class Assessment:
     # Hypotheses by falling probability, which sums to 1; no effect means no gap
     hypotheses: tuple[WeightedHypothesis, ...]
     diagnosis: Diagnosis | None = None  # The diagnosis; None before there are samples enough
+    # Manoeuvres by what they are expected to tell per minute, the best first
+    worth: tuple[next_experiment.ManoeuvreWorth, ...] = ()
+    # Effects that neither the samples nor a manoeuvre of this stage can show
+    hidden: tuple[str, ...] = ()
 
     @property
     def fault(self) -> str:
@@ -127,47 +129,36 @@ class Assessment:
         return ' '.join([verdict.status, *verdict.effects]) if verdict else ''
 
 
-@dataclass(frozen=True)
-class Ranking:
-    """The manoeuvres by what they are expected to tell per minute."""
-
-    assessment: Assessment  # The assessment, with the effects that only the manoeuvres can show
-    worth: tuple[next_experiment.ManoeuvreWorth, ...]  # Manoeuvres, the best first
-    # Effects that neither the samples nor a manoeuvre of this stage can show
-    hidden: tuple[str, ...]
-
-
 def run_round(question: Question, recordings: Sequence[Recording], sensor: Sensor,
               limits: StageLimits, seed: int = 0) -> tuple[Answer, Diagnosis | None]:
     """Diagnose the samples so far, and choose the next manoeuvre."""
-    assessment = _assess(recordings, sensor, seed)
-    hypotheses = assessment.hypotheses
+    diagnosis = diagnose(recordings, sensor, seed=seed) if recordings else None
+    report = diagnosis.report if diagnosis else None
+    # The prior probabilities, where the samples are too few.
+    assessment = Assessment(report.verdict.hypotheses if report else normalised(
+        {(): _NOTHING, (UNKNOWN,): 1 - _NOTHING}), diagnosis)
+    best = assessment.hypotheses[0]
     if assessment.fault:
-        return Answer(hypotheses, Outcome.INSEPARABLE, fault=assessment.fault), \
-            assessment.diagnosis
-    if hypotheses[0].effects and hypotheses[0].probability >= CERTAIN:
+        return Answer(assessment.hypotheses, Outcome.INSEPARABLE, fault=assessment.fault), \
+            diagnosis
+    if best.effects and best.probability >= CERTAIN:
         # Effects that were not seen so far only take probability from no gap, so that the
         # manoeuvres need not be simulated.
-        return decide(Ranking(assessment, (), ()), question, True), assessment.diagnosis
+        return decide(assessment, question, True), diagnosis
     manoeuvres = plan_all(limits, question.pose, 60 * question.minutes)
     in_time = [m for m in manoeuvres if m.minutes <= question.remaining_minutes]
-    ranking = rank(assessment, sensor, in_time or manoeuvres)
-    return decide(ranking, question, bool(in_time)), assessment.diagnosis
-
-
-def _assess(recordings: Sequence[Recording], sensor: Sensor, seed: int = 0) -> Assessment:
-    """Diagnose the samples; the probabilities are the prior ones where they are too few."""
-    diagnosis = diagnose(recordings, sensor, seed=seed) if recordings else None
-    if diagnosis is not None and diagnosis.report is not None:
-        return Assessment(diagnosis.report.verdict.hypotheses, diagnosis)
-    return Assessment(normalised({(): _NOTHING, (UNKNOWN,): 1 - _NOTHING}), diagnosis)
+    return decide(rank(assessment, sensor, in_time or manoeuvres), question, bool(in_time)), \
+        diagnosis
 
 
 def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedManoeuvre]
-         ) -> Ranking:
-    """Rank manoeuvres by their expected information per minute, given the samples so far."""
-    diagnosis = assessment.diagnosis
-    report = diagnosis.report if diagnosis else None
+         ) -> Assessment:
+    """
+    Rank manoeuvres by their expected information per minute, given the samples so far.
+
+    The hypotheses then have the effects that only the manoeuvres can show, too.
+    """
+    report = assessment.diagnosis.report if assessment.diagnosis else None
     model = report.linear_model if report else None
     seen = {v.effect for v in model.variants} if model else set()
     considered = {e for h in next_experiment.leading(assessment.hypotheses) for e in h.effects}
@@ -180,25 +171,26 @@ def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedMan
     unseen = weights.get((), 0.0) * (1 / max(len(excited | seen), 1))
     for effect in sorted(excited - seen):
         weights.setdefault((effect,), unseen)
-    complete = Assessment(normalised(weights), diagnosis)
-    worth = next_experiment.rank_responses(responses, complete.hypotheses, model)
-    on_the_mean = {e.name for e in candidates()}
-    return Ranking(complete, worth, tuple(sorted(on_the_mean - excited - seen)))
+    hypotheses = normalised(weights)
+    return Assessment(
+        hypotheses, assessment.diagnosis,
+        next_experiment.rank_responses(responses, hypotheses, model),
+        tuple(sorted({e.name for e in candidates()} - excited - seen)))
 
 
-def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
+def decide(assessment: Assessment, question: Question, has_time: bool) -> Answer:
     """
     Choose the next manoeuvre, or end.
 
     A verdict that was the same in the round before is not expected to change by more of the same:
     only manoeuvres of a kind that is not recorded yet follow it.
     """
-    hypotheses, verdict = ranking.assessment.hypotheses, ranking.assessment.verdict
+    hypotheses, verdict = assessment.hypotheses, assessment.verdict
     best = hypotheses[0]
-    following = [w for w in ranking.worth if w.per_minute > _SMALLEST_PER_MINUTE]
+    following = [w for w in assessment.worth if w.per_minute > _SMALLEST_PER_MINUTE]
     if verdict and verdict == question.verdict:
-        kinds = {KIND_OF[name] for name in question.recorded}
-        following = [w for w in following if KIND_OF[w.name] not in kinds]
+        kinds = {CATALOGUE[name].kind for name in question.recorded}
+        following = [w for w in following if CATALOGUE[w.name].kind not in kinds]
     totals = accumulate(hypothesis.probability for hypothesis in hypotheses)
     # The fewest that together have 90 %
     named = hypotheses[:next((i for i, total in enumerate(totals, 1) if total >= CERTAIN), None)]
@@ -214,21 +206,15 @@ def decide(ranking: Ranking, question: Question, has_time: bool) -> Answer:
         outcome = Outcome.TIME_OVER
     else:
         return Answer(hypotheses, Outcome.GO_ON, manoeuvre=following[0].name,
-                      hidden=ranking.hidden, verdict=verdict)
-    return Answer(hypotheses, outcome, _sentence(outcome, named), hidden=ranking.hidden,
-                  verdict=verdict)
-
-
-def _sentence(outcome: Outcome, named: Sequence[WeightedHypothesis]) -> str:
-    """Return the result in one sentence with one number."""
-    percent = f'{100 * sum(h.probability for h in named):.0f} %'
+                      hidden=assessment.hidden, verdict=verdict)
     names = listed([hypothesis_text(h.effects) for h in named])
-    return {
-        Outcome.CERTAIN: f'The recording shows {names}: {percent}.',
-        Outcome.NO_VISIBLE_GAP: f'There is no gap that this stage can show: {percent}.',
-        Outcome.INSEPARABLE: f'This stage cannot separate {names}: together {percent}.',
-        Outcome.TIME_OVER: f'The time is over; the recording shows {names}: together {percent}.',
-    }[outcome]
+    sentence = {Outcome.CERTAIN: f'The recording shows {names}: ',
+                Outcome.NO_VISIBLE_GAP: 'There is no gap that this stage can show: ',
+                Outcome.INSEPARABLE: f'This stage cannot separate {names}: together ',
+                Outcome.TIME_OVER: f'The time is over; the recording shows {names}: together '}
+    return Answer(hypotheses, outcome, f'{sentence[outcome]}'
+                  f'{100 * sum(h.probability for h in named):.0f} %.', hidden=assessment.hidden,
+                  verdict=verdict)
 
 
 def hypothesis_text(effects: Sequence[str]) -> str:
@@ -283,9 +269,8 @@ class OutputFolder:
 def _write_diagnosis(folder: OutputFolder, diagnosis: Diagnosis, recording: Recording,
                      with_page: bool) -> None:
     """Write report and parameters of a diagnosis."""
-    subject = (f'{folder.bag.name} ({recording.time_s[-1] - recording.time_s[0]:.0f} s, '
-               f'{recording.rate_hz:.4g} Hz, {" ".join(recording.axes)})  minus  simulation of '
-               f'{folder.baseline.name}')
+    subject = (f'{folder.bag.name} ({np.ptp(recording.time_s):.0f} s, {recording.rate_hz:.4g} Hz, '
+               f'{" ".join(recording.axes)})  minus  simulation of {folder.baseline.name}')
     lines = screen_lines(diagnosis, subject) if diagnosis.report is not None else []
     steps = [('simulate with these parameters', 'ros2 run adxl_ros simulate rich --params '
               f'{folder.parameters} -o sim.csv')] if lines else []
@@ -354,16 +339,6 @@ class State(Enum):
     STOPPED = 'stopped'
 
 
-@dataclass(frozen=True)
-class Status:
-    """What an investigation does."""
-
-    state: State  # Its state
-    text: str  # What happens, for people
-    minutes: float  # Time since its beginning, min
-    remaining_s: float  # Time to the end of a manoeuvre, s; 0 in other states
-
-
 class Investigation:
     """The state machine."""
 
@@ -403,14 +378,23 @@ class Investigation:
         """Return the speed on the way to the newest command, rad/s; None at its end."""
         return None if self._stream is None or self._stream.is_done else self._stream.speed
 
-    def status(self) -> Status:
-        """Return what it does."""
-        texts = {State.RECORDING: 'waiting for samples and stage',
-                 State.DIAGNOSING: 'diagnosing the samples so far; the stage rests',
-                 State.MOVING: CATALOGUE[self._manoeuvre].text if self._manoeuvre else '',
-                 State.FINISHED: 'finished', State.STOPPED: f'stopped: {self.reason}'}
-        remaining_s = self._stream.remaining_s if self._stream else 0.0
-        return Status(self.state, texts[self.state], self._minutes(), remaining_s)
+    @property
+    def text(self) -> str:
+        """Return what it does, for people."""
+        return {State.RECORDING: 'waiting for samples and stage',
+                State.DIAGNOSING: 'diagnosing the samples so far; the stage rests',
+                State.MOVING: CATALOGUE[self._manoeuvre].text if self._manoeuvre else '',
+                State.FINISHED: 'finished', State.STOPPED: f'stopped: {self.reason}'}[self.state]
+
+    @property
+    def minutes(self) -> float:
+        """Return the time since its beginning, min."""
+        return 0.0 if self._begin_s is None else (self._now_s - self._begin_s) / 60
+
+    @property
+    def remaining_s(self) -> float:
+        """Return the time to the end of a manoeuvre, s; 0 in other states."""
+        return self._stream.remaining_s if self._stream else 0.0
 
     def step(self, now_s: float, pose: Pose | None) -> Pose | None:
         """Go on."""
@@ -434,9 +418,6 @@ class Investigation:
             self._hold()
         return self._command
 
-    def _minutes(self) -> float:
-        return 0.0 if self._begin_s is None else (self._now_s - self._begin_s) / 60
-
     def _hold(self) -> None:
         """Command the present pose, if the stage has been commanded before."""
         self._stream = None
@@ -447,7 +428,7 @@ class Investigation:
         """Wait until the stage has been there for a while; refuse a stage outside its limits."""
         if now_s - self._since_s < _FIRST_REST_S:
             return
-        if self._limits.excess_rad(pose) > _OUTSIDE_RAD:
+        if np.abs(np.subtract(pose, self._limits.nearest(*pose))).max() > _OUTSIDE_RAD:
             self.stop(f'the stage is at {_text(pose)}, outside of its limits; move it, or set '
                       'limits.alpha_deg and limits.beta_deg')
             return
@@ -458,7 +439,7 @@ class Investigation:
         """Ask for a diagnosis of the samples so far."""
         assert self._begin_s is not None
         self.state, self._stream = State.DIAGNOSING, None
-        self._asked_minutes = self._minutes()
+        self._asked_minutes = self.minutes
         self._flush()
         self._diagnoser.ask(Question(
             self._command or self._limits.nearest(*pose), self._asked_minutes,

@@ -65,10 +65,6 @@ class StageLimits:
         return Pose(float(np.clip(alpha_rad, *self.alpha_rad)),
                     float(np.clip(beta_rad, *self.beta_rad)))
 
-    def excess_rad(self, pose: Pose) -> float:
-        """Return how far the worse angle of a pose is beyond the limits, rad; 0 within them."""
-        return max(abs(angle - near) for angle, near in zip(pose, self.nearest(*pose)))
-
 
 class Path:
     """A path of the stage within its limits, move by move."""
@@ -180,8 +176,6 @@ CATALOGUE = {
         'long rests', 'rest for a minute in two opposite poses',
         [('rest', 90, 45, _LONG_REST_S), ('rest', 90, 225, _LONG_REST_S)])}
 """Manoeuvres by name."""
-KIND_OF = {name: manoeuvre.kind for name, manoeuvre in CATALOGUE.items()}
-"""Kind of each manoeuvre."""
 
 
 @dataclass(frozen=True)

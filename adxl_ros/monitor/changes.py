@@ -286,8 +286,7 @@ def _without(reason: str) -> DiagnosisResult:
 def _diagnose(folder: Path, given: DiagnosisInput) -> DiagnosisResult:
     """Diagnose; write the samples, the baseline, and the files of the diagnosis."""
     from adxl_ros.diagnose.diagnosis import diagnose  # the node itself needs none
-    from adxl_ros.diagnose.documents import documents
-    from adxl_ros.diagnose.page import Run
+    from adxl_ros.diagnose.page import documents, Run
     from adxl_ros.diagnose.report import as_json
     os.nice(_NICENESS)
     folder.mkdir(parents=True, exist_ok=True)

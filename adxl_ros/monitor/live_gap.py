@@ -108,9 +108,12 @@ class LiveGap:
         self._blocks: deque[Block] = deque(
             maxlen=max(round(settings.window_s * 1e9 / BLOCK_NS), _FEWEST_BLOCKS))
         self._ends_ns: deque[int] = deque(maxlen=_MEMORY)
+        # Random walk of a healthy unit, or of its file if that is larger.
+        walk_g = float(np.max(sensor.values.get('bias_walk', {}).get('density_g_per_rts', ()),
+                              initial=effect_named('bias_walk').diagnosis.healthy_density))
         count = len(sensor.axes)
         self._test = ChangeTest(2 * count, settings.false_alarms_per_day, BLOCK_NS * 1e-9,
-                                (_healthy_walk(sensor),) * count + (np.inf,) * count)
+                                (G0_MPS2 * walk_g,) * count + (np.inf,) * count)
         self._changed_ns: dict[str, int] = {}
         self._prediction = reference_stream.Prediction(sensor, self.reference)
         self.left_out = self._prediction.left_out  # Effects that the reference cannot drive
@@ -154,9 +157,8 @@ class LiveGap:
     def report(self) -> tuple[AxisGap, ...]:
         """Return the gap of each axis over the window; nothing before the first seconds."""
         blocks = list(self._blocks)
-        if len(blocks) < _FEWEST_BLOCKS:
-            return ()
-        return tuple(self._axis_gap(d, axis, blocks) for d, axis in enumerate(self.sensor.axes))
+        return tuple(self._axis_gap(d, axis, blocks) for d, axis in enumerate(self.sensor.axes)
+                     if len(blocks) >= _FEWEST_BLOCKS)
 
     def diagnosis_input(self, begin_ns: int = 0) -> DiagnosisInput:
         """Return what there is since a stamp, ns, of at most the history, for a diagnosis."""
@@ -165,18 +167,19 @@ class LiveGap:
         stamps_ns, accel_mps2 = self._samples.between(begin_ns, newest_ns + 1)
         origin_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
         columns = dict(zip(ACCEL, accel_mps2.T))
-        around = begin_ns - BLOCK_NS, newest_ns + BLOCK_NS
+        around, force = (begin_ns - BLOCK_NS, newest_ns + BLOCK_NS), None
         at_ns, readings = self.reference.readings.between(*around)
-        force = None
-        if self.reference.kind is ReferenceKind.STAGE:
-            for name, values in zip(JOINTS.values(), readings.T):
-                columns[name] = _aligned(at_ns, values, stamps_ns, LONGEST_MOVE_NS)
-        else:
-            force = (at_ns - origin_ns) * 1e-9, readings
+        tracks = {name: (at_ns, values, LONGEST_MOVE_NS)
+                  for name, values in zip(JOINTS.values(), readings.T)}
+        if self.reference.kind is not ReferenceKind.STAGE:
+            tracks, force = {}, ((at_ns - origin_ns) * 1e-9, readings)
         for name, buffer in self.reference.surroundings.items():
             at_ns, readings = buffer.between(*around)
             if len(at_ns) > 1:
-                columns[name] = _aligned(at_ns, readings[:, 0], stamps_ns)
+                tracks[name] = at_ns, readings[:, 0], np.inf
+        for name, track in tracks.items():
+            # Unknown where no reading is near.
+            columns[name] = Track('the reference', *track).interpolate(stamps_ns)
         return DiagnosisInput(Recording(
             'the running stream', (stamps_ns - origin_ns) * 1e-9, columns,
             sensor_info(self.sensor)), self.sensor, force)
@@ -280,20 +283,13 @@ class LiveGap:
             noise_g = noise.sample_std_v(self.sensor)[d] / self.sensor.nominal_scale_v_per_g[d]
             std_mg = float(np.sqrt((noise_g * G0_MPS2) ** 2 + encoder)) / _MG
             floor, source = Interval(std_mg, std_mg, std_mg), 'parameters'
-        datasheet = _rms_interval(np.array([block.datasheet_square[d] for block in blocks]))
+        datasheet = _rms_interval(np.array([block.datasheet_square[d] for block in blocks])).value
         explained = None
-        if datasheet.value > _EXPLAINED_LEAST * floor.value:
-            explained = float(np.clip((datasheet.value ** 2 - gap.value ** 2) / (
-                datasheet.value ** 2 - floor.value ** 2), 0.0, 1.0))
+        if datasheet > _EXPLAINED_LEAST * floor.value:
+            explained = float(np.clip((datasheet ** 2 - gap.value ** 2) / (
+                datasheet ** 2 - floor.value ** 2), 0.0, 1.0))
         offset_mg = float(np.mean([block.mean_mps2[d] for block in blocks])) / _MG
         return AxisGap(axis, gap, floor, source, offset_mg, explained)
-
-
-def _healthy_walk(sensor: Sensor) -> float:
-    """Return the random walk of a healthy unit, or of its file if that is larger, m/s²/√s."""
-    healthy = effect_named('bias_walk').diagnosis.healthy_density
-    walks = sensor.values.get('bias_walk', {}).get('density_g_per_rts', ())
-    return G0_MPS2 * float(np.max(walks, initial=healthy))
 
 
 def _rms_interval(squares: np.ndarray) -> Interval:
@@ -305,9 +301,3 @@ def _rms_interval(squares: np.ndarray) -> Interval:
                  * batches.std(ddof=1) / np.sqrt(len(batches)))
     value, low, high = np.sqrt(np.maximum([mean, mean - half, mean + half], 0.0)) / _MG
     return Interval(float(value), float(low), float(high))
-
-
-def _aligned(at_ns: np.ndarray, values: np.ndarray, stamps_ns: np.ndarray,
-             longest_ns: float = np.inf) -> np.ndarray:
-    """Return readings, (k,), at the stamps of samples, ns, (n,); NaN where they are unknown."""
-    return Track('the reference', at_ns, values, longest_ns).interpolate(stamps_ns)

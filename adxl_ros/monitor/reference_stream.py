@@ -10,16 +10,14 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from functools import partial
 from itertools import takewhile
-from typing import NamedTuple
 
-from adxl_ros.diagnose.comparison import noiseless
+from adxl_ros.diagnose.comparison import gravity_slopes, noiseless
 from adxl_ros.files.recording_columns import JOINTS
 from adxl_ros.files.robot_readings import Readings
 from adxl_ros.model import noise
 from adxl_ros.model.constants import MAD_TO_STD, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern
-from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import Response
@@ -77,10 +75,6 @@ class StreamBuffer:
         self._nothing = np.zeros(0, np.int64), np.zeros((0, columns))
         self._pieces: deque[tuple[np.ndarray, np.ndarray]] = deque()
 
-    def __len__(self) -> int:
-        """Return the number of rows."""
-        return self._rows
-
     @property
     def newest_ns(self) -> int | None:
         """Return the newest stamp, ns; None without rows."""
@@ -120,11 +114,8 @@ class ReferenceKind(Enum):
     ROBOT = 'robot'
 
 
-class BlockMotion(NamedTuple):
-    """What the reference shows of one block."""
-
-    moves: bool  # Whether it moves
-    error_mps2: np.ndarray  # Standard deviation of the force by the steps of an encoder, (3,)
+BlockMotion = tuple[bool, np.ndarray]
+"""Whether the reference moves in a block, and what its encoders make of the force, m/s², (3,)."""
 
 
 class ReferenceStream:
@@ -182,23 +173,19 @@ class ReferenceStream:
         changes = np.ptp(readings[first:], axis=0)
         if self.kind is not ReferenceKind.STAGE:
             self._force = ForcePath(time_s, readings)
-            return BlockMotion(bool((changes > _STILL_MPS2).any()), self.error_mps2)
+            return bool((changes > _STILL_MPS2).any()), self.error_mps2
         step_rad = self._sensor.stage_resolution_rad
         self._paths = [SmoothedPath(time_s, values, step)
                        for values, step in zip(readings.T, (step_rad, step_rad, 0.0))]
         largest = max(_STILL_STEPS * step_rad, _STILL_RAD)
-        return BlockMotion(bool((changes > largest).any()), self._encoder_error_mps2(np.linspace(
-            (begin_ns - self._origin_ns) * 1e-9, (end_ns - self._origin_ns) * 1e-9, 3)))
-
-    def _encoder_error_mps2(self, time_s: np.ndarray) -> np.ndarray:
-        """Return what the steps of the encoder make of the force at some times, m/s², (3,)."""
+        time_s = (np.linspace(begin_ns, end_ns, 3) - self._origin_ns) * 1e-9
         alpha, beta = (path(time_s) for path in self._paths[:2])
-        alpha_std, beta_std = (_path_std(path, time_s) for path in self._paths[:2])
-        angles = (alpha, beta), (alpha + alpha_std, beta), (alpha, beta + beta_std)
-        force, by_alpha, by_beta = (np.array(specific_force(a, b, self._sensor.local_gravity_mps2))
-                                    for a, b in angles)
-        squares = (by_alpha - force) ** 2 + (by_beta - force) ** 2
-        return np.asarray(np.sqrt(squares.mean(axis=1)))
+        stds = [errors.std if isinstance(path, SmoothedPath) and (errors := path.errors(time_s))
+                else 0.0 for path in self._paths[:2]]
+        squares = np.sum([(slope * std) ** 2 for slope, std in zip(
+            gravity_slopes(alpha, beta), stds)], axis=0)
+        return bool((changes > largest).any()), \
+            self._sensor.local_gravity_mps2 * np.sqrt(squares.mean(axis=1))
 
     def _joint(self, number: int, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         return self._paths[number](time_s, order)
@@ -265,12 +252,6 @@ def _add_finite(buffer: StreamBuffer, stamp_ns: np.ndarray, rows: np.ndarray, lo
     buffer.add(stamp_ns, rows[finite])
 
 
-def _path_std(path: Path, time_s: np.ndarray) -> np.ndarray:
-    """Return the standard deviation of a path at times, s, (n,), by the steps of its encoder."""
-    errors = path.errors(time_s) if isinstance(path, SmoothedPath) else None
-    return np.zeros(len(time_s)) if errors is None else errors.std
-
-
 @dataclass(frozen=True)
 class Block:
     """The comparison of one block; m axes."""
@@ -329,14 +310,14 @@ class Prediction:
                                for respond in self._responses)
         if is_first:
             return None
-        mean_mps2 = _clean_mean(modelled)
+        mean_mps2, (moves, error_mps2) = _clean_mean(modelled), motion
         independent = float(noise.effective_samples(
             len(stamp_ns), 1 / self._sensor.rate_hz, self._sensor.rc_s))
         freedom = max(1 - 1 / max(independent, 1.0), 0.5)
         return Block(
             end_ns, mean_mps2, (modelled ** 2).mean(axis=0),
             modelled.var(axis=0) / freedom + _SMALLEST_MPS2 ** 2, _log_noise(modelled),
-            (datasheet ** 2).mean(axis=0), motion.error_mps2[:len(mean_mps2)] ** 2, motion.moves)
+            (datasheet ** 2).mean(axis=0), error_mps2[:len(mean_mps2)] ** 2, moves)
 
 
 def _log_noise(residual: np.ndarray) -> np.ndarray:

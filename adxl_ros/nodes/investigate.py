@@ -245,9 +245,8 @@ class Investigate(Node):
                 header=Header(stamp=now.to_msg()), name=['alpha', 'beta'], position=list(command),
                 velocity=list(run.speed or ())))
         if self._screen is not None:
-            status = run.status()
-            left = f', {status.remaining_s:.0f} s left' if status.state is State.MOVING else ''
-            self._screen.show(f'{status.minutes:5.1f} min{left}  {status.text}'[:COLUMNS])
+            left = f', {run.remaining_s:.0f} s left' if run.state is State.MOVING else ''
+            self._screen.show(f'{run.minutes:5.1f} min{left}  {run.text}'[:COLUMNS])
         now_s = time.monotonic()
         if not run.has_ended:
             self._busy_s = now_s
@@ -286,15 +285,14 @@ class Investigate(Node):
         return response
 
     def _status(self) -> Status:
-        status = self._investigation.status()
-        level = Level.WARN if status.state in (State.STOPPED, State.RECORDING) else Level.OK
-        answers = self._investigation.answers
-        values = {'state': status.state.value, 'minutes': status.minutes}
-        if answers:
-            best = answers[-1][1].hypotheses[0]
+        run = self._investigation
+        level = Level.WARN if run.state in (State.STOPPED, State.RECORDING) else Level.OK
+        values = {'state': run.state.value, 'minutes': run.minutes}
+        if run.answers:
+            best = run.answers[-1][1].hypotheses[0]
             values |= {'hypothesis': ' '.join(best.effects) or 'no gap',
                        'probability': best.probability}
-        return Status(level, status.text, self._sensor.serial, values)
+        return Status(level, run.text, self._sensor.serial, values)
 
 
 def _work(node: Investigate, executor: Executor) -> None:

@@ -9,18 +9,15 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from adxl_ros.diagnose import page
 from adxl_ros.diagnose.diagnosis import diagnose as diagnose_recordings, Diagnosis, self_check
-from adxl_ros.diagnose.documents import as_text, documents
-from adxl_ros.diagnose.report import as_json, screen_lines
+from adxl_ros.diagnose.report import as_json, as_text, screen_lines
 from adxl_ros.diagnose.residual_map import gap_in, GapInUnit, quantity
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store, parameter_file, recording
+from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.recording_columns import NO_UNIT, Recording
 from adxl_ros.model.effects import library
-from adxl_ros.model.population import posterior
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import page as html_page
 from adxl_ros.report.screen import NextStep
@@ -90,7 +87,6 @@ def diagnose(options: argparse.Namespace) -> int:
     if options.align and not (options.sim or options.urdf):
         raise UserError('--align: shifts --sim or a robot, and neither is given')
     reading = cli.reading_options(options)
-    population = calibration_store.read_population(options.prior) if options.prior else None
     unit = quantity(options.quantity) if options.quantity else None
     html_page.check_libraries()
     with cli.progress('reading') as show:
@@ -101,22 +97,24 @@ def diagnose(options: argparse.Namespace) -> int:
         if options.urdf:
             sim = cli.robot_path(options, recordings[0], sensor).as_motion()
         prior_lines: list[str] = []
-        if population is not None:
-            sensor, line, _ = posterior(sensor, population)
+        if options.prior:
+            from adxl_ros.files import calibration_store
+            from adxl_ros.model.population import posterior
+            sensor, line, _ = posterior(sensor, calibration_store.read_population(options.prior))
             prior_lines = ['', f' prior: {line}']
         diagnosis = diagnose_recordings(recordings, sensor, sim, options.seed,
                                         lambda stage, done: show(done, stage), options.align,
                                         options.material)
         subject = _subject(recordings, sensor, options.sim or options.urdf)
-        lines = [*screen_lines(diagnosis, subject), *prior_lines]
-        if options.self_check and diagnosis.report is not None:
+        lines, found, gap = screen_lines(diagnosis, subject), diagnosis.report, None
+        lines += prior_lines
+        if options.self_check and found:
             lines += ['', ' ' + self_check(diagnosis, recordings, sim, options.self_check,
                                            options.seed,
                                            lambda done: show(done, 'self-check'))]
-        gap = gap_in(unit, diagnosis.full_rate, diagnosis.report.baseline,
-                     diagnosis.report.sensor, options.seed) \
-            if unit is not None and diagnosis.report is not None else None
-        lines += ['', f' in      {gap.text}'] if gap else []
+        if unit and found:
+            gap = gap_in(unit, diagnosis.full_rate, found.baseline, found.sensor, options.seed)
+            lines += ['', f' in      {gap.text}']
         report = _write(options, diagnosis, subject, lines, gap)
     if options.json:
         print(as_text(report), end='')
@@ -134,10 +132,11 @@ def diagnose(options: argparse.Namespace) -> int:
 def _write(options: argparse.Namespace, diagnosis: Diagnosis, subject: str, lines: list[str],
            gap: GapInUnit | None) -> dict[str, Any]:
     """Write the files of a diagnosis; return its report."""
+    from adxl_ros.diagnose import page
     folder = Path(options.output)
     cli.make_folder(folder)
     report = as_json(diagnosis) | ({'gap_in': gap._asdict()} if gap else {})
-    for name, text in documents(diagnosis, report, lines, page.Run(
+    for name, text in page.documents(diagnosis, report, lines, page.Run(
             subject, Path(options.params or parameter_file.nominal_path()).name,
             _next_steps(options, diagnosis))).items():
         write_text(folder / name, text)

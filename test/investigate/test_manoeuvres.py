@@ -51,7 +51,7 @@ def test_commands_keep_the_limits_however_late_the_calls_are(name, limits):
     while not stream.is_done:
         elapsed_s = rng.choice([0.001, 0.02, 0.1, 3.0])
         command = stream.advance(elapsed_s, last)
-        assert limits.excess_rad(command) == 0
+        assert limits.nearest(*command) == command
         largest = limits.rate_rad_s * min(elapsed_s, LONGEST_STEP_S) + 1e-12
         assert max(abs(c - p) for c, p in zip(command, last)) <= largest
         last = command

@@ -14,10 +14,9 @@ from adxl_ros.investigate.investigation import (
     Outcome,
     Question,
     rank,
-    Ranking,
     run_round,
 )
-from adxl_ros.investigate.manoeuvres import KIND_OF, plan, plan_all, Pose, StageLimits
+from adxl_ros.investigate.manoeuvres import CATALOGUE, plan, plan_all, Pose, StageLimits
 import numpy as np
 import pytest
 from units import nominal
@@ -70,15 +69,16 @@ def test_a_manoeuvre_that_does_not_fit_in_the_time_is_not_chosen():
     assert shortest != first_round()[0].manoeuvre
     answer, _ = run_round(Question(pose, 0.0, minutes[shortest] + 1e-6, False), [], SENSOR, LIMITS)
     assert answer.manoeuvre == shortest
-    assert decide(Ranking(between((), ('hysteresis',)), (told_nothing(1.0),), ()),
+    assert decide(replace(between((), ('hysteresis',)), worth=(told_nothing(1.0),)),
                   FIRST, False).outcome is Outcome.TIME_OVER
 
 
 @pytest.mark.parametrize('probability, outcome', [(0.96, Outcome.CERTAIN), (0.85, Outcome.GO_ON)])
 def test_90_percent_of_a_hypothesis_is_a_verdict(probability, outcome):
     assessment = Assessment((WeightedHypothesis(('hysteresis',), probability),
-                             WeightedHypothesis((), 1 - probability)))
-    decision = decide(Ranking(assessment, (told_nothing(1.0),), ()), FIRST, True)
+                             WeightedHypothesis((), 1 - probability)),
+                            worth=(told_nothing(1.0),))
+    decision = decide(assessment, FIRST, True)
     assert decision.outcome is outcome
     if outcome is Outcome.CERTAIN:
         assert decision.sentence == 'The recording shows hysteresis: 96 %.'
@@ -88,16 +88,18 @@ def test_a_verdict_that_stays_after_every_kind_of_manoeuvre_ends_it():
     """The manoeuvres still promise much, as where the probability of no gap has a ceiling."""
     verdict = SimpleNamespace(status='no_gap', effects=())
     assessment = Assessment((WeightedHypothesis((), 0.8), WeightedHypothesis(('gravity',), 0.2)),
-                            SimpleNamespace(report=SimpleNamespace(verdict=verdict), fault=None))
-    worth = tuple(ManoeuvreWorth(m.name, m.minutes, 1.0) for m in plan_all(LIMITS, Pose(1.5, 0.0)))
+                            SimpleNamespace(report=SimpleNamespace(verdict=verdict), fault=None),
+                            tuple(ManoeuvreWorth(m.name, m.minutes, 1.0)
+                                  for m in plan_all(LIMITS, Pose(1.5, 0.0))))
     question, recorded = FIRST, []
-    while (answer := decide(Ranking(assessment, worth, ()), question, True)).manoeuvre:
+    while (answer := decide(assessment, question, True)).manoeuvre:
         recorded.append(answer.manoeuvre)
         question = replace(FIRST, recorded=tuple(recorded), verdict=answer.verdict)
-    assert {KIND_OF[name] for name in recorded} == set(KIND_OF.values())
-    assert len(recorded) == len(set(KIND_OF.values()))
+    kinds = {m.kind for m in CATALOGUE.values()}
+    assert {CATALOGUE[name].kind for name in recorded} == kinds
+    assert len(recorded) == len(kinds)
     assert answer.outcome is Outcome.NO_VISIBLE_GAP
-    changed = decide(Ranking(assessment, worth, ()), replace(question, verdict='unknown'), True)
+    changed = decide(assessment, replace(question, verdict='unknown'), True)
     assert changed.outcome is Outcome.GO_ON
 
 
