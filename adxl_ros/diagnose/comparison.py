@@ -46,8 +46,7 @@ specific force then changes by less than the noise within a second."""
 SETTLING_S = 0.3
 """A sample rests if no joint moves within this time before it, s. Chosen: an RC filter of 15 Hz
 has settled."""
-_LONGEST_S = 1e3
-"""Time since the last move where there was none, s. Chosen: beyond any creep."""
+_LONGEST_S = 1e3  # Time since the last move where there was none, s. Chosen: beyond any creep
 _LONGEST_BRIDGE_S, _SLOWEST_S, _USUAL_GAPS = 0.1, 1.0, 3.0
 """Longest time without a reading that is bridged, s: of a joint, and of a slow encoder, whose
 readings are a move apart at most; and the same in usual gaps. Those of messages of a bag."""
@@ -76,8 +75,7 @@ adds 4 % to the noise."""
 _SAME_MOTION = 2.0
 """Ratio of recorded and simulated motion from which one is an alias. Chosen: an alias below 0.2 of
 the rate has a ratio of 4."""
-_NAMED_PARTS = 4
-"""Parts that a note names. Chosen: it stays one or two lines."""
+_NAMED_PARTS = 4  # Parts that a note names. Chosen: it stays one or two lines
 _FEWEST_WINDOWS, _BAND_HZ = 20, 2.0
 """Fewest windows, and width of the bands, Hz, by which fading is judged. Chosen: noise then has a
 coherence of 0.05, and a line of the mains is one value."""

@@ -74,8 +74,7 @@ _EVEN_STAMPS = 0.01
 slowest motion."""
 _LARGEST_SCATTER = 0.45
 """Deviation, in samples, by which a stamp still shows the number of its sample: below one half."""
-_USUAL_STEP = 1.5
-"""Largest step of one sample, in medians of all steps: halfway to two samples."""
+_USUAL_STEP = 1.5  # Largest step of one sample, in medians of all steps: halfway to two samples
 _SMALLEST_MOVE_RAD = 0.01
 """Range of an angle, rad, above which the stage moves. Chosen: beyond the jitter of an encoder."""
 _SAMPLES = 4000
@@ -86,8 +85,7 @@ to which changed ones are right. Chosen: it is 0.03 where the sensor is mounted 
 _AGED_ZERO_G = 0.01
 """Zero-g, g, from which its sign tells an inverted axis from a wrong angle. Chosen: that of a
 healthy unit ages by less."""
-_FEWEST_SAMPLES = 50
-"""Fewest samples of any recording. Chosen: one for each of 48 blocks."""
+_FEWEST_SAMPLES = 50  # Fewest samples of any recording. Chosen: one for each of 48 blocks
 _LARGEST_UNEXPLAINED_MOTION_G, _RANGE_QUANTILES = 0.3, (0.02, 0.98)
 """Range of the output between its quantiles, g, that drift and noise cannot explain without a
 reference. Chosen: 17° of tilt, and outliers."""
@@ -106,8 +104,7 @@ jumps may have. Chosen: gaps of a lossy link are no fault of the clock."""
 _SMALLEST_RANGE_V, _SMALLEST_STEP_V, _DEAD_SHARE = 0.05, 1e-9, 1e-4
 """Range of an output that moves, V; step of an ADC that stands for none, V; and share of its
 simulated range that a wired axis covers. Chosen: 50 mg; rounding errors; any wrong unit."""
-_LARGEST_LEVEL_G = 1e3
-"""Largest median output, g. Chosen: above that of any sensor on a stage."""
+_LARGEST_LEVEL_G = 1e3  # Largest median output, g. Chosen: above that of any sensor on a stage
 _UNIT_TOLERANCE = 0.1
 """Relative deviation of a gain from the ratio of two units. Chosen: above any scale error."""
 _UNIT_RATIOS = {9.80665: 'm/s² instead of g', 1e3: 'mV instead of V', 1e-3: 'kV instead of V',

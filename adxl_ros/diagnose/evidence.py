@@ -49,8 +49,7 @@ _REST_S, _PARTS_OF_REST = 1.0, 4
 Chosen: slower changes are part of the gap, and a part is longer than its samples correlate."""
 _FEWEST_PARTS, _MOST_PARTS = 20, 100
 """Parts from which an interval is drawn. Chosen: 20 parts show their spread to 16 %."""
-FEWEST_SAMPLES = 200
-"""Fewest samples of an estimate. Chosen: 5 % of the standard deviation."""
+FEWEST_SAMPLES = 200  # Fewest samples of an estimate. Chosen: 5 % of the standard deviation
 _REPEAT_SHORTEST_S, _REPEAT_DELAY_S = 20.0, 10.0
 """Shortest repeat of a trajectory, s, and smallest delay of one in the same recording. Chosen: a
 few moves, beyond the correlation of a move with itself."""
@@ -74,8 +73,7 @@ BLOCKS = 48
 and blocks of a few seconds in a short recording."""
 _ITERATIONS = 3
 """Iterations over coefficients and noise. Chosen: the filters no longer change then."""
-_SMALLEST_SQUARES_V2 = 1e-300
-"""Smallest sum of squares, V², whose logarithm is taken: above zero."""
+_SMALLEST_SQUARES_V2 = 1e-300  # Smallest sum of squares, V², whose logarithm is taken: above zero
 _RIDGE = 1e-12
 """Ridge on the scaled precision. Chosen: columns that differ by a millionth are separable."""
 UNDETERMINED_SHARE, _UNDETERMINED_RATIO = 0.5, 3.0

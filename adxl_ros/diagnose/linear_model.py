@@ -53,8 +53,7 @@ one."""
 _CLIPPED_SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
 """Shares of the samples that are clipped by the limits that are tried. Chosen: neighbours differ
 by factors of 1.5 to 2.5."""
-_SMALLEST_V = 1e-9
-"""Change of the output, V, that is a rounding error."""
+_SMALLEST_V = 1e-9  # Change of the output, V, that is a rounding error
 _SIMULATED_SHARE = 0.5
 """Share of the run time of a linear model that its simulations take. Measured."""
 _OTHER_RESTS_SHARE = 0.2
@@ -65,8 +64,7 @@ _SMALLEST_BENT_SHARE = 0.1
 """Share of an effect that differs from a straight line over the force, below which the effect is
 a straight line itself. Chosen: a tenth of an effect is material."""
 
-Simulate = Callable[[Sensor], np.ndarray]
-"""Mean output of a sensor in one recording, V, (n, m)."""
+Simulate = Callable[[Sensor], np.ndarray]  # Mean output of a sensor in one recording, V, (n, m)
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,7 @@ from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate_blocks
 import numpy as np
 
-_SHOWN_STDS = 4.0
-"""Size of a coefficient, in standard deviations, that shows: it gains 8 nats."""
+_SHOWN_STDS = 4.0  # Size of a coefficient, in standard deviations, that shows: it gains 8 nats
 _RATE_HZ = 62.5
 """Sample rate of the simulated manoeuvres, Hz. Chosen: run time; a stage moves far slower."""
 _SMALLEST_PROBABILITY, _MOST_HYPOTHESES = 1e-3, 40

@@ -46,16 +46,14 @@ _SEGMENT, _POINTS_PER_OCTAVE = 4096, 12
 _COLOURS = {'explained': 'green', 'partly': 'amber', 'no_gap': 'grey', 'inseparable': 'amber',
             'insufficient': 'amber', 'unknown': 'red', 'bad_data': 'red'}
 """Colour of the badge for each status."""
-_MOST_CELLS = 20
-"""Largest number of parts of the map. Chosen: one screen."""
+_MOST_CELLS = 20  # Largest number of parts of the map. Chosen: one screen
 _PLOTTED_POINTS = 3000
 """Largest number of points of a line. Chosen: more than a wide screen has columns."""
 _INK, _EFFECT_COLOUR = '#1f2933', '#5b8fd6'
 _CURVE_COLOURS = {'recorded': _INK, 'stated noise': plots.QUIET_COLOUR} | dict.fromkeys(
     ('before', 'without the effect'), plots.BEFORE_COLOUR) | dict.fromkeys(
         ('after', 'with the effect'), plots.AFTER_COLOUR)
-_WIDE = {'l': 8, 'r': 12, 't': 36, 'b': 8}
-"""Margins of a plot with a legend, pixels."""
+_WIDE = {'l': 8, 'r': 12, 't': 36, 'b': 8}  # Margins of a plot with a legend, pixels
 
 
 @dataclass(frozen=True)

@@ -33,14 +33,11 @@ from adxl_ros.report.quantities import (
 from adxl_ros.report.screen import COLUMNS, wrapped
 import numpy as np
 
-_DIGITS = 6
-"""Significant digits of the report. Chosen: more than any of its numbers has."""
-_MOST_CELLS = 40
-"""Largest number of cells in the report. Chosen: cells of small share say little."""
+_DIGITS = 6  # Significant digits of the report. Chosen: more than any of its numbers has
+_MOST_CELLS = 40  # Largest number of cells in the report. Chosen: cells of small share say little
 PROBABLE = 0.05
 """Smallest probability of what terminal and page show first. Chosen: that of a rival."""
-_WITHOUT_GAP = ('no_gap', 'insufficient')
-"""Verdicts in which there is no gap to close."""
+_WITHOUT_GAP = ('no_gap', 'insufficient')  # Verdicts in which there is no gap to close
 _MATTERS = 0.3
 """Error of the reference, in material amplitudes, that is shown: it adds 5 % to them."""
 _FLOOR_SOURCES = {'still': 'from rests', 'repeats': 'from repeats of a trajectory',
@@ -53,8 +50,7 @@ _DIMENSIONS = {
     'ageing': 'force and time together', 'since_move_s': 'the time since a move',
     'code': 'the code of the ADC', 'lag': 'the recent history of the force'}
 """Dimensions of the reproducible rest, for people."""
-_MOST_DIMENSIONS = 2
-"""Dimensions that a sentence names. Chosen: the strongest ones."""
+_MOST_DIMENSIONS = 2  # Dimensions that a sentence names. Chosen: the strongest ones
 NOISE_STAYS = 'The effects are noise, which no simulation repeats sample by sample.'
 """Why effects on the noise close nothing."""
 
@@ -368,10 +364,8 @@ def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]
 
 _BADGE_COLUMNS, _GAP_COLUMNS, _LABEL_COLUMNS = 29, 24, 9
 """Columns of the verdict, of the gap before and after, and of the words before rows of text."""
-_SURE_COLUMNS, _SHARE_COLUMNS = 8, 7
-"""Columns of the table of effects."""
-_MOST_OTHERS = 3
-"""Other effects that the screen lists; the page has all of them."""
+_SURE_COLUMNS, _SHARE_COLUMNS = 8, 7  # Columns of the table of effects
+_MOST_OTHERS = 3  # Other effects that the screen lists; the page has all of them
 
 
 def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:

@@ -36,8 +36,7 @@ from adxl_ros.model.sensor import Sensor
 import numpy as np
 import scipy
 
-RANGES = 8
-"""Number of ranges of a dimension, with equally many samples. Chosen: a row of the page."""
+RANGES = 8  # Number of ranges of a dimension, with equally many samples. Chosen: a row of the page
 _DRAWS, _FEWEST_BLOCKS = 500, 3
 """Draws of random signs, and fewest blocks of a cell. Chosen: probabilities down to 0.002."""
 BLOCK_S = 2.0

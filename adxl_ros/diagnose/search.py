@@ -28,8 +28,7 @@ import numpy as np
 _EVALUATIONS, _HALVINGS = 8, 2
 """Largest number of simulations of a hypothesis, and of halvings of a step. Chosen: most need
 five, and a quarter of a step is enough for the library."""
-_EVIDENCE_TOLERANCE = 1e-3
-"""A step may lower the log evidence by this. Chosen: far below one unit."""
+_EVIDENCE_TOLERANCE = 1e-3  # A step may lower the log evidence by this. Chosen: far below one unit
 _SMALLEST_STEP, _SMALLEST_GAIN, _SMALLEST_GAIN_SHARE = 1e-3, 0.5, 1e-4
 """Step, in prior standard deviations, and gain of log evidence, also divided by that of all steps,
 below which a fit has converged. Chosen: far below any interval; a large effect needs no more
@@ -40,8 +39,7 @@ geometry and clocks have exact forms. Tuned by hand on simulated recordings of t
 the blind check."""
 _HEALTHY_STDS = 3.0
 """Largest departure of a healthy unit, in standard deviations: one unit in 400 exceeds it."""
-LARGEST_SET = 3
-"""Largest number of effects in a set. Chosen: one recording hardly separates more."""
+LARGEST_SET = 3  # Largest number of effects in a set. Chosen: one recording hardly separates more
 _SINGLES, _FITTED_SINGLES, _FURTHER, _COMPLETED = 8, 5, 3, 4
 """Singles whose pairs are ranked, singles that are fitted, further effects beside the best set,
 and sets that are fitted without each effect. Chosen: run time."""
@@ -54,8 +52,7 @@ three axes cost as much, and the held-out figures decide."""
 _HOPELESS_SHARE, _SMALLEST_DEFICIT = 0.2, 100.0
 """A set that gains less than the best one by this share of it, and by this log evidence, is not
 refined or extended. Its form would have to be wrong by as much of the gap."""
-_LARGEST_GAIN_RATIO = 5.0
-"""What a fit in full may gain, divided by what the linear model promises."""
+_LARGEST_GAIN_RATIO = 5.0  # What a fit in full may gain, divided by what the linear model promises
 _NEAR_START = 1.4
 """Largest ratio of the start of a size to the one at which the effect was simulated: the starts
 differ by factors of two."""

@@ -37,24 +37,19 @@ from adxl_ros.report.quantities import Interval
 import numpy as np
 import scipy
 
-UNKNOWN = 'unknown'
-"""Name of what no effect of the library explains."""
-HEALTHY = ''
-"""The drift of a healthy unit's noise."""
-MATERIAL_MG = 0.1
-"""Amplitude that a user would act on, mg, unless `--material` states another one."""
+UNKNOWN = 'unknown'  # Name of what no effect of the library explains
+HEALTHY = ''  # The drift of a healthy unit's noise
+MATERIAL_MG = 0.1  # Amplitude that a user would act on, mg, unless `--material` states another one
 MATERIAL_SHARE_OF_NOISE = 0.1
 """Share of the noise that a user would act on: it adds half a per cent to the rms."""
 _SHARE_OF_SET, _SHARE_OF_FORM = 0.03, 0.1
 """Share of the explained power that each effect of a set must hold, and the same beside an effect
 whose form is not exact over the same variables."""
-_NATS = 3.0
-"""Held-out log likelihood that a further effect must gain."""
+_NATS = 3.0  # Held-out log likelihood that a further effect must gain
 _SMALLEST_P = 0.001
 """Probability of the increments of a drift below which they are of something else. Chosen: one
 error in 1000."""
-_LOWEST, _HIGHEST = 0.05, 0.95
-"""Quantiles of the 90 % intervals."""
+_LOWEST, _HIGHEST = 0.05, 0.95  # Quantiles of the 90 % intervals
 _REPEATED, _RIGHT = (0.0, 0.5, 0.8, 0.95, 1.0), (0.2, 0.4, 0.6, 0.75, 0.9)
 """Shares of the draws that repeat a verdict, and how often such verdicts were right. Rounded from
 40 working cases (seed 901): of those that all draws repeat, 21 of 25."""
@@ -63,8 +58,7 @@ _POSE = {'force', 'cross_force', 'alpha_rad', 'beta_rad'}
 _SHOWN_BY_POSE = {ProofVariable.OWN_FORCE, ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z,
                   ProofVariable.ALPHA, ProofVariable.BETA}
 """Variables over which an effect that only changes with the pose shows."""
-_DRAWS = 200
-"""Draws of blocks. Chosen: the 5 % quantile has 10 draws below it."""
+_DRAWS = 200  # Draws of blocks. Chosen: the 5 % quantile has 10 draws below it
 FOLDS, _RUN_BLOCKS = 4, 2
 """Parts of a recording, each of which is held out once, and neighbouring blocks that are held out
 together. Chosen: run time, and slow effects change within two."""

@@ -18,8 +18,7 @@ from typing import BinaryIO
 
 from adxl_ros.errors import UserError
 
-_SUFFIX = '.part'
-"""End of the names of directories in which new files are written."""
+_SUFFIX = '.part'  # End of the names of directories in which new files are written
 
 
 @contextmanager

@@ -17,8 +17,7 @@ from adxl_ros.files.mcap_file import Piece
 from adxl_ros.files.recording_columns import NOMINAL_KEYS
 from adxl_ros.model.constants import MEASURED_AXES
 
-_ENDINGS = ('.mcap', '.db3')
-"""Ends of the names of files in a recording's directory."""
+_ENDINGS = ('.mcap', '.db3')  # Ends of the names of files in a recording's directory
 
 
 class Bag:
@@ -127,8 +126,7 @@ def _files(path: Path) -> list[Path]:
 
 IMU, JOINT_STATE = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/JointState'
 TEMPERATURE, BATTERY_STATE = 'sensor_msgs/msg/Temperature', 'sensor_msgs/msg/BatteryState'
-DIAGNOSTIC_STATUS = 'diagnostic_msgs/msg/DiagnosticStatus'
-"""Type of `sensor_info`."""
+DIAGNOSTIC_STATUS = 'diagnostic_msgs/msg/DiagnosticStatus'  # Type of `sensor_info`
 
 
 class Topics(NamedTuple):

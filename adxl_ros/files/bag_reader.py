@@ -35,8 +35,7 @@ import numpy as np
 _ABSENT_VARIANCE = 1e5
 """Variance from which an axis counts as absent, (m/s²)²; absent axes are written with 1e6."""
 
-_EXACT_NS = 1 << 53
-"""Largest time, ns, that float64 resolves to single nanoseconds."""
+_EXACT_NS = 1 << 53  # Largest time, ns, that float64 resolves to single nanoseconds
 
 
 def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,

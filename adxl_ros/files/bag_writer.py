@@ -31,15 +31,12 @@ from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-FRAME = 'imu_link'
-"""Frame of the sensor's messages (REP-145)."""
+FRAME = 'imu_link'  # Frame of the sensor's messages (REP-145)
 
-_ROWS_AT_ONCE = 65536
-"""Samples that are made into messages at a time (chosen: some 20 MB)."""
+_ROWS_AT_ONCE = 65536  # Samples that are made into messages at a time (chosen: some 20 MB)
 _END_OF_TIME_NS = (1 << 31) * 1_000_000_000
 """First stamp that is too late, ns: builtin_interfaces/Time has 32 bits of signed seconds."""
-_LONGEST_NS = (1 << 63) - 1
-"""Largest duration of ROS, ns: a QoS without a deadline."""
+_LONGEST_NS = (1 << 63) - 1  # Largest duration of ROS, ns: a QoS without a deadline
 
 
 class Form(NamedTuple):

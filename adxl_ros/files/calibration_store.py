@@ -187,10 +187,8 @@ def sha256(paths: Sequence[str | os.PathLike]) -> str:
         hashlib.sha256(''.join(f'{line}\n' for line in checksums).encode()).hexdigest()
 
 
-FORMAT = 1
-"""Version of the format. A file of another version is refused."""
-_DIGITS = 9
-"""Significant digits of the values (chosen: far below any uncertainty)."""
+FORMAT = 1  # Version of the format. A file of another version is refused
+_DIGITS = 9  # Significant digits of the values (chosen: far below any uncertainty)
 _HEAD = """\
 # Mean and spread of each coefficient over the units of a fleet, written by fleet.
 # The name of a coefficient is its column of fleet.parquet, which ends in its unit.

@@ -124,11 +124,9 @@ def _one_field(name: str, code: str, count: int = 1) -> Callable[[bytes], Layout
 vector3_stamped = _one_field('vector', 'f8', 3)
 """Finds the fields of a geometry_msgs/Vector3Stamped."""
 
-temperature = _one_field('temperature', 'f8')
-"""Finds the fields of a sensor_msgs/Temperature."""
+temperature = _one_field('temperature', 'f8')  # Finds the fields of a sensor_msgs/Temperature
 
-battery_state = _one_field('voltage', 'f4')
-"""Finds the voltage of a sensor_msgs/BatteryState."""
+battery_state = _one_field('voltage', 'f4')  # Finds the voltage of a sensor_msgs/BatteryState
 
 
 def message(stamped_frame: str, *parts: str | int | Sequence[float] | np.ndarray) -> bytes:

@@ -61,8 +61,7 @@ _REFERENCES = {
 }
 """Names of references by role."""
 
-_EPOCH_S = (9e8, 4e9)
-"""Bounds of times since 1970, s: 1998 to 2096."""
+_EPOCH_S = (9e8, 4e9)  # Bounds of times since 1970, s: 1998 to 2096
 
 _CONSTANT = 0.3
 """Largest relative scatter of a length that is that of gravity (chosen: a hand that turns a
@@ -71,11 +70,9 @@ sensor makes less)."""
 _REST_ROWS = 16
 """Rows of a window; the quietest quarter of them is at rest (chosen: short in every log)."""
 
-_LARGEST = 1e30
-"""Larger magnitudes are no readings and no stamps."""
+_LARGEST = 1e30  # Larger magnitudes are no readings and no stamps
 
-_TURNED = 0.3
-"""Smallest spread of an axis in that of another one of a sensor that is turned."""
+_TURNED = 0.3  # Smallest spread of an axis in that of another one of a sensor that is turned
 
 _COUNTS = (64, 100, 128, 256, 512, 1000, 1024, 1365, 2048, 4096, 8192, 16384, 32768)
 """Usual counts of 1 g."""

@@ -16,8 +16,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, G0_MPS2, MEASURED_AXES
 import numpy as np
 
-_EXAMPLE = 'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg'
-"""A mapping, for messages."""
+_EXAMPLE = 'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg'  # A mapping, for messages
 
 _ENTRY = re.compile(r"""\s*([^=,\s]+)\s*=\s*(?:"([^"]*)"|'([^']*)'|([^,"'\n]*?))\s*"""
                     r"""(?::\s*([^:,"'\n]*?))?\s*(?:,|\n|$)""")

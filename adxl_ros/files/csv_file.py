@@ -34,11 +34,9 @@ _HEAD_BYTES, _HEAD_LINES = 1 << 20, 200
 """Beginning that shows the form of a file (chosen: more than any preamble seen)."""
 _FEWEST_NUMBERS = 2
 """Fewest numbers of a line of samples with text (chosen: `rate, 100` is in a preamble)."""
-_DELIMITERS = ('\t', ';', ',', ' ')
-"""Delimiters; the first that fits is taken."""
+_DELIMITERS = ('\t', ';', ',', ' ')  # Delimiters; the first that fits is taken
 
-_INFO = re.compile(r'#+\s*([A-Za-z_][\w.]*)\s*:(?:\s+(.*))?$')
-"""A comment line with key and value."""
+_INFO = re.compile(r'#+\s*([A-Za-z_][\w.]*)\s*:(?:\s+(.*))?$')  # A comment line with key and value
 _NO_MARKS = bytes(set(range(256)) - set(b',\n#\0'))
 """Bytes besides the ends of fields and lines, comments, and zeros, at which pandas ends a text."""
 _FIELD = re.compile(r'\s*([-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infinity))?\s*',
@@ -51,8 +49,7 @@ _DATE = re.compile(rb'"?(\d{4})[-/](\d\d)[-/](\d\d)[T ](\d\d:\d\d:\d\d(?:[.,]\d{
 """A date and time by ISO 8601; without an offset it counts as UTC."""
 _LABEL = re.compile(rb'"?[A-Za-z_][\w ]*"?\s*[:=]\s*(?=[-+.]?\d)')
 """A label before a number, as in `x: 0.1` and `"x": 0.1`."""
-_COMMENT = re.compile(r'\s*(#|//|%)')
-"""Begin of a comment."""
+_COMMENT = re.compile(r'\s*(#|//|%)')  # Begin of a comment
 
 
 @dataclass(frozen=True)

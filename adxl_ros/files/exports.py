@@ -31,12 +31,9 @@ import numpy as np
 
 WHITE_NOISE, FILTER, STEPS = 'white noise', 'RC filter', 'ADC steps'
 """Names of parts: noise of a sample before the ADC, low-pass of the output, and rounding."""
-_COLUMNS = 75
-"""Columns of the head without the signs of a comment; chosen: 79 with them."""
-_NOT_HELD = 'not held'
-"""In place of the place of a part that a file lacks."""
-_SMALLEST_MG = 5e-4
-"""Size below which a part counts as 0, mg; chosen: half of the last digit."""
+_COLUMNS = 75  # Columns of the head without the signs of a comment; chosen: 79 with them
+_NOT_HELD = 'not held'  # In place of the place of a part that a file lacks
+_SMALLEST_MG = 5e-4  # Size below which a part counts as 0, mg; chosen: half of the last digit
 _ABSENT = np.diag([-1.0, 0.0, 0.0])
 """Covariance of a quantity that the sensor does not measure (sensor_msgs/Imu)."""
 
@@ -293,10 +290,8 @@ def _at(place: str, *parts: str) -> dict[str, str]:
 
 _NOISE = (WHITE_NOISE, 'noise_excess')
 _ROUNDING = (STEPS, 'quantisation')
-_SAMPLE = (*_NOISE, *_ROUNDING)
-"""Parts in the variance of one sample."""
-_GAUSSIAN = {**_at('std', *_NOISE), 'bias': 'mean'}
-"""Places of the parts in Gaussian noise."""
+_SAMPLE = (*_NOISE, *_ROUNDING)  # Parts in the variance of one sample
+_GAUSSIAN = {**_at('std', *_NOISE), 'bias': 'mean'}  # Places of the parts in Gaussian noise
 
 FORMATS = {
     'broadcaster': Format(

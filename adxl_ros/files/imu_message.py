@@ -19,8 +19,7 @@ _STAMP_OFFSET, _FRAME_LENGTH = 4, slice(12, 16)
 _ANGULAR_VELOCITY, _ACCELERATION, _END = 13 * 8, 25 * 8, 37 * 8
 """Offsets behind the header, bytes: first come a quaternion and its covariance, then each vector
 with its covariance, all float64."""
-_QUATERNION = 4
-"""Numbers of a quaternion, which stand before the orientation's covariance."""
+_QUATERNION = 4  # Numbers of a quaternion, which stand before the orientation's covariance
 _UNSET = (0.0, 0.0, 0.0, 1.0, *[0.0] * 9)
 """Quaternion and covariance of an orientation that nobody has set."""
 

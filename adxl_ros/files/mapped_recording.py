@@ -44,18 +44,14 @@ from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.kinematics import stage_angles
 import numpy as np
 
-_TIME_LIMIT_S = 9e9
-"""Largest magnitude of a time, s: in nanoseconds it fits into 64 bits (9.2e18)."""
+_TIME_LIMIT_S = 9e9  # Largest magnitude of a time, s: in nanoseconds it fits into 64 bits (9.2e18)
 _EPOCH_S = 1e8
 """First time from which times count from 1970, s: three years (chosen: no sensor runs so long)."""
 _LENGTHS_G = (0.5, 2.0)
 """Bounds of the median length of readings in the right unit, g (chosen: most are near 1 g)."""
-_TURN_RAD = 2 * np.pi
-"""Largest roll and pitch, rad."""
-_FEWEST_STAMPS = 8
-"""Stamps whose steps show their unit. Chosen: a lost sample hides no median."""
-_WHOLE = 1e-3
-"""Largest distance of a stamp from a whole number by rounding, in its unit."""
+_TURN_RAD = 2 * np.pi  # Largest roll and pitch, rad
+_FEWEST_STAMPS = 8  # Stamps whose steps show their unit. Chosen: a lost sample hides no median
+_WHOLE = 1e-3  # Largest distance of a stamp from a whole number by rounding, in its unit
 
 _NATIVE = {TIME: 'time', **{column: joint for joint, column in JOINTS.items()},
            'temperature_c': 'temperature', 'supply_v': 'supply'}

@@ -21,10 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-_MESSAGE, _MESSAGE_INDEX = 5, 7
-"""Operation codes of records (specification, "Records")."""
-_RECORD_HEAD = struct.Struct('<BQ')
-"""Operation code and length of a record."""
+_MESSAGE, _MESSAGE_INDEX = 5, 7  # Operation codes of records (specification, "Records")
+_RECORD_HEAD = struct.Struct('<BQ')  # Operation code and length of a record
 _CHUNK_HEAD = struct.Struct('<QQQII')
 """First and last time of a chunk, its size, CRC-32, and the length of its compression's name; the
 name and the 8 bytes of the length of its records follow."""
@@ -35,17 +33,14 @@ _INDEX_HEAD = struct.Struct('<BQHI')
 """Code and size of a message index record, its channel and the size of its entries, bytes."""
 _INDEX_ENTRY = np.dtype([('log_ns', '<u8'), ('offset', '<u8')])
 """Log time of a message, and where its record begins in the chunk."""
-_INDEX_OFFSET = struct.Struct('<HQ')
-"""A channel, and where its message index begins in the file."""
+_INDEX_OFFSET = struct.Struct('<HQ')  # A channel, and where its message index begins in the file
 _INDEX_BYTE = 32
 """Place of the length of the message index offsets in a chunk index record. They follow, and the
 size of the message indices."""
-_CHUNK_BYTES = 1 << 20
-"""Size that a chunk hardly exceeds, bytes; that of rosbags."""
+_CHUNK_BYTES = 1 << 20  # Size that a chunk hardly exceeds, bytes; that of rosbags
 _LARGE_BYTES = 2 << 30
 """Size from which a file that is read leaves the cache (chosen): smaller ones are read again."""
-_PIECE_MESSAGES = 4096
-"""Messages that are collected to a piece (chosen: some MB)."""
+_PIECE_MESSAGES = 4096  # Messages that are collected to a piece (chosen: some MB)
 
 Raws = Sequence[bytes] | np.ndarray
 """Messages of one type: their bytes one by one, or as rows of equal length, (n, size)."""
@@ -186,8 +181,7 @@ def _write_chunk(writer: Any, batches: list[Batch]) -> None:
                 + (storage.bio.tell() - begin).to_bytes(8, 'little') + text[_INDEX_BYTE + 12:])
 
 
-_MAGIC = b'\x89MCAP0\r\n'
-"""First and last bytes of a whole file (specification, "Magic")."""
+_MAGIC = b'\x89MCAP0\r\n'  # First and last bytes of a whole file (specification, "Magic")
 
 
 def is_unfinished(path: Path) -> bool:

@@ -23,11 +23,9 @@ from adxl_ros.model.sensor import Envelope, names_of, neutral, Sensor
 import numpy as np
 import yaml
 
-FORMAT = 1
-"""Version of the format. A file of another version is refused."""
+FORMAT = 1  # Version of the format. A file of another version is refused
 
-UNITS = 'V, V/g, 1/g, rad'
-"""Units of the coefficients: written into every file, and checked."""
+UNITS = 'V, V/g, 1/g, rad'  # Units of the coefficients: written into every file, and checked
 
 SENSOR_FIELDS: dict[str, Field[Any]] = {
     field.metadata['key']: field for field in fields(Sensor) if field.metadata}
@@ -68,8 +66,7 @@ _ASYMMETRY = 1e-6
 _LOWEST_EIGENVALUE = -1e-9
 """Permitted rounding below 0 of a correlation matrix's eigenvalues (chosen: as above)."""
 
-MakeError = Callable[[str, str], Exception]
-"""Makes the exception to raise from a key and a reason."""
+MakeError = Callable[[str, str], Exception]  # Makes the exception to raise from a key and a reason
 
 
 def nominal_path() -> Path:

@@ -26,11 +26,9 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_BLOCK_ROWS = 65536
-"""Samples that are read at a time (chosen: some MB)."""
+_BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 
-_MAGIC_BYTES = 16
-"""Bytes at the beginning of a file that show its format."""
+_MAGIC_BYTES = 16  # Bytes at the beginning of a file that show its format
 
 _ENDINGS = {b'\x89MCAP': '.mcap', b'SQLite format 3': '.db3', b'\x28\xb5\x2f\xfd': '.zstd',
             b'#ROSBAG': '.bag'}

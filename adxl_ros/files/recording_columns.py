@@ -15,11 +15,9 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, to_volts, with_axes
 import numpy as np
 
-FORMAT = '1'
-"""Version of the recording format, the key `format`."""
+FORMAT = '1'  # Version of the recording format, the key `format`
 
-NO_UNIT = 'nominal'
-"""Serial number that stands for no particular unit."""
+NO_UNIT = 'nominal'  # Serial number that stands for no particular unit
 
 NOMINAL_KEYS = ('nominal_zero_g_v', 'nominal_scale_v_per_g')
 """Keys of the nominal values, V and V/g; each is a field of `Sensor`, too."""
@@ -97,8 +95,7 @@ def converted_info(texts: Mapping[str, str], sensor: Sensor) -> dict[str, str]:
 
 
 TIME = 'time_s'
-VOLTS = ('x_v', 'y_v', 'z_v')
-"""Columns of the ADC volts by axis."""
+VOLTS = ('x_v', 'y_v', 'z_v')  # Columns of the ADC volts by axis
 ACCEL = ('ax_mps2', 'ay_mps2', 'az_mps2')
 """Columns of the specific force by axis after the nominal conversion."""
 JOINTS = {'alpha': 'alpha_rad', 'beta': 'beta_rad', 'shift': 'shift_m'}
@@ -262,8 +259,7 @@ _SHORT = 0.1
 """Longest step within a burst, as a share of one between bursts (chosen: beyond jitter)."""
 _SHORT_SHARE = 0.45
 """Smallest share of such steps among all (chosen: bursts of two samples have 0.5)."""
-_EVEN = 0.25
-"""A median step from this share of the mean step shows stamps without bursts."""
+_EVEN = 0.25  # A median step from this share of the mean step shows stamps without bursts
 _EVEN_STEPS = 0.02
 """Largest median deviation of even steps, as a share of them (chosen: rate right to 0.5 %)."""
 _LAG = 64

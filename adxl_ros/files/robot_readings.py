@@ -21,8 +21,7 @@ _TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 _BASE = ('x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw')
 """Columns of the pose of the base in a table, behind `base_`."""
 
-Track = tuple[np.ndarray, np.ndarray]
-"""Time, s, (k,), and values, (k,) or (k, 7)."""
+Track = tuple[np.ndarray, np.ndarray]  # Time, s, (k,), and values, (k,) or (k, 7)
 
 
 class Readings(NamedTuple):

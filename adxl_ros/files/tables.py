@@ -20,8 +20,7 @@ from adxl_ros.files.csv_file import find_form, read_blocks
 from adxl_ros.model.kinematics import stage_angles
 import numpy as np
 
-_BLOCK_ROWS = 65536
-"""Rows that are read at a time (chosen: some MB)."""
+_BLOCK_ROWS = 65536  # Rows that are read at a time (chosen: some MB)
 
 _MAPPINGS = {
     'sensor_accel': 'time={time}:us,x=x:mps2,y=y:mps2,z=z:mps2,temperature=temperature:c',
@@ -162,15 +161,12 @@ _FORMATS: Mapping[str, Callable[[str], Table]] = {
     '.npz': _open_npz, '.parquet': _open_parquet, '.pq': _open_parquet}
 """Formats besides text and logs by the ends of their files' names."""
 
-TABLE_ENDINGS = (*_FORMATS, '.ulg')
-"""Ends of the names of tables that are no text."""
+TABLE_ENDINGS = (*_FORMATS, '.ulg')  # Ends of the names of tables that are no text
 
 
-_ANGLES = ('alpha', 'beta', 'roll', 'pitch')
-"""Begin of the names of columns with angles."""
+_ANGLES = ('alpha', 'beta', 'roll', 'pitch')  # Begin of the names of columns with angles
 
-_LEVEL_RAD = 1e-9
-"""Largest sine of alpha at which beta does not matter."""
+_LEVEL_RAD = 1e-9  # Largest sine of alpha at which beta does not matter
 
 
 class PoseTable(NamedTuple):

@@ -31,8 +31,7 @@ from adxl_ros.report.page import as_utf_8, without_secrets
 
 _ENDINGS = ('.csv', '.mcap', '.db3')
 """Ends of the names of recordings in a folder, beside those of other tables."""
-_BAG = 'metadata.yaml'
-"""File that makes a folder a bag."""
+_BAG = 'metadata.yaml'  # File that makes a folder a bag
 _TIMES = ('mtime', 'LastModified', 'last_modified', 'updated', 'modified')
 """Properties of an object that are the time of the last change, by the names of file systems."""
 _STAMPS = ('ETag', 'etag', 'e_tag', 'md5Hash', 'Content-MD5', 'Digest', 'created', 'ino',
@@ -45,10 +44,8 @@ _SILENCE_S = 60.0
 take as long as it likes, where aiohttp would stop after five minutes."""
 _DATES_S = (946684800.0, 4102444800.0)
 """Stamps between these count from 1970, s: the years 2000 to 2100. Others count from a start."""
-NO_FILE = 'no such file'
-"""Fault of a recording that is not there."""
-_MANIFEST_COLUMNS = ('url', 'serial', 'params', 'date')
-"""Columns of a manifest."""
+NO_FILE = 'no such file'  # Fault of a recording that is not there
+_MANIFEST_COLUMNS = ('url', 'serial', 'params', 'date')  # Columns of a manifest
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,7 @@ from adxl_ros.report.quantities import decimals, number
 import numpy as np
 import pandas as pd
 
-_TREND_HEIGHT = 190
-"""Height of the plot of a trend, pixels."""
+_TREND_HEIGHT = 190  # Height of the plot of a trend, pixels
 _MOST_EFFECTS = 20
 """Largest count of effects in the matrix. Chosen: their names fit beside each other."""
 _ROW_PIXELS = 16
@@ -43,10 +42,8 @@ _MOST_PIXELS = 640
 _MATRIX_HEAD_PIXELS = 150
 """Heights of the matrix: of a unit with a name, of all units, and of the names of effects."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
-_SHOWN = 12
-"""Number of units in the first table and with a plot. Chosen: they fit on one screen."""
-_MOST_ROWS = 50
-"""Largest count of outliers and of reasons on the page; the table holds them all."""
+_SHOWN = 12  # Number of units in the first table and with a plot. Chosen: they fit on one screen
+_MOST_ROWS = 50  # Largest count of outliers and of reasons on the page; the table holds them all
 _DECIMALS = 3
 """Decimals of a scatter, mg, mg/g or µg. Chosen: far below the noise of any recording."""
 _MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))

@@ -41,24 +41,17 @@ import scipy
 
 FALSE_DISCOVERY_RATE = 0.05
 """Share of the claimed slopes that may be false. Chosen: the usual value."""
-_INTERVAL = 0.9
-"""Probability of the intervals. Chosen: that of all intervals of the package."""
-_MIN_RECORDINGS = 3
-"""Fewest recordings with a slope: one more than level and slope."""
+_INTERVAL = 0.9  # Probability of the intervals. Chosen: that of all intervals of the package
+_MIN_RECORDINGS = 3  # Fewest recordings with a slope: one more than level and slope
 _LARGEST_CORRELATION = 0.95
 """Largest correlation of neighbours. Chosen: above it a scatter is a drift of its own."""
-_ROUNDS = 20
-"""Rounds of the factor by correlation; it changes by less than 1e-3 after ten."""
+_ROUNDS = 20  # Rounds of the factor by correlation; it changes by less than 1e-3 after ten
 _SMALLEST_SHARE = 1e-8
 """Smallest variance beside the stated errors, relative to that of the values."""
-_FIT_TOLERANCE = 1e-3
-"""Tolerance of the logarithms of both variances."""
-FALSE_OUTLIERS = 0.05
-"""Probability that a fleet without outliers has one on its page. Chosen."""
-_MIN_OF_OUTLIERS = 5
-"""Fewest recordings of a unit with outliers. Chosen: a median needs them."""
-_MAD_EFFICIENCY = 0.37
-"""Efficiency of that median for normal values (Rousseeuw and Croux 1993)."""
+_FIT_TOLERANCE = 1e-3  # Tolerance of the logarithms of both variances
+FALSE_OUTLIERS = 0.05  # Probability that a fleet without outliers has one on its page. Chosen
+_MIN_OF_OUTLIERS = 5  # Fewest recordings of a unit with outliers. Chosen: a median needs them
+_MAD_EFFICIENCY = 0.37  # Efficiency of that median for normal values (Rousseeuw and Croux 1993)
 _MAD_BIAS = 0.8
 """That median of n values is too small by the factor 1 − 0.8/n (Croux and Rousseeuw 1992)."""
 
@@ -290,8 +283,7 @@ _FAR_MADS = 5.0
 """Units further from the median do not count in the first round. Chosen: far beyond normal."""
 MIN_GROUP = 5
 """Fewest units of a group. Chosen: fewer have nothing in common that a test could show."""
-CHANCE = 0.01
-"""Probability of a false group among all groups. Chosen."""
+CHANCE = 0.01  # Probability of a false group among all groups. Chosen
 
 
 def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

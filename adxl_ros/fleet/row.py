@@ -29,15 +29,11 @@ from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.model.constants import AXES
 import yaml
 
-Row = dict[str, Any]
-"""The values of one recording by column."""
+Row = dict[str, Any]  # The values of one recording by column
 
-TABLE = 'fleet.parquet'
-"""Name of the table."""
-PAGE = 'fleet.html'
-"""Name of the page beside the table."""
-POPULATION = 'population.yaml'
-"""Name of the file of the population beside the table."""
+TABLE = 'fleet.parquet'  # Name of the table
+PAGE = 'fleet.html'  # Name of the page beside the table
+POPULATION = 'population.yaml'  # Name of the file of the population beside the table
 
 OUTCOMES = ('done', 'refused', 'crashed')
 """Values of `outcome`: the tasks gave results; the recording was refused, and `refusal` has the
@@ -176,8 +172,7 @@ def as_table(rows: Iterable[Row]) -> Any:
         for row in rows], arrow_schema())
 
 
-TASKS = ('check', 'noise', 'fit', 'diagnose')
-"""All tasks, in the order in which they run."""
+TASKS = ('check', 'noise', 'fit', 'diagnose')  # All tasks, in the order in which they run
 
 
 class ParameterText(NamedTuple):

@@ -28,14 +28,10 @@ from adxl_ros.fleet.row import arrow_schema, as_table, Recipe, Row, TABLE
 from adxl_ros.fleet.task import make_row, refused, Result, StagingError
 from adxl_ros.workers import Finished, finished_tasks, Pool, write
 
-_ROWS = 'rows'
-"""Folder of the rows."""
-_REPORTS = 'reports'
-"""Folder of the files of single recordings."""
-_BATCH_ROWS = 1000
-"""Rows that are in memory at once while the table is written. Chosen: some MB."""
-_LOCK = 'client.lock'
-"""File that the client of a folder locks; it names the client."""
+_ROWS = 'rows'  # Folder of the rows
+_REPORTS = 'reports'  # Folder of the files of single recordings
+_BATCH_ROWS = 1000  # Rows that are in memory at once while the table is written. Chosen: some MB
+_LOCK = 'client.lock'  # File that the client of a folder locks; it names the client
 _NAME_DIGITS = 16
 """Digits of a SHA-256 in names of files and folders. Chosen: 10⁵ rows have no pair."""
 _SECONDS = {'check': (0.02, 30.0), 'noise': (0.05, 60.0), 'fit': (1.0, 100.0),

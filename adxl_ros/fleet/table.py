@@ -45,12 +45,9 @@ _TEXTS = ['url', 'hash', 'serial', 'outcome', 'refusal', 'refused_by', 'calibrat
 """Columns of texts that the page uses."""
 _OTHERS = ['date', 'effects', 'calibration_age_days', 'gap_floor_mps2']
 """Columns that the page uses, beside those of the quantities."""
-_YEAR = np.timedelta64(31_557_600_000_000, 'us')
-"""A year of 365.25 days."""
-TOLERANCE_MG = 3.5
-"""Largest gap of a unit that is in order, mg. Chosen: an error of 0.2° in tilt."""
-MG = 1e3 / G0_MPS2
-"""Milli-g in 1 m/s²."""
+_YEAR = np.timedelta64(31_557_600_000_000, 'us')  # A year of 365.25 days
+TOLERANCE_MG = 3.5  # Largest gap of a unit that is in order, mg. Chosen: an error of 0.2° in tilt
+MG = 1e3 / G0_MPS2  # Milli-g in 1 m/s²
 
 
 @dataclass(frozen=True)
@@ -247,8 +244,7 @@ _MOST = 0.5
 """Share from which most have an effect: recordings of a unit, units of a group or of the fleet."""
 RECENT = 5
 """Number of recordings whose median is the gap of a unit now. Chosen: one odd one is no gap."""
-MAX_AGE_DAYS = 365.0
-"""Largest age of a calibration, days. Chosen: a year."""
+MAX_AGE_DAYS = 365.0  # Largest age of a calibration, days. Chosen: a year
 DAYS_PER_YEAR = 365.25
 _FARTHEST_DAYS = 10 * DAYS_PER_YEAR
 """A drift that needs longer is no matter of urgency. Chosen: the life of a robot."""

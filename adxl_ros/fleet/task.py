@@ -51,8 +51,7 @@ if TYPE_CHECKING:
     from adxl_ros.diagnose.diagnosis import Diagnosis
 
 
-_SPARE_MB = 64
-"""Space that stays free, MB. Chosen: a task writes some MB."""
+_SPARE_MB = 64  # Space that stays free, MB. Chosen: a task writes some MB
 _LEFT_S = 86400.0
 """Age from which a temporary folder is that of a killed worker, s. Chosen: no task takes a day."""
 

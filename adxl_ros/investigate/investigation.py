@@ -231,8 +231,7 @@ def listed(names: Sequence[str]) -> str:
     return quantities.listed([*names[:_LARGEST_NAMED], *more], 'or')
 
 
-_NICENESS = 10
-"""Niceness of the process. Chosen: the node that records comes first."""
+_NICENESS = 10  # Niceness of the process. Chosen: the node that records comes first
 _WITHOUT_DIAGNOSIS = {'bag', 'baseline.yaml'}
 """Files of an investigation that was stopped before its first diagnosis of samples."""
 

@@ -30,8 +30,7 @@ _SLOW_SHARE = 1 / 3
 nine times smaller."""
 _SWING_RAD = np.radians(15.0)
 """Amplitude of swings and of reversals, rad. Chosen: far beyond every backlash."""
-_SWINGS = 4
-"""Number of swings forth and back. Chosen: their reversals are averaged."""
+_SWINGS = 4  # Number of swings forth and back. Chosen: their reversals are averaged
 LONGEST_STEP_S = 0.2
 """Longest time of a manoeuvre between two commands, s. Chosen: the stage then comes to rest within
 a fifth of a second at the limit of rate where the commands end. A command is ahead of the stage by

@@ -34,8 +34,7 @@ _DECISION_S = 0.5
 then a busy machine has read what the kernel keeps, each buffer with an answer of its own."""
 _BACK_NS = 500_000_000
 """Stamps that go back by more belong to another clock, ns; others are samples that came before."""
-_URI_KINDS = ('local:', 'ip:', 'usb:', 'serial:')
-"""Kinds of libiio contexts that are real devices."""
+_URI_KINDS = ('local:', 'ip:', 'usb:', 'serial:')  # Kinds of libiio contexts that are real devices
 _RATE_TOLERANCE = 1e-3
 """Relative difference from the declared rate above which the status names both."""
 
@@ -43,24 +42,20 @@ _RATE_TOLERANCE = 1e-3
 _KEPT_S = 0.32
 """Duration of the samples that the kernel keeps while nobody reads, s; chosen: a busy machine
 delays a read by less."""
-_MIN_KERNEL_BUFFERS = 4
-"""Fewest buffers of the kernel, the default of libiio."""
+_MIN_KERNEL_BUFFERS = 4  # Fewest buffers of the kernel, the default of libiio
 _MAX_KERNEL_BUFFERS = 320
 """Most buffers of the kernel; chosen: single samples at 1 kHz are kept as long as others, and its
 memory has a bound at high rates."""
-_ANSWERS = 20
-"""Answers of a device that are timed when it is opened."""
+_ANSWERS = 20  # Answers of a device that are timed when it is opened
 _ROUND_TRIPS = 4.0
 """Shortest duration of a buffer by the mean time of an answer. Chosen: each buffer needs one,
 so that the reads catch up with four times the sample rate after a delay."""
-_MAX_BUFFER = 2000
-"""Most samples of a buffer."""
+_MAX_BUFFER = 2000  # Most samples of a buffer
 _TIMEOUT_S = 1.0
 """Lateness after which a buffer will not come, s: the server was killed or stopped."""
 _CLOCK_ATTRIBUTE = 'current_timestamp_clock'
 """Attribute of the kernel that selects the clock of the time stamps."""
-_MAX_STAMP_NS = 2 ** 62
-"""Largest plausible time stamp, ns."""
+_MAX_STAMP_NS = 2 ** 62  # Largest plausible time stamp, ns
 _INSTALL = ('link.type iio needs the Python package pylibiio and the library libiio 0.x: '
             f'{install_hint("pylibiio<1")} and sudo apt install libiio0')
 """What a user is told where libiio is not installed."""

@@ -16,8 +16,7 @@ import numpy as np
 
 _ROWS = 2000
 """Rows of a block. Chosen: reading a block takes some milliseconds, so samples leave in time."""
-_MAX_CLOCK_NS = 2 ** 31 * 10 ** 9
-"""Largest time of a ROS clock, ns: its seconds are an int32."""
+_MAX_CLOCK_NS = 2 ** 31 * 10 ** 9  # Largest time of a ROS clock, ns: its seconds are an int32
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,7 @@ _INFO_WAIT_S = 1.5
 """Longest time without an info frame after opening, s. Derived: a board sends one each second."""
 _COMMAND_PAUSE_S = 0.5
 """Shortest time between two commands, s. Chosen: a board has answered by then."""
-_SILENT_FRAMES = 3
-"""A board also counts as silent only after this many times its longest frame."""
+_SILENT_FRAMES = 3  # A board also counts as silent only after this many times its longest frame
 _MAX_BYTES_PER_S = 4e6
 """Bytes that are read per second at most. Chosen: more than USB full speed carries."""
 _MAX_RATE_RATIO = 20.0
@@ -47,27 +46,19 @@ kernel or is lost there. So no device can keep the node busy or fill its memory.
 _CREDIT_S = 0.2
 """Reading time that a link saves up for a burst, s. Chosen: the backlog of a stall is read at
 once."""
-_MAX_PAUSE_S = 0.05
-"""Longest pause of one read, s, so that the driver reacts to its end."""
-_UNSTATED_RATE_HZ = 1000.0
-"""Sample rate before the info frame, Hz: that of the firmware."""
-_SILENT = 'silent, the board sends nothing'
-"""Error of a port that is open but delivers nothing."""
+_MAX_PAUSE_S = 0.05  # Longest pause of one read, s, so that the driver reacts to its end
+_UNSTATED_RATE_HZ = 1000.0  # Sample rate before the info frame, Hz: that of the firmware
+_SILENT = 'silent, the board sends nothing'  # Error of a port that is open but delivers nothing
 
-_WAIT_MS = 50
-"""Longest wait for bytes, ms, so that the driver reacts to its end."""
-_MAX_READ = 65536
-"""Most bytes of one read: more than a terminal or a socket usually holds."""
+_WAIT_MS = 50  # Longest wait for bytes, ms, so that the driver reacts to its end
+_MAX_READ = 65536  # Most bytes of one read: more than a terminal or a socket usually holds
 _CHECK_S = 0.1
 """Period of the check of a silent port, s: its name may stand for another device by now."""
-_BITS_PER_BYTE = 10
-"""Bits of a byte on a UART: 8 and start and stop bit."""
-_SYSFS = Path('/sys/dev/char')
-"""Devices of the kernel by their numbers."""
+_BITS_PER_BYTE = 10  # Bits of a byte on a UART: 8 and start and stop bit
+_SYSFS = Path('/sys/dev/char')  # Devices of the kernel by their numbers
 _USB_DRIVER = 'cdc_acm'
 """Driver of boards that are USB devices themselves: they ignore the baud rate."""
-_LOCKED = (errno.EAGAIN, errno.EBUSY)
-"""Errors of a port that another process has locked."""
+_LOCKED = (errno.EAGAIN, errno.EBUSY)  # Errors of a port that another process has locked
 _RECONNECT_S = 3.0
 """Silence after which a network connection is made again, s: a lost peer sends no error."""
 

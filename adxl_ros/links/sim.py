@@ -19,8 +19,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 _AHEAD_NS = 50_000_000
 """Length of a block of samples, ns. Chosen: a block costs less than its samples one by one."""
-_MAX_BLOCK = 4096
-"""Most samples of a block. Chosen: it bounds the memory at high sample rates."""
+_MAX_BLOCK = 4096  # Most samples of a block. Chosen: it bounds the memory at high sample rates
 _LOST_S = 1.0
 """Silence after which a stage counts as lost, s of steady time. Chosen: a stage sends 100 poses a
 second."""
@@ -34,8 +33,7 @@ Chosen: five of the stage's steps."""
 _BEAT_NS = 10_000_000
 """The first sample lies on a multiple of this, ns, as the stage's stamps do. So every reference
 has a sample of its own."""
-_FOREVER_NS = 2 ** 63 - 1
-"""Largest stamp, ns: no motion bounds the time."""
+_FOREVER_NS = 2 ** 63 - 1  # Largest stamp, ns: no motion bounds the time
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,7 @@ from adxl_ros.workers import in_background
 import numpy as np
 import scipy
 
-_DAY_S = 86400.0
-"""One day, s."""
+_DAY_S = 86400.0  # One day, s
 _LENGTHS = 10
 """Number of lengths, each twice the one before. Chosen: of blocks of 1 s, 1 s to 8.5 minutes."""
 _BEFORE = 4
@@ -61,13 +60,11 @@ of the noise is followed."""
 _SMALLEST = 1e-6
 """Smallest usual size of a difference, in the unit of the series; a series without noise has none
 of its own."""
-_NEVER = 1e300
-"""Limit that no difference reaches."""
+_NEVER = 1e300  # Limit that no difference reaches
 _RESERVE = 0.5
 """Share of the permitted false alarms that the limits use. Chosen: usual sizes are estimates, and
 noise is not quite normal."""
-_KINDS = 2
-"""Kinds of windows: at rest throughout, and with motion. Like is compared with like."""
+_KINDS = 2  # Kinds of windows: at rest throughout, and with motion. Like is compared with like
 
 
 class Change(NamedTuple):
@@ -188,14 +185,11 @@ class ChangeTest:
                 usable[channels] = False
 
 
-NAME = 'changes.jsonl'
-"""Name of the file."""
+NAME = 'changes.jsonl'  # Name of the file
 _FIRST_UTC_NS = 10 ** 18
 """Earliest stamp that is UTC, ns: September 2001. Chosen: a simulator begins at 0."""
-_NICENESS = 15
-"""Niceness of the process; chosen: every node of the robot has priority."""
-_REASON_LENGTH = 300
-"""Most characters of a reason; chosen: one line of diagnostics."""
+_NICENESS = 15  # Niceness of the process; chosen: every node of the robot has priority
+_REASON_LENGTH = 300  # Most characters of a reason; chosen: one line of diagnostics
 
 
 @dataclass(frozen=True)

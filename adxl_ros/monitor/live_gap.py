@@ -20,8 +20,7 @@ from adxl_ros.report.quantities import Interval
 import numpy as np
 import scipy
 
-BLOCK_NS = 1_000_000_000
-"""Length of a block, ns: one second, as the reports."""
+BLOCK_NS = 1_000_000_000  # Length of a block, ns: one second, as the reports
 _LATE_NS = 5_000_000_000
 """Time that a block waits for its reference, ns. Chosen: longer than a busy network delays."""
 _BREAK_NS = 10_000_000_000
@@ -30,24 +29,19 @@ small beside the noise of a second."""
 _JUMP_NS = 1_000_000_000
 """Step of the stamps backwards from which the clock has jumped, ns; chosen: no network reorders
 samples so far."""
-_FEWEST_SAMPLES = 4
-"""Fewest samples of a block; chosen: a variance needs some."""
+_FEWEST_SAMPLES = 4  # Fewest samples of a block; chosen: a variance needs some
 _RATE_TOLERANCE = 0.02
 """Largest relative difference of the measured rate from the stated one. Chosen: above the errors
 of clocks, below those of a wrong file."""
 _BATCHES = 10
 """Batches of blocks whose scatter gives an interval. Chosen: they are long enough to be
 independent, and Student's t is then near the normal."""
-_FEWEST_BLOCKS = 5
-"""Fewest blocks of a report; chosen: an interval needs some."""
-_CONFIDENCE = 0.9
-"""Probability of the intervals, as in all reports of the package."""
-_MG = 1e-3 * G0_MPS2
-"""One mg, m/s²."""
+_FEWEST_BLOCKS = 5  # Fewest blocks of a report; chosen: an interval needs some
+_CONFIDENCE = 0.9  # Probability of the intervals, as in all reports of the package
+_MG = 1e-3 * G0_MPS2  # One mg, m/s²
 _MEMORY = 4096
 """Blocks whose stamps are known; chosen: more than the longest comparison of the test."""
-_MOST_CHANGES = 100
-"""Changes in memory; chosen: the record on disk has all."""
+_MOST_CHANGES = 100  # Changes in memory; chosen: the record on disk has all
 _OPEN = 1.1
 """Rms of the gap, divided by the floor, from which it is open. Chosen: the intervals alone would
 call every twentieth closed gap open."""

@@ -32,8 +32,7 @@ AFTER_NS = 250_000_000
 the delay of a sensor."""
 _LONGEST_GAP_NS = 500_000_000
 """Longest time between readings that a path bridges, ns. Chosen: five readings at 10 Hz."""
-_FEWEST = 6
-"""Fewest readings of a path; a quintic spline needs them."""
+_FEWEST = 6  # Fewest readings of a path; a quintic spline needs them
 _STILL_STEPS = 1.5
 """Change of a reading, in steps of the encoder, by which a resting joint may change. Chosen: a
 reading between two steps changes by one."""

@@ -88,8 +88,7 @@ class CalibrationSettings:
                                600.0, name='thermal.block_s')
 
 
-_SCREEN_END_S = 5.0
-"""Longest wait for the end of the screen, s; chosen: far above its usual end."""
+_SCREEN_END_S = 5.0  # Longest wait for the end of the screen, s; chosen: far above its usual end
 _RESET = b'\x1b[?1049l\x1b[?2004l\x1b[?25h\x1b[0m'
 """Leaves alternate screen and bracketed paste and shows the cursor, by the codes of xterm."""
 
@@ -274,8 +273,7 @@ _NOTICE_S = 0.05
 """Time between two looks at the level of the diagnostics, s; chosen: short for people."""
 _FAREWELL_NS = 2_500_000_000
 """Time from the end of a calibration to that of the node, ns; chosen: two reports come within."""
-_QUEUE = 100
-"""Messages that wait while the node fits; chosen: some seconds of slow topics."""
+_QUEUE = 100  # Messages that wait while the node fits; chosen: some seconds of slow topics
 _STAGE_QUEUE = 1000
 """Messages of the stage that wait meanwhile; more, because its angles come faster."""
 _CHECK_POSES = {'full': 16, 'quick': 8}
@@ -284,15 +282,13 @@ _EXAMPLES = {
     'a stage that is turned by hand': '--ros-args -p stage.mode:=manual -p output:=unit.yaml',
     'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml'}
 """Examples of arguments, by their purpose."""
-_SAMPLES = 'imu/data_raw'
-"""Topic of the samples, relative to the namespace of the node."""
+_SAMPLES = 'imu/data_raw'  # Topic of the samples, relative to the namespace of the node
 _YAW_VARIANCE = 8
 """Place of the variance of yaw in an orientation's covariance of 9 numbers, from 0."""
 _INFO_NS = 1_000_000_000
 """Time that samples wait for `sensor_info`, ns; chosen: a latched message comes within it, also
 where the samples of seconds come within a tenth of it."""
-_SAMPLES_QUEUE = 20000
-"""Samples that are kept: 20 s at 1 kHz, longer than a fit takes."""
+_SAMPLES_QUEUE = 20000  # Samples that are kept: 20 s at 1 kHz, longer than a fit takes
 
 
 class Samples:

@@ -64,14 +64,12 @@ class CompensationSettings:
                                        'case is turned', name='mounting.frame_id')
 
 
-_RPY = 'mounting.rpy_rad'
-"""Parameter of the rotation."""
+_RPY = 'mounting.rpy_rad'  # Parameter of the rotation
 _LEVEL_S = 1.0
 """Time over which a rest is averaged, s; chosen: the noise of a sample then is negligible."""
 _FEWEST_SAMPLES = 10
 """Smallest number of samples of that rest; chosen: they show whether the sensor moves."""
-_MAX_NOISE = 3.0
-"""Largest scatter of a rest, in standard deviations of a sample's noise; chosen."""
+_MAX_NOISE = 3.0  # Largest scatter of a rest, in standard deviations of a sample's noise; chosen
 _MAX_GRAVITY_ERROR = 0.1
 """Largest relative departure of a rest from gravity; chosen: beyond an uncalibrated sensor."""
 
@@ -150,8 +148,7 @@ def _mounting(rpy_rad: Sequence[float]) -> Mounting:
     return Mounting((roll, pitch, yaw))
 
 
-_DEPTH = 100
-"""Samples that are kept while the node is busy: 0.1 s at 1 kHz."""
+_DEPTH = 100  # Samples that are kept while the node is busy: 0.1 s at 1 kHz
 _LOOK_S = 0.5
 """Time between two looks at who publishes and, where it is unknown, at the sensor, s; chosen."""
 _LEVELS = {State.REFUSED: Level.ERROR, State.COMPENSATING: Level.OK}

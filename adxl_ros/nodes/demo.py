@@ -30,27 +30,19 @@ from adxl_ros.process import ended_by_closed_output
 from adxl_ros.report.screen import coloured
 import numpy as np
 
-_LONGEST_S = 600.0
-"""Longest time of a step, s; chosen: far above what sweep and fit take."""
-_POLL_S = 0.2
-"""Time between two looks at the progress, s."""
+_LONGEST_S = 600.0  # Longest time of a step, s; chosen: far above what sweep and fit take
+_POLL_S = 0.2  # Time between two looks at the progress, s
 _SPEED = 40.0
 """Sensor time per real time; chosen: two cores can follow, and a slower machine takes longer."""
 _RATE_HZ = 250.0
 """Rate of the simulated sensor, Hz. Chosen: its noise ends at 50 Hz, so that more samples would
 say no more, and many times real time leaves room to catch up."""
-_SWEEP_S = 1060.0
-"""Sensor time of the sweep, s; measured."""
-_OVERHEAD_S = 15.0
-"""Real time of start, fit and report, s; measured."""
-_PLANES_DEG = [30.0, 60.0, 90.0, 120.0, 150.0]
-"""Planes alpha of the sweep, degrees."""
-_STEP_DEG = 30.0
-"""Step of beta in each plane, degrees."""
-_CHECK_POSES = 16
-"""Number of poses that are kept out of the fit."""
-_SEED = 203
-"""Default seed of the demonstrated unit and its stage; chosen."""
+_SWEEP_S = 1060.0  # Sensor time of the sweep, s; measured
+_OVERHEAD_S = 15.0  # Real time of start, fit and report, s; measured
+_PLANES_DEG = [30.0, 60.0, 90.0, 120.0, 150.0]  # Planes alpha of the sweep, degrees
+_STEP_DEG = 30.0  # Step of beta in each plane, degrees
+_CHECK_POSES = 16  # Number of poses that are kept out of the fit
+_SEED = 203  # Default seed of the demonstrated unit and its stage; chosen
 _STARTED = ('driver', 'stage', 'calibration')
 """Nodes of the demonstration in the order of their start."""
 _UNIT_EFFECTS = {'bias': 0.5, 'scale_factor': 0.5, 'misalignment': 0.7, 'cross_axis': 0.7,
@@ -71,10 +63,8 @@ _UNATTENDED = {'autostart': True, 'screen': False,
                'qos_overrides./imu/data_raw.subscription.depth': _QUEUE}
 """Parameters of a calibration that nobody controls and that loses no sample: at many times real
 time, a best-effort subscriber loses samples on a busy machine."""
-_EXAMPLES = {'the simulated sensor': '-o demo_output'}
-"""Examples of arguments, by their purpose."""
-NEXT_PAGE = 'docs/start/tilt.md'
-"""Page that a user reads next."""
+_EXAMPLES = {'the simulated sensor': '-o demo_output'}  # Examples of arguments, by their purpose
+NEXT_PAGE = 'docs/start/tilt.md'  # Page that a user reads next
 
 
 def _command(name: str, params_file: Path, parameters: Mapping[str, object]) -> list[str]:

@@ -21,8 +21,7 @@ from adxl_ros.nodes.topics import DiagnosticsReporter, Level, Status, STEADY
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
-DEFAULT_FRAME = 'imu_link'
-"""Frame of the case, unless a parameter or a simulator states it."""
+DEFAULT_FRAME = 'imu_link'  # Frame of the case, unless a parameter or a simulator states it
 
 
 @dataclass(frozen=True)

@@ -53,10 +53,8 @@ class InvestigateSettings:
     seed: int = parameter(0, 'seed of the diagnosis', '', *SEEDS)
 
 
-_INDENT = 11 * ' '
-"""Spaces in place of the time at the beginning of a line."""
-_MOST_NAMED = 3
-"""Largest number of hypotheses in a line; chosen: a reader keeps them in mind."""
+_INDENT = 11 * ' '  # Spaces in place of the time at the beginning of a line
+_MOST_NAMED = 3  # Largest number of hypotheses in a line; chosen: a reader keeps them in mind
 
 
 def answer_lines(minutes: float, answer: Answer) -> list[str]:
@@ -87,12 +85,9 @@ def closing_lines(ended: Investigation, folder: OutputFolder) -> list[str]:
     return ['', *end_lines(result, files, following and f'ros2 run adxl_ros {following}')]
 
 
-_SAMPLES = 'imu/data_raw'
-"""Topic of the samples."""
-_SAMPLES_QUEUE = 20000
-"""Samples that are kept while the thread is busy: 20 s at 1 kHz."""
-_SLOW_QUEUE = 1000
-"""Messages of a slow topic that wait meanwhile; chosen: 10 s of a stage."""
+_SAMPLES = 'imu/data_raw'  # Topic of the samples
+_SAMPLES_QUEUE = 20000  # Samples that are kept while the thread is busy: 20 s at 1 kHz
+_SLOW_QUEUE = 1000  # Messages of a slow topic that wait meanwhile; chosen: 10 s of a stage
 _KINDS = {'stage/joint_states': JointState, 'stage/command': JointState,
           'temperature': Temperature, 'supply': BatteryState, 'sensor_info': DiagnosticStatus}
 """Type of each topic beside the samples."""
@@ -154,16 +149,13 @@ class BagRecorder:
             self._info = data
 
 
-_POLL_S = 0.02
-"""Time between two commands, s; chosen: a tenth of the largest step."""
-_SILENT_S = 3.0
-"""Time without samples or poses after which the stage is stopped, s; chosen."""
+_POLL_S = 0.02  # Time between two commands, s; chosen: a tenth of the largest step
+_SILENT_S = 3.0  # Time without samples or poses after which the stage is stopped, s; chosen
 _LONGEST_TURN_S = 0.2
 """Longest time between two commands that counts as silence, s; chosen: ten turns."""
 _FAREWELL_S = 0.5
 """Time for which the last command is repeated at the end, s; chosen: the stage has it then."""
-_COMMAND_QUEUE = 10
-"""Commands that are kept for a slow subscriber; chosen."""
+_COMMAND_QUEUE = 10  # Commands that are kept for a slow subscriber; chosen
 _EXAMPLES = {'a unit by its parameter file, within limits':
              '--ros-args --params-file unit.yaml -p limits.rate_deg_s:=10.0 '
              "-p 'limits.beta_deg:=[-90.0,90.0]'"}

@@ -18,10 +18,8 @@ from typing import IO
 
 from adxl_ros.report.screen import bar
 
-_KILL_S = 10.0
-"""Longest time that a process may take to end, s; chosen: a node ends within 1 s."""
-_FIRST_DOMAIN = 60
-"""First ROS domain of jobs; chosen: beyond those that robots use."""
+_KILL_S = 10.0  # Longest time that a process may take to end, s; chosen: a node ends within 1 s
+_FIRST_DOMAIN = 60  # First ROS domain of jobs; chosen: beyond those that robots use
 _DOMAINS = 40
 """Number of ROS domains of jobs; chosen: the last one is below 101, the last safe one."""
 
@@ -89,14 +87,10 @@ def _flush() -> None:
             stream.flush()
 
 
-_BAR_WIDTH = 30
-"""Columns of the bar. A line with its bar has 79 columns."""
-_NAME_WIDTH = 11
-"""Columns of the name of a step."""
-_TEXT_WIDTH = 16
-"""Columns of the text beside a bar."""
-_LINE_WIDTH = 69
-"""Columns of a line without a bar, before its time."""
+_BAR_WIDTH = 30  # Columns of the bar. A line with its bar has 79 columns
+_NAME_WIDTH = 11  # Columns of the name of a step
+_TEXT_WIDTH = 16  # Columns of the text beside a bar
+_LINE_WIDTH = 69  # Columns of a line without a bar, before its time
 
 
 class LiveLine:

@@ -81,8 +81,7 @@ LINK = arguments(driver.DriverSettings, 'frame_id', 'link.type', 'link.port', 'l
 STAGE = (*arguments(stage.StageSettings, 'stage.type'), *arguments(
     stage.BridgeSettings, *(spec.name for spec in specs_of(stage.BridgeSettings))))
 """Arguments of the stage."""
-SPEED = arguments(driver.DriverSettings, speed='link.speed')
-"""Speed of a simulated sensor."""
+SPEED = arguments(driver.DriverSettings, speed='link.speed')  # Speed of a simulated sensor
 
 
 def declared(name: str, default: str, description: str, *choices: str) -> DeclareLaunchArgument:

@@ -17,16 +17,14 @@ from adxl_ros.nodes.sample_output import References, SampleOutput
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState, Temperature
 
-_SIMULATOR_QUEUE = 1000
-"""Samples that are kept while the node is busy: 1 s at 1 kHz."""
+_SIMULATOR_QUEUE = 1000  # Samples that are kept while the node is busy: 1 s at 1 kHz
 _FIELDS = {'orientation': 4, 'orientation_covariance': 9, 'angular_velocity': 3,
            'angular_velocity_covariance': 9, 'linear_acceleration': 3}
 """Number fields of sensor_msgs/Imu with their counts."""
 _PAUSE_S = 0.004
 """Time between two looks at the samples, s. At 1 kHz four of them then share a run of the chain,
 which costs as much as ten samples."""
-_LOOK_S = 1.0
-"""Time between two looks at the publishers of the samples, s; chosen."""
+_LOOK_S = 1.0  # Time between two looks at the publishers of the samples, s; chosen
 
 
 class SimulatorInput:
@@ -76,15 +74,12 @@ a clock that leaps after a late wake-up would flood the other nodes."""
 _JUMP_NS = 5_000_000_000
 """Smallest step of the clock that counts as a jump, ns; chosen: a driver that was held up for less
 makes up its samples, and the queue of imu/data_raw holds them at 1 kHz."""
-_DISCOVERY_NS = 300_000_000
-"""Time after which a new subscriber is sure to receive, ns; chosen."""
+_DISCOVERY_NS = 300_000_000  # Time after which a new subscriber is sure to receive, ns; chosen
 _CLOCK_SEARCH_NS = 1_000_000_000
 """Time between two searches for another clock, and before the first sample, ns; chosen: nodes find
 each other within it."""
-_QUEUE = 5000
-"""Messages of the stage that are kept between two reads."""
-_LOG_INTERVAL_S = 1.0
-"""Shortest time between two logs of the state of a link, s; chosen."""
+_QUEUE = 5000  # Messages of the stage that are kept between two reads
+_LOG_INTERVAL_S = 1.0  # Shortest time between two logs of the state of a link, s; chosen
 
 
 class LinkReader:

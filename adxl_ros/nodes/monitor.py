@@ -88,8 +88,7 @@ def axis_status(gap: AxisGap, serial: str) -> Status:
                   f'{gap.floor.value:.3g} mg', serial, values)
 
 
-_INPUT_QUEUE = 10000
-"""Messages that are kept while the node is busy: 10 s at 1 kHz."""
+_INPUT_QUEUE = 10000  # Messages that are kept while the node is busy: 10 s at 1 kHz
 
 
 class MonitorStreams:
@@ -128,10 +127,8 @@ _TOPICS = {ReferenceKind.STAGE: 'stage/joint_states', ReferenceKind.IMU: 'imu/id
 """Usual topic of each reference."""
 _TURN_S = 0.05
 """Time between two looks at the topics, s; chosen: a turn costs as much as ten messages."""
-_PERIOD_S = 1.0
-"""Time between two messages on `gap`, s."""
-_QUEUE = 10
-"""Messages that are kept for a slow subscriber; chosen: 10 s."""
+_PERIOD_S = 1.0  # Time between two messages on `gap`, s
+_QUEUE = 10  # Messages that are kept for a slow subscriber; chosen: 10 s
 _INFO_S = 3.0
 """Time that samples wait for `sensor_info`, s; chosen: a latched message comes within 1 s."""
 _SHORTEST_S = 20.0

@@ -36,20 +36,14 @@ from rclpy.parameter import Parameter
 import yaml
 
 T = TypeVar('T')
-Kind = Parameter.Type
-"""Types of ROS parameters."""
-LINK = 'link.'
-"""Begin of the names of all parameters of a link; the driver alone has them."""
-SEEDS = (0, 2 ** 31 - 1)
-"""Range of seeds."""
-_ANY_NODE = ('use_sim_time', 'start_type_description_service')
-"""Parameters of every node of rclpy."""
+Kind = Parameter.Type  # Types of ROS parameters
+LINK = 'link.'  # Begin of the names of all parameters of a link; the driver alone has them
+SEEDS = (0, 2 ** 31 - 1)  # Range of seeds
+_ANY_NODE = ('use_sim_time', 'start_type_description_service')  # Parameters of every node of rclpy
 _FREE_PREFIXES = ('provenance.', 'qos_overrides.', LINK)
 """Prefixes whose names are not known here: free keys, topics, and what the driver checks."""
-_FILE_FLAG = '--params-file'
-"""Argument of rcl before a parameter file."""
-_RULE_FLAGS = ('-p', '--param')
-"""Arguments of rcl before one parameter."""
+_FILE_FLAG = '--params-file'  # Argument of rcl before a parameter file
+_RULE_FLAGS = ('-p', '--param')  # Arguments of rcl before one parameter
 _OF_LAUNCH = 'launch_params_'
 """Begin of the names of files in which launch_ros gives the parameters of a launch."""
 _LARGEST = 3600.0

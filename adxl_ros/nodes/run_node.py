@@ -25,8 +25,7 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
-_WITHOUT_SENSOR = ('stage', 'screen')
-"""Nodes without the parameters of a sensor."""
+_WITHOUT_SENSOR = ('stage', 'screen')  # Nodes without the parameters of a sensor
 _LISTED_OF_SENSOR = ('sensor.', 'stage.')
 """Begins of the names of those parameters of a file that are listed one by one."""
 _TYPES = {Kind.DOUBLE: 'float', Kind.INTEGER: 'int', Kind.STRING: 'text', Kind.BOOL: 'bool',
@@ -89,8 +88,7 @@ _TIMER_SLACK = Path('/proc/self/timerslack_ns')
 """File that sets by how much the kernel may delay a wake-up of this process (man 5 proc)."""
 _SLACK_NS = '1000'
 """Largest such delay, ns; chosen: far below the period of samples. The default is 50 µs."""
-_PLACE = r', at /\S+:\d+'
-"""Places in rcl within the text of its refusals."""
+_PLACE = r', at /\S+:\d+'  # Places in rcl within the text of its refusals
 
 
 @ended_by_closed_output()

@@ -87,10 +87,8 @@ class Tally:
             f'{new[name]} samples {name}' for name in ('missing', 'saturated') if new[name])
 
 
-_REFERENCE_QUEUE = 1000
-"""References that are kept for a slow subscriber: 10 s of stage angles."""
-_STAGE = 'stage/joint_states'
-"""Topic of the stage angles, which have several columns."""
+_REFERENCE_QUEUE = 1000  # References that are kept for a slow subscriber: 10 s of stage angles
+_STAGE = 'stage/joint_states'  # Topic of the stage angles, which have several columns
 _COLUMNS = {_STAGE: tuple(JOINTS.values()), 'temperature': ('temperature_c',),
             'supply': ('supply_v',)}
 """Columns of a recording by topic."""
@@ -155,8 +153,7 @@ class References:
 
 _UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'
 """Name that the middleware gives a node that it has not discovered yet (rmw_dds_common)."""
-_QUEUE = 5000
-"""Samples that are kept for a slow subscriber: 5 s at 1 kHz."""
+_QUEUE = 5000  # Samples that are kept for a slow subscriber: 5 s at 1 kHz
 
 
 def imu_writer(sensor: Sensor, frame_id: str) -> topics.MessageWriter:

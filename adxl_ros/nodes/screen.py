@@ -39,12 +39,9 @@ class ScreenSettings:
     node_pid: int = parameter(0, 'process of the node that has started this screen')
 
 
-Styled = tuple[str, str]
-"""A style of prompt_toolkit and its text."""
-Line = list[Styled]
-"""A line of the screen."""
-Row = tuple[str, str, str]
-"""Label, text and style of a row."""
+Styled = tuple[str, str]  # A style of prompt_toolkit and its text
+Line = list[Styled]  # A line of the screen
+Row = tuple[str, str, str]  # Label, text and style of a row
 
 _COLOURS = {'dwell': 'ansigreen', 'refused': 'ansired', 'silent': 'ansired',
             'question': 'ansiyellow', 'rest': 'ansiyellow', 'stage': 'ansiyellow',
@@ -52,22 +49,16 @@ _COLOURS = {'dwell': 'ansigreen', 'refused': 'ansired', 'silent': 'ansired',
 """Styles by phase."""
 _MOTIONS = {'rms': 'moving', 'drift': 'drifting'}
 """What a sensor does that is not at rest, by the quantity that shows it."""
-_LEAST_WIDTH = 20
-"""A narrower terminal is drawn as if it had this width, columns."""
+_LEAST_WIDTH = 20  # A narrower terminal is drawn as if it had this width, columns
 _LEAST_LINES = 4
 """Lines that a low terminal keeps beside log and keys: title, text, pose and angles."""
-_TEXT_LINES = 5
-"""Largest number of lines of the text at the top."""
-_LABEL_WIDTH = 11
-"""Width of the labels with a space, columns: the longest is 'tilt error'."""
-_BAR_WIDTH = 12
-"""Width of a bar, columns."""
+_TEXT_LINES = 5  # Largest number of lines of the text at the top
+_LABEL_WIDTH = 11  # Width of the labels with a space, columns: the longest is 'tilt error'
+_BAR_WIDTH = 12  # Width of a bar, columns
 _COEFFICIENT_BAR_WIDTH = 3
 """Width of the bar of a coefficient, columns: the intervals of three axes are long."""
-_SHORTEST_NAME = 8
-"""Smallest width of the name of a coefficient, columns."""
-_FEW_LINES = 3
-"""Largest number of lines of the log, and of a text with a label."""
+_SHORTEST_NAME = 8  # Smallest width of the name of a coefficient, columns
+_FEW_LINES = 3  # Largest number of lines of the log, and of a text with a label
 
 
 def draw(contents: ScreenContents, log: Iterable[Styled], columns: int, rows: int) -> list[Line]:
@@ -163,8 +154,7 @@ def _bar(share: float, width: int = _BAR_WIDTH) -> str:
     return '█' * full + '░' * (width - full)
 
 
-_REFRESH_S = 0.2
-"""Time between two drawings, s: the node publishes contents five times a second."""
+_REFRESH_S = 0.2  # Time between two drawings, s: the node publishes contents five times a second
 
 
 def full_screen(lines: Callable[[int, int], list[Line]], press: Callable[[str], None],
@@ -215,16 +205,13 @@ def _terminal() -> tuple[TextIO, TextIO]:
 
 _SERVICES = ('start', 'resume', 'start_over', 'capture', 'redo', 'skip', 'finish', 'abort')
 """Services of the calibration node that keys call."""
-_SPIN_S = 0.02
-"""Time between two callbacks, s; chosen: far more often than messages come."""
-_SILENT_S = 2.0
-"""Age at which a display is reported as missing, s; chosen: ten missing messages."""
+_SPIN_S = 0.02  # Time between two callbacks, s; chosen: far more often than messages come
+_SILENT_S = 2.0  # Age at which a display is reported as missing, s; chosen: ten missing messages
 _QUEUE = 100
 """Lines of all nodes' logs that wait; chosen: far more than come between two callbacks."""
 _STYLES = {Log.WARN: 'ansiyellow', Log.ERROR: 'ansired', Log.FATAL: 'ansired'}
 """Styles of log lines by level."""
-_PLAIN = 'ansibrightblack'
-"""Style of other log lines."""
+_PLAIN = 'ansibrightblack'  # Style of other log lines
 _EXAMPLES = {'in the namespace of the sensor': '--ros-args -r __ns:=/arm'}
 """Examples of arguments, by their purpose."""
 

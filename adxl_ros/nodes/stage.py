@@ -91,10 +91,8 @@ _STEP_NS = 10_000_000
 """Step of the simulation, ns; chosen: 100 poses a second, as a controller of a stage sends."""
 _JUMP_NS = 1_000_000_000
 """Smallest jump of ROS time after which the motion goes on from there, ns; chosen."""
-_QUEUE = 1000
-"""Poses that are kept for a slow subscriber: 10 s of ROS time."""
-_ANGLES = ('alpha', 'beta')
-"""Joints of a real stage."""
+_QUEUE = 1000  # Poses that are kept for a slow subscriber: 10 s of ROS time
+_ANGLES = ('alpha', 'beta')  # Joints of a real stage
 
 
 class SimulatedStageNode:
@@ -180,18 +178,14 @@ class SimulatedStageNode:
         return Status(level, text, 'simulated', {**values, 'refused': self._refusal_count})
 
 
-_SILENT_NS = 2_000_000_000
-"""Time without joint states after which diagnostics warn, ns; chosen."""
+_SILENT_NS = 2_000_000_000  # Time without joint states after which diagnostics warn, ns; chosen
 _GRACE_NS = 2_000_000_000
 """Time that a motion may take beyond its duration before its command is sent again, ns; chosen."""
-_ARRIVED_RAD = 0.01
-"""Largest distance from the goal of a joint that has arrived, rad; chosen."""
-_SHORTEST_S = 0.2
-"""Shortest duration of a trajectory, s; chosen."""
+_ARRIVED_RAD = 0.01  # Largest distance from the goal of a joint that has arrived, rad; chosen
+_SHORTEST_S = 0.2  # Shortest duration of a trajectory, s; chosen
 _BRIDGE_QUEUE = 100
 """Positions that are kept for a slow subscriber; chosen: 1 s of a usual controller."""
-_COMMAND_QUEUE = 10
-"""Commands that are kept, of the calibration and for the controller; chosen."""
+_COMMAND_QUEUE = 10  # Commands that are kept, of the calibration and for the controller; chosen
 _STATES_QUEUE = 1000
 """Joint states of the controller that are kept: 1 s of the fastest controllers."""
 _DEFAULT_COMMANDS = {'trajectory': '/joint_trajectory_controller/joint_trajectory',

@@ -46,10 +46,8 @@ sys.modules.setdefault('rosidl_generator_py.generate_py_impl', None)  # type: ig
 _OVERRIDING = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
                                     QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
 """Policies that parameters can override."""
-STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-"""The clock of intervals."""
-_SILENT_S = 3.0
-"""Time without messages after which a topic is silent, s; chosen."""
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # The clock of intervals
+_SILENT_S = 3.0  # Time without messages after which a topic is silent, s; chosen
 _LONGEST_WAIT_NS = 100_000_000
 """Longest wait for a message, ns; chosen: a thread that waits sees within it that it shall end."""
 _MIXED_S = 3.0
@@ -295,10 +293,8 @@ class Inbox:
         self._node.destroy_subscription(self._subscription)
 
 
-_PERIOD_S = 1.0
-"""Time between two reports, s; the usual rate of ROS diagnostics."""
-_REPORTS = 10
-"""Reports that are kept for a slow subscriber."""
+_PERIOD_S = 1.0  # Time between two reports, s; the usual rate of ROS diagnostics
+_REPORTS = 10  # Reports that are kept for a slow subscriber
 
 
 @dataclass(frozen=True)

@@ -18,16 +18,11 @@ Figure = dict[str, Any]
 """A figure of plotly.js: `data` is the list of its traces, `layout` its layout."""
 AXIS_COLOURS = {'x': '#1f5fbf', 'y': '#c8641b', 'z': '#2a8a43'}
 """Colours of the axes of the sensor (chosen: colour-blind people can distinguish them)."""
-BEFORE_COLOUR = '#c0392b'
-"""Colour of what the simulator lacks at first."""
-AFTER_COLOUR = '#2a8a43'
-"""Colour of the state after a correction."""
-QUIET_COLOUR = '#7b8794'
-"""Colour of what is only there for comparison."""
-_DIGITS = 5
-"""Significant digits of plotted values (chosen: below a pixel of a zoomed plot)."""
-_FINE_DECADES = 4
-"""Decades from which a logarithmic axis has a tick at the powers of ten only."""
+BEFORE_COLOUR = '#c0392b'  # Colour of what the simulator lacks at first
+AFTER_COLOUR = '#2a8a43'  # Colour of the state after a correction
+QUIET_COLOUR = '#7b8794'  # Colour of what is only there for comparison
+_DIGITS = 5  # Significant digits of plotted values (chosen: below a pixel of a zoomed plot)
+_FINE_DECADES = 4  # Decades from which a logarithmic axis has a tick at the powers of ten only
 _FONT = {'family': 'system-ui, "DejaVu Sans", sans-serif', 'size': 12, 'color': '#1f2933'}
 _GRID = {'gridcolor': '#e4e7eb', 'zerolinecolor': '#9aa5b1', 'linecolor': '#9aa5b1',
          'automargin': True, 'exponentformat': 'none', 'hoverformat': '.4~g'}

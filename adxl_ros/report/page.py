@@ -23,8 +23,7 @@ from adxl_ros.errors import install_hint, UserError
 from adxl_ros.process import package_version
 from adxl_ros.report.figures import png
 
-_DPI = 100
-"""Resolution of pictures, dots per inch (chosen: sharp at the page's width)."""
+_DPI = 100  # Resolution of pictures, dots per inch (chosen: sharp at the page's width)
 _GZIP_LEVEL = 6
 """Level of compression (chosen: 0.3 s for plotly.js; level 9 takes three times as long)."""
 
@@ -70,10 +69,8 @@ def download_url(text: str) -> str:
     return f'data:application/yaml;base64,{b64encode(text.encode()).decode()}'
 
 
-_PASSWORD = re.compile(r'(?<=://)([^/@:\s]*):[^/@\s]*@')
-"""User and password of an address."""
-_QUERY = re.compile(r'(?<=://)([^\s?#\'"]*)\?([^\s#\'"]*)')
-"""Place and query of an address."""
+_PASSWORD = re.compile(r'(?<=://)([^/@:\s]*):[^/@\s]*@')  # User and password of an address
+_QUERY = re.compile(r'(?<=://)([^\s?#\'"]*)\?([^\s#\'"]*)')  # Place and query of an address
 _SECRET = re.compile(
     r'x-(amz|goog)-|token|[-_]key|key-pair|(api|access)key|secret|signature|passw|pwd|credential'
     r'|jwt|auth(?!ors?$)|googleaccessid'

@@ -12,12 +12,9 @@ import numpy as np
 
 _MOST_DECIMALS = 7
 """Largest number of decimals (chosen: a table of 79 columns has room for ten digits)."""
-_UNKNOWN_DECIMALS = 4
-"""Number of decimals of a coefficient without an interval."""
-_NEARLY_ALL = 0.995
-"""Share from which a percentage would be rounded to 100."""
-_SMALLEST_MG = 0.005
-"""Acceleration, mg, that rounds to 0.00 below this."""
+_UNKNOWN_DECIMALS = 4  # Number of decimals of a coefficient without an interval
+_NEARLY_ALL = 0.995  # Share from which a percentage would be rounded to 100
+_SMALLEST_MG = 0.005  # Acceleration, mg, that rounds to 0.00 below this
 _UNIT_SUFFIXES = ('m', 's', 'rad', 'v', 'hz', 'f', 'g')
 """Ends of parameter names that repeat the unit of the value."""
 

@@ -10,14 +10,10 @@ import sys
 import textwrap
 from typing import Any, NamedTuple, TextIO
 
-COLUMNS = 79
-"""Columns of a terminal that a tool uses."""
-_NO_BREAK = '\N{NO-BREAK SPACE}'
-"""A blank at which no line is wrapped."""
-_LABEL_COLUMNS = 8
-"""Columns of the words before files and commands."""
-_STEP_COLUMNS = _LABEL_COLUMNS + 3
-"""Columns before the purpose of one of several steps."""
+COLUMNS = 79  # Columns of a terminal that a tool uses
+_NO_BREAK = '\N{NO-BREAK SPACE}'  # A blank at which no line is wrapped
+_LABEL_COLUMNS = 8  # Columns of the words before files and commands
+_STEP_COLUMNS = _LABEL_COLUMNS + 3  # Columns before the purpose of one of several steps
 _GREEN, _RED, _YELLOW = '\x1b[32m', '\x1b[31m', '\x1b[33m'
 """Codes of xterm: good, bad, and not decided."""
 _COLOURS = {'GAP EXPLAINED': _GREEN, 'PARTLY EXPLAINED': _YELLOW, 'NO GAP': _GREEN,

@@ -26,8 +26,7 @@ from adxl_ros.signals.recorded_sensor import BeyondRange, listed, load_sensor, m
 from adxl_ros.tools import command_line as cli
 import numpy as np
 
-_BLOCK_ROWS = 8192
-"""Samples that are corrected at a time (chosen: their arrays stay in the cache)."""
+_BLOCK_ROWS = 8192  # Samples that are corrected at a time (chosen: their arrays stay in the cache)
 
 _DIGITS = 12
 """Significant digits of an estimate (chosen: rounding is below a millionth of the noise)."""

@@ -25,16 +25,14 @@ from adxl_ros.signals.findings import Ability, check_recording, Findings, Record
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.tools import command_line as cli
 
-_NAME_COLUMNS = 20
-"""Columns of the name of a recording."""
+_NAME_COLUMNS = 20  # Columns of the name of a recording
 _HEAD = ('recording', 'length', 'rate', 'missing', 'rest', 'axes', 'verdict')
 _COLUMNS = (_NAME_COLUMNS, '>13', '>10', '>9', '>8', '>6', 11)
 _SHOWS_HEAD = ('effect', 'from', 'typical', '')
 _SHOWS_COLUMNS = (24, 16, 14)
 _MOST_SHOWN = 1_000_000
 """Samples up to which it is listed what `diagnose` could show. Chosen: a minute, and 1 GB."""
-_LABEL_COLUMNS = 12
-"""Columns of the label of a line below a recording."""
+_LABEL_COLUMNS = 12  # Columns of the label of a line below a recording
 
 
 def _lines(results: list[Findings]) -> list[str]:

@@ -83,8 +83,7 @@ def effect_list(effects: Iterable[Effect]) -> str:
 RECORDING_HELP = 'rosbag2 directory, .mcap, CSV or another table'
 """Help text of the argument that names a recording."""
 
-_HIGHEST_RATE_HZ = 1e5
-"""Largest sample rate, Hz: that of a parameter file."""
+_HIGHEST_RATE_HZ = 1e5  # Largest sample rate, Hz: that of a parameter file
 
 
 def add_recording_options(parse: argparse.ArgumentParser) -> None:

@@ -35,8 +35,7 @@ _EXAMPLES = {
         'real.csv --sim gazebo.csv --align -o gap',
 }
 """Examples of arguments, by their purpose."""
-_FILES = ('report.html', 'params.yaml', 'report.json')
-"""Files of a diagnosis."""
+_FILES = ('report.html', 'params.yaml', 'report.json')  # Files of a diagnosis
 
 
 def parser() -> argparse.ArgumentParser:

@@ -25,8 +25,7 @@ _EXAMPLES = {
 }
 """Examples of arguments, by their purpose."""
 
-FORMATS = dict(sorted(exports.FORMATS.items()))
-"""All formats by name."""
+FORMATS = dict(sorted(exports.FORMATS.items()))  # All formats by name
 
 
 def parser() -> argparse.ArgumentParser:

@@ -31,8 +31,7 @@ from adxl_ros.report.screen import wrapped
 from adxl_ros.tools import command_line as cli
 from adxl_ros.workers import open_pool, RETRIES
 
-PROG = 'fleet'
-"""Name of the command, for messages."""
+PROG = 'fleet'  # Name of the command, for messages
 _EXAMPLES = {
     'all recordings of a folder': 'recordings -o results',
     'a bucket, on a Dask cluster':
@@ -40,12 +39,9 @@ _EXAMPLES = {
     'what it would cost': 'manifest.csv -o results --dry-run',
 }
 """Examples of arguments, by their purpose."""
-_UNITS = 5
-"""Units that a plan names. Chosen: one or two lines."""
-_REASON_COLUMNS = 12
-"""Columns before a reason."""
-_MOST_REASONS = 3
-"""Reasons of refusals on the screen. Chosen: the page has all."""
+_UNITS = 5  # Units that a plan names. Chosen: one or two lines
+_REASON_COLUMNS = 12  # Columns before a reason
+_MOST_REASONS = 3  # Reasons of refusals on the screen. Chosen: the page has all
 _SHOWN = ('url', 'outcome', 'refusal', 'refused_by', 'serial', 'status')
 """What the screen needs of a row; the others are not kept."""
 

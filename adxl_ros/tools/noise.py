@@ -28,19 +28,15 @@ from adxl_ros.tools import command_line as cli
 import numpy as np
 import yaml
 
-MICRO_G = 1e6 / G0_MPS2
-"""1 m/s² in µg."""
+MICRO_G = 1e6 / G0_MPS2  # 1 m/s² in µg
 _LARGEST_STD_MPS2 = 0.3
 """Noise of a sample from which a sensor vibrates, m/s². Chosen: three times that of a low-cost
 IMU at 1 kHz."""
-_LARGEST_FILLED = 0.01
-"""Share of missing samples from which white noise changes visibly. Chosen."""
-_NAMES = ('white noise N', 'bias instability B', 'random walk K')
-"""Names of the terms."""
+_LARGEST_FILLED = 0.01  # Share of missing samples from which white noise changes visibly. Chosen
+_NAMES = ('white noise N', 'bias instability B', 'random walk K')  # Names of the terms
 _UNITS = {'white': 'm/s^2/sqrt(Hz)', 'instability': 'm/s^2', 'walk': 'm/s^2/sqrt(s)'}
 """Keys and units of the terms in JSON."""
-_YAML_COLUMNS = 60
-"""Columns after which a list is wrapped; its last number may be beyond."""
+_YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
 
 
 def _head(result: RecordingNoise) -> list[str]:
@@ -218,8 +214,7 @@ def _plot(result: RecordingNoise) -> Any:
     return figure
 
 
-_BLOCK_ROWS = 65536
-"""Samples that are read at a time (chosen: some MB)."""
+_BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 _EXAMPLES = {
     'noise of each axis, with the Allan deviation as a page': 'still.mcap --report noise',
     'a parameter file for compensation and diagnose':

@@ -38,8 +38,7 @@ _EXAMPLES = {
 }
 """Examples of arguments, by their purpose."""
 
-Output = Callable[[Columns], None]
-"""Takes a block of simulated samples."""
+Output = Callable[[Columns], None]  # Takes a block of simulated samples
 
 
 def parser() -> argparse.ArgumentParser:

@@ -232,14 +232,10 @@ def link_module(name: str) -> LinkModule:
     return cast(LinkModule, import_module(f'{_LINKS}.{name}'))
 
 
-_FIRST_S = 0.01
-"""First waiting time, s; each failure doubles it."""
-_LONGEST_S = 0.08
-"""Longest waiting time, s: a device that is back is noticed within it."""
-_SLOW_S = 1.0
-"""Waiting time for a device that is there but does not fit the parameters, s."""
-_MAX_WAIT_S = 0.05
-"""Longest wait of one call, s, so that the driver reacts to its end."""
+_FIRST_S = 0.01  # First waiting time, s; each failure doubles it
+_LONGEST_S = 0.08  # Longest waiting time, s: a device that is back is noticed within it
+_SLOW_S = 1.0  # Waiting time for a device that is there but does not fit the parameters, s
+_MAX_WAIT_S = 0.05  # Longest wait of one call, s, so that the driver reacts to its end
 
 
 def reason(error: Exception) -> str:
@@ -296,12 +292,9 @@ class Watchdog:
         return self._silent_s
 
 
-SUPPLY = 'supply'
-"""Role of the channel with the supply voltage."""
-TEMPERATURE = 'temperature'
-"""Role of the channel with the temperature."""
-UNUSED = '-'
-"""Role of a channel that is not read."""
+SUPPLY = 'supply'  # Role of the channel with the supply voltage
+TEMPERATURE = 'temperature'  # Role of the channel with the temperature
+UNUSED = '-'  # Role of a channel that is not read
 COLUMNS = {SUPPLY: 'supply_v', TEMPERATURE: 'temperature_c'}
 """Column of a recording by the role of a reference channel."""
 

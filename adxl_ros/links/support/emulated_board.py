@@ -20,17 +20,13 @@ import numpy as np
 
 _FRAME_SAMPLES = 10
 """Most samples of a frame, and those of a frame before the first command, as in the firmware."""
-_READ_BYTES = 4096
-"""Most bytes from the host that are read at once."""
-_INFO_S = 1.0
-"""Period of the info frames, s, as the firmware sends them."""
+_READ_BYTES = 4096  # Most bytes from the host that are read at once
+_INFO_S = 1.0  # Period of the info frames, s, as the firmware sends them
 _SUPPLY_SCALE = 2.0
 """Ratio of the supply's divider, V/V, as in the firmware: the ADC cannot measure its own
 reference."""
-_TEMPERATURE_ZERO_V = 0.5
-"""Output of the temperature sensor at 0 degC, V, as a TMP36 has it."""
-_TEMPERATURE_V_PER_C = 0.01
-"""Slope of the temperature sensor, V/degC, as a TMP36 has it."""
+_TEMPERATURE_ZERO_V = 0.5  # Output of the temperature sensor at 0 degC, V, as a TMP36 has it
+_TEMPERATURE_V_PER_C = 0.01  # Slope of the temperature sensor, V/degC, as a TMP36 has it
 
 
 class Board:

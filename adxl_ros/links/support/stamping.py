@@ -22,16 +22,12 @@ import numpy as np
 
 # Limits and time constants without a source are chosen for links of 0.1 to 5 ms of jitter at
 # 1 kHz; test_link_support measures their accuracy.
-_WINDOW_S = 0.5
-"""Length of a window, s, of which only the earliest arrival counts."""
-_MIN_ARRIVALS = 25
-"""Arrivals that a window needs, so that its earliest one is early."""
-_MAX_WINDOW_S = 5.0
-"""Length at which a window ends without these arrivals, s."""
+_WINDOW_S = 0.5  # Length of a window, s, of which only the earliest arrival counts
+_MIN_ARRIVALS = 25  # Arrivals that a window needs, so that its earliest one is early
+_MAX_WINDOW_S = 5.0  # Length at which a window ends without these arrivals, s
 _SPAN_S = 25.0
 """Age at which a window is forgotten, s. A crystal's drift is constant over this time."""
-_MIN_WINDOWS = 20
-"""Number of windows that are kept whatever their age."""
+_MIN_WINDOWS = 20  # Number of windows that are kept whatever their age
 _FIRST_WAIT_S = 0.15
 """Time for which the samples of the first clock wait for their stamps, s. Of some arrivals one is
 early."""
@@ -49,8 +45,7 @@ _LATE_WEIGHT = 0.1
 information."""
 _FIT_ITERATIONS = 8
 """Iterations of the reweighted least squares. Chosen: the weights settle in fewer."""
-_EARLY_NS = 20e6
-"""Earliness of an arrival that shows a forward step of the device's clock, ns."""
+_EARLY_NS = 20e6  # Earliness of an arrival that shows a forward step of the device's clock, ns
 _SHIFT_NS = 20e6
 """Common lateness of two windows that shows a backward step of the device's clock, ns."""
 _STOPPED_NS = 250e6
@@ -59,16 +54,12 @@ _CATCH_UP_RATIO = 1.5
 """Late samples that come this many times faster than they were taken were delayed on the way."""
 _SMOOTH_NS = 50e6
 """Largest difference that the stamps take up smoothly, ns. A larger one forward is a step."""
-_MAX_BEND = 0.05
-"""Largest change of slope for a small difference, relative to the drift."""
-_MAX_STEEP_BEND = 0.5
-"""Largest change of slope for a difference beyond `_SMOOTH_NS`."""
-_MIN_SLOPE = 1e-3
-"""Smallest slope of the stamps: they go forward whatever a faulty device sends."""
+_MAX_BEND = 0.05  # Largest change of slope for a small difference, relative to the drift
+_MAX_STEEP_BEND = 0.5  # Largest change of slope for a difference beyond `_SMOOTH_NS`
+_MIN_SLOPE = 1e-3  # Smallest slope of the stamps: they go forward whatever a faulty device sends
 _SHIFT_TOLERANCE_NS = _SHIFT_NS / 4
 """Largest difference between two windows that are late by the same amount, ns."""
-_SHIFT_WINDOWS = 3
-"""Windows that a backward step needs: one before it and two after it."""
+_SHIFT_WINDOWS = 3  # Windows that a backward step needs: one before it and two after it
 
 
 class _Window(NamedTuple):
@@ -278,8 +269,7 @@ class IdentityMap:
 _STEP_NS = 1_000_000
 """Change of the system clock's offset that counts as a step, ns. Chosen: slewing by NTP is slower.
 """
-_TRIES = 3
-"""Readings of which the least interrupted one counts."""
+_TRIES = 3  # Readings of which the least interrupted one counts
 _MAX_UNCERTAINTY_NS = 20_000
 """Uncertainty above which a reading is ignored, ns: the process was interrupted."""
 
@@ -330,8 +320,7 @@ class Block:
 _FOLLOW_NS = 10_000_000
 """Time between two readings of the system clock, ns; chosen: a reading takes several microseconds,
 and nobody sees a clock that was set 10 ms later."""
-_FOREVER_NS = 2 ** 63 - 1
-"""Largest time, ns: any waiting time is over by then."""
+_FOREVER_NS = 2 ** 63 - 1  # Largest time, ns: any waiting time is over by then
 
 
 class Stamper:

@@ -16,20 +16,14 @@ import zlib
 
 import numpy as np
 
-VERSION = 1
-"""Version of the format."""
-SAMPLES_TYPE = 1
-"""Type of a frame with samples."""
-INFO_TYPE = 2
-"""Type of a frame that describes the board."""
+VERSION = 1  # Version of the format
+SAMPLES_TYPE = 1  # Type of a frame with samples
+INFO_TYPE = 2  # Type of a frame that describes the board
 COMMAND_TYPE = 3
 """Type of a frame from the host to the board, which sets how many samples a frame has."""
-RAIL = 1
-"""Flag of a frame with samples: a code is at a rail of the ADC."""
-AFTER_RESET = 2
-"""Flag of all frames from a reset to the first one with samples."""
-MAX_CHANNELS = 8
-"""Most channels of a board; a frame with more of them is invalid."""
+RAIL = 1  # Flag of a frame with samples: a code is at a rail of the ADC
+AFTER_RESET = 2  # Flag of all frames from a reset to the first one with samples
+MAX_CHANNELS = 8  # Most channels of a board; a frame with more of them is invalid
 
 _SAMPLES = struct.Struct('<BBHIQIHBB')
 """A payload with samples: type, version, flags, block_seq, time, index, overruns, numbers of
@@ -38,29 +32,20 @@ _INFO = struct.Struct('<BBHIfBBf16s')
 """An info payload: the same four, then sample rate, bits, channels, vref, serial number."""
 _COMMAND = struct.Struct('<BBHII')
 """A command, the shortest payload: the same four, then latency in µs."""
-_CRC = struct.Struct('<I')
-"""CRC-32 behind the payload, as zlib computes it."""
-MAX_COUNT = 255
-"""Most samples of a frame: their number is a u8."""
-_BLOCK = 254
-"""Most bytes of a block of COBS."""
-_MAX_PAYLOAD = _SAMPLES.size + MAX_COUNT * MAX_CHANNELS * 2
-"""Most bytes of a payload."""
+_CRC = struct.Struct('<I')  # CRC-32 behind the payload, as zlib computes it
+MAX_COUNT = 255  # Most samples of a frame: their number is a u8
+_BLOCK = 254  # Most bytes of a block of COBS
+_MAX_PAYLOAD = _SAMPLES.size + MAX_COUNT * MAX_CHANNELS * 2  # Most bytes of a payload
 MAX_FRAME_BYTES = _MAX_PAYLOAD + _CRC.size + 2 + _MAX_PAYLOAD // 254
 """Most bytes of a frame without its 0x00: COBS adds one byte for each 254."""
 _MAX_LOAD = 0.85
 """Largest share of the time of a wire that frames take. Chosen: info frames and the tolerance of
 baud rates, 5 %, need the other part."""
-_MAX_TIME_US = 2 ** 53
-"""Largest time of a device clock, µs: 285 years."""
-RATES_HZ = (0.01, 1e5)
-"""Bounds of the sample rate, Hz, as `sensor.rate_hz` permits."""
-_VREFS_V = (0.1, 100.0)
-"""Bounds of the reference voltage, V, as `sensor.adc_vref_v` permits."""
-MAX_BITS = 16
-"""Largest resolution of the ADC, bit: codes are u16."""
-MAX_SERIAL = 16
-"""Most characters of a serial number."""
+_MAX_TIME_US = 2 ** 53  # Largest time of a device clock, µs: 285 years
+RATES_HZ = (0.01, 1e5)  # Bounds of the sample rate, Hz, as `sensor.rate_hz` permits
+_VREFS_V = (0.1, 100.0)  # Bounds of the reference voltage, V, as `sensor.adc_vref_v` permits
+MAX_BITS = 16  # Largest resolution of the ADC, bit: codes are u16
+MAX_SERIAL = 16  # Most characters of a serial number
 
 
 class WireError(Exception):
@@ -259,8 +244,7 @@ class Splitter:
         self._incomplete, self._skipping = b'', False
 
 
-_TOLERANCE_US = 1000.0
-"""Absolute tolerance between the device's clock and its count, µs."""
+_TOLERANCE_US = 1000.0  # Absolute tolerance between the device's clock and its count, µs
 _TOLERANCE = 0.002
 """Relative tolerance between the device's clock and its count. Chosen: a real rate differs from
 the stated one by less."""
