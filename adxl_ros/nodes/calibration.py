@@ -256,7 +256,7 @@ class DisplayPublisher:
         keys = () if phase is Phase.FIT else _KEYS.get(
             controller.state, _BY_HAND if controller.settings.operator_captures else _RUNNING)
         if session is not None:
-            live = session.newest.reading(session.guide.stillness(session.newest))
+            live = session.guide.newest.reading(session.guide.stillness())
         else:
             live = None if newest is None else newest.reading(newest.stillness())
         self._publisher.publish(String(data=screen_contents.ScreenContents(
@@ -315,10 +315,6 @@ class Samples:
         """Forget all samples but the newest, as many as the queue holds."""
         self._receive()
         del self._raw[:max(len(self._raw) - count, 0)]
-
-    def clear(self) -> None:
-        """Forget all samples so far."""
-        self.keep_newest(0)
 
     def waiting(self) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -388,7 +384,7 @@ class Calibration(Node):
         self.announce, self.withdraw_pose = announcer.announce, announcer.withdraw
         self._samples = Samples(self)
         self._controller = controller.Controller(
-            settings, sensor, controller.Resume(own.resume), self._samples, self, anonymous)
+            settings, sensor, own.resume, self._samples, self, anonymous)
         if own.autostart:
             self._controller.start()
         self._connect()
@@ -398,7 +394,7 @@ class Calibration(Node):
 
     def log(self, severity: controller.Severity, text: str) -> None:
         """Log a line."""
-        topics.log(self, severity.name, text)
+        topics.log(self, severity, text)
 
     def answer_captures(self, answer: Answer) -> None:
         """Answer all calls of ~/capture that wait."""
@@ -450,8 +446,8 @@ class Calibration(Node):
             raise SystemExit(0 if self._controller.outcome else 1)
 
     def _status(self) -> Status:
-        report = self._controller.report()
-        return Status(self._level(), report.status.text, report.serial, report.values)
+        status, serial, values = self._controller.report()
+        return Status(self._level(), status.text, serial, values)
 
     def _level(self) -> Level:
         if self._samples.mixture():

@@ -11,6 +11,7 @@ from dataclasses import replace
 import math
 from typing import NamedTuple
 
+from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.guided.screen_contents import AxisReading, LiveReading, RestReading
 from adxl_ros.files.recording_columns import stamped_rate_hz
 from adxl_ros.files.sweep_journal import JournalEntry, PoseDropped, PoseRecord
@@ -121,17 +122,15 @@ class Dwell:
                                   learn=False)
         self._stamps: list[np.ndarray] = []
         self._volts: list[np.ndarray] = []
-        self._count = 0
 
     def __len__(self) -> int:
-        return self._count
+        return sum(map(len, self._stamps))
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """Take samples."""
         new = stamps_ns >= self.arrived_ns
         self._stamps.append(stamps_ns[new])
         self._volts.append(volts[new])
-        self._count += int(new.sum())
         # From the arrival: float64 seconds since 1970 resolve only 0.2 µs.
         self._finder.feed((stamps_ns[new] - self.arrived_ns) * 1e-9, volts[new])
 
@@ -156,25 +155,18 @@ class Dwell:
         """Return the samples of a rest, V, (n, m)."""
         return np.concatenate(self._volts)[rest.start:rest.stop]
 
-    def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return all samples: their stamps, ns, (n,), and volts, (n, m)."""
-        return np.concatenate(self._stamps), np.concatenate(self._volts)
-
-    def after(self, stop_ns: int) -> Dwell | None:
-        """Return the dwell that begins with the first sample after a stamp, ns, if any."""
-        stamps_ns, volts = self.samples()
-        later = stamps_ns > stop_ns
-        if not later.any():
-            return None
-        dwell = Dwell(self._sensor, int(stamps_ns[later][0]))
-        dwell.feed(stamps_ns[later], volts[later])
+    def after(self, stop_ns: int) -> Dwell:
+        """Return a dwell with the samples after a stamp, ns."""
+        dwell = Dwell(self._sensor, stop_ns + 1)
+        dwell.feed(np.concatenate(self._stamps), np.concatenate(self._volts))
         return dwell
 
     def record(self, pose: int, rest: Rest, samples: int) -> PoseRecord:
         """Average the first samples of a rest."""
-        (stamps, volts), start, stop = self.samples(), rest.start, rest.start + samples
+        stamps, start, stop = np.concatenate(self._stamps), rest.start, rest.start + samples
         times = (stamps - self.arrived_ns) * 1e-9
-        mean, std = rest_means(times, volts, [Rest(start, stop, times[start], times[stop - 1])],
+        mean, std = rest_means(times, np.concatenate(self._volts),
+                               [Rest(start, stop, times[start], times[stop - 1])],
                                self._sensor.rate_hz, datasheet_noise(self._sensor))
         return PoseRecord(pose=pose, start_ns=int(stamps[start]), stop_ns=int(stamps[stop - 1]),
                           samples=samples, mean_v=tuple(mean[0].tolist()),
@@ -253,6 +245,7 @@ class Guide:
         self.accepted = {record.pose: record for record in accepted}  # By number
         self.to_verify: list[PoseRecord] = []  # Poses to take again, to check the mounting
         self.readings = {'temperature': Readings(), 'supply': Readings()}  # °C and V
+        self.newest = NewestSamples(sensor)
         self.newest_ns: int | None = None  # Stamp of the newest sample, ns
         self.refusal = self._new_refusal = ''  # Why the newest pose was refused; '' if not
 
@@ -270,6 +263,27 @@ class Guide:
     def previous(self) -> int | None:
         """Return the number of the previous pose, from 0; None where there is none."""
         return max(self.accepted, default=None)
+
+    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> str:
+        """Take samples, ns, (n,), and V, (n, m); return why they are of no use, or ''."""
+        if not len(stamps_ns):
+            return ''
+        self.newest.feed(stamps_ns, volts)
+        if fault := pose_plan.rate_fault(self.newest.rate_hz(), self.sensor):
+            return fault
+        if went_back(self.newest_ns, stamps_ns[0]):
+            self.begin_stream(((self.newest_ns or 0) - int(stamps_ns[0])) * 1e-9)
+        self.newest_ns = int(stamps_ns[-1])
+        self.take_samples(stamps_ns, volts)
+        return ''
+
+    def begin_stream(self, back_s: float) -> None:
+        """Begin again, as the stamps went back by a time."""
+        raise NotImplementedError
+
+    def take_samples(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
+        """Take samples whose stamps go on."""
+        raise NotImplementedError
 
     def redo(self, append: Callable[[JournalEntry], None]) -> str:
         """Forget the previous pose, in the journal first; return a line for people, or ''."""
@@ -292,9 +306,9 @@ class Guide:
         """Return further values for programs, by key."""
         return {}
 
-    def stillness(self, newest: NewestSamples) -> Stillness | None:
+    def stillness(self) -> Stillness | None:
         """Return whether the newest samples are at rest; None while they are too few."""
-        return newest.stillness()
+        return self.newest.stillness()
 
     def refuse(self, reason: str) -> None:
         """Refuse a pose; a new reason is kept for `new_refusal`."""
@@ -313,12 +327,13 @@ class Guide:
                                    for readings in self.readings.values())
         return replace(record, temperature_c=temperature_c, supply_v=supply_v)
 
-    def temperature_fault(self, now_c: float, span_c: float) -> str:
-        """Refuse a pose whose temperature differs from that of the first pose."""
-        first_c = next((record.temperature_c for _, record in sorted(self.accepted.items())
-                        if math.isfinite(record.temperature_c)), math.nan)
-        if not abs(now_c - first_c) > span_c:
-            return ''
-        return (f'temperature moved {abs(now_c - first_c):.1f} °C since the first pose '
-                f'({first_c:.1f} to {now_c:.1f} °C), must stay within {span_c:g} °C; wait until '
-                'it is back, or finish with the poses so far')
+
+def temperature_fault(accepted: Mapping[int, PoseRecord], now_c: float, span_c: float) -> str:
+    """Refuse a pose whose temperature differs from that of the first pose."""
+    first_c = next((record.temperature_c for _, record in sorted(accepted.items())
+                    if math.isfinite(record.temperature_c)), math.nan)
+    if not abs(now_c - first_c) > span_c:
+        return ''
+    return (f'temperature moved {abs(now_c - first_c):.1f} °C since the first pose '
+            f'({first_c:.1f} to {now_c:.1f} °C), must stay within {span_c:g} °C; wait until '
+            'it is back, or finish with the poses so far')

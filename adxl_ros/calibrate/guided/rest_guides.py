@@ -13,7 +13,7 @@ from adxl_ros.calibrate.fits import gravity_fit, thermal_fit
 from adxl_ros.calibrate.fits.gravity_fit import force_g, MIN_RESTS, NAMES, nominal_rests
 from adxl_ros.calibrate.fits.thermal_fit import PARTS
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
-from adxl_ros.calibrate.guided.guide import Dwell, Guide, NewestSamples, NextPose, went_back
+from adxl_ros.calibrate.guided.guide import Dwell, Guide, NextPose, temperature_fault
 from adxl_ros.calibrate.guided.screen_contents import (
     CoefficientRow,
     Coverage,
@@ -55,28 +55,21 @@ class HandRests(Guide):
         super().__init__(sensor, accepted)
         self._span_c = temperature_span_c
         self._skipped = np.zeros(len(gravity_fit.UP), bool)
-        self._begin_stream()
+        self.begin_stream()
         self._update_estimate()
 
-    def _begin_stream(self) -> None:
+    def begin_stream(self, back_s: float = 0.0) -> None:
         """Begin a stream: the rests so far belong to another one."""
         self._resumed = list(self.accepted.values())
         self._stamps: list[np.ndarray] = []
-        self._newest = NewestSamples(self.sensor)
         self._announced_ns = self._next_search_ns = 0
         self._dropped: list[PoseRecord] = []
         self._finder = RestFinder(
             self.sensor.rate_hz, len(self.sensor.axes), datasheet_noise(self.sensor), learn=True)
 
-    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
-        """Take samples: their stamps, ns, (n,), and volts, (n, m)."""
-        if not len(stamps_ns):
-            return
-        if went_back(self.newest_ns, stamps_ns[0]):
-            self._begin_stream()
-        self.newest_ns = int(stamps_ns[-1])
+    def take_samples(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
+        """Give samples to the search for rests."""
         self._stamps.append(stamps_ns)
-        self._newest.feed(stamps_ns, volts)
         # Since the first stamp: seconds since 1970 would resolve only 0.2 µs.
         self._finder.feed((stamps_ns - self._stamps[0][0]) * 1e-9, volts)
 
@@ -134,15 +127,15 @@ class HandRests(Guide):
         return [*self._resumed, *(replace(record, pose=number)
                                   for number, record in enumerate(kept, first))]
 
-    def stillness(self, newest: NewestSamples) -> Stillness | None:
+    def stillness(self) -> Stillness | None:
         """Return whether the newest samples are at rest, by the noise that the stream shows."""
         return self._finder.stillness()
 
     def up(self) -> np.ndarray | None:
         """Return the direction that points up at present, (3,); None without samples."""
-        if not len(self._newest.volts):
+        if not len(self.newest.volts):
             return None
-        mean_v = self._newest.volts[-_UP_SAMPLES:].mean(axis=0, keepdims=True)
+        mean_v = self.newest.volts[-_UP_SAMPLES:].mean(axis=0, keepdims=True)
         rests = nominal_rests(mean_v, 0 * mean_v, self.sensor)
         force = force_g(rests.mean, self._parameters)[0]
         return force / max(float(np.linalg.norm(force)), _MIN_FORCE_G)
@@ -177,7 +170,7 @@ class HandRests(Guide):
         """Return why a rest is refused, or ''."""
         if at_a_rail(self.sensor, Poses.from_records([record])).any():
             return 'saturated: the ADC is at its rail in this rest; check supply and wiring'
-        return self.temperature_fault(record.temperature_c, self._span_c)
+        return temperature_fault(self.accepted, record.temperature_c, self._span_c)
 
     def _records(self, number: int) -> Iterator[PoseRecord]:
         """Give a record of each rest of the stream, each with the same number."""
@@ -268,13 +261,13 @@ class ThermalGuide(Guide):
         self._dwell: Dwell | None = None
         self._update()
 
-    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
-        """Take samples: their stamps, ns, (n,), and volts, (n, m)."""
-        if not len(stamps_ns):
-            return
-        if self._dwell is None or went_back(self.newest_ns, int(stamps_ns[0])):
-            self._dwell = Dwell(self.sensor, int(stamps_ns[0]))
-        self.newest_ns = int(stamps_ns[-1])
+    def begin_stream(self, back_s: float) -> None:
+        """Begin the block again."""
+        self._dwell = None
+
+    def take_samples(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
+        """Add samples to the block."""
+        self._dwell = self._dwell or Dwell(self.sensor, int(stamps_ns[0]))
         self._dwell.feed(stamps_ns, volts)
 
     def accept(self) -> PoseRecord | None:
