@@ -255,15 +255,16 @@ class DisplayPublisher:
         unit, session, newest = stream.unit, controller.session, stream.newest
         keys = () if phase is Phase.FIT else _KEYS.get(
             controller.state, _BY_HAND if controller.settings.operator_captures else _RUNNING)
+        coefficients: list[screen_contents.Row] = []
         if session is not None:
-            live = session.guide.newest.reading(session.guide.stillness())
+            rows, coefficients = session.rows()
         else:
-            live = None if newest is None else newest.reading(newest.stillness())
+            rows = [] if newest is None else newest.rows(newest.stillness())
         self._publisher.publish(String(data=screen_contents.ScreenContents(
             phase=phase.value, text=text, unit=f'{unit.serial} ({unit.axes})' if unit else '',
-            output=str(controller.settings.output), keys=keys, live=live,
-            progress=None if session is None else session.guide.progress(),
-            estimate=None if session is None else session.estimate(),
+            output=str(controller.settings.output), keys=keys, rows=tuple(rows),
+            coefficients=tuple(coefficients),
+            open_poses=0 if session is None else session.guide.open_poses,
             outcome=controller.outcome).to_json()))
 
 

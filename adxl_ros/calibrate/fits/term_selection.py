@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from adxl_ros.calibrate.fits import full_model
-from adxl_ros.calibrate.fits.linear import AFFINE
 from adxl_ros.calibrate.fits.linearisation import Linearised, linearised
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model.constants import Z_90
@@ -28,7 +27,7 @@ import scipy
 
 ALWAYS = ('bias', 'scale_factor')
 """Terms that every fit has and that are not compared."""
-_MAX_OPEN = 3
+MAX_OPEN = 3
 """Largest number of the twelve coefficients that their priors may give. Chosen: an axis that never
 points up or down leaves its scale factor and two misalignments open."""
 _MIN_CHANGE = {'temperature_c': 0.5, 'supply_v': 0.02}
@@ -65,15 +64,6 @@ def candidates(poses: Poses) -> tuple[str, ...]:
 def fit(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> Sensor:
     """Fit the full model with selected terms, and with some effects in any case."""
     return fit_selected(sensor, poses, effects)[0].fitted
-
-
-def fit_affine(sensor: Sensor, poses: Poses, max_open: int = _MAX_OPEN) -> full_model.FullFit:
-    """
-    Fit zero-g, scale factor and misalignment alone, for poses that do not determine more.
-
-    max_open: number of coefficients that the poses may leave to their priors.
-    """
-    return full_model.fit_full(sensor, poses, AFFINE, max_open)
 
 
 def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()

@@ -12,10 +12,9 @@ import math
 from typing import NamedTuple
 
 from adxl_ros.calibrate.guided import pose_plan
-from adxl_ros.calibrate.guided.screen_contents import AxisReading, LiveReading, RestReading
+from adxl_ros.calibrate.guided.screen_contents import Row
 from adxl_ros.files.recording_columns import stamped_rate_hz
 from adxl_ros.files.sweep_journal import JournalEntry, PoseDropped, PoseRecord
-from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.report.quantities import duration
 from adxl_ros.signals.rest_detection import (
@@ -71,21 +70,20 @@ class NewestSamples:
             return math.nan
         return stamped_rate_hz((self.stamps_ns - self.stamps_ns[0]) * 1e-9)
 
-    def reading(self, stillness: Stillness | None) -> LiveReading | None:
-        """Return what the sensor reads at present, for the screen; None without samples."""
+    def rows(self, stillness: Stillness | None) -> list[Row]:
+        """Return what the sensor reads at present, for the screen."""
         if not len(self.volts):
-            return None
-        unit, rate_hz = self._sensor, self.rate_hz()
-        shown = to_nominal_mps2(self.volts[-self._count(_SHOWN_S):], unit)
-        axes = tuple(map(AxisReading, unit.axes, shown.mean(axis=0).tolist(),
-                         shown.std(axis=0).tolist()))
-        rest = None
+            return []
+        shown = to_nominal_mps2(self.volts[-self._count(_SHOWN_S):], self._sensor)
+        axes = '  '.join(f'{axis} {mean:+.3f} ± {rms:.3f}' for axis, mean, rms in zip(
+            self._sensor.axes, shown.mean(axis=0), shown.std(axis=0)))
+        rate = f'  {self.rate_hz():.0f} Hz' if math.isfinite(self.rate_hz()) else ''
+        rows = [Row('reads', f'{axes} m/s²{rate}')]
         if stillness is not None:
-            scale = G0_MPS2 / float(unit.nominal_scale_v_per_g[stillness.axis])
-            rest = RestReading(bool(stillness.at_rest), unit.axes[stillness.axis],
-                               stillness.statistic, float(stillness.value) * scale,
-                               float(stillness.limit) * scale)
-        return LiveReading(axes, rate_hz if math.isfinite(rate_hz) else None, rest)
+            share = stillness.value / stillness.limit if stillness.limit else 1.0
+            rows.append(Row('rest', stillness.describe_mps2(self._sensor), share,
+                            'green' if stillness.at_rest else 'yellow'))
+        return rows
 
     def _count(self, seconds: float) -> int:
         return max(round(seconds * self._sensor.rate_hz), _FEWEST_SAMPLES)

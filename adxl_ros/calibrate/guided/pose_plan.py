@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
-from adxl_ros.calibrate.guided.screen_contents import Coverage
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.sensor import Sensor
@@ -136,7 +135,7 @@ def spread(count: int) -> list[Target]:
             for alpha_rad, beta_rad in zip(alpha.tolist(), beta.tolist())]
 
 
-def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> tuple[Coverage, ...]:
+def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> str:
     """Count the poses of a plan by plane and by direction of travel, and the check poses."""
     alpha_rad, beta_rad, check = np.array([(t.alpha_rad, t.beta_rad, t.check) for t in targets]).T
     planes, grid, turn = np.round(np.degrees(alpha_rad)), check == 0, np.diff(beta_rad, prepend=0)
@@ -145,8 +144,8 @@ def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> tuple[Cove
     groups |= {'beta forth': grid & (turn > 0), 'beta back': grid & (turn < 0),
                'check poses': ~grid}
     taken = np.isin(np.arange(len(targets)), list(accepted))
-    return tuple(Coverage(name, int((taken & group).sum()), int(group.sum()))
-                 for name, group in groups.items() if group.any())
+    return ', '.join(f'{name} {(taken & group).sum()}/{group.sum()}'
+                     for name, group in groups.items() if group.any())
 
 
 _RATE_ERROR = 0.05

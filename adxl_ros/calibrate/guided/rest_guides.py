@@ -14,14 +14,7 @@ from adxl_ros.calibrate.fits.gravity_fit import force_g, MIN_RESTS, NAMES, nomin
 from adxl_ros.calibrate.fits.thermal_fit import PARTS
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
 from adxl_ros.calibrate.guided.guide import Dwell, Guide, NextPose, temperature_fault
-from adxl_ros.calibrate.guided.screen_contents import (
-    CoefficientRow,
-    Coverage,
-    Estimate,
-    Phase,
-    Progress,
-    Status,
-)
+from adxl_ros.calibrate.guided.screen_contents import Phase, Row, Status, tilt_row
 from adxl_ros.calibrate.poses import at_a_rail, Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
@@ -214,23 +207,23 @@ class HandGuide(HandRests):
         return Status(phase, f'{rests}; {stillness.describe_mps2(self.sensor)}; '
                       f'{self.destination()}', False)
 
-    def progress(self) -> Progress:
-        """Return the progress of the calibration, for the screen."""
-        up = self.up()
-        position = '' if up is None else \
-            f'{gravity_fit.points_up(int(np.argmax(gravity_fit.UP @ up)))} now'
-        return Progress(
-            number=self.pose_number, destination=self.destination(), position=position,
-            accepted=len(self.accepted), total=ENOUGH_RESTS)
+    def progress(self) -> list[Row]:
+        """Return direction, readings and progress, for the screen."""
+        up, count = self.up(), len(self.accepted)
+        now = [] if up is None else [Row('now', gravity_fit.points_up(
+            int(np.argmax(gravity_fit.UP @ up))) + ' now')]
+        return [Row('pose', f'{self.pose_number}: {self.destination()}'), *now,
+                *self.newest.rows(self.stillness()),
+                Row('poses', f'{count} done, {max(ENOUGH_RESTS - count, 0)} left for a good fit',
+                    count / ENOUGH_RESTS)]
 
-    def estimate_contents(self) -> Estimate:
-        """Return what the rests determine so far, for the screen."""
-        groups = [np.flatnonzero(count == gravity_fit.AXES_UP) for count in (1, 2, 3)]
-        return Estimate(
-            coverage=tuple(Coverage(f'{name} up', int(self.covered[group].sum()), len(group))
-                           for name, group in zip(('faces', 'edges', 'corners'), groups)),
-            coefficients=self.rows,
-            tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()))
+    def estimated(self) -> tuple[list[Row], list[Row]]:
+        """Return coverage and error, and the coefficients by the rests so far, for the screen."""
+        groups = {name: self.covered[axes == gravity_fit.AXES_UP] for name, axes in (
+            ('faces', 1), ('edges', 2), ('corners', 3))}
+        return [Row('coverage', ', '.join(f'{name} up {group.sum()}/{len(group)}'
+                                          for name, group in groups.items())),
+                tilt_row(self.tilt_error_rad())], self.rows
 
     def tilt_error_rad(self) -> float:
         """Return the expected rms error of alpha and beta by the rests so far, rad."""
@@ -351,19 +344,20 @@ class ThermalGuide(Guide):
             text += 'the sensor moves; '
         return Status(Phase.DWELL if at_rest else Phase.REST, text + self.destination(), False)
 
-    def progress(self) -> Progress:
-        """Return the progress of the calibration, for the screen."""
-        direction = 'warming' if self._passed.rises else 'cooling'
-        position = f'{self._blocks_c[-1]:.1f} °C, {direction}' if self.accepted else ''
-        done = int(self._passed.warming.sum() + self._passed.cooling.sum())
-        return Progress(
-            number=self.pose_number, destination=self.destination(), position=position,
-            accepted=done, total=2 * PARTS)
+    def progress(self) -> list[Row]:
+        """Return temperature, readings and progress, for the screen."""
+        passed = self._passed
+        now = [Row('now', f'{self._blocks_c[-1]:.1f} °C, '
+                   f'{"warming" if passed.rises else "cooling"}')] if self.accepted else []
+        done = int(passed.warming.sum() + passed.cooling.sum())
+        return [Row('pose', f'{self.pose_number}: {self.destination()}'), *now,
+                *self.newest.rows(self.stillness()),
+                Row('parts', f'{done} done, {2 * PARTS - done} left for a good fit',
+                    done / (2 * PARTS))]
 
-    def estimate_contents(self) -> Estimate:
-        """Return what the blocks determine so far, for the screen."""
-        fit, (low_c, high_c) = self._fit, self._settings.range_c
-        rows: tuple[CoefficientRow, ...] = ()
+    def estimated(self) -> tuple[list[Row], list[Row]]:
+        """Return coverage and error, and the coefficients by the blocks so far, for the screen."""
+        fit, (low_c, high_c), rows = self._fit, self._settings.range_c, []
         if fit is not None:
             prior = [thermal_fit.PRIOR_WIDTH * parameter_of(name).scale for name in fit.names]
             rows = running_estimate.coefficient_rows(
@@ -371,10 +365,8 @@ class ThermalGuide(Guide):
         error = f'not known yet over {low_c:g} to {high_c:g} °C' if self._error_mg is None else \
             (f'zero-g {self._error_mg:.2g} mg expected over {low_c:g} to {high_c:g} °C, after '
              f'{self._blocks_c.min():.1f} to {self._blocks_c.max():.1f} °C')
-        return Estimate(
-            coverage=(Coverage('warming', int(self._passed.warming.sum()), PARTS),
-                      Coverage('cooling', int(self._passed.cooling.sum()), PARTS)),
-            coefficients=rows, range_error=error)
+        return [Row('coverage', f'warming {self._passed.warming.sum()}/{PARTS}, '
+                    f'cooling {self._passed.cooling.sum()}/{PARTS}'), Row('error', error)], rows
 
     def tilt_error_rad(self) -> float:
         """Return NaN: blocks in one orientation do not determine the tilt."""

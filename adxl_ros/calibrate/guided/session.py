@@ -13,7 +13,7 @@ from typing import Any
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
 from adxl_ros.calibrate.guided.rest_guides import HandGuide, ThermalGuide, ThermalSettings
-from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Estimate, StageMode
+from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Row, StageMode
 from adxl_ros.calibrate.guided.stage_guide import StageGuide
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import page
@@ -146,7 +146,7 @@ class Session:
         if settings.store:
             remove_unfinished(calibration_store.unit_folder(settings.store, unit.serial), '')
         self._fitted: list[PoseRecord] = []
-        self._estimate: tuple[list[int], Estimate] | None = None
+        self._estimated: tuple[list[int], tuple[list[Row], list[Row]]] | None = None
         entries = self.journal.entries
         accepted = sweep_journal.accepted_poses(entries)
         self.resumed = len(accepted)  # Number of the poses of an interrupted calibration
@@ -188,12 +188,13 @@ class Session:
         if unverified > len(self.guide.to_verify):
             yield 'the sensor is mounted as it was'
 
-    def estimate(self) -> Estimate:
-        """Return what the poses determine so far; it is computed once for each pose."""
+    def rows(self) -> tuple[list[Row], list[Row]]:
+        """Return rows and coefficients for the screen; estimated once for each pose."""
         key = [record.stop_ns for record in self.guide.accepted.values()]
-        if self._estimate is None or key != self._estimate[0]:
-            self._estimate = key, self.guide.estimate_contents()
-        return self._estimate[1]
+        if self._estimated is None or key != self._estimated[0]:
+            self._estimated = key, self.guide.estimated()
+        rows, coefficients = self._estimated[1]
+        return [*self.guide.progress(), *rows], coefficients
 
     def finish(self) -> calibration.CalibrationResult:
         """Fit the poses so far and write the parameter file; `end` follows all other files."""

@@ -7,10 +7,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
-from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate, screen_contents
+from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate
 from adxl_ros.calibrate.guided.guide import Dwell, EncoderTrack, Guide, NextPose, temperature_fault
 from adxl_ros.calibrate.guided.pose_plan import Course, MOVE_S, Target
-from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode, Status
+from adxl_ros.calibrate.guided.screen_contents import (
+    CaptureSettings,
+    Phase,
+    Row,
+    StageMode,
+    Status,
+    tilt_row,
+)
 from adxl_ros.calibrate.poses import angle_tolerance_rad, SettingTracker
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord, PoseSkipped
@@ -283,12 +290,11 @@ class StageGuide(StageSweep):
             'pose': str(self.pose_number), 'poses': str(count),
             'stage_mode': self.settings.stage_mode.value, 'alpha_rad': target.alpha_rad,
             'beta_rad': target.beta_rad, 'check': 'true' if target.check else 'false'}
-        number = f'pose {self.pose_number} of {count}'
+        task, command_rad = f'turn the stage to {self.destination()}, then capture', None
         if self.moves_itself:
-            return NextPose(f'{number}: {self.destination()}', values,
-                            (target.alpha_rad, target.beta_rad), self.newest_ns or 0)
-        return NextPose(f'{number}: turn the stage to {self.destination()}, then capture', values,
-                        None)
+            task, command_rad = self.destination(), (target.alpha_rad, target.beta_rad)
+        return NextPose(f'pose {self.pose_number} of {count}: {task}', values, command_rad,
+                        self.newest_ns or 0)
 
     def status(self) -> Status:
         """Return what the guide waits for, with the values that matter."""
@@ -319,33 +325,32 @@ class StageGuide(StageSweep):
         return Status(Phase.STAGE, f'the stage has not arrived at {place}{since}: {distance}',
                       late)
 
-    def progress(self) -> screen_contents.Progress:
-        """Return the progress of the sweep, for the screen."""
-        target, angles_rad, position = self.course.target, self.encoder.angles_rad, ''
+    def progress(self) -> list[Row]:
+        """Return pose, readings and progress of the sweep, for the screen."""
+        target, angles_rad, total = self.course.target, self.encoder.angles_rad, len(
+            self.course.targets)
+        rows = [Row('pose', f'{self.pose_number} of {total}: {self.destination()}')]
         if target is not None and angles_rad is not None:
-            position = ', '.join(
+            rows.append(Row('now', ', '.join(
                 f'{joint} {np.degrees(now):.2f}° ({np.degrees(now - wanted):+.2f}°)'
                 for joint, now, wanted in zip(('alpha', 'beta'), angles_rad,
-                                              (target.alpha_rad, target.beta_rad)))
+                                              (target.alpha_rad, target.beta_rad)))))
         rests = [] if self.dwell is None else self.dwell.rests()
-        at_rest_s = (rests[-1].stop - rests[-1].start) / self.sensor.rate_hz if rests else 0.0
+        samples, dwell_s = rests[-1].stop - rests[-1].start if rests else 0, self.settings.dwell_s
+        at_rest_s = min(samples / self.sensor.rate_hz, dwell_s)
         intervals_ns = np.abs(np.diff([record.stop_ns for record in self.accepted.values()]))
-        pose_s = self.settings.dwell_s + MOVE_S if len(intervals_ns) < _FEWEST_INTERVALS else \
+        pose_s = dwell_s + MOVE_S if len(intervals_ns) < _FEWEST_INTERVALS else \
             float(np.median(intervals_ns)) * 1e-9
-        return screen_contents.Progress(
-            number=self.pose_number, destination=self.destination(), position=position,
-            accepted=len(self.accepted), total=len(self.course.targets),
-            skipped=len(self.course.skipped), open_poses=self.open_poses,
-            remaining_s=self.open_poses * pose_s, dwelt_s=min(at_rest_s, self.settings.dwell_s),
-            dwell_s=self.settings.dwell_s)
+        skipped = f'{len(self.course.skipped)} left out, ' if self.course.skipped else ''
+        return [*rows, *self.newest.rows(self.stillness()),
+                Row('dwell', f'{at_rest_s:.1f} of {dwell_s:g} s', at_rest_s / dwell_s),
+                Row('poses', f'{len(self.accepted)} done, {skipped}{self.open_poses} left, about '
+                    f'{self.open_poses * pose_s / 60:.0f} min', 1 - self.open_poses / total)]
 
-    def estimate_contents(self) -> screen_contents.Estimate:
-        """Return what the poses determine so far, for the screen."""
+    def estimated(self) -> tuple[list[Row], list[Row]]:
+        """Return coverage and error, and the coefficients by the poses so far, for the screen."""
         targets, closed = self.course.targets, self.course.closed
         final = self.estimate.with_poses([target for number, target in enumerate(targets)
                                           if number not in closed and not target.check])
-        return screen_contents.Estimate(
-            coverage=pose_plan.by_plane(targets, self.accepted),
-            coefficients=self.estimate.rows(),
-            tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()),
-            final_tilt_error_deg=running_estimate.degrees_or_none(final.tilt_error_rad()))
+        return [Row('coverage', pose_plan.by_plane(targets, self.accepted)),
+                tilt_row(self.tilt_error_rad(), final.tilt_error_rad())], self.estimate.rows()

@@ -43,11 +43,6 @@ class Assessment:
     tilt_noise: str = ''
 
     @property
-    def limited_by(self) -> str:
-        """Return the largest cause of the acceleration error, as `ErrorBudget.limited_by`."""
-        return self.accel.limited_by
-
-    @property
     def error_mg(self) -> float:
         """Return the error of the calibration itself, mg rms over the axes."""
         return rms_mg(self.accel.calibration)
@@ -159,7 +154,7 @@ def summary_lines(fitted: Sensor, assessment: Assessment | None, errors: Sequenc
     lines = [*acceptance_lines(fitted), '', *errors]
     if assessment is not None:
         lines += ['', *limit_table(assessment, fitted),
-                  f' limited by               {LIMITS[assessment.limited_by]}']
+                  f' limited by               {LIMITS[assessment.accel.limited_by]}']
     return [*lines, *unit_line(fitted)]
 
 
@@ -243,7 +238,8 @@ def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutEr
                'verdict_datasheet': assessment.accel_datasheet,
                'verdict_noise': assessment.accel_noise,
                'verdict_tilt_datasheet': assessment.tilt_datasheet,
-               'verdict_tilt_noise': assessment.tilt_noise, 'limited_by': assessment.limited_by}
+               'verdict_tilt_noise': assessment.tilt_noise,
+               'limited_by': assessment.accel.limited_by}
     return {key: entry for key, entry in entries.items() if entry}
 
 

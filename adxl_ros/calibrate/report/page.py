@@ -105,8 +105,8 @@ def page(result: CalibrationResult, past: Sequence[Sensor],
         'about': [f'{fitted.model} model', f'{len(result.poses)} poses', f'axes {fitted.axes}'],
         'badge': _badge(fitted),
         'tiles': _tiles(result, assessment),
-        'advice': f'Limited by {acceptance.LIMITS[assessment.limited_by]}.' if assessment else
-        'Take more poses: too few were held out to assess this calibration.',
+        'advice': f'Limited by {acceptance.LIMITS[assessment.accel.limited_by]}.'
+        if assessment else 'Take more poses: too few were held out to assess this calibration.',
         'file_name': re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml',
         'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
         'figures': drawn,
@@ -159,7 +159,7 @@ def _tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dic
             tiles.append({'label': label, 'text': f'{before} → {after} {unit}',
                           'note': f'rms on held-out poses, 90 %: {low} to {high} {unit}'})
     if assessment is not None:
-        tiles.append({'label': 'limited by', 'text': assessment.limited_by,
+        tiles.append({'label': 'limited by', 'text': assessment.accel.limited_by,
                       'note': f'calibration error {digits(assessment.error_mg)} mg, without '
                               'noise and stage error of the check'})
     return tiles
