@@ -213,10 +213,8 @@ class GravityFit:
     converged: bool = True  # Whether parameters and excess variance have converged
 
 
-class _Estimate(NamedTuple):
-    parameters: np.ndarray  # (9,)
-    excess_g2: float  # Variance of the magnitudes beyond the noise of the means
-    converged: bool
+_Estimate = tuple[np.ndarray, float, bool]
+"""Parameters, (9,), variance beyond the noise of the means, g², and whether they converged."""
 
 
 def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> GravityFit:
@@ -297,8 +295,8 @@ def _fit(rests: NominalRests) -> _Estimate:
         squares = _residual(rests, parameters) ** 2
         before_g2, excess_g2 = excess_g2, _excess(squares, variance, freedom)
         if abs(excess_g2 - before_g2) <= _EXCESS_TOLERANCE * (excess_g2 + variance.min()):
-            return _Estimate(parameters, excess_g2, converged)
-    return _Estimate(parameters, excess_g2, False)
+            return parameters, excess_g2, converged
+    return parameters, excess_g2, False
 
 
 def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:

@@ -87,11 +87,7 @@ def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
 
 
 def compare_terms(full: full_model.FullFit) -> list[Term]:
-    """
-    Compare the fit with models that have one term less or one term more.
-
-    All are linearised at the fit, where the chain is linear to far below the noise.
-    """
+    """Compare the fit, linearised there, with models that have one term less or one term more."""
     about, term = _linearised(full, ())
     log_likelihood = -about.deviance(full.stage) / 2
     compared = []
@@ -163,12 +159,7 @@ def report_lines(full: full_model.FullFit, poses: Poses, terms: Sequence[Term]) 
 
 
 def _weakest_direction(fitted: Sensor) -> str:
-    """
-    Name the direction of the coefficients that the poses determine least.
-
-    The condition number is the square root of the ratio of the extreme eigenvalues of the
-    covariance, with each coefficient in units of its typical size.
-    """
+    """Name the direction that the poses determine least, in typical sizes, and the condition."""
     names = fitted.covariance_names
     scale = np.array([parameter_of(name).scale for name in names])
     values, vectors = np.linalg.eigh(fitted.covariance / np.outer(scale, scale))

@@ -229,12 +229,7 @@ class NextPose(NamedTuple):
 
 
 class Guide:
-    """
-    What all guides share: the accepted poses, and what was refused.
-
-    By itself it is the guide of a sensor that no stage carries. No pose is known before it is
-    taken, so that none is open, and none can be taken again to check the mounting.
-    """
+    """What all guides share; by itself one without a plan: no pose is open or repeated."""
 
     moves_itself = False  # Whether a stage turns itself, so that nobody captures
 

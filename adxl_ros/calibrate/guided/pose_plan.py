@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The pose plan, and checks of one pose.
-
-A check returns one line with the value that is wrong and what to do, or '' if all is well.
-"""
+"""The pose plan, and checks of a pose: one line on what is wrong and what to do, or empty."""
 
 from __future__ import annotations
 

@@ -43,6 +43,8 @@ class HandRests(Guide):
     runs: `poses_to_fit` finds those of the complete stream once more, as `fit` does.
     """
 
+    next_up: int | None  # Orientation to ask for
+
     def __init__(self, sensor: Sensor, temperature_span_c: float,
                  accepted: Sequence[PoseRecord] = ()) -> None:
         super().__init__(sensor, accepted)
@@ -98,7 +100,7 @@ class HandRests(Guide):
             return 'there is no direction left to skip'
         self._skipped[self.next_up] = True
         skipped = gravity_fit.points_up(self.next_up)
-        self._choose_next_up()
+        self.next_up = gravity_fit.next_up(~self.covered & ~self._skipped, self.up())
         return f'the direction in which {skipped} is left out'
 
     def forget(self, number: int) -> str:
@@ -153,10 +155,6 @@ class HandRests(Guide):
                               covariance=covariance, covariance_names=NAMES)
         force = force_g(rests.mean, self._parameters)
         self.covered = gravity_fit.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
-        self._choose_next_up()
-
-    def _choose_next_up(self) -> None:
-        """Choose the orientation to ask for."""
         self.next_up = gravity_fit.next_up(~self.covered & ~self._skipped, self.up())
 
     def _fault(self, record: PoseRecord) -> str:

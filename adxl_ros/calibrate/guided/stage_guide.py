@@ -36,11 +36,7 @@ class MountingError(UserError):
 
 
 class StageSweep(Guide):
-    """
-    Takes the poses of a plan on a stage that turns itself, or that an operator turns.
-
-    After arrival or capture a full dwell at rest is averaged; motion begins the dwell again.
-    """
+    """Takes the poses of a plan: after arrival or capture a full dwell at rest is averaged."""
 
     def __init__(self, sensor: Sensor, targets: Sequence[Target], settings: CaptureSettings,
                  accepted: Sequence[PoseRecord] = (), skipped: Iterable[int] = ()) -> None:

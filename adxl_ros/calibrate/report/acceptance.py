@@ -121,11 +121,7 @@ def _two_digits(value: float) -> str:
 
 
 def unit_line(sensor: Sensor) -> list[str]:
-    """
-    Return a line that compares the unit with its datasheet; none without a datasheet.
-
-    It names the coefficients whose whole 90 % interval exceeds the datasheet's maximum.
-    """
+    """Name the coefficients whose whole 90 % interval exceeds the maximum of the datasheet."""
     if not sensor.datasheet:
         return []
     names = sensor.covariance_names
@@ -244,11 +240,7 @@ def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutEr
 
 
 def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
-    """
-    Return whether the calibration error is within its limit, and sentences on it.
-
-    The limit is that of the datasheet, or the noise of one sample where no datasheet states one.
-    """
+    """Compare the error with the datasheet, or with the noise where it states none."""
     provenance = fitted.provenance
     if 'own_accel_mg' not in provenance:
         return NOT_SHOWN, ['no pose was kept out of the fit to assess it']

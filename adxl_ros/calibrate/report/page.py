@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The page of a calibration: one file that opens offline, with figures that plotly.js draws.
-
-- Its pictures: figures 2 to 8 of the paper for one unit, and errors of fits.
-"""
+"""The page of a calibration, one file that opens offline, and the figures of the paper."""
 
 from __future__ import annotations
 
@@ -44,11 +40,7 @@ _BEYOND_WHISKER = 1.08
 
 def write(folder: str | os.PathLike, result: CalibrationResult,
           store: str | os.PathLike = '', stated: Mapping[str, Any] | None = None) -> None:
-    """
-    Write `report.html`, and the plots of the unit as `calibration.png`.
-
-    stated: standard uncertainties of the laboratory; see `gum.uncertainty`.
-    """
+    """Write page and plots; stated: uncertainties of a laboratory, see `gum.uncertainty`."""
     html_page.check_libraries()
     past = calibration_store.history(store, result.fitted.serial).calibrations \
         if str(store) else []
