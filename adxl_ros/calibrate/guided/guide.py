@@ -11,7 +11,6 @@ from dataclasses import replace
 import math
 from typing import NamedTuple
 
-from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.guided.screen_contents import Row
 from adxl_ros.files.recording_columns import stamped_rate_hz
 from adxl_ros.files.sweep_journal import JournalEntry, PoseDropped, PoseRecord
@@ -219,6 +218,18 @@ class EncoderTrack:
         return f'nothing on stage/joint_states for {silent_s:.0f} s' if silent_s > SILENT_S else ''
 
 
+_RATE_ERROR = 0.05
+"""Largest relative error of the sample rate; chosen: above the error of any oscillator."""
+
+
+def rate_fault(measured_hz: float, unit: Sensor) -> str:
+    """Refuse samples whose rate is not that of the unit."""
+    if not abs(measured_hz / unit.rate_hz - 1) > _RATE_ERROR:
+        return ''
+    return (f'samples are {measured_hz:.4g} a second by their stamps, but rate_hz is '
+            f'{unit.rate_hz:.4g}; correct the rate of the driver')
+
+
 class NextPose(NamedTuple):
     """The pose to go to, as it is announced."""
 
@@ -262,7 +273,7 @@ class Guide:
         if not len(stamps_ns):
             return ''
         self.newest.feed(stamps_ns, volts)
-        if fault := pose_plan.rate_fault(self.newest.rate_hz(), self.sensor):
+        if fault := rate_fault(self.newest.rate_hz(), self.sensor):
             return fault
         if went_back(self.newest_ns, stamps_ns[0]):
             self.begin_stream(((self.newest_ns or 0) - int(stamps_ns[0])) * 1e-9)
@@ -314,11 +325,16 @@ class Guide:
         text, self._new_refusal = self._new_refusal, ''
         return text
 
-    def with_ambient(self, record: PoseRecord) -> PoseRecord:
-        """Add temperature and supply to a record."""
-        temperature_c, supply_v = (readings.mean(record.start_ns, record.stop_ns)
-                                   for readings in self.readings.values())
-        return replace(record, temperature_c=temperature_c, supply_v=supply_v)
+    def tilt_error_rad(self) -> float:
+        """Return the expected rms error of alpha and beta, rad; NaN where none shows."""
+        return math.nan
+
+
+def with_ambient(record: PoseRecord, readings: Mapping[str, Readings]) -> PoseRecord:
+    """Add temperature and supply to a record."""
+    temperature_c, supply_v = (quantity.mean(record.start_ns, record.stop_ns)
+                               for quantity in readings.values())
+    return replace(record, temperature_c=temperature_c, supply_v=supply_v)
 
 
 def temperature_fault(accepted: Mapping[int, PoseRecord], now_c: float, span_c: float) -> str:

@@ -144,8 +144,6 @@ def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> str:
                      for name, group in groups.items() if group.any())
 
 
-_RATE_ERROR = 0.05
-"""Largest relative error of the sample rate; chosen: above the error of any oscillator."""
 _CHANGE_G = 0.003
 """Largest change of a repeated pose beyond noise and stage error, g; chosen: a turn of 0.17°."""
 _NOISE_STDS = 3.0  # Stds of the noise in the limit of a change; chosen: exceeded once in 400
@@ -180,14 +178,6 @@ def saturation_fault(sensor: Sensor, volts: np.ndarray) -> str:
     return (f'saturated: {sensor.axes[axis]} reads {signed_text(reading_g)} g '
             f'({reading_v:.3f} V), beyond its range of ±{sensor.range_g:g} g or at a rail of the '
             'ADC; check supply and wiring')
-
-
-def rate_fault(measured_hz: float, unit: Sensor) -> str:
-    """Refuse samples whose rate is not that of the unit."""
-    if not abs(measured_hz / unit.rate_hz - 1) > _RATE_ERROR:
-        return ''
-    return (f'samples are {measured_hz:.4g} a second by their stamps, but rate_hz is '
-            f'{unit.rate_hz:.4g}; correct the rate of the driver')
 
 
 def signed_text(value: float) -> str:

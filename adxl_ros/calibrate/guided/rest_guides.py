@@ -13,7 +13,13 @@ from adxl_ros.calibrate.fits import gravity_fit, thermal_fit
 from adxl_ros.calibrate.fits.gravity_fit import force_g, MIN_RESTS, NAMES, nominal_rests
 from adxl_ros.calibrate.fits.thermal_fit import PARTS
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
-from adxl_ros.calibrate.guided.guide import Dwell, Guide, NextPose, temperature_fault
+from adxl_ros.calibrate.guided.guide import (
+    Dwell,
+    Guide,
+    NextPose,
+    temperature_fault,
+    with_ambient,
+)
 from adxl_ros.calibrate.guided.screen_contents import Phase, Row, Status, tilt_row
 from adxl_ros.calibrate.poses import at_a_rail, Poses
 from adxl_ros.errors import UserError
@@ -172,9 +178,9 @@ class HandRests(Guide):
         for rest in self._finder.rests():
             mean_v, std_v = self._finder.means([rest])
             span = int(stamps_ns[rest.start]), int(stamps_ns[rest.stop - 1])
-            yield self.with_ambient(PoseRecord(
+            yield with_ambient(PoseRecord(
                 pose=number, start_ns=span[0], stop_ns=span[1], samples=rest.stop - rest.start,
-                mean_v=tuple(mean_v[0].tolist()), std_v=tuple(std_v[0].tolist())))
+                mean_v=tuple(mean_v[0].tolist()), std_v=tuple(std_v[0].tolist())), self.readings)
 
 
 class HandGuide(HandRests):
@@ -272,8 +278,8 @@ class ThermalGuide(Guide):
             if len(dwell) > _PATIENCE * samples:
                 self._dwell = None
             return None
-        record = self.with_ambient(
-            dwell.record(max(self.accepted, default=-1) + 1, rest, samples))
+        record = with_ambient(
+            dwell.record(max(self.accepted, default=-1) + 1, rest, samples), self.readings)
         self.refuse('no temperature: nothing on the topic temperature; publish the reading of a '
                     'thermometer at the sensor' if not math.isfinite(record.temperature_c) else
                     pose_plan.saturation_fault(self.sensor, dwell.volts(rest)[:samples]))
@@ -365,10 +371,6 @@ class ThermalGuide(Guide):
              f'{self._blocks_c.min():.1f} to {self._blocks_c.max():.1f} °C')
         return [Row('coverage', f'warming {self._passed.warming.sum()}/{PARTS}, '
                     f'cooling {self._passed.cooling.sum()}/{PARTS}'), Row('error', error)], rows
-
-    def tilt_error_rad(self) -> float:
-        """Return NaN: blocks in one orientation do not determine the tilt."""
-        return math.nan
 
     def _update(self) -> None:
         """Bring coverage, fit and expected error up to date."""

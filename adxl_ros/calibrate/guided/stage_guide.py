@@ -184,8 +184,9 @@ class StageSweep(Guide):
             alpha_rad, beta_rad = readings_rad.mean(axis=0).tolist() if len(readings_rad) else \
                 self.encoder.angles_rad or (alpha_rad, beta_rad)
         alpha, beta = self.tracker.settings(*span, alpha_rad, beta_rad)
-        record = replace(self.with_ambient(record), alpha_rad=alpha_rad, beta_rad=beta_rad,
-                         check=target.check, alpha_setting=alpha, beta_setting=beta)
+        record = replace(guide.with_ambient(record, self.readings),
+                         alpha_rad=alpha_rad, beta_rad=beta_rad, check=target.check,
+                         alpha_setting=alpha, beta_setting=beta)
         if refusal := _fault(self, record, dwell, rest):
             self.refuse(refusal)
         elif self.to_verify:
