@@ -244,7 +244,7 @@ def _fit_full(sensor: Sensor, poses: Poses, recordings: Sequence[RecordedPoses],
 
 def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
     """Fit the twelve coefficients of a three-axis unit to poses that determine no more."""
-    full = term_selection.fit_affine(sensor, poses)
+    full = full_model.fit_full(sensor, poses, linear.AFFINE, term_selection.MAX_OPEN)
     still_open = acceptance.open_coefficients(full.fitted)
     notes = [f'{len(poses)} poses determine zero-g, scale factor and misalignment, no further '
              'terms; more poses show those']
@@ -254,7 +254,7 @@ def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
 
     def refit(sensor: Sensor, poses: Poses) -> Sensor:
         # With more open coefficients it would be another fit, whose errors are not those of this.
-        return term_selection.fit_affine(sensor, poses, len(still_open)).fitted
+        return full_model.fit_full(sensor, poses, linear.AFFINE, len(still_open)).fitted
 
     return _StageFit(full.fitted, refit, full, notes=notes)
 

@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Poses: mean output at rest with the angles of the stage's encoder.
-
-Poses between which the stage has not moved a joint are of one setting of the joint.
-"""
+"""Poses: mean output at rest with the angles of the encoder, by setting of each joint."""
 
 from __future__ import annotations
 
@@ -70,15 +66,13 @@ class Poses:
         return len(self.volts)
 
     @classmethod
-    def without_volts(cls, alpha_rad: np.ndarray, beta_rad: np.ndarray, std_v: np.ndarray,
-                      setting: np.ndarray | None = None) -> Poses:
+    def without_volts(cls, alpha_rad: np.ndarray, beta_rad: np.ndarray, std_v: np.ndarray
+                      ) -> Poses:
         """Make poses that have not been measured, with a noise, (m,) or (k, m), of their means."""
         count = len(alpha_rad)
         noise_v = np.broadcast_to(std_v, (count, np.shape(std_v)[-1])).copy()
-        poses = cls(np.zeros_like(noise_v), noise_v, alpha_rad, beta_rad, np.zeros((count, 2)),
-                    np.zeros(count, bool))
-        return poses if setting is None else replace(
-            poses, alpha_setting=setting, beta_setting=setting)
+        return cls(np.zeros_like(noise_v), noise_v, alpha_rad, beta_rad, np.zeros((count, 2)),
+                   np.zeros(count, bool))
 
     @staticmethod
     def from_records(records: Sequence[PoseRecord]) -> Poses:

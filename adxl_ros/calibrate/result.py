@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The result of a calibration: the fitted unit with its provenance, validity range and report.
-
-It is compared with the truth of a simulated unit, and with earlier calibrations.
-"""
+"""The result of a calibration, compared with the truth and with earlier calibrations."""
 
 from __future__ import annotations
 
@@ -73,11 +69,7 @@ class CalibrationResult:
         parameter_file.save(path, self.fitted, self.comments())
 
     def keep(self, folder: str | os.PathLike) -> str:
-        """
-        Copy the calibration to the store, unless it is '' or cannot be written.
-
-        returns: one line with the path or the reason.
-        """
+        """Copy the calibration to the store, if one is named; return one line on it."""
         if not str(folder):
             return 'not kept in a store'
         stored = calibration_store.history(folder, self.fitted.serial).calibrations
@@ -169,11 +161,7 @@ def _mean_text(values: np.ndarray, digits: str) -> str:
 
 
 def envelope(fitted: Sensor, force: np.ndarray, poses: Poses, misfit_mps2: float) -> Envelope:
-    """
-    Return the validity range of a calibration.
-
-    force: specific force of k poses, check poses among them, m/s², (k, 3).
-    """
+    """Return the validity range by the specific force of all poses, m/s², (k, 3)."""
     finite_c = poses.temperature_c[np.isfinite(poses.temperature_c)]
     rest_leverage = leverage(fitted)
     largest = max(float(rest_leverage(list(stretch * force.T)).max())
@@ -303,11 +291,7 @@ _QUANTITIES = {
 
 def history(newest: Sensor, stored: Sequence[Sensor]
             ) -> tuple[list[str], list[list[str]], str] | None:
-    """
-    Return head and rows of the calibrations of a unit, and the changes since the one before.
-
-    Of the stored ones those of other data and the same axes count; None without any.
-    """
+    """Return head and rows of the calibrations with other data, and what has changed."""
     by_data: dict[str, Sensor] = {}
     for sensor in (*stored, newest):
         # Two fits of the same data show no drift: only the last one counts.

@@ -161,8 +161,10 @@ class LiveStream:
             self.counts['outside'] += 1
             self.outside = estimate.outside
         xx, xy, xz, yy, yz, zz = estimate.covariance
-        if self._forces is not None:
-            self._forces.append(estimate.force)
+        # Read once: `collected` may take the list away at any time.
+        forces = self._forces
+        if forces is not None:
+            forces.append(estimate.force)
         self._corrected += 1
         if self._corrected % chain.stride:
             return

@@ -254,15 +254,16 @@ class DisplayPublisher:
         unit, session, newest = stream.unit, controller.session, stream.newest
         keys = () if phase is Phase.FIT else _KEYS.get(
             controller.state, _BY_HAND if controller.settings.operator_captures else _RUNNING)
+        coefficients: list[screen_contents.Row] = []
         if session is not None:
-            live = session.newest.reading(session.guide.stillness(session.newest))
+            rows, coefficients = session.rows()
         else:
-            live = None if newest is None else newest.reading(newest.stillness())
+            rows = [] if newest is None else newest.rows(newest.stillness())
         self._publisher.publish(String(data=screen_contents.ScreenContents(
             phase=phase.value, text=text, unit=f'{unit.serial} ({unit.axes})' if unit else '',
-            output=str(controller.settings.output), keys=keys, live=live,
-            progress=None if session is None else session.guide.progress(),
-            estimate=None if session is None else session.estimate(),
+            output=str(controller.settings.output), keys=keys, rows=tuple(rows),
+            coefficients=tuple(coefficients),
+            open_poses=0 if session is None else session.guide.open_poses,
             outcome=controller.outcome).to_json()))
 
 
@@ -311,10 +312,6 @@ class Samples:
         """Forget all samples but the newest, as many as the queue holds."""
         self._receive()
         del self._raw[:max(len(self._raw) - count, 0)]
-
-    def clear(self) -> None:
-        """Forget all samples so far."""
-        self.keep_newest(0)
 
     def waiting(self) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -384,7 +381,7 @@ class Calibration(Node):
         self.announce, self.withdraw_pose = announcer.announce, announcer.withdraw
         self._samples = Samples(self)
         self._controller = controller.Controller(
-            settings, sensor, controller.Resume(own.resume), self._samples, self, anonymous)
+            settings, sensor, own.resume, self._samples, self, anonymous)
         if own.autostart:
             self._controller.start()
         self._connect()
@@ -394,7 +391,7 @@ class Calibration(Node):
 
     def log(self, severity: controller.Severity, text: str) -> None:
         """Log a line."""
-        topics.log(self, severity.name, text)
+        topics.log(self, severity, text)
 
     def answer_captures(self, answer: Answer) -> None:
         """Answer all calls of ~/capture that wait."""
@@ -446,8 +443,8 @@ class Calibration(Node):
             raise SystemExit(0 if self._controller.outcome else 1)
 
     def _status(self) -> Status:
-        report = self._controller.report()
-        return Status(self._level(), report.status.text, report.serial, report.values)
+        status, serial, values = self._controller.report()
+        return Status(self._level(), status.text, serial, values)
 
     def _level(self) -> Level:
         if self._samples.mixture():

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 import os
@@ -16,8 +16,7 @@ from textwrap import wrap
 import time
 from typing import Any, TextIO
 
-from adxl_ros.calibrate.guided import screen_contents as screen
-from adxl_ros.calibrate.guided.screen_contents import ScreenContents
+from adxl_ros.calibrate.guided.screen_contents import Row, ScreenContents
 from adxl_ros.errors import UserError
 from adxl_ros.nodes.jobs import held_output
 from adxl_ros.nodes.parameters import check_given, declare_all, parameter
@@ -41,14 +40,11 @@ class ScreenSettings:
 
 Styled = tuple[str, str]  # A style of prompt_toolkit and its text
 Line = list[Styled]  # A line of the screen
-Row = tuple[str, str, str]  # Label, text and style of a row
 
 _COLOURS = {'dwell': 'ansigreen', 'refused': 'ansired', 'silent': 'ansired',
             'question': 'ansiyellow', 'rest': 'ansiyellow', 'stage': 'ansiyellow',
             'operator': 'bold ansicyan', 'fit': 'ansigreen'}
 """Styles by phase."""
-_MOTIONS = {'rms': 'moving', 'drift': 'drifting'}
-"""What a sensor does that is not at rest, by the quantity that shows it."""
 _LEAST_WIDTH = 20  # A narrower terminal is drawn as if it had this width, columns
 _LEAST_LINES = 4
 """Lines that a low terminal keeps beside log and keys: title, text, pose and angles."""
@@ -68,15 +64,16 @@ def draw(contents: ScreenContents, log: Iterable[Styled], columns: int, rows: in
     title = f' calibration{task if contents.output else ""}'
     body = [('reverse', f'{title:{width}}'), *_styled(
         _COLOURS.get(contents.phase, 'bold'), wrap(contents.text, width)[:_TEXT_LINES])]
-    for label, text, style in (*_readings(contents.progress, contents.live),
-                               *_progress(contents.progress, contents.estimate)):
-        body += _styled(style, wrap(text, width, initial_indent=f'{label:{_LABEL_WIDTH}}',
-                                    subsequent_indent=_LABEL_WIDTH * ' ')[:_FEW_LINES])
+    for row in contents.rows:
+        bar = '' if row.share is None else f'{_bar(row.share)} '
+        body += _styled(row.style, wrap(
+            f'{bar}{row.text}', width, initial_indent=f'{row.label:{_LABEL_WIDTH}}',
+            subsequent_indent=_LABEL_WIDTH * ' ')[:_FEW_LINES])
     for text in contents.outcome:
         # A line that fits keeps its spaces.
         body += _styled('', [text] if len(text) <= width else wrap(text, width))
-    if contents.estimate is not None and not contents.outcome:
-        body += _styled('', _coefficients(contents.estimate.coefficients, width))
+    if not contents.outcome:
+        body += _styled('', _coefficients(contents.coefficients, width))
     messages = [line for style, text in log for line in _styled(style, wrap(text, width))]
     messages = messages[-_FEW_LINES:]
     # A small terminal keeps the keys and the first lines, which say what to do.
@@ -92,57 +89,10 @@ def _styled(style: str, lines: Iterable[str]) -> list[Styled]:
     return [(style, line) for line in lines]
 
 
-def _readings(progress: screen.Progress | None, live: screen.LiveReading | None) -> Iterator[Row]:
-    """Yield the pose, where the stage is, and what the sensor reads."""
-    if progress is not None:
-        total = '' if progress.remaining_s is None else f' of {progress.total}'
-        yield 'pose', f'{progress.number}{total}: {progress.destination}', ''
-        if progress.position:
-            yield 'now', progress.position, ''
-    if live is None:
-        return
-    axes = '  '.join(f'{axis.axis} {axis.mean_mps2:+.3f} ± {axis.rms_mps2:.3f}'
-                     for axis in live.axes)
-    rate = '' if live.rate_hz is None else f'  {live.rate_hz:.0f} Hz'
-    yield 'reads', f'{axes} m/s²{rate}', ''
-    if (rest := live.rest) is not None:
-        bar = _bar(rest.value_mps2 / rest.limit_mps2 if rest.limit_mps2 else 1.0)
-        motion = 'at rest' if rest.at_rest else _MOTIONS[rest.quantity]
-        yield 'rest', (f'{bar} {motion}: {rest.value_mps2:.2g} m/s² {rest.quantity} on '
-                       f'{rest.axis}, must be below {rest.limit_mps2:.2g}'), \
-            'green' if rest.at_rest else 'yellow'
-    if progress is not None and progress.dwell_s is not None and progress.dwelt_s is not None:
-        bar = _bar(progress.dwelt_s / progress.dwell_s)
-        yield 'dwell', f'{bar} {progress.dwelt_s:.1f} of {progress.dwell_s:g} s', ''
-
-
-def _progress(progress: screen.Progress | None, estimate: screen.Estimate | None) -> Iterator[Row]:
-    """Yield how many poses are done, what they cover, and how good the fit will be."""
-    if progress is None or estimate is None:
-        return
-    closed = progress.accepted + progress.skipped
-    skipped = f'{progress.skipped} left out, ' if progress.skipped else ''
-    time = ' for a good fit' if progress.remaining_s is None else \
-        f', about {progress.remaining_s / 60:.0f} min'
-    yield 'parts' if estimate.range_error else 'poses', (
-        f'{_bar(closed / progress.total)} {progress.accepted} done, {skipped}'
-        f'{max(progress.total - closed, 0)} left{time}'), ''
-    yield 'coverage', ', '.join(f'{row.group} {row.accepted}/{row.total}'
-                                for row in estimate.coverage), ''
-    if estimate.range_error:
-        yield 'error', estimate.range_error, ''
-    elif estimate.tilt_error_deg is None:
-        yield 'tilt error', 'one axis does not show the vertical', ''
-    else:
-        final = '' if estimate.final_tilt_error_deg is None else \
-            f', {estimate.final_tilt_error_deg:.2g}° after all poses'
-        yield 'tilt error', f'{estimate.tilt_error_deg:.2g}° expected now{final}', 'bold'
-
-
-def _coefficients(rows: Sequence[screen.CoefficientRow], width: int) -> list[str]:
-    """Return a row for each coefficient: name without unit, bar and intervals."""
-    texts = {row.name.split(',')[0]: f'{_bar(row.determined, _COEFFICIENT_BAR_WIDTH)} '
-             + ' '.join(row.intervals).replace(' ± ', '±') for row in rows}
+def _coefficients(rows: Sequence[Row], width: int) -> list[str]:
+    """Return a line for each coefficient: name, bar and intervals."""
+    texts = {row.label: f'{_bar(row.share or 0.0, _COEFFICIENT_BAR_WIDTH)} {row.text}'
+             for row in rows}
     longest = max(map(len, texts.values()), default=0)
     room = max(min(max(map(len, texts), default=0), width - 1 - longest), _SHORTEST_NAME)
     return [f'{name[:room]:{room}} {text}' for name, text in texts.items()]
@@ -278,10 +228,9 @@ class Screen(Node):
         contents = self._shown()
         services = {entry.key: entry.service for entry in contents.keys}
         service = services.get('c' if key == ' ' else key)
-        open_poses = contents.progress.open_poses if contents.progress else 0
-        if service == 'finish' and open_poses and not self._finish_is_confirmed:
+        if service == 'finish' and contents.open_poses and not self._finish_is_confirmed:
             self._finish_is_confirmed = True
-            self._say(f'{open_poses} poses are open; press f again to fit what there is')
+            self._say(f'{contents.open_poses} poses are open; press f again to fit what there is')
             return
         self._finish_is_confirmed = False
         if service is not None:
@@ -297,7 +246,7 @@ class Screen(Node):
         before = self._contents.phase
         try:
             self._contents = ScreenContents.from_json(message.data)
-        except ValueError:
+        except (LookupError, TypeError, ValueError):
             self._contents = ScreenContents(
                 'refused', f'{self._target} is of another version of adxl_ros; update both')
         if self._contents.phase != before:

@@ -254,11 +254,7 @@ class _Search:
             steps + 1).last
 
     def _step(self) -> float:
-        """
-        Move coefficients and angles to the most likely ones, or part of the way if better.
-
-        returns: the longest component of the step in standard deviations.
-        """
+        """Move coefficients and angles to likelier ones; return the longest step, in stds."""
         weighted = self._weighted()
         solved = self._solved(weighted, _ROUND_STEPS)
         errors = solved.covariance.predicted_errors(solved.about.residual)
@@ -415,12 +411,7 @@ def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
 
 
 def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError) -> str:
-    """
-    Name the poses that would help most, one by one, as `(alpha, beta)` in degrees.
-
-    Each pose of a 15° grid shrinks the joint confidence region of all coefficients the most, in
-    units of their typical size (D-optimality; Fedorov 1972).
-    """
+    """Name the poses of a 15° grid that would help most (D-optimality; Fedorov 1972), in deg."""
     grid = linearisation.candidate_poses(np.median(poses.std_v, axis=0))
     scale = np.array([parameter_of(name).scale for name in names])
     rows = linearisation.whitened_jacobian(unit, grid, tuple(names), stage) * scale

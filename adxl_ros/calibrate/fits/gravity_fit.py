@@ -13,9 +13,7 @@ Somebody who turns a sensor by hand is asked for the faces, edges and corners of
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from itertools import product
 from typing import NamedTuple
 
@@ -38,8 +36,7 @@ PRIOR_STD = 0.1
 DETERMINED_STD = 0.01
 """Standard deviation below which a parameter counts as determined: 10 mg, 1 % or 0.6°, the usual
 tolerances of datasheets."""
-TRIAL_STD_G = 1e-4
-"""Standard deviation of a rest's magnitude before the excess is estimated, g."""
+TRIAL_STD_G = 1e-4  # Standard deviation of a rest's magnitude before the excess is estimated, g
 _ROUNDING_STD_G = 1e-9  # Std of a mean by rounding alone, so that no weight is infinite
 _MAX_VALUE = 0.5  # Largest magnitude of a parameter in an iteration; chosen: five prior stds
 _PRIOR_INFORMATION = np.eye(len(NAMES)) / PRIOR_STD ** 2
@@ -138,8 +135,6 @@ def regularised_fit(rests: NominalRests, steps: int) -> np.ndarray:
 def fisher_information(rests: NominalRests, parameters: np.ndarray, excess_g2: float
                        ) -> np.ndarray:
     """Return the Fisher information of rests about the parameters, without the prior, (9, 9)."""
-    if not len(rests.mean):
-        return np.zeros((len(NAMES), len(NAMES)))
     rows = linearised(rests.mean, parameters).jacobian
     return rows.T @ (rows / (magnitude_variance(rests, parameters) + excess_g2)[:, None])
 
@@ -184,8 +179,9 @@ MIN_RESTS = len(NAMES) + 1
 _TOLERANCE = 1e-12  # Relative tolerance of `leastsq` in cost, parameters and gradient
 _UNSCALED = np.ones(len(NAMES))  # Weights of the parameters in the trust region of `leastsq`: none
 _CONVERGED = (1, 2, 3, 4)  # States of `leastsq` in which it has converged (MINPACK, lmder)
-STRETCHES = 5
-"""Stretches of time that are held out in turn. Chosen: the usual number of folds."""
+_STRETCHES = 5
+"""Stretches of time that are held out in turn: neighbours share temperature and time, so that a
+rest that is held out alone shows no drift. Chosen: the usual number of folds."""
 _MAX_ROUNDS = 20  # Largest count of rounds of parameters and excess variance
 _EXCESS_TOLERANCE = 1e-6
 """The excess variance has converged if it changes by less, relative to the variance."""
@@ -216,14 +212,11 @@ class GravityFit:
     converged: bool = True  # Whether parameters and excess variance have converged
 
 
-class _Estimate(NamedTuple):
-    parameters: np.ndarray  # (9,)
-    excess_g2: float  # Variance of the magnitudes beyond the noise of the means
-    converged: bool
+_Estimate = tuple[np.ndarray, float, bool]
+"""Parameters, (9,), variance beyond the noise of the means, g², and whether they converged."""
 
 
-def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
-                stretches: int = STRETCHES) -> GravityFit:
+def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> GravityFit:
     """
     Fit the nine parameters by maximum likelihood of the magnitudes.
 
@@ -237,9 +230,6 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
         Mean of each rest and its standard deviation, V, (k, 3), in the order of time.
     sensor
         Nominal values and local gravity of a three-axis sensor.
-    stretches
-        Groups of successive rests that are held out together: neighbours share temperature and
-        time, so that a rest that is held out alone shows no drift.
 
     Returns
     -------
@@ -255,10 +245,8 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
     """
     rests = nominal_rests(mean_v, std_v, sensor)
     _require_determined(rests, np.zeros(len(NAMES)), 0.0)
-    fits = cache(lambda mask: _fit(rests[np.frombuffer(mask, bool)]))
-
-    kept = _inliers(rests, lambda mask: fits(mask.tobytes()))
-    parameters, excess_g2, converged = fits(kept.tobytes())
+    kept = _inliers(rests)
+    parameters, excess_g2, converged = _fit(rests[kept])
     _require_determined(rests[kept], parameters, excess_g2)
     variance = magnitude_variance(rests, parameters) + excess_g2
     covariance = np.linalg.inv(
@@ -272,7 +260,7 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor,
         values=values, covariance=covariance * np.outer(units, units),
         before_mps2=G0_MPS2 * (np.linalg.norm(rests.mean, axis=1) - rests.gravity_g),
         residual_mps2=G0_MPS2 * residual,
-        held_out_mps2=G0_MPS2 * _held_out(rests, kept, parameters, variance, residual, stretches),
+        held_out_mps2=G0_MPS2 * _held_out(rests, kept, parameters, variance, residual),
         expected_mps2=G0_MPS2 * np.sqrt(variance),
         excess_mps2=G0_MPS2 * float(np.sqrt(excess_g2)),
         outliers=tuple(int(i) for i in np.flatnonzero(~kept)),
@@ -306,8 +294,8 @@ def _fit(rests: NominalRests) -> _Estimate:
         squares = _residual(rests, parameters) ** 2
         before_g2, excess_g2 = excess_g2, _excess(squares, variance, freedom)
         if abs(excess_g2 - before_g2) <= _EXCESS_TOLERANCE * (excess_g2 + variance.min()):
-            return _Estimate(parameters, excess_g2, converged)
-    return _Estimate(parameters, excess_g2, False)
+            return parameters, excess_g2, converged
+    return parameters, excess_g2, False
 
 
 def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
@@ -320,7 +308,7 @@ def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
                                        xtol=1e-30))
 
 
-def _inliers(rests: NominalRests, fit: Callable[[np.ndarray], _Estimate]) -> np.ndarray:
+def _inliers(rests: NominalRests) -> np.ndarray:
     """
     Mark the rests that fit the others, (k,) bool.
 
@@ -343,7 +331,7 @@ def _inliers(rests: NominalRests, fit: Callable[[np.ndarray], _Estimate]) -> np.
     kept = size <= _MAX_DEVIATIONS * np.sqrt(
         variance + magnitude_variance(rests, robust.x).mean())
     for _ in range(2 * max_outliers):
-        distance = _studentised(rests, kept, fit(kept))
+        distance = _studentised(rests, kept, _fit(rests[kept]))
         limit = -scipy.special.stdtrit(max(kept.sum() - MIN_RESTS, 1),
                                        _OUTLIER_CHANCE / (2 * count))
         excluded, included = np.where(kept, np.inf, distance), np.where(kept, distance, 0)
@@ -374,13 +362,12 @@ def _studentised(rests: NominalRests, kept: np.ndarray, estimate: _Estimate) -> 
 
 
 def _held_out(rests: NominalRests, kept: np.ndarray, parameters: np.ndarray,
-              variance: np.ndarray, residual: np.ndarray, stretches: int) -> np.ndarray:
+              variance: np.ndarray, residual: np.ndarray) -> np.ndarray:
     """Return magnitude minus gravity by the fit to the other stretches of rests, g, (k,)."""
     errors, used = residual.copy(), rests[kept]
     count = len(used.mean)
-    stretches = min(stretches, count)
-    stretch = np.arange(count) * stretches // count
-    for number in range(stretches):
+    stretch = np.arange(count) * _STRETCHES // count
+    for number in np.unique(stretch):
         others = stretch != number
         # Of nine rests the other eight determine no fit.
         without = parameters if others.sum() < len(NAMES) else _solve(

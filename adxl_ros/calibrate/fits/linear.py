@@ -67,11 +67,7 @@ def fit(sensor: Sensor, poses: Poses, may_be_open: bool = False) -> Sensor:
 
 def _fit_line(reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray, used: np.ndarray,
               nominal: np.ndarray, is_open: bool) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Fit zero-g and scale factor to the poses used; values, (2,), and covariance, (2, 2).
-
-    Where they may stay open, they have a wide prior about the nominal ones.
-    """
+    """Fit zero-g and scale factor to the poses used; values, (2,), and covariance, (2, 2)."""
     design = np.column_stack([np.ones(len(volts)), reference_g])
     departure = volts - design @ nominal
     line = np.zeros(2) if is_open else np.linalg.lstsq(design[used], departure[used],

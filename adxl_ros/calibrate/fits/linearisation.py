@@ -178,10 +178,9 @@ def shared_settings(poses: Poses) -> tuple[np.ndarray, int]:
     return numbers, count
 
 
-def volts_covariance(unit: Sensor, poses: Poses, error: StageError,
-                     kept: np.ndarray | None = None) -> PoseCovariance:
-    """Return the covariance of the volts about the model; `kept`: poses that count, or all."""
-    return PoseCovariance(angle_jacobian(unit, poses), poses, shared_settings(poses), error, kept)
+def volts_covariance(unit: Sensor, poses: Poses, error: StageError) -> PoseCovariance:
+    """Return the covariance of the volts of poses about the model."""
+    return PoseCovariance(angle_jacobian(unit, poses), poses, shared_settings(poses), error)
 
 
 _MIN_TOTAL_RAD = 1e-7
@@ -365,7 +364,9 @@ def candidate_poses(std_v: np.ndarray) -> Poses:
     """Return a grid over the sphere with a noise, (m,); each pose sets both joints anew."""
     alpha, beta = np.meshgrid(np.arange(round(np.pi / GRID_RAD) + 1) * GRID_RAD,
                               np.arange(round(2 * np.pi / GRID_RAD)) * GRID_RAD)
-    return Poses.without_volts(alpha.ravel(), beta.ravel(), std_v, np.arange(alpha.size))
+    settings = np.arange(alpha.size)
+    return replace(Poses.without_volts(alpha.ravel(), beta.ravel(), std_v),
+                   alpha_setting=settings, beta_setting=settings)
 
 
 def whitened_jacobian(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],

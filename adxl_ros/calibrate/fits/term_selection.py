@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from adxl_ros.calibrate.fits import full_model
-from adxl_ros.calibrate.fits.linear import AFFINE
 from adxl_ros.calibrate.fits.linearisation import Linearised, linearised
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model.constants import Z_90
@@ -26,9 +25,8 @@ from adxl_ros.report.quantities import with_half_width
 import numpy as np
 import scipy
 
-ALWAYS = ('bias', 'scale_factor')
-"""Terms that every fit has and that are not compared."""
-_MAX_OPEN = 3
+ALWAYS = ('bias', 'scale_factor')  # Terms that every fit has and that are not compared
+MAX_OPEN = 3
 """Largest number of the twelve coefficients that their priors may give. Chosen: an axis that never
 points up or down leaves its scale factor and two misalignments open."""
 _MIN_CHANGE = {'temperature_c': 0.5, 'supply_v': 0.02}
@@ -67,15 +65,6 @@ def fit(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> Sensor:
     return fit_selected(sensor, poses, effects)[0].fitted
 
 
-def fit_affine(sensor: Sensor, poses: Poses, max_open: int = _MAX_OPEN) -> full_model.FullFit:
-    """
-    Fit zero-g, scale factor and misalignment alone, for poses that do not determine more.
-
-    max_open: number of coefficients that the poses may leave to their priors.
-    """
-    return full_model.fit_full(sensor, poses, AFFINE, max_open)
-
-
 def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
                  ) -> tuple[full_model.FullFit, list[Term]]:
     """Fit the full model and effects as `fit_full` does, and add terms that the poses support."""
@@ -97,11 +86,7 @@ def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
 
 
 def compare_terms(full: full_model.FullFit) -> list[Term]:
-    """
-    Compare the fit with models that have one term less or one term more.
-
-    All are linearised at the fit, where the chain is linear to far below the noise.
-    """
+    """Compare the fit, linearised there, with models that have one term less or one term more."""
     about, term = _linearised(full, ())
     log_likelihood = -about.deviance(full.stage) / 2
     compared = []
@@ -173,12 +158,7 @@ def report_lines(full: full_model.FullFit, poses: Poses, terms: Sequence[Term]) 
 
 
 def _weakest_direction(fitted: Sensor) -> str:
-    """
-    Name the direction of the coefficients that the poses determine least.
-
-    The condition number is the square root of the ratio of the extreme eigenvalues of the
-    covariance, with each coefficient in units of its typical size.
-    """
+    """Name the direction that the poses determine least, in typical sizes, and the condition."""
     names = fitted.covariance_names
     scale = np.array([parameter_of(name).scale for name in names])
     values, vectors = np.linalg.eigh(fitted.covariance / np.outer(scale, scale))

@@ -299,8 +299,7 @@ def expected_error_mg(fit: ThermalFit, covered: Passed, calibrated_c: float) -> 
     return 1e3 * float(np.hypot(fit.error_g(covered.middles_c, calibrated_c), unseen_g).max())
 
 
-BLOCK_S = 10.0
-"""Length of a block, s. Chosen: short beside the lag of a thermometer."""
+BLOCK_S = 10.0  # Length of a block, s. Chosen: short beside the lag of a thermometer
 _FEWEST_SAMPLES = 10
 """Fewest samples of a block. Chosen: their scatter shows whether the sensor rests."""
 _MOST_BLOCKS = 2000  # Largest number of blocks. Chosen: a fit of less than a second

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from enum import auto, Enum
-from typing import NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, TypeAlias
 
 from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
 from adxl_ros.calibrate.guided.guide import NewestSamples, NextPose, STALE_NS
@@ -15,12 +15,12 @@ from adxl_ros.calibrate.guided.session import Session, SessionSettings
 from adxl_ros.calibrate.guided.stage_guide import MountingError
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import StreamInfo, unit_of
+from adxl_ros.files.sweep_journal import differences
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import recorded_sensor
 import numpy as np
 
-IDLE_TEXT = 'idle; call ~/start'
-"""Status of a controller that has not been started."""
+IDLE_TEXT = 'idle; call ~/start'  # Status of a controller that has not been started
 
 
 class ControllerState(Enum):
@@ -32,20 +32,7 @@ class ControllerState(Enum):
     RUNNING = auto()
 
 
-class Resume(Enum):
-    """What to do with an interrupted calibration."""
-
-    ASK = 'ask'  # The operator if somebody is at a screen; else resume it
-    CONTINUE = 'continue'
-    ANEW = 'anew'  # Put its journal aside and begin a new calibration
-
-
-class Severity(Enum):
-    """Severity of a log line."""
-
-    INFO = auto()
-    WARNING = auto()
-    ERROR = auto()
+Severity: TypeAlias = Literal['INFO', 'WARNING', 'ERROR']
 
 
 class Answer(NamedTuple):
@@ -56,14 +43,6 @@ class Answer(NamedTuple):
 
 
 _NOT_RUNNING = Answer(False, 'no calibration is running')
-
-
-class Report(NamedTuple):
-    """What the diagnostics report."""
-
-    status: Status  # What the calibration waits for
-    serial: str  # Serial number of the sensor; '' while it is unknown
-    values: dict[str, str | float]  # Further values by key
 
 
 class Outputs(Protocol):
@@ -102,31 +81,8 @@ class SampleSource(Protocol):
     def waiting(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the waiting samples: stamps, ns, (n,), and specific force, m/s², (n, 3)."""
 
-    def clear(self) -> None:
-        """Forget the waiting samples."""
-
-    def keep_newest(self) -> None:
-        """Forget the oldest of the waiting samples."""
-
-
-class _Log:
-    """The log of a controller, which does not repeat itself."""
-
-    def __init__(self, outputs: Outputs) -> None:
-        self._outputs = outputs
-        self.last = self._last_warning = ''  # The newest line
-
-    def line(self, severity: Severity, text: str) -> None:
-        """Log a line unless it was the last one."""
-        if text != self.last:
-            self._outputs.log(severity, text)
-        self.last = text
-
-    def warn_once(self, key: str, text: str) -> None:
-        """Log a warning once for a key, although its times change."""
-        if key != self._last_warning and text != self.last:
-            self._outputs.log(Severity.WARNING, text)
-        self._last_warning = key
+    def keep_newest(self, count: int = ...) -> None:
+        """Forget all waiting samples but the newest."""
 
 
 class StreamSensor:
@@ -158,37 +114,36 @@ class StreamSensor:
             return None
         return unit
 
-    def watch(self, log: _Log, outputs: Outputs, shows: bool, waits: bool) -> None:
-        """Look at the samples while no calibration runs, if that is shown or waited for."""
+    def watch(self, shows: bool, waits: bool) -> tuple[Severity, str] | None:
+        """Look at the samples of no calibration, if shown or waited for; return a line to log."""
         if self.unit is None and (waits or shows):
             # A driver that has just begun states its sensor on another topic.
             self._samples.keep_newest()
-            if not self.fault:
-                self._measure(log, outputs)
-        elif self.unit is not None and self.newest is not None and shows:
+            return None if self.fault else self._measure()
+        if self.unit is not None and self.newest is not None and shows:
             self.newest.feed(*self._samples.take(self.unit))
         else:
-            self._samples.clear()
+            self._samples.keep_newest(0)
+        return None
 
-    def _measure(self, log: _Log, outputs: Outputs) -> None:
+    def _measure(self) -> tuple[Severity, str] | None:
         """Measure the sensor of a stream that states nothing of itself."""
         stamps_ns, accel_mps2 = self._samples.waiting()
         if not len(stamps_ns) or np.ptp(stamps_ns) < recorded_sensor.SHORTEST_S * 1e9:
-            return
+            return None
         try:
             unit, lines = recorded_sensor.unit_of_stream(self._anonymous, stamps_ns, accel_mps2)
         except UserError as error:
-            log.line(Severity.WARNING, f'imu/data_raw: {error}')
-            self._samples.clear()
-            return
-        outputs.log(Severity.INFO, f'no sensor_info: measured from the stream: {"; ".join(lines)}')
+            self._samples.keep_newest(0)
+            return 'WARNING', f'imu/data_raw: {error}'
         self.take(unit)
+        return 'INFO', f'no sensor_info: measured from the stream: {"; ".join(lines)}'
 
 
 class Controller:
     """Runs guided calibrations, one after the other."""
 
-    def __init__(self, settings: SessionSettings, sensor: Sensor, resume: Resume,
+    def __init__(self, settings: SessionSettings, sensor: Sensor, resume: str,
                  samples: SampleSource, outputs: Outputs, anonymous: Sensor | None = None
                  ) -> None:
         self.settings = settings
@@ -200,9 +155,11 @@ class Controller:
         self.outcome: tuple[str, ...] = ()  # Lines on the calibration that ended last
         self.may_ask = False  # Whether somebody is at a screen who can be asked
         self.shows_idle_stream = False  # Whether a screen shows samples without a calibration
-        self._sensor, self._resume = sensor, resume
-        self._samples, self._outputs, self._log = samples, outputs, _Log(outputs)
-        self._starts_over: bool | None = None
+        # Whether to put an interrupted calibration aside; None asks an operator at a screen
+        self._by_default = {'ask': None, 'continue': False, 'anew': True}[resume]
+        self._starts_over = self._by_default
+        self._sensor, self._samples, self._outputs = sensor, samples, outputs
+        self._last = self._warned = ''  # The newest line, and the newest obstacle
         self._accepted = 0
 
     def start(self, start_over: bool | None = None) -> Answer:
@@ -211,13 +168,13 @@ class Controller:
             return Answer(False, 'a calibration is running; finish or abort it first')
         if self.state is not ControllerState.ASKING or start_over is not None:
             self.state, self.question = ControllerState.WAITING_FOR_SENSOR, ''
-            self._starts_over = start_over
+            self._starts_over = self._by_default if start_over is None else start_over
             self._try_to_start()
         if self.state is ControllerState.ASKING:
             return Answer(False, self.question)
         if self.state is ControllerState.WAITING_FOR_SENSOR:
             return Answer(True, 'starts when sensor_info comes, or samples show the sensor')
-        return Answer(self.session is not None, self._log.last)
+        return Answer(self.session is not None, self._last)
 
     def capture(self) -> Answer:
         """Take the pose that the operator has reached; the end of the dwell answers later."""
@@ -232,7 +189,7 @@ class Controller:
         self._take_samples(self.session)
         obstacle = guide.capture()
         if obstacle:
-            self._log.line(Severity.WARNING, obstacle)
+            self._say('WARNING', obstacle)
         return Answer(not obstacle, obstacle or 'averaging')
 
     def change_pose(self, request: str) -> Answer:
@@ -240,7 +197,7 @@ class Controller:
         if self.session is None:
             return _NOT_RUNNING
         try:
-            text = getattr(self.session.guide, request)(self.session.append)
+            text = getattr(self.session.guide, request)(self.session.journal.append)
         except UserError as error:
             return Answer(False, f'{error}')
         if not text:
@@ -248,23 +205,49 @@ class Controller:
             return Answer(False, f'no pose to {what}')
         self.fit_fault = ''
         self._outputs.answer_captures(Answer(False, text))
-        self._log.line(Severity.INFO, text)
+        self._say('INFO', text)
         return Answer(True, text)
 
     def finish(self) -> Answer:
         """Fit the poses so far and write the files."""
-        if self.session is None:
+        session = self.session
+        if session is None:
             return _NOT_RUNNING
-        self._take_samples(self.session)
-        return Answer(self._fit(self.session), self._log.last)
+        self._take_samples(session)
+        self._say('INFO', f'fitting {session.accepted_count} poses')
+        self._outputs.show_fit(self._last)
+        self.fit_fault = ''
+        try:
+            result = session.finish()
+            self._outputs.log('INFO', result.keep(self.settings.store))
+            try:
+                session.write_report(result)
+            except (UserError, OSError) as error:
+                self._say('ERROR', f'no report: {error}')
+            session.end()
+        except (UserError, OSError) as error:
+            # The poses stay: further poses, or room on the disk, can still lead to a fit.
+            text = f'cannot finish: {error}'
+            if session.guide.next_pose() is None:
+                self.fit_fault = text = f'{text}; finish again, redo or abort'
+            self._say('ERROR', text)
+            return Answer(False, text)
+        for line in result.comments():
+            self._outputs.log('INFO', line)
+        self.outcome = (result.summary[0].strip(), *result.summary[1:], *result.warnings)
+        self._outputs.log('INFO', self.outcome[0])
+        open_poses = session.guide.open_poses
+        advice = f'; {open_poses} poses are open: start again to go on' if open_poses else ''
+        self._stop('INFO', f'wrote {self.settings.output}{advice}')
+        return Answer(True, self._last)
 
     def abort(self) -> Answer:
         """End without a fit; the poses stay in the journal."""
         if self.state is ControllerState.IDLE:
             return _NOT_RUNNING
         kept = f'; its poses stay in {self.session.journal.path}' if self.session else ''
-        self._stop(Severity.INFO, f'aborted{kept}')
-        return Answer(True, self._log.last)
+        self._stop('INFO', f'aborted{kept}')
+        return Answer(True, self._last)
 
     def read_sensor_info(self, info: StreamInfo) -> None:
         """Take what the stream states about its sensor; a running session needs the same one."""
@@ -273,17 +256,14 @@ class Controller:
             unit = self.stream.stated(info)
         except UserError as error:
             if session is not None:
-                self._stop(Severity.ERROR, f'{error}; the poses are kept')
-            self._log.line(Severity.ERROR, f'{error}')
+                self._stop('ERROR', f'{error}; the poses are kept')
+            self._say('ERROR', f'{error}')
             return
         if unit is None:
             return
         if session is not None:
-            old, new = self.settings.head(session.unit), self.settings.head(unit)
-            changes = ', '.join(f'{key} was {old[key]}, is {new[key]}' for key in old
-                                if old[key] != new[key])
-            if changes:
-                self._stop(Severity.ERROR, f'sensor_info: {changes}: changed during the '
+            if changes := differences(self.settings.head(session.unit), self.settings.head(unit)):
+                self._stop('ERROR', f'sensor_info: {changes}: changed during the '
                            'calibration; put it back and start again, the poses are kept')
             else:
                 # The driver has started again, and may have been touched.
@@ -306,28 +286,29 @@ class Controller:
             self._try_to_start()
         session = self.session
         if session is None:
-            self.stream.watch(self._log, self._outputs, self.shows_idle_stream,
-                              self.state is not ControllerState.IDLE)
+            if line := self.stream.watch(self.shows_idle_stream,
+                                         self.state is not ControllerState.IDLE):
+                self._say(*line)
             return
         self._take_samples(session)
         try:
             for text in session.take_poses():
-                self._log.line(Severity.INFO, text)
+                self._say('INFO', text)
                 self._outputs.answer_captures(Answer(True, text))
         except MountingError as error:
-            self._stop(Severity.ERROR, f'{error}')
+            self._stop('ERROR', f'{error}')
             return
         except UserError as error:
-            self._log.line(Severity.ERROR, f'{error}')
+            self._say('ERROR', f'{error}')
             self._outputs.answer_captures(Answer(False, f'{error}'))
         if refusal := session.guide.new_refusal():
-            self._log.line(Severity.WARNING, refusal)
+            self._say('WARNING', refusal)
             self._outputs.answer_captures(Answer(False, refusal))
         pose = session.guide.next_pose()
         if pose is not None:
             self._outputs.announce(pose)
         elif not self.fit_fault:
-            self._fit(session)
+            self.finish()
 
     def status(self) -> Status:
         """Return what the calibration waits for."""
@@ -343,15 +324,15 @@ class Controller:
             return Status(Phase.INFO, f'waiting for sensor_info; {obstacle}', True)
         if self.session is None:
             idle = f'{IDLE_TEXT}; {stream.outlook}' if stream.outlook else IDLE_TEXT
-            return Status(Phase.IDLE, self._log.last or idle, False)
+            return Status(Phase.IDLE, self._last or idle, False)
         if silence := self._samples.silence():
             return Status(Phase.SILENT, silence, True)
         if fault := self.session.fault or self.fit_fault:
             return Status(Phase.REFUSED, fault, True)
         return self.session.guide.status()
 
-    def report(self) -> Report:
-        """Return what the diagnostics report; log an obstacle once for each pose and phase."""
+    def report(self) -> tuple[Status, str, dict[str, str | float]]:
+        """Return status, serial number and values by key; log an obstacle once for each pose."""
         status, unit, session = self.status(), self.stream.unit, self.session
         values: dict[str, str | float] = {
             'accepted': str(self._accepted), 'output': str(self.settings.output),
@@ -365,9 +346,12 @@ class Controller:
             if np.isfinite(tilt_rad):
                 values['tilt_error_deg'] = float(np.degrees(tilt_rad))
         if status.late:
-            poses = '' if session is None else session.accepted_count
-            self._log.warn_once(f'{status.phase.value} {poses}', status.text)
-        return Report(status, unit.serial if unit else '', values)
+            # The times in its text change.
+            obstacle = f'{status.phase.value} {session.accepted_count if session else ""}'
+            if obstacle != self._warned and status.text != self._last:
+                self._outputs.log('WARNING', status.text)
+            self._warned = obstacle
+        return status, unit.serial if unit else '', values
 
     def _try_to_start(self) -> None:
         """Begin a session if the sensor is known and the operator has nothing to answer."""
@@ -375,16 +359,15 @@ class Controller:
         if unit is None:
             return
         try:
-            if self.may_ask and self._resume is Resume.ASK and self._starts_over is None:
+            if self.may_ask and self._starts_over is None:
                 self.question = self.settings.question(unit)
             if self.question:
                 self.state = ControllerState.ASKING
                 return
-            starts_over = self._resume is Resume.ANEW if self._starts_over is None else \
-                self._starts_over
-            self.session = session = Session(unit, self.settings, starts_over, self._sensor)
+            self.session = session = Session(unit, self.settings, bool(self._starts_over),
+                                             self._sensor)
         except UserError as error:
-            self._stop(Severity.ERROR, f'{error}')
+            self._stop('ERROR', f'{error}')
             return
         self.state, self.outcome = ControllerState.RUNNING, ()
         self._samples.restart_silence()
@@ -394,43 +377,13 @@ class Controller:
             if session.guide.to_verify else ''
         resumed = f', resumed after {session.resumed} poses{check}; resume:=anew puts them aside' \
             if session.resumed else ''
-        self._log.line(Severity.INFO, f'calibrating {unit.serial}: {task}{resumed}')
+        self._say('INFO', f'calibrating {unit.serial}: {task}{resumed}')
 
     def _take_samples(self, session: Session) -> None:
         """Give the session the samples that have come, and log what is wrong with them."""
         stamps_ns, volts = self._samples.take(self.stream.unit or session.unit)
         if fault := session.feed(stamps_ns, volts, self._samples.fault):
-            self._log.line(Severity.ERROR, fault)
-
-    def _fit(self, session: Session) -> bool:
-        """Fit and write all files; return whether that succeeded."""
-        self._log.line(Severity.INFO, f'fitting {session.accepted_count} poses')
-        self._outputs.show_fit(self._log.last)
-        self.fit_fault = ''
-        try:
-            result = session.finish()
-            self._outputs.log(Severity.INFO, result.keep(self.settings.store))
-            try:
-                session.write_report(result)
-            except (UserError, OSError) as error:
-                self._log.line(Severity.ERROR, f'no report: {error}')
-            session.end()
-        except (UserError, OSError) as error:
-            # The poses stay: further poses, or room on the disk, can still lead to a fit.
-            text = f'cannot finish: {error}'
-            if session.guide.next_pose() is None:
-                text = f'{text}; finish again, redo or abort'
-                self.fit_fault = text
-            self._log.line(Severity.ERROR, text)
-            return False
-        for line in result.comments():
-            self._outputs.log(Severity.INFO, line)
-        self.outcome = (result.summary[0].strip(), *result.summary[1:], *result.warnings)
-        self._outputs.log(Severity.INFO, self.outcome[0])
-        open_poses = session.guide.open_poses
-        advice = f'; {open_poses} poses are open: start again to go on' if open_poses else ''
-        self._stop(Severity.INFO, f'wrote {self.settings.output}{advice}')
-        return True
+            self._say('ERROR', fault)
 
     def _stop(self, severity: Severity, text: str) -> None:
         """End the session, or the wait for one, with a line for people."""
@@ -441,4 +394,10 @@ class Controller:
         self.question = self.fit_fault = ''
         self._outputs.answer_captures(Answer(False, text))
         self._outputs.withdraw_pose(text)
-        self._log.line(severity, text)
+        self._say(severity, text)
+
+    def _say(self, severity: Severity, text: str) -> None:
+        """Log a line unless it was the last one."""
+        if text != self._last:
+            self._outputs.log(severity, text)
+        self._last = text

@@ -11,10 +11,9 @@ from dataclasses import replace
 import math
 from typing import NamedTuple
 
-from adxl_ros.calibrate.guided.screen_contents import AxisReading, LiveReading, RestReading
+from adxl_ros.calibrate.guided.screen_contents import Row
 from adxl_ros.files.recording_columns import stamped_rate_hz
 from adxl_ros.files.sweep_journal import JournalEntry, PoseDropped, PoseRecord
-from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.report.quantities import duration
 from adxl_ros.signals.rest_detection import (
@@ -70,21 +69,20 @@ class NewestSamples:
             return math.nan
         return stamped_rate_hz((self.stamps_ns - self.stamps_ns[0]) * 1e-9)
 
-    def reading(self, stillness: Stillness | None) -> LiveReading | None:
-        """Return what the sensor reads at present, for the screen; None without samples."""
+    def rows(self, stillness: Stillness | None) -> list[Row]:
+        """Return what the sensor reads at present, for the screen."""
         if not len(self.volts):
-            return None
-        unit, rate_hz = self._sensor, self.rate_hz()
-        shown = to_nominal_mps2(self.volts[-self._count(_SHOWN_S):], unit)
-        axes = tuple(map(AxisReading, unit.axes, shown.mean(axis=0).tolist(),
-                         shown.std(axis=0).tolist()))
-        rest = None
+            return []
+        shown = to_nominal_mps2(self.volts[-self._count(_SHOWN_S):], self._sensor)
+        axes = '  '.join(f'{axis} {mean:+.3f} ± {rms:.3f}' for axis, mean, rms in zip(
+            self._sensor.axes, shown.mean(axis=0), shown.std(axis=0)))
+        rate = f'  {self.rate_hz():.0f} Hz' if math.isfinite(self.rate_hz()) else ''
+        rows = [Row('reads', f'{axes} m/s²{rate}')]
         if stillness is not None:
-            scale = G0_MPS2 / float(unit.nominal_scale_v_per_g[stillness.axis])
-            rest = RestReading(bool(stillness.at_rest), unit.axes[stillness.axis],
-                               stillness.statistic, float(stillness.value) * scale,
-                               float(stillness.limit) * scale)
-        return LiveReading(axes, rate_hz if math.isfinite(rate_hz) else None, rest)
+            share = stillness.value / stillness.limit if stillness.limit else 1.0
+            rows.append(Row('rest', stillness.describe_mps2(self._sensor), share,
+                            'green' if stillness.at_rest else 'yellow'))
+        return rows
 
     def _count(self, seconds: float) -> int:
         return max(round(seconds * self._sensor.rate_hz), _FEWEST_SAMPLES)
@@ -121,17 +119,15 @@ class Dwell:
                                   learn=False)
         self._stamps: list[np.ndarray] = []
         self._volts: list[np.ndarray] = []
-        self._count = 0
 
     def __len__(self) -> int:
-        return self._count
+        return sum(map(len, self._stamps))
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """Take samples."""
         new = stamps_ns >= self.arrived_ns
         self._stamps.append(stamps_ns[new])
         self._volts.append(volts[new])
-        self._count += int(new.sum())
         # From the arrival: float64 seconds since 1970 resolve only 0.2 µs.
         self._finder.feed((stamps_ns[new] - self.arrived_ns) * 1e-9, volts[new])
 
@@ -156,25 +152,18 @@ class Dwell:
         """Return the samples of a rest, V, (n, m)."""
         return np.concatenate(self._volts)[rest.start:rest.stop]
 
-    def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return all samples: their stamps, ns, (n,), and volts, (n, m)."""
-        return np.concatenate(self._stamps), np.concatenate(self._volts)
-
-    def after(self, stop_ns: int) -> Dwell | None:
-        """Return the dwell that begins with the first sample after a stamp, ns, if any."""
-        stamps_ns, volts = self.samples()
-        later = stamps_ns > stop_ns
-        if not later.any():
-            return None
-        dwell = Dwell(self._sensor, int(stamps_ns[later][0]))
-        dwell.feed(stamps_ns[later], volts[later])
+    def after(self, stop_ns: int) -> Dwell:
+        """Return a dwell with the samples after a stamp, ns."""
+        dwell = Dwell(self._sensor, stop_ns + 1)
+        dwell.feed(np.concatenate(self._stamps), np.concatenate(self._volts))
         return dwell
 
     def record(self, pose: int, rest: Rest, samples: int) -> PoseRecord:
         """Average the first samples of a rest."""
-        (stamps, volts), start, stop = self.samples(), rest.start, rest.start + samples
+        stamps, start, stop = np.concatenate(self._stamps), rest.start, rest.start + samples
         times = (stamps - self.arrived_ns) * 1e-9
-        mean, std = rest_means(times, volts, [Rest(start, stop, times[start], times[stop - 1])],
+        mean, std = rest_means(times, np.concatenate(self._volts),
+                               [Rest(start, stop, times[start], times[stop - 1])],
                                self._sensor.rate_hz, datasheet_noise(self._sensor))
         return PoseRecord(pose=pose, start_ns=int(stamps[start]), stop_ns=int(stamps[stop - 1]),
                           samples=samples, mean_v=tuple(mean[0].tolist()),
@@ -229,6 +218,18 @@ class EncoderTrack:
         return f'nothing on stage/joint_states for {silent_s:.0f} s' if silent_s > SILENT_S else ''
 
 
+_RATE_ERROR = 0.05
+"""Largest relative error of the sample rate; chosen: above the error of any oscillator."""
+
+
+def rate_fault(measured_hz: float, unit: Sensor) -> str:
+    """Refuse samples whose rate is not that of the unit."""
+    if not abs(measured_hz / unit.rate_hz - 1) > _RATE_ERROR:
+        return ''
+    return (f'samples are {measured_hz:.4g} a second by their stamps, but rate_hz is '
+            f'{unit.rate_hz:.4g}; correct the rate of the driver')
+
+
 class NextPose(NamedTuple):
     """The pose to go to, as it is announced."""
 
@@ -239,12 +240,7 @@ class NextPose(NamedTuple):
 
 
 class Guide:
-    """
-    What all guides share: the accepted poses, and what was refused.
-
-    By itself it is the guide of a sensor that no stage carries. No pose is known before it is
-    taken, so that none is open, and none can be taken again to check the mounting.
-    """
+    """What all guides share; by itself one without a plan: no pose is open or repeated."""
 
     moves_itself = False  # Whether a stage turns itself, so that nobody captures
 
@@ -253,6 +249,7 @@ class Guide:
         self.accepted = {record.pose: record for record in accepted}  # By number
         self.to_verify: list[PoseRecord] = []  # Poses to take again, to check the mounting
         self.readings = {'temperature': Readings(), 'supply': Readings()}  # °C and V
+        self.newest = NewestSamples(sensor)
         self.newest_ns: int | None = None  # Stamp of the newest sample, ns
         self.refusal = self._new_refusal = ''  # Why the newest pose was refused; '' if not
 
@@ -270,6 +267,27 @@ class Guide:
     def previous(self) -> int | None:
         """Return the number of the previous pose, from 0; None where there is none."""
         return max(self.accepted, default=None)
+
+    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> str:
+        """Take samples, ns, (n,), and V, (n, m); return why they are of no use, or ''."""
+        if not len(stamps_ns):
+            return ''
+        self.newest.feed(stamps_ns, volts)
+        if fault := rate_fault(self.newest.rate_hz(), self.sensor):
+            return fault
+        if went_back(self.newest_ns, stamps_ns[0]):
+            self.begin_stream(((self.newest_ns or 0) - int(stamps_ns[0])) * 1e-9)
+        self.newest_ns = int(stamps_ns[-1])
+        self.take_samples(stamps_ns, volts)
+        return ''
+
+    def begin_stream(self, back_s: float) -> None:
+        """Begin again, as the stamps went back by a time."""
+        raise NotImplementedError
+
+    def take_samples(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
+        """Take samples whose stamps go on."""
+        raise NotImplementedError
 
     def redo(self, append: Callable[[JournalEntry], None]) -> str:
         """Forget the previous pose, in the journal first; return a line for people, or ''."""
@@ -292,9 +310,9 @@ class Guide:
         """Return further values for programs, by key."""
         return {}
 
-    def stillness(self, newest: NewestSamples) -> Stillness | None:
+    def stillness(self) -> Stillness | None:
         """Return whether the newest samples are at rest; None while they are too few."""
-        return newest.stillness()
+        return self.newest.stillness()
 
     def refuse(self, reason: str) -> None:
         """Refuse a pose; a new reason is kept for `new_refusal`."""
@@ -307,18 +325,24 @@ class Guide:
         text, self._new_refusal = self._new_refusal, ''
         return text
 
-    def with_ambient(self, record: PoseRecord) -> PoseRecord:
-        """Add temperature and supply to a record."""
-        temperature_c, supply_v = (readings.mean(record.start_ns, record.stop_ns)
-                                   for readings in self.readings.values())
-        return replace(record, temperature_c=temperature_c, supply_v=supply_v)
+    def tilt_error_rad(self) -> float:
+        """Return the expected rms error of alpha and beta, rad; NaN where none shows."""
+        return math.nan
 
-    def temperature_fault(self, now_c: float, span_c: float) -> str:
-        """Refuse a pose whose temperature differs from that of the first pose."""
-        first_c = next((record.temperature_c for _, record in sorted(self.accepted.items())
-                        if math.isfinite(record.temperature_c)), math.nan)
-        if not abs(now_c - first_c) > span_c:
-            return ''
-        return (f'temperature moved {abs(now_c - first_c):.1f} °C since the first pose '
-                f'({first_c:.1f} to {now_c:.1f} °C), must stay within {span_c:g} °C; wait until '
-                'it is back, or finish with the poses so far')
+
+def with_ambient(record: PoseRecord, readings: Mapping[str, Readings]) -> PoseRecord:
+    """Add temperature and supply to a record."""
+    temperature_c, supply_v = (quantity.mean(record.start_ns, record.stop_ns)
+                               for quantity in readings.values())
+    return replace(record, temperature_c=temperature_c, supply_v=supply_v)
+
+
+def temperature_fault(accepted: Mapping[int, PoseRecord], now_c: float, span_c: float) -> str:
+    """Refuse a pose whose temperature differs from that of the first pose."""
+    first_c = next((record.temperature_c for _, record in sorted(accepted.items())
+                    if math.isfinite(record.temperature_c)), math.nan)
+    if not abs(now_c - first_c) > span_c:
+        return ''
+    return (f'temperature moved {abs(now_c - first_c):.1f} °C since the first pose '
+            f'({first_c:.1f} to {now_c:.1f} °C), must stay within {span_c:g} °C; wait until '
+            'it is back, or finish with the poses so far')

@@ -1,30 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The pose plan, and checks of one pose.
-
-A check returns one line with the value that is wrong and what to do, or '' if all is well.
-"""
+"""The pose plan, and checks of a pose: one line on what is wrong and what to do, or empty."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
-from adxl_ros.calibrate.guided.screen_contents import Coverage
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-ORDER = 3
-"""Version of the order of `guided`; an interrupted sweep resumes only in the same order."""
+ORDER = 3  # Version of the order of `guided`; an interrupted sweep resumes only in the same order
 KINDS = ('full', 'quick')
 """Kinds of plans: planes as in the paper, or the fewest poses that reach a tilt error."""
-STEP_RAD = float(np.radians(30.0))
-"""Step of beta, rad, as in the paper."""
-MOVE_S = 5.0
-"""Time of a move with settling, s; chosen: it is used until poses show the real time."""
+STEP_RAD = float(np.radians(30.0))  # Step of beta, rad, as in the paper
+MOVE_S = 5.0  # Time of a move with settling, s; chosen: it is used until poses show the real time
 _FLAT = 0.2
 """Lower bound of |sin α| of the planes that show beta well, as in equation (15) of the paper."""
 _ROUNDING = 1e-6  # Largest rounding error of the sine of a multiple of a quarter turn
@@ -136,7 +128,7 @@ def spread(count: int) -> list[Target]:
             for alpha_rad, beta_rad in zip(alpha.tolist(), beta.tolist())]
 
 
-def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> tuple[Coverage, ...]:
+def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> str:
     """Count the poses of a plan by plane and by direction of travel, and the check poses."""
     alpha_rad, beta_rad, check = np.array([(t.alpha_rad, t.beta_rad, t.check) for t in targets]).T
     planes, grid, turn = np.round(np.degrees(alpha_rad)), check == 0, np.diff(beta_rad, prepend=0)
@@ -145,12 +137,10 @@ def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> tuple[Cove
     groups |= {'beta forth': grid & (turn > 0), 'beta back': grid & (turn < 0),
                'check poses': ~grid}
     taken = np.isin(np.arange(len(targets)), list(accepted))
-    return tuple(Coverage(name, int((taken & group).sum()), int(group.sum()))
-                 for name, group in groups.items() if group.any())
+    return ', '.join(f'{name} {(taken & group).sum()}/{group.sum()}'
+                     for name, group in groups.items() if group.any())
 
 
-_RATE_ERROR = 0.05
-"""Largest relative error of the sample rate; chosen: above the error of any oscillator."""
 _CHANGE_G = 0.003
 """Largest change of a repeated pose beyond noise and stage error, g; chosen: a turn of 0.17°."""
 _NOISE_STDS = 3.0  # Stds of the noise in the limit of a change; chosen: exceeded once in 400
@@ -185,14 +175,6 @@ def saturation_fault(sensor: Sensor, volts: np.ndarray) -> str:
     return (f'saturated: {sensor.axes[axis]} reads {signed_text(reading_g)} g '
             f'({reading_v:.3f} V), beyond its range of ±{sensor.range_g:g} g or at a rail of the '
             'ADC; check supply and wiring')
-
-
-def rate_fault(measured_hz: float, unit: Sensor) -> str:
-    """Refuse samples whose rate is not that of the unit."""
-    if not abs(measured_hz / unit.rate_hz - 1) > _RATE_ERROR:
-        return ''
-    return (f'samples are {measured_hz:.4g} a second by their stamps, but rate_hz is '
-            f'{unit.rate_hz:.4g}; correct the rate of the driver')
 
 
 def signed_text(value: float) -> str:

@@ -13,15 +13,14 @@ from adxl_ros.calibrate.fits import gravity_fit, thermal_fit
 from adxl_ros.calibrate.fits.gravity_fit import force_g, MIN_RESTS, NAMES, nominal_rests
 from adxl_ros.calibrate.fits.thermal_fit import PARTS
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
-from adxl_ros.calibrate.guided.guide import Dwell, Guide, NewestSamples, NextPose, went_back
-from adxl_ros.calibrate.guided.screen_contents import (
-    CoefficientRow,
-    Coverage,
-    Estimate,
-    Phase,
-    Progress,
-    Status,
+from adxl_ros.calibrate.guided.guide import (
+    Dwell,
+    Guide,
+    NextPose,
+    temperature_fault,
+    with_ambient,
 )
+from adxl_ros.calibrate.guided.screen_contents import Phase, Row, Status, tilt_row
 from adxl_ros.calibrate.poses import at_a_rail, Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
@@ -29,8 +28,7 @@ from adxl_ros.model.sensor import parameter_of, Sensor
 from adxl_ros.signals.rest_detection import datasheet_noise, RestFinder, Stillness
 import numpy as np
 
-ENOUGH_RESTS = 24
-"""Rests that are recommended; chosen: nearly all of the 26 orientations."""
+ENOUGH_RESTS = 24  # Rests that are recommended; chosen: nearly all of the 26 orientations
 _ENDED_NS = 1_000_000_000  # A rest is announced when the stream has gone on for longer after it
 _SEARCH_PERIOD_NS = 500_000_000
 """Shortest time between two searches for rests, ns: each one looks at the whole stream."""
@@ -50,33 +48,28 @@ class HandRests(Guide):
     runs: `poses_to_fit` finds those of the complete stream once more, as `fit` does.
     """
 
+    next_up: int | None  # Orientation to ask for
+
     def __init__(self, sensor: Sensor, temperature_span_c: float,
                  accepted: Sequence[PoseRecord] = ()) -> None:
         super().__init__(sensor, accepted)
         self._span_c = temperature_span_c
         self._skipped = np.zeros(len(gravity_fit.UP), bool)
-        self._begin_stream()
+        self.begin_stream()
         self._update_estimate()
 
-    def _begin_stream(self) -> None:
+    def begin_stream(self, back_s: float = 0.0) -> None:
         """Begin a stream: the rests so far belong to another one."""
         self._resumed = list(self.accepted.values())
         self._stamps: list[np.ndarray] = []
-        self._newest = NewestSamples(self.sensor)
         self._announced_ns = self._next_search_ns = 0
         self._dropped: list[PoseRecord] = []
         self._finder = RestFinder(
             self.sensor.rate_hz, len(self.sensor.axes), datasheet_noise(self.sensor), learn=True)
 
-    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
-        """Take samples: their stamps, ns, (n,), and volts, (n, m)."""
-        if not len(stamps_ns):
-            return
-        if went_back(self.newest_ns, stamps_ns[0]):
-            self._begin_stream()
-        self.newest_ns = int(stamps_ns[-1])
+    def take_samples(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
+        """Give samples to the search for rests."""
         self._stamps.append(stamps_ns)
-        self._newest.feed(stamps_ns, volts)
         # Since the first stamp: seconds since 1970 would resolve only 0.2 µs.
         self._finder.feed((stamps_ns - self._stamps[0][0]) * 1e-9, volts)
 
@@ -112,7 +105,7 @@ class HandRests(Guide):
             return 'there is no direction left to skip'
         self._skipped[self.next_up] = True
         skipped = gravity_fit.points_up(self.next_up)
-        self._choose_next_up()
+        self.next_up = gravity_fit.next_up(~self.covered & ~self._skipped, self.up())
         return f'the direction in which {skipped} is left out'
 
     def forget(self, number: int) -> str:
@@ -134,15 +127,15 @@ class HandRests(Guide):
         return [*self._resumed, *(replace(record, pose=number)
                                   for number, record in enumerate(kept, first))]
 
-    def stillness(self, newest: NewestSamples) -> Stillness | None:
+    def stillness(self) -> Stillness | None:
         """Return whether the newest samples are at rest, by the noise that the stream shows."""
         return self._finder.stillness()
 
     def up(self) -> np.ndarray | None:
         """Return the direction that points up at present, (3,); None without samples."""
-        if not len(self._newest.volts):
+        if not len(self.newest.volts):
             return None
-        mean_v = self._newest.volts[-_UP_SAMPLES:].mean(axis=0, keepdims=True)
+        mean_v = self.newest.volts[-_UP_SAMPLES:].mean(axis=0, keepdims=True)
         rests = nominal_rests(mean_v, 0 * mean_v, self.sensor)
         force = force_g(rests.mean, self._parameters)[0]
         return force / max(float(np.linalg.norm(force)), _MIN_FORCE_G)
@@ -167,17 +160,13 @@ class HandRests(Guide):
                               covariance=covariance, covariance_names=NAMES)
         force = force_g(rests.mean, self._parameters)
         self.covered = gravity_fit.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
-        self._choose_next_up()
-
-    def _choose_next_up(self) -> None:
-        """Choose the orientation to ask for."""
         self.next_up = gravity_fit.next_up(~self.covered & ~self._skipped, self.up())
 
     def _fault(self, record: PoseRecord) -> str:
         """Return why a rest is refused, or ''."""
         if at_a_rail(self.sensor, Poses.from_records([record])).any():
             return 'saturated: the ADC is at its rail in this rest; check supply and wiring'
-        return self.temperature_fault(record.temperature_c, self._span_c)
+        return temperature_fault(self.accepted, record.temperature_c, self._span_c)
 
     def _records(self, number: int) -> Iterator[PoseRecord]:
         """Give a record of each rest of the stream, each with the same number."""
@@ -188,9 +177,9 @@ class HandRests(Guide):
         for rest in self._finder.rests():
             mean_v, std_v = self._finder.means([rest])
             span = int(stamps_ns[rest.start]), int(stamps_ns[rest.stop - 1])
-            yield self.with_ambient(PoseRecord(
+            yield with_ambient(PoseRecord(
                 pose=number, start_ns=span[0], stop_ns=span[1], samples=rest.stop - rest.start,
-                mean_v=tuple(mean_v[0].tolist()), std_v=tuple(std_v[0].tolist())))
+                mean_v=tuple(mean_v[0].tolist()), std_v=tuple(std_v[0].tolist())), self.readings)
 
 
 class HandGuide(HandRests):
@@ -221,23 +210,23 @@ class HandGuide(HandRests):
         return Status(phase, f'{rests}; {stillness.describe_mps2(self.sensor)}; '
                       f'{self.destination()}', False)
 
-    def progress(self) -> Progress:
-        """Return the progress of the calibration, for the screen."""
-        up = self.up()
-        position = '' if up is None else \
-            f'{gravity_fit.points_up(int(np.argmax(gravity_fit.UP @ up)))} now'
-        return Progress(
-            number=self.pose_number, destination=self.destination(), position=position,
-            accepted=len(self.accepted), total=ENOUGH_RESTS)
+    def progress(self) -> list[Row]:
+        """Return direction, readings and progress, for the screen."""
+        up, count = self.up(), len(self.accepted)
+        now = [] if up is None else [Row('now', gravity_fit.points_up(
+            int(np.argmax(gravity_fit.UP @ up))) + ' now')]
+        return [Row('pose', f'{self.pose_number}: {self.destination()}'), *now,
+                *self.newest.rows(self.stillness()),
+                Row('poses', f'{count} done, {max(ENOUGH_RESTS - count, 0)} left for a good fit',
+                    count / ENOUGH_RESTS)]
 
-    def estimate_contents(self) -> Estimate:
-        """Return what the rests determine so far, for the screen."""
-        groups = [np.flatnonzero(count == gravity_fit.AXES_UP) for count in (1, 2, 3)]
-        return Estimate(
-            coverage=tuple(Coverage(f'{name} up', int(self.covered[group].sum()), len(group))
-                           for name, group in zip(('faces', 'edges', 'corners'), groups)),
-            coefficients=self.rows,
-            tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()))
+    def estimated(self) -> tuple[list[Row], list[Row]]:
+        """Return coverage and error, and the coefficients by the rests so far, for the screen."""
+        groups = {name: self.covered[axes == gravity_fit.AXES_UP] for name, axes in (
+            ('faces', 1), ('edges', 2), ('corners', 3))}
+        return [Row('coverage', ', '.join(f'{name} up {group.sum()}/{len(group)}'
+                                          for name, group in groups.items())),
+                tilt_row(self.tilt_error_rad())], self.rows
 
     def tilt_error_rad(self) -> float:
         """Return the expected rms error of alpha and beta by the rests so far, rad."""
@@ -268,13 +257,13 @@ class ThermalGuide(Guide):
         self._dwell: Dwell | None = None
         self._update()
 
-    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
-        """Take samples: their stamps, ns, (n,), and volts, (n, m)."""
-        if not len(stamps_ns):
-            return
-        if self._dwell is None or went_back(self.newest_ns, int(stamps_ns[0])):
-            self._dwell = Dwell(self.sensor, int(stamps_ns[0]))
-        self.newest_ns = int(stamps_ns[-1])
+    def begin_stream(self, back_s: float) -> None:
+        """Begin the block again."""
+        self._dwell = None
+
+    def take_samples(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
+        """Add samples to the block."""
+        self._dwell = self._dwell or Dwell(self.sensor, int(stamps_ns[0]))
         self._dwell.feed(stamps_ns, volts)
 
     def accept(self) -> PoseRecord | None:
@@ -288,8 +277,8 @@ class ThermalGuide(Guide):
             if len(dwell) > _PATIENCE * samples:
                 self._dwell = None
             return None
-        record = self.with_ambient(
-            dwell.record(max(self.accepted, default=-1) + 1, rest, samples))
+        record = with_ambient(
+            dwell.record(max(self.accepted, default=-1) + 1, rest, samples), self.readings)
         self.refuse('no temperature: nothing on the topic temperature; publish the reading of a '
                     'thermometer at the sensor' if not math.isfinite(record.temperature_c) else
                     pose_plan.saturation_fault(self.sensor, dwell.volts(rest)[:samples]))
@@ -358,19 +347,20 @@ class ThermalGuide(Guide):
             text += 'the sensor moves; '
         return Status(Phase.DWELL if at_rest else Phase.REST, text + self.destination(), False)
 
-    def progress(self) -> Progress:
-        """Return the progress of the calibration, for the screen."""
-        direction = 'warming' if self._passed.rises else 'cooling'
-        position = f'{self._blocks_c[-1]:.1f} °C, {direction}' if self.accepted else ''
-        done = int(self._passed.warming.sum() + self._passed.cooling.sum())
-        return Progress(
-            number=self.pose_number, destination=self.destination(), position=position,
-            accepted=done, total=2 * PARTS)
+    def progress(self) -> list[Row]:
+        """Return temperature, readings and progress, for the screen."""
+        passed = self._passed
+        now = [Row('now', f'{self._blocks_c[-1]:.1f} °C, '
+                   f'{"warming" if passed.rises else "cooling"}')] if self.accepted else []
+        done = int(passed.warming.sum() + passed.cooling.sum())
+        return [Row('pose', f'{self.pose_number}: {self.destination()}'), *now,
+                *self.newest.rows(self.stillness()),
+                Row('parts', f'{done} done, {2 * PARTS - done} left for a good fit',
+                    done / (2 * PARTS))]
 
-    def estimate_contents(self) -> Estimate:
-        """Return what the blocks determine so far, for the screen."""
-        fit, (low_c, high_c) = self._fit, self._settings.range_c
-        rows: tuple[CoefficientRow, ...] = ()
+    def estimated(self) -> tuple[list[Row], list[Row]]:
+        """Return coverage and error, and the coefficients by the blocks so far, for the screen."""
+        fit, (low_c, high_c), rows = self._fit, self._settings.range_c, []
         if fit is not None:
             prior = [thermal_fit.PRIOR_WIDTH * parameter_of(name).scale for name in fit.names]
             rows = running_estimate.coefficient_rows(
@@ -378,14 +368,8 @@ class ThermalGuide(Guide):
         error = f'not known yet over {low_c:g} to {high_c:g} °C' if self._error_mg is None else \
             (f'zero-g {self._error_mg:.2g} mg expected over {low_c:g} to {high_c:g} °C, after '
              f'{self._blocks_c.min():.1f} to {self._blocks_c.max():.1f} °C')
-        return Estimate(
-            coverage=(Coverage('warming', int(self._passed.warming.sum()), PARTS),
-                      Coverage('cooling', int(self._passed.cooling.sum()), PARTS)),
-            coefficients=rows, range_error=error)
-
-    def tilt_error_rad(self) -> float:
-        """Return NaN: blocks in one orientation do not determine the tilt."""
-        return math.nan
+        return [Row('coverage', f'warming {self._passed.warming.sum()}/{PARTS}, '
+                    f'cooling {self._passed.cooling.sum()}/{PARTS}'), Row('error', error)], rows
 
     def _update(self) -> None:
         """Bring coverage, fit and expected error up to date."""

@@ -12,7 +12,7 @@ from adxl_ros.calibrate.fits import full_model, linearisation
 from adxl_ros.calibrate.fits.linearisation import linearised, StageError
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.guided.pose_plan import signed_text, Target
-from adxl_ros.calibrate.guided.screen_contents import CoefficientRow
+from adxl_ros.calibrate.guided.screen_contents import Row
 from adxl_ros.calibrate.poses import coefficient_jacobian, Poses, predicted_volts
 from adxl_ros.calibrate.report import held_out
 from adxl_ros.files.sweep_journal import PoseRecord
@@ -77,18 +77,15 @@ class RunningEstimate:
         return replace(self, covariance=np.linalg.inv(
             np.linalg.inv(self.covariance) + information))
 
-    def sensor(self) -> Sensor:
-        """Return the unit with the covariance of its coefficients, without those of the stage."""
-        of_unit = [i for i, name in enumerate(self.names)
-                   if not full_model.belongs_to_stage(name)]
-        return replace(self.unit, covariance=self.covariance[np.ix_(of_unit, of_unit)],
-                       covariance_names=tuple(self.names[i] for i in of_unit))
-
     def tilt_error_rad(self) -> float:
         """Return the expected rms error of alpha and beta over the sphere, rad."""
-        return tilt_error_rad(self.sensor(), self.pose_std_v)
+        of_unit = [i for i, name in enumerate(self.names)
+                   if not full_model.belongs_to_stage(name)]
+        unit = replace(self.unit, covariance=self.covariance[np.ix_(of_unit, of_unit)],
+                       covariance_names=tuple(self.names[i] for i in of_unit))
+        return tilt_error_rad(unit, self.pose_std_v)
 
-    def rows(self) -> tuple[CoefficientRow, ...]:
+    def rows(self) -> list[Row]:
         """Return the coefficients for the screen."""
         std = np.sqrt(np.diag(self.covariance))
         return coefficient_rows(self.names, get(self.unit, self.names), std, self.prior)
@@ -139,27 +136,18 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
     return min(math.sqrt(variance), np.pi / 2)
 
 
-def degrees_or_none(angle_rad: float) -> float | None:
-    """Return an angle in degrees; None for NaN."""
-    return float(np.degrees(angle_rad)) if np.isfinite(angle_rad) else None
-
-
 def coefficient_rows(names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray,
-                     prior: np.ndarray) -> tuple[CoefficientRow, ...]:
-    """Lay out coefficients for the screen, one row for each parameter of the unit."""
+                     prior: np.ndarray) -> list[Row]:
+    """Lay out the parameters of the unit: how far the prior has shrunk, and 90 % intervals."""
     places: dict[Coefficient, list[int]] = {}
     for i, name in enumerate(names):
         if not full_model.belongs_to_stage(name):
             places.setdefault(name.without_axis, []).append(i)
-    rows = []
-    for name, place in places.items():
-        unit = parameter_of(names[place[0]]).unit
-        rows.append(CoefficientRow(
-            f'{name}, {unit}' if unit else str(name),
-            tuple(f'{names[i].axis or names[i].parameter} '
-                  + with_half_width(values[i], Z_90 * std[i]).replace('+-', '±') for i in place),
-            float(np.min(1 - np.clip(std[place] / prior[place], 0, 1)))))
-    return tuple(rows)
+    return [Row(str(name), ' '.join(
+        f'{names[i].axis or names[i].parameter} '
+        + with_half_width(values[i], Z_90 * std[i]).replace(' +- ', '±') for i in place),
+        float(np.min(1 - np.clip(std[place] / prior[place], 0, 1))))
+        for name, place in places.items()]
 
 
 _SPARE_READINGS = 40

@@ -7,7 +7,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from enum import Enum
 import json
-from typing import Any, get_args, get_type_hints
+import math
 
 
 class StageMode(Enum):
@@ -70,77 +70,21 @@ class Status:
 
 
 @dataclass(frozen=True)
-class AxisReading:
-    """What one axis reads at present."""
+class Row:
+    """A line of the screen."""
 
-    axis: str
-    mean_mps2: float  # Of the newest samples
-    rms_mps2: float  # About the mean
-
-
-@dataclass(frozen=True)
-class RestReading:
-    """Whether the sensor is at rest."""
-
-    at_rest: bool  # Whether both quantities of all axes are within their limits
-    axis: str  # The one that moves most
-    quantity: str  # 'rms' or 'drift'
-    value_mps2: float  # The quantity on that axis
-    limit_mps2: float
+    label: str
+    text: str
+    share: float | None = None  # Of a bar before the text that is full; None without a bar
+    style: str = ''  # Of prompt_toolkit
 
 
-@dataclass(frozen=True)
-class LiveReading:
-    """What the sensor reads at present."""
-
-    axes: tuple[AxisReading, ...]
-    rate_hz: float | None  # By the stamps; None while the samples are too few
-    rest: RestReading | None  # None while the samples are too few
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Progress of a calibration."""
-
-    number: int  # Number of the next pose, from 1
-    destination: str  # The pose to reach, for people
-    position: str  # Where the sensor is at present, for people; '' where it is unknown
-    accepted: int  # Number of accepted poses
-    total: int
-    skipped: int = 0
-    open_poses: int = 0  # That a fit would miss now; 0 where the number of poses is not fixed
-    remaining_s: float | None = None  # For the open poses; None where their number is not fixed
-    dwelt_s: float | None = None  # Time at rest in the pose so far; None without a fixed dwell
-    dwell_s: float | None = None  # The required time
-
-
-@dataclass(frozen=True)
-class Coverage:
-    """How many poses of one group are taken."""
-
-    group: str
-    accepted: int
-    total: int
-
-
-@dataclass(frozen=True)
-class CoefficientRow:
-    """One parameter of an effect, as the poses determine it so far."""
-
-    name: str  # With its unit
-    intervals: tuple[str, ...]  # Value and half of the 90 % interval of each axis
-    determined: float  # Share of the datasheet's standard deviation that is gone, worst axis
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What the poses determine so far."""
-
-    coverage: tuple[Coverage, ...]
-    coefficients: tuple[CoefficientRow, ...]
-    tilt_error_deg: float | None = None  # Expected rms; None where no pose shows both angles
-    final_tilt_error_deg: float | None = None  # After all poses, if their number is fixed
-    range_error: str = ''  # Expected error over a range of temperature, if that is calibrated
+def tilt_row(now_rad: float, final_rad: float = math.nan) -> Row:
+    """Return the expected rms tilt error now, and after all poses if their number is fixed."""
+    if not math.isfinite(now_rad):
+        return Row('tilt error', 'one axis does not show the vertical')
+    final = f', {math.degrees(final_rad):.2g}° after all poses' if math.isfinite(final_rad) else ''
+    return Row('tilt error', f'{math.degrees(now_rad):.2g}° expected now{final}', style='bold')
 
 
 @dataclass(frozen=True)
@@ -161,9 +105,9 @@ class ScreenContents:
     unit: str = ''  # Serial number and axes of the sensor; '' before they are known
     output: str = ''  # The parameter file that is to be written
     keys: tuple[KeyAction, ...] = ()  # Keys that have an action now
-    live: LiveReading | None = None  # None without samples
-    progress: Progress | None = None  # Of the running calibration, if one runs
-    estimate: Estimate | None = None
+    rows: tuple[Row, ...] = ()  # What the sensor reads, and the progress
+    coefficients: tuple[Row, ...] = ()  # As the poses determine them so far
+    open_poses: int = 0  # That a fit would miss now; 0 where the number of poses is not fixed
     outcome: tuple[str, ...] = ()  # Lines on the calibration that has ended
 
     def to_json(self) -> str:
@@ -172,20 +116,8 @@ class ScreenContents:
 
     @staticmethod
     def from_json(text: str) -> ScreenContents:
-        """Return the contents of a text."""
-        try:
-            contents: ScreenContents = _restored(ScreenContents, dict(json.loads(text)))
-        except (LookupError, TypeError, ValueError) as error:
-            raise ValueError(f'no contents of a screen: {error}') from None
-        return contents
-
-
-def _restored(kind: Any, value: Any) -> Any:
-    """Return a value of JSON as the type that its field states."""
-    if isinstance(value, list):
-        return tuple(_restored(get_args(kind)[0], part) for part in value)
-    if not isinstance(value, dict):
-        return value
-    kind = next(iter(get_args(kind)), kind)  # Of `Kind | None`
-    kinds = get_type_hints(kind)
-    return kind(**{name: _restored(kinds[name], part) for name, part in value.items()})
+        """Return the contents of a text of this version; of others LookupError or TypeError."""
+        values = json.loads(text)
+        for name, kind in (('keys', KeyAction), ('rows', Row), ('coefficients', Row)):
+            values[name] = tuple(kind(**each) for each in values[name])
+        return ScreenContents(**{**values, 'outcome': tuple(values['outcome'])})

@@ -12,16 +12,15 @@ from typing import Any
 
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
-from adxl_ros.calibrate.guided.guide import NewestSamples
 from adxl_ros.calibrate.guided.rest_guides import HandGuide, ThermalGuide, ThermalSettings
-from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Estimate, StageMode
+from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Row, StageMode
 from adxl_ros.calibrate.guided.stage_guide import StageGuide
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import page
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.atomic_write import remove_unfinished
-from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord
+from adxl_ros.files.sweep_journal import MountingUnchecked, PoseRecord
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, with_axes
 import numpy as np
@@ -136,7 +135,6 @@ class Session:
             self._base = replace(with_axes(base, unit.axes), serial=unit.serial,
                                  rate_hz=unit.rate_hz)
         self.unit, self.settings = unit, settings
-        self.newest = NewestSamples(unit)  # The newest samples
         self.fault = ''  # What is wrong with the samples, or ''
         # The accepted poses on disk
         self.journal = sweep_journal.Journal(settings.journal, settings.head(unit), start_over)
@@ -148,9 +146,8 @@ class Session:
         if settings.store:
             remove_unfinished(calibration_store.unit_folder(settings.store, unit.serial), '')
         self._fitted: list[PoseRecord] = []
-        self._estimate: tuple[list[int], Estimate] | None = None
+        self._estimated: tuple[list[int], tuple[list[Row], list[Row]]] | None = None
         entries = self.journal.entries
-        self._is_mounting_unchecked = any(isinstance(e, MountingUnchecked) for e in entries)
         accepted = sweep_journal.accepted_poses(entries)
         self.resumed = len(accepted)  # Number of the poses of an interrupted calibration
         self.stage: StageGuide | None = None
@@ -168,20 +165,11 @@ class Session:
         """Return the number of accepted poses."""
         return len(self.guide.accepted)
 
-    def append(self, entry: JournalEntry) -> None:
-        """Write an entry into the journal."""
-        self.journal.append(entry)
-        self._is_mounting_unchecked |= isinstance(entry, MountingUnchecked)
-
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray, fault: str = '') -> str:
         """Take samples, (n,) and (n, m), and what is wrong with them; return a new fault."""
         if not len(stamps_ns) and not fault:
             return ''
-        if not fault:
-            self.newest.feed(stamps_ns, volts)
-            fault = pose_plan.rate_fault(self.newest.rate_hz(), self.unit)
-        if not fault:
-            self.guide.feed(stamps_ns, volts)
+        fault = fault or self.guide.feed(stamps_ns, volts)
         before, self.fault = self.fault, fault
         return '' if before else fault
 
@@ -200,12 +188,13 @@ class Session:
         if unverified > len(self.guide.to_verify):
             yield 'the sensor is mounted as it was'
 
-    def estimate(self) -> Estimate:
-        """Return what the poses determine so far; it is computed once for each pose."""
+    def rows(self) -> tuple[list[Row], list[Row]]:
+        """Return rows and coefficients for the screen; estimated once for each pose."""
         key = [record.stop_ns for record in self.guide.accepted.values()]
-        if self._estimate is None or key != self._estimate[0]:
-            self._estimate = key, self.guide.estimate_contents()
-        return self._estimate[1]
+        if self._estimated is None or key != self._estimated[0]:
+            self._estimated = key, self.guide.estimated()
+        rows, coefficients = self._estimated[1]
+        return [*self.guide.progress(), *rows], coefficients
 
     def finish(self) -> calibration.CalibrationResult:
         """Fit the poses so far and write the parameter file; `end` follows all other files."""
@@ -220,7 +209,8 @@ class Session:
             self._base, poses, source, range_c=self.settings.thermal.range_c) \
             if self.settings.mode == 'thermal' else calibration.calibrate(
                 self.unit, [calibration.RecordedPoses(source, poses)])
-        if self._is_mounting_unchecked:
+        entries = sweep_journal.read(self.journal.path).entries
+        if any(isinstance(entry, MountingUnchecked) for entry in entries):
             provenance = {**result.fitted.provenance,
                           'mounting': 'not checked after an interruption'}
             result = replace(result, fitted=replace(result.fitted, provenance=provenance))

@@ -7,10 +7,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
-from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate, screen_contents
-from adxl_ros.calibrate.guided.guide import Dwell, EncoderTrack, Guide, NextPose
+from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate
+from adxl_ros.calibrate.guided.guide import Dwell, EncoderTrack, Guide, NextPose, temperature_fault
 from adxl_ros.calibrate.guided.pose_plan import Course, MOVE_S, Target
-from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode, Status
+from adxl_ros.calibrate.guided.screen_contents import (
+    CaptureSettings,
+    Phase,
+    Row,
+    StageMode,
+    Status,
+    tilt_row,
+)
 from adxl_ros.calibrate.poses import angle_tolerance_rad, SettingTracker
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord, PoseSkipped
@@ -21,8 +28,7 @@ import numpy as np
 _LONGEST_DWELL_S = 60.0
 """Time beyond two dwells after which a moving sensor's samples are dropped, s; chosen: it bounds
 the memory and the time of the rest detection."""
-_FEWEST_INTERVALS = 3
-"""Poses of this session whose times predict those of the open ones; chosen: a median of two."""
+_FEWEST_INTERVALS = 2  # Times between poses whose median predicts those of the open ones; chosen
 
 
 class MountingError(UserError):
@@ -30,11 +36,7 @@ class MountingError(UserError):
 
 
 class StageSweep(Guide):
-    """
-    Takes the poses of a plan on a stage that turns itself, or that an operator turns.
-
-    After arrival or capture a full dwell at rest is averaged; motion begins the dwell again.
-    """
+    """Takes the poses of a plan: after arrival or capture a full dwell at rest is averaged."""
 
     def __init__(self, sensor: Sensor, targets: Sequence[Target], settings: CaptureSettings,
                  accepted: Sequence[PoseRecord] = (), skipped: Iterable[int] = ()) -> None:
@@ -44,7 +46,6 @@ class StageSweep(Guide):
         self.uses_encoder = settings.stage_mode is not StageMode.MANUAL
         self.course = Course(targets, self.accepted, skipped)
         self.encoder = EncoderTrack()
-        self._resumed = len(self.accepted)
         self.tracker = SettingTracker(angle_tolerance_rad(sensor), accepted)
         self.estimate = running_estimate.from_records(sensor, self.poses_to_fit(),
                                                       settings.dwell_s)
@@ -60,8 +61,7 @@ class StageSweep(Guide):
     def go(self, index: int) -> None:
         """Begin the attempt to take a pose, given by its number from 0."""
         self.course.index = index
-        self.has_arrived = False
-        self.dwell = Dwell(self.sensor, self.encoder.newest_ns or 0)  # Samples since the arrival
+        self.dwell: Dwell | None = None  # Samples since the arrival; None before it
         self.since_ns = self.newest_ns  # Newest stamp when the attempt began, ns
         self.refusal = ''
         target = self.course.target
@@ -69,10 +69,9 @@ class StageSweep(Guide):
         if target is not None and self.settings.stage_mode is not StageMode.ENCODER:
             self.tracker.command(self.newest_ns or 0, target.alpha_rad, target.beta_rad)
 
-    def restart_dwell(self, has_arrived: bool) -> None:
+    def restart_dwell(self) -> None:
         """Average from the next sample on."""
         self.dwell = Dwell(self.sensor, (self.newest_ns or 0) + 1)
-        self.has_arrived = has_arrived
 
     def verify(self) -> None:
         """Take the newest pose again before others, to check the mounting."""
@@ -92,7 +91,7 @@ class StageSweep(Guide):
             if fault:
                 return f'{fault}; turn the stage there and capture again'
         self.refusal = ''
-        self.restart_dwell(True)
+        self.restart_dwell()
         return ''
 
     def skip(self, append: Callable[[JournalEntry], None]) -> str:
@@ -134,65 +133,61 @@ class StageSweep(Guide):
             return
         distance_rad = max(abs(alpha_rad - target.alpha_rad), abs(beta_rad - target.beta_rad))
         if distance_rad > self.settings.tolerance_rad:
-            self.has_arrived = False
-        elif not self.has_arrived:
-            self.dwell, self.has_arrived = Dwell(self.sensor, stamp_ns), True
+            self.dwell = None
+        elif self.dwell is None:
+            self.dwell = Dwell(self.sensor, stamp_ns)
 
     def read_command(self, alpha_rad: float, beta_rad: float) -> None:
         """Take a command that somebody gave the stage; in other modes the targets are these."""
         if self.settings.stage_mode is StageMode.ENCODER:
             self.tracker.command(self.newest_ns or 0, alpha_rad, beta_rad)
 
-    def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
-        """Take samples: their stamps, ns, (n,), and volts, (n, m)."""
-        if not len(stamps_ns):
-            return
-        if guide.went_back(self.newest_ns, stamps_ns[0]):
-            back_s = ((self.newest_ns or 0) - int(stamps_ns[0])) * 1e-9
-            self._new_refusal = f'imu/data_raw went back in time by {back_s:.0f} s: the pose ' \
-                'begins again'
-            self.verify()
-            self.tracker.lose_track()
-            self.encoder.offsets_s.clear()
-            self.since_ns, self.dwell, self.has_arrived = None, Dwell(self.sensor, 0), False
-        self.newest_ns = int(stamps_ns[-1])
+    def begin_stream(self, back_s: float) -> None:
+        """Begin the pose again; the stage may have moved, and the sensor, too."""
+        self._new_refusal = f'imu/data_raw went back in time by {back_s:.0f} s: the pose begins ' \
+            'again'
+        self.verify()
+        self.tracker.lose_track()
+        self.encoder.offsets_s.clear()
+        self.since_ns = self.dwell = None
+
+    def take_samples(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
+        """Add samples to the dwell of a stage that has arrived."""
         if self.since_ns is None:
             self.since_ns = int(stamps_ns[0])
-        if self.has_arrived:
+        if self.dwell is not None:
             self.dwell.feed(stamps_ns, volts)
 
     def accept(self) -> PoseRecord | None:
         """Return the pose for the journal when a full dwell at rest is complete, else None."""
-        target, settings = self.course.target, self.settings
+        target, settings, dwell = self.course.target, self.settings, self.dwell
         samples = round(settings.dwell_s * self.sensor.rate_hz)
-        if target is None or not self.has_arrived or len(self.dwell) < samples or (
+        if target is None or dwell is None or len(dwell) < samples or (
                 self.uses_encoder and self.encoder.clock_fault()):
             return None
-        rest = self.dwell.full_rest(samples)
+        rest = dwell.full_rest(samples)
         if rest is None:
-            age_s = len(self.dwell) / self.sensor.rate_hz
-            if age_s > _LONGEST_DWELL_S + 2 * settings.dwell_s and not self.dwell.at_rest():
-                self.restart_dwell(True)
+            age_s = len(dwell) / self.sensor.rate_hz
+            if age_s > _LONGEST_DWELL_S + 2 * settings.dwell_s and not dwell.at_rest():
+                self.restart_dwell()
             return None
-        record = self.dwell.record(self.course.index, rest, samples)
+        record = dwell.record(self.course.index, rest, samples)
         if self.uses_encoder and (self.encoder.newest_ns or 0) < record.stop_ns:
             silence = self.encoder.silence(self.newest_ns or 0)
             if silence and settings.stage_mode is StageMode.ENCODER:
                 self.refuse(f'{silence}; capture again when it is back')
             return None
         span = record.start_ns, record.stop_ns
-        angles_rad = target.alpha_rad, target.beta_rad
+        alpha_rad, beta_rad = target.alpha_rad, target.beta_rad
         if self.uses_encoder:
             readings_rad = self.tracker.between(*span)
             alpha_rad, beta_rad = readings_rad.mean(axis=0).tolist() if len(readings_rad) else \
-                self.encoder.angles_rad or angles_rad
-            angles_rad = alpha_rad, beta_rad
-        settings_of_joints = self.tracker.settings(*span, *angles_rad)
-        record = replace(
-            self.with_ambient(record), alpha_rad=angles_rad[0], beta_rad=angles_rad[1],
-            check=target.check, alpha_setting=settings_of_joints[0],
-            beta_setting=settings_of_joints[1])
-        if refusal := _fault(self, record, rest):
+                self.encoder.angles_rad or (alpha_rad, beta_rad)
+        alpha, beta = self.tracker.settings(*span, alpha_rad, beta_rad)
+        record = replace(guide.with_ambient(record, self.readings),
+                         alpha_rad=alpha_rad, beta_rad=beta_rad, check=target.check,
+                         alpha_setting=alpha, beta_setting=beta)
+        if refusal := _fault(self, record, dwell, rest):
             self.refuse(refusal)
         elif self.to_verify:
             _verify_mounting(self, record)
@@ -212,10 +207,12 @@ class StageSweep(Guide):
     def refuse(self, reason: str) -> None:
         """Report a refusal once. A commanded stage averages again, an operator captures again."""
         super().refuse(reason)
-        self.restart_dwell(self.moves_itself)
+        self.restart_dwell()
+        if not self.moves_itself:
+            self.dwell = None
 
 
-def _fault(sweep: StageSweep, record: PoseRecord, rest: Rest) -> str:
+def _fault(sweep: StageSweep, record: PoseRecord, dwell: Dwell, rest: Rest) -> str:
     """Return why a pose is refused, or ''."""
     settings, fault = sweep.settings, ''
     if settings.stage_mode is StageMode.ENCODER:
@@ -224,12 +221,12 @@ def _fault(sweep: StageSweep, record: PoseRecord, rest: Rest) -> str:
             sweep.course.targets[record.pose], *now_rad, settings.near_rad)
     elif settings.stage_mode is StageMode.MANUAL:
         # Without an encoder the first rest shows where the operator captured.
-        first_v = sweep.dwell.volts(sweep.dwell.rests()[0]).mean(axis=0)
+        first_v = dwell.volts(dwell.rests()[0]).mean(axis=0)
         fault = pose_plan.turn_fault(sweep.sensor, np.array(record.mean_v) - first_v,
                                      settings.near_rad)
     fault = fault or pose_plan.saturation_fault(
-        sweep.sensor, sweep.dwell.volts(rest)) or sweep.temperature_fault(
-            record.temperature_c, settings.temperature_span_c)
+        sweep.sensor, dwell.volts(rest)) or temperature_fault(
+            sweep.accepted, record.temperature_c, settings.temperature_span_c)
     if fault or sweep.to_verify:
         return fault
     return sweep.estimate.reading_fault(Target(record.alpha_rad, record.beta_rad),
@@ -290,12 +287,11 @@ class StageGuide(StageSweep):
             'pose': str(self.pose_number), 'poses': str(count),
             'stage_mode': self.settings.stage_mode.value, 'alpha_rad': target.alpha_rad,
             'beta_rad': target.beta_rad, 'check': 'true' if target.check else 'false'}
-        number = f'pose {self.pose_number} of {count}'
+        task, command_rad = f'turn the stage to {self.destination()}, then capture', None
         if self.moves_itself:
-            return NextPose(f'{number}: {self.destination()}', values,
-                            (target.alpha_rad, target.beta_rad), self.newest_ns or 0)
-        return NextPose(f'{number}: turn the stage to {self.destination()}, then capture', values,
-                        None)
+            task, command_rad = self.destination(), (target.alpha_rad, target.beta_rad)
+        return NextPose(f'pose {self.pose_number} of {count}: {task}', values, command_rad,
+                        self.newest_ns or 0)
 
     def status(self) -> Status:
         """Return what the guide waits for, with the values that matter."""
@@ -306,13 +302,13 @@ class StageGuide(StageSweep):
         if self.uses_encoder and (fault := self.encoder.clock_fault()):
             return Status(Phase.STAGE, fault, True)
         silence = self.encoder.silence(self.newest_ns or 0) if self.uses_encoder else ''
-        if silence and (self.has_arrived or by_encoder):
+        if silence and (self.dwell is not None or by_encoder):
             return Status(Phase.STAGE, silence, waited_s > guide.SILENT_S)
         if self.refusal:
             return Status(Phase.REFUSED, self.refusal, True)
         late = waited_s > self.settings.timeout_s
         since, place = f' for {waited_s:.0f} s' if late else '', self.destination()
-        if self.has_arrived:
+        if self.dwell is not None:
             stillness = self.dwell.stillness()
             if stillness is not None and stillness.at_rest:
                 return Status(Phase.DWELL, f'at {place}: averaging', late)
@@ -326,34 +322,32 @@ class StageGuide(StageSweep):
         return Status(Phase.STAGE, f'the stage has not arrived at {place}{since}: {distance}',
                       late)
 
-    def progress(self) -> screen_contents.Progress:
-        """Return the progress of the sweep, for the screen."""
-        target, angles_rad, position = self.course.target, self.encoder.angles_rad, ''
+    def progress(self) -> list[Row]:
+        """Return pose, readings and progress of the sweep, for the screen."""
+        target, angles_rad, total = self.course.target, self.encoder.angles_rad, len(
+            self.course.targets)
+        rows = [Row('pose', f'{self.pose_number} of {total}: {self.destination()}')]
         if target is not None and angles_rad is not None:
-            position = ', '.join(
+            rows.append(Row('now', ', '.join(
                 f'{joint} {np.degrees(now):.2f}° ({np.degrees(now - wanted):+.2f}°)'
                 for joint, now, wanted in zip(('alpha', 'beta'), angles_rad,
-                                              (target.alpha_rad, target.beta_rad)))
-        rests = self.dwell.rests() if self.has_arrived else []
-        at_rest_s = (rests[-1].stop - rests[-1].start) / self.sensor.rate_hz if rests else 0.0
-        # The time of a pose is that of the poses of this session.
-        ends_ns = [record.stop_ns for record in list(self.accepted.values())[self._resumed:]]
-        pose_s = self.settings.dwell_s + MOVE_S if len(ends_ns) < _FEWEST_INTERVALS else \
-            float(np.median(np.abs(np.diff(ends_ns)))) * 1e-9
-        return screen_contents.Progress(
-            number=self.pose_number, destination=self.destination(), position=position,
-            accepted=len(self.accepted), total=len(self.course.targets),
-            skipped=len(self.course.skipped), open_poses=self.open_poses,
-            remaining_s=self.open_poses * pose_s, dwelt_s=min(at_rest_s, self.settings.dwell_s),
-            dwell_s=self.settings.dwell_s)
+                                              (target.alpha_rad, target.beta_rad)))))
+        rests = [] if self.dwell is None else self.dwell.rests()
+        samples, dwell_s = rests[-1].stop - rests[-1].start if rests else 0, self.settings.dwell_s
+        at_rest_s = min(samples / self.sensor.rate_hz, dwell_s)
+        intervals_ns = np.abs(np.diff([record.stop_ns for record in self.accepted.values()]))
+        pose_s = dwell_s + MOVE_S if len(intervals_ns) < _FEWEST_INTERVALS else \
+            float(np.median(intervals_ns)) * 1e-9
+        skipped = f'{len(self.course.skipped)} left out, ' if self.course.skipped else ''
+        return [*rows, *self.newest.rows(self.stillness()),
+                Row('dwell', f'{at_rest_s:.1f} of {dwell_s:g} s', at_rest_s / dwell_s),
+                Row('poses', f'{len(self.accepted)} done, {skipped}{self.open_poses} left, about '
+                    f'{self.open_poses * pose_s / 60:.0f} min', 1 - self.open_poses / total)]
 
-    def estimate_contents(self) -> screen_contents.Estimate:
-        """Return what the poses determine so far, for the screen."""
+    def estimated(self) -> tuple[list[Row], list[Row]]:
+        """Return coverage and error, and the coefficients by the poses so far, for the screen."""
         targets, closed = self.course.targets, self.course.closed
         final = self.estimate.with_poses([target for number, target in enumerate(targets)
                                           if number not in closed and not target.check])
-        return screen_contents.Estimate(
-            coverage=pose_plan.by_plane(targets, self.accepted),
-            coefficients=self.estimate.rows(),
-            tilt_error_deg=running_estimate.degrees_or_none(self.tilt_error_rad()),
-            final_tilt_error_deg=running_estimate.degrees_or_none(final.tilt_error_rad()))
+        return [Row('coverage', pose_plan.by_plane(targets, self.accepted)),
+                tilt_row(self.tilt_error_rad(), final.tilt_error_rad())], self.estimate.rows()

@@ -19,12 +19,9 @@ from adxl_ros.report.quantities import duration, with_half_width
 import numpy as np
 import scipy
 
-PASS = 'PASS'
-"""Outcome: the whole 90 % interval of the error is within the limit."""
-FAIL = 'FAIL'
-"""Outcome: the error exceeds the limit."""
-NOT_SHOWN = 'NOT SHOWN'
-"""Outcome: the error is within the limit, but its 90 % interval is not."""
+PASS = 'PASS'  # Outcome: the whole 90 % interval of the error is within the limit
+FAIL = 'FAIL'  # Outcome: the error exceeds the limit
+NOT_SHOWN = 'NOT SHOWN'  # Outcome: the error is within the limit, but its 90 % interval is not
 _UPPER_QUANTILE = 0.95  # Probability of the upper end of a 90 % interval
 _NONLINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
 """Parameter whose typical datasheet value limits the error of acceleration."""
@@ -41,11 +38,6 @@ class Assessment:
     accel_noise: str  # Against the noise of one sample
     tilt_datasheet: str = ''
     tilt_noise: str = ''
-
-    @property
-    def limited_by(self) -> str:
-        """Return the largest cause of the acceleration error, as `ErrorBudget.limited_by`."""
-        return self.accel.limited_by
 
     @property
     def error_mg(self) -> float:
@@ -126,11 +118,7 @@ def _two_digits(value: float) -> str:
 
 
 def unit_line(sensor: Sensor) -> list[str]:
-    """
-    Return a line that compares the unit with its datasheet; none without a datasheet.
-
-    It names the coefficients whose whole 90 % interval exceeds the datasheet's maximum.
-    """
+    """Name the coefficients whose whole 90 % interval exceeds the maximum of the datasheet."""
     if not sensor.datasheet:
         return []
     names = sensor.covariance_names
@@ -159,7 +147,7 @@ def summary_lines(fitted: Sensor, assessment: Assessment | None, errors: Sequenc
     lines = [*acceptance_lines(fitted), '', *errors]
     if assessment is not None:
         lines += ['', *limit_table(assessment, fitted),
-                  f' limited by               {LIMITS[assessment.limited_by]}']
+                  f' limited by               {LIMITS[assessment.accel.limited_by]}']
     return [*lines, *unit_line(fitted)]
 
 
@@ -243,16 +231,13 @@ def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutEr
                'verdict_datasheet': assessment.accel_datasheet,
                'verdict_noise': assessment.accel_noise,
                'verdict_tilt_datasheet': assessment.tilt_datasheet,
-               'verdict_tilt_noise': assessment.tilt_noise, 'limited_by': assessment.limited_by}
+               'verdict_tilt_noise': assessment.tilt_noise,
+               'limited_by': assessment.accel.limited_by}
     return {key: entry for key, entry in entries.items() if entry}
 
 
 def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
-    """
-    Return whether the calibration error is within its limit, and sentences on it.
-
-    The limit is that of the datasheet, or the noise of one sample where no datasheet states one.
-    """
+    """Compare the error with the datasheet, or with the noise where it states none."""
     provenance = fitted.provenance
     if 'own_accel_mg' not in provenance:
         return NOT_SHOWN, ['no pose was kept out of the fit to assess it']

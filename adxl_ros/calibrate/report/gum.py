@@ -31,8 +31,7 @@ from adxl_ros.report.quantities import number
 import numpy as np
 import yaml
 
-K = 2
-"""Coverage factor of an expanded uncertainty; about 95 % for a normal distribution."""
+K = 2  # Coverage factor of an expanded uncertainty; about 95 % for a normal distribution
 _EARTH_HALF_RANGE_MPS2 = 0.027
 """Half of the range of gravity at sea level, 9.780 to 9.832 m/s², about the standard gravity."""
 _LOCAL_STD_MPS2 = 5e-4
@@ -259,12 +258,10 @@ def read_laboratory(path: str | os.PathLike | None) -> dict[str, Any]:
         raise UserError(f'{path}: found {", ".join(map(str, given))}; expected a mapping with '
                         f'some of {", ".join(known)}')
     for name, value in given.items():
-        form = 'number such as 1.0e-5' if name in STATED else 'text'
+        form = 'number such as 1.0e-5' if name in STATED else _PATTERNS.get(name, 'text')
         is_right = isinstance(value, (int, float)) and 0 <= value < math.inf \
-            if name in STATED else isinstance(value, str) and value.strip()
-        if is_right and name in _PATTERNS:
-            form = _PATTERNS[name]
-            is_right = bool(re.fullmatch(form, value))
+            if name in STATED else isinstance(value, str) and \
+            re.fullmatch(_PATTERNS.get(name, r'\s*\S[\s\S]*'), value)
         if not is_right:
             raise UserError(f'{path}: {name}: {value!r} is no {form}')
     return {**_LABORATORY, **given}
@@ -273,13 +270,11 @@ def read_laboratory(path: str | os.PathLike | None) -> dict[str, Any]:
 def _quantity(name: str, values: Any, unit: str, std: Any = None, about: str = '',
               kind: str = '') -> dict[str, Any]:
     """Describe a quantity of one value, or of a list, with the expanded uncertainty of each."""
-    return {'name': name, 'about': about, 'kind': kind, 'unit': unit,
-            'numbers': _numbers(values), 'is_list': np.ndim(values) > 0,
-            'expanded': '' if std is None else _numbers(K * np.asarray(std))}
-
-
-def _numbers(values: Any) -> str:
-    return ' '.join(f'{value:.7g}' for value in np.ravel(values))
+    expanded: Any = [] if std is None else K * np.asarray(std)
+    numbers, expanded = (' '.join(f'{value:.7g}' for value in np.ravel(each))
+                         for each in (values, expanded))
+    return {'name': name, 'about': about, 'kind': kind, 'unit': unit, 'numbers': numbers,
+            'is_list': np.ndim(values) > 0, 'expanded': expanded}
 
 
 def si_unit(unit: str) -> tuple[str, float]:

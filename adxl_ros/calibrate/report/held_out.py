@@ -43,10 +43,8 @@ Fit = Callable[[Sensor, Poses], Sensor]
 
 _FOLDS = 5  # Number of folds where no pose is marked as a check pose; chosen: the usual number
 _MAX_ANGLE_STD_RAD = np.radians(1.0)
-"""Largest standard deviation of an angle, rad, at which its error counts.
-
-Chosen: it leaves out poses near ±90°, which determine alpha poorly without z.
-"""
+"""Largest standard deviation of an angle, rad, at which its error counts; chosen: without z poses
+near ±90° determine alpha poorly."""
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-The page of a calibration: one file that opens offline, with figures that plotly.js draws.
-
-- Its pictures: figures 2 to 8 of the paper for one unit, and errors of fits.
-"""
+"""The page of a calibration, one file that opens offline, and the figures of the paper."""
 
 from __future__ import annotations
 
@@ -30,8 +26,7 @@ from adxl_ros.report import figures, page as html_page
 from adxl_ros.report.figures import AXIS_COLOURS, Figure
 import numpy as np
 
-FILES = ('report.html', 'calibration.png')
-"""Files of a report."""
+FILES = ('report.html', 'calibration.png')  # Files of a report
 _COLOURS = {PASS: 'green', NOT_SHOWN: 'amber', FAIL: 'red'}  # Colour of the badge by outcome
 _PART_COLOURS = {'noise': '#7b8794', 'stage': '#d9930d', 'coefficients': '#1f5fbf',
                  'model': '#c0392b'}
@@ -44,11 +39,7 @@ _BEYOND_WHISKER = 1.08
 
 def write(folder: str | os.PathLike, result: CalibrationResult,
           store: str | os.PathLike = '', stated: Mapping[str, Any] | None = None) -> None:
-    """
-    Write `report.html`, and the plots of the unit as `calibration.png`.
-
-    stated: standard uncertainties of the laboratory; see `gum.uncertainty`.
-    """
+    """Write page and plots; stated: uncertainties of a laboratory, see `gum.uncertainty`."""
     html_page.check_libraries()
     past = calibration_store.history(store, result.fitted.serial).calibrations \
         if str(store) else []
@@ -105,8 +96,8 @@ def page(result: CalibrationResult, past: Sequence[Sensor],
         'about': [f'{fitted.model} model', f'{len(result.poses)} poses', f'axes {fitted.axes}'],
         'badge': _badge(fitted),
         'tiles': _tiles(result, assessment),
-        'advice': f'Limited by {acceptance.LIMITS[assessment.limited_by]}.' if assessment else
-        'Take more poses: too few were held out to assess this calibration.',
+        'advice': f'Limited by {acceptance.LIMITS[assessment.accel.limited_by]}.'
+        if assessment else 'Take more poses: too few were held out to assess this calibration.',
         'file_name': re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml',
         'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
         'figures': drawn,
@@ -159,7 +150,7 @@ def _tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dic
             tiles.append({'label': label, 'text': f'{before} → {after} {unit}',
                           'note': f'rms on held-out poses, 90 %: {low} to {high} {unit}'})
     if assessment is not None:
-        tiles.append({'label': 'limited by', 'text': assessment.limited_by,
+        tiles.append({'label': 'limited by', 'text': assessment.accel.limited_by,
                       'note': f'calibration error {digits(assessment.error_mg)} mg, without '
                               'noise and stage error of the check'})
     return tiles

@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-from adxl_ros.calibrate.guided.controller import Controller, ControllerState, Resume, Severity
+from adxl_ros.calibrate.guided.controller import Controller, ControllerState
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode
 from adxl_ros.calibrate.guided.session import SessionSettings
 from adxl_ros.errors import UserError
@@ -22,7 +22,7 @@ TRUTH = drawn(np.random.default_rng(3), UNIT)
 class Rig:
     """A controller with a sensor on a stage: a source of samples and the end of all outputs."""
 
-    def __init__(self, folder, mode=StageMode.COMMANDED, resume=Resume.ASK, **changes):
+    def __init__(self, folder, mode=StageMode.COMMANDED, resume='ask', **changes):
         self.fault = self.silence_text = ''
         self.log_lines, self.answers, self.withdrawn = [], [], []
         self.pose, self.angles_rad = None, (0.0, 0.0)
@@ -62,15 +62,14 @@ class Rig:
     def silence(self):
         return self.silence_text
 
-    def clear(self):
-        self._waiting.clear()
-
     def waiting(self):
         """Return no samples: they are too few to measure the sensor."""
         return np.zeros(0, np.int64), np.zeros((0, 3))
 
-    def keep_newest(self):
-        """Keep all waiting samples, as there are few."""
+    def keep_newest(self, count=None):
+        """Keep all waiting samples, as there are few, or none."""
+        if count == 0:
+            self._waiting.clear()
 
     def say_info(self, **changes):
         info = {**sensor_info(UNIT), **changes}
@@ -144,14 +143,14 @@ def test_a_sweep_goes_from_the_wait_for_its_sensor_to_its_file(rig, tmp_path):
     bench.turn_until(lambda: controller.session.accepted_count == 2)
     assert bench.pose.text == 'pose 3 of 22: alpha 90.0°, beta 90.0°'
     assert bench.pose.values['check'] == 'false' and bench.answers[-1].success
-    report = controller.report()
-    assert report.serial == 'C1' and report.values['accepted'] == '2'
-    assert report.values['phase'] == controller.status().phase.value
-    assert 0 < report.values['tilt_error_deg'] < 90
+    status, serial, values = controller.report()
+    assert serial == 'C1' and values['accepted'] == '2'
+    assert values['phase'] == status.phase.value
+    assert 0 < values['tilt_error_deg'] < 90
     bench.turn_until(lambda: controller.state is ControllerState.IDLE, 120)
     assert controller.session is None and bench.pose is None
     assert bench.withdrawn == [f'wrote {tmp_path / "unit.yaml"}']
-    assert controller.outcome and controller.report().values['verdict']
+    assert controller.outcome and controller.report()[2]['verdict']
     assert parameter_file.load(tmp_path / 'unit.yaml').serial == 'C1'
 
 
@@ -182,7 +181,7 @@ def test_an_operator_at_a_screen_has_a_choice_and_others_resume(rig, tmp_path):
     assert continuing.controller.start().success
     assert continuing.controller.session.resumed == 3
 
-    anew = rig(resume=Resume.ANEW)
+    anew = rig(resume='anew')
     anew.say_info()
     assert anew.controller.start().success
     assert anew.controller.session.resumed == 0
@@ -204,7 +203,7 @@ def test_a_fit_that_fails_at_the_end_waits_for_a_decision(rig, tmp_path, monkeyp
     assert status.phase is Phase.REFUSED and status.late
     assert status.text == 'cannot finish: unit.yaml: the disk is full; finish again, redo or abort'
     bench.turn(0.5)
-    assert bench.lines(Severity.ERROR) == [status.text], 'one attempt has one report'
+    assert bench.lines('ERROR') == [status.text], 'one attempt has one report'
     assert bench.controller.change_pose('redo') == (True, 'pose 10 will be taken again')
     assert not bench.controller.fit_fault
     bench.turn_until(lambda: bench.controller.fit_fault)
@@ -222,7 +221,7 @@ def test_a_capture_has_its_answer_when_its_pose_is_on_disk_or_refused(rig):
     assert bench.controller.status().phase is Phase.OPERATOR
     answer = bench.controller.capture()
     assert not answer.success and answer.message.startswith('alpha is 45.0° from the target 45°')
-    assert bench.lines(Severity.WARNING)[-1] == answer.message
+    assert bench.lines('WARNING')[-1] == answer.message
     bench.angles_rad = (np.pi / 4, 0.0)
     bench.turn(0.5)
     assert bench.controller.capture() == (True, 'averaging')
@@ -254,7 +253,7 @@ def test_another_sensor_ends_the_session_and_a_restarted_driver_checks_the_mount
     assert bench.controller.state is ControllerState.IDLE
     assert 'rate_hz was 200.0, is 100.0: changed during the calibration' in bench.lines()[-1]
     bench.say_info(serial='C2')
-    assert bench.controller.stream.unit is None and bench.lines(Severity.ERROR)[-1].startswith(
+    assert bench.controller.stream.unit is None and bench.lines('ERROR')[-1].startswith(
         'sensor_info: is of the sensor C2')
     bench.controller.start()
     assert bench.controller.status().phase is Phase.REFUSED

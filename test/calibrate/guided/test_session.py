@@ -59,7 +59,7 @@ def test_a_pose_to_be_repeated_is_neither_fitted_nor_resumed(begin):
     session = begin()
     take(session, 2)
     take(session, 1, 0.3)
-    assert session.guide.redo(session.append) == 'pose 3 will be taken again'
+    assert session.guide.redo(session.journal.append) == 'pose 3 will be taken again'
     assert poses_on_disk(session) == [0, 1]
     assert [e.pose for e in session.guide.poses_to_fit()] == [0, 1]
     session = begin()

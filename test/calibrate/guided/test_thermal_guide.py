@@ -83,16 +83,15 @@ def play(session, stamps_ns, volts, temperatures_c):
 def test_the_range_is_covered_in_both_directions_and_the_file_has_the_slopes(begin):
     session = begin()
     assert session.guide.destination() == 'warm it from 10 to 40 °C'
-    assert session.guide.estimate_contents().range_error == 'not known yet over 10 to 40 °C'
+    assert session.guide.estimated()[0][1].text == 'not known yet over 10 to 40 °C'
     play(session, *recorded('temperature_bias:per_k=4e-4'))
     assert session.guide.next_pose() is None
     values = session.guide.values()
     assert (values['warming'], values['cooling']) == ('100%', '100%')
     assert 0 < values['expected_error_mg'] < 0.5
-    estimate = session.guide.estimate_contents()
-    assert 'mg expected over 10 to 40 °C' in estimate.range_error
-    assert [(row.group, row.accepted) for row in estimate.coverage] == [
-        ('warming', 10), ('cooling', 10)]
+    (coverage, error), _ = session.guide.estimated()
+    assert 'mg expected over 10 to 40 °C' in error.text
+    assert coverage.text == 'warming 10/10, cooling 10/10'
     fitted = session.finish().fitted
     assert fitted.effects == ('bias', 'temperature_bias')
     slopes = fitted.values['temperature_bias']['per_k']

@@ -75,7 +75,7 @@ def test_the_stated_calibration_error_is_right(check, units, within):
         estimated.append((assessment.error_mg, assessment.error_deg))
         true.append(true_errors(truth, result))
         measured.append(result.held_out[-1].accel_mg.rms)
-        assert assessment.limited_by == 'stage'
+        assert assessment.accel.limited_by == 'stage'
         assert (assessment.accel_datasheet, assessment.accel_noise) == ('PASS', 'PASS')
         entries = result.fitted.provenance
         assert float(entries['own_accel_mg']) == pytest.approx(assessment.error_mg, rel=1e-3)
@@ -97,13 +97,13 @@ CASES = {
 def test_the_limiting_part_of_the_error_is_named(name):
     """Chance changes one outcome in a hundred, so that one of two units must have the name."""
     limit, settings = CASES[name]
-    named = [calibrated(seed, **settings)[1].assessments[-1].limited_by for seed in range(2)]
+    named = [calibrated(seed, **settings)[1].assessments[-1].accel.limited_by for seed in range(2)]
     assert limit in named, named
 
 
 def test_a_linear_model_fails_because_of_its_model():
     _, result = calibrated(1)
-    outcomes = {row.model: (row.accel_datasheet, row.accel_noise, row.limited_by)
+    outcomes = {row.model: (row.accel_datasheet, row.accel_noise, row.accel.limited_by)
                 for row in result.assessments}
     assert outcomes['linear'] == ('FAIL', 'FAIL', 'model')
     assert outcomes['full'][:2] == ('PASS', 'PASS')
@@ -131,9 +131,9 @@ def test_outcomes_of_the_acceptance(parts, outcome):
         ErrorBudget(1.0, 0.0, 0.9, 0.1, 0.0, 0.2), replace(budget, tilt_per_axis=1.0)), sensor)
     assert (tilted.accel_datasheet, tilted.tilt_datasheet) == ('PASS', outcome)
     if len(parts) == 7:
-        assert assessment.limited_by == 'stage or model'
+        assert assessment.accel.limited_by == 'stage or model'
     else:
-        assert assessment.limited_by == ('model' if outcome == 'FAIL' else 'stage')
+        assert assessment.accel.limited_by == ('model' if outcome == 'FAIL' else 'stage')
 
 
 @pytest.mark.parametrize(('correlation', 'min_coverage'), [(0.0, 0.82), (0.9, 0.7)])
