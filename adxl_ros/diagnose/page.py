@@ -28,7 +28,6 @@ from adxl_ros.report import figures as plots, page as html_page
 from adxl_ros.report.figures import Figure, figure, line, rounded
 from adxl_ros.report.quantities import decimals, mg, mg_text, percent
 import numpy as np
-import pandas as pd
 import scipy
 
 _BINS, _FEWEST_SAMPLES = 10, 20
@@ -182,6 +181,7 @@ def _proof(effect: str, comparison: BaselineComparison, full_rate: BaselineCompa
 def _binned(variables: Sequence[Over], comparison: BaselineComparison, sensor: Sensor,
             without: Sensor) -> Figure:
     """Draw means of the residual without an effect over the variable that shows it best."""
+    import pandas as pd
     to_mg, used = mg(1 / comparison.scale_v_per_mps2), comparison.used
     residual_mg = (comparison.residual_v(without) * to_mg)[used]
     model_mg = residual_mg - (comparison.residual_v(sensor) * to_mg)[used]
@@ -257,6 +257,7 @@ def _spectra(comparison: BaselineComparison, signals_v: Mapping[str, np.ndarray]
 
     Points are equally dense per octave.
     """
+    import pandas as pd
     sensor, scale, densities = comparison.sensor, comparison.scale_v_per_mps2, {}
     for label, signal_v in signals_v.items():
         signal_mg = np.nan_to_num(mg(bridged(signal_v, comparison.used) / scale))

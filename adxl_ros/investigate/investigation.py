@@ -29,7 +29,6 @@ import shutil
 from adxl_ros.diagnose import next_experiment
 from adxl_ros.diagnose.diagnosis import diagnose, Diagnosis
 from adxl_ros.diagnose.linear_model import candidates
-from adxl_ros.diagnose.page import documents, Run
 from adxl_ros.diagnose.report import as_json, screen_lines
 from adxl_ros.diagnose.verdict import normalised, UNKNOWN, WeightedHypothesis
 from adxl_ros.errors import one_line, UserError
@@ -268,6 +267,7 @@ class OutputFolder:
 def _write_diagnosis(folder: OutputFolder, diagnosis: Diagnosis, recording: Recording,
                      with_page: bool) -> None:
     """Write report and parameters of a diagnosis."""
+    from adxl_ros.diagnose.page import documents, Run
     subject = (f'{folder.bag.name} ({np.ptp(recording.time_s):.0f} s, {recording.rate_hz:.4g} Hz, '
                f'{" ".join(recording.axes)})  minus  simulation of {folder.baseline.name}')
     lines = screen_lines(diagnosis, subject) if diagnosis.report is not None else []
