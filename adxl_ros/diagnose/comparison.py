@@ -326,7 +326,7 @@ def _in_gaps(time_s: np.ndarray, read_s: np.ndarray, longest_s: float
 
 
 def leave_out(comparison: BaselineComparison, rows: np.ndarray, reason: str
-               ) -> BaselineComparison:
+              ) -> BaselineComparison:
     """Return a comparison that does not use some samples, and notes why and when."""
     if not rows.any():
         return comparison
@@ -353,7 +353,7 @@ def without_gaps(comparison: BaselineComparison) -> BaselineComparison:
 
 
 def stated_poses(recording: Recording, sensor: Sensor
-                  ) -> tuple[Recording, list[tuple[np.ndarray, str]]]:
+                 ) -> tuple[Recording, list[tuple[np.ndarray, str]]]:
     """
     Fill the gaps of the stage's joints; return samples that are not known there, and reasons.
 
@@ -431,7 +431,7 @@ def _without_jerks(comparison: BaselineComparison, force: Any, noise_g: float
 
 
 def without_fast_motion(comparison: BaselineComparison, columns: dict[str, np.ndarray]
-                         ) -> BaselineComparison:
+                        ) -> BaselineComparison:
     """Leave out samples at which the reference moves faster than its readings show."""
     sensor, time_s, force = comparison.sensor, comparison.time_s, comparison.motion.force
     noise_g = float(np.min(noise.analog_std_v(sensor) / sensor.scale_v_per_g))

@@ -137,7 +137,7 @@ class _Shift(NamedTuple):
 
 
 def _align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bool
-                ) -> tuple[Recording, Motion, list[str]]:
+                 ) -> tuple[Recording, Motion, list[str]]:
     """
     Find the part of a recording that another simulator covers, and check their time.
 
@@ -209,7 +209,7 @@ def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> _Shif
 
 
 def _correlations(first: np.ndarray, second: np.ndarray, smallest: int
-                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Correlate two motions, g, (n, m) and (n', m), at all lags, each over the samples that overlap.
 
@@ -528,7 +528,7 @@ def _check_axes(comparison: BaselineComparison) -> None:
     if not len(moving):
         return
     lags, _, by_lag = _correlations(simulated_g, np.nan_to_num(measured_g),
-                                             2 * len(simulated_g) // 3)
+                                    2 * len(simulated_g) // 3)
     by_lag = np.where(np.abs(lags) <= _LARGEST_DELAY_S * sensor.rate_hz, by_lag, -1.0)
     best = int(np.argmax(by_lag))
     delay_s = lags[best] / sensor.rate_hz

@@ -40,7 +40,7 @@ class StreamInfo:
 
     @property
     def serial(self) -> str:
-        """Serial number of the unit; `NO_UNIT` where none is stated."""
+        """Return the serial number of the unit; `NO_UNIT` where none is stated."""
         return self.texts.get('serial', NO_UNIT)
 
     @property
@@ -167,7 +167,7 @@ class Recording:
 
     @property
     def axes(self) -> str:
-        """The measured axes: x, xy or xyz."""
+        """Return the measured axes: x, xy or xyz."""
         return AXES[:len(self.sensor_columns)]
 
     @property

@@ -205,10 +205,13 @@ XSENS_MPS2 = 9.81744
     ('mpu9150_2', G0_MPS2, (8, 24), 0.26, 0.33),
     ('xsens_multiposition', XSENS_MPS2, (100, 150), 0.104, 0.16),
     ('two_axis_stand', G0_MPS2, (60, 64), 0.12, 0.145)])
-def test_residuals_of_real_recordings(shared_dir, name, local, before, within, without):
+def test_residuals_of_real_recordings(shared_dir, monkeypatch, name, local, before, within,
+                                      without):
     """The rms residuals over the rests, mg, are those of published methods or better."""
     sensor, _, means, errors = real(shared_dir, name, local)
-    fit = fit_gravity(means, errors, sensor, len(means))
+    # The published figures leave out one rest at a time.
+    monkeypatch.setattr(gravity_fit, '_STRETCHES', len(means))
+    fit = fit_gravity(means, errors, sensor)
     assert before[0] < MG * rms(fit.before_mps2) < before[1]
     assert MG * rms(fit.residual_mps2) < within
     assert MG * rms(fit.held_out_mps2) < without
