@@ -51,7 +51,7 @@ def test_a_screen_drives_the_sweep_of_a_node_without_a_terminal(start, in_termin
     seen.press('q')
     assert seen.wait() == 0
     assert seen.restored()
-    _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
+    entries = sweep_journal.read(tmp_path / 'unit.yaml.journal').entries
     poses = sweep_journal.accepted_poses(entries)
     # The screen causes no loss: every pose has all samples.
     assert len(poses) >= 10

@@ -126,7 +126,7 @@ def test_the_screen_guides_an_operator_through_a_sweep(start, terminal, tmp_path
         assert 'pose 6 is on disk' in seen.raw.decode().split('\x1b[?1049l')[-1]
     assert parameter_file.load(tmp_path / 'unit.yaml').serial == 'T1'
     assert (tmp_path / 'unit.yaml.previous').read_text() == 'the earlier one\n'
-    _, entries = sweep_journal.read(tmp_path / 'unit.yaml.journal')
+    entries = sweep_journal.read(tmp_path / 'unit.yaml.journal').entries
     poses = sweep_journal.accepted_poses(entries)
     assert len(poses) == 5 and sweep_journal.skipped_poses(entries) == {4}
     # The screen causes no loss: every pose has all samples.
