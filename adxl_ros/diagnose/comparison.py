@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Any
 
 from adxl_ros.files.recording_columns import JOINTS, Recording
+from adxl_ros.files.reference_alignment import LONGEST_MOVE_NS, USUAL_GAPS
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
@@ -47,9 +48,9 @@ SETTLING_S = 0.3
 """A sample rests if no joint moves within this time before it, s. Chosen: an RC filter of 15 Hz
 has settled."""
 _LONGEST_S = 1e3  # Time since the last move where there was none, s. Chosen: beyond any creep
-_LONGEST_BRIDGE_S, _SLOWEST_S, _USUAL_GAPS = 0.1, 1.0, 3.0
+_LONGEST_BRIDGE_S, _SLOWEST_S = LONGEST_MOVE_NS / 1e9, 1.0
 """Longest time without a reading that is bridged, s: of a joint, and of a slow encoder, whose
-readings are a move apart at most; and the same in usual gaps. Those of messages of a bag."""
+readings are a move apart at most."""
 _BEFORE_S, _AFTER_S = 0.1, 0.3
 """Times that are left out beside a gap, s. Chosen: the spline is uncertain before it, and an RC
 filter of 15 Hz has settled after it."""
@@ -342,7 +343,7 @@ def without_gaps(comparison: BaselineComparison) -> BaselineComparison:
     time_s, force = comparison.time_s, comparison.motion.force
     if not isinstance(force, ForcePath):
         return comparison
-    limit_s = max(_LONGEST_BRIDGE_S, _USUAL_GAPS * float(np.median(np.diff(force.time_s))))
+    limit_s = max(_LONGEST_BRIDGE_S, USUAL_GAPS * float(np.median(np.diff(force.time_s))))
     unknown = np.zeros(len(time_s), bool)
     for begin, end in _in_gaps(time_s, force.time_s, limit_s):
         if end > begin:
@@ -370,7 +371,7 @@ def stated_poses(recording: Recording, sensor: Sensor
             continue
         step = 0.0 if joint == 'shift' else sensor.stage_resolution_rad
         filled = np.interp(time_s, time_s[read], values[read])
-        limit_s = max(_LONGEST_BRIDGE_S, min(_USUAL_GAPS * float(np.median(np.diff(
+        limit_s = max(_LONGEST_BRIDGE_S, min(USUAL_GAPS * float(np.median(np.diff(
             time_s[read]))), _SLOWEST_S))
         unknown, columns[name] = np.zeros(len(time_s), bool), values.copy()
         for begin, end in _in_gaps(time_s, time_s[read], _LONGEST_BRIDGE_S):

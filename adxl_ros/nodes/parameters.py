@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, fields, is_dataclass
 from difflib import get_close_matches
 from importlib import import_module
-from itertools import chain, pairwise
+from itertools import pairwise
 from pathlib import Path
 import re
 import sys
@@ -102,12 +102,6 @@ def node_specs(module: ModuleType) -> list[Spec]:
             for spec in specs_of(value)]
 
 
-def all_specs() -> Iterator[Spec]:
-    """Yield the parameters of all nodes, without those of sensor and link."""
-    return chain.from_iterable(
-        node_specs(import_module(f'adxl_ros.nodes.{name}')) for name in NODES)
-
-
 def link_specs(link: str) -> list[Spec]:
     """Return the parameters of a link, `link.type` aside."""
     return [Spec(f'{LINK}{option.name}', option.default, **option.metadata)
@@ -140,12 +134,18 @@ def check_given(node: Node) -> None:
                             f'node {name}; begin the file with /**: or {name}:')
     known = {*_ANY_NODE, *(spec.name for spec in (
         *sensor_specs(), *node_specs(sys.modules[type(node).__module__])))}
+    # One file may serve all nodes: a node ignores what another one has. The others are loaded one
+    # after the other, and only until one has the name.
+    others = (spec.name for other in NODES
+              for spec in node_specs(import_module(f'adxl_ros.nodes.{other}')))
     for name in given_parameters(node):
         if name in known or name.startswith(_FREE_PREFIXES):
             continue
-        # One file may serve all nodes: a node ignores what another one has.
-        known |= {spec.name for spec in all_specs()}
-        if name not in known:
+        for other in others:
+            known.add(other)
+            if other == name:
+                break
+        else:
             raise parameter_error(name, 'no node has a parameter of this name; did you mean '
                                   f'{get_close_matches(name, sorted(known), 1, 0.0)[0]}?')
 
