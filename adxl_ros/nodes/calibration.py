@@ -413,7 +413,8 @@ class Calibration(Node):
         if self._has_stage:
             self._stage = topics.Inbox(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
             topics.create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
-        topics.subscribe_surroundings(self, _QUEUE, self._controller.read_quantity)
+        self._take_surroundings = topics.subscribe_surroundings(
+            self, _QUEUE, self._controller.read_quantity)
         start = self._controller.start
         requests: dict[str, Callable[[], Answer]] = {
             'start': start, 'resume': partial(start, start_over=False),
@@ -432,6 +433,7 @@ class Calibration(Node):
 
     def _poll(self) -> None:
         self._read_stage()
+        self._take_surroundings()
         # A poll may begin a calibration and end it at once.
         self._has_run |= self._controller.state is not ControllerState.IDLE
         self._controller.poll()

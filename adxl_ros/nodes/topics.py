@@ -92,15 +92,29 @@ def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[A
 
 
 def subscribe_surroundings(node: Node, depth: int, take: Callable[[str, int, float], object]
-                           ) -> None:
-    """Give temperature, °C, and supply, V, to a function, with topic and stamp, ns."""
+                           ) -> Callable[[], None]:
+    """
+    Give temperature, °C, and supply, V, to a function, with topic and stamp, ns.
+
+    returns: a function that gives those that wait at once, before samples of the same time.
+    """
     def give(topic: str, field: str, message: Any) -> None:
         stamp = message.header.stamp
         take(topic, stamp.sec * 10 ** 9 + stamp.nanosec, getattr(message, field))
 
+    subscriptions = []
     for topic, kind, field in (('temperature', Temperature, 'temperature'),
                                ('supply', BatteryState, 'voltage')):
-        create_subscription(node, kind, topic, partial(give, topic, field), depth)
+        callback = partial(give, topic, field)
+        subscriptions.append((create_subscription(node, kind, topic, callback, depth), kind,
+                              callback))
+
+    def take_waiting() -> None:
+        for subscription, kind, callback in subscriptions:
+            for message in take_messages(subscription, kind, False, depth):
+                callback(message)
+
+    return take_waiting
 
 
 @contextmanager

@@ -235,11 +235,11 @@ def test_a_resting_sensor_is_calibrated_over_temperature(start, tmp_path):
         graph.spin_until(lambda: graph.reports('calibration', 'waiting for sensor_info'), 30, 'up')
         start('driver', '--ros-args', '--params-file', tmp_path / 'base.yaml', *FAST, '-p',
               'link.type:=replay', '-p', f'link.recording:={tmp_path / "oven.csv"}', '-p',
-              'link.speed:=10.0', '-p', 'autostart:=false', *KEPT)
+              'link.speed:=40.0', '-p', 'autostart:=false', *KEPT)
         assert graph.change('driver', Transition.TRANSITION_CONFIGURE)
         graph.spin_until(lambda: graph.node.count_publishers('imu/data_raw'), 30, 'a publisher')
         assert graph.change('driver', Transition.TRANSITION_ACTIVATE)
-        graph.spin_until((tmp_path / 'warm.yaml').exists, 120, 'the file')
+        graph.spin_until((tmp_path / 'warm.yaml').exists, 60, 'the file')
         assert graph.has_reported('calibration', 'of 10 to 40 °C, warming')
         assert graph.has_reported('calibration', 'expected error')
     warm = parameter_file.load(tmp_path / 'warm.yaml')
