@@ -38,11 +38,12 @@ def imu_table(raws):
 
 
 class Graph:
-    """The messages of topics, and the newest diagnostics by the name of the node."""
+    """The messages of topics; by the name of a node its newest diagnostics and their time, ns."""
 
     def __init__(self):
         self.got = defaultdict(list)
         self.diagnostics = {}
+        self.reported_ns = {}
         self._messages = defaultdict(set)
         self._context = Context()
         self._clients = {}
@@ -64,6 +65,7 @@ class Graph:
         for status in message.status:
             name = status.name.split(':')[0]
             self.diagnostics[name] = status
+            self.reported_ns[name] = stamp_ns(message)
             self._messages[name].add(status.message)
 
     def listen(self, kind, topic, depth=10000, latched=False, raw=False):
@@ -98,14 +100,26 @@ class Graph:
             self._executor.spin_once(timeout_sec=remaining_s)
 
     def call(self, kind, service, request, timeout_s=20.0):
-        # A new client may miss the answer, so each service has one client.
+        """
+        Return the answer of a service.
+
+        Fast DDS loses the answer to a client that the server has not discovered within 100 ms
+        (ros2/rmw_fastrtps issue 842). So each service has one client, and it asks again.
+        """
         client = self._clients.get(service)
         if client is None:
             client = self._clients[service] = self.node.create_client(kind, service)
         assert client.wait_for_service(PATIENCE * timeout_s), f'no service {service}'
-        future = client.call_async(request)
-        self.spin_until(future.done, timeout_s, f'answer of {service}')
-        return future.result()
+        futures, ask_again_s = [], 0.0
+
+        def answered():
+            nonlocal ask_again_s
+            if time.monotonic() >= ask_again_s:
+                futures.append(client.call_async(request))
+                ask_again_s = time.monotonic() + timeout_s
+            return any(future.done() for future in futures)
+        self.spin_until(answered, timeout_s, f'answer of {service}')
+        return next(future.result() for future in futures if future.done())
 
     def change(self, node, transition):
         request = ChangeState.Request(transition=Transition(id=transition))

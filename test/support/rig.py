@@ -139,20 +139,24 @@ class DriverRig:
             round(self.diagnostic('missing_estimated') - self._estimated_before))
 
     def _settle(self):
-        self.wait_for_samples(round(0.3 * self._rate_hz), 30)
-        self.graph.diagnostics.clear()
-        self.graph.spin_until(lambda: 'driver' in self.graph.diagnostics, 10, 'diagnostics')
+        """Wait for a sample of this moment, and for diagnostics that came after it."""
+        self._wait_for_stamp(time.time_ns(), 30, 'a sample of now')
+        sampled_ns = time.time_ns()
+        self.graph.spin_until(lambda: self.graph.reported_ns.get('driver', 0) > sampled_ns, 10,
+                              'diagnostics')
         self.graph.spin(0.05)
         self.collect()
 
     def wait_for_recovery(self, back_ns, purpose):
         """Wait for a sample taken after a monotonic time; a second later it is late."""
-        ros_ns = back_ns + time.time_ns() - time.monotonic_ns()
+        self._wait_for_stamp(back_ns + time.time_ns() - time.monotonic_ns(), 1,
+                             f'a new sample after: {purpose}')
 
-        def recovered():
+    def _wait_for_stamp(self, ros_ns, timeout_s, purpose):
+        def reached():
             self.collect()
-            return self.stamps[-1] >= ros_ns
-        self.graph.spin_until(recovered, 1, f'a new sample after: {purpose}')
+            return len(self.stamps) and self.stamps[-1] >= ros_ns
+        self.graph.spin_until(reached, timeout_s, purpose)
 
 
 class SerialRig(DriverRig):
