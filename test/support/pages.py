@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
+
 """Pages in a real Chromium: opening them, and faults of their layout."""
 
 from contextlib import contextmanager
 import shutil
 
+from processes import PATIENCE
 import pytest
 
 CHROMIUM = next(filter(None, map(shutil.which, (
@@ -83,6 +85,7 @@ def opener(browser):
 
     def begin(path, width=1366):
         page = browser.new_page(viewport={'width': width, 'height': 768})
+        page.set_default_timeout(PATIENCE * 30_000)  # ms
         pages.append(page)
         messages = []
         page.on('console', lambda message: messages.append(f'{message.type}: {message.text}'))
