@@ -12,6 +12,7 @@ from functools import partial
 from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
+from io import BytesIO
 import os
 from pathlib import Path
 import platform
@@ -33,7 +34,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, with_axes
 from adxl_ros.nodes.jobs import executable
-from adxl_ros.signals.allan_deviation import AllanStream, CellMeans
+from adxl_ros.signals.allan_deviation import Phase
 from adxl_ros.simulate.response import simulate
 from adxl_ros.simulate.sensor_model import SensorModel
 from adxl_ros.simulate.trajectories import rich, sweep
@@ -283,11 +284,10 @@ def _allan() -> Job:
     samples, block = np.random.default_rng(0).normal(size=1_000_000), 65536
 
     def ours() -> None:
-        stream, cells = AllanStream(1), CellMeans(1)
+        stream = Phase(1, BytesIO())
         for begin in range(0, len(samples), block):
             stream.feed(samples[begin:begin + block, None])
-            cells.feed(samples[begin:begin + block, None])
-        stream.result(_RATE_HZ, cells)
+        stream.allan_deviation(_RATE_HZ), stream.cells()
 
     return Job(f'Allan deviation, {len(samples)} samples', ours, 1.0, {
         'allantools': lambda: import_module('allantools').oadev(

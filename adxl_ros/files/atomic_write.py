@@ -40,8 +40,12 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         fresh = Path(folder, target.name)
         with _locked(Path(folder)):
             yield fresh
-            _sync_tree(fresh)
-            _exchange(fresh, target, Path(folder))
+            for written in [*fresh.rglob('*'), fresh]:
+                sync(written)
+            if fresh.is_dir() and target.is_dir():
+                # No directory can be renamed over one that holds files.
+                os.replace(target, Path(folder, 'old'))
+            os.replace(fresh, target)
             sync(target.parent)
     except OSError as error:
         raise UserError(f'{target}: cannot write: {error.strerror or error}') from None
@@ -85,20 +89,6 @@ def keep_previous(path: str | os.PathLike) -> None:
     if Path(path).is_file():
         with atomic_path(f'{path}.previous') as fresh:
             shutil.copyfile(path, fresh)
-
-
-def _exchange(fresh: Path, target: Path, folder: Path) -> None:
-    if fresh.is_dir() and target.is_dir():
-        # A directory cannot be renamed over one that holds files: the old one moves out first.
-        os.replace(target, folder / 'old')
-    os.replace(fresh, target)
-
-
-def _sync_tree(path: Path) -> None:
-    if path.is_dir():
-        for child in path.iterdir():
-            _sync_tree(child)
-    sync(path)
 
 
 def sync(path: Path) -> None:

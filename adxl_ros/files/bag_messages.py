@@ -8,7 +8,6 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager, ExitStack
 import os
 from pathlib import Path
-import re
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import install_hint, one_line, UserError
@@ -40,14 +39,13 @@ class Bag:
                            if connection.topic in topics and connection.msgcount]
             names = {connection.id: connection.topic for connection in connections}
             chunks = [] if self._is_packed else mcap_file.in_order(storage, names)
-            total = len(chunks) or sum(connection.msgcount for connection in connections)
             pieces = (mcap_file.read_chunk(storage.bio, chunk, names) for chunk in chunks) \
                 if chunks else mcap_file.collected_pieces(self._messages(storage, connections))
-            count = 0
+            total = len(chunks) or \
+                sum(each.msgcount for each in connections) / mcap_file.PIECE_MESSAGES
             with _readable(self.path):
-                for piece in pieces:
-                    count += 1 if chunks else sum(map(len, piece.messages.values()))
-                    self.done = (number + count / total) / len(self._storages)
+                for count, piece in enumerate(pieces, 1):
+                    self.done = (number + min(count / total, 1.0)) / len(self._storages)
                     yield piece
         self.done = 1.0
 
@@ -119,9 +117,7 @@ def _files(path: Path) -> list[Path]:
     if not files:
         raise UserError(f'{path}: is a directory without metadata.yaml, .mcap or .db3 files; '
                         'expected a rosbag2 recording; ros2 bag reindex writes metadata.yaml')
-    # name_10.mcap comes behind name_9.mcap.
-    return sorted(files, key=lambda file: (
-        [int(number) for number in re.findall(r'\d+', file.stem)], file.name))
+    return sorted(files, key=lambda file: (len(file.name), file.name))  # 10 comes behind 9
 
 
 IMU, JOINT_STATE = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/JointState'

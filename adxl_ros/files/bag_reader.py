@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
+from functools import partial
 import os
 
 from adxl_ros.errors import UserError
@@ -28,7 +29,6 @@ from adxl_ros.files.recording_columns import (
     Recording,
     StampCheck,
 )
-from adxl_ros.files.reference_alignment import LONGEST_MOVE_NS, seconds, Track
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 import numpy as np
 
@@ -36,6 +36,87 @@ _ABSENT_VARIANCE = 1e5
 """Variance from which an axis counts as absent, (m/s²)²; absent axes are written with 1e6."""
 
 _EXACT_NS = 1 << 53  # Largest time, ns, that float64 resolves to single nanoseconds
+
+LONGEST_MOVE_NS = 1e8
+"""Longest time between two messages in which a joint moves, ns, that is interpolated. Chosen: an
+acceleration of 1 rad/s² then bends the path by 1 mrad, which is the noise of an ADXL203."""
+USUAL_GAPS = 3.0
+"""Gap between messages, in usual ones, that is bridged, however long. Chosen: a slow reference
+loses single messages."""
+
+
+def seconds(stamp_ns: int) -> str:
+    """Return a stamp, ns, as text in seconds with all nanoseconds."""
+    whole_s, rest_ns = divmod(int(stamp_ns), 1_000_000_000)
+    return f'{whole_s}.{rest_ns:09d} s'
+
+
+class Track:
+    """
+    One reference over time.
+
+    Between two messages the value is on the straight line between theirs; angles are not
+    wrapped. Before the first and after the last message their value is held for one period of the
+    reference; beyond that the reference is NaN. So it is in a long gap over which it has changed:
+    nobody knows how.
+    """
+
+    def __init__(self, where: str, stamp_ns: np.ndarray, value: np.ndarray,
+                 longest_ns: float = np.inf) -> None:
+        """
+        Take the messages.
+
+        stamp_ns: stamps, ns, (k,). Of messages with the same stamp the last one counts; value:
+        values, (k,); NaN where it was not sampled; longest_ns: gap that is bridged, ns.
+        """
+        stamps, values = stamp_ns[~np.isnan(value)], value[~np.isnan(value)]
+        step = np.diff(stamps)
+        if (step < 0).any():
+            i = int((step < 0).argmax())
+            raise UserError(f'{where}: time runs backwards: {seconds(stamps[i + 1])} comes '
+                            f'after {seconds(stamps[i])}')
+        is_last = np.append(step > 0, True)[:len(stamps)]
+        self._stamp_ns, self._value = stamps[is_last], values[is_last]
+        step = step[step > 0]
+        self._usual_ns = float(np.median(step)) if len(step) else 0.0
+        self._longest_ns = max(longest_ns, USUAL_GAPS * self._usual_ns)
+        self._gap_ns = 0
+
+    def interpolate(self, stamp_ns: np.ndarray) -> np.ndarray:
+        """Return the reference at ascending stamps, ns, (n,): (n,), NaN where it is unknown."""
+        if not len(self._stamp_ns) or not len(stamp_ns):
+            return np.full(len(stamp_ns), np.nan)
+        first, last = np.searchsorted(self._stamp_ns, stamp_ns[[0, -1]])
+        part = slice(max(first - 1, 0), last + 1)  # The messages around the samples
+        values, begin_ns = self._value[part], self._stamp_ns[part][0]
+        sample_ns, message_ns = stamp_ns - begin_ns, self._stamp_ns[part] - begin_ns
+        result = np.interp(sample_ns, message_ns, values)
+        is_known = (sample_ns >= -self._usual_ns) & (sample_ns <= message_ns[-1] + self._usual_ns)
+        after = np.searchsorted(message_ns, sample_ns).clip(max=len(message_ns) - 1)
+        is_long = np.append(False, (np.diff(message_ns) > self._longest_ns)
+                            & (np.diff(values) != 0))
+        is_inside = (sample_ns > message_ns[0]) & (sample_ns < message_ns[after])
+        result[~is_known | (is_inside & is_long[after])] = np.nan
+        if is_known.any():
+            gaps_ns = np.abs(sample_ns - message_ns[[np.maximum(after - 1, 0), after]]).min(axis=0)
+            self._gap_ns = max(self._gap_ns, int(gaps_ns[is_known].max()))
+        return result
+
+    @property
+    def alignment(self) -> Alignment:
+        """
+        How well the reference was aligned so far: residual, in its unit, and largest gap, s.
+
+        The residual is the rms difference between each message and the straight line between its
+        neighbours. Interpolation over twice the period misses it, so that it bounds the error
+        over one period. It is 0 where every sample has a message with its own stamp.
+        """
+        if not self._gap_ns or len(self._value) < 3:
+            return Alignment(0.0, self._gap_ns * 1e-9)
+        time_ns, value = self._stamp_ns - self._stamp_ns[0], self._value
+        share = (time_ns[1:-1] - time_ns[:-2]) / (time_ns[2:] - time_ns[:-2])
+        residual = value[1:-1] - (value[:-2] + share * (value[2:] - value[:-2]))
+        return Alignment(float(np.sqrt(np.mean(residual ** 2))), self._gap_ns * 1e-9)
 
 
 def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
@@ -77,7 +158,7 @@ class _Samples:
 
     def add(self, raws: Raws) -> None:
         """Decode and check further messages."""
-        stamp_ns, columns = _columns(self.where, raws, cdr.imu, ACCEL, self._force)
+        stamp_ns, columns = _columns(self.where, raws, cdr.imu, self._force)
         force = np.column_stack(list(columns.values()))
         if not self.count:
             self._begin(raws[:1], int(stamp_ns[0]))
@@ -104,7 +185,7 @@ class _Samples:
         self._first_ns = stamp_ns
         if stamp_ns > _EXACT_NS:
             self.epoch_ns = stamp_ns // 1_000_000_000 * 1_000_000_000
-        table = next(_tables(self.where, first, cdr.imu))
+        table = next(cdr.tables(first, cdr.imu))
         variance = table.numbers('linear_acceleration_covariance')[0, [0, 4, 8]]
         if self.axes is None:
             is_there = (variance < _ABSENT_VARIANCE) & (variance[0] != -1)
@@ -122,39 +203,37 @@ class _Samples:
         return dict(zip(ACCEL, table.numbers('linear_acceleration').T))
 
 
-def _tables(where: str, raws: Raws, find: Callable[[bytes], cdr.Layout]) -> Iterator[cdr.Table]:
-    """Group messages by layout; a damaged one is an error that names file and topic."""
-    try:
-        yield from cdr.tables(raws, find)
-    except cdr.CdrError as error:
-        raise UserError(f'{where}: a message is damaged: {error}') from None
+Values = Callable[[cdr.Table], Mapping[str, np.ndarray]]
+"""Returns the columns of messages, (k,) each, by name."""
 
 
-def _columns(where: str, raws: Raws, find: Callable[[bytes], cdr.Layout], names: Iterable[str],
-             values: Callable[[cdr.Table], Mapping[str, np.ndarray]]
+def _columns(where: str, raws: Raws, find: Callable[[bytes], cdr.Layout], values: Values
              ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return stamps, ns, (k,), and columns, (k,) each; NaN where a message has no value."""
     stamp_ns = np.empty(len(raws), np.int64)
-    columns = {name: np.full(len(raws), np.nan) for name in names}
-    for table in _tables(where, raws, find):
-        stamp_ns[table.rows] = table.stamp_ns()
-        for name, column in values(table).items():
-            columns[name][table.rows] = column
+    columns: dict[str, np.ndarray] = {}
+    try:
+        for table in cdr.tables(raws, find):
+            stamp_ns[table.rows] = table.stamp_ns()
+            for name, column in values(table).items():
+                columns.setdefault(name, np.full(len(raws), np.nan))[table.rows] = column
+    except cdr.CdrError as error:
+        raise UserError(f'{where}: a message is damaged: {error}') from None
     return stamp_ns, columns
 
 
-def _series(bag: Bag, topic: str, find: Callable[[bytes], cdr.Layout], names: Iterable[str],
-            values: Callable[[cdr.Table], Mapping[str, np.ndarray]]
+def _series(bag: Bag, topic: str, find: Callable[[bytes], cdr.Layout], values: Values
             ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Return stamps and log times, ns, (k,), and columns, (k,), of all messages of a topic."""
-    parts = [(piece.log_ns[topic], *_columns(f'{bag.path}: topic {topic}', piece.messages[topic],
-                                             find, names, values))
-             for piece in bag.pieces([topic])]
-    logs, stamps, columns = zip(*parts)
+    logs, stamps, columns = zip(*((piece.log_ns[topic], *_columns(
+        f'{bag.path}: topic {topic}', piece.messages[topic], find, values))
+        for piece in bag.pieces([topic])))
     log_ns = np.concatenate(logs)
     order = np.argsort(log_ns, kind='stable')  # A file that was cut off has no index by time
     return np.concatenate(stamps)[order], log_ns[order], {
-        name: np.concatenate([part[name] for part in columns])[order] for name in names}
+        name: np.concatenate([part.get(name, np.full(len(log), np.nan))
+                              for part, log in zip(columns, logs)])[order]
+        for name in dict.fromkeys(name for part in columns for name in part)}
 
 
 def _positions(table: cdr.Table, names: Mapping[str, str]) -> dict[str, np.ndarray]:
@@ -162,24 +241,23 @@ def _positions(table: cdr.Table, names: Mapping[str, str]) -> dict[str, np.ndarr
     if 'position' not in table.layout.fields:
         return {}
     joints = [text for key, text in table.layout.texts.items() if key != 'frame_id']
-    return {names[joint]: values for joint, values in zip(joints, table.numbers('position').T)
-            if joint in names}
+    positions = dict(zip(joints, table.numbers('position').T))
+    return {column: positions[joint] for joint, column in names.items() if joint in positions}
 
 
 def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
-    """Return the references by column."""
+    """Return the references by column; none of a joint without a position."""
     tracks = {}
-    for topic, find, names, longest_ns, values in (
-            (topics.joints, cdr.joint_state, JOINTS.values(), LONGEST_MOVE_NS,
-             lambda table: _positions(table, JOINTS)),
-            (topics.temperature, cdr.temperature, ['temperature_c'], np.inf,
+    for topic, find, longest_ns, values in (
+            (topics.joints, cdr.joint_state, LONGEST_MOVE_NS, partial(_positions, names=JOINTS)),
+            (topics.temperature, cdr.temperature, np.inf,
              lambda table: {'temperature_c': table.numbers('temperature')[:, 0]}),
-            (topics.supply, cdr.battery_state, ['supply_v'], np.inf,
+            (topics.supply, cdr.battery_state, np.inf,
              lambda table: {'supply_v': table.numbers('voltage')[:, 0]})):
         if not topic:
             continue
         where = f'{bag.path}: topic {topic}'
-        stamp_ns, _, columns = _series(bag, topic, find, names, values)
+        stamp_ns, _, columns = _series(bag, topic, find, values)
         for name, value in columns.items():
             wrong = np.abs(value) > LIMIT
             if wrong.any():
@@ -198,8 +276,8 @@ def _commands(bag: Bag, topics: Topics) -> dict[str, tuple[np.ndarray, np.ndarra
     """
     if not topics.command:
         return {}
-    stamp_ns, log_ns, columns = _series(bag, topics.command, cdr.joint_state, COMMANDS.values(),
-                                        lambda table: _positions(table, COMMANDS))
+    stamp_ns, log_ns, columns = _series(bag, topics.command, cdr.joint_state,
+                                        partial(_positions, names=COMMANDS))
     stamp_ns = np.where(stamp_ns == 0, log_ns, stamp_ns)
     commands = {}
     for name, value in columns.items():
@@ -217,7 +295,7 @@ def _block(bag: Bag, samples: _Samples, tracks: Mapping[str, Track],
     force, samples.force = samples.force[:rows], samples.force[rows:]
     columns = dict(zip(ACCEL[:len(samples.axes or '')], force.T.copy()))
     columns |= {name: track.interpolate(stamp_ns) for name, track in tracks.items()}
-    alignments = {name: Alignment(*track.alignment) for name, track in tracks.items()}
+    alignments = {name: track.alignment for name, track in tracks.items()}
     for name, (begin_ns, value) in commands.items():
         # Each is in force until the next one; before the first it is NaN.
         columns[name] = np.append(value, np.nan)[np.searchsorted(begin_ns, stamp_ns, 'right') - 1]
@@ -228,19 +306,11 @@ def _block(bag: Bag, samples: _Samples, tracks: Mapping[str, Track],
                      bag.done, samples.stamps.remarks, samples.stamps.bad)
 
 
-def drop_unsampled(recording: Recording) -> None:
-    """Remove the columns of joints without a single position or command."""
-    for column in (*JOINTS.values(), *COMMANDS.values()):
-        if column in recording.columns and np.isnan(recording.columns[column]).all():
-            del recording.columns[column]
-            recording.alignments.pop(column, None)
-
-
 def log_times(path: str | os.PathLike, topic: str) -> Iterator[np.ndarray]:
     """Yield header stamp and log time of the samples of a bag, ns, (k, 2), in blocks."""
     with open_bag(path) as bag:
         imu = find_topics(bag, topic).imu
         for piece in bag.pieces([imu]):
             stamp_ns, _ = _columns(f'{bag.path}: topic {imu}', piece.messages[imu], cdr.header,
-                                   (), lambda table: {})
+                                   lambda table: {})
             yield np.column_stack([stamp_ns, piece.log_ns[imu]])

@@ -122,10 +122,11 @@ def recording_bag(path: str | os.PathLike, sensor: Sensor
                            *_joint_batches(bag, part.stamp_ns, _changes(part.columns), COMMANDS,
                                            '/stage/command')]
                 for column, (topic, field, form) in _SCALARS.items():
-                    known = ~np.isnan(part.columns.get(column, np.full(len(part), np.nan)))
-                    if known.any():
+                    values = part.columns.get(column, np.zeros(0))
+                    if not np.isnan(values).all():
+                        known = ~np.isnan(values)
                         batches.append(bag.batch(topic, form, part.stamp_ns[known],
-                                                 {field: part.columns[column][known]}))
+                                                 {field: values[known]}))
                 bag.append(batches)
 
         yield append
@@ -152,13 +153,12 @@ def _write_info(bag: _NewBag, recording: Recording, sensor: Sensor) -> None:
 def _joint_batches(bag: _NewBag, stamp_ns: np.ndarray, columns: Mapping[str, np.ndarray],
                    names: Mapping[str, str], topic: str) -> Iterator[Batch]:
     """Yield one batch for each set of joints that were sampled together."""
-    joints = [joint for joint, column in names.items() if column in columns]
-    values = np.column_stack([np.zeros((len(stamp_ns), 0)),
-                              *(columns[names[joint]] for joint in joints)])
+    none = np.full(len(stamp_ns), np.nan)
+    values = np.column_stack([columns.get(column, none) for column in names.values()])
     is_sampled = ~np.isnan(values)
     for pattern in np.unique(is_sampled, axis=0):
         rows = (is_sampled == pattern).all(axis=1)
-        sampled = [joint for joint, is_there in zip(joints, pattern) if is_there]
+        sampled = [joint for joint, is_there in zip(names, pattern) if is_there]
         template = cdr.message('', len(sampled), *sampled, len(sampled), np.zeros(len(sampled)),
                                0, 0)
         if sampled:
@@ -232,10 +232,9 @@ class LiveBag:
     def __init__(self, path: Path) -> None:
         """Open a new bag."""
         rosbag2 = import_rosbags()
-        self._types = typestore()
         self._writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
         self._writer.open()
-        self._connections: dict[str, Any] = {}
+        self._bag = _NewBag(path, self._writer)
         self._flushed_ns = 0
         self._lock = threading.RLock()
         self._is_open = True
@@ -245,10 +244,7 @@ class LiveBag:
         with self._lock:
             if not self._is_open:
                 return
-            if topic not in self._connections:
-                self._connections[topic] = self._writer.add_connection(topic, kind,
-                                                                       typestore=self._types)
-            self._writer.write(self._connections[topic], time_ns, data)
+            self._writer.write(self._bag.connection(topic, kind), time_ns, data)
             if time_ns - self._flushed_ns > _FLUSH_NS:
                 self.flush()
                 self._flushed_ns = time_ns

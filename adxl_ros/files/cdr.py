@@ -52,35 +52,29 @@ class Layout:
 
     def numbers(self, name: str, code: str, count: int = 1) -> None:
         """Pass over numbers."""
-        if not count:
-            return
-        size = int(code[1:])
-        start = self._aligned(size)
-        self._advance(start, size * count)
-        self.fields[name] = NumberField(start, code, count)
+        if count:
+            self.fields[name] = NumberField(self._take(int(code[1:]), count), code, count)
 
     def length(self) -> int:
         """Pass over the length of a string or sequence, and return it."""
-        start = self._aligned(4)
-        self._advance(start, 4)
+        start = self._take(4)
         self.fixed += range(start, start + 4)
         return struct.unpack_from(self.order + 'I', self._raw, start)[0]
 
     def text(self, name: str) -> None:
         """Pass over a string."""
         size = self.length()
-        start = self._offset
-        self._advance(start, size)
+        start = self._take(1, size)
         self.fixed += range(start, start + size)
         self.texts[name] = self._raw[start:start + size].rstrip(b'\0').decode(errors='replace')
 
-    def _aligned(self, size: int) -> int:
-        return self._offset + (_BODY_OFFSET - self._offset) % size
-
-    def _advance(self, start: int, size: int) -> None:
-        self._offset = start + size
+    def _take(self, size: int, count: int = 1) -> int:
+        """Pass over numbers of a size, and return where they begin: at a multiple of it."""
+        start = self._offset + (_BODY_OFFSET - self._offset) % size
+        self._offset = start + size * count
         if self._offset > len(self._raw):
             raise CdrError(f'{len(self._raw)} bytes are too few for it')
+        return start
 
 
 def header(raw: bytes) -> Layout:
@@ -133,15 +127,12 @@ def message(stamped_frame: str, *parts: str | int | Sequence[float] | np.ndarray
     """Return a message at the stamp 0 with strings, lengths and numbers behind its header."""
     data = bytearray(b'\0\1\0\0')
     for part in (np.zeros(2, np.int32), stamped_frame, *parts):
-        if isinstance(part, str):
-            text = part.encode() + b'\0'
-            part, rest = len(text), text
-        else:
-            rest = b''
-        values = np.uint32(part) if isinstance(part, int) else np.asarray(part)
+        text = part.encode() + b'\0' if isinstance(part, str) else b''
+        number = len(text) if isinstance(part, str) else part
+        values = np.uint32(number) if isinstance(number, int) else np.asarray(number)
         if values.size:
             data += bytes((_BODY_OFFSET - len(data)) % values.itemsize) + values.tobytes()
-        data += rest
+        data += text
     return bytes(data)
 
 
@@ -168,18 +159,18 @@ class Table:
 
 def tables(raws: Sequence[bytes] | np.ndarray, find: Callable[[bytes], Layout]) -> Iterator[Table]:
     """Group messages by layout; an array has one of equal length in each row."""
-    sizes = np.full(len(raws), raws.shape[1]) if isinstance(raws, np.ndarray) else \
-        np.array([len(raw) for raw in raws])
-    for size in dict.fromkeys(sizes.tolist()):
-        rows = np.flatnonzero(sizes == size)
-        data = raws if isinstance(raws, np.ndarray) else np.frombuffer(
-            b''.join([raws[i] for i in rows.tolist()]), np.uint8).reshape(len(rows), size)
+    if isinstance(raws, np.ndarray):
+        groups = [(np.arange(len(raws)), raws)]
+    else:
+        sizes = np.array([len(raw) for raw in raws])
+        groups = [(rows, np.frombuffer(b''.join([raws[i] for i in rows.tolist()]), np.uint8)
+                   .reshape(len(rows), size))
+                  for size in dict.fromkeys(sizes.tolist())
+                  for rows in [np.flatnonzero(sizes == size)]]
+    for rows, data in groups:
         while len(rows):
             layout = find(data[0].tobytes())
             differs = (data[:, layout.fixed] != data[0, layout.fixed]).any(axis=1)
-            if not differs.any():
-                yield Table(rows, data, layout)
-                break
             yield Table(rows[~differs], data[~differs], layout)
             rows, data = rows[differs], data[differs]
 
@@ -188,16 +179,10 @@ def fill(template: bytes, find: Callable[[bytes], Layout], stamp_ns: np.ndarray,
          fields: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the bytes, (n, size), of messages with stamps, ns, (n,), and fields, (n, count)."""
     layout = find(template)
+    data = np.tile(np.frombuffer(template, np.uint8), (len(stamp_ns), 1))
     sec, nanosec = np.divmod(stamp_ns, 1_000_000_000)
-    values = {'sec': sec, 'nanosec': nanosec, **fields}
-    places = [layout.fields[name] for name in values]
-    record = np.dtype({'names': list(values), 'offsets': [place.offset for place in places],
-                       'formats': [(layout.order + place.code, (place.count,))
-                                   for place in places],
-                       'itemsize': len(template)})
-    data = np.empty((len(stamp_ns), len(template)), np.uint8)
-    data[:] = np.frombuffer(template, np.uint8)
-    records = data.view(record)[:, 0]
-    for name, place in zip(values, places):
-        records[name] = values[name].reshape(-1, place.count)
+    for name, values in {'sec': sec, 'nanosec': nanosec, **fields}.items():
+        place = layout.fields[name]
+        numbers = values.reshape(-1, place.count).astype(layout.order + place.code, 'C')
+        data[:, place.offset:][:, :numbers.itemsize * place.count] = numbers.view(np.uint8)
     return data

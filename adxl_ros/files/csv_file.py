@@ -47,8 +47,9 @@ _NUMBER = re.compile(r'[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)'
 _DATE = re.compile(rb'"?(\d{4})[-/](\d\d)[-/](\d\d)[T ](\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)'
                    rb'(?:Z|([-+]\d\d):?(\d\d))?"?')
 """A date and time by ISO 8601; without an offset it counts as UTC."""
-_LABEL = re.compile(rb'"?[A-Za-z_][\w ]*"?\s*[:=]\s*(?=[-+.]?\d)')
-"""A label before a number, as in `x: 0.1` and `"x": 0.1`."""
+_LABEL = re.compile(rb'"?\b[A-Za-z_][\w ]{0,40}"?\s{0,4}[:=]\s*(?=[-+.]?\d)')
+"""A label before a number, as in `x: 0.1` and `"x": 0.1`. Its length is bounded, because a search
+takes that many steps at each letter of a text without labels."""
 _COMMENT = re.compile(r'\s*(#|//|%)')  # Begin of a comment
 
 
@@ -211,10 +212,10 @@ def find_form(path: str) -> Form:
     if head[:2] in (b'\xff\xfe', b'\xfe\xff'):
         raise UserError(f'{path}:1:1: is UTF-16; save the file as UTF-8')
     if len(head) == _HEAD_BYTES:
-        if b'\n' not in head:
+        head, is_line, _ = head.rpartition(b'\n')  # The last line may be cut
+        if not is_line:
             raise UserError(f'{path}: a line is longer than {_HEAD_BYTES} bytes; this is no CSV '
                             'recording')
-        head = head.rpartition(b'\n')[0]  # The last line may be cut
     lines = _in_utf_8(head).decode().split('\n')[:_HEAD_LINES]
     written = [line for line in lines if line.strip() and not line.lstrip().startswith('#')]
     if not written:

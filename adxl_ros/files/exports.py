@@ -137,7 +137,12 @@ def _head(export: Export, software: str, prefix: str = '# ') -> str:
     if stage := stage_effects(sensor):
         lines += ['', *wrap('Left out, as errors of the stage or of another reference: '
                             f'{", ".join(stage)}.', _COLUMNS)]
-    lines += ['', *wrap(origin_text(sensor), _COLUMNS), '',
+    noise_from, rate_from = map(sensor.provenance.get, ('noise_from', 'rate_from'))
+    stated = sensor.datasheet_name or 'the parameter file'
+    origin = f'measured in {noise_from}' if noise_from else \
+        f'the figure of {stated}; nobody measured it'
+    rate = f'that of {rate_from}' if rate_from else 'as the parameter file states it'
+    lines += ['', *wrap(f'White noise: {origin}. Rate: {rate}.', _COLUMNS), '',
               'Sizes: change of the output in the manoeuvre rich (7 minutes of turns,',
               'shaking, warming and a step of the supply), by simulation.',
               'All that is not held, but for noise and steps: '
@@ -150,16 +155,6 @@ def _head(export: Export, software: str, prefix: str = '# ') -> str:
 def _without_double_dashes(text: str) -> str:
     """Return a text with single dashes: a comment of XML may not hold two."""
     return re.sub('--+', '-', text)
-
-
-def origin_text(sensor: Sensor) -> str:
-    """Return whose figures the white noise and the sample rate are."""
-    noise_from, rate_from = map(sensor.provenance.get, ('noise_from', 'rate_from'))
-    stated = sensor.datasheet_name or 'the parameter file'
-    return (f'White noise: measured in {noise_from}. ' if noise_from else
-            f'White noise: the figure of {stated}; nobody measured it. ') + (
-            f'Rate: that of {rate_from}.' if rate_from else
-            'Rate: as the parameter file states it.')
 
 
 def _flat_noise(sensor: Sensor, prefix: str = '# ') -> str:

@@ -40,7 +40,7 @@ size of the message indices."""
 _CHUNK_BYTES = 1 << 20  # Size that a chunk hardly exceeds, bytes; that of rosbags
 _LARGE_BYTES = 2 << 30
 """Size from which a file that is read leaves the cache (chosen): smaller ones are read again."""
-_PIECE_MESSAGES = 4096  # Messages that are collected to a piece (chosen: some MB)
+PIECE_MESSAGES = 4096  # Messages that are collected to a piece (chosen: some MB)
 
 Raws = Sequence[bytes] | np.ndarray
 """Messages of one type: their bytes one by one, or as rows of equal length, (n, size)."""
@@ -57,7 +57,7 @@ class Piece:
 def collected_pieces(messages: Iterable[tuple[str, bytes, int]]) -> Iterator[Piece]:
     """Collect messages with topic and log time, ns, to pieces."""
     iterator = iter(messages)
-    while batch := list(islice(iterator, _PIECE_MESSAGES)):
+    while batch := list(islice(iterator, PIECE_MESSAGES)):
         raws: dict[str, list[bytes]] = {}
         log_ns: dict[str, list[int]] = {}
         for topic, raw, time_ns in batch:

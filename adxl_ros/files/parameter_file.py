@@ -15,7 +15,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.errors import UserError
+from adxl_ros.errors import one_line, UserError
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Role
@@ -203,32 +203,25 @@ def compose(path: str | os.PathLike) -> yaml.Node | None:
         reason = error.strerror if isinstance(error, OSError) else 'not UTF-8 text'
         raise UserError(f'{path}: cannot be read: {reason}') from None
     except yaml.YAMLError as error:
-        raise _yaml_error(path, error) from None
-
-
-def _yaml_error(path: str | os.PathLike, error: yaml.YAMLError) -> UserError:
-    problem = ' '.join(str(getattr(error, 'problem', error)).split())
-    return UserError(f'{_where(path, getattr(error, "problem_mark", None))}: not YAML: {problem}')
+        problem = ' '.join(str(getattr(error, 'problem', error)).split())
+        place = _where(path, getattr(error, 'problem_mark', None))
+        raise UserError(f'{place}: not YAML: {problem}') from None
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return values and places by dotted key, from below `/**: ros__parameters:`."""
+    parameters: Any = compose(path)
+    for key in ('/**', 'ros__parameters'):
+        children = parameters.value if isinstance(parameters, yaml.MappingNode) else ()
+        below = next((value for name, value in children if name.value == key), None)
+        if not isinstance(below, yaml.MappingNode):
+            place = _where(path, parameters and parameters.start_mark)
+            raise UserError(f'{place}: no {key!r} with parameters below it; a parameter file '
+                            "begins with '/**:' and 'ros__parameters:'")
+        parameters = below
     flat: dict[str, Any] = {}
-    try:
-        parameters: Any = compose(path)
-        for key in ('/**', 'ros__parameters'):
-            children = parameters.value if isinstance(parameters, yaml.MappingNode) else ()
-            below = [value for name, value in children
-                     if name.value == key and isinstance(value, yaml.MappingNode)]
-            if not below:
-                place = _where(path, parameters and parameters.start_mark)
-                raise UserError(f'{place}: no {key!r} with parameters below it; a parameter file '
-                                "begins with '/**:' and 'ros__parameters:'")
-            parameters = below[0]
-        marks = {'': parameters.start_mark}
-        _flatten(parameters, '', flat, marks, path)
-    except yaml.YAMLError as error:
-        raise _yaml_error(path, error) from None
+    marks = {'': parameters.start_mark}
+    _flatten(parameters, '', flat, marks, path)
     return flat, marks
 
 
@@ -249,7 +242,11 @@ def _flatten(node: yaml.MappingNode, prefix: str, flat: dict[str, Any], marks: d
             _flatten(value, f'{key}.', flat, marks, path)
         else:
             marks[key] = value.start_mark
-            flat[key] = yaml.constructor.SafeConstructor().construct_object(value, deep=True)
+            try:
+                flat[key] = yaml.constructor.SafeConstructor().construct_object(value, deep=True)
+            except (yaml.YAMLError, ValueError) as error:
+                raise UserError(f'{_where(path, value.start_mark)}: {key}: {one_line(error)}'
+                                ) from None
 
 
 @dataclass(frozen=True)
@@ -261,16 +258,18 @@ class _FlatReader:
 
     def sensor(self, may_measure: bool) -> Sensor:
         """Make the sensor; every value is checked."""
-        unstated = [field for key, field in SENSOR_FIELDS.items()
-                    if may_measure and key not in self.flat
-                    and field.metadata['placeholder'] is not None]
         # The axes come first, as they say how many values the others have.
         axes = self._field(SENSOR_FIELDS['sensor.axes'])
-        values = {field.name: self._field(field, axes) for field in SENSOR_FIELDS.values()
-                  if field not in unstated}
-        for field in unstated:
+        values: dict[str, Any] = {}
+        unstated = []
+        for key, field in SENSOR_FIELDS.items():
             value = field.metadata['placeholder']
-            values[field.name] = np.full(len(axes), value) if field.type == 'np.ndarray' else value
+            if may_measure and key not in self.flat and value is not None:
+                unstated.append(field.name)
+                is_array = field.type == 'np.ndarray'
+                values[field.name] = np.full(len(axes), value) if is_array else value
+            else:
+                values[field.name] = self._field(field, axes)
         self._require(values['z_sign'], 'sensor.z_sign', '0, but must be 1 (upright) or -1')
         effects = self._names('effects')
         coefficients = {name: self._coefficients(name, axes) for name in effects}
@@ -281,8 +280,7 @@ class _FlatReader:
                                   for key, value in self._below('provenance.').items()},
                       datasheet_name=str(self.flat.get('datasheet.name', '')),
                       datasheet=self._datasheet(),
-                      link=self._below(_LINK),
-                      unstated=tuple(field.name for field in unstated))
+                      link=self._below(_LINK), unstated=tuple(unstated))
 
     def _require(self, is_right: Any, key: str, reason: str) -> None:
         if not is_right:
@@ -384,9 +382,7 @@ class _FlatReader:
                           f'{name!r} is no parameter of the listed effects')
         if not names:
             return np.zeros((0, 0)), ()
-        self._require(key in self.flat, key, f'missing; {len(names)} names stand in '
-                      'covariance_names')
-        matrix = self._numbers(key, self.flat[key])
+        matrix = self._numbers(key, self.flat.get(key, []))
         self._require(matrix.size == len(names) ** 2, key, f'{matrix.size} values, but '
                       f'{len(names)} names need {len(names) ** 2}')
         matrix = matrix.reshape(len(names), -1)

@@ -14,10 +14,11 @@ from contextlib import contextmanager
 from dataclasses import replace
 import os
 from pathlib import Path
-from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import mapped_recording
+from adxl_ros.files import bag_reader, mapped_recording
+from adxl_ros.files.bag_writer import recording_bag
+from adxl_ros.files.column_guess import describe
 from adxl_ros.files.column_mapping import AS_IT_IS, Mounting, parse_mapping, ReadingOptions
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import ACCEL, concatenate, Recording, TIME, VOLTS
@@ -57,11 +58,7 @@ def read(path: str | os.PathLike, reading: ReadingOptions = AS_IT_IS) -> Recordi
         The recording cannot be read, or holds values that no sensor gives.
 
     """
-    recording = concatenate(blocks(path, _BLOCK_ROWS, reading))
-    if is_bag(path):
-        from adxl_ros.files.bag_reader import drop_unsampled  # tables need none of it
-        drop_unsampled(recording)
-    return recording
+    return concatenate(blocks(path, _BLOCK_ROWS, reading))
 
 
 def blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions = AS_IT_IS
@@ -72,15 +69,9 @@ def blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions = AS_IT_I
     All blocks have the same columns, except for a CSV column that turns out to be text further
     down. Alignments, cut and remarks of a block are those up to its end.
     """
-    read_blocks = _bag_blocks(path, rows, reading=reading) if is_bag(path) else \
+    read_blocks = bag_reader.blocks(path, rows, reading=reading) if is_bag(path) else \
         _table_blocks(path, rows, reading)
     return _mounted(read_blocks, reading.mounting) if reading.mounting else read_blocks
-
-
-def _bag_blocks(path: str | os.PathLike, rows: int, **options: Any
-                ) -> Generator[Recording, None, None]:
-    from adxl_ros.files import bag_reader  # tables need none of it
-    return bag_reader.blocks(path, rows, **options)
 
 
 def _table_blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions
@@ -92,7 +83,6 @@ def _table_blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions
     try:
         yield from mapped_recording.blocks(table, mapping, reading, rows)
     except mapped_recording.NotNativeError as error:
-        from adxl_ros.files.column_guess import describe  # few files need it
         text, options = describe(table)
         raise UserError(f'{error}; {text}', options) from None
 
@@ -140,7 +130,7 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> Recording:
         The file cannot be read, or an axis is missing.
 
     """
-    parts = (_bag_blocks(path, _BLOCK_ROWS, ideal=True) if is_bag(path)
+    parts = (bag_reader.blocks(path, _BLOCK_ROWS, ideal=True) if is_bag(path)
              else mapped_recording.blocks(open_table(path), None, AS_IT_IS, _BLOCK_ROWS, ACCEL))
     ideal = concatenate(parts)
     return replace(ideal, time_s=ideal.time_s + (ideal.epoch_ns - epoch_ns) / 1e9,
@@ -156,16 +146,13 @@ def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Record
     ending determines the format. A bag holds the nominal conversion of `sensor`.
     """
     if Path(path).suffix != '.csv':
-        from adxl_ros.files.bag_writer import recording_bag  # tables need none of it
         with recording_bag(path, sensor) as append:
             yield append
         return
     with csv_writer(path) as append:
         def write_block(block: Recording) -> None:
-            info = {key: value for key, value in block.info.items() if key != 'epoch_ns'}
-            if block.epoch_ns:
-                info['epoch_ns'] = str(block.epoch_ns)
-            append({TIME: block.time_s, **block.columns}, info)
+            epoch = {'epoch_ns': str(block.epoch_ns)} if block.epoch_ns else {}
+            append({TIME: block.time_s, **block.columns}, {**block.info, **epoch})
 
         yield write_block
 

@@ -34,11 +34,6 @@ class StreamInfo:
     where: str  # The file or topic, for messages
 
     @property
-    def format_version(self) -> str:
-        """Version of the recording format."""
-        return self.texts.get('format', FORMAT)
-
-    @property
     def serial(self) -> str:
         """Return the serial number of the unit; `NO_UNIT` where none is stated."""
         return self.texts.get('serial', NO_UNIT)
@@ -357,9 +352,10 @@ class StampCheck:
 
 def check_unit(info: StreamInfo, axes: str, sensor: Sensor) -> None:
     """Refuse samples that state another unit than the one that `sensor` describes."""
-    if info.format_version != FORMAT:
-        raise UserError(f'{info.where}: format version {info.format_version}, but this package '
-                        f'reads version {FORMAT}; update the package')
+    version = info.texts.get('format', FORMAT)
+    if version != FORMAT:
+        raise UserError(f'{info.where}: format version {version}, but this package reads version '
+                        f'{FORMAT}; update the package')
     _check_serial(info, sensor)
     if axes != sensor.axes:
         raise UserError(f'{info.where}: samples of the axes {axes}, but the parameters of '

@@ -10,12 +10,11 @@ from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.files.bag_messages import Bag, open_bag, typestore
+from adxl_ros.files.bag_messages import Bag, JOINT_STATE, open_bag, typestore
 from adxl_ros.files.recording import is_bag
 from adxl_ros.files.tables import open_table
 import numpy as np
 
-_JOINT_STATE = 'sensor_msgs/msg/JointState'
 _ODOMETRY = 'nav_msgs/msg/Odometry'
 _TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 _BASE = ('x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw')
@@ -88,7 +87,7 @@ def _from_table(path: str) -> Readings:
 
 def _topic(bag: Bag, topic: str) -> str:
     """Return the topic of the joints."""
-    topics = sorted(name for name, kind in bag.types if kind == _JOINT_STATE)
+    topics = sorted(name for name, kind in bag.types if kind == JOINT_STATE)
     named = [name for name in topics if name.strip('/') == topic.strip('/')]
     found = named if topic else [name for name in topics if name.endswith('/joint_states')
                                  and not name.endswith('stage/joint_states')] or topics

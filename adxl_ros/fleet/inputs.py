@@ -182,13 +182,15 @@ def fault_of(error: BaseException) -> str:
 def _source(fs: Any, path: str, **known: Any) -> Source:
     """Return a recording by its address, which is the path itself on this machine."""
     # A name that is not UTF-8 has no place in a table.
-    address, options = as_utf_8(str(fs.unstrip_protocol(path))), fs.storage_options
-    scheme, _, rest = address.partition(':///')
-    if rest and options.get('host'):
+    address = as_utf_8(str(fs.unstrip_protocol(path)))
+    user, password, host, port = (
+        fs.storage_options.get(name) for name in ('username', 'password', 'host', 'port'))
+    if host:
         # The path in a server does not name the server.
-        login = ':'.join(filter(None, map(options.get, ('username', 'password'))))
-        port = f':{options["port"]}' if options.get('port') else ''
-        address = f'{scheme}://{login}{"@" * bool(login)}{options["host"]}{port}/{rest}'
+        server = f'{host}:{port}' if port else host
+        if user:
+            server = f'{user}:{password}@{server}' if password else f'{user}@{server}'
+        address = address.replace(':///', f'://{server}/', 1)
     url = without_secrets(address)
     return Source(url.removeprefix('file://'), **known, address=address if address != url else '')
 

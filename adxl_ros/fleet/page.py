@@ -12,21 +12,9 @@ from pathlib import Path
 
 from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import write_text
+from adxl_ros.fleet import table as fleet
 from adxl_ros.fleet.pooling import FALSE_DISCOVERY_RATE
 from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE
-from adxl_ros.fleet.table import (
-    analyse,
-    DAYS_PER_YEAR,
-    effect_matrix,
-    far_out,
-    FleetTable,
-    QuantityResult,
-    rank,
-    read,
-    State,
-    TOLERANCE_MG,
-    UnitState,
-)
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.population import Population
 from adxl_ros.report import figures as plotly, page as html_page
@@ -48,8 +36,8 @@ _DECIMALS = 3
 """Decimals of a scatter, mg, mg/g or µg. Chosen: far below the noise of any recording."""
 _MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))
 """Columns that tell whether a unit is within the tolerance."""
-_SENTENCES = {State.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
-              State.IN_ORDER: 'All units are within the tolerance.'}
+_SENTENCES = {fleet.State.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
+              fleet.State.IN_ORDER: 'All units are within the tolerance.'}
 """What the most urgent state means for the user; the others mean the same."""
 
 
@@ -59,11 +47,12 @@ def date_text(year: float) -> str:
 
 
 def _stamps(years: Iterable[float]) -> list[str]:
-    return [f'{_EPOCH + timedelta(days=float(year) * DAYS_PER_YEAR):%Y-%m-%d %H:%M}'
+    return [f'{_EPOCH + timedelta(days=float(year) * fleet.DAYS_PER_YEAR):%Y-%m-%d %H:%M}'
             for year in years]
 
 
-def _trend_figure(table: FleetTable, result: QuantityResult, unit: int) -> plotly.Figure:
+def _trend_figure(table: fleet.FleetTable, result: fleet.QuantityResult, unit: int
+                  ) -> plotly.Figure:
     """Plot a quantity of a unit over time, about its mean where units differ by far more."""
     quantity, place = result.quantity, result.place_of(unit)
     is_relative = quantity.is_coefficient and quantity.is_force
@@ -90,7 +79,7 @@ def _trend_figure(table: FleetTable, result: QuantityResult, unit: int) -> plotl
                           | {'x': _stamps(years[shown])})
     # Calibrations between recordings, where a period ends
     rows = table.rows_of(unit)
-    made = table.years[rows] - table['calibration_age_days'][rows] / DAYS_PER_YEAR
+    made = table.years[rows] - table['calibration_age_days'][rows] / fleet.DAYS_PER_YEAR
     begins = made[1:][np.diff(table.period[rows]) > 0]
     marks = [{'type': 'line', 'x0': stamp, 'x1': stamp, 'yref': 'paper', 'y0': 0, 'y1': 1,
               'line': {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'}}
@@ -102,7 +91,7 @@ def _trend_figure(table: FleetTable, result: QuantityResult, unit: int) -> plotl
         yaxis={'title': {'text': title}, 'nticks': 5})
 
 
-def _matrix_figure(table: FleetTable, share: pd.DataFrame) -> plotly.Figure:
+def _matrix_figure(table: fleet.FleetTable, share: pd.DataFrame) -> plotly.Figure:
     """Plot how often each effect is named in each unit."""
     share = share.iloc[:, :_MOST_EFFECTS]
     columns = list(share)
@@ -122,9 +111,9 @@ def _matrix_figure(table: FleetTable, share: pd.DataFrame) -> plotly.Figure:
 def write(folder: Path) -> list[Path]:
     """Write page and population of a fleet beside its table."""
     html_page.check_libraries()
-    table = read(folder / TABLE)
-    results = analyse(table)
-    distant = far_out(results, table.serials)
+    table = fleet.read(folder / TABLE)
+    results = fleet.analyse(table)
+    distant = fleet.far_out(results, table.serials)
     population = Population(POPULATION, {
         result.quantity.column: result.population.pooled for result in results
         if result.population is not None and result.population.pooled.prediction_std > 0})
@@ -135,11 +124,11 @@ def write(folder: Path) -> list[Path]:
     return [folder / name for name in (PAGE, POPULATION)]
 
 
-def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> str:
+def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folder: Path) -> str:
     """Return the page of a fleet."""
-    distant = far_out(results, table.serials)
-    units = rank(table, results, distant)
-    share, findings = effect_matrix(table)
+    distant = fleet.far_out(results, table.serials)
+    units = fleet.rank(table, results, distant)
+    share, findings = fleet.effect_matrix(table)
     # Units that drift come first, although others may be more urgent.
     plotted = [(unit, shown[0]) for unit in sorted(units, key=lambda unit: not unit.drifts)
                if (shown := [*(drift.result for drift in unit.drifts), *(
@@ -174,31 +163,31 @@ def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> 
         'outliers': _outlier_rows(table, results),
         'outlier_count': sum(int(result.is_outlier.sum()) for result in results),
         'refusals': _refusal_rows(table), 'most_rows': _MOST_ROWS,
-        'tolerance': number(TOLERANCE_MG), 'false_discovery': f'{FALSE_DISCOVERY_RATE:.0%}',
+        'tolerance': number(fleet.TOLERANCE_MG), 'false_discovery': f'{FALSE_DISCOVERY_RATE:.0%}',
         'drifts': sum(int(result.is_claimed.sum()) for result in results)})
 
 
-def _badge(table: FleetTable, units: Sequence[UnitState], counts: Counter[State]
+def _badge(table: fleet.FleetTable, units: Sequence[fleet.UnitState], counts: Counter[fleet.State]
            ) -> dict[str, str]:
     if not units:
         return {'colour': 'grey', 'word': 'NO UNITS',
                 'sentence': 'No recording states a serial number.'}
     worst = units[0].state
-    if worst >= State.FAR_OUT and table.frame[[*_MEASURES]].isna().all(axis=None):
+    if worst >= fleet.State.FAR_OUT and table.frame[[*_MEASURES]].isna().all(axis=None):
         # What was not measured is not within the tolerance.
         return {'colour': 'grey', 'word': 'NOT MEASURED',
                 'sentence': 'No gap and no zero-g were measured; they need diagnose and fit.'}
-    return {'colour': worst.colour, 'word': 'IN ORDER' if worst is State.IN_ORDER else
+    return {'colour': worst.colour, 'word': 'IN ORDER' if worst is fleet.State.IN_ORDER else
             f'{counts[worst]} of {len(units)} {worst.words}'.upper(), 'sentence': _SENTENCES.get(
                 worst, 'No unit is out of tolerance. Look at the head of the list.')}
 
 
-def _tiles(table: FleetTable, counts: Counter[State]) -> list[dict[str, str]]:
+def _tiles(table: fleet.FleetTable, counts: Counter[fleet.State]) -> list[dict[str, str]]:
     outcomes = Counter(table['outcome'].tolist())
     return [{'label': 'recordings', 'text': str(len(table)),
              'note': f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed'},
             *({'label': f'units: {state.words}', 'text': str(counts[state]), 'note': ''}
-              for state in State)]
+              for state in fleet.State)]
 
 
 def _link(folder: Path, report: str) -> str:
@@ -207,7 +196,7 @@ def _link(folder: Path, report: str) -> str:
                  if report and (folder / name).exists()), '')
 
 
-def _population_rows(results: Sequence[QuantityResult]) -> list[list[str]]:
+def _population_rows(results: Sequence[fleet.QuantityResult]) -> list[list[str]]:
     rows = []
     for result in results:
         population, quantity, scatter = result.population, result.quantity, result.trends.scatter
@@ -226,7 +215,7 @@ def _population_rows(results: Sequence[QuantityResult]) -> list[list[str]]:
     return rows
 
 
-def _outlier_rows(table: FleetTable, results: Sequence[QuantityResult]
+def _outlier_rows(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult]
                   ) -> list[dict[str, str]]:
     """Return the recordings that are far from others of their unit, the farthest first."""
     outliers = [(float(result.distance[i]), result.rows[i], result.quantity,
@@ -240,7 +229,7 @@ def _outlier_rows(table: FleetTable, results: Sequence[QuantityResult]
             for distance, row, quantity, value in outliers[:_MOST_ROWS]]
 
 
-def _refusal_rows(table: FleetTable) -> list[list[str]]:
+def _refusal_rows(table: fleet.FleetTable) -> list[list[str]]:
     """Return the reasons of refusals: how often, in how many units, and an example."""
     failed = table.frame.assign(unit=table.unit)[table['outcome'] != 'done']
     kinds = np.array([reason_kind(row) for row in failed.to_dict('records')], object)

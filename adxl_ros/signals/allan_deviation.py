@@ -6,6 +6,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+import os
+import tempfile
+from typing import IO
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
@@ -14,13 +17,9 @@ from adxl_ros.signals.block_statistics import gap_s
 from adxl_ros.signals.rest_detection import RecordedRests, Rest
 import numpy as np
 
-_LONGEST = 1 << 20
-"""Largest number of samples of an averaging time with all overlaps. Chosen: 17 min at 1 kHz, and
-25 MB an axis."""
 _MOST_CELLS = 1 << 17
-"""Cells of a stream at most; then neighbours are joined. Chosen: 24 h at 1 kHz are cells of 1 s.
-"""
-_AT_ONCE = 1 << 13  # Samples that are added at a time. Chosen: they stay in the cache of a core
+"""A stream has fewer cells. Chosen: 24 h at 1 kHz are cells of 1 s."""
+_AT_ONCE = 1 << 14  # Samples that are read at a time. Chosen: they stay in the cache of a core
 _FEWEST_AVERAGES = 3  # Averages side by side at the longest time. Chosen: two differences
 
 
@@ -39,93 +38,64 @@ class AllanDeviation:
         return 1 / np.sqrt(2 * (self.averages - 1))
 
 
-class CellMeans:
+class Phase:
     """
-    Means of cells of equal length.
+    The running sums of a stream, from which its Allan deviation and the means of cells follow.
 
-    Where there are too many cells, neighbours are joined. The memory is bounded so, and cells of
-    a short stream are short.
-    """
-
-    def __init__(self, columns: int) -> None:
-        self.size = 1  # Samples of a cell
-        self.means = np.empty((0, columns))  # Means by cell and column, (k, c)
-        self._leftover = np.empty((0, columns))
-
-    def feed(self, rows: np.ndarray) -> None:
-        """Add the next rows of the stream, (n, c)."""
-        rows = np.concatenate([self._leftover, rows])
-        stop = len(rows) // self.size * self.size
-        cells = rows[:stop].reshape(-1, self.size, rows.shape[1]).mean(axis=1)
-        self.means, self._leftover = np.concatenate([self.means, cells]), rows[stop:].copy()
-        while len(self.means) >= _MOST_CELLS:
-            even = len(self.means) // 2 * 2
-            odd = np.repeat(self.means[even:], self.size, axis=0)
-            self._leftover = np.concatenate([odd, self._leftover])
-            self.means = self.means[:even].reshape(-1, 2, rows.shape[1]).mean(axis=1)
-            self.size *= 2
-
-
-class AllanStream:
-    """
-    Computes the overlapping Allan deviation at octaves of time while the samples come in.
-
-    Up to an averaging time of 2²⁰ samples, all overlaps are used. Longer times come from the
-    means of cells, in steps of a cell, which is less than a hundredth of such a time.
+    They are kept in a temporary file, 8 bytes a sample and axis, so that the memory is bounded.
     """
 
-    def __init__(self, axes: int) -> None:
-        # Sum of squared second differences by octave and axis, and their number by octave
-        self._sums = np.zeros((_LONGEST.bit_length(), axes))
-        self._counts = [0] * _LONGEST.bit_length()
-        # Running sums of the samples, of which the newest are kept
-        self._phase = np.zeros((axes, 3 * _LONGEST))
-        self._kept = 1
-        self._offset: np.ndarray | None = None
-        self.count = 0
+    def __init__(self, axes: int, file: IO[bytes]) -> None:
+        self.count = 0  # Samples so far
+        self._file = file
+        self._offset = self._sum = np.zeros(axes)
+        self._file.write(self._sum.tobytes())
 
     def feed(self, samples: np.ndarray) -> None:
         """Add the next samples of the stream, (n, m)."""
-        if self._offset is None:
+        if not self.count:
             self._offset = samples[0].copy()
-        for begin in range(0, len(samples), _AT_ONCE):
-            part = samples[begin:begin + _AT_ONCE]
-            if self._kept + len(part) > self._phase.shape[1]:
-                # The longest octave needs twice its length.
-                self._phase[:, :2 * _LONGEST] = \
-                    self._phase[:, self._kept - 2 * _LONGEST:self._kept].copy()
-                self._kept = 2 * _LONGEST
-            last, self._kept = self._kept - 1, self._kept + len(part)
-            self._phase[:, last + 1:self._kept] = (
-                np.cumsum((part - self._offset).T, axis=1) + self._phase[:, [last]])
-            self.count += len(part)
-            for octave, before in enumerate(self._counts):
-                size = 1 << octave
-                new = self.count + 1 - 2 * size - before  # differences that end in `part`
-                if new <= 0:
-                    break
-                late, middle, early = (self._phase[:, self._kept - new - lag:self._kept - lag]
+        sums = self._sum + np.cumsum(samples - self._offset, axis=0)
+        self._sum = sums[-1]
+        self.count += len(samples)
+        try:
+            self._file.seek(0, os.SEEK_END)
+            self._file.write(sums.tobytes())
+        except OSError as error:
+            raise UserError(f'{tempfile.gettempdir()}: cannot be written: {error.strerror}; set '
+                            'TMPDIR to a larger disk') from None
+
+    def _sums(self, begin: int, stop: int) -> np.ndarray:
+        """Return the sums of the first `begin` to `stop` − 1 samples, (stop − begin, m)."""
+        self._file.seek(begin * self._sum.nbytes)
+        data = self._file.read((stop - begin) * self._sum.nbytes)
+        return np.frombuffer(data).reshape(stop - begin, -1)
+
+    def allan_deviation(self, rate_hz: float) -> AllanDeviation:
+        """Return the overlapping Allan deviation at octaves of time, with all overlaps."""
+        sizes = 1 << np.arange((self.count // _FEWEST_AVERAGES).bit_length())
+        squares = np.zeros((len(sizes), len(self._sum)))
+        for octave, size in enumerate(sizes.tolist()):
+            number = self.count + 1 - 2 * size
+            for begin in range(0, number, _AT_ONCE):
+                stop = min(begin + _AT_ONCE, number)
+                early, middle, late = (self._sums(begin + lag, stop + lag)
                                        for lag in (0, size, 2 * size))
                 difference = late - middle - (middle - early)
-                self._sums[octave] += np.einsum('ij,ij->i', difference, difference)
-                self._counts[octave] += new
+                squares[octave] += np.einsum('ij,ij->j', difference, difference) / number
+        return AllanDeviation(sizes / rate_hz, np.sqrt(squares / 2) / sizes[:, None],
+                              self.count / sizes)
 
-    def result(self, rate_hz: float, cells: CellMeans) -> AllanDeviation:
-        """Return the Allan deviation of the samples so far."""
-        sizes = [1 << octave for octave in range((self.count // _FEWEST_AVERAGES).bit_length())]
-        squares = [sums / count for _, sums, count in zip(sizes, self._sums, self._counts)]
-        squares += [_from_cells(cells, size // cells.size) * cells.size ** 2
-                    for size in sizes[len(squares):]]
-        size = np.array(sizes)
-        return AllanDeviation(size / rate_hz, np.sqrt(np.array(squares) / 2) / size[:, None],
-                              self.count / size)
-
-
-def _from_cells(cells: CellMeans, size: int) -> np.ndarray:
-    """Return the mean square of second differences over `size` cells by axis, u², (m,)."""
-    phase = np.cumsum(np.vstack([np.zeros_like(cells.means[0]), cells.means - cells.means[0]]), 0)
-    differences = phase[2 * size:] - 2 * phase[size:-size] + phase[:-2 * size]
-    return (differences ** 2).mean(axis=0)
+    def cells(self) -> tuple[int, np.ndarray]:
+        """Return the samples of a cell, a power of two, and the means of all cells, (k, m)."""
+        size = 1
+        while self.count // size >= _MOST_CELLS:
+            size *= 2
+        step = max(_AT_ONCE // size, 1) * size
+        edges = np.concatenate([
+            self._sums(i, min(i + step - size + 1, self.count + 1))[::size].copy()
+            for i in range(0, self.count + 1, step)])
+        return size, self._offset + np.diff(edges, axis=0) / size
 
 
 _WINDOW_S = 2.0  # Shortest window of the std of a sample, s. Chosen: slow noise is slower
@@ -185,19 +155,19 @@ def longest_rest(read: Callable[[], Iterable[Recording]], unit: Sensor, first: R
                 if stop_s - start_s > _LARGEST_END_S]
     if not motion_s:
         rest = replace(rest, time_start_s=first_s, time_stop_s=last_s)
-    samples = _Samples(first)
-    for block in read():
-        samples.feed(block, unit, rest)
-    return samples.stretch(last_s - first_s, motion_s)
+    with tempfile.TemporaryFile() as file:
+        samples = _Samples(first, file)
+        for block in read():
+            samples.feed(block, unit, rest)
+        return samples.stretch(last_s - first_s, motion_s)
 
 
 class _Samples:
     """The undisturbed samples of a rest; gaps are filled by straight lines."""
 
-    def __init__(self, first: Recording) -> None:
+    def __init__(self, first: Recording, file: IO[bytes]) -> None:
         self._first, columns = first, len(first.sensor_columns)
-        self._allan = AllanStream(columns)
-        self._cells = CellMeans(columns)
+        self._phase = Phase(columns, file)
         self._resolution = np.full(columns, np.inf)
         self._filled = 0
         # Stamps of the first and the newest sample, and the newest row
@@ -229,8 +199,7 @@ class _Samples:
         if len(full) > len(rows):
             self._filled += len(full) - len(rows)
             rows = np.column_stack([np.interp(full, number, column) for column in rows.T])
-        self._allan.feed(rows[new:])
-        self._cells.feed(rows[new:])
+        self._phase.feed(rows[new:])
 
     def stretch(self, recorded_s: float, motion_s: list[tuple[float, float]]) -> StillStretch:
         """Return the samples as a rest; refuse an axis that never changes."""
@@ -239,13 +208,13 @@ class _Samples:
                 raise UserError(f'{self._first.path}: {name} never changes from '
                                 f'{self._start_s:.4g} s to {self._stop_s:.4g} s; the axis is '
                                 'stuck, or not connected')
-        cells, count = self._cells, self._allan.count
+        count = self._phase.count
         rate_hz = (count - 1) / (self._stop_s - self._start_s)
-        allan = self._allan.result(rate_hz, cells)
+        allan, (size, means) = self._phase.allan_deviation(rate_hz), self._phase.cells()
         # The variance within 2^k samples is that of the octaves of Haar's wavelets in it.
         octaves = max(int(np.ceil(np.log2(_WINDOW_S * rate_hz))), 1)
         variance = (allan.deviation[:octaves] ** 2).sum(axis=0) / 2 / (1 - 0.5 ** octaves)
         return StillStretch(
             self._start_s, self._stop_s, rate_hz, count, self._filled, allan,
-            cells.size / rate_hz, cells.means, np.sqrt(variance), self._resolution, recorded_s,
+            size / rate_hz, means, np.sqrt(variance), self._resolution, recorded_s,
             motion_s)
