@@ -222,8 +222,8 @@ def _columns(where: str, raws: Raws, find: Callable[[bytes], cdr.Layout], values
     return stamp_ns, columns
 
 
-def _series(bag: Bag, topic: str, find: Callable[[bytes], cdr.Layout], values: Values
-            ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+def series(bag: Bag, topic: str, find: Callable[[bytes], cdr.Layout], values: Values
+           ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Return stamps and log times, ns, (k,), and columns, (k,), of all messages of a topic."""
     logs, stamps, columns = zip(*((piece.log_ns[topic], *_columns(
         f'{bag.path}: topic {topic}', piece.messages[topic], find, values))
@@ -236,20 +236,21 @@ def _series(bag: Bag, topic: str, find: Callable[[bytes], cdr.Layout], values: V
         for name in dict.fromkeys(name for part in columns for name in part)}
 
 
-def _positions(table: cdr.Table, names: Mapping[str, str]) -> dict[str, np.ndarray]:
-    """Return the positions of joints by column."""
+def positions(table: cdr.Table, names: Mapping[str, str] | None = None) -> dict[str, np.ndarray]:
+    """Return the positions of joints by column, or of all joints by name."""
     if 'position' not in table.layout.fields:
         return {}
     joints = [text for key, text in table.layout.texts.items() if key != 'frame_id']
-    positions = dict(zip(joints, table.numbers('position').T))
-    return {column: positions[joint] for joint, column in names.items() if joint in positions}
+    values = dict(zip(joints, table.numbers('position').T))
+    return values if names is None else {
+        column: values[joint] for joint, column in names.items() if joint in values}
 
 
 def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
     """Return the references by column; none of a joint without a position."""
     tracks = {}
     for topic, find, longest_ns, values in (
-            (topics.joints, cdr.joint_state, LONGEST_MOVE_NS, partial(_positions, names=JOINTS)),
+            (topics.joints, cdr.joint_state, LONGEST_MOVE_NS, partial(positions, names=JOINTS)),
             (topics.temperature, cdr.temperature, np.inf,
              lambda table: {'temperature_c': table.numbers('temperature')[:, 0]}),
             (topics.supply, cdr.battery_state, np.inf,
@@ -257,7 +258,7 @@ def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
         if not topic:
             continue
         where = f'{bag.path}: topic {topic}'
-        stamp_ns, _, columns = _series(bag, topic, find, values)
+        stamp_ns, _, columns = series(bag, topic, find, values)
         for name, value in columns.items():
             wrong = np.abs(value) > LIMIT
             if wrong.any():
@@ -276,8 +277,8 @@ def _commands(bag: Bag, topics: Topics) -> dict[str, tuple[np.ndarray, np.ndarra
     """
     if not topics.command:
         return {}
-    stamp_ns, log_ns, columns = _series(bag, topics.command, cdr.joint_state,
-                                        partial(_positions, names=COMMANDS))
+    stamp_ns, log_ns, columns = series(bag, topics.command, cdr.joint_state,
+                                       partial(positions, names=COMMANDS))
     stamp_ns = np.where(stamp_ns == 0, log_ns, stamp_ns)
     commands = {}
     for name, value in columns.items():

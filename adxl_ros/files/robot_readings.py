@@ -11,6 +11,7 @@ from typing import NamedTuple
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.bag_messages import Bag, JOINT_STATE, open_bag, typestore
+from adxl_ros.files.bag_reader import positions, series
 from adxl_ros.files.recording import is_bag
 from adxl_ros.files.tables import open_table
 import numpy as np
@@ -100,21 +101,8 @@ def _topic(bag: Bag, topic: str) -> str:
 
 def _joints(bag: Bag, topic: str, epoch_ns: int) -> dict[str, Track]:
     """Return the readings of all joints of a topic."""
-    readings: dict[str, tuple[list[np.ndarray], list[np.ndarray]]] = {}
-    try:
-        for table in (table for piece in bag.pieces([topic])
-                      for table in cdr.tables(piece.messages[topic], cdr.joint_state)):
-            names = [text for key, text in table.layout.texts.items() if key != 'frame_id']
-            if 'position' not in table.layout.fields:
-                continue
-            for name, values in zip(names, table.numbers('position').T):
-                times, positions = readings.setdefault(name, ([], []))
-                times.append(table.stamp_ns())
-                positions.append(values)
-    except cdr.CdrError as error:
-        raise UserError(f'{bag.path}: topic {topic}: {error}') from None
-    return {name: _track((np.concatenate(times) - epoch_ns) / 1e9, np.concatenate(positions))
-            for name, (times, positions) in readings.items()}
+    stamp_ns, _, columns = series(bag, topic, cdr.joint_state, positions)
+    return {name: _track((stamp_ns - epoch_ns) / 1e9, values) for name, values in columns.items()}
 
 
 def _track(time_s: np.ndarray, values: np.ndarray) -> Track:
