@@ -15,11 +15,11 @@ from adxl_ros.files.bag_messages import (
     find_ideal,
     find_topics,
     open_bag,
+    Raws,
     read_info,
     Topics,
 )
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
-from adxl_ros.files.mcap_file import Raws
 from adxl_ros.files.recording_columns import (
     ACCEL,
     Alignment,

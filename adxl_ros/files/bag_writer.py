@@ -15,6 +15,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.atomic_write import atomic_path, release_written
 from adxl_ros.files.bag_messages import (
+    Batch,
     BATTERY_STATE,
     DIAGNOSTIC_STATUS,
     import_rosbags,
@@ -22,8 +23,8 @@ from adxl_ros.files.bag_messages import (
     JOINT_STATE,
     TEMPERATURE,
     typestore,
+    write_messages,
 )
-from adxl_ros.files.mcap_file import Batch, write_messages
 from adxl_ros.files.recording_columns import COMMANDS, converted_info, JOINTS, Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 import fcntl
@@ -86,34 +86,30 @@ JournalEntry: TypeAlias = PoseRecord | PoseDropped | PoseSkipped | MountingUnche
 """What a line of a journal after its head may hold."""
 
 
-def _line(entry: JournalEntry) -> dict[str, Any]:
-    """Return the keys and values of the line of an entry."""
-    match entry:
-        case PoseRecord():
-            return entry.to_json()
-        case PoseDropped(pose):
-            return {'drop': pose}
-        case PoseSkipped(pose):
-            return {'skip': pose, 'drop': pose}
-        case MountingUnchecked():
-            return {'mounting': 'not checked'}
-        case Fitted(rests, done):
-            return {'rests': [rest.to_json() for rest in rests], 'done': done}
+_LINES: Mapping[type, Callable[[Any], dict[str, Any]]] = {
+    PoseRecord: PoseRecord.to_json,
+    PoseDropped: lambda entry: {'drop': entry.pose},
+    PoseSkipped: lambda entry: {'skip': entry.pose, 'drop': entry.pose},
+    MountingUnchecked: lambda entry: {'mounting': 'not checked'},
+    Fitted: lambda entry: {'rests': [rest.to_json() for rest in entry.rests], 'done': entry.done},
+}
+"""What makes the keys and values of the line of an entry."""
+
+_ENTRIES: Mapping[str, Callable[[Any], JournalEntry]] = {
+    'pose': PoseRecord.from_json,
+    'skip': lambda line: PoseSkipped(line['skip']),
+    'drop': lambda line: PoseDropped(line['drop']),
+    'mounting': lambda line: MountingUnchecked(),
+    'rests': lambda line: Fitted(tuple(map(PoseRecord.from_json, line['rests'])), line['done']),
+}
+"""What makes an entry of a line, by the first of these keys that the line has."""
 
 
 def _entry(line: Mapping[str, Any]) -> JournalEntry:
     """Return the entry of a line."""
-    match line:
-        case {'pose': _}:
-            return PoseRecord.from_json(line)
-        case {'skip': pose}:
-            return PoseSkipped(pose)
-        case {'drop': pose}:
-            return PoseDropped(pose)
-        case {'mounting': _}:
-            return MountingUnchecked()
-        case {'rests': rests, 'done': done}:
-            return Fitted(tuple(map(PoseRecord.from_json, rests)), done)
+    for key, make in _ENTRIES.items():
+        if key in line:
+            return make(line)
     raise ValueError('no pose, drop, skip, mounting or fit')
 
 
@@ -169,7 +165,7 @@ class Journal:
 
     def append(self, entry: JournalEntry) -> None:
         """Write one entry and wait until it is on the disk."""
-        self._append_line(_line(entry))
+        self._append_line(_LINES[type(entry)](entry))
 
     def close(self) -> None:
         """Close the file, so that others can lock it."""

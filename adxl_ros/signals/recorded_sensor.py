@@ -99,8 +99,7 @@ def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = 
     step_v = stats.adc_step(blocks)
     variance_v2, limit_v2 = stats.quiet_variance(blocks, windows, step_v)
     rc_s = unit.rc_s
-    states_filter = not {'rc_resistance_ohm', 'rc_capacitance_f'} & set(unit.unstated)
-    if not states_filter:
+    if 'rc_capacitance_f' in unit.unstated:
         quiet = stats.quiet_blocks(blocks, windows, limit_v2, spans.window)
         rests = [volts[blocks.start[begin]:blocks.start[end - 1] + spans.size]
                  for begin, end in stats.true_runs(quiet, blocks.run)]
@@ -114,16 +113,13 @@ def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = 
                                                      _MAX_NOISE_G_PER_RTHZ),
               'range_g': range_g, 'rc_resistance_ohm': RESISTANCE_OHM,
               'rc_capacitance_f': rc_s / RESISTANCE_OHM}
-    lines = []
-    if 'noise_density_g_per_rthz' in unit.unstated:
-        lines.append('noise of a sample: ' + _by_axis(unit, noise_g))
-    if 'adc_bits' in unit.unstated:
-        lines.append('resolution: ' + _by_axis(unit, step_v / scale_v_per_g))
-    if not states_filter:
-        lines.append(f'filter: {rc_s * 1e3:.3g} ms' if rc_s else
-                     'filter: the noise at rest shows none')
-    if 'range_g' in unit.unstated:
-        lines.append(f'range: ±{range_g:g} g (largest reading {largest_g:.3g} g)')
+    texts = {
+        'noise_density_g_per_rthz': 'noise of a sample: ' + _by_axis(unit, noise_g),
+        'adc_bits': 'resolution: ' + _by_axis(unit, step_v / scale_v_per_g),
+        'rc_capacitance_f': f'filter: {rc_s * 1e3:.3g} ms' if rc_s else
+                            'filter: the noise at rest shows none',
+        'range_g': f'range: ±{range_g:g} g (largest reading {largest_g:.3g} g)'}
+    lines = [text for name, text in texts.items() if name in unit.unstated]
     used = {name: value for name, value in values.items() if name in unit.unstated}
     return replace(unit, unstated=(), measured=unit.unstated, **used), lines
 

@@ -146,6 +146,7 @@ def test_forms_that_are_read(tmp_path: Path, text: str | bytes) -> None:
     (f'# epoch_ns: soon\n{HEADER}\n{GOOD}', ": epoch_ns is 'soon', expected whole nanoseconds"),
     (f'{HEADER}\n{GOOD}'.encode('utf-16'), ':1:1: is UTF-16; save the file as UTF-8'),
     (b'a' * 6_000_000, ': a line is longer than 1048576 bytes'),
+    (b'a' * 900_000, ': the first 200 lines hold no row of numbers'),
     (b'#ROSBAG V2.0\n', ': is a bag of ROS 1; convert it: rosbags-convert'),
     (b'\x89MCAP0\r\n', ': is a bag; rename it so that it ends in .mcap'),
     (b'\x28\xb5\x2f\xfd', ': is compressed; name the directory with its metadata.yaml')])
