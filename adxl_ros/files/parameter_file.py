@@ -15,7 +15,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.errors import one_line, UserError
+from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Role
@@ -245,8 +245,8 @@ def _flatten(node: yaml.MappingNode, prefix: str, flat: dict[str, Any], marks: d
             try:
                 flat[key] = yaml.constructor.SafeConstructor().construct_object(value, deep=True)
             except (yaml.YAMLError, ValueError) as error:
-                raise UserError(f'{_where(path, value.start_mark)}: {key}: {one_line(error)}'
-                                ) from None
+                problem = getattr(error, 'problem', error)
+                raise UserError(f'{_where(path, value.start_mark)}: not YAML: {problem}') from None
 
 
 @dataclass(frozen=True)
@@ -382,7 +382,9 @@ class _FlatReader:
                           f'{name!r} is no parameter of the listed effects')
         if not names:
             return np.zeros((0, 0)), ()
-        matrix = self._numbers(key, self.flat.get(key, []))
+        self._require(key in self.flat, key, f'missing; {len(names)} names stand in '
+                      'covariance_names')
+        matrix = self._numbers(key, self.flat[key])
         self._require(matrix.size == len(names) ** 2, key, f'{matrix.size} values, but '
                       f'{len(names)} names need {len(names) ** 2}')
         matrix = matrix.reshape(len(names), -1)
