@@ -29,7 +29,7 @@ from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_axes, with_neutral
 from adxl_ros.report.quantities import Interval
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.response import simulate_at_stamps
+from adxl_ros.simulate.response import simulate
 import numpy as np
 
 ShowProgress = Callable[[str, float], None]
@@ -345,9 +345,8 @@ def self_check(diagnosis: Diagnosis, recordings: list[Recording], sim: Motion | 
         drawn = []
         for k, (c, recording) in enumerate(zip(diagnosis.full_rate, recordings)):
             sensor = replace(report.sensor, rate_hz=recording.rate_hz)
-            parts = list(simulate_at_stamps(sensor, c.motion, recording,
-                                            seed + 1 + i * len(recordings) + k))
-            columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+            columns = simulate(sensor, c.motion, seed + 1 + i * len(recordings) + k,
+                               like=recording)
             drawn.append(replace(recording, time_s=columns.pop('time_s'), columns=columns))
         again = diagnose(drawn, report.baseline, sim, seed).report
         if again is not None:

@@ -43,7 +43,7 @@ from adxl_ros.model.sensor import parameter_of, Sensor, with_neutral
 from adxl_ros.report.quantities import listed
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.response import simulate_blocks
+from adxl_ros.simulate.response import simulate
 import numpy as np
 
 _SHOWN_STDS = 4.0  # Size of a coefficient, in standard deviations, that shows: it gains 8 nats
@@ -220,8 +220,7 @@ def predict(name: str, motion: Motion, begin_s: float, sensor: Sensor, effects: 
     begin_s: time of its motion at which it begins, s.
     """
     at_rate = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
-    parts = list(simulate_blocks(at_rate, motion, 0, begin_s))
-    columns = {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
+    columns = simulate(at_rate, motion, 0, begin_s)
     recording = Recording(name, columns.pop('time_s'), columns)
     comparison = at_search_rate(compare(recording, at_rate))
     model = linear.build_linear_model([comparison], only=effects)

@@ -236,8 +236,7 @@ class RobotForce:
             self._gravity_mps2, since_s=-0.1)
         inside = (path.time_s > 0) & (path.time_s < time_s[-1] - 1e-9 * _MARGIN_NS)
         self._given_ns = int(at_ns[-1]) + _GRID_NS
-        reference.error_mps2 = np.sqrt(np.mean(
-            (path.rounding_mps2 + path.smoothing_mps2)[inside] ** 2, axis=0))
+        reference.error_mps2 = np.sqrt(np.mean(path.error_mps2[inside] ** 2, axis=0))
         reference.add_readings(at_ns, np.column_stack(path((at_ns - begin_ns) * 1e-9)))
 
 

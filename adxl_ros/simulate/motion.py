@@ -91,11 +91,10 @@ class Motion:
         return {name: path for name, path in paths.items() if path}
 
 
-def encoder_reading(angle_rad: np.ndarray, resolution_rad: float) -> np.ndarray:
-    """Round angles, rad, to the steps of an encoder."""
-    if not resolution_rad:
-        return angle_rad
-    return np.rint(angle_rad / resolution_rad) * resolution_rad
+def encoder_reading(position: np.ndarray, resolution: float | np.ndarray) -> np.ndarray:
+    """Round positions to the steps of an encoder; those of a resolution of 0 are exact."""
+    with np.errstate(divide='ignore', invalid='ignore'):
+        return np.where(resolution, np.rint(position / resolution) * resolution, position)
 
 
 POINTS = 6  # Points of the polynomial between the steps of a grid; chosen: as exact as the filters
@@ -110,22 +109,20 @@ def lagrange_weights(position: np.ndarray) -> np.ndarray:
 
 def check_needs(sensor: Sensor, motion: Motion) -> None:
     """Refuse an effect that has nothing to act on."""
-    missing, is_robot = {}, getattr(motion.force, 'is_robot', False)
-    if motion.force is not None:
-        missing[Need.STAGE] = 'this manoeuvre has none, only specific force'
-        if not is_robot:
-            missing[Need.ROTATION] = 'it is not known beside a specific force'
-    if not is_robot:
-        missing[Need.ROBOT] = 'the motion is not that of a robot; give --urdf'
-    if not sensor.adc_bits > 0:
-        missing[Need.ADC] = 'the sensor has none: sensor.adc_bits is 0'
-    if not np.any(sensor.noise_density_g_per_rthz):
-        missing[Need.NOISE] = 'the sensor has none: sensor.noise_density_g_per_rthz is 0'
+    has_stage, is_robot = motion.force is None, getattr(motion.force, 'is_robot', False)
+    missing = {
+        Need.STAGE: (has_stage, 'this manoeuvre has none, only specific force'),
+        Need.ROTATION: (has_stage or is_robot, 'it is not known beside a specific force'),
+        Need.ROBOT: (is_robot, 'the motion is not that of a robot; give --urdf'),
+        Need.ADC: (sensor.adc_bits > 0, 'the sensor has none: sensor.adc_bits is 0'),
+        Need.NOISE: (np.any(sensor.noise_density_g_per_rthz),
+                     'the sensor has none: sensor.noise_density_g_per_rthz is 0')}
     for name in sensor.effects:
         for need in effect_named(name).needs:
-            if need in missing:
-                raise UserError(f'{name} acts on the {need.value}, but {missing[need]}; leave the '
-                                'effect out')
+            is_there, reason = missing.get(need, (True, ''))
+            if not is_there:
+                raise UserError(f'{name} acts on the {need.value}, but {reason}; leave the effect '
+                                'out')
 
 
 JOINTS = ('alpha', 'beta', 'shift')  # Names of the joints, in the order of all arrays
@@ -147,10 +144,8 @@ class SimulatedStage:
     def __init__(self, pose: np.ndarray, slew: np.ndarray, settling_s: float,
                  resolution: np.ndarray, seed: int) -> None:
         """Rest at a pose; `slew` is the largest velocity, and a resolution of 0 is exact."""
-        self._slew = slew
-        self._speed = np.array(slew, float)
-        self._omega = _SETTLED / settling_s
-        self._resolution = resolution
+        self._slew, self._speed = slew, np.array(slew, float)
+        self._omega, self._resolution = _SETTLED / settling_s, resolution
         self._rng = np.random.default_rng(seed)
         self._commanded = np.array(pose, float)
         self._goal = self._reachable(self._commanded)
@@ -193,8 +188,7 @@ class SimulatedStage:
     def encoder(self) -> np.ndarray:
         """Return the readings of the encoders, rad, rad, m, (3,)."""
         # + 0.0 turns -0.0 into 0.0.
-        return np.array([encoder_reading(position, resolution) for position, resolution in
-                         zip(self.position, self._resolution)]) + 0.0
+        return encoder_reading(self.position, self._resolution) + 0.0
 
     def moving(self) -> bool:
         """Return whether a joint is more than an encoder step from its goal."""
@@ -203,5 +197,5 @@ class SimulatedStage:
 
     def _reachable(self, target: np.ndarray) -> np.ndarray:
         """Return where the joints come to rest for a target, (3,)."""
-        on_step = np.array([encoder_reading(p, r) for p, r in zip(target, self._resolution)])
-        return on_step + self._resolution * self._rng.uniform(-0.5, 0.5, 3)
+        return encoder_reading(target, self._resolution) \
+            + self._resolution * self._rng.uniform(-0.5, 0.5, 3)

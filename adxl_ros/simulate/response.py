@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Hashable, Iterator
 from dataclasses import replace
 from functools import partial
 from math import ceil
-from typing import Any, TypeVar
+from typing import Any
 
 from adxl_ros.files.recording_columns import Recording, REFERENCES
 from adxl_ros.model import noise
@@ -63,7 +63,7 @@ class Response:
         self._seed = seed
         self._force_path: Callable[[np.ndarray], Components] | None = None
         self._chain = Chain(sensor, seed=seed)
-        self._kept: Callable[[str, Hashable, Callable[[], Any]], Any] = _computed
+        self._kept = ChainMemo(0)
         self._block_steps = _BLOCK_STEPS
         steps_per_sample = ceil(motion.internal_rate_hz / sensor.rate_hz - _ROUNDING)
         self._step_s = 1 / (sensor.rate_hz * steps_per_sample)
@@ -242,68 +242,49 @@ class Response:
         return drawn[np.cumsum(passed) - 1] * std_v
 
 
-def _computed(_part: str, _key: Hashable, compute: Callable[[], Any]) -> Any:
-    """Compute a result, in place of a memo."""
-    return compute()
-
-
-_KEPT = 3  # Results kept of each part. Chosen: baseline, hypothesis, one more; 100 MB for 10 min
-
-_Result = TypeVar('_Result')
-
-
 class ChainMemo:
     """Results of parts of the chain by what they depend on, the newest of each part."""
 
-    def __init__(self) -> None:
-        self._kept: dict[str, dict[Hashable, object]] = {}
+    def __init__(self, most: int = 3) -> None:
+        """Keep so many of each part. Chosen: baseline, hypothesis, one more; 100 MB for 10 min."""
+        self._most = most
+        self._kept: dict[str, dict[Hashable, Any]] = {}
 
-    def __call__(self, part: str, key: Hashable, compute: Callable[[], _Result]) -> _Result:
+    def __call__(self, part: str, key: Hashable, compute: Callable[[], Any]) -> Any:
         """Return a result that was computed before, or compute it."""
         kept = self._kept.setdefault(part, {})
         # The entry moves to the end, so that the one that was not used for longest is dropped.
-        kept[key] = kept.pop(key) if key in kept else compute()
-        while len(kept) > _KEPT:
+        result = kept[key] = kept.pop(key) if key in kept else compute()
+        if len(kept) > self._most:
             del kept[next(iter(kept))]
-        return kept[key]  # type: ignore[return-value]
+        return result
 
 
-def simulate(sensor: Sensor, motion: Motion, seed: int) -> Columns:
+def simulate(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0,
+             like: Recording | None = None) -> Columns:
     """
     Simulate a whole recording: columns by canonical name, (n,) each.
 
-    They are `time_s`, volts by axis, encoders, and temperature and supply if they change.
+    They are `time_s`, volts by axis, encoders, and temperature and supply if they change; see
+    `simulate_blocks`.
     """
-    parts = list(simulate_blocks(sensor, motion, seed))
+    parts = list(simulate_blocks(sensor, motion, seed, begin_s, like))
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def simulate_blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0
-                    ) -> Iterator[Columns]:
-    """Simulate a recording block by block."""
-    respond = Response(sensor, motion, seed, begin_s)
+def simulate_blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0,
+                    like: Recording | None = None) -> Iterator[Columns]:
+    """Simulate a recording block by block; another one that it is like has its stamps."""
     count = max(int(round(motion.duration_s * sensor.rate_hz, 6)), 1)
-    for begin in range(0, count, _BLOCK_ROWS):
-        time_s = begin_s + np.arange(begin, min(begin + _BLOCK_ROWS, count)) / sensor.rate_hz
-        yield {**_samples(respond, time_s), **_references(sensor, motion, time_s)}
-
-
-def simulate_at_stamps(sensor: Sensor, motion: Motion, recording: Recording, seed: int
-                       ) -> Iterator[Columns]:
-    """Simulate samples at the stamps of a recording, beside its references, block by block."""
-    respond = Response(sensor, motion, seed, float(recording.time_s[0]))
-    references = [name for name in REFERENCES if name in recording.columns]
-    for begin in range(0, len(recording), _BLOCK_ROWS):
+    stamps_s = begin_s + np.arange(count) / sensor.rate_hz if like is None else like.time_s
+    respond = Response(sensor, motion, seed, float(stamps_s[0]))
+    for begin in range(0, len(stamps_s), _BLOCK_ROWS):
         part = slice(begin, begin + _BLOCK_ROWS)
-        yield {**_samples(respond, recording.time_s[part]),
-               **{name: recording.columns[name][part] for name in references}}
-
-
-def _samples(respond: Response, time_s: np.ndarray) -> Columns:
-    """Return the next stamps, s, with the volts of each axis."""
-    volts = respond(time_s)
-    return {'time_s': time_s,
-            **{f'{axis}_v': volts[:, d] for d, axis in enumerate(respond.sensor.axes)}}
+        time_s = stamps_s[part]
+        columns = {'time_s': time_s, **{
+            f'{axis}_v': volts for axis, volts in zip(sensor.axes, respond(time_s).T)}}
+        yield columns | (_references(sensor, motion, time_s) if like is None else {
+            name: like.columns[name][part] for name in REFERENCES if name in like.columns})
 
 
 def _references(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:
@@ -325,28 +306,20 @@ _RATE_HZ = 250.0  # Largest rate there, Hz; chosen: twice the bandwidth of the m
 _SHORT_RC_S = 1e-9  # RC of a filter that does nothing, s; chosen: not 0
 
 
-class PartSizes:
-    """Simulates a sensor in a manoeuvre with and without parts of it."""
-
-    def __init__(self, sensor: Sensor, motion: Motion) -> None:
-        """Prepare the comparison."""
-        self._sensor = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
-        self._motion = replace(motion, internal_rate_hz=self._sensor.rate_hz)
-        count = int(motion.duration_s * self._sensor.rate_hz)
-        self._stamps_s = np.arange(count) / self._sensor.rate_hz
-        self._memo = ChainMemo()
-
-    def change_mg(self, effects: Collection[str], is_filtered: bool = True) -> float:
-        """Return the rms of what some effects change, and the filter, too, if it is left out."""
-        sensor, needs = self._sensor, [set(effect_named(name).needs) for name in effects]
-        if not needs or not all({Need.ADC, Need.NOISE} & each for each in needs):
-            sensor = replace(sensor, adc_bits=_FINE_BITS if sensor.adc_bits else 0,
-                             noise_density_g_per_rthz=_QUIET * sensor.noise_density_g_per_rthz)
-        other = replace(sensor, values={**sensor.values, **{
-            name: neutral(effect_named(name), sensor.axes) for name in effects}})
-        if other.rc_s and not is_filtered:
-            other = replace(other, rc_resistance_ohm=_SHORT_RC_S / other.rc_capacitance_f)
-        volts = [Response(unit, self._motion, _SEED).whole(self._stamps_s, self._memo)
-                 for unit in (sensor, other)]
-        change_g = (volts[0] - volts[1]) / sensor.nominal_scale_v_per_g
-        return float(1e3 * np.sqrt(np.mean(change_g ** 2)))
+def change_mg(sensor: Sensor, motion: Motion, memo: ChainMemo, effects: Collection[str],
+              is_filtered: bool = True) -> float:
+    """Return the rms of what some effects change, and the filter, too, if it is left out."""
+    sensor = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
+    motion = replace(motion, internal_rate_hz=sensor.rate_hz)
+    stamps_s = np.arange(int(motion.duration_s * sensor.rate_hz)) / sensor.rate_hz
+    needs = [set(effect_named(name).needs) for name in effects]
+    if not needs or not all({Need.ADC, Need.NOISE} & each for each in needs):
+        sensor = replace(sensor, adc_bits=_FINE_BITS if sensor.adc_bits else 0,
+                         noise_density_g_per_rthz=_QUIET * sensor.noise_density_g_per_rthz)
+    other = replace(sensor, values={**sensor.values, **{
+        name: neutral(effect_named(name), sensor.axes) for name in effects}})
+    if other.rc_s and not is_filtered:
+        other = replace(other, rc_resistance_ohm=_SHORT_RC_S / other.rc_capacitance_f)
+    volts = [Response(unit, motion, _SEED).whole(stamps_s, memo) for unit in (sensor, other)]
+    change_g = (volts[0] - volts[1]) / sensor.nominal_scale_v_per_g
+    return float(1e3 * np.sqrt(np.mean(change_g ** 2)))

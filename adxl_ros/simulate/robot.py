@@ -101,9 +101,8 @@ class Robot:
             joint = model.joints[model.getJointId(name)]
             angle, v[:, joint.idx_v], a[:, joint.idx_v] = joints[:, :, number]
             # Pinocchio has cosine and sine of a joint without limits.
-            values = (angle,) if joint.nq == 1 else (np.cos(angle), np.sin(angle))
-            for k, value in enumerate(values):
-                q[:, joint.idx_q + k] = value
+            q[:, joint.idx_q:joint.idx_q + joint.nq] = np.column_stack(
+                [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)])
         result = np.empty((4, len(q), 3))
         up = np.array([0.0, 0.0, 1.0])
         for i in range(len(q)):
@@ -184,8 +183,7 @@ class RobotPath(ForcePath):
 
     def text(self) -> str:
         """Return what is known of the robot, for people."""
-        error_mg = 1e3 / G0_MPS2 * np.sqrt(np.mean(
-            (self.rounding_mps2 + self.smoothing_mps2) ** 2))
+        error_mg = 1e3 / G0_MPS2 * np.sqrt(np.mean(self.error_mps2 ** 2))
         return (f'{self._robot.frame} moves by {", ".join(self.joints) or "its base"}, from '
                 f'{self.time_s[0]:.3g} to {self.time_s[-1]:.3g} s; the encoders leave an error of '
                 f'{error_mg:.2g} mg rms')
@@ -241,7 +239,7 @@ class RobotPath(ForcePath):
         error forgets its past at the rate by which it changes, divided by its size: the
         correlation of neighbours on a grid that is finer than the changes would say far less.
         """
-        error = self.rounding_mps2[:, component] + self.smoothing_mps2[:, component]
+        error = self.error_mps2[:, component]
         around = max(round(_AROUND_S / (self.time_s[1] - self.time_s[0])), 3)
         size, rate = (np.sqrt(np.maximum(uniform_filter1d(v ** 2, around), 0.0)) for v in (
             error, np.gradient(error, self.time_s)))
@@ -259,13 +257,13 @@ class RobotPath(ForcePath):
         return self._read_again(2)
 
     @cached_property
-    def rounding_mps2(self) -> np.ndarray:
+    def error_mps2(self) -> np.ndarray:
         """
-        Draw the error that the steps of the encoders leave, m/s², at `time_s`, (n, 3).
+        Draw the error by the steps of the encoders and by smoothing, m/s², at `time_s`, (n, 3).
 
         The smoothed motion is read by encoders whose steps lie elsewhere, and smoothed again.
         """
-        return self._read_again(1)
+        return self._read_again(1) + self.smoothing_mps2
 
     def _read_again(self, every: int) -> np.ndarray:
         """Return the change by reading the smoothed motion: by its encoders, or exactly some."""

@@ -8,7 +8,6 @@ Many sensors may be other units each, drawn from a population or around a calibr
 
 from __future__ import annotations
 
-from collections import deque
 from copy import copy
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -65,21 +64,25 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
     file, 'calibration' for the covariance of the unit's own coefficients, else the population.yaml
     of a fleet; returns: the distribution. Only effects that are functions of one sample are in it.
     """
-    limit: float | np.ndarray
+    limit: float | np.ndarray = np.inf
     if units == 'datasheet':
-        names, std, limit = _datasheet(sensor)
+        rows = [(name, typical or maximum / _STDS_OF_MAXIMUM, maximum or np.inf)
+                for parameter, (typical, maximum) in sensor.datasheet.items()
+                for name in names_of(effect_named(parameter.effect), sensor.axes)
+                if name.without_axis == parameter]
+        names = [name for name, *_ in rows]
+        std, largest = np.array([row[1:] for row in rows], float).reshape(-1, 2).T
         mean = np.array([parameter_of(name).neutral for name in names])
-        root = np.diag(std)
+        root, limit = np.diag(std), largest / std
     elif units == 'calibration':
-        names, limit = list(sensor.covariance_names), np.inf
+        names = list(sensor.covariance_names)
         size, vectors = np.linalg.eigh(sensor.covariance)
         mean, root = get(sensor, names), vectors * np.sqrt(np.maximum(size, 0.0))
     else:
         population = units if isinstance(units, Population) else \
             calibration_store.read_population(units)
         prior = population.prior(sensor)
-        names, limit = list(prior.names), np.inf
-        mean, root = prior.mean, np.diag(prior.std)
+        names, mean, root = list(prior.names), prior.mean, np.diag(prior.std)
     if not names:
         raise UserError(f'units {str(units)!r}: {sensor.serial} has no coefficients to draw from '
                         'it; give datasheet tolerances, a calibration with a covariance, or the '
@@ -87,19 +90,6 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
     drawn = [effect_named(name.effect).invertible for name in names]
     return UnitDraws(tuple(name for name, is_drawn in zip(names, drawn) if is_drawn),
                      mean[drawn], root[drawn], np.broadcast_to(limit, len(names)))
-
-
-def _datasheet(sensor: Sensor) -> tuple[list[Coefficient], np.ndarray, np.ndarray]:
-    """Return coefficients, standard deviations, and limits in these, of a datasheet."""
-    names: list[Coefficient] = []
-    std, limit = [], []
-    for parameter, (typical, maximum) in sensor.datasheet.items():
-        of_axes = [name for name in names_of(effect_named(parameter.effect), sensor.axes)
-                   if name.without_axis == parameter]
-        names += of_axes
-        std += [typical or maximum / _STDS_OF_MAXIMUM] * len(of_axes)
-        limit += [maximum / std[-1] if maximum and of_axes else np.inf] * len(of_axes)
-    return names, np.array(std), np.array(limit)
 
 
 _SAME_STEP = 1e-6  # Relative change of equal time steps; chosen: above rounding
@@ -141,12 +131,12 @@ class SensorModel:
         self.sensor = params if isinstance(params, Sensor) else parameter_file.load(params)
         self.draws = unit_draws(self.sensor, units) if units is not None else None
         self._delay_s = float(self.sensor.values.get('time_offset', {}).get('offset_s', 0.0))
-        reasons = {name: _reason_to_leave_out(effect_named(name), self._delay_s)
-                   for name in self.sensor.effects}
         # Reason by name of an effect of the unit that is not simulated
-        self.left_out = {name: reason for name, reason in reasons.items() if reason}
-        check_needs(replace(self.sensor, effects=tuple(
-            name for name in self.sensor.effects if name not in self.left_out)), Motion(0.0))
+        self.left_out = {
+            name: reason for name in self.sensor.effects
+            if (reason := _reason_to_leave_out(effect_named(name), self._delay_s))}
+        kept = tuple(name for name in self.sensor.effects if name not in self.left_out)
+        check_needs(replace(self.sensor, effects=kept), Motion(0.0))
         # Drawn coefficients of the sensors, (n, k); None before the first step, or without draws
         self.coefficients: np.ndarray | None = None
         self._units_rng, self._white = (np.random.default_rng([seed, n]) for n in (1, 0))
@@ -159,16 +149,13 @@ class SensorModel:
             simulated, [name for name in simulated.effects if name not in self.left_out], seed)
         self._past_weights = np.zeros(0)
         self._shape: tuple[int, ...] = ()
-        self._dt_s = 0.0
-        self._std_v = np.zeros(0)
+        self._dt_s, self._std_v = 0.0, np.zeros(0)
         self._switch_on(0)
 
     def _switch_on(self, count: int) -> None:
-        """Forget all that sensors remember."""
-        self._filters: list[dict[str, Any]] = [{} for _ in self.sensor.axes]
-        self._noise: np.ndarray | None = None
-        self._past: deque[np.ndarray] = deque()
-        self._steps = np.zeros(count)
+        """Forget all that sensors remember: steps since power-on, filters, noise, past forces."""
+        self._memory: dict[str, Any] = {
+            'steps': np.zeros(count), 'filters': [{} for _ in self.sensor.axes]}
         self._reset = np.zeros(0, int)  # Sensors that begin anew in the next step
 
     def reset(self, env_ids: Any = None) -> None:
@@ -182,7 +169,7 @@ class SensorModel:
             nothing to do.
 
         """
-        if count := len(self._steps):
+        if count := len(self._memory['steps']):
             rows = np.arange(count)[slice(None) if env_ids is None else env_ids if isinstance(
                 env_ids, slice | list) else _on_host(env_ids)]
             self._reset = np.union1d(self._reset, rows)
@@ -193,7 +180,7 @@ class SensorModel:
         if self.draws is None:
             return
         if self.coefficients is None:
-            self.coefficients = np.empty((len(self._steps), len(self.draws.names)))
+            self.coefficients = np.empty((len(self._memory['steps']), len(self.draws.names)))
         self.coefficients[rows] = self.draws.draw(len(rows), self._units_rng)
         self._chain.put_units(self.draws.names, self.coefficients)
 
@@ -245,29 +232,22 @@ class SensorModel:
             new._switch_on(len(begun))
             new._chain = self._chain.anew(begun)
             readings[begun] = new._advance(rows[begun], [v[:, begun] for v in environment])
-            self._take_over(new, begun)
+            _put_rows([*self._chain.memories(), self._memory],
+                      [*new._chain.memories(), new._memory], begun)
+            self._reset = np.zeros(0, int)
         return _like(readings.reshape(force.shape), specific_force)
 
     def _advance(self, rows: np.ndarray, environment: list[np.ndarray]) -> np.ndarray:
         """Return the readings of all sensors at the next step, m/s², (n, 3)."""
         # Time is the first axis of the components, as in a recording; sensors are the second.
-        now = Environment(self._steps[None] * self._dt_s, *environment)
+        now = Environment(self._memory['steps'][None] * self._dt_s, *environment)
         delayed = self._delayed(rows)
         volts = self._volts(now, [delayed[None, :, c] for c in range(3)])
-        self._steps = self._steps + 1
+        self._memory['steps'] = self._memory['steps'] + 1
         readings = np.zeros((len(rows), 3))
         readings[:, [AXES.index(axis) for axis in self.sensor.axes]] = to_nominal_mps2(
             volts, self.sensor)
         return readings
-
-    def _take_over(self, new: SensorModel, rows: np.ndarray) -> None:
-        """Take the memory of sensors that began anew."""
-        for whole, part in zip(self._chain.memories(), new._chain.memories()):
-            _put_rows(whole, part, rows)
-        for whole, part in zip((*self._filters, vars(self)), (*new._filters, {
-                key: vars(new)[key] for key in ('_noise', '_past', '_steps')})):
-            _put_rows(whole, part, rows)
-        self._reset = np.zeros(0, int)
 
     def _check(self, force: np.ndarray, dt_s: float) -> None:
         """Refuse a call that does not continue the last one."""
@@ -277,7 +257,7 @@ class SensorModel:
             raise UserError(f'dt is {dt_s} s; it must be positive')
         if not np.isfinite(force).all():
             raise UserError('the specific force is not finite; check the simulation')
-        if not len(self._steps):
+        if not len(self._memory['steps']):
             self._shape, self._dt_s = force.shape, float(dt_s)
             self._std_v = noise.analog_std_v(replace(self.sensor, rate_hz=1 / self._dt_s))
             self._switch_on(force.size // 3)
@@ -293,15 +273,15 @@ class SensorModel:
         """Return the force of the instant that `time_offset` sets, from the past samples."""
         if self._delay_s <= 0:
             return rows
-        if not self._past:
+        if 'past' not in self._memory:
             steps = self._delay_s / self._dt_s
             newest = max(int(steps) + 1 - POINTS // 2, 0)
             self._past_weights = lagrange_weights(np.array([steps - newest]))[0]
-            self._past = deque([rows.copy()] * (newest + POINTS), maxlen=newest + POINTS)
-        self._past.append(rows.copy())
-        # The oldest samples of the queue, whose newest one has the first weight.
-        oldest = [self._past[i] for i in range(POINTS)]
-        return sum(weight * past for weight, past in zip(self._past_weights, reversed(oldest)))
+            self._memory['past'] = [rows.copy()] * (newest + POINTS)
+        self._memory['past'] = [*self._memory['past'][1:], rows.copy()]
+        # The oldest samples, whose newest one has the first weight.
+        return sum(weight * past for weight, past in zip(
+            self._past_weights, reversed(self._memory['past'][:POINTS])))
 
     def _volts(self, now: Environment, force: list[np.ndarray]) -> np.ndarray:
         """Run the chain, and add the noise behind the filter as `Response` does: V, (n, m)."""
@@ -309,15 +289,15 @@ class SensorModel:
         self._chain(Place.FORCE, signals)
         analog_v = self._chain.volts(signals)
         signals.input_v = [low_pass(np.asarray(volts), rc_s, self._dt_s, memory)
-                           for volts, rc_s, memory in zip(analog_v, signals.rc_s, self._filters)]
+                           for volts, rc_s, memory in zip(analog_v, signals.rc_s,
+                                                          self._memory['filters'])]
         if self._std_v.any():
             decay = np.array([np.exp(-self._dt_s / rc) if rc else 0.0 for rc in signals.rc_s])
             drawn = self._white.standard_normal((force[0].shape[-1], len(decay)))
-            # The first sample is stationary.
-            self._noise = drawn if self._noise is None else \
-                decay * self._noise + np.sqrt(1 - decay ** 2) * drawn
-            signals.input_v = [v + n for v, n in zip(
-                signals.input_v, (self._noise * self._std_v).T)]
+            if 'noise' in self._memory:  # else it is the first sample, which is stationary
+                drawn = decay * self._memory['noise'] + np.sqrt(1 - decay ** 2) * drawn
+            self._memory['noise'] = drawn
+            signals.input_v = [v + n for v, n in zip(signals.input_v, (drawn * self._std_v).T)]
         return self._chain.convert(signals)[0]
 
 
@@ -375,7 +355,7 @@ def _put_rows(whole: Any, part: Any, rows: np.ndarray) -> None:
     """Put the memory of some sensors into that of all; sensors are the axis of other length."""
     for key in part if isinstance(part, dict) else range(len(part)):
         old, new = whole.get(key) if isinstance(whole, dict) else whole[key], part[key]
-        if isinstance(new, dict | deque) and old is not None:
+        if isinstance(new, dict | list) and old is not None:
             _put_rows(old, new, rows)
         elif isinstance(new, np.ndarray) and old is not None and old.shape != new.shape:
             axis = next(i for i, (m, n) in enumerate(zip(old.shape, new.shape)) if m != n)

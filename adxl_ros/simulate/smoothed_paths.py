@@ -84,14 +84,13 @@ class SmoothedPath:
         """
         sampled = np.isfinite(reading)
         self._time_s, self._reading = time_s[sampled], reading[sampled]
-        self._windows: dict[int, scipy.interpolate.BSpline] = {}
         self._step = step if is_seen else visible_step(self._reading, step)
         if not is_seen and self._step == step and _is_interpolated(self._reading, step):
             kept = _places_of_readings(self._reading, _SMALLEST_CHANGE * step)
             self._time_s, self._reading = self._time_s[kept], self._reading[kept]
-        self._knot_s, self._is_seen = knot_s, is_seen
-        self._strength = self._matched_strength(self._step)
-        self._degree = degree
+        self._windows: dict[int, scipy.interpolate.BSpline] = {}
+        self._knot_s, self._is_seen, self._degree = knot_s, is_seen, degree
+        self._strength = self._matched_strength()
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         """Return a derivative; see `motion.Path`."""
@@ -131,12 +130,29 @@ class SmoothedPath:
         return PathErrors(self._step * np.minimum(ratio, 1 / np.sqrt(12)),
                           np.minimum(4 * corner_hz, changes_hz))
 
-    def _spline(self, window: int) -> scipy.interpolate.BSpline:
-        if window not in self._windows:
-            self._windows[window] = smoothing_spline(
-                *self._part(window), self._strength, self._step, self._degree, self._knot_s,
-                not self._is_seen)
-        return self._windows[window]
+    def _spline(self, number: int) -> scipy.interpolate.BSpline:
+        if number not in self._windows:
+            self._windows[number] = self._fitted(number)
+        return self._windows[number]
+
+    def _fitted(self, number: int) -> scipy.interpolate.BSpline:
+        """Fit the smoothing spline of a window."""
+        time_s, reading = self._part(number)
+        if len(time_s) <= 2 * _DEGREE or np.ptp(reading) == 0:
+            return scipy.interpolate.make_interp_spline(time_s, reading, k=1) \
+                if len(time_s) > 1 else \
+                scipy.interpolate.BSpline(np.array([0.0, 1.0]), reading, 0, extrapolate=True)
+        if not self._step:
+            interval_s = np.diff(time_s)
+            even = interval_s.max() < _MAX_UNEVENNESS * np.median(interval_s)
+            return scipy.interpolate.make_interp_spline(
+                time_s, reading, k=self._degree if even else _DEGREE)
+        window = _Window(time_s, reading, self._knot_s)
+        # The noise of readings with a step of their own has no bounds.
+        coefficients = window.coefficients(self._strength) if self._is_seen else \
+            window.bounded_coefficients(self._strength, np.where(
+                _moving(reading), 0.0, _REST_WEIGHT), self._step / 2)
+        return scipy.interpolate.BSpline(window.knots, window.mean + coefficients, _DEGREE)
 
     def _part(self, window: int) -> tuple[np.ndarray, np.ndarray]:
         """Return times, s, and readings of a window with its margins, (n,) each."""
@@ -144,34 +160,27 @@ class SmoothedPath:
         part = slice(*np.searchsorted(self._time_s, [low_s, low_s + _WINDOW_S + 2 * _MARGIN_S]))
         return self._time_s[part], self._reading[part]
 
-    def _matched_strength(self, step: float) -> float:
+    def _matched_strength(self) -> float:
         """Return the median strength that windows all over the recording need."""
         last = int((self._time_s[-1] - self._time_s[0]) // _WINDOW_S)
-        strengths = [matched_strength(*self._part(int(window)), step, self._knot_s)
-                     for window in np.unique(np.linspace(0, last, _PROBES).round())]
-        positive = [strength for strength in strengths if strength]
-        return float(np.median(positive)) if positive else _USUAL_STRENGTH
+        strengths = [self._strength_of(int(number))
+                     for number in np.unique(np.linspace(0, last, _PROBES).round())]
+        return float(np.median(list(filter(None, strengths)) or _USUAL_STRENGTH))
 
+    def _strength_of(self, number: int) -> float:
+        """Find the largest strength whose deviation in a window is at most that of an encoder."""
+        time_s, reading = self._part(number)
+        moving = _moving(reading)
+        if not self._step or moving.sum() < _MIN_MOVING:
+            return 0.0
+        window = _Window(time_s, reading, self._knot_s)
 
-def smoothing_spline(time_s: np.ndarray, reading: np.ndarray, strength: float, step: float,
-                     degree: int = _DEGREE, knot_s: float = KNOT_S, is_bounded: bool = True
-                     ) -> scipy.interpolate.BSpline:
-    """
-    Fit the smoothing spline of one window to finite readings; see `SmoothedPath`.
+        def too_strong(strength: float) -> bool:
+            deviation = reading - window.mean - window.design @ window.coefficients(strength)
+            return bool(np.sqrt(np.mean(deviation[moving] ** 2)) > self._step / np.sqrt(12))
 
-    is_bounded: whether no reading is off by more than half a step, as by an encoder.
-    """
-    if len(time_s) <= 2 * _DEGREE or np.ptp(reading) == 0:
-        return scipy.interpolate.make_interp_spline(time_s, reading, k=1) if len(time_s) > 1 else \
-            scipy.interpolate.BSpline(np.array([0.0, 1.0]), reading, 0, extrapolate=True)
-    if not step:
-        interval_s = np.diff(time_s)
-        even = interval_s.max() < _MAX_UNEVENNESS * np.median(interval_s)
-        return scipy.interpolate.make_interp_spline(time_s, reading, k=degree if even else _DEGREE)
-    window = _Window(time_s, reading, knot_s)
-    return scipy.interpolate.BSpline(window.knots, window.mean + (window.bounded_coefficients(
-        strength, np.where(_moving(reading), 0.0, _REST_WEIGHT), step / 2)
-        if is_bounded else window.coefficients(strength)), _DEGREE)
+        index = bisect_left(_STRENGTHS, True, key=too_strong)
+        return float(_STRENGTHS[max(index - 1, 0)]) if index < len(_STRENGTHS) else 0.0
 
 
 def visible_step(reading: np.ndarray, step: float) -> float:
@@ -231,22 +240,6 @@ def noise_step(reading: np.ndarray, smallest: float, time_s: np.ndarray | None =
         / np.linalg.norm(weights, axis=0)
     moving = differences[np.abs(np.diff(reading))[4:] > smallest]
     return float(np.sqrt(12 * np.mean(moving ** 2))) if len(moving) else 0.0
-
-
-def matched_strength(time_s: np.ndarray, reading: np.ndarray, step: float,
-                     knot_s: float = KNOT_S) -> float:
-    """Find the largest strength whose deviation is at most that of an encoder."""
-    moving = _moving(reading)
-    if not step or moving.sum() < _MIN_MOVING:
-        return 0.0
-    window = _Window(time_s, reading, knot_s)
-
-    def too_strong(strength: float) -> bool:
-        deviation = reading - window.mean - window.design @ window.coefficients(strength)
-        return bool(np.sqrt(np.mean(deviation[moving] ** 2)) > step / np.sqrt(12))
-
-    index = bisect_left(_STRENGTHS, True, key=too_strong)
-    return float(_STRENGTHS[max(index - 1, 0)]) if index < len(_STRENGTHS) else 0.0
 
 
 class _Window:

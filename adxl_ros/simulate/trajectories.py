@@ -130,36 +130,36 @@ class Script:
             self.rows.append(row)
 
 
-def visit(poses_rad: Sequence[tuple[float, float]], dwell_s: float = DWELL_S) -> Motion:
+def _visit(poses_deg: Sequence[tuple[float, float]]) -> Motion:
     """Rest in poses and move between them."""
+    poses_rad = np.radians(poses_deg).tolist()
     script = Script(*poses_rad[0])
     for pose in poses_rad:
         script.go(*pose)
-        script.rest(dwell_s + SETTLE_S)
-    alpha, beta = script.joints()
-    return Motion(script.now, alpha, beta)
+        script.rest(DWELL_S + SETTLE_S)
+    return Motion(script.now, *script.joints())
 
 
 def sweep(_: np.random.Generator) -> Motion:
     """Visit planes alpha 90, 60, 30, 120, 150° forth and back (experiments 1 and 2)."""
     forth = list(range(0, 361, 30))
-    return _visit_deg([(alpha, beta) for alpha in (90, 60, 30, 120, 150)
+    return _visit([(alpha, beta) for alpha in (90, 60, 30, 120, 150)
                        for beta in forth + forth[::-1]])
 
 
 def tilt_alpha(_: np.random.Generator) -> Motion:
     """Turn alpha from −180 to 180° by 30° at beta 0 (figure 10a)."""
-    return _visit_deg([(angle, 0) for angle in range(-180, 181, 30)])
+    return _visit([(angle, 0) for angle in range(-180, 181, 30)])
 
 
 def tilt_beta(_: np.random.Generator) -> Motion:
     """Turn beta at alpha 90° (figure 10b); at 0, as printed, beta would not show."""
-    return _visit_deg([(90, angle) for angle in range(-180, 181, 30)])
+    return _visit([(90, angle) for angle in range(-180, 181, 30)])
 
 
 def tilt_both(_: np.random.Generator) -> Motion:
     """Turn both together from −180 to 180° by 30° (figure 10c)."""
-    return _visit_deg([(angle, angle) for angle in range(-180, 181, 30)])
+    return _visit([(angle, angle) for angle in range(-180, 181, 30)])
 
 
 def motion(_: np.random.Generator) -> Motion:
@@ -175,8 +175,7 @@ def shaker(_: np.random.Generator) -> Motion:
     for beta in (np.pi / 2, 0.0, np.pi):
         script.go(np.pi / 2, beta)
         shakes.append(_shake(script))
-    alpha, beta_path = script.joints()
-    return Motion(script.now, alpha, beta_path, lambda time_s, order=0: np.sum(
+    return Motion(script.now, *script.joints(), lambda time_s, order=0: np.sum(
         [shake(time_s, order) for shake in shakes], axis=0))
 
 
@@ -193,7 +192,7 @@ def soak(_: np.random.Generator) -> Motion:
 def tumble(rng: np.random.Generator) -> Motion:
     """Rest in 40 directions drawn evenly over the sphere."""
     alpha = np.degrees(np.arccos(rng.uniform(-1, 1, 40)))
-    return _visit_deg(list(zip(alpha, rng.uniform(0, 360, 40))))
+    return _visit(list(zip(alpha, rng.uniform(0, 360, 40))))
 
 
 def rich(_: np.random.Generator) -> Motion:
@@ -237,10 +236,6 @@ def _shake(script: Script) -> SweptSine:
     return SweptSine(begin_s, _SHAKE_S)
 
 
-def _visit_deg(poses: Sequence[tuple[float, float]]) -> Motion:
-    return visit([(np.radians(a), np.radians(b)) for a, b in poses])
-
-
 TRAJECTORIES: dict[str, Callable[[np.random.Generator], Motion]] = {
     f.__name__: f for f in (sweep, tilt_alpha, tilt_beta, tilt_both, motion, shaker, soak,
                             tumble, rich)}
@@ -259,10 +254,9 @@ def motion_from_force(ideal: Recording, resampled: bool) -> tuple[Motion, float]
         raise UserError(f'{ideal.path}: {len(time_s)} samples of specific force; at least '
                         f'{_MIN_FORCE_SAMPLES} are needed')
     begin_s = float(time_s[0])
-    duration_s = float(time_s[-1] - begin_s)
     rate_hz = round(1 / float(np.median(np.diff(time_s))), 6)
     return Motion(
-        duration_s + 1 / rate_hz, force=ForcePath(time_s, force_mps2),
+        float(time_s[-1] - begin_s) + 1 / rate_hz, force=ForcePath(time_s, force_mps2),
         internal_rate_hz=rate_hz if resampled else max(rate_hz, INTERNAL_RATE_HZ)), begin_s
 
 
@@ -272,18 +266,14 @@ def motion_from_references(read: Recording, sensor: Sensor) -> Motion:
         if name not in read.columns or np.isnan(read.columns[name]).all():
             raise UserError(f'{read.path}: no stage angle {name} to follow; for specific force '
                             f'say simulate imu --force {read.path}')
-    resolution = {'alpha': sensor.stage_resolution_rad, 'beta': sensor.stage_resolution_rad,
-                  'shift': 0.0}
-    paths: dict[str, Any] = dict(environment_paths(read))
+    paths: dict[str, Any] = environment_paths(read)
     for joint, name in JOINTS.items():
-        values = read.columns.get(name)
-        if values is None or np.isnan(values).all():
-            paths[joint] = Held()
-            continue
+        resolution = 0.0 if joint == 'shift' else sensor.stage_resolution_rad
         if joint != 'shift':
-            _check_speed(read, name, resolution[joint])
-        paths[joint] = SmoothedPath(read.time_s, values, resolution[joint],
-                                    BAND_LIMITED_DEGREE)
+            _check_speed(read, name, resolution)
+        if np.isfinite(read.columns.get(name, np.nan)).any():
+            paths[joint] = SmoothedPath(read.time_s, read.columns[name], resolution,
+                                        BAND_LIMITED_DEGREE)
     return Motion(float(read.time_s[-1] - read.time_s[0]), **paths)
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from adxl_ros.files import exports, parameter_file
@@ -13,7 +14,7 @@ from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.screen import entry_list
-from adxl_ros.simulate.response import PartSizes
+from adxl_ros.simulate.response import ChainMemo, change_mg
 from adxl_ros.simulate.trajectories import TRAJECTORIES
 from adxl_ros.tools import command_line as cli
 import numpy as np
@@ -56,21 +57,22 @@ def export(options: argparse.Namespace) -> int:
 def _sized(sensor: Sensor, options: argparse.Namespace, holds: Mapping[str, str],
            show: Callable[[float], None]) -> exports.Export:
     """Simulate the sizes of all parts of a sensor."""
-    parts = PartSizes(sensor, TRAJECTORIES['rich'](np.random.default_rng(0)))
+    motion = TRAJECTORIES['rich'](np.random.default_rng(0))
+    change = partial(change_mg, sensor, motion, ChainMemo())
     stage = exports.stage_effects(sensor)
     sizes_mg = {}
     for number, name in enumerate(own := [name for name in sensor.effects if name not in stage]):
         show(number / len(own))
-        sizes_mg[name] = parts.change_mg([name])
+        sizes_mg[name] = change([name])
     axes = exports.axes(sensor)
     sizes_mg[exports.WHITE_NOISE] = _rms_mg([axis.noise_std_mps2 for axis in axes])
     if sensor.adc_bits:
         sizes_mg[exports.STEPS] = _rms_mg([axis.step_mps2 / np.sqrt(12) for axis in axes])
     if sensor.rc_s:
-        sizes_mg[exports.FILTER] = parts.change_mg([], False)
+        sizes_mg[exports.FILTER] = change([], False)
     return exports.Export(sensor, Path(options.params).name, holds, sizes_mg,
-                          parts.change_mg([name for name in own if name not in holds],
-                                          exports.FILTER in holds))
+                          change([name for name in own if name not in holds],
+                                 exports.FILTER in holds))
 
 
 def _rms_mg(values_mps2: list[float]) -> float:

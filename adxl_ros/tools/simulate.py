@@ -20,7 +20,7 @@ from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.screen import entry_list
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ
-from adxl_ros.simulate.response import Columns, simulate_at_stamps, simulate_blocks
+from adxl_ros.simulate.response import Columns, simulate_blocks
 from adxl_ros.simulate.trajectories import (
     motion_from_force,
     motion_from_references,
@@ -37,8 +37,6 @@ _EXAMPLES = {
         'real.csv --params unit.yaml -o simulated.csv',
 }
 """Examples of arguments, by their purpose."""
-
-Output = Callable[[Columns], None]  # Takes a block of simulated samples
 
 
 def parser() -> argparse.ArgumentParser:
@@ -83,17 +81,18 @@ def simulate(options: argparse.Namespace) -> int:
     _check_reference(sensor, options)
     sensor, begin_s, duration_s, blocks = _samples(sensor, options)
     with ExitStack() as stack:
-        outputs: list[Output] = []
-        if options.port:
-            outputs.append(_board_output(stack, sensor, options.port))
-        if options.output:
-            outputs.append(_file_output(stack, sensor, options.output))
+        send = _board_output(stack, sensor, options.port) if options.port else None
+        write = stack.enter_context(recording.writer(options.output, sensor)) \
+            if options.output else None
         show = stack.enter_context(cli.progress('simulate'))
         for columns in blocks:
-            for output in outputs:
-                output(columns)
+            if send:
+                send(columns)
+            time_s = columns.pop('time_s')
+            if write:
+                write(Recording(options.output, time_s, columns, sensor_info(sensor)))
             if duration_s:
-                show(min((columns['time_s'][-1] - begin_s) / duration_s, 1.0))
+                show(min((time_s[-1] - begin_s) / duration_s, 1.0))
     _print_end(options, sensor, duration_s)
     return 0
 
@@ -134,9 +133,9 @@ def _check_reference(sensor: Sensor, options: argparse.Namespace) -> None:
 def _samples(sensor: Sensor, options: argparse.Namespace
              ) -> tuple[Sensor, float, float, Iterator[Columns]]:
     """Return the sensor at its rate, begin and duration, s, and the samples of a trajectory."""
+    begin_s, like = 0.0, None
     if options.trajectory in TRAJECTORIES:
-        begin_s, motion = 0.0, TRAJECTORIES[options.trajectory](
-            np.random.default_rng(options.seed))
+        motion = TRAJECTORIES[options.trajectory](np.random.default_rng(options.seed))
     elif options.trajectory == 'imu':
         # The specific force of another simulator, at its rate or another.
         motion, begin_s = motion_from_force(recording.read_ideal(options.force),
@@ -149,20 +148,12 @@ def _samples(sensor: Sensor, options: argparse.Namespace
         read = cli.read('simulate', options.trajectory)
         motion, begin_s = motion_from_references(read, sensor), float(read.time_s[0])
         if options.rate is None:
-            sensor = replace(sensor, rate_hz=read.rate_hz)
-            return (sensor, begin_s, motion.duration_s,
-                    simulate_at_stamps(sensor, motion, read, options.seed))
+            sensor, like = replace(sensor, rate_hz=read.rate_hz), read
     return (sensor, begin_s, motion.duration_s,
-            simulate_blocks(sensor, motion, options.seed, begin_s))
+            simulate_blocks(sensor, motion, options.seed, begin_s, like))
 
 
-def _file_output(stack: ExitStack, sensor: Sensor, path: str) -> Output:
-    write, info = stack.enter_context(recording.writer(path, sensor)), sensor_info(sensor)
-    return lambda columns: write(Recording(path, columns['time_s'], {
-        name: values for name, values in columns.items() if name != 'time_s'}, info))
-
-
-def _board_output(stack: ExitStack, sensor: Sensor, port: str) -> Output:
+def _board_output(stack: ExitStack, sensor: Sensor, port: str) -> Callable[[Columns], None]:
     emulated_board.check_sensor(sensor)
     descriptor = stack.enter_context(emulated_board.open_terminal(port))
     boards: list[emulated_board.Board] = []
