@@ -196,9 +196,9 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
 
     first = _prior_mean(neutral_sensor, names) + [start.get(name, 0.0) for name in names]
     first = np.array([shapes.get(name.without_axis, value) for name, value in zip(names, first)])
-    solution = gauss_newton(linearised_at, first, has_ended, _EVALUATIONS, _HALVINGS,
-                            _EVIDENCE_TOLERANCE)
-    linearised = linearise(linear_model, effects, solution.last.linearised.sensor)
+    last = gauss_newton(linearised_at, first, has_ended, _EVALUATIONS, _HALVINGS,
+                        _EVIDENCE_TOLERANCE)
+    linearised = linearise(linear_model, effects, last.linearised.sensor)
     fit, j = linearised.fit(), len(names)
     at_values = linearised.values - linearised.prior_mean[:j]
     std = np.sqrt(np.diag(fit.covariance)[:j])

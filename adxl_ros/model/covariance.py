@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -102,8 +102,7 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
         count = np.size(force[0])
         by_coefficients = np.zeros((len(sensor.axes), len(sensor.axes), count))
         if len(sensor.covariance):
-            by_coefficients = _coefficient_variance(by_coefficient(force, environment),
-                                                    sensor.covariance)
+            by_coefficients = _propagated(by_coefficient(force, environment), sensor.covariance)
         noise_v2 = np.diag(sample_variance_v2)[:, :, None]
         measured = _propagated(tangent.back, by_coefficients + noise_v2)
         largest = np.zeros(count)
@@ -121,28 +120,12 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
     return covariance
 
 
-def _coefficient_variance(slope: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Propagate the covariance of coefficients by slopes, (m, k, n), to volts, (m, m, n)."""
-    m, k = slope.shape[:2]
-    columns = np.ascontiguousarray(np.swapaxes(slope, 0, 1)).reshape(k, m, -1)
-    spread = (covariance @ columns.reshape(k, -1)).reshape(columns.shape)
-    variance = np.empty((m, m, columns.shape[2]))
-    for i in range(m):
-        for j in range(i + 1):
-            variance[i, j] = variance[j, i] = np.einsum('kn,kn->n', columns[:, i], spread[:, j])
-    return variance
-
-
-def _propagated(back: list[Components], volts: np.ndarray) -> np.ndarray:
-    """Propagate a covariance of the volts, (m, m, n), by `Tangent.back` to the force."""
-    m = len(back)
-    half = [[sum(back[i][a] * volts[a, b] for a in range(m)) for b in range(m)] for i in range(m)]
-    covariance = np.empty_like(volts)
-    for i in range(m):
-        for j in range(i + 1):
-            covariance[i, j] = covariance[j, i] = sum(
-                half[i][b] * back[j][b] for b in range(m))
-    return covariance
+def _propagated(slope: Any, covariance: np.ndarray) -> np.ndarray:
+    """Propagate a covariance, (k, k) or (k, k, n), by slopes, (m, k, n): (m, m, n)."""
+    slope = np.asarray(slope).reshape(len(slope), len(covariance), -1)
+    spread = np.tensordot(covariance, slope, (1, 1)) if covariance.ndim == 2 else \
+        np.einsum('abn,jbn->ajn', covariance, slope)
+    return np.einsum('ian,ajn->ijn', slope, spread)
 
 
 def leverage(sensor: Sensor) -> Callable[[Components], np.ndarray]:
@@ -153,7 +136,7 @@ def leverage(sensor: Sensor) -> Callable[[Components], np.ndarray]:
     def force_leverage(force: Components) -> np.ndarray:
         if not sensor.covariance_names:
             return np.zeros(np.shape(force[0]) or 1)
-        variance = _coefficient_variance(by_coefficient(force), sensor.covariance)
+        variance = _propagated(by_coefficient(force), sensor.covariance)
         tangent = signal_chain.tangent(respond, sensor.axes, force)
         return np.trace(_propagated(tangent.back, variance))
 

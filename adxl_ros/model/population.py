@@ -48,18 +48,15 @@ class Population:
 
     def prior(self, sensor: Sensor) -> Prior:
         """Return the prior of a unit's departures from its nominal values."""
-        names, mean, std = [], [], []
-        for effect, parameter, column, nominal in (
-                ('bias', 'offset_v', 'zero_g_{}_v', sensor.nominal_zero_g_v),
-                ('scale_factor', 'offset_v_per_g', 'scale_{}_v_per_g',
-                 sensor.nominal_scale_v_per_g)):
-            for axis, nominal_value in zip(sensor.axes, nominal):
-                pooled = self.coefficients.get(column.format(axis))
-                if pooled is not None:
-                    names.append(Coefficient(effect, parameter, axis))
-                    mean.append(pooled.mean - float(nominal_value))
-                    std.append(pooled.prediction_std)
-        return Prior(tuple(names), np.array(mean), np.array(std))
+        rows = [(Coefficient(effect, parameter, axis), pooled.mean - value, pooled.prediction_std)
+                for effect, parameter, column, nominal in (
+                    ('bias', 'offset_v', 'zero_g_{}_v', sensor.nominal_zero_g_v),
+                    ('scale_factor', 'offset_v_per_g', 'scale_{}_v_per_g',
+                     sensor.nominal_scale_v_per_g))
+                for axis, value in zip(sensor.axes, nominal.tolist())
+                if (pooled := self.coefficients.get(column.format(axis)))]
+        mean, std = np.array([row[1:] for row in rows]).reshape(-1, 2).T
+        return Prior(tuple(name for name, *_ in rows), mean, std)
 
 
 class Prior(NamedTuple):
@@ -81,32 +78,26 @@ class Posterior(NamedTuple):
 
 def posterior(sensor: Sensor, population: Population) -> Posterior:
     """
-    Combine the coefficients of a unit with its population.
+    Combine the coefficients of a unit with its population, unless they contradict each other.
 
     A unit without zero-g and scale factor of its own takes those of the population.
     """
-    prior = population.prior(sensor)
-    if not prior.names:
+    names, mean, std = population.prior(sensor)
+    if not names:
         return Posterior(sensor, f'{population.name} has no zero-g or scale factor of the axes '
                          f'{sensor.axes}; it is not used')
     if not set(_EFFECTS) & set(sensor.effects):
-        unit = replace(put(with_neutral(sensor, _EFFECTS), prior.names, prior.mean),
-                       covariance=np.diag(prior.std ** 2), covariance_names=prior.names)
+        unit = replace(put(with_neutral(sensor, _EFFECTS), names, mean),
+                       covariance=np.diag(std ** 2), covariance_names=names)
         return Posterior(unit, f'zero-g and scale factor are those of '
                          f'{population.name}: the unit has none of its own')
-    used = [i for i, name in enumerate(prior.names) if name in sensor.covariance_names]
+    used = [i for i, name in enumerate(names) if name in sensor.covariance_names]
     if not used:
         return Posterior(sensor, f'{population.name} is not used: zero-g and scale factor of '
                          'the unit have no uncertainty')
-    return _combined(sensor, population, Prior(tuple(prior.names[i] for i in used),
-                                               prior.mean[used], prior.std[used]))
-
-
-def _combined(sensor: Sensor, population: Population, prior: Prior) -> Posterior:
-    """Return the unit by its own estimate and the prior, unless they contradict each other."""
-    places = [sensor.covariance_names.index(name) for name in prior.names]
-    departure = prior.mean - get(sensor, prior.names)
-    total = sensor.covariance[np.ix_(places, places)] + np.diag(prior.std ** 2)
+    places = [sensor.covariance_names.index(names[i]) for i in used]
+    departure = mean[used] - get(sensor, [names[i] for i in used])
+    total = sensor.covariance[np.ix_(places, places)] + np.diag(std[used] ** 2)
     square = float(departure @ np.linalg.solve(total, departure))
     chance = float(scipy.special.chdtrc(len(places), square))
     if chance < STRANGER_CHANCE:

@@ -272,19 +272,14 @@ def to_nominal_mps2(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 def names_of(effect: Effect, axes: str) -> tuple[Coefficient, ...]:
     """Name the coefficients of an effect: by parameter, for those measured axes that it has."""
-    return tuple(name for p in effect.parameters for name in _names_of_parameter(effect, p, axes))
-
-
-def _names_of_parameter(effect: Effect, parameter: Parameter, axes: str) -> list[Coefficient]:
-    if not parameter.axes:
-        return [Coefficient(effect.name, parameter.name)]
-    return [Coefficient(effect.name, parameter.name, a) for a in axes if a in parameter.axes]
+    return tuple(Coefficient(effect.name, p.name, axis) for p in effect.parameters
+                 for axis in (axes if p.axes else ('',)) if axis in p.axes)
 
 
 def fitted_of(effect: Effect, axes: str) -> tuple[Coefficient, ...]:
     """Name the coefficients as `names_of`, without those of parameters that fits hold."""
-    return tuple(name for p in effect.parameters if not p.held
-                 for name in _names_of_parameter(effect, p, axes))
+    held = {p.name for p in effect.parameters if p.held}
+    return tuple(name for name in names_of(effect, axes) if name.parameter not in held)
 
 
 def parameter_of(name: Coefficient) -> Parameter:
@@ -323,14 +318,11 @@ def get(sensor: Sensor, names: Sequence[Coefficient]) -> np.ndarray:
 def put(sensor: Sensor, names: Sequence[Coefficient],
         coefficients: Sequence[float] | np.ndarray) -> Sensor:
     """Return a copy of the sensor with other values of some coefficients, (k,)."""
-    values = {effect: dict(by_parameter) for effect, by_parameter in sensor.values.items()}
-    copied = set()
+    values = dict(sensor.values)
+    for effect in {name.effect for name in names}:
+        values[effect] = {p: np.array(value, float) for p, value in values[effect].items()}
     for name, value in zip(names, coefficients):
-        by_parameter = values[name.effect]
-        if name.without_axis not in copied:
-            by_parameter[name.parameter] = np.array(by_parameter[name.parameter], float)
-            copied.add(name.without_axis)
-        by_parameter[name.parameter][_index(sensor, name)] = value
+        values[name.effect][name.parameter][_index(sensor, name)] = value
     return replace(sensor, values=values)
 
 

@@ -143,7 +143,7 @@ class SensorModel:
         simulated = self.sensor
         if self.draws:
             # An effect with neutral values is skipped, and here they are replaced.
-            simulated = with_neutral(simulated, {name.effect for name in self.draws.names})
+            simulated = with_neutral(simulated, [name.effect for name in self.draws.names])
             simulated = put(simulated, self.draws.names, [1e-9] * len(self.draws.names))
         self._chain = Chain(
             simulated, [name for name in simulated.effects if name not in self.left_out], seed)

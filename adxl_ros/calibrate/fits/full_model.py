@@ -35,7 +35,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Place, Role
-from adxl_ros.model.gauss_newton import gauss_newton, halve_until, Iterate
+from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import get, names_of, parameter_of, put, Sensor, with_neutral
 import numpy as np
 import scipy
@@ -251,7 +251,7 @@ class _Search:
         return gauss_newton(
             linearise, get(self._unit, self._names),
             lambda _, previous, __: previous is not None and previous.step_std < _LAST_STEP_STD,
-            steps + 1).last
+            steps + 1)
 
     def _step(self) -> float:
         """Move coefficients and angles to likelier ones; return the longest step, in stds."""
@@ -260,10 +260,6 @@ class _Search:
         errors = solved.covariance.predicted_errors(solved.about.residual)
         start = get(self._unit, self._names)
 
-        def attempt(share: float) -> tuple[np.ndarray, linearisation.AngleErrors]:
-            return (start + share * (solved.values - start),
-                    self._errors.interpolated(errors, share))
-
         def cost(values: np.ndarray, angles: linearisation.AngleErrors) -> float:
             residual = self._measured.volts - predicted_volts(
                 put(self._unit, self._names, values), _turned(self._measured, angles.total_rad))
@@ -271,9 +267,12 @@ class _Search:
                          + np.sum(self._precision * values ** 2)
                          + solved.covariance.penalty(angles))
 
-        highest = cost(start, self._errors)
-        (values, self._errors), _, _ = halve_until(
-            attempt, lambda trial: cost(*trial) <= highest, _MAX_HALVINGS)
+        highest, before = cost(start, self._errors), self._errors
+        for share in 0.5 ** np.arange(_MAX_HALVINGS + 1):
+            values = start + share * (solved.values - start)
+            self._errors = before.interpolated(errors, share)
+            if cost(values, self._errors) <= highest:
+                break
         self._unit = put(self._unit, self._names, values)
         self._poses = _turned_linearly(self._unit, self._measured, self._errors.total_rad)
         return float(np.abs((values - start) * np.sqrt(np.diag(solved.information))).max())

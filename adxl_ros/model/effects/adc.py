@@ -8,6 +8,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from adxl_ros.model.effects.base import (
+    add,
     ActsOn,
     Detector,
     DiagnosisHints,
@@ -111,8 +112,8 @@ def spikes(signals: Signals, p: Parameters) -> None:
     drawn = signals.rng.random((*np.shape(signals.environment.time_s), axes, 2))
     hit = drawn[..., 0] < p['rate_hz'] * signals.dt_s
     sign = np.where(drawn[..., 1] < 0.5, -1.0, 1.0)
-    for d, amplitude in enumerate(p['amplitude_v']):
-        signals.volts[d] = signals.volts[d] + np.where(hit[..., d], amplitude * sign[..., d], 0.0)
+    add(signals.volts, (np.where(hit[..., d], amplitude * sign[..., d], 0.0)
+                        for d, amplitude in enumerate(p['amplitude_v'])))
 
 
 _NEVER = -2 ** 40  # Index of a start that lies before any recording; chosen: far below 0
@@ -302,9 +303,8 @@ def flicker(signals: Signals, p: Parameters) -> None:
         signals.memory['state'] = np.stack([state, np.zeros_like(state)], axis=1)
     noise, signals.memory['state'] = sosfilt(
         shaping.sections, signals.rng.standard_normal(shape), axis=0, zi=signals.memory['state'])
-    for d, density in enumerate(p['density_g_per_rthz']):
-        signals.volts[d] = (signals.volts[d]
-                            + density * noise[..., d] * signals.nominal_scale_v_per_g[d])
+    add(signals.volts, (density * noise[..., d] * signals.nominal_scale_v_per_g[d]
+                        for d, density in enumerate(p['density_g_per_rthz'])))
 
 
 @effect(Place.ADC,
@@ -340,8 +340,8 @@ def bias_walk(signals: Signals, p: Parameters) -> None:
     walk = np.stack([first_order_recursion(1.0, a, drawn[..., d], last[..., d])
                      for d, a in enumerate(np.exp(-returns))], axis=-1)
     signals.memory['walked'] = walk[-1]
-    for d, scale in enumerate(signals.nominal_scale_v_per_g):
-        signals.volts[d] = signals.volts[d] + walk[..., d] * scale
+    add(signals.volts, (walk[..., d] * scale
+                        for d, scale in enumerate(signals.nominal_scale_v_per_g)))
 
 
 @effect(Place.ADC,
@@ -361,5 +361,4 @@ def mains_hum(signals: Signals, p: Parameters) -> None:
     Add A·sin(2π·f·t + φ) to the volts of each axis.
     """
     wave = np.sin(2 * np.pi * p['frequency_hz'] * signals.environment.time_s + p['phase_rad'])
-    for d, amplitude in enumerate(p['amplitude_v']):
-        signals.volts[d] = signals.volts[d] + amplitude * wave
+    add(signals.volts, (amplitude * wave for amplitude in p['amplitude_v']))

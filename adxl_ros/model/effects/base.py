@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from enum import auto, Enum, IntEnum
 import math
@@ -403,6 +403,12 @@ class Effect:
         return Concern.STAGE if self.place is Place.STAGE \
             or {Need.STAGE, Need.ROTATION} & set(self.needs) \
             else Concern.SENSOR
+
+
+def add(components: Components, values: Iterable[Value]) -> None:
+    """Add a value to each of the first components; arrays that others hold stay as they are."""
+    for d, value in enumerate(values):
+        components[d] = components[d] + value
 
 
 def effect(place: Place, *parameters: Parameter, cause: str, **properties: Any

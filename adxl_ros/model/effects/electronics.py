@@ -4,6 +4,7 @@
 
 from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects.base import (
+    add,
     DiagnosisHints,
     effect,
     FormDimension,
@@ -32,8 +33,7 @@ import numpy as np
                                  revealed_by=Manoeuvre.REMOUNT, proof=(ProofVariable.TIME,)))
 def bias(signals: Signals, p: Parameters) -> None:
     """Zero-g of a unit minus the nominal one (B of equation 2)."""
-    for d, offset in enumerate(p['offset_v']):
-        signals.zero_g_v[d] = signals.zero_g_v[d] + offset
+    add(signals.zero_g_v, p['offset_v'])
 
 
 @effect(Place.ELECTRONICS,
@@ -47,8 +47,7 @@ def bias(signals: Signals, p: Parameters) -> None:
                                  revealed_by=Manoeuvre.REMOUNT, proof=(ProofVariable.OWN_FORCE,)))
 def scale_factor(signals: Signals, p: Parameters) -> None:
     """Scale factor of a unit minus the nominal one (SF of equation 1)."""
-    for d, offset in enumerate(p['offset_v_per_g']):
-        signals.scale_v_per_g[d] = signals.scale_v_per_g[d] + offset
+    add(signals.scale_v_per_g, p['offset_v_per_g'])
 
 
 _SCALE_EXPONENT = 1.135
@@ -153,8 +152,8 @@ def temperature_bias(signals: Signals, p: Parameters) -> None:
     Add k·(T − 25 °C) + k2·(T − 25 °C)² to the output, g.
     """
     warmer_k = signals.environment.temperature_c - NOMINAL_TEMPERATURE_C
-    for d, (per_k, per_k2) in enumerate(zip(p['per_k'], p['per_k2'])):
-        signals.output[d] = signals.output[d] + warmer_k * (per_k + warmer_k * per_k2)
+    add(signals.output, (warmer_k * (per_k + warmer_k * per_k2)
+                         for per_k, per_k2 in zip(p['per_k'], p['per_k2'])))
 
 
 @effect(Place.ELECTRONICS,
@@ -207,8 +206,7 @@ def thermal_lag(signals: Signals, p: Parameters) -> None:
     if not any(p['per_k']) or not np.ndim(temperature_c):
         return
     lag_k = low_pass(temperature_c, p['tau_s'], signals.dt_s, signals.memory) - temperature_c
-    for d, per_k in enumerate(p['per_k']):
-        signals.output[d] = signals.output[d] + per_k * lag_k
+    add(signals.output, (per_k * lag_k for per_k in p['per_k']))
 
 
 @effect(Place.ELECTRONICS,
@@ -238,8 +236,7 @@ def thermal_hysteresis(signals: Signals, p: Parameters) -> None:
     if not any(p['half_width_g']) or not np.ndim(temperature_c):
         return
     branch = loop(temperature_c, p['reach_k'], signals.memory)
-    for d, half_width in enumerate(p['half_width_g']):
-        signals.output[d] = signals.output[d] - half_width * branch
+    add(signals.output, (-half_width * branch for half_width in p['half_width_g']))
 
 
 @effect(Place.ELECTRONICS,
@@ -259,5 +256,4 @@ def warm_up(signals: Signals, p: Parameters) -> None:
     Add A·exp(−t/τ) to the output, g; t is the time since power-on.
     """
     unsettled = np.exp(-signals.environment.time_s / p['tau_s'])
-    for d, amplitude in enumerate(p['amplitude_g']):
-        signals.output[d] = signals.output[d] + amplitude * unsettled
+    add(signals.output, (amplitude * unsettled for amplitude in p['amplitude_g']))

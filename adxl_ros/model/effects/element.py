@@ -6,6 +6,7 @@ from functools import lru_cache
 from typing import Any
 
 from adxl_ros.model.effects.base import (
+    add,
     ARRAYS,
     Components,
     DiagnosisHints,
@@ -33,9 +34,9 @@ is out of plane is y."""
 
 def _bias_by(others: tuple[int, int, int], signals: Signals, p: Parameters) -> None:
     """Add p1·A_c + p2·A_c² of another axis c to each measured axis."""
-    for d, (p1, p2) in enumerate(zip(p['linear'], p['quadratic_per_g'])):
-        other = signals.sensed[others[d]]
-        signals.output[d] = signals.output[d] + (p1 + p2 * other) * other
+    other = [signals.sensed[other] for other in others]
+    add(signals.output, ((p1 + p2 * c) * c for p1, p2, c in zip(
+        p['linear'], p['quadratic_per_g'], other)))
 
 
 @effect(Place.ELEMENT,
@@ -83,9 +84,8 @@ def scale_factor_cross(signals: Signals, p: Parameters) -> None:
     squares of the other two. A quadratic term would equal a sum of `nonlinearity`,
     `scale_factor_z` and `scale_factor`, so that the effect has none.
     """
-    for d, s in enumerate(p['linear_per_g']):
-        other = signals.sensed[_IN_PLANE[d]]
-        signals.output[d] = signals.output[d] + s * signals.sensed[d] * other
+    add(signals.output, (s * sensed * signals.sensed[other] for s, sensed, other in zip(
+        p['linear_per_g'], signals.sensed, _IN_PLANE)))
 
 
 @effect(Place.ELEMENT,
@@ -101,9 +101,9 @@ def scale_factor_cross(signals: Signals, p: Parameters) -> None:
                                  proof=(ProofVariable.FORCE_Z, ProofVariable.OWN_FORCE)))
 def scale_factor_z(signals: Signals, p: Parameters) -> None:
     """Scale factor by the out-of-plane axis, y for z: equations 15 and 17, centred and in g."""
-    for d, (r1, r2) in enumerate(zip(p['linear_per_g'], p['quadratic_per_g2'])):
-        other = signals.sensed[_OUT_OF_PLANE[d]]
-        signals.output[d] = signals.output[d] + signals.sensed[d] * (r1 + r2 * other) * other
+    other = [signals.sensed[other] for other in _OUT_OF_PLANE]
+    add(signals.output, (sensed * (r1 + r2 * c) * c for sensed, r1, r2, c in zip(
+        signals.sensed, p['linear_per_g'], p['quadratic_per_g2'], other)))
 
 
 @effect(Place.ELEMENT,
@@ -120,9 +120,7 @@ def nonlinearity(signals: Signals, p: Parameters) -> None:
 
     Add k·a³ of the axis's own acceleration, g.
     """
-    for d, k in enumerate(p['cubic_per_g2']):
-        sensed = signals.sensed[d]
-        signals.output[d] = signals.output[d] + k * sensed * sensed * sensed
+    add(signals.output, (k * a * a * a for k, a in zip(p['cubic_per_g2'], signals.sensed)))
 
 
 @effect(Place.ELEMENT,
@@ -139,9 +137,7 @@ def quadratic(signals: Signals, p: Parameters) -> None:
 
     Add k·a² of the axis's own acceleration, g.
     """
-    for d, k in enumerate(p['quadratic_per_g']):
-        sensed = signals.sensed[d]
-        signals.output[d] = signals.output[d] + k * sensed * sensed
+    add(signals.output, (k * a * a for k, a in zip(p['quadratic_per_g'], signals.sensed)))
 
 
 @effect(Place.ELEMENT,
