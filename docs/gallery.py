@@ -11,9 +11,8 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient, Effect, Manoeuvre, Need
 from adxl_ros.model.sensor import put, Sensor, typical, with_axes
-from adxl_ros.simulate.motion import Held, Knots, Motion
+from adxl_ros.simulate.motion import ForcePath, Held, Knots, Motion
 from adxl_ros.simulate.response import Columns, simulate
-from adxl_ros.simulate.smoothed_paths import ForcePath
 from adxl_ros.simulate.trajectories import Steps, SweptSine
 import matplotlib
 

@@ -23,9 +23,8 @@ from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import true_runs
-from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion, Path
+from adxl_ros.simulate.motion import BAND_LIMITED_DEGREE, ForcePath, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import ChainMemo, Response
-from adxl_ros.simulate.smoothed_paths import BAND_LIMITED_DEGREE, ForcePath
 from adxl_ros.simulate.trajectories import environment_paths, motion_from_references
 import numpy as np
 import scipy

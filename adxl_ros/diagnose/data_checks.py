@@ -39,8 +39,7 @@ from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD, Z_90
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.recorded_sensor import find_polarity_fault
-from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.smoothed_paths import ForcePath
+from adxl_ros.simulate.motion import ForcePath, Motion
 import numpy as np
 import scipy
 

@@ -40,7 +40,7 @@ from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, DriftSpectrum, Role
 from adxl_ros.model.sensor import parameter_of, Sensor
 from adxl_ros.signals.block_statistics import true_runs
-from adxl_ros.simulate.smoothed_paths import ForcePath, SmoothedPath
+from adxl_ros.simulate.motion import ForcePath, SmoothedPath
 import numpy as np
 import scipy
 

@@ -10,9 +10,10 @@ from functools import partial
 from math import inf
 from typing import NamedTuple
 
+from adxl_ros.files.recording_columns import JOINTS
 from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.simulate.motion import JOINTS, Motion
+from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline

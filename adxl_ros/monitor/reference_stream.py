@@ -19,10 +19,9 @@ from adxl_ros.model.constants import MAD_TO_STD, NOMINAL_SUPPLY_V, NOMINAL_TEMPE
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Motion, Path
+from adxl_ros.simulate.motion import ForcePath, Held, INTERNAL_RATE_HZ, Motion, Path, SmoothedPath
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.robot import Robot, RobotPath
-from adxl_ros.simulate.smoothed_paths import ForcePath, SmoothedPath
 import numpy as np
 
 BEFORE_NS = 2_000_000_000

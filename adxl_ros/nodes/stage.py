@@ -11,11 +11,12 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.parameter_file import SENSOR_FIELDS
+from adxl_ros.files.recording_columns import JOINTS
 from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.parameters import declare_all, parameter, parameter_error
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Level, Status, STEADY
-from adxl_ros.simulate.motion import JOINTS, SimulatedStage
+from adxl_ros.simulate.trajectories import SimulatedStage
 from builtin_interfaces.msg import Duration
 import numpy as np
 from rclpy.node import Node

@@ -29,12 +29,12 @@ from adxl_ros.model.signal_chain import Chain
 from adxl_ros.simulate.motion import (
     check_needs,
     encoder_reading,
+    ForcePath,
     Held,
     lagrange_weights,
     Motion,
     POINTS,
 )
-from adxl_ros.simulate.smoothed_paths import ForcePath
 import numpy as np
 
 Columns = dict[str, np.ndarray]  # Columns of a recording by canonical name, (n,) each

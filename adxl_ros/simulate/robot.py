@@ -21,11 +21,14 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.robot_readings import Readings
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Components
-from adxl_ros.simulate.motion import Held, INTERNAL_RATE_HZ, Motion, Path
-from adxl_ros.simulate.smoothed_paths import (
+from adxl_ros.simulate.motion import (
     ForcePath,
+    Held,
+    INTERNAL_RATE_HZ,
     KNOT_S,
+    Motion,
     noise_step,
+    Path,
     PathErrors,
     SmoothedPath,
 )

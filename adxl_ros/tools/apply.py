@@ -81,8 +81,7 @@ def apply(options: argparse.Namespace) -> int:
     _report_effects(first, sensor, options.undo_filter)
     estimator = RecordingEstimator(sensor, first, options.inverse == 'paper', options.undo_filter)
     block, beyond = first, BeyondRange()
-    opened = (_table if Path(options.output).suffix == '.csv' else _bag)(options.output)
-    with opened as write, cli.progress('apply') as show:
+    with _output(options.output) as write, cli.progress('apply') as show:
         for block, estimates in estimator.blocks(itertools.chain([first], blocks)):
             write(block, estimates)
             explained = ~(estimates.unsolved | estimates.at_rail)
@@ -107,20 +106,17 @@ def apply(options: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _table(path: str) -> Iterator[Callable[[Recording, Estimates], None]]:
-    """Open a CSV file, and yield a function that appends a block with its estimates."""
-    with csv_writer(path, _DIGITS) as append:
-        yield lambda block, estimates: append(
-            {'time_s': block.epoch_ns * 1e-9 + block.time_s, **_columns(estimates)})
-
-
-@contextmanager
-def _bag(path: str) -> Iterator[Callable[[Recording, Estimates], None]]:
-    """Open a bag, and yield a function that appends a block with its estimates."""
-    fields = ImuFields()
-    with tilt_bag(path) as append:
-        yield lambda block, estimates: append(block.stamp_ns[~estimates.unsolved],
-                                              *fields(estimates))
+def _output(path: str) -> Iterator[Callable[[Recording, Estimates], None]]:
+    """Open a CSV file or a bag, and yield a function that appends a block with its estimates."""
+    if Path(path).suffix == '.csv':
+        with csv_writer(path, _DIGITS) as append_rows:
+            yield lambda block, estimates: append_rows(
+                {'time_s': block.epoch_ns * 1e-9 + block.time_s, **_columns(estimates)})
+    else:
+        fields = ImuFields()
+        with tilt_bag(path) as append:
+            yield lambda block, estimates: append(block.stamp_ns[~estimates.unsolved],
+                                                  *fields(estimates))
 
 
 def _report_effects(block: Recording, sensor: Sensor, undo_filter: bool) -> None:
@@ -139,9 +135,9 @@ def _report_effects(block: Recording, sensor: Sensor, undo_filter: bool) -> None
 
 
 def _columns(estimates: Estimates) -> dict[str, np.ndarray]:
-    columns = {f'a{axis}_mps2': values for axis, values in zip(AXES, estimates.force_mps2)}
-    columns |= {f'a{axis}_std_mps2': values
-                for axis, values in zip(AXES, estimates.force_std_mps2)}
+    columns = {f'a{axis}{name}_mps2': values for name, force in (
+        ('', estimates.force_mps2), ('_std', estimates.force_std_mps2))
+        for axis, values in zip(AXES, force)}
     for names in (('roll', 'pitch', 'inclination'), ('alpha', 'beta')):
         columns |= {f'{name}_rad': getattr(estimates.tilt, name) for name in names}
         columns |= {f'{name}_std_rad': getattr(estimates.tilt, f'{name}_std') for name in names}

@@ -16,7 +16,6 @@ import shlex
 import signal
 import sys
 import textwrap
-from types import FrameType
 from typing import TYPE_CHECKING
 
 from adxl_ros.errors import UserError
@@ -175,9 +174,7 @@ def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
             values = dict(sensor.values.get(name) or neutral(effect, sensor.axes)) \
                 if rest else typical(effect, sensor.axes)
             for part in filter(None, rest.split(',')):
-                key, _, number = (word.strip() for word in part.partition('='))
-                parameter, _, axis = key.partition('.')
-                values[parameter] = _value(effect, values, sensor.axes, parameter, axis, number)
+                _put(effect, values, sensor.axes, part)
         except UserError as error:
             raise UserError(f'--effect {text}: {error}') from None
         effects = sensor.effects if name in sensor.effects else (*sensor.effects, name)
@@ -185,9 +182,10 @@ def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
     return sensor
 
 
-def _value(effect: Effect, values: Mapping[str, np.ndarray], axes: str, name: str, axis: str,
-           number: str) -> np.ndarray:
-    """Return one parameter with a new value for all its axes or one."""
+def _put(effect: Effect, values: dict[str, np.ndarray], axes: str, text: str) -> None:
+    """Put a new value for all axes of a parameter, or for one, in place of its values."""
+    key, _, number = (word.strip() for word in text.partition('='))
+    name, _, axis = key.partition('.')
     parameters = {parameter.name: parameter for parameter in effect.parameters}
     if name not in parameters:
         raise UserError(f'{effect.name} has no parameter {name!r}, but {", ".join(parameters)}')
@@ -198,15 +196,11 @@ def _value(effect: Effect, values: Mapping[str, np.ndarray], axes: str, name: st
         raise UserError(f'{number!r} is not a number from {parameter.lower:g} to '
                         f'{parameter.upper:g} ({parameter.unit}); a typical {name} is '
                         f'{parameter.scale:g}')
-    if not (parameter.axes or axis):
-        return np.array(value)
-    chosen = [i for i, a in enumerate(axes) if a in parameter.axes and axis in ('', a)]
-    if not chosen:
+    chosen = [a in parameter.axes and axis in ('', a) for a in axes]
+    if not any(chosen) and (parameter.axes or axis):
         raise UserError(f'no axis {axis!r} to act on; the sensor has {axes}, {name} acts on '
                         f'{parameter.axes or "none, it is one number"}')
-    changed = np.array(values[name], float)
-    changed[chosen] = value
-    return changed
+    values[name] = np.where(chosen if parameter.axes else True, value, values[name])
 
 
 def print_end(result: Sequence[str], files: Iterable[str | os.PathLike],
@@ -224,7 +218,8 @@ def quoted(*words: str | os.PathLike) -> str:
 @ended_by_closed_output()
 def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int]) -> int:
     """Parse the command line and run a tool."""
-    signal.signal(signal.SIGTERM, _terminated)
+    # It ends by an exception, so that unfinished files are removed.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         return command(parser.parse_args())
     except UserError as error:
@@ -242,11 +237,6 @@ def note(text: str, paste: str = '') -> None:
                              break_long_words=False, break_on_hyphens=False)
         text += f'\n{paste}' * bool(paste)
     print(text, file=sys.stderr)
-
-
-def _terminated(number: int, frame: FrameType | None) -> None:
-    """End by an exception, so that unfinished files are removed."""
-    sys.exit(128 + number)
 
 
 def make_folder(folder: Path) -> None:

@@ -23,7 +23,7 @@ from adxl_ros.report.figures import png, pyplot
 from adxl_ros.report.quantities import duration
 from adxl_ros.report.screen import row
 from adxl_ros.signals import noise_parameters
-from adxl_ros.signals.noise_parameters import AxisNoise, Estimate, RecordingNoise, settings
+from adxl_ros.signals.noise_parameters import AxisNoise, RecordingNoise, settings
 from adxl_ros.tools import command_line as cli
 import numpy as np
 import yaml
@@ -78,14 +78,9 @@ def _walk_lines(result: RecordingNoise) -> list[str]:
 
 
 def _micro_g_intervals(noise: AxisNoise) -> list[str]:
-    return [_interval(estimate.scaled(MICRO_G)) for estimate in noise.estimates]
-
-
-def _interval(estimate: Estimate) -> str:
-    """Return an estimate with its interval, or its upper limit."""
-    if not estimate.is_seen:
-        return f'below {estimate.high:.3g}'
-    return f'{estimate.value:.3g} ({estimate.low:.3g} to {estimate.high:.3g})'
+    """Return the estimates with their intervals, or their upper limits."""
+    return [f'{e.value:.3g} ({e.low:.3g} to {e.high:.3g})' if e.is_seen else f'below {e.high:.3g}'
+            for e in (estimate.scaled(MICRO_G) for estimate in noise.estimates)]
 
 
 def _paste_lines(result: RecordingNoise) -> list[str]:
@@ -154,9 +149,8 @@ def _as_json(result: RecordingNoise) -> dict[str, Any]:
 
 
 def _axis_json(noise: AxisNoise) -> dict[str, Any]:
-    terms = {name: {'value': estimate.value if estimate.is_seen else None,
-                    'ci': [estimate.low, estimate.high], 'unit': unit}
-             for (name, unit), estimate in zip(_UNITS.items(), noise.estimates)}
+    terms = {name: {'value': e.value if e.is_seen else None, 'ci': [e.low, e.high], 'unit': unit}
+             for (name, unit), e in zip(_UNITS.items(), noise.estimates)}
     bound_s = noise.fit.bound_s
     return {**terms, 'correlation_s': bound_s if np.isfinite(bound_s) else None,
             'rounding': noise.rounding,
@@ -174,22 +168,17 @@ _COLUMNS = ('axis', 'white noise N, µg/√Hz', 'bias instability B, µg', 'rand
 
 
 def _write_page(folder: Path, result: RecordingNoise) -> list[Path]:
-    page, plot = folder / 'report.html', folder / 'allan.png'
-    figure = _plot(result)
-    write_text(page, _page(result, figure))
-    write_bytes(plot, png(figure))
-    return [page, plot]
-
-
-def _page(result: RecordingNoise, figure: Any) -> str:
+    page, plot, figure = folder / 'report.html', folder / 'allan.png', _plot(result)
     rows = [[noise.axis, *_micro_g_intervals(noise),
              f'{noise.lowest * MICRO_G:.3g} at {noise.lowest_s:.3g} s',
              f'{noise.sample_std:.3g}', f'{noise.fit.highest_hz:.3g}'] for noise in result.axes]
-    return html_page.render('adxl_ros.tools', 'noise.html', {
+    write_text(page, html_page.render('adxl_ros.tools', 'noise.html', {
         'title': 'Noise at rest', 'about': _head(result), 'badge': None, 'figures': {},
         'warnings': _warnings(result), 'columns': _COLUMNS, 'rows': rows,
         'picture': html_page.picture_url(figure),
-        'paste_lines': _paste_lines(result)})
+        'paste_lines': _paste_lines(result)}))
+    write_bytes(plot, png(figure))
+    return [page, plot]
 
 
 def _plot(result: RecordingNoise) -> Any:

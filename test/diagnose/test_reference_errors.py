@@ -8,9 +8,8 @@ import json
 
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording, sensor_info
-from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.motion import ForcePath, Motion
 from adxl_ros.simulate.response import Response
-from adxl_ros.simulate.smoothed_paths import ForcePath
 from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest

@@ -10,8 +10,7 @@ from adxl_ros.investigate.manoeuvres import (
     Pose,
     StageLimits,
 )
-from adxl_ros.simulate.motion import SimulatedStage
-from adxl_ros.simulate.trajectories import RUN_UP_S
+from adxl_ros.simulate.trajectories import RUN_UP_S, SimulatedStage
 import numpy as np
 import pytest
 

@@ -11,9 +11,8 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Need, Place
 from adxl_ros.model.filters import play, resonator
 from adxl_ros.model.sensor import get, names_of, parameter_of, put, typical, with_neutral
-from adxl_ros.simulate.motion import Held, Knots, Motion
+from adxl_ros.simulate.motion import ForcePath, Held, Knots, Motion
 from adxl_ros.simulate.response import Response, simulate
-from adxl_ros.simulate.smoothed_paths import ForcePath
 from adxl_ros.simulate.trajectories import Steps
 import numpy as np
 import pytest

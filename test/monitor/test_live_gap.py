@@ -11,10 +11,9 @@ from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.monitor.changes import GapChange
 from adxl_ros.monitor.live_gap import GapSettings, LiveGap
 from adxl_ros.monitor.reference_stream import ReferenceKind, RobotForce
-from adxl_ros.simulate.motion import Held, Motion
+from adxl_ros.simulate.motion import ForcePath, Held, Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.robot import Robot
-from adxl_ros.simulate.smoothed_paths import ForcePath
 from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest

@@ -2,7 +2,7 @@
 
 """Paths through readings of encoders: their error, its prediction, and fast motion."""
 
-from adxl_ros.simulate.smoothed_paths import SmoothedPath, visible_step
+from adxl_ros.simulate.motion import SmoothedPath, visible_step
 from adxl_ros.simulate.trajectories import tumble
 import numpy as np
 import pytest

@@ -7,10 +7,9 @@ import json
 from adxl_ros.files import parameter_file
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import get, to_nominal_mps2
-from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.motion import ForcePath, Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.robot import Robot
-from adxl_ros.simulate.smoothed_paths import ForcePath
 from adxl_ros.tools.command_line import with_effects
 from bags import bag_of, EPOCH_NS, imu, joints
 import numpy as np

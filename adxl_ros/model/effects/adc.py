@@ -8,8 +8,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from adxl_ros.model.effects.base import (
-    add,
     ActsOn,
+    add,
     Detector,
     DiagnosisHints,
     DriftSpectrum,

@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The sensing element and its mounting: force along and across its axes, and their directions."""
+"""
+The sensing element, its mounting and its electronics, from the force to the input of the ADC.
+
+Force along and across the axes, and their directions; zero-g, scale factor, supply, temperature,
+output stage and filter.
+"""
 
 from functools import lru_cache
 from typing import Any
 
+from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects.base import (
     add,
     ARRAYS,
@@ -14,15 +20,17 @@ from adxl_ros.model.effects.base import (
     FLOATS,
     FormDimension,
     Manoeuvre,
+    Need,
     Parameter,
     Parameters,
     Place,
     ProofVariable,
     Role,
     Signals,
+    StraightLine,
     Value,
 )
-from adxl_ros.model.filters import low_pass, resonator, stop
+from adxl_ros.model.filters import loop, low_pass, resonator, stop
 import numpy as np
 
 _IN_PLANE, _OUT_OF_PLANE = (1, 0, 0), (2, 2, 1)
@@ -265,3 +273,240 @@ def mount_resonance(signals: Signals, p: Parameters) -> None:
             transmitted = resonator(sensed, p['frequency_hz'], p['damping_ratio'], signals.dt_s,
                                     signals.memory.setdefault(d, {}))
             signals.sensed[d] = sensed + gain * (transmitted - sensed)
+
+
+@effect(Place.ELECTRONICS,
+        Parameter('offset_v', 'V', -2.0, 2.0, 0.1, 'ADXL203 datasheet: zero-g 2.4 to 2.6 V',
+                  'zero-g output minus the nominal one'),
+        exact=True, invertible=True,
+        cause='The zero-g output of this unit is not the nominal one; calibrate the unit.',
+        # Zero-g of a healthy unit changes by 0.1 mg from day to day (tuned by hand on simulated
+        # recordings).
+        diagnosis=DiagnosisHints(straight_line=StraightLine.ZERO_G, healthy_std=1e-4,
+                                 revealed_by=Manoeuvre.REMOUNT, proof=(ProofVariable.TIME,)))
+def bias(signals: Signals, p: Parameters) -> None:
+    """Zero-g of a unit minus the nominal one (B of equation 2)."""
+    add(signals.zero_g_v, p['offset_v'])
+
+
+@effect(Place.ELECTRONICS,
+        Parameter('offset_v_per_g', 'V/g', -0.9, 9.0, 0.04,
+                  'ADXL203 datasheet: 960 to 1040 mV/g', 'scale factor minus the nominal one'),
+        exact=True, invertible=True,
+        cause='The scale factor of this unit is not the nominal one; calibrate the unit.',
+        # The scale factor of a healthy unit changes by 0.01 % from day to day (tuned by hand on
+        # simulated recordings).
+        diagnosis=DiagnosisHints(straight_line=StraightLine.SCALE_FACTOR, healthy_std=1e-4,
+                                 revealed_by=Manoeuvre.REMOUNT, proof=(ProofVariable.OWN_FORCE,)))
+def scale_factor(signals: Signals, p: Parameters) -> None:
+    """Scale factor of a unit minus the nominal one (SF of equation 1)."""
+    add(signals.scale_v_per_g, p['offset_v_per_g'])
+
+
+_SCALE_EXPONENT = 1.135
+"""Typical exponent of the scale factor, ln(560/1000)/ln(3/5): 560 mV/g at 3 V and 1000 mV/g at 5 V
+(ADXL203 datasheet, specifications)."""
+
+
+@effect(Place.ELECTRONICS,
+        Parameter('zero_g_exponent', '1', -3.0, 3.0, 1.0, 'ADXL203 datasheet: ratiometric',
+                  'exponent of the supply voltage in the zero-g; 0 is independent of it'),
+        Parameter('scale_exponent', '1', -3.0, 3.0, _SCALE_EXPONENT,
+                  'ADXL203 datasheet: 560 mV/g at 3 V, not 600',
+                  'exponent of the supply voltage in the scale factor; 0 is independent of it'),
+        Parameter('nominal_v', 'V', 1.0, 30.0, NOMINAL_SUPPLY_V,
+                  'ADXL203 datasheet: values at 5 V',
+                  'supply voltage of the datasheet values', '',
+                  neutral=NOMINAL_SUPPLY_V, held=True, role=Role.SHAPE),
+        invertible=True, follows=('supply_v',),
+        cause='The output follows the supply; measure the supply and correct, or regulate it.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SUPPLY, form=(FormDimension.SUPPLY,),
+                                 proof=(ProofVariable.SUPPLY,)))
+def supply(signals: Signals, p: Parameters) -> None:
+    """Supply voltage: zero-g and scale factor follow it, though not exactly in proportion."""
+    ratio = signals.environment.supply_v / p['nominal_v']
+    for d, (zero, scale) in enumerate(zip(p['zero_g_exponent'], p['scale_exponent'])):
+        signals.zero_g_v[d] = signals.zero_g_v[d] * ratio ** zero
+        signals.scale_v_per_g[d] = signals.scale_v_per_g[d] * ratio ** scale
+
+
+@effect(Place.ELECTRONICS,
+        Parameter('limit_g', 'g', 0.1, 1000.0, 1.0,
+                  'ADXL203 datasheet: range 1.7 g at least; lower with a low supply',
+                  'largest output of either sign; 1000 does not clip', neutral=1000.0,
+                  role=Role.LIMIT),
+        Parameter('knee_g', 'g', 0.0, 0.5, 0.02, 'physics: an amplifier near its rail',
+                  'width of a soft clip; 0 is hard', '', typical=0.0,
+                  role=Role.OPTIONAL),
+        Parameter('offset_g', 'g', -0.5, 0.5, 0.02,
+                  'ADXL203 datasheet: zero-g 2.4 to 2.6 V between rails of 0 and 5 V',
+                  'middle of the two limits', typical=0.0, role=Role.OPTIONAL),
+        smooth=False,
+        cause='The output clips; raise the supply, lower the gain, or choose a wider range.',
+        diagnosis=DiagnosisHints(form=(FormDimension.FORCE,), proof=(ProofVariable.OWN_FORCE,)))
+def saturation(signals: Signals, p: Parameters) -> None:
+    """
+    Saturation: the output stage clips at its limit.
+
+    Clip the output of each axis at plus and minus its limit about an offset, g.
+
+    With a knee w the clip is soft: x − w·ln(1 + exp((x − limit)/w)), and the same below. The
+    offset is that of the zero-g from the middle of the rails.
+    """
+    knee_g = float(p['knee_g'])
+    for d, (limit, offset) in enumerate(zip(p['limit_g'], p['offset_g'])):
+        x = signals.output[d]
+        upper, lower = limit + offset, limit - offset
+        if not knee_g:
+            signals.output[d] = np.clip(x, -lower, upper)
+        else:
+            beyond = [np.logaddexp(0.0, (sign * x - rail) / knee_g)
+                      for sign, rail in ((1, upper), (-1, lower))]
+            signals.output[d] = x - knee_g * (beyond[0] - beyond[1])
+
+
+_WITHOUT_FILTER_S = 1e-3  # Time constant that r counts in where no filter is stated, s. Chosen
+
+
+@effect(Place.ELECTRONICS,
+        Parameter('resistance_ratio', '1', -0.95, 1000.0, 1.0,
+                  'ADXL203 datasheet: 32 kOhm +-25 %; ADXL355: settings from 1 to 1000 Hz',
+                  "filter's resistance divided by the stated one, minus 1; ms without a filter",
+                  typical=0.15, starts=(0.03, *(2.0 ** n for n in range(7)))),
+        needs=(Need.FILTER,),
+        cause='The output filter is not the stated one; measure its resistor and capacitor.',
+        # The RC product of a healthy unit is within some 2 % of the measured one (chosen:
+        # resistors and capacitors of 1 %, and their temperature).
+        diagnosis=DiagnosisHints(healthy_std=0.02,
+                                 stated_by=('rc_resistance_ohm', 'rc_capacitance_f'),
+                                 revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,),
+                                 proof=(ProofVariable.FREQUENCY,)))
+def bandwidth(signals: Signals, p: Parameters) -> None:
+    """Bandwidth of the output filter: on-chip resistors differ by 25 %, registers set the rest."""
+    for d, ratio in enumerate(p['resistance_ratio']):
+        signals.rc_s[d] = signals.rc_s[d] * (1 + ratio) if signals.rc_s[d] \
+            else _WITHOUT_FILTER_S * max(ratio, 0.0)
+
+
+@effect(Place.ELECTRONICS,
+        Parameter('per_k', 'g/K', -0.1, 0.1, 1e-4, 'ADXL203 datasheet: 0.1 mg/degC',
+                  'slope of the zero-g over temperature at 25 degC'),
+        Parameter('per_k2', 'g/K^2', -0.01, 0.01, 1e-6,
+                  'physics: a slope that changes by 1 % a degree',
+                  'curvature of the zero-g over temperature', typical=0.0, role=Role.OPTIONAL),
+        invertible=True, follows=('temperature_c',),
+        cause='The zero-g follows the temperature; measure it and correct, or keep it steady.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, form=(FormDimension.TEMPERATURE,),
+                                 proof=(ProofVariable.TEMPERATURE,)))
+def temperature_bias(signals: Signals, p: Parameters) -> None:
+    """
+    Zero-g that changes with temperature.
+
+    Add k·(T − 25 °C) + k2·(T − 25 °C)² to the output, g.
+    """
+    warmer_k = signals.environment.temperature_c - NOMINAL_TEMPERATURE_C
+    add(signals.output, (warmer_k * (per_k + warmer_k * per_k2)
+                         for per_k, per_k2 in zip(p['per_k'], p['per_k2'])))
+
+
+@effect(Place.ELECTRONICS,
+        Parameter('per_k', '1/K', -0.01, 0.01, 1e-4,
+                  'ADXL203 datasheet: sensitivity +-0.3 % over temperature',
+                  'relative slope of the scale factor over temperature, from 25 degC on'),
+        Parameter('per_k2', '1/K^2', -0.001, 0.001, 1e-6,
+                  'physics: a slope that changes by 1 % a degree',
+                  'relative curvature of the scale factor over temperature', typical=0.0,
+                  role=Role.OPTIONAL),
+        invertible=True, follows=('temperature_c',),
+        cause='The scale factor follows the temperature; measure it and correct, or keep it '
+              'steady.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, form=(FormDimension.TEMPERATURE,),
+                                 proof=(ProofVariable.TEMPERATURE,)))
+def temperature_scale(signals: Signals, p: Parameters) -> None:
+    """
+    Scale factor that changes with temperature.
+
+    Multiply the scale factor by 1 + k·(T − 25 °C) + k2·(T − 25 °C)².
+    """
+    warmer_k = signals.environment.temperature_c - NOMINAL_TEMPERATURE_C
+    for d, (per_k, per_k2) in enumerate(zip(p['per_k'], p['per_k2'])):
+        signals.scale_v_per_g[d] = signals.scale_v_per_g[d] * (
+            1 + warmer_k * (per_k + warmer_k * per_k2))
+
+
+@effect(Place.ELECTRONICS,
+        Parameter('per_k', 'g/K', -0.1, 0.1, 1e-4, 'ADXL203 datasheet: 0.1 mg/degC',
+                  'slope of the zero-g over the temperature that lags the thermometer'),
+        Parameter('tau_s', 's', 1.0, 1e4, 60.0, 'physics: a small board in moving air',
+                  'time constant between thermometer and sensor', '', neutral=60.0,
+                  role=Role.SHAPE, starts=(8.0, 25.0, 80.0, 250.0)),
+        follows=('temperature_c',),
+        cause='The thermometer is warm earlier or later than the sensor; mount it at the sensor, '
+              'or change the temperature slowly.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, time_constant='tau_s',
+                                 form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
+                                 proof=(ProofVariable.TEMPERATURE_RATE,)))
+def thermal_lag(signals: Signals, p: Parameters) -> None:
+    """
+    Lag of the sensor behind its thermometer, or lead, so that the zero-g is late or early.
+
+    Add k·(θ − T) to the output, g; θ follows the measured temperature T by 1/(1 + τ·s).
+
+    A sensor that lags its thermometer has the slope of its zero-g over temperature as k: its
+    zero-g then follows θ. A sensor that leads its thermometer has a k of the opposite sign.
+    """
+    temperature_c = signals.environment.temperature_c
+    if not any(p['per_k']) or not np.ndim(temperature_c):
+        return
+    lag_k = low_pass(temperature_c, p['tau_s'], signals.dt_s, signals.memory) - temperature_c
+    add(signals.output, (per_k * lag_k for per_k in p['per_k']))
+
+
+@effect(Place.ELECTRONICS,
+        Parameter('half_width_g', 'g', -0.1, 0.1, 2e-3,
+                  'physics: friction and creep in solder and die attach',
+                  'zero-g while cooling minus that while warming, divided by 2'),
+        Parameter('reach_k', 'K', 0.1, 200.0, 10.0, 'physics: part of the range',
+                  'half of the change after a reversal that opens the loop', '',
+                  neutral=10.0, role=Role.SHAPE, starts=(2.0, 10.0, 50.0)),
+        smooth=False, follows=('temperature_c',),
+        cause='The zero-g depends on whether the sensor warms or cools; relieve its package of '
+              'stress, or state the loop as an uncertainty.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT,
+                                 form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
+                                 proof=(ProofVariable.TEMPERATURE_RATE,
+                                        ProofVariable.TEMPERATURE)))
+def thermal_hysteresis(signals: Signals, p: Parameters) -> None:
+    """
+    Thermal hysteresis: a zero-g that differs between warming and cooling.
+
+    Add a loop over temperature to the zero-g, which begins when the temperature turns back.
+
+    The loop has its full width when the temperature has changed by 2·`reach_k` since. It does not
+    depend on how fast the temperature changes. The first branch belongs to `temperature_bias`.
+    """
+    temperature_c = signals.environment.temperature_c
+    if not any(p['half_width_g']) or not np.ndim(temperature_c):
+        return
+    branch = loop(temperature_c, p['reach_k'], signals.memory)
+    add(signals.output, (-half_width * branch for half_width in p['half_width_g']))
+
+
+@effect(Place.ELECTRONICS,
+        Parameter('amplitude_g', 'g', -0.5, 0.5, 2e-3, 'physics: self-heating by 20 K, 0.1 mg/K',
+                  'zero-g at power-on minus the settled one'),
+        Parameter('tau_s', 's', 1.0, 1e5, 300.0, 'physics: a board in still air',
+                  'time constant of settling', '', neutral=300.0, role=Role.SHAPE,
+                  starts=(15.0, 60.0, 300.0, 1500.0)),
+        invertible=True, follows=('time_s',),
+        cause='The sensor warms up after power-on; wait some time constants before measuring.',
+        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, form=(FormDimension.TIME,),
+                                 proof=(ProofVariable.TIME,)))
+def warm_up(signals: Signals, p: Parameters) -> None:
+    """
+    Warm-up: a zero-g that settles after power-on.
+
+    Add A·exp(−t/τ) to the output, g; t is the time since power-on.
+    """
+    unsettled = np.exp(-signals.environment.time_s / p['tau_s'])
+    add(signals.output, (amplitude * unsettled for amplitude in p['amplitude_g']))
