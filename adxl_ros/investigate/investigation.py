@@ -186,10 +186,10 @@ def decide(assessment: Assessment, question: Question, has_time: bool) -> Answer
     """
     hypotheses, verdict = assessment.hypotheses, assessment.verdict
     best = hypotheses[0]
-    following = [w for w in assessment.worth if w.per_minute > _SMALLEST_PER_MINUTE]
-    if verdict and verdict == question.verdict:
-        kinds = {CATALOGUE[name].kind for name in question.recorded}
-        following = [w for w in following if CATALOGUE[w.name].kind not in kinds]
+    kinds = {CATALOGUE[name].kind for name in question.recorded} \
+        if verdict and verdict == question.verdict else set()
+    following = [w for w in assessment.worth if w.per_minute > _SMALLEST_PER_MINUTE
+                 and CATALOGUE[w.name].kind not in kinds]
     totals = accumulate(hypothesis.probability for hypothesis in hypotheses)
     # The fewest that together have 90 %
     named = hypotheses[:next((i for i, total in enumerate(totals, 1) if total >= CERTAIN), None)]
@@ -264,22 +264,6 @@ class OutputFolder:
         parameter_file.save(self.baseline, sensor)
 
 
-def _write_diagnosis(folder: OutputFolder, diagnosis: Diagnosis, recording: Recording,
-                     with_page: bool) -> None:
-    """Write report and parameters of a diagnosis."""
-    from adxl_ros.diagnose.page import documents, Run
-    subject = (f'{folder.bag.name} ({np.ptp(recording.time_s):.0f} s, {recording.rate_hz:.4g} Hz, '
-               f'{" ".join(recording.axes)})  minus  simulation of {folder.baseline.name}')
-    lines = screen_lines(diagnosis, subject) if diagnosis.report is not None else []
-    steps = [('simulate with these parameters', 'ros2 run adxl_ros simulate rich --params '
-              f'{folder.parameters} -o sim.csv')] if lines else []
-    command = shlex.join(['ros2', 'run', 'adxl_ros', 'diagnose', str(folder.bag), '--params',
-                          str(folder.baseline), '-o', f'{folder.path}_again'])
-    run = Run(subject, folder.baseline.name, steps, command=command) if with_page else None
-    for name, text in documents(diagnosis, as_json(diagnosis), lines, run).items():
-        write_text(folder.path / name, text)
-
-
 class BackgroundDiagnoser:
     """Diagnoses the bag of a folder in a process of its own."""
 
@@ -310,9 +294,22 @@ def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, see
     sensor = parameter_file.load(folder.baseline)
     recordings = [recording_files.read(folder.bag)] if question.has_samples else []
     answer, diagnosis = run_round(question, recordings, sensor, limits, seed)
-    if diagnosis is not None:
-        _write_diagnosis(folder, diagnosis, recordings[0],
-                         with_page=answer.outcome is not Outcome.GO_ON)
+    if diagnosis is None:
+        return answer
+    from adxl_ros.diagnose.page import documents, Run
+    read = recordings[0]
+    subject = (f'{folder.bag.name} ({np.ptp(read.time_s):.0f} s, {read.rate_hz:.4g} Hz, '
+               f'{" ".join(read.axes)})  minus  simulation of {folder.baseline.name}')
+    lines = screen_lines(diagnosis, subject) if diagnosis.report is not None else []
+    steps = [('simulate with these parameters', 'ros2 run adxl_ros simulate rich --params '
+              f'{folder.parameters} -o sim.csv')] if lines else []
+    command = shlex.join(['ros2', 'run', 'adxl_ros', 'diagnose', str(folder.bag), '--params',
+                          str(folder.baseline), '-o', f'{folder.path}_again'])
+    # The page is that of the end.
+    run = None if answer.outcome is Outcome.GO_ON else \
+        Run(subject, folder.baseline.name, steps, command=command)
+    for name, text in documents(diagnosis, as_json(diagnosis), lines, run).items():
+        write_text(folder.path / name, text)
     return answer
 
 
@@ -354,8 +351,7 @@ class Investigation:
         self._diagnoser, self._show, self._flush = diagnoser, show, flush
         self._begin_s: float | None = None
         self.moved_s = 0.0  # Time of the manoeuvres so far, s
-        self._now_s = self._since_s = 0.0
-        self._asked_minutes = 0.0
+        self._now_s = self._since_s = self._asked_minutes = 0.0
         self._pose: Pose | None = None
         self._command: Pose | None = None
         self._stream: CommandStream | None = None

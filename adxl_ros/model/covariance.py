@@ -193,8 +193,14 @@ def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
         is_own = name.axis and effect_named(name.effect).place in (Place.ELEMENT,
                                                                    Place.ELECTRONICS)
         groups.setdefault(name.without_axis if is_own else name, []).append(row)
-    differences = [(rows, *_difference(sensor, [names[row] for row in rows]))
-                   for rows in groups.values()]
+    differences = []
+    for rows in groups.values():
+        moved = [names[row] for row in rows]
+        step = _RELATIVE_STEP * parameter_of(moved[0]).scale
+        pair = [static_chain(put(sensor, moved, get(sensor, moved) + change))
+                for change in (step, -step)]
+        first = max(effect_named(moved[0].effect).place, Place.MOUNTING)
+        differences.append((rows, first, step, pair))
 
     def by_coefficient(force: Components,
                        environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
@@ -216,13 +222,3 @@ def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
         return slopes
 
     return by_coefficient
-
-
-def _difference(sensor: Sensor, names: list[Coefficient]
-                ) -> tuple[Place, float, list[signal_chain.Chain]]:
-    """Return where the chain changes with coefficients, by which step, and both chains."""
-    step = _RELATIVE_STEP * parameter_of(names[0]).scale
-    values = get(sensor, names)
-    pair = [static_chain(put(sensor, names, values + sign * step))
-            for sign in (1, -1)]
-    return max(effect_named(names[0].effect).place, Place.MOUNTING), step, pair

@@ -123,19 +123,13 @@ class Chain:
                     shared, tuple) else tuple(by_axis.get(axis, value) for axis, value in
                                               zip(self.sensor.axes, shared))
 
-    def anew(self, rows: np.ndarray | slice) -> Chain:
-        """Return the chain of some sensors as after power-on; random generators are shared."""
-        def of_rows(value: Any) -> Any:
-            if isinstance(value, tuple):
-                return tuple(map(of_rows, value))
-            return value[rows] if np.ndim(value) else value
-
+    def anew(self) -> Chain:
+        """Return the chain as after power-on; random generators are shared."""
         new = copy(self)
         new.effects = {place: [copy(effect) for effect in effects]
                        for place, effects in self.effects.items()}
         for effect in new._running():
-            effect.memory = {}
-            effect.parameters = {name: of_rows(v) for name, v in effect.parameters.items()}
+            effect.memory, effect.parameters = {}, dict(effect.parameters)
         return new
 
     def memories(self) -> list[dict[Any, Any]]:

@@ -266,15 +266,15 @@ class DiagnosisRun:
         """Return the end; None while it runs."""
         if self._end.done():
             error = self._end.exception()
-            return self._end.result() if error is None else _without(one_line(error))
-        if time.monotonic() < self._end_s:
+            if error is None:
+                return self._end.result()
+            reason = one_line(error)[:_REASON_LENGTH]
+        elif time.monotonic() < self._end_s:
             return None
-        self.close()
-        return _without(f'it takes longer than diagnose.budget_s, {self._budget_s:.0f} s')
-
-
-def _without(reason: str) -> DiagnosisResult:
-    return DiagnosisResult(False, f'no diagnosis: {reason[:_REASON_LENGTH]}')
+        else:
+            self.close()
+            reason = f'it takes longer than diagnose.budget_s, {self._budget_s:.0f} s'
+        return DiagnosisResult(False, f'no diagnosis: {reason}')
 
 
 def _diagnose(folder: Path, given: DiagnosisInput) -> DiagnosisResult:

@@ -126,13 +126,16 @@ class LiveGap:
         self.counts['samples'] += len(stamp_ns)
         self.counts['dropped'] += int((~finite).sum())
         stamp_ns, accel_mps2 = stamp_ns[finite], accel_mps2[finite]
-        newest_ns = self._samples.newest_ns
-        steps_ns = np.diff(stamp_ns, prepend=stamp_ns[:1] if newest_ns is None else newest_ns)
+        steps_ns = _steps_ns(self._samples.newest_ns, stamp_ns)
         jumps = np.flatnonzero((steps_ns < -_JUMP_NS) | (steps_ns > _BREAK_NS))
         for i, part in enumerate(np.split(np.arange(len(stamp_ns)), jumps)):
             if i:
                 self._restart()
-            self._append(stamp_ns[part], accel_mps2[part])
+            newest_ns = self._samples.newest_ns
+            kept_ns = self._samples.add(stamp_ns[part], accel_mps2[part])
+            self.counts['dropped'] += len(part) - len(kept_ns)
+            periods = np.rint(_steps_ns(newest_ns, kept_ns) * 1e-9 * self.sensor.rate_hz)
+            self.counts['missing'] += int((periods - 1).clip(0).sum())
 
     def advance(self) -> list[GapChange]:
         """Compare all seconds whose reference is known; return the changes in them."""
@@ -182,15 +185,6 @@ class LiveGap:
         """Return the time of the samples since a stamp, ns, that are kept, s."""
         stamps_ns, _ = self._samples.between(begin_ns, self.newest_ns + 1)
         return float(stamps_ns[-1] - stamps_ns[0]) * 1e-9 if len(stamps_ns) else 0.0
-
-    def _append(self, stamp_ns: np.ndarray, accel_mps2: np.ndarray) -> None:
-        """Keep samples, and count what is missing before them."""
-        newest_ns = self._samples.newest_ns
-        kept_ns = self._samples.add(stamp_ns, accel_mps2)
-        self.counts['dropped'] += len(stamp_ns) - len(kept_ns)
-        steps_ns = np.diff(kept_ns, prepend=kept_ns[:1] if newest_ns is None else newest_ns)
-        periods = np.rint(steps_ns * 1e-9 * self.sensor.rate_hz)
-        self.counts['missing'] += int((periods - 1).clip(0).sum())
 
     def _restart(self) -> None:
         """Begin again after a jump of the stamps; what was learnt of the noise is kept."""
@@ -267,31 +261,37 @@ class LiveGap:
 
     def _axis_gap(self, d: int, axis: str, blocks: list[Block]) -> AxisGap:
         """Return the gap of one axis."""
-        gap = _rms_interval(np.array([block.square[d] for block in blocks]))
-        still = [block for block in blocks if not block.moves]
-        encoder = np.array([block.reference_square[d] for block in blocks]).mean()
-        if len(still) >= _FEWEST_BLOCKS:
-            floor = _rms_interval(np.array([block.noise_square[d] for block in still]) + encoder)
+        def of_blocks(name: str) -> np.ndarray:
+            return np.array([getattr(block, name)[d] for block in blocks])
+
+        gap, encoder = _rms_interval(of_blocks('square')), of_blocks('reference_square').mean()
+        still = [not block.moves for block in blocks]
+        if sum(still) >= _FEWEST_BLOCKS:
+            floor = _rms_interval(of_blocks('noise_square')[still] + encoder)
             source = 'rest'
         else:
             noise_g = noise.sample_std_v(self.sensor)[d] / self.sensor.nominal_scale_v_per_g[d]
             std_mg = float(np.sqrt((noise_g * G0_MPS2) ** 2 + encoder)) / _MG
             floor, source = Interval(std_mg, std_mg, std_mg), 'parameters'
-        datasheet = _rms_interval(np.array([block.datasheet_square[d] for block in blocks])).value
+        datasheet = _rms_interval(of_blocks('datasheet_square')).value
         explained = None
         if datasheet > _EXPLAINED_LEAST * floor.value:
             explained = float(np.clip((datasheet ** 2 - gap.value ** 2) / (
                 datasheet ** 2 - floor.value ** 2), 0.0, 1.0))
-        offset_mg = float(np.mean([block.mean_mps2[d] for block in blocks])) / _MG
-        return AxisGap(axis, gap, floor, source, offset_mg, explained)
+        return AxisGap(axis, gap, floor, source, float(of_blocks('mean_mps2').mean()) / _MG,
+                       explained)
+
+
+def _steps_ns(newest_ns: int | None, stamp_ns: np.ndarray) -> np.ndarray:
+    """Return the steps of stamps from the newest one before on; 0 to the very first."""
+    return np.diff(stamp_ns, prepend=stamp_ns[:1] if newest_ns is None else newest_ns)
 
 
 def _rms_interval(squares: np.ndarray) -> Interval:
     """Return the rms, mg, of the mean squares of blocks, (m/s²)², (n,), with its interval."""
-    batches = np.array([part.mean() for part in np.array_split(
-        squares, min(_BATCHES, len(squares)))])
+    batches = [part.mean() for part in np.array_split(squares, min(_BATCHES, len(squares)))]
     mean = float(squares.mean())
     half = float(scipy.special.stdtrit(len(batches) - 1, 0.5 + _CONFIDENCE / 2)
-                 * batches.std(ddof=1) / np.sqrt(len(batches)))
+                 * np.std(batches, ddof=1) / np.sqrt(len(batches)))
     value, low, high = np.sqrt(np.maximum([mean, mean - half, mean + half], 0.0)) / _MG
     return Interval(float(value), float(low), float(high))

@@ -126,8 +126,7 @@ class ReferenceStream:
         self.readings = StreamBuffer(3, span_ns)
         self.surroundings = {name: StreamBuffer(1, span_ns) for name in _USUAL}
         self.error_mps2 = np.zeros(3)  # Standard deviation of the newest forces by their source
-        self._held = [0.0, 0.0, 0.0]
-        self._origin_ns = 0
+        self._held, self._origin_ns = [0.0, 0.0, 0.0], 0
         self._paths: list[Path] = [Held(), Held(), Held()]
         self._force: ForcePath
 
@@ -276,11 +275,10 @@ class Prediction:
         self.left_out = () if reference.kind is ReferenceKind.STAGE else tuple(
             name for name in sensor.effects if effect_named(name).concern is Concern.STAGE)
         effects = tuple(name for name in sensor.effects if name not in self.left_out)
-        self._sensor, self._reference = sensor, reference
+        self._sensor, self._reference, self._origin_ns = sensor, reference, 0
         self._sensors = [noiseless(replace(sensor, effects=effects)),
                          noiseless(replace(sensor, effects=(), values={}))]
         self._responses: list[Response] = []
-        self._origin_ns = 0
 
     def restart(self) -> None:
         """Let the next block be the first one."""

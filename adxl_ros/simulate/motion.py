@@ -208,11 +208,10 @@ class SmoothedPath:
         """Return a derivative; see `motion.Path`."""
         begin_s, end_s = self._time_s[0], self._time_s[-1]
         inside_s = np.clip(time_s, begin_s, end_s)
-        number = ((inside_s - begin_s) / _WINDOW_S).astype(int)
+        numbers = ((inside_s - begin_s) / _WINDOW_S).astype(int)
         values = np.empty(len(time_s))
-        begins = np.flatnonzero(np.diff(number, prepend=-1))
-        for begin, end in pairwise([*begins.tolist(), len(number)]):
-            values[begin:end] = self._spline(int(number[begin]))(inside_s[begin:end], order)
+        for number in np.unique(numbers).tolist():
+            values[numbers == number] = self._spline(number)(inside_s[numbers == number], order)
         if order:
             values[(time_s < begin_s) | (time_s > end_s)] = 0.0
         return values

@@ -224,13 +224,15 @@ class SensorModel:
         begun = self._reset
         if len(begun) == count:
             self._switch_on(count)
-            self._chain = self._chain.anew(slice(None))
+            self._chain = self._chain.anew()
             begun = self._reset
         readings = self._advance(rows, environment)
         if len(begun):
             new = copy(self)
             new._switch_on(len(begun))
-            new._chain = self._chain.anew(begun)
+            new._chain = self._chain.anew()
+            if self.draws is not None and self.coefficients is not None:
+                new._chain.put_units(self.draws.names, self.coefficients[begun])
             readings[begun] = new._advance(rows[begun], [v[:, begun] for v in environment])
             _put_rows([*self._chain.memories(), self._memory],
                       [*new._chain.memories(), new._memory], begun)

@@ -188,10 +188,9 @@ def _with_what_shows(result: Findings, options: argparse.Namespace, reading: Rea
         if isinstance(shown, DataFault):
             reason = shown.message
         else:
-            scale_v_per_g = float(sensor.scale_v_per_g.mean())
-            effects = sorted(shown, key=lambda effect: not effect.shows)
             result = replace(result, shows=tuple(
-                shows_row(effect, scale_v_per_g) for effect in effects))
+                shows_row(effect, float(sensor.scale_v_per_g.mean()))
+                for effect in sorted(shown, key=lambda effect: not effect.shows)))
     except UserError as error:
         reason = one_line(error)
         if options.urdf:

@@ -107,7 +107,11 @@ def fit(options: argparse.Namespace) -> int:
                 read = robot.with_angles(read)
                 unit = replace(unit, stage_resolution_rad=max(
                     unit.stage_resolution_rad, robot.step_rad))
-            _report_range(read, unit)
+            beyond = BeyondRange()
+            beyond.add(read.volts(unit), unit)
+            text = beyond.describe(unit)
+            if text and 'range_g' not in unit.measured:  # but stated by the parameter file
+                cli.note(f'fit: {read.path}: {text}')
             show(0.3 * (number + 0.5) / len(options.recording), 'reading')
             thermal = _thermal_blocks(options, read, unit)
             if thermal is not None:
@@ -138,8 +142,13 @@ def fit(options: argparse.Namespace) -> int:
     cli.note(f'fit: {result.keep(options.store)}')
     report = [Path(options.report) / name for name in page.FILES] if options.report else []
     report += [Path(options.dcc)] if options.dcc else []
-    lines = [*(_head(result) if thermal is None else ()), *result.summary, *result.warnings]
-    cli.print_end([*lines, *measured, ''], [options.output, *report], cli.command(
+    fitted = result.fitted
+    # What was wrong with the unit, and what is fitted
+    head = [errors_in_words(fitted), '',
+            f'{fitted.serial}: {fitted.model} model of {result.inliers.sum()} poses, '
+            f'{len(fitted.covariance_names)} coefficients', ''] if thermal is None else []
+    lines = [*head, *result.summary, *result.warnings, *measured, '']
+    cli.print_end(lines, [options.output, *report], cli.command(
         'apply', f'{cli.quoted(options.recording[0])}{cli.reading_text(options)} --params '
         f'{cli.quoted(options.output)} -o tilt.csv'))
     return 0
@@ -155,23 +164,6 @@ def _thermal_blocks(options: argparse.Namespace, read: Recording, unit: Sensor) 
         raise UserError(f'--report {options.report}: a fit over temperature has no page; leave '
                         'it out')
     return blocks
-
-
-def _report_range(read: Recording, unit: Sensor) -> None:
-    """Report readings beyond a range that the parameter file states on stderr."""
-    beyond = BeyondRange()
-    beyond.add(read.volts(unit), unit)
-    text = beyond.describe(unit)
-    if text and 'range_g' not in unit.measured:
-        cli.note(f'fit: {read.path}: {text}')
-
-
-def _head(result: calibration.CalibrationResult) -> list[str]:
-    """Return what was wrong with the unit, and what is fitted."""
-    fitted = result.fitted
-    return [errors_in_words(fitted), '',
-            f'{fitted.serial}: {fitted.model} model of {result.inliers.sum()} poses, '
-            f'{len(fitted.covariance_names)} coefficients', '']
 
 
 def main() -> int:

@@ -93,7 +93,13 @@ def simulate(options: argparse.Namespace) -> int:
                 write(Recording(options.output, time_s, columns, sensor_info(sensor)))
             if duration_s:
                 show(min((time_s[-1] - begin_s) / duration_s, 1.0))
-    _print_end(options, sensor, duration_s)
+    result = (f'Simulated {options.trajectory}: {duration_s:.4g} s at {sensor.rate_hz:.4g} Hz, '
+              f'axes {sensor.axes}. Sensor {sensor.serial}, effects: '
+              f'{", ".join(sensor.effects) or "none"}.')
+    params = f' --params {cli.quoted(options.params)}' if options.params else ''
+    tool, output = ('fit', 'unit.yaml') if options.trajectory == 'sweep' else ('diagnose', 'gap')
+    cli.print_end([result], filter(None, [options.output]), cli.command(
+        tool, f'{cli.quoted(options.output)}{params} -o {output}') if options.output else '')
     return 0
 
 
@@ -167,16 +173,6 @@ def _board_output(stack: ExitStack, sensor: Sensor, port: str) -> Callable[[Colu
         boards[0].send(columns)
 
     return send
-
-
-def _print_end(options: argparse.Namespace, sensor: Sensor, duration_s: float) -> None:
-    result = (f'Simulated {options.trajectory}: {duration_s:.4g} s at {sensor.rate_hz:.4g} Hz, '
-              f'axes {sensor.axes}. Sensor {sensor.serial}, effects: '
-              f'{", ".join(sensor.effects) or "none"}.')
-    params = f' --params {cli.quoted(options.params)}' if options.params else ''
-    tool, output = ('fit', 'unit.yaml') if options.trajectory == 'sweep' else ('diagnose', 'gap')
-    cli.print_end([result], filter(None, [options.output]), cli.command(
-        tool, f'{cli.quoted(options.output)}{params} -o {output}') if options.output else '')
 
 
 def main() -> int:
