@@ -198,11 +198,10 @@ class RobotPath(ForcePath):
 
     def with_angles(self, read: Recording) -> Recording:
         """Add the angles of a stage that turns the sensor as the robot does; see `angles`."""
-        alpha_rad, beta_rad = self.angles(read.time_s)
         known = (read.time_s >= self.time_s[0]) & (read.time_s <= self.time_s[-1])
-        return replace(read, columns={**read.columns, **{
-            name: np.where(known, angle, np.nan) for name, angle in (
-                ('alpha_rad', alpha_rad), ('beta_rad', beta_rad))}})
+        alpha_rad, beta_rad = np.where(known, self.angles(read.time_s), np.nan)
+        return replace(read, columns={**read.columns, 'alpha_rad': alpha_rad,
+                                      'beta_rad': beta_rad})
 
     def angles(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -294,10 +293,8 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
             f'{readings.path}: no position of {", ".join(missing)}, which '
             f'{"move" if len(missing) > 1 else "moves"} {robot.frame} in {robot.urdf}; recorded '
             f'are {", ".join(readings.joints) or "no joints"}')
-    tracks = []
-    for name in robot.joints:
-        times, values = readings.joints[name]
-        tracks.append((name, times, np.unwrap(values)))
+    tracks = [(name, readings.joints[name][0], np.unwrap(readings.joints[name][1]))
+              for name in robot.joints]
     if readings.base is not None:
         times, pose = readings.base
         signs = np.cumprod(np.append(1.0, np.where(np.sum(

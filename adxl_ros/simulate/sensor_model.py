@@ -343,7 +343,7 @@ def _on_host(array: Any) -> np.ndarray:
 
 def _like(values: np.ndarray, like: Any) -> Any:
     """Return values as an array of the same library, type and device as another one."""
-    if isinstance(like, np.ndarray) or (np.ndim(like) == 1 and isinstance(like, (list, tuple))):
+    if isinstance(like, np.ndarray | list | tuple):
         return values
     try:
         from array_api_compat import array_namespace, device
