@@ -7,10 +7,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
-from enum import auto, Enum
 from math import inf
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
@@ -25,29 +24,6 @@ _STALE_S = 60.0
 _SHORTEST_SILENCE_S = 0.5
 """Shortest interval in which samples are missed, s; chosen. A report on a change of level may
 follow the last one by less than a sample period."""
-
-
-class State(Enum):
-    """States of a compensated stream; of several that hold, the first one is reported."""
-
-    REFUSED = auto()
-    SILENT = auto()
-    UNKNOWN = auto()
-    DROPPING = auto()
-    SATURATED = auto()
-    NOT_CONFIRMED = auto()
-    SURROUNDINGS_UNKNOWN = auto()
-    NOT_CALIBRATED = auto()
-    OUTSIDE = auto()
-    NEWER_CALIBRATION = auto()
-    COMPENSATING = auto()
-
-
-class Status(NamedTuple):
-    """State of a compensated stream."""
-
-    state: State  # The state
-    text: str  # The state in one line for people, with its reason
 
 
 @dataclass(frozen=True)
@@ -150,35 +126,32 @@ class CompensationPolicy:
             return None
         return calibration_store.newer(self._store, sensor)
 
-    def status(self, interval: Interval, newer: Path | None, calibration: str) -> Status:
-        """Return the state of the stream: the first one that holds."""
+    def status(self, interval: Interval, newer: Path | None, calibration: str
+               ) -> tuple[str, str]:
+        """Return level (OK, WARN, ERROR) and text of the state: the first one that holds."""
+        if self.refusal:
+            return 'ERROR', f'publishing nothing: {self.refusal}'
         counts, samples = interval.counts, self._full_name('imu/data_raw')
         no_info = f'nothing on {self._full_name("sensor_info")}'
         is_silent = not counts.get('received') and interval.duration_s > _SHORTEST_SILENCE_S
-        is_newer = newer is not None and not self.is_named(calibration)
         unknown = self._unknown_surroundings(interval)
-        states = (
-            (self.refusal, State.REFUSED, f'publishing nothing: {self.refusal}'),
-            (is_silent, State.SILENT, f'no samples on {samples}'),
-            (interval.obstacle, State.UNKNOWN,
-             f'publishing nothing yet: {no_info}, and {samples} does not show its sensor: '
-             f'{interval.obstacle}'),
-            (counts.get('dropped'), State.DROPPING,
+        warnings = (
+            (is_silent, f'no samples on {samples}'),
+            (interval.obstacle, f'publishing nothing yet: {no_info}, and {samples} does not show '
+             f'its sensor: {interval.obstacle}'),
+            (counts.get('dropped'),
              f'{counts.get("dropped")} samples dropped that no force explains'),
-            (counts.get('saturated'), State.SATURATED,
+            (counts.get('saturated'),
              f'{counts.get("saturated")} samples with the ADC at its rail'),
-            (self.info is None, State.NOT_CONFIRMED, f'unit not confirmed: {no_info}'),
-            (unknown, State.SURROUNDINGS_UNKNOWN, unknown),
-            (not self.sensor.effects, State.NOT_CALIBRATED,
-             'not calibrated: the datasheet values apply'),
-            (counts.get('outside'), State.OUTSIDE,
-             f'{counts.get("outside")} samples outside of what was calibrated, their covariance '
-             f'raised: {"; ".join(interval.outside)}'),
-            (is_newer, State.NEWER_CALIBRATION,
+            (self.info is None, f'unit not confirmed: {no_info}'),
+            (unknown, unknown),
+            (not self.sensor.effects, 'not calibrated: the datasheet values apply'),
+            (counts.get('outside'), f'{counts.get("outside")} samples outside of what was '
+             f'calibrated, their covariance raised: {"; ".join(interval.outside)}'),
+            (newer is not None and not self.is_named(calibration),
              f'a newer calibration is in the store: {newer}; set calibration to it, or start '
-             'again'),
-            (True, State.COMPENSATING, 'compensating'))
-        return next(Status(state, text) for holds, state, text in states if holds)
+             'again'))
+        return next((('WARN', text) for holds, text in warnings if holds), ('OK', 'compensating'))
 
     def _unknown_surroundings(self, interval: Interval) -> str:
         """Name an effect whose temperature or supply nobody publishes, or return ''."""

@@ -43,7 +43,7 @@ class LiveStream:
     """
     Corrects the samples of one stream.
 
-    One thread calls it with samples; another one may replace the sensor and the surroundings
+    One thread calls it with samples and surroundings; another one may replace the sensor
     meanwhile. A sample has the coefficients before or after a replacement, never some of both.
 
     publish_tilt, publish_free: take roll, pitch and inclination, and the acceleration without
@@ -63,7 +63,6 @@ class LiveStream:
         self._publish_imu, self._publish_tilt = publish_imu, publish_tilt
         self._chain: _Chain
         self._angles_rad = [0.0, 0.0, 0.0]
-        self._new_surroundings: dict[str, float] = {}
         self.counts: Counter[str] = Counter()  # Samples since the start, by the names of `COUNTS`
         # What the newest sample outside of the calibrated range exceeds, in words
         self.outside: tuple[str, ...] = ()
@@ -116,7 +115,8 @@ class LiveStream:
 
     def surround(self, name: str, value: float) -> None:
         """Take a temperature or supply into account, from the next sample on."""
-        self._new_surroundings = {**self._new_surroundings, name: value}
+        self.surroundings = {**self.surroundings, name: value}
+        self._chain.live.set_environment(**{name: value})
 
     def __call__(self, raw: bytes) -> None:
         """Correct one sample, a serialized sensor_msgs/Imu, and publish the result."""
@@ -134,10 +134,6 @@ class LiveStream:
             return
         # Read once: another thread may replace the chain at any time.
         chain = self._chain
-        if self._new_surroundings:
-            new, self._new_surroundings = self._new_surroundings, {}
-            chain.live.set_environment(**new)
-            self.surroundings |= new
         volts = chain.live.volts(accel_mps2)
         if self.may_be_foreign and any(accel_mps2[len(volts):]):
             self.hold()

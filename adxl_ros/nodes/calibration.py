@@ -93,20 +93,21 @@ _RESET = b'\x1b[?1049l\x1b[?2004l\x1b[?25h\x1b[0m'
 """Leaves alternate screen and bracketed paste and shows the cursor, by the codes of xterm."""
 
 
-def open_screen(node_name: str) -> tuple[OwnScreen | None, str]:
+def open_screen(node_name: str, log: Callable[[str], object]) -> OwnScreen | None:
     """Start a screen if this process has a terminal, and is no background job of it."""
     is_terminal = all(stream and stream.isatty() for stream in (sys.stdin, sys.stdout))
     if not is_terminal or os.environ.get('TERM') == 'dumb':
-        return None, ''
+        return None
     # A terminal that does not control this process has no background.
     with suppress(OSError):
         if os.tcgetpgrp(sys.stdin.fileno()) != os.getpgrp():
-            return None, ''
+            return None
     try:
         import prompt_toolkit  # noqa: F401
     except ImportError:
-        return None, 'no screen, plain lines: it needs prompt_toolkit; pip install prompt_toolkit'
-    return OwnScreen(node_name), ''
+        log('no screen, plain lines: it needs prompt_toolkit; pip install prompt_toolkit')
+        return None
+    return OwnScreen(node_name)
 
 
 class OwnScreen:
@@ -216,10 +217,8 @@ class DisplayPublisher:
 
     def __init__(self, node: Node, controller: Controller, starts_screen: bool) -> None:
         self._node, self._controller = node, controller
-        self._own_screen, obstacle = open_screen(node.get_fully_qualified_name()) \
-            if starts_screen else (None, '')
-        if obstacle:
-            node.get_logger().info(obstacle)
+        self._own_screen = open_screen(node.get_fully_qualified_name(), node.get_logger().info) \
+            if starts_screen else None
         controller.may_ask = self._own_screen is not None
         self._publisher = create_publisher(node, String, '~/display', 1, latched=True)
         node.create_timer(_PERIOD_S, self.update, clock=STEADY)
@@ -413,8 +412,7 @@ class Calibration(Node):
         if self._has_stage:
             self._stage = topics.Inbox(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
             topics.create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
-        self._take_surroundings = topics.subscribe_surroundings(
-            self, _QUEUE, self._controller.read_quantity)
+        self._surroundings = topics.Surroundings(self, _QUEUE)
         start = self._controller.start
         requests: dict[str, Callable[[], Answer]] = {
             'start': start, 'resume': partial(start, start_over=False),
@@ -433,7 +431,9 @@ class Calibration(Node):
 
     def _poll(self) -> None:
         self._read_stage()
-        self._take_surroundings()
+        for topic, stamps_ns, values in self._surroundings.take():
+            for stamp_ns, value in zip(stamps_ns.tolist(), values[:, 0].tolist()):
+                self._controller.read_quantity(topic, stamp_ns, value)
         # A poll may begin a calibration and end it at once.
         self._has_run |= self._controller.state is not ControllerState.IDLE
         self._controller.poll()

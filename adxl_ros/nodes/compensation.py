@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any
 
-from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval, State
+from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval
 from adxl_ros.compensate.inversions import HALF
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, imu_message, parameter_file
+from adxl_ros.links.support.base import COLUMNS
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import Mounting
@@ -151,8 +152,6 @@ def _mounting(rpy_rad: Sequence[float]) -> Mounting:
 _DEPTH = 100  # Samples that are kept while the node is busy: 0.1 s at 1 kHz
 _LOOK_S = 0.5
 """Time between two looks at who publishes and, where it is unknown, at the sensor, s; chosen."""
-_LEVELS = {State.REFUSED: Level.ERROR, State.COMPENSATING: Level.OK}
-"""Levels of the states; all others are warnings."""
 _EXAMPLES = {'the newest calibration of the unit in the store': '',
              'a calibration by its file': '--ros-args -p calibration:=unit.yaml'}
 """Examples of arguments, by their purpose."""
@@ -199,9 +198,8 @@ class Compensation(Node):
         self.create_timer(_LOOK_S, self._look, clock=STEADY)
         topics.create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
                                    latched=True)
-        topics.subscribe_surroundings(self, 1, self._surround)
-        self._thread = topics.RepeatingThread(
-            self, lambda: self._samples.receive(self._stream), 'imu/data_raw')
+        self._surroundings = topics.Surroundings(self, 1)
+        self._thread = topics.RepeatingThread(self, self._receive, 'imu/data_raw')
 
     def close(self) -> None:
         """End the thread that receives."""
@@ -294,12 +292,15 @@ class Compensation(Node):
                    f'publishing nothing: {refusal}' if refusal else 'publishing again')
         self._diagnostics.notice(Level.ERROR if refusal else Level.OK)
 
-    def _surround(self, topic: str, _: int, value: float) -> None:
-        """Use a temperature, °C, or supply, V, from the next sample on; ignore NaN."""
-        name = {'temperature': 'temperature_c', 'supply': 'supply_v'}[topic]
-        if isfinite(value):
-            self._stream.surround(name, value)
-            self._heard_ns[name] = self.get_clock().now().nanoseconds
+    def _receive(self) -> None:
+        """Correct the samples that come, by the newest finite temperature and supply."""
+        self._samples.wait()
+        for topic, _, values in self._surroundings.take():
+            if isfinite(value := float(values[-1, 0])):
+                self._stream.surround(COLUMNS[topic], value)
+                self._heard_ns[COLUMNS[topic]] = self.get_clock().now().nanoseconds
+        for sample in self._samples.take():
+            self._stream(sample)
 
     def _status(self) -> Status:
         steady_ns, ros_ns = STEADY.now().nanoseconds, self.get_clock().now().nanoseconds
@@ -312,13 +313,13 @@ class Compensation(Node):
             {name: (ros_ns - ns) * 1e-9 for name, ns in self._heard_ns.items()},
             self._obstacle if self._stream.unknown is not None else '')
         newer = self._policy.newer()
-        state, text = self._policy.status(interval, newer, self._calibration())
+        level, text = self._policy.status(interval, newer, self._calibration())
         late = HALF if self._settings.undo_filter else 0
         values = {'rate_in_hz': round(counts['received'] / duration_s, 1),
                   'rate_out_hz': round(counts['published'] / duration_s, 1), **totals,
                   'delay_s': late / self._policy.rate_hz, **self._ages.report(),
                   **self._policy.values(interval, newer)}
-        return Status(_LEVELS.get(state, Level.WARN), text, self._policy.sensor.serial, values)
+        return Status(Level[level], text, self._policy.sensor.serial, values)
 
 
 def main() -> int:

@@ -10,8 +10,9 @@ from pathlib import Path
 import time
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import calibration_store, cdr
+from adxl_ros.files import calibration_store
 from adxl_ros.files.recording_columns import check_unit, NO_UNIT, StreamInfo, unit_of
+from adxl_ros.links.support.base import COLUMNS
 from adxl_ros.monitor import changes
 from adxl_ros.monitor.changes import DiagnosisResult, DiagnosisRun, iso_time
 from adxl_ros.monitor.live_gap import AxisGap, GapSettings, LiveGap
@@ -24,7 +25,7 @@ from adxl_ros.report.quantities import percent
 from adxl_ros.simulate.robot import Robot
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
-from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
+from sensor_msgs.msg import Imu, JointState
 from std_srvs.srv import Trigger
 
 
@@ -97,19 +98,15 @@ class MonitorStreams:
     def __init__(self, node: Node, kind: ReferenceKind, reference_topic: str,
                  robot: RobotForce | None) -> None:
         self._kind, self._robot = kind, robot
-        reference = Imu if kind is ReferenceKind.IMU else JointState
-        self.samples, self.reference, self._temperature, self._supply = (
-            Inbox(node, message, topic, _INPUT_QUEUE) for message, topic in (
-                (Imu, 'imu/data_raw'), (reference, reference_topic),
-                (Temperature, 'temperature'), (BatteryState, 'supply')))
+        self.samples = Inbox(node, Imu, 'imu/data_raw', _INPUT_QUEUE)
+        self.reference = Inbox(node, Imu if kind is ReferenceKind.IMU else JointState,
+                               reference_topic, _INPUT_QUEUE)
+        self._surroundings = topics.Surroundings(node, _INPUT_QUEUE)
 
     def take_others(self, reference: ReferenceStream) -> None:
         """Add reference and surroundings that wait."""
-        for name, field, inbox, layout in (
-                ('temperature_c', 'temperature', self._temperature, cdr.temperature),
-                ('supply_v', 'voltage', self._supply, cdr.battery_state)):
-            stamps_ns, fields = topics.decoded(inbox.take(), layout, **{field: 1})
-            reference.add_surroundings(name, stamps_ns, fields[field])
+        for topic, stamps_ns, values in self._surroundings.take():
+            reference.add_surroundings(COLUMNS[topic], stamps_ns, values)
         messages = self.reference.take()
         if self._kind is ReferenceKind.IMU:
             reference.add_readings(*topics.imu_samples(messages))

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 import struct
 import sys
 import threading
@@ -89,32 +88,6 @@ def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[A
             kind, topic, take_all, qos, raw=raw, callback_group=group,
             qos_overriding_options=_OVERRIDING)
     return subscription
-
-
-def subscribe_surroundings(node: Node, depth: int, take: Callable[[str, int, float], object]
-                           ) -> Callable[[], None]:
-    """
-    Give temperature, °C, and supply, V, to a function, with topic and stamp, ns.
-
-    returns: a function that gives those that wait at once, before samples of the same time.
-    """
-    def give(topic: str, field: str, message: Any) -> None:
-        stamp = message.header.stamp
-        take(topic, stamp.sec * 10 ** 9 + stamp.nanosec, getattr(message, field))
-
-    subscriptions = []
-    for topic, kind, field in (('temperature', Temperature, 'temperature'),
-                               ('supply', BatteryState, 'voltage')):
-        callback = partial(give, topic, field)
-        subscriptions.append((create_subscription(node, kind, topic, callback, depth), kind,
-                              callback))
-
-    def take_waiting() -> None:
-        for subscription, kind, callback in subscriptions:
-            for message in take_messages(subscription, kind, False, depth):
-                callback(message)
-
-    return take_waiting
 
 
 @contextmanager
@@ -305,6 +278,27 @@ class Inbox:
     def destroy(self) -> None:
         """Remove the subscription; a thread that waits must have ended."""
         self._node.destroy_subscription(self._subscription)
+
+
+_SURROUNDINGS = {'temperature': (Temperature, cdr.temperature, 'temperature'),
+                 'supply': (BatteryState, cdr.battery_state, 'voltage')}
+"""Type, layout and field of each topic."""
+
+
+class Surroundings:
+    """Keeps temperature, °C, and supply, V, until they are taken, before samples of that time."""
+
+    def __init__(self, node: Node, depth: int) -> None:
+        self._inboxes = {topic: Inbox(node, kind, topic, depth)
+                         for topic, (kind, _, _) in _SURROUNDINGS.items()}
+
+    def take(self) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+        """Yield each topic with stamps, ns, (n,), and values, (n, 1), since the last call."""
+        for topic, inbox in self._inboxes.items():
+            if messages := inbox.take():
+                _, layout, field = _SURROUNDINGS[topic]
+                stamps_ns, fields = decoded(messages, layout, **{field: 1})
+                yield topic, stamps_ns, fields[field]
 
 
 _PERIOD_S = 1.0  # Time between two reports, s; the usual rate of ROS diagnostics

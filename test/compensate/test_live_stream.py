@@ -65,7 +65,6 @@ def test_temperature_and_supply_apply_from_the_next_sample_on() -> None:
     warm = NOMINAL_ENVIRONMENT._replace(temperature_c=35.0)
     stream = Stream(sensor)
     stream.surround('temperature_c', 35.0)
-    assert stream.surroundings == {}
     stream.send(sensor, 0.7, 0.4, warm)
     assert stream.surroundings == {'temperature_c': 35.0}
     np.testing.assert_allclose(stream.force(), specific_force(0.7, 0.4, G), atol=1e-6)

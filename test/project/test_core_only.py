@@ -59,7 +59,7 @@ for use in (lambda: tables.open_table('log.ulg'), lambda: tables.open_table('log
         print(error)
 sys.stdin.isatty = sys.stdout.isatty = lambda: True
 os.tcgetpgrp = lambda fd: os.getpgrp()
-print(*open_screen('/calibration'))
+open_screen('/calibration', print)
 """
     done = run_without_extras(code)
     assert done.returncode == 0, done.stderr
@@ -69,8 +69,8 @@ print(*open_screen('/calibration'))
                                   'pyserial', "'pylibiio<1' and sudo apt install libiio0")):
         assert re.search(f'install .*{re.escape(name)}', line), line
     # A calibration goes on.
-    assert lines[-1] == ('None no screen, plain lines: it needs prompt_toolkit; pip install '
-                         'prompt_toolkit')
+    assert lines[-1] == \
+        'no screen, plain lines: it needs prompt_toolkit; pip install prompt_toolkit'
 
 
 def test_a_csv_is_fitted(tmp_path: Path) -> None:
