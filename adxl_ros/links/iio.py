@@ -170,7 +170,7 @@ class IioLink(base.DeviceLink):
             self._adc = adc
             self.sensor = replace(self._declared, **adc)  # type: ignore[arg-type]
             if stream.by_host_clock:
-                self._stamper.clock = IdentityMap()
+                self._stamper.clock = IdentityMap(0.0)
             self._stamper.restart(1e9 / stream.rate_hz)
             self._newest_ns = -1
 

@@ -106,6 +106,16 @@ def test_a_step_of_the_device_clock_is_recognised(step_ms):
     assert np.abs(errors[15000 + 3000:]).max() < 1.0, 'from three seconds after the step on'
 
 
+def test_stamps_keep_their_distances_after_the_load_of_a_busy_host():
+    frames = DelayedFrames(50, 0.05, 0.5)
+    frames.run(1000)
+    frames.run(200, late_ms=100)
+    frames.run(1500)
+    steps = np.diff(np.concatenate(frames.stamps))
+    assert (steps < 0.4 * MS).sum() <= 1 and frames.map.steps == 2, 'there and back'
+    assert np.abs(frames.errors()[-2000:]).max() < 1.0
+
+
 def data(index, time_us=None, flags=0):
     """Return a frame of ten samples, by default at its time at 1 kHz."""
     time_us = index * 1000 if time_us is None else time_us

@@ -46,24 +46,19 @@ information."""
 _FIT_ITERATIONS = 8
 """Iterations of the reweighted least squares. Chosen: the weights settle in fewer."""
 _EARLY_NS = 20e6  # Earliness of an arrival that shows a forward step of the device's clock, ns
-_SHIFT_NS = 20e6
-"""Common lateness of two windows that shows a backward step of the device's clock, ns."""
+_LATE_NS = 20e6
+"""Lateness of arrivals, ns, that shows a backward step of the device's clock if it stays."""
+_SHIFT_S = 1.0  # Time after which lateness that has stayed counts as a step, s: two windows
 _STOPPED_NS = 250e6
-"""Lateness of an arrival after which the next arrivals decide whether the clock stopped, ns."""
-_CATCH_UP_RATIO = 1.5
-"""Late samples that come this many times faster than they were taken were delayed on the way."""
+"""Lateness of an arrival, ns, after which samples wait until its cause is known."""
+_SAME_NS = 5e6  # Largest change of a lateness that stays, ns
 _SMOOTH_NS = 50e6
 """Largest difference that the stamps take up smoothly, ns. A larger one forward is a step."""
-_MAX_BEND = 0.05  # Largest change of slope for a small difference, relative to the drift
-_MAX_STEEP_BEND = 0.5  # Largest change of slope for a difference beyond `_SMOOTH_NS`
-_MIN_SLOPE = 1e-3  # Smallest slope of the stamps: they go forward whatever a faulty device sends
-_SHIFT_TOLERANCE_NS = _SHIFT_NS / 4
-"""Largest difference between two windows that are late by the same amount, ns."""
-_SHIFT_WINDOWS = 3  # Windows that a backward step needs: one before it and two after it
+_MAX_BEND = 0.5  # Largest difference between the slopes of stamps and device time
 
 
-class _Window(NamedTuple):
-    """The earliest arrival of a window: device time, and its lag behind host time, ns."""
+class _Arrival(NamedTuple):
+    """An arrival: device time, and its lag behind host time, ns."""
 
     device_ns: int
     lag_ns: int
@@ -74,184 +69,160 @@ class ClockMap:
     Map of a device's clock by the arrivals of its samples.
 
     drift_ppm: drift of the device's clock, ppm; positive where it is slower than the host's;
-    jitter_ns: median distance of the windows' earliest arrivals from the line, ns; settled:
+    jitter_ns: median distance of the windows' earliest arrivals from the fit, ns; settled:
     whether samples get stamps. They wait in the first instants of a new clock.
     """
 
     def __init__(self, delay_s: float, decision_s: float = _LATER_WAIT_S) -> None:
-        self._decision_s = decision_s
         self.steps = 0  # How often the device's clock has stepped, by its arrivals
-        self._delay_ns = round(delay_s * 1e9)
+        self._delay_ns, self._decision_s = round(delay_s * 1e9), decision_s
         self._newest_stamp_ns: int | None = None
         self._wait_s = _FIRST_WAIT_S
         self.restart()
 
     def restart(self) -> None:
         """Begin a new clock; its stamps follow the earlier ones."""
-        self.drift_ppm = self.jitter_ns = 0.0
+        self.drift_ppm = self.jitter_ns = self._offset_ns = 0.0
         self.settled = False
-        self._windows: deque[_Window] = deque()
-        self._open: _Window | None = None
-        self._opened_ns = self._seen_ns = self._count = 0
-        self._first_arrived_ns: int | None = None
-        # Arrivals far too late, device time and host time, ns: their samples were delayed, or the
-        # device's clock stopped
-        self._late: list[tuple[int, int]] = []
-        self._former_lag_ns: float | None = None
+        self._first: _Arrival | None = None
+        self._windows: deque[_Arrival] = deque()  # The earliest arrival of each window
+        self._open: _Arrival | None = None  # That of the window that has not ended
+        self._opened_ns = self._steered_ns = self._count = 0
+        # Arrivals in a row far too late: the samples were delayed, or the clock has stepped back.
+        self._late: list[_Arrival] = []
         # The stamps lie on a line through this point, device time and host time, ns.
         self._line_device_ns = self._line_host_ns = 0
         self._slope = 1.0
 
     def observe(self, device_ns: int, arrived_ns: int) -> bool:
-        """Take an arrival."""
-        lag_ns = arrived_ns - self._delay_ns - device_ns
-        # How far the arrival lies above the line; far below it, the device's clock stepped forward
-        lateness_ns = lag_ns + device_ns - self._line(device_ns)
-        is_early = self.settled and lateness_ns < -_EARLY_NS
-        if is_early or self._is_shifted(lag_ns):
-            former_ns = self._former_lag_ns
-            # Samples that a busy host read late have looked like those of a clock that stopped.
-            was_delayed = is_early and former_ns is not None and lag_ns > former_ns - _EARLY_NS
-            self.steps += not was_delayed
+        """Take an arrival; return whether it shows a forward step of the device's clock."""
+        arrival = _Arrival(device_ns, arrived_ns - self._delay_ns - device_ns)
+        late_ns = self._lateness_ns(arrival) if self.settled else 0
+        if late_ns > _LATE_NS:
+            # It stays out of the windows, until later ones explain it.
+            self._late.append(arrival)
+            return False
+        stepped = late_ns < -_EARLY_NS
+        if stepped:
+            self.steps += 1
             self.restart()
-            self._former_lag_ns = former_ns if was_delayed else None
-            self.observe(device_ns, arrived_ns)
-            return not was_delayed
-        if self.settled:
-            if lateness_ns > (_SHIFT_NS if self._late else _STOPPED_NS):
-                # It stays out of the windows, until later ones explain it.
-                self._late.append((device_ns, arrived_ns))
-                return False
-            self._late.clear()  # the delayed samples have been delivered
-        if self._first_arrived_ns is None:
-            self._first_arrived_ns = arrived_ns
-        self._update_window(device_ns, lag_ns)
-        return False
+        self._late.clear()  # the delayed samples have been delivered
+        self._take(arrival)
+        return stepped
 
     def ready(self, now_ns: int) -> bool:
         """Return whether samples can be stamped at a host time, ns."""
-        if len(self._late) > 1 and now_ns - self._late[0][1] >= self._decision_s * 1e9:
-            self._resolve()
-        if not self.settled and self._open is not None and self._first_arrived_ns is not None \
-                and now_ns - self._first_arrived_ns >= self._wait_s * 1e9:
-            self.settled = True
-            self._wait_s = _LATER_WAIT_S
-            self._line_device_ns = self._open.device_ns
-            self._line_host_ns = self._line_device_ns + self._fit(self._line_device_ns)
-        return self.settled and not self._late
+        is_held = bool(self._late) and self._lateness_ns(self._late[0]) > _STOPPED_NS
+        if len(self._late) > 1 and self._has_passed(
+                self._decision_s if is_held else _SHIFT_S, self._late[0], now_ns):
+            is_held = False
+            self._explain_lateness()
+        first = self._first
+        if not self.settled and first and self._has_passed(self._wait_s, first, now_ns):
+            self.settled, self._wait_s = True, _LATER_WAIT_S
+            self._line_device_ns = self._steered_ns = first.device_ns
+            self._line_host_ns = self._clock_ns(first.device_ns)
+        return self.settled and not is_held
 
     def host_ns(self, device_ns: np.ndarray) -> np.ndarray:
         """Map ascending device times, ns, (n,), to host times that ascend from call to call."""
-        stamps = np.rint(self._line(device_ns)).astype(np.int64)
-        newest_ns = self._newest_stamp_ns
-        if newest_ns is not None and stamps[0] <= newest_ns:
+        stamps = self._stamps(device_ns)
+        if self._newest_stamp_ns is not None and stamps[0] <= self._newest_stamp_ns:
             # Continue from the stamps so far, further than a reading of the system clock may err.
-            newest_ns += _MAX_UNCERTAINTY_NS
-            self._line_host_ns += newest_ns + 1 - int(stamps[0])
-            self._steer(int(device_ns[0]), _HORIZON_S)
-            stamps = np.maximum(np.rint(self._line(device_ns)).astype(np.int64),
-                                newest_ns + 1 + np.arange(len(stamps)))
-        self._newest_stamp_ns = int(stamps[-1])
+            self._line_device_ns = int(device_ns[0])
+            self._line_host_ns = self._newest_stamp_ns + _MAX_UNCERTAINTY_NS + 1
+            self._steer(self._line_device_ns, _HORIZON_S)
+            stamps = self._stamps(device_ns)
+        # The line turns about the newest stamp, so that what follows comes after it.
+        self._line_device_ns, self._line_host_ns = int(device_ns[-1]), int(stamps[-1])
+        self._newest_stamp_ns = self._line_host_ns
         return stamps
 
-    def _line(self, device_ns: Any) -> Any:
-        return self._line_host_ns + (device_ns - self._line_device_ns) * self._slope
+    def _stamps(self, device_ns: np.ndarray) -> np.ndarray:
+        ahead_ns = (device_ns - self._line_device_ns) * self._slope
+        return self._line_host_ns + np.rint(ahead_ns).astype(np.int64)
 
-    def _update_window(self, device_ns: int, lag_ns: int) -> None:
-        """Add an arrival to the open window; a window that ends corrects the line."""
+    def _clock_ns(self, device_ns: int) -> int:
+        """Return the host time of a device time by the fit, ns."""
+        origin = self._windows[-1] if self._windows else self._open
+        assert origin is not None, 'an arrival precedes what follows from it'
+        ahead_ns = self._offset_ns + self.drift_ppm * 1e-6 * (device_ns - origin.device_ns)
+        return device_ns + origin.lag_ns + round(ahead_ns)
+
+    def _lateness_ns(self, arrival: _Arrival) -> int:
+        return arrival.lag_ns + arrival.device_ns - self._clock_ns(arrival.device_ns)
+
+    def _has_passed(self, wait_s: float, arrival: _Arrival, now_ns: int) -> bool:
+        """Return whether a time, s, has passed since an arrival."""
+        return now_ns - sum(arrival) - self._delay_ns >= wait_s * 1e9
+
+    def _take(self, arrival: _Arrival) -> None:
+        """Add an arrival to the open window; an end of a window, and a better first, steer."""
+        device_ns, lag_ns = arrival
+        self._first = self._first or arrival
         if self._open is None:
             self._opened_ns, self._count = device_ns, 0
         if self._open is None or lag_ns < self._open.lag_ns:
-            self._open = _Window(device_ns, lag_ns)
-            if self.settled and not self._windows:
-                self._steer(device_ns, max(_FIRST_HORIZON_S, 2e-9 * (device_ns - self._seen_ns)))
+            self._open = arrival
+            if not self._windows:
+                self._steer(device_ns, _FIRST_HORIZON_S)
         self._count += 1
-        self._seen_ns = device_ns
         open_s = (device_ns - self._opened_ns) * 1e-9
-        complete = open_s >= _WINDOW_S and self._count >= _MIN_ARRIVALS
-        if complete or open_s >= _MAX_WINDOW_S:
+        if (open_s >= _WINDOW_S and self._count >= _MIN_ARRIVALS) or open_s >= _MAX_WINDOW_S:
             self._windows.append(self._open)
             self._open = None
             while len(self._windows) > _MIN_WINDOWS \
                     and device_ns - self._windows[0].device_ns > _SPAN_S * 1e9:
                 self._windows.popleft()
-            self._steer(device_ns, max(_HORIZON_S, 2 * open_s))
+            self._steer(device_ns, _HORIZON_S)
 
     def _steer(self, device_ns: int, horizon_s: float) -> None:
-        """Turn the line so that it meets the best line at the horizon."""
-        host_ns = round(self._line(device_ns))
-        horizon_ns = round(horizon_s * 1e9)
-        difference_ns = device_ns + self._fit(device_ns) - host_ns
-        if difference_ns > _SMOOTH_NS:
-            host_ns, difference_ns = host_ns + difference_ns, 0
-        bend = _MAX_BEND if abs(difference_ns) < _SMOOTH_NS else _MAX_STEEP_BEND
-        target_ns = device_ns + horizon_ns
-        slope = (target_ns + self._fit(target_ns) - host_ns) / horizon_ns
-        drift = 1 + self.drift_ppm * 1e-6
-        self._slope = max(min(max(slope, drift - bend), drift + bend), _MIN_SLOPE)
-        self._line_device_ns, self._line_host_ns = device_ns, host_ns
+        """Fit the clock, and turn the line so that it meets the clock at the horizon."""
+        self._fit()
+        if not self.settled:
+            return
+        behind_ns = self._clock_ns(self._line_device_ns) - self._line_host_ns
+        if behind_ns > _SMOOTH_NS:
+            self._line_host_ns += behind_ns
+        target_ns = device_ns + round(max(horizon_s * 1e9, 2 * (device_ns - self._steered_ns)))
+        self._steered_ns = device_ns
+        rise_ns = self._clock_ns(target_ns) - self._line_host_ns
+        slope = rise_ns / (target_ns - self._line_device_ns)
+        self._slope = min(max(slope, 1 - _MAX_BEND), 1 + _MAX_BEND)
 
-    def _fit(self, device_ns: int) -> int:
+    def _fit(self) -> None:
         """
-        Fit the best line to the windows; return the lag of a device time on it, ns.
+        Fit the best line to the windows, by reweighted least squares.
 
         A window above the line counts less, and a drift of 0 is the prior.
         """
-        windows = [self._open] if self._open and not self._windows else [*self._windows]
-        origin = windows[-1]
-        time_s = np.array([w.device_ns - origin.device_ns for w in windows]) * 1e-9
-        lag_ns = np.array([w.lag_ns - origin.lag_ns for w in windows], float)
+        windows = np.array(self._windows or [self._open])
+        time_s, lag_ns = ((windows - windows[-1]) * (1e-9, 1)).T
         weight = np.ones(len(windows))
-        offset_ns = slope = 0.0
         for _ in range(_FIT_ITERATIONS):
-            mean_s = np.average(time_s, weights=weight)
-            mean_ns = np.average(lag_ns, weights=weight)
+            mean_s, mean_ns = np.average([time_s, lag_ns], axis=1, weights=weight)
             spread_s2 = weight @ (time_s - mean_s) ** 2
             slope = weight @ ((time_s - mean_s) * (lag_ns - mean_ns)) / (spread_s2 + _PRIOR_S2)
-            offset_ns = mean_ns - slope * mean_s
-            residual_ns = lag_ns - offset_ns - slope * time_s
+            residual_ns = lag_ns - mean_ns - slope * (time_s - mean_s)
             weight = np.where(residual_ns > 0, _LATE_WEIGHT, 1.0)
-            self.jitter_ns = float(np.median(np.abs(residual_ns)))
-        self.drift_ppm = float(slope) * 1e-3
-        ahead_s = (device_ns - origin.device_ns) * 1e-9
-        return origin.lag_ns + round(offset_ns + slope * ahead_s)
+        self._offset_ns, self.drift_ppm = float(mean_ns - slope * mean_s), float(slope) * 1e-3
+        self.jitter_ns = float(np.median(np.abs(residual_ns)))
 
-    def _resolve(self) -> None:
-        """Begin a new clock if the late samples come at the pace of time: the clock stopped."""
+    def _explain_lateness(self) -> None:
+        """Begin a new clock if the late samples were late by the same time: it stepped back."""
         late, self._late = self._late, []
-        (first_device_ns, first_ns), (last_device_ns, last_ns) = late[0], late[-1]
-        if last_device_ns - first_device_ns > _CATCH_UP_RATIO * (last_ns - first_ns):
-            return
-        self.steps += 1
-        former_ns = self._former_lag_ns
-        if former_ns is None:
-            former_ns = self._line(first_device_ns) - first_device_ns
-        self.restart()
-        self._former_lag_ns = former_ns
-        self._first_arrived_ns = first_ns
-        self._open = _Window(last_device_ns, min(
-            arrived_ns - self._delay_ns - device_ns for device_ns, arrived_ns in late))
-        self._opened_ns, self._count = last_device_ns, 1
-
-    def _is_shifted(self, lag_ns: int) -> bool:
-        """Return whether the last two windows are late by the same amount: a backward step."""
-        if len(self._windows) < _SHIFT_WINDOWS \
-                or lag_ns - self._windows[-1].lag_ns < -_SHIFT_TOLERANCE_NS:
-            return False
-        before_ns, first_ns, second_ns = (self._windows[i].lag_ns for i in (-3, -2, -1))
-        return first_ns - before_ns > _SHIFT_NS and abs(second_ns - first_ns) < _SHIFT_TOLERANCE_NS
+        half = len(late) // 2
+        first_ns, second_ns = (min(arrival.lag_ns for arrival in part)
+                               for part in (late[:half], late[half:]))
+        if abs(second_ns - first_ns) < _SAME_NS:
+            self.steps += 1
+            self.restart()
+            for arrival in late:
+                self._take(arrival)
 
 
-class IdentityMap:
-    """Map for a device that stamps by the host's own monotonic clock."""
-
-    # As those of `ClockMap`, and constant
-    steps = 0
-    settled = True
-    drift_ppm = jitter_ns = 0.0
-
-    def restart(self) -> None:
-        """Do nothing: this map learns nothing."""
+class IdentityMap(ClockMap):
+    """Map for a device that stamps by the host's own monotonic clock: it learns nothing."""
 
     def observe(self, device_ns: int, arrived_ns: int) -> bool:
         """Do nothing: this clock does not step."""
@@ -259,6 +230,7 @@ class IdentityMap:
 
     def ready(self, now_ns: int) -> bool:
         """Return True: samples can be stamped at any time."""
+        self.settled = True
         return True
 
     def host_ns(self, device_ns: np.ndarray) -> np.ndarray:
@@ -272,26 +244,6 @@ _STEP_NS = 1_000_000
 _TRIES = 3  # Readings of which the least interrupted one counts
 _MAX_UNCERTAINTY_NS = 20_000
 """Uncertainty above which a reading is ignored, ns: the process was interrupted."""
-
-
-class SystemClockMap:
-    """Map from the host's monotonic clock, which is never set, to ROS time, the system clock."""
-
-    def __init__(self) -> None:
-        self.steps = 0  # How often the system clock was set since the map began
-        self._offset_ns = _system_offset()[1]
-
-    def update(self) -> None:
-        """Follow the system clock."""
-        uncertainty_ns, offset_ns = _system_offset()
-        if uncertainty_ns > _MAX_UNCERTAINTY_NS:
-            return
-        self.steps += abs(offset_ns - self._offset_ns) >= _STEP_NS
-        self._offset_ns = offset_ns
-
-    def ros_ns(self, host_ns: np.ndarray) -> np.ndarray:
-        """Return the ROS times of monotonic times, ns."""
-        return host_ns + self._offset_ns
 
 
 def _system_offset() -> tuple[int, int]:
@@ -326,11 +278,12 @@ _FOREVER_NS = 2 ** 63 - 1  # Largest time, ns: any waiting time is over by then
 class Stamper:
     """Holds samples until the device's clock is known, stamps them and counts lost ones."""
 
-    def __init__(self, clock: ClockMap | IdentityMap, references: Sequence[str]) -> None:
+    def __init__(self, clock: ClockMap, references: Sequence[str]) -> None:
         self.clock = clock  # Map of the device's clock
         self.period_ns = 0.0  # Sample period, ns; 0 before the first `restart`
-        self._system_clock = SystemClockMap()
-        self._followed_ns = 0
+        # ROS time, the system clock, beyond the monotonic clock, which is never set, ns
+        self._ros_offset_ns = _system_offset()[1]
+        self._system_steps = self._followed_ns = 0
         self._references, self._period = references, 0
         self._unstamped: list[Block] = []
         self._stamped: list[Samples] = []
@@ -395,20 +348,23 @@ class Stamper:
         return {'clock': 'settled' if clock.settled else 'settling',
                 'clock_drift_ppm': round(clock.drift_ppm, 2),
                 'clock_jitter_us': round(clock.jitter_ns * 1e-3, 1),
-                'clock_steps': clock.steps, 'system_clock_steps': self._system_clock.steps}
+                'clock_steps': clock.steps, 'system_clock_steps': self._system_steps}
 
     def events(self) -> tuple[Event, Event]:
         """Return the events of the clocks, for the status of a link."""
         return (Event('the clock of the device has stepped: a new map of it begins',
                       self.clock.steps),
-                Event('the system clock was set: the stamps follow it', self._system_clock.steps))
+                Event('the system clock was set: the stamps follow it', self._system_steps))
 
     def _stamp(self) -> None:
         """Stamp the waiting samples, with the number of samples that are missing before them."""
         now_ns = time.monotonic_ns()
         if now_ns - self._followed_ns >= _FOLLOW_NS:
             self._followed_ns = now_ns
-            self._system_clock.update()
+            uncertainty_ns, offset_ns = _system_offset()
+            if uncertainty_ns <= _MAX_UNCERTAINTY_NS:
+                self._system_steps += abs(offset_ns - self._ros_offset_ns) >= _STEP_NS
+                self._ros_offset_ns = offset_ns
         for block in self._unstamped:
             host_ns = self.clock.host_ns(block.device_ns)
             if self._new_clock and self._last_ns is not None:
@@ -417,7 +373,7 @@ class Stamper:
             self._new_clock = False
             self._last_ns = int(host_ns[-1])
             self._stamped.append(Samples(
-                self._system_clock.ros_ns(host_ns), block.volts, time.time_ns(),
+                host_ns + self._ros_offset_ns, block.volts, time.time_ns(),
                 self._counted + self._estimated, self._thin(host_ns, block.references),
                 self._estimated))
             self._counted = self._estimated = 0
