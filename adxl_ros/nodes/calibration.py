@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
-import math
 import os
 from pathlib import Path
 import signal
@@ -274,6 +273,7 @@ _NOTICE_S = 0.05
 _FAREWELL_NS = 2_500_000_000
 """Time from the end of a calibration to that of the node, ns; chosen: two reports come within."""
 _QUEUE = 100  # Messages that wait while the node fits; chosen: some seconds of slow topics
+_STAGE_TOPICS = ('stage/command', 'stage/joint_states')
 _STAGE_QUEUE = 1000
 """Messages of the stage that wait meanwhile; more, because its angles come faster."""
 _CHECK_POSES = {'full': 16, 'quick': 8}
@@ -409,9 +409,8 @@ class Calibration(Node):
         self._diagnostics = topics.DiagnosticsReporter(self, 'calibration', self._status)
         topics.create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
                                    latched=True)
-        if self._has_stage:
-            self._stage = topics.Inbox(self, JointState, 'stage/joint_states', _STAGE_QUEUE)
-            topics.create_subscription(self, JointState, 'stage/command', self._on_command, _QUEUE)
+        self._stage = {topic: topics.Inbox(self, JointState, topic, _STAGE_QUEUE)
+                       for topic in (_STAGE_TOPICS if self._has_stage else ())}
         self._surroundings = topics.Surroundings(self, _QUEUE)
         start = self._controller.start
         requests: dict[str, Callable[[], Answer]] = {
@@ -457,18 +456,15 @@ class Calibration(Node):
         self._controller.read_sensor_info(topics.stream_info(message, 'sensor_info'))
 
     def _read_stage(self) -> None:
-        """Give the angles of the stage that have come to the guide."""
-        for reading in topics.joint_readings(self._stage.take() if self._has_stage else ()):
-            alpha_rad, beta_rad = _angles(reading.position)
-            session = self._controller.session
-            if session is not None and session.stage is not None \
-                    and math.isfinite(alpha_rad) and math.isfinite(beta_rad):
-                session.stage.read_encoder(reading.stamp_ns, alpha_rad, beta_rad)
-
-    def _on_command(self, message: JointState) -> None:
+        """Give the commands and the angles of the stage that have come to the guide."""
         session = self._controller.session
-        if session is not None and session.stage is not None:
-            session.stage.read_command(*_angles(dict(zip(message.name, message.position))))
+        stage = session.stage if session is not None else None
+        for topic, inbox in self._stage.items():
+            for reading in topics.joint_readings(inbox.take()):
+                if stage is not None and topic == 'stage/command':
+                    stage.read_command(*reading.angles)
+                elif stage is not None and np.isfinite(reading.angles).all():
+                    stage.read_encoder(reading.stamp_ns, *reading.angles)
 
     def _service(self, request: Callable[[], Answer]) -> Callable[..., Trigger.Response]:
         """Make the callback of a service that calls a request of the controller."""
@@ -520,11 +516,6 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
         capture=capture, output=output, journal=journal, report=own.report, store=own.store,
         thermal=ThermalSettings(parameters.low_and_high(
             'thermal.range_c', own.range_c, ThermalSettings.range_c), own.block_s))
-
-
-def _angles(position_rad: dict[str, float]) -> tuple[float, float]:
-    """Return the angles alpha and beta, rad; NaN for a joint that is not named."""
-    return position_rad.get('alpha', math.nan), position_rad.get('beta', math.nan)
 
 
 def main() -> int:

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,6 @@ from adxl_ros.files.bag_writer import LiveBag
 from adxl_ros.investigate import investigation
 from adxl_ros.investigate.investigation import Answer, Investigation, OutputFolder, State
 from adxl_ros.investigate.manoeuvres import CATALOGUE, Pose, StageLimits
-from adxl_ros.links.support.base import Watchdog
 from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.jobs import LiveLine
 from adxl_ros.nodes.parameters import low_and_high, parameter, SEEDS
@@ -28,8 +26,6 @@ from adxl_ros.report.quantities import percent
 from adxl_ros.report.screen import COLUMNS, end_lines
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
-from rclpy.clock import Clock, ClockType
-from rclpy.executors import Executor
 from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_msgs.msg import Header
@@ -85,74 +81,13 @@ def closing_lines(ended: Investigation, folder: OutputFolder) -> list[str]:
     return ['', *end_lines(result, files, following and f'ros2 run adxl_ros {following}')]
 
 
-_SAMPLES = 'imu/data_raw'  # Topic of the samples
-_SAMPLES_QUEUE = 20000  # Samples that are kept while the thread is busy: 20 s at 1 kHz
-_SLOW_QUEUE = 1000  # Messages of a slow topic that wait meanwhile; chosen: 10 s of a stage
-_KINDS = {'stage/joint_states': JointState, 'stage/command': JointState,
+_SAMPLES, _STAGE = 'imu/data_raw', 'stage/joint_states'
+_KINDS = {_SAMPLES: Imu, _STAGE: JointState, 'stage/command': JointState,
           'temperature': Temperature, 'supply': BatteryState, 'sensor_info': DiagnosticStatus}
-"""Type of each topic beside the samples."""
-
-
-class BagRecorder:
-    """Writes the topics of the package into a bag. A thread of its own takes the samples."""
-
-    def __init__(self, node: Node, watchdog: Watchdog) -> None:
-        """Subscribe; nothing is kept before `start`."""
-        self._node, self._watchdog = node, watchdog
-        self.has_samples = False  # Whether a sample has come
-        self.bag: LiveBag | None = None  # None before `start`
-        self._thread: topics.RepeatingThread | None = None
-        self._system = Clock(clock_type=ClockType.SYSTEM_TIME)
-        # The message of sensor_info comes once, perhaps before the bag is open.
-        self._info = b''
-        for topic, kind in _KINDS.items():
-            topics.create_subscription(node, kind, topic, partial(self._write, topic), _SLOW_QUEUE,
-                                       latched=topic == 'sensor_info', raw=True)
-        self.samples = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
-
-    def listen(self) -> None:
-        """Take samples, so that `has_samples` shows them."""
-        self._thread = topics.RepeatingThread(
-            self._node, lambda: self.samples.receive(self._write_sample), _SAMPLES)
-
-    def start(self, path: Path) -> None:
-        """Begin to write."""
-        self.bag = LiveBag(path)
-        if self._info:
-            self._write('sensor_info', self._info)
-
-    def flush(self) -> None:
-        """Write the messages so far to the file."""
-        if self.bag is not None:
-            self.bag.flush()
-
-    def close(self) -> None:
-        """End the thread, and write the end of the bag."""
-        if self._thread is not None:
-            self._thread.close()
-            self._thread = None
-        if self.bag is not None:
-            self.bag.close()
-
-    def _write_sample(self, data: bytes) -> None:
-        self.has_samples = True
-        self._watchdog.feed()
-        self._write(_SAMPLES, data)
-
-    def _write(self, topic: str, data: bytes) -> None:
-        if self.bag is not None:
-            kind = _KINDS.get(topic, Imu)
-            package = kind.__module__.partition('.')[0]
-            self.bag.write(self._node.resolve_topic_name(topic), f'{package}/msg/{kind.__name__}',
-                           data, self._system.now().nanoseconds)
-        elif topic == 'sensor_info':
-            self._info = data
-
+"""Type of each recorded topic."""
+_QUEUE = 20000  # Messages of a topic that are kept while the node is busy: 20 s at 1 kHz
 
 _POLL_S = 0.02  # Time between two commands, s; chosen: a tenth of the largest step
-_SILENT_S = 3.0  # Time without samples or poses after which the stage is stopped, s; chosen
-_LONGEST_TURN_S = 0.2
-"""Longest time between two commands that counts as silence, s; chosen: ten turns."""
 _FAREWELL_S = 0.5
 """Time for which the last command is repeated at the end, s; chosen: the stage has it then."""
 _COMMAND_QUEUE = 10  # Commands that are kept for a slow subscriber; chosen
@@ -173,61 +108,75 @@ class Investigate(Node):
         super().__init__('investigate')
         parameters.check_given(self)
         self._sensor = parameters.make_sensor(parameters.declare_sensor(self))
-        self._settings = own = parameters.declare_all(self, InvestigateSettings)
+        own = parameters.declare_all(self, InvestigateSettings)
         alpha_deg = low_and_high('limits.alpha_deg', own.alpha_deg, (0.0, 180.0))
         beta_deg = low_and_high('limits.beta_deg', own.beta_deg, (0.0, 360.0))
         alpha_rad, beta_rad = np.radians([alpha_deg, beta_deg]).tolist()
-        self._limits = limits = StageLimits(alpha_rad, beta_rad, float(np.radians(own.rate_deg_s)))
+        limits = StageLimits(alpha_rad, beta_rad, float(np.radians(own.rate_deg_s)))
         self._commands = topics.create_publisher(self, JointState, 'stage/command', _COMMAND_QUEUE)
         self.create_service(Trigger, '~/abort', self._on_abort)
-        topics.create_subscription(self, JointState, 'stage/joint_states', self._on_stage,
-                                   _SLOW_QUEUE)
+        self._inboxes = {topic: topics.Inbox(self, kind, topic, _QUEUE,
+                                             latched=topic == 'sensor_info')
+                         for topic, kind in _KINDS.items()}
+        self._bag: LiveBag | None = None  # None before sensor and stage are there
+        self._has_samples = False
         self._pose: Pose | None = None
-        self._watchdogs = {topic: Watchdog(_LONGEST_TURN_S)
-                           for topic in ('imu/data_raw', 'stage/joint_states')}
         self._diagnostics = topics.DiagnosticsReporter(self, 'investigate', self._status)
-        self._recorder = BagRecorder(self, self._watchdogs['imu/data_raw'])
         self._folder = OutputFolder.free(Path(own.output))
+        self._screen = LiveLine()
         self._investigation = Investigation(
             limits, own.minutes,
             investigation.BackgroundDiagnoser(self._folder, limits, own.seed),
-            lambda minutes, answer: self._print(answer_lines(minutes, answer)),
-            self._recorder.flush)
-        self._screen: LiveLine | None = None
+            lambda minutes, answer: self._screen.add(*answer_lines(minutes, answer)), self._flush)
         self._busy_s = time.monotonic()
         self._request = ''
+        # A handler of rclpy would end the graph before the stage has its last command.
+        for number, name in ((signal.SIGINT, 'Ctrl-C'), (signal.SIGTERM, 'SIGTERM')):
+            signal.signal(number, partial(self.request_stop, name))
+        ranges = ', '.join(f'{joint} {low:.0f} to {high:.0f}°' for joint, (low, high) in (
+            ('alpha', alpha_deg), ('beta', beta_deg)))
+        self._screen.add(f'Investigation into {self._folder.path}, manoeuvres of '
+                         f'{own.minutes:g} minutes at most',
+                         f'Stage within {ranges}, {own.rate_deg_s:.3g}°/s', '')
+        self.create_timer(_POLL_S, self._poll, clock=topics.STEADY)
 
     def request_stop(self, name: str, *_: object) -> None:
         """Stop the investigation at the next turn; a signal may come at any time."""
         self._request = name
 
-    def begin(self) -> None:
-        """Wait for sensor and stage; the files are made when both are there."""
-        self._screen = LiveLine()
-        ranges = ', '.join(f'{joint} {low:.0f} to {high:.0f}°' for joint, (low, high) in (
-            ('alpha', np.degrees(self._limits.alpha_rad)),
-            ('beta', np.degrees(self._limits.beta_rad))))
-        self._print([f'Investigation into {self._folder.path}, manoeuvres of '
-                     f'{self._settings.minutes:g} minutes at most',
-                     f'Stage within {ranges}, {np.degrees(self._limits.rate_rad_s):.3g}°/s', ''])
-        self._recorder.listen()
-        self.create_timer(_POLL_S, self._poll, clock=topics.STEADY)
-
     def close(self) -> None:
         """Write the end of the bag, and end the screen and the diagnosis."""
         self._investigation.stop('the node has ended')
-        self._recorder.close()
-        if self._screen is not None:
-            self._screen.close()
+        if self._bag is not None:
+            self._bag.close()
+        self._screen.close()
 
-    def _print(self, lines: Sequence[str]) -> None:
-        if self._screen is not None:
-            self._screen.add(*lines)
+    def _flush(self) -> None:
+        """Write the messages so far to the file, for the diagnosis."""
+        if self._bag is not None:
+            self._bag.flush()
+
+    def _take(self) -> None:
+        """Take and record the messages that have come; `sensor_info` waits for the bag."""
+        for topic, kind in _KINDS.items():
+            if self._bag is None and topic == 'sensor_info':
+                continue
+            messages = self._inboxes[topic].take()
+            if self._bag is not None:
+                name = f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
+                for message in messages:
+                    self._bag.write(self.resolve_topic_name(topic), name, message, time.time_ns())
+            if topic == _STAGE:
+                for reading in topics.joint_readings(messages):
+                    if np.isfinite(reading.angles).all():
+                        self._pose = Pose(*reading.angles)
+            self._has_samples |= topic == _SAMPLES and bool(messages)
 
     def _poll(self) -> None:
         run = self._investigation
         if self._request:
             run.stop(self._request)
+        self._take()
         if not run.has_ended:
             self._check_streams(run)
         now = self.get_clock().now()
@@ -236,40 +185,28 @@ class Investigate(Node):
             self._commands.publish(JointState(
                 header=Header(stamp=now.to_msg()), name=['alpha', 'beta'], position=list(command),
                 velocity=list(run.speed or ())))
-        if self._screen is not None:
-            left = f', {run.remaining_s:.0f} s left' if run.state is State.MOVING else ''
-            self._screen.show(f'{run.minutes:5.1f} min{left}  {run.text}'[:COLUMNS])
+        left = f', {run.remaining_s:.0f} s left' if run.state is State.MOVING else ''
+        self._screen.show(f'{run.minutes:5.1f} min{left}  {run.text}'[:COLUMNS])
         now_s = time.monotonic()
         if not run.has_ended:
             self._busy_s = now_s
         elif now_s - self._busy_s > _FAREWELL_S:
             # The stage has its last command.
             self.close()
-            self._print(closing_lines(run, self._folder))
+            self._screen.add(*closing_lines(run, self._folder))
             raise SystemExit(0 if run.has_verdict else 1)
 
     def _check_streams(self, run: Investigation) -> None:
         """Stop where sensor or stage is silent; wait for both at the beginning."""
-        if run.state is State.RECORDING:
-            if not self._recorder.has_samples:
-                self._pose = None
-            elif self._pose is not None and self._recorder.bag is None:
-                self._folder.make(self._sensor)
-                self._recorder.start(self._folder.bag)
-            return
-        faults = [self._recorder.samples.fault(), *(
-            f'nothing on {self.resolve_topic_name(topic)} for {silent_s:.0f} s'
-            for topic, watchdog in self._watchdogs.items()
-            if (silent_s := watchdog.check()) > _SILENT_S)]
-        for fault in filter(None, faults):
-            run.stop(f'{fault}; the stage holds its pose')
-
-    def _on_stage(self, message: JointState) -> None:
-        angles_rad = dict(zip(message.name, message.position))
-        pose = Pose(angles_rad.get('alpha', np.nan), angles_rad.get('beta', np.nan))
-        if np.isfinite(pose).all():
-            self._pose = pose
-            self._watchdogs['stage/joint_states'].feed()
+        if run.state is not State.RECORDING:
+            for topic in (_SAMPLES, _STAGE):
+                if silence := self._inboxes[topic].silence():
+                    run.stop(f'{silence}; the stage holds its pose')
+        elif not self._has_samples:
+            self._pose = None
+        elif self._pose is not None and self._bag is None:
+            self._folder.make(self._sensor)
+            self._bag = LiveBag(self._folder.bag)
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._request = '~/abort was called'
@@ -287,15 +224,6 @@ class Investigate(Node):
         return Status(level, run.text, self._sensor.serial, values)
 
 
-def _work(node: Investigate, executor: Executor) -> None:
-    """Run the node; a signal stops the stage before the node ends."""
-    # A handler of rclpy would end the graph before the stage has its last command.
-    for number, name in ((signal.SIGINT, 'Ctrl-C'), (signal.SIGTERM, 'SIGTERM')):
-        signal.signal(number, partial(node.request_stop, name))
-    node.begin()
-    executor.spin()
-
-
 def main() -> int:
     """Run the node."""
-    return run(Investigate, __doc__, _EXAMPLES, _work)
+    return run(Investigate, __doc__, _EXAMPLES)

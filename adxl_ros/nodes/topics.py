@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from math import nan
 import struct
 import sys
 import threading
@@ -208,15 +209,15 @@ class Inbox:
     was started again, and over and over where two send by turns.
     """
 
-    def __init__(self, node: Node, kind: Any, topic: str, depth: int, reliable: bool = False
-                 ) -> None:
+    def __init__(self, node: Node, kind: Any, topic: str, depth: int, **options: bool) -> None:
+        """Subscribe; `reliable` and `latched` are those of `create_subscription`."""
         self._node, self._kind, self._depth = node, kind, depth
         self.heard_s = time.monotonic()  # When messages came last
         self._topic = node.resolve_topic_name(topic)
         self._number, self._back_s, self._mixed_until_s = 0, -_MIXED_S, 0.0
         self._subscription = create_subscription(
             node, kind, topic, lambda _: None, depth, raw=True, group=NotForExecutors(),
-            reliable=reliable)
+            **options)
         self._wait_set: Any = None
 
     def wait(self) -> None:
@@ -381,6 +382,11 @@ class JointReading(NamedTuple):
     stamp_ns: int  # Stamp, ns
     position: dict[str, float]  # Position by joint, rad or m
     velocity: dict[str, float]  # Velocity by joint, rad/s or m/s; empty where the message has none
+
+    @property
+    def angles(self) -> tuple[float, float]:
+        """Return alpha and beta, rad; NaN for a joint that is not named."""
+        return self.position.get('alpha', nan), self.position.get('beta', nan)
 
 
 def joint_readings(messages: Sequence[bytes]) -> list[JointReading]:
