@@ -24,11 +24,6 @@ _SILENT_S = 0.5
 """Time without a buffer after which a device counts as silent, s. Chosen: 250 buffers."""
 _SILENT_BUFFERS = 3
 """A device also counts as silent only after this many times the duration of its buffer."""
-_BATCH_S = 0.02
-"""Longest duration of the buffers that one read passes on together, s; chosen: passing twenty
-samples on costs little more than passing two."""
-_WAITING_SHARE = 0.5
-"""A buffer has waited for the reader if its read takes less than this share of its duration."""
 _DECISION_S = 0.5
 """Duration of late samples after which the clock of the device counts as stopped, s. Chosen: by
 then a busy machine has read what the kernel keeps, each buffer with an answer of its own."""
@@ -84,7 +79,7 @@ def open_link(sensor: Sensor, settings: Settings) -> IioLink:
     return IioLink(sensor, settings)
 
 
-class IioLink(base.DeviceLink):
+class IioLink(base.Link):
     """
     The samples of a buffered IIO device, stamped by its timestamp channel.
 
@@ -100,7 +95,6 @@ class IioLink(base.DeviceLink):
         self._stream: _Stream | None = None
         self._stamper = Stamper(ClockMap(settings.delay, _DECISION_S), self.references)
         self._backoff = base.Backoff()
-        self._is_behind = False
         self._error = ''
         self._adc: dict[str, float] = {}
         self._connections = self._repeated = 0
@@ -114,7 +108,7 @@ class IioLink(base.DeviceLink):
                 self._open()
         else:
             try:
-                self._receive(self._stream)
+                self._add(*self._stream.read())
             except (_ReadError, UserError) as error:
                 # After a time-out the stream is not reliable: everything is opened again.
                 self._error = str(error)
@@ -173,16 +167,6 @@ class IioLink(base.DeviceLink):
                 self._stamper.clock = IdentityMap(0.0)
             self._stamper.restart(1e9 / stream.rate_hz)
             self._newest_ns = -1
-
-    def _receive(self, stream: _Stream) -> None:
-        """Take a buffer, or several together while they have waited for the reader."""
-        for _ in range(max(round(_BATCH_S / stream.buffer_s), 1)):
-            began_s = time.monotonic()
-            self._add(*stream.read())
-            was_behind = self._is_behind
-            self._is_behind = time.monotonic() - began_s < _WAITING_SHARE * stream.buffer_s
-            if not (was_behind and self._is_behind):
-                return
 
     def _add(self, device_ns: np.ndarray, values: Mapping[str, np.ndarray]) -> None:
         """Pass the samples of a buffer on, without those that came before."""

@@ -35,7 +35,7 @@ def open_link(sensor: Sensor, settings: Settings) -> Replay:
     return Replay(sensor, settings)
 
 
-class Replay:
+class Replay(base.Link):
     """
     The samples of a recording at the pace of a clock.
 
@@ -44,6 +44,7 @@ class Replay:
 
     live = False
     waits_for_listener = True
+    sensor: Sensor
     _block: Recording | None
     _row: int
     _stamps: np.ndarray

@@ -161,7 +161,7 @@ class _FrameSize:
         self._due_s = now_s + _COMMAND_PAUSE_S
 
 
-class SerialLink(base.DeviceLink):
+class SerialLink(base.Link):
     """
     The samples of a board, each once and in order, stamped by the clock of the board.
 

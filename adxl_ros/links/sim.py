@@ -60,7 +60,7 @@ def open_link(sensor: Sensor, settings: Settings) -> SimulatedSensor:
     return SimulatedSensor(sensor, settings)
 
 
-class SimulatedSensor:
+class SimulatedSensor(base.Link):
     """
     The signal chain forward in time, driven by the true motion of the stage.
 
@@ -70,10 +70,9 @@ class SimulatedSensor:
     """
 
     live = False
-    references = ()
-    waits_for_listener = False
-    start_ns = None
     joint_state_topic = 'stage/true_joint_states'
+
+    sensor: Sensor
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         self.sensor = sensor
@@ -136,9 +135,6 @@ class SimulatedSensor:
     def status(self) -> base.LinkStatus:
         """Return whether a stage moves the sensor."""
         return self._status
-
-    def close(self) -> None:
-        """Do nothing: the link holds nothing open."""
 
     def _stamp(self, index: float | np.ndarray) -> np.ndarray:
         return self._origin_ns + np.rint(index * (1e9 / self.sensor.rate_hz)).astype(np.int64)

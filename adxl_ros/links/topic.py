@@ -119,7 +119,7 @@ def open_link(sensor: Sensor, settings: Settings) -> EmulatedSensor:
     return EmulatedSensor(sensor, settings)
 
 
-class EmulatedSensor(base.DeviceLink):
+class EmulatedSensor(base.Link):
     """
     The signal chain behind the ideal samples of a simulator.
 

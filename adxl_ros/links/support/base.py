@@ -141,20 +141,21 @@ def no_samples(sensor: Sensor, until_ns: int) -> Samples:
 
 
 class Link(Protocol):
-    """A source of samples, as `open_link` returns it."""
+    """A source of samples, as `open_link` returns it; the defaults are those of a device."""
 
     # Sensor that makes the samples readable; None until the device has described itself
-    sensor: Sensor | None
+    sensor: Sensor | None = None
     # Whether a device sends the samples. Then `read` waits for them for about 50 ms and their
     # stamps are final. Otherwise `read` returns at once what is due.
-    live: bool
-    references: tuple[str, ...]  # Names of the references that come with the samples
-    waits_for_listener: bool  # Whether the first sample waits for the first subscriber
+    live: bool = True
+    references: tuple[str, ...] = ()  # Names of the references that come with the samples
+    waits_for_listener: bool = False  # Whether the first sample waits for the first subscriber
     # Time of the first sample, ns, where the link has a time of its own; else None
-    start_ns: int | None
+    start_ns: int | None = None
 
     def begin(self, now_ns: int) -> int:
         """Make the next sample due now, also after a jump of the clock; return the lost ones."""
+        return 0
 
     def read(self, now_ns: int) -> Samples:
         """Return the samples that are due; raises `UserError` when there will be no more."""
@@ -164,23 +165,7 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Close what the link holds open."""
-
-
-class DeviceLink:
-    """What links to a device have in common, for their classes to inherit."""
-
-    live = True
-    waits_for_listener = False
-    start_ns: int | None = None
-    references: tuple[str, ...] = ()
-    sensor: Sensor | None = None
-
-    def begin(self, now_ns: int) -> int:
-        """Do nothing: samples before the beginning do not count as lost."""
-        return 0
-
-    def close(self) -> None:
-        """Do nothing: the link holds nothing open."""
+        return
 
 
 @runtime_checkable
