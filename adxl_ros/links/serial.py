@@ -52,8 +52,6 @@ _SILENT = 'silent, the board sends nothing'  # Error of a port that is open but 
 
 _WAIT_MS = 50  # Longest wait for bytes, ms, so that the driver reacts to its end
 _MAX_READ = 65536  # Most bytes of one read: more than a terminal or a socket usually holds
-_CHECK_S = 0.1
-"""Period of the check of a silent port, s: its name may stand for another device by now."""
 _BITS_PER_BYTE = 10  # Bits of a byte on a UART: 8 and start and stop bit
 _SYSFS = Path('/sys/dev/char')  # Devices of the kernel by their numbers
 _USB_DRIVER = 'cdc_acm'
@@ -125,42 +123,6 @@ class _Conversion:
                               lost)
 
 
-class _FrameSize:
-    """
-    Asks a board for frames that are as short as the latency, until it obeys.
-
-    Only a device that has sent a frame gets bytes: another one could take them for its own
-    commands. A board answers with its info frame, so that the first samples need not wait.
-    """
-
-    def __init__(self, settings: Settings, port: _Port) -> None:
-        self._settings, self._port = settings, port
-        self._newest = self._sent = 0
-        self._due_s = 0.0
-        self.duration_s = 0.0  # Duration of the newest frame, s
-
-    def take(self, count: int, rate_hz: float) -> None:
-        """Take the number of samples of a frame, and their rate."""
-        self._newest, self.duration_s = count, count / rate_hz
-
-    def command(self, info: BoardInfo | None) -> None:
-        """Send a command where the newest frame is not as it shall be."""
-        now_s = time.monotonic()
-        count, self._newest = self._newest, 0
-        if not count or now_s < self._due_s:
-            return
-        latency_us = round(self._settings.latency_ms * 1e3)
-        if info is not None:
-            wanted = wire_format.samples_that_fit(
-                self._settings.samples_together(info.rate_hz), info, self._port.uart_bytes_per_s)
-            if count == wanted:
-                return
-            latency_us = max(latency_us, round(wanted / info.rate_hz * 1e6))
-        self._port.write(wire_format.encode_command(self._sent, latency_us))
-        self._sent += 1
-        self._due_s = now_s + _COMMAND_PAUSE_S
-
-
 class SerialLink(base.Link):
     """
     The samples of a board, each once and in order, stamped by the clock of the board.
@@ -185,7 +147,9 @@ class SerialLink(base.Link):
         self._misfit = ''
         self._counter = wire_format.FrameCounter()
         self._stamper = Stamper(ClockMap(settings.delay), self.references)
-        self._size = _FrameSize(settings, self._port)
+        self._frame_s = 0.0  # Duration of the newest frame, s
+        self._unjudged = self._commands = 0  # Samples of a frame that is new; commands so far
+        self._command_due_s = 0.0
         self._counts: Counter[str] = Counter()
         self._last_frame_s = self._created_s = time.monotonic()
         self._busy_until_s = self._unpaid_s = 0.0
@@ -194,7 +158,7 @@ class SerialLink(base.Link):
         """Wait for bytes, at most 50 ms, and return the samples that they complete."""
         # What need not precede the samples of the last call follows them.
         self._throttle()
-        self._size.command(self._info)
+        self._ask_for_short_frames()
         if not self._arrivals:
             self._receive()
         while self._arrivals:
@@ -217,7 +181,7 @@ class SerialLink(base.Link):
             'bytes': self._port.received_bytes, 'skipped_bytes': self._splitter.skipped,
             'held_back': counts['held_back'], 'repeated': self._counter.repeated,
             'device_overruns': self._counter.overruns,
-            'frame_ms': round(self._size.duration_s * 1e3, 3),
+            'frame_ms': round(self._frame_s * 1e3, 3),
             'rail_frames': counts['rail_frames'], 'resets': counts['resets'],
             'connections': self._port.connections, **self._stamper.statistics()}
         reset = base.Event('the device was reset or is another one: a new count begins',
@@ -236,7 +200,7 @@ class SerialLink(base.Link):
         opened_s = max(self._port.opened_s, self._created_s)
         if info is None and now_s - opened_s < _INFO_WAIT_S:
             return base.Level.OK, 'connecting'
-        long_s = _SILENT_FRAMES * self._size.duration_s
+        long_s = _SILENT_FRAMES * self._frame_s
         silent_s = now_s - max(self._port.last_byte_s, self._created_s)
         if silent_s > max(_SILENT_S, long_s):
             return base.Level.WARN, f'{port}: {_SILENT}'
@@ -249,6 +213,28 @@ class SerialLink(base.Link):
         if info is None:
             return base.Level.WARN, f'{port}: waiting for the info frame of the board'
         return base.Level.OK, 'streaming'
+
+    def _ask_for_short_frames(self) -> None:
+        """
+        Ask a board for frames that are as short as the latency, until it obeys.
+
+        Only a device that has sent a frame gets bytes: another one could take them for its own
+        commands. A board answers with its info frame, so that the first samples need not wait.
+        """
+        now_s, info = time.monotonic(), self._info
+        count, self._unjudged = self._unjudged, 0
+        if not count or now_s < self._command_due_s:
+            return
+        latency_us = round(self._settings.latency_ms * 1e3)
+        if info is not None:
+            wanted = wire_format.samples_that_fit(
+                self._settings.samples_together(info.rate_hz), info, self._port.uart_bytes_per_s)
+            if count == wanted:
+                return
+            latency_us = max(latency_us, round(wanted / info.rate_hz * 1e6))
+        self._port.write(wire_format.encode_command(self._commands, latency_us))
+        self._commands += 1
+        self._command_due_s = now_s + _COMMAND_PAUSE_S
 
     def _receive(self) -> None:
         """Read bytes and queue the frames that they complete."""
@@ -268,7 +254,7 @@ class SerialLink(base.Link):
                 continue
             self._counts['frames'] += 1
             self._last_frame_s = time.monotonic()
-            self._port.confirm()
+            self._port.backoff.reset()
             samples += len(frame.codes) if isinstance(frame, SampleFrame) else 1
             self._arrivals.append((frame, arrived_ns))
         rate_hz = self._info.rate_hz if self._info else _UNSTATED_RATE_HZ
@@ -306,7 +292,8 @@ class SerialLink(base.Link):
     def _on_samples(self, frame: SampleFrame, arrived_ns: int) -> None:
         """Check, count and stamp the samples of a frame."""
         info, conversion, count = self._info, self._conversion, len(frame.codes)
-        self._size.take(count, info.rate_hz if info else _UNSTATED_RATE_HZ)
+        self._unjudged = count
+        self._frame_s = count / (info.rate_hz if info else _UNSTATED_RATE_HZ)
         if info is None or conversion is None:
             self._counts['held_back'] += count
             return
@@ -342,29 +329,26 @@ class _Port:
         self._pyserial = import_pyserial()
         self._port: Any = None
         self._poll: Any = None
-        self._backoff = base.Backoff()
-        self._checked_s = 0.0
+        self.backoff = base.Backoff()  # Of the attempts to open it; bytes that make sense reset it
         # Why the port is not open, in one line; '' while it is open and before the first attempt
         self.error = ''
 
     def read(self) -> bytes | None:
         """Return the bytes that have come, b'' after 50 ms; None where the port was not open."""
         if self._port is None:
-            if self._backoff.wait():
+            if self.backoff.wait():
                 self._open()
             return None
         try:
             chunk = self._read()
-            now_s = time.monotonic()
-            if chunk:
-                self.received_bytes += len(chunk)
-                self.last_byte_s = now_s
-            elif now_s - max(self.last_byte_s, self._checked_s) > _CHECK_S:
-                self._checked_s = now_s
-                self._check_device(now_s)
+            if not chunk:
+                self._check_device()
         except OSError as error:
             self._lose(f'unplugged: {error.strerror or error}')
             return None
+        if chunk:
+            self.received_bytes += len(chunk)
+            self.last_byte_s = time.monotonic()
         return chunk
 
     def write(self, raw: bytes) -> None:
@@ -375,10 +359,6 @@ class _Port:
                 os.write(self._port.fileno(), raw)
             elif self._port is not None:
                 self._port.write(raw)
-
-    def confirm(self) -> None:
-        """Take note that the bytes made sense: the next failure is retried soon."""
-        self._backoff.reset()
 
     def close(self) -> None:
         """Close the port."""
@@ -434,15 +414,15 @@ class _Port:
         """Close the port for a reason; the next `read` opens it again."""
         self.error = f'{self._name}: {why}'
         self.close()
-        self._backoff.fail()
+        self.backoff.fail()
 
-    def _check_device(self, now_s: float) -> None:
+    def _check_device(self) -> None:
         """Close a silent port whose name stands for another device, or for none."""
         if self._poll is None:
             return
         opened = os.fstat(self._port.fileno())
         if stat.S_ISSOCK(opened.st_mode):
-            if now_s - max(self.last_byte_s, self.opened_s) > _RECONNECT_S:
+            if time.monotonic() - max(self.last_byte_s, self.opened_s) > _RECONNECT_S:
                 self._lose(_SILENT)
         elif not os.path.exists(self._name) or os.stat(self._name).st_rdev != opened.st_rdev:
             self._lose('unplugged: its name is gone, or stands for another device now')
