@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import ceil, inf
 import time
-from typing import NamedTuple
 
 from adxl_ros.files.recording_columns import is_even, stamped_rate_hz
 from adxl_ros.links.support import base
@@ -57,18 +56,6 @@ class Settings(base.SimulatorSettings):
     temperature_topic: str = base.option('temperature', 'topic of the temperature of the sensor, '
                                          'sensor_msgs/Temperature; 25 °C until it comes')
     seed: int = base.option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)
-
-
-class _Ideal(NamedTuple):
-    """One sample of the simulator: stamp, ns, and the fields of its message."""
-
-    stamp_ns: int
-    fields: dict[str, np.ndarray]
-
-    @property
-    def force(self) -> np.ndarray:
-        """Return the specific force, m/s², (3,)."""
-        return self.fields['linear_acceleration']
 
 
 class _Chain:
@@ -145,8 +132,9 @@ class EmulatedSensor(base.Link):
         self._chain: _Chain | None = None
         # Period of the samples, and the longest gap through which the chain runs on, ns
         self._period_ns = self._longest_ns = 0.0
-        self._held: list[_Ideal] = []
-        self._made: list[tuple[_Ideal, np.ndarray]] = []
+        # Samples of the simulator by stamp, ns, and fields, and their volts
+        self._held: list[tuple[int, dict[str, np.ndarray]]] = []
+        self._made: list[tuple[int, dict[str, np.ndarray], np.ndarray]] = []
         self._missing = 0
         self._restart()
 
@@ -167,7 +155,7 @@ class EmulatedSensor(base.Link):
             for name, value in _ABSENT.items():
                 if not np.isfinite([*sample[name], *sample[f'{name}_covariance']]).all():
                     sample |= {name: value, f'{name}_covariance': _NOT_MEASURED}
-            self._sense(_Ideal(stamp, sample))
+            self._sense(stamp, sample)
         self._run_chain()
 
     def read(self, now_ns: int) -> base.Samples:
@@ -177,10 +165,10 @@ class EmulatedSensor(base.Link):
         if not made:
             empty = base.no_samples(self._unit, self._newest_ns or 0)
             return replace(empty, missing=missing, estimated=missing)
-        passed = {name: np.array([ideal.fields[name] for ideal, _ in made])
-                  for name in made[0][0].fields if name != 'linear_acceleration'}
-        return base.Samples(np.array([ideal.stamp_ns for ideal, _ in made], np.int64),
-                            np.array([volts for _, volts in made]), made[-1][0].stamp_ns, missing,
+        stamps_ns, fields, volts = zip(*made)
+        passed = {name: np.array([values[name] for values in fields])
+                  for name in fields[0] if name != 'linear_acceleration'}
+        return base.Samples(np.array(stamps_ns, np.int64), np.array(volts), stamps_ns[-1], missing,
                             estimated=missing, imu_fields=passed)
 
     def status(self) -> base.LinkStatus:
@@ -211,31 +199,31 @@ class EmulatedSensor(base.Link):
         self._run_chain()
         self._chain = None
         self._held.clear()
-        self._last: _Ideal | None = None
+        self._last: tuple[int, np.ndarray] | None = None  # The last stamp, ns, and force
 
-    def _sense(self, ideal: _Ideal) -> None:
+    def _sense(self, stamp_ns: int, fields: dict[str, np.ndarray]) -> None:
         """Hold a sample for the chain, or drop it; a reset and a long gap begin anew."""
-        step_ns = 1 if self._newest_ns is None else ideal.stamp_ns - self._newest_ns
+        step_ns = 1 if self._newest_ns is None else stamp_ns - self._newest_ns
         if step_ns <= 0:
             if step_ns >= -_LATE_PERIODS * self._period_ns:
                 self._counts['late'] += 1
                 return
             self._counts['resets'] += 1
             self._restart()
-        if not np.isfinite(ideal.force).all():
+        if not np.isfinite(fields['linear_acceleration']).all():
             self._counts['not_finite'] += 1
             return
         if self._chain is not None and step_ns > self._longest_ns:
             self._counts['gaps'] += 1
             self._missing += round(step_ns / self._period_ns) - 1 if self._shows_losses else 0
             self._restart()
-        self._newest_ns = ideal.stamp_ns
-        self._held.append(ideal)
+        self._newest_ns = stamp_ns
+        self._held.append((stamp_ns, fields))
 
     def _has_chain(self) -> bool:
         """Return whether there is a chain; it is made once the held samples show the rate."""
         if self._chain is None and self._held:
-            stamps_ns = np.array([held.stamp_ns for held in self._held])
+            stamps_ns = np.array([stamp_ns for stamp_ns, _ in self._held])
             count, time_s = len(stamps_ns), (stamps_ns - stamps_ns[0]) * 1e-9
             is_long = time_s[-1] >= _FIRST_S and count >= _MIN_FIRST
             if is_long or (count >= _FIRST and is_even(time_s)):
@@ -258,17 +246,17 @@ class EmulatedSensor(base.Link):
         assert self._chain is not None, 'see _has_chain'
         forces: list[np.ndarray] = []
         places = []
-        for ideal in self._held:
-            last = self._last or ideal
-            step_ns = ideal.stamp_ns - last.stamp_ns
+        for stamp_ns, fields in self._held:
+            force = fields['linear_acceleration']
+            last_ns, last_force = self._last or (stamp_ns, force)
+            step_ns = stamp_ns - last_ns
             steps = max(round(step_ns / self._period_ns), 1) if self._shows_losses else 1
             self._missing += steps - 1
             if step_ns <= self._longest_ns:
-                forces += [last.force + k / steps * (ideal.force - last.force)
-                           for k in range(1, steps)]
+                forces += [last_force + k / steps * (force - last_force) for k in range(1, steps)]
             places.append(len(forces))
-            forces.append(ideal.force)
-            self._last = ideal
+            forces.append(force)
+            self._last = stamp_ns, force
         volts = self._chain(np.array(forces), self._temperature_c)
-        self._made += zip(self._held, volts[places])
+        self._made += ((*held, made) for held, made in zip(self._held, volts[places]))
         self._held.clear()

@@ -11,6 +11,7 @@ encoder in C.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+import itertools
 import struct
 import zlib
 
@@ -82,15 +83,15 @@ class Encoder:
 
     def __init__(self, info: BoardInfo) -> None:
         self.info = info
-        self._sequence = 0
+        self._sequence = itertools.count()
         self._flags = AFTER_RESET
 
     def info_frame(self) -> bytes:
         """Encode the frame that comes first and then every second."""
         i = self.info
         return encode_payload(_INFO.pack(
-            INFO_TYPE, VERSION, self._flags, self._next_sequence(), i.rate_hz, i.bits, i.channels,
-            i.vref_v, i.serial.encode('ascii')))
+            INFO_TYPE, VERSION, self._flags, next(self._sequence) % 2 ** 32, i.rate_hz, i.bits,
+            i.channels, i.vref_v, i.serial.encode('ascii')))
 
     def sample_frame(self, time_us: int, index: int, codes: np.ndarray, overruns: int = 0,
                      flags: int = 0) -> bytes:
@@ -98,13 +99,9 @@ class Encoder:
         rail = RAIL if (codes == 0).any() or (codes >= 2 ** self.info.bits - 1).any() else 0
         flags |= self._flags | rail
         self._flags = 0
-        head = _SAMPLES.pack(SAMPLES_TYPE, VERSION, flags, self._next_sequence(), time_us,
+        head = _SAMPLES.pack(SAMPLES_TYPE, VERSION, flags, next(self._sequence) % 2 ** 32, time_us,
                              index % 2 ** 32, overruns % 2 ** 16, *codes.shape)
         return encode_payload(head + codes.astype('<u2').tobytes())
-
-    def _next_sequence(self) -> int:
-        self._sequence += 1
-        return (self._sequence - 1) % 2 ** 32
 
 
 def encode_payload(payload: bytes) -> bytes:
