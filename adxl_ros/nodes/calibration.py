@@ -33,9 +33,7 @@ from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import create_publisher, Level, Status, status_message, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.task import Future
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -374,7 +372,7 @@ class Calibration(Node):
         self._own = own = parameters.declare_all(self, CalibrationSettings)
         settings = _session_settings(own)
         self._has_stage = settings.mode == 'stage'
-        self._captures: list[Future] = []
+        self._captures: list[object] = []  # Requests that wait for the end of a capture
         announcer = Announcer(self, self._has_stage)
         # What the controller asks of a node
         self.announce, self.withdraw_pose = announcer.announce, announcer.withdraw
@@ -394,8 +392,7 @@ class Calibration(Node):
 
     def answer_captures(self, answer: Answer) -> None:
         """Answer all calls of ~/capture that wait."""
-        for future in self._captures:
-            future.set_result(answer)
+        self._capture_service.answer(self._captures, *answer)
         self._captures.clear()
 
     def close(self) -> None:
@@ -421,9 +418,8 @@ class Calibration(Node):
             'finish': self._controller.finish, 'abort': self._controller.abort}
         for name, request in requests.items():
             self.create_service(Trigger, f'~/{name}', self._service(request))
-        # The answer comes when the pose is on disk. Until then the node must take samples.
-        self.create_service(Trigger, '~/capture', self._on_capture,
-                            callback_group=ReentrantCallbackGroup())
+        # The answer comes when the pose is on disk.
+        self._capture_service = topics.LateService(self, '~/capture')
         self.create_timer(_POLL_S, self._poll, clock=STEADY)
         self.create_timer(_NOTICE_S, lambda: self._diagnostics.notice(self._level()),
                           clock=STEADY)
@@ -433,6 +429,12 @@ class Calibration(Node):
         for topic, stamps_ns, values in self._surroundings.take():
             for stamp_ns, value in zip(stamps_ns.tolist(), values[:, 0].tolist()):
                 self._controller.read_quantity(topic, stamp_ns, value)
+        for request in self._capture_service.take():
+            answer = self._controller.capture()
+            if answer.success:
+                self._captures.append(request)
+            else:
+                self._capture_service.answer([request], *answer)
         # A poll may begin a calibration and end it at once.
         self._has_run |= self._controller.state is not ControllerState.IDLE
         self._controller.poll()
@@ -474,17 +476,6 @@ class Calibration(Node):
             self._display.update()
             return response
         return respond
-
-    async def _on_capture(self, _: Trigger.Request,
-                          response: Trigger.Response) -> Trigger.Response:
-        self._read_stage()
-        answer = self._controller.capture()
-        if answer.success:
-            future = Future()
-            self._captures.append(future)
-            answer = await future
-        response.success, response.message = answer
-        return response
 
 
 def _session_settings(own: CalibrationSettings) -> SessionSettings:

@@ -20,13 +20,12 @@ from adxl_ros.monitor.reference_stream import ReferenceKind, ReferenceStream, Ro
 from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.parameters import parameter
 from adxl_ros.nodes.run_node import run
-from adxl_ros.nodes.topics import Inbox, Level, NotForExecutors, Status, take_request
+from adxl_ros.nodes.topics import Inbox, Level, Status
 from adxl_ros.report.quantities import percent
 from adxl_ros.simulate.robot import Robot
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
-from std_srvs.srv import Trigger
 
 
 @dataclass(frozen=True)
@@ -90,35 +89,6 @@ def axis_status(gap: AxisGap, serial: str) -> Status:
 
 
 _INPUT_QUEUE = 10000  # Messages that are kept while the node is busy: 10 s at 1 kHz
-
-
-class MonitorStreams:
-    """Takes samples, reference and surroundings."""
-
-    def __init__(self, node: Node, kind: ReferenceKind, reference_topic: str,
-                 robot: RobotForce | None) -> None:
-        self._kind, self._robot = kind, robot
-        self.samples = Inbox(node, Imu, 'imu/data_raw', _INPUT_QUEUE)
-        self.reference = Inbox(node, Imu if kind is ReferenceKind.IMU else JointState,
-                               reference_topic, _INPUT_QUEUE)
-        self._surroundings = topics.Surroundings(node, _INPUT_QUEUE)
-
-    def take_others(self, reference: ReferenceStream) -> None:
-        """Add reference and surroundings that wait."""
-        for topic, stamps_ns, values in self._surroundings.take():
-            reference.add_surroundings(COLUMNS[topic], stamps_ns, values)
-        messages = self.reference.take()
-        if self._kind is ReferenceKind.IMU:
-            reference.add_readings(*topics.imu_samples(messages))
-        else:
-            readings = [reading for reading in topics.joint_readings(messages) if reading.position]
-            (self._robot.add if self._robot else reference.add_joints)(
-                [reading.stamp_ns for reading in readings],
-                [reading.position for reading in readings])
-        if self._robot:
-            self._robot.send(reference)
-
-
 _TOPICS = {ReferenceKind.STAGE: 'stage/joint_states', ReferenceKind.IMU: 'imu/ideal',
            ReferenceKind.ROBOT: 'joint_states'}
 """Usual topic of each reference."""
@@ -153,7 +123,8 @@ class Monitor(Node):
         self._own = own = parameters.declare_all(self, MonitorSettings)
         self._kind = ReferenceKind(own.reference)
         self._reference_topic = own.reference_topic or _TOPICS[self._kind]
-        robot = RobotForce(Robot(own.urdf, own.frame), self._file_sensor.local_gravity_mps2) \
+        self._robot = RobotForce(
+            Robot(own.urdf, own.frame), self._file_sensor.local_gravity_mps2) \
             if self._kind is ReferenceKind.ROBOT else None
         self._settings = GapSettings(own.window_s, own.false_alarms_per_day, own.history_s,
                                      own.wait_s)
@@ -163,14 +134,16 @@ class Monitor(Node):
         self._refusal = ''
         self._run: DiagnosisRun | None = None
         self._result: DiagnosisResult | None = None
-        self._headers: list[object] = []
+        self._requests: list[object] = []
         self._changed_ns = 0  # Begin of a change that is not diagnosed yet, ns; 0 without one
         self._diagnosed_s = -_PAUSE_S
         self._begun_s = 0.0
-        self._streams = MonitorStreams(self, self._kind, self._reference_topic, robot)
+        self._samples = Inbox(self, Imu, 'imu/data_raw', _INPUT_QUEUE)
+        self._reference = Inbox(self, Imu if self._kind is ReferenceKind.IMU else JointState,
+                                self._reference_topic, _INPUT_QUEUE)
+        self._surroundings = topics.Surroundings(self, _INPUT_QUEUE)
         self._publisher = topics.create_publisher(self, DiagnosticArray, 'gap', _QUEUE)
-        self._service = self.create_service(Trigger, '~/diagnose', lambda _, answer: answer,
-                                            callback_group=NotForExecutors())
+        self._service = topics.LateService(self, '~/diagnose')
         self._diagnostics = topics.DiagnosticsReporter(self, 'gap', self._status)
         self._info_topic = self.resolve_topic_name('sensor_info')
         topics.create_subscription(
@@ -211,16 +184,31 @@ class Monitor(Node):
     def _turn(self) -> None:
         """Take what has come, compare, and serve."""
         now_s = time.monotonic()
-        stamps_ns, accel_mps2 = topics.imu_samples(self._streams.samples.take())
+        stamps_ns, accel_mps2 = topics.imu_samples(self._samples.take())
         if len(stamps_ns):
             self._begun_s = self._begun_s or now_s
         if self._info is None and self._begun_s and now_s - self._begun_s > _INFO_S:
             self._compare_by(StreamInfo({}, self._info_topic))
         if self._info is not None and not self._refusal:
             self._live.add_samples(stamps_ns, accel_mps2)
-            self._streams.take_others(self._live.reference)
+            self._take_others(self._live.reference)
             self._advance()
         self._serve()
+
+    def _take_others(self, reference: ReferenceStream) -> None:
+        """Add reference and surroundings that wait."""
+        for topic, stamps_ns, values in self._surroundings.take():
+            reference.add_surroundings(COLUMNS[topic], stamps_ns, values)
+        messages = self._reference.take()
+        if self._kind is ReferenceKind.IMU:
+            reference.add_readings(*topics.imu_samples(messages))
+        else:
+            readings = [reading for reading in topics.joint_readings(messages) if reading.position]
+            (self._robot.add if self._robot else reference.add_joints)(
+                [reading.stamp_ns for reading in readings],
+                [reading.position for reading in readings])
+        if self._robot:
+            self._robot.send(reference)
 
     def _advance(self) -> None:
         """Compare, and put changes on disk before they are published."""
@@ -255,11 +243,11 @@ class Monitor(Node):
 
     def _serve(self) -> None:
         """Take requests of ~/diagnose, and answer them when the diagnosis ends."""
-        while (request := take_request(self._service, Trigger)) is not None:
-            self._headers.append(request[1])
-            if self._run is None and self._live.span_s() >= _SHORTEST_S:
+        self._requests += self._service.take()
+        if self._requests and self._run is None:
+            if self._live.span_s() >= _SHORTEST_S:
                 self._begin_diagnosis(0)
-            elif self._run is None:
+            else:
                 self._answer(False, f'less than {_SHORTEST_S:g} s of samples; ask again later')
         if self._run is not None and (result := self._run.result) is not None:
             self._run = None
@@ -270,16 +258,15 @@ class Monitor(Node):
 
     def _answer(self, success: bool, text: str) -> None:
         """Answer all requests that wait."""
-        for header in self._headers:
-            self._service.send_response(Trigger.Response(success=success, message=text), header)
-        self._headers.clear()
+        self._service.answer(self._requests, success, text)
+        self._requests.clear()
 
     def _obstacle(self) -> str:
         """Return why nothing is compared; empty where samples are."""
-        silence = self._refusal or self._streams.samples.silence()
+        silence = self._refusal or self._samples.silence()
         if silence or self._info is None:
             return silence or 'waiting for sensor_info'
-        silence = self._streams.reference.silence()
+        silence = self._reference.silence()
         return f'{silence}: no reference' if silence else self._live.obstacle
 
     def _state(self) -> tuple[Status, dict[str, Status]]:
@@ -306,7 +293,7 @@ class Monitor(Node):
                                        for key, value in status.values.items()}}
         values |= {**self._live.counts, 'diagnosis_runs': self._run is not None,
                    'false_alarms_per_day': self._settings.false_alarms_per_day}
-        faults = self._refusal, self._streams.samples.fault(), self._streams.reference.fault()
+        faults = self._refusal, self._samples.fault(), self._reference.fault()
         level = Level.ERROR if any(faults) else summary.level
         return replace(summary, level=level, values=values)
 

@@ -35,9 +35,9 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import serialize_message
-from rclpy.service import Service
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import BatteryState, Imu, Temperature
+from std_srvs.srv import Trigger
 
 # The package of each message imports the generator of Python from .msg files, with its parser and
 # templates: a tenth of the time in which a node starts. The package can do without it.
@@ -188,15 +188,27 @@ def take_messages(subscription: Subscription, kind: Any, raw: bool, limit: int,
                 yield message_and_info[0]
 
 
-def take_request(service: Service, kind: Any) -> tuple[Any, Any] | None:
+class LateService:
     """
-    Take a request that waits in a service, to answer it later by `Service.send_response`.
+    A service of the type Trigger whose requests are answered later.
 
     An executor wants the answer at once, and polls a coroutine that waits without a pause.
     """
-    with service.handle:
-        request, header = service.handle.service_take_request(kind.Request)
-    return None if header is None else (request, header)
+
+    def __init__(self, node: Node, name: str) -> None:
+        self._service = node.create_service(Trigger, name, lambda _, answer: answer,
+                                            callback_group=NotForExecutors())
+
+    def take(self) -> list[Any]:
+        """Return the requests that have come since the last call, to be answered."""
+        with self._service.handle as handle:
+            taken = iter(lambda: handle.service_take_request(Trigger.Request)[1], None)
+            return list(taken)
+
+    def answer(self, requests: Sequence[Any], success: bool, text: str) -> None:
+        """Answer requests."""
+        for request in requests:
+            self._service.send_response(Trigger.Response(success=success, message=text), request)
 
 
 class Inbox:
