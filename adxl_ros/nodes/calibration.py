@@ -371,9 +371,8 @@ class Calibration(Node):
         anonymous = replace(parameters.anonymous_sensor(self, flat), link=link)
         self._own = own = parameters.declare_all(self, CalibrationSettings)
         settings = _session_settings(own)
-        self._has_stage = settings.mode == 'stage'
         self._captures: list[object] = []  # Requests that wait for the end of a capture
-        announcer = Announcer(self, self._has_stage)
+        announcer = Announcer(self, own.mode == 'stage')
         # What the controller asks of a node
         self.announce, self.withdraw_pose = announcer.announce, announcer.withdraw
         self._samples = Samples(self)
@@ -404,10 +403,12 @@ class Calibration(Node):
     def _connect(self) -> None:
         """Make diagnostics, subscriptions, services and the timer."""
         self._diagnostics = topics.DiagnosticsReporter(self, 'calibration', self._status)
-        topics.create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
-                                   latched=True)
+        topics.create_subscription(
+            self, DiagnosticStatus, 'sensor_info', lambda message:
+            self._controller.read_sensor_info(topics.stream_info(message, 'sensor_info')), 1,
+            latched=True)
         self._stage = {topic: topics.Inbox(self, JointState, topic, _STAGE_QUEUE)
-                       for topic in (_STAGE_TOPICS if self._has_stage else ())}
+                       for topic in (_STAGE_TOPICS if self._own.mode == 'stage' else ())}
         self._surroundings = topics.Surroundings(self, _QUEUE)
         start = self._controller.start
         requests: dict[str, Callable[[], Answer]] = {
@@ -453,9 +454,6 @@ class Calibration(Node):
         if self._samples.mixture():
             return Level.ERROR
         return Level.WARN if self._controller.status().late else Level.OK
-
-    def _on_info(self, message: DiagnosticStatus) -> None:
-        self._controller.read_sensor_info(topics.stream_info(message, 'sensor_info'))
 
     def _read_stage(self) -> None:
         """Give the commands and the angles of the stage that have come to the guide."""

@@ -8,7 +8,7 @@ The topic tilt has three angles in a Vector3Stamped, so tf2 must not transform i
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isfinite
@@ -27,7 +27,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.parameters import parameter
 from adxl_ros.nodes.run_node import run
-from adxl_ros.nodes.sample_output import SampleAges
+from adxl_ros.nodes.sample_output import age_report, MOST_AGES
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.signals.recorded_sensor import unit_of_stream
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -176,7 +176,7 @@ class Compensation(Node):
         self._reported: Counter[str] = Counter()
         self._reported_ns = STEADY.now().nanoseconds
         self._diagnostics = topics.DiagnosticsReporter(self, 'compensation', self._status)
-        self._ages = SampleAges()
+        self._ages_s: deque[float] = deque(maxlen=MOST_AGES)
         self._data = topics.create_publisher(self, Imu, 'imu/data', _DEPTH)
         tilt = topics.create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
         free = topics.create_publisher(
@@ -209,7 +209,7 @@ class Compensation(Node):
         """Publish a corrected sample, and take note of its age."""
         self._data.publish(raw)
         stamp_s, _ = imu_message.read(raw)
-        self._ages.add((self.get_clock().now().nanoseconds * 1e-9 - stamp_s,))
+        self._ages_s.append(self.get_clock().now().nanoseconds * 1e-9 - stamp_s)
 
     def _load(self, path: str) -> tuple[Sensor, str] | None:
         """Load the file of `calibration`, if one is named; it is refused if it does not fit."""
@@ -317,7 +317,7 @@ class Compensation(Node):
         late = HALF if self._settings.undo_filter else 0
         values = {'rate_in_hz': round(counts['received'] / duration_s, 1),
                   'rate_out_hz': round(counts['published'] / duration_s, 1), **totals,
-                  'delay_s': late / self._policy.rate_hz, **self._ages.report(),
+                  'delay_s': late / self._policy.rate_hz, **age_report(self._ages_s),
                   **self._policy.values(interval, newer)}
         return Status(Level[level], text, self._policy.sensor.serial, values)
 

@@ -171,15 +171,11 @@ class LinkReader:
     def _paced_turn(self) -> None:
         """Wait until samples are due, and publish them."""
         self._is_real_time = not (self._output.is_clock or self._ros.ros_time_is_active)
-        if self._is_real_time:
-            # Samples that are due would wait for it. Motion is known some time ahead.
-            self._take_motion()
         pause_s = self._due_s - time.monotonic()
         time.sleep(min(max(pause_s, 0.0), _LONGEST_PAUSE_S))
         if pause_s <= _LONGEST_PAUSE_S:
-            if not self._is_real_time:
-                # The stage moves on with the clock of the last tick.
-                self._take_motion()
+            # The stage moves on with the clock of the last tick.
+            self._take_motion()
             self._tick()
             self._due_s = self._next_due_s()
 
@@ -205,7 +201,10 @@ class LinkReader:
         if self._now_ns is None:
             if not self._may_begin(step_ns):
                 return
-            self._now_ns = self._begin()
+            start_ns = self._link.start_ns if self._output.is_clock else None
+            self._now_ns = self._ros.now().nanoseconds if start_ns is None else start_ns
+            self._link.begin(self._now_ns)
+            self._output.tally.begin(self._now_ns)
         samples = self._link.read(self._due_ns(self._now_ns, step_ns))
         self._now_ns = samples.until_ns
         if len(samples.stamp_ns):
@@ -223,14 +222,6 @@ class LinkReader:
             return False
         self._subscribed_ns = self._subscribed_ns + step_ns if self._output.subscribed() else 0
         return not self._link.waits_for_listener or self._subscribed_ns >= _DISCOVERY_NS
-
-    def _begin(self) -> int:
-        """Let the first sample be due; return its sensor time, ns."""
-        start_ns = self._link.start_ns if self._output.is_clock else None
-        now_ns = self._ros.now().nanoseconds if start_ns is None else start_ns
-        self._link.begin(now_ns)
-        self._output.tally.begin(now_ns)
-        return now_ns
 
     def _due_ns(self, now_ns: int, step_ns: int) -> int:
         """Return the sensor time up to which samples are due, ns."""

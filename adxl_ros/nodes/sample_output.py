@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 import math
 from typing import Any
 
@@ -25,27 +25,17 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 
-_KEPT = 10_000
+MOST_AGES = 10_000
 """Newest ages that count; chosen: one second at 10 kHz, in a memory that does not grow."""
 
 
-class SampleAges:
-    """Ages of the newest published samples; one thread adds them, another one reports."""
-
-    def __init__(self) -> None:
-        self._ages_s: deque[float] = deque(maxlen=_KEPT)
-
-    def add(self, ages_s: Iterable[float]) -> None:
-        """Add the ages of samples that were published just now, s."""
-        self._ages_s.extend(ages_s)
-
-    def report(self) -> dict[str, float]:
-        """Return median and 99th percentile since the last report, ms; nothing without samples."""
-        ages_s, self._ages_s = self._ages_s, deque(maxlen=_KEPT)
-        if not ages_s:
-            return {}
-        p50_ms, p99_ms = np.percentile(list(ages_s), [50, 99]) * 1e3
-        return {'age_p50_ms': round(float(p50_ms), 3), 'age_p99_ms': round(float(p99_ms), 3)}
+def age_report(ages_s: deque[float]) -> dict[str, float]:
+    """Take the ages, s, that another thread adds; return their percentiles, ms, if any."""
+    taken_s = [ages_s.popleft() for _ in range(len(ages_s))]
+    if not taken_s:
+        return {}
+    p50_ms, p99_ms = np.percentile(taken_s, [50, 99]) * 1e3
+    return {'age_p50_ms': round(float(p50_ms), 3), 'age_p99_ms': round(float(p99_ms), 3)}
 
 
 class Tally:
@@ -60,7 +50,7 @@ class Tally:
     def __init__(self, steady_ns: int) -> None:
         self.now_ns: int | None = None  # Sensor time up to which samples have been read, ns
         self.counts: Counter[str] = Counter()  # By the names above
-        self.ages = SampleAges()  # Ages of the samples on publication
+        self.ages_s: deque[float] = deque(maxlen=MOST_AGES)  # Of the samples on publication, s
         self.newest_ns: int | None = None  # Stamp of the newest sample, ns
         # Times and counts at the last report
         self._reported = Counter(steady_ns=steady_ns)
@@ -83,7 +73,7 @@ class Tally:
             'speed': round(elapsed_ns / new['steady_ns'], 3)}
         if self.newest_ns is not None:
             values['age_s'] = round((sensor_ns - self.newest_ns) * 1e-9, 6)
-        return values | self.ages.report(), ', '.join(
+        return values | age_report(self.ages_s), ', '.join(
             f'{new[name]} samples {name}' for name in ('missing', 'saturated') if new[name])
 
 
@@ -241,7 +231,7 @@ class SampleOutput:
         # The age of a sample is the time until here: all that can wait comes after it.
         now_ns = samples.until_ns if self.is_clock else self._stamp_clock.now().nanoseconds
         references.publish(samples.stamp_ns, samples.references)
-        self.tally.ages.add(((now_ns - published_ns) * 1e-9).tolist())
+        self.tally.ages_s.extend(((now_ns - published_ns) * 1e-9).tolist())
         self.tally.counts.update(
             samples=len(published_ns), missing=finite.missing, estimated=finite.estimated,
             saturated=int(self.sensor.saturated(finite.volts).any(axis=1).sum()))

@@ -201,9 +201,9 @@ class LateService:
 
     def take(self) -> list[Any]:
         """Return the requests that have come since the last call, to be answered."""
-        with self._service.handle as handle:
-            taken = iter(lambda: handle.service_take_request(Trigger.Request)[1], None)
-            return list(taken)
+        handle = self._service.handle
+        with handle:
+            return list(iter(lambda: handle.service_take_request(Trigger.Request)[1], None))
 
     def answer(self, requests: Sequence[Any], success: bool, text: str) -> None:
         """Answer requests."""
