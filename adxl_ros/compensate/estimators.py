@@ -302,13 +302,13 @@ class LiveEstimator:
 
         Each axis gets the variance `unknown`; a derived z also gets that of noise and motion.
         """
-        if not self._derives_z:
-            xx, xy, xz, yy, yz, zz = cell.covariance
-            return xx + unknown, xy, xz, yy + unknown, yz, zz + unknown
-        xx, xy, _, yy, _, _ = cell.covariance
-        xx, xy, xz, yy, yz, zz = force_errors.derived_z_covariance(
-            force, (xx, xy, yy), cell.tangent.slope, FLOATS)
-        return xx + unknown, xy, xz, yy + unknown, yz, zz + self._noise_variance[0] + motion
+        xx, xy, xz, yy, yz, zz = cell.covariance
+        further = unknown
+        if self._derives_z:
+            xx, xy, xz, yy, yz, zz = force_errors.derived_z_covariance(
+                force, (xx, xy, yy), cell.tangent.slope, FLOATS)
+            further = self._noise_variance[0] + motion
+        return xx + unknown, xy, xz, yy + unknown, yz, zz + further
 
     def _cell(self, force: Components) -> _Cell:
         key = (round(force[0] / _CELL_MPS2), round(force[1] / _CELL_MPS2),

@@ -114,26 +114,22 @@ class OwnScreen:
         self._saved = termios.tcgetattr(sys.stdin.fileno())
         # Ctrl-C during the start is for the node. The screen inherits the mask.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        self._process = subprocess.Popen([
+        self.process = subprocess.Popen([
             sys.executable, executable('screen'), '--ros-args', '-p', f'node:={node_name}', '-p',
             f'node_pid:={os.getpid()}'])
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         self._output = ExitStack()
         self._output.enter_context(held_output())
 
-    def alive(self) -> bool:
-        """Return whether the process of the screen still runs."""
-        return self._process.poll() is None
-
     def close(self) -> None:
         """End the screen, restore the terminal if the screen did not, and print what was held."""
-        self._process.terminate()
+        self.process.terminate()
         try:
-            self._process.wait(_SCREEN_END_S)
+            self.process.wait(_SCREEN_END_S)
         except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        if self._process.returncode < 0:
+            self.process.kill()
+            self.process.wait()
+        if self.process.returncode < 0:
             with suppress(OSError, termios.error):
                 os.write(sys.stdin.fileno(), _RESET)
                 termios.tcsetattr(sys.stdin.fileno(), termios.TCSANOW, self._saved)
@@ -223,7 +219,7 @@ class DisplayPublisher:
     def update(self) -> None:
         """Notice who looks, and publish the contents for them."""
         controller = self._controller
-        if self._own_screen is not None and not self._own_screen.alive():
+        if self._own_screen is not None and self._own_screen.process.poll() is not None:
             self.close()
             self._node.get_logger().warning('the screen has ended; plain lines from here on')
         controller.may_ask = self._own_screen is not None or bool(

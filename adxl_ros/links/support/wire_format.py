@@ -313,7 +313,10 @@ class FrameCounter:
 
     def _follow(self, frame: SampleFrame, arrived_us: float) -> AcceptedFrame | None:
         """Compare a frame with the previous one; None where the next one must decide."""
-        if self._previous is None or (frame.flags & AFTER_RESET and not self._is_first(frame)):
+        # The first frames of a count have the flag of a reset, also where they come twice.
+        is_first = self._first is not None and (frame.sequence, frame.time_us, frame.index) == (
+            self._first.sequence, self._first.time_us, self._first.index)
+        if self._previous is None or (frame.flags & AFTER_RESET and not is_first):
             return AcceptedFrame(frame, None)
         ahead, passed_us = self._step(self._previous, frame)
         in_step = self._agree(ahead, passed_us)
@@ -325,11 +328,6 @@ class FrameCounter:
         elif ahead < 0:
             return None
         return AcceptedFrame(frame, ahead if ahead > 0 and in_step else None)
-
-    def _is_first(self, frame: SampleFrame) -> bool:
-        first = self._first
-        return first is not None and (frame.sequence, frame.time_us, frame.index) == (
-            first.sequence, first.time_us, first.index)
 
     def _step(self, first: SampleFrame, second: SampleFrame) -> tuple[int, float]:
         """Return the samples and the time, µs, from the end of a frame to another one."""
