@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import product
 
-from adxl_ros.calibrate.fits import full_model, term_selection
+from adxl_ros.calibrate.fits import full_model
 from adxl_ros.calibrate.fits.linearisation import StageError
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
 from adxl_ros.calibrate.poses import Poses, predicted_volts
@@ -67,7 +67,7 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     targets = pose_plan.guided(pose_plan.default_planes_rad(axes), pose_plan.STEP_RAD, 0) \
         if kind == 'full' else running_estimate.quick(sensor, _DWELL_S, float(np.radians(0.1)), 0)
     poses, true_rad = _swept(truth, targets, stage == STAGES[0], step, rng)
-    fit, _ = term_selection.fit_selected(sensor, poses)
+    fit, _ = full_model.fit_selected(sensor, poses)
     names = fit.fitted.covariance_names
     truth_of_fit = with_neutral(truth, {name.effect for name in names})
     error = get(fit.fitted, names) - get(truth_of_fit, names)

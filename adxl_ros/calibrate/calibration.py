@@ -4,12 +4,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
-from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, term_selection, thermal_fit
+from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, thermal_fit
 from adxl_ros.calibrate.fits.linearisation import volts_covariance
 from adxl_ros.calibrate.poses import at_a_rail, Poses, predicted_volts, reference_force
 from adxl_ros.calibrate.report import acceptance, held_out
@@ -23,15 +23,10 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import get, Sensor
 from adxl_ros.report.quantities import with_half_width
-from adxl_ros.signals.recorded_sensor import (
-    CERTAIN_CORRELATION,
-    FilterNoise,
-    find_polarity_fault,
-    with_filter,
-)
+from adxl_ros.signals import recorded_sensor
 import numpy as np
 
-STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': term_selection.fit}
+STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': full_model.fit}
 """Models that are fitted against the stage, simplest first."""
 
 
@@ -41,11 +36,8 @@ class RecordedPoses:
 
     source: str  # Name of the recording, for messages and the provenance
     poses: Poses  # With angles or without
-    filters: Sequence[FilterNoise | None] = ()  # Estimated output filter of each axis
-
-
-def _joined(recordings: Sequence[RecordedPoses]) -> Poses:
-    return Poses.joined([recording.poses for recording in recordings])
+    # Estimated output filter of each axis
+    filters: Sequence[recorded_sensor.FilterNoise | None] = ()
 
 
 def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None = None,
@@ -81,7 +73,7 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
 
     """
     source = ', '.join(recording.source for recording in recordings)
-    poses = _joined(recordings)
+    poses = Poses.joined([recording.poses for recording in recordings])
     lines: list[str] = []
     if (at_rail := at_a_rail(sensor, poses)).any():
         starts_s = poses.time_s[at_rail, 0]
@@ -120,22 +112,22 @@ class _StageFit:
     fitted: Sensor
     refit: held_out.Fit  # The same fit to other poses, for cross-validation
     full: full_model.FullFit | None = None  # The full fit; None for other models
-    terms: Sequence[term_selection.Term] = ()  # Evidence for the terms of a full fit
+    terms: Sequence[full_model.Term] = ()  # Evidence for the terms of a full fit
     notes: Sequence[str] = ()  # What to know about the choice of the model
 
 
 def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
                    effects: Sequence[str], source: str, data_sha256: str,
                    population: Population | None) -> CalibrationResult:
-    poses = _joined(recordings)
+    poses = Poses.joined([recording.poses for recording in recordings])
     _check_polarity(sensor, poses)
-    fit = _richest_fit(sensor, recordings, model, effects, population)
+    fit = _richest_fit(sensor, poses.subset(~poses.check), recordings, model, effects)
     if population is not None:
         fit = _with_population(fit, population)
     full, fitted, fitting = fit.full, fit.fitted, np.flatnonzero(~poses.check)
     fit_lines, warnings, outliers = ([], [], ()) if full is None else (
-        term_selection.report_lines(full, poses.subset(fitting), fit.terms),
-        term_selection.warnings(full, poses.subset(fitting)),
+        full_model.report_lines(full, poses.subset(fitting), fit.terms),
+        full_model.warnings(full, poses.subset(fitting)),
         tuple(fitting[list(full.outliers)].tolist()))
     errors, assessments = _assessed(
         sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit)
@@ -144,7 +136,7 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
     residual_mg = ((poses.volts - predicted_volts(fitted, poses)) / fitted.scale_v_per_g
                    * 1e3)[fitting]
     if fitted.model == 'full':
-        fitted, filter_lines = with_filter(
+        fitted, filter_lines = recorded_sensor.with_filter(
             fitted, [recording.filters for recording in recordings if recording.filters])
         fit_lines += filter_lines
     error_mps2 = np.nan_to_num(np.sqrt(assessment.accel.calibration)).item() if assessment else 0.0
@@ -170,8 +162,8 @@ def _check_polarity(sensor: Sensor, poses: Poses) -> None:
     with np.errstate(invalid='ignore', divide='ignore'):
         correlation = np.array([[np.corrcoef(volts, force)[0, 1] for force in reference]
                                 for volts in poses.volts.T])
-    fault = find_polarity_fault(correlation, [AXES.index(axis) for axis in sensor.axes],
-                                CERTAIN_CORRELATION)
+    fault = recorded_sensor.find_polarity_fault(
+        correlation, [AXES.index(a) for a in sensor.axes], recorded_sensor.CERTAIN_CORRELATION)
     if fault is not None:
         raise UserError(fault.describe(sensor.axes[fault.axis], AXES[fault.follows]))
 
@@ -208,21 +200,23 @@ def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit
         for row in errors if row.model != 'nominal')
 
 
-def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
-                 effects: Sequence[str], population: Population | None) -> _StageFit:
+def _richest_fit(sensor: Sensor, poses: Poses, recordings: Sequence[RecordedPoses],
+                 model: str | None, effects: Sequence[str]) -> _StageFit:
     """Fit a model, or the richest one that the poses determine; also note why no richer one."""
-    poses = _joined(recordings)
-    poses = poses.subset(~poses.check)
-    fits: dict[str, Callable[[], _StageFit]] = {
-        'full': lambda: _fit_full(sensor, poses, recordings, effects),
-        'physical': lambda: _StageFit(linear.fit_physical(sensor, poses), linear.fit_physical),
-        'linear': lambda: _fit_linear(sensor, poses, population)}
+    def fitted(name: str) -> _StageFit:
+        if name != 'full':
+            return _StageFit(STAGE_FITS[name](sensor, poses), STAGE_FITS[name])
+        full, terms = full_model.fit_selected(sensor, poses, effects)
+        if len(recordings) > 1:
+            _require_one_mounting(full, recordings)
+        return _StageFit(full.fitted, partial(full_model.fit, effects=effects), full, terms)
+
     if model:
-        return fits[model]()
+        return fitted(model)
     refusals: list[str] = []
     for name in ('full', 'physical'):
         try:
-            return replace(fits[name](), notes=refusals)
+            return replace(fitted(name), notes=refusals)
         except _ContradictionError:
             raise
         except UserError as error:
@@ -231,20 +225,12 @@ def _richest_fit(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str
         # The fit of the twelve coefficients states for itself what is open.
         with suppress(UserError):
             return _fit_affine(sensor, poses)
-    return replace(fits['linear'](), notes=refusals)
-
-
-def _fit_full(sensor: Sensor, poses: Poses, recordings: Sequence[RecordedPoses],
-              effects: Sequence[str]) -> _StageFit:
-    full, terms = term_selection.fit_selected(sensor, poses, effects)
-    if len(recordings) > 1:
-        _require_one_mounting(full, recordings)
-    return _StageFit(full.fitted, partial(term_selection.fit, effects=effects), full, terms)
+    return replace(fitted('linear'), notes=refusals)
 
 
 def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
     """Fit the twelve coefficients of a three-axis unit to poses that determine no more."""
-    full = full_model.fit_full(sensor, poses, linear.AFFINE, term_selection.MAX_OPEN)
+    full = full_model.fit_full(sensor, poses, linear.AFFINE, full_model.MAX_OPEN)
     still_open = acceptance.open_coefficients(full.fitted)
     notes = [f'{len(poses)} poses determine zero-g, scale factor and misalignment, no further '
              'terms; more poses show those']
@@ -257,22 +243,6 @@ def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
         return full_model.fit_full(sensor, poses, linear.AFFINE, len(still_open)).fitted
 
     return _StageFit(full.fitted, refit, full, notes=notes)
-
-
-def _fit_linear(sensor: Sensor, poses: Poses, population: Population | None) -> _StageFit:
-    """Fit the linear model; poses may leave to the population what it has."""
-    if population is None:
-        return _StageFit(linear.fit(sensor, poses), linear.fit)
-    axes = {name.axis for name in population.prior(sensor).names if name.effect == 'scale_factor'}
-    fit_line = partial(linear.fit, may_be_open=set(sensor.axes) <= axes)
-    fitted = fit_line(sensor, poses)
-    combined = posterior(fitted, population)
-    if not combined.is_stranger:
-        return _StageFit(fitted, fit_line)
-    try:
-        return _fit_linear(sensor, poses, None)
-    except UserError as error:
-        raise UserError(f'{error}; {combined.line}') from None
 
 
 _MAX_TURN_RAD = np.radians(0.3)
@@ -336,7 +306,7 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
     fitted = replace(
         sensor, model='gravity', effects=('bias', 'scale_factor', 'misalignment'),
         values=fit.values, covariance=fit.covariance, covariance_names=gravity_fit.NAMES)
-    warnings = [] if fit.converged else [term_selection.NOT_CONVERGED]
+    warnings = [] if fit.converged else [full_model.NOT_CONVERGED]
     if population is not None:
         combined = posterior(fitted, population)
         fitted = combined.sensor
@@ -392,10 +362,15 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
                  f'{fit.span_c[1]:.1f} degC'})
     covered = thermal_fit.passed(blocks.temperature_c, (low_c, high_c))
     error_mg = thermal_fit.expected_error_mg(fit, covered, calibrated_c)
+    std = dict(zip(fit.names, Z_90 * np.sqrt(np.diag(fit.covariance))))
+    pairs = [[Coefficient('temperature_bias', name, axis) for name in ('per_k', 'per_k2')]
+             for axis in fitted.axes]
     lines = [
         f'zero-g over temperature: {len(blocks)} blocks at rest, '
         f'{fit.span_c[0]:.1f} to {fit.span_c[1]:.1f} °C',
-        *_slope_lines(fitted, fit),
+        *(f'  {slope.axis}  {with_half_width(k * 1e3, std[slope] * 1e3)} mg/K at 25 °C, '
+          f'{with_half_width(k2 * 1e6, std[curvature] * 1e6)} µg/K²'
+          for slope, curvature in pairs for k, k2 in [get(fitted, [slope, curvature])]),
         'residual ' + ', '.join(f'{axis} {value * 1e3:.2g}' for axis, value in zip(
             base.axes, fit.residual_g)) + ' mg rms',
         f'warming and cooling differ: {fit.history} ({fit.shape:.3g} '
@@ -407,12 +382,3 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
         lines.append('scale factor over temperature: not fitted, it needs a second orientation')
     return CalibrationResult(nominal=base, fitted=fitted, summary=lines, poses=poses)
 
-
-def _slope_lines(fitted: Sensor, fit: thermal_fit.ThermalFit) -> list[str]:
-    """Return slope and curvature of each axis with half of their 90 % intervals."""
-    std = dict(zip(fit.names, Z_90 * np.sqrt(np.diag(fit.covariance))))
-    pairs = [[Coefficient('temperature_bias', name, axis) for name in ('per_k', 'per_k2')]
-             for axis in fitted.axes]
-    return [f'  {slope.axis}  {with_half_width(k * 1e3, std[slope] * 1e3)} mg/K at 25 °C, '
-            f'{with_half_width(k2 * 1e6, std[curvature] * 1e6)} µg/K²'
-            for slope, curvature in pairs for k, k2 in [get(fitted, [slope, curvature])]]

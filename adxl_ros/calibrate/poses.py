@@ -19,14 +19,8 @@ from adxl_ros.model.effects.base import Coefficient, Components, Environment, NO
 from adxl_ros.model.kinematics import specific_force, UPRIGHT
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor
-from adxl_ros.signals import recorded_sensor
-from adxl_ros.signals.rest_detection import (
-    datasheet_noise,
-    recording_finder,
-    Rest,
-    rest_means,
-    SAME_ANGLE_RAD,
-)
+from adxl_ros.signals import recorded_sensor, rest_detection
+from adxl_ros.signals.rest_detection import Rest, SAME_ANGLE_RAD
 import numpy as np
 
 _SAME_PLANE_RAD = np.radians(1.0)  # Largest difference of neighbouring angles alpha in one plane
@@ -146,8 +140,7 @@ def at_a_rail(sensor: Sensor, poses: Poses) -> np.ndarray:
     """Return the poses, (k,) bool, whose mean is false as samples are at a rail of the ADC."""
     rails_v = np.array([0.0, sensor.adc_vref_v - sensor.lsb_v])
     reach_v = (_RAIL_STDS * sample_std_v(sensor) + sensor.lsb_v) * bool(sensor.adc_bits)
-    distance_v = np.abs(poses.volts[:, :, None] - rails_v).min(axis=2)
-    return (distance_v < reach_v).any(axis=1)
+    return (np.abs(poses.volts[:, :, None] - rails_v).min(axis=2) < reach_v).any(axis=1)
 
 
 _SHARE = 0.5
@@ -262,23 +255,23 @@ def recorded_settings(rests: np.ndarray, readings_rad: np.ndarray | None,
     commands_rad: encoder and command at each sample, (n,); NaN or None where there is none.
     """
     missing = np.full(int(rests.max(initial=0)), np.nan)
-    readings = missing if readings_rad is None else readings_rad
-    commands = missing if commands_rad is None else commands_rad
-    settings, number = np.zeros(len(rests), int), 0
-    before_rad = held_rad = np.nan
-    middle, begin = None, -1
-    for i in np.argsort(rests[:, 0], kind='stable'):
-        start, stop = rests[i]
-        mean_rad = _mean_of_finite(readings[start:stop])
-        given = commands[begin + 1:start + 1]
-        given = given[np.isfinite(given)]
-        if middle is not None:
-            number += int(_moved(np.append(readings[middle:(start + stop) // 2], mean_rad),
-                                 before_rad, given, held_rad, tolerance_rad))
-        settings[i], middle, begin = number, (start + stop) // 2, start
-        before_rad = mean_rad if np.isfinite(mean_rad) else before_rad
-        held_rad = given[-1] if len(given) else held_rad
+    readings, commands = (missing if v is None else v for v in (readings_rad, commands_rad))
+    order = np.argsort(rests[:, 0], kind='stable')
+    start, stop = rests[order].T
+    middle, settings = (start + stop) // 2, np.zeros(len(rests), int)
+    means_rad = np.array([_mean_of_finite(readings[a:b]) for a, b in zip(start, stop)])
+    before_rad, held_rad = _last_finite(means_rad), _last_finite(commands)[start]
+    settings[order[1:]] = np.cumsum([
+        _moved(np.append(readings[middle[i]:middle[i + 1]], means_rad[i + 1]), before_rad[i],
+               commands[start[i] + 1:start[i + 1] + 1], held_rad[i], tolerance_rad)
+        for i in range(len(rests) - 1)])
     return settings
+
+
+def _last_finite(values: np.ndarray) -> np.ndarray:
+    """Return the last finite value up to each place, (n,); NaN before the first one."""
+    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), -1))
+    return np.where(last >= 0, values[last], np.nan)
 
 
 def _mean_of_finite(values: np.ndarray) -> float:
@@ -381,7 +374,7 @@ def extract_poses(recording: Recording, sensor: Sensor,
     """Find the rests of a recording, or take those of a journal, and average each."""
     volts, angles = recording.volts(sensor), recording.stage_angles
     if records is None:
-        finder = recording_finder(sensor, angles is not None)
+        finder = rest_detection.recording_finder(sensor, angles is not None)
         finder.feed(recording.time_s, volts, angles)
         rests = finder.rests()
     else:
@@ -394,8 +387,8 @@ def extract_poses(recording: Recording, sensor: Sensor,
         return np.array([np.nan if values is None else
                          _mean_of_finite(values[rest.start:rest.stop]) for rest in rests])
 
-    mean, std = rest_means(recording.time_s, volts, rests, sensor.rate_hz,
-                           datasheet_noise(sensor))
+    mean, std = rest_detection.rest_means(recording.time_s, volts, rests, sensor.rate_hz,
+                           rest_detection.datasheet_noise(sensor))
     measured = {'volts': mean, 'std_v': std,
                 'time_s': np.array([[rest.time_start_s, rest.time_stop_s] for rest in rests]),
                 'temperature_c': means(recording.columns.get('temperature_c')),

@@ -284,8 +284,7 @@ def _at_rest(motion: Motion, time_s: np.ndarray, reference: Reference, volts: np
 
 def direction_of_last_move(rate: np.ndarray, smallest: float = _REST_RATE) -> np.ndarray:
     """Return the direction of the last move, −1 or 1, 0 before the first, (n,)."""
-    moving = np.abs(rate) > smallest
-    last = np.maximum.accumulate(np.where(moving, np.arange(len(rate)), -1))
+    last = np.maximum.accumulate(np.where(np.abs(rate) > smallest, np.arange(len(rate)), -1))
     return np.where(last >= 0, np.sign(rate[np.maximum(last, 0)]), 0.0)
 
 

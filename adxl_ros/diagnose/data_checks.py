@@ -18,21 +18,8 @@ from itertools import product
 from os.path import basename
 from typing import NamedTuple
 
-from adxl_ros.diagnose import noise_effects
-from adxl_ros.diagnose.comparison import (
-    at_search_rate,
-    BaselineComparison,
-    code_step_v,
-    compare,
-    fading_frequency_hz,
-    leave_out,
-    Reference,
-    seen_step_rad,
-    SMALLEST_MOTION_G,
-    stated_poses,
-    without_fast_motion,
-    without_gaps,
-)
+from adxl_ros.diagnose import comparison as beside, noise_effects
+from adxl_ros.diagnose.comparison import BaselineComparison, compare, Reference, SMALLEST_MOTION_G
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD, Z_90
@@ -153,28 +140,29 @@ def _align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: b
     elif may_shift:
         notes = [f'--align: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may be an '
                  'effect of the sensor (time_offset), and nothing is shifted']
-    begin_s, end_s = force.time_s[0], force.time_s[-1]
-    covered = (recording.time_s >= begin_s) & (recording.time_s <= end_s)
-    if not covered.any():
+    covered, begin_s, end_s = _covered(recording, force)
+    span = f'it is from {begin_s:.6g} to {end_s:.6g} s'
+    if not len(covered):
         advice = f'its motion fits, but is {shift.text}; use --align' if shift else \
             'no shift makes its motion fit; give that of this recording'
-        raise DataFault('no_overlap', f'{force.name} does not overlap the recording in time: it '
-                        f'is from {begin_s:.6g} to {end_s:.6g} s, {basename(recording.path)} from '
-                        f'{recording.time_s[0]:.6g} to {recording.time_s[-1]:.6g} s; {advice}')
+        raise DataFault('no_overlap', f'{force.name} does not overlap the recording in time: '
+                        f'{span}, {basename(recording.path)} from {recording.time_s[0]:.6g} to '
+                        f'{recording.time_s[-1]:.6g} s; {advice}')
     if shift and not may_shift:
         raise DataFault('time_misaligned', f'{force.name} is {shift.text}; use --align, or '
                         f'shift its stamps by {-shift.late_s:+.6g} s')
-    if not covered.all():
-        outside_s = (1 - covered.mean()) * float(np.ptp(recording.time_s))
+    if len(covered) < len(recording):
+        outside_s = (1 - len(covered) / len(recording)) * float(np.ptp(recording.time_s))
         notes.append(f'left out: {outside_s:.3g} s of the recording that {force.name} does not '
-                     f'cover (it is from {begin_s:.6g} to {end_s:.6g} s)')
-    return _between(recording, begin_s, end_s), replace(sim, force=force), notes
+                     f'cover ({span})')
+    return covered, replace(sim, force=force), notes
 
 
-def _between(recording: Recording, begin_s: float, end_s: float) -> Recording:
-    """Return the samples of a recording between two times."""
-    return recording.rows(int(np.searchsorted(recording.time_s, begin_s)),
-                          int(np.searchsorted(recording.time_s, end_s, 'right')))
+def _covered(recording: Recording, force: ForcePath) -> tuple[Recording, float, float]:
+    """Return the part of a recording that a force covers, and begin and end of the force, s."""
+    begin_s, end_s = force.time_s[0], force.time_s[-1]
+    return recording.rows(int(np.searchsorted(recording.time_s, begin_s)), int(
+        np.searchsorted(recording.time_s, end_s, 'right'))), begin_s, end_s
 
 
 def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> _Shift | None:
@@ -236,9 +224,9 @@ def _correlations(first: np.ndarray, second: np.ndarray, smallest: int
 def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: float,
                 correlation: float) -> _Shift:
     """Fit shift, zero-g and scale factor to blocks of the recording, from a rough shift."""
-    begin_s, end_s = force.time_s[0] - late_s, force.time_s[-1] - late_s
-    comparison = compare(_between(recording, begin_s, end_s), sensor,
-                         Motion(float(end_s - begin_s), force=force.shifted(-late_s)))
+    shifted = force.shifted(-late_s)
+    covered, begin_s, end_s = _covered(recording, shifted)
+    comparison = compare(covered, sensor, Motion(float(end_s - begin_s), force=shifted))
     time_s, volts = comparison.time_s, comparison.volts
     simulated_v = comparison.simulated_v(comparison.sensor)
     # The ends may need values from outside.
@@ -278,12 +266,13 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
         recording, sim, notes = _align_force(recording, sensor, sim, may_shift)
     else:
         _check_encoder(recording, sensor)
-        step_rad, stated_rad = seen_step_rad(recording, sensor), sensor.stage_resolution_rad
-        if step_rad > stated_rad:
+        step_rad = beside.seen_step_rad(recording, sensor)
+        if step_rad > sensor.stage_resolution_rad:
+            stated_deg = np.degrees(sensor.stage_resolution_rad)
             notes.append(f'the stage reads in steps of {np.degrees(step_rad):.3g}°, not of '
-                         f'{np.degrees(stated_rad):.3g}° as stated: this is used')
+                         f'{stated_deg:.3g}° as stated: this is used')
             sensor = replace(sensor, stage_resolution_rad=step_rad)
-        recording, left_out = stated_poses(recording, sensor)
+        recording, left_out = beside.stated_poses(recording, sensor)
     comparison = compare(recording, sensor, sim)
     if even_s is not None and len(even_s) == len(recording):
         # Samples may also have been taken unevenly, so that the simulation decides.
@@ -293,10 +282,10 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
             notes.append(f'stamps are uneven, and an even rate of {evenly.sensor.rate_hz:.6g} '
                          'Hz explains them: it is used')
     for rows, reason in left_out if comparison.joints else ():
-        comparison = leave_out(comparison, rows, reason)
+        comparison = beside.leave_out(comparison, rows, reason)
     # What moves too fast is looked for where the reference is stated.
-    comparison = without_fast_motion(without_gaps(comparison), recording.columns)
-    fading_hz = fading_frequency_hz(comparison)
+    comparison = beside.without_fast_motion(beside.without_gaps(comparison), recording.columns)
+    fading_hz = beside.fading_frequency_hz(comparison)
     if fading_hz is not None:
         notes.append(f'the reference is smoother than the sensor: above {fading_hz:.3g} Hz it '
                      'lacks motion that the recording has; effects that show in fast motion are '
@@ -422,7 +411,7 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording:
 
     Where the codes of the ADC are coarser than stated, the baseline gets their number of bits.
     """
-    search_comparison = at_search_rate(comparison)
+    search_comparison = beside.at_search_rate(comparison)
     try:
         _check_samples(comparison, search_comparison)
     except DataFault as fault:
@@ -486,7 +475,7 @@ def _check_range(comparison: BaselineComparison, finite: np.ndarray) -> None:
     volts, simulated_v = (v[finite] for v in (comparison.volts, comparison.simulated_v(sensor)))
     lsb_v, range_v = max(sensor.lsb_v, _SMALLEST_STEP_V), np.ptp(volts, axis=0)
     # Coarse codes repeat in an extreme pose, so that the simulation must differ, too.
-    step_v = np.maximum(code_step_v(volts), lsb_v)
+    step_v = np.maximum(beside.code_step_v(volts), lsb_v)
     railed = max(float(np.mean((np.abs(volts - rail_v) < lsb_v / 2)
                                & (np.abs(simulated_v - rail_v) > step_v), axis=0)[
         range_v > _SMALLEST_RANGE_V].max(initial=0.0))

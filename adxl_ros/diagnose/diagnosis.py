@@ -322,8 +322,7 @@ def what_shows(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | No
         checked = check(recordings, sensor, sim)
     except DataFault as fault:
         return fault
-    compared = [c.search_comparison for c in checked]
-    model = build_linear_model(compared)
+    model = build_linear_model([c.search_comparison for c in checked])
     floor = estimate_floor([c.comparison for c in checked])
     return next_experiment.could_show(model, checked[0].comparison, floor.noise_v,
                                       material_mps2(model, floor))

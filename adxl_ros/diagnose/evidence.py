@@ -346,8 +346,7 @@ def expected_drift_g(effect: str, density: float, comparison: BaselineComparison
 
 def _power(polynomial: np.ndarray, order: int) -> np.ndarray:
     """Return the coefficients of |p(L)|², of the powers of L from −order to order."""
-    square = np.convolve(polynomial, polynomial[::-1])
-    return np.pad(square, order - (len(polynomial) - 1))
+    return np.pad(np.convolve(polynomial, polynomial[::-1]), order - (len(polynomial) - 1))
 
 
 def _spectral_factor(spectrum: np.ndarray, order: int) -> np.ndarray:

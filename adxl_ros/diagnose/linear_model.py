@@ -23,18 +23,8 @@ from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.evidence import LinearFit, Whitener
 from adxl_ros.errors import UserError
-from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import (
-    ActsOn,
-    Coefficient,
-    Concern,
-    DiagnosisHints,
-    Effect,
-    Manoeuvre,
-    Parameter,
-    Role,
-    StraightLine,
-)
+from adxl_ros.model.effects import base, effect_named, library
+from adxl_ros.model.effects.base import Coefficient, Concern, Effect, Parameter, Role
 from adxl_ros.model.sensor import names_of, parameter_of, put, Sensor, with_neutral
 import numpy as np
 
@@ -89,7 +79,7 @@ class Variant:
 
 def candidates() -> list[Effect]:
     """Return the effects of the library that act on the mean of the output."""
-    return [effect for effect in library().values() if effect.acts_on is ActsOn.MEAN]
+    return [effect for effect in library().values() if effect.acts_on is base.ActsOn.MEAN]
 
 
 def variants(comparison: BaselineComparison, effect: Effect, baseline_v: np.ndarray
@@ -178,7 +168,7 @@ def _variant(comparison: BaselineComparison, effect: Effect, parameters: Sequenc
                   - baseline_v) / size
         # Without a known pose only changes show, except of the zero-g itself.
         if comparison.reference is Reference.NONE \
-                and effect.diagnosis.straight_line is not StraightLine.ZERO_G:
+                and effect.diagnosis.straight_line is not base.StraightLine.ZERO_G:
             change -= change.mean(axis=0)
         for name in names_of(replace(effect, parameters=(p,)), axes):
             reached = [axes.index(name.axis)] if p.axes else list(range(len(axes)))
@@ -212,7 +202,7 @@ def sensitivities_at(simulate: Simulate, sensor: Sensor, names: Sequence[Coeffic
     return out
 
 
-def hints_of(name: Coefficient) -> DiagnosisHints:
+def hints_of(name: Coefficient) -> base.DiagnosisHints:
     """Return the hints of the effect of a coefficient."""
     return effect_named(name.effect).diagnosis
 
@@ -312,7 +302,7 @@ class LinearModel:
             return PRIOR_WIDTH * parameter_of(name).scale \
                 if {*hints.stated_by} & {*sensor.measured} else hints.healthy_std
         scale = float(sensor.scale_v_per_g[sensor.axes.index(name.axis)])
-        zero_g = hints.straight_line is StraightLine.ZERO_G
+        zero_g = hints.straight_line is base.StraightLine.ZERO_G
         if zero_g and not self.pose_known:
             return scale
         # Converters round or cut off, which shifts the zero-g by a part of a step.
@@ -360,7 +350,7 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     # What shows in the fast motion that a smooth reference lacks would be found in that.
     effects = [e for e in candidates() if (
         only is None or e.name in only or e.diagnosis.nuisance) and not (
-        fades and e.diagnosis.revealed_by is Manoeuvre.SHAKE and not e.exact
+        fades and e.diagnosis.revealed_by is base.Manoeuvre.SHAKE and not e.exact
         and e.concern is not Concern.REFERENCE)]
     for i, (comparison, output_v) in enumerate(zip(comparisons, baseline_v)):
         for k, effect in enumerate(effects):
@@ -394,10 +384,9 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     # The first column of an effect is that of its smallest start.
     nuisance_columns = [{names[k]: values for k, values in reversed(channel.items())
                          if hints_of(names[k]).nuisance} for channel in by_channel]
-    parts = parts_at_rest(comparisons, nuisance_columns, by_channel, len(names))
     return LinearModel(list(comparisons), baseline_v, kept, column_ids, names,
                        np.array(prior_std), channels, list(filters), by_channel, nuisance_columns,
-                       parts)
+                       parts_at_rest(comparisons, nuisance_columns, by_channel, len(names)))
 
 
 def filters_for(filters: Sequence[list[Whitener]], effects: Sequence[str]

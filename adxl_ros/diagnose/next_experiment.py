@@ -23,14 +23,8 @@ from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
-from adxl_ros.diagnose import linear_model as linear, noise_effects
-from adxl_ros.diagnose.comparison import (
-    at_search_rate,
-    BaselineComparison,
-    compare,
-    Reference,
-    with_values,
-)
+from adxl_ros.diagnose import comparison as beside, linear_model as linear, noise_effects
+from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.evidence import expected_drift_g, LinearFit
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
@@ -222,7 +216,7 @@ def predict(name: str, motion: Motion, begin_s: float, sensor: Sensor, effects: 
     at_rate = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
     columns = simulate(at_rate, motion, 0, begin_s)
     recording = Recording(name, columns.pop('time_s'), columns)
-    comparison = at_search_rate(compare(recording, at_rate))
+    comparison = beside.at_search_rate(beside.compare(recording, at_rate))
     model = linear.build_linear_model([comparison], only=effects)
     keys = _keys(model)
     places = {key: place for place, key in enumerate(keys.values())}

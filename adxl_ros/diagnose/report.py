@@ -19,17 +19,8 @@ from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern
 from adxl_ros.model.sensor import fitted_of, get, parameter_of
-from adxl_ros.report.quantities import (
-    amplitude_text,
-    counted,
-    Interval,
-    listed,
-    mg_text,
-    parameter_label,
-    parameter_text,
-    percent,
-    power_text,
-)
+from adxl_ros.report import quantities
+from adxl_ros.report.quantities import amplitude_text, Interval, listed, mg_text, percent
 from adxl_ros.report.screen import COLUMNS, wrapped
 import numpy as np
 
@@ -232,7 +223,7 @@ def badge(diagnosis: Diagnosis) -> str:
             'insufficient': 'TOO LITTLE DATA', 'unknown': 'UNKNOWN CAUSE',
             'inseparable': 'CAUSES NOT SEPARATED',
             'partly': f'PARTLY EXPLAINED, {percent(verdict.explained_share)}',
-            'explained': f'GAP EXPLAINED by {counted(len(verdict.effects), "effect")}',
+            'explained': f'GAP EXPLAINED by {quantities.counted(len(verdict.effects), "effect")}',
             }[verdict.status]
 
 
@@ -297,9 +288,9 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
         rows.append(Row('upper limit', mg_text(verdict.upper_limit_mps2),
                         'a larger gap would have shown'))
     else:
-        rows.append(Row('explained', power_text(verdict.explained), 'by ' + listed(
+        rows.append(Row('explained', quantities.power_text(verdict.explained), 'by ' + listed(
             sorted(verdict.best), 'and') if verdict.best else 'no effect on the mean'))
-    rows.append(Row('repeats, not explained', power_text(verdict.rest),
+    rows.append(Row('repeats, not explained', quantities.power_text(verdict.rest),
                     'by flexible functions, held out'))
     text, note = f'from {mg_text(verdict.material_mps2)}', 'smaller is no gap'
     if verdict.reference_mps2 > _MATTERS * verdict.material_mps2:
@@ -346,9 +337,9 @@ def closes(report: Report) -> bool:
 def shown_row(row: CouldShow, scale_v_per_g: float) -> list[str]:
     """Return effect, parameter, smallest and typical size, and the manoeuvre that shows it."""
     p, revealed_by = parameter_of(row.name), effect_named(row.name.effect).diagnosis.revealed_by
-    smallest, typical = (parameter_text({'value': v, 'unit': p.unit}, scale_v_per_g, 2)
+    smallest, typical = (quantities.parameter_text({'value': v, 'unit': p.unit}, scale_v_per_g, 2)
                          for v in (row.smallest, p.scale))
-    return [row.name.effect, parameter_label(p.name, False),
+    return [row.name.effect, quantities.parameter_label(p.name, False),
             smallest if row.shows else 'cannot show', typical,
             MENU[revealed_by].text if revealed_by else '']
 
@@ -439,13 +430,13 @@ def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
     is_single = len({key.partition('.')[0] for key in parameters}) == 1
     lines, zeros, all_v_per_g = [], [], report.baseline.scale_v_per_g
     for key, parameter in parameters.items():
-        label, ci = parameter_label(key, is_single), parameter.get('ci')
+        label, ci = quantities.parameter_label(key, is_single), parameter.get('ci')
         if ci and ci[0] <= 0 <= ci[1]:
             zeros.append(label)
         else:
             scale = dict(zip(report.baseline.axes, all_v_per_g)).get(
                 key.partition('.')[2], all_v_per_g.mean())
-            lines.append(f'{label} {parameter_text(parameter, float(scale))}'.strip())
+            lines.append(f'{label} {quantities.parameter_text(parameter, float(scale))}'.strip())
     return lines + ([f'{", ".join(zeros)}: not different from 0'.removeprefix(': ')]
                     if zeros else [])
 

@@ -21,13 +21,8 @@ from itertools import pairwise
 from math import prod
 from typing import NamedTuple
 
-from adxl_ros.diagnose.comparison import (
-    BaselineComparison,
-    direction_of_last_move,
-    gravity_slopes,
-    Reference,
-    time_since_move_s,
-)
+from adxl_ros.diagnose import comparison as beside
+from adxl_ros.diagnose.comparison import BaselineComparison, direction_of_last_move
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import FormDimension as Form
@@ -93,7 +88,7 @@ def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> li
     force_g = ((baseline_v - comparison.sensor.zero_g_v) / comparison.sensor.scale_v_per_g).T
     common, slopes = _common(comparison), np.zeros((2, len(AXES), 0))
     if comparison.joints:
-        slopes = gravity_slopes(*(joint(comparison.time_s) for joint in comparison.joints))
+        slopes = beside.gravity_slopes(*(joint(comparison.time_s) for joint in comparison.joints))
     bases = []
     for axis, along_g in enumerate(force_g):
         factors = {Form.TEMPERATURE: along_g, Form.SUPPLY: along_g,
@@ -169,7 +164,7 @@ def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, vol
         change_g, np.abs(change_g).max() * _SMALLEST_RATE)]
     basis[Form.DIRECTION] = np.array([d * factor for d in directions
                                       for factor in (np.ones_like(along_g), along_g)])
-    since_s = time_since_move_s(time_s, rates)
+    since_s = beside.time_since_move_s(time_s, rates)
     turning = np.sum([np.abs(r) * (np.abs(r) > _SMALLEST_RATE) for r in moving], axis=0)
     basis[Form.SINCE_MOVE] = _same_size([
         *(np.exp(-since_s / tau_s) for tau_s in _RELAXATION_S),
@@ -245,7 +240,7 @@ def dimensions(comparison: BaselineComparison) -> dict[str, np.ndarray]:
                    'rate_rad_s': np.hypot(*rates),
                    'direction_alpha': direction_of_last_move(rates[0]),
                    'direction_beta': direction_of_last_move(rates[1]),
-                   'since_move_s': np.minimum(time_since_move_s(time_s, rates),
+                   'since_move_s': np.minimum(beside.time_since_move_s(time_s, rates),
                                               _LONGEST_SINCE_MOVE_S)}
     return {name: v for name, v in values.items() if np.ptp(v) > _SMALLEST_RANGE}
 
@@ -256,7 +251,7 @@ def not_covered(comparisons: Sequence[BaselineComparison]) -> list[str]:
     for comparison in comparisons:
         covered |= {name for name, values in dimensions(comparison).items()
                     if name != 'temperature_c' or np.ptp(values) >= _SMALLEST_WARMING_C}
-    if all(c.reference is Reference.SIMULATOR for c in comparisons):
+    if all(c.reference is beside.Reference.SIMULATOR for c in comparisons):
         covered |= _STAGE_ONLY
     return [text for name, text in _COVERAGE.items() if name not in covered]
 

@@ -233,7 +233,6 @@ class Search:
     def __init__(self, model: LinearModel) -> None:
         self.model = model
         self.found = {frozenset[str](): fit_hypothesis(model, (), {}, {})}
-        self._null = model.null_fit
 
     @property
     def best(self) -> Hypothesis:
@@ -264,7 +263,7 @@ class Search:
                 break
             self._extend(best)
             if self.best.log_evidence - best.log_evidence < _IMMATERIAL * (
-                    best.log_evidence - self._null.log_evidence):
+                    best.log_evidence - self.model.null_fit.log_evidence):
                 break
         best = self.best
         for effect in {self.model.variants[i].effect for i in straight} - {*best.effects}:

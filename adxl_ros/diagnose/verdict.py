@@ -21,13 +21,7 @@ from typing import NamedTuple
 import warnings
 
 from adxl_ros.diagnose import evidence as linear
-from adxl_ros.diagnose.evidence import (
-    BLOCKS,
-    expected_drift_g,
-    LinearFit,
-    LinearisedHypothesis,
-    Whitener,
-)
+from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis, Whitener
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.residual_map import Basis
 from adxl_ros.model.constants import G0_MPS2
@@ -174,8 +168,9 @@ class HeldOutFits:
     @cached_property
     def drift_mps2(self) -> float:
         """Return the expected rms of the drift that the fitted noise has, m/s²."""
-        sizes_g = [expected_drift_g(w.effect, density, comparison) for w, density, (comparison, _)
-                   in zip(self._whiteners, self.drift_densities(), self.model.places)]
+        sizes_g = [linear.expected_drift_g(w.effect, density, comparison)
+                   for w, density, (comparison, _) in zip(
+                       self._whiteners, self.drift_densities(), self.model.places)]
         return float(G0_MPS2 * np.sqrt(np.mean(np.square(sizes_g))))
 
 

@@ -8,7 +8,6 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import PooledCoefficient, Population
 from adxl_ros.model.sensor import get, put, with_neutral
 import numpy as np
-import pytest
 from units import nominal
 
 NAMES = [Coefficient(*effect, axis) for effect in (('bias', 'offset_v'), (
@@ -35,34 +34,28 @@ def drawn(rng):
                MEAN + STD * rng.normal(size=4))
 
 
-def test_an_open_axis_takes_the_population(run_tool, tmp_path):
+def test_poses_take_the_population(run_tool, tmp_path):
     truth = replace(drawn(np.random.default_rng(1)), serial='N1')
     parameter_file.save(tmp_path / 'truth.yaml', truth)
     calibration_store.write_population(tmp_path / 'population.yaml', population(), [])
-    run_tool('simulate', 'tilt_alpha', '--params', 'truth.yaml', '--rate', 100, '-o', 'one.csv')
-    done = run_tool('fit', 'one.csv', '-o', 'unit.yaml')
-    assert done.returncode == 1 and 'y: its reference spans 0.00 g' in done.stderr
-    done = run_tool('fit', 'one.csv', '--prior', 'population.yaml', '-o', 'unit.yaml')
+    run_tool('simulate', 'sweep', '--params', 'truth.yaml', '--rate', 100, '-o', 'one.csv')
+    done = run_tool('fit', 'one.csv', '--model', 'linear', '--prior', 'population.yaml',
+                    '-o', 'unit.yaml')
     assert done.returncode == 0, done.stderr
     assert 'prior: population.yaml is the prior of 4 coefficients' in done.stdout
     unit = parameter_file.load(tmp_path / 'unit.yaml')
     std = dict(zip(unit.covariance_names, np.sqrt(np.diag(unit.covariance))))
-    assert std[NAMES[3]] == pytest.approx(1e-3, rel=0.01)
     assert std[NAMES[2]] < 0.97e-3
     assert np.all(np.abs(get(unit, NAMES) - get(truth, NAMES)) < 4 * STD)
     assert unit.provenance['prior'] == 'population.yaml'
 
 
 def test_a_stranger_is_named_by_fit(run_tool, tmp_path):
-    """A wrong prior is said and not used: the fit is that without it, or is refused."""
+    """A wrong prior is said and not used: the fit is that without it."""
     truth = drawn(np.random.default_rng(2))
     parameter_file.save(tmp_path / 'truth.yaml', truth)
     calibration_store.write_population(tmp_path / 'wrong.yaml', population(0.1), [])
-    for name in ('tilt_alpha', 'sweep'):
-        run_tool('simulate', name, '--params', 'truth.yaml', '--rate', 50, '-o', f'{name}.csv')
-    done = run_tool('fit', 'tilt_alpha.csv', '--prior', 'wrong.yaml', '-o', 'a.yaml')
-    assert done.returncode == 1 and not (tmp_path / 'a.yaml').exists()
-    assert 'is not of wrong.yaml: χ²' in done.stderr and 'does not determine' in done.stderr
+    run_tool('simulate', 'sweep', '--params', 'truth.yaml', '--rate', 50, '-o', 'sweep.csv')
     for arguments in (['--prior', 'wrong.yaml', '-o', 'a.yaml'], ['-o', 'b.yaml']):
         done = run_tool('fit', 'sweep.csv', '--model', 'linear', *arguments)
         assert done.returncode == 0, done.stderr

@@ -13,14 +13,21 @@ nuisance parameter with a prior.
 
 Gauge: p0, q0 of (11) and (13) belong to the zero-g and r0 of (15) to the scale factor. p1 and q1
 are the misalignment to first order, so that `cross_axis.linear` and `cross_axis_z.linear` stay 0.
-Products such as r1·p1·z·c distinguish them. Where these are significant (`term_selection`), both
-are fitted, with the datasheet's 1.5 % as prior. At rest x² + y² + z² is g², so that a square of
-the own axis equals those of the others, and `quadratic` is not fitted. The case's x is where
+Products such as r1·p1·z·c distinguish them. Where these are significant
+(`gauge_is_identifiable`), both are fitted, with the datasheet's 1.5 % as prior. At rest
+x² + y² + z² is g², so that a square of the own axis equals those of the others, and `quadratic` is
+not fitted. The case's x is where
 beta = 0 points, so that an offset of beta is part of the misalignment.
 
 A three-axis unit has the same kinds of terms on each axis: squares of both other axes
 (`cross_axis`, `cross_axis_z`), a scale factor that depends on either (`scale_factor_cross`,
 `scale_factor_z`), and a cube. A two-axis unit has those of the paper and a cube.
+
+Terms are selected by Bayes factors: the ratio of the marginal likelihoods of the poses with a term
+and without it. Coefficients are integrated over their priors, and both models have the stage error
+of the richer one. A candidate has a stage error of its own, so that what it explains is no error
+of the stage. Poses that share a setting of a joint share its error. A term that follows alpha,
+which is set a few times only, must therefore explain more than that error does by chance.
 """
 
 from __future__ import annotations
@@ -32,11 +39,12 @@ from adxl_ros.calibrate.fits import linear, linearisation
 from adxl_ros.calibrate.fits.linearisation import Linearised, linearised, StageError
 from adxl_ros.calibrate.poses import angle_jacobian, Poses, predicted_volts
 from adxl_ros.errors import UserError
-from adxl_ros.model.constants import AXES
-from adxl_ros.model.effects import effect_named
+from adxl_ros.model.constants import AXES, Z_90
+from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Place, Role
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import get, names_of, parameter_of, put, Sensor, with_neutral
+from adxl_ros.report.quantities import with_half_width
 import numpy as np
 import scipy
 
@@ -193,7 +201,6 @@ class _Search:
                  stated: StageError) -> None:
         self._measured, self._names, self._stated = poses, names, stated
         self._precision = prior_precision(names)  # Inverse prior variances, (p,)
-        self._sizes = np.array([parameter_of(name).scale for name in names])
         self._unit, self._stage = unit, stated  # Unit with coefficients, and stage error
         # Predicted errors of the angles, and the poses turned by them; see `_turned_linearly`
         none_rad = np.zeros((len(poses), 2))
@@ -245,7 +252,7 @@ class _Search:
             about = self._about(put(self._unit, self._names, values), poses)
             covariance = about.covariance(self._stage)
             step, information = about.solve(covariance)
-            step *= min(1.0, _MAX_STEP_SIZES / np.abs(step / self._sizes).max())
+            step *= min(1.0, _MAX_STEP_SIZES / np.abs(step / _sizes(self._names)).max())
             return _Iterate(values, step, 0.0, about, covariance, information)
 
         return gauss_newton(
@@ -338,20 +345,14 @@ def term_of(name: Coefficient) -> str:
 
 def effect_of(term: str) -> str:
     """Return the effect of a term, which is its name or one of `GAUGE`."""
-    return Coefficient.parse(term).effect if term in GAUGE else term
+    return term.partition('.')[0]
 
 
 def prior_precision(names: Sequence[Coefficient]) -> np.ndarray:
     """Return the inverse prior variances of coefficients about 0, (p,)."""
-    return 1 / np.square([_prior_std(name) for name in names])
-
-
-def _prior_std(name: Coefficient) -> float:
-    if name in _BASE_TILT:
-        return float(LEVEL_STD_RAD)
-    return parameter_of(name).scale * (
+    return 1 / np.square([LEVEL_STD_RAD if name in _BASE_TILT else parameter_of(name).scale * (
         _GAUGE_PRIOR_SIZES if term_of(name) in GAUGE else
-        _STAGE_PRIOR_SIZES if belongs_to_stage(name) else _SENSOR_PRIOR_SIZES)
+        _STAGE_PRIOR_SIZES if belongs_to_stage(name) else _SENSOR_PRIOR_SIZES) for name in names])
 
 
 def fisher_information(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
@@ -359,6 +360,11 @@ def fisher_information(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
     """Return the Fisher information, priors included, (p, p); the Cramér-Rao bound inverted."""
     about = linearised(unit, poses, names, prior_precision(names))
     return about.information(about.covariance(stage))
+
+
+def _sizes(names: Sequence[Coefficient]) -> np.ndarray:
+    """Return the typical sizes of coefficients, (p,)."""
+    return np.array([parameter_of(name).scale for name in names])
 
 
 def _turned(poses: Poses, errors_rad: np.ndarray) -> Poses:
@@ -382,7 +388,7 @@ def belongs_to_stage(name: Coefficient) -> bool:
 def open_coefficients(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
                       stage: StageError) -> list[Coefficient]:
     """Return the sensor's coefficients that poses leave as uncertain as their typical size."""
-    scale = np.array([parameter_of(name).scale for name in names])
+    scale = _sizes(names)
     required = [not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_PRIOR_SUFFICES)
                 for name in names]
     # The poses must determine a required coefficient without its prior.
@@ -412,10 +418,185 @@ def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
 def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError) -> str:
     """Name the poses of a 15° grid that would help most (D-optimality; Fedorov 1972), in deg."""
     grid = linearisation.candidate_poses(np.median(poses.std_v, axis=0))
-    scale = np.array([parameter_of(name).scale for name in names])
+    scale = _sizes(names)
     rows = linearisation.whitened_jacobian(unit, grid, tuple(names), stage) * scale
     information = fisher_information(unit, poses, names, stage) * np.outer(scale, scale)
     chosen = linearisation.choose_poses(rows, information + _REGULARISATION * np.eye(len(names)),
                                         _NAMED_POSES)
     return ', '.join(f'({np.degrees(grid.alpha_rad[i]):.0f}, {np.degrees(grid.beta_rad[i]):.0f})'
                      for i in chosen)
+
+
+ALWAYS = ('bias', 'scale_factor')  # Terms that every fit has and that are not compared
+MAX_OPEN = 3
+"""Largest number of the twelve coefficients that their priors may give. Chosen: an axis that never
+points up or down leaves its scale factor and two misalignments open."""
+_MIN_CHANGE = {'temperature_c': 0.5, 'supply_v': 0.02}
+"""Smallest range of temperature, °C, and supply, V, for which effects that follow them are
+candidates. Chosen: 0.5 °C changes the zero-g by 0.05 mg, about the noise of a mean."""
+_MAX_ADDED = 6  # Largest count of added terms
+_GAUGE_CHANCE = 0.01  # Probability of freeing the linear cross-axis terms although they are 0
+
+
+@dataclass(frozen=True)
+class Term:
+    """Evidence for a term."""
+
+    name: str  # Effect, or one of `GAUGE`
+    is_fitted: bool  # Whether the fit has the term
+    # Log marginal likelihood of the poses with the term minus that without, nats
+    log_bayes_factor: float
+
+    @property
+    def is_supported(self) -> bool:
+        """Return whether the poses are more likely with the term than without it."""
+        return self.log_bayes_factor > 0.0
+
+
+def candidates(poses: Poses) -> tuple[str, ...]:
+    """Name the terms that these poses may need beyond the default ones."""
+    changed = {name for name, change in _MIN_CHANGE.items()
+               if np.ptp(getattr(poses.environment, name)) > change}
+    following = [name for name, effect in library().items()
+                 if effect.invertible and changed & set(effect.follows)]
+    return ('stage_eccentricity', *following)
+
+
+def fit(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> Sensor:
+    """Fit the full model with selected terms, and with some effects in any case."""
+    return fit_selected(sensor, poses, effects)[0].fitted
+
+
+def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
+                 ) -> tuple[FullFit, list[Term]]:
+    """Fit the full model and effects as `fit_full` does, and add terms that the poses support."""
+    terms = tuple(dict.fromkeys((*default_terms(sensor.axes), *effects)))
+    full = fit_full(sensor, poses, terms)
+    if gauge_is_identifiable(full):
+        terms = (*terms, *GAUGE)
+        full = fit_full(sensor, poses, terms)
+    compared = compare_terms(full)
+    for _ in range(_MAX_ADDED):
+        supported = [term for term in compared if not term.is_fitted and term.is_supported]
+        if not supported:
+            break
+        # One at a time: what one term explains, another need not.
+        terms = (*terms, max(supported, key=lambda term: term.log_bayes_factor).name)
+        full = fit_full(sensor, poses, terms)
+        compared = compare_terms(full)
+    return full, compared
+
+
+def compare_terms(full: FullFit) -> list[Term]:
+    """Compare the fit, linearised there, with models that have one term less or one term more."""
+    about, term = _linearised(full, ())
+    log_likelihood = -about.deviance(full.stage) / 2
+    compared = []
+    for name in dict.fromkeys(term):
+        if name in ALWAYS or name in GAUGE:
+            continue
+        excluded = term == name
+        if name == 'misalignment':
+            # The linear cross-axis terms would take its place.
+            excluded = excluded | np.isin(term, GAUGE)
+        poorer = -about.without(excluded).deviance(full.stage) / 2
+        compared.append(Term(str(name), True, log_likelihood - poorer))
+    for name in candidates(full.linear_poses):
+        if name not in term:
+            richer, _ = _linearised(full, [name])
+            stage = richer.stage_error(full.stated_std_rad, full.stage)
+            compared.append(Term(name, False, -richer.deviance(stage) / 2 - log_likelihood))
+    return compared
+
+
+def gauge_is_identifiable(full: FullFit) -> bool:
+    """
+    Test whether the poses distinguish the linear cross-axis terms from the misalignment.
+
+    The test is the likelihood ratio of all of these terms, two for each axis. A fit without them
+    has errors of the size of their products with other terms.
+    """
+    about, term = _linearised(full, GAUGE)
+    gauge = np.isin(term, GAUGE)
+    ratio = about.without(gauge).misfit(full.stage) - about.misfit(full.stage)
+    return bool(ratio > scipy.special.chdtri(gauge.sum(), _GAUGE_CHANCE))
+
+
+def _linearised(full: FullFit, added: Sequence[str]) -> tuple[Linearised, np.ndarray]:
+    """Linearise the fit with further terms; also return the term of each coefficient, (p,)."""
+    unit = with_neutral(full.unit, map(effect_of, added))
+    further = [name for term in added
+               for name in fitted_coefficients(unit.axes, (term,))
+               if name not in full.names]
+    names = (*full.names, *further)
+    return (linearised(unit, full.linear_poses, names, prior_precision(names),
+                       full.kept),
+            np.array([term_of(name) for name in names]))
+
+
+NOT_CONVERGED = ('the fit did not converge: coefficients and intervals are those of its last '
+                 'step; add poses, or leave out terms')
+"""Line of a fit that did not converge."""
+_MAX_WARMING_K = 3.0
+"""Range of temperature beyond which the report warns, K: 0.3 mg by the datasheet's 0.1 mg/°C."""
+_BAD_STAGE_RATIO = 1.5
+"""Ratio of the estimated to the stated stage error from which the report warns."""
+_MIN_STAGE_EXCESS_RAD = 1e-5
+"""Excess over that ratio from which the report warns, rad, for a stage without a stated error."""
+_MAX_PARTS = 4  # Largest count of components of the weakest direction in the report
+_MIN_PART = 0.2  # Smallest component of the weakest direction, a unit vector, in the report
+
+
+def report_lines(full: FullFit, poses: Poses, terms: Sequence[Term]) -> list[str]:
+    """Report the stage, the weakest direction and the terms of a fit of poses."""
+    helpful = next_poses(full.unit, poses, full.names, full.stage)
+    return [
+        *_stage_lines(full),
+        _weakest_direction(full.fitted),
+        f'next poses that would help most, (alpha, beta) in deg: {helpful}',
+        *(['log Bayes factor of each term, nats; above 0 the poses support it:'] if terms else []),
+        *(f'  {term.name:20} {term.log_bayes_factor:10.1f}'
+          f'{"" if term.is_supported else "   not supported by these poses"}' for term in terms)]
+
+
+def _weakest_direction(fitted: Sensor) -> str:
+    """Name the direction that the poses determine least, in typical sizes, and the condition."""
+    names, scale = fitted.covariance_names, _sizes(fitted.covariance_names)
+    values, vectors = np.linalg.eigh(fitted.covariance / np.outer(scale, scale))
+    weakest = vectors[:, -1]
+    parts = ' '.join(f'{weakest[i]:+.2f} {names[i]}' for i in np.argsort(-np.abs(weakest))[
+        :_MAX_PARTS] if abs(weakest[i]) > _MIN_PART)
+    return (f'least determined: {parts}, std {np.sqrt(values[-1]):.2g} typical sizes (condition '
+            f'number {np.sqrt(values[-1] / values[0]):.0f})')
+
+
+def warnings(full: FullFit, poses: Poses) -> list[str]:
+    """Return what is wrong with the poses or the fit, one line each."""
+    lines = [] if full.converged else [NOT_CONVERGED]
+    if full.stage.total_rad > _BAD_STAGE_RATIO * full.stated_std_rad + _MIN_STAGE_EXCESS_RAD:
+        lines.append('the reference is worse than stated, or the model lacks an effect that looks '
+                     'like a stage error; poses are weighted accordingly')
+    if full.outliers:
+        named = [f'{i + 1} (alpha {np.degrees(poses.alpha_rad[i]):.1f}, beta '
+                 f'{np.degrees(poses.beta_rad[i]):.1f} deg, from {poses.time_s[i, 0]:.1f} s, '
+                 f'{np.sqrt(full.squared_distances[i]):.0f} sigma)' for i in full.outliers]
+        lines.append(f'outliers, left out: pose {", ".join(named)}')
+    change_k = np.ptp(poses.environment.temperature_c)
+    if change_k > _MAX_WARMING_K and 'temperature_bias' not in full.fitted.effects:
+        lines.append(f'temperature moved by {change_k:.1f} degC, which the model ignores; keep it '
+                     'steady, or fit --effect temperature_bias')
+    return lines
+
+
+def _stage_lines(full: FullFit) -> list[str]:
+    setting_deg = np.degrees(full.stage.setting_rad * full.stage.joints)
+    pose_deg = np.degrees(full.stage.pose_rad * full.stage.joints)
+    lines = [f'stage error: alpha {setting_deg[0]:.2g}, beta {setting_deg[1]:.2g} deg rms by '
+             f'setting, {pose_deg[0]:.2g} and {pose_deg[1]:.2g} deg by pose (stated '
+             f'{np.degrees(full.stated_std_rad):.2g} deg)']
+    std = np.sqrt(np.diag(np.linalg.inv(full.information)))
+    values = [f'{name} {with_half_width(float(value), Z_90 * value_std)} {parameter_of(name).unit}'
+              for name, value, value_std in zip(full.names, get(full.unit, full.names), std)
+              if belongs_to_stage(name)]
+    lines.append(f'stage: {", ".join(values)} (90 % intervals)')
+    return lines

@@ -25,19 +25,14 @@ _MIN_SPAN_G = 0.2
 cross-axis terms dominate the slope."""
 
 
-_OPEN_STD_V = 0.5  # Prior std of a zero-g that may be open; chosen: far wider than any unit
-_OPEN_STD_V_PER_G = 0.2  # Prior std of a scale factor that may be open; chosen: as above
-
-
-def fit(sensor: Sensor, poses: Poses, may_be_open: bool = False) -> Sensor:
+def fit(sensor: Sensor, poses: Poses) -> Sensor:
     """
     Fit scale factor and zero-g of each axis by least squares over the reference.
 
     Where an axis has been at +1 g and at −1 g, only those poses count, which is
     SF = (V₊ − V₋)/2 (1) and B = (V₊ + V₋)/2 (2), in g of 9.80665 m/s². Otherwise all poses count.
     The covariance is scaled to the residuals over all poses, so that it covers what the linear
-    model leaves out. Poses that do not determine a scale factor are refused, unless it may be
-    open: it is nominal then, with an uncertainty that any prior reduces.
+    model leaves out. Poses that do not determine a scale factor are refused.
     """
     force = np.column_stack(reference_force(poses, sensor.local_gravity_mps2)) / G0_MPS2
     nominal = np.column_stack([sensor.nominal_zero_g_v, sensor.nominal_scale_v_per_g])
@@ -45,41 +40,28 @@ def fit(sensor: Sensor, poses: Poses, may_be_open: bool = False) -> Sensor:
     lines, covariance = np.zeros((count, 2)), np.zeros((2 * count, 2 * count))
     for d, axis in enumerate(sensor.axes):
         reference_g = force[:, AXES.index(axis)]
-        volts, std_v = poses.volts[:, d], poses.std_v[:, d]
         used = np.abs(reference_g) >= sensor.local_gravity_mps2 / G0_MPS2 * _UPRIGHT_COS
         if not ((reference_g[used] > 0).any() and (reference_g[used] < 0).any()):
-            used = np.ones(len(volts), bool)
+            used = np.ones(len(poses), bool)
         span_g = np.ptp(reference_g[used])
-        is_open = may_be_open and span_g < _MIN_SPAN_G
-        if not is_open and (used.sum() < 2 or span_g < _MIN_SPAN_G):
+        if used.sum() < 2 or span_g < _MIN_SPAN_G:
             raise UserError(f'{axis}: its reference spans {span_g:.2f} g over {used.sum()} poses, '
                             'which does not determine the scale factor; add poses with the axis '
                             'up and down')
-        lines[d], of_axis = _fit_line(reference_g, volts, std_v, used, nominal[d], is_open)
-        covariance[np.ix_([d, count + d], [d, count + d])] = of_axis
+        design = np.column_stack([np.ones(len(poses)), reference_g])
+        departure = poses.volts[:, d] - design @ nominal[d]
+        change = np.linalg.lstsq(design[used], departure[used], rcond=None)[0]
+        lines[d] = nominal[d] + change
+        variance = max(np.sum((departure - design @ change) ** 2) / max(len(poses) - 2, 1),
+                       np.mean(poses.std_v[:, d] ** 2))
+        covariance[np.ix_([d, count + d], [d, count + d])] = np.linalg.inv(
+            design[used].T @ design[used] / variance)
     values = {'bias': {'offset_v': lines[:, 0] - sensor.nominal_zero_g_v},
               'scale_factor': {'offset_v_per_g': lines[:, 1] - sensor.nominal_scale_v_per_g}}
     names = [Coefficient(effect, parameter, axis) for effect, by_parameter in values.items()
              for parameter in by_parameter for axis in sensor.axes]
     return replace(sensor, model='linear', effects=('bias', 'scale_factor'), values=values,
                    covariance=covariance, covariance_names=tuple(names))
-
-
-def _fit_line(reference_g: np.ndarray, volts: np.ndarray, std_v: np.ndarray, used: np.ndarray,
-              nominal: np.ndarray, is_open: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Fit zero-g and scale factor to the poses used; values, (2,), and covariance, (2, 2)."""
-    design = np.column_stack([np.ones(len(volts)), reference_g])
-    departure = volts - design @ nominal
-    line = np.zeros(2) if is_open else np.linalg.lstsq(design[used], departure[used],
-                                                       rcond=None)[0]
-    residual, freedom = departure - design @ line, len(volts) - (1 if is_open else 2)
-    variance = max(np.sum((residual - is_open * residual.mean()) ** 2) / max(freedom, 1),
-                   np.mean(std_v ** 2))
-    prior = is_open * np.diag([_OPEN_STD_V ** -2, _OPEN_STD_V_PER_G ** -2])
-    covariance = np.linalg.inv(design[used].T @ design[used] / variance + prior)
-    if is_open:
-        line = covariance @ (design.T @ departure) / variance
-    return nominal + line, covariance
 
 
 EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z',
@@ -226,8 +208,7 @@ def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:
     variance = poses.std_v ** 2 + np.sum(
         angle_jacobian(fitted, poses) ** 2 * fitted.stage_std_rad ** 2, axis=2)
     chi2 = np.sum((poses.volts - predicted) ** 2 / variance)
-    freedom = max(poses.volts.size - len(fitted.covariance_names), 1)
-    widening = np.sqrt(max(chi2 / freedom, 1.0))
+    widening = np.sqrt(max(chi2 / max(poses.volts.size - len(fitted.covariance_names), 1), 1.0))
     rng = np.random.default_rng(0)
     drawn = []
     for _ in range(_REPLICAS):

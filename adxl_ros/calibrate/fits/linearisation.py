@@ -254,8 +254,7 @@ class Linearised:
         """Return the minimum of rᵀS⁻¹r plus the prior's sum of squares."""
         covariance = self.covariance(error)
         step, _ = self.solve(covariance)
-        residual = (self.residual - self.design @ step)[:, :, None]
-        return float(covariance.products(residual)[0, 0]
+        return float(covariance.products((self.residual - self.design @ step)[:, :, None])[0, 0]
                      + np.sum(self.precision * (self.values + step) ** 2))
 
     def deviance(self, error: StageError) -> float:
@@ -373,5 +372,4 @@ def whitened_jacobian(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...]
                       stage: StageError) -> np.ndarray:
     """Return the Jacobian, (k, m, p), whitened by noise and stage error, without settings."""
     design = coefficient_jacobian(unit, poses, names)
-    covariance = volts_covariance(unit, poses, stage)
-    return covariance.whiten_by_pose(design).reshape(design.shape)
+    return volts_covariance(unit, poses, stage).whiten_by_pose(design).reshape(design.shape)

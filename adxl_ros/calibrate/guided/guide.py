@@ -16,13 +16,8 @@ from adxl_ros.files.recording_columns import stamped_rate_hz
 from adxl_ros.files.sweep_journal import JournalEntry, PoseDropped, PoseRecord
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.report.quantities import duration
-from adxl_ros.signals.rest_detection import (
-    datasheet_noise,
-    Rest,
-    rest_means,
-    RestFinder,
-    Stillness,
-)
+from adxl_ros.signals import rest_detection
+from adxl_ros.signals.rest_detection import datasheet_noise, Rest, Stillness
 import numpy as np
 
 _REST_WINDOW_S = 1.2
@@ -115,8 +110,8 @@ class Dwell:
     def __init__(self, sensor: Sensor, arrived_ns: int) -> None:
         self.arrived_ns = arrived_ns
         self._sensor = sensor
-        self._finder = RestFinder(sensor.rate_hz, len(sensor.axes), datasheet_noise(sensor),
-                                  learn=False)
+        self._finder = rest_detection.RestFinder(sensor.rate_hz, len(sensor.axes),
+                                                 datasheet_noise(sensor), learn=False)
         self._stamps: list[np.ndarray] = []
         self._volts: list[np.ndarray] = []
 
@@ -162,7 +157,7 @@ class Dwell:
         """Average the first samples of a rest."""
         stamps, start, stop = np.concatenate(self._stamps), rest.start, rest.start + samples
         times = (stamps - self.arrived_ns) * 1e-9
-        mean, std = rest_means(times, np.concatenate(self._volts),
+        mean, std = rest_detection.rest_means(times, np.concatenate(self._volts),
                                [Rest(start, stop, times[start], times[stop - 1])],
                                self._sensor.rate_hz, datasheet_noise(self._sensor))
         return PoseRecord(pose=pose, start_ns=int(stamps[start]), stop_ns=int(stamps[stop - 1]),

@@ -12,14 +12,8 @@ import math
 from adxl_ros.calibrate.fits import gravity_fit, thermal_fit
 from adxl_ros.calibrate.fits.gravity_fit import force_g, MIN_RESTS, NAMES, nominal_rests
 from adxl_ros.calibrate.fits.thermal_fit import PARTS
-from adxl_ros.calibrate.guided import pose_plan, running_estimate
-from adxl_ros.calibrate.guided.guide import (
-    Dwell,
-    Guide,
-    NextPose,
-    temperature_fault,
-    with_ambient,
-)
+from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate
+from adxl_ros.calibrate.guided.guide import Dwell, Guide, NextPose
 from adxl_ros.calibrate.guided.screen_contents import Phase, Row, Status, tilt_row
 from adxl_ros.calibrate.poses import at_a_rail, Poses
 from adxl_ros.errors import UserError
@@ -123,9 +117,8 @@ class HandRests(Guide):
         kept = [record for record in self._records(0) if not self._fault(record) and not any(
             record.start_ns <= other.stop_ns and other.start_ns <= record.stop_ns
             for other in self._dropped)]
-        first = len(self._resumed)
         return [*self._resumed, *(replace(record, pose=number)
-                                  for number, record in enumerate(kept, first))]
+                                  for number, record in enumerate(kept, len(self._resumed)))]
 
     def stillness(self) -> Stillness | None:
         """Return whether the newest samples are at rest, by the noise that the stream shows."""
@@ -166,7 +159,7 @@ class HandRests(Guide):
         """Return why a rest is refused, or ''."""
         if at_a_rail(self.sensor, Poses.from_records([record])).any():
             return 'saturated: the ADC is at its rail in this rest; check supply and wiring'
-        return temperature_fault(self.accepted, record.temperature_c, self._span_c)
+        return guide.temperature_fault(self.accepted, record.temperature_c, self._span_c)
 
     def _records(self, number: int) -> Iterator[PoseRecord]:
         """Give a record of each rest of the stream, each with the same number."""
@@ -177,7 +170,7 @@ class HandRests(Guide):
         for rest in self._finder.rests():
             mean_v, std_v = self._finder.means([rest])
             span = int(stamps_ns[rest.start]), int(stamps_ns[rest.stop - 1])
-            yield with_ambient(PoseRecord(
+            yield guide.with_ambient(PoseRecord(
                 pose=number, start_ns=span[0], stop_ns=span[1], samples=rest.stop - rest.start,
                 mean_v=tuple(mean_v[0].tolist()), std_v=tuple(std_v[0].tolist())), self.readings)
 
@@ -277,7 +270,7 @@ class ThermalGuide(Guide):
             if len(dwell) > _PATIENCE * samples:
                 self._dwell = None
             return None
-        record = with_ambient(
+        record = guide.with_ambient(
             dwell.record(max(self.accepted, default=-1) + 1, rest, samples), self.readings)
         self.refuse('no temperature: nothing on the topic temperature; publish the reading of a '
                     'thermometer at the sensor' if not math.isfinite(record.temperature_c) else

@@ -73,9 +73,8 @@ class RunningEstimate:
         angles_rad = np.array([(target.alpha_rad, target.beta_rad) for target in targets])
         poses = Poses.without_volts(angles_rad[:, 0], angles_rad[:, 1], self.pose_std_v)
         model = linearised(self.unit, poses, self.names, np.zeros(len(self.names)))
-        information = model.information(model.covariance(self.stage))
         return replace(self, covariance=np.linalg.inv(
-            np.linalg.inv(self.covariance) + information))
+            np.linalg.inv(self.covariance) + model.information(model.covariance(self.stage))))
 
     def tilt_error_rad(self) -> float:
         """Return the expected rms error of alpha and beta over the sphere, rad."""

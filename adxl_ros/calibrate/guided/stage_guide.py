@@ -7,17 +7,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
-from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate
+from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate, screen_contents
 from adxl_ros.calibrate.guided.guide import Dwell, EncoderTrack, Guide, NextPose, temperature_fault
 from adxl_ros.calibrate.guided.pose_plan import Course, MOVE_S, Target
-from adxl_ros.calibrate.guided.screen_contents import (
-    CaptureSettings,
-    Phase,
-    Row,
-    StageMode,
-    Status,
-    tilt_row,
-)
+from adxl_ros.calibrate.guided.screen_contents import Phase, Row, StageMode, Status
 from adxl_ros.calibrate.poses import angle_tolerance_rad, SettingTracker
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord, PoseSkipped
@@ -38,8 +31,9 @@ class MountingError(UserError):
 class StageSweep(Guide):
     """Takes the poses of a plan: after arrival or capture a full dwell at rest is averaged."""
 
-    def __init__(self, sensor: Sensor, targets: Sequence[Target], settings: CaptureSettings,
-                 accepted: Sequence[PoseRecord] = (), skipped: Iterable[int] = ()) -> None:
+    def __init__(self, sensor: Sensor, targets: Sequence[Target],
+                 settings: screen_contents.CaptureSettings, accepted: Sequence[PoseRecord] = (),
+                 skipped: Iterable[int] = ()) -> None:
         super().__init__(sensor, accepted)
         self.settings = settings
         self.moves_itself = settings.stage_mode is StageMode.COMMANDED
@@ -347,7 +341,8 @@ class StageGuide(StageSweep):
     def estimated(self) -> tuple[list[Row], list[Row]]:
         """Return coverage and error, and the coefficients by the poses so far, for the screen."""
         targets, closed = self.course.targets, self.course.closed
-        final = self.estimate.with_poses([target for number, target in enumerate(targets)
-                                          if number not in closed and not target.check])
+        final_rad = self.estimate.with_poses(
+            [target for number, target in enumerate(targets)
+             if number not in closed and not target.check]).tilt_error_rad()
         return [Row('coverage', pose_plan.by_plane(targets, self.accepted)),
-                tilt_row(self.tilt_error_rad(), final.tilt_error_rad())], self.estimate.rows()
+                screen_contents.tilt_row(self.tilt_error_rad(), final_rad)], self.estimate.rows()

@@ -123,11 +123,10 @@ def unit_line(sensor: Sensor) -> list[str]:
         return []
     names = sensor.covariance_names
     half_widths = Z_90 * np.sqrt(np.diag(sensor.covariance))
-    maxima = [sensor.datasheet.get(name.without_axis, (0.0, 0.0))[1] for name in names]
     beyond = [f'{name} is {with_half_width(float(value), half_width)} {parameter_of(name).unit}, '
               f'beyond {maximum:g}'
-              for name, value, half_width, maximum in zip(names, get(sensor, names), half_widths,
-                                                          maxima)
+              for name, value, half_width in zip(names, get(sensor, names), half_widths)
+              for _, maximum in [sensor.datasheet.get(name.without_axis, (0.0, 0.0))]
               if 0 < maximum < abs(value) - half_width]
     return [f'unit within {sensor.datasheet_name or "its datasheet"}: '
             + (f'{FAIL}: {"; ".join(beyond)}' if beyond else PASS)]

@@ -188,8 +188,7 @@ def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray,
     inverse = signal_chain.inverse(fitted, np.where(np.cos(held.alpha_rad) < 0, -1, 1))
     shifted = [np.column_stack(inverse(list(held.volts.T), environment._replace(
         **{field: getattr(environment, field) + sign * step}))) for sign in (1, -1)]
-    axes = [AXES.index(axis) for axis in fitted.axes]
-    slope = (shifted[0] - shifted[1])[:, axes] / (2 * step)
+    slope = (shifted[0] - shifted[1])[:, [AXES.index(axis) for axis in fitted.axes]] / (2 * step)
     if name == 'temperature':
         # What the model does not follow drifts as the datasheet states.
         slope = np.sqrt(slope ** 2 + (G0_MPS2 * fitted.envelope.zero_g_per_k) ** 2
