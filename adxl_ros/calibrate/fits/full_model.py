@@ -550,8 +550,17 @@ _MIN_PART = 0.2  # Smallest component of the weakest direction, a unit vector, i
 def report_lines(full: FullFit, poses: Poses, terms: Sequence[Term]) -> list[str]:
     """Report the stage, the weakest direction and the terms of a fit of poses."""
     helpful = next_poses(full.unit, poses, full.names, full.stage)
+    setting_deg, pose_deg = (np.degrees(rad * full.stage.joints) for rad in (
+        full.stage.setting_rad, full.stage.pose_rad))
+    std = np.sqrt(np.diag(np.linalg.inv(full.information)))
+    values = [f'{name} {with_half_width(float(value), Z_90 * value_std)} {parameter_of(name).unit}'
+              for name, value, value_std in zip(full.names, get(full.unit, full.names), std)
+              if belongs_to_stage(name)]
     return [
-        *_stage_lines(full),
+        f'stage error: alpha {setting_deg[0]:.2g}, beta {setting_deg[1]:.2g} deg rms by setting, '
+        f'{pose_deg[0]:.2g} and {pose_deg[1]:.2g} deg by pose (stated '
+        f'{np.degrees(full.stated_std_rad):.2g} deg)',
+        f'stage: {", ".join(values)} (90 % intervals)',
         _weakest_direction(full.fitted),
         f'next poses that would help most, (alpha, beta) in deg: {helpful}',
         *(['log Bayes factor of each term, nats; above 0 the poses support it:'] if terms else []),
@@ -585,18 +594,4 @@ def warnings(full: FullFit, poses: Poses) -> list[str]:
     if change_k > _MAX_WARMING_K and 'temperature_bias' not in full.fitted.effects:
         lines.append(f'temperature moved by {change_k:.1f} degC, which the model ignores; keep it '
                      'steady, or fit --effect temperature_bias')
-    return lines
-
-
-def _stage_lines(full: FullFit) -> list[str]:
-    setting_deg = np.degrees(full.stage.setting_rad * full.stage.joints)
-    pose_deg = np.degrees(full.stage.pose_rad * full.stage.joints)
-    lines = [f'stage error: alpha {setting_deg[0]:.2g}, beta {setting_deg[1]:.2g} deg rms by '
-             f'setting, {pose_deg[0]:.2g} and {pose_deg[1]:.2g} deg by pose (stated '
-             f'{np.degrees(full.stated_std_rad):.2g} deg)']
-    std = np.sqrt(np.diag(np.linalg.inv(full.information)))
-    values = [f'{name} {with_half_width(float(value), Z_90 * value_std)} {parameter_of(name).unit}'
-              for name, value, value_std in zip(full.names, get(full.unit, full.names), std)
-              if belongs_to_stage(name)]
-    lines.append(f'stage: {", ".join(values)} (90 % intervals)')
     return lines
