@@ -14,8 +14,7 @@ from enum import Enum
 from functools import cached_property
 from typing import Any
 
-from adxl_ros.files.bag_reader import LONGEST_MOVE_NS, USUAL_GAPS
-from adxl_ros.files.recording_columns import JOINTS, Recording
+from adxl_ros.files.recording_columns import JOINTS, LONGEST_MOVE_NS, Recording, USUAL_GAPS
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named

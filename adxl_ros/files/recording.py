@@ -14,11 +14,10 @@ from contextlib import contextmanager
 from dataclasses import replace
 import os
 from pathlib import Path
+from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import bag_reader, mapped_recording
-from adxl_ros.files.bag_writer import recording_bag
-from adxl_ros.files.column_guess import describe
+from adxl_ros.files import mapped_recording
 from adxl_ros.files.column_mapping import AS_IT_IS, Mounting, parse_mapping, ReadingOptions
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import ACCEL, concatenate, Recording, TIME, VOLTS
@@ -69,9 +68,15 @@ def blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions = AS_IT_I
     All blocks have the same columns, except for a CSV column that turns out to be text further
     down. Alignments, cut and remarks of a block are those up to its end.
     """
-    read_blocks = bag_reader.blocks(path, rows, reading=reading) if is_bag(path) else \
+    read_blocks = _bag_blocks(path, rows, reading=reading) if is_bag(path) else \
         _table_blocks(path, rows, reading)
     return _mounted(read_blocks, reading.mounting) if reading.mounting else read_blocks
+
+
+def _bag_blocks(path: str | os.PathLike, rows: int, **options: Any
+                ) -> Generator[Recording, None, None]:
+    from adxl_ros.files import bag_reader  # tables need none of it
+    return bag_reader.blocks(path, rows, **options)
 
 
 def _table_blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions
@@ -83,6 +88,7 @@ def _table_blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions
     try:
         yield from mapped_recording.blocks(table, mapping, reading, rows)
     except mapped_recording.NotNativeError as error:
+        from adxl_ros.files.column_guess import describe  # few files need it
         text, options = describe(table)
         raise UserError(f'{error}; {text}', options) from None
 
@@ -130,7 +136,7 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> Recording:
         The file cannot be read, or an axis is missing.
 
     """
-    parts = (bag_reader.blocks(path, _BLOCK_ROWS, ideal=True) if is_bag(path)
+    parts = (_bag_blocks(path, _BLOCK_ROWS, ideal=True) if is_bag(path)
              else mapped_recording.blocks(open_table(path), None, AS_IT_IS, _BLOCK_ROWS, ACCEL))
     ideal = concatenate(parts)
     return replace(ideal, time_s=ideal.time_s + (ideal.epoch_ns - epoch_ns) / 1e9,
@@ -146,6 +152,7 @@ def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Record
     ending determines the format. A bag holds the nominal conversion of `sensor`.
     """
     if Path(path).suffix != '.csv':
+        from adxl_ros.files.bag_writer import recording_bag  # tables need none of it
         with recording_bag(path, sensor) as append:
             yield append
         return

@@ -396,3 +396,85 @@ def recorded_unit(sensor: Sensor, recording: Recording) -> Sensor:
     """Return the nominal sensor of a recording, with the sample rate of its stamps."""
     unit = unit_of(sensor, recording.stream_info, recording.axes, recording.rate_hz)
     return replace(unit, provenance={**unit.provenance, 'rate_from': Path(recording.path).name})
+
+
+LONGEST_MOVE_NS = 1e8
+"""Longest time between two messages in which a joint moves, ns, that is interpolated. Chosen: an
+acceleration of 1 rad/s² then bends the path by 1 mrad, which is the noise of an ADXL203."""
+USUAL_GAPS = 3.0
+"""Gap between messages, in usual ones, that is bridged, however long. Chosen: a slow reference
+loses single messages."""
+
+
+def seconds(stamp_ns: int) -> str:
+    """Return a stamp, ns, as text in seconds with all nanoseconds."""
+    whole_s, rest_ns = divmod(int(stamp_ns), 1_000_000_000)
+    return f'{whole_s}.{rest_ns:09d} s'
+
+
+class Track:
+    """
+    One reference over time.
+
+    Between two messages the value is on the straight line between theirs; angles are not
+    wrapped. Before the first and after the last message their value is held for one period of the
+    reference; beyond that the reference is NaN. So it is in a long gap over which it has changed:
+    nobody knows how.
+    """
+
+    def __init__(self, where: str, stamp_ns: np.ndarray, value: np.ndarray,
+                 longest_ns: float = np.inf) -> None:
+        """
+        Take the messages.
+
+        stamp_ns: stamps, ns, (k,). Of messages with the same stamp the last one counts; value:
+        values, (k,); NaN where it was not sampled; longest_ns: gap that is bridged, ns.
+        """
+        stamps, values = stamp_ns[~np.isnan(value)], value[~np.isnan(value)]
+        step = np.diff(stamps)
+        if (step < 0).any():
+            i = int((step < 0).argmax())
+            raise UserError(f'{where}: time runs backwards: {seconds(stamps[i + 1])} comes '
+                            f'after {seconds(stamps[i])}')
+        is_last = np.append(step > 0, True)[:len(stamps)]
+        self._stamp_ns, self._value = stamps[is_last], values[is_last]
+        step = step[step > 0]
+        self._usual_ns = float(np.median(step)) if len(step) else 0.0
+        self._longest_ns = max(longest_ns, USUAL_GAPS * self._usual_ns)
+        self._gap_ns = 0
+
+    def interpolate(self, stamp_ns: np.ndarray) -> np.ndarray:
+        """Return the reference at ascending stamps, ns, (n,): (n,), NaN where it is unknown."""
+        if not len(self._stamp_ns) or not len(stamp_ns):
+            return np.full(len(stamp_ns), np.nan)
+        first, last = np.searchsorted(self._stamp_ns, stamp_ns[[0, -1]])
+        part = slice(max(first - 1, 0), last + 1)  # The messages around the samples
+        values, begin_ns = self._value[part], self._stamp_ns[part][0]
+        sample_ns, message_ns = stamp_ns - begin_ns, self._stamp_ns[part] - begin_ns
+        result = np.interp(sample_ns, message_ns, values)
+        is_known = (sample_ns >= -self._usual_ns) & (sample_ns <= message_ns[-1] + self._usual_ns)
+        after = np.searchsorted(message_ns, sample_ns).clip(max=len(message_ns) - 1)
+        is_long = np.append(False, (np.diff(message_ns) > self._longest_ns)
+                            & (np.diff(values) != 0))
+        is_inside = (sample_ns > message_ns[0]) & (sample_ns < message_ns[after])
+        result[~is_known | (is_inside & is_long[after])] = np.nan
+        if is_known.any():
+            gaps_ns = np.abs(sample_ns - message_ns[[np.maximum(after - 1, 0), after]]).min(axis=0)
+            self._gap_ns = max(self._gap_ns, int(gaps_ns[is_known].max()))
+        return result
+
+    @property
+    def alignment(self) -> Alignment:
+        """
+        How well the reference was aligned so far: residual, in its unit, and largest gap, s.
+
+        The residual is the rms difference between each message and the straight line between its
+        neighbours. Interpolation over twice the period misses it, so that it bounds the error
+        over one period. It is 0 where every sample has a message with its own stamp.
+        """
+        if not self._gap_ns or len(self._value) < 3:
+            return Alignment(0.0, self._gap_ns * 1e-9)
+        time_ns, value = self._stamp_ns - self._stamp_ns[0], self._value
+        share = (time_ns[1:-1] - time_ns[:-2]) / (time_ns[2:] - time_ns[:-2])
+        residual = value[1:-1] - (value[:-2] + share * (value[2:] - value[:-2]))
+        return Alignment(float(np.sqrt(np.mean(residual ** 2))), self._gap_ns * 1e-9)

@@ -7,8 +7,14 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 
-from adxl_ros.files.bag_reader import LONGEST_MOVE_NS, Track
-from adxl_ros.files.recording_columns import ACCEL, JOINTS, Recording, sensor_info
+from adxl_ros.files.recording_columns import (
+    ACCEL,
+    JOINTS,
+    LONGEST_MOVE_NS,
+    Recording,
+    sensor_info,
+    Track,
+)
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
