@@ -381,4 +381,3 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
     if not has_scale:
         lines.append('scale factor over temperature: not fitted, it needs a second orientation')
     return CalibrationResult(nominal=base, fitted=fitted, summary=lines, poses=poses)
-

@@ -388,7 +388,7 @@ def extract_poses(recording: Recording, sensor: Sensor,
                          _mean_of_finite(values[rest.start:rest.stop]) for rest in rests])
 
     mean, std = rest_detection.rest_means(recording.time_s, volts, rests, sensor.rate_hz,
-                           rest_detection.datasheet_noise(sensor))
+                                          rest_detection.datasheet_noise(sensor))
     measured = {'volts': mean, 'std_v': std,
                 'time_s': np.array([[rest.time_start_s, rest.time_stop_s] for rest in rests]),
                 'temperature_c': means(recording.columns.get('temperature_c')),

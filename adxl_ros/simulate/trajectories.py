@@ -155,7 +155,7 @@ def sweep(_: np.random.Generator) -> Motion:
     """Visit planes alpha 90, 60, 30, 120, 150° forth and back (experiments 1 and 2)."""
     forth = list(range(0, 361, 30))
     return _visit([(alpha, beta) for alpha in (90, 60, 30, 120, 150)
-                       for beta in forth + forth[::-1]])
+                   for beta in forth + forth[::-1]])
 
 
 def tilt_alpha(_: np.random.Generator) -> Motion:

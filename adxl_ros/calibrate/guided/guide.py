@@ -157,9 +157,10 @@ class Dwell:
         """Average the first samples of a rest."""
         stamps, start, stop = np.concatenate(self._stamps), rest.start, rest.start + samples
         times = (stamps - self.arrived_ns) * 1e-9
-        mean, std = rest_detection.rest_means(times, np.concatenate(self._volts),
-                               [Rest(start, stop, times[start], times[stop - 1])],
-                               self._sensor.rate_hz, datasheet_noise(self._sensor))
+        mean, std = rest_detection.rest_means(
+            times, np.concatenate(self._volts),
+            [Rest(start, stop, times[start], times[stop - 1])],
+            self._sensor.rate_hz, datasheet_noise(self._sensor))
         return PoseRecord(pose=pose, start_ns=int(stamps[start]), stop_ns=int(stamps[stop - 1]),
                           samples=samples, mean_v=tuple(mean[0].tolist()),
                           std_v=tuple(std[0].tolist()))

@@ -52,6 +52,8 @@ _SHIFT_S = 1.0  # Time after which lateness that has stayed counts as a step, s:
 _STOPPED_NS = 250e6
 """Lateness of an arrival, ns, after which samples wait until its cause is known."""
 _SAME_NS = 5e6  # Largest change of a lateness that stays, ns
+_CATCH_UP_RATIO = 1.5
+"""Late samples that come this many times faster than they were taken were delayed on the way."""
 _SMOOTH_NS = 50e6
 """Largest difference that the stamps take up smoothly, ns. A larger one forward is a step."""
 _MAX_BEND = 0.5  # Largest difference between the slopes of stamps and device time
@@ -87,6 +89,8 @@ class ClockMap:
         self._first: _Arrival | None = None
         self._windows: deque[_Arrival] = deque()  # The earliest arrival of each window
         self._open: _Arrival | None = None  # That of the window that has not ended
+        # Lag before the clock seemed to step back, ns: the samples may have been delayed after all
+        self._former_lag_ns: int | None = None
         self._opened_ns = self._steered_ns = self._count = 0
         # Arrivals in a row far too late: the samples were delayed, or the clock has stepped back.
         self._late: list[_Arrival] = []
@@ -104,7 +108,9 @@ class ClockMap:
             return False
         stepped = late_ns < -_EARLY_NS
         if stepped:
-            self.steps += 1
+            former_ns = self._former_lag_ns
+            stepped = former_ns is None or arrival.lag_ns < former_ns - _EARLY_NS
+            self.steps += stepped
             self.restart()
         self._late.clear()  # the delayed samples have been delivered
         self._take(arrival)
@@ -211,12 +217,17 @@ class ClockMap:
     def _explain_lateness(self) -> None:
         """Begin a new clock if the late samples were late by the same time: it stepped back."""
         late, self._late = self._late, []
-        half = len(late) // 2
+        taken_ns, half = late[-1].device_ns - late[0].device_ns, len(late) // 2
         first_ns, second_ns = (min(arrival.lag_ns for arrival in part)
                                for part in (late[:half], late[half:]))
-        if abs(second_ns - first_ns) < _SAME_NS:
+        if abs(second_ns - first_ns) < _SAME_NS \
+                and taken_ns < _CATCH_UP_RATIO * (sum(late[-1]) - sum(late[0])):
+            former_ns = self._former_lag_ns
+            if former_ns is None:
+                former_ns = late[0].lag_ns - self._lateness_ns(late[0])
             self.steps += 1
             self.restart()
+            self._former_lag_ns = former_ns
             for arrival in late:
                 self._take(arrival)
 
