@@ -112,29 +112,38 @@ class DelayedInversion:
 
     def __init__(self, rc_s: np.ndarray, rate_hz: float) -> None:
         """Prepare for time constants by axis, (m,)."""
-        self._rc_s, self._rate_hz = rc_s, rate_hz
-        self._near: deque[tuple[float, list[float], object]] = deque(maxlen=2 * HALF + 1)
-        self._waiting = 0  # Number of the newest samples that were not returned yet
+        self._rate_hz = rate_hz
+        self._near: deque[tuple[float, list[float], object]] = deque()
+        self._index = 0
+        gain = rc_s * rate_hz
+        self._kernels = [[(gain * w).tolist() for w in derivative_weights(half)]
+                         for half in range(HALF + 1)]
 
     def __call__(self, time_s: float, volts: list[float], token: object
                  ) -> Iterator[tuple[float, list[float], object]]:
         """Take a sample; yield those that are ready, before a gap all, before the filter."""
-        if self._near and not 0 < (time_s - self._near[-1][0]) * self._rate_hz < MAX_GAP:
-            yield from self._ready(0)
-            self._near.clear()
-        self._near.append((time_s, volts, token))
-        self._waiting += 1
-        yield from self._ready(HALF)
+        near = self._near
+        if near and not 0 < (time_s - near[-1][0]) * self._rate_hz < MAX_GAP:
+            while self._index < len(near):
+                yield self._next()
+            near.clear()
+            self._index = 0
+        near.append((time_s, volts, token))
+        if len(near) - self._index > HALF:
+            yield self._next()
 
-    def _ready(self, after: int) -> Iterator[tuple[float, list[float], object]]:
-        """Yield the waiting samples that have so many samples after them."""
-        if self._waiting <= after:
-            return
-        times_s, volts, tokens = zip(*self._near)
-        undone_v = undo_filter(np.array(volts), np.array(times_s), self._rc_s, self._rate_hz)
-        for i in range(-self._waiting, -after):
-            yield times_s[i], undone_v[i].tolist(), tokens[i]
-        self._waiting = after
+    def _next(self) -> tuple[float, list[float], object]:
+        near, index = self._near, self._index
+        half = min(index, len(near) - 1 - index, HALF)
+        stamp_s, volts, token = near[index]
+        kernel = self._kernels[half]
+        undone_v = [v + sum(kernel[k][d] * near[index - half + k][1][d]
+                            for k in range(2 * half + 1)) for d, v in enumerate(volts)]
+        if index >= HALF:
+            near.popleft()
+        else:
+            self._index += 1
+        return stamp_s, undone_v, token
 
 
 _NEAR_ZERO_G = 1e-6
