@@ -171,6 +171,9 @@ def tables(raws: Sequence[bytes] | np.ndarray, find: Callable[[bytes], Layout]) 
         while len(rows):
             layout = find(data[0].tobytes())
             differs = (data[:, layout.fixed] != data[0, layout.fixed]).any(axis=1)
+            if not differs.any():  # as usual: no copy
+                yield Table(rows, data, layout)
+                break
             yield Table(rows[~differs], data[~differs], layout)
             rows, data = rows[differs], data[differs]
 

@@ -94,15 +94,17 @@ def read_blocks(path: str, form: Form, names: Collection[str], required: Collect
     with _opened(path) as file:
         size = max(os.fstat(file.fileno()).st_size, 1)
         while data := _in_utf_8(file.read(_CHUNK_BYTES) + file.readline()):
-            numbers: Sequence[int] = range(last + 1, last + 1 + data.count(b'\n'))
-            last = numbers[-1]
+            *preamble, data = data.split(b'\n', max(form.first_line - 1 - last, 0))
+            for line in preamble:
+                _add_info(line, info)
+            first = last + len(preamble) + 1
+            last = first - 1 + data.count(b'\n')
+            numbers: Sequence[int] = range(first, last + 1)
             marks = data.translate(None, _NO_MARKS)
             # An empty line, or one field, follows the end of a line.
-            if numbers[0] < form.first_line or b'#' in marks or b'\n\n' in marks \
-                    or marks.startswith(b'\n'):
+            if b'#' in marks or b'\n\n' in marks or marks.startswith(b'\n'):
                 rows = [(line, number) for line, number in zip(data.split(b'\n'), numbers)
-                        if line.strip() and not _add_info(line, info)
-                        and number >= form.first_line]
+                        if line.strip() and not _add_info(line, info)]
                 data = b''.join(line + b'\n' for line, _ in rows)
                 numbers = [number for _, number in rows]
             if not data:
@@ -146,7 +148,7 @@ def _in_utf_8(data: bytes) -> bytes:
             data = data.decode('utf-8-sig').encode()
         except UnicodeDecodeError:
             data = data.decode('cp1252', errors='replace').encode()
-    data = data.replace(b'\r\n', b'\n')
+    data = data.replace(b'\r\n', b'\n') if b'\r' in data else data
     return data + b'\n' if data and not data.endswith(b'\n') else data
 
 
