@@ -21,8 +21,8 @@ from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.covariance import leverage
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.accelerometer import OTHER_AXIS
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.effects.element import OTHER_AXIS
 from adxl_ros.model.sensor import Envelope, get, parameter_of, Sensor, STRETCH, with_neutral
 from adxl_ros.process import package_version
 from adxl_ros.report.quantities import decimals, mg_text

@@ -6,8 +6,8 @@ import json
 
 from adxl_ros.model import noise
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.accelerometer import direction
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.effects.element import direction
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import get, names_of, parameter_of, put, with_neutral
 import numpy as np

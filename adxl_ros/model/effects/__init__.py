@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The library of effects: each file of this folder holds those of one place."""
+"""The library of effects, a file for stage and reference, accelerometer, ADC with noise."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The sensing element, its mounting and its electronics, from the force to the input of the ADC.
+The accelerometer: mounting, sensing element and electronics, from the force to the ADC's input.
 
 Force along and across the axes, and their directions; zero-g, scale factor, supply, temperature,
 output stage and filter.
