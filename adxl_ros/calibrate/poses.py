@@ -19,7 +19,7 @@ from adxl_ros.model.effects.base import Coefficient, Components, Environment, NO
 from adxl_ros.model.kinematics import specific_force, UPRIGHT
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor
-from adxl_ros.signals import recorded_sensor, rest_detection
+from adxl_ros.signals import block_statistics, recorded_sensor, rest_detection
 from adxl_ros.signals.rest_detection import Rest, SAME_ANGLE_RAD
 import numpy as np
 
@@ -260,18 +260,13 @@ def recorded_settings(rests: np.ndarray, readings_rad: np.ndarray | None,
     start, stop = rests[order].T
     middle, settings = (start + stop) // 2, np.zeros(len(rests), int)
     means_rad = np.array([_mean_of_finite(readings[a:b]) for a, b in zip(start, stop)])
-    before_rad, held_rad = _last_finite(means_rad), _last_finite(commands)[start]
+    before_rad, held_rad = (block_statistics.held_values(v, np.isfinite(v))
+                            for v in (means_rad, commands))
     settings[order[1:]] = np.cumsum([
         _moved(np.append(readings[middle[i]:middle[i + 1]], means_rad[i + 1]), before_rad[i],
-               commands[start[i] + 1:start[i + 1] + 1], held_rad[i], tolerance_rad)
+               commands[start[i] + 1:start[i + 1] + 1], held_rad[start[i]], tolerance_rad)
         for i in range(len(rests) - 1)])
     return settings
-
-
-def _last_finite(values: np.ndarray) -> np.ndarray:
-    """Return the last finite value up to each place, (n,); NaN before the first one."""
-    last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), -1))
-    return np.where(last >= 0, values[last], np.nan)
 
 
 def _mean_of_finite(values: np.ndarray) -> float:

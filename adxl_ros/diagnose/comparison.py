@@ -21,7 +21,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.block_statistics import true_runs
+from adxl_ros.signals.block_statistics import held_values, true_runs
 from adxl_ros.simulate.motion import BAND_LIMITED_DEGREE, ForcePath, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import ChainMemo, Response
 from adxl_ros.simulate.trajectories import environment_paths, motion_from_references
@@ -283,8 +283,7 @@ def _at_rest(motion: Motion, time_s: np.ndarray, reference: Reference, volts: np
 
 def direction_of_last_move(rate: np.ndarray, smallest: float = _REST_RATE) -> np.ndarray:
     """Return the direction of the last move, −1 or 1, 0 before the first, (n,)."""
-    last = np.maximum.accumulate(np.where(np.abs(rate) > smallest, np.arange(len(rate)), -1))
-    return np.where(last >= 0, np.sign(rate[np.maximum(last, 0)]), 0.0)
+    return held_values(np.sign(rate), np.abs(rate) > smallest, 0.0)
 
 
 def time_since_move_s(time_s: np.ndarray, rates: Sequence[np.ndarray]) -> np.ndarray:

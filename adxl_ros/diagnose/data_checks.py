@@ -18,7 +18,7 @@ from itertools import product
 from os.path import basename
 from typing import NamedTuple
 
-from adxl_ros.diagnose import comparison as beside, noise_effects
+from adxl_ros.diagnose import comparison as baseline, noise_effects
 from adxl_ros.diagnose.comparison import BaselineComparison, compare, Reference, SMALLEST_MOTION_G
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model import noise
@@ -266,13 +266,13 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
         recording, sim, notes = _align_force(recording, sensor, sim, may_shift)
     else:
         _check_encoder(recording, sensor)
-        step_rad = beside.seen_step_rad(recording, sensor)
+        step_rad = baseline.seen_step_rad(recording, sensor)
         if step_rad > sensor.stage_resolution_rad:
             stated_deg = np.degrees(sensor.stage_resolution_rad)
             notes.append(f'the stage reads in steps of {np.degrees(step_rad):.3g}°, not of '
                          f'{stated_deg:.3g}° as stated: this is used')
             sensor = replace(sensor, stage_resolution_rad=step_rad)
-        recording, left_out = beside.stated_poses(recording, sensor)
+        recording, left_out = baseline.stated_poses(recording, sensor)
     comparison = compare(recording, sensor, sim)
     if even_s is not None and len(even_s) == len(recording):
         # Samples may also have been taken unevenly, so that the simulation decides.
@@ -282,10 +282,10 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
             notes.append(f'stamps are uneven, and an even rate of {evenly.sensor.rate_hz:.6g} '
                          'Hz explains them: it is used')
     for rows, reason in left_out if comparison.joints else ():
-        comparison = beside.leave_out(comparison, rows, reason)
+        comparison = baseline.leave_out(comparison, rows, reason)
     # What moves too fast is looked for where the reference is stated.
-    comparison = beside.without_fast_motion(beside.without_gaps(comparison), recording.columns)
-    fading_hz = beside.fading_frequency_hz(comparison)
+    comparison = baseline.without_fast_motion(baseline.without_gaps(comparison), recording.columns)
+    fading_hz = baseline.fading_frequency_hz(comparison)
     if fading_hz is not None:
         notes.append(f'the reference is smoother than the sensor: above {fading_hz:.3g} Hz it '
                      'lacks motion that the recording has; effects that show in fast motion are '
@@ -411,7 +411,7 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording:
 
     Where the codes of the ADC are coarser than stated, the baseline gets their number of bits.
     """
-    search_comparison = beside.at_search_rate(comparison)
+    search_comparison = baseline.at_search_rate(comparison)
     try:
         _check_samples(comparison, search_comparison)
     except DataFault as fault:
@@ -475,7 +475,7 @@ def _check_range(comparison: BaselineComparison, finite: np.ndarray) -> None:
     volts, simulated_v = (v[finite] for v in (comparison.volts, comparison.simulated_v(sensor)))
     lsb_v, range_v = max(sensor.lsb_v, _SMALLEST_STEP_V), np.ptp(volts, axis=0)
     # Coarse codes repeat in an extreme pose, so that the simulation must differ, too.
-    step_v = np.maximum(beside.code_step_v(volts), lsb_v)
+    step_v = np.maximum(baseline.code_step_v(volts), lsb_v)
     railed = max(float(np.mean((np.abs(volts - rail_v) < lsb_v / 2)
                                & (np.abs(simulated_v - rail_v) > step_v), axis=0)[
         range_v > _SMALLEST_RANGE_V].max(initial=0.0))

@@ -141,6 +141,12 @@ def true_runs(mask: np.ndarray, group: np.ndarray | None = None) -> list[tuple[i
     return [(int(first), int(stop)) for first, stop in pairwise(edges) if mask[first]]
 
 
+def held_values(values: np.ndarray, known: np.ndarray, before: float = np.nan) -> np.ndarray:
+    """Hold each known value until the next one, (n,); `before` is the value before the first."""
+    last = np.maximum.accumulate(np.where(known, np.arange(len(known)), -1))
+    return np.where(last >= 0, values[last], before)
+
+
 _WINDOW_S = 0.25  # Length of the window of a variance, s. Chosen: under half of the shortest rest
 _WINDOW_SAMPLES = 8  # Fewest samples of that window. Chosen: fewer show no variance
 _HALF_S = 0.5  # Shortest halves whose means are compared, s. Chosen: two windows
