@@ -20,7 +20,7 @@ from adxl_ros.calibrate.report import page
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.atomic_write import remove_unfinished
-from adxl_ros.files.sweep_journal import PoseRecord
+from adxl_ros.files.sweep_journal import MountingUnchecked, PoseRecord
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, with_axes
 import numpy as np
@@ -209,6 +209,11 @@ class Session:
             self._base, poses, source, range_c=self.settings.thermal.range_c) \
             if self.settings.mode == 'thermal' else calibration.calibrate(
                 self.unit, [calibration.RecordedPoses(source, poses)])
+        entries = sweep_journal.read(self.journal.path).entries
+        if any(isinstance(entry, MountingUnchecked) for entry in entries):
+            provenance = {**result.fitted.provenance,
+                          'mounting': 'not checked after an interruption'}
+            result = replace(result, fitted=replace(result.fitted, provenance=provenance))
         result.save(self.settings.output)
         self._fitted = records
         return result
