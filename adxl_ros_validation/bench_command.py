@@ -55,7 +55,8 @@ class Listener(Node):
         """Keep the messages of some time."""
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s and len(self.messages) < limit:
-            self._inbox.receive(lambda raw: self.messages.append((time.time_ns(), raw)))
+            self._inbox.wait()
+            self.messages += [(time.time_ns(), raw) for raw in self._inbox.take()]
         if not self.messages:
             raise UserError(f'no messages for {seconds:g} s')
 

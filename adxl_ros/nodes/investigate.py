@@ -168,9 +168,10 @@ class Investigate(Node):
                 continue
             messages = self._inboxes[topic].take()
             if self._bag is not None:
-                name = f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
+                recorded = self.resolve_topic_name(topic), \
+                    f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
                 for message in messages:
-                    self._bag.write(self.resolve_topic_name(topic), name, message, time.time_ns())
+                    self._bag.write(*recorded, message, time.time_ns())
             if topic == _STAGE:
                 for reading in topics.joint_readings(messages):
                     if np.isfinite(reading.angles).all():

@@ -256,12 +256,6 @@ class Inbox:
             self.heard_s = time.monotonic()
         return messages
 
-    def receive(self, callback: Callable[[bytes], object]) -> None:
-        """Wait for a message for up to 0.1 s, and give all that have come to a function."""
-        self.wait()
-        for message in self.take():
-            callback(message)
-
     def _accepts(self, number: int | None) -> bool:
         """Return whether to take a message of a sequence number; None where the RMW has none."""
         if number is not None:

@@ -183,7 +183,7 @@ def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
 
 
 def _put(effect: Effect, values: dict[str, np.ndarray], axes: str, text: str) -> None:
-    """Put a new value for all axes of a parameter, or for one, in place of its values."""
+    """Set a parameter for all its axes, or for one, by a text such as `gain.x = 0.01`."""
     key, _, number = (word.strip() for word in text.partition('='))
     name, _, axis = key.partition('.')
     parameters = {parameter.name: parameter for parameter in effect.parameters}

@@ -16,8 +16,8 @@ are the misalignment to first order, so that `cross_axis.linear` and `cross_axis
 Products such as r1·p1·z·c distinguish them. Where these are significant
 (`gauge_is_identifiable`), both are fitted, with the datasheet's 1.5 % as prior. At rest
 x² + y² + z² is g², so that a square of the own axis equals those of the others, and `quadratic` is
-not fitted. The case's x is where
-beta = 0 points, so that an offset of beta is part of the misalignment.
+not fitted. The case's x is where beta = 0 points, so that an offset of beta is part of the
+misalignment.
 
 A three-axis unit has the same kinds of terms on each axis: squares of both other axes
 (`cross_axis`, `cross_axis_z`), a scale factor that depends on either (`scale_factor_cross`,
@@ -248,11 +248,13 @@ class _Search:
 
     def _solved(self, poses: Poses, steps: int) -> _Iterate:
         """Take Gauss-Newton steps without step control: the chain is nearly linear in them."""
+        sizes = _sizes(self._names)
+
         def linearise(values: np.ndarray) -> _Iterate:
             about = self._about(put(self._unit, self._names, values), poses)
             covariance = about.covariance(self._stage)
             step, information = about.solve(covariance)
-            step *= min(1.0, _MAX_STEP_SIZES / np.abs(step / _sizes(self._names)).max())
+            step *= min(1.0, _MAX_STEP_SIZES / np.abs(step / sizes).max())
             return _Iterate(values, step, 0.0, about, covariance, information)
 
         return gauss_newton(

@@ -65,6 +65,11 @@ class _Arrival(NamedTuple):
     device_ns: int
     lag_ns: int
 
+    @property
+    def host_ns(self) -> int:
+        """Return the host time of the arrival, ns, without the delay of the link."""
+        return self.device_ns + self.lag_ns
+
 
 class ClockMap:
     """
@@ -156,11 +161,11 @@ class ClockMap:
         return device_ns + origin.lag_ns + round(ahead_ns)
 
     def _lateness_ns(self, arrival: _Arrival) -> int:
-        return arrival.lag_ns + arrival.device_ns - self._clock_ns(arrival.device_ns)
+        return arrival.host_ns - self._clock_ns(arrival.device_ns)
 
     def _has_passed(self, wait_s: float, arrival: _Arrival, now_ns: int) -> bool:
         """Return whether a time, s, has passed since an arrival."""
-        return now_ns - sum(arrival) - self._delay_ns >= wait_s * 1e9
+        return now_ns - arrival.host_ns - self._delay_ns >= wait_s * 1e9
 
     def _take(self, arrival: _Arrival) -> None:
         """Add an arrival to the open window; an end of a window, and a better first, steer."""
@@ -221,7 +226,7 @@ class ClockMap:
         first_ns, second_ns = (min(arrival.lag_ns for arrival in part)
                                for part in (late[:half], late[half:]))
         if abs(second_ns - first_ns) < _SAME_NS \
-                and taken_ns < _CATCH_UP_RATIO * (sum(late[-1]) - sum(late[0])):
+                and taken_ns < _CATCH_UP_RATIO * (late[-1].host_ns - late[0].host_ns):
             former_ns = self._former_lag_ns
             if former_ns is None:
                 former_ns = late[0].lag_ns - self._lateness_ns(late[0])
