@@ -5,10 +5,10 @@
 from collections.abc import Callable
 import csv
 from dataclasses import replace
-import os
 from pathlib import Path
 import signal
 import subprocess
+import sys
 
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording, sensor_info
@@ -17,7 +17,7 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 import numpy as np
-from processes import executable, wait_until
+from processes import executable, PATIENCE
 import pytest
 from units import drawn, nominal
 
@@ -156,24 +156,32 @@ def test_bad_input_leaves_the_earlier_output(run_tool: RunTool, tmp_path: Path) 
     assert f'{tmp_path}/unit.yaml:3:5: ' in refused(run_tool, path)
 
 
+# Sends a signal to its own process when the output that is written gets its name, runs a tool.
+INTERRUPTED = """import os, runpy, sys
+number = int(sys.argv.pop(1))
+def interrupt(event, arguments):
+    if event == 'os.rename' and '/.out' in str(arguments[0]):
+        os.kill(os.getpid(), number)
+sys.addaudithook(interrupt)
+del sys.argv[0]
+runpy.run_path(sys.argv[0], run_name='__main__')
+"""
+
+
 @pytest.mark.parametrize(('number', 'status', 'output'), [
     (signal.SIGINT, 130, 'out.csv'), (signal.SIGTERM, 143, 'out.csv'),
     (signal.SIGINT, 130, 'out.mcap'), (signal.SIGINT, 130, 'out')])
 def test_an_interruption_leaves_no_output(tmp_path: Path, number: int, status: int, output: str
                                           ) -> None:
     sensor = unit()
-    path = record(tmp_path, sensor, volts_of(sensor, *np.full((2, 500000), 0.5)))
-    process = subprocess.Popen(
-        [executable('apply'), path, '--params', tmp_path / 'unit.yaml', '-o',
-         tmp_path / output], stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: os.nice(19))  # This test comes first, so that the signal is in time
-    wait_until(lambda: [p for p in tmp_path.iterdir() if p.name.startswith('.out')], 20.0,
-               'output begun')
-    process.send_signal(number)
-    _, messages = process.communicate(timeout=20)
-    assert process.returncode == status
-    assert messages.count('\n') <= 1
-    assert 'Traceback' not in messages
+    path = record(tmp_path, sensor, volts_of(sensor))
+    done = subprocess.run(
+        [sys.executable, '-c', INTERRUPTED, str(int(number)), executable('apply'), path,
+         '--params', tmp_path / 'unit.yaml', '-o', tmp_path / output],
+        stderr=subprocess.PIPE, text=True, timeout=60 * PATIENCE)
+    assert done.returncode == status
+    assert done.stderr.count('\n') <= 1
+    assert 'Traceback' not in done.stderr
     assert sorted(p.name for p in tmp_path.iterdir()) == ['made.csv', 'unit.yaml']
 
 
