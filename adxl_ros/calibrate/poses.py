@@ -14,7 +14,7 @@ from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.files.tables import PoseTable
 from adxl_ros.model import signal_chain
-from adxl_ros.model.effects import base
+from adxl_ros.model.effects import base, effect_named
 from adxl_ros.model.effects.base import Coefficient, Components, Environment, NOMINAL_ENVIRONMENT
 from adxl_ros.model.kinematics import specific_force, UPRIGHT
 from adxl_ros.model.noise import sample_std_v
@@ -190,9 +190,13 @@ def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Co
     signals = base.Signals(
         NOMINAL_ENVIRONMENT, alpha=base.Joint(alpha_rad), beta=base.Joint(beta_rad),
         up=list(UPRIGHT), gravity_mps2=unit.local_gravity_mps2)
-    signal_chain.Chain(unit)(base.Place.STAGE, signals)
+    signal_chain.Chain(unit, filter(_is_of_stage, unit.effects))(base.Place.STAGE, signals)
     return specific_force(signals.alpha.position, signals.beta.position, signals.gravity_mps2,
                           0.0, signals.up)
+
+
+def _is_of_stage(effect: str) -> bool:
+    return effect_named(effect).place is base.Place.STAGE
 
 
 def angle_jacobian(unit: Sensor, poses: Poses) -> np.ndarray:
@@ -207,11 +211,16 @@ def angle_jacobian(unit: Sensor, poses: Poses) -> np.ndarray:
 
 def coefficient_jacobian(unit: Sensor, poses: Poses, names: Sequence[Coefficient]) -> np.ndarray:
     """Differentiate the predicted volts by coefficients, V per their unit, (k, m, p)."""
+    force = stage_force(unit, poses.alpha_rad, poses.beta_rad)
+
+    def volts(name: Coefficient, value: np.ndarray) -> np.ndarray:
+        changed = put(unit, [name], value)
+        return predicted_volts(changed, poses) if _is_of_stage(name.effect) else np.column_stack(
+            signal_chain.static_response(changed)(force, poses.environment))
+
     def slope(name: Coefficient) -> np.ndarray:
         value, step = get(unit, [name]), _COEFFICIENT_STEP * parameter_of(name).scale
-        above = predicted_volts(put(unit, [name], value + step), poses)
-        below = predicted_volts(put(unit, [name], value - step), poses)
-        return (above - below) / (2 * step)
+        return (volts(name, value + step) - volts(name, value - step)) / (2 * step)
 
     return np.stack([slope(name) for name in names], axis=2)
 

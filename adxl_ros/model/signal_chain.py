@@ -56,7 +56,8 @@ class RunningEffect:
         sizes = [p for p in effect.parameters if p.role is not Role.SHAPE]
         # At the neutral values of its sizes and limits an effect does nothing.
         self.is_neutral = bool(sizes) and all(
-            np.all(np.equal(self.parameters.get(p.name, p.neutral), p.neutral)) for p in sizes)
+            self.parameters.get(p.name) in (None, p.neutral, (p.neutral,) * len(sensor.axes))
+            for p in sizes)
         self.name, self.place, self.apply = name, effect.place, effect.apply
         self.key = (name, *sorted(self.parameters.items()))
         self.memory: dict[str, Any] = {}
