@@ -32,6 +32,10 @@ settings.register_profile('search', deadline=None, max_examples=2000)
 settings.load_profile('same')
 
 
+SHARED = {'committed_check', 'evaluations', 'report_folder', 'two_effects'}
+"""Fixtures that take long to make: the tests that use one run in one worker of xdist."""
+
+
 def pytest_configure(config: pytest.Config) -> None:
     # After SIGTERM a run stops the processes that it has started, as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -48,8 +52,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         fixtures = set(getattr(item, 'fixturenames', ()))
         if 'ros_env' in fixtures:
             item.add_marker(pytest.mark.live)
-        if {'committed_check', 'evaluations'} & fixtures:
-            item.add_marker(pytest.mark.xdist_group(item.path.stem))
+        for fixture in SHARED & fixtures:
+            item.add_marker(pytest.mark.xdist_group(fixture))
     # The longest first, so that no worker waits for the others at the end.
     items.sort(key=lambda item: [item.get_closest_marker(mark) is None
                                  for mark in ('xdist_group', 'long')])

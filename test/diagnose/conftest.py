@@ -2,9 +2,7 @@
 
 """A diagnosis that several modules share."""
 
-import subprocess
-
-from processes import executable
+from processes import run_executable
 import pytest
 
 
@@ -16,8 +14,7 @@ def two_effects(made_once):
 
 def diagnose_two_effects(folder):
     def call(name, *arguments, status=0):
-        done = subprocess.run([executable(name), *arguments], cwd=folder, capture_output=True,
-                              text=True, timeout=300)
+        done = run_executable(name, *arguments, cwd=folder)
         assert done.returncode == status, done.stderr
         return done.stdout
 

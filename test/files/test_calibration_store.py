@@ -9,7 +9,7 @@ import subprocess
 
 from adxl_ros.files import calibration_store, parameter_file
 import numpy as np
-from processes import executable
+from processes import executable, PATIENCE, run_executable
 import pytest
 from units import drawn, NOMINAL, nominal
 
@@ -26,9 +26,9 @@ def swept_csv(made_once):
 
 def sweep(folder):
     (folder / 'u7.yaml').write_text(NOMINAL.read_text().replace('serial: nominal', 'serial: U/7'))
-    done = subprocess.run([executable('simulate'), 'sweep', '--params', 'u7.yaml', '--rate', '100',
-                           '--effect', 'bias', '--effect', 'misalignment', '--seed', '5', '-o',
-                           'sweep.csv'], cwd=folder, capture_output=True, text=True, timeout=120)
+    done = run_executable('simulate', 'sweep', '--params', 'u7.yaml', '--rate', '100', '--effect',
+                          'bias', '--effect', 'misalignment', '--seed', '5', '-o', 'sweep.csv',
+                          cwd=folder)
     assert done.returncode == 0, done.stderr
     lines = (folder / 'sweep.csv').read_text().splitlines()
     head = next(i for i, line in enumerate(lines) if line.startswith('time_s'))
@@ -113,7 +113,7 @@ def test_a_full_disk_keeps_the_old_file(swept_csv, tmp_path):
     done = subprocess.run(
         ['bash', '-c', 'ulimit -f 1; trap "" XFSZ; exec "$@"', 'bash', executable('fit'),
          'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml'],
-        cwd=tmp_path, capture_output=True, text=True, timeout=60)
+        cwd=tmp_path, capture_output=True, text=True, timeout=60 * PATIENCE)
     assert done.returncode == 1
     assert 'u.yaml: cannot write: File too large' in done.stderr
     assert done.stderr.count('\n') == 1

@@ -8,7 +8,7 @@ from pathlib import Path
 import subprocess
 
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
-from processes import executable, NEEDS_ROS2, REPO
+from processes import executable, NEEDS_ROS2, PATIENCE, REPO
 import pytest
 
 SCRIPTS = [entry for entry in distribution('adxl_ros').entry_points
@@ -23,7 +23,8 @@ def run(*args: str, **options: object) -> subprocess.CompletedProcess:
     if Path(get_package_prefix('adxl_ros')) != REPO / 'install' / 'adxl_ros':
         pytest.skip('the package under test was not built by make build')
     command = [options.pop('path', REPO / 'run'), *args]
-    return subprocess.run(command, text=True, capture_output=True, timeout=60, **options)
+    return subprocess.run(command, text=True, capture_output=True,
+                          timeout=60 * PATIENCE, **options)
 
 
 @pytest.mark.parametrize('script', SCRIPTS, ids=EXECUTABLES)

@@ -10,7 +10,7 @@ import subprocess
 import sys
 
 from adxl_ros.model.effects import library
-from processes import executable, run_executable, run_in_process, TOOLS
+from processes import executable, PATIENCE, run_executable, run_in_process, TOOLS
 import pytest
 from terminal import Terminal
 
@@ -125,8 +125,8 @@ def test_output_that_nobody_reads_ends_an_executable_without_a_message(name: str
     try:
         # argparse ignores the pipe where nothing is buffered.
         piped = subprocess.run([executable(name), '--help'], text=True, stdout=writer,
-                               stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, timeout=60,
-                               env=os.environ | {'PYTHONUNBUFFERED': ''})
+                               stdin=subprocess.DEVNULL, stderr=subprocess.PIPE,
+                               timeout=60 * PATIENCE, env=os.environ | {'PYTHONUNBUFFERED': ''})
     finally:
         os.close(writer)
     assert (piped.returncode, piped.stderr) == (1, '')
@@ -135,5 +135,6 @@ def test_output_that_nobody_reads_ends_an_executable_without_a_message(name: str
 def test_a_pipe_between_processes_that_breaks_is_not_hidden() -> None:
     code = ('from adxl_ros.process import ended_by_closed_output\n'
             'with ended_by_closed_output():\n    raise BrokenPipeError')
-    done = subprocess.run([sys.executable, '-c', code], text=True, capture_output=True, timeout=60)
+    done = subprocess.run([sys.executable, '-c', code], text=True, capture_output=True,
+                          timeout=60 * PATIENCE)
     assert done.returncode == 1 and 'BrokenPipeError' in done.stderr

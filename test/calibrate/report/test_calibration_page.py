@@ -5,12 +5,11 @@
 from dataclasses import replace
 from itertools import product
 import re
-import subprocess
 
 from adxl_ros.files import calibration_store, parameter_file
 import numpy as np
 from pages import layout_faults, NEEDS_CHROMIUM, wait_until_drawn, WIDTHS
-from processes import executable
+from processes import run_executable
 import pytest
 from units import NOMINAL
 
@@ -27,8 +26,7 @@ def fill_report(folder):
     (folder / 'u7.yaml').write_text(text)
 
     def run(name, *arguments):
-        done = subprocess.run([executable(name), *arguments, '--params', 'u7.yaml'], cwd=folder,
-                              capture_output=True, text=True, timeout=120)
+        done = run_executable(name, *arguments, '--params', 'u7.yaml', cwd=folder)
         assert done.returncode == 0, done.stderr
 
     run('simulate', 'sweep', '--rate', '100', '--effect', 'bias', '--effect', 'cross_axis_z',
