@@ -84,9 +84,9 @@ class RecordingEstimator:
         at_rail = signal_chain.at_a_rail(volts, sensor)
         with np.errstate(all='ignore'):  # some volts have no solution
             force = self._inverse(list(input_v.T), environment)
-            covariance, leverage = self._covariance(force, environment)
+            covariance = self._covariance(force, environment)
             outside = np.isfinite(force[0]) & sensor.envelope.is_outside(
-                environment.temperature_c, force, leverage)
+                environment.temperature_c, force)
             covariance[:, :, at_rail] = np.inf
             angles = tilt(force, covariance, 'z' in sensor.axes)
         force_mps2 = np.array(force)
@@ -318,9 +318,8 @@ class LiveEstimator:
             if len(self._cells) >= _MAX_CELLS:
                 self._cells.clear()
             middle = [float(k * _CELL_MPS2) for k in key]
-            measured, tangent, leverage = self._measured_covariance(middle, self._environment)
-            outside = self._envelope.describe_outside(self._environment.temperature_c, middle,
-                                                      float(leverage[0]))
+            measured, tangent = self._measured_covariance(middle, self._environment)
+            outside = self._envelope.describe_outside(self._environment.temperature_c, middle)
             covariance = np.diag([0.0, UNMEASURED_VARIANCE, UNMEASURED_VARIANCE])
             axes = [AXES.index(axis) for axis in self.sensor.axes]
             covariance[np.ix_(axes, axes)] = measured[:, :, 0]
