@@ -46,28 +46,23 @@ def force_covariance(sensor: Sensor, force: Components,
     x/y sensor is derived from |f| = g; see `derived_z_covariance`. The variance of the volts is
     that of one sample unless given, V², (m,). Returned in (m/s²)², (3, 3, n).
     """
-    return prepared_covariance(sensor, sample_variance_v2)(force, environment)
+    force = [np.atleast_1d(np.asarray(f, float)) for f in force]
+    return of_three_axes(sensor, force, *measured_covariance(
+        sensor, sample_variance_v2)(force, environment))
 
 
-def prepared_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = None
-                        ) -> Callable[[Components, Environment], np.ndarray]:
-    """Prepare `force_covariance` for block after block."""
-    of_measured = measured_covariance(sensor, sample_variance_v2)
+def of_three_axes(sensor: Sensor, force: Components, measured: np.ndarray,
+                  tangent: signal_chain.Tangent) -> np.ndarray:
+    """Complete the result of `measured_covariance` to `force_covariance`."""
+    if sensor.axes == 'xy':
+        in_plane = measured[0, 0], measured[0, 1], measured[1, 1]
+        xx, xy, xz, yy, yz, zz = derived_z_covariance(force, in_plane, tangent.slope, ARRAYS)
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    covariance = np.zeros((3, 3, len(force[0])))
+    covariance[1, 1] = covariance[2, 2] = UNMEASURED_VARIANCE
     axes = [AXES.index(axis) for axis in sensor.axes]
-
-    def covariance_of(force: Components, environment: Environment) -> np.ndarray:
-        force = [np.atleast_1d(np.asarray(f, float)) for f in force]
-        measured, tangent = of_measured(force, environment)
-        covariance = np.zeros((3, 3, len(force[0])))
-        covariance[1, 1] = covariance[2, 2] = UNMEASURED_VARIANCE
-        covariance[np.ix_(axes, axes)] = measured
-        if sensor.axes == 'xy':
-            in_plane = measured[0, 0], measured[0, 1], measured[1, 1]
-            xx, xy, xz, yy, yz, zz = derived_z_covariance(force, in_plane, tangent.slope, ARRAYS)
-            covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        return covariance
-
-    return covariance_of
+    covariance[np.ix_(axes, axes)] = measured
+    return covariance
 
 
 def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = None
@@ -148,32 +143,21 @@ def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
     """
     Prepare the derivatives of the volts by the coefficients in `sensor.covariance_names`.
 
-    They are central differences. Coefficients of one parameter that act on their own axes share
-    one. They map a force and an `Environment` (nominal unless given) to derivatives, (m, k, n).
+    They are central differences. They map a force and an `Environment` (nominal unless given) to
+    derivatives, (m, k, n).
     """
     names = sensor.covariance_names
-    groups: dict[Coefficient, list[int]] = {}
-    for row, name in enumerate(names):
-        is_own = name.axis and effect_named(name.effect).place in (Place.ELEMENT,
-                                                                   Place.ELECTRONICS)
-        groups.setdefault(name.without_axis if is_own else name, []).append(row)
-    differences = []
-    for rows in groups.values():
-        moved = [names[row] for row in rows]
-        step = _RELATIVE_STEP * parameter_of(moved[0]).scale
-        differences.append((rows, step, [
-            static_response(put(sensor, moved, get(sensor, moved) + change))
-            for change in (step, -step)]))
+    steps = [_RELATIVE_STEP * parameter_of(name).scale for name in names]
+    pairs = [[static_response(put(sensor, [name], get(sensor, [name]) + change))
+              for change in (step, -step)] for name, step in zip(names, steps)]
 
     def by_coefficient(force: Components,
                        environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
         slopes = np.zeros((len(sensor.axes), len(names), np.size(force[0])))
-        for rows, step, pair in differences:
+        for row, (step, pair) in enumerate(zip(steps, pairs)):
             above, below = (respond(force, environment) for respond in pair)
-            for row in rows:
-                own = sensor.axes.find(names[row].axis)
-                for axis in range(len(above)) if len(rows) == 1 else (own,):
-                    slopes[axis, row] = (above[axis] - below[axis]) / (2 * step)
+            for axis, (a, b) in enumerate(zip(above, below)):
+                slopes[axis, row] = (a - b) / (2 * step)
         return slopes
 
     return by_coefficient

@@ -151,21 +151,19 @@ def _axis_json(noise: AxisNoise) -> dict[str, Any]:
             'rounding': noise.rounding,
             'density_g_per_rthz': noise_parameters.density_g_per_rthz(noise),
             'sample_std_mps2': noise.sample_std, 'resolution_mps2': noise.resolution,
-            'lowest': {'tau_s': noise.lowest_s, 'deviation_mps2': noise.lowest},
             'fitted_below_hz': noise.fit.highest_hz}
 
 
 _INCHES = (5.0, 4.4)
 """Width and height of the plot of an axis, inches. Chosen: three fit beside each other."""
 _COLUMNS = ('axis', 'white noise N, µg/√Hz', 'bias instability B, µg', 'random walk K, µg/√s',
-            'lowest Allan deviation, µg', 'noise of a sample, m/s²', 'fitted below, Hz')
+            'noise of a sample, m/s²', 'fitted below, Hz')
 """Head of the table."""
 
 
 def _write_page(folder: Path, result: RecordingNoise) -> list[Path]:
     page, plot, figure = folder / 'report.html', folder / 'allan.png', _plot(result)
     rows = [[noise.axis, *_micro_g_intervals(noise),
-             f'{noise.lowest * MICRO_G:.3g} at {noise.lowest_s:.3g} s',
              f'{noise.sample_std:.3g}', f'{noise.fit.highest_hz:.3g}'] for noise in result.axes]
     write_text(page, html_page.render('adxl_ros.tools', 'noise.html', {
         'title': 'Noise at rest', 'about': _head(result), 'badge': None, 'figures': {},
