@@ -16,7 +16,7 @@ from adxl_ros.model import covariance as force_errors, noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects.base import Components, Environment, FLOATS, NOMINAL_ENVIRONMENT
-from adxl_ros.model.kinematics import angles, Mounting, roll_pitch_covariance, Tilt, tilt
+from adxl_ros.model.kinematics import angles, Mounting, Tilt, tilt
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -138,7 +138,6 @@ class Estimate(NamedTuple):
     roll: tuple[float, float]
     pitch: tuple[float, float]
     inclination: tuple[float, float]
-    roll_pitch: float  # Covariance of roll and pitch, rad²
     # Whether the ADC is at a rail; the variances are then those of an unmeasured axis
     saturated: bool
     # Texts on how the sample lies outside of the validity range; the variances include it
@@ -220,8 +219,7 @@ class LiveEstimator:
                 self.mounting.rotate(force), self.mounting.rotate_covariance(covariance),
                 self.mounting.rotate_covariance(moved))
         roll, pitch, inclination, _ = angles(force, moved, FLOATS)
-        return Estimate(force, covariance, roll, pitch, inclination,
-                        roll_pitch_covariance(force, moved, FLOATS), saturated, cell.outside)
+        return Estimate(force, covariance, roll, pitch, inclination, saturated, cell.outside)
 
     def set_environment(self, temperature_c: float | None = None, supply_v: float | None = None
                         ) -> None:

@@ -13,15 +13,12 @@ from typing import Any
 
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
     ARRAYS,
-    Coefficient,
     Components,
     Environment,
     Maths,
     NOMINAL_ENVIRONMENT,
-    Place,
     Value,
 )
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor

@@ -19,13 +19,6 @@ N²·rate (ethz-asl/kalibr, wiki/IMU-Noise-Model)."""
 _HARMONICS = 50  # Harmonics of rounding that are summed. Chosen: the others hold 1 %
 
 
-class Rounding(NamedTuple):
-    """Variance of the ADC's rounding on one axis."""
-
-    held_v2: float  # Part that stays while the output stays, V²
-    white_v2: float  # Part that is new in each sample, V²
-
-
 class Electronics(NamedTuple):
     """RC filter and white noise of a unit."""
 
@@ -60,22 +53,21 @@ def sample_std_v(sensor: Sensor) -> np.ndarray:
     return np.hypot(analog_std_v(sensor), sensor.lsb_v / np.sqrt(12))
 
 
-def rounding(sensor: Sensor, axis: int) -> Rounding:
+def held_rounding(sensor: Sensor) -> np.ndarray:
     """
-    Split the variance of the ADC's rounding, LSB²/12, by the noise before it.
+    Return the share of the ADC's rounding that stays while the output stays, by axis, (m,).
 
-    Noise of standard deviation σ makes the rounding random. The part that depends on the mean
-    output alone is a sawtooth, whose k-th harmonic has the variance LSB²/(2π²k²)·exp(−(2πkσ/LSB)²)
-    (Widrow and Kollár 2008, section 4.4). Above half a step of noise nothing of it is left.
+    Noise of standard deviation σ makes the rounding random, of the variance LSB²/12. The part
+    that depends on the mean output alone is a sawtooth, whose k-th harmonic has the variance
+    LSB²/(2π²k²)·exp(−(2πkσ/LSB)²) (Widrow and Kollár 2008, section 4.4). Above half a step of
+    noise nothing of it is left.
     """
-    total_v2 = sensor.lsb_v ** 2 / 12
-    if not total_v2:
-        return Rounding(0.0, 0.0)
-    harmonics = np.arange(1, _HARMONICS + 1)
-    sigma_steps = float(analog_std_v(sensor)[axis]) / sensor.lsb_v
-    shares = 6 / (np.pi * harmonics) ** 2 * np.exp(-(2 * np.pi * harmonics * sigma_steps) ** 2)
-    held_v2 = total_v2 * float(shares.sum())
-    return Rounding(held_v2, total_v2 - held_v2)
+    if not sensor.lsb_v:
+        return np.zeros(len(sensor.axes))
+    harmonics = np.arange(1, _HARMONICS + 1)[:, None]
+    sigma_steps = analog_std_v(sensor) / sensor.lsb_v
+    return np.sum(6 / (np.pi * harmonics) ** 2
+                  * np.exp(-(2 * np.pi * harmonics * sigma_steps) ** 2), axis=0)
 
 
 def density_v2_per_hz(sensor: Sensor, frequency_hz: np.ndarray) -> np.ndarray:
