@@ -7,7 +7,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT, Place
+from adxl_ros.model.effects.base import Need, NOMINAL_ENVIRONMENT, Place
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.signal_chain import Chain
 import numpy as np
@@ -28,8 +28,9 @@ class Electronics(NamedTuple):
 
 def electronics(sensor: Sensor) -> Electronics:
     """Return filter and white noise of a unit by its effects."""
-    chain = Chain(sensor, [name for name in sensor.effects
-                           if effect_named(name).place is Place.ELECTRONICS])
+    # No other effect changes them; one with a memory may take arrays alone.
+    chain = Chain(sensor, [name for name in sensor.effects if effect_named(name).needs in (
+        (Need.FILTER,), (Need.NOISE,))])
     signals = chain.signals(NOMINAL_ENVIRONMENT, output=[0.0] * len(sensor.axes))
     chain(Place.ELECTRONICS, signals)
     return Electronics(np.array(signals.rc_s), np.array(signals.noise_ratio))
