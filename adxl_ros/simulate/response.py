@@ -134,6 +134,9 @@ class Response:
         while self._done_steps < until or signals is None:
             volts, signals = self._advance(min(until - self._done_steps, self._block_steps))
             kept.append(volts)
+            if sum(map(len, kept)) > 2 * self._block_steps:  # a gap, without samples
+                first += sum(map(len, kept[:-1]))
+                kept = kept[-1:]
         grid = np.concatenate(kept) if len(kept[0]) else kept[-1]
         self._tail = grid[-(2 * POINTS):]
         if aligned:
