@@ -13,7 +13,7 @@ from adxl_ros.model.effects.base import Coefficient, Effect, Manoeuvre, Need
 from adxl_ros.model.sensor import put, Sensor, typical, with_axes
 from adxl_ros.simulate.motion import ForcePath, Held, Knots, Motion
 from adxl_ros.simulate.response import Columns, simulate
-from adxl_ros.simulate.trajectories import Steps, SweptSine
+from adxl_ros.simulate.trajectories import Steps, swept_sine
 import matplotlib
 
 matplotlib.use('Agg')
@@ -71,7 +71,7 @@ def plane(alpha_deg: float, axes: str = 'xy') -> Scene:
 
 REST = Motion(300.0, Held(np.radians(60)), Held(np.radians(30)), internal_rate_hz=1000.0)
 SWING = Motion(6.0, Held(np.pi / 2), Knots([0, 1, 2, 3, 4, 5, 6], [0, 0, 1.5, 0, -1.5, 0, 0]))
-SHAKE = Motion(44.0, Held(np.pi / 2), Held(np.pi / 2), SweptSine(2.0, 40.0))
+SHAKE = Motion(44.0, Held(np.pi / 2), Held(np.pi / 2), swept_sine(2.0))
 WARM = replace(REST, duration_s=1200.0, internal_rate_hz=10.0,
                temperature_c=Steps(25.0, ((200, 45), (700, 10)), 60.0))
 CYCLE = replace(WARM, temperature_c=Knots([0, 600, 1200], [5.0, 65.0, 5.0],

@@ -19,11 +19,10 @@ from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import keep_previous
 from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
-from adxl_ros.model.covariance import leverage
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.accelerometer import OTHER_AXIS
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.sensor import Envelope, get, parameter_of, Sensor, STRETCH, with_neutral
+from adxl_ros.model.sensor import Envelope, get, parameter_of, Sensor, with_neutral
 from adxl_ros.process import package_version
 from adxl_ros.report.quantities import decimals, mg_text
 import numpy as np
@@ -163,13 +162,10 @@ def _mean_text(values: np.ndarray, digits: str) -> str:
 def envelope(fitted: Sensor, force: np.ndarray, poses: Poses, misfit_mps2: float) -> Envelope:
     """Return the validity range by the specific force of all poses, m/s², (k, 3)."""
     finite_c = poses.temperature_c[np.isfinite(poses.temperature_c)]
-    rest_leverage = leverage(fitted)
-    largest = max(float(rest_leverage(list(stretch * force.T)).max())
-                  for stretch in (1.0, STRETCH))
     return Envelope((float(finite_c.min()), float(finite_c.max())) if finite_c.size else None,
                     zero_g_per_k=_unmodelled_slope(fitted, 'temperature_bias'),
                     scale_per_k=_unmodelled_slope(fitted, 'temperature_scale'),
-                    leverage=largest, misfit_mps2=misfit_mps2,
+                    misfit_mps2=misfit_mps2,
                     force_low_mps2=tuple(force.min(axis=0).tolist()),
                     force_high_mps2=tuple(force.max(axis=0).tolist()))
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from math import exp
 from typing import NamedTuple
 
 from adxl_ros.compensate.inversions import noise_variance_v2, paper_inverse, undo_filter_blocks
@@ -15,7 +16,7 @@ from adxl_ros.model import covariance as force_errors, noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects.base import Components, Environment, FLOATS, NOMINAL_ENVIRONMENT
-from adxl_ros.model.kinematics import angles, Mounting, roll_pitch_covariance, Tilt, tilt
+from adxl_ros.model.kinematics import angles, Mounting, Tilt, tilt
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -57,7 +58,7 @@ class RecordingEstimator:
         self._sensor, self._undo_filter = sensor, undo_filter
         self._begin_s = float(first.time_s[0])
         self._inverse = (paper_inverse if paper else signal_chain.inverse)(sensor)
-        self._covariance = force_errors.prepared_covariance(
+        self._measured_covariance = force_errors.measured_covariance(
             sensor, noise_variance_v2(sensor) if undo_filter else None)
 
     def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
@@ -84,9 +85,10 @@ class RecordingEstimator:
         at_rail = signal_chain.at_a_rail(volts, sensor)
         with np.errstate(all='ignore'):  # some volts have no solution
             force = self._inverse(list(input_v.T), environment)
-            covariance, leverage = self._covariance(force, environment)
+            covariance = force_errors.of_three_axes(
+                sensor, force, *self._measured_covariance(force, environment))
             outside = np.isfinite(force[0]) & sensor.envelope.is_outside(
-                environment.temperature_c, force, leverage)
+                environment.temperature_c, force)
             covariance[:, :, at_rail] = np.inf
             angles = tilt(force, covariance, 'z' in sensor.axes)
         force_mps2 = np.array(force)
@@ -103,9 +105,7 @@ it, so that its samples share them."""
 
 _MAX_CELLS = 4096  # Most cells in memory; chosen: the forces of all poses fill about as many
 
-_CELL_ENVIRONMENT = Environment(time_s=0.0, temperature_c=0.5, supply_v=0.01)
-"""Change of the surroundings, °C and V, from which the cells are computed again; chosen: the
-tangent hardly varies within it. Time has no limit."""
+_CELL_C, _CELL_V = 0.5, 0.01  # The same of temperature, °C, and supply, V
 
 _MAX_ACCEL_MPS2 = 1e6  # Acceleration that no sensor outputs, m/s²; chosen: far beyond any range
 
@@ -114,15 +114,15 @@ _TOLERANCE_MPS2 = 1e-8  # Largest next step of a converged inverse; chosen: far 
 _MAX_STEPS = 8
 """Newton steps after which the inverse starts from zero; chosen: one or two suffice usually."""
 
-_MOTION_S = 0.5
-"""Interval of the variance that separates motion from noise, s; chosen: the RC filter leaves some
-24 independent samples in it."""
+_MOTION_S = 0.2
+"""Time constant of the variance that separates motion from noise, s; chosen: the RC filter leaves
+some 20 independent samples in twice of it, and a strong vibration is forgotten after 2 s."""
 
 _PAUSE_S = 1.0
-"""Time without a sample after which the variance begins again, s; chosen: two intervals."""
+"""Time without a sample after which the variance begins again, s; chosen: some time constants."""
 
 _NOISE_FACTOR = 2
-"""Multiple of the noise variance that does not count as motion; chosen: the variance of some 24
+"""Multiple of the noise variance that does not count as motion; chosen: the variance of some 20
 samples hardly exceeds it by chance."""
 
 
@@ -138,7 +138,6 @@ class Estimate(NamedTuple):
     roll: tuple[float, float]
     pitch: tuple[float, float]
     inclination: tuple[float, float]
-    roll_pitch: float  # Covariance of roll and pitch, rad²
     # Whether the ADC is at a rail; the variances are then those of an unmeasured axis
     saturated: bool
     # Texts on how the sample lies outside of the validity range; the variances include it
@@ -163,9 +162,8 @@ class LiveEstimator:
     have no solution, it differs by a few hundredths of its standard deviation.
 
     Angles, and the z of equation 5, hold at rest only. Motion adds to their variances: the
-    variance of the in-plane force over half a second, as far as it exceeds twice that of the
-    noise. The larger of the last two half seconds counts. A derived z also gets the noise
-    variance of a measured axis.
+    exponentially weighted variance of the in-plane force, as far as it exceeds twice that of the
+    noise. A derived z also gets the noise variance of a measured axis.
     """
 
     def __init__(self, sensor: Sensor, paper: bool = False, undo_filter: bool = False,
@@ -185,15 +183,16 @@ class LiveEstimator:
             sensor.axes, signal_chain.gravity_mps2(sensor), FLOATS)
         self._invert = signal_chain.inverse(sensor)
         self._use(sensor.without_temperature_range())
-        self._cells: dict[tuple[int, int, int], _Cell] = {}
+        self._cells: dict[tuple[int, ...], _Cell] = {}
         noise_mps2 = np.sqrt(self._variance_v2) / sensor.scale_v_per_g * G0_MPS2
         self._noise_variance = (noise_mps2[:2] ** 2).tolist()
         self._derives_z = sensor.axes == 'xy'
         # The last force, and the volts at the ADC's input that respond to it.
         self._force: Components = [0.0, 0.0, 0.0]
-        self._environment = self._cells_environment = NOMINAL_ENVIRONMENT
+        self._environment = NOMINAL_ENVIRONMENT
         self._last_volts = self._respond(self._force)
-        self._time_s = float('-inf')
+        # Time of the last sample, and weighted mean and variance of the in-plane force
+        self._time_s, self._mean, self._variance = float('-inf'), [0.0, 0.0], [0.0, 0.0]
 
     def volts(self, accel_mps2: Sequence[float]) -> Components:
         """Undo the nominal conversion; an empty list if a value exceeds that of any sensor."""
@@ -220,8 +219,7 @@ class LiveEstimator:
                 self.mounting.rotate(force), self.mounting.rotate_covariance(covariance),
                 self.mounting.rotate_covariance(moved))
         roll, pitch, inclination, _ = angles(force, moved, FLOATS)
-        return Estimate(force, covariance, roll, pitch, inclination,
-                        roll_pitch_covariance(force, moved, FLOATS), saturated, cell.outside)
+        return Estimate(force, covariance, roll, pitch, inclination, saturated, cell.outside)
 
     def set_environment(self, temperature_c: float | None = None, supply_v: float | None = None
                         ) -> None:
@@ -233,10 +231,6 @@ class LiveEstimator:
             self._environment = self._environment._replace(temperature_c=temperature_c)
         if supply_v is not None:
             self._environment = self._environment._replace(supply_v=supply_v)
-        if any(abs(now - then) > limit for now, then, limit in zip(
-                self._environment[1:], self._cells_environment[1:], _CELL_ENVIRONMENT[1:])):
-            self._cells.clear()
-            self._cells_environment = self._environment
         self._last_volts = self._respond(self._force, self._environment)
 
     def _use(self, sensor: Sensor) -> None:
@@ -271,29 +265,15 @@ class LiveEstimator:
 
     def _motion_variance(self, force: Components, time_s: float) -> float:
         """Return the variance of the recent in-plane force beyond its noise, (m/s²)²."""
-        if not 0 <= time_s - self._time_s < _PAUSE_S:
-            self._previous_excess = 0.0
-            self._begin_interval(time_s)
-        elif time_s - self._begin_s > _MOTION_S:
-            self._previous_excess = self._excess()
-            self._begin_interval(time_s)
-        self._time_s = time_s
-        self._count += 1
-        # Welford's recurrence of mean and sum of squares.
-        for d, value in enumerate(force[:len(self._noise_variance)]):
-            deviation = value - self._mean[d]
-            self._mean[d] += deviation / self._count
-            self._squares[d] += deviation * (value - self._mean[d])
-        return max(self._excess(), self._previous_excess)
-
-    def _begin_interval(self, time_s: float) -> None:
-        self._begin_s, self._count = time_s, 0
-        self._mean, self._squares = [0.0, 0.0], [0.0, 0.0]
-
-    def _excess(self) -> float:
-        """Return the variance of this interval beyond a multiple of that of the noise, (m/s²)²."""
-        return max(0.0, *(squares / self._count - _NOISE_FACTOR * variance
-                          for squares, variance in zip(self._squares, self._noise_variance)))
+        elapsed_s, self._time_s = time_s - self._time_s, time_s
+        kept = exp(-elapsed_s / _MOTION_S) if 0 <= elapsed_s < _PAUSE_S else 0.0
+        excess = 0.0
+        for d, noise_variance in enumerate(self._noise_variance):
+            deviation = force[d] - self._mean[d]
+            self._mean[d] += (1 - kept) * deviation
+            self._variance[d] = kept * (self._variance[d] + (1 - kept) * deviation * deviation)
+            excess = max(excess, self._variance[d] - _NOISE_FACTOR * noise_variance)
+        return excess
 
     def _covariance(self, force: Components, cell: _Cell, unknown: float, motion: float
                     ) -> tuple[float, ...]:
@@ -311,16 +291,17 @@ class LiveEstimator:
         return xx + unknown, xy, xz, yy + unknown, yz, zz + further
 
     def _cell(self, force: Components) -> _Cell:
+        around = self._environment
         key = (round(force[0] / _CELL_MPS2), round(force[1] / _CELL_MPS2),
-               round(force[2] / _CELL_MPS2))
+               round(force[2] / _CELL_MPS2), round(around.temperature_c / _CELL_C),
+               round(around.supply_v / _CELL_V))
         cell = self._cells.get(key)
         if cell is None:
             if len(self._cells) >= _MAX_CELLS:
                 self._cells.clear()
-            middle = [float(k * _CELL_MPS2) for k in key]
-            measured, tangent, leverage = self._measured_covariance(middle, self._environment)
-            outside = self._envelope.describe_outside(self._environment.temperature_c, middle,
-                                                      float(leverage[0]))
+            middle = [float(k * _CELL_MPS2) for k in key[:3]]
+            measured, tangent = self._measured_covariance(middle, around)
+            outside = self._envelope.describe_outside(around.temperature_c, middle)
             covariance = np.diag([0.0, UNMEASURED_VARIANCE, UNMEASURED_VARIANCE])
             axes = [AXES.index(axis) for axis in self.sensor.axes]
             covariance[np.ix_(axes, axes)] = measured[:, :, 0]

@@ -18,7 +18,6 @@ from adxl_ros.model.effects.base import ARRAYS, Components, FLOATS
 from adxl_ros.model.kinematics import (
     Mounting,
     quaternion,
-    roll_pitch_covariance,
     UNKNOWN_ANGLE_RAD2,
     UNOBSERVABLE_RAD2,
 )
@@ -193,9 +192,8 @@ class LiveStream:
                 self._angles_rad[i] = angle
             variances.append(variance if observable else UNKNOWN_ANGLE_RAD2)
         roll, pitch, _ = variances
-        both = estimate.roll_pitch if max(roll, pitch) < UNKNOWN_ANGLE_RAD2 else 0.0
         return (*quaternion(self._angles_rad[0], self._angles_rad[1], FLOATS),
-                roll, both, 0.0, both, pitch, 0.0, 0.0, 0.0, UNKNOWN_ANGLE_RAD2)
+                roll, 0.0, 0.0, 0.0, pitch, 0.0, 0.0, 0.0, UNKNOWN_ANGLE_RAD2)
 
 
 def free_acceleration(force_mps2: Components, quaternion: Sequence[float], gravity_mps2: float
@@ -230,12 +228,13 @@ class ImuFields:
         shown_rad = np.stack([tilt.roll, tilt.pitch, tilt.inclination])[:, solved]
         std_rad = np.stack([tilt.roll_std, tilt.pitch_std])[:, solved]
         angles_rad = self._held(shown_rad)
-        variance = np.where(np.isfinite(std_rad), std_rad ** 2, UNKNOWN_ANGLE_RAD2)
+        variances = np.zeros((9, len(force.T)))
+        variances[[0, 4]] = np.where(np.isfinite(std_rad), std_rad ** 2, UNKNOWN_ANGLE_RAD2)
+        variances[8] = UNKNOWN_ANGLE_RAD2
         return {'linear_acceleration': force.T,
                 'linear_acceleration_covariance': covariance.reshape(9, -1).T,
                 'orientation': np.stack(quaternion(angles_rad[0], angles_rad[1], ARRAYS)).T,
-                'orientation_covariance': _orientation_covariance(force, covariance, *variance).T
-                }, angles_rad.T
+                'orientation_covariance': variances.T}, angles_rad.T
 
     def _held(self, angles_rad: np.ndarray) -> np.ndarray:
         """Return angles, rad, (3, n), with the last known value in place of NaN."""
@@ -243,15 +242,3 @@ class ImuFields:
         held = pandas.DataFrame(np.vstack([self._last_rad, angles_rad.T])).ffill().to_numpy()
         self._last_rad = held[-1]
         return held[1:].T
-
-
-def _orientation_covariance(force: np.ndarray, covariance: np.ndarray, roll_rad2: np.ndarray,
-                            pitch_rad2: np.ndarray) -> np.ndarray:
-    """Return the covariance of roll, pitch and yaw, (9, n), by that of a force, (3, 3, n)."""
-    components = tuple(covariance[i, j] for i in range(3) for j in range(i, 3))
-    both = roll_pitch_covariance(list(force), components, ARRAYS)
-    is_known = np.maximum(roll_rad2, pitch_rad2) < UNKNOWN_ANGLE_RAD2
-    elements = np.zeros((9, len(roll_rad2)))
-    elements[0], elements[4], elements[8] = roll_rad2, pitch_rad2, UNKNOWN_ANGLE_RAD2
-    elements[1] = elements[3] = np.where(is_known, both, 0.0)
-    return elements

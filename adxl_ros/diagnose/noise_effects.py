@@ -222,8 +222,7 @@ def _excess(residual_v: np.ndarray, simulated_v: np.ndarray, sensor: Sensor, row
     """Find noise above the level of drawn noise in samples, (n,) bool, that may rest."""
     recorded, drawn = (white_noise_v(v, sensor, rows) for v in (residual_v, simulated_v))
     # The level of noise far below a step of the ADC does not show.
-    roundings = [noise.rounding(sensor, d) for d in range(len(drawn))]
-    shows = np.array([r.held_v2 <= r.white_v2 for r in roundings]) & (drawn > 0)
+    shows = (noise.held_rounding(sensor) <= 0.5) & (drawn > 0)
     ratio = recorded / np.where(shows, drawn, np.inf)
     if resting:
         # Noise past the RC filter looks excessive in the innovations, but not in the samples.

@@ -35,7 +35,6 @@ ENVELOPE = {
     'temperature_c': 'lowest and highest temperature of the poses, degC',
     'zero_g_per_k': 'drift of the zero-g beyond them, g/K',
     'scale_per_k': 'drift of the scale factor beyond them, 1/K',
-    'leverage': 'largest leverage of the poses, (m/s^2)^2',
     'misfit_mps2': 'error of held-out poses beyond noise and stage, m/s^2',
     'force_low_mps2': 'lowest specific force of the poses by component, m/s^2',
     'force_high_mps2': 'highest specific force of the poses by component, m/s^2',

@@ -9,24 +9,20 @@ Outside of the validity range of the calibration, `validity` adds to the covaria
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
     ARRAYS,
-    Coefficient,
     Components,
     Environment,
     Maths,
     NOMINAL_ENVIRONMENT,
-    Place,
     Value,
 )
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor
-from adxl_ros.model.signal_chain import ANALOG, analog_response, static_chain
+from adxl_ros.model.signal_chain import analog_response, static_response
 import numpy as np
 
 UNMEASURED_VARIANCE = 1e6  # Of an axis that is not there, (m/s²)²; chosen: above any force
@@ -47,75 +43,52 @@ def force_covariance(sensor: Sensor, force: Components,
     x/y sensor is derived from |f| = g; see `derived_z_covariance`. The variance of the volts is
     that of one sample unless given, V², (m,). Returned in (m/s²)², (3, 3, n).
     """
-    return prepared_covariance(sensor, sample_variance_v2)(force, environment)[0]
+    force = [np.atleast_1d(np.asarray(f, float)) for f in force]
+    return of_three_axes(sensor, force, *measured_covariance(
+        sensor, sample_variance_v2)(force, environment))
 
 
-def prepared_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = None
-                        ) -> Callable[[Components, Environment], tuple[np.ndarray, np.ndarray]]:
-    """Prepare `force_covariance`, beside the leverage of the forces, for block after block."""
-    of_measured = measured_covariance(sensor, sample_variance_v2)
+def of_three_axes(sensor: Sensor, force: Components, measured: np.ndarray,
+                  tangent: signal_chain.Tangent) -> np.ndarray:
+    """Complete the result of `measured_covariance` to `force_covariance`."""
+    if sensor.axes == 'xy':
+        in_plane = measured[0, 0], measured[0, 1], measured[1, 1]
+        xx, xy, xz, yy, yz, zz = derived_z_covariance(force, in_plane, tangent.slope, ARRAYS)
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    covariance = np.zeros((3, 3, len(force[0])))
+    covariance[1, 1] = covariance[2, 2] = UNMEASURED_VARIANCE
     axes = [AXES.index(axis) for axis in sensor.axes]
-
-    def covariance_and_leverage(force: Components, environment: Environment
-                                ) -> tuple[np.ndarray, np.ndarray]:
-        force = [np.atleast_1d(np.asarray(f, float)) for f in force]
-        measured, tangent, force_leverage = of_measured(force, environment)
-        covariance = np.zeros((3, 3, len(force[0])))
-        covariance[1, 1] = covariance[2, 2] = UNMEASURED_VARIANCE
-        covariance[np.ix_(axes, axes)] = measured
-        if sensor.axes == 'xy':
-            in_plane = measured[0, 0], measured[0, 1], measured[1, 1]
-            xx, xy, xz, yy, yz, zz = derived_z_covariance(force, in_plane, tangent.slope, ARRAYS)
-            covariance = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        return covariance, force_leverage
-
-    return covariance_and_leverage
-
-
-class MeasuredCovariance(NamedTuple):
-    """Uncertainty of the force along the measured axes."""
-
-    covariance: np.ndarray  # Covariance, (m/s²)², (m, m, n)
-    tangent: signal_chain.Tangent  # The tangent of the inverse at the force
-    # Leverage of the force in the validity range, (m/s²)², (n,); 0 without such a range
-    leverage: np.ndarray
+    covariance[np.ix_(axes, axes)] = measured
+    return covariance
 
 
 def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = None
-                        ) -> Callable[..., MeasuredCovariance]:
+                        ) -> Callable[..., tuple[np.ndarray, signal_chain.Tangent]]:
     """
     Prepare the covariance of the measured axes, given the others; see `force_covariance`.
 
-    It maps specific force and an `Environment` (nominal unless given) to `MeasuredCovariance`.
+    It maps specific force and an `Environment` (nominal unless given) to the covariance, (m/s²)²,
+    (m, m, n), and the tangent of the inverse at the force.
     """
     if sample_variance_v2 is None:
         sample_variance_v2 = noise.sample_std_v(sensor) ** 2
     respond = analog_response(sensor)
-    follows = any(effect_named(name).follows for name in sensor.effects)
     by_coefficient = coefficient_tangent(sensor)
-    force_leverage = leverage(sensor)
     envelope = sensor.envelope
 
     def covariance(force: Components, environment: Environment = NOMINAL_ENVIRONMENT
-                   ) -> MeasuredCovariance:
+                   ) -> tuple[np.ndarray, signal_chain.Tangent]:
         tangent = signal_chain.tangent(respond, sensor.axes, force, environment)
-        count = np.size(force[0])
-        by_coefficients = np.zeros((len(sensor.axes), len(sensor.axes), count))
+        variance_v2 = np.diag(sample_variance_v2)[:, :, None]
         if len(sensor.covariance):
-            by_coefficients = _propagated(by_coefficient(force, environment), sensor.covariance)
-        noise_v2 = np.diag(sample_variance_v2)[:, :, None]
-        measured = _propagated(tangent.back, by_coefficients + noise_v2)
-        largest = np.zeros(count)
-        if envelope.leverage:
-            # The range is that of the nominal surroundings.
-            largest = force_leverage(force) if follows else np.trace(
-                _propagated(tangent.back, by_coefficients))
-        if envelope.temperature_c or envelope.leverage:
-            extrapolation = envelope.extrapolation(force, largest if envelope.leverage else 0.0)
-            for d, axis in enumerate(sensor.axes):
-                measured[d, d] += envelope.added_variance(
-                    force[AXES.index(axis)], environment.temperature_c, extrapolation, G0_MPS2)
-        return MeasuredCovariance(measured, tangent, largest)
+            variance_v2 = variance_v2 + _propagated(
+                by_coefficient(force, environment), sensor.covariance)
+        measured = _propagated(tangent.back, variance_v2)
+        extrapolation = envelope.extrapolation(force)
+        for d, axis in enumerate(sensor.axes):
+            measured[d, d] += envelope.added_variance(
+                force[AXES.index(axis)], environment.temperature_c, extrapolation, G0_MPS2)
+        return measured, tangent
 
     return covariance
 
@@ -126,21 +99,6 @@ def _propagated(slope: Any, covariance: np.ndarray) -> np.ndarray:
     spread = np.tensordot(covariance, slope, (1, 1)) if covariance.ndim == 2 else \
         np.einsum('abn,jbn->ajn', covariance, slope)
     return np.einsum('ian,ajn->ijn', slope, spread)
-
-
-def leverage(sensor: Sensor) -> Callable[[Components], np.ndarray]:
-    """Prepare the leverage of forces: the trace of their covariance by coefficients alone."""
-    respond = analog_response(sensor)
-    by_coefficient = coefficient_tangent(sensor)
-
-    def force_leverage(force: Components) -> np.ndarray:
-        if not sensor.covariance_names:
-            return np.zeros(np.shape(force[0]) or 1)
-        variance = _propagated(by_coefficient(force), sensor.covariance)
-        tangent = signal_chain.tangent(respond, sensor.axes, force)
-        return np.trace(_propagated(tangent.back, variance))
-
-    return force_leverage
 
 
 def derived_z_covariance(force: Components, measured: tuple[Value, Value, Value],
@@ -182,43 +140,21 @@ def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
     """
     Prepare the derivatives of the volts by the coefficients in `sensor.covariance_names`.
 
-    They are central differences. Each begins at the place of its effect: up to there, the chain
-    is the same for all. Coefficients of one parameter that act on their own axes share one.
-    They map a force and an `Environment` (nominal unless given) to derivatives, (m, k, n).
+    They are central differences. They map a force and an `Environment` (nominal unless given) to
+    derivatives, (m, k, n).
     """
-    chain = static_chain(sensor)
     names = sensor.covariance_names
-    groups: dict[Coefficient, list[int]] = {}
-    for row, name in enumerate(names):
-        is_own = name.axis and effect_named(name.effect).place in (Place.ELEMENT,
-                                                                   Place.ELECTRONICS)
-        groups.setdefault(name.without_axis if is_own else name, []).append(row)
-    differences = []
-    for rows in groups.values():
-        moved = [names[row] for row in rows]
-        step = _RELATIVE_STEP * parameter_of(moved[0]).scale
-        pair = [static_chain(put(sensor, moved, get(sensor, moved) + change))
-                for change in (step, -step)]
-        first = max(effect_named(moved[0].effect).place, Place.MOUNTING)
-        differences.append((rows, first, step, pair))
+    steps = [_RELATIVE_STEP * parameter_of(name).scale for name in names]
+    pairs = [[static_response(put(sensor, [name], get(sensor, [name]) + change))
+              for change in (step, -step)] for name, step in zip(names, steps)]
 
     def by_coefficient(force: Components,
                        environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
-        signals = chain.signals(environment, force=force)
-        begins = {}
-        for place in ANALOG:
-            begins[place] = signals
-            signals = replace(signals)
-            chain(place, signals)
-        begins[Place.ADC] = signals
         slopes = np.zeros((len(sensor.axes), len(names), np.size(force[0])))
-        for rows, first, step, pair in differences:
-            above, below = (each.through_adc(each.volts(replace(begins[first]), first))
-                            for each in pair)
-            for row in rows:
-                own = sensor.axes.find(names[row].axis)
-                for axis in range(len(above)) if len(rows) == 1 else (own,):
-                    slopes[axis, row] = (above[axis] - below[axis]) / (2 * step)
+        for row, (step, pair) in enumerate(zip(steps, pairs)):
+            above, below = (respond(force, environment) for respond in pair)
+            for axis, (a, b) in enumerate(zip(above, below)):
+                slopes[axis, row] = (a - b) / (2 * step)
         return slopes
 
     return by_coefficient

@@ -177,16 +177,6 @@ def angles(force: Components, covariance: tuple[Value, ...],
             (maths.atan2(maths.sqrt(plane2), z), inclination), (maths.atan2(0.0 - y, x), beta))
 
 
-def roll_pitch_covariance(force: Components, covariance: tuple[Value, ...],
-                          maths: Maths) -> Value:
-    """Return the first-order covariance of roll and pitch, rad²; see `angles`."""
-    x, y, z = force
-    _, xy, xz, yy, yz, zz = covariance
-    side2 = y * y + z * z + _FORCE2_FLOOR
-    by_pitch = x * (y * (z * yy - y * yz) + z * (z * yz - y * zz)) / side2 - (z * xy - y * xz)
-    return by_pitch / (maths.sqrt(side2) * (x * x + side2))
-
-
 def quaternion(roll_rad: Value, pitch_rad: Value, maths: Maths) -> tuple[Value, ...]:
     """Return the orientation x, y, z, w of a roll and pitch, rad, at a yaw of 0."""
     sr, cr = maths.sin(roll_rad / 2), maths.cos(roll_rad / 2)

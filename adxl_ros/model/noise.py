@@ -7,8 +7,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Need, NOMINAL_ENVIRONMENT, Place, Signals
+from adxl_ros.model.effects.base import Need, NOMINAL_ENVIRONMENT, Place
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.signal_chain import Chain
 import numpy as np
 
 ONE_SIDED = float(np.sqrt(2))
@@ -16,13 +17,6 @@ ONE_SIDED = float(np.sqrt(2))
 signs: N of IEEE Std 952 and `accelerometer_noise_density` of Kalibr, whose sample has the variance
 N²·rate (ethz-asl/kalibr, wiki/IMU-Noise-Model)."""
 _HARMONICS = 50  # Harmonics of rounding that are summed. Chosen: the others hold 1 %
-
-
-class Rounding(NamedTuple):
-    """Variance of the ADC's rounding on one axis."""
-
-    held_v2: float  # Part that stays while the output stays, V²
-    white_v2: float  # Part that is new in each sample, V²
 
 
 class Electronics(NamedTuple):
@@ -34,14 +28,11 @@ class Electronics(NamedTuple):
 
 def electronics(sensor: Sensor) -> Electronics:
     """Return filter and white noise of a unit by its effects."""
-    count = len(sensor.axes)
-    signals = Signals(NOMINAL_ENVIRONMENT, rc_s=[sensor.rc_s] * count, noise_ratio=[1.0] * count,
-                      zero_g_v=sensor.nominal_zero_g_v.tolist(), output=[0.0] * count,
-                      scale_v_per_g=sensor.nominal_scale_v_per_g.tolist())
-    for effect in map(effect_named, sensor.effects):
-        # They change nothing else, so that the rest of the chain need not run.
-        if effect.needs in ((Need.FILTER,), (Need.NOISE,)) and effect.place is Place.ELECTRONICS:
-            effect.apply(signals, sensor.parameters(effect.name))
+    # No other effect changes them; one with a memory may take arrays alone.
+    chain = Chain(sensor, [name for name in sensor.effects if effect_named(name).needs in (
+        (Need.FILTER,), (Need.NOISE,))])
+    signals = chain.signals(NOMINAL_ENVIRONMENT, output=[0.0] * len(sensor.axes))
+    chain(Place.ELECTRONICS, signals)
     return Electronics(np.array(signals.rc_s), np.array(signals.noise_ratio))
 
 
@@ -63,22 +54,21 @@ def sample_std_v(sensor: Sensor) -> np.ndarray:
     return np.hypot(analog_std_v(sensor), sensor.lsb_v / np.sqrt(12))
 
 
-def rounding(sensor: Sensor, axis: int) -> Rounding:
+def held_rounding(sensor: Sensor) -> np.ndarray:
     """
-    Split the variance of the ADC's rounding, LSB²/12, by the noise before it.
+    Return the share of the ADC's rounding that stays while the output stays, by axis, (m,).
 
-    Noise of standard deviation σ makes the rounding random. The part that depends on the mean
-    output alone is a sawtooth, whose k-th harmonic has the variance LSB²/(2π²k²)·exp(−(2πkσ/LSB)²)
-    (Widrow and Kollár 2008, section 4.4). Above half a step of noise nothing of it is left.
+    Noise of standard deviation σ makes the rounding random, of the variance LSB²/12. The part
+    that depends on the mean output alone is a sawtooth, whose k-th harmonic has the variance
+    LSB²/(2π²k²)·exp(−(2πkσ/LSB)²) (Widrow and Kollár 2008, section 4.4). Above half a step of
+    noise nothing of it is left.
     """
-    total_v2 = sensor.lsb_v ** 2 / 12
-    if not total_v2:
-        return Rounding(0.0, 0.0)
-    harmonics = np.arange(1, _HARMONICS + 1)
-    sigma_steps = float(analog_std_v(sensor)[axis]) / sensor.lsb_v
-    shares = 6 / (np.pi * harmonics) ** 2 * np.exp(-(2 * np.pi * harmonics * sigma_steps) ** 2)
-    held_v2 = total_v2 * float(shares.sum())
-    return Rounding(held_v2, total_v2 - held_v2)
+    if not sensor.lsb_v:
+        return np.zeros(len(sensor.axes))
+    harmonics = np.arange(1, _HARMONICS + 1)[:, None]
+    sigma_steps = analog_std_v(sensor) / sensor.lsb_v
+    return np.sum(6 / (np.pi * harmonics) ** 2
+                  * np.exp(-(2 * np.pi * harmonics * sigma_steps) ** 2), axis=0)
 
 
 def density_v2_per_hz(sensor: Sensor, frequency_hz: np.ndarray) -> np.ndarray:

@@ -19,7 +19,6 @@ MODELS = ('nominal', 'linear', 'physical', 'full', 'gravity')
 MARGIN_K = 2.0
 """Distance from the temperatures of the poses that counts as inside, K; chosen: by the datasheet
 it is 0.2 mg, below the noise of a sample. No thermometer is at the element."""
-STRETCH = 1.1  # Factor of the poses' forces at which h_max is taken, too; chosen: see `Envelope`
 MARGIN_MPS2 = 2.0
 """Distance from the forces of the poses that counts as inside, m/s²; chosen: planes from 30° on
 leave 1.3 m/s² to level, and nearby forces share one result."""
@@ -36,20 +35,12 @@ class Envelope:
     factor, one standard deviation each. A model that follows temperature has slopes of its own,
     whose covariance grows by itself.
 
-    Pose. The extrapolation ρ of a force is the larger of two ratios:
-
-    - The leverage h = trace(∂f/∂θ·Σ·∂f/∂θᵀ) by the largest leverage of the poses, h_max. This is
-      the regressor variable hull (Montgomery, Peck, Vining, Introduction to Linear Regression
-      Analysis, "hidden extrapolation").
-    - The square of the distance from the middle of the poses' forces, divided by half of their
-      range plus `MARGIN_MPS2`, in the component where it is largest. It covers terms that the
-      model lacks.
-
-    A force is outside where ρ > 1. The squares of the model's terms grow as ρ, and the covariance
-    does, too. What the model lacks is of higher order: its square grows at least as ρ². With the
-    misfit u of held-out poses, an axis gets the variance u²·(ρ² − 1), where ρ > 1. h_max is taken
-    at the forces of the poses and at `STRETCH` times them. Otherwise noise, and forces that share
-    a tangent with their neighbours, would count as outside.
+    Pose. The extrapolation ρ of a force is the square of its distance from the middle of the
+    poses' forces, divided by half of their range plus `MARGIN_MPS2`, in the component where it is
+    largest. A force is outside where ρ > 1. The squares of the model's terms grow as ρ, and the
+    covariance by the coefficients does, too. What the model lacks is of higher order: its square
+    grows at least as ρ². With the misfit u of held-out poses, an axis gets the variance
+    u²·(ρ² − 1), where ρ > 1.
     """
 
     # Lowest and highest temperature of the poses, °C; None if it was not measured
@@ -58,7 +49,6 @@ class Envelope:
     zero_g_per_k: float = 0.0
     # Typical slope of the scale factor, 1/K, by the datasheet; 0 if the model follows it
     scale_per_k: float = 0.0
-    leverage: float = 0.0  # Largest leverage of the poses, h_max, (m/s²)²; 0 if unknown
     # Misfit of held-out poses beyond noise and stage error, by axis, m/s²
     misfit_mps2: float = 0.0
     # force_low_mps2, force_high_mps2: Lowest and highest specific force of the poses by component,
@@ -74,9 +64,9 @@ class Envelope:
         return np.maximum(0.0, np.maximum(low - MARGIN_K - temperature_c,
                                           temperature_c - high - MARGIN_K))
 
-    def extrapolation(self, force: Sequence[Any], leverage: Any) -> Any:
-        """Return the extrapolation ρ of forces, m/s², with their leverage, (m/s²)²; 1 inside."""
-        rho = np.maximum(1.0, leverage / self.leverage if self.leverage else 1.0)
+    def extrapolation(self, force: Sequence[Any]) -> Any:
+        """Return the extrapolation ρ of forces, m/s²; 1 inside."""
+        rho: Any = 1.0
         for value, low, high in zip(force, self.force_low_mps2, self.force_high_mps2):
             distance = np.abs(value - (low + high) / 2) / ((high - low) / 2 + MARGIN_MPS2)
             rho = np.maximum(rho, distance ** 2)
@@ -90,19 +80,18 @@ class Envelope:
                 + (axis_mps2 * self.scale_per_k * beyond_k) ** 2
                 + self.misfit_mps2 ** 2 * (extrapolation ** 2 - 1))
 
-    def is_outside(self, temperature_c: Any, force: Sequence[Any], leverage: Any) -> np.ndarray:
+    def is_outside(self, temperature_c: Any, force: Sequence[Any]) -> np.ndarray:
         """Return which samples lie outside of the validity range, (n,)."""
-        return (self.beyond_k(temperature_c) > 0) | (self.extrapolation(force, leverage) > 1)
+        return (self.beyond_k(temperature_c) > 0) | (self.extrapolation(force) > 1)
 
-    def describe_outside(self, temperature_c: float, force: Sequence[float], leverage: float
-                         ) -> tuple[str, ...]:
+    def describe_outside(self, temperature_c: float, force: Sequence[float]) -> tuple[str, ...]:
         """Describe in words how one sample lies outside of the validity range."""
         texts = []
         if self.temperature_c is not None and self.beyond_k(temperature_c) > 0:
             low, high = self.temperature_c
             texts.append(f'temperature {temperature_c:.1f} degC, calibrated at {low:.1f} to '
                          f'{high:.1f}')
-        rho = float(self.extrapolation(force, leverage))
+        rho = float(self.extrapolation(force))
         if rho > 1:
             texts.append(f'force near {", ".join(f"{f:.1f}" for f in force)} m/s^2, '
                          f'{rho ** 0.5:.2g} times as far out as the calibrated poses')

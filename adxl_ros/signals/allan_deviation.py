@@ -112,7 +112,6 @@ class StillStretch:
     stop_s: float  # Its last stamp, s
     rate_hz: float  # Sample rate by its stamps, Hz
     count: int  # Number of its samples
-    filled: int  # Samples among them that were missing, and lie on a line between their neighbours
     allan: AllanDeviation  # Their Allan deviation, m/s²
     step_s: float  # Length of a cell, s
     means: np.ndarray  # Means of the cells by axis, m/s², (k, m)
@@ -163,16 +162,14 @@ def longest_rest(read: Callable[[], Iterable[Recording]], unit: Sensor, first: R
 
 
 class _Samples:
-    """The undisturbed samples of a rest; gaps are filled by straight lines."""
+    """The undisturbed samples of a rest; those after a gap follow those before it."""
 
     def __init__(self, first: Recording, file: IO[bytes]) -> None:
         self._first, columns = first, len(first.sensor_columns)
         self._phase = Phase(columns, file)
         self._resolution = np.full(columns, np.inf)
-        self._filled = 0
-        # Stamps of the first and the newest sample, and the newest row
-        self._start_s = self._stop_s = np.nan
-        self._last: np.ndarray | None = None
+        self._start_s = self._stop_s = 0.0  # Stamps of the first and the newest sample
+        self._gaps_s = 0.0  # Time of the gaps
 
     def feed(self, block: Recording, unit: Sensor, rest: Rest) -> None:
         """Add the samples of a block that are part of the rest."""
@@ -183,23 +180,15 @@ class _Samples:
         if not inside.any():
             return
         rows, time_s = block.accel_mps2(unit)[inside], time_s[inside]
-        new = int(self._last is not None)
-        if self._last is None:
-            self._start_s = float(time_s[0])
-        else:
-            time_s, rows = np.append(self._stop_s, time_s), np.vstack([self._last, rows])
-        self._last, self._stop_s = rows[-1], float(time_s[-1])
+        if not self._phase.count:
+            self._start_s = self._stop_s = float(time_s[0])
+        steps_s = np.diff(time_s, prepend=self._stop_s)
+        self._gaps_s += float(steps_s[steps_s > gap_s(self._first.rate_hz)].sum())
+        self._stop_s = float(time_s[-1])
         changes = np.abs(np.diff(rows, axis=0))
         self._resolution = np.minimum(self._resolution, np.where(
             changes > 0, changes, np.inf).min(axis=0, initial=np.inf))
-        steps_s, rate_hz = np.diff(time_s), self._first.rate_hz
-        advance = np.where(steps_s > gap_s(rate_hz), np.rint(steps_s * rate_hz), 1)
-        number = np.concatenate([[0], np.cumsum(advance)])
-        full = np.arange(number[-1] + 1)
-        if len(full) > len(rows):
-            self._filled += len(full) - len(rows)
-            rows = np.column_stack([np.interp(full, number, column) for column in rows.T])
-        self._phase.feed(rows[new:])
+        self._phase.feed(rows)
 
     def stretch(self, recorded_s: float, motion_s: list[tuple[float, float]]) -> StillStretch:
         """Return the samples as a rest; refuse an axis that never changes."""
@@ -209,12 +198,12 @@ class _Samples:
                                 f'{self._start_s:.4g} s to {self._stop_s:.4g} s; the axis is '
                                 'stuck, or not connected')
         count = self._phase.count
-        rate_hz = (count - 1) / (self._stop_s - self._start_s)
+        rate_hz = (count - 1) / (self._stop_s - self._start_s - self._gaps_s)
         allan, (size, means) = self._phase.allan_deviation(rate_hz), self._phase.cells()
         # The variance within 2^k samples is that of the octaves of Haar's wavelets in it.
         octaves = max(int(np.ceil(np.log2(_WINDOW_S * rate_hz))), 1)
         variance = (allan.deviation[:octaves] ** 2).sum(axis=0) / 2 / (1 - 0.5 ** octaves)
         return StillStretch(
-            self._start_s, self._stop_s, rate_hz, count, self._filled, allan,
+            self._start_s, self._stop_s, rate_hz, count, allan,
             size / rate_hz, means, np.sqrt(variance), self._resolution, recorded_s,
             motion_s)

@@ -48,12 +48,6 @@ _CLIPPED_WINDOW_S = 0.1  # Longest time beside them in which it moves, s. Chosen
 _CLIPPED_CODES = 20
 """Change, in steps of the resolution, that a smooth peak does not reach within the time that it
 stays at its top. Chosen: a parabola reaches nine."""
-_HELD_S = 1.0  # Shortest reported time without any change, s. Chosen: noise is faster
-_STUCK_S = 5.0
-"""Shortest time without any change of one axis alone that is reported, s. Chosen: a coarse axis
-may rest for some seconds between two codes."""
-_HELD_SAMPLES = 20  # Fewest samples of such a time. Chosen: a slow sensor repeats a few
-_CHANGING = 0.5  # Share of samples that change. Chosen: fewer of a coarse sensor at rest
 
 
 @dataclass(frozen=True)
@@ -65,17 +59,6 @@ class AxisRange:
     highest_mps2: float  # Its highest value, m/s²
     clipped: int  # Times at which it stays at an extreme value in motion
     is_stuck: bool  # Whether it never changes
-    # Longest time in which it does not change although it usually does, s; 0 for none
-    held_s: float
-
-
-@dataclass(frozen=True)
-class LogDelay:
-    """Log time minus header stamp of the samples of a bag."""
-
-    median_s: float  # Median, s
-    spread_s: float  # Time from the 1st to the 99th percentile without drift, s
-    drift_ppm: float  # Its drift by log time, 10⁻⁶
 
 
 @dataclass(frozen=True)
@@ -93,8 +76,6 @@ class RecordingContents:
     longest_gap_s: float  # Longest gap, s; 0 for none
     bad_stamps: BadStamps  # Samples whose stamp does not increase
     axes: tuple[AxisRange, ...]  # Ranges by axis
-    # Longest time in which no axis changes although the samples usually do, s; 0 for none
-    held_s: float
     rest_share: float  # Share of the time at rest
     longest_rest_s: float  # Longest rest, s
     rests: int  # Number of rests
@@ -104,13 +85,14 @@ class RecordingContents:
     # Lowest and highest value of each reference, by column
     reference_ranges: dict[str, tuple[float, float]]
     reference_means: dict[str, float]  # Mean of each reference, by column
-    delay: LogDelay | None  # Log time minus header stamp; None where there is no bag
+    # Usual log time minus header stamp, s; None where there is no bag
+    log_delay_s: float | None
     remarks: tuple[str, ...]  # What was assumed or left out in reading
     cut: str  # Where a damaged file ends; empty if it is whole
 
 
 def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
-            delay: LogDelay | None) -> RecordingContents:
+            log_delay_s: float | None) -> RecordingContents:
     """Find what a recording holds."""
     blocks = iter(blocks)
     first = next((block for block in blocks if len(block)), None)
@@ -118,8 +100,6 @@ def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
         raise UserError('the recording holds no samples')
     unit, stamps = unit_of(first), _Stamps(first)
     axes = [_Axis(name, stamps.period_s) for name in first.sensor_columns]
-    held = _Held(_HELD_S / stamps.period_s)  # of all axes together
-    last = first.accel_mps2(unit)[:1]
     rests = RecordedRests(unit, first)
     # Lowest and highest value, sum and count of each reference by block
     references: dict[str, list[tuple[float, float, float, int]]] = {}
@@ -127,10 +107,7 @@ def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
         if not len(block):
             continue
         stamps.feed(block.time_s)
-        accel_mps2 = np.concatenate([last, block.accel_mps2(unit)])
-        last = accel_mps2[-1:]
-        held.feed((np.diff(accel_mps2, axis=0) != 0).any(axis=1))
-        for axis, values in zip(axes, accel_mps2.T):
+        for axis, values in zip(axes, block.accel_mps2(unit).T):
             axis.feed(values)
         rests.feed(block)
         for name, values in block.columns.items():
@@ -150,28 +127,20 @@ def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
         rate_hz=round(1 / stamps.period_s, 6), jitter_s=stamps.jitter_s, burst=stamps.burst,
         missing=stamps.missing, gaps=stamps.gaps, longest_gap_s=stamps.longest_gap_s,
         bad_stamps=block.bad_stamps, axes=tuple(axis.result() for axis in axes),
-        held_s=held.samples * stamps.period_s,
         rest_share=min(sum(spans_s) / span_s, 1.0), longest_rest_s=max(spans_s, default=0.0),
         rests=len(spans_s), poses=_count_poses(means_mps2),
         length_g=float(np.median(lengths_g)) if spans_s and len(unit.axes) == len(AXES) else None,
         reference_ranges={name: (min(low), max(high)) for name, (low, high, *_) in parts.items()},
         reference_means={name: sum(total) / sum(count)
                          for name, (_, _, total, count) in parts.items()},
-        delay=delay, remarks=block.remarks, cut=block.cut)
+        log_delay_s=log_delay_s, remarks=block.remarks, cut=block.cut)
 
 
-def log_delay(times_ns: Iterable[np.ndarray]) -> LogDelay | None:
-    """Compare log times with header stamps, ns, (k, 2) by block; None without messages."""
+def log_delay_s(times_ns: Iterable[np.ndarray]) -> float | None:
+    """Return the median of log time minus header stamp, ns, (k, 2) by block; None without any."""
     # A few messages of each block are enough, whatever the length of the recording.
     parts = [block[::max(len(block) // 128, 1)] for block in times_ns]
-    if not parts:
-        return None
-    times = np.concatenate(parts)
-    delay_s = (times[:, 1] - times[:, 0]) * 1e-9
-    time_s = (times[:, 1] - times[0, 1]) * 1e-9
-    line = np.polyfit(time_s, delay_s, 1) if np.ptp(time_s) > 0 else np.zeros(2)
-    low_s, high_s = np.quantile(delay_s - np.polyval(line, time_s), [0.01, 0.99])
-    return LogDelay(float(np.median(delay_s)), float(high_s - low_s), 1e6 * float(line[0]))
+    return 1e-9 * float(np.median(np.diff(np.concatenate(parts)))) if parts else None
 
 
 class _Stamps:
@@ -219,43 +188,17 @@ class _Stamps:
         return self.period_s * float(np.sqrt(self._squares / max(self._usual, 1)))
 
 
-class _Held:
-    """The longest time without change of samples that usually change."""
-
-    def __init__(self, shortest: float) -> None:
-        self._shortest = max(shortest, _HELD_SAMPLES)
-        self.changes = self._count = self._samples = self._longest = 0
-
-    def feed(self, is_new: np.ndarray) -> None:
-        """Add whether each further sample differs from the one before, (n,)."""
-        self.changes += int(is_new.sum())
-        self._count += len(is_new)
-        # Samples from one change to the next, the first and last of which continue elsewhere
-        runs = np.diff(np.flatnonzero(is_new), prepend=-1 - self._samples, append=len(is_new)) - 1
-        self._samples = int(runs[-1])
-        self._longest = max(self._longest, int(runs.max()))
-
-    @property
-    def samples(self) -> int:
-        """Return the number of samples without change; 0 where it is usual or short."""
-        is_held = (self._longest >= self._shortest
-                   and self.changes > _CHANGING * (self._count - self._longest))
-        return self._longest if is_held else 0
-
-
 class _Axis:
-    """Extreme values of an axis, and times without change."""
+    """Extreme values of an axis."""
 
     def __init__(self, name: str, period_s: float) -> None:
         self._name, self._period_s = name, period_s
         # Largest value of minus the samples and of the samples, and how often they stay there
         self._largest, self._clipped = [-np.inf, -np.inf], [0, 0]
-        self._held = _Held(_STUCK_S / period_s)
 
     def feed(self, values: np.ndarray) -> None:
-        """Add further samples, m/s², behind the last one before, (1 + n,)."""
+        """Add further samples, m/s², (n,)."""
         steps = np.abs(np.diff(values))
-        self._held.feed(steps != 0)
         smallest = float(steps[steps > 0].min(initial=np.inf))
         drop = max(_CLIPPED_STEP_G * G0_MPS2, _CLIPPED_CODES * smallest)
         for side, signed in enumerate((-values, values)):
@@ -276,9 +219,8 @@ class _Axis:
 
     def result(self) -> AxisRange:
         """Return the range of the axis."""
-        return AxisRange(self._name, -self._largest[0], self._largest[1],
-                         sum(self._clipped), not self._held.changes,
-                         self._held.samples * self._period_s)
+        low, high = -self._largest[0], self._largest[1]
+        return AxisRange(self._name, low, high, sum(self._clipped), low == high)
 
 
 def _count_poses(means_mps2: Sequence[np.ndarray]) -> int:
@@ -297,8 +239,6 @@ _LARGEST_JITTER = 0.3  # Jitter of a sound log, periods. Chosen: samples still s
 _FEWEST_CLIPPED = 3  # Clippings from which a log is not sound. Chosen: one may be a knock
 _LENGTHS_G = (0.8, 1.25)  # Bounds of gravity, g. Chosen: zero-g and scale stay within
 _LARGEST_DELAY_S = 0.1  # Mentioned delay of the log time, s. Chosen: recorders are faster
-_LARGEST_SPREAD_S = 1.0  # Mentioned spread of it, s. Chosen: a step of the clock is larger
-_LARGEST_DRIFT_PPM = 200.0  # Mentioned drift of it, 10⁻⁶. Chosen: twice that of a quartz
 _MOVED_RAD = 0.01  # Range from which a stage moves, rad. Chosen: beyond jitter of encoders
 _FOLLOWED = {'temperature_c': ('temperature', 1.0), 'supply_v': ('supply', 0.1)}
 """Name of a reference and its smallest range, °C and V, that shows effects at rest. Chosen: a
@@ -373,14 +313,9 @@ def _stamp_faults(contents: RecordingContents) -> list[str]:
 def _sample_faults(contents: RecordingContents) -> list[str]:
     faults = [f'{axis.name} never changes; the axis is stuck, or not connected'
               for axis in contents.axes if axis.is_stuck]
-    faults += [f'{axis.name} does not change for {axis.held_s:.3g} s while other axes do; the '
-               'axis is stuck then' for axis in contents.axes
-               if axis.held_s > contents.held_s and not axis.is_stuck]
     faults += [f'{axis.name} stays at its extreme value {axis.clipped} times in motion; its range '
                f'ends at {axis.lowest_mps2 / G0_MPS2:.3g} or {axis.highest_mps2 / G0_MPS2:.3g} g'
                for axis in contents.axes if axis.clipped >= _FEWEST_CLIPPED]
-    if contents.held_s:
-        faults.append(f'no axis changes for {contents.held_s:.3g} s; the driver repeats a sample')
     length_g = contents.length_g
     if length_g is not None and not _LENGTHS_G[0] < length_g < _LENGTHS_G[1]:
         unit = likely_unit(length_g * G0_MPS2)
@@ -398,18 +333,11 @@ def _remarks(contents: RecordingContents) -> list[str]:
     if contents.burst > 1:
         remarks.append(f'stamps come in bursts of {contents.burst} samples; --rate '
                        f'{contents.rate_hz:.4g} stamps by index')
-    delay = contents.delay
-    if delay is not None and abs(delay.median_s) > _LARGEST_DELAY_S:
-        order = 'after' if delay.median_s > 0 else 'before'
-        remarks.append(f'log time is {duration(abs(delay.median_s))} {order} header time; the '
-                       'clocks of sensor and recorder differ')
-    if delay is not None and delay.spread_s > _LARGEST_SPREAD_S:
-        remarks.append(f'log time minus header time varies by {delay.spread_s:.3g} s; a clock was '
-                       'set, messages came late, or the headers have simulated time')
-    if delay is not None and abs(delay.drift_ppm) > _LARGEST_DRIFT_PPM:
-        ratio = 1 - 1e-6 * delay.drift_ppm
-        remarks.append(f'header time runs {ratio:.6g} times as fast as log time; the headers have '
-                       'simulated time, or a clock of their own')
+    delay_s = contents.log_delay_s or 0.0
+    if abs(delay_s) > _LARGEST_DELAY_S:
+        order = 'after' if delay_s > 0 else 'before'
+        remarks.append(f'log time is {duration(abs(delay_s))} {order} header time; the clocks of '
+                       'sensor and recorder differ, or the headers have simulated time')
     return remarks
 
 
@@ -466,16 +394,16 @@ def check_recording(path: str, params: str | None, reading: ReadingOptions,
                     show: Callable[[float], None] = lambda done: None) -> Findings:
     """Return the findings of a recording; one that cannot be read is not sound."""
     try:
-        delay = None
+        delay_s = None
         if reading.rate_hz is None and recording.is_bag(path):
-            delay = log_delay(log_times(path, reading.topic))
+            delay_s = log_delay_s(log_times(path, reading.topic))
 
         def unit_of(block: Recording) -> Sensor:
             sensor = load_sensor(params, block)
             return uncalibrated(sensor, block.stream_info, block.axes, sensor.rate_hz)
 
         blocks = recording.blocks(path, BLOCK_ROWS, reading)
-        contents = examine(_shown(blocks, show), unit_of, delay)
+        contents = examine(_shown(blocks, show), unit_of, delay_s)
     except UserError as error:
         reason = one_line(error).removeprefix(f'{path}: ')
         return Findings(path, None, (reason,), paste=error.paste)

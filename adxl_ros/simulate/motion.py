@@ -43,7 +43,23 @@ class Held:
         return np.full(len(time_s), 0.0 if order else self.value)
 
 
-class Knots:
+class Pieces:
+    """A path of piecewise polynomials."""
+
+    def __init__(self, pieces: scipy.interpolate.PPoly) -> None:
+        """Take the polynomials."""
+        self._orders = [pieces, pieces.derivative(), pieces.derivative(2)]
+        self._begin_s, self._end_s = float(pieces.x[0]), float(pieces.x[-1])
+
+    def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
+        """Return a derivative; see `Path`."""
+        values = self._orders[order](np.clip(time_s, self._begin_s, self._end_s))
+        if order and len(time_s) and (time_s[0] < self._begin_s or time_s[-1] > self._end_s):
+            values[(time_s < self._begin_s) | (time_s > self._end_s)] = 0.0
+        return values
+
+
+class Knots(Pieces):
     """
     A path through knots, by polynomials of degree 5 with continuous second derivatives.
 
@@ -56,17 +72,8 @@ class Knots:
         """Interpolate ascending knots, (k,); second derivatives there are 0."""
         rates = np.zeros(len(time_s)) if velocity is None else np.asarray(velocity, float)
         derivatives = np.column_stack([position, rates, np.zeros(len(time_s))])
-        pieces = scipy.interpolate.PPoly.from_bernstein_basis(
-            scipy.interpolate.BPoly.from_derivatives(time_s, derivatives))
-        self._orders = [pieces, pieces.derivative(), pieces.derivative(2)]
-        self._begin_s, self._end_s = float(time_s[0]), float(time_s[-1])
-
-    def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return a derivative; see `Path`."""
-        values = self._orders[order](np.clip(time_s, self._begin_s, self._end_s))
-        if order and len(time_s) and (time_s[0] < self._begin_s or time_s[-1] > self._end_s):
-            values[(time_s < self._begin_s) | (time_s > self._end_s)] = 0.0
-        return values
+        super().__init__(scipy.interpolate.PPoly.from_bernstein_basis(
+            scipy.interpolate.BPoly.from_derivatives(time_s, derivatives)))
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,11 @@ from adxl_ros.simulate.motion import (
     Knots,
     Motion,
     Path,
+    Pieces,
     SmoothedPath,
 )
 import numpy as np
+import scipy
 
 SLEW_RAD_S = np.pi / 4  # Largest rate between poses, rad/s; chosen: 30° take 1.25 s
 DWELL_S = 5.0  # Dwell of a pose, s: the time over which the paper averages
@@ -37,39 +39,19 @@ _SHAKE_HIGH_HZ = 40.0  # Highest frequency, Hz; chosen: near the bandwidth
 _SHAKE_MPS2 = 1.0  # Amplitude of the shaker, m/s²; chosen: a tenth of gravity
 _SHAKE_S = 40.0  # Duration of the shaker, s; chosen: some 9 s for each octave
 _FADE_S = 2.0  # Fade in and out, s; chosen: four of the longest periods
+_SHAKE_KNOTS_HZ = 1000.0  # Knots of its spline a second; chosen: the force is exact to 0.4 µg
 
 
-class SweptSine:
-    """
-    A sine of constant acceleration whose frequency grows exponentially, faded in and out.
-
-    x = −E·sin φ with φ̇ = ω = ω₀·exp(k·t) and E = a·w/ω², w from 0 to 1 and back.
-    """
-
-    def __init__(self, begin_s: float, duration_s: float) -> None:
-        """Set the times of the sine."""
-        self._begin_s, self._end_s = begin_s, begin_s + duration_s
-        self._omega = 2 * np.pi * _SHAKE_LOW_HZ
-        self._k = np.log(_SHAKE_HIGH_HZ / _SHAKE_LOW_HZ) / duration_s
-        self._window = Knots([0, _FADE_S, duration_s - _FADE_S, duration_s], [0, 1, 1, 0])
-
-    def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return a derivative; see `motion.Path`."""
-        values = np.zeros(len(time_s))
-        active = (time_s > self._begin_s) & (time_s < self._end_s)
-        if not active.any():
-            return values
-        t, k = time_s[active] - self._begin_s, self._k
-        omega = self._omega * np.exp(k * t)
-        phase = (omega - self._omega) / k
-        w0, w1, w2 = (self._window(t, i) for i in range(3))
-        # E and its derivatives, and those of E·exp(iφ)
-        e0, e1, e2 = (_SHAKE_MPS2 / omega ** 2 * w for w in (
-            w0, w1 - 2 * k * w0, w2 - 4 * k * w1 + 4 * k * k * w0))
-        turning = (e0, e1 + 1j * omega * e0,
-                   e2 + 2j * omega * e1 + (1j * k * omega - omega ** 2) * e0)[order]
-        values[active] = -(turning * np.exp(1j * phase)).imag
-        return values
+def swept_sine(begin_s: float) -> Pieces:
+    """Return a sine of constant acceleration whose frequency grows exponentially, with fades."""
+    time_s = np.linspace(0.0, _SHAKE_S, round(_SHAKE_S * _SHAKE_KNOTS_HZ) + 1)
+    growth_per_s = np.log(_SHAKE_HIGH_HZ / _SHAKE_LOW_HZ) / _SHAKE_S
+    omega = 2 * np.pi * _SHAKE_LOW_HZ * np.exp(growth_per_s * time_s)
+    amplitude_m = _SHAKE_MPS2 / omega ** 2 * Knots(
+        [0, _FADE_S, _SHAKE_S - _FADE_S, _SHAKE_S], [0, 1, 1, 0])(time_s)
+    position_m = -amplitude_m * np.sin((omega - omega[0]) / growth_per_s)
+    return Pieces(scipy.interpolate.PPoly.from_spline(
+        scipy.interpolate.make_interp_spline(begin_s + time_s, position_m, k=5)))
 
 
 @dataclass(frozen=True)
@@ -239,12 +221,12 @@ def rich(_: np.random.Generator) -> Motion:
     return Motion(end, *script.joints(), shift, temperature_c, supply_v)
 
 
-def _shake(script: Script) -> SweptSine:
+def _shake(script: Script) -> Pieces:
     """Rest while the shaker runs, and return its path."""
     script.rest(2.0)
     begin_s = script.now
     script.rest(_SHAKE_S + 2.0)
-    return SweptSine(begin_s, _SHAKE_S)
+    return swept_sine(begin_s)
 
 
 TRAJECTORIES: dict[str, Callable[[np.random.Generator], Motion]] = {

@@ -100,9 +100,8 @@ def _value_lines(contents: RecordingContents) -> list[str]:
                        for axis in contents.axes),
              *(f'{name} {low:.4g} to {high:.4g} {column_unit(name)}'
                for name, (low, high) in contents.reference_ranges.items())]
-    if contents.delay is not None:
-        texts.append(f'log time minus header time {short_time(contents.delay.median_s)}, '
-                     f'spread {short_time(contents.delay.spread_s)}')
+    if contents.log_delay_s is not None:
+        texts.append(f'log time minus header time {short_time(contents.log_delay_s)}')
     return texts
 
 

@@ -32,7 +32,6 @@ MICRO_G = 1e6 / G0_MPS2  # 1 m/s² in µg
 _LARGEST_STD_MPS2 = 0.3
 """Noise of a sample from which a sensor vibrates, m/s². Chosen: three times that of a low-cost
 IMU at 1 kHz."""
-_LARGEST_FILLED = 0.01  # Share of missing samples from which white noise changes visibly. Chosen
 _NAMES = ('white noise N', 'bias instability B', 'random walk K')  # Names of the terms
 _UNITS = {'white': 'm/s^2/sqrt(Hz)', 'instability': 'm/s^2', 'walk': 'm/s^2/sqrt(s)'}
 """Keys and units of the terms in JSON."""
@@ -105,9 +104,6 @@ def _warnings(result: RecordingNoise) -> list[str]:
                      f'{begin_s:.5g} s to {end_s:.5g} s. Used is the longest rest, '
                      f'{duration(rest.span_s)} of {duration(rest.recorded_s)}. Record again '
                      'without touching the sensor.')
-    if rest.filled > _LARGEST_FILLED * rest.count:
-        texts.append(f'{rest.filled} samples ({100 * rest.filled / rest.count:.2g} %) are '
-                     'missing. They are filled by straight lines, which lowers N.')
     for noise in result.axes:
         texts += [f'{noise.axis}: {text}' for text in _axis_warnings(rest.span_s, noise)]
     return texts
@@ -137,8 +133,7 @@ def _as_json(result: RecordingNoise) -> dict[str, Any]:
     rest, letters = result.rest, [noise.axis for noise in result.axes]
     return {
         'schema': 1, 'recording': result.path, 'rate_hz': rest.rate_hz, 'samples': rest.count,
-        'filled_samples': rest.filled, 'rest_s': [rest.start_s, rest.stop_s],
-        'recorded_s': rest.recorded_s,
+        'rest_s': [rest.start_s, rest.stop_s], 'recorded_s': rest.recorded_s,
         'axes': {noise.axis: _axis_json(noise) for noise in result.axes},
         'allan_deviation': {'tau_s': rest.allan.tau_s.tolist(),
                             **dict(zip(letters, rest.allan.deviation.T.tolist()))},
@@ -156,21 +151,19 @@ def _axis_json(noise: AxisNoise) -> dict[str, Any]:
             'rounding': noise.rounding,
             'density_g_per_rthz': noise_parameters.density_g_per_rthz(noise),
             'sample_std_mps2': noise.sample_std, 'resolution_mps2': noise.resolution,
-            'lowest': {'tau_s': noise.lowest_s, 'deviation_mps2': noise.lowest},
             'fitted_below_hz': noise.fit.highest_hz}
 
 
 _INCHES = (5.0, 4.4)
 """Width and height of the plot of an axis, inches. Chosen: three fit beside each other."""
 _COLUMNS = ('axis', 'white noise N, µg/√Hz', 'bias instability B, µg', 'random walk K, µg/√s',
-            'lowest Allan deviation, µg', 'noise of a sample, m/s²', 'fitted below, Hz')
+            'noise of a sample, m/s²', 'fitted below, Hz')
 """Head of the table."""
 
 
 def _write_page(folder: Path, result: RecordingNoise) -> list[Path]:
     page, plot, figure = folder / 'report.html', folder / 'allan.png', _plot(result)
     rows = [[noise.axis, *_micro_g_intervals(noise),
-             f'{noise.lowest * MICRO_G:.3g} at {noise.lowest_s:.3g} s',
              f'{noise.sample_std:.3g}', f'{noise.fit.highest_hz:.3g}'] for noise in result.axes]
     write_text(page, html_page.render('adxl_ros.tools', 'noise.html', {
         'title': 'Noise at rest', 'about': _head(result), 'badge': None, 'figures': {},

@@ -8,7 +8,7 @@ from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.covariance import coefficient_tangent, force_covariance
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import ARRAYS, Coefficient, Environment, FLOATS, Need, Role
-from adxl_ros.model.kinematics import angles, roll_pitch_covariance, specific_force, tilt
+from adxl_ros.model.kinematics import angles, specific_force, tilt
 from adxl_ros.model.sensor import get, names_of, parameter_of, put, Sensor, with_neutral
 from hypothesis import given, strategies as st
 import numpy as np
@@ -164,26 +164,7 @@ def test_floats_and_arrays_agree() -> None:
     force = rng.normal(size=(3, 200)) * 6
     mixed = rng.normal(size=(200, 3, 3)) * 0.1
     spread = np.array([(m @ m.T)[np.triu_indices(3)] for m in mixed]).T
-    arrays = np.array([*np.array(angles(list(force), tuple(spread), ARRAYS)).reshape(8, -1),
-                       roll_pitch_covariance(list(force), tuple(spread), ARRAYS)])
+    arrays = np.array(angles(list(force), tuple(spread), ARRAYS)).reshape(8, -1)
     for i in range(200):
         f, s = force[:, i].tolist(), tuple(spread[:, i].tolist())
-        floats = [*np.ravel(angles(f, s, FLOATS)), roll_pitch_covariance(f, s, FLOATS)]
-        np.testing.assert_allclose(floats, arrays[:, i], rtol=1e-12)
-
-
-def test_covariance_of_roll_and_pitch_equals_finite_differences() -> None:
-    force = np.array([3.0, -4.0, 8.0])
-    spread = np.array([[4, 1, 2], [1, 5, -1], [2, -1, 6]]) * 1e-4
-
-    def roll_pitch(f: np.ndarray) -> np.ndarray:
-        return np.array([np.arctan2(f[1], f[2]), np.arctan2(-f[0], np.hypot(f[1], f[2]))])
-
-    by = np.array([(roll_pitch(force + h) - roll_pitch(force - h)) / 2e-6
-                   for h in 1e-6 * np.eye(3)]).T
-    expected = by @ spread @ by.T
-    six = tuple(spread[np.triu_indices(3)].tolist())
-    (_, roll), (_, pitch), _, _ = angles(force.tolist(), six, FLOATS)
-    assert [roll, pitch] == pytest.approx(np.diag(expected).tolist(), rel=1e-6)
-    assert roll_pitch_covariance(force.tolist(), six, FLOATS) == pytest.approx(
-        expected[0, 1], rel=1e-6)
+        np.testing.assert_allclose(np.ravel(angles(f, s, FLOATS)), arrays[:, i], rtol=1e-12)

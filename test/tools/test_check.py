@@ -99,9 +99,6 @@ ROW = np.arange(6000)
      'stamps scatter by'), (lambda t, a: (t, a * [1, 0, 1]), None, 'ay_mps2 never changes'),
     (clipped, 1, 'ax_mps2 stays at its extreme value'),
     (clipped_slowly, 1, 'ax_mps2 stays at its extreme value'),
-    (lambda t, a: (t, np.c_[a[:, :2], a[np.minimum(ROW, 4499), 2]]), 1,
-     'az_mps2 does not change for 15 s while other axes do'),
-    (lambda t, a: (t, a[np.where(ROW // 300 == 10, 2999, ROW)]), 1, 'no axis changes for 3 s'),
     (lambda t, a: (t, a / G), None, 'seem to be in g')])
 def test_each_fault_is_named(tmp_path: Path, change: Callable, count: int | None, fault: str
                              ) -> None:
@@ -146,26 +143,9 @@ def test_log_time_against_header_time(tmp_path: Path) -> None:
     late = [replace(item, log_ns=item.stamp_ns + 250_000_000) for item in sent]
     bag_of(tmp_path / 'late', late)
     result = checked(tmp_path, 'late')
-    assert result['contents']['delay']['median_s'] == pytest.approx(0.25)
-    assert result['contents']['delay']['spread_s'] < 1e-3
+    assert result['contents']['log_delay_s'] == pytest.approx(0.25)
     assert result['sound']
     assert any('log time is 0.25 s after header time' in text for text in result['remarks'])
-    simulated = [replace(item, log_ns=item.stamp_ns + 4 * 10 ** 7 * i)
-                 for i, item in enumerate(sent)]
-    bag_of(tmp_path / 'simulated', simulated)
-    result = checked(tmp_path, 'simulated')
-    assert result['sound']
-    assert any('header time runs 0.2 times as fast' in text for text in result['remarks'])
-    paces = np.cumsum(np.where(np.arange(1000) < 300, 4 * 10 ** 7, 10 ** 7))
-    varying = [replace(item, log_ns=item.stamp_ns + int(late_ns))
-               for item, late_ns in zip(sent, paces)]
-    bag_of(tmp_path / 'varying', varying)
-    assert checked(tmp_path, 'varying')['sound'], 'a simulator that runs at a varying pace'
-    jumped = [replace(item, log_ns=item.stamp_ns + (5 * 10 ** 9 if i > 500 else 0))
-              for i, item in enumerate(sent)]
-    bag_of(tmp_path / 'jumped', jumped)
-    remarks = checked(tmp_path, 'jumped')['remarks']
-    assert any('log time minus header time varies' in text for text in remarks)
 
 
 def test_the_mapping_of_a_foreign_log_is_one_line(tmp_path: Path) -> None:

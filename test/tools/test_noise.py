@@ -114,14 +114,15 @@ def test_noise_that_rounding_hides_is_not_written(tmp_path: Path) -> None:
     assert kept[1:] == pytest.approx(np.sqrt(2) * N / G, rel=0.1)
 
 
-def test_a_few_lost_samples_are_filled_and_a_long_gap_is_not(tmp_path: Path) -> None:
+def test_a_rest_goes_on_after_a_few_lost_samples_and_not_after_a_long_gap(tmp_path: Path) -> None:
     time_s, accel = samples(600.0)
     kept = np.ones(len(time_s), bool)
     kept[1000:1020] = False
     write_csv(tmp_path / 'lost.csv', time_s[kept], accel[kept])
     result = as_json(tmp_path, 'lost.csv')
     # A rest is found in blocks of 0.05 s.
-    assert 20 <= result['filled_samples'] <= 25 and 29990 <= result['samples'] <= 30000
+    assert 29970 <= result['samples'] <= 29980
+    assert result['rate_hz'] == pytest.approx(RATE_HZ, rel=1e-4)
     kept[10000:10200] = False
     write_csv(tmp_path / 'gap.csv', time_s[kept], accel[kept])
     result = as_json(tmp_path, 'gap.csv')

@@ -7,9 +7,6 @@ Force along and across the axes, and their directions; zero-g, scale factor, sup
 output stage and filter.
 """
 
-from functools import lru_cache
-from typing import Any
-
 from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects.base import (
     add,
@@ -203,32 +200,17 @@ def vibration_rectification(signals: Signals, p: Parameters) -> None:
                                                              signals.dt_s, square)
 
 
-@lru_cache(maxsize=64)
-def direction(axis: int, alpha_rad: float, beta_rad: float) -> Components:
+def direction(axis: int, alpha_rad: Value, beta_rad: Value) -> Components:
     """
     Return the unit vector of one sensing axis in the case frame.
 
     Θx = R_y(α)·R_z(β)·[1 0 0]ᵀ (18), Θy = R_x(α)·R_z(β)·[0 1 0]ᵀ (19), and in the same manner
     Θz = R_x(α)·R_y(β)·[0 0 1]ᵀ.
     """
-    return _direction(axis, alpha_rad, beta_rad)
-
-
-def _direction(axis: int, alpha_rad: Value, beta_rad: Value) -> Components:
     maths = ARRAYS if np.ndim(alpha_rad) or np.ndim(beta_rad) else FLOATS
     sa, ca, sb, cb = (f(angle) for angle in (alpha_rad, beta_rad)
                       for f in (maths.sin, maths.cos))
     return [[ca * cb, sb, -sa * cb], [-sb, ca * cb, sa * cb], [sb, -sa * cb, ca * cb]][axis]
-
-
-def _directions(memory: dict[Any, Any], alpha_rad: tuple, beta_rad: tuple) -> list[Components]:
-    """Return the sensing axes; those of many units, with angles (n,), are kept in the memory."""
-    if not any(map(np.ndim, (*alpha_rad, *beta_rad))):
-        return [direction(d, *angles) for d, angles in enumerate(zip(alpha_rad, beta_rad))]
-    if memory.get('alpha_rad') is not alpha_rad:
-        memory.update(alpha_rad=alpha_rad, directions=[
-            _direction(d, *angles) for d, angles in enumerate(zip(alpha_rad, beta_rad))])
-    return memory['directions']
 
 
 @effect(Place.MOUNTING,
@@ -245,8 +227,12 @@ def _directions(memory: dict[Any, Any], alpha_rad: tuple, beta_rad: tuple) -> li
                                  proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)))
 def misalignment(signals: Signals, p: Parameters) -> None:
     """Directions of the sensing axes in the case: equations 18 and 19, and the same for z."""
+    alpha_rad, beta_rad, memory = p['alpha_rad'], p['beta_rad'], signals.memory
+    if memory.get('alpha_rad') is not alpha_rad or memory.get('beta_rad') is not beta_rad:
+        memory.update(alpha_rad=alpha_rad, beta_rad=beta_rad, directions=[
+            direction(d, *angles) for d, angles in enumerate(zip(alpha_rad, beta_rad))])
     force = list(signals.sensed)
-    for d, (tx, ty, tz) in enumerate(_directions(signals.memory, p['alpha_rad'], p['beta_rad'])):
+    for d, (tx, ty, tz) in enumerate(memory['directions']):
         signals.sensed[d] = tx * force[0] + ty * force[1] + tz * force[2]
 
 

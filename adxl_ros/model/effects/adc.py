@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
 
 from adxl_ros.model.effects.base import (
     ActsOn,
@@ -197,78 +196,29 @@ _LOWEST_HZ = 1e-5  # Lowest corner, Hz; chosen: the density is 1/f from ten time
 _HIGHEST_RATIO = 10 ** -0.5
 """Highest corner divided by the sample rate; chosen: aliasing replaces the missing corners."""
 _PER_DECADE = 2
-"""Corners per decade; chosen: the sum is 1/f within 2 % up to a fifth of the sample rate."""
-_BISECTIONS = 60  # Bisections between two poles on a logarithmic axis; chosen: as fine as float64
-
-
-class _Shaping(NamedTuple):
-    """Filter of k first-order sections that turns white noise into flicker noise."""
-
-    # Coefficients of the sections as `scipy.signal.sosfilt` takes them, (k, 6)
-    sections: np.ndarray
-    # States of the sections in stationary noise, of k independent standard normals, (k, k)
-    stationary: np.ndarray
+"""Corners per decade; chosen: the density is 1/f within 3 % up to a fifth of the sample rate."""
+_MATCHED = 0.02  # Frequency divided by the sample rate at which the density is exact; chosen
 
 
 @lru_cache(maxsize=8)
-def corners_hz(rate_hz: float) -> np.ndarray:
-    """Return the corners of the processes for a sample rate, Hz, the highest first."""
+def _flicker_filter(rate_hz: float) -> np.ndarray:
+    """
+    Return the sections that make flicker noise of k = 1 from white noise, as `sosfilt` takes them.
+
+    Between the poles of each two neighbouring corners there is a zero in their geometric mean, so
+    that the density falls by a factor of 10 in a decade.
+    """
     highest = _HIGHEST_RATIO * rate_hz
     count = int(np.log10(highest / _LOWEST_HZ) * _PER_DECADE) + 1
-    return highest * 10 ** (-np.arange(count) / _PER_DECADE)
-
-
-@lru_cache(maxsize=8)
-def _shaping(rate_hz: float) -> _Shaping:
-    """
-    Factor the spectrum of the sampled processes for a sample rate, Hz.
-
-    A process of variance 1 has the spectrum sinh θ/(cosh θ − cos ω), with the pole exp(−θ) at
-    θ = 2π·corner/rate. In cos ω, the zeros of the sum are real and separate the poles. White noise
-    through these poles and zeros has the spectrum of the sum (Wold's decomposition).
-    """
-    poles = 2 * np.pi * corners_hz(rate_hz) / rate_hz
-    zeros = _zeros(poles)
-    # The densities of the processes, σ²·2/(π·f_c)/(1 + (f/f_c)²), sum up to σ²/(f·Δln f).
-    variance = np.log(10) / _PER_DECADE
-    gain = (np.sqrt(variance * np.tanh(poles / 2).sum())
-            * np.prod(1 + np.exp(-poles)) / np.prod(1 + np.exp(-zeros)))  # at half the rate
-    sections = np.zeros((len(poles), 6))
+    corners = 2 * np.pi * highest / rate_hz * 10 ** (-np.arange(count) / _PER_DECADE)
+    poles, zeros = np.exp(-corners), np.exp(-np.sqrt(corners[:-1] * corners[1:]))
+    turn = np.exp(2j * np.pi * _MATCHED)
+    passed = np.abs(np.prod(turn - zeros) / np.prod(turn - poles))
+    sections = np.zeros((count, 6))
     sections[:, [0, 3]] = 1.0
-    sections[:, 1], sections[:, 4] = -np.exp(-zeros), -np.exp(-poles)
-    sections[0, :2] *= gain
-    return _Shaping(sections, gain * _stationary(poles, zeros))
-
-
-def _zeros(poles: np.ndarray) -> np.ndarray:
-    """Return the zeros of Σ sinh θ/(cosh θ − cosh φ) for k poles θ, (k,); the last is infinite."""
-    upper, lower = np.log(poles[:-1]), np.log(poles[1:])
-    pole = poles[:, None]
-    for _ in range(_BISECTIONS):
-        middle = (lower + upper) / 2
-        zero = np.exp(middle)
-        sums = np.sum(np.sinh(pole) / (np.sinh((pole + zero) / 2) * np.sinh((pole - zero) / 2)),
-                      axis=0)
-        # From pole to pole the sum rises from −∞ to ∞.
-        upper, lower = np.where(sums > 0, middle, upper), np.where(sums > 0, lower, middle)
-    return np.append(np.exp(lower), np.inf)
-
-
-def _stationary(poles: np.ndarray, zeros: np.ndarray) -> np.ndarray:
-    """Return the states of sections of gain 1 in stationary noise by standard normals, (k, k)."""
-    # One pole alone, y' = exp(−θ)·y + white noise, has the covariance 1/(1 − exp(−θ − θ')).
-    single = np.linalg.cholesky(-1 / np.expm1(-(poles[:, None] + poles)))
-    # Partial fractions: the output of section j is a weighted sum of the single poles up to j.
-    states = np.zeros_like(single)
-    weights = np.zeros(len(poles))
-    for j, (pole, zero) in enumerate(zip(poles, zeros)):
-        apart = np.expm1(poles[:j] - pole)
-        states[j, :j] = weights[:j] * np.exp(-pole) * np.expm1(pole - zero) / apart
-        weights[:j] *= np.expm1(poles[:j] - zero) / apart
-        weights[j] = -np.expm1(pole - zero) * np.prod(np.expm1(pole - zeros[:j])
-                                                      / np.expm1(pole - poles[:j]))
-        states[j, j] = weights[j] * np.exp(-pole)
-    return states @ single
+    sections[:-1, 1], sections[:, 4] = -zeros, -poles
+    sections[0, :2] /= passed * np.sqrt(2 * _MATCHED)
+    return sections
 
 
 @effect(Place.ADC,
@@ -283,12 +233,12 @@ def _stationary(poles: np.ndarray, zeros: np.ndarray) -> np.ndarray:
                                  revealed_by=Manoeuvre.HEAT, proof=(ProofVariable.FREQUENCY,)))
 def flicker(signals: Signals, p: Parameters) -> None:
     """
-    Flicker noise: 1/f noise as a sum of Ornstein-Uhlenbeck processes, drawn by one filter.
+    Flicker noise: 1/f noise, which is 0 at power-on.
 
     Add noise of the one-sided density k²/f, g²/Hz, from 10⁻⁴ Hz up to a fifth of the rate.
 
-    Ornstein-Uhlenbeck processes of equal variance, whose corners are evenly spaced on a
-    logarithmic axis, sum up to 1/f (van der Ziel 1950). Their sum is sampled exactly.
+    White noise passes a filter whose poles and zeros alternate, evenly spaced on a logarithmic
+    axis (Plaszczynski 2007).
     """
     assert signals.rng is not None
     shape = (*np.shape(signals.environment.time_s), len(p['density_g_per_rthz']))
@@ -296,13 +246,10 @@ def flicker(signals: Signals, p: Parameters) -> None:
         return
     # scipy.signal takes 0.5 s to import.
     from scipy.signal import sosfilt
-    shaping = _shaping(1 / signals.dt_s)
-    if 'state' not in signals.memory:
-        drawn = signals.rng.standard_normal((len(shaping.stationary), *shape[1:]))
-        state = np.tensordot(shaping.stationary, drawn, 1)
-        signals.memory['state'] = np.stack([state, np.zeros_like(state)], axis=1)
+    sections = _flicker_filter(1 / signals.dt_s)
     noise, signals.memory['state'] = sosfilt(
-        shaping.sections, signals.rng.standard_normal(shape), axis=0, zi=signals.memory['state'])
+        sections, signals.rng.standard_normal(shape), axis=0,
+        zi=signals.memory.get('state', np.zeros((len(sections), 2, *shape[1:]))))
     add(signals.volts, (density * noise[..., d] * signals.nominal_scale_v_per_g[d]
                         for d, density in enumerate(p['density_g_per_rthz'])))
 

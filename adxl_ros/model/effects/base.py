@@ -374,21 +374,16 @@ class Effect:
     smooth: bool = True  # Whether the output is differentiable by the parameters
     # Whether the form of the effect is certain, as that of geometry or of a clock
     exact: bool = False
-    # Property of the output in which the effect shows; the texts 'mean' and 'noise' are accepted,
-    # too
+    # Property of the output in which the effect shows
     acts_on: ActsOn = ActsOn.MEAN
     # Whether the inverse undoes the effect. The effect then is a smooth function of force and
     # environment of one sample. Effects of the stage, with a memory or with noise are not.
     invertible: bool = False
-    # Parts of the chain that the effect acts on; their names as text are accepted, too
+    # Parts of the chain that the effect acts on
     needs: tuple[Need, ...] = ()
     # Names of the fields of `Environment` that the effect depends on
     follows: tuple[str, ...] = ()
     diagnosis: DiagnosisHints = DiagnosisHints()  # Properties that only the diagnosis uses
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, 'acts_on', ActsOn(self.acts_on))
-        object.__setattr__(self, 'needs', tuple(map(Need, self.needs)))
 
     @property
     def limits(self) -> list[Parameter]:
