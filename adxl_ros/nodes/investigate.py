@@ -74,10 +74,7 @@ def closing_lines(ended: Investigation, folder: OutputFolder) -> list[str]:
         result = [f'Stopped without a verdict: {ended.reason}']
         following = f'diagnose {bag} --params {baseline} -o {gap}' if ended.moved_s else ''
     else:
-        answer = ended.answers[-1][1]
-        result = [answer.sentence]
-        if answer.hidden:
-            result.append(f'It cannot show {investigation.listed(answer.hidden)}.')
+        result = [ended.answers[-1][1].sentence]
         following = f'simulate rich --params {parameters} -o sim.csv'
     return ['', *end_lines(result, files, following and f'ros2 run adxl_ros {following}')]
 

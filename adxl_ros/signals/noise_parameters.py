@@ -323,9 +323,6 @@ class AxisNoise:
     sample_std: float  # Standard deviation of a sample, m/s²
     resolution: float  # Smallest change of a sample, m/s²
     rounding: float  # N of the rounding to this resolution, m/s²/√Hz, which `fit` does not contain
-    # lowest_s, lowest: Time, s, and value, m/s², of the lowest point of the Allan deviation
-    lowest_s: float
-    lowest: float
 
     @property
     def estimates(self) -> tuple[Estimate, Estimate, Estimate]:
@@ -368,13 +365,10 @@ def recording_noise(read: Callable[[], Iterable[Recording]], params: str | None,
     noises = []
     for i, axis in enumerate(unit.axes):
         fit = fit_noise(rest.means[:, i], rest.step_s, variances)
-        deviation = rest.allan.deviation[:, i]
-        lowest = int(np.argmin(deviation))
         std, resolution = float(rest.sample_std[i]), float(rest.resolution[i])
         rounding = resolution / float(np.sqrt(12 * rest.rate_hz))
         noises.append(AxisNoise(axis, without_rounding(fit, std, resolution, rounding), std,
-                                resolution, rounding, float(rest.allan.tau_s[lowest]),
-                                float(deviation[lowest])))
+                                resolution, rounding))
         show((i + 1) / len(unit.axes))
     return RecordingNoise(first.path, sensor, unit, rest, noises)
 
