@@ -27,9 +27,6 @@ import numpy as np
 import yaml
 
 MICRO_G = 1e6 / G0_MPS2  # 1 m/s² in µg
-_LARGEST_STD_MPS2 = 0.3
-"""Noise of a sample from which a sensor vibrates, m/s². Chosen: three times that of a low-cost
-IMU at 1 kHz."""
 _LARGEST_FILLED = 0.01  # Share of missing samples from which white noise changes visibly. Chosen
 _NAMES = ('white noise N', 'bias instability B', 'random walk K')  # Names of the terms
 _YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
@@ -60,16 +57,13 @@ def _tables(result: RecordingNoise) -> list[str]:
 
 
 def _walk_lines(result: RecordingNoise) -> list[str]:
-    """Return the bounds of the walks, and for which times K holds."""
+    """Return the bounds of the walks."""
     rows = []
     for noise in result.axes:
         time_s, k = noise.fit.bound_s, MICRO_G * noise.fit.walk.value
         if np.isfinite(time_s):
             rows.append(f' {noise.axis}: the walk has bounds, {k * np.sqrt(time_s / 2):.3g} µg '
                         f'rms; correlation time {time_s:.3g} s')
-    if any(noise.fit.walk.is_seen for noise in result.axes):
-        rows.append(f' K holds for times up to {duration(result.rest.span_s)}, those of the '
-                    'recording.')
     return rows
 
 
@@ -123,9 +117,6 @@ def _axis_warnings(span_s: float, noise: AxisNoise) -> list[str]:
     if not noise.fit.white.is_seen:
         texts.append('N is not determined. A parameter file keeps the figure of --params, or '
                      'states no white noise.')
-    if noise.sample_std > _LARGEST_STD_MPS2:
-        texts.append(f'one sample has a noise of {noise.sample_std:.2g} m/s², expected less than '
-                     f'{_LARGEST_STD_MPS2:g}. The sensor seems to vibrate.')
     return texts
 
 
