@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from math import ceil, inf
 import time
 
-from adxl_ros.files.recording_columns import stamped_rate_hz
+from adxl_ros.files.recording_columns import is_even, stamped_rate_hz
 from adxl_ros.links.support import base
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.sensor import Sensor
@@ -21,9 +21,12 @@ import numpy as np
 _SILENT_S = 3.0
 """Steady time without samples after which the stream counts as silent, s; chosen: as for the
 samples of the calibration node."""
+_FIRST = 50
+"""Samples with even stamps that determine the rate, before the first one is published; chosen:
+0.25 s at 200 Hz."""
 _FIRST_S = 1.0
-"""Simulated time whose samples determine the rate, before the first one is published, s; chosen:
-for uneven stamps and slow simulators."""
+"""Simulated time after which other samples determine the rate, s; chosen: for uneven stamps and
+slow simulators."""
 _MIN_FIRST = 5
 """Fewest samples that determine a rate; chosen: four differences survive one lost sample."""
 _STEP_SCATTER = 0.45
@@ -221,8 +224,9 @@ class EmulatedSensor(base.Link):
         """Return whether there is a chain; it is made once the held samples show the rate."""
         if self._chain is None and self._held:
             stamps_ns = np.array([stamp_ns for stamp_ns, _ in self._held])
-            time_s = (stamps_ns - stamps_ns[0]) * 1e-9
-            if time_s[-1] >= _FIRST_S and len(time_s) >= _MIN_FIRST:
+            count, time_s = len(stamps_ns), (stamps_ns - stamps_ns[0]) * 1e-9
+            is_long = time_s[-1] >= _FIRST_S and count >= _MIN_FIRST
+            if is_long or (count >= _FIRST and is_even(time_s)):
                 rate_hz = stamped_rate_hz(time_s)
                 # Where steps of the stamps are whole periods, longer ones show losses.
                 steps = np.diff(time_s) * rate_hz
