@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.nodes.jobs import cpu_time_s, executable, running, use_own_graph
+from adxl_ros.nodes.jobs import executable, running, use_own_graph
 from adxl_ros.nodes.topics import Inbox
 from adxl_ros.tools import command_line as cli
 from adxl_ros_validation.bench_jobs import offline_jobs, print_table, spread
@@ -163,6 +163,13 @@ def _subjects(stack: ExitStack, iiod: str | None) -> list[_Subject]:
           for link, command in drivers.items()),
         *(_Subject(f'driver, {link}, compensation', 'imu/data', [command, [compensation]],
                    'imu/data_raw') for link, command in drivers.items())]
+
+
+def cpu_time_s(pid: int) -> float:
+    """Return the time that a process has spent on a core so far, s."""
+    # Behind the name of the command, its user and system time are fields 11 and 12 (man 5 proc).
+    fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
+    return sum(map(int, fields[11:13])) / os.sysconf('SC_CLK_TCK')
 
 
 @contextmanager

@@ -79,7 +79,7 @@ TOPICS = [
      'gap, noise floor and changes, mg; once a second',
      'monitor', 'you'),
     ('diagnostics', 'diagnostic_msgs/DiagnosticArray',
-     'state of each node, once a second and at each change',
+     'state of each node, once a second; that of the driver at each change of level, too',
      'driver, compensation, calibration, stage, monitor, investigate', 'you'),
     ('imu/ideal', 'sensor_msgs/Imu',
      'ideal samples of your simulator, for the link `topic`',

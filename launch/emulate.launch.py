@@ -6,7 +6,7 @@ Start a realistic sensor in another simulator: the driver on its ideal Imu.
     ros2 launch adxl_ros emulate.launch.py in_topic:=/imu params_file:=gap/params.yaml
 
     ros2 launch adxl_ros emulate.launch.py in_topic:=/imu out_topic:=/robot/imu/data_raw \
-        params_file:=unit_17.yaml seed:=3 frame_id:=imu_link rpy_rad:=3.14159,0,0
+        params_file:=unit_17.yaml seed:=3 frame_id:=imu_link
 
 The simulator publishes sensor_msgs/Imu with specific force, and /clock. The sensor of the
 parameter file appears on imu/data_raw with the stamps of the simulator. A driver that ends is
@@ -26,8 +26,6 @@ LINK = arguments(DriverSettings, 'frame_id', in_topic='link.topic',
 def generate_launch_description() -> LaunchDescription:
     return launch_nodes.describe([
         *launch_nodes.common_arguments(*LINK),
-        launch_nodes.declared('rpy_rad', '0,0,0', 'roll, pitch and yaw of the case in the frame '
-                              'of the ideal samples, rad'),
         launch_nodes.declared('out_topic', 'imu/data_raw', 'topic of the realistic samples'),
         launch_nodes.declared('use_sim_time', 'true', 'follow the clock of the simulator', 'true',
                               'false')], make_nodes)
@@ -35,10 +33,8 @@ def generate_launch_description() -> LaunchDescription:
 
 def make_nodes(context: LaunchContext) -> list[Action]:
     """Return the driver."""
-    angles = launch_nodes.three_numbers(context, 'rpy_rad')
-    rotation = {f'link.{name}_rad': angle for name, angle in zip(('roll', 'pitch', 'yaw'), angles)}
     return [launch_nodes.make_node(
         context, 'driver', {
-            'link.type': 'topic', **rotation, **launch_nodes.given_parameters(context, LINK),
+            'link.type': 'topic', **launch_nodes.given_parameters(context, LINK),
             'use_sim_time': text(context, 'use_sim_time') == 'true'},
         remappings=[('imu/data_raw', text(context, 'out_topic'))])]

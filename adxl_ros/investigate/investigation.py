@@ -28,8 +28,8 @@ import shutil
 
 from adxl_ros.diagnose import next_experiment
 from adxl_ros.diagnose.diagnosis import diagnose, Diagnosis
-from adxl_ros.diagnose.linear_model import candidates
-from adxl_ros.diagnose.report import as_json, screen_lines
+from adxl_ros.diagnose.linear_model import LinearModel
+from adxl_ros.diagnose.report import as_json
 from adxl_ros.diagnose.verdict import normalised, UNKNOWN, WeightedHypothesis
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording as recording_files
@@ -77,6 +77,10 @@ class Outcome(Enum):
     TIME_OVER = 'time_over'
 
 
+Hypotheses = tuple[WeightedHypothesis, ...]
+"""Hypotheses by falling probability, which sums to 1; no effect means no gap."""
+
+
 @dataclass(frozen=True)
 class Question:
     """What a round begins with."""
@@ -93,39 +97,12 @@ class Question:
 class Answer:
     """What a round ends with."""
 
-    hypotheses: tuple[WeightedHypothesis, ...]  # Hypotheses by falling probability
+    hypotheses: Hypotheses
     outcome: Outcome  # Why the investigation goes on or ends
     sentence: str = ''  # The result in one sentence; '' where it goes on
     manoeuvre: str = ''  # Name of the next manoeuvre; '' at the end
     fault: str = ''  # Fault of the recording that makes a verdict impossible; '' without one
-    hidden: tuple[str, ...] = ()  # Effects that this stage cannot show
     verdict: str = ''  # Status and effects of the diagnosis; '' without a verdict
-
-
-@dataclass(frozen=True)
-class Assessment:
-    """Probabilities of the hypotheses, and the diagnosis that gives them."""
-
-    # Hypotheses by falling probability, which sums to 1; no effect means no gap
-    hypotheses: tuple[WeightedHypothesis, ...]
-    diagnosis: Diagnosis | None = None  # The diagnosis; None before there are samples enough
-    # Manoeuvres by what they are expected to tell per minute, the best first
-    worth: tuple[next_experiment.ManoeuvreWorth, ...] = ()
-    # Effects that neither the samples nor a manoeuvre of this stage can show
-    hidden: tuple[str, ...] = ()
-
-    @property
-    def fault(self) -> str:
-        """Return the fault of the recording that makes a verdict impossible; '' without one."""
-        fault = self.diagnosis.fault if self.diagnosis else None
-        return '' if fault is None or fault.status == 'insufficient' else fault.message
-
-    @property
-    def verdict(self) -> str:
-        """Return status and effects of the diagnosis; '' without a verdict."""
-        report = self.diagnosis.report if self.diagnosis else None
-        verdict = report.verdict if report else None
-        return ' '.join([verdict.status, *verdict.effects]) if verdict else ''
 
 
 def run_round(question: Question, recordings: Sequence[Recording], sensor: Sensor,
@@ -134,61 +111,60 @@ def run_round(question: Question, recordings: Sequence[Recording], sensor: Senso
     diagnosis = diagnose(recordings, sensor, seed=seed) if recordings else None
     report = diagnosis.report if diagnosis else None
     # The prior probabilities, where the samples are too few.
-    assessment = Assessment(report.verdict.hypotheses if report else normalised(
-        {(): _NOTHING, (UNKNOWN,): 1 - _NOTHING}), diagnosis)
-    best = assessment.hypotheses[0]
-    if assessment.fault:
-        return Answer(assessment.hypotheses, Outcome.INSEPARABLE, fault=assessment.fault), \
-            diagnosis
+    hypotheses = report.verdict.hypotheses if report else normalised(
+        {(): _NOTHING, (UNKNOWN,): 1 - _NOTHING})
+    fault = diagnosis.fault if diagnosis else None
+    if fault is not None and fault.status != 'insufficient':
+        return Answer(hypotheses, Outcome.INSEPARABLE, fault=fault.message), diagnosis
+    verdict = ' '.join([report.verdict.status, *report.verdict.effects]) if report else ''
+    best = hypotheses[0]
     if best.effects and best.probability >= CERTAIN:
         # Effects that were not seen so far only take probability from no gap, so that the
         # manoeuvres need not be simulated.
-        return decide(assessment, question, True), diagnosis
+        return decide(hypotheses, (), question, True, verdict), diagnosis
     manoeuvres = plan_all(limits, question.pose, 60 * question.minutes)
     in_time = [m for m in manoeuvres if m.minutes <= question.remaining_minutes]
-    return decide(rank(assessment, sensor, in_time or manoeuvres), question, bool(in_time)), \
-        diagnosis
+    ranked = rank(hypotheses, report.linear_model if report else None, sensor,
+                  in_time or manoeuvres)
+    return decide(*ranked, question, bool(in_time), verdict), diagnosis
 
 
-def rank(assessment: Assessment, sensor: Sensor, manoeuvres: Sequence[PlannedManoeuvre]
-         ) -> Assessment:
+def rank(hypotheses: Hypotheses, model: LinearModel | None, sensor: Sensor,
+         manoeuvres: Sequence[PlannedManoeuvre]
+         ) -> tuple[Hypotheses, tuple[next_experiment.ManoeuvreWorth, ...]]:
     """
-    Rank manoeuvres by their expected information per minute, given the samples so far.
+    Rank manoeuvres by their expected information per minute, the best first.
 
-    The hypotheses then have the effects that only the manoeuvres can show, too.
+    model: that of the samples so far, None without any. The hypotheses then have the effects that
+    only the manoeuvres can show, too.
     """
-    report = assessment.diagnosis.report if assessment.diagnosis else None
-    model = report.linear_model if report else None
     seen = {v.effect for v in model.variants} if model else set()
-    considered = {e for h in next_experiment.leading(assessment.hypotheses) for e in h.effects}
+    considered = {e for h in next_experiment.leading(hypotheses) for e in h.effects}
     needed = sorted(considered | (set(library()) - seen))
     responses = [next_experiment.predict(m.name, m.motion, m.begin_s, sensor, needed)
                  for m in manoeuvres]
     excited = {v.effect for response in responses for v in response.linear_model.variants}
     # Effects that the samples could not show keep their prior odds over no gap.
-    weights = {h.effects: h.probability for h in assessment.hypotheses}
+    weights = {h.effects: h.probability for h in hypotheses}
     unseen = weights.get((), 0.0) * (1 / max(len(excited | seen), 1))
     for effect in sorted(excited - seen):
         weights.setdefault((effect,), unseen)
     hypotheses = normalised(weights)
-    return Assessment(
-        hypotheses, assessment.diagnosis,
-        next_experiment.rank_responses(responses, hypotheses, model),
-        tuple(sorted({e.name for e in candidates()} - excited - seen)))
+    return hypotheses, next_experiment.rank_responses(responses, hypotheses, model)
 
 
-def decide(assessment: Assessment, question: Question, has_time: bool) -> Answer:
+def decide(hypotheses: Hypotheses, worth: Sequence[next_experiment.ManoeuvreWorth],
+           question: Question, has_time: bool, verdict: str = '') -> Answer:
     """
     Choose the next manoeuvre, or end.
 
     A verdict that was the same in the round before is not expected to change by more of the same:
     only manoeuvres of a kind that is not recorded yet follow it.
     """
-    hypotheses, verdict = assessment.hypotheses, assessment.verdict
     best = hypotheses[0]
     kinds = {CATALOGUE[name].kind for name in question.recorded} \
         if verdict and verdict == question.verdict else set()
-    following = [w for w in assessment.worth if w.per_minute > _SMALLEST_PER_MINUTE
+    following = [w for w in worth if w.per_minute > _SMALLEST_PER_MINUTE
                  and CATALOGUE[w.name].kind not in kinds]
     totals = accumulate(hypothesis.probability for hypothesis in hypotheses)
     # The fewest that together have 90 %
@@ -204,16 +180,14 @@ def decide(assessment: Assessment, question: Question, has_time: bool) -> Answer
     elif not has_time:
         outcome = Outcome.TIME_OVER
     else:
-        return Answer(hypotheses, Outcome.GO_ON, manoeuvre=following[0].name,
-                      hidden=assessment.hidden, verdict=verdict)
+        return Answer(hypotheses, Outcome.GO_ON, manoeuvre=following[0].name, verdict=verdict)
     names = listed([hypothesis_text(h.effects) for h in named])
     sentence = {Outcome.CERTAIN: f'The recording shows {names}: ',
                 Outcome.NO_VISIBLE_GAP: 'There is no gap that this stage can show: ',
                 Outcome.INSEPARABLE: f'This stage cannot separate {names}: together ',
                 Outcome.TIME_OVER: f'The time is over; the recording shows {names}: together '}
     return Answer(hypotheses, outcome, f'{sentence[outcome]}'
-                  f'{100 * sum(h.probability for h in named):.0f} %.', hidden=assessment.hidden,
-                  verdict=verdict)
+                  f'{100 * sum(h.probability for h in named):.0f} %.', verdict=verdict)
 
 
 def hypothesis_text(effects: Sequence[str]) -> str:
@@ -297,18 +271,14 @@ def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, see
     if diagnosis is None:
         return answer
     from adxl_ros.diagnose.page import documents, Run
-    read = recordings[0]
-    subject = (f'{folder.bag.name} ({np.ptp(read.time_s):.0f} s, {read.rate_hz:.4g} Hz, '
-               f'{" ".join(read.axes)})  minus  simulation of {folder.baseline.name}')
-    lines = screen_lines(diagnosis, subject) if diagnosis.report is not None else []
-    steps = [('simulate with these parameters', 'ros2 run adxl_ros simulate rich --params '
-              f'{folder.parameters} -o sim.csv')] if lines else []
+    report = as_json(diagnosis)
+    subject = f'{folder.bag}  minus  simulation of {folder.baseline.name}'
     command = shlex.join(['ros2', 'run', 'adxl_ros', 'diagnose', str(folder.bag), '--params',
                           str(folder.baseline), '-o', f'{folder.path}_again'])
     # The page is that of the end.
     run = None if answer.outcome is Outcome.GO_ON else \
-        Run(subject, folder.baseline.name, steps, command=command)
-    for name, text in documents(diagnosis, as_json(diagnosis), lines, run).items():
+        Run(subject, folder.baseline.name, [], command=command)
+    for name, text in documents(diagnosis, report, [report['summary']], run).items():
         write_text(folder.path / name, text)
     return answer
 

@@ -255,15 +255,12 @@ class DisplayPublisher:
             phase=phase.value, text=text, unit=f'{unit.serial} ({unit.axes})' if unit else '',
             output=str(controller.settings.output), keys=keys, rows=tuple(rows),
             coefficients=tuple(coefficients),
-            open_poses=0 if session is None else session.guide.open_poses,
             outcome=controller.outcome).to_json()))
 
 
 _POLL_S = 0.02
 """Time between two steps of the controller, s; chosen: short beside a dwell of seconds, also where
 sensor time is many times real time."""
-_NOTICE_S = 0.05
-"""Time between two looks at the level of the diagnostics, s; chosen: short for people."""
 _FAREWELL_NS = 2_500_000_000
 """Time from the end of a calibration to that of the node, ns; chosen: two reports come within."""
 _QUEUE = 100  # Messages that wait while the node fits; chosen: some seconds of slow topics
@@ -398,7 +395,7 @@ class Calibration(Node):
 
     def _connect(self) -> None:
         """Make diagnostics, subscriptions, services and the timer."""
-        self._diagnostics = topics.DiagnosticsReporter(self, 'calibration', self._status)
+        topics.DiagnosticsReporter(self, 'calibration', self._status)
         topics.create_subscription(
             self, DiagnosticStatus, 'sensor_info', lambda message:
             self._controller.read_sensor_info(topics.stream_info(message, 'sensor_info')), 1,
@@ -418,8 +415,6 @@ class Calibration(Node):
         # The answer comes when the pose is on disk.
         self._capture_service = topics.LateService(self, '~/capture')
         self.create_timer(_POLL_S, self._poll, clock=STEADY)
-        self.create_timer(_NOTICE_S, lambda: self._diagnostics.notice(self._level()),
-                          clock=STEADY)
 
     def _poll(self) -> None:
         self._read_stage()

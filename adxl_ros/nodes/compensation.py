@@ -81,7 +81,6 @@ class MountingParameters:
     def __init__(self, node: Node, stream: LiveStream, settings: CompensationSettings) -> None:
         self._node, self._stream = node, stream
         self._frame_id = settings.mounting_frame_id
-        self._is_averaging = False
         self._mount(_mounting(settings.rpy_rad))
         parameters.on_change(node, _RPY, _mounting, self._mount)
         # The answer comes after a second of samples, which the node takes meanwhile.
@@ -93,17 +92,13 @@ class MountingParameters:
         self._stream.mount(mounting, self._frame_id)
 
     async def _on_level(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._is_averaging:
-            response.message = 'a rest is being averaged; wait for its answer'
-            return response
-        self._is_averaging, over = True, Future()
+        over: Future = Future()
         self._stream.collect()
         timer = self._node.create_timer(_LEVEL_S, lambda: over.set_result(True), clock=STEADY)
         await over
         self._node.destroy_timer(timer)
-        forces_mps2, self._is_averaging = self._stream.collected(), False
         try:
-            levelled = level(self._mounting, forces_mps2, self._stream.sensor)
+            levelled = level(self._mounting, self._stream.collected(), self._stream.sensor)
         except UserError as error:
             response.message = f'{error}'
             return response
@@ -175,7 +170,7 @@ class Compensation(Node):
         self._obstacle = ''
         self._reported: Counter[str] = Counter()
         self._reported_ns = STEADY.now().nanoseconds
-        self._diagnostics = topics.DiagnosticsReporter(self, 'compensation', self._status)
+        topics.DiagnosticsReporter(self, 'compensation', self._status)
         self._ages_s: deque[float] = deque(maxlen=MOST_AGES)
         self._data = topics.create_publisher(self, Imu, 'imu/data', _DEPTH)
         tilt = topics.create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
@@ -290,7 +285,6 @@ class Compensation(Node):
             return
         topics.log(self, 'ERROR' if refusal else 'INFO',
                    f'publishing nothing: {refusal}' if refusal else 'publishing again')
-        self._diagnostics.notice(Level.ERROR if refusal else Level.OK)
 
     def _receive(self) -> None:
         """Correct the samples that come, by the newest finite temperature and supply."""

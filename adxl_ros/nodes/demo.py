@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -25,9 +26,8 @@ from adxl_ros.files import parameter_file, sweep_journal
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import jobs
-from adxl_ros.nodes.run_node import program_parser
 from adxl_ros.process import ended_by_closed_output
-from adxl_ros.report.screen import coloured
+from adxl_ros.report.screen import coloured, program_parser
 import numpy as np
 
 _LONGEST_S = 600.0  # Longest time of a step, s; chosen: far above what sweep and fit take
@@ -100,7 +100,7 @@ def _poses(journal: Path) -> tuple[int, list[sweep_journal.PoseRecord]]:
 @ended_by_closed_output()
 def main() -> int:
     """Run the demonstration; return the exit status."""
-    parser = program_parser('demo', __doc__, _EXAMPLES)
+    parser = program_parser(argparse.ArgumentParser, 'demo', __doc__, _EXAMPLES)
     parser.add_argument('-o', dest='output', metavar='DIR', default='demo_output', type=Path,
                         help='folder of pages and calibrations (default demo_output)')
     parser.add_argument('--seed', type=int, metavar='N', default=_SEED,

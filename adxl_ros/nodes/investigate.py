@@ -17,7 +17,6 @@ from adxl_ros.files.bag_writer import LiveBag
 from adxl_ros.investigate import investigation
 from adxl_ros.investigate.investigation import Answer, Investigation, OutputFolder, State
 from adxl_ros.investigate.manoeuvres import CATALOGUE, Pose, StageLimits
-from adxl_ros.links.support.base import Watchdog
 from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.jobs import LiveLine
 from adxl_ros.nodes.parameters import low_and_high, parameter, SEEDS
@@ -67,19 +66,11 @@ def answer_lines(minutes: float, answer: Answer) -> list[str]:
 
 def closing_lines(ended: Investigation, folder: OutputFolder) -> list[str]:
     """Return the result, where the files are, and what to do next."""
-    bag, baseline, gap, parameters = (shlex.quote(str(path)) for path in (
-        folder.bag, folder.baseline, folder.path / 'gap', folder.parameters))
     files = [str(path) for path in (folder.report, folder.parameters, folder.bag) if path.exists()]
     if ended.state is State.STOPPED:
-        result = [f'Stopped without a verdict: {ended.reason}']
-        following = f'diagnose {bag} --params {baseline} -o {gap}' if ended.moved_s else ''
-    else:
-        answer = ended.answers[-1][1]
-        result = [answer.sentence]
-        if answer.hidden:
-            result.append(f'It cannot show {investigation.listed(answer.hidden)}.')
-        following = f'simulate rich --params {parameters} -o sim.csv'
-    return ['', *end_lines(result, files, following and f'ros2 run adxl_ros {following}')]
+        return ['', *end_lines([f'Stopped without a verdict: {ended.reason}'], files)]
+    return ['', *end_lines([ended.answers[-1][1].sentence], files, 'ros2 run adxl_ros simulate '
+                           f'rich --params {shlex.quote(str(folder.parameters))} -o sim.csv')]
 
 
 _SAMPLES, _STAGE = 'imu/data_raw', 'stage/joint_states'
@@ -89,9 +80,6 @@ _KINDS = {_SAMPLES: Imu, _STAGE: JointState, 'stage/command': JointState,
 _QUEUE = 20000  # Messages of a topic that are kept while the node is busy: 20 s at 1 kHz
 
 _POLL_S = 0.02  # Time between two commands, s; chosen: a tenth of the largest step
-_SILENT_S = 3.0  # Time without samples or poses after which the stage is stopped, s; chosen
-_LONGEST_TURN_S = 0.2
-"""Longest time between two commands that counts as silence, s; chosen: ten turns."""
 _FAREWELL_S = 0.5
 """Time for which the last command is repeated at the end, s; chosen: the stage has it then."""
 _COMMAND_QUEUE = 10  # Commands that are kept for a slow subscriber; chosen
@@ -123,7 +111,6 @@ class Investigate(Node):
                                              latched=topic == 'sensor_info')
                          for topic, kind in _KINDS.items()}
         self._bag: LiveBag | None = None  # None before sensor and stage are there
-        self._watchdogs = {topic: Watchdog(_LONGEST_TURN_S) for topic in (_SAMPLES, _STAGE)}
         self._has_samples = False
         self._pose: Pose | None = None
         self._diagnostics = topics.DiagnosticsReporter(self, 'investigate', self._status)
@@ -176,9 +163,7 @@ class Investigate(Node):
                 for reading in topics.joint_readings(messages):
                     if np.isfinite(reading.angles).all():
                         self._pose = Pose(*reading.angles)
-            if messages and topic in self._watchdogs:
-                self._watchdogs[topic].feed()
-                self._has_samples |= topic == _SAMPLES
+            self._has_samples |= topic == _SAMPLES and bool(messages)
 
     def _poll(self) -> None:
         run = self._investigation
@@ -207,12 +192,9 @@ class Investigate(Node):
     def _check_streams(self, run: Investigation) -> None:
         """Stop where sensor or stage is silent; wait for both at the beginning."""
         if run.state is not State.RECORDING:
-            faults = [self._inboxes[_SAMPLES].fault(), *(
-                f'nothing on {self.resolve_topic_name(topic)} for {silent_s:.0f} s'
-                for topic, watchdog in self._watchdogs.items()
-                if (silent_s := watchdog.check()) > _SILENT_S)]
-            for fault in filter(None, faults):
-                run.stop(f'{fault}; the stage holds its pose')
+            for topic in (_SAMPLES, _STAGE):
+                if silence := self._inboxes[topic].silence():
+                    run.stop(f'{silence}; the stage holds its pose')
         elif not self._has_samples:
             self._pose = None
         elif self._pose is not None and self._bag is None:

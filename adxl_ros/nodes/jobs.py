@@ -52,13 +52,6 @@ def running(commands: Sequence[Sequence[str]], errors: int | IO[bytes] = subproc
                 process.kill()
 
 
-def cpu_time_s(pid: int) -> float:
-    """Return the time that a process has spent on a core so far, s."""
-    # Behind the name of the command, its user and system time are fields 11 and 12 (man 5 proc).
-    fields = Path(f'/proc/{pid}/stat').read_text().rsplit(')', 1)[1].split()
-    return sum(map(int, fields[11:13])) / os.sysconf('SC_CLK_TCK')
-
-
 @contextmanager
 def held_output() -> Iterator[None]:
     """Keep what this process prints, and print it at the end: lines would tear the screen."""

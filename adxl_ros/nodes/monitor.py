@@ -49,8 +49,6 @@ class MonitorSettings:
                             'folder of the record of changes and of the diagnoses')
     automatic: bool = parameter(True, 'diagnose a change, or an open gap',
                                 name='diagnose.automatic')
-    budget_s: float = parameter(300.0, 'longest time of a diagnosis', 's', 1.0, 3600.0,
-                                name='diagnose.budget_s')
 
 
 def gap_status(live: LiveGap, likely: DiagnosisResult | None, window_s: float) -> Status:
@@ -144,7 +142,7 @@ class Monitor(Node):
         self._surroundings = topics.Surroundings(self, _INPUT_QUEUE)
         self._publisher = topics.create_publisher(self, DiagnosticArray, 'gap', _QUEUE)
         self._service = topics.LateService(self, '~/diagnose')
-        self._diagnostics = topics.DiagnosticsReporter(self, 'gap', self._status)
+        topics.DiagnosticsReporter(self, 'gap', self._status)
         self._info_topic = self.resolve_topic_name('sensor_info')
         topics.create_subscription(
             self, DiagnosticStatus, 'sensor_info', lambda message: self._compare_by(
@@ -223,7 +221,6 @@ class Monitor(Node):
         if found:
             # The waiting time of a diagnosis does not start again with a further change.
             self._changed_ns = self._changed_ns or min(change.since_ns for change in found)
-            self._diagnostics.notice(Level.WARN)
 
     def _diagnose_if_due(self) -> None:
         """Diagnose a change, or the first open gap, once there are enough samples."""
@@ -238,8 +235,7 @@ class Monitor(Node):
     def _begin_diagnosis(self, begin_ns: int) -> None:
         """Begin a diagnosis of the samples since a stamp, ns."""
         name = datetime.now(UTC).strftime('diagnosis_%Y%m%dT%H%M%S_%fZ')
-        self._run = DiagnosisRun(self._output / name, self._live.diagnosis_input(begin_ns),
-                                 self._own.budget_s)
+        self._run = DiagnosisRun(self._output / name, self._live.diagnosis_input(begin_ns))
 
     def _serve(self) -> None:
         """Take requests of ~/diagnose, and answer them when the diagnosis ends."""

@@ -18,8 +18,8 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.links.support import base
 from adxl_ros.nodes import parameters
 from adxl_ros.nodes.parameters import Kind, Spec
-from adxl_ros.process import ended_by_closed_output, package_version
-from adxl_ros.report.screen import command_lines, wrapped
+from adxl_ros.process import ended_by_closed_output
+from adxl_ros.report.screen import program_parser
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -35,34 +35,15 @@ _USAGE = '%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE\n    -r FRO
 """Usage of a node."""
 
 
-def program_parser(name: str, description: str | None, examples: Mapping[str, str],
-                   usage: str | None = None) -> argparse.ArgumentParser:
-    """Make the parser of a program that starts nodes, with `--version` and examples."""
-    lines = ['examples:']
-    for purpose, arguments in examples.items():
-        command = f'ros2 run adxl_ros {name} {arguments}'.rstrip()
-        lines += [f'  {purpose}:', *command_lines(command, 4 * ' ')]
-    parser = argparse.ArgumentParser(
-        prog=name, usage=usage, epilog='\n'.join(lines),
-        description='\n'.join(wrapped(' '.join((description or '').split()))),
-        formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--version', action='version', version=f'adxl_ros {package_version()}')
-    return parser
-
-
-def _parameter_groups(name: str, own: Iterable[Spec]) -> Iterator[tuple[str, list[Spec], str]]:
-    """Yield title, parameters and remark of each group of parameters of a node."""
-    yield 'parameters', sorted(own), ''
+def _parameter_groups(name: str, own: Iterable[Spec]) -> Iterator[tuple[str, list[Spec]]]:
+    """Yield title and parameters of each group of parameters of a node."""
+    yield 'parameters', sorted(own)
     for link in base.link_names() if name == 'driver' else ():
-        yield f'with link.type:={link}', sorted(parameters.link_specs(link)), ''
+        yield f'with link.type:={link}', sorted(parameters.link_specs(link))
     if name not in _WITHOUT_SENSOR:
-        of_file = parameters.nominal_specs()
-        listed = [spec for spec in of_file if spec.name.startswith(_LISTED_OF_SENSOR)]
-        yield ('parameters of the sensor, usually from --params-file', sorted(listed),
-               '\n'.join(wrapped(
-                   f'and {len(of_file) - len(listed)} others of a parameter file: effects, their '
-                   'coefficients with covariance, and the datasheet; "ros2 param describe '
-                   f'/{name} NAME" shows each')))
+        yield 'parameters of the sensor, usually from --params-file', sorted(
+            spec for spec in parameters.nominal_specs()
+            if spec.name.startswith(_LISTED_OF_SENSOR))
 
 
 def _help(spec: Spec) -> str:
@@ -105,13 +86,14 @@ def run(make_node: Callable[[], Node], description: str | None, examples: Mappin
     try:
         # It names a fault of a file by its place; rclpy does not.
         parameters.check_params_files()
-        parser = program_parser(name, description, examples, _USAGE)
+        parser = program_parser(argparse.ArgumentParser, name, description, examples)
+        parser.usage = _USAGE
         # People ask for help behind --ros-args, too.
         asked = [word for word in sys.argv if word in ('-h', '--help', '--version')]
         if asked:
             own = parameters.node_specs(sys.modules[make_node.__module__])
-            for title, specs, remark in _parameter_groups(name, own):
-                group = parser.add_argument_group(title, remark or None)
+            for title, specs in _parameter_groups(name, own):
+                group = parser.add_argument_group(title)
                 for spec in specs:
                     group.add_argument(spec.name, help=_help(spec))
         parser.parse_args(asked or remove_ros_args(sys.argv)[1:])

@@ -177,7 +177,6 @@ class Screen(Node):
         self._target = self.resolve_topic_name(name)
         self._contents, self._received_s = ScreenContents('info', ''), 0.0
         self._log: deque[tuple[str, str]] = deque(maxlen=_FEW_LINES)  # Styles and messages
-        self._finish_is_confirmed = False
         self._application = full_screen(
             lambda columns, rows: draw(self._shown(), self._log, columns, rows), self._press,
             self._leave)
@@ -224,15 +223,9 @@ class Screen(Node):
                        f'{self._target}; is it running in this ROS domain?')
 
     def _press(self, key: str) -> None:
-        """Call the service of a key; the space captures, `finish` may need a second key."""
-        contents = self._shown()
-        services = {entry.key: entry.service for entry in contents.keys}
+        """Call the service of a key; the space captures."""
+        services = {entry.key: entry.service for entry in self._shown().keys}
         service = services.get('c' if key == ' ' else key)
-        if service == 'finish' and contents.open_poses and not self._finish_is_confirmed:
-            self._finish_is_confirmed = True
-            self._say(f'{contents.open_poses} poses are open; press f again to fit what there is')
-            return
-        self._finish_is_confirmed = False
         if service is not None:
             answer = self._keyed[service].call_async(Trigger.Request())
             answer.add_done_callback(lambda future: self._say(future.result().message))

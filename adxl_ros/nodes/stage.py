@@ -121,7 +121,7 @@ class SimulatedStageNode:
         self._refusal = ''
         self._encoders = topics.create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
         self._true = topics.create_publisher(node, JointState, 'stage/true_joint_states', _QUEUE)
-        self._diagnostics = topics.DiagnosticsReporter(node, 'stage', self._status)
+        topics.DiagnosticsReporter(node, 'stage', self._status)
         topics.create_subscription(node, JointState, 'stage/command', self._on_command,
                                    _COMMAND_QUEUE)
         node.get_logger().info('simulated stage: waiting for '
@@ -141,7 +141,6 @@ class SimulatedStageNode:
             self._refusal = f'{self._node.resolve_topic_name("stage/command")}: {error}'
             self._node.get_logger().warning(
                 f'{self._refusal}; the stage stays with the command before')
-            self._diagnostics.notice(Level.WARN)
 
     def _tick(self) -> None:
         """Simulate up to the time at which a new command may take effect; show what is due."""
@@ -217,14 +216,14 @@ class StageBridge:
         self._states_topic = node.resolve_topic_name(own.joint_states)
         self._speed_rad_s = own.speed_rad_s
         self._angles_rad, self._goal_rad = np.full(2, np.nan), np.full(2, np.nan)
-        self._heard_ns = self._resend_ns = self._commanded_ns = self._late_ns = 0
+        self._heard_ns = self._resend_ns = 0
         self._refusal = ''
         self._positions = topics.create_publisher(node, JointState, 'stage/joint_states',
                                                   _BRIDGE_QUEUE)
         self._commands = topics.create_publisher(
             node, JointTrajectory if kind == 'trajectory' else JointState,
             own.command or _DEFAULT_COMMANDS[kind], _COMMAND_QUEUE)
-        self._diagnostics = topics.DiagnosticsReporter(node, 'stage', self._status)
+        topics.DiagnosticsReporter(node, 'stage', self._status)
         topics.create_subscription(node, JointState, 'stage/command', self._on_command,
                                    _COMMAND_QUEUE)
         topics.create_subscription(node, JointState, own.joint_states, self._on_states,
@@ -245,19 +244,16 @@ class StageBridge:
             if reason != self._refusal:
                 self._node.get_logger().warning(reason)
             self._refusal = reason
-            self._diagnostics.notice(Level.WARN)
             return
         now_ns = STEADY.now().nanoseconds
-        is_new = not np.array_equal(goal_rad, self._goal_rad)
         # The calibration repeats its command: a controller would begin its trajectory each time.
-        if not is_new and (self._arrived() or now_ns < self._resend_ns):
+        if np.array_equal(goal_rad, self._goal_rad) and (
+                self._arrived() or now_ns < self._resend_ns):
             return
         # The longer way to the goal counts.
         duration_s = max(np.abs(goal_rad - self._angles_rad).max() / self._speed_rad_s,
                          _SHORTEST_S)
         self._resend_ns = now_ns + round(duration_s * 1e9) + _GRACE_NS
-        if is_new:
-            self._commanded_ns, self._late_ns = now_ns, self._resend_ns
         self._goal_rad, self._refusal = goal_rad, ''
         self._send(duration_s)
 
@@ -300,18 +296,12 @@ class StageBridge:
 
     def _state(self) -> tuple[Level, str]:
         """Return the level and one line: the motion, or why there is none."""
-        now_ns = STEADY.now().nanoseconds
         if self._refusal:
             return Level.WARN, f'refused {self._refusal}'
-        if now_ns - self._heard_ns > _SILENT_NS:
+        if STEADY.now().nanoseconds - self._heard_ns > _SILENT_NS:
             return Level.WARN, (f'nothing on {self._states_topic} of {" and ".join(self._names)}; '
                                 'is the controller running, and has it these joints?')
         is_there = self._arrived() or np.isnan(self._goal_rad).any()
-        if not is_there and now_ns > self._late_ns:
-            angles = ', '.join(f'{name} is at {angle:.1f}° of {goal:.1f}°' for name, angle, goal in
-                               zip(_ANGLES, *np.degrees([self._angles_rad, self._goal_rad])))
-            late_s = (now_ns - self._commanded_ns) * 1e-9
-            return Level.WARN, f'the controller has not followed for {late_s:.0f} s: {angles}'
         return Level.OK, 'at rest' if is_there else 'on the way'
 
 

@@ -3,13 +3,18 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 import os
 import re
 import sys
 import textwrap
-from typing import Any, NamedTuple, TextIO
+from typing import Any, NamedTuple, TextIO, TypeVar
 
+from adxl_ros.process import package_version
+
+P = TypeVar('P', bound=argparse.ArgumentParser)
 COLUMNS = 79  # Columns of a terminal that a tool uses
 _NO_BREAK = '\N{NO-BREAK SPACE}'  # A blank at which no line is wrapped
 _LABEL_COLUMNS = 8  # Columns of the words before files and commands
@@ -31,6 +36,22 @@ class NextStep(NamedTuple):
 
     purpose: str  # What it is for, one sentence without a period
     command: str  # The command line that does it
+
+
+def program_parser(kind: type[P], name: str, description: str | None,
+                   examples: Mapping[str, str]) -> P:
+    """Make the parser of an executable, which has `--help` with examples, and `--version`."""
+    lines = ['examples:']
+    for purpose, arguments in examples.items():
+        command = f'ros2 run adxl_ros {name} {arguments}'.rstrip()
+        lines += [f'  {purpose}:', *command_lines(command, 4 * ' ')]
+    parser = kind(
+        prog=name, description='\n'.join(wrapped(' '.join((description or '').split()))),
+        formatter_class=partial(argparse.RawDescriptionHelpFormatter, width=COLUMNS),
+        epilog='\n'.join(lines))
+    parser.add_argument('--version', action='version', version=f'adxl_ros {package_version()}',
+                        help='show the version and exit')
+    return parser
 
 
 def row(cells: Iterable[str], formats: Iterable[str | int]) -> str:

@@ -120,7 +120,7 @@ def _page(results: list[Findings]) -> str:
 _EXAMPLES = {
     'all recordings of a day, with a page': '*.mcap --report check',
     'a log of other software':
-        'log.csv \\\n        --columns time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg',
+        'log.csv --columns time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg',
 }
 """Examples of arguments, by their purpose."""
 

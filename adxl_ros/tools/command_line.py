@@ -8,14 +8,12 @@ import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import partial
 import math
 import os
 from pathlib import Path
 import shlex
 import signal
 import sys
-import textwrap
 from typing import TYPE_CHECKING
 
 from adxl_ros.errors import UserError
@@ -30,9 +28,9 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Effect
 from adxl_ros.model.sensor import neutral, Sensor, typical
-from adxl_ros.process import ended_by_closed_output, package_version
+from adxl_ros.process import ended_by_closed_output
 from adxl_ros.report.quantities import column_unit
-from adxl_ros.report.screen import bar, COLUMNS, end_lines, entry_list, NextStep
+from adxl_ros.report.screen import bar, end_lines, entry_list, NextStep, program_parser
 import numpy as np
 
 if TYPE_CHECKING:
@@ -55,16 +53,9 @@ class _Parser(argparse.ArgumentParser):
 
 def argument_parser(tool: str, description: str | None, examples: Mapping[str, str],
                     details: Callable[[], str] | None = None) -> argparse.ArgumentParser:
-    """Make the parser of a tool, which has `--help` with examples, and `--version`."""
-    lines = [f'  {purpose}:\n    {command(tool, arguments)}'
-             for purpose, arguments in examples.items()]
-    parse = _Parser(
-        prog=tool, description=textwrap.fill(' '.join((description or '').split()), COLUMNS),
-        formatter_class=partial(argparse.RawDescriptionHelpFormatter, width=COLUMNS),
-        epilog='\n'.join(['examples:', *lines]))
+    """Make the parser of a tool; `details` makes the end of its help text."""
+    parse = program_parser(_Parser, tool, description, examples)
     parse.details = details
-    parse.add_argument('--version', action='version', version=f'adxl_ros {package_version()}',
-                       help='show the version and exit')
     return parse
 
 
@@ -223,19 +214,15 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
     try:
         return command(parser.parse_args())
     except UserError as error:
-        note(f'{parser.prog}: {" ".join(str(error).split())}', error.paste)
+        note(f'{parser.prog}: {" ".join(str(error).split())}')
         return 1
     except KeyboardInterrupt:
         note(f'{parser.prog}: interrupted')
         return 130
 
 
-def note(text: str, paste: str = '') -> None:
-    """Print a message on stderr: one line, which a terminal gets wrapped between words."""
-    if sys.stderr.isatty():
-        text = textwrap.fill(text.removesuffix(paste), COLUMNS, subsequent_indent='  ',
-                             break_long_words=False, break_on_hyphens=False)
-        text += f'\n{paste}' * bool(paste)
+def note(text: str) -> None:
+    """Print a message on stderr, in one line."""
     print(text, file=sys.stderr)
 
 

@@ -49,7 +49,10 @@ def export(options: argparse.Namespace) -> int:
         exported = _sized(sensor, options, exports.places(exporter, sensor), show)
     write_text(options.output, exports.text(options.format, exported))
     held = [name for name in exported.sizes_mg if name in exported.holds]
-    cli.print_end(_result_lines(exported, options.format, held), [options.output], cli.command(
+    lost = [name for name in exported.sizes_mg if name not in exported.holds]
+    lines = [f'Sensor {sensor.serial} for {options.format}. The file holds: {", ".join(held)}.']
+    lines += [f'It lacks: {", ".join(lost)}; its head has their sizes.'] * bool(lost)
+    cli.print_end(lines, [options.output], cli.command(
         'simulate', f'rich --params {cli.quoted(options.params)} -o rich.csv'))
     return 0
 
@@ -78,20 +81,6 @@ def _sized(sensor: Sensor, options: argparse.Namespace, holds: Mapping[str, str]
 def _rms_mg(values_mps2: list[float]) -> float:
     """Return the rms of values in m/s², mg."""
     return float(1e3 / G0_MPS2 * np.sqrt(np.mean(np.square(values_mps2))))
-
-
-def _result_lines(exported: exports.Export, format_name: str, held: list[str]) -> list[str]:
-    """Return what the file holds, and the size of what it does not hold."""
-    lost = sorted((name for name in exported.sizes_mg if name not in held),
-                  key=lambda name: -exported.sizes_mg[name])
-    lines = [f'Sensor {exported.sensor.serial} for {format_name}. '
-             f'The file holds: {", ".join(held)}.']
-    if lost:
-        sizes = [f'{name} {exports.size_text(exported.sizes_mg[name])}' for name in lost]
-        lines += [f'Its model lacks, mg rms in the manoeuvre rich: {", ".join(sizes)}.',
-                  f'Together {exports.size_text(exported.remaining_mg)} mg rms, without noise and '
-                  'steps of the ADC.']
-    return lines
 
 
 def main() -> int:

@@ -19,7 +19,6 @@ from adxl_ros.fleet.row import (
     as_date,
     make_recipe,
     OUTCOMES,
-    reason_kind,
     Row,
     task_names,
     TASKS,
@@ -27,7 +26,6 @@ from adxl_ros.fleet.row import (
 from adxl_ros.fleet.run import only_client, Plan, plan, Results, work
 from adxl_ros.report.page import command_of_this_process
 from adxl_ros.report.quantities import counted, duration, file_size
-from adxl_ros.report.screen import wrapped
 from adxl_ros.tools import command_line as cli
 from adxl_ros.workers import open_pool, RETRIES
 
@@ -35,14 +33,12 @@ PROG = 'fleet'  # Name of the command, for messages
 _EXAMPLES = {
     'all recordings of a folder': 'recordings -o results',
     'a bucket, on a Dask cluster':
-        "'s3://robots/**/*.mcap' \\\n        --scheduler tcp://head:8786 -o results",
+        "'s3://robots/**/*.mcap' --scheduler tcp://head:8786 -o results",
     'what it would cost': 'manifest.csv -o results --dry-run',
 }
 """Examples of arguments, by their purpose."""
 _UNITS = 5  # Units that a plan names. Chosen: one or two lines
-_REASON_COLUMNS = 12  # Columns before a reason
-_MOST_REASONS = 3  # Reasons of refusals on the screen. Chosen: the page has all
-_SHOWN = ('url', 'outcome', 'refusal', 'refused_by', 'serial', 'status')
+_SHOWN = ('outcome', 'refused_by', 'serial', 'status')
 """What the screen needs of a row; the others are not kept."""
 
 
@@ -158,22 +154,17 @@ def _result_lines(rows: Sequence[Row], to_do: Plan) -> list[str]:
                 f' left out  {_left_out(to_do)}' * bool(to_do.outside)]
     outcomes = Counter(row['outcome'] for row in rows)
     parts = [f'{outcomes[name]} {name}' for name in OUTCOMES if outcomes[name] or name == 'done']
-    statuses = Counter(row['status'] for row in rows if row['status'])
+    def counts(column: str) -> str:
+        values = Counter(row[column] for row in rows if row[column])
+        return ', '.join(f'{count} {value}' for value, count in values.most_common())
+
     figures = {
         'units': str(len({row['serial'] for row in rows if row['serial']})),
-        'left out': _left_out(to_do),
-        'verdicts': ', '.join(f'{count} {name}' for name, count in statuses.most_common())}
-    kinds: dict[tuple[str, str], list[str]] = {}
-    for row in rows:
-        if row['refusal']:
-            kinds.setdefault((row['refused_by'], reason_kind(row)), []).append(row['refusal'])
-    ordered = sorted(kinds.items(), key=lambda item: -len(item[1]))
-    reasons = [line for (task, _), texts in ordered[:_MOST_REASONS]
-               for line in wrapped(f' {len(texts):>9}  {task}: {texts[0]}', _REASON_COLUMNS)]
+        'left out': _left_out(to_do), 'verdicts': counts('status'),
+        'refused by': counts('refused_by')}
     return [f'{counted(len(rows), "recording")}: {", ".join(parts)}'
             + (f'; {to_do.done} had their row before' if to_do.done else ''), '',
-            *(f' {name:11}{value}' for name, value in figures.items() if value),
-            *(['', ' refused by'] if reasons else []), *reasons]
+            *(f' {name:11}{value}' for name, value in figures.items() if value)]
 
 
 def main() -> int:

@@ -7,18 +7,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from dataclasses import replace
-import json
 from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.atomic_write import write_bytes, write_text
+from adxl_ros.files.atomic_write import write_bytes
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report import page as html_page
 from adxl_ros.report.figures import png, pyplot
 from adxl_ros.report.quantities import duration
 from adxl_ros.report.screen import row
@@ -29,12 +27,7 @@ import numpy as np
 import yaml
 
 MICRO_G = 1e6 / G0_MPS2  # 1 m/s² in µg
-_LARGEST_STD_MPS2 = 0.3
-"""Noise of a sample from which a sensor vibrates, m/s². Chosen: three times that of a low-cost
-IMU at 1 kHz."""
 _NAMES = ('white noise N', 'bias instability B', 'random walk K')  # Names of the terms
-_UNITS = {'white': 'm/s^2/sqrt(Hz)', 'instability': 'm/s^2', 'walk': 'm/s^2/sqrt(s)'}
-"""Keys and units of the terms in JSON."""
 _YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
 
 
@@ -63,16 +56,13 @@ def _tables(result: RecordingNoise) -> list[str]:
 
 
 def _walk_lines(result: RecordingNoise) -> list[str]:
-    """Return the bounds of the walks, and for which times K holds."""
+    """Return the bounds of the walks."""
     rows = []
     for noise in result.axes:
         time_s, k = noise.fit.bound_s, MICRO_G * noise.fit.walk.value
         if np.isfinite(time_s):
             rows.append(f' {noise.axis}: the walk has bounds, {k * np.sqrt(time_s / 2):.3g} µg '
                         f'rms; correlation time {time_s:.3g} s')
-    if any(noise.fit.walk.is_seen for noise in result.axes):
-        rows.append(f' K holds for times up to {duration(result.rest.span_s)}, those of the '
-                    'recording.')
     return rows
 
 
@@ -123,55 +113,11 @@ def _axis_warnings(span_s: float, noise: AxisNoise) -> list[str]:
     if not noise.fit.white.is_seen:
         texts.append('N is not determined. A parameter file keeps the figure of --params, or '
                      'states no white noise.')
-    if noise.sample_std > _LARGEST_STD_MPS2:
-        texts.append(f'one sample has a noise of {noise.sample_std:.2g} m/s², expected less than '
-                     f'{_LARGEST_STD_MPS2:g}. The sensor seems to vibrate.')
     return texts
-
-
-def _as_json(result: RecordingNoise) -> dict[str, Any]:
-    rest, letters = result.rest, [noise.axis for noise in result.axes]
-    return {
-        'schema': 1, 'recording': result.path, 'rate_hz': rest.rate_hz, 'samples': rest.count,
-        'rest_s': [rest.start_s, rest.stop_s], 'recorded_s': rest.recorded_s,
-        'axes': {noise.axis: _axis_json(noise) for noise in result.axes},
-        'allan_deviation': {'tau_s': rest.allan.tau_s.tolist(),
-                            **dict(zip(letters, rest.allan.deviation.T.tolist()))},
-        'settings': {program: {name: values[0] if len(values) == 1 else values
-                               for name, values, _ in entries}
-                     for program, entries in settings(result.axes, rest.rate_hz).items()},
-        'warnings': _warnings(result)}
-
-
-def _axis_json(noise: AxisNoise) -> dict[str, Any]:
-    terms = {name: {'value': e.value if e.is_seen else None, 'ci': [e.low, e.high], 'unit': unit}
-             for (name, unit), e in zip(_UNITS.items(), noise.estimates)}
-    bound_s = noise.fit.bound_s
-    return {**terms, 'correlation_s': bound_s if np.isfinite(bound_s) else None,
-            'rounding': noise.rounding,
-            'density_g_per_rthz': noise_parameters.density_g_per_rthz(noise),
-            'sample_std_mps2': noise.sample_std, 'resolution_mps2': noise.resolution,
-            'fitted_below_hz': noise.fit.highest_hz}
 
 
 _INCHES = (5.0, 4.4)
 """Width and height of the plot of an axis, inches. Chosen: three fit beside each other."""
-_COLUMNS = ('axis', 'white noise N, µg/√Hz', 'bias instability B, µg', 'random walk K, µg/√s',
-            'noise of a sample, m/s²', 'fitted below, Hz')
-"""Head of the table."""
-
-
-def _write_page(folder: Path, result: RecordingNoise) -> list[Path]:
-    page, plot, figure = folder / 'report.html', folder / 'allan.png', _plot(result)
-    rows = [[noise.axis, *_micro_g_intervals(noise),
-             f'{noise.sample_std:.3g}', f'{noise.fit.highest_hz:.3g}'] for noise in result.axes]
-    write_text(page, html_page.render('adxl_ros.tools', 'noise.html', {
-        'title': 'Noise at rest', 'about': _head(result), 'badge': None, 'figures': {},
-        'warnings': _warnings(result), 'columns': _COLUMNS, 'rows': rows,
-        'picture': html_page.picture_url(figure),
-        'paste_lines': _paste_lines(result)}))
-    write_bytes(plot, png(figure))
-    return [page, plot]
 
 
 def _plot(result: RecordingNoise) -> Any:
@@ -198,7 +144,7 @@ def _plot(result: RecordingNoise) -> Any:
 
 _BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 _EXAMPLES = {
-    'noise of each axis, with the Allan deviation as a page': 'still.mcap --report noise',
+    'noise of each axis, with its Allan deviation': 'still.mcap --report noise',
     'a parameter file for compensation and diagnose':
         'still.csv --params my_sensor.yaml -o my_noise.yaml',
     "a camera's IMU in a bag": 'bag --topic /camera/imu',
@@ -216,17 +162,13 @@ def parser() -> argparse.ArgumentParser:
                             'recording in m/s² that names no sensor, any IMU)')
     parse.add_argument('-o', dest='output', metavar='FILE.yaml',
                        help='a parameter file with the measured noise')
-    parse.add_argument('--report', metavar='DIR',
-                       help='write the page report.html and the curve allan.png there')
-    parse.add_argument('--json', action='store_true', help='print the result as JSON')
+    parse.add_argument('--report', metavar='DIR', help='write the curve allan.png there')
     cli.add_recording_options(parse)
     return parse
 
 
 def noise(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    if options.report:
-        html_page.check_libraries()
     reading = cli.reading_options(options)
     newest: list[Recording] = []
     with cli.progress('noise') as show:
@@ -242,8 +184,9 @@ def noise(options: argparse.Namespace) -> int:
     cli.report_reading('noise', *newest)
     files: list[Path] = []
     if options.report:
-        cli.make_folder(Path(options.report))
-        files += _write_page(Path(options.report), result)
+        files = [Path(options.report) / 'allan.png']
+        cli.make_folder(files[0].parent)
+        write_bytes(files[0], png(_plot(result)))
     if options.output:
         name = Path(options.recording).name
         fresh = noise_parameters.with_noise(_sensor(result), result.axes)
@@ -252,9 +195,6 @@ def noise(options: argparse.Namespace) -> int:
                 f'Noise measured in {duration(rest.span_s)} at rest of {result.path}.',
                 'Density: over positive frequencies, as datasheets state it.', *_tables(result)])
         files.insert(0, Path(options.output))
-    if options.json:
-        print(json.dumps(_as_json(result), indent=1))
-        return 0
     print('\n'.join([*_head(result), '', *_tables(result), '', *_paste_lines(result), '']))
     warnings = [f'WARNING {text}' for text in _warnings(result)]
     following = cli.command('diagnose', f'RECORDING --params {cli.quoted(options.output)} '

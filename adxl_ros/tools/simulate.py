@@ -32,7 +32,7 @@ import numpy as np
 _EXAMPLES = {
     'a calibration sweep of the nominal sensor': 'sweep -o sweep.csv',
     'two effects, one of typical size and one with a value':
-        'rich --effect lever_arm \\\n        --effect temperature_bias:per_k.x=4e-4 -o rich.mcap',
+        'rich --effect lever_arm --effect temperature_bias:per_k.x=4e-4 -o rich.mcap',
     'the motion of a recording, by a calibrated sensor':
         'real.csv --params unit.yaml -o simulated.csv',
 }
@@ -125,15 +125,11 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _check_reference(sensor: Sensor, options: argparse.Namespace) -> None:
-    """Refuse errors of a reference where no recorded force is the reference."""
-    stated = {text.partition(':')[0] for text in options.effect}
+    """Name the errors of a reference where no recorded force is the reference."""
     for name in sensor.effects:
         if effect_named(name).concern is Concern.REFERENCE and not options.force:
-            if name in stated:
-                raise UserError(f'--effect {name} acts on the specific force of a recording: say '
-                                'simulate imu --force RECORDING, or leave the effect out')
-            print(f'{name} is an error of the reference that the sensor was compared with, and '
-                  'is left out', file=sys.stderr)
+            cli.note(f'simulate: {name} is an error of the reference, and is left out without '
+                     '--force')
 
 
 def _samples(sensor: Sensor, options: argparse.Namespace

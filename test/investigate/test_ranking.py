@@ -4,12 +4,10 @@
 
 from dataclasses import replace
 from functools import cache
-from types import SimpleNamespace
 
 from adxl_ros.diagnose.next_experiment import ManoeuvreWorth
 from adxl_ros.diagnose.verdict import WeightedHypothesis
 from adxl_ros.investigate.investigation import (
-    Assessment,
     decide,
     Outcome,
     Question,
@@ -33,7 +31,7 @@ BEYOND = ('saturation',)
 
 
 def between(*hypotheses):
-    return Assessment(tuple(WeightedHypothesis(h, 1 / len(hypotheses)) for h in hypotheses))
+    return tuple(WeightedHypothesis(h, 1 / len(hypotheses)) for h in hypotheses)
 
 
 def planned(*names):
@@ -50,13 +48,10 @@ def first_round():
     return run_round(FIRST, [], SENSOR, LIMITS)
 
 
-def worth(ranking):
-    return {w.name: w.information for w in ranking.worth}
-
-
 def test_fast_turns_show_an_arm_better_than_rests_and_slow_turns():
     names = ('rests_on_axes', 'fast_turn_of_beta', 'slow_turn_of_beta')
-    information = worth(rank(between(BEYOND, ('lever_arm',)), SENSOR, planned(*names)))
+    _, worth = rank(between(BEYOND, ('lever_arm',)), None, SENSOR, planned(*names))
+    information = {w.name: w.information for w in worth}
     assert information['fast_turn_of_beta'] > information['rests_on_axes']
     assert information['fast_turn_of_beta'] > information['slow_turn_of_beta']
 
@@ -69,16 +64,15 @@ def test_a_manoeuvre_that_does_not_fit_in_the_time_is_not_chosen():
     assert shortest != first_round()[0].manoeuvre
     answer, _ = run_round(Question(pose, 0.0, minutes[shortest] + 1e-6, False), [], SENSOR, LIMITS)
     assert answer.manoeuvre == shortest
-    assert decide(replace(between((), ('hysteresis',)), worth=(told_nothing(1.0),)),
-                  FIRST, False).outcome is Outcome.TIME_OVER
+    assert decide(between((), ('hysteresis',)), (told_nothing(1.0),), FIRST, False
+                  ).outcome is Outcome.TIME_OVER
 
 
 @pytest.mark.parametrize('probability, outcome', [(0.96, Outcome.CERTAIN), (0.85, Outcome.GO_ON)])
 def test_90_percent_of_a_hypothesis_is_a_verdict(probability, outcome):
-    assessment = Assessment((WeightedHypothesis(('hysteresis',), probability),
-                             WeightedHypothesis((), 1 - probability)),
-                            worth=(told_nothing(1.0),))
-    decision = decide(assessment, FIRST, True)
+    hypotheses = (WeightedHypothesis(('hysteresis',), probability),
+                  WeightedHypothesis((), 1 - probability))
+    decision = decide(hypotheses, (told_nothing(1.0),), FIRST, True)
     assert decision.outcome is outcome
     if outcome is Outcome.CERTAIN:
         assert decision.sentence == 'The recording shows hysteresis: 96 %.'
@@ -86,20 +80,18 @@ def test_90_percent_of_a_hypothesis_is_a_verdict(probability, outcome):
 
 def test_a_verdict_that_stays_after_every_kind_of_manoeuvre_ends_it():
     """The manoeuvres still promise much, as where the probability of no gap has a ceiling."""
-    verdict = SimpleNamespace(status='no_gap', effects=())
-    assessment = Assessment((WeightedHypothesis((), 0.8), WeightedHypothesis(('gravity',), 0.2)),
-                            SimpleNamespace(report=SimpleNamespace(verdict=verdict), fault=None),
-                            tuple(ManoeuvreWorth(m.name, m.minutes, 1.0)
-                                  for m in plan_all(LIMITS, Pose(1.5, 0.0))))
+    hypotheses = (WeightedHypothesis((), 0.8), WeightedHypothesis(('gravity',), 0.2))
+    worth = tuple(ManoeuvreWorth(m.name, m.minutes, 1.0)
+                  for m in plan_all(LIMITS, Pose(1.5, 0.0)))
     question, recorded = FIRST, []
-    while (answer := decide(assessment, question, True)).manoeuvre:
+    while (answer := decide(hypotheses, worth, question, True, 'no_gap')).manoeuvre:
         recorded.append(answer.manoeuvre)
         question = replace(FIRST, recorded=tuple(recorded), verdict=answer.verdict)
     kinds = {m.kind for m in CATALOGUE.values()}
     assert {CATALOGUE[name].kind for name in recorded} == kinds
     assert len(recorded) == len(kinds)
     assert answer.outcome is Outcome.NO_VISIBLE_GAP
-    changed = decide(assessment, replace(question, verdict='unknown'), True)
+    changed = decide(hypotheses, worth, replace(question, verdict='unknown'), True, 'no_gap')
     assert changed.outcome is Outcome.GO_ON
 
 
@@ -108,5 +100,4 @@ def test_the_first_round_needs_no_samples():
     answer, diagnosis = first_round()
     assert diagnosis is None
     assert answer.outcome is Outcome.GO_ON
-    assert 'temperature_bias' in answer.hidden
     assert sum(h.probability for h in answer.hypotheses) == pytest.approx(1)

@@ -9,7 +9,6 @@ from adxl_ros.links.support.wire_format import (
     AFTER_RESET,
     BoardInfo,
     decode,
-    decode_command,
     encode_command,
     encode_payload,
     Encoder,
@@ -18,6 +17,7 @@ from adxl_ros.links.support.wire_format import (
     Splitter,
     WireError,
 )
+from faulty_board import decode_command
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest

@@ -38,7 +38,6 @@ def launch(start: Callable[..., Started]) -> Callable[..., Started]:
     ('calibrate', 'screen:=maybe', '"maybe" is not valid'),
     ('robot', 'output_rate_hz:=slow', 'output_rate_hz:=slow: expected a number'),
     ('robot', 'mounting_xyz_m:=0.1', 'mounting_xyz_m:=0.1: expected three numbers'),
-    ('emulate', 'rpy_rad:=0.1', 'rpy_rad:=0.1: expected three numbers'),
     ('emulate', 'seed:=odd', 'seed:=odd: expected a number'),
     ('calibrate', 'sweep_planes_deg:=flat', 'sweep_planes_deg:=flat: expected a number'),
     ('calibrate', 'link_type:=serial', 'link_type is serial, but the stage would be simulated'),

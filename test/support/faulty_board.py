@@ -34,14 +34,9 @@ import sys
 import time
 import tty
 
+from adxl_ros.links.support import wire_format
 from adxl_ros.links.support.base import samples_within
-from adxl_ros.links.support.wire_format import (
-    BoardInfo,
-    decode_command,
-    Encoder,
-    Splitter,
-    WireError,
-)
+from adxl_ros.links.support.wire_format import BoardInfo, Encoder, Splitter, WireError
 import numpy as np
 
 CODES = 65534
@@ -50,6 +45,14 @@ BLOCK = 10
 """Most samples of a frame, and those before the first command, as the firmware sends them."""
 BANNER = b'\r\nets Jun  8 2016 00:22:57\r\nrst:0x1 (POWERON_RESET)\0\r\nboot\r\n'
 """What an ESP32 prints when it starts."""
+
+
+def decode_command(raw):
+    """Decode a frame from the host; return its latency, µs."""
+    payload = wire_format._checked_payload(raw)
+    if payload[0] != wire_format.COMMAND_TYPE:
+        raise WireError('no command')
+    return wire_format._COMMAND.unpack(payload)[-1]
 
 
 def mark(k):

@@ -107,7 +107,6 @@ class ScreenContents:
     keys: tuple[KeyAction, ...] = ()  # Keys that have an action now
     rows: tuple[Row, ...] = ()  # What the sensor reads, and the progress
     coefficients: tuple[Row, ...] = ()  # As the poses determine them so far
-    open_poses: int = 0  # That a fit would miss now; 0 where the number of poses is not fixed
     outcome: tuple[str, ...] = ()  # Lines on the calibration that has ended
 
     def to_json(self) -> str:

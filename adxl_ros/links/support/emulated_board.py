@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 import os
 from pathlib import Path
 import pty
@@ -18,9 +18,7 @@ from adxl_ros.links.support.base import samples_within
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_FRAME_SAMPLES = 10
-"""Most samples of a frame, and those of a frame before the first command, as in the firmware."""
-_READ_BYTES = 4096  # Most bytes from the host that are read at once
+_FRAME_S = 0.002  # Duration of the samples of a frame, s: the usual latency of a driver
 _INFO_S = 1.0  # Period of the info frames, s, as the firmware sends them
 _SUPPLY_SCALE = 2.0
 """Ratio of the supply's divider, V/V, as in the firmware: the ADC cannot measure its own
@@ -33,8 +31,7 @@ class Board:
     """
     Sends the samples of a sensor.
 
-    Frames that nobody reads are dropped and counted, as on a board without a host. A command of
-    the host sets the samples of a frame, and an info frame answers it.
+    Frames that nobody reads are dropped and counted, as on a board without a host.
     """
 
     def __init__(self, sensor: Sensor, roles: list[str], fd: int) -> None:
@@ -45,8 +42,7 @@ class Board:
         self._index = self._overruns = 0
         self._informed_s = -_INFO_S
         self._unsent = b''
-        self._splitter = wire_format.Splitter()
-        self._frame_samples = _FRAME_SAMPLES
+        self._frame_samples = samples_within(_FRAME_S, sensor.rate_hz)
 
     def send(self, columns: Mapping[str, np.ndarray]) -> None:
         """Send the samples of columns, (n,) each, every frame at the time of its last sample."""
@@ -56,7 +52,6 @@ class Board:
         if self._began_s is None:
             self._began_s = time.monotonic()
         while len(codes):
-            self._obey()
             block, codes = codes[:self._frame_samples], codes[self._frame_samples:]
             first_s = self._index / self._sensor.rate_hz
             if first_s - self._informed_s >= _INFO_S and self._write(self._encoder.info_frame()):
@@ -68,18 +63,6 @@ class Board:
             if not self._write(frame):
                 self._overruns += len(block)
             self._index += len(block)
-
-    def _obey(self) -> None:
-        try:
-            received = os.read(self._fd, _READ_BYTES)
-        except OSError:
-            return  # nothing has come; a terminal that is gone shows in the next write
-        for raw in self._splitter.split(received):
-            with suppress(wire_format.WireError):
-                latency_s = wire_format.decode_command(raw) * 1e-6
-                self._frame_samples = min(samples_within(latency_s, self._sensor.rate_hz),
-                                          _FRAME_SAMPLES)
-                self._informed_s = -_INFO_S
 
     def _write(self, frame: bytes) -> bool:
         """Write a frame, after the rest of a previous one; return whether it was taken."""

@@ -126,14 +126,6 @@ def encode_command(sequence: int, latency_us: int) -> bytes:
     return b'\0' + encode_payload(payload)
 
 
-def decode_command(raw: bytes) -> int:
-    """Decode a frame from the host, as a board does; return its latency, µs."""
-    payload = _checked_payload(raw)
-    if payload[0] != COMMAND_TYPE or len(payload) != _COMMAND.size:
-        raise WireError('no command')
-    return int(_COMMAND.unpack(payload)[-1])
-
-
 def samples_that_fit(count: int, info: BoardInfo, bytes_per_s: float) -> int:
     """Return the smallest number of samples of a frame that a wire carries with a margin."""
     for samples in range(count, MAX_COUNT):
