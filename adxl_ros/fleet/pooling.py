@@ -281,9 +281,9 @@ _MAX_OUTLIERS = 0.25
 """Largest share of units that are far out. Chosen: more of them are a population of their own."""
 _FAR_MADS = 5.0
 """Units further from the median do not count in the first round. Chosen: far beyond normal."""
-MIN_GROUP = 5
-"""Fewest units of a group. Chosen: fewer have nothing in common that a test could show."""
-CHANCE = 0.01  # Probability of a false group among all groups. Chosen
+_MIN_BATCH = 5
+"""Fewest units of a batch. Chosen: fewer have nothing in common that a test could show."""
+_CHANCE = 0.01  # Probability of a false batch among all batches. Chosen
 
 
 def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -439,25 +439,18 @@ class BadBatch(NamedTuple):
     high: float
 
 
-def by_prefix(names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return the groups whose names begin alike, (m,) bool each, by the shortest beginning."""
-    counts = Counter(name[:length] for name in names for length in range(1, len(name) + 1))
-    groups: dict[bytes, tuple[str, np.ndarray]] = {}
-    for prefix in sorted(counts, key=len):
-        if MIN_GROUP <= counts[prefix] < len(names):
-            members = np.array([name.startswith(prefix) for name in names])
-            groups.setdefault(members.tobytes(), (prefix, members))
-    return dict(groups.values())
-
-
 def bad_batch(serials: Sequence[str], level: np.ndarray, tolerance: float, tests: int
               ) -> BadBatch | None:
     """Return the most certain batch whose level differs by more than a tolerance."""
-    # The larger part of a fleet is what the others are compared with.
-    groups = {prefix: members for prefix, members in by_prefix(serials).items()
-              if members.sum() <= len(serials) / 2}
-    best, lowest = None, CHANCE / (max(len(groups), 1) * tests)
-    for prefix, members in groups.items():
+    counts = Counter(name[:length] for name in serials for length in range(1, len(name) + 1))
+    batches: dict[bytes, tuple[str, np.ndarray]] = {}  # By their members, with the shortest prefix
+    for prefix in sorted(counts, key=len):
+        # The larger part of a fleet is what the others are compared with.
+        if _MIN_BATCH <= counts[prefix] <= len(serials) / 2:
+            members = np.array([name.startswith(prefix) for name in serials])
+            batches.setdefault(members.tobytes(), (prefix, members))
+    best, lowest = None, _CHANCE / (max(len(batches), 1) * tests)
+    for prefix, members in batches.values():
         test = scipy.stats.ttest_ind(level[members], level[~members], equal_var=False)
         difference = float(level[members].mean() - level[~members].mean())
         if test.pvalue < lowest and abs(difference) > tolerance:

@@ -5,10 +5,6 @@ The table of a fleet in the order of units and time, and what it says.
 
 Each quantity has trends, a population and outliers.
 
-A group is all units whose serial numbers begin alike, or all that are recorded in folders whose
-names begin alike. An effect belongs to a group if it is more frequent there than elsewhere by
-Fisher's exact test, whose chance all groups and effects share (Bonferroni).
-
 The order of units by urgency is that of the table in docs/howto/fleet.md. A unit has the first
 state that fits:
 
@@ -32,13 +28,12 @@ from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.fleet import pooling
-from adxl_ros.fleet.pooling import by_prefix, Recordings
+from adxl_ros.fleet.pooling import Recordings
 from adxl_ros.fleet.row import NOISE
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.report.quantities import counted, number
 import numpy as np
 import pandas as pd
-import scipy
 
 _TEXTS = ['url', 'hash', 'serial', 'outcome', 'refusal', 'refused_by', 'calibration_id', 'status',
           'report']
@@ -240,8 +235,6 @@ def far_out(results: Sequence[QuantityResult], serials: Sequence[str]) -> list[F
 
 _VERDICTS = ('no_gap', 'explained', 'partly', 'inseparable', 'unknown')
 """Statuses of recordings whose effects are judged."""
-_MOST = 0.5
-"""Share from which most have an effect: recordings of a unit, units of a group or of the fleet."""
 RECENT = 5
 """Number of recordings whose median is the gap of a unit now. Chosen: one odd one is no gap."""
 MAX_AGE_DAYS = 365.0  # Largest age of a calibration, days. Chosen: a year
@@ -250,12 +243,12 @@ _FARTHEST_DAYS = 10 * DAYS_PER_YEAR
 """A drift that needs longer is no matter of urgency. Chosen: the life of a robot."""
 
 
-def effect_matrix(table: FleetTable) -> tuple[pd.DataFrame, list[str]]:
+def effect_matrix(table: FleetTable) -> pd.DataFrame:
     """
-    Count the named effects by unit, and look for what units with an effect have in common.
+    Return the share of the recordings of each unit in which each effect is named.
 
-    returns: share of the recordings in which each effect is named, the most frequent first, by the
-    numbers of the units with a verdict; and one sentence for each finding.
+    The rows are the numbers of the units with a verdict, the columns the effects, the most
+    frequent first.
     """
     used = np.isin(table['status'].astype(str), _VERDICTS) & (table.unit >= 0) & table.first
     frame, unit = table.frame[used], table.unit[used]
@@ -263,33 +256,7 @@ def effect_matrix(table: FleetTable) -> tuple[pd.DataFrame, list[str]]:
     effects = sorted(counts, key=lambda name: (-counts[name], name))
     has = pd.DataFrame([[name in names for name in effects] for names in frame['effects']],
                        columns=effects, dtype=float)
-    share = has.groupby(unit).mean()
-    by_place = has.groupby([unit, [url.rpartition('/')[0] for url in frame['url']]]).mean()
-    common = (share > _MOST).sum()
-    findings = [
-        *(f'{common[name]} of {len(share)} units have {name}. Look for what they share: stage, '
-          'mounting, parameter file, batch.' for name in effects
-          if common[name] > _MOST * len(share) and len(share) >= pooling.MIN_GROUP),
-        *_frequent([table.serials[unit] for unit in share.index], share > _MOST,
-                   'with a serial number', 'a bad batch'),
-        *_frequent([folder for _, folder in by_place.index], by_place > _MOST, 'recorded in',
-                   'a bad stage or place')]
-    return share, findings
-
-
-def _frequent(names: Sequence[str], has: pd.DataFrame, what: str, cause: str) -> list[str]:
-    """Name the group of names in which each effect is more frequent than elsewhere, if any."""
-    groups, findings = by_prefix(names), []
-    for effect, named in has.items() if groups else ():
-        chance, prefix, members = min((scipy.stats.hypergeom.logsf(
-            (members & named).sum() - 1, len(named), named.sum(), members.sum()), prefix, members)
-            for prefix, members in groups.items())
-        inside, size = (members & named).sum(), members.sum()
-        limit = np.log(pooling.CHANCE / (len(groups) * has.shape[1]))
-        if chance < limit and inside > _MOST * size:
-            findings.append(f'{inside} of {size} units {what} {prefix}… have {effect}, and '
-                            f'{named.sum() - inside} of the {len(named) - size} others: {cause}.')
-    return findings
+    return has.groupby(unit).mean()
 
 
 class State(IntEnum):
