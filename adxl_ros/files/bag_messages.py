@@ -337,7 +337,7 @@ class Topics(NamedTuple):
 
 def find_topics(bag: Bag, topic: str = '') -> Topics:
     """Find the topics by their names, in any namespace, and their types."""
-    imu = _find_imu(bag, topic)
+    imu = find_imu(bag, topic)
     is_own = imu.endswith('imu/data_raw')
     space = imu.removesuffix('imu/data_raw') if is_own else imu[:imu.rfind('/') + 1]
 
@@ -356,30 +356,20 @@ def find_topics(bag: Bag, topic: str = '') -> Topics:
     return Topics(imu, joints, info, temperature, supply, beside('command', JOINT_STATE))
 
 
-def find_ideal(bag: Bag) -> Topics:
-    """Find another simulator's specific force: the only topic of its type, or imu/data_raw."""
-    topics = _imu_topics(bag)
-    return Topics(topics[0] if len(topics) == 1 else _find_imu(bag, ''))
-
-
-def _find_imu(bag: Bag, named: str) -> str:
+def find_imu(bag: Bag, named: str = '') -> str:
     """Return the topic that the user has named, that of this package, or the only one."""
     topics = _imu_topics(bag)
     if not topics:
         held = ', '.join(f'{topic} ({kind})' for topic, kind in sorted(bag.types))
         raise UserError(f'{bag.path}: no topic of type {IMU}; it holds {held or "no messages"}'
                         + f'; {bag.cut}' * bool(bag.cut))
-    if named:
-        chosen = [topic for topic in topics if topic.strip('/') == named.strip('/')]
-        if not chosen:
-            raise UserError(f'{bag.path}: no topic {named} of type {IMU}; name one of '
-                            f'{", ".join(topics)}')
-        return chosen[0]
-    own = _only(bag, 'imu/data_raw', IMU)
-    if not own and len(topics) > 1:
-        raise UserError(f'{bag.path}: several topics of type {IMU}, none of them imu/data_raw: '
-                        f'{", ".join(topics)}; choose one: --topic {topics[0]}')
-    return own or topics[0]
+    own = [topic for topic in topics if f'/{topic}'.endswith('/imu/data_raw')]
+    chosen = [topic for topic in topics if topic.strip('/') == named.strip('/')] if named else \
+        own or topics
+    if len(chosen) != 1:
+        raise UserError(f'{bag.path}: {len(chosen) or "no"} topics {named or IMU}; choose '
+                        f'one with --topic: {", ".join(chosen or topics)}')
+    return chosen[0]
 
 
 def _imu_topics(bag: Bag) -> list[str]:

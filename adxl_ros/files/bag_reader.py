@@ -12,7 +12,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.bag_messages import (
     Bag,
-    find_ideal,
+    find_imu,
     find_topics,
     open_bag,
     Raws,
@@ -47,7 +47,7 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
         if reading.mapping is not None or reading.lsb_per_g or reading.lsb_at_0g:
             raise UserError(f'{bag.path}: is a bag, with topics in m/s²; leave --columns and '
                             '--lsb-per-g out, or name a topic with --topic')
-        topics = find_ideal(bag) if ideal else find_topics(bag, reading.topic)
+        topics = Topics(find_imu(bag)) if ideal else find_topics(bag, reading.topic)
         info = read_info(bag, topics.info)
         tracks, commands = _tracks(bag, topics), _commands(bag, topics)
         samples = _Samples(f'{bag.path}: topic {topics.imu}', AXES if ideal else info.get('axes'),
@@ -231,7 +231,7 @@ def _block(bag: Bag, samples: _Samples, tracks: Mapping[str, Track],
 def log_times(path: str | os.PathLike, topic: str) -> Iterator[np.ndarray]:
     """Yield header stamp and log time of the samples of a bag, ns, (k, 2), in blocks."""
     with open_bag(path) as bag:
-        imu = find_topics(bag, topic).imu
+        imu = find_imu(bag, topic)
         for piece in bag.pieces([imu]):
             stamp_ns, _ = _columns(f'{bag.path}: topic {imu}', piece.messages[imu], cdr.header,
                                    lambda table: {})

@@ -53,8 +53,7 @@ def _trend_figure(table: fleet.FleetTable, result: fleet.QuantityResult, unit: i
                   ) -> plotly.Figure:
     """Plot a quantity of a unit over time, about its mean where units differ by far more."""
     quantity, place = result.quantity, result.place_of(unit)
-    is_relative = quantity.is_coefficient and quantity.is_force
-    origin = float(result.trends.level[place]) if is_relative and place is not None else 0.0
+    origin = result.trends.level[place] if quantity.is_coefficient and place is not None else 0.0
     part = table.unit[result.rows] == unit
     years, is_outlier = result.recordings.time[part], result.is_outlier[part]
     value = quantity.factor * (result.recordings.value[part] - origin)
@@ -82,7 +81,7 @@ def _trend_figure(table: fleet.FleetTable, result: fleet.QuantityResult, unit: i
     marks = [{'type': 'line', 'x0': stamp, 'x1': stamp, 'yref': 'paper', 'y0': 0, 'y1': 1,
               'line': {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'}}
              for stamp in _stamps(begins[np.isfinite(begins)])]
-    title = quantity.shown_unit + ' from the mean' * is_relative
+    title = quantity.shown_unit + ' from the mean' * quantity.is_coefficient
     return plotly.figure(
         traces, _TREND_HEIGHT, showlegend=False, shapes=marks,
         xaxis={'type': 'date', 'nticks': 3, 'tickangle': 0, 'tickformat': '%b %Y'},

@@ -13,8 +13,7 @@ state that fits:
 2. Drifts: a claimed slope takes it out of the tolerance. The nearest date comes first.
 3. Not judged: its last recordings are refused. The longest series comes first.
 4. Far out: a coefficient is not that of the population. The farthest comes first.
-5. Old calibration: its calibration is older than a year, or it has none.
-6. In order.
+5. In order.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ from typing import NamedTuple
 from adxl_ros.errors import UserError
 from adxl_ros.fleet import pooling
 from adxl_ros.fleet.pooling import Recordings
-from adxl_ros.fleet.row import NOISE
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.report.quantities import counted, number
 import numpy as np
@@ -57,11 +55,6 @@ class Quantity:
     # Column of its standard deviation, or columns of both ends of its 90 % interval
     error_columns: tuple[str, ...]
     is_coefficient: bool = True  # Whether the units of a fleet have a population of it
-
-    @property
-    def is_force(self) -> bool:
-        """Whether the quantity is an error of specific force, which has a tolerance."""
-        return self.shown_unit.startswith('mg')
 
     def text(self, value: float, low: float, high: float) -> str:
         """Return a difference with its interval, in the unit of the page."""
@@ -145,11 +138,6 @@ def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
                      (f'zero_g_std_{axis}_v',)),
             Quantity(f'scale_{axis}_v_per_g', f'scale factor {axis}', 'V/g', 'mg/g', mg_per_v,
                      (f'scale_std_{axis}_v_per_g',))]
-    listed += [
-        Quantity(f'noise_{letter}_{axis}_{name}', f'{label[:-2]} {axis}', unit,
-                 unit.replace('m/s²', 'µg'), 1e6 / G0_MPS2,
-                 tuple(f'noise_{letter}_{end}_{axis}_{name}' for end in ('low', 'high')))
-        for axis in AXES for letter, label, name, unit in NOISE]
     return tuple(listed)
 
 
@@ -195,9 +183,8 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
         units = np.unique(table.unit[rows[~is_outlier]])
         population, batch = None, None
         if quantity.is_coefficient and len(units) >= pooling.MIN_UNITS:
-            if quantity.is_force:
-                batch = pooling.bad_batch([table.serials[unit] for unit in units], trends.level,
-                                          TOLERANCE_MG / quantity.factor, len(measured))
+            batch = pooling.bad_batch([table.serials[unit] for unit in units], trends.level,
+                                      TOLERANCE_MG / quantity.factor, len(measured))
             population = pooling.random_effects(trends.level, trends.level_std, coefficients,
                                                 None if batch is None else batch.members)
         none = np.zeros(len(units), bool)
@@ -237,7 +224,6 @@ _VERDICTS = ('no_gap', 'explained', 'partly', 'inseparable', 'unknown')
 """Statuses of recordings whose effects are judged."""
 RECENT = 5
 """Number of recordings whose median is the gap of a unit now. Chosen: one odd one is no gap."""
-MAX_AGE_DAYS = 365.0  # Largest age of a calibration, days. Chosen: a year
 DAYS_PER_YEAR = 365.25
 _FARTHEST_DAYS = 10 * DAYS_PER_YEAR
 """A drift that needs longer is no matter of urgency. Chosen: the life of a robot."""
@@ -266,8 +252,7 @@ class State(IntEnum):
     DRIFTS = 2
     NOT_JUDGED = 3
     FAR_OUT = 4
-    OLD_CALIBRATION = 5
-    IN_ORDER = 6
+    IN_ORDER = 5
 
     @property
     def words(self) -> str:
@@ -277,7 +262,7 @@ class State(IntEnum):
     @property
     def colour(self) -> str:
         """Return the colour of the badge of a unit."""
-        return ('red', 'amber', 'amber', 'amber', 'grey', 'green')[self - 1]
+        return ('red', 'amber', 'amber', 'amber', 'green')[self - 1]
 
 
 class Drift(NamedTuple):
@@ -285,9 +270,8 @@ class Drift(NamedTuple):
 
     result: QuantityResult  # Its quantity
     text: str  # The slope with its interval, for people
-    days: float  # Days until the unit is out of its tolerance; infinite for a quantity without one
-    # Gap now, or the drift since the calibration where there is no gap; NaN for a quantity without
-    # a tolerance
+    days: float  # Days until the unit is out of its tolerance; infinite for a gap that shrinks
+    # Gap now, or the drift since the calibration where there is no gap; NaN for a gap that shrinks
     reached_mg: float
 
 
@@ -346,10 +330,6 @@ def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult],
         state, urgency = State.FAR_OUT, -abs(distant.distance)
         reason = f'{distant.quantity.label} is {-urgency:.1f} standard deviations from the mean ' \
             'of the fleet.'
-    elif not age_days <= MAX_AGE_DAYS:
-        state, urgency = State.OLD_CALIBRATION, -age_days if age_days > 0 else -np.inf
-        reason = f'Its calibration is {age_days:.0f} days old.' if age_days > 0 else \
-            'It has no calibration with a date.'
     return UnitState(
         urgency, unit, table.serials[unit], state, reason[:1].upper() + reason[1:], drifts,
         f'{number(gap_mg)} / {number(floor_mg)}' if np.isfinite(gap_mg) else '-',
@@ -381,7 +361,7 @@ def _drifts(unit: int, results: Sequence[QuantityResult], over_mg: float, age_da
         slope, half = float(result.trends.slope[place]), float(result.half_width[place])
         text = f'{quantity.label} {quantity.text(slope, slope - half, slope + half)} per year'
         days, reached_mg = np.inf, np.nan
-        if quantity.is_force and (quantity.is_coefficient or slope > 0):
+        if quantity.is_coefficient or slope > 0:
             # A coefficient is right at its calibration, and the gap shows what it is now.
             mg_per_day = abs(quantity.factor * slope) / DAYS_PER_YEAR
             reached_mg = over_mg if np.isfinite(over_mg) else mg_per_day * np.nan_to_num(age_days)
