@@ -349,31 +349,31 @@ def find_topics(bag: Bag, topic: str = '') -> Topics:
                                                                 JOINT_STATE)
     info = beside('sensor_info', DIAGNOSTIC_STATUS)
     # With several sensors, the only sensor_info may be that of another one.
-    if info is None and (is_own or len(_imu_topics(bag)) == 1):
+    if info is None and (is_own or [kind for _, kind in bag.types].count(IMU) == 1):
         info = _only(bag, 'sensor_info', DIAGNOSTIC_STATUS)
     temperature, supply = beside('temperature', TEMPERATURE), beside('supply', BATTERY_STATE)
     space = joints.removesuffix('joint_states') if joints else f'{space}stage/'
     return Topics(imu, joints, info, temperature, supply, beside('command', JOINT_STATE))
 
 
-def find_imu(bag: Bag, named: str = '') -> str:
-    """Return the topic that the user has named, that of this package, or the only one."""
-    topics = _imu_topics(bag)
+def choose_topic(bag: Bag, kind: str, own: str, named: str, option: str = '--topic') -> str:
+    """Return the topic of a type that the user has named, that of the usual name, or the only."""
+    topics = sorted(topic for topic, other in bag.types if other == kind)
     if not topics:
         held = ', '.join(f'{topic} ({kind})' for topic, kind in sorted(bag.types))
-        raise UserError(f'{bag.path}: no topic of type {IMU}; it holds {held or "no messages"}'
+        raise UserError(f'{bag.path}: no topic of type {kind}; it holds {held or "no messages"}'
                         + f'; {bag.cut}' * bool(bag.cut))
-    own = [topic for topic in topics if f'/{topic}'.endswith('/imu/data_raw')]
     chosen = [topic for topic in topics if topic.strip('/') == named.strip('/')] if named else \
-        own or topics
+        [topic for topic in topics if f'/{topic}'.endswith(f'/{own}')] or topics
     if len(chosen) != 1:
-        raise UserError(f'{bag.path}: {len(chosen) or "no"} topics {named or IMU}; choose '
-                        f'one with --topic: {", ".join(chosen or topics)}')
+        raise UserError(f'{bag.path}: {len(chosen) or "no"} topics {named or kind}; choose one '
+                        f'with {option}: {", ".join(chosen or topics)}')
     return chosen[0]
 
 
-def _imu_topics(bag: Bag) -> list[str]:
-    return sorted(topic for topic, kind in bag.types if kind == IMU)
+def find_imu(bag: Bag, named: str = '') -> str:
+    """Return the topic of the sensor's output."""
+    return choose_topic(bag, IMU, 'imu/data_raw', named)
 
 
 def _only(bag: Bag, name: str, kind: str) -> str | None:

@@ -75,11 +75,11 @@ class _Samples:
         self.force = np.zeros((0, 3))  # Their specific force, m/s², (n, 3)
         self._rate_hz = reading.rate_hz
         self._first_ns = 0
-        self._frame: str | None = None
 
     def add(self, raws: Raws) -> None:
         """Decode and check further messages."""
-        stamp_ns, columns = _columns(self.where, raws, cdr.imu, self._force)
+        stamp_ns, columns = _columns(self.where, raws, cdr.imu, lambda table: dict(
+            zip(ACCEL, table.numbers('linear_acceleration').T)))
         force = np.column_stack(list(columns.values()))
         if not self.count:
             self._begin(raws[:1], int(stamp_ns[0]))
@@ -114,14 +114,6 @@ class _Samples:
         if self.axes not in MEASURED_AXES:
             raise UserError(f'{self.where}: linear_acceleration_covariance gives the axes '
                             f'{self.axes or "none"}, expected x, xy or xyz; record sensor_info')
-
-    def _force(self, table: cdr.Table) -> dict[str, np.ndarray]:
-        frame = table.layout.texts['frame_id']
-        if self._frame not in (None, frame):
-            raise UserError(f'{self.where}: frame_id changes from {self._frame!r} to {frame!r}; '
-                            'record each sensor on a topic of its own')
-        self._frame = frame
-        return dict(zip(ACCEL, table.numbers('linear_acceleration').T))
 
 
 Values = Callable[[cdr.Table], Mapping[str, np.ndarray]]

@@ -137,12 +137,11 @@ def _head(export: Export, software: str, prefix: str = '# ') -> str:
     if stage := stage_effects(sensor):
         lines += ['', *wrap('Left out, as errors of the stage or of another reference: '
                             f'{", ".join(stage)}.', _COLUMNS)]
-    noise_from, rate_from = map(sensor.provenance.get, ('noise_from', 'rate_from'))
+    noise_from = sensor.provenance.get('noise_from')
     stated = sensor.datasheet_name or 'the parameter file'
     origin = f'measured in {noise_from}' if noise_from else \
         f'the figure of {stated}; nobody measured it'
-    rate = f'that of {rate_from}' if rate_from else 'as the parameter file states it'
-    lines += ['', *wrap(f'White noise: {origin}. Rate: {rate}.', _COLUMNS), '',
+    lines += ['', *wrap(f'White noise: {origin}.', _COLUMNS), '',
               'Sizes: change of the output in the manoeuvre rich (7 minutes of turns,',
               'shaking, warming and a step of the supply), by simulation.',
               'All that is not held, but for noise and steps: '

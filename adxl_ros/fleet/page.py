@@ -110,21 +110,16 @@ def write(folder: Path) -> list[Path]:
     html_page.check_libraries()
     table = fleet.read(folder / TABLE)
     results = fleet.analyse(table)
-    distant = fleet.far_out(results, table.serials)
-    population = Population(POPULATION, {
-        result.quantity.column: result.population.pooled for result in results
-        if result.population is not None and result.population.pooled.prediction_std > 0})
-    calibration_store.write_population(folder / POPULATION, population, [
-        {'serial': item.serial, 'coefficient': item.quantity.column, 'value': item.value,
-         'distance': item.distance} for item in distant])
+    calibration_store.write_population(folder / POPULATION, Population(POPULATION, {
+        result.quantity.column: result.population for result in results
+        if result.population is not None and result.population.prediction_std > 0}))
     write_text(folder / PAGE, page(table, results, folder))
     return [folder / name for name in (PAGE, POPULATION)]
 
 
 def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folder: Path) -> str:
     """Return the page of a fleet."""
-    distant = fleet.far_out(results, table.serials)
-    units = fleet.rank(table, results, distant)
+    units = fleet.rank(table, results)
     share = fleet.effect_matrix(table)
     # Units that drift come first, although others may be more urgent.
     plotted = [(unit, shown[0]) for unit in sorted(units, key=lambda unit: not unit.drifts)
@@ -166,7 +161,7 @@ def _badge(table: fleet.FleetTable, units: Sequence[fleet.UnitState], counts: Co
         return {'colour': 'grey', 'word': 'NO UNITS',
                 'sentence': 'No recording states a serial number.'}
     worst = units[0].state
-    if worst >= fleet.State.FAR_OUT and table.frame[[*_MEASURES]].isna().all(axis=None):
+    if worst is fleet.State.IN_ORDER and table.frame[[*_MEASURES]].isna().all(axis=None):
         # What was not measured is not within the tolerance.
         return {'colour': 'grey', 'word': 'NOT MEASURED',
                 'sentence': 'No gap and no zero-g were measured; they need diagnose and fit.'}

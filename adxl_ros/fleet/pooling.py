@@ -274,7 +274,7 @@ _GRID = (np.arange(400) + 0.5) / 400
 """Shares x of the spreads s·x/(1 − x) over which the likelihood is integrated. Chosen: more change
 the integrals by less than 1e-3."""
 _OUTLIER_CHANCE = 0.05
-"""Probability that a page names a unit although all units are of one population. Chosen."""
+"""Probability that a unit does not count although all units are of one population. Chosen."""
 _MAX_ROUNDS = 10
 """Largest count of rounds of spread and outliers; a round seldom changes after the second."""
 _MAX_OUTLIERS = 0.25
@@ -334,19 +334,13 @@ class RandomEffects:
             pooled.spread ** 2 + pooled.mean_std ** 2 + self.std ** 2)
 
 
-def random_effects(estimates: np.ndarray, std: np.ndarray, tests: int | None = None,
-                   strangers: np.ndarray | None = None) -> RandomEffects:
+def random_effects(estimates: np.ndarray, std: np.ndarray, tests: int | None = None
+                   ) -> RandomEffects:
     """
     Estimate mean and spread of a population, without the units that are not of it.
 
-    estimates: estimates of at least `MIN_UNITS` units, (n,); std: their standard deviations, (n,);
-    strangers: units that are known not to be of the population, (n,) bool.
+    estimates: estimates of at least `MIN_UNITS` units, (n,); std: their standard deviations, (n,).
     """
-    if strangers is not None:
-        others = random_effects(estimates[~strangers], std[~strangers], tests)
-        is_far_out = strangers.copy()
-        is_far_out[~strangers] = others.is_far_out
-        return RandomEffects(others.pooled, estimates, std, is_far_out)
     chance = _OUTLIER_CHANCE / (2 * (tests or len(estimates)))
     deviation = np.abs(estimates - np.median(estimates))
     scale = MAD_TO_STD * np.median(deviation)

@@ -12,8 +12,7 @@ state that fits:
    calibration. The largest comes first.
 2. Drifts: a claimed slope takes it out of the tolerance. The nearest date comes first.
 3. Not judged: its last recordings are refused. The longest series comes first.
-4. Far out: a coefficient is not that of the population. The farthest comes first.
-5. In order.
+4. In order.
 """
 
 from __future__ import annotations
@@ -29,6 +28,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.fleet import pooling
 from adxl_ros.fleet.pooling import Recordings
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
+from adxl_ros.model.population import PooledCoefficient
 from adxl_ros.report.quantities import counted, number
 import numpy as np
 import pandas as pd
@@ -49,7 +49,6 @@ class Quantity:
 
     column: str  # Column of its value; the quantity is named by it
     label: str  # Its name for people
-    unit: str  # Unit of the column
     shown_unit: str  # Unit on the page
     factor: float  # Factor from the column's unit to that of the page
     # Column of its standard deviation, or columns of both ends of its 90 % interval
@@ -127,16 +126,16 @@ def read(path: str | os.PathLike) -> FleetTable:
 
 def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
     """Return all quantities of a table."""
-    listed = [Quantity('gap_before_mps2', 'gap', 'm/s²', 'mg', MG,
+    listed = [Quantity('gap_before_mps2', 'gap', 'mg', MG,
                        ('gap_before_low_mps2', 'gap_before_high_mps2'), is_coefficient=False)]
     for axis in AXES:
         scales = np.zeros(0) if table is None else table[f'scale_{axis}_v_per_g']
         scales = scales[scales > 0]
         mg_per_v = 1e3 / float(np.median(scales)) if len(scales) else 1e3
         listed += [
-            Quantity(f'zero_g_{axis}_v', f'zero-g {axis}', 'V', 'mg', mg_per_v,
+            Quantity(f'zero_g_{axis}_v', f'zero-g {axis}', 'mg', mg_per_v,
                      (f'zero_g_std_{axis}_v',)),
-            Quantity(f'scale_{axis}_v_per_g', f'scale factor {axis}', 'V/g', 'mg/g', mg_per_v,
+            Quantity(f'scale_{axis}_v_per_g', f'scale factor {axis}', 'mg/g', mg_per_v,
                      (f'scale_std_{axis}_v_per_g',))]
     return tuple(listed)
 
@@ -160,7 +159,7 @@ class QuantityResult:
     half_width: np.ndarray  # Half of the interval of each slope, (k,)
     # Mean and spread over the units, None where they are too few, and units of one batch that are
     # not of this population
-    population: pooling.RandomEffects | None
+    population: PooledCoefficient | None
     batch: pooling.BadBatch | None
 
     def place_of(self, unit: int) -> int | None:
@@ -185,8 +184,9 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
         if quantity.is_coefficient and len(units) >= pooling.MIN_UNITS:
             batch = pooling.bad_batch([table.serials[unit] for unit in units], trends.level,
                                       TOLERANCE_MG / quantity.factor, len(measured))
-            population = pooling.random_effects(trends.level, trends.level_std, coefficients,
-                                                None if batch is None else batch.members)
+            usual = slice(None) if batch is None else ~batch.members
+            population = pooling.random_effects(trends.level[usual], trends.level_std[usual],
+                                                coefficients).pooled
         none = np.zeros(len(units), bool)
         results.append(QuantityResult(quantity, rows, recordings, distance, is_outlier, units,
                                       trends, none, np.zeros(len(units)), population, batch))
@@ -200,24 +200,6 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
     return [replace(result, is_claimed=claimed, half_width=factors * result.trends.slope_std)
             for result, claimed, factors in zip(
                 results, np.split(is_claimed, splits), np.split(factor, splits))]
-
-
-class FarOut(NamedTuple):
-    """A unit that is not of the population."""
-
-    serial: str
-    quantity: Quantity
-    value: float
-    distance: float  # Distance from the mean, standard deviations
-
-
-def far_out(results: Sequence[QuantityResult], serials: Sequence[str]) -> list[FarOut]:
-    """Return the units that are not of the population, the farthest first."""
-    units = [FarOut(serials[result.units[i]], result.quantity,
-                    float(result.population.estimates[i]), float(result.population.distances()[i]))
-             for result in results if result.population is not None
-             for i in np.flatnonzero(result.population.is_far_out)]
-    return sorted(units, key=lambda unit: -abs(unit.distance))
 
 
 _VERDICTS = ('no_gap', 'explained', 'partly', 'inseparable', 'unknown')
@@ -251,8 +233,7 @@ class State(IntEnum):
     OUT_OF_TOLERANCE = 1
     DRIFTS = 2
     NOT_JUDGED = 3
-    FAR_OUT = 4
-    IN_ORDER = 5
+    IN_ORDER = 4
 
     @property
     def words(self) -> str:
@@ -262,7 +243,7 @@ class State(IntEnum):
     @property
     def colour(self) -> str:
         """Return the colour of the badge of a unit."""
-        return ('red', 'amber', 'amber', 'amber', 'green')[self - 1]
+        return ('red', 'amber', 'amber', 'green')[self - 1]
 
 
 class Drift(NamedTuple):
@@ -292,17 +273,13 @@ class UnitState:
     report: str  # Folder of the single reports of its last recording; empty for none
 
 
-def rank(table: FleetTable, results: Sequence[QuantityResult],
-         distant: Sequence[FarOut]) -> list[UnitState]:
+def rank(table: FleetTable, results: Sequence[QuantityResult]) -> list[UnitState]:
     """Return all units, the most urgent first."""
-    farthest = {item.serial: item for item in reversed(distant)}
-    states = [_state_of(unit, table, results, farthest.get(serial))
-              for unit, serial in enumerate(table.serials)]
+    states = [_state_of(unit, table, results) for unit in range(len(table.serials))]
     return sorted(states, key=lambda unit: (unit.state, unit.urgency, unit.serial))
 
 
-def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult],
-              distant: FarOut | None) -> UnitState:
+def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult]) -> UnitState:
     """Return a unit with the first state that fits."""
     rows = table.rows_of(unit)
     gap_mg, floor_mg, over_mg = _gap_now(table, rows)
@@ -326,10 +303,6 @@ def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult],
         state, urgency = State.NOT_JUDGED, -series
         reason = f'Refused, {counted(series, "recording")} in a row: ' \
             f'{table["refusal"][rows[-1]] or table["outcome"][rows[-1]]}'
-    elif distant is not None:
-        state, urgency = State.FAR_OUT, -abs(distant.distance)
-        reason = f'{distant.quantity.label} is {-urgency:.1f} standard deviations from the mean ' \
-            'of the fleet.'
     return UnitState(
         urgency, unit, table.serials[unit], state, reason[:1].upper() + reason[1:], drifts,
         f'{number(gap_mg)} / {number(floor_mg)}' if np.isfinite(gap_mg) else '-',

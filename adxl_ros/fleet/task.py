@@ -31,7 +31,6 @@ from adxl_ros.files.recording_columns import NO_UNIT, recorded_unit, Recording
 from adxl_ros.fleet import inputs
 from adxl_ros.fleet.inputs import begin_of, Source
 from adxl_ros.fleet.row import (
-    code_version,
     empty_row,
     finite,
     NOISE,
@@ -41,7 +40,7 @@ from adxl_ros.fleet.row import (
     sha256_of,
 )
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.process import package_version
+from adxl_ros.process import code_version, package_version
 from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
 from adxl_ros.signals.noise_parameters import recording_noise
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated

@@ -101,7 +101,7 @@ BAD = {
     'covariance not symmetric': ('[1.0e-6, 0.0, 0.0, 1.0e-6]', '[1.0e-6, 5.0e-7, 0.0, 1.0e-6]',
                                  r':28:17: covariance: not symmetric and positive'),
     'covariance not positive': ('[1.0e-6, 0.0, 0.0, 1.0e-6]', '[1.0e-6, 2.0e-6, 2.0e-6, 1.0e-6]',
-                                r':28:17: covariance: not symmetric and positive: .* eigenvalue is -1;'),
+                                r':28:17: covariance: not symmetric and positive'),
     'negative variance': ('[1.0e-6, 0.0, 0.0, 1.0e-6]', '[-1.0e-6, 0.0, 0.0, 1.0e-6]',
                           r':28:17: covariance: not symmetric and positive'),
     'no namespace': ('/**:', 'driver:', r":1:1: no '/\*\*' with parameters below it"),

@@ -7,7 +7,6 @@ from adxl_ros.fleet import page as fleet_page
 from made_up_fleet import MadeUpFleet
 from pages import layout_faults, NEEDS_CHROMIUM, wait_until_drawn, WIDTHS
 import pytest
-import yaml
 
 pa = pytest.importorskip('pyarrow')
 pq = pytest.importorskip('pyarrow.parquet')
@@ -105,14 +104,11 @@ def test_files_beside_the_page(folders):
 
 @pytest.mark.parametrize('batch', [6, 10])
 def test_a_bad_batch_shows_without_a_diagnosis(tmp_path, batch):
-    """The page names it, its units are far out, and the others are the population."""
+    """The page names it, and the others are the population."""
     fleet = MadeUpFleet(units=24, per_unit=3, batch=batch, batch_scale=1.05)
     text = page_without('effects', fleet, tmp_path)
     assert f'{batch} units with a serial number B… have a scale factor x that differs by +' in text
     assert f'from that of the {24 - batch} others: a bad batch.' in text
-    stated = yaml.safe_load((tmp_path / 'population.yaml').read_text())['far_out']
-    strange = [unit['serial'] for unit in stated if unit['coefficient'] == 'scale_x_v_per_g']
-    assert len(strange) == batch and all(serial.startswith('B') for serial in strange)
     pooled = read_population(tmp_path / 'population.yaml').coefficients['scale_x_v_per_g']
     assert pooled.units == 24 - batch
 
