@@ -317,25 +317,8 @@ def _common_variance(variance: np.ndarray, freedom: np.ndarray) -> tuple[float, 
     return float(np.exp(mean + scipy.special.digamma(half) - np.log(half))), 2 * half
 
 
-@dataclass(frozen=True)
-class RandomEffects:
-    """A coefficient over n units."""
-
-    pooled: PooledCoefficient  # Mean and spread of the population
-    # estimates, std: The units' own estimates and their standard deviations, (n,)
-    estimates: np.ndarray
-    std: np.ndarray
-    is_far_out: np.ndarray  # Units that are not of this population, (n,) bool. They do not count.
-
-    def distances(self) -> np.ndarray:
-        """Return the distances of the units from the mean, in standard deviations, (n,)."""
-        pooled = self.pooled
-        return (self.estimates - pooled.mean) / np.sqrt(
-            pooled.spread ** 2 + pooled.mean_std ** 2 + self.std ** 2)
-
-
 def random_effects(estimates: np.ndarray, std: np.ndarray, tests: int | None = None
-                   ) -> RandomEffects:
+                   ) -> PooledCoefficient:
     """
     Estimate mean and spread of a population, without the units that are not of it.
 
@@ -346,13 +329,15 @@ def random_effects(estimates: np.ndarray, std: np.ndarray, tests: int | None = N
     scale = MAD_TO_STD * np.median(deviation)
     kept = _largest_dropped(deviation / np.hypot(max(scale, np.finfo(float).tiny), std), _FAR_MADS)
     for _ in range(_MAX_ROUNDS):
-        population = _of_units(estimates, std, kept)
+        pooled = _of_units(estimates[kept], std[kept])
+        distance = np.abs(estimates - pooled.mean) / np.sqrt(
+            pooled.spread ** 2 + pooled.mean_std ** 2 + std ** 2)
         limit = -float(scipy.special.stdtrit(kept.sum() - 2, chance))
-        now = _largest_dropped(np.abs(population.distances()), limit)
+        now = _largest_dropped(distance, limit)
         if np.array_equal(now, kept):
             break
         kept = now
-    return population
+    return pooled
 
 
 def _largest_dropped(distance: np.ndarray, limit: float) -> np.ndarray:
@@ -365,20 +350,18 @@ def _largest_dropped(distance: np.ndarray, limit: float) -> np.ndarray:
     return kept
 
 
-def _of_units(estimates: np.ndarray, std: np.ndarray, kept: np.ndarray) -> RandomEffects:
+def _of_units(estimates: np.ndarray, std: np.ndarray) -> PooledCoefficient:
     """Return the population of the units that count."""
-    y, variance = estimates[kept], std[kept] ** 2
-    unit = max(float(np.ptp(y)), float(std[kept].max()), np.finfo(float).tiny)
-    y, variance = (y - y.mean()) / unit, variance / unit ** 2
+    unit = max(float(np.ptp(estimates)), float(std.max()), np.finfo(float).tiny)
+    y, variance = (estimates - estimates.mean()) / unit, (std / unit) ** 2
     spread2, low, high = _spreads2(y, variance)
     mean, _ = weighted_mean(y, variance, spread2)
     mean_variance, prediction_variance = _variances(y, variance, mean)
-    pooled = PooledCoefficient(
-        mean=float(estimates[kept].mean() + unit * mean), mean_std=unit * mean_variance ** 0.5,
+    return PooledCoefficient(
+        mean=float(estimates.mean() + unit * mean), mean_std=unit * mean_variance ** 0.5,
         spread=unit * spread2 ** 0.5, spread_low=unit * low ** 0.5,
         spread_high=unit * high ** 0.5, prediction_std=unit * prediction_variance ** 0.5,
-        units=int(kept.sum()))
-    return RandomEffects(pooled, estimates, std, is_far_out=~kept)
+        units=len(estimates))
 
 
 def _variances(y: np.ndarray, variance: np.ndarray, mean: float) -> tuple[float, float]:

@@ -186,7 +186,7 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
                                       TOLERANCE_MG / quantity.factor, len(measured))
             usual = slice(None) if batch is None else ~batch.members
             population = pooling.random_effects(trends.level[usual], trends.level_std[usual],
-                                                coefficients).pooled
+                                                coefficients)
         none = np.zeros(len(units), bool)
         results.append(QuantityResult(quantity, rows, recordings, distance, is_outlier, units,
                                       trends, none, np.zeros(len(units)), population, batch))

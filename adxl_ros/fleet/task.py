@@ -21,7 +21,6 @@ import shlex
 import shutil
 import tempfile
 from time import monotonic, time
-import traceback
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from adxl_ros.errors import one_line, UserError
@@ -260,10 +259,8 @@ class _Job:
                 else:
                     self.refuse(name, reason)
             except Exception as error:
-                place = traceback.extract_tb(error.__traceback__)[-1]
-                self.refuse(name, self.plain(
-                    f'{type(error).__name__}: {one_line(error)} ({Path(place.filename).name}:'
-                    f'{place.lineno})'), 'crashed')
+                self.refuse(name, self.plain(f'{type(error).__name__}: {one_line(error)}'),
+                            'crashed')
         # Many recordings have no noise; what the others need says more.
         order = [name for name in tasks if name in skipped]
         if order and not has_result:
