@@ -35,6 +35,8 @@ _DATE, _DATE_LETTERS = '%Y%m%dT%H%M%SZ', 16
 """Date in file names, ISO 8601 basic format, and its length."""
 _OLDEST = datetime.min.replace(tzinfo=timezone.utc)
 """Date of a calibration without a date, which sorts first."""
+_MAX_NAME = 120
+"""Characters of a serial number in a file name (chosen: file systems permit 255 bytes)."""
 _HASH_DIGITS = 8
 """Digits of the data's SHA-256 in an id (chosen: enough for calibrations of one second)."""
 
@@ -98,9 +100,13 @@ def unit_folder(folder: str | os.PathLike, serial: str) -> Path:
 
 
 def _name(serial: str) -> str:
-    """Return a serial number as a file name: quoted by %."""
+    """Return a serial number as a file name: quoted by %, and hashed where it is too long."""
     quoted = quote(serial, safe=" #+,;=@()[]'")
-    return quoted if quoted.strip('.') else quoted.replace('.', '%2E')
+    if not quoted.strip('.'):
+        quoted = quoted.replace('.', '%2E')
+    if len(quoted) <= _MAX_NAME:
+        return quoted
+    return f'{quoted[:_MAX_NAME]}-{hashlib.sha256(serial.encode()).hexdigest()[:16]}'
 
 
 def put(folder: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) -> Path | None:
