@@ -235,6 +235,9 @@ def find_form(path: str) -> Form:
         size, most = max(numbers.items(), key=lambda item: item[1], default=(0, 0))
         if (most, -size) > best:
             best, form = (most, -size), _form(lines, plain, first[size], delimiter)
+    if 'time_s' in _fields(written[0], ',') and not (form and form.header_line):
+        number = lines.index(written[0]) + 1  # a recording of the package without good samples
+        return _named(_fields(written[0], ','), number, number + 1, ',', False)
     if form is None:
         raise UserError(f'{path}: the first {_HEAD_LINES} lines hold no row of numbers; expected '
                         'a header, and a line of numbers for each sample')

@@ -107,7 +107,8 @@ def test_forms_that_are_read(tmp_path: Path, text: str | bytes) -> None:
 
 @pytest.mark.parametrize(('text', 'message'), [
     ('', ': is empty'),
-    ('# serial: A17\n', ': is empty'), (HEADER, ': the first 200 lines hold no row of numbers'),
+    ('# serial: A17\n', ': is empty'), (f'{HEADER}\n', ': has a header, but no samples'),
+    (f'{HEADER}', ': has a header, but no samples'),
     (GOOD, ': no column time_s; the columns are 1, 2, 3, 4, 5; none looks '),
     (f'{HEADER}\n{GOOD}'.replace('time_s', 't'), ':1: no column time_s; the columns are t, x_v, '),
     (f'time_s,alpha_rad\n{GOOD}', ':1: no column of a sensor: needs x_v'),
