@@ -4,6 +4,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 import hashlib
 from importlib.metadata import PackageNotFoundError, version
 import os
@@ -24,6 +25,7 @@ def package_version() -> str:
         return 'unknown'
 
 
+@lru_cache(maxsize=1)
 def code_version() -> str:
     """Return the SHA-256 of version and code of this package."""
     code = [path.name.encode() + path.read_bytes()

@@ -337,7 +337,7 @@ class Topics(NamedTuple):
 
 def find_topics(bag: Bag, topic: str = '') -> Topics:
     """Find the topics by their names, in any namespace, and their types."""
-    imu = _find_imu(bag, topic)
+    imu = find_imu(bag, topic)
     is_own = imu.endswith('imu/data_raw')
     space = imu.removesuffix('imu/data_raw') if is_own else imu[:imu.rfind('/') + 1]
 
@@ -349,41 +349,31 @@ def find_topics(bag: Bag, topic: str = '') -> Topics:
                                                                 JOINT_STATE)
     info = beside('sensor_info', DIAGNOSTIC_STATUS)
     # With several sensors, the only sensor_info may be that of another one.
-    if info is None and (is_own or len(_imu_topics(bag)) == 1):
+    if info is None and (is_own or [kind for _, kind in bag.types].count(IMU) == 1):
         info = _only(bag, 'sensor_info', DIAGNOSTIC_STATUS)
     temperature, supply = beside('temperature', TEMPERATURE), beside('supply', BATTERY_STATE)
     space = joints.removesuffix('joint_states') if joints else f'{space}stage/'
     return Topics(imu, joints, info, temperature, supply, beside('command', JOINT_STATE))
 
 
-def find_ideal(bag: Bag) -> Topics:
-    """Find another simulator's specific force: the only topic of its type, or imu/data_raw."""
-    topics = _imu_topics(bag)
-    return Topics(topics[0] if len(topics) == 1 else _find_imu(bag, ''))
-
-
-def _find_imu(bag: Bag, named: str) -> str:
-    """Return the topic that the user has named, that of this package, or the only one."""
-    topics = _imu_topics(bag)
+def choose_topic(bag: Bag, kind: str, own: str, named: str, option: str = '--topic') -> str:
+    """Return the topic of a type that the user has named, that of the usual name, or the only."""
+    topics = sorted(topic for topic, other in bag.types if other == kind)
     if not topics:
         held = ', '.join(f'{topic} ({kind})' for topic, kind in sorted(bag.types))
-        raise UserError(f'{bag.path}: no topic of type {IMU}; it holds {held or "no messages"}'
+        raise UserError(f'{bag.path}: no topic of type {kind}; it holds {held or "no messages"}'
                         + f'; {bag.cut}' * bool(bag.cut))
-    if named:
-        chosen = [topic for topic in topics if topic.strip('/') == named.strip('/')]
-        if not chosen:
-            raise UserError(f'{bag.path}: no topic {named} of type {IMU}; name one of '
-                            f'{", ".join(topics)}')
-        return chosen[0]
-    own = _only(bag, 'imu/data_raw', IMU)
-    if not own and len(topics) > 1:
-        raise UserError(f'{bag.path}: several topics of type {IMU}, none of them imu/data_raw: '
-                        f'{", ".join(topics)}; choose one: --topic {topics[0]}')
-    return own or topics[0]
+    chosen = [topic for topic in topics if topic.strip('/') == named.strip('/')] if named else \
+        [topic for topic in topics if f'/{topic}'.endswith(f'/{own}')] or topics
+    if len(chosen) != 1:
+        raise UserError(f'{bag.path}: {len(chosen) or "no"} topics {named or kind}; choose one '
+                        f'with {option}: {", ".join(chosen or topics)}')
+    return chosen[0]
 
 
-def _imu_topics(bag: Bag) -> list[str]:
-    return sorted(topic for topic, kind in bag.types if kind == IMU)
+def find_imu(bag: Bag, named: str = '') -> str:
+    """Return the topic of the sensor's output."""
+    return choose_topic(bag, IMU, 'imu/data_raw', named)
 
 
 def _only(bag: Bag, name: str, kind: str) -> str | None:

@@ -12,7 +12,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.bag_messages import (
     Bag,
-    find_ideal,
+    find_imu,
     find_topics,
     open_bag,
     Raws,
@@ -47,7 +47,7 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
         if reading.mapping is not None or reading.lsb_per_g or reading.lsb_at_0g:
             raise UserError(f'{bag.path}: is a bag, with topics in m/s²; leave --columns and '
                             '--lsb-per-g out, or name a topic with --topic')
-        topics = find_ideal(bag) if ideal else find_topics(bag, reading.topic)
+        topics = Topics(find_imu(bag)) if ideal else find_topics(bag, reading.topic)
         info = read_info(bag, topics.info)
         tracks, commands = _tracks(bag, topics), _commands(bag, topics)
         samples = _Samples(f'{bag.path}: topic {topics.imu}', AXES if ideal else info.get('axes'),
@@ -75,11 +75,11 @@ class _Samples:
         self.force = np.zeros((0, 3))  # Their specific force, m/s², (n, 3)
         self._rate_hz = reading.rate_hz
         self._first_ns = 0
-        self._frame: str | None = None
 
     def add(self, raws: Raws) -> None:
         """Decode and check further messages."""
-        stamp_ns, columns = _columns(self.where, raws, cdr.imu, self._force)
+        stamp_ns, columns = _columns(self.where, raws, cdr.imu, lambda table: dict(
+            zip(ACCEL, table.numbers('linear_acceleration').T)))
         force = np.column_stack(list(columns.values()))
         if not self.count:
             self._begin(raws[:1], int(stamp_ns[0]))
@@ -114,14 +114,6 @@ class _Samples:
         if self.axes not in MEASURED_AXES:
             raise UserError(f'{self.where}: linear_acceleration_covariance gives the axes '
                             f'{self.axes or "none"}, expected x, xy or xyz; record sensor_info')
-
-    def _force(self, table: cdr.Table) -> dict[str, np.ndarray]:
-        frame = table.layout.texts['frame_id']
-        if self._frame not in (None, frame):
-            raise UserError(f'{self.where}: frame_id changes from {self._frame!r} to {frame!r}; '
-                            'record each sensor on a topic of its own')
-        self._frame = frame
-        return dict(zip(ACCEL, table.numbers('linear_acceleration').T))
 
 
 Values = Callable[[cdr.Table], Mapping[str, np.ndarray]]
@@ -231,7 +223,7 @@ def _block(bag: Bag, samples: _Samples, tracks: Mapping[str, Track],
 def log_times(path: str | os.PathLike, topic: str) -> Iterator[np.ndarray]:
     """Yield header stamp and log time of the samples of a bag, ns, (k, 2), in blocks."""
     with open_bag(path) as bag:
-        imu = find_topics(bag, topic).imu
+        imu = find_imu(bag, topic)
         for piece in bag.pieces([imu]):
             stamp_ns, _ = _columns(f'{bag.path}: topic {imu}', piece.messages[imu], cdr.header,
                                    lambda table: {})

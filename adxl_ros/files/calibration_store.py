@@ -10,7 +10,7 @@ count by the date inside. The population of a fleet is a file of its own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, fields
 from datetime import datetime, timezone
 import hashlib
@@ -18,7 +18,7 @@ import math
 import os
 from pathlib import Path
 import re
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from urllib.parse import quote
 
 from adxl_ros.errors import UserError
@@ -35,10 +35,10 @@ _DATE, _DATE_LETTERS = '%Y%m%dT%H%M%SZ', 16
 """Date in file names, ISO 8601 basic format, and its length."""
 _OLDEST = datetime.min.replace(tzinfo=timezone.utc)
 """Date of a calibration without a date, which sorts first."""
-_HASH_DIGITS = 8
-"""Digits of the data's SHA-256 in an id (chosen: enough for calibrations of one second)."""
 _MAX_NAME = 120
 """Characters of a serial number in a file name (chosen: file systems permit 255 bytes)."""
+_HASH_DIGITS = 8
+"""Digits of the data's SHA-256 in an id (chosen: enough for calibrations of one second)."""
 
 
 class StoredCalibration(NamedTuple):
@@ -198,20 +198,15 @@ _HEAD = """\
 """Comments at the begin of the file."""
 
 
-def write_population(path: str | os.PathLike, population: Population,
-                     far_out: Sequence[Mapping[str, Any]]) -> None:
+def write_population(path: str | os.PathLike, population: Population) -> None:
     """Write a population."""
     contents = {
         'format': FORMAT, 'version': package_version(),
-        'coefficients': {name: {key: _rounded(value) for key, value in asdict(pooled).items()}
-                         for name, pooled in population.coefficients.items()},
-        'far_out': [{key: _rounded(value) for key, value in unit.items()} for unit in far_out]}
+        'coefficients': {
+            name: {**{key: float(f'{value:.{_DIGITS}g}') for key, value in asdict(pooled).items()},
+                   'units': pooled.units} for name, pooled in population.coefficients.items()}}
     text = yaml.safe_dump(contents, sort_keys=False, allow_unicode=True, default_flow_style=None)
     write_text(path, _HEAD.format(name=Path(path).name) + text)
-
-
-def _rounded(value: Any) -> Any:
-    return float(f'{value:.{_DIGITS}g}') if isinstance(value, float) else value
 
 
 def read_population(path: str | os.PathLike) -> Population:
@@ -222,14 +217,15 @@ def read_population(path: str | os.PathLike) -> Population:
             or not isinstance(contents.get('coefficients'), dict):
         raise UserError(f'{path}: no population of format {FORMAT}; give the population.yaml '
                         'that fleet writes')
-    names = [field.name for field in fields(PooledCoefficient)]
     pooled = {}
     for name, values in contents['coefficients'].items():
-        numbers: list[Any] = [values.get(key) if isinstance(values, dict) else None
-                              for key in names]
-        if not all(type(each) in (int, float) and math.isfinite(each) for each in numbers) \
-                or not values['prediction_std'] > 0:
+        try:
+            pooled[str(name)] = PooledCoefficient(**values)
+            is_right = all(map(math.isfinite, values.values())) and values['prediction_std'] > 0
+        except TypeError:
+            is_right = False
+        if not is_right:
             raise UserError(f'{path}: coefficients.{name}: {values!r} is no set of numbers '
-                            f'{", ".join(names)}, with a positive prediction_std')
-        pooled[str(name)] = PooledCoefficient(*numbers)
+                            f'{", ".join(each.name for each in fields(PooledCoefficient))}, with '
+                            'a positive prediction_std')
     return Population(Path(path).name, pooled)

@@ -61,14 +61,9 @@ _REFERENCES = {
 }
 """Names of references by role."""
 
-_EPOCH_S = (9e8, 4e9)  # Bounds of times since 1970, s: 1998 to 2096
-
 _CONSTANT = 0.3
 """Largest relative scatter of a length that is that of gravity (chosen: a hand that turns a
 sensor makes less)."""
-
-_REST_ROWS = 16
-"""Rows of a window; the quietest quarter of them is at rest (chosen: short in every log)."""
 
 _LARGEST = 1e30  # Larger magnitudes are no readings and no stamps
 
@@ -94,13 +89,11 @@ def describe(table: Table) -> tuple[str, str]:
     if not unit:
         return (f'{seen}; none looks like an accelerometer: name the columns, for example',
                 "--columns 'time=COLUMN:s,x=COLUMN:g,y=COLUMN:g,z=COLUMN:g'")
-    reason = f'the readings have a length of {length:.4g}' + f' about {zero:.4g}' * (zero != 0)
-    reason += f', so {unit}'
     sources = {axis: Source(name, unit) for axis, name in zip(AXES, outputs)}
     stamps, note = '--rate HZ', ' (write the sample rate for HZ)'
     if time:
-        source, time_reason = _time_source(table, time, values[time])
-        reason, sources = f'{time_reason} and {reason}', {'time': source, **sources}
+        source = _time_source(table, time, values[time])
+        sources = {'time': source, **sources}
         stamps = _stamp_options(values[time], source)
         note = ' (add --params with the parameter file of the sensor)' * (unit in ('v', 'mv'))
     sources |= _references(values, {*outputs, time}) if table.has_names else {}
@@ -109,7 +102,7 @@ def describe(table: Table) -> tuple[str, str]:
         usual = min(_COUNTS, key=lambda count: abs(np.log(count / length)))
         options += f' --lsb-per-g {round(length) if zero else usual}'
         options += f' --lsb-at-0g {zero:.0f}' * bool(zero)
-    return f'{seen}; the best guess, because {reason}{note}:', options
+    return f'{seen}; the best guess{note}:', options
 
 
 def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[str, float, float]:
@@ -129,7 +122,7 @@ def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[s
     zero = 0.0
     if low.min() > 0 and spread.min() > _TURNED * spread.max():
         zero = float(np.mean(low + spread / 2))
-    lengths = np.linalg.norm(_at_rest(readings) - zero, axis=1)
+    lengths = np.linalg.norm(readings - zero, axis=1)
     length = float(np.median(lengths))
     if not unit:
         is_volts = table.has_names and all(map(_VOLT_NAMES.search, outputs))
@@ -138,16 +131,6 @@ def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[s
     is_gravity = np.median(np.abs(lengths - length)) <= _CONSTANT * length and \
         0.5 < length / GRAVITY.get(unit, length) < 2
     return (unit if is_gravity or len(outputs) < len(AXES) else ''), zero, length
-
-
-def _at_rest(readings: np.ndarray) -> np.ndarray:
-    """Return the means of the quietest quarter of the windows, (k, m)."""
-    count = len(readings) // _REST_ROWS
-    if count < 4:
-        return readings
-    windows = readings[:count * _REST_ROWS].reshape(count, _REST_ROWS, -1)
-    variance = windows.var(axis=1).sum(axis=1)
-    return np.asarray(windows.mean(axis=1)[variance <= np.quantile(variance, 0.25)])
 
 
 def _stamp_options(values: np.ndarray, source: Source) -> str:
@@ -172,22 +155,15 @@ def _time_column(table: Table, values: Mapping[str, np.ndarray]) -> str | None:
     return next(iter([*named, *others]), None)
 
 
-def _time_source(table: Table, name: str, values: np.ndarray) -> tuple[Source, str]:
-    """Return a time with its unit, and the reason."""
+def _time_source(table: Table, name: str, values: np.ndarray) -> Source:
+    """Return a time with the unit that its name states, or in which its steps are usual."""
     finite = values[np.isfinite(values)]
     steps = np.diff(finite)
     step = float(np.median(steps[steps > 0]))
-    divisors = {unit: each.divisor for unit, each in UNITS[Quantity.TIME].items()}
-    stated = table.units.get(name) or unit_in_name(name, Quantity.TIME)
-    # A unit in the name counts unless no sensor has samples at such steps.
-    if stated and is_sensor_step(step / divisors[stated], False):
-        return Source(name, stated), f'{name} has steps of {step:.4g} {stated}'
-    for unit in ('ns', 'us', 'ms', 'epoch'):
-        if _EPOCH_S[0] < finite[0] / divisors[unit] < _EPOCH_S[1] and \
-                is_sensor_step(step / divisors[unit], False):
-            return Source(name, unit), f'{name} counts from 1970'
-    unit = time_unit_of_step(step, bool((finite == np.rint(finite)).all()))
-    return Source(name, unit), f'{name} has steps of {step:.4g}, so {unit}'
+    unit = table.units.get(name) or unit_in_name(name, Quantity.TIME)
+    if not unit or not is_sensor_step(step / UNITS[Quantity.TIME][unit].divisor, False):
+        unit = time_unit_of_step(step, bool((finite == np.rint(finite)).all()))
+    return Source(name, unit)
 
 
 def _outputs(table: Table, names: list[str], values: Mapping[str, np.ndarray]) -> list[str]:

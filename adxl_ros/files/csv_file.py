@@ -57,10 +57,8 @@ _COMMENT = re.compile(r'\s*(#|//|%)')  # Begin of a comment
 class Form:
     """How a text table is written."""
 
-    # The columns as the header states them; their numbers from 1 where it does not, or states a
-    # name twice
+    # The columns as the header states them; the number from 1 of one without a name of its own
     names: tuple[str, ...]
-    repeated: str  # A name that stands twice; empty for none
     header_line: int  # Number of the line with the names, from 1; 0 where there is none
     first_line: int  # Number of the first line with samples
     delimiter: str  # A tab, semicolon, comma or blank; several blanks are one
@@ -261,9 +259,8 @@ def _form(lines: Sequence[str], plain: Sequence[str], index: int, delimiter: str
 def _named(names: Sequence[str], *about: Any) -> Form:
     """Return a form with distinct names: one that is empty or stands twice gives its number."""
     names = [' '.join(name.split()) for name in names]
-    repeated = next((name for name in names if name and names.count(name) > 1), '')
     return Form(tuple(name if name and names.count(name) == 1 else str(i + 1)
-                      for i, name in enumerate(names)), repeated, *about)
+                      for i, name in enumerate(names)), *about)
 
 
 def _header(lines: Sequence[str], delimiter: str, count: int) -> tuple[int, list[str]]:

@@ -14,7 +14,7 @@ from functools import partial
 import json
 import re
 from textwrap import fill, indent, wrap
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import parameter_file
@@ -137,12 +137,11 @@ def _head(export: Export, software: str, prefix: str = '# ') -> str:
     if stage := stage_effects(sensor):
         lines += ['', *wrap('Left out, as errors of the stage or of another reference: '
                             f'{", ".join(stage)}.', _COLUMNS)]
-    noise_from, rate_from = map(sensor.provenance.get, ('noise_from', 'rate_from'))
+    noise_from = sensor.provenance.get('noise_from')
     stated = sensor.datasheet_name or 'the parameter file'
     origin = f'measured in {noise_from}' if noise_from else \
         f'the figure of {stated}; nobody measured it'
-    rate = f'that of {rate_from}' if rate_from else 'as the parameter file states it'
-    lines += ['', *wrap(f'White noise: {origin}. Rate: {rate}.', _COLUMNS), '',
+    lines += ['', *wrap(f'White noise: {origin}.', _COLUMNS), '',
               'Sizes: change of the output in the manoeuvre rich (7 minutes of turns,',
               'shaking, warming and a step of the supply), by simulation.',
               'All that is not held, but for noise and steps: '
@@ -186,13 +185,8 @@ def size_text(size_mg: float) -> str:
 
 
 def _json(export: Export) -> str:
-    """Return all values with units: the linear response, and the parameters of all effects."""
+    """Return all values: the linear response with units, and the parameter file."""
     sensor = export.sensor
-    effects: dict[str, dict[str, Any]] = {}
-    for effect in sensor.effects:
-        units = {parameter.name: parameter.unit for parameter in effect_named(effect).parameters}
-        effects[effect] = {name: {'value': np.asarray(value, float).tolist(), 'unit': units[name]}
-                           for name, value in sensor.values[effect].items()}
     return json.dumps({
         'schema': 1,
         'source': export.source,
@@ -207,7 +201,6 @@ def _json(export: Export) -> str:
         'gain': gain(sensor).tolist(),
         'filter_s': noise.electronics(sensor).rc_s.tolist(),
         'position_m': arm_m(sensor),
-        'effects': effects,
         'parts': [{'name': name, 'size_mg': round(size, 6),
                    'place': export.holds.get(name, _NOT_HELD)}
                   for name, size in export.sizes_mg.items()],
@@ -294,7 +287,7 @@ FORMATS = {
     'fusioncore': Format('parameters of FusionCore 0.3', {
         **_at('imu.accel_noise', *_SAMPLE), 'bias_walk': 'ukf.q_accel_bias',
         'lever_arm': 'imu.lever_arm_x, _y, _z'}),
-    'json': Format('all values with units, for any program', {
+    'json': Format('all values, for any program', {
         **_at('axes.noise_std_mps2', *_NOISE), 'bias': 'axes.zero_g_mps2',
         **_at('gain', 'scale_factor', 'misalignment'), 'bias_walk': 'axes.walk_density',
         'lever_arm': 'position_m', **_at('axes.step_mps2', *_ROUNDING),

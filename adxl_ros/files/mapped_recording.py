@@ -11,7 +11,6 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import (
     ColumnMapping,
     is_sensor_step,
-    likely_unit,
     listed,
     LSB,
     ReadingOptions,
@@ -40,15 +39,13 @@ from adxl_ros.files.recording_columns import (
     TIME,
     VOLTS,
 )
-from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.constants import AXES
 from adxl_ros.model.kinematics import stage_angles
 import numpy as np
 
 _TIME_LIMIT_S = 9e9  # Largest magnitude of a time, s: in nanoseconds it fits into 64 bits (9.2e18)
 _EPOCH_S = 1e8
 """First time from which times count from 1970, s: three years (chosen: no sensor runs so long)."""
-_LENGTHS_G = (0.5, 2.0)
-"""Bounds of the median length of readings in the right unit, g (chosen: most are near 1 g)."""
 _TURN_RAD = 2 * np.pi  # Largest roll and pitch, rad
 _FEWEST_STAMPS = 8  # Stamps whose steps show their unit. Chosen: a lost sample hides no median
 _WHOLE = 1e-3  # Largest distance of a stamp from a whole number by rounding, in its unit
@@ -69,8 +66,6 @@ def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
     output: the columns of the sensor that must be there; else those that are.
     """
     names = table.names
-    if table.repeated:
-        raise NotNativeError(f'{table.header}: column {table.repeated} stands twice; keep one')
     # Where one form of output is there, the other may stand there in any unit.
     outputs = next((kind for kind in (output, VOLTS, ACCEL) if set(kind) & set(names)),
                    (*VOLTS, *ACCEL))
@@ -123,7 +118,6 @@ class _Converter:
         if 'time' not in mapping.sources and reading.rate_hz is None:
             raise UserError(f'{mapping.where}: has no time; add time=COLUMN:UNIT, or give '
                             '--rate HZ to stamp by index')
-        self._assumed: list[str] = []  # Columns whose unit nothing states
         # Column and unit by role
         self.sources = {role: self._source(table, role, source)
                         for role, source in mapping.sources.items()}
@@ -147,8 +141,8 @@ class _Converter:
             name = names[int(name) - 1]
         unit = source.unit or table.units.get(name) or unit_in_name(name, ROLES[role])
         if not unit:
-            unit = ROLES[role].value
-            self._assumed.append(f'{name} in {unit}')
+            raise UserError(f'{self._where}: nothing states the unit of {name}; write for example '
+                            f'{role}={source.column}:{ROLES[role].value}')
         return Source(name, unit)
 
     def _unit(self, role: str) -> Unit:
@@ -187,7 +181,7 @@ class _Converter:
         columns = {name: np.ascontiguousarray(values[is_kept])
                    for name, values in columns.items()}
         if not self.count and is_kept.any():
-            self._look_at_first(outputs[is_kept], time_s[is_kept])
+            self._look_at_first(time_s[is_kept])
         self.count += int(is_kept.sum())
         info = {key: text for key, text in block.info.items() if key != 'epoch_ns'}
         left_out = f'{self._path}: left out, lines without a reading of the sensor: {self._empty}'
@@ -252,17 +246,12 @@ class _Converter:
         return time_s, self._stamps.increasing(time_s, is_sample,
                                                lambda row: block.where(row, source.column))
 
-    def _look_at_first(self, outputs: np.ndarray, time_s: np.ndarray) -> None:
-        """Note what is assumed; refuse readings and stamps that are in another unit."""
-        if len(time_s) > _FEWEST_STAMPS and self._reading.rate_hz is None:
-            self._check_step(time_s)
-        if len(self._axes) == len(AXES) and not self._is_volts:
-            self._check_length(outputs)
-        if self._assumed:
-            self._remarks.append(f'{self._path}: columns without a unit are read as '
-                                 f'{", ".join(self._assumed)}')
-        bursts = describe_bursts(time_s) if len(time_s) > _FEWEST_STAMPS else ''
-        if bursts:
+    def _look_at_first(self, time_s: np.ndarray) -> None:
+        """Refuse stamps that are in another unit, and note those in bursts."""
+        if len(time_s) <= _FEWEST_STAMPS or self._reading.rate_hz is not None:
+            return
+        self._check_step(time_s)
+        if bursts := describe_bursts(time_s):
             self._remarks.append(f'{self._path}: {bursts.removeprefix("; ")}; this rate is '
                                  'used, and --rate HZ stamps by index')
 
@@ -280,18 +269,6 @@ class _Converter:
                 f'{source.unit} are {rate_hz:.3g} Hz; if that is right, give --rate '
                 f'{rate_hz:.3g}, and if they are {unit}:',
                 f'--columns {shell_quoted(str(fitting))}')
-
-    def _check_length(self, outputs: np.ndarray) -> None:
-        """Compare the length of the readings with gravity: a wrong unit shows in it."""
-        first = self._axes[0]
-        length_g = float(np.median(np.linalg.norm(outputs, axis=1))) / G0_MPS2
-        if not _LENGTHS_G[0] < length_g < _LENGTHS_G[1]:
-            text = (f'{self._path}: {", ".join(axis.column for axis in self._axes)} have a length '
-                    f'of {length_g:.3g} g in {first.unit}, where gravity has 1 g')
-            if f'{first.column} in {first.unit}' in self._assumed:
-                raise UserError(f'{text}; state their unit, for example x={first.column}:'
-                                f'{likely_unit(length_g * G0_MPS2) or "UNIT"}')
-            self._remarks.append(f'{text}: check the unit')
 
 
 def _refuse(block: TableBlock, source: Source, wrong: np.ndarray, reason: str,

@@ -59,11 +59,9 @@ _SMALLEST_VARIANCE = 1e-300
 """Smaller variances count as this in the check of a covariance (chosen: near the smallest
 float64, so that a variance of 0 divides nothing by 0)."""
 
-_ASYMMETRY = 1e-6
-"""Permitted asymmetry of a correlation (chosen: far above the digits that a file holds)."""
-
-_LOWEST_EIGENVALUE = -1e-9
-"""Permitted rounding below 0 of a correlation matrix's eigenvalues (chosen: as above)."""
+_ROUNDING = 1e-6
+"""Permitted asymmetry of a correlation matrix, and its eigenvalues below 0 (chosen: far above the
+digits that a file holds)."""
 
 MakeError = Callable[[str, str], Exception]  # Makes the exception to raise from a key and a reason
 
@@ -387,17 +385,13 @@ class _FlatReader:
         self._require(matrix.size == len(names) ** 2, key, f'{matrix.size} values, but '
                       f'{len(names)} names need {len(names) ** 2}')
         matrix = matrix.reshape(len(names), -1)
-        variances = np.diag(matrix)
-        least = variances.argmin()
-        self._require(variances[least] >= 0, key, f'the variance of {names[least]} is '
-                      f'{variances[least]:g}, not positive')
-        std = np.sqrt(np.maximum(variances, _SMALLEST_VARIANCE))
+        std = np.sqrt(np.maximum(np.diag(matrix), _SMALLEST_VARIANCE))
         correlation = matrix / np.outer(std, std)
-        self._require(np.abs(correlation - correlation.T).max() <= _ASYMMETRY, key,
-                      'not symmetric')
+        asymmetry = np.abs(correlation - correlation.T).max()
         smallest = np.linalg.eigvalsh(correlation).min()
-        self._require(smallest >= _LOWEST_EIGENVALUE, key, 'not positive: its smallest eigenvalue '
-                      f'is {smallest:.3g} in units of the variances')
+        self._require(asymmetry <= _ROUNDING and smallest >= -_ROUNDING, key,
+                      f'not symmetric and positive: its correlations differ by {asymmetry:.3g}, '
+                      f'their smallest eigenvalue is {smallest:.3g}; fit the calibration again')
         return matrix, tuple(coefficients[name] for name in names)
 
     def _envelope(self) -> Envelope:

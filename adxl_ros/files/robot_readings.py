@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.files.bag_messages import Bag, JOINT_STATE, open_bag, typestore
+from adxl_ros.files.bag_messages import Bag, choose_topic, JOINT_STATE, open_bag, typestore
 from adxl_ros.files.bag_reader import positions, series
 from adxl_ros.files.recording import is_bag
 from adxl_ros.files.tables import open_table
@@ -67,7 +67,13 @@ def read(path: str | os.PathLike, epoch_ns: int, topic: str = '', root: str = ''
     if not is_bag(path):
         return _from_table(str(path))
     with open_bag(path) as bag:
-        joints = _joints(bag, _topic(bag, topic), epoch_ns) if needs_joints else {}
+        joints = {}
+        if needs_joints:
+            stamp_ns, _, columns = series(
+                bag, choose_topic(bag, JOINT_STATE, 'joint_states', topic, '--joints'),
+                cdr.joint_state, positions)
+            joints = {name: _track((stamp_ns - epoch_ns) / 1e9, values)
+                      for name, values in columns.items()}
         return Readings(str(path), joints, _base(bag, root, epoch_ns))
 
 
@@ -84,25 +90,6 @@ def _from_table(path: str) -> Readings:
     return Readings(path, {joint: _track(times, columns[name]) for name, joint in joints.items()},
                     _track(times, np.column_stack([columns[name] for name in base]))
                     if base else None)
-
-
-def _topic(bag: Bag, topic: str) -> str:
-    """Return the topic of the joints."""
-    topics = sorted(name for name, kind in bag.types if kind == JOINT_STATE)
-    named = [name for name in topics if name.strip('/') == topic.strip('/')]
-    found = named if topic else [name for name in topics if name.endswith('/joint_states')
-                                 and not name.endswith('stage/joint_states')] or topics
-    if len(found) != 1:
-        raise UserError(f'{bag.path}: {len(found) or "no"} topics of sensor_msgs/JointState'
-                        f'{f" named {topic}" if topic else ""}; there are '
-                        f'{", ".join(topics) or "none"}; name one by --joints TOPIC')
-    return found[0]
-
-
-def _joints(bag: Bag, topic: str, epoch_ns: int) -> dict[str, Track]:
-    """Return the readings of all joints of a topic."""
-    stamp_ns, _, columns = series(bag, topic, cdr.joint_state, positions)
-    return {name: _track((stamp_ns - epoch_ns) / 1e9, values) for name, values in columns.items()}
 
 
 def _track(time_s: np.ndarray, values: np.ndarray) -> Track:

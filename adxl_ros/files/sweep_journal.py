@@ -43,11 +43,8 @@ class PoseRecord:
 
     def to_json(self) -> dict[str, Any]:
         """Return the keys and values of the record's line; NaN and None have no key."""
-        line = {key: value for key, value in asdict(self).items()
+        return {key: value for key, value in asdict(self).items()
                 if value is not None and value == value}  # NaN differs from itself
-        if 'alpha_rad' not in line:
-            del line['check']
-        return line
 
     @classmethod
     def from_json(cls, line: Mapping[str, Any]) -> PoseRecord:

@@ -218,9 +218,9 @@ def _modified(info: Mapping[str, Any]) -> str:
     return as_date(str(value))
 
 
-def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] | None:
+def _manifest_rows(text: str, fs: Any, path: str) -> list[dict[str, str]] | None:
     """
-    Return the rows of a manifest by their numbers, which are lines of a CSV file.
+    Return the rows of a manifest.
 
     It is None for a recording, and where nothing can be read: its task reports why.
     """
@@ -232,43 +232,37 @@ def _manifest_rows(text: str, fs: Any, path: str) -> dict[int, dict[str, str]] |
         with fs.open(path, 'rb') as file:
             if suffix == '.csv':
                 return _csv_rows(text, TextIOWrapper(file, 'utf-8-sig', newline=''))
-            from pyarrow import parquet, string
+            from pyarrow import parquet
             content = parquet.ParquetFile(file)
             names = [name for name in _MANIFEST_COLUMNS if name in content.schema_arrow.names]
-            columns = [column.cast(string()).fill_null('').to_pylist()
-                       for column in content.read(names).columns]
-        return dict(enumerate((dict(zip(names, row)) for row in zip(*columns)), 1)) \
-            if 'url' in names else None
+            return [{name: '' if value is None else str(value) for name, value in row.items()}
+                    for row in content.read(names).to_pylist()] if 'url' in names else None
     except UserError:
         raise
     except Exception:
         return None
 
 
-def _csv_rows(text: str, file: Iterable[str]) -> dict[int, dict[str, str]] | None:
-    """Return the rows of a manifest, by line and column; None for a recording."""
-    lines = ((number, line) for number, line in enumerate(file, 1)
-             if line.strip() and not line.lstrip().startswith('#'))
-    _, head = next(lines, (0, ''))
-    delimiter = max(',;\t', key=head.count)
-    names = [name.strip() for name in next(csv.reader([head.lower()], delimiter=delimiter))]
-    if 'url' not in names:
+def _csv_rows(text: str, file: Iterable[str]) -> list[dict[str, str]] | None:
+    """Return the rows of a manifest; None for a recording."""
+    lines = (line for line in file if line.strip() and not line.startswith('#'))
+    table = csv.DictReader(lines, skipinitialspace=True)
+    if 'url' not in (table.fieldnames or ()):
         return None
-    rows = {}
-    for number, line in lines:
-        cells, = csv.reader([line], delimiter=delimiter)
-        if len(cells) != len(names):
-            raise UserError(f'{text}: row {number}: {len(cells)} columns, expected {len(names)}')
-        rows[number] = dict(zip(names, map(str.strip, cells)))
+    rows = list(table)
+    for number, row in enumerate(rows, 1):
+        if None in row or None in row.values():
+            raise UserError(f'{text}: row {number}: has not the {len(table.fieldnames or ())} '
+                            'columns of the header')
     return rows
 
 
-def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> Iterable[Source]:
+def _of_manifest(text: str, rows: list[dict[str, str]]) -> Iterable[Source]:
     """Return the recordings that a manifest lists; the last row of a recording counts."""
     folder = text.rpartition('/')[0]
     if not rows:
         raise UserError(f'{text}: the manifest has no row below its header')
-    for number, row in rows.items():
+    for number, row in enumerate(rows, 1):
         if not row['url']:
             raise UserError(f'{text}: row {number}: url is empty')
         if row.get('date') and not as_date(row['date']):
@@ -287,7 +281,7 @@ def _of_manifest(text: str, rows: dict[int, dict[str, str]]) -> Iterable[Source]
                        date=as_date(row.get('date', '')))
 
     with ThreadPoolExecutor(_THREADS) as pool:
-        return list(pool.map(source, rows.values()))
+        return list(pool.map(source, rows))
 
 
 def _beside(folder: str, url: str) -> str:

@@ -18,7 +18,7 @@ from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.population import Population
 from adxl_ros.report import figures as plotly, page as html_page
-from adxl_ros.report.quantities import decimals, number
+from adxl_ros.report.quantities import number
 import numpy as np
 import pandas as pd
 
@@ -32,8 +32,6 @@ _MATRIX_HEAD_PIXELS = 150
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _SHOWN = 12  # Number of units in the first table and with a plot. Chosen: they fit on one screen
 _MOST_ROWS = 50  # Largest count of outliers and of reasons on the page; the table holds them all
-_DECIMALS = 3
-"""Decimals of a scatter, mg, mg/g or µg. Chosen: far below the noise of any recording."""
 _MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))
 """Columns that tell whether a unit is within the tolerance."""
 _SENTENCES = {fleet.State.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
@@ -55,8 +53,7 @@ def _trend_figure(table: fleet.FleetTable, result: fleet.QuantityResult, unit: i
                   ) -> plotly.Figure:
     """Plot a quantity of a unit over time, about its mean where units differ by far more."""
     quantity, place = result.quantity, result.place_of(unit)
-    is_relative = quantity.is_coefficient and quantity.is_force
-    origin = float(result.trends.level[place]) if is_relative and place is not None else 0.0
+    origin = result.trends.level[place] if quantity.is_coefficient and place is not None else 0.0
     part = table.unit[result.rows] == unit
     years, is_outlier = result.recordings.time[part], result.is_outlier[part]
     value = quantity.factor * (result.recordings.value[part] - origin)
@@ -84,7 +81,7 @@ def _trend_figure(table: fleet.FleetTable, result: fleet.QuantityResult, unit: i
     marks = [{'type': 'line', 'x0': stamp, 'x1': stamp, 'yref': 'paper', 'y0': 0, 'y1': 1,
               'line': {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'}}
              for stamp in _stamps(begins[np.isfinite(begins)])]
-    title = quantity.shown_unit + ' from the mean' * is_relative
+    title = quantity.shown_unit + ' from the mean' * quantity.is_coefficient
     return plotly.figure(
         traces, _TREND_HEIGHT, showlegend=False, shapes=marks,
         xaxis={'type': 'date', 'nticks': 3, 'tickangle': 0, 'tickformat': '%b %Y'},
@@ -113,22 +110,17 @@ def write(folder: Path) -> list[Path]:
     html_page.check_libraries()
     table = fleet.read(folder / TABLE)
     results = fleet.analyse(table)
-    distant = fleet.far_out(results, table.serials)
-    population = Population(POPULATION, {
-        result.quantity.column: result.population.pooled for result in results
-        if result.population is not None and result.population.pooled.prediction_std > 0})
-    calibration_store.write_population(folder / POPULATION, population, [
-        {'serial': item.serial, 'coefficient': item.quantity.column, 'value': item.value,
-         'distance': item.distance} for item in distant])
+    calibration_store.write_population(folder / POPULATION, Population(POPULATION, {
+        result.quantity.column: result.population for result in results
+        if result.population is not None and result.population.prediction_std > 0}))
     write_text(folder / PAGE, page(table, results, folder))
     return [folder / name for name in (PAGE, POPULATION)]
 
 
 def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folder: Path) -> str:
     """Return the page of a fleet."""
-    distant = fleet.far_out(results, table.serials)
-    units = fleet.rank(table, results, distant)
-    share, findings = fleet.effect_matrix(table)
+    units = fleet.rank(table, results)
+    share = fleet.effect_matrix(table)
     # Units that drift come first, although others may be more urgent.
     plotted = [(unit, shown[0]) for unit in sorted(units, key=lambda unit: not unit.drifts)
                if (shown := [*(drift.result for drift in unit.drifts), *(
@@ -155,11 +147,7 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
         'trends': [{'figure': f'trend-{i}', 'title': f'{unit.serial}: {result.quantity.label}',
                     'text': f'{unit.drifts[0].text}.' if unit.drifts else 'No slope is claimed.'}
                    for i, (unit, result) in enumerate(plotted)],
-        'findings': [*batches, *findings], 'has_effects': 'matrix' in figures,
-        'judged': len(share), 'populations': _population_rows(results),
-        'far_out': [
-            [item.serial, item.quantity.label, f'{item.value:.5g} {item.quantity.unit}',
-             number(item.distance, True)] for item in distant[:_MOST_ROWS]],
+        'batches': batches, 'has_effects': 'matrix' in figures, 'judged': len(share),
         'outliers': _outlier_rows(table, results),
         'outlier_count': sum(int(result.is_outlier.sum()) for result in results),
         'refusals': _refusal_rows(table), 'most_rows': _MOST_ROWS,
@@ -173,7 +161,7 @@ def _badge(table: fleet.FleetTable, units: Sequence[fleet.UnitState], counts: Co
         return {'colour': 'grey', 'word': 'NO UNITS',
                 'sentence': 'No recording states a serial number.'}
     worst = units[0].state
-    if worst >= fleet.State.FAR_OUT and table.frame[[*_MEASURES]].isna().all(axis=None):
+    if worst is fleet.State.IN_ORDER and table.frame[[*_MEASURES]].isna().all(axis=None):
         # What was not measured is not within the tolerance.
         return {'colour': 'grey', 'word': 'NOT MEASURED',
                 'sentence': 'No gap and no zero-g were measured; they need diagnose and fit.'}
@@ -194,25 +182,6 @@ def _link(folder: Path, report: str) -> str:
     """Return the address of a single report: its page where there is one; empty for none."""
     return next((name for name in (f'{report}/report.html', report)
                  if report and (folder / name).exists()), '')
-
-
-def _population_rows(results: Sequence[fleet.QuantityResult]) -> list[list[str]]:
-    rows = []
-    for result in results:
-        population, quantity, scatter = result.population, result.quantity, result.trends.scatter
-        if population is None:
-            continue
-        pooled, factor, unit = population.pooled, quantity.factor, quantity.shown_unit
-        spread, low, high = (number(factor * value) for value in (
-            pooled.spread, pooled.spread_low, pooled.spread_high))
-        rows.append([
-            quantity.label, f'{pooled.mean:.{decimals(pooled.mean_std)}f} ± '
-            f'{number(pooled.mean_std, digits=2)} {quantity.unit}',
-            f'{spread} ({low} to {high}) {unit}',
-            *(f'{number(round(factor * value, _DECIMALS))} {unit}'
-              for value in (scatter.recording, scatter.calibration)),
-            str(pooled.units), str(int(population.is_far_out.sum()))])
-    return rows
 
 
 def _outlier_rows(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult]

@@ -274,16 +274,16 @@ _GRID = (np.arange(400) + 0.5) / 400
 """Shares x of the spreads s·x/(1 − x) over which the likelihood is integrated. Chosen: more change
 the integrals by less than 1e-3."""
 _OUTLIER_CHANCE = 0.05
-"""Probability that a page names a unit although all units are of one population. Chosen."""
+"""Probability that a unit does not count although all units are of one population. Chosen."""
 _MAX_ROUNDS = 10
 """Largest count of rounds of spread and outliers; a round seldom changes after the second."""
 _MAX_OUTLIERS = 0.25
 """Largest share of units that are far out. Chosen: more of them are a population of their own."""
 _FAR_MADS = 5.0
 """Units further from the median do not count in the first round. Chosen: far beyond normal."""
-MIN_GROUP = 5
-"""Fewest units of a group. Chosen: fewer have nothing in common that a test could show."""
-CHANCE = 0.01  # Probability of a false group among all groups. Chosen
+_MIN_BATCH = 5
+"""Fewest units of a batch. Chosen: fewer have nothing in common that a test could show."""
+_CHANCE = 0.01  # Probability of a false batch among all batches. Chosen
 
 
 def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -317,48 +317,27 @@ def _common_variance(variance: np.ndarray, freedom: np.ndarray) -> tuple[float, 
     return float(np.exp(mean + scipy.special.digamma(half) - np.log(half))), 2 * half
 
 
-@dataclass(frozen=True)
-class RandomEffects:
-    """A coefficient over n units."""
-
-    pooled: PooledCoefficient  # Mean and spread of the population
-    # estimates, std: The units' own estimates and their standard deviations, (n,)
-    estimates: np.ndarray
-    std: np.ndarray
-    is_far_out: np.ndarray  # Units that are not of this population, (n,) bool. They do not count.
-
-    def distances(self) -> np.ndarray:
-        """Return the distances of the units from the mean, in standard deviations, (n,)."""
-        pooled = self.pooled
-        return (self.estimates - pooled.mean) / np.sqrt(
-            pooled.spread ** 2 + pooled.mean_std ** 2 + self.std ** 2)
-
-
-def random_effects(estimates: np.ndarray, std: np.ndarray, tests: int | None = None,
-                   strangers: np.ndarray | None = None) -> RandomEffects:
+def random_effects(estimates: np.ndarray, std: np.ndarray, tests: int | None = None
+                   ) -> PooledCoefficient:
     """
     Estimate mean and spread of a population, without the units that are not of it.
 
-    estimates: estimates of at least `MIN_UNITS` units, (n,); std: their standard deviations, (n,);
-    strangers: units that are known not to be of the population, (n,) bool.
+    estimates: estimates of at least `MIN_UNITS` units, (n,); std: their standard deviations, (n,).
     """
-    if strangers is not None:
-        others = random_effects(estimates[~strangers], std[~strangers], tests)
-        is_far_out = strangers.copy()
-        is_far_out[~strangers] = others.is_far_out
-        return RandomEffects(others.pooled, estimates, std, is_far_out)
     chance = _OUTLIER_CHANCE / (2 * (tests or len(estimates)))
     deviation = np.abs(estimates - np.median(estimates))
     scale = MAD_TO_STD * np.median(deviation)
     kept = _largest_dropped(deviation / np.hypot(max(scale, np.finfo(float).tiny), std), _FAR_MADS)
     for _ in range(_MAX_ROUNDS):
-        population = _of_units(estimates, std, kept)
+        pooled = _of_units(estimates[kept], std[kept])
+        distance = np.abs(estimates - pooled.mean) / np.sqrt(
+            pooled.spread ** 2 + pooled.mean_std ** 2 + std ** 2)
         limit = -float(scipy.special.stdtrit(kept.sum() - 2, chance))
-        now = _largest_dropped(np.abs(population.distances()), limit)
+        now = _largest_dropped(distance, limit)
         if np.array_equal(now, kept):
             break
         kept = now
-    return population
+    return pooled
 
 
 def _largest_dropped(distance: np.ndarray, limit: float) -> np.ndarray:
@@ -371,20 +350,18 @@ def _largest_dropped(distance: np.ndarray, limit: float) -> np.ndarray:
     return kept
 
 
-def _of_units(estimates: np.ndarray, std: np.ndarray, kept: np.ndarray) -> RandomEffects:
+def _of_units(estimates: np.ndarray, std: np.ndarray) -> PooledCoefficient:
     """Return the population of the units that count."""
-    y, variance = estimates[kept], std[kept] ** 2
-    unit = max(float(np.ptp(y)), float(std[kept].max()), np.finfo(float).tiny)
-    y, variance = (y - y.mean()) / unit, variance / unit ** 2
+    unit = max(float(np.ptp(estimates)), float(std.max()), np.finfo(float).tiny)
+    y, variance = (estimates - estimates.mean()) / unit, (std / unit) ** 2
     spread2, low, high = _spreads2(y, variance)
     mean, _ = weighted_mean(y, variance, spread2)
     mean_variance, prediction_variance = _variances(y, variance, mean)
-    pooled = PooledCoefficient(
-        mean=float(estimates[kept].mean() + unit * mean), mean_std=unit * mean_variance ** 0.5,
+    return PooledCoefficient(
+        mean=float(estimates.mean() + unit * mean), mean_std=unit * mean_variance ** 0.5,
         spread=unit * spread2 ** 0.5, spread_low=unit * low ** 0.5,
         spread_high=unit * high ** 0.5, prediction_std=unit * prediction_variance ** 0.5,
-        units=int(kept.sum()))
-    return RandomEffects(pooled, estimates, std, is_far_out=~kept)
+        units=len(estimates))
 
 
 def _variances(y: np.ndarray, variance: np.ndarray, mean: float) -> tuple[float, float]:
@@ -439,25 +416,18 @@ class BadBatch(NamedTuple):
     high: float
 
 
-def by_prefix(names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return the groups whose names begin alike, (m,) bool each, by the shortest beginning."""
-    counts = Counter(name[:length] for name in names for length in range(1, len(name) + 1))
-    groups: dict[bytes, tuple[str, np.ndarray]] = {}
-    for prefix in sorted(counts, key=len):
-        if MIN_GROUP <= counts[prefix] < len(names):
-            members = np.array([name.startswith(prefix) for name in names])
-            groups.setdefault(members.tobytes(), (prefix, members))
-    return dict(groups.values())
-
-
 def bad_batch(serials: Sequence[str], level: np.ndarray, tolerance: float, tests: int
               ) -> BadBatch | None:
     """Return the most certain batch whose level differs by more than a tolerance."""
-    # The larger part of a fleet is what the others are compared with.
-    groups = {prefix: members for prefix, members in by_prefix(serials).items()
-              if members.sum() <= len(serials) / 2}
-    best, lowest = None, CHANCE / (max(len(groups), 1) * tests)
-    for prefix, members in groups.items():
+    counts = Counter(name[:length] for name in serials for length in range(1, len(name) + 1))
+    batches: dict[bytes, tuple[str, np.ndarray]] = {}  # By their members, with the shortest prefix
+    for prefix in sorted(counts, key=len):
+        # The larger part of a fleet is what the others are compared with.
+        if _MIN_BATCH <= counts[prefix] <= len(serials) / 2:
+            members = np.array([name.startswith(prefix) for name in serials])
+            batches.setdefault(members.tobytes(), (prefix, members))
+    best, lowest = None, _CHANCE / (max(len(batches), 1) * tests)
+    for prefix, members in batches.values():
         test = scipy.stats.ttest_ind(level[members], level[~members], equal_var=False)
         difference = float(level[members].mean() - level[~members].mean())
         if test.pvalue < lowest and abs(difference) > tolerance:

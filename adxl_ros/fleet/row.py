@@ -22,11 +22,11 @@ from pathlib import Path
 import re
 from typing import Any, NamedTuple
 
-from adxl_ros import process
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.model.constants import AXES
+from adxl_ros.process import code_version
 import yaml
 
 Row = dict[str, Any]  # The values of one recording by column
@@ -273,10 +273,3 @@ def _stored(folder: str) -> dict[str, list[ParameterText]]:
     except (OSError, ValueError) as error:
         raise UserError(f'{folder}: cannot be read: {one_line(error)}') from None
     return stored
-
-
-@lru_cache(maxsize=1)
-def code_version() -> str:
-    """Return the SHA-256 of version and code of the package, and of its default sensors."""
-    return sha256_of(process.code_version(), parameter_file.nominal_path().read_text('utf-8'),
-                     parameter_file.any_imu_path().read_text('utf-8'))

@@ -37,7 +37,7 @@ _NAME_DIGITS = 16
 _SECONDS = {'check': (0.02, 30.0), 'noise': (0.05, 60.0), 'fit': (1.0, 100.0),
             'diagnose': (10.0, 500.0)}
 """Usual run time of each task: of any recording, s, and for each GB, s. Measured on one core with
-CSV files of 416 s at 250 Hz; replaced by the run times of earlier rows where there are some."""
+CSV files of 416 s at 250 Hz."""
 _IDENTITY = ('url', 'serial', 'date', 'date_source', 'calibration_id', 'calibration_age_days')
 """Columns of a recording whose content is that of another row, which has its other values."""
 
@@ -58,8 +58,7 @@ def only_client(folder: Path) -> Iterator[None]:
         yield
 
 
-_KEPT = ('written', 'key', 'outcome', 'serial', 'date', 'date_source', 'size_bytes', 'seconds',
-         'tasks')
+_KEPT = ('written', 'key', 'outcome', 'serial', 'date', 'date_source')
 """Columns of a row that the client keeps in memory."""
 
 
@@ -166,8 +165,9 @@ def plan(sources: Sequence[Source], recipe: Recipe, results: Results, only_faile
         done = len(chosen) - len(todo)
     todo = todo[:limit]
     size_bytes = sum(source.size_bytes or 0 for source in todo)
-    return Plan(todo, done, len(sources) - done - len(todo), size_bytes,
-                _expected_s(len(todo), size_bytes, recipe, results) / 3600)
+    expected_s = sum(_SECONDS[name][0] * len(todo) + _SECONDS[name][1] * size_bytes / 1e9
+                     for name in recipe.tasks)
+    return Plan(todo, done, len(sources) - done - len(todo), size_bytes, expected_s / 3600)
 
 
 def _since(sources: Sequence[Source], since: str, results: Results) -> list[Source]:
@@ -189,16 +189,6 @@ def is_done(source: Source, entry: Entry | None, recipe: Recipe) -> bool:
     parameters = recipe.parameters_of(source.serial or row['serial'] or '',
                                       source.date or row['date'] or '', source.params)
     return recipe.digest(parameters, source.serial) == entry.digest
-
-
-def _expected_s(count: int, size_bytes: int, recipe: Recipe, results: Results) -> float:
-    """Return the expected run time on one core, s: by earlier rows, else by usual times."""
-    earlier = [row for _, _, _, row in results.newest.values()
-               if row['tasks'] == [*recipe.tasks] and row['outcome'] == 'done']
-    if read := sum(row['size_bytes'] for row in earlier):
-        return size_bytes * sum(row['seconds'] for row in earlier) / read
-    return sum(_SECONDS[name][0] * count + _SECONDS[name][1] * size_bytes / 1e9
-               for name in recipe.tasks)
 
 
 def work(pool: Pool, sources: Sequence[Source], recipe: Recipe, results: Results,

@@ -5,10 +5,6 @@ The table of a fleet in the order of units and time, and what it says.
 
 Each quantity has trends, a population and outliers.
 
-A group is all units whose serial numbers begin alike, or all that are recorded in folders whose
-names begin alike. An effect belongs to a group if it is more frequent there than elsewhere by
-Fisher's exact test, whose chance all groups and effects share (Bonferroni).
-
 The order of units by urgency is that of the table in docs/howto/fleet.md. A unit has the first
 state that fits:
 
@@ -16,9 +12,7 @@ state that fits:
    calibration. The largest comes first.
 2. Drifts: a claimed slope takes it out of the tolerance. The nearest date comes first.
 3. Not judged: its last recordings are refused. The longest series comes first.
-4. Far out: a coefficient is not that of the population. The farthest comes first.
-5. Old calibration: its calibration is older than a year, or it has none.
-6. In order.
+4. In order.
 """
 
 from __future__ import annotations
@@ -32,13 +26,12 @@ from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.fleet import pooling
-from adxl_ros.fleet.pooling import by_prefix, Recordings
-from adxl_ros.fleet.row import NOISE
+from adxl_ros.fleet.pooling import Recordings
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
+from adxl_ros.model.population import PooledCoefficient
 from adxl_ros.report.quantities import counted, number
 import numpy as np
 import pandas as pd
-import scipy
 
 _TEXTS = ['url', 'hash', 'serial', 'outcome', 'refusal', 'refused_by', 'calibration_id', 'status',
           'report']
@@ -56,17 +49,11 @@ class Quantity:
 
     column: str  # Column of its value; the quantity is named by it
     label: str  # Its name for people
-    unit: str  # Unit of the column
     shown_unit: str  # Unit on the page
     factor: float  # Factor from the column's unit to that of the page
     # Column of its standard deviation, or columns of both ends of its 90 % interval
     error_columns: tuple[str, ...]
     is_coefficient: bool = True  # Whether the units of a fleet have a population of it
-
-    @property
-    def is_force(self) -> bool:
-        """Whether the quantity is an error of specific force, which has a tolerance."""
-        return self.shown_unit.startswith('mg')
 
     def text(self, value: float, low: float, high: float) -> str:
         """Return a difference with its interval, in the unit of the page."""
@@ -139,22 +126,17 @@ def read(path: str | os.PathLike) -> FleetTable:
 
 def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
     """Return all quantities of a table."""
-    listed = [Quantity('gap_before_mps2', 'gap', 'm/s²', 'mg', MG,
+    listed = [Quantity('gap_before_mps2', 'gap', 'mg', MG,
                        ('gap_before_low_mps2', 'gap_before_high_mps2'), is_coefficient=False)]
     for axis in AXES:
         scales = np.zeros(0) if table is None else table[f'scale_{axis}_v_per_g']
         scales = scales[scales > 0]
         mg_per_v = 1e3 / float(np.median(scales)) if len(scales) else 1e3
         listed += [
-            Quantity(f'zero_g_{axis}_v', f'zero-g {axis}', 'V', 'mg', mg_per_v,
+            Quantity(f'zero_g_{axis}_v', f'zero-g {axis}', 'mg', mg_per_v,
                      (f'zero_g_std_{axis}_v',)),
-            Quantity(f'scale_{axis}_v_per_g', f'scale factor {axis}', 'V/g', 'mg/g', mg_per_v,
+            Quantity(f'scale_{axis}_v_per_g', f'scale factor {axis}', 'mg/g', mg_per_v,
                      (f'scale_std_{axis}_v_per_g',))]
-    listed += [
-        Quantity(f'noise_{letter}_{axis}_{name}', f'{label[:-2]} {axis}', unit,
-                 unit.replace('m/s²', 'µg'), 1e6 / G0_MPS2,
-                 tuple(f'noise_{letter}_{end}_{axis}_{name}' for end in ('low', 'high')))
-        for axis in AXES for letter, label, name, unit in NOISE]
     return tuple(listed)
 
 
@@ -177,7 +159,7 @@ class QuantityResult:
     half_width: np.ndarray  # Half of the interval of each slope, (k,)
     # Mean and spread over the units, None where they are too few, and units of one batch that are
     # not of this population
-    population: pooling.RandomEffects | None
+    population: PooledCoefficient | None
     batch: pooling.BadBatch | None
 
     def place_of(self, unit: int) -> int | None:
@@ -200,11 +182,11 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
         units = np.unique(table.unit[rows[~is_outlier]])
         population, batch = None, None
         if quantity.is_coefficient and len(units) >= pooling.MIN_UNITS:
-            if quantity.is_force:
-                batch = pooling.bad_batch([table.serials[unit] for unit in units], trends.level,
-                                          TOLERANCE_MG / quantity.factor, len(measured))
-            population = pooling.random_effects(trends.level, trends.level_std, coefficients,
-                                                None if batch is None else batch.members)
+            batch = pooling.bad_batch([table.serials[unit] for unit in units], trends.level,
+                                      TOLERANCE_MG / quantity.factor, len(measured))
+            usual = slice(None) if batch is None else ~batch.members
+            population = pooling.random_effects(trends.level[usual], trends.level_std[usual],
+                                                coefficients)
         none = np.zeros(len(units), bool)
         results.append(QuantityResult(quantity, rows, recordings, distance, is_outlier, units,
                                       trends, none, np.zeros(len(units)), population, batch))
@@ -220,42 +202,21 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
                 results, np.split(is_claimed, splits), np.split(factor, splits))]
 
 
-class FarOut(NamedTuple):
-    """A unit that is not of the population."""
-
-    serial: str
-    quantity: Quantity
-    value: float
-    distance: float  # Distance from the mean, standard deviations
-
-
-def far_out(results: Sequence[QuantityResult], serials: Sequence[str]) -> list[FarOut]:
-    """Return the units that are not of the population, the farthest first."""
-    units = [FarOut(serials[result.units[i]], result.quantity,
-                    float(result.population.estimates[i]), float(result.population.distances()[i]))
-             for result in results if result.population is not None
-             for i in np.flatnonzero(result.population.is_far_out)]
-    return sorted(units, key=lambda unit: -abs(unit.distance))
-
-
 _VERDICTS = ('no_gap', 'explained', 'partly', 'inseparable', 'unknown')
 """Statuses of recordings whose effects are judged."""
-_MOST = 0.5
-"""Share from which most have an effect: recordings of a unit, units of a group or of the fleet."""
 RECENT = 5
 """Number of recordings whose median is the gap of a unit now. Chosen: one odd one is no gap."""
-MAX_AGE_DAYS = 365.0  # Largest age of a calibration, days. Chosen: a year
 DAYS_PER_YEAR = 365.25
 _FARTHEST_DAYS = 10 * DAYS_PER_YEAR
 """A drift that needs longer is no matter of urgency. Chosen: the life of a robot."""
 
 
-def effect_matrix(table: FleetTable) -> tuple[pd.DataFrame, list[str]]:
+def effect_matrix(table: FleetTable) -> pd.DataFrame:
     """
-    Count the named effects by unit, and look for what units with an effect have in common.
+    Return the share of the recordings of each unit in which each effect is named.
 
-    returns: share of the recordings in which each effect is named, the most frequent first, by the
-    numbers of the units with a verdict; and one sentence for each finding.
+    The rows are the numbers of the units with a verdict, the columns the effects, the most
+    frequent first.
     """
     used = np.isin(table['status'].astype(str), _VERDICTS) & (table.unit >= 0) & table.first
     frame, unit = table.frame[used], table.unit[used]
@@ -263,33 +224,7 @@ def effect_matrix(table: FleetTable) -> tuple[pd.DataFrame, list[str]]:
     effects = sorted(counts, key=lambda name: (-counts[name], name))
     has = pd.DataFrame([[name in names for name in effects] for names in frame['effects']],
                        columns=effects, dtype=float)
-    share = has.groupby(unit).mean()
-    by_place = has.groupby([unit, [url.rpartition('/')[0] for url in frame['url']]]).mean()
-    common = (share > _MOST).sum()
-    findings = [
-        *(f'{common[name]} of {len(share)} units have {name}. Look for what they share: stage, '
-          'mounting, parameter file, batch.' for name in effects
-          if common[name] > _MOST * len(share) and len(share) >= pooling.MIN_GROUP),
-        *_frequent([table.serials[unit] for unit in share.index], share > _MOST,
-                   'with a serial number', 'a bad batch'),
-        *_frequent([folder for _, folder in by_place.index], by_place > _MOST, 'recorded in',
-                   'a bad stage or place')]
-    return share, findings
-
-
-def _frequent(names: Sequence[str], has: pd.DataFrame, what: str, cause: str) -> list[str]:
-    """Name the group of names in which each effect is more frequent than elsewhere, if any."""
-    groups, findings = by_prefix(names), []
-    for effect, named in has.items() if groups else ():
-        chance, prefix, members = min((scipy.stats.hypergeom.logsf(
-            (members & named).sum() - 1, len(named), named.sum(), members.sum()), prefix, members)
-            for prefix, members in groups.items())
-        inside, size = (members & named).sum(), members.sum()
-        limit = np.log(pooling.CHANCE / (len(groups) * has.shape[1]))
-        if chance < limit and inside > _MOST * size:
-            findings.append(f'{inside} of {size} units {what} {prefix}… have {effect}, and '
-                            f'{named.sum() - inside} of the {len(named) - size} others: {cause}.')
-    return findings
+    return has.groupby(unit).mean()
 
 
 class State(IntEnum):
@@ -298,9 +233,7 @@ class State(IntEnum):
     OUT_OF_TOLERANCE = 1
     DRIFTS = 2
     NOT_JUDGED = 3
-    FAR_OUT = 4
-    OLD_CALIBRATION = 5
-    IN_ORDER = 6
+    IN_ORDER = 4
 
     @property
     def words(self) -> str:
@@ -310,7 +243,7 @@ class State(IntEnum):
     @property
     def colour(self) -> str:
         """Return the colour of the badge of a unit."""
-        return ('red', 'amber', 'amber', 'amber', 'grey', 'green')[self - 1]
+        return ('red', 'amber', 'amber', 'green')[self - 1]
 
 
 class Drift(NamedTuple):
@@ -318,9 +251,8 @@ class Drift(NamedTuple):
 
     result: QuantityResult  # Its quantity
     text: str  # The slope with its interval, for people
-    days: float  # Days until the unit is out of its tolerance; infinite for a quantity without one
-    # Gap now, or the drift since the calibration where there is no gap; NaN for a quantity without
-    # a tolerance
+    days: float  # Days until the unit is out of its tolerance; infinite for a gap that shrinks
+    # Gap now, or the drift since the calibration where there is no gap; NaN for a gap that shrinks
     reached_mg: float
 
 
@@ -341,17 +273,13 @@ class UnitState:
     report: str  # Folder of the single reports of its last recording; empty for none
 
 
-def rank(table: FleetTable, results: Sequence[QuantityResult],
-         distant: Sequence[FarOut]) -> list[UnitState]:
+def rank(table: FleetTable, results: Sequence[QuantityResult]) -> list[UnitState]:
     """Return all units, the most urgent first."""
-    farthest = {item.serial: item for item in reversed(distant)}
-    states = [_state_of(unit, table, results, farthest.get(serial))
-              for unit, serial in enumerate(table.serials)]
+    states = [_state_of(unit, table, results) for unit in range(len(table.serials))]
     return sorted(states, key=lambda unit: (unit.state, unit.urgency, unit.serial))
 
 
-def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult],
-              distant: FarOut | None) -> UnitState:
+def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult]) -> UnitState:
     """Return a unit with the first state that fits."""
     rows = table.rows_of(unit)
     gap_mg, floor_mg, over_mg = _gap_now(table, rows)
@@ -375,14 +303,6 @@ def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult],
         state, urgency = State.NOT_JUDGED, -series
         reason = f'Refused, {counted(series, "recording")} in a row: ' \
             f'{table["refusal"][rows[-1]] or table["outcome"][rows[-1]]}'
-    elif distant is not None:
-        state, urgency = State.FAR_OUT, -abs(distant.distance)
-        reason = f'{distant.quantity.label} is {-urgency:.1f} standard deviations from the mean ' \
-            'of the fleet.'
-    elif not age_days <= MAX_AGE_DAYS:
-        state, urgency = State.OLD_CALIBRATION, -age_days if age_days > 0 else -np.inf
-        reason = f'Its calibration is {age_days:.0f} days old.' if age_days > 0 else \
-            'It has no calibration with a date.'
     return UnitState(
         urgency, unit, table.serials[unit], state, reason[:1].upper() + reason[1:], drifts,
         f'{number(gap_mg)} / {number(floor_mg)}' if np.isfinite(gap_mg) else '-',
@@ -414,7 +334,7 @@ def _drifts(unit: int, results: Sequence[QuantityResult], over_mg: float, age_da
         slope, half = float(result.trends.slope[place]), float(result.half_width[place])
         text = f'{quantity.label} {quantity.text(slope, slope - half, slope + half)} per year'
         days, reached_mg = np.inf, np.nan
-        if quantity.is_force and (quantity.is_coefficient or slope > 0):
+        if quantity.is_coefficient or slope > 0:
             # A coefficient is right at its calibration, and the gap shows what it is now.
             mg_per_day = abs(quantity.factor * slope) / DAYS_PER_YEAR
             reached_mg = over_mg if np.isfinite(over_mg) else mg_per_day * np.nan_to_num(age_days)

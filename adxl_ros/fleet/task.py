@@ -21,7 +21,6 @@ import shlex
 import shutil
 import tempfile
 from time import monotonic, time
-import traceback
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from adxl_ros.errors import one_line, UserError
@@ -31,7 +30,6 @@ from adxl_ros.files.recording_columns import NO_UNIT, recorded_unit, Recording
 from adxl_ros.fleet import inputs
 from adxl_ros.fleet.inputs import begin_of, Source
 from adxl_ros.fleet.row import (
-    code_version,
     empty_row,
     finite,
     NOISE,
@@ -41,7 +39,7 @@ from adxl_ros.fleet.row import (
     sha256_of,
 )
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.process import package_version
+from adxl_ros.process import code_version, package_version
 from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
 from adxl_ros.signals.noise_parameters import recording_noise
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
@@ -261,10 +259,8 @@ class _Job:
                 else:
                     self.refuse(name, reason)
             except Exception as error:
-                place = traceback.extract_tb(error.__traceback__)[-1]
-                self.refuse(name, self.plain(
-                    f'{type(error).__name__}: {one_line(error)} ({Path(place.filename).name}:'
-                    f'{place.lineno})'), 'crashed')
+                self.refuse(name, self.plain(f'{type(error).__name__}: {one_line(error)}'),
+                            'crashed')
         # Many recordings have no noise; what the others need says more.
         order = [name for name in tasks if name in skipped]
         if order and not has_result:

@@ -17,7 +17,6 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.calibration_store import sha256
 from adxl_ros.files.recording_columns import recorded_unit, Recording
-from adxl_ros.files.tables import read_pose_table
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor, with_axes
@@ -55,8 +54,7 @@ def parser() -> argparse.ArgumentParser:
                        help='use the rests that the journal of this sweep names')
     parse.add_argument('--poses', metavar='FILE',
                        help='table with the angles of each rest: alpha_deg and beta_deg, or '
-                            'roll_deg and pitch_deg; start_s and stop_s where the rows are not '
-                            'the rests in their order')
+                            'roll_deg and pitch_deg')
     parse.add_argument('-o', dest='output', metavar='FILE.yaml', required=True,
                        help='the parameter file of the calibrated sensor')
     parse.add_argument('--report', metavar='DIR',
@@ -121,7 +119,7 @@ def fit(options: argparse.Namespace) -> int:
                 break
             poses = extract_poses(read, unit, records)
             if options.poses:
-                poses = with_table_angles(poses, read_pose_table(options.poses), read.epoch_ns)
+                poses = with_table_angles(poses, options.poses)
             recordings.append(calibration.RecordedPoses(
                 Path(path).name, poses, estimate_filters(read, unit, poses)))
         assert unit is not None, 'argparse asks for a recording'

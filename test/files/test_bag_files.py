@@ -246,12 +246,9 @@ CUT_IMU = bytes(STORE.serialize_cdr(imu(T[1]).message, IMU))[:100]
      f': no topic of type {IMU}; it holds /imu/data_raw ({STRING})'),
     ([joints(T[0])], f': no topic of type {IMU}; it holds /stage/joint_states ({JOINTS})'),
     ([imu(T[0], topic='/imu'), imu(T[0], topic='/camera/imu')],
-     f': several topics of type {IMU}, none of them imu/data_raw: /camera/imu, /imu; choose one: '
-     '--topic /camera/imu'),
+     f': 2 topics {IMU}; choose one with --topic: /camera/imu, /imu'),
     ([imu(T[0], topic='/a/imu/data_raw'), imu(T[0], topic='/b/imu/data_raw')],
-     ': several topics imu/data_raw: /a/imu/data_raw, /b/imu/data_raw; record one sensor'),
-    ([imu(T[0]), imu(T[1], frame='imu_link2')],
-     ": topic /imu/data_raw: frame_id changes from 'imu_link' to 'imu_link2'"),
+     f': 2 topics {IMU}; choose one with --topic: /a/imu/data_raw, /b/imu/data_raw'),
     ([imu(T[1]), imu(T[2]), imu(T[0])],
      ': topic /imu/data_raw: message 3, stamped 1750000000.123456789 s: time runs backwards, '
      '0.002 s before the newest sample'),
@@ -293,7 +290,7 @@ def test_ideal_force(tmp_path: Path) -> None:
     assert (ideal.time_s == (np.array(T) - EPOCH_NS) / 1e9).all()
     assert [ideal.columns[name].tolist() for name in ACCEL] == [[0, 1, 2], [2] * 3, [3] * 3]
     two = [*messages, *(imu(t, topic='/other/imu') for t in T)]
-    with pytest.raises(UserError, match='several topics of type sensor_msgs/msg/Imu'):
+    with pytest.raises(UserError, match='2 topics sensor_msgs/msg/Imu'):
         recording.read_ideal(bags.bag_of(tmp_path / 'two', two))
     with pytest.raises(UserError, match='no topic of type sensor_msgs/msg/Imu'):
         recording.read_ideal(bags.bag_of(tmp_path / 'none', [joints(T[0])]))

@@ -202,7 +202,7 @@ def test_units_around_a_calibration_have_its_covariance():
 def test_units_of_a_fleet(tmp_path):
     pooled = PooledCoefficient(2.45, 1e-3, 0.02, 0.015, 0.03, 0.021, 12)
     calibration_store.write_population(tmp_path / 'population.yaml',
-                                       Population('fleet', {'zero_g_x_v': pooled}), [])
+                                       Population('fleet', {'zero_g_x_v': pooled}))
     model = SensorModel(nominal('xyz'), units=tmp_path / 'population.yaml')
     model(np.zeros((5000, 3)), 1 / RATE_HZ)
     assert model.coefficients.mean() == pytest.approx(2.45 - 2.5, abs=2e-3)

@@ -166,7 +166,7 @@ def test_a_manifest_states_unit_parameters_and_date(run_tool, tmp_path):
     (tmp_path / 'day' / 'list.csv').write_text('\nurl,serial\n\nu0000_0000.csv\n')
     wrong = run_tool('fleet', 'day/list.csv', '-o', 'out')
     assert wrong.returncode == 1
-    assert 'day/list.csv: row 4: 1 columns, expected 2' in wrong.stderr
+    assert 'day/list.csv: row 1: has not the 2 columns of the header' in wrong.stderr
 
 
 def test_what_cannot_be_reached_or_read_is_a_row(run_tool, tmp_path):
@@ -175,7 +175,7 @@ def test_what_cannot_be_reached_or_read_is_a_row(run_tool, tmp_path):
     (tmp_path / 'day' / 'empty.csv').write_text('')
     dead = f'127.0.0.1:{free_port()}'
     (tmp_path / 'day' / 'list.csv').write_text(
-        f'URL;Serial\n\nu0000_0000.csv;U0\nftp://robot:secret@{dead}/a.csv;\ngs2://b/b.csv;\n')
+        f'url,serial\n\nu0000_0000.csv,U0\nftp://robot:secret@{dead}/a.csv,\ngs2://b/b.csv,\n')
     words = ('--do', 'check', '--jobs', 1, '-o')
     run_tool('fleet', 'day/list.csv', *words, 'listed')
     rows = {row['url']: row['refusal'] for row in table_of(tmp_path / 'listed')}

@@ -265,8 +265,8 @@ def test_numbered_columns_and_a_mapping_file(run_tool, tmp_path) -> None:
     ('t,x,y,z,r,p\n' + 20 * '0,0,0,1,90,0\n',
      ['--columns', f'{XYZ_G},roll=r:rad,pitch=p:deg', '--rate', '9'],
      'log.csv:2:5: r is 90, no roll in rad; delete the line, or correct the unit'),
-    (SHORT, ['--columns', NO_UNIT], 'x, y, z have a length of 0.102 g in mps2, where gravity has '
-                                    '1 g; state their unit, for example x=x:g'),
+    (SHORT, ['--columns', NO_UNIT], '--columns: nothing states the unit of x; write for example '
+                                    'x=x:mps2'),
     (SHORT, ['--columns', 'gone.txt'], '--columns gone.txt: is neither a mapping nor a file'),
     (SHORT, ['--columns', XYZ_G, '--axes', 'x=-y,y=y'], '--axes x=-y,y=y: each axis of the'),
     (SHORT, ['--columns', XYZ_G, '--lsb-per-g', '4'], '--lsb-per-g: no column is in LSB'),
@@ -295,9 +295,9 @@ def test_several_imu_topics_of_a_bag_are_named(run_tool, tmp_path) -> None:
     bag_with(tmp_path, ['/camera/imu', '/body/imu/data'])
     done = run_tool('fit', 'bag', '-o', 'unit.yaml')
     assert done.returncode == 1
-    assert '/body/imu/data, /camera/imu; choose one: --topic /body/imu/data' in done.stderr
+    assert 'choose one with --topic: /body/imu/data, /camera/imu' in done.stderr
     done = run_tool('fit', 'bag', '--topic', 'camera/gyro', '-o', 'unit.yaml')
-    assert '; name one of /body/imu/data, /camera/imu' in done.stderr
+    assert 'no topics camera/gyro; choose one with --topic: /body/imu/data, ' in done.stderr
     done = run_tool('fit', 'bag', '--topic', 'camera/imu', '-o', 'unit.yaml')
     assert done.returncode == 0, done.stderr
     check_errors(tmp_path / 'unit.yaml')

@@ -37,7 +37,7 @@ def drawn(rng):
 def test_poses_take_the_population(run_tool, tmp_path):
     truth = replace(drawn(np.random.default_rng(1)), serial='N1')
     parameter_file.save(tmp_path / 'truth.yaml', truth)
-    calibration_store.write_population(tmp_path / 'population.yaml', population(), [])
+    calibration_store.write_population(tmp_path / 'population.yaml', population())
     run_tool('simulate', 'sweep', '--params', 'truth.yaml', '--rate', 100, '-o', 'one.csv')
     done = run_tool('fit', 'one.csv', '--model', 'linear', '--prior', 'population.yaml',
                     '-o', 'unit.yaml')
@@ -54,7 +54,7 @@ def test_a_stranger_is_named_by_fit(run_tool, tmp_path):
     """A wrong prior is said and not used: the fit is that without it."""
     truth = drawn(np.random.default_rng(2))
     parameter_file.save(tmp_path / 'truth.yaml', truth)
-    calibration_store.write_population(tmp_path / 'wrong.yaml', population(0.1), [])
+    calibration_store.write_population(tmp_path / 'wrong.yaml', population(0.1))
     run_tool('simulate', 'sweep', '--params', 'truth.yaml', '--rate', 50, '-o', 'sweep.csv')
     for arguments in (['--prior', 'wrong.yaml', '-o', 'a.yaml'], ['-o', 'b.yaml']):
         done = run_tool('fit', 'sweep.csv', '--model', 'linear', *arguments)
