@@ -12,7 +12,6 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.sweep_journal import PoseRecord
-from adxl_ros.files.tables import PoseTable
 from adxl_ros.model import signal_chain
 from adxl_ros.model.effects import base
 from adxl_ros.model.effects.base import Coefficient, Components, Environment, NOMINAL_ENVIRONMENT
@@ -143,31 +142,16 @@ def at_a_rail(sensor: Sensor, poses: Poses) -> np.ndarray:
     return (np.abs(poses.volts[:, :, None] - rails_v).min(axis=2) < reach_v).any(axis=1)
 
 
-_SHARE = 0.5
-"""Smallest share of a rest that must lie within the span of its pose (chosen: a span that was
-noted by hand is not exact)."""
-
-
-def with_table_angles(poses: Poses, table: PoseTable, epoch_ns: int) -> Poses:
-    """Give rests the angles of a table, by the times of its poses or in their order."""
-    starts = ', '.join(f'{start_s:.1f}' for start_s in poses.time_s[:, 0]) + ' s'
-    angles = table.angles_rad
-    if table.span_s is None and len(angles) != len(poses):
+def with_table_angles(poses: Poses, path: str, angles_rad: np.ndarray) -> Poses:
+    """Give rests the angles alpha and beta, (k, 2), of the rows of a table, in their order."""
+    if len(angles_rad) != len(poses):
+        starts = ', '.join(f'{start_s:.1f}' for start_s in poses.time_s[:, 0])
         raise UserError(
-            f'{table.path}: has {len(angles)} poses, but the recording has {len(poses)} rests, '
-            f'which begin at {starts}; write a row for each rest (with empty angles where they '
-            'are not known), or add the columns start_s and stop_s')
-    if table.span_s is not None:
-        angles, length_s = np.full((len(poses), 2), np.nan), np.diff(poses.time_s, axis=1)[:, 0]
-        begin_s, end_s = poses.time_s.T
-        for (start_s, stop_s), pose in zip(table.span_s - epoch_ns * 1e-9, table.angles_rad):
-            shared_s = np.minimum(end_s, stop_s) - np.maximum(begin_s, start_s)
-            angles[shared_s >= _SHARE * length_s * (stop_s > start_s)] = pose
-        if np.isnan(angles).any(axis=1).all():
-            raise UserError(f'{table.path}: no pose lies at a rest of the recording; the rests '
-                            f'begin at {starts}')
-    return Poses(poses.volts, poses.std_v, angles[:, 0], angles[:, 1], poses.time_s, poses.check,
-                 poses.temperature_c, poses.supply_v)
+            f'{path}: has {len(angles_rad)} poses, but the recording has {len(poses)} rests, '
+            f'which begin at {starts} s; write a row for each rest (with empty angles where they '
+            'are not known)')
+    return Poses(poses.volts, poses.std_v, angles_rad[:, 0], angles_rad[:, 1], poses.time_s,
+                 poses.check, poses.temperature_c, poses.supply_v)
 
 
 _ANGLE_STEP_RAD = 1e-4

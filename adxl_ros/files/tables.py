@@ -12,7 +12,7 @@ from io import StringIO
 import os
 from pathlib import Path
 import re
-from typing import Any, NamedTuple
+from typing import Any
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files.column_mapping import Quantity, Table, TableBlock, unit_in_name, UNITS
@@ -169,22 +169,11 @@ _ANGLES = ('alpha', 'beta', 'roll', 'pitch')  # Begin of the names of columns wi
 _LEVEL_RAD = 1e-9  # Largest sine of alpha at which beta does not matter
 
 
-class PoseTable(NamedTuple):
-    """Angles of k poses."""
-
-    path: str  # The file, for messages
-    angles_rad: np.ndarray  # Stage angles alpha and beta, rad, (k, 2); NaN where a pose has none
-    # First and last time of each pose, s by the clock of the recording, (k, 2); None where the
-    # rows are the rests in their order
-    span_s: np.ndarray | None
-
-
-def read_pose_table(path: str | os.PathLike) -> PoseTable:
+def read_pose_table(path: str | os.PathLike) -> np.ndarray:
     """
-    Read a table with a row for each pose.
+    Read a table of stage angles alpha and beta, rad, (k, 2); NaN where a pose has none.
 
-    Its columns are `alpha` and `beta`, or `roll` and `pitch`, each with its unit (`alpha_deg`),
-    and `start_s` and `stop_s`, or `time_s`, where the rows are not the rests in their order.
+    Its columns are `alpha` and `beta`, or `roll` and `pitch`, each with its unit (`alpha_deg`).
     """
     table = open_table(path)
     columns = {role: name for role in _ANGLES for name in table.names
@@ -195,12 +184,9 @@ def read_pose_table(path: str | os.PathLike) -> PoseTable:
         raise UserError(f'{path}: has no angles of the poses; expected the columns alpha_deg and '
                         f'beta_deg, or roll_deg and pitch_deg; the columns are '
                         f'{", ".join(table.names)}')
-    choices: tuple[tuple[str, ...], ...] = (('start_s', 'stop_s'), ('time_s', 'time_s'), ())
-    times = next(names for names in choices if set(names) <= set(table.names))
-    names = list(dict.fromkeys([columns[role] for role in pair] + [*times]))
-    values = table.read(names)
-    angles = []
-    for name in (columns[role] for role in pair):
+    names = [columns[role] for role in pair]
+    values, angles = table.read(names), []
+    for name in names:
         unit = unit_in_name(name, Quantity.ANGLE)
         if unit is None:
             raise UserError(f'{path}: column {name} states no unit; name it {name}_deg or '
@@ -211,5 +197,4 @@ def read_pose_table(path: str | os.PathLike) -> PoseTable:
     # At alpha 0 and 180 degrees beta does not matter, and people leave its cell empty.
     angles[1] = np.where(np.isnan(angles[1]) & (np.abs(np.sin(angles[0])) < _LEVEL_RAD), 0.0,
                          angles[1])
-    return PoseTable(table.path, np.column_stack(angles),
-                     np.column_stack([values[name] for name in times]) if times else None)
+    return np.column_stack(angles)
