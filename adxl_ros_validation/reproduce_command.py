@@ -80,7 +80,7 @@ def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> _Repro
             Path(path).name, extract_poses(read, unit)))
     result = calibration.calibrate(unit, recordings, 'full')
     cli.make_folder(folder / FIGURES)
-    unit_page.draw(folder / FIGURES / 'sweep.png', result)
+    write_bytes(folder / FIGURES / 'sweep.png', png(unit_page.paper_figure(result)))
     lines = '\n'.join(result.comments())
     paper = f'The paper: alpha {in_words("alpha")}; beta {in_words("beta")}.'
     page = (f"# The paper's calibration of {', '.join(paths)}\n\n```\n{lines}\n```\n\n{paper}\n\n"
@@ -103,9 +103,9 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Re
     unit = experiments.calibrated(truth, first)
     pictures = folder / FIGURES
     cli.make_folder(pictures)
-    unit_page.draw_sweep(pictures / 'sweep.png', experiments.bare(truth),
-                         unit.fitted['physical'], unit.poses)
-    for name, figure in (('misalignment', draw_misalignment(*results['paper'][0].directions)),
+    for name, figure in (('sweep', unit_page.draw_sweep(
+                             experiments.bare(truth), unit.fitted['physical'], unit.poses)),
+                         ('misalignment', draw_misalignment(*results['paper'][0].directions)),
                          ('tilt', draw_tilt(results['paper'][0])),
                          ('motion', draw_motion(unit.fitted, experiments.shaken(truth, first))),
                          ('components', draw_components(truth, unit.fitted))):

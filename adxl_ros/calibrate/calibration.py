@@ -357,9 +357,7 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
         misfit_mps2=float(np.hypot(base.envelope.misfit_mps2, misfit_mps2))))
     fitted = with_provenance(fitted, source, poses, data_sha256, {
         'reference': 'rest over temperature', 'base': base.provenance.get('id', base.serial),
-        'residual_mg': f'{misfit_mps2 / G0_MPS2 * 1e3:.4f}',
-        'sweep': f'{len(blocks)} blocks at rest, {fit.span_c[0]:.1f} to '
-                 f'{fit.span_c[1]:.1f} degC'})
+        'residual_mg': f'{misfit_mps2 / G0_MPS2 * 1e3:.4f}'})
     covered = thermal_fit.passed(blocks.temperature_c, (low_c, high_c))
     error_mg = thermal_fit.expected_error_mg(fit, covered, calibrated_c)
     std = dict(zip(fit.names, Z_90 * np.sqrt(np.diag(fit.covariance))))

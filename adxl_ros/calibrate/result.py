@@ -11,7 +11,7 @@ import hashlib
 import os
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
-from adxl_ros.calibrate.poses import planes, Poses
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.errors import UserError
@@ -27,8 +27,6 @@ from adxl_ros.process import package_version
 from adxl_ros.report.quantities import decimals, mg_text
 import numpy as np
 
-_SAME_BETA_RAD = 1e-3
-"""Smaller changes of beta are no step of the sweep, rad. Chosen: below any step of a plan."""
 _SAME_FIT_TOLERANCE = 1e-6
 """Largest relative difference of coefficients of the same fit: the rounding in a file."""
 
@@ -101,18 +99,14 @@ class CalibrationResult:
 
 def coefficient_lines(sensor: Sensor) -> list[str]:
     """Return the fitted coefficients with their 90 % intervals as text."""
-    by_name: dict[str, list[str]] = {}
-    for row in compare(sensor, sensor):
-        # After a comma stands the other axis, which differs from axis to axis.
-        by_name.setdefault(row.name if ', ' in row.label else row.label, []).append(
-            f'{row.axis} {row.fitted:.6g} +- {row.half_width:.2g} {row.unit}'.strip())
     return [f'{sensor.serial}: {sensor.model} model, coefficient +- half of its 90 % interval',
-            *(f'  {name:34} {"   ".join(by_axis)}' for name, by_axis in by_name.items())]
+            *(f'  {row.label:{_LONGEST_LABEL}} {row.axis:1} {rounded(row, row.fitted):>10} +- '
+              f'{rounded(row, row.half_width)} {row.unit}' for row in compare(sensor, sensor))]
 
 
 def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,
                     results: Mapping[str, str]) -> Sensor:
-    """Add date, sources, sweep, data hash, results and id to a fitted unit."""
+    """Add date, sources, data hash, results and id to a fitted unit."""
     entries = {
         **{key: text for key, text in fitted.provenance.items() if key.endswith('_from')},
         # A text of YAML, where +00:00 makes a date, which ros2 param cannot set.
@@ -120,7 +114,7 @@ def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,
         'package_version': package_version(), 'source': source,
         'data_sha256': data_sha256 or _sha256(poses),
         'poses': str(int((~poses.check).sum())), 'check_poses': str(int(poses.check.sum())),
-        'sweep': _sweep_text(poses), 'temperature_c': _mean_text(poses.temperature_c, '.2f'),
+        'temperature_c': _mean_text(poses.temperature_c, '.2f'),
         'supply_v': _mean_text(poses.supply_v, '.4f'), **results}
     calibration_id = calibration_store.calibration_id(replace(fitted, provenance=entries))
     return replace(fitted, provenance={'id': calibration_id, **entries})
@@ -134,24 +128,6 @@ def _sha256(poses: Poses) -> str:
         digest.update(f'{field.name} {values.shape}'.encode())
         digest.update(values.tobytes())
     return digest.hexdigest()
-
-
-def _sweep_text(poses: Poses) -> str:
-    """Describe the fitted poses: planes, range and steps of beta, directions."""
-    fitted = poses.subset(~poses.check)
-    if not np.isfinite(fitted.alpha_rad).all():
-        return f'{len(fitted)} rests in directions of its own, against gravity'
-    first, last, lowest, highest = np.degrees([
-        fitted.alpha_rad.min(), fitted.alpha_rad.max(), fitted.beta_rad.min(),
-        fitted.beta_rad.max()])
-    changes = np.diff(fitted.beta_rad)
-    steps = np.abs(changes)[np.abs(changes) > _SAME_BETA_RAD]
-    step = np.degrees(np.median(steps)) if steps.size else 0.0
-    both_ways = (changes > _SAME_BETA_RAD).any() and (changes < -_SAME_BETA_RAD).any()
-    # Without a colon: ros2 param reads the text as YAML again.
-    return (f'{len(fitted)} poses, {len(planes(fitted.alpha_rad))} planes alpha from '
-            f'{first:.0f} to {last:.0f} deg; beta {lowest:.0f} to {highest:.0f} '
-            f'deg, steps of {step:.0f}, {"both directions" if both_ways else "one direction"}')
 
 
 def _mean_text(values: np.ndarray, digits: str) -> str:
@@ -242,15 +218,11 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
 
 
 def errors_in_words(fitted: Sensor) -> str:
-    """Return the largest errors of the uncalibrated sensor, for people."""
+    """Return the largest zero-g error of the uncalibrated sensor, for people."""
     offset_g = (fitted.zero_g_v - fitted.nominal_zero_g_v) / fitted.nominal_scale_v_per_g
-    gain = fitted.scale_v_per_g / fitted.nominal_scale_v_per_g - 1
-    first, second = int(np.argmax(np.abs(offset_g))), int(np.argmax(np.abs(gain)))
-    shift, slope = ('much' if error > 0 else 'little'
-                    for error in (offset_g[first], gain[second]))
-    return (f'Uncalibrated, {fitted.axes[first]} reads {mg_text(abs(offset_g[first]) * G0_MPS2)} '
-            f'too {shift}, and {fitted.axes[second]} {abs(100 * gain[second]):.2g} % too '
-            f'{slope}.')
+    axis = int(np.argmax(np.abs(offset_g)))
+    return (f'Uncalibrated, {fitted.axes[axis]} reads {mg_text(abs(offset_g[axis]) * G0_MPS2)} '
+            f'too {"much" if offset_g[axis] > 0 else "little"}.')
 
 
 _LONGEST_LABEL = 26  # Columns that a coefficient's name may take, so that its line has at most 79
@@ -279,43 +251,16 @@ def rounded(row: Comparison, value: float) -> str:
     return f'{round(value, places) + 0.0:.{places}f}'
 
 
-_QUANTITIES = {
-    'zero-g': ('zero_g_v', Coefficient('bias', 'offset_v'), 'mg'),
-    'scale factor': ('scale_v_per_g', Coefficient('scale_factor', 'offset_v_per_g'), 'permille')}
-"""Field of a sensor, fitted parameter, and unit of a change of what calibrations compare."""
-
-
 def history(newest: Sensor, stored: Sequence[Sensor]
-            ) -> tuple[list[str], list[list[str]], str] | None:
-    """Return head and rows of the calibrations with other data, and what has changed."""
-    by_data: dict[str, Sensor] = {}
-    for sensor in (*stored, newest):
-        # Two fits of the same data show no drift: only the last one counts.
-        if sensor.axes == newest.axes:
-            data = sensor.provenance.get('data_sha256') or calibration_store.calibration_id(sensor)
-            by_data.pop(data, None)
-            by_data[data] = sensor
-    if len(by_data) < 2:
-        return None
-    rows = [[sensor.provenance.get('date', f'no. {i}')[:16].replace('T', ' '),
+            ) -> tuple[list[str], list[list[str]]] | None:
+    """Return head and rows of the calibrations of a unit; None without an earlier one."""
+    rows = [[sensor.provenance.get('date', '-')[:16].replace('T', ' '),
              calibration_store.calibration_id(sensor), sensor.model,
              sensor.provenance.get('temperature_c', '-'),
              *(f'{value:.5f}' for value in (*sensor.zero_g_v, *sensor.scale_v_per_g))]
-            for i, sensor in enumerate(by_data.values(), 1)]
-    before, now = list(by_data.values())[-2:]
-    changes = []
-    for label, (field, parameter, unit) in _QUANTITIES.items():
-        for d, axis in enumerate(now.axes):
-            name, scale = replace(parameter, axis=axis), 1e3 / now.scale_v_per_g[d]
-            variance = sum(float(sensor.covariance[i, i]) for sensor in (before, now)
-                           for i, own in enumerate(sensor.covariance_names) if own == name)
-            change = scale * (getattr(now, field) - getattr(before, field))[d]
-            half_width = scale * Z_90 * variance ** 0.5
-            if abs(change) > half_width:
-                changes.append(f'{label} of {axis} changed by {change:+.2f} +- {half_width:.2f} '
-                               f'{unit}')
+            for sensor in (*stored, newest) if sensor.axes == newest.axes]
+    if len(rows) < 2:
+        return None
     head = ['date', 'id', 'model', 'temperature, °C',
-            *(f'{label} {axis}' for label in _QUANTITIES for axis in newest.axes)]
-    return head, rows, f'Since {rows[-2][1]}, {rows[-2][0]}' + (
-        f': {"; ".join(changes)}.' if changes else
-        ', nothing has changed beyond the 90 % intervals.')
+            *(f'{label} {axis}' for label in ('zero-g', 'scale factor') for axis in newest.axes)]
+    return head, rows

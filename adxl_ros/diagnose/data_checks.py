@@ -22,7 +22,7 @@ from adxl_ros.diagnose import comparison as baseline, noise_effects
 from adxl_ros.diagnose.comparison import BaselineComparison, compare, Reference, SMALLEST_MOTION_G
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model import noise
-from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD, Z_90
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.recorded_sensor import find_polarity_fault
@@ -47,8 +47,7 @@ motion that repeats fits at several shifts."""
 _LARGEST_ERROR_RATIO = 0.5
 """A shift shows if it reduces 1 − correlation below this share. Chosen: noise that is not shifted
 keeps it."""
-_BLOCKS, _FINE_SAMPLES = 10, 20_000
-"""Blocks and samples of the fine search. Chosen: their scatter shows the error to 24 %."""
+_FINE_SAMPLES = 20_000  # Largest number of samples of the fine search. Chosen: run time
 _SAME_ROUGHNESS = 1.05
 """Ratio of the steps of two residuals up to which they are equal. Chosen: above its scatter by
 noise in a thousand samples."""
@@ -108,20 +107,6 @@ class DataFault(Exception):
     comparisons: tuple[BaselineComparison, ...] = ()
 
 
-class _Shift(NamedTuple):
-    """How much later the motion of a simulator is stamped than that of a recording."""
-
-    late_s: float  # The shift, s; negative where the simulator is early
-    std_s: float  # Its standard deviation, s
-    correlation: float  # Correlation of the two motions without the shift
-
-    @property
-    def text(self) -> str:
-        """Return the shift with its 90 % error and correlation, for people."""
-        return (f'{abs(self.late_s):.4f} s {"late" if self.late_s > 0 else "early"} '
-                f'(± {Z_90 * self.std_s:.4f} s, correlation {self.correlation:.3f})')
-
-
 def _align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bool
                  ) -> tuple[Recording, Motion, list[str]]:
     """
@@ -131,26 +116,26 @@ def _align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: b
     """
     force, notes = sim.force, []
     assert isinstance(force, ForcePath)
-    shift = _find_shift(recording, sensor, force)
-    if shift and may_shift:
-        force = force.shifted(-shift.late_s)
-        notes = [f'--align: {force.name} was {shift.text}, and is shifted by '
-                 f'{-shift.late_s:+.6g} s; a latency of the sensor is a part of that and cannot '
-                 'show']
+    late_s = _find_shift(recording, sensor, force)
+    shift = f'{abs(late_s):.4f} s {"late" if late_s > 0 else "early"}' if late_s else ''
+    if late_s and may_shift:
+        force = force.shifted(-late_s)
+        notes = [f'--align: {force.name} was {shift}, and is shifted by {-late_s:+.6g} s; a '
+                 'latency of the sensor is a part of that and cannot show']
     elif may_shift:
         notes = [f'--align: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may be an '
                  'effect of the sensor (time_offset), and nothing is shifted']
     covered, begin_s, end_s = _covered(recording, force)
     span = f'it is from {begin_s:.6g} to {end_s:.6g} s'
     if not len(covered):
-        advice = f'its motion fits, but is {shift.text}; use --align' if shift else \
+        advice = f'its motion fits, but is {shift}; use --align' if shift else \
             'no shift makes its motion fit; give that of this recording'
         raise DataFault('no_overlap', f'{force.name} does not overlap the recording in time: '
                         f'{span}, {basename(recording.path)} from {recording.time_s[0]:.6g} to '
                         f'{recording.time_s[-1]:.6g} s; {advice}')
-    if shift and not may_shift:
-        raise DataFault('time_misaligned', f'{force.name} is {shift.text}; use --align, or '
-                        f'shift its stamps by {-shift.late_s:+.6g} s')
+    if late_s and not may_shift:
+        raise DataFault('time_misaligned', f'{force.name} is {shift}; use --align, or '
+                        f'shift its stamps by {-late_s:+.6g} s')
     if len(covered) < len(recording):
         outside_s = (1 - len(covered) / len(recording)) * float(np.ptp(recording.time_s))
         notes.append(f'left out: {outside_s:.3g} s of the recording that {force.name} does not '
@@ -165,9 +150,9 @@ def _covered(recording: Recording, force: ForcePath) -> tuple[Recording, float, 
         np.searchsorted(recording.time_s, end_s, 'right'))), begin_s, end_s
 
 
-def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> _Shift | None:
+def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> float | None:
     """
-    Return the shift of a simulator from the cross-correlation of both motions over all overlaps.
+    Return how much later a simulator is stamped, s, by the cross-correlation of both motions.
 
     None where it may be a latency, or does not show.
     """
@@ -191,8 +176,8 @@ def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> _Shif
             abs(lags_s[unshifted]) < step_s and 1 - correlation[best]
             > _LARGEST_ERROR_RATIO * (1 - correlation[unshifted])):
         return None
-    fine = _fine_shift(recording, sensor, force, float(lags_s[best]), float(correlation[best]))
-    return fine if abs(fine.late_s) > LARGEST_LATENCY_S else None
+    late_s = _fine_shift(recording, sensor, force, float(lags_s[best]))
+    return late_s if abs(late_s) > LARGEST_LATENCY_S else None
 
 
 def _correlations(first: np.ndarray, second: np.ndarray, smallest: int
@@ -221,9 +206,8 @@ def _correlations(first: np.ndarray, second: np.ndarray, smallest: int
             np.where(compared, correlation, -1.0))
 
 
-def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: float,
-                correlation: float) -> _Shift:
-    """Fit shift, zero-g and scale factor to blocks of the recording, from a rough shift."""
+def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: float) -> float:
+    """Fit shift, s, zero-g and scale factor to the recording, from a rough shift."""
     shifted = force.shifted(-late_s)
     covered, begin_s, end_s = _covered(recording, shifted)
     comparison = compare(covered, sensor, Motion(float(end_s - begin_s), force=shifted))
@@ -234,21 +218,18 @@ def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: 
         & (time_s < time_s[-1] - LARGEST_LATENCY_S)
     rows = np.flatnonzero(inside)[::max(1, len(recording) // _FINE_SAMPLES)]
 
-    def left_v2(more_s: float, part: np.ndarray) -> float:
-        """Return what zero-g and scale factor leave of a part after a further shift."""
+    def left_v2(more_s: float) -> float:
+        """Return what zero-g and scale factor leave after a further shift."""
         left = 0.0
-        for measured, simulated in zip(volts[part].T, simulated_v.T):
-            line = np.column_stack([np.ones(len(part)), np.interp(
-                time_s[part] + more_s, time_s, simulated)])
+        for measured, simulated in zip(volts[rows].T, simulated_v.T):
+            line = np.column_stack([np.ones(len(rows)), np.interp(
+                time_s[rows] + more_s, time_s, simulated)])
             left += float(np.sum((measured - line @ np.linalg.lstsq(line, measured)[0]) ** 2))
         return left
 
-    more_s, *of_blocks = (float(scipy.optimize.minimize_scalar(
-        left_v2, bounds=(-LARGEST_LATENCY_S, LARGEST_LATENCY_S), args=(part,), method='bounded',
-        options={'xatol': 1e-6}).x) for part in (rows, *np.array_split(rows, _BLOCKS)))
-    # A block at rest shows no shift, so that the median scatter counts.
-    std_s = MAD_TO_STD * float(np.median(np.abs(np.subtract(of_blocks, more_s)))) / _BLOCKS ** 0.5
-    return _Shift(late_s + more_s, std_s, correlation)
+    return late_s + float(scipy.optimize.minimize_scalar(
+        left_v2, bounds=(-LARGEST_LATENCY_S, LARGEST_LATENCY_S), method='bounded',
+        options={'xatol': 1e-6}).x)
 
 
 def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, may_shift: bool

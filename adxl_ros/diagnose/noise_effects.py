@@ -6,7 +6,7 @@ An effect names its detector in its own file; the detector estimates its paramet
 gap does not show such effects, and the simulator gives a line a phase, and spikes their instants,
 that are not those of the recording. The same statistic of recording and simulation is compared
 instead: power by band, the amplitude of a line, the rate and size of spikes, the share of
-repeated samples, the distance of codes, the level of the noise, the Allan deviation of a drift.
+repeated samples, the distance of codes, the level of the noise.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from adxl_ros.diagnose.comparison import at_search_rate, BaselineComparison, code_step_v
-from adxl_ros.diagnose.evidence import bridged, drifts_among
+from adxl_ros.diagnose.comparison import BaselineComparison, code_step_v
+from adxl_ros.diagnose.evidence import bridged
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD
 from adxl_ros.model.effects import effect_named, library
@@ -64,9 +64,6 @@ several axes; the largest one. Chosen: in 10⁵ samples, chance explains runs of
 _BANDS, _LOWEST_EDGE_HZ, _TIMES_S = 5, 0.05, (0.1, 1.0, 10.0)
 """Bands of frequency, smallest edge, Hz, and averaging times of the Allan deviation, s. Chosen:
 half a decade each; a period of 20 s."""
-_DRAWS, _LONGEST_ALLAN_S, _ALLAN_WINDOWS = 4, 10.0, 10
-"""Drawn recordings of a drift, and averaging time of its Allan deviation, s: at most so many times
-shorter than the recording. Chosen: fewer means scatter by more."""
 
 
 @dataclass(frozen=True)
@@ -360,18 +357,13 @@ def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sen
     """Compare the noise-like effects of the recordings with those of their simulation."""
     # By effect, quantity and unit: pairs of recorded and simulated values, one of each recording
     values: dict[tuple[str, str, str], list] = {}
-    for c in comparisons:
+    for c in comparisons if detections else ():
         signals = [(c.volts, bridged(c.residual_v(mean_sensor), c.used)),
-                   _simulated(c, named_sensor, seed)] if detections else []
+                   _simulated(c, named_sensor, seed)]
         for detection in detections:
             recorded, simulated = (list(_statistics(c, detection, *s)) for s in signals)
             for (quantity, unit, value), (*_, other) in zip(recorded, simulated):
                 values.setdefault((detection.effect, quantity, unit), []).append((value, other))
-        averaging_s = min(_LONGEST_ALLAN_S, min(o.span_s for o in comparisons) / _ALLAN_WINDOWS)
-        for drift in drifts_among(named_sensor.effects):
-            values.setdefault((drift, f'Allan deviation at {averaging_s:.2g} s', 'm/s^2'),
-                              []).append(_allan_values(at_search_rate(c), mean_sensor,
-                                                       named_sensor, averaging_s, seed))
     remainders: list[NoiseRemainder] = []
     for key, pairs in values.items():
         recorded, simulated = np.sqrt(np.mean(np.square(np.array(pairs, float)), axis=0))
@@ -417,16 +409,6 @@ def _statistics(comparison: BaselineComparison, detection: Detection, volts: np.
         lost = coarse_codes(volts, sensor)
         bits = sum(lost.values.values()) if lost else np.zeros(len(scale))
         yield 'distance of codes', 'm/s^2', sensor.lsb_v * 2 ** bits / scale
-
-
-def _allan_values(comparison: BaselineComparison, mean_sensor: Sensor, named_sensor: Sensor,
-                  averaging_s: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return Allan deviations of the recording and of the simulation, m/s², (m,) each."""
-    count, scale = round(averaging_s * comparison.sensor.rate_hz), comparison.scale_v_per_mps2
-    recorded_v = bridged(comparison.residual_v(mean_sensor), comparison.used)
-    squares = [allan_deviation(comparison.simulated_noise_v(named_sensor, seed + i), count) ** 2
-               for i in range(_DRAWS)]
-    return allan_deviation(recorded_v, count) / scale, np.sqrt(np.mean(squares, axis=0)) / scale
 
 
 def floor_without(floor_mps2: float, remainders: Sequence[NoiseRemainder], stated_mps2: float

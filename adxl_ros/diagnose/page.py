@@ -139,7 +139,7 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
         'where': [_cell(c) for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
         'menu': [[m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
                  for m in proposal['menu']] if proposal else [],
-        'could_show': [(row.shows, *words.shown_row(row, scale)) for row in report.could_show]}
+        'could_show': [(row.shows, *words.shows_row(row, scale)) for row in report.could_show]}
 
 
 def _cell(cell: ResidualCell) -> list[str]:
@@ -271,11 +271,10 @@ def _spectra(comparison: BaselineComparison, signals_v: Mapping[str, np.ndarray]
     panels = []
     for d, axis in enumerate(sensor.axes):
         curves = {label: np.where(v[:, d] > 0, v[:, d], np.nan) for label, v in densities.items()}
-        panels.append(({'title': {'text': f'{axis}, mg/√Hz'},
-                        **plots.log_axis(np.concatenate(list(curves.values())))},
+        panels.append(({'title': {'text': f'{axis}, mg/√Hz'}, 'type': 'log'},
                        [line(hz, v, label, _CURVE_COLOURS[label]) for label, v in curves.items()]))
     return _stacked(panels, 60 + 190 * len(panels), _WIDE,
-                    {'title': {'text': Over.FREQUENCY.value}, **plots.log_axis(hz)})
+                    {'title': {'text': Over.FREQUENCY.value}, 'type': 'log'})
 
 
 def waterfall(report: Report) -> Figure:

@@ -29,8 +29,6 @@ _MOST_CELLS = 40  # Largest number of cells in the report. Chosen: cells of smal
 PROBABLE = 0.05
 """Smallest probability of what terminal and page show first. Chosen: that of a rival."""
 _WITHOUT_GAP = ('no_gap', 'insufficient')  # Verdicts in which there is no gap to close
-_MATTERS = 0.3
-"""Error of the reference, in material amplitudes, that is shown: it adds 5 % to them."""
 _FLOOR_SOURCES = {'still': 'from rests', 'repeats': 'from repeats of a trajectory',
                   'assumed': 'assumed from the parameter file'}
 _DIMENSIONS = {
@@ -292,12 +290,9 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
             sorted(verdict.best), 'and') if verdict.best else 'no effect on the mean'))
     rows.append(Row('repeats, not explained', quantities.power_text(verdict.rest),
                     'by flexible functions, held out'))
-    text, note = f'from {mg_text(verdict.material_mps2)}', 'smaller is no gap'
-    if verdict.reference_mps2 > _MATTERS * verdict.material_mps2:
-        highest = float(np.hypot(verdict.material_mps2, verdict.reference_mps2))
-        text += f', {mg_text(highest)} if it follows the pose'
-        note += f'; the reference has errors of {mg_text(verdict.reference_mps2)}'
-    rows.append(Row('material', text, note))
+    rows += [Row('material', f'from {mg_text(verdict.material_mps2)}', 'smaller is no gap'),
+             Row('errors of the reference', mg_text(verdict.reference_mps2),
+                 'what follows the pose must exceed them, too')]
     fading_hz = [c.fading_hz for c in diagnosis.comparisons if c.fading_hz is not None]
     if report.linear_model.lost_motion_mps2:
         rows.append(Row('not in the reference', f'{mg_text(report.linear_model.lost_motion_mps2)} '
@@ -334,23 +329,17 @@ def closes(report: Report) -> bool:
         and not is_only_noise(report)
 
 
-def shown_row(row: CouldShow, scale_v_per_g: float) -> list[str]:
-    """Return effect, parameter, smallest and typical size, and the manoeuvre that shows it."""
-    p, revealed_by = parameter_of(row.name), effect_named(row.name.effect).diagnosis.revealed_by
-    smallest, typical = (quantities.parameter_text({'value': v, 'unit': p.unit}, scale_v_per_g, 2)
-                         for v in (row.smallest, p.scale))
-    return [row.name.effect, quantities.parameter_label(p.name, False),
-            smallest if row.shows else 'cannot show', typical,
-            MENU[revealed_by].text if revealed_by else '']
-
-
 def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]:
     """Return effect, smallest and typical size, and what is missing to show it; '' for nothing."""
-    effect, _, smallest, typical, manoeuvre = shown_row(row, scale_v_per_g)
-    of_reference = effect_named(effect).concern is Concern.REFERENCE
-    return effect, smallest, typical, '' if row.shows else \
-        'needs --sim' if of_reference else \
-        f'needs: {manoeuvre}' if manoeuvre else 'no manoeuvre shows it'
+    p, effect = parameter_of(row.name), effect_named(row.name.effect)
+    smallest, typical = (quantities.parameter_text({'value': v, 'unit': p.unit}, scale_v_per_g, 2)
+                         for v in (row.smallest, p.scale))
+    if row.shows:
+        return effect.name, smallest, typical, ''
+    revealed_by = effect.diagnosis.revealed_by
+    missing = 'needs --sim' if effect.concern is Concern.REFERENCE else \
+        f'needs: {MENU[revealed_by].text}' if revealed_by else 'no manoeuvre shows it'
+    return effect.name, 'cannot show', typical, missing
 
 
 _BADGE_COLUMNS, _GAP_COLUMNS, _LABEL_COLUMNS = 29, 24, 9

@@ -171,10 +171,9 @@ _LEVEL_RAD = 1e-9  # Largest sine of alpha at which beta does not matter
 
 def read_pose_table(path: str | os.PathLike) -> np.ndarray:
     """
-    Return the stage angles alpha and beta of a table, rad, (k, 2): a row for each rest.
+    Read a table of stage angles alpha and beta, rad, (k, 2); NaN where a pose has none.
 
-    Its columns are `alpha` and `beta`, or `roll` and `pitch`, each with its unit (`alpha_deg`). A
-    pose without angles is NaN.
+    Its columns are `alpha` and `beta`, or `roll` and `pitch`, each with its unit (`alpha_deg`).
     """
     table = open_table(path)
     columns = {role: name for role in _ANGLES for name in table.names
@@ -186,8 +185,7 @@ def read_pose_table(path: str | os.PathLike) -> np.ndarray:
                         f'beta_deg, or roll_deg and pitch_deg; the columns are '
                         f'{", ".join(table.names)}')
     names = [columns[role] for role in pair]
-    values = table.read(names)
-    angles = []
+    values, angles = table.read(names), []
     for name in names:
         unit = unit_in_name(name, Quantity.ANGLE)
         if unit is None:

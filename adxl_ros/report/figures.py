@@ -22,7 +22,6 @@ BEFORE_COLOUR = '#c0392b'  # Colour of what the simulator lacks at first
 AFTER_COLOUR = '#2a8a43'  # Colour of the state after a correction
 QUIET_COLOUR = '#7b8794'  # Colour of what is only there for comparison
 _DIGITS = 5  # Significant digits of plotted values (chosen: below a pixel of a zoomed plot)
-_FINE_DECADES = 4  # Decades from which a logarithmic axis has a tick at the powers of ten only
 _FONT = {'family': 'system-ui, "DejaVu Sans", sans-serif', 'size': 12, 'color': '#1f2933'}
 _GRID = {'gridcolor': '#e4e7eb', 'zerolinecolor': '#9aa5b1', 'linecolor': '#9aa5b1',
          'automargin': True, 'exponentformat': 'none', 'hoverformat': '.4~g'}
@@ -60,17 +59,6 @@ def points(x: Iterable[float], y: Iterable[float], half_width: Iterable[float], 
 def axis_number(name: str, number: int) -> str:
     """Return plotly's name of the i-th axis of a figure."""
     return name if number == 1 else f'{name}{number}'
-
-
-def log_axis(values: np.ndarray) -> Figure:
-    """Return the properties of a logarithmic axis with ticks at 1, 2 and 5 of each decade."""
-    positive = values[values > 0]
-    low, high = (float(f(positive)) for f in (np.min, np.max)) if positive.size else (1.0, 10.0)
-    decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
-    fine = (1, 2, 5) if len(decades) < _FINE_DECADES else (1,)
-    ticks = [float(f'{step * decade:.1g}') for decade in decades for step in fine]
-    return {'type': 'log', 'tickmode': 'array', 'tickvals': ticks,
-            'ticktext': [np.format_float_positional(tick, trim='-') for tick in ticks]}
 
 
 def rounded(values: Iterable[float]) -> list[float | None]:

@@ -75,14 +75,6 @@ def short_time(seconds: float) -> str:
     return f'{1e3 * seconds:.3g} ms' if abs(seconds) >= 1e-6 else '< 0.001 ms'
 
 
-def file_size(count: int) -> str:
-    """Return a number of bytes with its prefix."""
-    for factor, unit in ((1e9, 'GB'), (1e6, 'MB'), (1e3, 'kB')):
-        if count >= factor:
-            return f'{count / factor:.3g} {unit}'
-    return f'{count} B'
-
-
 def listed(names: Sequence[str], word: str) -> str:
     """Return names separated by commas, with a word before the last one."""
     return f' {word} '.join(filter(None, [', '.join(names[:-1]), *names[-1:]]))

@@ -53,18 +53,15 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--journal', metavar='FILE',
                        help='use the rests that the journal of this sweep names')
     parse.add_argument('--poses', metavar='FILE',
-                       help='table with the angles of each rest: alpha_deg and beta_deg, or '
-                            'roll_deg and pitch_deg')
+                       help='table with the angles of each rest, in their order: alpha_deg and '
+                            'beta_deg, or roll_deg and pitch_deg')
     parse.add_argument('-o', dest='output', metavar='FILE.yaml', required=True,
                        help='the parameter file of the calibrated sensor')
     parse.add_argument('--report', metavar='DIR',
-                       help='write the page report.html and its plots there')
+                       help='write the page report.html there')
     parse.add_argument('--dcc', metavar='FILE.xml',
                        help='write a Digital Calibration Certificate of a calibration on a stage, '
                             f'by the schema DCC {gum.SCHEMA_VERSION} of PTB')
-    parse.add_argument('--dcc-data', metavar='FILE',
-                       help='YAML file with what a laboratory states for it, as laboratory_name, '
-                            'customer_name, responsible, gravity_std_mps2')
     parse.add_argument('--store', metavar='DIR', default=str(calibration_store.default_folder()),
                        help='the calibration store, which gets a copy (default: %(default)s); '
                             'empty for none')
@@ -85,7 +82,6 @@ def fit(options: argparse.Namespace) -> int:
         raise UserError('--journal and --poses: one of them names the rests of one recording')
     if options.report or options.dcc:
         html_page.check_libraries()
-    laboratory = gum.read_laboratory(options.dcc_data)
     population = calibration_store.read_population(options.prior) if options.prior else None
     records = sweep_journal.poses_to_fit(sweep_journal.read(options.journal).entries) \
         if options.journal else None
@@ -131,14 +127,14 @@ def fit(options: argparse.Namespace) -> int:
                 with_axes(base, unit.axes), thermal, Path(options.recording[0]).name, sha)
         result = replace(result, details=[*result.details, *measured])
         if options.dcc:
-            gum.write(options.dcc, result, laboratory)
+            gum.write(options.dcc, result)
         if options.report:
             show(0.6, 'report')
             cli.make_folder(Path(options.report))
-            page.write(options.report, result, options.store, laboratory)
+            page.write(options.report, result, options.store)
     result.save(options.output)
     cli.note(f'fit: {result.keep(options.store)}')
-    report = [Path(options.report) / name for name in page.FILES] if options.report else []
+    report = [Path(options.report) / page.PAGE] if options.report else []
     report += [Path(options.dcc)] if options.dcc else []
     fitted = result.fitted
     # What was wrong with the unit, and what is fitted

@@ -25,7 +25,7 @@ from adxl_ros.fleet.row import (
 )
 from adxl_ros.fleet.run import only_client, Plan, plan, Results, work
 from adxl_ros.report.page import command_of_this_process
-from adxl_ros.report.quantities import counted, duration, file_size
+from adxl_ros.report.quantities import counted, duration, number
 from adxl_ros.tools import command_line as cli
 from adxl_ros.workers import open_pool, RETRIES
 
@@ -134,12 +134,13 @@ def _plan_lines(to_do: Plan, results: Results) -> list[str]:
     units = Counter(source.serial or stated or known.get(source.url) or NO_UNIT
                     for source, (stated, _) in zip(to_do.todo, stated_by(to_do.todo)))
     unknown = units.pop(NO_UNIT, 0)
-    largest = ', '.join(f'{serial} ({number})' for serial, number in units.most_common(_UNITS))
+    largest = ', '.join(f'{serial} ({count})' for serial, count in units.most_common(_UNITS))
     rows = {'done already': str(to_do.done), 'left out': _left_out(to_do),
             'core hours': f'{to_do.core_hours:.3g}',
             'units': largest and f'{len(units)}: {largest}{", ..." * (len(units) > _UNITS)}',
             'unknown unit': counted(unknown, 'recording')}
-    return [f'{counted(len(to_do.todo), "recording")} to do, {file_size(to_do.size_bytes)}, about '
+    size_gb = number(to_do.size_bytes / 1e9, digits=2)
+    return [f'{counted(len(to_do.todo), "recording")} to do, {size_gb} GB, about '
             f'{duration(3600 * to_do.core_hours)} of one core', '',
             *(f' {name:13}{text}' for name, text in rows.items() if text), '']
 

@@ -25,7 +25,7 @@ def test_simulate_fit_and_apply_make_one_path(run_tool, tmp_path):
     assert done.returncode == 0, done.stderr
     assert '<si:uncertaintyXMLList>' in (tmp_path / 'certificate.xml').read_text()
     assert 'full model' in done.stdout and 'poses that the fit has not seen' in done.stdout
-    assert (tmp_path / 'figures' / 'calibration.png').stat().st_size > 20000
+    assert (tmp_path / 'figures' / 'report.html').stat().st_size > 20000
     fitted = parameter_file.load(tmp_path / 'unit.yaml')
     np.testing.assert_allclose(fitted.zero_g_v, truth.zero_g_v, atol=5e-4)
     np.testing.assert_allclose(fitted.scale_v_per_g, truth.scale_v_per_g, atol=5e-4)

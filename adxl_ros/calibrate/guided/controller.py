@@ -340,8 +340,7 @@ class Controller:
         if session is not None:
             guide = session.guide
             values |= {'phase': status.phase.value, 'pose': str(guide.pose_number),
-                       'next': guide.destination(), 'accepted': str(session.accepted_count),
-                       **guide.values()}
+                       'next': guide.destination(), 'accepted': str(session.accepted_count)}
             tilt_rad = guide.tilt_error_rad()
             if np.isfinite(tilt_rad):
                 values['tilt_error_deg'] = float(np.degrees(tilt_rad))

@@ -302,10 +302,6 @@ class Guide:
         """Return the poses for the fit: the accepted ones, by number."""
         return [self.accepted[number] for number in sorted(self.accepted)]
 
-    def values(self) -> dict[str, str | float]:
-        """Return further values for programs, by key."""
-        return {}
-
     def stillness(self) -> Stillness | None:
         """Return whether the newest samples are at rest; None while they are too few."""
         return self.newest.stillness()

@@ -308,20 +308,7 @@ class ThermalGuide(Guide):
     def next_pose(self) -> NextPose | None:
         """Return what to announce; None once the range is covered."""
         return None if self._passed.complete else \
-            NextPose(self.destination(), self.values(), None)
-
-    def values(self) -> dict[str, str | float]:
-        """Return span, coverage and expected error for programs, by key."""
-        low_c, high_c = self._settings.range_c
-        values: dict[str, str | float] = {
-            'range_c': f'{low_c:g} to {high_c:g}',
-            'warming': f'{self._passed.warming.mean():.0%}',
-            'cooling': f'{self._passed.cooling.mean():.0%}'}
-        if self.accepted:
-            values['span_c'] = f'{self._blocks_c.min():.1f} to {self._blocks_c.max():.1f}'
-        if self._error_mg is not None:
-            values['expected_error_mg'] = self._error_mg
-        return values
+            NextPose(self.destination(), {}, None)
 
     def status(self) -> Status:
         """Return what the guide waits for, with the values that matter."""
@@ -330,15 +317,10 @@ class ThermalGuide(Guide):
         if self._passed.complete:
             return Status(Phase.DONE, self.destination(), False)
         at_rest = self._dwell is not None and self._dwell.at_rest()
-        text, values = f'{len(self.accepted)} blocks; ', self.values()
-        if 'span_c' in values:
-            text += (f'{values["span_c"]} of {values["range_c"]} °C, warming '
-                     f'{values["warming"]}, cooling {values["cooling"]}; ')
-            if self._error_mg is not None:
-                text += f'expected error {self._error_mg:.2g} mg; '
-        if self._dwell is not None and not at_rest:
-            text += 'the sensor moves; '
-        return Status(Phase.DWELL if at_rest else Phase.REST, text + self.destination(), False)
+        motion = '' if at_rest or self._dwell is None else 'the sensor moves; '
+        (coverage, error), _ = self.estimated()
+        return Status(Phase.DWELL if at_rest else Phase.REST, f'{len(self.accepted)} blocks; '
+                      f'{coverage.text}; {error.text}; {motion}{self.destination()}', False)
 
     def progress(self) -> list[Row]:
         """Return temperature, readings and progress, for the screen."""

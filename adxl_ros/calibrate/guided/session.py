@@ -139,7 +139,7 @@ class Session:
         # The accepted poses on disk
         self.journal = sweep_journal.Journal(settings.journal, settings.head(unit), start_over)
         # A process that was killed while it wrote has left unfinished files.
-        places = [*(Path(settings.report, name) for name in page.FILES if settings.report),
+        places = [*([Path(settings.report, page.PAGE)] if settings.report else []),
                   settings.output, settings.journal]
         for place in places:
             remove_unfinished(place.parent, place.name)

@@ -11,11 +11,12 @@ from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.fits.linear import AFFINE
 from adxl_ros.calibrate.report import held_out
 from adxl_ros.calibrate.report.held_out import ErrorBudget, ErrorBudgets, HeldOutErrors, rms_mg
-from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.sensor import get, parameter_of, Sensor
-from adxl_ros.report.quantities import duration, with_half_width
+from adxl_ros.model.noise import sample_std_v
+from adxl_ros.model.sensor import parameter_of, Sensor
+from adxl_ros.report.quantities import duration
 import numpy as np
 import scipy
 
@@ -29,15 +30,13 @@ _NONLINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
 
 @dataclass(frozen=True)
 class Assessment:
-    """The outcomes of one model: PASS, FAIL or NOT SHOWN by limit, '' without a limit."""
+    """The outcomes of one model at the `limit`: PASS, FAIL or NOT SHOWN; '' without a limit."""
 
     model: str
     accel: ErrorBudget  # (m/s²)² per axis
     tilt: ErrorBudget  # rad²
-    accel_datasheet: str  # Against the typical nonlinearity of the datasheet
-    accel_noise: str  # Against the noise of one sample
-    tilt_datasheet: str = ''
-    tilt_noise: str = ''
+    accel_outcome: str
+    tilt_outcome: str
 
     @property
     def error_mg(self) -> float:
@@ -53,28 +52,24 @@ class Assessment:
 def assess(model: str, budgets: ErrorBudgets, sensor: Sensor, is_certain: bool = True
            ) -> Assessment:
     """
-    Compare the calibration error of one model, without noise and stage error, with its limits.
+    Compare the calibration error of one model, without noise and stage error, with its `limit`.
 
-    The limit by the datasheet is the typical nonlinearity at full scale, the only error that the
-    manufacturer's own calibration leaves. The limit by the noise is the noise of one sample, rms
-    over the axes. The limits of tilt are the tilt errors that such errors of each axis cause.
+    The limit of tilt is the tilt error that such errors of each axis cause.
 
     is_certain: whether the fit has converged and determines its coefficients. Else its errors at
     the held-out poses show nothing of others, so that it cannot pass.
     """
-    def outcome(budget: ErrorBudget, limit: float) -> str:
-        if not limit > 0:
+    def outcome(budget: ErrorBudget, limit_square: float) -> str:
+        if not limit_square > 0:
             return ''
         # Where stage and model are inseparable, the model part may be an error of the stage.
         certain = budget.calibration if budget.separable else budget.coefficients
-        passes = is_certain and budget.calibration_high <= limit
-        return FAIL if certain > limit else PASS if passes else NOT_SHOWN
+        passes = is_certain and budget.calibration_high <= limit_square
+        return FAIL if certain > limit_square else PASS if passes else NOT_SHOWN
 
-    datasheet, noise = nonlinearity_mps2(sensor) ** 2, held_out.sample_noise_mps2(sensor) ** 2
-    accel, tilt = budgets
-    return Assessment(model, accel, tilt, outcome(accel, datasheet), outcome(accel, noise),
-                      outcome(tilt, datasheet * tilt.tilt_per_axis),
-                      outcome(tilt, noise * tilt.tilt_per_axis))
+    (accel, tilt), square = budgets, limit(sensor)[0] ** 2
+    return Assessment(model, accel, tilt, outcome(accel, square),
+                      outcome(tilt, square * tilt.tilt_per_axis))
 
 
 def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, kept: np.ndarray
@@ -106,30 +101,23 @@ def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, ke
                     tilt_per_axis=2 / gravity ** 2))
 
 
-def nonlinearity_mps2(sensor: Sensor) -> float:
-    """Return the typical nonlinearity at full scale by the datasheet, m/s²; 0 if not stated."""
+def limit(sensor: Sensor) -> tuple[float, str]:
+    """
+    Return the limit of the error of acceleration, m/s², and where it comes from.
+
+    It is the typical nonlinearity at full scale by the datasheet, the only error that the
+    manufacturer's own calibration leaves; where none is stated, the noise of one sample.
+    """
     typical, _ = sensor.datasheet.get(_NONLINEARITY, (0.0, 0.0))
-    return typical * sensor.range_g ** 3 * G0_MPS2
+    if typical:
+        return typical * sensor.range_g ** 3 * G0_MPS2, 'datasheet'
+    noise_g = sample_std_v(sensor) / sensor.scale_v_per_g
+    return G0_MPS2 * float(np.sqrt(np.mean(noise_g ** 2))), 'noise of one sample'
 
 
 def _two_digits(value: float) -> str:
     """Write a value with two digits, the last zero too."""
     return f'{value:.0f}' if value >= 10 else f'{value:#.2g}'
-
-
-def unit_line(sensor: Sensor) -> list[str]:
-    """Name the coefficients whose whole 90 % interval exceeds the maximum of the datasheet."""
-    if not sensor.datasheet:
-        return []
-    names = sensor.covariance_names
-    half_widths = Z_90 * np.sqrt(np.diag(sensor.covariance))
-    beyond = [f'{name} is {with_half_width(float(value), half_width)} {parameter_of(name).unit}, '
-              f'beyond {maximum:g}'
-              for name, value, half_width in zip(names, get(sensor, names), half_widths)
-              for _, maximum in [sensor.datasheet.get(name.without_axis, (0.0, 0.0))]
-              if 0 < maximum < abs(value) - half_width]
-    return [f'unit within {sensor.datasheet_name or "its datasheet"}: '
-            + (f'{FAIL}: {"; ".join(beyond)}' if beyond else PASS)]
 
 
 LIMITS = {
@@ -147,7 +135,7 @@ def summary_lines(fitted: Sensor, assessment: Assessment | None, errors: Sequenc
     if assessment is not None:
         lines += ['', *limit_table(assessment, fitted),
                   f' limited by               {LIMITS[assessment.accel.limited_by]}']
-    return [*lines, *unit_line(fitted)]
+    return lines
 
 
 def held_out_lines(models: Sequence[HeldOutErrors], inliers: int) -> list[str]:
@@ -182,17 +170,12 @@ def digits(value: float) -> str:
 
 
 def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
-    """Lay out the error of the calibration below its limits, with one outcome for each figure."""
-    rows = [('calibration error', 1e3 * assessment.accel.calibration ** 0.5 / G0_MPS2,
-             assessment.error_deg, '', '')]
-    for name, limit_mps2, accel, tilt in (
-            ('limit by the datasheet', nonlinearity_mps2(sensor), assessment.accel_datasheet,
-             assessment.tilt_datasheet),
-            ('noise of one sample', held_out.sample_noise_mps2(sensor), assessment.accel_noise,
-             assessment.tilt_noise)):
-        if accel:
-            rows.append((name, 1e3 * limit_mps2 / G0_MPS2, float(np.degrees(
-                limit_mps2 * np.sqrt(assessment.tilt.tilt_per_axis))), accel, tilt))
+    """Lay out the error of the calibration above its limit, with one outcome for each figure."""
+    limit_mps2, _ = limit(sensor)
+    rows = (('calibration error', assessment.error_mg, assessment.error_deg, '', ''),
+            ('limit', 1e3 * limit_mps2 / G0_MPS2,
+             np.degrees(limit_mps2 * np.sqrt(assessment.tilt.tilt_per_axis)),
+             assessment.accel_outcome, assessment.tilt_outcome))
     return [f' {name:24} {"-" if np.isnan(value_deg) else _two_digits(value_deg):>7} ° {tilt:9} '
             f'{_two_digits(value_mg):>8} mg {accel}'.rstrip()
             for name, value_mg, value_deg, accel, tilt in rows]
@@ -223,14 +206,9 @@ def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutEr
     for errors in models[-1:]:
         numbers |= {'held_out_poses': errors.pose_count,
                     'held_out_tilt_rms_deg': errors.tilt_deg.rms,
-                    'held_out_tilt_max_deg': errors.tilt_deg.largest,
-                    'held_out_accel_rms_mg': errors.accel_mg.rms,
-                    'held_out_accel_max_mg': errors.accel_mg.largest}
+                    'held_out_accel_rms_mg': errors.accel_mg.rms}
     entries = {**{key: f'{value:.4g}' for key, value in numbers.items() if np.isfinite(value)},
-               'verdict_datasheet': assessment.accel_datasheet,
-               'verdict_noise': assessment.accel_noise,
-               'verdict_tilt_datasheet': assessment.tilt_datasheet,
-               'verdict_tilt_noise': assessment.tilt_noise,
+               'verdict': assessment.accel_outcome, 'verdict_tilt': assessment.tilt_outcome,
                'limited_by': assessment.accel.limited_by}
     return {key: entry for key, entry in entries.items() if entry}
 
@@ -240,20 +218,17 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
     provenance = fitted.provenance
     if 'own_accel_mg' not in provenance:
         return NOT_SHOWN, ['no pose was kept out of the fit to assess it']
-    limit_mps2, kind, allows = nonlinearity_mps2(fitted), 'datasheet', 'the datasheet allows'
-    if not limit_mps2:
-        limit_mps2, kind = held_out.sample_noise_mps2(fitted), 'noise'
-        allows = 'the noise of one sample is'
-    limit = f'{_two_digits(1e3 * limit_mps2 / G0_MPS2)} mg'
-    accel = provenance.get(f'verdict_{kind}', '')
-    outcomes = accel, provenance.get(f'verdict_tilt_{kind}')
+    limit_mps2, origin = limit(fitted)
+    limit_text = f'{_two_digits(1e3 * limit_mps2 / G0_MPS2)} mg'
+    accel = provenance.get('verdict', '')
+    outcomes = accel, provenance.get('verdict_tilt', '')
     outcome = next((word for word in (FAIL, NOT_SHOWN) if word in outcomes), PASS)
-    lines = [f'calibration error {_two_digits(float(provenance["own_accel_mg"]))} mg; {allows} '
-             f'{limit}']
+    error, verb = float(provenance['own_accel_mg']), 'allows' if origin == 'datasheet' else 'is'
+    lines = [f'calibration error {_two_digits(error)} mg; the {origin} {verb} {limit_text}']
     if outcome == FAIL:
         if accel != FAIL:
             tilt_deg = float(provenance['own_tilt_deg'])
-            lines = [f'tilt error {tilt_deg:.2g}°, more than {limit} causes']
+            lines = [f'tilt error {tilt_deg:.2g}°, more than {limit_text} causes']
         lines.append('Take more poses or a richer model; else do not use this file.')
     elif outcome == NOT_SHOWN:
         open_names = ', '.join(map(str, open_coefficients(fitted)))

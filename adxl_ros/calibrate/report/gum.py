@@ -9,27 +9,21 @@ Squares of contributions add. Those of noise, coefficients, stage and model are 
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
-import math
 import os
-import re
 from typing import Any, NamedTuple
 
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.calibrate.report import acceptance, held_out
-from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.report.acceptance import FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.result import CalibrationResult, compare
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.files.parameter_file import compose
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.sensor import MARGIN_K, Sensor
 from adxl_ros.report.quantities import number
 import numpy as np
-import yaml
 
 K = 2  # Coverage factor of an expanded uncertainty; about 95 % for a normal distribution
 _EARTH_HALF_RANGE_MPS2 = 0.027
@@ -39,11 +33,9 @@ _LOCAL_STD_MPS2 = 5e-4
 _NOT_LOCAL_MPS2 = (G0_MPS2, 9.8, 9.81)
 """Values of gravity that are those of no place in particular, m/s²."""
 _UNIFORM = np.sqrt(3)  # Half-width of a uniform distribution divided by its standard deviation
-_SURROUNDINGS = {'temperature': ('temperature_c', 'temperature_std_k', 'K', MARGIN_K, 0.1),
-                 'supply': ('supply_v', 'supply_std_v', 'V', 0.0, 1e-3)}
-"""Field of a pose, key of `STATED`, unit, margin of the range, and step of central differences."""
-STATED = ('gravity_std_mps2', 'temperature_std_k', 'supply_std_v')
-"""Inputs whose standard uncertainty a laboratory may state."""
+_SURROUNDINGS = {'temperature': ('temperature_c', 'K', MARGIN_K, 0.1),
+                 'supply': ('supply_v', 'V', 0.0, 1e-3)}
+"""Field of a pose, unit, margin of the range, and step of central differences."""
 MODEL = (
     'a = F(V; θ, T, U)·(1 + δg/g) − g·(∂u/∂α·δα + ∂u/∂β·δβ) + δm. The measurand a is the '
     'acceleration along an axis of the case at the stated pose α, β. F inverts the calibrated '
@@ -110,14 +102,9 @@ class Uncertainty:
         return divmod(int(np.argmax(self.combined_mps2)), self.error_mps2.shape[1])
 
 
-def uncertainty(result: CalibrationResult, stated: Mapping[str, Any] | None = None
-                ) -> Uncertainty | None:
-    """
-    Return the uncertainty at the held-out poses that determine alpha; None without such poses.
-
-    stated: standard uncertainties that the laboratory states, by the names of `STATED`.
-    """
-    fitted, stated = result.fitted, stated or {}
+def uncertainty(result: CalibrationResult) -> Uncertainty | None:
+    """Return the uncertainty at the held-out poses that determine alpha; None without any."""
+    fitted = result.fitted
     if not result.held_out or not np.isfinite(result.assessments[-1].accel.measured):
         return None
     errors, assessment = result.held_out[-1], result.assessments[-1]
@@ -139,9 +126,7 @@ def uncertainty(result: CalibrationResult, stated: Mapping[str, Any] | None = No
         stage_kind = 'A, scatter of the poses'
         stage_rad = stage_rad * excess ** 0.5 or budget.stage ** 0.5 / gravity
     gravity_std, gravity_kind = _LOCAL_STD_MPS2, 'B, anomalies of gravity'
-    if 'gravity_std_mps2' in stated:
-        gravity_std, gravity_kind = stated['gravity_std_mps2'], 'B, stated'
-    elif gravity in _NOT_LOCAL_MPS2:
+    if gravity in _NOT_LOCAL_MPS2:
         gravity_std, gravity_kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, not local: anywhere'
     inputs = (
         Input('noise of the mean', 'A, normal', 1e3 * np.mean(held.std_v, axis=0), 'mV', by_noise),
@@ -151,40 +136,32 @@ def uncertainty(result: CalibrationResult, stated: Mapping[str, Any] | None = No
         Input('model', 'A, held-out errors', 1e3 * model / G0_MPS2, 'mg', model),
         Input('local gravity', gravity_kind, gravity_std, 'm/s²',
               np.abs(reference) / gravity * gravity_std),
-        *(_surroundings(name, fitted, held, reference, stated) for name in _SURROUNDINGS))
-    limit_name, decisions = _decisions(assessment, fitted)
-    return Uncertainty(fitted.axes, held.alpha_rad, held.beta_rad, reference, error, inputs,
-                       limit_name, decisions)
-
-
-def _decisions(assessment: Assessment, fitted: Sensor) -> tuple[str, tuple[Decision, ...]]:
-    """Return where the limits come from, and the decisions that the verdict of a tool shows."""
-    limit_mps2, name = acceptance.nonlinearity_mps2(fitted), 'nonlinearity of the datasheet'
-    outcomes = assessment.accel_datasheet, assessment.tilt_datasheet
-    if not limit_mps2:
-        limit_mps2, name = held_out.sample_noise_mps2(fitted), 'noise of one sample'
-        outcomes = assessment.accel_noise, assessment.tilt_noise
+        *(_surroundings(name, fitted, held, reference) for name in _SURROUNDINGS))
+    limit_mps2, limit_name = acceptance.limit(fitted)
     tilt_limit_rad = limit_mps2 * assessment.tilt.tilt_per_axis ** 0.5
-    return name, tuple(
+    decisions = tuple(
         Decision(quantity, unit, scale * part.calibration ** 0.5,
                  scale * (part.calibration_high ** 0.5 - part.calibration ** 0.5), scale * limit,
                  outcome)
         for quantity, unit, scale, part, limit, outcome in (
-            ('acceleration', 'mg', 1e3 / G0_MPS2, assessment.accel, limit_mps2, outcomes[0]),
-            ('tilt', '°', float(np.degrees(1.0)), assessment.tilt, tilt_limit_rad, outcomes[1]))
+            ('acceleration', 'mg', 1e3 / G0_MPS2, assessment.accel, limit_mps2,
+             assessment.accel_outcome),
+            ('tilt', '°', float(np.degrees(1.0)), assessment.tilt, tilt_limit_rad,
+             assessment.tilt_outcome))
         if outcome)
+    return Uncertainty(fitted.axes, held.alpha_rad, held.beta_rad, reference, error, inputs,
+                       limit_name, decisions)
 
 
-def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray,
-                  stated: Mapping[str, Any]) -> Input:
+def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray) -> Input:
     """Return the contribution of temperature or supply, uniform over those of the poses."""
-    field, key, unit, margin, step = _SURROUNDINGS[name]
+    field, unit, margin, step = _SURROUNDINGS[name]
     values, environment = getattr(held, field), held.environment
     seen = values[np.isfinite(values)]
     half_range = margin + (np.ptp(seen) / 2 if seen.size else 0.0)
     kind = 'B, range of the poses' if seen.size else \
         f'B, ±{margin:g} {unit}, not measured' if margin else 'not measured, taken as constant'
-    std = stated.get(key, half_range / _UNIFORM)
+    std = half_range / _UNIFORM
     inverse = signal_chain.inverse(fitted, np.where(np.cos(held.alpha_rad) < 0, -1, 1))
     shifted = [np.column_stack(inverse(list(held.volts.T), environment._replace(
         **{field: getattr(environment, field) + sign * step}))) for sign in (1, -1)]
@@ -193,27 +170,21 @@ def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray,
         # What the model does not follow drifts as the datasheet states.
         slope = np.sqrt(slope ** 2 + (G0_MPS2 * fitted.envelope.zero_g_per_k) ** 2
                         + (reference * fitted.envelope.scale_per_k) ** 2)
-    return Input(name, 'B, stated' if key in stated else kind, std, unit,
-                 np.abs(np.nan_to_num(slope)) * std)
+    return Input(name, kind, std, unit, np.abs(np.nan_to_num(slope)) * std)
 
 
-def budget_rows(found: Uncertainty) -> list[list[str]]:
-    """Lay out the inputs at the pose of the largest uncertainty: the table of the GUM."""
-    rows, at = [], found.worst
+def section(found: Uncertainty | None) -> dict[str, Any] | None:
+    """Return the uncertainty, at the pose where it is largest, as the page shows it."""
+    if found is None:
+        return None
+    rows = []
     for row in found.inputs:
-        std = float(np.broadcast_to(row.std, found.error_mps2.shape)[at])
-        part_mg = 1e3 * float(row.contribution_mps2[at]) / G0_MPS2
+        std = float(np.broadcast_to(row.std, found.error_mps2.shape)[found.worst])
+        part_mg = 1e3 * float(row.contribution_mps2[found.worst]) / G0_MPS2
         sensitivity = '1' if row.unit == 'mg' else \
             f'{number(part_mg / std if std else 0.0, digits=2)} mg per {row.unit}'
         rows.append([row.name, f'{number(std, digits=2)} {row.unit} ({row.kind})', sensitivity,
                      f'{part_mg:.3f}'])
-    return rows
-
-
-def section(found: Uncertainty | None) -> dict[str, Any] | None:
-    """Return the uncertainty as the page shows it."""
-    if found is None:
-        return None
     expanded_mg, (pose, axis) = 1e3 * K * found.combined_mps2 / G0_MPS2, found.worst
     alpha, beta = np.degrees([found.alpha_rad[pose], found.beta_rad[pose]])
     inside = np.abs(found.error_mps2) <= K * found.combined_mps2
@@ -225,7 +196,7 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
     return {
         'model': MODEL, 'meaning': MEANING, 'rule': RULE, 'limit_name': found.limit_name,
         'pose': f'alpha {alpha:.1f}°, beta {beta:.1f}°, axis {found.axes[axis]}',
-        'budget': budget_rows(found), 'decisions': decisions,
+        'budget': rows, 'decisions': decisions,
         'combined': f'{expanded_mg[pose, axis] / K:.3f} mg',
         'expanded': f'{expanded_mg[pose, axis]:.2f} mg',
         'range': f'{expanded_mg.min():.2f} to {expanded_mg.max():.2f} mg',
@@ -233,37 +204,10 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
 
 
 SCHEMA_VERSION = '3.2.0'
-NOT_STATED = 'not stated'
-_LABORATORY = {
-    **{f'{who}_{what}': NOT_STATED for who in ('laboratory', 'customer')
-       for what in ('name', 'email', 'city')},
-    'laboratory_country': 'ZZ', 'customer_country': 'ZZ', 'place': 'other',
-    'responsible': NOT_STATED, 'manufacturer': NOT_STATED, 'stage': NOT_STATED, 'identifier': ''}
-"""Texts of a laboratory's file, and what stands for those that are missing; ZZ is no country."""
-_PATTERNS = {'laboratory_country': '[A-Z]{2}', 'customer_country': '[A-Z]{2}',
-             'place': 'laboratory|customer|laboratoryBranch|customerBranch|other'}
-"""What the schema asks of texts."""
-_UNITS = {'V': 'volt', 'rad': 'radian', '°': 'degree', 'K': 'kelvin', 's': 'second', 'm': 'metre'}
-"""Units of D-SI; all others count as 1."""
+_UNITS = {'V': (r'\volt', 1.0), '°': (r'\degree', 1.0),
+          'V/g': (r'\volt\metre\tothe{-1}\second\tothe{2}', 1 / G0_MPS2)}
+"""Units in D-SI, where g is none, and factors of the coefficients that a certificate states."""
 _ACCELERATION = r'\metre\second\tothe{-2}'
-
-
-def read_laboratory(path: str | os.PathLike | None) -> dict[str, Any]:
-    """Read the texts and the standard uncertainties of a laboratory's YAML file; None has none."""
-    node = compose(path) if path is not None else None
-    given = yaml.constructor.SafeConstructor().construct_document(node) if node else {}
-    known = (*_LABORATORY, *STATED)
-    if not isinstance(given, dict) or not set(given) <= set(known):
-        raise UserError(f'{path}: found {", ".join(map(str, given))}; expected a mapping with '
-                        f'some of {", ".join(known)}')
-    for name, value in given.items():
-        form = 'number such as 1.0e-5' if name in STATED else _PATTERNS.get(name, 'text')
-        is_right = isinstance(value, (int, float)) and 0 <= value < math.inf \
-            if name in STATED else isinstance(value, str) and \
-            re.fullmatch(_PATTERNS.get(name, r'\s*\S[\s\S]*'), value)
-        if not is_right:
-            raise UserError(f'{path}: {name}: {value!r} is no {form}')
-    return {**_LABORATORY, **given}
 
 
 def _quantity(name: str, values: Any, unit: str, std: Any = None, about: str = '',
@@ -276,23 +220,9 @@ def _quantity(name: str, values: Any, unit: str, std: Any = None, about: str = '
             'is_list': np.ndim(values) > 0, 'expanded': expanded}
 
 
-def si_unit(unit: str) -> tuple[str, float]:
-    """Return a unit such as V/g in D-SI, and the factor of its values: g is no unit there."""
-    powers: Counter[str] = Counter()
-    for sign, part in zip((1, -1), unit.replace('²', '^2').split('/')):
-        base, _, power = part.partition('^')
-        powers[base] += sign * int(power or 1)
-    g = powers.pop('g', 0)
-    powers['m'] += g
-    powers['s'] -= 2 * g
-    parts = [f'\\{_UNITS[base]}' + (f'\\tothe{{{power}}}' if power != 1 else '')
-             for base, power in powers.items() if base in _UNITS and power]
-    return ''.join(parts) or r'\one', G0_MPS2 ** g
-
-
-def write(path: str | os.PathLike, result: CalibrationResult, laboratory: dict[str, Any]) -> None:
+def write(path: str | os.PathLike, result: CalibrationResult) -> None:
     """Write the certificate of a calibration against a stage, by the template of its elements."""
-    found = uncertainty(result, laboratory)
+    found = uncertainty(result)
     if found is None:
         raise UserError(f'{path}: a certificate states errors at stage angles, and no pose with '
                         'angles was kept out of the fit; leave --dcc out')
@@ -302,16 +232,13 @@ def write(path: str | os.PathLike, result: CalibrationResult, laboratory: dict[s
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     fitted = result.fitted
     write_text(path, environment.get_template('certificate.xml').render(
-        schema_version=SCHEMA_VERSION, not_stated=NOT_STATED, k=K, rule=RULE,
+        schema_version=SCHEMA_VERSION, k=K, rule=RULE,
         method=f'{MEANING} {MODEL}', fitted=fitted, provenance=fitted.provenance,
-        step_deg=np.degrees(fitted.stage_resolution_rad),
-        laboratory={name: ' '.join(str(words).split()) for name, words in laboratory.items()},
-        **_results(fitted, found)))
+        step_deg=np.degrees(fitted.stage_resolution_rad), **_results(fitted, found)))
 
 
 def _results(fitted: Sensor, found: Uncertainty) -> dict[str, list[Any]]:
-    """Return decisions, errors, coefficients, budget and conditions as quantities."""
-    worst, axis = found.worst
+    """Return decisions, errors, coefficients and conditions as quantities."""
     decisions = [
         {'quantity': row.quantity, 'outcome': row.outcome,
          'conformity': {PASS: 'pass', FAIL: 'fail'}.get(
@@ -335,12 +262,10 @@ def _results(fitted: Sensor, found: Uncertainty) -> dict[str, list[Any]]:
         for d, name in enumerate(fitted.axes)]
     coefficients = [_quantity(f'{row.label} {row.axis}', factor * row.fitted, unit,
                               factor * row.half_width / Z_90, row.name)
-                    for row in compare(fitted, fitted) for unit, factor in [si_unit(row.unit)]]
-    budget = [_quantity(cells[0], row.contribution_mps2[worst, axis], _ACCELERATION, None,
-                        f'standard uncertainty {cells[1]}, sensitivity {cells[2]}')
-              for cells, row in zip(budget_rows(found), found.inputs)]
+                    for row in compare(fitted, fitted) if row.unit in _UNITS
+                    for unit, factor in [_UNITS[row.unit]]]
     conditions = [_quantity('local gravity', fitted.local_gravity_mps2, _ACCELERATION)]
     conditions += [_quantity(f'{name} temperature', value + 273.15, r'\kelvin') for name, value in
                    zip(('lowest', 'highest'), fitted.envelope.temperature_c or ())]
     return {'decisions': decisions, 'errors': errors, 'coefficients': coefficients,
-            'budget': budget, 'conditions': conditions}
+            'conditions': conditions}

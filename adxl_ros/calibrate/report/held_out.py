@@ -29,7 +29,7 @@ from typing import NamedTuple
 
 from adxl_ros.calibrate.poses import Poses, reference_force, stage_force
 from adxl_ros.errors import UserError
-from adxl_ros.model import noise, signal_chain
+from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import coefficient_tangent, force_covariance
 from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT
@@ -42,20 +42,18 @@ Fit = Callable[[Sensor, Poses], Sensor]
 """A function that fits a nominal sensor to poses and returns the fitted unit."""
 
 _FOLDS = 5  # Number of folds where no pose is marked as a check pose; chosen: the usual number
-_MAX_ANGLE_STD_RAD = np.radians(1.0)
-"""Largest standard deviation of an angle, rad, at which its error counts; chosen: without z poses
-near ±90° determine alpha poorly."""
+_MAX_ALPHA_STD_RAD = np.radians(1.0)
+"""Largest standard deviation of alpha, rad, at which the tilt error of a pose counts; chosen:
+without z poses near ±90° determine alpha poorly."""
 
 
 @dataclass(frozen=True)
 class PoseErrors:
     """Errors of a calibrated sensor, measured minus reference, pose by pose."""
 
-    # Errors of the angles, (k,); NaN where the pose does not determine them
-    alpha_rad: np.ndarray
-    beta_rad: np.ndarray
     accel_mps2: np.ndarray  # Along the measured axes, (k, m)
-    tilt_rad: np.ndarray  # Angle between measured and reference vertical, (k,)
+    # Angle between measured and reference vertical, (k,); NaN where the pose determines no alpha
+    tilt_rad: np.ndarray
     force_mps2: np.ndarray  # The measured specific force, (k, 3)
 
 
@@ -74,8 +72,6 @@ class HeldOutErrors:
 
     model: str
     tilt_deg: ErrorStatistic
-    alpha_deg: ErrorStatistic
-    beta_deg: ErrorStatistic
     accel_mg: ErrorStatistic  # Over the measured axes
     errors: PoseErrors  # The errors of all held-out poses
     pose_index: np.ndarray  # Index of each held-out pose among all poses, (k,)
@@ -92,9 +88,7 @@ def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Po
     """
     Compare a calibrated sensor with the stage, pose by pose.
 
-    As f(−α, β + π) = f(α, β), the angles of the reference are those with 0 ≤ α ≤ π. A sensor
-    without z cannot distinguish α from π − α: its alpha is at most π/2, and the reference gives
-    the sign of its z.
+    A sensor without z cannot distinguish α from π − α: the reference gives the sign of its z.
     """
     reference = reference_force(poses, sensor.local_gravity_mps2) if stage is None else \
         stage_force(stage, poses.alpha_rad, poses.beta_rad)
@@ -102,23 +96,11 @@ def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Po
     force = signal_chain.inverse(sensor, z_sign)(list(poses.volts.T), poses.environment)
     covariance = force_covariance(sensor, force, np.mean(poses.std_v, axis=0) ** 2,
                                   poses.environment)
-    measures_z = 'z' in sensor.axes
-    angles = tilt(force, covariance, measures_z)
-    alpha = np.arctan2(np.hypot(*reference[:2]), reference[2])
-    if not measures_z:
-        alpha = np.minimum(alpha, np.pi - alpha)
-    beta = np.arctan2(-reference[1], reference[0])
+    shows_tilt = tilt(force, covariance, 'z' in sensor.axes).alpha_std < _MAX_ALPHA_STD_RAD
     measured = [AXES.index(axis) for axis in sensor.axes]
-    alpha_determined = angles.alpha_std < _MAX_ANGLE_STD_RAD
-    beta_determined = angles.beta_std < _MAX_ANGLE_STD_RAD
-    beta_error = (angles.beta - beta + np.pi) % (2 * np.pi) - np.pi
     tilt_error = angle_between(np.column_stack(force), np.column_stack(reference))
-    return PoseErrors(
-        np.where(alpha_determined, angles.alpha - alpha, np.nan),
-        np.where(beta_determined, beta_error, np.nan),
-        np.column_stack([force[d] - reference[d] for d in measured]),
-        np.where(alpha_determined, tilt_error, np.nan),
-        np.column_stack(force))
+    return PoseErrors(np.column_stack([force[d] - reference[d] for d in measured]),
+                      np.where(shows_tilt, tilt_error, np.nan), np.column_stack(force))
 
 
 def angle_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -133,9 +115,8 @@ def summarise(model: str, errors: PoseErrors, pose_index: np.ndarray | None = No
     count = len(errors.accel_mps2)
     accel_mg = errors.accel_mps2[determining_alpha(errors)] / G0_MPS2 * 1e3
     return HeldOutErrors(
-        model, statistic(np.degrees(errors.tilt_rad)), statistic(np.degrees(errors.alpha_rad)),
-        statistic(np.degrees(errors.beta_rad)), statistic(accel_mg),
-        errors, np.arange(count) if pose_index is None else pose_index, tuple(fitted),
+        model, statistic(np.degrees(errors.tilt_rad)), statistic(accel_mg), errors,
+        np.arange(count) if pose_index is None else pose_index, tuple(fitted),
         np.zeros(count, int) if fold is None else fold)
 
 
@@ -428,12 +409,6 @@ def _scatter(sensor: Sensor, poses: Poses) -> tuple[float, float, bool]:
     magnitude = np.linalg.norm(errors.force_mps2, axis=1) - gravity
     excess = max(float(np.mean(errors.accel_mps2 ** 2) - np.mean(magnitude ** 2)), 0.0)
     return excess, 3 * excess / gravity ** 2, False
-
-
-def sample_noise_mps2(sensor: Sensor) -> float:
-    """Return the noise of one sample, rms over the axes, m/s²."""
-    noise_g = noise.sample_std_v(sensor) / sensor.scale_v_per_g
-    return float(np.sqrt(np.mean(noise_g ** 2))) * G0_MPS2
 
 
 def rms_mg(mean_square: float) -> float:

@@ -4,8 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 import os
 from pathlib import Path
 import re
@@ -18,7 +17,7 @@ from adxl_ros.calibrate.report.acceptance import Assessment, digits, FAIL, NOT_S
 from adxl_ros.calibrate.result import CalibrationResult, compare, history, rounded
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
-from adxl_ros.files.atomic_write import write_bytes, write_text
+from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import get, Sensor
@@ -26,7 +25,7 @@ from adxl_ros.report import figures, page as html_page
 from adxl_ros.report.figures import AXIS_COLOURS, Figure
 import numpy as np
 
-FILES = ('report.html', 'calibration.png')  # Files of a report
+PAGE = 'report.html'  # The file of a report
 _COLOURS = {PASS: 'green', NOT_SHOWN: 'amber', FAIL: 'red'}  # Colour of the badge by outcome
 _PART_COLOURS = {'noise': '#7b8794', 'stage': '#d9930d', 'coefficients': '#1f5fbf',
                  'model': '#c0392b'}
@@ -38,40 +37,31 @@ _BEYOND_WHISKER = 1.08
 
 
 def write(folder: str | os.PathLike, result: CalibrationResult,
-          store: str | os.PathLike = '', stated: Mapping[str, Any] | None = None) -> None:
-    """Write page and plots; stated: uncertainties of a laboratory, see `gum.uncertainty`."""
+          store: str | os.PathLike = '') -> None:
+    """Write the page."""
     html_page.check_libraries()
     past = calibration_store.history(store, result.fitted.serial).calibrations \
         if str(store) else []
-    page_path, plot_path = (Path(folder) / name for name in FILES)
-    write_text(page_path, page(result, [sensor for _, sensor in past], stated))
-    # If the poses do not suffice for the figures of the paper, the page states the reason.
-    with suppress(UserError):
-        draw(plot_path, result)
+    write_text(Path(folder) / PAGE, page(result, [sensor for _, sensor in past]))
 
 
-def draw(path: str | os.PathLike, result: CalibrationResult) -> None:
-    """Write figures 2 to 8 of the paper for a unit as PNG."""
-    draw_sweep(path, result.nominal, _paper_sensor(result), result.poses)
-
-
-def _paper_sensor(result: CalibrationResult) -> Sensor:
-    """Return the unit by a model that the paper's figures can show."""
+def paper_figure(result: CalibrationResult) -> Any:
+    """Draw figures 2 to 8 of the paper for a unit, by its model or at least the physical one."""
     if result.gravity_fit is not None:
         raise UserError('they need the angles of a stage')
-    return result.fitted if result.fitted.model in ('physical', 'full') else \
+    unit = result.fitted if result.fitted.model in ('physical', 'full') else \
         linear.fit_physical(result.nominal, result.poses.subset(~result.poses.check))
+    return draw_sweep(result.nominal, unit, result.poses)
 
 
-def page(result: CalibrationResult, past: Sequence[Sensor],
-         stated: Mapping[str, Any] | None = None) -> str:
+def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     """Lay out the page."""
     fitted = result.fitted
     errors_of = {errors.model: errors for errors in result.held_out}
     row_of = {row.model: row for row in result.assessments}
     errors = result.held_out[-1] if result.held_out else None
     assessment = result.assessments[-1] if result.assessments else None
-    rows = _coefficients(fitted)
+    rows, (limit_mps2, origin) = _coefficients(fitted), acceptance.limit(fitted)
     drawn: dict[str, Figure] = {}
     to_mg = 1e3 / G0_MPS2
     if (fit := result.gravity_fit) is not None:
@@ -83,14 +73,11 @@ def page(result: CalibrationResult, past: Sequence[Sensor],
         drawn['errors'] = _error_figure(
             held_out.determining_alpha(errors.errors), to_mg * errors.errors.accel_mps2, half_mg,
             fitted.axes, 'held-out pose', 'error of acceleration, mg')
-    picture, fault, paper_model = '', '', 'physical'
+    picture, fault = '', ''
     try:
-        unit = _paper_sensor(result)
-        picture = html_page.picture_url(_sweep(result.nominal, unit, result.poses))
-        paper_model = unit.model
+        picture = html_page.picture_url(paper_figure(result))
     except UserError as error:
         fault = str(error)
-    temperature_c = fitted.envelope.temperature_c
     return html_page.render('adxl_ros.calibrate.report', 'calibration.html', {
         'title': f'Calibration of {fitted.serial}, {fitted.provenance["date"][:10]}',
         'about': [f'{fitted.model} model', f'{len(result.poses)} poses', f'axes {fitted.axes}'],
@@ -107,21 +94,15 @@ def page(result: CalibrationResult, past: Sequence[Sensor],
         'datasheet': fitted.datasheet_name,
         'models': list(errors_of or row_of), 'errors_of': errors_of, 'row_of': row_of,
         'poses': len(result.poses), 'digits': digits, 'mg': held_out.rms_mg,
-        'datasheet_mg': 1e3 * acceptance.nonlinearity_mps2(fitted) / G0_MPS2,
-        'noise_mg': 1e3 * held_out.sample_noise_mps2(fitted) / G0_MPS2,
+        'limit': f'{origin} ({1e3 * limit_mps2 / G0_MPS2:.2g} mg)',
         'budget': assessment.accel if assessment and errors else None,
         'part_colours': _PART_COLOURS,
-        'gum': gum.section(gum.uncertainty(result, stated)),
+        'gum': gum.section(gum.uncertainty(result)),
         'history': history(fitted, past),
-        'paper_model': paper_model,
         'picture': picture, 'picture_fault': fault,
         'report_lines': result.report_lines,
-        'provenance': [
-            ['serial', fitted.serial], ['model', fitted.model],
-            ['effects', ', '.join(fitted.effects)],
-            *([key.replace('_', ' '), value] for key, value in fitted.provenance.items()),
-            ['valid for temperatures', f'{temperature_c[0]:.1f} to {temperature_c[1]:.1f} °C'
-             if temperature_c else 'not measured']]})
+        'provenance': [[key.replace('_', ' '), value]
+                       for key, value in fitted.provenance.items()]})
 
 
 def _badge(fitted: Sensor) -> dict[str, str]:
@@ -226,12 +207,7 @@ _VERTICAL = np.sin(np.radians(89))
 """Smallest sine of alpha in the plane alpha = 90°; chosen: stages are better than 1°."""
 
 
-def draw_sweep(path: str | os.PathLike, sensor: Sensor, fitted: Sensor, poses: Poses) -> None:
-    """Write figures 2 to 8 of the paper as PNG."""
-    write_bytes(path, figures.png(_sweep(sensor, fitted, poses)))
-
-
-def _sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:
+def draw_sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:
     """Draw figures 2 to 8 of the paper for the x and y axes, one row per axis."""
     swept = poses.subset(~poses.check)
     line, regressions = linear.fit(sensor, swept), linear.regress_axes(sensor, swept)

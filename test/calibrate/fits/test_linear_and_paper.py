@@ -36,7 +36,7 @@ def test_equations_1_to_3():
 def test_physical_recovers_the_unit(axes):
     rng = np.random.default_rng(7)
     sensor = nominal(axes)
-    inside, alpha_deg = [], []
+    inside, tilt_deg = [], []
     for _ in range(6):
         truth = drawn(rng, sensor)
         for effect in ('cross_axis', 'cross_axis_z', 'scale_factor_z'):
@@ -53,9 +53,9 @@ def test_physical_recovers_the_unit(axes):
             inside.append(abs(error) < 1.645 * sigma)
         errors = held_out.summarise(
             'physical', held_out.pose_errors(fitted, poses.subset(poses.check)))
-        alpha_deg.append(errors.alpha_deg.rms)
+        tilt_deg.append(errors.tilt_deg.rms)
         assert errors.accel_mg.rms < 0.6
-    assert np.mean(alpha_deg) < 0.1
+    assert np.mean(tilt_deg) < 0.1
     assert 0.85 < np.mean(inside) < 0.99
 
 
@@ -67,7 +67,7 @@ def test_physical_reduces_the_tilt_error_as_the_paper_does():
         poses = swept(rng, drawn(rng, sensor))
         linear_errors, physical_errors = held_out.cross_validate(
             {'linear': linear.fit, 'physical': linear.fit_physical}, sensor, poses)
-        ratios.append(physical_errors.alpha_deg.rms / linear_errors.alpha_deg.rms)
+        ratios.append(physical_errors.tilt_deg.rms / linear_errors.tilt_deg.rms)
     assert np.mean(ratios) < 1 - 0.889
 
 

@@ -85,7 +85,7 @@ def test_table_of_the_truth() -> None:
 
 
 def test_table_of_errors() -> None:
-    errors = held_out.PoseErrors(*np.zeros((2, 3)), np.full((3, 2), 0.45),
+    errors = held_out.PoseErrors(np.full((3, 2), 0.45),
                                  np.radians(np.full(3, 7.2)), np.zeros((3, 3)))
     fitted = replace(errors, accel_mps2=errors.accel_mps2 / 100, tilt_rad=np.full(3, np.nan))
     models = [held_out.summarise('nominal', errors), held_out.summarise('full', fitted)]
@@ -103,8 +103,8 @@ def test_table_of_errors() -> None:
     ('PASS', 'FAIL', [' FAIL  tilt error 0.33°, more than 3.4 mg causes', 'do not use']),
     ('PASS', 'NOT SHOWN', [' NOT SHOWN  calibration error 0.20 mg', 'too few'])])
 def test_acceptance(accel: str, tilt: str, begin: list[str]) -> None:
-    provenance = {'own_accel_mg': '0.201', 'own_tilt_deg': '0.3251', 'verdict_datasheet': accel,
-                  'verdict_tilt_datasheet': tilt}
+    provenance = {'own_accel_mg': '0.201', 'own_tilt_deg': '0.3251', 'verdict': accel,
+                  'verdict_tilt': tilt}
     lines = acceptance_lines(replace(fitted_and_truth()[0], provenance=provenance))
     assert len(lines) == len(begin) and max(map(len, lines)) <= 79
     assert all(text in line for text, line in zip(begin, lines))
