@@ -11,7 +11,7 @@ import hashlib
 import os
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
-from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.poses import planes, Poses
 from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.errors import UserError
@@ -106,7 +106,11 @@ def coefficient_lines(sensor: Sensor) -> list[str]:
 
 def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,
                     results: Mapping[str, str]) -> Sensor:
-    """Add date, sources, data hash, results and id to a fitted unit."""
+    """Add date, sources, sweep, data hash, results and id to a fitted unit."""
+    alpha_deg = np.degrees(poses.alpha_rad[~poses.check])
+    # Without a colon: ros2 param reads the text as YAML again.
+    sweep = f'{len(planes(np.radians(alpha_deg)))} planes alpha from {alpha_deg.min():.0f} to ' \
+            f'{alpha_deg.max():.0f} deg' if np.isfinite(alpha_deg).all() else 'against gravity'
     entries = {
         **{key: text for key, text in fitted.provenance.items() if key.endswith('_from')},
         # A text of YAML, where +00:00 makes a date, which ros2 param cannot set.
@@ -114,7 +118,7 @@ def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,
         'package_version': package_version(), 'source': source,
         'data_sha256': data_sha256 or _sha256(poses),
         'poses': str(int((~poses.check).sum())), 'check_poses': str(int(poses.check.sum())),
-        'temperature_c': _mean_text(poses.temperature_c, '.2f'),
+        'sweep': sweep, 'temperature_c': _mean_text(poses.temperature_c, '.2f'),
         'supply_v': _mean_text(poses.supply_v, '.4f'), **results}
     calibration_id = calibration_store.calibration_id(replace(fitted, provenance=entries))
     return replace(fitted, provenance={'id': calibration_id, **entries})

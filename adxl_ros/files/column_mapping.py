@@ -47,6 +47,7 @@ class Table:
     units: Mapping[str, str] = field(default_factory=dict)  # Units that the format states
     default_mapping: str = ''  # Mapping that the definition of the format states
     header_line: int | None = None  # Line of a text file with the names; 0 where it has none
+    repeated: str = ''  # A name that stands twice; empty for none
 
     @property
     def has_names(self) -> bool:

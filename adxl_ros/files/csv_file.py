@@ -59,6 +59,7 @@ class Form:
 
     # The columns as the header states them; the number from 1 of one without a name of its own
     names: tuple[str, ...]
+    repeated: str  # A name that stands twice; empty for none
     header_line: int  # Number of the line with the names, from 1; 0 where there is none
     first_line: int  # Number of the first line with samples
     delimiter: str  # A tab, semicolon, comma or blank; several blanks are one
@@ -259,8 +260,9 @@ def _form(lines: Sequence[str], plain: Sequence[str], index: int, delimiter: str
 def _named(names: Sequence[str], *about: Any) -> Form:
     """Return a form with distinct names: one that is empty or stands twice gives its number."""
     names = [' '.join(name.split()) for name in names]
+    repeated = next((name for name in names if name and names.count(name) > 1), '')
     return Form(tuple(name if name and names.count(name) == 1 else str(i + 1)
-                      for i, name in enumerate(names)), *about)
+                      for i, name in enumerate(names)), repeated, *about)
 
 
 def _header(lines: Sequence[str], delimiter: str, count: int) -> tuple[int, list[str]]:

@@ -66,6 +66,8 @@ def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
     output: the columns of the sensor that must be there; else those that are.
     """
     names = table.names
+    if table.repeated:
+        raise NotNativeError(f'{table.header}: column {table.repeated} stands twice; keep one')
     # Where one form of output is there, the other may stand there in any unit.
     outputs = next((kind for kind in (output, VOLTS, ACCEL) if set(kind) & set(names)),
                    (*VOLTS, *ACCEL))

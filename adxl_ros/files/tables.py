@@ -43,7 +43,7 @@ def open_table(path: str | os.PathLike, topic: str = '') -> Table:
         return _FORMATS[ending](path)
     form = find_form(path)
     return Table(path, form.names, partial(read_blocks, path, form),
-                 header_line=form.header_line)
+                 header_line=form.header_line, repeated=form.repeated)
 
 
 def _in_memory(path: str, columns: Mapping[str, np.ndarray], cut: str = '', **about: Any) -> Table:

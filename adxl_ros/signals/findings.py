@@ -48,6 +48,11 @@ _CLIPPED_WINDOW_S = 0.1  # Longest time beside them in which it moves, s. Chosen
 _CLIPPED_CODES = 20
 """Change, in steps of the resolution, that a smooth peak does not reach within the time that it
 stays at its top. Chosen: a parabola reaches nine."""
+_STUCK_S = 5.0
+"""Shortest time without change that is reported, s. Chosen: a coarse axis may rest for some
+seconds between two codes."""
+_STUCK_SAMPLES = 20  # Fewest samples of such a time. Chosen: a slow sensor repeats a few
+_CHANGING = 0.5  # Share of the other samples that change. Chosen: fewer of a coarse axis at rest
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,8 @@ class AxisRange:
     highest_mps2: float  # Its highest value, m/s²
     clipped: int  # Times at which it stays at an extreme value in motion
     is_stuck: bool  # Whether it never changes
+    # Longest time in which it does not change although it usually does, s; 0 for none
+    stuck_s: float
 
 
 @dataclass(frozen=True)
@@ -195,9 +202,16 @@ class _Axis:
         self._name, self._period_s = name, period_s
         # Largest value of minus the samples and of the samples, and how often they stay there
         self._largest, self._clipped = [-np.inf, -np.inf], [0, 0]
+        self._last, self._count, self._changes = np.nan, 0, 0
+        self._equal = self._most_equal = 0  # Samples since the last change, and most between two
 
     def feed(self, values: np.ndarray) -> None:
         """Add further samples, m/s², (n,)."""
+        changes = np.flatnonzero(np.diff(values, prepend=self._last))
+        equal = np.diff(changes, prepend=-1 - self._equal, append=len(values)) - 1
+        self._equal, self._most_equal = int(equal[-1]), max(self._most_equal, int(equal.max()))
+        self._count, self._changes = self._count + len(values), self._changes + len(changes)
+        self._last = values[-1]
         steps = np.abs(np.diff(values))
         smallest = float(steps[steps > 0].min(initial=np.inf))
         drop = max(_CLIPPED_STEP_G * G0_MPS2, _CLIPPED_CODES * smallest)
@@ -220,7 +234,11 @@ class _Axis:
     def result(self) -> AxisRange:
         """Return the range of the axis."""
         low, high = -self._largest[0], self._largest[1]
-        return AxisRange(self._name, low, high, sum(self._clipped), low == high)
+        stuck_s = self._most_equal * self._period_s
+        is_reported = (stuck_s >= _STUCK_S and self._most_equal >= _STUCK_SAMPLES
+                       and self._changes > _CHANGING * (self._count - self._most_equal))
+        return AxisRange(self._name, low, high, sum(self._clipped), low == high,
+                         stuck_s * is_reported)
 
 
 def _count_poses(means_mps2: Sequence[np.ndarray]) -> int:
@@ -313,6 +331,8 @@ def _stamp_faults(contents: RecordingContents) -> list[str]:
 def _sample_faults(contents: RecordingContents) -> list[str]:
     faults = [f'{axis.name} never changes; the axis is stuck, or not connected'
               for axis in contents.axes if axis.is_stuck]
+    faults += [f'{axis.name} does not change for {axis.stuck_s:.3g} s; the axis is stuck then, or '
+               'the driver repeats a sample' for axis in contents.axes if axis.stuck_s]
     faults += [f'{axis.name} stays at its extreme value {axis.clipped} times in motion; its range '
                f'ends at {axis.lowest_mps2 / G0_MPS2:.3g} or {axis.highest_mps2 / G0_MPS2:.3g} g'
                for axis in contents.axes if axis.clipped >= _FEWEST_CLIPPED]

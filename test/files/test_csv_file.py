@@ -113,7 +113,7 @@ def test_forms_that_are_read(tmp_path: Path, text: str | bytes) -> None:
     (f'{HEADER}\n{GOOD}'.replace('time_s', 't'), ':1: no column time_s; the columns are t, x_v, '),
     (f'time_s,alpha_rad\n{GOOD}', ':1: no column of a sensor: needs x_v'),
     (f'#\ntime_s,y_v,z_v\n{GOOD}', ':2: no column x_v beside y_v, z_v'),
-    (f'time_s,x_v,y_v,x_v\n{GOOD}', ':1: no column x_v beside y_v'),
+    (f'time_s,x_v,y_v,x_v\n{GOOD}', ':1: column x_v stands twice; keep one'),
     *((f'{head}\n{GOOD}', f':1:{place}: column {head.split(",")[place - 1]} is in another unit; '
        f'expected the column {right}') for head, place, right in (
         ('time_s,x_mv', 2, 'x_v'), ('time_s,x_v,y_v,z_mv', 4, 'z_v'),

@@ -99,6 +99,10 @@ ROW = np.arange(6000)
      'stamps scatter by'), (lambda t, a: (t, a * [1, 0, 1]), None, 'ay_mps2 never changes'),
     (clipped, 1, 'ax_mps2 stays at its extreme value'),
     (clipped_slowly, 1, 'ax_mps2 stays at its extreme value'),
+    (lambda t, a: (t, np.c_[a[:, :2], a[np.minimum(ROW, 4499), 2]]), 1,
+     'az_mps2 does not change for 15 s'),
+    (lambda t, a: (t, a[np.where(ROW // 600 == 5, 2999, ROW)]), 3,
+     'ay_mps2 does not change for 6 s'),
     (lambda t, a: (t, a / G), None, 'seem to be in g')])
 def test_each_fault_is_named(tmp_path: Path, change: Callable, count: int | None, fault: str
                              ) -> None:
