@@ -14,6 +14,7 @@ from pathlib import Path
 import shlex
 import signal
 import sys
+import textwrap
 from typing import TYPE_CHECKING
 
 from adxl_ros.errors import UserError
@@ -30,7 +31,7 @@ from adxl_ros.model.effects.base import Effect
 from adxl_ros.model.sensor import neutral, Sensor, typical
 from adxl_ros.process import ended_by_closed_output
 from adxl_ros.report.quantities import column_unit
-from adxl_ros.report.screen import bar, end_lines, entry_list, NextStep, program_parser
+from adxl_ros.report.screen import bar, COLUMNS, end_lines, entry_list, NextStep, program_parser
 import numpy as np
 
 if TYPE_CHECKING:
@@ -214,15 +215,19 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
     try:
         return command(parser.parse_args())
     except UserError as error:
-        note(f'{parser.prog}: {" ".join(str(error).split())}')
+        note(f'{parser.prog}: {" ".join(str(error).split())}', error.paste)
         return 1
     except KeyboardInterrupt:
         note(f'{parser.prog}: interrupted')
         return 130
 
 
-def note(text: str) -> None:
-    """Print a message on stderr, in one line."""
+def note(text: str, paste: str = '') -> None:
+    """Print a message on stderr: one line, which a terminal gets wrapped between words."""
+    if sys.stderr.isatty():
+        text = textwrap.fill(text.removesuffix(paste), COLUMNS, subsequent_indent='  ',
+                             break_long_words=False, break_on_hyphens=False)
+        text += f'\n{paste}' * bool(paste)
     print(text, file=sys.stderr)
 
 
