@@ -7,9 +7,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Need, NOMINAL_ENVIRONMENT, Place
+from adxl_ros.model.effects.base import Need, NOMINAL_ENVIRONMENT, Place, Signals
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.signal_chain import Chain
 import numpy as np
 
 ONE_SIDED = float(np.sqrt(2))
@@ -28,11 +27,14 @@ class Electronics(NamedTuple):
 
 def electronics(sensor: Sensor) -> Electronics:
     """Return filter and white noise of a unit by its effects."""
-    # No other effect changes them; one with a memory may take arrays alone.
-    chain = Chain(sensor, [name for name in sensor.effects if effect_named(name).needs in (
-        (Need.FILTER,), (Need.NOISE,))])
-    signals = chain.signals(NOMINAL_ENVIRONMENT, output=[0.0] * len(sensor.axes))
-    chain(Place.ELECTRONICS, signals)
+    count = len(sensor.axes)
+    signals = Signals(NOMINAL_ENVIRONMENT, rc_s=[sensor.rc_s] * count, noise_ratio=[1.0] * count,
+                      zero_g_v=sensor.nominal_zero_g_v.tolist(), output=[0.0] * count,
+                      scale_v_per_g=sensor.nominal_scale_v_per_g.tolist())
+    for effect in map(effect_named, sensor.effects):
+        # They change nothing else, so that the rest of the chain need not run.
+        if effect.needs in ((Need.FILTER,), (Need.NOISE,)) and effect.place is Place.ELECTRONICS:
+            effect.apply(signals, sensor.parameters(effect.name))
     return Electronics(np.array(signals.rc_s), np.array(signals.noise_ratio))
 
 

@@ -155,6 +155,7 @@ def _result_lines(rows: Sequence[Row], to_do: Plan) -> list[str]:
                 f' left out  {_left_out(to_do)}' * bool(to_do.outside)]
     outcomes = Counter(row['outcome'] for row in rows)
     parts = [f'{outcomes[name]} {name}' for name in OUTCOMES if outcomes[name] or name == 'done']
+
     def counts(column: str) -> str:
         values = Counter(row[column] for row in rows if row[column])
         return ', '.join(f'{count} {value}' for value, count in values.most_common())
