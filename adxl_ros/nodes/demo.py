@@ -42,7 +42,7 @@ _OVERHEAD_S = 15.0  # Real time of start, fit and report, s; measured
 _PLANES_DEG = [30.0, 60.0, 90.0, 120.0, 150.0]  # Planes alpha of the sweep, degrees
 _STEP_DEG = 30.0  # Step of beta in each plane, degrees
 _CHECK_POSES = 16  # Number of poses that are kept out of the fit
-_SEED = 203  # Default seed of the demonstrated unit and its stage; chosen
+_SEED = 203  # Seed of the demonstrated unit and its stage; chosen
 _STARTED = ('driver', 'stage', 'calibration')
 """Nodes of the demonstration in the order of their start."""
 _UNIT_EFFECTS = {'bias': 0.5, 'scale_factor': 0.5, 'misalignment': 0.7, 'cross_axis': 0.7,
@@ -103,19 +103,14 @@ def main() -> int:
     parser = program_parser(argparse.ArgumentParser, 'demo', __doc__, _EXAMPLES)
     parser.add_argument('-o', dest='output', metavar='DIR', default='demo_output', type=Path,
                         help='folder of pages and calibrations (default demo_output)')
-    parser.add_argument('--seed', type=int, metavar='N', default=_SEED,
-                        help=f'seed of the simulated unit and its stage (default {_SEED})')
     options = parser.parse_args()
-    if not 0 <= options.seed < 2 ** 31:
-        parser.error(f'--seed: {options.seed} is not between 0 and {2 ** 31 - 1}')
     jobs.use_own_graph()
     try:
         try:
             options.output.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(f'{options.output}: {error.strerror}') from None
-        _run_sweep(options.output, options.seed)
-        _print('', *file_lines({'Next': f'your own sensor: {NEXT_PAGE}'}))
+        _run_sweep(options.output)
     except UserError as error:
         print(f'demo: {error}', file=sys.stderr)
         return 1
@@ -124,12 +119,12 @@ def main() -> int:
     return 0
 
 
-def _run_sweep(folder: Path, seed: int) -> None:
+def _run_sweep(folder: Path) -> None:
     """Sweep a simulated sensor whose coefficients are drawn at datasheet spread."""
     unit, nominal = folder / 'simulated_unit.yaml', folder / 'nominal.yaml'
     sensor = replace(parameter_file.load(parameter_file.nominal_path()), serial='demo',
                      rate_hz=_RATE_HZ)
-    truth = _draw_unit(sensor, seed)
+    truth = _draw_unit(sensor)
     parameter_file.save(nominal, sensor)
     parameter_file.save(unit, truth, ['The truth of the simulated unit.'])
     name = parameter_file.nominal_path().stem
@@ -143,7 +138,7 @@ def _run_sweep(folder: Path, seed: int) -> None:
         path.unlink(missing_ok=True)
     commands = [
         _command('driver', unit, _KEEPING | {'link.type': 'sim', 'link.speed': _SPEED}),
-        _command('stage', nominal, {'delay_s': _DELAY_S, 'seed': seed}),
+        _command('stage', nominal, {'delay_s': _DELAY_S, 'seed': _SEED}),
         _command('calibration', nominal, {
             **_UNATTENDED, 'output': output, 'store': folder / 'calibrations', 'report': report,
             'sweep.planes_deg': _PLANES_DEG, 'sweep.step_deg': _STEP_DEG,
@@ -167,16 +162,17 @@ def _run_sweep(folder: Path, seed: int) -> None:
     fitted = parameter_file.load(output)
     _print('', *screen_table(_held_out_errors(sensor, fitted, poses)), '',
            *truth_table(compare(fitted, truth)), '', *acceptance_lines(fitted), '',
-           *file_lines({'Page': report / 'report.html', 'Calibration': output}))
+           f' Page         {report / "report.html"}', f' Calibration  {output}',
+           f' Next         your own sensor: {NEXT_PAGE}')
 
 
-def _draw_unit(sensor: Sensor, seed: int) -> Sensor:
+def _draw_unit(sensor: Sensor) -> Sensor:
     """
     Draw the coefficients of a unit: 0.5 to 1.5 times a multiple of their typical values.
 
     The linear cross-axis terms are part of the misalignment, as in the fits.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(_SEED)
     values = {name: {p.name: np.array([
         multiple * p.scale * rng.choice((-1, 1)) * rng.uniform(*_SPREAD)
         * (p.name != 'linear') if axis in p.axes else 0.0
@@ -193,11 +189,6 @@ def _held_out_errors(nominal: Sensor, fitted: Sensor, poses: Poses
               fitted.model: fitted}
     return [unseen.summarise(model, unseen.pose_errors(sensor, held_out))
             for model, sensor in models.items()]
-
-
-def file_lines(values: dict[str, object]) -> list[str]:
-    """Return one line for each value, with its name before it."""
-    return [f' {name:12} {value}' for name, value in values.items()]
 
 
 def _print(*lines: str) -> None:
