@@ -191,7 +191,6 @@ FORMAT = 1  # Version of the format. A file of another version is refused
 _DIGITS = 9  # Significant digits of the values (chosen: far below any uncertainty)
 _HEAD = """\
 # Mean and spread of each coefficient over the units of a fleet, written by fleet.
-# The name of a coefficient is its column of fleet.parquet, which ends in its unit.
 # prediction_std is the standard deviation of a further unit about the mean.
 # Use it: ros2 run adxl_ros fit NEW.mcap --prior {name} -o unit.yaml
 """

@@ -339,12 +339,11 @@ and the keys and values of the comments before the header."""
 
 
 @contextmanager
-def csv_writer(path: str | os.PathLike, digits: int | None = None) -> Iterator[Append]:
+def csv_writer(path: str | os.PathLike) -> Iterator[Append]:
     """
     Open a new CSV file, and yield a function that appends rows to it.
 
-    Numbers have all the digits that bring back the same float64, or those behind the first column
-    some significant digits. NaN is written empty.
+    Numbers have all the digits that bring back the same float64. NaN is written empty.
     """
     with atomic_path(path) as fresh, open(fresh, 'wb') as file:
         def append(columns: Mapping[str, np.ndarray], info: Mapping[str, str] | None = None
@@ -353,32 +352,21 @@ def csv_writer(path: str | os.PathLike, digits: int | None = None) -> Iterator[A
                 file.writelines(f'# {key}: {" ".join(value.split())}\n'.encode()
                                 for key, value in (info or {}).items())
                 file.write((','.join(columns) + '\n').encode())
-            file.write(_csv_rows({
-                name: np.asarray(values) if i == 0 or digits is None else
-                _rounded(np.asarray(values), digits)
-                for i, (name, values) in enumerate(columns.items())}))
+            file.write(_csv_rows(columns))
             release_written(file)
 
         yield append
 
 
-def _csv_rows(columns: dict[str, np.ndarray]) -> bytes:
+def _csv_rows(columns: Mapping[str, np.ndarray]) -> bytes:
     """Return rows of text: by pyarrow where it is installed, which takes a tenth of the time."""
     try:
         import pyarrow.csv
     except ImportError:
         import pandas
-        return pandas.DataFrame(columns).to_csv(header=False, index=False).encode()
+        return pandas.DataFrame(dict(columns)).to_csv(header=False, index=False).encode()
     table = pyarrow.table({name: pyarrow.array(values, from_pandas=True)
                            for name, values in columns.items()})
     sink = pyarrow.BufferOutputStream()
     pyarrow.csv.write_csv(table, sink, pyarrow.csv.WriteOptions(include_header=False))
     return sink.getvalue().to_pybytes()
-
-
-def _rounded(values: np.ndarray, digits: int) -> np.ndarray:
-    """Round numbers to significant digits."""
-    with np.errstate(all='ignore'):  # zero, NaN and infinity stay as they are
-        scale = 10.0 ** (digits - 1 - np.floor(np.log10(np.abs(values))))
-        rounded = np.rint(values * scale) / scale
-    return np.where(np.isfinite(rounded), rounded, values)

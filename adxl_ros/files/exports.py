@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, fields
 from functools import partial
 import json
 import re
-from textwrap import fill, indent, wrap
+from textwrap import indent, wrap
 from typing import NamedTuple
 
 from adxl_ros.errors import install_hint, UserError
@@ -156,23 +156,6 @@ def _without_double_dashes(text: str) -> str:
     return re.sub('--+', '-', text)
 
 
-def _flat_noise(sensor: Sensor, prefix: str = '# ') -> str:
-    """
-    Return how much quieter white noise is than filtered noise of the same rms at low frequency.
-
-    Filtered noise is AR(1) with a = exp(−dt/RC), whose density there is √((1 + a)/(1 − a)) times
-    that of white noise.
-    """
-    rc_s = float(noise.electronics(sensor).rc_s.max())
-    if not rc_s:
-        return ''
-    ratio = np.tanh(0.5 / (sensor.rate_hz * rc_s)) ** -0.5
-    return indent(fill(
-        'White noise is not filtered here: its spectrum is flat up to half the rate. Its density '
-        f'is {ratio:.3g} times too small below the corner of the filter, '
-        f'{0.5 / (np.pi * rc_s):.3g} Hz.', _COLUMNS), prefix)
-
-
 def stage_effects(sensor: Sensor) -> list[str]:
     """Return the effects that are errors of a reference, and do not go with the sensor."""
     return [name for name in sensor.effects
@@ -263,8 +246,8 @@ def text(name: str, export: Export) -> str:
                             keep_trailing_newline=True)
     templates.filters |= {'yaml': _yaml, 'single_dashes': _without_double_dashes}
     return templates.get_template(f'{name}.jinja').render(
-        head=partial(_head, export), flat_noise=partial(_flat_noise, sensor),
-        white=partial(_white_density, export), walk=walk, walk_remark=f'# {remark}',
+        head=partial(_head, export), white=partial(_white_density, export), walk=walk,
+        walk_remark=f'# {remark}',
         kalibr_settings=kalibr_settings, sensor=sensor, source=export.source, axes=axes(sensor),
         by_axis=values, arm_m=arm_m(sensor), delay_s=delay_s(sensor), gain=coupling.tolist(),
         walk_a_sample=tuple(density / sensor.rate_hz ** 0.5 for density in values['walk_density']),

@@ -318,7 +318,8 @@ class _FlatReader:
         numbers = value if isinstance(value, (list, tuple, np.ndarray)) else [value]
         for number in numbers:
             self._require(isinstance(number, float), key,
-                          f'{number!r} is not a floating-point number{_as_float(number)}')
+                          f'{number!r} is not a floating-point number; write it with a point, as '
+                          '1.0 and 1.0e-6')
             self._require(np.isfinite(number), key, f'{number} is not a finite number')
         self._require(not axes or len(numbers) == len(axes), key,
                       f'{len(numbers)} values for {len(axes)} axes ({axes})')
@@ -421,11 +422,3 @@ class _FlatReader:
                           f'expected {len(names)} values of 0 or more, one for each name')
             departures.append(values.tolist())
         return dict(zip(map(Coefficient.parse, names), zip(*departures)))
-
-
-def _as_float(value: Any) -> str:
-    """Suggest what to write for an integer, or for 1e-6, which YAML reads as text."""
-    try:
-        return f'; write {float_text(float(value))}'
-    except (TypeError, ValueError):
-        return ''

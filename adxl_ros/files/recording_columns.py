@@ -104,15 +104,6 @@ LIMIT = 1e6
 every sensor, stage and reference of the package)."""
 
 
-class Alignment(NamedTuple):
-    """How well a reference was aligned with the stamps of the samples."""
-
-    # Rms difference between a message and the line between its neighbours, in the unit of the
-    # reference. 0 where no sample needed an interpolation.
-    residual: float
-    gap_s: float  # Largest time between a sample and the message nearest to it, s
-
-
 class BadStamps(NamedTuple):
     """Samples whose stamp does not increase."""
 
@@ -134,8 +125,8 @@ class Recording:
     columns: dict[str, np.ndarray]
     # The keys and values of `sensor_info`, and other `# key: value` lines
     info: dict[str, str] = field(default_factory=dict)
-    # How well each reference was aligned, by column
-    alignments: dict[str, Alignment] = field(default_factory=dict)
+    # Residual of the alignment of each reference by its stamps, in its unit, by column
+    alignments: dict[str, float] = field(default_factory=dict)
     cut: str = ''  # Where a damaged recording ends; empty if it is whole
     # Origin of `time_s`, ns. Whole seconds near the first stamp where the stamps of a bag count
     # from 1970, because float64 seconds since then resolve only 0.2 µs; else 0.
@@ -441,7 +432,7 @@ class Track:
         step = step[step > 0]
         self._usual_ns = float(np.median(step)) if len(step) else 0.0
         self._longest_ns = max(longest_ns, USUAL_GAPS * self._usual_ns)
-        self._gap_ns = 0
+        self._is_exact = True  # Whether each sample so far has a message with its own stamp
 
     def interpolate(self, stamp_ns: np.ndarray) -> np.ndarray:
         """Return the reference at ascending stamps, ns, (n,): (n,), NaN where it is unknown."""
@@ -458,23 +449,21 @@ class Track:
                             & (np.diff(values) != 0))
         is_inside = (sample_ns > message_ns[0]) & (sample_ns < message_ns[after])
         result[~is_known | (is_inside & is_long[after])] = np.nan
-        if is_known.any():
-            gaps_ns = np.abs(sample_ns - message_ns[[np.maximum(after - 1, 0), after]]).min(axis=0)
-            self._gap_ns = max(self._gap_ns, int(gaps_ns[is_known].max()))
+        self._is_exact &= bool((sample_ns == message_ns[after])[is_known].all())
         return result
 
     @property
-    def alignment(self) -> Alignment:
+    def alignment(self) -> float:
         """
-        How well the reference was aligned so far: residual, in its unit, and largest gap, s.
+        How well the reference was aligned so far: its residual, in its unit.
 
-        The residual is the rms difference between each message and the straight line between its
+        It is the rms difference between each message and the straight line between its
         neighbours. Interpolation over twice the period misses it, so that it bounds the error
         over one period. It is 0 where every sample has a message with its own stamp.
         """
-        if not self._gap_ns or len(self._value) < 3:
-            return Alignment(0.0, self._gap_ns * 1e-9)
+        if self._is_exact or len(self._value) < 3:
+            return 0.0
         time_ns, value = self._stamp_ns - self._stamp_ns[0], self._value
         share = (time_ns[1:-1] - time_ns[:-2]) / (time_ns[2:] - time_ns[:-2])
         residual = value[1:-1] - (value[:-2] + share * (value[2:] - value[:-2]))
-        return Alignment(float(np.sqrt(np.mean(residual ** 2))), self._gap_ns * 1e-9)
+        return float(np.sqrt(np.mean(residual ** 2)))

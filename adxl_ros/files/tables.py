@@ -11,13 +11,11 @@ from functools import partial
 from io import StringIO
 import os
 from pathlib import Path
-import re
 from typing import Any
 
 from adxl_ros.errors import install_hint, one_line, UserError
-from adxl_ros.files.column_mapping import Quantity, Table, TableBlock, unit_in_name, UNITS
+from adxl_ros.files.column_mapping import Table, TableBlock
 from adxl_ros.files.csv_file import find_form, read_blocks
-from adxl_ros.model.kinematics import stage_angles
 import numpy as np
 
 _BLOCK_ROWS = 65536  # Rows that are read at a time (chosen: some MB)
@@ -164,37 +162,19 @@ _FORMATS: Mapping[str, Callable[[str], Table]] = {
 TABLE_ENDINGS = (*_FORMATS, '.ulg')  # Ends of the names of tables that are no text
 
 
-_ANGLES = ('alpha', 'beta', 'roll', 'pitch')  # Begin of the names of columns with angles
+_POSE_COLUMNS = ('alpha_deg', 'beta_deg')  # Columns of a table of poses
 
 _LEVEL_RAD = 1e-9  # Largest sine of alpha at which beta does not matter
 
 
 def read_pose_table(path: str | os.PathLike) -> np.ndarray:
-    """
-    Read a table of stage angles alpha and beta, rad, (k, 2); NaN where a pose has none.
-
-    Its columns are `alpha` and `beta`, or `roll` and `pitch`, each with its unit (`alpha_deg`).
-    """
+    """Read a table of `alpha_deg` and `beta_deg` as rad, (k, 2); NaN where a pose has none."""
     table = open_table(path)
-    columns = {role: name for role in _ANGLES for name in table.names
-               if re.match(rf'(?i){role}(\b|_|$)', name)}
-    pair = next((pair for pair in (('alpha', 'beta'), ('roll', 'pitch'))
-                 if set(pair) <= set(columns)), None)
-    if pair is None:
-        raise UserError(f'{path}: has no angles of the poses; expected the columns alpha_deg and '
-                        f'beta_deg, or roll_deg and pitch_deg; the columns are '
-                        f'{", ".join(table.names)}')
-    names = [columns[role] for role in pair]
-    values, angles = table.read(names), []
-    for name in names:
-        unit = unit_in_name(name, Quantity.ANGLE)
-        if unit is None:
-            raise UserError(f'{path}: column {name} states no unit; name it {name}_deg or '
-                            f'{name}_rad')
-        angles.append(UNITS[Quantity.ANGLE][unit].convert(values[name]))
-    if pair == ('roll', 'pitch'):
-        angles = list(stage_angles(*angles))
+    if not set(_POSE_COLUMNS) <= set(table.names):
+        raise UserError(f'{path}: has no angles of the poses; expected the columns '
+                        f'{" and ".join(_POSE_COLUMNS)}; the columns are {", ".join(table.names)}')
+    values = table.read(_POSE_COLUMNS)
+    alpha_rad, beta_rad = (np.radians(values[name]) for name in _POSE_COLUMNS)
     # At alpha 0 and 180 degrees beta does not matter, and people leave its cell empty.
-    angles[1] = np.where(np.isnan(angles[1]) & (np.abs(np.sin(angles[0])) < _LEVEL_RAD), 0.0,
-                         angles[1])
-    return np.column_stack(angles)
+    is_open = np.isnan(beta_rad) & (np.abs(np.sin(alpha_rad)) < _LEVEL_RAD)
+    return np.column_stack([alpha_rad, np.where(is_open, 0.0, beta_rad)])

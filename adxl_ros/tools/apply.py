@@ -28,9 +28,6 @@ import numpy as np
 
 _BLOCK_ROWS = 8192  # Samples that are corrected at a time (chosen: their arrays stay in the cache)
 
-_DIGITS = 12
-"""Significant digits of an estimate (chosen: rounding is below a millionth of the noise)."""
-
 _COUNTED = {
     'unsolved': 'have no solution: their cells are empty, and a bag leaves them out',
     'outside': 'lie outside of the validity range (temperature or force): their standard '
@@ -109,7 +106,7 @@ def apply(options: argparse.Namespace) -> int:
 def _output(path: str) -> Iterator[Callable[[Recording, Estimates], None]]:
     """Open a CSV file or a bag, and yield a function that appends a block with its estimates."""
     if Path(path).suffix == '.csv':
-        with csv_writer(path, _DIGITS) as append_rows:
+        with csv_writer(path) as append_rows:
             yield lambda block, estimates: append_rows(
                 {'time_s': block.epoch_ns * 1e-9 + block.time_s, **_columns(estimates)})
     else:

@@ -257,13 +257,11 @@ def report_reading(tool: str, recording: Recording) -> None:
     """Report on stderr what was assumed in reading, the cut, and the alignment of references."""
     for line in (*recording.remarks, *[recording.cut] * bool(recording.cut)):
         note(f'{tool}: {line}')
-    for name, alignment in recording.alignments.items():
+    for name, residual in recording.alignments.items():
         # References with the stamps of the samples need no alignment.
-        if alignment.gap_s:
-            unit = column_unit(name)
+        if residual:
             note(f'{tool}: {recording.path}: {name} aligned by its stamps: residual '
-                 f'{alignment.residual:.3g} {unit} rms, nearest message at most '
-                 f'{alignment.gap_s:.3g} s away')
+                 f'{residual:.3g} {column_unit(name)} rms')
 
 
 def read(tool: str, path: str, reading: ReadingOptions = AS_IT_IS) -> Recording:

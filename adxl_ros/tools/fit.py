@@ -53,8 +53,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--journal', metavar='FILE',
                        help='use the rests that the journal of this sweep names')
     parse.add_argument('--poses', metavar='FILE',
-                       help='table with the angles of each rest, in their order: alpha_deg and '
-                            'beta_deg, or roll_deg and pitch_deg')
+                       help='table with alpha_deg and beta_deg of each rest, in their order')
     parse.add_argument('-o', dest='output', metavar='FILE.yaml', required=True,
                        help='the parameter file of the calibrated sensor')
     parse.add_argument('--report', metavar='DIR',

@@ -83,15 +83,6 @@ def test_the_head_says_what_the_format_cannot_hold(exported, name):
     assert max(map(len, exported[name].screen.splitlines())) <= COLUMNS
 
 
-@pytest.mark.parametrize('name', ['fusioncore', 'isaaclab', 'sdf'])
-def test_the_head_says_how_much_too_quiet_flat_noise_is(exported, name):
-    frequency_hz = np.linspace(0, unit().rate_hz / 2, 20001)
-    density = noise.density_v2_per_hz(replace(unit(), adc_bits=0), frequency_hz)[:, 0]
-    text = ' '.join(line.strip('# ') for line in exported[name].text.splitlines())
-    ratio = float(text.split('Its density is ')[1].split()[0])
-    assert ratio == pytest.approx(np.sqrt(density[0] / density.mean()), rel=0.01)
-
-
 def test_sdf(exported):
     """The zero-g is in the mean: gz-sensors draws the sign of bias_mean."""
     imu = ElementTree.fromstring(exported['sdf'].text).find('model/link/sensor')
