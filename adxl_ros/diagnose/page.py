@@ -16,7 +16,7 @@ from adxl_ros.diagnose import report as words
 from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.evidence import bridged
-from adxl_ros.diagnose.residual_map import BLOCK_S, ResidualCell, SIGNIFICANT_P
+from adxl_ros.diagnose.residual_map import BLOCK_S, ResidualCell
 from adxl_ros.files import parameter_file
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, Z_90
@@ -45,7 +45,6 @@ _SEGMENT, _POINTS_PER_OCTAVE = 4096, 12
 _COLOURS = {'explained': 'green', 'partly': 'amber', 'no_gap': 'grey', 'inseparable': 'amber',
             'insufficient': 'amber', 'unknown': 'red', 'bad_data': 'red'}
 """Colour of the badge for each status."""
-_MOST_CELLS = 20  # Largest number of parts of the map. Chosen: one screen
 _PLOTTED_POINTS = 3000
 """Largest number of points of a line. Chosen: more than a wide screen has columns."""
 _INK, _EFFECT_COLOUR = '#1f2933', '#5b8fd6'
@@ -122,7 +121,7 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
         'figures': {'waterfall': waterfall(report), 'signals': signals(compared, best.sensor),
                     'spectrum': _spectra(full_rate, {
                         'before': full_rate.residual_v(full_rate.sensor),
-                        'after': full_rate.residual_v(best.sensor)}, True),
+                        'after': full_rate.residual_v(best.sensor)}),
                     **{f'proof-{name}': drawn for name, (drawn, _) in proofs.items()}},
         'tiles': rows[:3] + [r for r in rows[3:] if r.label in (
             'upper limit', 'explained', 'repeats, not explained')][:4 - len(rows[:3])],
@@ -136,7 +135,7 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
         'hypotheses': [[', '.join(h['effects']) or 'no gap', percent(h['probability'])]
                        for h in objects['hypotheses']],
         'not_covered': objects['not_covered'],
-        'where': [_cell(c) for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
+        'where': [_cell(c) for c in report.residual_cells],
         'menu': [[m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
                  for m in proposal['menu']] if proposal else [],
         'could_show': [(row.shows, *words.shows_row(row, scale)) for row in report.could_show]}
@@ -250,8 +249,7 @@ def _variables(comparison: BaselineComparison) -> dict[Over, np.ndarray]:
     return of_axes | {name: np.repeat(v[:, None], len(axes), axis=1) for name, v in of_all.items()}
 
 
-def _spectra(comparison: BaselineComparison, signals_v: Mapping[str, np.ndarray],
-             with_stated: bool = False) -> Figure:
+def _spectra(comparison: BaselineComparison, signals_v: Mapping[str, np.ndarray]) -> Figure:
     """
     Draw spectra of signals, V, (n, m), and the stated noise, in one panel for each axis.
 
@@ -266,8 +264,7 @@ def _spectra(comparison: BaselineComparison, signals_v: Mapping[str, np.ndarray]
         octave = np.floor(np.log2(all_hz / all_hz[0]) * _POINTS_PER_OCTAVE)
         hz = pd.Series(all_hz).groupby(octave).mean().to_numpy()
         densities[label] = np.sqrt(pd.DataFrame(power).groupby(octave).mean().to_numpy())
-    if with_stated:
-        densities['stated noise'] = mg(np.sqrt(noise.density_v2_per_hz(sensor, hz)) / scale)
+    densities['stated noise'] = mg(np.sqrt(noise.density_v2_per_hz(sensor, hz)) / scale)
     panels = []
     for d, axis in enumerate(sensor.axes):
         curves = {label: np.where(v[:, d] > 0, v[:, d], np.nan) for label, v in densities.items()}

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 from adxl_ros.diagnose.comparison import Reference
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.next_experiment import CouldShow, MENU
-from adxl_ros.diagnose.residual_map import SIGNIFICANT_P
 from adxl_ros.diagnose.search import Hypothesis
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict
 from adxl_ros.model.constants import Z_90
@@ -25,7 +24,6 @@ from adxl_ros.report.screen import COLUMNS, wrapped
 import numpy as np
 
 _DIGITS = 6  # Significant digits of the report. Chosen: more than any of its numbers has
-_MOST_CELLS = 40  # Largest number of cells in the report. Chosen: cells of small share say little
 PROBABLE = 0.05
 """Smallest probability of what terminal and page show first. Chosen: that of a rival."""
 _WITHOUT_GAP = ('no_gap', 'insufficient')  # Verdicts in which there is no gap to close
@@ -63,23 +61,19 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
             'probability': 1.0}, 'hypotheses': [], 'gap': None, 'where': [], 'candidates': [],
             'notes': notes(diagnosis), 'next_experiment': None, 'summary': fault.message}
     verdict, proposal = report.verdict, report.next_experiment
-    # Rounded probabilities still sum to 1.
-    probabilities = [round(h.probability, _DIGITS) for h in verdict.hypotheses]
-    probabilities[0] = round(1 - sum(probabilities[1:]), _DIGITS)
     return _rounded({
         'schema': 1,
         'verdict': {'status': verdict.status, 'effects': verdict.effects,
                     'groups': verdict.groups, 'of': concern(verdict), 'data_fault': None,
                     'probability': verdict.probability},
-        'hypotheses': [{'effects': h.effects, 'probability': p}
-                       for h, p in zip(verdict.hypotheses, probabilities)],
+        'hypotheses': [h._asdict() for h in verdict.hypotheses],
         'gap': _gap(report),
         'explained': _power(verdict.explained), 'rest': _power(verdict.rest),
         'rest_follows': verdict.rest_follows, 'material': verdict.material_mps2,
         'lost_without': {e: _power(p) for e, p in verdict.lost_without.items()},
         'where': [{'axis': c.axis, 'dimension': c.dimension, 'range': (c.low, c.high),
                    'mean': c.mean_mps2, 'share': c.share, 'p': c.p}
-                  for c in report.residual_cells if c.p < SIGNIFICANT_P][:_MOST_CELLS],
+                  for c in report.residual_cells],
         'not_covered': report.not_covered, 'notes': notes(diagnosis),
         'could_show': [
             {'effect': r.name.effect, 'parameter': r.name.parameter, 'axis': r.name.axis or None,

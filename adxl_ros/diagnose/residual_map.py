@@ -36,8 +36,9 @@ _DRAWS, _FEWEST_BLOCKS = 500, 3
 """Draws of random signs, and fewest blocks of a cell. Chosen: probabilities down to 0.002."""
 BLOCK_S = 2.0
 """Length of the blocks that change sign together, s. Chosen: beyond the correlation of noise."""
-SIGNIFICANT_P = 0.05
-"""Family-wise probability below which a cell is reported. Chosen: the usual level."""
+_SIGNIFICANT_P, _MOST_CELLS = 0.05, 40
+"""Family-wise probability below which a cell is reported, and their largest number. Chosen: the
+usual level; cells of small share say little."""
 _SMALLEST_RANGE, _SMALLEST_WARMING_C, _LONGEST_SINCE_MOVE_S = 1e-3, 1.0, 60.0
 """Range of a dimension, in its unit, below which it is constant; that of a temperature that is
 covered, °C; and longest time since a move, s. Chosen: an encoder, 0.1 mg, and the end of creep."""
@@ -257,7 +258,7 @@ def not_covered(comparisons: Sequence[BaselineComparison]) -> list[str]:
 
 
 def residual_map(comparison: BaselineComparison, seed: int) -> list[ResidualCell]:
-    """Test the means of the residual over all dimensions together; the largest share is first."""
+    """Return the significant means of the residual over all dimensions, by falling share."""
     used = comparison.used
     residual = comparison.residual_v(comparison.sensor) / comparison.scale_v_per_mps2
     residual = np.where(used[:, None], residual - residual[used].mean(axis=0), 0.0)
@@ -285,8 +286,8 @@ def residual_map(comparison: BaselineComparison, seed: int) -> list[ResidualCell
     p = (1 + (largest[None] >= statistic[:, None]).sum(axis=1)) / (_DRAWS + 1)
     share = np.minimum(mean ** 2 * count / max(total, 1e-300), 1.0)
     cells = [ResidualCell(*place, *map(float, figures))
-             for place, *figures in zip(places, mean, share, p)]
-    return sorted(cells, key=lambda cell: -cell.share)
+             for place, *figures in zip(places, mean, share, p) if figures[-1] < _SIGNIFICANT_P]
+    return sorted(cells, key=lambda cell: -cell.share)[:_MOST_CELLS]
 
 
 INTEGRATED_S = 10.0
