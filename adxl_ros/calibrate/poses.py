@@ -164,10 +164,11 @@ _COEFFICIENT_STEP = 1e-3
 linear over a thousandth of a typical size."""
 
 
-def predicted_volts(unit: Sensor, poses: Poses, shift_rad: tuple[float, float] = (0.0, 0.0)
-                    ) -> np.ndarray:
-    """Predict the mean output of a unit in poses, V, (k, m)."""
-    force = stage_force(unit, poses.alpha_rad + shift_rad[0], poses.beta_rad + shift_rad[1])
+def predicted_volts(unit: Sensor, poses: Poses, shift_rad: tuple[float, float] = (0.0, 0.0),
+                    force: Components | None = None) -> np.ndarray:
+    """Predict the mean output of a unit in poses, V, (k, m); `force` is that of `stage_force`."""
+    force = force or stage_force(unit, poses.alpha_rad + shift_rad[0],
+                                 poses.beta_rad + shift_rad[1])
     return np.column_stack(signal_chain.static_response(unit)(force, poses.environment))
 
 
@@ -199,14 +200,12 @@ def coefficient_jacobian(unit: Sensor, poses: Poses, names: Sequence[Coefficient
     """Differentiate the predicted volts by coefficients, V per their unit, (k, m, p)."""
     force = stage_force(unit, poses.alpha_rad, poses.beta_rad)
 
-    def volts(name: Coefficient, value: np.ndarray) -> np.ndarray:
-        changed = put(unit, [name], value)
-        return predicted_volts(changed, poses) if _is_of_stage(name.effect) else np.column_stack(
-            signal_chain.static_response(changed)(force, poses.environment))
-
     def slope(name: Coefficient) -> np.ndarray:
         value, step = get(unit, [name]), _COEFFICIENT_STEP * parameter_of(name).scale
-        return (volts(name, value + step) - volts(name, value - step)) / (2 * step)
+        shared = None if _is_of_stage(name.effect) else force
+        above, below = (predicted_volts(put(unit, [name], value + change), poses, force=shared)
+                        for change in (step, -step))
+        return (above - below) / (2 * step)
 
     return np.stack([slope(name) for name in names], axis=2)
 

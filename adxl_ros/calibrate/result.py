@@ -107,10 +107,8 @@ def coefficient_lines(sensor: Sensor) -> list[str]:
 def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,
                     results: Mapping[str, str]) -> Sensor:
     """Add date, sources, sweep, data hash, results and id to a fitted unit."""
-    alpha_deg = np.degrees(poses.alpha_rad[~poses.check])
-    # Without a colon: ros2 param reads the text as YAML again.
-    sweep = f'{len(planes(np.radians(alpha_deg)))} planes alpha from {alpha_deg.min():.0f} to ' \
-            f'{alpha_deg.max():.0f} deg' if np.isfinite(alpha_deg).all() else 'against gravity'
+    alpha_rad = poses.alpha_rad[~poses.check]
+    sweep = f'{len(planes(alpha_rad))} planes alpha' if np.isfinite(alpha_rad).all() else 'rests'
     entries = {
         **{key: text for key, text in fitted.provenance.items() if key.endswith('_from')},
         # A text of YAML, where +00:00 makes a date, which ros2 param cannot set.

@@ -99,7 +99,7 @@ _UNIT_RATIOS = {9.80665: 'm/s² instead of g', 1e3: 'mV instead of V', 1e-3: 'kV
 
 @dataclass(eq=False)
 class DataFault(Exception):
-    """A fault of the recording, with the recordings that were compared before."""
+    """A fault of the recording, with the recordings whose notes say more."""
 
     name: str  # Name in the report: `verdict.data_fault`
     message: str  # What is wrong and what to do, one line
@@ -393,11 +393,7 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording:
     Where the codes of the ADC are coarser than stated, the baseline gets their number of bits.
     """
     search_comparison = baseline.at_search_rate(comparison)
-    try:
-        _check_samples(comparison, search_comparison)
-    except DataFault as fault:
-        fault.comparisons = (comparison,)
-        raise
+    _check_samples(comparison, search_comparison)
     volts, time_s, sensor = comparison.volts, comparison.time_s, comparison.sensor
     used = comparison.used & np.isfinite(volts).all(axis=1)
     coarse = noise_effects.coarse_codes(volts, sensor)

@@ -123,8 +123,7 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
                         'before': full_rate.residual_v(full_rate.sensor),
                         'after': full_rate.residual_v(best.sensor)}),
                     **{f'proof-{name}': drawn for name, (drawn, _) in proofs.items()}},
-        'tiles': rows[:3] + [r for r in rows[3:] if r.label in (
-            'upper limit', 'explained', 'repeats, not explained')][:4 - len(rows[:3])],
+        'tiles': rows[:4],
         'effects': [{
             'name': c['effect'], 'sure': percent(c['probability']), 'cause': c['cause'],
             'share': '' if c['share'] is None else f'{percent(c["share"])} of the gap',

@@ -13,7 +13,7 @@ from adxl_ros.diagnose.comparison import Reference
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.next_experiment import CouldShow, MENU
 from adxl_ros.diagnose.search import Hypothesis
-from adxl_ros.diagnose.verdict import UNKNOWN, Verdict
+from adxl_ros.diagnose.verdict import Verdict
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern
@@ -230,8 +230,7 @@ def headline(diagnosis: Diagnosis) -> str:
     rest = amplitude_text(verdict.remaining)
     where = [_DIMENSIONS[d] for d in verdict.rest_follows[:_MOST_DIMENSIONS]]
     follows = f' It follows {listed(where, "and")}.' if where and verdict.rest.low > 0 else ''
-    several = 'these recordings do' if len(diagnosis.comparisons) > 1 else 'this recording does'
-    separate = f': {several} not separate them' if verdict.groups else ''
+    separate = ': the data do not separate them' if verdict.groups else ''
     noise = f' {NOISE_STAYS}' if is_only_noise(diagnosis.report) else ''
     of_reference = ' This is an error of the reference, not of the sensor.' \
         if concern(verdict) == Concern.REFERENCE.value else ''
@@ -339,7 +338,6 @@ def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]
 _BADGE_COLUMNS, _GAP_COLUMNS, _LABEL_COLUMNS = 29, 24, 9
 """Columns of the verdict, of the gap before and after, and of the words before rows of text."""
 _SURE_COLUMNS, _SHARE_COLUMNS = 8, 7  # Columns of the table of effects
-_MOST_OTHERS = 3  # Other effects that the screen lists; the page has all of them
 
 
 def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
@@ -383,7 +381,7 @@ def named_effects(report: Report, objects: dict[str, Any]) -> list[str]:
 
 
 def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
-    """Lay out the named effects, and other probable hypotheses."""
+    """Lay out the named effects; the page has other probable hypotheses."""
     named = named_effects(report, objects)
     candidates = {c['effect']: c for c in objects['candidates']}
     width = max(map(len, ('effect', *named))) + 2
@@ -397,14 +395,7 @@ def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
         lines.append(f' {name:{width}}{sure:{_SURE_COLUMNS}}{first:{size_columns}}'
                      f'{"" if share is None else percent(share):>{_SHARE_COLUMNS}}'.rstrip())
         lines += [f'{"":{1 + width + _SURE_COLUMNS}}{size}' for size in more]
-    others = {name: c['probability'] for name, c in candidates.items() if name not in named}
-    if report.verdict.status != 'unknown':
-        others['something unknown'] = sum(h['probability'] for h in objects['hypotheses']
-                                          if UNKNOWN in h['effects'])
-    texts = [f'{name} ({percent(p)})' for p, name in sorted(zip(others.values(), others),
-                                                            reverse=True) if p >= PROBABLE]
-    return lines + [''] * bool(texts and not named) + wrapped(
-        ' also possible: ' * bool(texts) + listed(texts[:_MOST_OTHERS], 'and'), 1)
+    return lines
 
 
 def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:

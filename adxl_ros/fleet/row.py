@@ -126,10 +126,6 @@ COLUMNS: tuple[Column, ...] = (
 )
 """All columns, in the order of the table."""
 
-TIMING = tuple(column.name for column in COLUMNS if column.is_timing)
-"""Columns that differ from run to run."""
-
-
 def empty_row() -> Row:
     """Return a row without any value."""
     return {column.name: [] if column.kind in ('texts', 'groups') else None

@@ -238,7 +238,7 @@ class _Axis:
         is_reported = (stuck_s >= _STUCK_S and self._most_equal >= _STUCK_SAMPLES
                        and self._changes > _CHANGING * (self._count - self._most_equal))
         return AxisRange(self._name, low, high, sum(self._clipped), low == high,
-                         stuck_s * is_reported)
+                         stuck_s * (is_reported or low == high))
 
 
 def _count_poses(means_mps2: Sequence[np.ndarray]) -> int:
@@ -329,10 +329,9 @@ def _stamp_faults(contents: RecordingContents) -> list[str]:
 
 
 def _sample_faults(contents: RecordingContents) -> list[str]:
-    faults = [f'{axis.name} never changes; the axis is stuck, or not connected'
-              for axis in contents.axes if axis.is_stuck]
-    faults += [f'{axis.name} does not change for {axis.stuck_s:.3g} s; the axis is stuck then, or '
-               'the driver repeats a sample' for axis in contents.axes if axis.stuck_s]
+    faults = [f'{axis.name} never changes; the axis is stuck, or not connected' if axis.is_stuck
+              else f'{axis.name} does not change for {axis.stuck_s:.3g} s; the axis is stuck, or '
+              'the driver repeats a sample' for axis in contents.axes if axis.stuck_s]
     faults += [f'{axis.name} stays at its extreme value {axis.clipped} times in motion; its range '
                f'ends at {axis.lowest_mps2 / G0_MPS2:.3g} or {axis.highest_mps2 / G0_MPS2:.3g} g'
                for axis in contents.axes if axis.clipped >= _FEWEST_CLIPPED]

@@ -394,12 +394,6 @@ def _is_coarse(std: float, resolution: float) -> bool:
     return std ** 2 < resolution ** 2 * (_DITHERED_STEPS ** 2 + 1 / 12)
 
 
-def density_g_per_rthz(noise: AxisNoise) -> float | None:
-    """Return the density of white noise as datasheets state it, g/√Hz; None if it is not seen."""
-    white = noise.fit.white
-    return ONE_SIDED * white.value / G0_MPS2 if white.is_seen else None
-
-
 def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
     """
     Give a sensor the measured noise.

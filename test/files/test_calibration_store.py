@@ -55,7 +55,7 @@ def test_provenance_store_and_the_previous_file(run_tool, swept_csv, tmp_path):
     assert provenance['temperature_c'] == '22.50'
     assert provenance['supply_v'] == '4.9500'
     assert provenance['poses'] == '125'
-    assert provenance['sweep'] == '5 planes alpha from 30 to 150 deg'
+    assert provenance['sweep'] == '5 planes alpha'
     assert provenance['package_version'] and provenance['date'] and provenance['residual_mg']
     assert float(provenance['held_out_tilt_rms_deg']) > 0
     assert provenance['id'].startswith('U/7-20')

@@ -4,11 +4,13 @@
 
 from pathlib import Path
 
-from adxl_ros.fleet.row import TIMING
+from adxl_ros.fleet.row import COLUMNS
 import numpy as np
 
 RATE_HZ = 50.0
 SPAN_S = 16.0
+TIMING = [column.name for column in COLUMNS if column.is_timing]
+"""Columns that differ from run to run."""
 
 
 def recording_text(serial, date, seed, span_s=SPAN_S):
