@@ -335,7 +335,7 @@ def documented_classes() -> Iterator[str]:
         else:
             signature = re.sub(r'<function \S+ at 0x\w+>', '...', str(inspect.signature(item)))
             lines += [f'{name}{signature}', '', inspect.getdoc(item) or '']
-        yield from [f'## {name}', *block('\n'.join(lines).rstrip().removesuffix('@property'))]
+        yield from [f'## {name}', *block('\n'.join(lines).removesuffix('@property').rstrip())]
         for part, member in inspect.getmembers(item, inspect.isfunction):
             if (part == '__call__' or not part.startswith('_')) and member.__doc__:
                 yield from block(f'{name}.{part}{inspect.signature(member)}\n\n'
