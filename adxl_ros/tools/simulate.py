@@ -78,7 +78,13 @@ def simulate(options: argparse.Namespace) -> int:
     if options.rate is not None:
         sensor = replace(sensor, rate_hz=options.rate)
     sensor = cli.with_effects(sensor, options.effect)
-    _check_reference(sensor, options)
+    stated = {text.partition(':')[0] for text in options.effect}
+    for name in sensor.effects:
+        if effect_named(name).concern is Concern.REFERENCE and not options.force:
+            if name in stated:
+                raise UserError(f'--effect {name}: acts on the specific force of a recording; say '
+                                'simulate imu --force RECORDING, or leave the effect out')
+            cli.note(f'simulate: {name} is an error of the reference, and is left out')
     sensor, begin_s, duration_s, blocks = _samples(sensor, options)
     with ExitStack() as stack:
         send = _board_output(stack, sensor, options.port) if options.port else None
@@ -122,14 +128,6 @@ def _check(options: argparse.Namespace) -> None:
     if (options.trajectory == 'imu') != bool(options.force):
         raise UserError('--force RECORDING and the trajectory imu need each other: '
                         'simulate imu --force RECORDING')
-
-
-def _check_reference(sensor: Sensor, options: argparse.Namespace) -> None:
-    """Name the errors of a reference where no recorded force is the reference."""
-    for name in sensor.effects:
-        if effect_named(name).concern is Concern.REFERENCE and not options.force:
-            cli.note(f'simulate: {name} is an error of the reference, and is left out without '
-                     '--force')
 
 
 def _samples(sensor: Sensor, options: argparse.Namespace

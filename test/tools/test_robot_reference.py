@@ -98,5 +98,5 @@ def test_a_recording_without_joints_is_refused(robot, run_tool, tmp_path):
     folder = robot('any').parent
     done = run_tool('diagnose', tmp_path / 'bare', '--urdf', folder / 'robot.urdf', '-o', 'gap')
     assert done.returncode == 1
-    assert 'no topics of sensor_msgs/JointState' in done.stderr
+    assert 'no topic of type sensor_msgs/msg/JointState' in done.stderr
     assert len(done.stderr.splitlines()) == 1
