@@ -44,7 +44,7 @@ def test_a_screen_drives_the_sweep_of_a_node_without_a_terminal(start, in_termin
     assert max(map(len, text.splitlines())) <= 79
     seen.press('f')
     # The acceptance of the fit stands in the place of the coefficients.
-    seen.wait_for('wrote unit.yaml', 'limit by the datasheet', timeout_s=60.0)
+    seen.wait_for('wrote unit.yaml', 'limited by', timeout_s=60.0)
     assert parameter_file.load(tmp_path / 'unit.yaml').serial == 'T1'
     seen.press('q')
     assert seen.wait() == 0
