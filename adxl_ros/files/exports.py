@@ -247,12 +247,11 @@ def text(name: str, export: Export) -> str:
     templates.filters |= {'yaml': _yaml, 'single_dashes': _without_double_dashes}
     return templates.get_template(f'{name}.jinja').render(
         head=partial(_head, export), white=partial(_white_density, export), walk=walk,
-        walk_remark=f'# {remark}',
-        kalibr_settings=kalibr_settings, sensor=sensor, source=export.source, axes=axes(sensor),
-        by_axis=values, arm_m=arm_m(sensor), delay_s=delay_s(sensor), gain=coupling.tolist(),
+        walk_remark=f'# {remark}', kalibr_settings=kalibr_settings, sensor=sensor,
+        source=export.source, axes=axes(sensor), by_axis=values, arm_m=arm_m(sensor),
+        delay_s=delay_s(sensor), gain=coupling.tolist(), absent=_ABSENT.ravel().tolist(),
         walk_a_sample=tuple(density / sensor.rate_hz ** 0.5 for density in values['walk_density']),
-        largest_mps2=_largest_mps2(sensor), absent=_ABSENT.ravel().tolist(),
-        covariance=np.diag(variance).ravel().tolist())
+        largest_mps2=_largest_mps2(sensor), covariance=np.diag(variance).ravel().tolist())
 
 
 def _at(place: str, *parts: str) -> dict[str, str]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import column_mapping, mapped_recording
+from adxl_ros.files import mapped_recording
 from adxl_ros.files.column_mapping import AS_IT_IS, Mounting, parse_mapping, ReadingOptions
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import ACCEL, concatenate, Recording, TIME, VOLTS
@@ -88,7 +88,7 @@ def _table_blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions
     try:
         yield from mapped_recording.blocks(table, mapping, reading, rows)
     except mapped_recording.NotNativeError as error:
-        text, options = column_mapping.propose(table)
+        text, options = mapped_recording.propose(table)
         raise UserError(f'{error}; {text}', options) from None
 
 

@@ -126,6 +126,7 @@ COLUMNS: tuple[Column, ...] = (
 )
 """All columns, in the order of the table."""
 
+
 def empty_row() -> Row:
     """Return a row without any value."""
     return {column.name: [] if column.kind in ('texts', 'groups') else None

@@ -78,10 +78,9 @@ def simulate(options: argparse.Namespace) -> int:
     if options.rate is not None:
         sensor = replace(sensor, rate_hz=options.rate)
     sensor = cli.with_effects(sensor, options.effect)
-    stated = {text.partition(':')[0] for text in options.effect}
     for name in sensor.effects:
         if effect_named(name).concern is Concern.REFERENCE and not options.force:
-            if name in stated:
+            if any(text.partition(':')[0] == name for text in options.effect):
                 raise UserError(f'--effect {name}: acts on the specific force of a recording; say '
                                 'simulate imu --force RECORDING, or leave the effect out')
             cli.note(f'simulate: {name} is an error of the reference, and is left out')

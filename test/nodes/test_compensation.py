@@ -255,7 +255,7 @@ def test_parameters_are_described_and_best_effort_publishers_received(
     ('format: 1', 'format: 9', ':3:13: format: version 9, but this package reads version 1'),
     ('units: V, V/g, 1/g, rad', 'units: mV', ":4:12: units: 'mV', but coefficients are in"),
     ('[2.0e-06, 1.0e-06, 1.0e-06, 3.0e-06]', '[2.0e-06, 9.0e-06, 9.0e-06, 3.0e-06]',
-     'covariance: not positive'), ('rate_hz: 1000.0', 'rate_hz: 1000', 'rate_hz'),
+     'covariance: not symmetric and positive'), ('rate_hz: 1000.0', 'rate_hz: 1000', 'rate_hz'),
     ('effects: [', 'effects: [[', 'not YAML')])
 def test_a_bad_file_ends_it_with_one_line(refusal: Callable, tmp_path: Path, right: str,
                                           wrong: str, message: str) -> None:
