@@ -25,7 +25,7 @@ import numpy as np
 
 _DIGITS = 6  # Significant digits of the report. Chosen: more than any of its numbers has
 PROBABLE = 0.05
-"""Smallest probability of what terminal and page show first. Chosen: that of a rival."""
+"""Smallest probability of an effect that the page shows first. Chosen: that of a rival."""
 _WITHOUT_GAP = ('no_gap', 'insufficient')  # Verdicts in which there is no gap to close
 _FLOOR_SOURCES = {'still': 'from rests', 'repeats': 'from repeats of a trajectory',
                   'assumed': 'assumed from the parameter file'}

@@ -196,7 +196,7 @@ class _Stamps:
 
 
 class _Axis:
-    """Extreme values of an axis."""
+    """Extreme values of an axis, and the longest time in which it does not change."""
 
     def __init__(self, name: str, period_s: float) -> None:
         self._name, self._period_s = name, period_s
