@@ -15,7 +15,7 @@ def main() -> None:
     """Replace the result, and the tables of the run in the log; a new run comes last there."""
     source, run = sys.argv[1:]
     made = json.loads(Path(source).read_text(encoding='utf-8'))
-    log = DOCS / 'measurements' / 'blind_check_log.md'
+    log = DOCS / 'measurements' / 'blind_check_log.txt'
     if f'<!-- {run} -->' not in log.read_text(encoding='utf-8'):
         with log.open('a', encoding='utf-8') as stream:
             stream.write(f'\n## {run.capitalize()} run\n\n<!-- {run} -->\n<!-- /{run} -->\n')

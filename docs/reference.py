@@ -28,6 +28,7 @@ from adxl_ros.files.column_mapping import UNITS
 from adxl_ros.fleet.row import COLUMNS
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
+from adxl_ros_validation.blind import scores
 
 DOCS = Path(__file__).resolve().parent
 MADE = '<!-- Made by `make reference`: change the package, not this page. -->'
@@ -344,7 +345,8 @@ def documented_classes() -> Iterator[str]:
 
 def figures() -> dict[Path, str]:
     """Return the pages with figures between marks, as the measurements have them now."""
-    made = {'demo': demo_table(), 'working cases': working_cases(), 'hand held': hand_held(),
+    made = {'demo': demo_table(), 'working cases': working_cases(), 'sealed': sealed(),
+            'hand held': hand_held(),
             'units': units()}
     pages = {}
     for path in [DOCS.parent / 'README.md', *DOCS.glob('*/*.md')]:
@@ -371,14 +373,77 @@ def demo_table() -> list[str]:
 
 
 def working_cases() -> list[str]:
-    """Return the scores of the working cases with their command and date."""
-    first, *lines = (DOCS / 'measurements' / 'working_cases.txt').read_text('utf-8').splitlines()
-    command, date, *remarks = first.removeprefix('# ').split(', ')
-    rows = [match.groups() for line in lines
-            if (match := re.match(r'(\w.*?) {2,}(\d+ % \(.*\)), (n = \d+)$', line))
-            and not line.startswith(('tracebacks', 'no verdict', '0.'))]
-    return [f'`{command}`, {date}; {", ".join(remarks)}. In brackets 90 % intervals.',
-            *table('verdict | share | cases', rows)[:-1]]
+    """Return the pooled scores of all draws of the last rule, with their commands."""
+    text = (DOCS / 'measurements' / 'working_cases.txt').read_text('utf-8')
+    draws = [Draw.parse(part) for part in text.split('\n== ')[1:]]
+    latest = [draw for draw in draws if draw.rule == draws[-1].rule]
+    commands = '; '.join(f'`{draw.command}`, {draw.date}, commit {draw.commit}'
+                         for draw in latest)
+    earlier = [draw for draw in draws if draw not in latest]
+    counts = {name: [(draw.hits[name], draw.counts[name]) for draw in latest
+                     if name in draw.hits] for name in SCORED}
+    rows = [(name, *pooled_score(made).split(', ')) for name, made in counts.items() if made]
+    return [f'{commands}; two cores. In brackets 90 % intervals.',
+            *table('verdict | share | cases', rows),
+            f'{len(earlier)} draws of earlier rules: {pooled(earlier)}.']
+
+
+SCORED = ('no gap where there is none', 'single effect, exactly',
+          'single effect, in the named set', 'pair, exactly',
+          'outside the library: unknown or partly', 'upper limit of no gap holds',
+          'harm: another recording made worse')
+"""Scores of the working cases that pages show."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Draw:
+    """One draw of working cases, with the hits and the number of cases of each score."""
+
+    command: str
+    date: str
+    commit: str
+    rule: str
+    hits: dict[str, int]
+    counts: dict[str, int]
+
+    @classmethod
+    def parse(cls, text: str) -> 'Draw':
+        """Read a draw from its head and its table of scores."""
+        head, *lines = text.splitlines()
+        command, date, commit, rule = head.split(', ')
+        hits, counts = {}, {}
+        for line in lines:
+            found = re.match(r'(\w.*?) {2,}(\d+) % \(.*\), n = (\d+)$', line)
+            if found:
+                name, percent, count = found[1], int(found[2]), int(found[3])
+                hits[name], counts[name] = round(percent * count / 100), count
+        return cls(command, date, commit.removeprefix('commit '), rule.removeprefix('rule '),
+                   hits, counts)
+
+
+def pooled_score(made: list[tuple[int, int]]) -> str:
+    """Return a share with its interval and number of cases, from hits and counts of draws."""
+    hits = sum(hit for hit, _ in made)
+    count = sum(count for _, count in made)
+    return scores.in_words(scores.share([True] * hits + [False] * (count - hits)))
+
+
+def pooled(draws: list[Draw]) -> str:
+    """Return the three decisive scores over draws, in words."""
+    words = {'single effect, exactly': 'single effects', 'pair, exactly': 'pairs',
+             'outside the library: unknown or partly': 'outside the library'}
+    return ', '.join(f'{words[name]} {sum(d.hits[name] for d in draws)} of '
+                     f'{sum(d.counts[name] for d in draws)}' for name in words)
+
+
+def sealed() -> list[str]:
+    """Return the result of the last sealed blind check, with all bars."""
+    page = (DOCS / 'maintain' / 'blind_check.md').read_text('utf-8')
+    result = page.split('<!-- result -->')[1].split('<!-- /result -->')[0]
+    rows = [[cell.strip() for cell in line.strip('|').split('|')]
+            for line in result.splitlines() if line.startswith('| ')]
+    return table('score | figure (90 % interval) | bar | met',
+                 [row for row in rows[1:] if row[-1] not in ('-', 'met')])[1:-1]
 
 
 def units() -> list[str]:

@@ -5,8 +5,8 @@ Measure the tilt error of a hand-held calibration against its number of rests.
     ./run --exec python docs/measurements/hand_held.py > docs/measurements/hand_held.txt
 
 Units of `lsm6dso` are drawn. Each rests in 40 random directions (`simulate tumble`), of which the
-first ones are fitted. The errors are those of 40 other rests of the same unit, after the one
-rotation that `~/level` and a yaw would take out.
+first ones are fitted. The errors are those of 40 other rests of the same unit, after `~/level`,
+which takes out roll and pitch of the mounting, and leaves its yaw.
 """
 
 from datetime import date
@@ -40,16 +40,24 @@ def rests_of(table: pd.DataFrame) -> list[tuple[int, int]]:
 
 
 def error_deg(truth: pd.DataFrame, corrected: pd.DataFrame) -> float:
-    """Return the rms angle between true and measured vertical over the rests, degrees."""
+    """Return the rms angle between true and levelled vertical over the rests, degrees."""
     true, measured = [], []
     for first, last in rests_of(truth):
         alpha, beta = truth[['alpha_rad', 'beta_rad']].iloc[(first + last) // 2]
         true.append([np.sin(alpha) * np.cos(beta), -np.sin(alpha) * np.sin(beta), np.cos(alpha)])
         mean = corrected[['ax_mps2', 'ay_mps2', 'az_mps2']].iloc[first:last].mean()
         measured.append(mean / np.linalg.norm(mean))
-    turn, _ = Rotation.align_vectors(true, measured)
-    cosine = np.sum(turn.apply(measured) * np.array(true), axis=1)
+    to_case, _ = Rotation.align_vectors(measured, true)
+    levelled = levelling(to_case.apply([0, 0, 1])).apply(measured)
+    cosine = np.sum(levelled * np.array(true), axis=1)
     return float(np.degrees(np.sqrt(np.mean(np.arccos(np.clip(cosine, -1, 1)) ** 2))))
+
+
+def levelling(vertical: np.ndarray) -> Rotation:
+    """Return the roll and pitch that turn the vertical of a level robot upright."""
+    x, y, z = vertical
+    roll, pitch = np.arctan2(y, z), np.arctan2(-x, np.hypot(y, z))
+    return Rotation.from_euler('xy', [roll, pitch])
 
 
 def unit_errors(seed: int, folder: Path) -> dict[int, float]:
