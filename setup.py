@@ -4,6 +4,7 @@
 
 from glob import glob
 from pathlib import Path
+import subprocess
 
 from setuptools import find_packages, setup
 
@@ -25,6 +26,17 @@ def executables(package: str, end: str = '') -> list[str]:
             if '\ndef main(' in path.read_text(encoding='utf-8')]
 
 
+def state_commit() -> None:
+    """Write the commit that is built into the package, so that pages and figures can name it."""
+    here = Path(__file__).resolve().parent
+    if (here / '.git').exists():
+        made = subprocess.run(['git', 'describe', '--always', '--dirty', '--exclude', '*'],
+                              cwd=here, capture_output=True, text=True)
+        if made.returncode == 0:
+            (here / PACKAGE / 'commit.txt').write_text(made.stdout, encoding='utf-8')
+
+
+state_commit()
 setup(
     name=PACKAGE,
     version='0.1.0',
@@ -32,7 +44,7 @@ setup(
     packages=[*find_packages(include=[PACKAGE, f'{PACKAGE}.*', f'{PACKAGE}_validation*']),
               f'{PACKAGE}.params'],
     package_dir={f'{PACKAGE}.params': 'params'},
-    package_data={PACKAGE: ['calibrate/report/*.html', 'calibrate/report/*.js',
+    package_data={PACKAGE: ['commit.txt', 'calibrate/report/*.html', 'calibrate/report/*.js',
                             'calibrate/report/*.xml', 'diagnose/*.html',
                             'files/export_templates/*', 'fleet/*.html', 'report/page_templates/*',
                             'tools/*.html'],

@@ -17,7 +17,7 @@ NODES = ('driver', 'stage', 'calibration', 'compensation', 'investigate', 'monit
 """The nodes, which set a handler of SIGINT of their own once they have loaded."""
 
 
-def package_version() -> str:
+def release_version() -> str:
     """Return the version of this package; 'unknown' when it runs from its source."""
     try:
         return version('adxl_ros')
@@ -26,11 +26,21 @@ def package_version() -> str:
 
 
 @lru_cache(maxsize=1)
+def package_version() -> str:
+    """Return version and commit, '0.1.0 (1a2b3c4)'; the commit is known to builds from git."""
+    try:
+        commit = Path(__file__).with_name('commit.txt').read_text('utf-8').strip()
+    except FileNotFoundError:
+        return release_version()
+    return f'{release_version()} ({commit})'
+
+
+@lru_cache(maxsize=1)
 def code_version() -> str:
     """Return the SHA-256 of version and code of this package."""
     code = [path.name.encode() + path.read_bytes()
             for path in sorted(Path(__file__).parent.rglob('*.py'))]
-    return hashlib.sha256(package_version().encode() + b''.join(code)).hexdigest()
+    return hashlib.sha256(release_version().encode() + b''.join(code)).hexdigest()
 
 
 def use_one_thread() -> None:

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import tempfile
 
+from adxl_ros.process import package_version
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
@@ -97,7 +98,8 @@ def main() -> None:
     """Print the table."""
     with tempfile.TemporaryDirectory() as folder:
         found = pd.DataFrame([unit_errors(seed, Path(folder)) for seed in range(UNITS)])
-    print(f'# ./run --exec python docs/measurements/hand_held.py, {date.today()}, version 0.1.0\n'
+    print(f'# ./run --exec python docs/measurements/hand_held.py, {date.today()}, '
+          f'adxl_ros {package_version()}\n'
           f'# {UNITS} units of lsm6dso, seeds 0 to {UNITS - 1}; rms tilt error on 40 other rests, '
           'degrees\nrests,median,worst')
     for count in found.columns:
