@@ -19,7 +19,14 @@ from adxl_ros.files.bag_messages import (
     read_info,
     Topics,
 )
-from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
+from adxl_ros.files.column_mapping import (
+    AS_IT_IS,
+    GRAVITY,
+    LSB,
+    Quantity,
+    ReadingOptions,
+    UNITS,
+)
 from adxl_ros.files.recording_columns import (
     ACCEL,
     COMMANDS,
@@ -44,9 +51,9 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
            reading: ReadingOptions = AS_IT_IS) -> Generator[Recording, None, None]:
     """Read a bag in blocks of at most `rows` samples."""
     with open_bag(path) as bag:
-        if reading.mapping is not None or reading.lsb_per_g or reading.lsb_at_0g:
-            raise UserError(f'{bag.path}: is a bag, with topics in m/s²; leave --columns and '
-                            '--lsb-per-g out, or name a topic with --topic')
+        if reading.mapping is not None:
+            raise UserError(f'{bag.path}: is a bag, which has no columns; leave --columns out: '
+                            '--topic names a topic, and --unit states its unit')
         topics = Topics(find_imu(bag)) if ideal else find_topics(bag, reading.topic)
         info = read_info(bag, topics.info)
         tracks, commands = _tracks(bag, topics), _commands(bag, topics)
@@ -73,19 +80,25 @@ class _Samples:
         self.count = 0  # Messages so far
         self.stamp_ns = np.zeros(0, np.int64)  # Stamps of the waiting samples, ns, (n,)
         self.force = np.zeros((0, 3))  # Their specific force, m/s², (n, 3)
-        self._rate_hz = reading.rate_hz
+        self._reading = reading
+        self._unit = reading.unit or 'mps2'  # Unit of the accelerations of the topic
+        if UNITS[Quantity.OUTPUT][self._unit].is_volts:
+            raise UserError(f'--unit {self._unit}: {where} has accelerations; write one of '
+                            f'{", ".join((*GRAVITY, LSB))}')
+        reading.check_counts(where, dict.fromkeys(ACCEL, self._unit))
         self._first_ns = 0
 
     def add(self, raws: Raws) -> None:
         """Decode and check further messages."""
         stamp_ns, columns = _columns(self.where, raws, cdr.imu, lambda table: dict(
             zip(ACCEL, table.numbers('linear_acceleration').T)))
-        force = np.column_stack(list(columns.values()))
+        force = self._reading.outputs(np.column_stack(list(columns.values())), 3 * [self._unit])
         if not self.count:
             self._begin(raws[:1], int(stamp_ns[0]))
-        if self._rate_hz is not None:
+        if self._reading.rate_hz is not None:
             number = self.count + np.arange(len(stamp_ns))
-            stamp_ns = self._first_ns + np.rint(number * 1e9 / self._rate_hz).astype(np.int64)
+            since_first_ns = np.rint(number * 1e9 / self._reading.rate_hz)
+            stamp_ns = self._first_ns + since_first_ns.astype(np.int64)
 
         def place(row: int) -> str:
             number = self.count + row + 1

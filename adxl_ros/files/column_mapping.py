@@ -145,7 +145,20 @@ def parse_mounting(text: str) -> Mounting:
     if set(mounting) != set(axes) or {AXES[index] for index, _ in mounting.values()} != set(axes):
         raise UserError(f'--axes {text}: each axis of the sensor must stand once on both sides; '
                         'write for example x=-y,y=x,z=z')
-    return tuple(mounting[axis] for axis in axes)
+    signed_axes = tuple(mounting[axis] for axis in axes)
+    if len(axes) == len(AXES) and _is_mirror(signed_axes):
+        raise UserError(f'--axes {text}: no rotation of the sensor gives this, because it turns a '
+                        'right-handed frame into a left-handed one; correct one sign, or the '
+                        'order of two axes')
+    return signed_axes
+
+
+def _is_mirror(mounting: Mounting) -> bool:
+    """Return whether a map of three axes has the determinant -1."""
+    matrix = np.zeros((len(AXES), len(AXES)))
+    for row, (column, sign) in enumerate(mounting):
+        matrix[row, column] = sign
+    return bool(np.linalg.det(matrix) < 0)
 
 
 class Quantity(Enum):
@@ -199,6 +212,7 @@ UNITS: Mapping[Quantity, Mapping[str, Unit]] = {
     Quantity.TIME: {'s': Unit(), 'ms': Unit(1e3), 'us': Unit(1e6), 'ns': Unit(1e9),
                     'epoch': Unit()},
     Quantity.OUTPUT: {'g': Unit(factor=G0_MPS2), 'mg': Unit(1e3, G0_MPS2), 'mps2': Unit(),
+                      'mmps2': Unit(1e3),
                       LSB: Unit(factor=G0_MPS2), UNSIGNED: Unit(factor=G0_MPS2),
                       'v': Unit(is_volts=True), 'mv': Unit(1e3, is_volts=True)},
     Quantity.ANGLE: {'rad': Unit(), 'deg': Unit(180.0, np.pi)},
@@ -218,6 +232,7 @@ _SPELLINGS = {
     's': 'sec secs second seconds', 'ms': 'msec millis milliseconds',
     'us': 'µs μs usec micros microseconds', 'ns': 'nsec nanoseconds', 'epoch': 'unix posix',
     'mps2': 'm/s^2 m/s² m/s2 ms2 ms^2 m/s/s ms-2 ms^-2 m_s2 mss m·s⁻² m.s-2 m_s^-2 m_s-2',
+    'mmps2': 'mm/s^2 mm/s² mm/s2 mms2 mm/s/s mms-2 mm_s2',
     'mg': 'millig', 'g': 'gs', LSB: 'counts count raw digits',
     'v': 'volt volts', 'mv': 'millivolt millivolts',
     'deg': '° degree degrees', 'rad': 'radian radians',
@@ -256,11 +271,48 @@ class ReadingOptions:
 
     topic: str = ''  # Samples in a bag, or message of a ULog file; empty for the only one
     mapping: ColumnMapping | None = None  # Columns of a table; None for those of the package
+    unit: str = ''  # Unit of the sensor's output, a key of `UNITS`; empty for what is stated
     lsb_per_g: tuple[float, ...] = ()  # Counts of 1 g: one for all axes, or one each
     lsb_at_0g: tuple[float, ...] = ()  # Counts at 0 g by axis; none for 0
     rate_hz: float | None = None  # Sample rate, Hz, that replaces the stamps; None keeps them
     drop_bad_stamps: bool = False  # Whether samples are left out whose stamp does not increase
     mounting: Mounting | None = None  # How the axes of the file are those of the sensor frame
+
+    def __post_init__(self) -> None:
+        """Refuse two statements of the unit."""
+        sources = self.mapping.sources if self.mapping else {}
+        stated = {sources[axis].unit for axis in AXES if axis in sources}
+        if self.unit and stated - {'', self.unit}:
+            raise UserError(f'--unit {self.unit}: --columns states another unit; leave one of '
+                            'them out')
+
+    def check_counts(self, where: str, units: Mapping[str, str]) -> None:
+        """
+        Refuse counts of 1 g without a column in LSB, or such a column without them.
+
+        where: file or option for messages; units: the unit of each axis by its column.
+        """
+        counts = [column for column, unit in units.items() if unit in (LSB, UNSIGNED)]
+        if counts and not self.lsb_per_g:
+            raise UserError(f'{where}: {counts[0]} is in LSB; add --lsb-per-g with the counts of '
+                            '1 g, as in the datasheet')
+        if not counts and (self.lsb_per_g or self.lsb_at_0g):
+            raise UserError(f'--lsb-per-g: no column is in LSB; add --unit {LSB}, or leave '
+                            '--lsb-per-g and --lsb-at-0g out')
+        if not {len(self.lsb_per_g), len(self.lsb_at_0g)} <= {0, 1, len(units)}:
+            raise UserError(f'--lsb-per-g, --lsb-at-0g: write one value for all {len(units)} '
+                            'axes, or one for each')
+
+    def outputs(self, readings: np.ndarray, units: Sequence[str]) -> np.ndarray:
+        """Return the output of the axes, (n, m), V or m/s², of readings in units, one an axis."""
+        per_g = np.broadcast_to(np.array(self.lsb_per_g or 1.0), len(units))
+        zero = np.broadcast_to(np.array(self.lsb_at_0g or 0.0), len(units))
+        outputs = []
+        for values, unit, scale, offset in zip(readings.T, units, per_g, zero):
+            if unit in (LSB, UNSIGNED):
+                values = ((signed(values) if unit == UNSIGNED else values) - offset) / scale
+            outputs.append(UNITS[Quantity.OUTPUT][unit].convert(values))
+        return np.column_stack(outputs)
 
 
 AS_IT_IS = ReadingOptions()
@@ -295,6 +347,15 @@ def time_unit_of_step(step: float, is_whole: bool) -> str:
     """Return the likely unit of stamps."""
     return next((unit for unit in ('s', 'ms', 'us', 'ns') if is_sensor_step(
         step / UNITS[Quantity.TIME][unit].divisor, is_whole)), 's')
+
+
+def parse_unit(text: str) -> str:
+    """Return the name of a unit of the sensor's output; empty for no text."""
+    name = unit_name(text, Quantity.OUTPUT) if text else ''
+    if name is None:
+        raise UserError(f'--unit {text}: unknown unit; write one of '
+                        f'{", ".join(UNITS[Quantity.OUTPUT])}')
+    return name
 
 
 def shell_quoted(text: str) -> str:

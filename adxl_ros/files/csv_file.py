@@ -329,8 +329,10 @@ def _since_1970(date: re.Match[bytes]) -> bytes:
     except ValueError:
         return date[0]
     offset_s = 3600 * int(hours) + (-60 if hours.startswith('-') else 60) * int(minutes)
-    seconds, nanoseconds = divmod(int(stamp.astype(np.int64)), 1_000_000_000)
-    return b'%d.%09d' % (seconds - offset_s, nanoseconds)
+    since_1970_ns = int(stamp.astype(np.int64)) - offset_s * 1_000_000_000
+    seconds, nanoseconds = divmod(abs(since_1970_ns), 1_000_000_000)
+    sign = b'-' if since_1970_ns < 0 else b''
+    return sign + b'%d.%09d' % (seconds, nanoseconds)
 
 
 Append = Callable[..., None]

@@ -149,7 +149,8 @@ class _Converter:
                 raise UserError(f'{self._where}: {table.path} has no column {name!r} for {role}; '
                                 f'the columns are {listed(names)}')
             name = names[int(name) - 1]
-        unit = source.unit or table.units.get(name) or unit_in_name(name, ROLES[role])
+        unit = (self._reading.unit if role in AXES else '') or source.unit or \
+            table.units.get(name) or unit_in_name(name, ROLES[role])
         if not unit:
             raise UserError(f'{self._where}: nothing states the unit of {name}; write for example '
                             f'{role}={source.column}:{ROLES[role].value}')
@@ -163,16 +164,11 @@ class _Converter:
         if any(self._unit(axis).is_volts != self._is_volts for axis in AXES[:len(self._axes)]):
             raise UserError(f'{self._where}: some axes are in volts and others are not; state one '
                             'kind')
-        counts = [axis.column for axis in self._axes if axis.unit in (LSB, UNSIGNED)]
-        per_g, at_0g = self._reading.lsb_per_g, self._reading.lsb_at_0g
-        if bool(counts) != bool(per_g):
-            raise UserError(f'{self._where}: {counts[0]} is in LSB; add --lsb-per-g with the '
-                            'counts of 1 g, as in the datasheet' if counts else
-                            '--lsb-per-g: no column is in LSB; write for example '
-                            f'x={self._axes[0].column}:lsb')
-        if not {len(per_g), len(at_0g)} <= {0, 1, len(self._axes)}:
-            raise UserError(f'--lsb-per-g, --lsb-at-0g: write one value for all '
-                            f'{len(self._axes)} axes, or one for each')
+        if self._is_native and self._reading.unit and \
+                self._is_volts != (self._axes[0].column in VOLTS):
+            raise UserError(f'--unit {self._reading.unit}: {self._axes[0].column} of '
+                            f'{self._path} says another quantity; name the columns by --columns')
+        self._reading.check_counts(self._where, {axis.column: axis.unit for axis in self._axes})
 
     def convert(self, block: TableBlock) -> Recording:
         """Return the samples of a block."""
@@ -202,16 +198,8 @@ class _Converter:
 
     def _outputs(self, block: TableBlock) -> np.ndarray:
         """Return the output of the sensor, (n, m), V or m/s²."""
-        count = len(self._axes)
-        per_g = np.broadcast_to(np.array(self._reading.lsb_per_g or 1.0), count)
-        zero = np.broadcast_to(np.array(self._reading.lsb_at_0g or 0.0), count)
-        outputs = []
-        for axis, source, scale, offset in zip(AXES, self._axes, per_g, zero):
-            values = block.columns[source.column]
-            if source.unit in (LSB, UNSIGNED):
-                values = ((signed(values) if source.unit == UNSIGNED else values) - offset) / scale
-            outputs.append(self._unit(axis).convert(values))
-        return np.column_stack(outputs)
+        readings = np.column_stack([block.columns[axis.column] for axis in self._axes])
+        return self._reading.outputs(readings, [axis.unit for axis in self._axes])
 
     def _references(self, block: TableBlock) -> dict[str, np.ndarray]:
         """Return the columns of references by name, (n,) each; NaN where not sampled."""
@@ -296,6 +284,11 @@ _TIME_NAMES = re.compile(r'(?i).*(time|stamp|zeit|date|clock|elapsed|epoch|milli
                          r'\W*(t|m?s|ms|us|ns|secs?|seconds?|(t|sec)[_\W].*)\W*')
 """Names of a time."""
 
+_COUNTER_WORDS = {
+    'packet', 'pkt', 'index', 'idx', 'count', 'counter', 'number', 'num', 'nr', 'no', 'seq',
+    'sequence', 'sample', 'frame', 'row', 'line', 'id'}
+"""Words in the name of a counter, which is no time."""
+
 _OTHER_SENSORS = re.compile(
     r'(?i)gyr|mag(?!nit)|\bm[xyz]\b|(?<![a-z])(pos|dist|height|alt|lat|lon|hum)|'
     r'angular|omega|rate|\bw[xyz]\b|g[xyz]r|rot|orient|quat|press|baro|vel|\bg[xyz]\b|'
@@ -362,8 +355,7 @@ def propose(table: Table) -> tuple[str, str]:
     sources |= _references(values, {*outputs, time}) if table.has_names else {}
     options = f'--columns {shell_quoted(str(ColumnMapping(sources)))} {stamps}'.rstrip()
     if unit in (LSB, UNSIGNED):
-        usual = min(_COUNTS, key=lambda count: abs(np.log(count / length)))
-        options += f' --lsb-per-g {round(length) if zero else usual}'
+        options += f' --lsb-per-g {round(length) if zero else _usual_counts(length)}'
         options += f' --lsb-at-0g {zero:.0f}' * bool(zero)
     return f'{seen}; the best guess{note}:', options
 
@@ -378,7 +370,8 @@ def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[s
         return '', 0.0, 0.0
     unit = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
     middle = (readings > _SIGN_GAP[0]) & (readings < _SIGN_GAP[1])
-    if unit in (None, LSB) and (readings == np.rint(readings)).all() and readings.min() >= 0 \
+    is_whole = bool((readings == np.rint(readings)).all())
+    if unit in (None, LSB) and is_whole and readings.min() >= 0 \
             and not middle.any() and _SIGN_GAP[1] < readings.max() < 1 << 16:
         unit, readings = UNSIGNED, signed(readings)
     low, spread = readings.min(axis=0), np.ptp(readings, axis=0)
@@ -389,16 +382,32 @@ def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[s
     length = float(np.median(lengths))
     if not unit:
         is_volts = table.has_names and all(map(_VOLT_NAMES.search, outputs))
-        unit = ('' if zero else likely_unit(length)) or ('v' if is_volts and length < 9 else LSB)
+        unit = ('' if zero else _gravity_unit(length, is_whole)) or \
+            ('v' if is_volts and length < 9 else LSB)
         unit = '' if unit == LSB and length + zero < 40 else unit
     is_gravity = np.median(np.abs(lengths - length)) <= _CONSTANT * length and \
         0.5 < length / GRAVITY.get(unit, length) < 2
     return (unit if is_gravity or len(outputs) < len(AXES) else ''), zero, length
 
 
+def _usual_counts(length: float) -> int:
+    """Return the usual counts of 1 g that are nearest to a length of gravity."""
+    return min(_COUNTS, key=lambda count: abs(np.log(count / length)))
+
+
+def _gravity_unit(length: float, is_whole: bool) -> str:
+    """Return the unit in which a length is that of gravity; none where counts fit better."""
+    unit = likely_unit(length)
+    if not unit or not is_whole:
+        return unit
+    departure = abs(np.log(length / GRAVITY[unit]))
+    return unit if departure <= abs(np.log(length / _usual_counts(length))) else ''
+
+
 def _stamp_options(values: np.ndarray, source: Source) -> str:
     """Return the option that stamps need which stand still or step back; empty for none."""
-    time_s = UNITS[Quantity.TIME][source.unit].convert(values[np.isfinite(values)] - values[0])
+    known = values[np.isfinite(values)]
+    time_s = UNITS[Quantity.TIME][source.unit].convert(known - known[0])
     if (np.diff(time_s) > 0).all():
         return ''
     if burst_samples(time_s) > 1:
@@ -414,8 +423,21 @@ def _time_column(table: Table, values: Mapping[str, np.ndarray]) -> str | None:
         if len(steps) > 2 and np.mean(steps >= 0) > 0.99 and np.mean(steps > 0) > 0.05:
             rising.append(name)
     named = [name for name in rising if table.has_names and _TIME_NAMES.fullmatch(name)]
-    others = [name for name in rising if not (np.diff(values[name]) == 1).all()]
+    others = [name for name in rising if not _is_counter(name, values[name])]
     return next(iter([*named, *others]), None)
+
+
+def _is_counter(name: str, column: np.ndarray) -> bool:
+    """Return whether a column numbers the samples: by its name, or because it rises by one."""
+    known = column[np.isfinite(column)]
+    steps = np.diff(known)
+    rises_by_one = (known == np.rint(known)).all() and np.median(steps[steps != 0]) == 1
+    return bool(rises_by_one) or not _COUNTER_WORDS.isdisjoint(map(str.lower, _words(name)))
+
+
+def _words(name: str) -> list[str]:
+    """Return the words in the name of a column."""
+    return re.split(r'[_\W]+|(?<=[a-z])(?=[A-Z])', name)
 
 
 def _time_source(table: Table, name: str, values: np.ndarray) -> Source:
@@ -451,8 +473,7 @@ def _by_axis(names: Sequence[str]) -> list[str]:
     by_letter: dict[str, str] = {}
     for name in names:
         bare = re.sub(r'[(\[{].*?[)\]}]', '', name).strip()
-        words = re.split(r'[_\W]+|(?<=[a-z])(?=[A-Z])', bare)
-        matches = list(filter(None, map(_AXIS_WORD.fullmatch, words)))
+        matches = list(filter(None, map(_AXIS_WORD.fullmatch, _words(bare))))
         if matches:
             by_letter.setdefault((matches[-1][1] or matches[-1][2]).lower(), name)
     if by_letter:

@@ -23,6 +23,7 @@ from adxl_ros.files.column_mapping import (
     AS_IT_IS,
     parse_mapping,
     parse_mounting,
+    parse_unit,
     ReadingOptions,
 )
 from adxl_ros.files.recording_columns import Recording
@@ -88,6 +89,10 @@ def add_recording_options(parse: argparse.ArgumentParser) -> None:
                        help='columns and units of a table, for example '
                             'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg; or a file that holds '
                             'them')
+    group.add_argument('--unit', metavar='UNIT', default='',
+                       help='unit of the samples of a topic or of all axes of a table: g, mg, '
+                            'mps2, mmps2, lsb ... (default: what the file states; topics are in '
+                            'm/s²)')
     group.add_argument('--lsb-per-g', metavar='COUNTS', default='',
                        help='counts of 1 g of columns in LSB: one number, or one for each axis')
     group.add_argument('--lsb-at-0g', metavar='COUNTS', default='',
@@ -126,6 +131,7 @@ def reading_options(options: argparse.Namespace) -> ReadingOptions:
                         f'{_HIGHEST_RATE_HZ:g}')
     return ReadingOptions(
         options.topic, parse_mapping(options.columns) if options.columns else None,
+        parse_unit(options.unit),
         _counts('--lsb-per-g', options.lsb_per_g, 0.0),
         _counts('--lsb-at-0g', options.lsb_at_0g, -math.inf), options.rate,
         options.drop_bad_stamps, parse_mounting(options.axes) if options.axes else None)
@@ -134,7 +140,7 @@ def reading_options(options: argparse.Namespace) -> ReadingOptions:
 def reading_text(options: argparse.Namespace) -> str:
     """Return the given options for a command line that reads the same recording."""
     words = []
-    for name in ('topic', 'columns', 'lsb_per_g', 'lsb_at_0g', 'rate', 'axes'):
+    for name in ('topic', 'columns', 'unit', 'lsb_per_g', 'lsb_at_0g', 'rate', 'axes'):
         if value := getattr(options, name):
             words += [f'--{name.replace("_", "-")}', str(value)]
     words += ['--drop-bad-stamps'] * options.drop_bad_stamps
