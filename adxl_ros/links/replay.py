@@ -63,6 +63,7 @@ class Replay(base.Link):
         self.start_ns = self._first_ns if 0 <= self._first_ns < _MAX_CLOCK_NS else None
         self._offset_ns = 0
         self._last_ns = self._first_ns - self._period_ns
+        self._has_ended = False
 
     def begin(self, now_ns: int) -> int:
         """Make the next sample due now; no sample is lost."""
@@ -74,6 +75,8 @@ class Replay(base.Link):
     def read(self, now_ns: int) -> base.Samples:
         """Return the rows that are due, at most to the end of a block."""
         block = self._block
+        # The samples of the read before this one are out: what they end has ended now.
+        self._has_ended = block is None
         if block is None:
             return base.no_samples(self.sensor, now_ns)
         end = int(np.searchsorted(self._stamps, now_ns - self._offset_ns, 'right'))
@@ -92,8 +95,8 @@ class Replay(base.Link):
         return samples
 
     def status(self) -> base.LinkStatus:
-        """Return whether the recording plays."""
-        return base.LinkStatus(base.Level.OK, 'playing' if self._block is not None else 'ended')
+        """Return whether the recording plays; it has ended once a read found no row."""
+        return base.LinkStatus(base.Level.OK, 'ended' if self._has_ended else 'playing')
 
     def close(self) -> None:
         """Close the file."""

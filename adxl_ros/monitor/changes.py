@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, UTC
+from datetime import datetime, timezone
 import json
 import os
 from pathlib import Path
@@ -224,7 +224,7 @@ def iso_time(stamp_ns: int) -> str:
     """Return a stamp, ns, as UTC to the second, such as 2026-11-23T05:00:00Z; else in seconds."""
     if stamp_ns < _FIRST_UTC_NS:
         return f'{stamp_ns * 1e-9:.0f} s'
-    return datetime.fromtimestamp(stamp_ns // 10 ** 9, UTC).strftime('%Y-%m-%dT%H:%M:%SZ')
+    return datetime.fromtimestamp(stamp_ns // 10 ** 9, timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
 
 
 def append(folder: Path, change: GapChange, serial: str) -> None:

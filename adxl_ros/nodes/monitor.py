@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from datetime import datetime, UTC
+from datetime import datetime, timezone
 from pathlib import Path
 import time
 
@@ -234,7 +234,7 @@ class Monitor(Node):
 
     def _begin_diagnosis(self, begin_ns: int) -> None:
         """Begin a diagnosis of the samples since a stamp, ns."""
-        name = datetime.now(UTC).strftime('diagnosis_%Y%m%dT%H%M%S_%fZ')
+        name = datetime.now(timezone.utc).strftime('diagnosis_%Y%m%dT%H%M%S_%fZ')
         self._run = DiagnosisRun(self._output / name, self._live.diagnosis_input(begin_ns))
 
     def _serve(self) -> None:

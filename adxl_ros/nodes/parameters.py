@@ -136,8 +136,8 @@ def check_given(node: Node) -> None:
         *sensor_specs(), *node_specs(sys.modules[type(node).__module__])))}
     # One file may serve all nodes: a node ignores what another one has. The others are loaded one
     # after the other, and only until one has the name.
-    others = (spec.name for other in NODES
-              for spec in node_specs(import_module(f'adxl_ros.nodes.{other}')))
+    broken: list[str] = []
+    others = _names_of_nodes(broken)
     for name in given_parameters(node):
         if name in known or name.startswith(_FREE_PREFIXES):
             continue
@@ -146,8 +146,22 @@ def check_given(node: Node) -> None:
             if other == name:
                 break
         else:
-            raise parameter_error(name, 'no node has a parameter of this name; did you mean '
-                                  f'{get_close_matches(name, sorted(known), 1, 0.0)[0]}?')
+            like = get_close_matches(name, sorted(known), 1, 0.0)[0]
+            unread = f' ({"; ".join(broken)})' if broken else ''
+            raise parameter_error(name, f'no node has a parameter of this name{unread}; did you '
+                                  f'mean {like}?')
+
+
+def _names_of_nodes(broken: list[str]) -> Iterator[str]:
+    """Yield the parameters of all nodes; add what is wrong with those that do not load."""
+    for node in NODES:
+        try:
+            module = import_module(f'adxl_ros.nodes.{node}')
+        # A fault of another node, whatever it is, must not hide the misspelt name of this one.
+        except Exception as error:
+            broken.append(f'{node} does not load: {one_line(error)}')
+            continue
+        yield from (spec.name for spec in node_specs(module))
 
 
 def declare_all(node: Node, settings: type[T]) -> T:

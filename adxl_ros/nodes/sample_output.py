@@ -22,6 +22,7 @@ import numpy as np
 from rclpy.clock import Clock as StampClock
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 
@@ -182,11 +183,21 @@ class SampleOutput:
         self._info = topics.create_publisher(node, DiagnosticStatus, 'sensor_info', 1,
                                              latched=True)
         self._clock = topics.create_publisher(node, Clock, '/clock', 1) if is_clock else None
+        self._left: Publisher | None = None  # Publisher of a clock that another node has become
+        self._leave = node.create_guard_condition(self._destroy_left)
 
     def destroy(self) -> None:
         """Remove the topics."""
+        self._destroy_left()
+        self._node.destroy_guard_condition(self._leave)
         for publisher in filter(None, (self._data, self._info, self._clock)):
             self._node.destroy_publisher(publisher)
+
+    def _destroy_left(self) -> None:
+        """Destroy the publisher of the clock; an executor that waits for it would fail."""
+        left, self._left = self._left, None
+        if left is not None:
+            self._node.destroy_publisher(left)
 
     def follow_other_clock(self) -> None:
         """Stop being the clock if another node is; of drivers, the one that sorts first stays."""
@@ -197,8 +208,9 @@ class SampleOutput:
         if self._clock is None or not any(
                 name != own and (name[1] != own[1] or name < own) for name in clocks):
             return
-        self._node.destroy_publisher(self._clock)
-        self._clock, self.is_clock = None, False
+        # The thread of the link calls this: the executor destroys the publisher in its own.
+        self._left, self._clock, self.is_clock = self._clock, None, False
+        self._leave.trigger()
         self._node.set_parameters([Parameter('use_sim_time', value=True)])
         self._node.get_logger().warning('another node publishes /clock: this driver follows it, '
                                         'and link.speed is that of this clock')

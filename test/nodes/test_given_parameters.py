@@ -4,6 +4,7 @@
 
 from importlib import import_module
 from pathlib import Path
+import sys
 
 from adxl_ros.files import parameter_file
 from adxl_ros.nodes.parameters import has_section, node_specs, sensor_specs
@@ -78,6 +79,13 @@ def test_the_file_of_a_unit_without_a_link_is_refused(refusal, unit):
     ('frameid:=case', 'did you mean frame_id?')])
 def test_a_driver_that_may_mean_a_real_sensor_is_refused(refusal, parameter, words):
     assert words in refusal('driver', ROS, '-p', parameter)
+
+
+def test_a_misspelt_name_is_reported_although_another_node_does_not_load(refusal, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'adxl_ros.nodes.monitor', None)
+    line = refusal('driver', ROS, '-p', 'frameid:=case')
+    assert 'did you mean frame_id?' in line
+    assert 'monitor does not load' in line
 
 
 @pytest.mark.parametrize('link, parameter, words', [

@@ -161,7 +161,12 @@ class Link(Protocol):
         """Return the samples that are due; raises `UserError` when there will be no more."""
 
     def status(self) -> LinkStatus:
-        """Return how the link works."""
+        """
+        Return how the link works.
+
+        Another thread may ask while the samples of the last read are not published yet. A link
+        that ends says so after the next read, so that the end comes after its samples.
+        """
 
     def close(self) -> None:
         """Close what the link holds open."""
