@@ -22,7 +22,7 @@ from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import get, Sensor
-from adxl_ros.report.quantities import with_half_width
+from adxl_ros.report.quantities import mg, with_half_width
 from adxl_ros.signals import recorded_sensor
 import numpy as np
 
@@ -357,7 +357,7 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
         misfit_mps2=float(np.hypot(base.envelope.misfit_mps2, misfit_mps2))))
     fitted = with_provenance(fitted, source, poses, data_sha256, {
         'reference': 'rest over temperature', 'base': base.provenance.get('id', base.serial),
-        'residual_mg': f'{misfit_mps2 / G0_MPS2 * 1e3:.4f}'})
+        'residual_mg': f'{mg(misfit_mps2):.4f}'})
     covered = thermal_fit.passed(blocks.temperature_c, (low_c, high_c))
     error_mg = thermal_fit.expected_error_mg(fit, covered, calibrated_c)
     std = dict(zip(fit.names, Z_90 * np.sqrt(np.diag(fit.covariance))))

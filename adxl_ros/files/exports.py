@@ -16,7 +16,7 @@ import re
 from textwrap import indent, wrap
 from typing import NamedTuple
 
-from adxl_ros.errors import install_hint, UserError
+from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.parameter_file import float_text
 from adxl_ros.model import noise, signal_chain
@@ -27,6 +27,7 @@ from adxl_ros.model.effects.base import Place
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.process import package_version
+from adxl_ros.report import templates
 import numpy as np
 
 WHITE_NOISE, FILTER, STEPS = 'white noise', 'RC filter', 'ADC steps'
@@ -126,7 +127,8 @@ def _head(export: Export, software: str, prefix: str = '# ') -> str:
     sensor = export.sensor
     width = max(map(len, export.sizes_mg)) + 2
     lines = [f'Sensor {sensor.serial}, axes {" ".join(sensor.axes)}, {sensor.rate_hz:.5g} Hz.',
-             f'Written by adxl_ros {package_version()} for {software}, from {export.source}.',
+             *wrap(f'Written by adxl_ros {package_version()} for {software}, from '
+                   f'{export.source}.', _COLUMNS),
              '',
              f'{"part":{width}}{"size, mg rms":14}in this file']
     for part, size_mg in sorted(export.sizes_mg.items(), key=lambda part: -part[1]):
@@ -227,10 +229,6 @@ def text(name: str, export: Export) -> str:
     """Return the content of a file in a format: the values of a sensor in its template."""
     if name == 'json':
         return _json(export)
-    try:
-        from jinja2 import Environment, PackageLoader, StrictUndefined
-    except ImportError:
-        raise UserError(f'--to {name} needs jinja2: {install_hint("jinja2")}') from None
     sensor = export.sensor
     values = {field.name: by_axis(sensor, field.name) for field in fields(Axis)[1:]}
     variance = [v if axis in sensor.axes else UNMEASURED_VARIANCE
@@ -241,11 +239,10 @@ def text(name: str, export: Export) -> str:
     if not walk:
         walk = effect_named('bias_walk').diagnosis.healthy_density * G0_MPS2
         remark += '\n# The random walk is that of a healthy unit: the file states none.'
-    templates = Environment(loader=PackageLoader('adxl_ros', 'files/export_templates'),
-                            undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-                            keep_trailing_newline=True)
-    templates.filters |= {'yaml': _yaml, 'single_dashes': _without_double_dashes}
-    return templates.get_template(f'{name}.jinja').render(
+    formats = templates.environment(f'--to {name}', ('adxl_ros', 'files/export_templates'),
+                                    escapes=False)
+    formats.filters |= {'yaml': _yaml, 'single_dashes': _without_double_dashes}
+    return formats.get_template(f'{name}.jinja').render(
         head=partial(_head, export), white=partial(_white_density, export), walk=walk,
         walk_remark=f'# {remark}', kalibr_settings=kalibr_settings, sensor=sensor,
         source=export.source, axes=axes(sensor), by_axis=values, arm_m=arm_m(sensor),

@@ -27,9 +27,9 @@ from typing import NamedTuple
 from adxl_ros.errors import UserError
 from adxl_ros.fleet import pooling
 from adxl_ros.fleet.pooling import Recordings
-from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
+from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.population import PooledCoefficient
-from adxl_ros.report.quantities import counted, number
+from adxl_ros.report.quantities import counted, mg, number
 import numpy as np
 import pandas as pd
 
@@ -40,7 +40,7 @@ _OTHERS = ['date', 'effects', 'calibration_age_days', 'gap_floor_mps2']
 """Columns that the page uses, beside those of the quantities."""
 _YEAR = np.timedelta64(31_557_600_000_000, 'us')  # A year of 365.25 days
 TOLERANCE_MG = 3.5  # Largest gap of a unit that is in order, mg. Chosen: an error of 0.2° in tilt
-MG = 1e3 / G0_MPS2  # Milli-g in 1 m/s²
+MG = mg(1.0)  # Milli-g in 1 m/s²
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from urllib.parse import unquote_plus
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.process import package_version
+from adxl_ros.report import templates
 from adxl_ros.report.figures import png
 
 _DPI = 100  # Resolution of pictures, dots per inch (chosen: sharp at the page's width)
@@ -40,15 +41,11 @@ def check_libraries() -> None:
 def render(package: str, template: str, values: Mapping[str, Any]) -> str:
     """Return a whole page."""
     check_libraries()
-    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
-    loader = ChoiceLoader([PackageLoader(package, ''),
-                           PackageLoader('adxl_ros.report', 'page_templates')])
-    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined,
-                              trim_blocks=True, lstrip_blocks=True)
+    layouts = templates.environment('a page', (package, ''), ('adxl_ros.report', 'page_templates'))
     plotly_js = gzip.compress(get_plotlyjs().encode(), _GZIP_LEVEL, mtime=0)
     made = f'made {datetime.now().astimezone():%Y-%m-%d %H:%M} by adxl_ros {package_version()}'
-    return environment.get_template(template).render(
+    return layouts.get_template(template).render(
         {'made': made, 'command': command_of_this_process(), **values},
         plotly_js=b64encode(plotly_js).decode())
 

@@ -21,6 +21,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.robot_readings import Readings
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Components
+from adxl_ros.report.quantities import mg
 from adxl_ros.simulate.motion import (
     ForcePath,
     Held,
@@ -186,7 +187,7 @@ class RobotPath(ForcePath):
 
     def text(self) -> str:
         """Return what is known of the robot, for people."""
-        error_mg = 1e3 / G0_MPS2 * np.sqrt(np.mean(self.error_mps2 ** 2))
+        error_mg = mg(np.sqrt(np.mean(self.error_mps2 ** 2)))
         return (f'{self._robot.frame} moves by {", ".join(self.joints) or "its base"}, from '
                 f'{self.time_s[0]:.3g} to {self.time_s[-1]:.3g} s; the encoders leave an error of '
                 f'{error_mg:.2g} mg rms')

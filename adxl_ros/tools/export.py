@@ -11,8 +11,8 @@ from pathlib import Path
 
 from adxl_ros.files import exports, parameter_file
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.quantities import mg
 from adxl_ros.report.screen import entry_list
 from adxl_ros.simulate.response import ChainMemo, change_mg
 from adxl_ros.simulate.trajectories import TRAJECTORIES
@@ -80,7 +80,7 @@ def _sized(sensor: Sensor, options: argparse.Namespace, holds: Mapping[str, str]
 
 def _rms_mg(values_mps2: list[float]) -> float:
     """Return the rms of values in m/s², mg."""
-    return float(1e3 / G0_MPS2 * np.sqrt(np.mean(np.square(values_mps2))))
+    return float(mg(np.sqrt(np.mean(np.square(values_mps2)))))
 
 
 def main() -> int:

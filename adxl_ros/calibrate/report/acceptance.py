@@ -16,7 +16,7 @@ from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import parameter_of, Sensor
-from adxl_ros.report.quantities import duration
+from adxl_ros.report.quantities import duration, mg
 import numpy as np
 import scipy
 
@@ -173,7 +173,7 @@ def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
     """Lay out the error of the calibration above its limit, with one outcome for each figure."""
     limit_mps2, _ = limit(sensor)
     rows = (('calibration error', assessment.error_mg, assessment.error_deg, '', ''),
-            ('limit', 1e3 * limit_mps2 / G0_MPS2,
+            ('limit', mg(limit_mps2),
              np.degrees(limit_mps2 * np.sqrt(assessment.tilt.tilt_per_axis)),
              assessment.accel_outcome, assessment.tilt_outcome))
     return [f' {name:24} {"-" if np.isnan(value_deg) else _two_digits(value_deg):>7} ° {tilt:9} '
@@ -184,7 +184,7 @@ def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
 def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:
     """State the errors against gravity of rests that begin at times, (k,), and the outliers."""
     kept = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-    before, after, unseen = (held_out.statistic(1e3 * values[kept] / G0_MPS2) for values in (
+    before, after, unseen = (held_out.statistic(mg(values[kept])) for values in (
         fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
     low, high = unseen.interval
     lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before.rms:.2f}, '
@@ -219,7 +219,7 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
     if 'own_accel_mg' not in provenance:
         return NOT_SHOWN, ['no pose was kept out of the fit to assess it']
     limit_mps2, origin = limit(fitted)
-    limit_text = f'{_two_digits(1e3 * limit_mps2 / G0_MPS2)} mg'
+    limit_text = f'{_two_digits(mg(limit_mps2))} mg'
     accel = provenance.get('verdict', '')
     outcomes = accel, provenance.get('verdict_tilt', '')
     outcome = next((word for word in (FAIL, NOT_SHOWN) if word in outcomes), PASS)

@@ -22,7 +22,8 @@ from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.sensor import MARGIN_K, Sensor
-from adxl_ros.report.quantities import number
+from adxl_ros.report import templates
+from adxl_ros.report.quantities import mg, number
 import numpy as np
 
 K = 2  # Coverage factor of an expanded uncertainty; about 95 % for a normal distribution
@@ -130,10 +131,10 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
         gravity_std, gravity_kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, not local: anywhere'
     inputs = (
         Input('noise of the mean', 'A, normal', 1e3 * np.mean(held.std_v, axis=0), 'mV', by_noise),
-        Input('coefficients', 'A, covariance of the fit', 1e3 * by_coefficients / G0_MPS2, 'mg',
+        Input('coefficients', 'A, covariance of the fit', mg(by_coefficients), 'mg',
               by_coefficients),
         Input('stage angles', stage_kind, np.degrees(stage_rad), '°', stage_mps2),
-        Input('model', 'A, held-out errors', 1e3 * model / G0_MPS2, 'mg', model),
+        Input('model', 'A, held-out errors', mg(model), 'mg', model),
         Input('local gravity', gravity_kind, gravity_std, 'm/s²',
               np.abs(reference) / gravity * gravity_std),
         *(_surroundings(name, fitted, held, reference) for name in _SURROUNDINGS))
@@ -144,7 +145,7 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
                  scale * (part.calibration_high ** 0.5 - part.calibration ** 0.5), scale * limit,
                  outcome)
         for quantity, unit, scale, part, limit, outcome in (
-            ('acceleration', 'mg', 1e3 / G0_MPS2, assessment.accel, limit_mps2,
+            ('acceleration', 'mg', mg(1.0), assessment.accel, limit_mps2,
              assessment.accel_outcome),
             ('tilt', '°', float(np.degrees(1.0)), assessment.tilt, tilt_limit_rad,
              assessment.tilt_outcome))
@@ -180,12 +181,13 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
     rows = []
     for row in found.inputs:
         std = float(np.broadcast_to(row.std, found.error_mps2.shape)[found.worst])
-        part_mg = 1e3 * float(row.contribution_mps2[found.worst]) / G0_MPS2
+        part_mg = float(mg(row.contribution_mps2[found.worst]))
         sensitivity = '1' if row.unit == 'mg' else \
             f'{number(part_mg / std if std else 0.0, digits=2)} mg per {row.unit}'
         rows.append([row.name, f'{number(std, digits=2)} {row.unit} ({row.kind})', sensitivity,
                      f'{part_mg:.3f}'])
-    expanded_mg, (pose, axis) = 1e3 * K * found.combined_mps2 / G0_MPS2, found.worst
+    expanded_mg = mg(K * found.combined_mps2)
+    pose, axis = found.worst
     alpha, beta = np.degrees([found.alpha_rad[pose], found.beta_rad[pose]])
     inside = np.abs(found.error_mps2) <= K * found.combined_mps2
     decisions = [[
@@ -226,12 +228,9 @@ def write(path: str | os.PathLike, result: CalibrationResult) -> None:
     if found is None:
         raise UserError(f'{path}: a certificate states errors at stage angles, and no pose with '
                         'angles was kept out of the fit; leave --dcc out')
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-    environment = Environment(
-        loader=PackageLoader('adxl_ros.calibrate.report', ''), autoescape=True,
-        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    elements = templates.environment('a certificate', ('adxl_ros.calibrate.report', ''))
     fitted = result.fitted
-    write_text(path, environment.get_template('certificate.xml').render(
+    write_text(path, elements.get_template('certificate.xml').render(
         schema_version=SCHEMA_VERSION, k=K, rule=RULE,
         method=f'{MEANING} {MODEL}', fitted=fitted, provenance=fitted.provenance,
         step_deg=np.degrees(fitted.stage_resolution_rad), **_results(fitted, found)))

@@ -35,6 +35,7 @@ from adxl_ros.model.covariance import coefficient_tangent, force_covariance
 from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT
 from adxl_ros.model.kinematics import tilt
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.quantities import mg
 import numpy as np
 import scipy
 
@@ -113,7 +114,7 @@ def summarise(model: str, errors: PoseErrors, pose_index: np.ndarray | None = No
               fitted: Sequence[Sensor] = (), fold: np.ndarray | None = None) -> HeldOutErrors:
     """Summarise the errors of one model; the arrays as in `HeldOutErrors`, None for one fold."""
     count = len(errors.accel_mps2)
-    accel_mg = errors.accel_mps2[determining_alpha(errors)] / G0_MPS2 * 1e3
+    accel_mg = mg(errors.accel_mps2[determining_alpha(errors)])
     return HeldOutErrors(
         model, statistic(np.degrees(errors.tilt_rad)), statistic(accel_mg), errors,
         np.arange(count) if pose_index is None else pose_index, tuple(fitted),
@@ -413,4 +414,4 @@ def _scatter(sensor: Sensor, poses: Poses) -> tuple[float, float, bool]:
 
 def rms_mg(mean_square: float) -> float:
     """Return the rms in mg of a mean square in (m/s²)²; 0 for a negative one."""
-    return sqrt(max(mean_square, 0.0)) / G0_MPS2 * 1e3
+    return float(mg(sqrt(max(mean_square, 0.0))))

@@ -23,6 +23,7 @@ from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import get, Sensor
 from adxl_ros.report import figures, page as html_page
 from adxl_ros.report.figures import AXIS_COLOURS, Figure
+from adxl_ros.report.quantities import mg
 import numpy as np
 
 PAGE = 'report.html'  # The file of a report
@@ -63,15 +64,14 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     assessment = result.assessments[-1] if result.assessments else None
     rows, (limit_mps2, origin) = _coefficients(fitted), acceptance.limit(fitted)
     drawn: dict[str, Figure] = {}
-    to_mg = 1e3 / G0_MPS2
     if (fit := result.gravity_fit) is not None:
         drawn['errors'] = _error_figure(
-            result.inliers, to_mg * fit.held_out_mps2[:, None], Z_90 * to_mg * fit.expected_mps2,
+            result.inliers, mg(fit.held_out_mps2[:, None]), Z_90 * mg(fit.expected_mps2),
             'x', 'rest', 'magnitude minus gravity, mg')
     elif errors is not None and assessment is not None:
-        half_mg = np.full(errors.pose_count, Z_90 * to_mg * assessment.accel.expected ** 0.5)
+        half_mg = np.full(errors.pose_count, Z_90 * mg(assessment.accel.expected ** 0.5))
         drawn['errors'] = _error_figure(
-            held_out.determining_alpha(errors.errors), to_mg * errors.errors.accel_mps2, half_mg,
+            held_out.determining_alpha(errors.errors), mg(errors.errors.accel_mps2), half_mg,
             fitted.axes, 'held-out pose', 'error of acceleration, mg')
     picture, fault = '', ''
     try:
@@ -94,7 +94,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
         'datasheet': fitted.datasheet_name,
         'models': list(errors_of or row_of), 'errors_of': errors_of, 'row_of': row_of,
         'poses': len(result.poses), 'digits': digits, 'mg': held_out.rms_mg,
-        'limit': f'{origin} ({1e3 * limit_mps2 / G0_MPS2:.2g} mg)',
+        'limit': f'{origin} ({mg(limit_mps2):.2g} mg)',
         'budget': assessment.accel if assessment and errors else None,
         'part_colours': _PART_COLOURS,
         'gum': gum.section(gum.uncertainty(result)),
@@ -143,8 +143,8 @@ def _sphere(result: CalibrationResult) -> dict[str, Any]:
     if fit is not None:
         force = np.column_stack(signal_chain.inverse(fitted)(
             list(poses.volts.T), poses.environment))
-        errors = {'nominal': 1e3 * fit.before_mps2[:, None] / G0_MPS2,
-                  'gravity': 1e3 * fit.residual_mps2[:, None] / G0_MPS2}
+        errors = {'nominal': mg(fit.before_mps2[:, None]),
+                  'gravity': mg(fit.residual_mps2[:, None])}
         quantities = [['magnitude minus gravity', 'mg']]
         labels = [f'rest {i + 1}' for i in range(len(poses))]
     else:
@@ -154,7 +154,7 @@ def _sphere(result: CalibrationResult) -> dict[str, Any]:
         for model, unit in units.items():
             of_unit = held_out.pose_errors(unit, poses)
             errors[model] = np.column_stack([np.degrees(of_unit.tilt_rad),
-                                             1e3 * of_unit.accel_mps2 / G0_MPS2])
+                                             mg(of_unit.accel_mps2)])
         quantities = [['tilt error', '°'], *([f'error of {a}', 'mg'] for a in fitted.axes)]
         labels = [f'pose {i}, alpha {alpha:.1f}°, beta {beta:.1f}°' for i, (alpha, beta) in
                   enumerate(np.degrees([poses.alpha_rad, poses.beta_rad]).T, 1)]
