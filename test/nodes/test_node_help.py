@@ -32,7 +32,7 @@ def test_version(name: str, run_tool) -> None:
     ros_args = () if name in ('demo', 'bench') else ('--ros-args',)
     done = run_tool(name, *ros_args, '--version')
     assert (done.returncode, done.stderr) == (0, '')
-    assert re.fullmatch(r'adxl_ros \d+\.\d+\.\d+\n', done.stdout)
+    assert re.fullmatch(r'adxl_ros \d+\.\d+\.\d+( \(\w+\))?\n', done.stdout)
 
 
 @pytest.mark.parametrize('name', PROGRAMS)

@@ -26,7 +26,7 @@ def test_help_version_and_wrong_usage(name: str, help_of: Callable, tmp_path: Pa
     assert max(map(len, text.splitlines())) <= COLUMNS
     done = run_in_process(name, '--version', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
-    assert re.fullmatch(r'adxl_ros \d+\.\d+\.\d+\n', done.stdout)
+    assert re.fullmatch(r'adxl_ros \d+\.\d+\.\d+( \(\w+\))?\n', done.stdout)
     refused = run_in_process(name, '--no-such-option', cwd=tmp_path)
     assert (refused.returncode, refused.stdout) == (2, '')
     assert refused.stderr.startswith(f'usage: {name}')
