@@ -9,7 +9,6 @@ loopback interface, in a domain that no other test run and no other graph uses.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 import fcntl
 from functools import partial
@@ -22,6 +21,7 @@ import sys
 
 from domain import BY_UDP, own_domain
 from hypothesis import settings
+import needs
 from pages import opener, running_browser
 from processes import executable, REPO, run_executable, run_in_process, Started
 import pytest
@@ -60,11 +60,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    reasons = Counter(report.longrepr[2].removeprefix('Skipped: ')
-                      for report in terminalreporter.stats.get('skipped', ()))
-    if reasons:
-        terminalreporter.write_line(f'skipped {reasons.total()} tests: ' + '; '.join(
-            f'{count} × {reason}' for reason, count in reasons.most_common()))
+    for line in needs.summary(report.longrepr[2].removeprefix('Skipped: ')
+                              for report in terminalreporter.stats.get('skipped', ())):
+        terminalreporter.write_line(line)
 
 
 @pytest.fixture(scope='module')
@@ -88,12 +86,19 @@ def private_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def ros_env(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[dict[str, str]]:
     """Set the environment of a private graph, and give the environment of its processes."""
+    kills = 'kill' in request.fixturenames
     with own_domain() as domain, pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_DOMAIN_ID', str(domain))
         patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         patch.delenv('ROS_LOCALHOST_ONLY', raising=False)
         patch.setenv('ROS_LOG_DIR', str(tmp_path / 'ros_log'))
-        yield os.environ | (BY_UDP if request.node.get_closest_marker('kills') else {})
+        yield os.environ | (BY_UDP if kills else {})
+
+
+@pytest.fixture
+def kill(ros_env: dict[str, str]) -> Callable[[int], None]:
+    """Give a function that kills a process by its id; all processes of the test talk by UDP."""
+    return lambda pid: os.kill(pid, signal.SIGKILL)
 
 
 @pytest.fixture
@@ -206,5 +211,5 @@ def shared_dir() -> Path:
     """Return the folder of real recordings and samples beside the repository."""
     path = REPO.parent / 'shared'
     if not path.is_dir():
-        pytest.skip(f'no recordings in {path}')
+        pytest.skip(needs.lack('../shared'))
     return path

@@ -22,6 +22,7 @@ from adxl_ros.links.support.wire_format import (
     RAIL,
 )
 from hypothesis import given, settings, strategies as st
+from needs import lack
 import numpy as np
 from processes import REPO
 import pytest
@@ -47,7 +48,7 @@ class Counts(ctypes.Structure):
 def library(made_once):
     compiler = shutil.which('cc') or shutil.which('gcc') or shutil.which('clang')
     if compiler is None:
-        pytest.skip('no C compiler: apt install gcc')
+        pytest.skip(lack('a C compiler', 'gcc'))
     folder = made_once('firmware', lambda folder: subprocess.run(
         [compiler, '-std=c99', '-Wall', '-Wextra', '-Werror', '-pedantic', '-shared', '-fPIC',
          '-o', folder / 'frame.so', SOURCE], check=True))
@@ -126,7 +127,7 @@ def test_no_stream_breaks_the_receiver(library, parts):
 def sketch(made_once):
     compiler = shutil.which('g++') or shutil.which('clang++')
     if compiler is None:
-        pytest.skip('no C++ compiler: apt install g++')
+        pytest.skip(lack('a C++ compiler', 'g++'))
     return made_once('sketch', lambda folder: subprocess.run(
         [compiler, '-std=c++17', '-O1', '-Wall', '-Wextra', '-Werror', '-pthread', '-x', 'c++',
          '-I', REPO / 'test' / 'support' / 'arduino', '-I', FOLDER, FOLDER / 'adxl_board.ino',

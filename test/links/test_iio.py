@@ -9,6 +9,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.links import iio
 from adxl_ros.links.support.base import Level
 import iiod
+from needs import lack
 import numpy as np
 from processes import PATIENCE
 import pytest
@@ -22,8 +23,8 @@ pytestmark = pytest.mark.long
 def library():
     try:
         iio.import_libiio()
-    except UserError as error:
-        pytest.skip(str(error))
+    except UserError:
+        pytest.skip(lack('libiio', 'libiio0'))
 
 
 @pytest.fixture

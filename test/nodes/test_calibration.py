@@ -1,7 +1,6 @@
 """The guided calibration through the live graph: stage, rests, journal, verdict, file."""
 
 from dataclasses import replace
-import time
 
 from adxl_ros.calibrate.poses import extract_poses
 from adxl_ros.files import parameter_file, recording, sweep_journal
@@ -11,19 +10,17 @@ from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.response import simulate
 from adxl_ros.tools.command_line import with_effects
 from diagnostic_msgs.msg import DiagnosticStatus
-from graph import Graph, RELIABLE
+from graph import Graph, QUEUE, RELIABLE
 from lifecycle_msgs.msg import Transition
 import numpy as np
 import pytest
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu, JointState
 from std_srvs.srv import Trigger
 from units import drawn, nominal
 
 FAST = ('-p', 'use_sim_time:=true')
 # At many times real time a best-effort subscriber, or one with a short queue, loses samples on a
-# busy machine. This queue holds 50 s.
-QUEUE = 100000
+# busy machine.
 LOSSLESS = (*RELIABLE, '-p', f'qos_overrides./imu/data_raw.subscription.depth:={QUEUE}',
             '-p', 'qos_overrides./stage/command.publisher.depth:=1000')
 KEPT = ('-p', f'qos_overrides./imu/data_raw.publisher.depth:={QUEUE}')
@@ -38,21 +35,6 @@ def _files(tmp_path, seed=3, axes='xy'):
     parameter_file.save(truth, drawn(np.random.default_rng(seed), base))
     parameter_file.save(bare, base)
     return truth, bare
-
-
-def _record(graph, kind, topic):
-    kept = []
-    qos = QoSProfile(depth=QUEUE)
-    if topic == '/sensor_info':
-        qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
-
-    def keep(raw):
-        kept.append((time.monotonic_ns(), raw))
-        while (waiting := made.handle.take_message(kind, True)) is not None:
-            kept.append((time.monotonic_ns(), waiting[0]))
-
-    made = graph.node.create_subscription(kind, topic, keep, qos, raw=True)
-    return kept
 
 
 def _sweep(start, truth, bare, *options, speed=4.0, slew_rad_s=0.5):
@@ -92,7 +74,8 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     kinds = {'/imu/data_raw': Imu, '/stage/joint_states': JointState,
              '/sensor_info': DiagnosticStatus, '/stage/command': JointState}
     with Graph() as graph:
-        kept = {topic: _record(graph, kind, topic) for topic, kind in kinds.items()}
+        kept = {topic: graph.listen(kind, topic, latched=topic == '/sensor_info', raw=True)
+                for topic, kind in kinds.items()}
         bench, node = _sweep(start, truth, bare, '-p', 'output:=unit.yaml', '-p',
                              'report:=report', '-p', 'link.type:=serial', '-p',
                              'link.port:=/dev/ttyACM0', speed=10.0, slew_rad_s=3.0)
@@ -122,7 +105,7 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     for topic, kind in (('/imu/data_raw', rosbags.IMU), ('/stage/joint_states', rosbags.JOINTS),
                         ('/sensor_info', rosbags.INFO), ('/stage/command', rosbags.JOINTS)):
         sent += [rosbags.Sent(topic, kind, arrival_ns, raw=raw)
-                 for arrival_ns, raw in kept[topic]]
+                 for arrival_ns, raw in zip(graph.arrived_ns[topic], kept[topic])]
     bag = rosbags.bag_of(tmp_path / 'bag', sorted(sent, key=lambda message: message.stamp_ns))
     done = run_tool('fit', bag, '--params', bare, '--journal', 'unit.yaml.journal',
                     '-o', 'offline.yaml')
@@ -166,7 +149,7 @@ def test_services_and_refusals(start, tmp_path):
         assert ask('finish') == (False, 'no calibration is running')
         assert ask('abort')[0] is False
         assert ask('start')[0]
-        graph.spin_until(lambda: int(graph.value('calibration', 'accepted')) >= 2, 60, 'two poses')
+        graph.spin_until(lambda: graph.number('calibration', 'accepted') >= 2, 60, 'two poses')
         assert ask('start') == (False, 'a calibration is running; finish or abort it first')
         assert ask('capture')[0] is False
         second = start('calibration', '--ros-args', '--params-file', bare, *FAST, *QUICK,
@@ -178,7 +161,7 @@ def test_services_and_refusals(start, tmp_path):
         assert not (tmp_path / 'calibration.yaml').exists()
 
         assert ask('start')[0]
-        graph.spin_until(lambda: int(graph.value('calibration', 'accepted')) >= 6, 60, 'resumed')
+        graph.spin_until(lambda: graph.number('calibration', 'accepted') >= 6, 60, 'resumed')
         done, words = ask('finish')
         assert done and words.startswith('wrote calibration.yaml; '), words
         assert words.endswith(' poses are open: start again to go on')
@@ -194,13 +177,13 @@ def test_the_node_can_end_with_its_calibration(start, tmp_path, output, status):
         _, node = _sweep(start, truth, bare, '-p', 'autostart:=true', '-p',
                          'exit_when_done:=true', '-p', f'output:={output}')
         if status == 0:
-            graph.spin_until(lambda: graph.reports('calibration', '')
-                             and int(graph.value('calibration', 'accepted')) >= 6, 60, 'six poses')
+            graph.spin_until(lambda: graph.number('calibration', 'accepted') >= 6, 60,
+                             'six poses')
             assert graph.call(Trigger, 'calibration/finish', Trigger.Request()).success
         graph.spin_until(lambda: node.popen.poll() is not None, 60, 'the end')
         assert node.wait() == status
         if status == 0:
-            assert int(graph.value('calibration', 'accepted')) >= 6
+            assert graph.number('calibration', 'accepted') >= 6
             assert 0 < len(graph.value('calibration', 'verdict')) < 80
             assert graph.value('calibration', 'verdict') in node.output()
 

@@ -5,7 +5,6 @@
 from dataclasses import replace
 from functools import partial
 import json
-import os
 import signal
 
 from adxl_ros.files import parameter_file, recording
@@ -121,12 +120,11 @@ def test_an_investigation_ends_with_the_effect_of_the_unit(laboratory, tmp_path)
     assert 'ros2 run adxl_ros diagnose found/bag --params found/baseline.yaml -o' in page
 
 
-@pytest.mark.kills
 def test_whatever_ends_an_investigation_leaves_the_stage_at_rest_and_the_bag_whole(
-        laboratory, in_terminal, tmp_path):
+        laboratory, in_terminal, kill, tmp_path):
     """The stage would move on for many seconds; it comes to rest near its pose at the end."""
     def killed(node):
-        os.kill(node.popen.pid, signal.SIGKILL)
+        kill(node.popen.pid)
 
     def aborted(_):
         assert laboratory.call(Trigger, '/investigate/abort', Trigger.Request()).success

@@ -3,7 +3,6 @@
 """The launch files under `ros2 launch`: refusals, failed starts, a killed driver, the end."""
 
 from collections.abc import Callable
-import os
 import re
 import shutil
 import signal
@@ -71,11 +70,11 @@ def test_a_driver_that_refuses_to_start_ends_the_launch(launch, tmp_path, name, 
 
 
 @pytest.mark.parametrize('name', ['robot', 'calibrate'])
-def test_a_killed_driver_starts_again(launch, name):
+def test_a_killed_driver_starts_again(launch, kill, name):
     launched = launch(name)
     launched.wait_for('active: link sim', 30)
     pid, = re.findall(r'\[driver-1\]: process started with pid \[(\d+)\]', launched.output())
-    os.kill(int(pid), signal.SIGKILL)
+    kill(int(pid))
     wait_until(lambda: launched.output().count('active: link sim') == 2, 30, 'active again')
     launched.popen.send_signal(signal.SIGINT)
     assert launched.wait(30) == 0

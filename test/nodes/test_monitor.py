@@ -6,10 +6,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import json
-import os
 from pathlib import Path
 import re
-import signal
 import time
 
 from adxl_ros.files import parameter_file
@@ -124,7 +122,7 @@ def test_gap_floor_and_a_change(monitor, graph, tmp_path) -> None:
     node = monitor('-p', 'diagnose.automatic:=false')
     streams.run_until(lambda: gaps and len(gaps[-1].status) == 4, 'the gap of three axes')
     streams.run_until(lambda: graph.reports('monitor', 'gap x'), 'diagnostics')
-    streams.run_until(lambda: int(graph.value('monitor', 'blocks')) > 80, '80 s')
+    streams.run_until(lambda: graph.number('monitor', 'blocks') > 80, '80 s')
     steady = gaps[-1]
     assert steady.status[0].level == DiagnosticStatus.OK, steady
     for axis in steady.status[1:]:
@@ -139,8 +137,8 @@ def test_gap_floor_and_a_change(monitor, graph, tmp_path) -> None:
     streams.run_until(lambda: graph.reports('monitor', 'changed since'), 'the change')
     status = graph.diagnostics['monitor']
     assert status.level == DiagnosticStatus.WARN
-    assert abs(float(graph.value('monitor', 'changed_since_s')) - changed_s) <= 2
-    assert float(graph.value('monitor', 'detected_s')) - changed_s < 10
+    assert abs(graph.number('monitor', 'changed_since_s') - changed_s) <= 2
+    assert graph.number('monitor', 'detected_s') - changed_s < 10
     assert re.search(r'changed since \S+: x by \+(19|20|21)', status.message)
     assert 'noise' not in status.message, 'a step is no noise'
     assert np.isfinite(numbers(gaps)).all()
@@ -157,10 +155,9 @@ def test_a_change_is_diagnosed_and_a_report_is_on_disk(monitor, graph, tmp_path)
     node = monitor('-p', 'diagnose.wait_s:=60.0')
     streams.is_shifted = True
     streams.run_until(lambda: graph.reports('monitor', 'gap x'), 'the gap')
-    streams.run_until(lambda: 'monitor' in graph.diagnostics and graph.value(
-        'monitor', 'diagnosis_runs') == 'True', 'an automatic diagnosis')
-    graph.spin_until(lambda: 'likely_effect' in values(graph.diagnostics['monitor']), 200,
-                     'the likely effect')
+    streams.run_until(lambda: graph.has_stated('monitor', 'diagnosis_runs', 'True'),
+                      'an automatic diagnosis')
+    graph.spin_until(lambda: graph.value('monitor', 'likely_effect'), 200, 'the likely effect')
     assert 'bias' in graph.value('monitor', 'likely_effect')
     answer = graph.call(Trigger, 'monitor/diagnose', Trigger.Request(), 200)
     assert answer.success, answer.message
@@ -171,7 +168,7 @@ def test_a_change_is_diagnosed_and_a_report_is_on_disk(monitor, graph, tmp_path)
     assert node.stop() == 0
 
 
-def test_a_killed_monitor_loses_no_change(monitor, graph, tmp_path) -> None:
+def test_a_killed_monitor_loses_no_change(monitor, graph, kill, tmp_path) -> None:
     streams = Streams(graph)
     record = tmp_path / 'kept' / 'changes.jsonl'
     for count in (1, 2):
@@ -179,11 +176,11 @@ def test_a_killed_monitor_loses_no_change(monitor, graph, tmp_path) -> None:
         name = f'monitor{count}'
         node = monitor('-r', f'__node:={name}', '-p', 'diagnose.automatic:=false')
         streams.run_until(lambda: graph.reports(name, 'gap x')  # noqa: B023
-                          and int(graph.value(name, 'blocks')) > 60, '60 s')  # noqa: B023
+                          and graph.number(name, 'blocks') > 60, '60 s')  # noqa: B023
         streams.is_shifted = not streams.is_shifted
         streams.run_until(lambda: record.exists() and record.read_text().count(
             '"axis": "x"') >= count, 'the record')  # noqa: B023
-        os.kill(node.popen.pid, signal.SIGKILL)
+        kill(node.popen.pid)
         node.popen.wait()
     lines = [json.loads(line) for line in record.read_text().splitlines()]
     assert len(lines) >= 2
@@ -197,7 +194,7 @@ def test_no_sample_at_1_khz_is_lost(start, graph) -> None:
     start('driver', '--ros-args', '-p', 'link.type:=sim', '-p',
           'qos_overrides./imu/data_raw.publisher.depth:=20000')
     graph.spin_until(lambda: graph.reports('monitor', 'gap x'), 40, 'the gap')
-    graph.spin_until(lambda: int(graph.value('monitor', 'samples')) > 8000, 40, '8000 samples')
+    graph.spin_until(lambda: graph.number('monitor', 'samples') > 8000, 40, '8000 samples')
     assert (graph.value('monitor', 'missing'), graph.value('monitor', 'dropped')) == ('0', '0')
-    assert 0.5 < float(graph.value('monitor', 'x_gap_mg')) / float(
-        graph.value('monitor', 'x_floor_mg')) < 1.1, 'the floor includes steps of the encoder'
+    assert 0.5 < graph.number('monitor', 'x_gap_mg') / graph.number(
+        'monitor', 'x_floor_mg') < 1.1, 'the floor includes steps of the encoder'

@@ -63,14 +63,13 @@ def test_a_screen_drives_the_sweep_of_a_node_without_a_terminal(start, in_termin
     node.wait_for('resumed after')
 
 
-@pytest.mark.kills
-def test_a_screen_waits_for_its_node_and_survives_it(start, in_terminal):
+def test_a_screen_waits_for_its_node_and_survives_it(start, in_terminal, kill):
     seen = in_terminal('screen', '--ros-args', '-r', '__ns:=/bench', '-p', 'node:=bridge')
     seen.wait_for('waiting for /bench/bridge', 'q  quit')
     names = ('--ros-args', '-r', '__ns:=/bench', '-r', '__node:=bridge')
     node = start('calibration', *names)
     seen.wait_for('press b to begin', 'b  begin')
-    node.popen.kill()
+    kill(node.popen.pid)
     seen.wait_for('waiting for /bench/bridge')
     # Keys without a node do nothing.
     seen.press('b')

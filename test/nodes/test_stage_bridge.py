@@ -21,7 +21,6 @@ class Controller(Graph):
         super().__init__()
         self.kind = kind
         self.angles = {'gripper': 0.2, 'turn': 0.0, 'tilt': 0.0}
-        self.commands = []
 
     def __enter__(self):
         super().__enter__()
@@ -29,12 +28,9 @@ class Controller(Graph):
         self.states = make(JointState, '/joint_states', 10)
         self.command = make(JointState, 'stage/command', 10)
         self.stage_states = self.listen(JointState, 'stage/joint_states')
-        if self.kind == 'trajectory':
-            self.node.create_subscription(
-                JointTrajectory, '/joint_trajectory_controller/joint_trajectory',
-                self.commands.append, 10)
-        else:
-            self.node.create_subscription(JointState, '/joint_commands', self.commands.append, 10)
+        self.commands = self.listen(*(
+            (JointTrajectory, '/joint_trajectory_controller/joint_trajectory')
+            if self.kind == 'trajectory' else (JointState, '/joint_commands')))
         self.node.create_timer(0.02, self.publish)
         return self
 

@@ -24,9 +24,6 @@ OTHERS = '\x1b[A\x1b[1;5A\x1bOA\x1bOS\x1b[[A\x1b[M af\x1b[<65;10;10M\x1b[15~\x1b
 """Arrow up, with Ctrl, of keypad mode; F4; F1 of a console; a mouse's wheel twice; F5; Alt-q."""
 
 
-SIGNALS = {'term': signal.SIGTERM, 'kill': signal.SIGKILL}
-
-
 @pytest.fixture
 def terminal(in_terminal, tmp_path):
     base = nominal('xyz', serial='T1', rate_hz=200.0)
@@ -135,21 +132,22 @@ def _tilt(screen):
     return float(line.split()[2].rstrip('°'))
 
 
-@pytest.mark.kills
 @pytest.mark.parametrize('how', ['ctrl-c', 'term', 'kill', 'kill of the screen'])
-def test_the_terminal_is_restored(terminal, how):
+def test_the_terminal_is_restored(terminal, kill, how):
     seen = terminal()
     seen.wait_for('press b to begin')
     screen, = children(seen.popen.pid)
     if how == 'ctrl-c':
         seen.press('\x03')
     elif how == 'kill of the screen':
-        os.kill(screen, signal.SIGKILL)
+        kill(screen)
         seen.wait_for('the screen has ended; plain lines from here on')
         assert seen.restored() and seen.popen.poll() is None
         seen.press('\x03')
+    elif how == 'kill':
+        kill(seen.popen.pid)
     else:
-        os.kill(seen.popen.pid, SIGNALS[how])
+        os.kill(seen.popen.pid, signal.SIGTERM)
     assert seen.wait() == (-signal.SIGKILL if how == 'kill' else 0)
     with Graph() as graph:
         graph.spin_until(lambda: seen.restored() and not Path(f'/proc/{screen}').exists(), 20,

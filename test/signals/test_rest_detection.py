@@ -6,6 +6,7 @@ from adxl_ros.files import recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.signals.rest_detection import find_rests, Noise, Rest, rest_means, RestFinder
 from hypothesis import given, settings, strategies
+from needs import lack
 import numpy as np
 from pace import within
 import pytest
@@ -223,7 +224,7 @@ def test_rests_of_real_recordings(shared_dir, name, min_rests, max_rests):
     """Real recordings have the number of rests that is documented, except for stops of 1 s."""
     path = shared_dir / 'real' / f'{name}.csv'
     if not path.exists():
-        pytest.skip(f'no {path}')
+        pytest.skip(lack('../shared'))
     stream = recording.read(path)
     samples = np.column_stack([stream.columns[f'a{a}_mps2'] for a in 'xyz'])
     assert min_rests <= len(find_rests(stream.time_s, samples, 100.0)) <= max_rests

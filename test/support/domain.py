@@ -15,8 +15,9 @@ DOMAINS = range(1, 102)
 BY_UDP = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET', 'FASTRTPS_DEFAULT_PROFILES_FILE':
           str(Path(__file__).with_name('udp_of_this_host.xml'))}
 """
-Variables for tests that kill a process. The shared memory of Fast DDS stays locked after a kill,
-and rmw_fastrtps always uses it with LOCALHOST. The profile limits the processes to this host.
+Variables for tests with the fixture `kill`. The shared memory of Fast DDS stays locked after a
+kill, and rmw_fastrtps always uses it with LOCALHOST. The profile limits the processes to this
+host.
 """
 
 

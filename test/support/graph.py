@@ -22,6 +22,10 @@ RELIABLE = ('-p', 'qos_overrides./imu/data_raw.subscription.reliability:=reliabl
 time."""
 
 
+QUEUE = 100_000
+"""Messages that wait for a busy listener."""
+
+
 def stamp_ns(message):
     return message.header.stamp.sec * 10 ** 9 + message.header.stamp.nanosec
 
@@ -38,13 +42,21 @@ def imu_table(raws):
 
 
 class Graph:
-    """The messages of topics; by the name of a node its newest diagnostics and their time, ns."""
+    """
+    The messages of topics; by the name of a node its newest diagnostics and their time, ns.
+
+    Its listeners are reliable and deep. A wait ends with all messages that have come by then, so
+    that an assertion sees what came before its condition.
+    """
 
     def __init__(self):
         self.got = defaultdict(list)
+        self.arrived_ns = defaultdict(list)
+        """Monotonic times at which the messages of a topic were taken, ns."""
         self.diagnostics = {}
         self.reported_ns = {}
-        self._messages = defaultdict(set)
+        self._statuses = defaultdict(list)
+        self._takes = []
         self._context = Context()
         self._clients = {}
 
@@ -53,7 +65,7 @@ class Graph:
         self.node = rclpy.create_node('tester', context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._diagnose, 100)
+        self._subscribe(DiagnosticArray, '/diagnostics', self._diagnose, QoSProfile(depth=QUEUE))
         return self
 
     def __exit__(self, *_):
@@ -66,24 +78,39 @@ class Graph:
             name = status.name.split(':')[0]
             self.diagnostics[name] = status
             self.reported_ns[name] = stamp_ns(message)
-            self._messages[name].add(status.message)
+            self._statuses[name].append(status)
 
-    def listen(self, kind, topic, depth=10000, latched=False, raw=False):
-        qos = QoSProfile(depth=depth)
-        if latched:
-            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
-        kept = self.got[topic]
-
-        def keep(first):
-            kept.append(first)
-            for _ in range(1000):
+    def _subscribe(self, kind, topic, receive, qos, raw=False):
+        def take(*first):
+            for message in first:
+                receive(message)
+            for _ in range(QUEUE):
                 message = subscription.handle.take_message(kind, raw)
                 if message is None:
                     break
-                kept.append(message[0])
+                receive(message[0])
 
-        subscription = self.node.create_subscription(kind, topic, keep, qos, raw=raw)
+        subscription = self.node.create_subscription(kind, topic, take, qos, raw=raw)
+        self._takes.append(take)
+
+    def listen(self, kind, topic, latched=False, raw=False):
+        """Return the list of the messages of a topic, serialized if `raw`; it grows."""
+        qos = QoSProfile(depth=QUEUE)
+        if latched:
+            qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        kept, arrived_ns = self.got[topic], self.arrived_ns[topic]
+
+        def receive(message):
+            kept.append(message)
+            arrived_ns.append(time.monotonic_ns())
+
+        self._subscribe(kind, topic, receive, qos, raw)
         return kept
+
+    def drain(self):
+        """Take all messages that wait."""
+        for take in self._takes:
+            take()
 
     def spin_until(self, condition, timeout_s, purpose):
         """Listen until a condition holds; fail with the purpose after a multiple of the time."""
@@ -93,11 +120,21 @@ class Graph:
             if time.monotonic() > end_s:
                 pytest.fail(f'{purpose}: not after {PATIENCE} times {timeout_s} s; '
                             f'diagnostics: {self.diagnostics}')
+        self.drain()
 
     def spin(self, seconds):
         end_s = time.monotonic() + seconds
         while (remaining_s := end_s - time.monotonic()) > 0:
             self._executor.spin_once(timeout_sec=remaining_s)
+        self.drain()
+
+    def wait_for_silence(self, topic, seconds=1.0, timeout_s=20.0):
+        """Listen until a topic has sent nothing for a time, s: what was under way has come."""
+        def is_silent():
+            last_ns = max(began_ns, *self.arrived_ns[topic][-1:])
+            return time.monotonic_ns() - last_ns > seconds * 1e9
+        began_ns = time.monotonic_ns()
+        self.spin_until(is_silent, timeout_s, f'silence on {topic}')
 
     def call(self, kind, service, request, timeout_s=20.0):
         """
@@ -130,7 +167,18 @@ class Graph:
 
     def has_reported(self, node, text):
         """Return whether a node has said this at any time."""
-        return any(text in message for message in self._messages[node])
+        return any(text in status.message for status in self._statuses[node])
+
+    def has_stated(self, node, key, value):
+        """Return whether a value in the diagnostics of a node was this at any time."""
+        return any((pair.key, pair.value) == (key, value)
+                   for status in self._statuses[node] for pair in status.values)
 
     def value(self, node, key):
-        return {pair.key: pair.value for pair in self.diagnostics[node].values}[key]
+        """Return a value in the newest diagnostics of a node; '' while there is none."""
+        values = self.diagnostics[node].values if node in self.diagnostics else ()
+        return {pair.key: pair.value for pair in values}.get(key, '')
+
+    def number(self, node, key):
+        """Return a number in the newest diagnostics of a node; NaN while there is none."""
+        return float(self.value(node, key) or 'nan')

@@ -9,7 +9,6 @@ is written, and one when the sweep has ended.
 
 from contextlib import suppress
 import json
-import os
 from pathlib import Path
 import re
 import signal
@@ -44,8 +43,8 @@ class Sweeps:
     missing or changed; broken: incomplete files, and other failures.
     """
 
-    def __init__(self, folder, env, seed):
-        self.folder, self.env = Path(folder), env
+    def __init__(self, folder, env, kill, seed):
+        self.folder, self.env, self._kill = Path(folder), env, kill
         self.rng = np.random.default_rng(seed)
         self.kills = self.sweeps = self.poses = self.in_fit = 0
         self.lost, self.broken = [], []
@@ -83,7 +82,7 @@ class Sweeps:
                 time.sleep(0.005 if moment != 'write' else 0.001)
             time.sleep(delay_s)
         finally:
-            os.kill(node.pid, signal.SIGKILL)
+            self._kill(node.pid)
             node.wait()
         self.kills += 1
         self._check(log.read_text(errors='replace'))
@@ -164,9 +163,9 @@ def _data(path):
     return parameter_file.load(path).provenance['data_sha256'] if path.exists() else ''
 
 
-def kill(folder, env, kills, seed):
-    """Kill a sweep a number of times; return the `Sweeps`."""
-    sweeps = Sweeps(folder, env, seed)
+def kill_sweeps(folder, env, kill, kills, seed):
+    """Kill a sweep a number of times by a function of its process id; return the `Sweeps`."""
+    sweeps = Sweeps(folder, env, kill, seed)
     try:
         while sweeps.kills < kills:
             sweeps.kill_once()

@@ -5,12 +5,13 @@
 from contextlib import contextmanager
 import shutil
 
+from needs import lack
 from processes import PATIENCE
 import pytest
 
 CHROMIUM = next(filter(None, map(shutil.which, (
     'chromium', 'chromium-browser', 'google-chrome'))), None)
-NEEDS_CHROMIUM = pytest.mark.skipif(CHROMIUM is None, reason='no Chromium: apt install chromium')
+NEEDS_CHROMIUM = pytest.mark.skipif(CHROMIUM is None, reason=lack('Chromium', 'chromium'))
 WIDTHS = (480, 900, 1280)
 """Widths of a phone, a tablet and a laptop, pixels."""
 

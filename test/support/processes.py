@@ -18,12 +18,13 @@ import sys
 import time
 
 from ament_index_python.packages import get_package_prefix
+from needs import lack
 import pytest
 
 REPO = Path(__file__).resolve().parents[2]
 """The root of the repository."""
-NEEDS_ROS2 = pytest.mark.skipif(shutil.which('ros2') is None, reason='no ros2 and launch: they '
-                                'have no wheels; source a ROS 2 Jazzy')
+NEEDS_ROS2 = pytest.mark.skipif(shutil.which('ros2') is None,
+                                reason=lack('ros2 and launch of a sourced ROS 2 Jazzy'))
 TOOLS = sorted({point.name for point in entry_points(group='console_scripts') if point.module
                 .startswith(('adxl_ros.tools.', 'adxl_ros_validation.'))} - {'bench'})
 """The command-line tools, as they are installed."""

@@ -13,7 +13,7 @@ import time
 
 from adxl_ros.model.sensor import to_volts
 from faulty_board import CODES, mark
-from graph import imu_table
+from graph import imu_table, QUEUE
 import iiod
 import numpy as np
 from sensor_msgs.msg import Imu
@@ -21,8 +21,6 @@ from units import nominal
 
 HERE = Path(__file__).resolve().parent
 """Folder of the scripts."""
-QUEUE = 100_000
-"""Samples that wait for a busy listener."""
 KEPT = ('-p', f'qos_overrides./imu/data_raw.publisher.depth:={QUEUE}')
 
 
@@ -63,7 +61,7 @@ class DriverRig:
     def __init__(self, graph, rate_hz):
         self.graph = graph
         self._rate_hz = rate_hz
-        self._raws = graph.listen(Imu, 'imu/data_raw', QUEUE, raw=True)
+        self._raws = graph.listen(Imu, 'imu/data_raw', raw=True)
         # numbers, stamps, errors: Number of each sample on the device, its stamp, ns, and the
         # error of the stamp, ms
         self.numbers = np.zeros(0, np.int64)
@@ -109,7 +107,7 @@ class DriverRig:
         self.errors = np.concatenate([self.errors, (stamps - self.taken_ns(numbers)) * 1e-6])
 
     def diagnostic(self, key):
-        return float(self.graph.value('driver', key)) if 'driver' in self.graph.diagnostics else 0
+        return float(self.graph.value('driver', key) or 0)
 
     def wait_for_samples(self, count, timeout_s, purpose='samples'):
         """Listen until so many further samples have come; fail with the purpose otherwise."""
@@ -144,7 +142,6 @@ class DriverRig:
         sampled_ns = time.time_ns()
         self.graph.spin_until(lambda: self.graph.reported_ns.get('driver', 0) > sampled_ns, 10,
                               'diagnostics')
-        self.graph.spin(0.05)
         self.collect()
 
     def wait_for_recovery(self, back_ns, purpose):

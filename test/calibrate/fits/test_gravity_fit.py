@@ -13,6 +13,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import to_volts
 from adxl_ros.signals.rest_detection import find_rests, rest_means
 from hypothesis import given, settings, strategies
+from needs import lack
 import numpy as np
 from pace import within
 import pytest
@@ -189,7 +190,7 @@ def unweighted_fit(means, errors, sensor):
 def real(shared_dir, name, local_gravity_mps2=G0_MPS2):
     path = shared_dir / 'real' / f'{name}.csv'
     if not path.exists():
-        pytest.skip(f'no {path}')
+        pytest.skip(lack('../shared'))
     stream = recording.read(path)
     sensor = nominal('xyz', local_gravity_mps2=local_gravity_mps2)
     volts = to_volts(np.column_stack([stream.columns[f'a{a}_mps2'] for a in 'xyz']), sensor)
