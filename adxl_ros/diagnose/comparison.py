@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Any
 
 from adxl_ros.files.recording_columns import JOINTS, LONGEST_MOVE_NS, Recording, USUAL_GAPS
+from adxl_ros.files.stamps import period_s, stamped_rate_hz
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
@@ -120,10 +121,10 @@ class BaselineComparison:
         """Return the number of samples."""
         return len(self.time_s)
 
-    @property
+    @cached_property
     def dt_s(self) -> float:
-        """Median time between samples, s."""
-        return float(np.median(np.diff(self.time_s)))
+        """Mean time between samples, s, without gaps."""
+        return period_s(self.time_s)
 
     @property
     def span_s(self) -> float:
@@ -273,8 +274,7 @@ def _at_rest(motion: Motion, time_s: np.ndarray, reference: Reference, volts: np
         from adxl_ros.signals.rest_detection import find_rests
         # The force of another simulator may be noisy, so that the sensor itself shows its rests.
         finite, at_rest = np.isfinite(volts).all(axis=1), np.zeros(len(time_s), bool)
-        for rest in find_rests(time_s[finite], volts[finite],
-                               1 / float(np.median(np.diff(time_s)))):
+        for rest in find_rests(time_s[finite], volts[finite], stamped_rate_hz(time_s)):
             at_rest |= (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
         return at_rest
     rates = [motion.alpha(time_s, 1), motion.beta(time_s, 1), motion.shift(time_s, 2)]
@@ -458,7 +458,7 @@ def without_fast_motion(comparison: BaselineComparison, columns: dict[str, np.nd
         coarse = comparison.used & (error_g > np.hypot(limit_g, step_g))
         if coarse.any():
             coarse = np.convolve(_with_aliases(comparison, coarse, noise_g), margin, 'same') > 0.5
-            rate_hz = 1 / float(np.median(np.diff(read_s)))
+            rate_hz = stamped_rate_hz(read_s)
             comparison = leave_out(
                 comparison, coarse, f'{name} moves too fast for its {rate_hz:.4g} readings a '
                 f'second (error up to {1e3 * error_g[coarse].max():.2g} mg); read it at a higher '

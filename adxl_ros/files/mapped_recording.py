@@ -36,17 +36,15 @@ from adxl_ros.files.column_mapping import (
 )
 from adxl_ros.files.recording_columns import (
     ACCEL,
-    burst_samples,
-    describe_bursts,
     JOINTS,
     LIMIT,
     Recording,
     sensor_columns,
     StampCheck,
-    stamped_rate_hz,
     TIME,
     VOLTS,
 )
+from adxl_ros.files.stamps import burst_samples, describe_bursts, stamped_rate_hz
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.kinematics import stage_angles
 import numpy as np

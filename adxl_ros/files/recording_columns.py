@@ -11,6 +11,7 @@ import re
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.stamps import describe_bursts, stamped_rate_hz
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, to_volts, with_axes
 import numpy as np
@@ -168,7 +169,7 @@ class Recording:
 
     @property
     def rate_hz(self) -> float:
-        """Sample rate by the stamps, Hz. Gaps and bursts of stamps do not change it."""
+        """Sample rate by the stamps, Hz: samples over their time, without gaps."""
         if len(self) < 2:
             raise UserError(f'{self.path}: {len(self)} samples; at least 2 are needed')
         return stamped_rate_hz(self.time_s)
@@ -237,72 +238,6 @@ def concatenate(parts: Iterable[Recording]) -> Recording:
                for name in last.columns}
     return replace(last, time_s=np.concatenate([block.time_s for block in blocks]),
                    columns=columns)
-
-
-_LONG_QUANTILE = 0.985
-"""Quantile of the steps that is one between bursts (chosen: a burst has at most 64 samples)."""
-_SHORT = 0.1
-"""Longest step within a burst, as a share of one between bursts (chosen: beyond jitter)."""
-_SHORT_SHARE = 0.45
-"""Smallest share of such steps among all (chosen: bursts of two samples have 0.5)."""
-_EVEN = 0.25  # A median step from this share of the mean step shows stamps without bursts
-_EVEN_STEPS = 0.02
-"""Largest median deviation of even steps, as a share of them (chosen: rate right to 0.5 %)."""
-_LAG = 64
-"""Most samples or bursts over which an uneven rate is taken (chosen: 2 % by a jitter of one)."""
-
-
-def burst_ends(time_s: np.ndarray) -> np.ndarray:
-    """Return the samples, (k,), that end a burst of stamps, s, (n,): all where none is seen."""
-    steps_s = np.diff(time_s)
-    if len(steps_s) >= 8 and np.median(steps_s) < _EVEN * steps_s.mean():
-        is_short = steps_s < _SHORT * np.quantile(steps_s, _LONG_QUANTILE)
-        if is_short.mean() >= _SHORT_SHARE:
-            return np.flatnonzero(~is_short)
-    return np.arange(len(time_s))
-
-
-def burst_samples(time_s: np.ndarray) -> int:
-    """Return the mean number of samples of a burst of stamps, s, (n,); 1 where there is none."""
-    return round((len(time_s) - 1) / max(len(burst_ends(time_s)), 1))
-
-
-def is_even(time_s: np.ndarray) -> bool:
-    """Return whether most steps of stamps, s, (n,), are one period."""
-    steps_s = np.diff(time_s)
-    step_s = np.median(steps_s)
-    return bool(np.median(np.abs(steps_s - step_s)) <= _EVEN_STEPS * step_s)
-
-
-def period_s(time_s: np.ndarray) -> float:
-    """
-    Return the period of two or more stamps, s, (n,); 0 where they stand.
-
-    It is the median over one sample, or over up to 64 where stamps jitter or come in bursts, so
-    that gaps do not change it.
-    """
-    last = burst_ends(time_s)
-    if len(last) < 2:
-        last = np.array([0, len(time_s) - 1])
-    is_single = len(last) == len(time_s) and is_even(time_s)
-    lag = 1 if is_single else max(min(_LAG, len(last) // 4), 1)
-    return float(np.median((time_s[last[lag:]] - time_s[last[:-lag]])
-                           / (last[lag:] - last[:-lag])))
-
-
-def stamped_rate_hz(time_s: np.ndarray) -> float:
-    """Return the sample rate of two or more stamps, s, (n,), Hz, to 1e-6; NaN where they stand."""
-    step_s = period_s(time_s)
-    return round(1 / step_s, 6) if step_s > 0 else float('nan')
-
-
-def describe_bursts(time_s: np.ndarray) -> str:
-    """Return `; ` and a clause for messages; empty where stamps do not come in bursts."""
-    size = burst_samples(time_s)
-    if size == 1:
-        return ''
-    return f'; stamps come in bursts of about {size} samples (USB, or a buffer), at a mean of ' \
-           f'{stamped_rate_hz(time_s):.4g} Hz'
 
 
 class StampCheck:

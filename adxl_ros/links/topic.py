@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from math import ceil, inf
 import time
 
-from adxl_ros.files.recording_columns import is_even, stamped_rate_hz
+from adxl_ros.files.stamps import is_even, stamped_rate_hz
 from adxl_ros.links.support import base
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.sensor import Sensor

@@ -15,6 +15,7 @@ from adxl_ros.files.recording_columns import (
     sensor_info,
     Track,
 )
+from adxl_ros.files.stamps import stamped_rate_hz
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
@@ -208,7 +209,7 @@ class LiveGap:
         stamps_ns, _ = self._samples.between(newest_ns - 2 * BLOCK_NS, newest_ns + 1)
         if len(stamps_ns) < _FEWEST_SAMPLES or newest_ns - stamps_ns[0] < BLOCK_NS:
             return False
-        measured_hz = 1e9 / float(np.median(np.diff(stamps_ns)))
+        measured_hz = stamped_rate_hz((stamps_ns - stamps_ns[0]) * 1e-9)
         if abs(measured_hz / self.sensor.rate_hz - 1) > _RATE_TOLERANCE:
             self.sensor = replace(self.sensor, rate_hz=measured_hz)
             self._prediction = reference_stream.Prediction(self.sensor, self.reference)

@@ -377,6 +377,11 @@ class Calibration(Node):
         self._has_run, self._busy_ns = False, 0
         self._display = DisplayPublisher(self, self._controller, own.screen)
         self.show_fit = self._display.show_fit
+        if not own.autostart and not self._controller.may_ask:
+            # Nobody sees a screen, so that the log says what the node waits for.
+            self.log('INFO', f'waits for a call of {self.resolve_service_name("~/start")}, or '
+                     f'start it with autostart:=true; it takes samples of '
+                     f'{self.resolve_topic_name(_SAMPLES)}')
 
     def log(self, severity: controller.Severity, text: str) -> None:
         """Log a line."""

@@ -18,12 +18,11 @@ from adxl_ros.files.bag_reader import log_times
 from adxl_ros.files.column_mapping import likely_unit, ReadingOptions
 from adxl_ros.files.recording_columns import (
     BadStamps,
-    burst_samples,
-    period_s,
     Recording,
     REFERENCES,
     uncalibrated,
 )
+from adxl_ros.files.stamps import burst_samples, lacks_samples, period_s
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.report.quantities import counted, duration
@@ -33,13 +32,6 @@ from adxl_ros.signals.recorded_sensor import load_sensor
 from adxl_ros.signals.rest_detection import RecordedRests
 import numpy as np
 
-_SCATTER_QUANTILE = 0.9  # Quantile of step deviations: their scatter. Chosen: 1 of 10 may be a gap
-_LARGE_SCATTER = 0.25  # Scatter, periods, from which the period is the mean step. Chosen
-_LONG_STEPS = (1.25, 1.5)
-"""Steps beyond the first number of periods, plus the second one times the scatter, are gaps.
-Chosen: a sample that is missing among stamps rounded to a seventh of a period is found."""
-_SHORTEST_GAP = 1.5  # Shortest gap, periods. Chosen: halfway to two
-_OUTLYING_STEP = 5.0  # Steps beyond this number of medians are not part of the mean step
 _SAME_POSE_G = 0.1  # Distance of the means of two rests of one orientation, g. Chosen: 6° of tilt
 _MOST_POSES = 200  # Orientations that are counted at most. Chosen: more than a sweep has
 _CLIPPED_SAMPLES = 3  # Equal samples at an extreme that are clipped. Chosen: noise repeats fewer
@@ -75,7 +67,7 @@ class RecordingContents:
     path: str  # The recording
     samples: int  # Number of samples
     span_s: float  # Time from the first to the last sample, s
-    rate_hz: float  # Usual rate, Hz
+    rate_hz: float  # Samples over their time, gaps left out, Hz
     jitter_s: float  # Rms deviation of the steps of the stamps, without gaps, s
     burst: int  # Samples of a burst of stamps; 1 for none
     missing: int  # Missing samples
@@ -131,7 +123,7 @@ def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
     span_s = stamps.last_s - stamps.first_s
     return RecordingContents(
         path=block.path, samples=stamps.count, span_s=span_s,
-        rate_hz=round(1 / stamps.period_s, 6), jitter_s=stamps.jitter_s, burst=stamps.burst,
+        rate_hz=stamps.rate_hz, jitter_s=stamps.jitter_s, burst=stamps.burst,
         missing=stamps.missing, gaps=stamps.gaps, longest_gap_s=stamps.longest_gap_s,
         bad_stamps=block.bad_stamps, axes=tuple(axis.result() for axis in axes),
         rest_share=min(sum(spans_s) / span_s, 1.0), longest_rest_s=max(spans_s, default=0.0),
@@ -151,48 +143,45 @@ def log_delay_s(times_ns: Iterable[np.ndarray]) -> float | None:
 
 
 class _Stamps:
-    """Statistics of the steps of the stamps; the period is that of the first block."""
+    """Statistics of the steps of the stamps; gaps are found by the period of the first block."""
 
     def __init__(self, first: Recording) -> None:
         if len(first) < 2:
             raise UserError(f'{first.path}: {len(first)} sample with a usable stamp; at least 2 '
                             'are needed; --rate HZ stamps by index')
-        time_s = first.time_s
-        self.burst = burst_samples(time_s)
-        self.period_s = period_s(time_s)
-        self.first_s = float(time_s[0])
+        self.burst = burst_samples(first.time_s)
+        self.period_s = period_s(first.time_s)
+        self.first_s = float(first.time_s[0])
         self.last_s = self.first_s - self.period_s
         self.count = self.missing = self.gaps = 0
         self.longest_gap_s = 0.0
-        self._squares, self._usual = 0.0, 0
-        steps_s = np.diff(time_s)
-        scatter = float(np.quantile(np.abs(steps_s / self.period_s - 1), _SCATTER_QUANTILE))
-        # The shortest gap, periods
-        self._gap_periods = max(_LONG_STEPS[0] + _LONG_STEPS[1] * scatter, _SHORTEST_GAP)
-        if self.burst > 1:
-            self._gap_periods = _SHORTEST_GAP * self.burst
-        elif scatter > _LARGE_SCATTER:
-            self.period_s = float(np.mean(steps_s[steps_s < _OUTLYING_STEP * self.period_s]))
+        # Sums over the steps that are no gaps
+        self._squares, self._usual_s, self._usual = 0.0, 0.0, 0
 
     def feed(self, time_s: np.ndarray) -> None:
         """Add further stamps."""
-        before_s = self.last_s if self.count else time_s[0] - self.period_s
-        steps = np.diff(time_s, prepend=before_s) / self.period_s
+        stamps_s = np.concatenate([[self.last_s], time_s]) if self.count else time_s
+        steps_s, is_gap = np.diff(stamps_s), lacks_samples(stamps_s, self.period_s)
         self.count += len(time_s)
         self.last_s = float(time_s[-1])
-        is_gap = steps > self._gap_periods
-        self.missing += int((np.rint(steps[is_gap]) - self.burst).sum())
+        lacking = np.rint(steps_s[is_gap] / self.period_s) - self.burst
+        self.missing += int(np.maximum(lacking, 1).sum())
         self.gaps += int(is_gap.sum())
-        self.longest_gap_s = max(self.longest_gap_s,
-                                 float(steps[is_gap].max(initial=0.0)) * self.period_s)
-        usual = steps[~is_gap]
-        self._squares += float(((usual - 1) ** 2).sum())
-        self._usual += len(usual)
+        self.longest_gap_s = max(self.longest_gap_s, float(steps_s[is_gap].max(initial=0.0)))
+        usual_s = steps_s[~is_gap]
+        self._squares += float(((usual_s - self.period_s) ** 2).sum())
+        self._usual_s += float(usual_s.sum())
+        self._usual += len(usual_s)
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples over their time, gaps left out, Hz."""
+        return round(self._usual / self._usual_s if self._usual_s else 1 / self.period_s, 6)
 
     @property
     def jitter_s(self) -> float:
         """Rms deviation of the steps that are no gaps, s."""
-        return self.period_s * float(np.sqrt(self._squares / max(self._usual, 1)))
+        return float(np.sqrt(self._squares / max(self._usual, 1)))
 
 
 class _Axis:

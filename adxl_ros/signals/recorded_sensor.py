@@ -11,7 +11,8 @@ from pathlib import Path
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.files.recording_columns import Recording, stamped_rate_hz, VOLTS
+from adxl_ros.files.recording_columns import Recording, VOLTS
+from adxl_ros.files.stamps import halves, late_by, stamped_rate_hz
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import names_of, put, Sensor, to_volts, with_axes, with_neutral
@@ -75,7 +76,9 @@ class BeyondRange:
 
 
 SHORTEST_S = 2.0  # Shortest time that shows noise, s. Chosen: some windows of 0.25 s
-_FEWEST_SAMPLES = 64  # Fewest samples that show it. Chosen: the variance is within a fifth
+FEWEST_SAMPLES = 64  # Fewest samples that show it. Chosen: the variance is within a fifth
+_MOST_BACKWARD = 0.1  # Largest share of stamps that step back. Chosen: two drivers make half
+_STEADY = 0.05  # Largest difference of the rate of half of the samples. Chosen: above any clock's
 _SMALLEST_RANGE_G = 2.0  # Smallest range that is taken, g: of common digital sensors
 _FILTER_START_SAMPLES = 2.0  # First RC of the search, periods. Chosen: slower ones are reached
 _MAX_NOISE_G_PER_RTHZ = 0.1  # Largest density of a parameter file, g/√Hz
@@ -92,10 +95,14 @@ def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = 
     scale_v_per_g, spans = unit.nominal_scale_v_per_g, Spans(unit.rate_hz)
     blocks = stats.BlockCutter(unit.rate_hz, len(unit.axes)).feed(time_s, volts)
     windows = stats.window_variance(blocks, spans)
-    if len(time_s) < _FEWEST_SAMPLES or not np.isfinite(windows).any():
+    if len(time_s) < FEWEST_SAMPLES or not np.isfinite(windows).any():
+        needed_s = max(SHORTEST_S, FEWEST_SAMPLES / unit.rate_hz)
+        gaps = stats.gap_s(unit.rate_hz)
+        why = f'; they come with gaps of up to {np.diff(time_s).max():.2g} s' \
+            if np.diff(time_s).max() > gaps else ''
         raise UserError(f'{where}{len(time_s)} samples at {unit.rate_hz:g} Hz do not show the '
-                        f'noise of the sensor; record at least {SHORTEST_S:g} s, or state '
-                        'sensor.noise_density_g_per_rthz in the parameter file')
+                        f'noise of the sensor{why}; record at least {needed_s:.3g} s without '
+                        'gaps, or state sensor.noise_density_g_per_rthz in the parameter file')
     step_v = stats.adc_step(blocks)
     variance_v2, limit_v2 = stats.quiet_variance(blocks, windows, step_v)
     rc_s = unit.rc_s
@@ -143,22 +150,34 @@ def unit_of_stream(sensor: Sensor, stamps_ns: np.ndarray, accel_mps2: np.ndarray
 
     An axis of the specific force, (n, 3), that is always 0 is not measured.
     """
-    steps_s = np.diff(stamps_ns) * 1e-9
-    if steps_s.sum() < SHORTEST_S:
-        raise UserError(f'{len(stamps_ns)} samples in {max(steps_s.sum(), 0):.1f} s; '
+    late_ns = late_by(stamps_ns)
+    backward = f'{np.count_nonzero(late_ns)} of {len(stamps_ns)} samples, whose stamp steps ' \
+        f'back by up to {late_ns.max(initial=0) * 1e-6:.3g} ms'
+    if np.count_nonzero(late_ns) > _MOST_BACKWARD * len(stamps_ns):
+        raise UserError(f'{backward}; one driver must stamp them, in their order')
+    stamps_ns, accel_mps2 = stamps_ns[late_ns == 0], accel_mps2[late_ns == 0]
+    time_s = (stamps_ns - stamps_ns[:1]) * 1e-9
+    if len(time_s) < 3 or time_s[-1] < SHORTEST_S:
+        raise UserError(f'{len(time_s)} samples in {np.ptp(time_s) if len(time_s) else 0:.1f} s; '
                         f'{SHORTEST_S:g} s show rate and noise')
-    rate_hz = stamped_rate_hz((stamps_ns - stamps_ns[0]) * 1e-9)
+    rate_hz = stamped_rate_hz(time_s)
     if not rate_hz > 0:
         raise UserError(f'the stamps of {len(stamps_ns)} samples do not advance; the driver must '
                         'stamp each sample')
+    rates = halves(time_s)
+    if not rates.agree(_STEADY):
+        raise UserError(f'stamps are uneven: {rates.first_hz:.4g} and then {rates.second_hz:.4g} '
+                        f'a second within {time_s[-1]:.1f} s; the host stalls, or the driver '
+                        'stamps samples when they arrive')
     present = ''.join(axis for axis, values in zip(AXES, accel_mps2.T) if values.any())
     axes = present if present in MEASURED_AXES else AXES
     unit = sensor if sensor.effects else with_axes(sensor, axes)
     unit = replace(unit, rate_hz=round(rate_hz, 3))
     volts = to_volts(accel_mps2[:, :len(unit.axes)], unit)
-    unit, lines = _measured(unit, (stamps_ns - stamps_ns[0]) * 1e-9, volts)
+    unit, lines = _measured(unit, time_s, volts)
     return (replace(unit, measured=(*unit.measured, 'rate_hz')),
-            [f'rate: {unit.rate_hz:.4g} Hz, axes: {unit.axes}', *lines])
+            [f'rate: {unit.rate_hz:.4g} Hz, axes: {unit.axes}', *lines,
+             *([f'left out: {backward}'] if late_ns.any() else [])])
 
 
 def _by_axis(sensor: Sensor, values_g: np.ndarray) -> str:

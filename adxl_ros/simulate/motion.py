@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Protocol
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.stamps import stamped_rate_hz
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Components, Need
 from adxl_ros.model.sensor import Sensor
@@ -235,7 +236,7 @@ class SmoothedPath:
         if not self._step or len(self._time_s) <= 2 * _DEGREE:
             return None
         inside_s = np.clip(time_s, self._time_s[0], self._time_s[-1])
-        rate_hz = 1 / float(np.median(np.diff(self._time_s)))
+        rate_hz = stamped_rate_hz(self._time_s)
         knot_s = max(self._knot_s, 2 / rate_hz)
         corner_hz = min(self._strength ** (-1 / 6) / (2 * np.pi * knot_s), 1 / (2 * knot_s))
         place = np.clip(np.searchsorted(self._time_s, inside_s), 0, len(self._time_s) - 1)

@@ -19,6 +19,7 @@ from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import robot_readings
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.robot_readings import Readings
+from adxl_ros.files.stamps import period_s, stamped_rate_hz
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Components
 from adxl_ros.report.quantities import mg
@@ -148,7 +149,7 @@ class RobotPath(ForcePath):
                        for times, values in self._tracks]
         begin_s = max(times[0] for times, _ in self._tracks)
         end_s = min(times[-1] for times, _ in self._tracks)
-        readings_hz = max(1 / float(np.median(np.diff(times))) for times, _ in self._tracks)
+        readings_hz = max(stamped_rate_hz(times) for times, _ in self._tracks)
         rate_hz = min(_PER_READING * readings_hz, _HIGHEST_RATE_HZ)
         grid_s = np.linspace(begin_s, end_s, max(int((end_s - begin_s) * rate_hz), 8))
         for times, _ in self._tracks:
@@ -166,7 +167,7 @@ class RobotPath(ForcePath):
     def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Path]:
         """Smooth the tracks."""
         return [SmoothedPath(times, values, step, is_seen=True, knot_s=min(
-            KNOT_S, _KNOT_READINGS * float(np.median(np.diff(times))))) if np.ptp(values)
+            KNOT_S, _KNOT_READINGS * period_s(times))) if np.ptp(values)
             else Held(float(values[0])) for (times, values), step in zip(tracks, self._steps)]
 
     def _moved(self, tracks: np.ndarray) -> np.ndarray:
@@ -181,7 +182,7 @@ class RobotPath(ForcePath):
 
     def as_motion(self) -> Motion:
         """Return the motion that a sensor in the frame follows."""
-        rate_hz = 1 / float(np.median(np.diff(self.time_s)))
+        rate_hz = stamped_rate_hz(self.time_s)
         return Motion(float(np.ptp(self.time_s)), force=self,
                       internal_rate_hz=max(rate_hz, INTERNAL_RATE_HZ))
 

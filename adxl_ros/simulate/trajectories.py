@@ -12,6 +12,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import ACCEL, JOINTS, Recording
+from adxl_ros.files.stamps import stamped_rate_hz
 from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import (
@@ -247,7 +248,7 @@ def motion_from_force(ideal: Recording, resampled: bool) -> tuple[Motion, float]
         raise UserError(f'{ideal.path}: {len(time_s)} samples of specific force; at least '
                         f'{_MIN_FORCE_SAMPLES} are needed')
     begin_s = float(time_s[0])
-    rate_hz = round(1 / float(np.median(np.diff(time_s))), 6)
+    rate_hz = stamped_rate_hz(time_s)
     return Motion(
         float(time_s[-1] - begin_s) + 1 / rate_hz, force=ForcePath(time_s, force_mps2),
         internal_rate_hz=rate_hz if resampled else max(rate_hz, INTERNAL_RATE_HZ)), begin_s

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stamps import period_s
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.filters import loop, play, stop
@@ -318,8 +319,7 @@ def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
         return None
     volts, time_s = recording.volts(unit), recording.time_s
     span_s = float(time_s[-1] - time_s[0])
-    block_s = max(BLOCK_S, span_s / _MOST_BLOCKS,
-                  _FEWEST_SAMPLES * float(np.median(np.diff(time_s))))
+    block_s = max(BLOCK_S, span_s / _MOST_BLOCKS, _FEWEST_SAMPLES * period_s(time_s))
     edges = np.unique(np.searchsorted(time_s, time_s[0] + block_s * np.arange(
         int(span_s / block_s) + 1)))
     parts = [slice(a, b) for a, b in pairwise(edges)

@@ -129,7 +129,8 @@ class StreamSensor:
     def _measure(self) -> tuple[Severity, str] | None:
         """Measure the sensor of a stream that states nothing of itself."""
         stamps_ns, accel_mps2 = self._samples.waiting()
-        if not len(stamps_ns) or np.ptp(stamps_ns) < recorded_sensor.SHORTEST_S * 1e9:
+        if len(stamps_ns) < recorded_sensor.FEWEST_SAMPLES or \
+                np.ptp(stamps_ns) < recorded_sensor.SHORTEST_S * 1e9:
             return None
         try:
             unit, lines = recorded_sensor.unit_of_stream(self._anonymous, stamps_ns, accel_mps2)
@@ -323,8 +324,8 @@ class Controller:
                 'without it, 2 s of samples show the sensor'
             return Status(Phase.INFO, f'waiting for sensor_info; {obstacle}', True)
         if self.session is None:
-            idle = f'{IDLE_TEXT}; {stream.outlook}' if stream.outlook else IDLE_TEXT
-            return Status(Phase.IDLE, self._last or idle, False)
+            hints = IDLE_TEXT, stream.outlook, self._samples.silence()
+            return Status(Phase.IDLE, self._last or '; '.join(filter(None, hints)), False)
         if silence := self._samples.silence():
             return Status(Phase.SILENT, silence, True)
         if fault := self.session.fault or self.fit_fault:

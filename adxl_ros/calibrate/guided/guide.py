@@ -12,7 +12,7 @@ import math
 from typing import NamedTuple
 
 from adxl_ros.calibrate.guided.screen_contents import Row
-from adxl_ros.files.recording_columns import stamped_rate_hz
+from adxl_ros.files.stamps import halves, late_by, stamped_rate_hz
 from adxl_ros.files.sweep_journal import JournalEntry, PoseDropped, PoseRecord
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.report.quantities import duration
@@ -22,6 +22,10 @@ import numpy as np
 
 _REST_WINDOW_S = 1.2
 """Newest samples that stay in memory, s; chosen: more than the rest detection looks at."""
+_RATE_WINDOW_S = 4.0
+"""Newest stamps that stay in memory, s; chosen: halves of it are long against a host's stalls."""
+_RATE_ERROR = 0.05
+"""Largest relative error of the sample rate; chosen: above the error of any oscillator."""
 _SHOWN_S = 0.5  # Newest samples whose mean is shown, s; chosen: steady to read and still quick
 _FEWEST_SAMPLES = 20  # Samples that stay at the lowest rates; chosen: they give the rate
 _BACK_NS = 1_000_000_000
@@ -39,23 +43,24 @@ def went_back(newest_ns: int | None, stamp_ns: int) -> bool:
 
 
 class NewestSamples:
-    """The newest 1.2 s of a stream, and at least twenty samples."""
+    """The newest 1.2 s of a stream and the stamps of 4 s, and at least twenty of both."""
 
     def __init__(self, sensor: Sensor) -> None:
         self._sensor = sensor
-        self.stamps_ns = np.zeros(0, np.int64)  # (n,)
+        self.stamps_ns = np.zeros(0, np.int64)  # (k,)
         self.volts = np.zeros((0, len(sensor.axes)))  # (n, m)
 
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """Take samples."""
-        keep = self._count(_REST_WINDOW_S)
-        self.stamps_ns = np.concatenate([self.stamps_ns, stamps_ns])[-keep:]
-        self.volts = np.concatenate([self.volts, volts])[-keep:]
+        self.stamps_ns = np.concatenate([self.stamps_ns, stamps_ns])[
+            -self._count(_RATE_WINDOW_S):]
+        self.volts = np.concatenate([self.volts, volts])[-self._count(_REST_WINDOW_S):]
 
     def stillness(self) -> Stillness | None:
         """Return whether the samples are at rest, by the datasheet's noise; None if too few."""
-        dwell = Dwell(self._sensor, int(self.stamps_ns[:1].sum()))
-        dwell.feed(self.stamps_ns, self.volts)
+        stamps_ns = self.stamps_ns[len(self.stamps_ns) - len(self.volts):]
+        dwell = Dwell(self._sensor, int(stamps_ns[:1].sum()))
+        dwell.feed(stamps_ns, self.volts)
         return dwell.stillness()
 
     def rate_hz(self) -> float:
@@ -63,6 +68,18 @@ class NewestSamples:
         if len(self.stamps_ns) < _FEWEST_SAMPLES:
             return math.nan
         return stamped_rate_hz((self.stamps_ns - self.stamps_ns[0]) * 1e-9)
+
+    def rate_fault(self) -> str:
+        """Return that the rate is not that of the sensor, for people; '' if it is."""
+        if len(self.stamps_ns) < _FEWEST_SAMPLES:
+            return ''
+        stated_hz = self._sensor.rate_hz
+        rates = halves((self.stamps_ns - self.stamps_ns[0]) * 1e-9)
+        # Samples that wait while the host stalls come late in one half or the other.
+        if not rates.contradict(stated_hz, _RATE_ERROR):
+            return ''
+        return (f'samples are {self.rate_hz():.4g} a second by their stamps, but rate_hz is '
+                f'{stated_hz:.4g}; correct the rate of the driver')
 
     def rows(self, stillness: Stillness | None) -> list[Row]:
         """Return what the sensor reads at present, for the screen."""
@@ -81,6 +98,27 @@ class NewestSamples:
 
     def _count(self, seconds: float) -> int:
         return max(round(seconds * self._sensor.rate_hz), _FEWEST_SAMPLES)
+
+
+class LateStamps:
+    """Samples of a stream that are left out, because their stamp steps back."""
+
+    def __init__(self) -> None:
+        self._number, self._newest_ns, self._largest_ns = 0, 0, 0
+
+    def count(self, stamps_ns: np.ndarray, late_ns: np.ndarray) -> None:
+        """Count further stamps, ns, (n,), and by how much they step back, ns, (n,)."""
+        if late_ns.any():
+            self._number += int(np.count_nonzero(late_ns))
+            self._newest_ns = int(stamps_ns[late_ns > 0].max())
+            self._largest_ns = max(self._largest_ns, int(late_ns.max()))
+
+    def fault(self, now_ns: int) -> str:
+        """Return what was left out, for people, while it is recent; else ''."""
+        if not self._number or now_ns - self._newest_ns > _RATE_WINDOW_S * 1e9:
+            return ''
+        return (f'imu/data_raw: left out, samples whose stamp steps back: {self._number} so far, '
+                f'by up to {self._largest_ns * 1e-6:.3g} ms; one driver must stamp them in order')
 
 
 class Readings:
@@ -214,18 +252,6 @@ class EncoderTrack:
         return f'nothing on stage/joint_states for {silent_s:.0f} s' if silent_s > SILENT_S else ''
 
 
-_RATE_ERROR = 0.05
-"""Largest relative error of the sample rate; chosen: above the error of any oscillator."""
-
-
-def rate_fault(measured_hz: float, unit: Sensor) -> str:
-    """Refuse samples whose rate is not that of the unit."""
-    if not abs(measured_hz / unit.rate_hz - 1) > _RATE_ERROR:
-        return ''
-    return (f'samples are {measured_hz:.4g} a second by their stamps, but rate_hz is '
-            f'{unit.rate_hz:.4g}; correct the rate of the driver')
-
-
 class NextPose(NamedTuple):
     """The pose to go to, as it is announced."""
 
@@ -247,6 +273,7 @@ class Guide:
         self.readings = {'temperature': Readings(), 'supply': Readings()}  # °C and V
         self.newest = NewestSamples(sensor)
         self.newest_ns: int | None = None  # Stamp of the newest sample, ns
+        self._late = LateStamps()
         self.refusal = self._new_refusal = ''  # Why the newest pose was refused; '' if not
 
     @property
@@ -268,14 +295,23 @@ class Guide:
         """Take samples, ns, (n,), and V, (n, m); return why they are of no use, or ''."""
         if not len(stamps_ns):
             return ''
-        self.newest.feed(stamps_ns, volts)
-        if fault := rate_fault(self.newest.rate_hz(), self.sensor):
-            return fault
         if went_back(self.newest_ns, stamps_ns[0]):
+            self.newest = NewestSamples(self.sensor)
             self.begin_stream(((self.newest_ns or 0) - int(stamps_ns[0])) * 1e-9)
+            self.newest_ns, self._late = None, LateStamps()
+        before_ns = stamps_ns[:1] if self.newest_ns is None else [self.newest_ns]
+        late_ns = late_by(np.concatenate([before_ns, stamps_ns]))[1:]
+        self._late.count(stamps_ns, late_ns)
+        # As steps of the time they would end each rest.
+        stamps_ns, volts = stamps_ns[late_ns == 0], volts[late_ns == 0]
+        if not len(stamps_ns):
+            return self._late.fault(self.newest_ns or 0)
         self.newest_ns = int(stamps_ns[-1])
+        self.newest.feed(stamps_ns, volts)
+        if fault := self.newest.rate_fault():
+            return fault
         self.take_samples(stamps_ns, volts)
-        return ''
+        return self._late.fault(self.newest_ns)
 
     def begin_stream(self, back_s: float) -> None:
         """Begin again, as the stamps went back by a time."""
