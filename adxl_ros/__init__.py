@@ -1,3 +1,58 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Driver, calibration, compensation and diagnosis of low-g analog MEMS accelerometers."""
+"""
+Driver, calibration, compensation and diagnosis of low-g analog MEMS accelerometers.
+
+The verbs of the package load when they are used, and need no ROS:
+
+    import adxl_ros as adxl
+    recording = adxl.read('sweep.csv')
+    fit = adxl.fit(recording, 'adxl203')
+    corrected = adxl.apply(recording, fit)
+    gap = adxl.diagnose(recording, fit)
+"""
+
+from importlib import import_module
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from adxl_ros.api.gap import diagnose
+    from adxl_ros.api.recordings import from_arrays, read
+    from adxl_ros.api.sensors import load
+    from adxl_ros.errors import UserError
+    from adxl_ros.simulate.sensor_model import SensorModel
+
+_MODULES = {
+    'diagnose': 'api.gap',
+    'from_arrays': 'api.recordings',
+    'load': 'api.sensors',
+    'read': 'api.recordings',
+    'SensorModel': 'simulate.sensor_model',
+    'UserError': 'errors',
+}
+"""Module of each name that `import adxl_ros` gives."""
+
+__all__ = ['SensorModel', 'UserError', 'diagnose', 'from_arrays', 'load', 'read']
+
+
+# Two verbs have the names of packages. A package becomes an attribute when it is first imported:
+# here, and not later in place of the verb.
+for _package in ('diagnose', 'simulate'):
+    import_module(f'{__name__}.{_package}')
+    del globals()[_package]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a verb when it is used first."""
+    if name == '__version__':
+        from adxl_ros.process import package_version
+        return package_version()
+    if name not in _MODULES:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    globals()[name] = value = getattr(import_module(f'{__name__}.{_MODULES[name]}'), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    """Return the names that are there, those that are not loaded as well."""
+    return sorted({*globals(), *_MODULES, '__version__'})

@@ -43,6 +43,16 @@ def code_version() -> str:
     return hashlib.sha256(release_version().encode() + b''.join(code)).hexdigest()
 
 
+STARTED_BY = 'ADXL_ROS_COMMAND'
+"""Environment variable with the words before the name of a tool, as its user wrote them."""
+
+
+def command(tool: str, arguments: str = '') -> str:
+    """Return the command line that runs a tool in the way in which this process was started."""
+    usual = 'ros2 run adxl_ros' if 'AMENT_PREFIX_PATH' in os.environ else 'adxl_ros'
+    return f'{os.environ.get(STARTED_BY, usual)} {tool} {arguments}'.rstrip()
+
+
 def use_one_thread() -> None:
     """
     Keep OpenBLAS to one thread, unless the user chooses a number; call it before numpy is loaded.

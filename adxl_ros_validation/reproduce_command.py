@@ -21,7 +21,7 @@ from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import package_version
-from adxl_ros.report.figures import png, pyplot
+from adxl_ros.report.figures import new_figure, png
 from adxl_ros.tools import command_line as cli
 from adxl_ros_validation import coverage, experiments
 from adxl_ros_validation.blind.report import filled, markdown_table, terminal_table
@@ -140,7 +140,8 @@ _SHOWN_S = (2.0, 2.5)
 
 def draw_misalignment(found_rad: dict[str, float], output_g: np.ndarray) -> Any:
     """Draw the search for β_x of (18) and the results of its three methods, as figure 9."""
-    figure, axis = pyplot().subplots(figsize=(7, 4.5), layout='constrained')
+    figure = new_figure(figsize=(7, 4.5))
+    axis = figure.subplots()
     axis.plot(np.degrees(experiments.SEARCH_RAD), 1e3 * (output_g - output_g.max()), 'o', ms=4,
               label='output, means of 5 s')
     for (label, value), colour in zip(found_rad.items(),
@@ -155,7 +156,8 @@ def draw_misalignment(found_rad: dict[str, float], output_g: np.ndarray) -> Any:
 
 def draw_tilt(unit: Unit) -> Any:
     """Draw figure 10: errors of alpha and beta in the three tilt experiments."""
-    figure, grid = pyplot().subplots(2, 3, figsize=(16, 8), layout='constrained', sharex=True)
+    figure = new_figure(figsize=(16, 8))
+    grid = figure.subplots(2, 3, sharex=True)
     for column, (run, asked_deg) in enumerate(RUNS.items()):
         turned = asked_deg[:, 1 if run == 'beta' else 0]
         for row, angle in enumerate(('alpha', 'beta')):
@@ -184,8 +186,8 @@ def draw_motion(units: dict[str, Sensor], shaken: tuple[np.ndarray, np.ndarray, 
 
     shaken: stamps, s, (n,); volts, (n, m); acceleration along x, m/s², (n,).
     """
-    figure, row = pyplot().subplots(1, len(units), figsize=(16, 4.5), layout='constrained',
-                                    sharey=True)
+    figure = new_figure(figsize=(16, 4.5))
+    row = figure.subplots(1, len(units), sharey=True)
     time_s = shaken[0]
     part = (time_s >= _SHOWN_S[0]) & (time_s <= _SHOWN_S[1])
     for axis, (name, unit) in zip(row, units.items()):
@@ -210,7 +212,8 @@ def draw_components(truth: Sensor, units: dict[str, Sensor]) -> Any:
              ('+ misalignment (18)', fitted, fitted.effects),
              ('actual response', truth, truth.effects))
     actual = signal_chain.static_response(truth)(pose)[0]
-    figure, (response, difference) = pyplot().subplots(1, 2, figsize=(14, 5), layout='constrained')
+    figure = new_figure(figsize=(14, 5))
+    response, difference = figure.subplots(1, 2)
     for label, unit, effects in steps:
         part = replace(unit, effects=effects, values={e: unit.values[e] for e in effects})
         volts = signal_chain.static_response(part)(pose)[0]

@@ -34,6 +34,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Concern, Detector, Manoeuvre
 from adxl_ros.model.sensor import parameter_of, Sensor, with_neutral
+from adxl_ros.process import command
 from adxl_ros.report.quantities import listed
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
@@ -48,8 +49,8 @@ _SMALLEST_PROBABILITY, _MOST_HYPOTHESES = 1e-3, 40
 together are far below the 5 % that remain at the end; run time."""
 _EVIDENCE_FACTOR = 0.3
 """Factor of the information, because no model of a sensor is exact (Miller and Dunson 2019)."""
-_OTHER_REFERENCE = 'ros2 run adxl_ros diagnose next.csv --sim next_simulated.csv -o next'
-"""Command for another recording beside another reference."""
+_OTHER_REFERENCE = 'next.csv --sim next_simulated.csv -o next'
+"""Arguments of `diagnose` for another recording beside another reference."""
 
 
 class CouldShow(NamedTuple):
@@ -376,11 +377,12 @@ def _experiment(manoeuvre: Manoeuvre, why: str, no_stage: bool) -> NextExperimen
     """Describe a manoeuvre with its command."""
     described, option = MENU[manoeuvre], ''
     if no_stage:
-        return NextExperiment(described.text, why, _OTHER_REFERENCE, beside_simulator=True)
+        return NextExperiment(described.text, why, command('diagnose', _OTHER_REFERENCE),
+                              beside_simulator=True)
     if described.remounted:
         option = f' --effect {":".join(_half_turn())}={np.pi:.6f}'
-    return NextExperiment(described.text, why, f'ros2 run adxl_ros simulate '
-                          f'{described.trajectory}{option} -o next.csv')
+    return NextExperiment(described.text, why, command(
+        'simulate', f'{described.trajectory}{option} -o next.csv'))
 
 
 def _half_turn() -> tuple[str, str]:

@@ -42,9 +42,10 @@ _CONTRIBUTION = 'what the model of the effect predicts, mg'
 _SEGMENT, _POINTS_PER_OCTAVE = 4096, 12
 """Samples in a segment of a spectrum, and points of its plot in an octave. Chosen: 0.06 Hz at
 250 Hz, and lines stay visible."""
-_COLOURS = {'explained': 'green', 'partly': 'amber', 'no_gap': 'grey', 'inseparable': 'amber',
-            'insufficient': 'amber', 'unknown': 'red', 'bad_data': 'red'}
+COLOURS = {'explained': 'green', 'partly': 'amber', 'no_gap': 'grey', 'inseparable': 'amber',
+           'insufficient': 'amber', 'unknown': 'red', 'bad_data': 'red'}
 """Colour of the badge for each status."""
+TILES = 4  # Figures at the top of the page
 _PLOTTED_POINTS = 3000
 """Largest number of points of a line. Chosen: more than a wide screen has columns."""
 _INK, _EFFECT_COLOUR = '#1f2933', '#5b8fd6'
@@ -89,7 +90,7 @@ def _page(diagnosis: Diagnosis, objects: dict[str, Any], run: Run, parameters: s
     """Lay out the page; raise UserError where Plotly or jinja2 is not installed."""
     values: dict[str, Any] = {
         'title': run.subject, 'about': [f'parameter file {run.parameter_file}'],
-        'badge': {'colour': _COLOURS[objects['verdict']['status']],
+        'badge': {'colour': COLOURS[objects['verdict']['status']],
                   'word': words.badge(diagnosis), 'sentence': words.headline(diagnosis)},
         'notes': words.notes(diagnosis), 'figures': {}, 'has_verdict': False,
         'download': parameters and html_page.download_url(parameters)}
@@ -123,7 +124,7 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
                         'before': full_rate.residual_v(full_rate.sensor),
                         'after': full_rate.residual_v(best.sensor)}),
                     **{f'proof-{name}': drawn for name, (drawn, _) in proofs.items()}},
-        'tiles': rows[:4],
+        'tiles': rows[:TILES],
         'effects': [{
             'name': c['effect'], 'sure': percent(c['probability']), 'cause': c['cause'],
             'share': '' if c['share'] is None else f'{percent(c["share"])} of the gap',

@@ -18,7 +18,13 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import mapped_recording
-from adxl_ros.files.column_mapping import AS_IT_IS, Mounting, parse_mapping, ReadingOptions
+from adxl_ros.files.column_mapping import (
+    AS_IT_IS,
+    Mounting,
+    parse_mapping,
+    ReadingOptions,
+    Table,
+)
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import ACCEL, concatenate, Recording, TIME, VOLTS
 from adxl_ros.files.tables import open_table
@@ -68,9 +74,14 @@ def blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions = AS_IT_I
     All blocks have the same columns, except for a CSV column that turns out to be text further
     down. Alignments, cut and remarks of a block are those up to its end.
     """
-    read_blocks = _bag_blocks(path, rows, reading=reading) if is_bag(path) else \
-        _table_blocks(path, rows, reading)
-    return _mounted(read_blocks, reading.mounting) if reading.mounting else read_blocks
+    if not is_bag(path):
+        return _table_blocks(open_table(path, reading.topic), rows, reading)
+    return _mounted(_bag_blocks(path, rows, reading=reading), reading.mounting)
+
+
+def of_table(table: Table, reading: ReadingOptions = AS_IT_IS) -> Recording:
+    """Return the whole recording that a table in memory holds."""
+    return concatenate(_table_blocks(table, _BLOCK_ROWS, reading))
 
 
 def _bag_blocks(path: str | os.PathLike, rows: int, **options: Any
@@ -79,21 +90,25 @@ def _bag_blocks(path: str | os.PathLike, rows: int, **options: Any
     return bag_reader.blocks(path, rows, **options)
 
 
-def _table_blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions
+def _table_blocks(table: Table, rows: int, reading: ReadingOptions
                   ) -> Generator[Recording, None, None]:
     """Yield the blocks of a table; propose a mapping where it has none."""
-    table = open_table(path, reading.topic)
     mapping = reading.mapping or (
         parse_mapping(table.default_mapping) if table.default_mapping else None)
     try:
-        yield from mapped_recording.blocks(table, mapping, reading, rows)
+        blocks = mapped_recording.blocks(table, mapping, reading, rows)
+        yield from _mounted(blocks, reading.mounting)
     except mapped_recording.NotNativeError as error:
         text, options = mapped_recording.propose(table)
         raise UserError(f'{error}; {text}', options) from None
 
 
-def _mounted(blocks: Iterator[Recording], mounting: Mounting) -> Generator[Recording, None, None]:
-    """Turn the blocks of a recording."""
+def _mounted(blocks: Iterator[Recording], mounting: Mounting | None
+             ) -> Generator[Recording, None, None]:
+    """Turn the blocks of a recording; they stay as they are without a mounting."""
+    if mounting is None:
+        yield from blocks
+        return
     columns, signs = map(list, zip(*mounting))
     for block in blocks:
         names = block.sensor_columns
@@ -137,9 +152,13 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> Recording:
     """
     parts = (_bag_blocks(path, _BLOCK_ROWS, ideal=True) if is_bag(path)
              else mapped_recording.blocks(open_table(path), None, AS_IT_IS, _BLOCK_ROWS, ACCEL))
-    ideal = concatenate(parts)
-    return replace(ideal, time_s=ideal.time_s + (ideal.epoch_ns - epoch_ns) / 1e9,
-                   epoch_ns=epoch_ns)
+    return at_epoch(concatenate(parts), epoch_ns)
+
+
+def at_epoch(recording: Recording, epoch_ns: int) -> Recording:
+    """Return a recording whose times count from another origin, ns."""
+    shift_s = (recording.epoch_ns - epoch_ns) / 1e9
+    return replace(recording, time_s=recording.time_s + shift_s, epoch_ns=epoch_ns)
 
 
 @contextmanager

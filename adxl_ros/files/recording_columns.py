@@ -14,6 +14,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.stamps import describe_bursts, stamped_rate_hz
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, to_volts, with_axes
+from adxl_ros.report.quantities import column_unit
 import numpy as np
 
 FORMAT = '1'  # Version of the recording format, the key `format`
@@ -112,11 +113,11 @@ class BadStamps(NamedTuple):
     backward: int  # Samples whose stamp is earlier
 
 
-@dataclass
+@dataclass(repr=False)
 class Recording:
     """Samples of one sensor, with references."""
 
-    path: str  # The file that it was read from, for messages
+    path: str  # The file that it was read from, or another name, for messages
     # Stamps of the samples, s since `epoch_ns`, (n,), strictly increasing. Missing samples are
     # gaps in it.
     time_s: np.ndarray
@@ -140,6 +141,38 @@ class Recording:
     def __len__(self) -> int:
         """Return the number of samples."""
         return len(self.time_s)
+
+    def __repr__(self) -> str:
+        """Return name, length, rate, axes and references in one line."""
+        span_s = float(self.time_s[-1] - self.time_s[0]) if len(self) else 0.0
+        rate = f', {self.rate_hz:.4g} Hz' if len(self) > 1 else ''
+        further = [name for name in self.columns if name not in self.sensor_columns]
+        return (f'{Path(self.path).name}: {span_s:.4g} s{rate}, axes {" ".join(self.axes)}'
+                + f', with {", ".join(further)}' * bool(further))
+
+    def to_pandas(self) -> Any:
+        """Return a DataFrame with the stamps as index, s, and a column for each of `columns`."""
+        from pandas import DataFrame, Index
+        return DataFrame(self.columns, index=Index(self.time_s, name=TIME))
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the sensor's output over time into axes of matplotlib, new ones for None."""
+        from adxl_ros.report.figures import axes_for, AXIS_COLOURS
+        ax, unit = axes_for(ax), 'V' if self.sensor_columns[0] in VOLTS else 'm/s²'
+        for axis, name in zip(self.axes, self.sensor_columns):
+            ax.plot(self.time_s, self.columns[name], lw=0.8, label=axis, color=AXIS_COLOURS[axis])
+        ax.set(xlabel='time, s', ylabel=f'output, {unit}')
+        ax.legend()
+        return ax
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return what was assumed in reading, where it is cut, and how references are aligned."""
+        # References with the stamps of the samples need no alignment.
+        aligned = [f'{self.path}: {name} aligned by its stamps: residual {residual:.3g} '
+                   f'{column_unit(name)} rms'
+                   for name, residual in self.alignments.items() if residual]
+        return (*self.remarks, *[self.cut] * bool(self.cut), *aligned)
 
     def rows(self, start: int, stop: int) -> Recording:
         """Return a part of the samples."""

@@ -11,6 +11,7 @@ from functools import partial
 from io import StringIO
 import os
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from adxl_ros.errors import install_hint, one_line, UserError
@@ -44,15 +45,20 @@ def open_table(path: str | os.PathLike, topic: str = '') -> Table:
                  header_line=form.header_line, repeated=form.repeated)
 
 
-def _in_memory(path: str, columns: Mapping[str, np.ndarray], cut: str = '', **about: Any) -> Table:
-    """Return a table of arrays (n,) by name; `cut` tells where a damaged file ends."""
+def in_memory(path: str, columns: Mapping[str, np.ndarray], cut: str = '',
+              info: Mapping[str, str] = MappingProxyType({}), **about: Any) -> Table:
+    """
+    Return a table of arrays (n,) by name.
+
+    cut: where a damaged file ends; info: keys and values that it states.
+    """
     def blocks(names: Collection[str], _: Collection[str]) -> Iterator[TableBlock]:
         rows = len(next(iter(columns.values())))
         for start in range(0, rows, _BLOCK_ROWS):
             stop = min(start + _BLOCK_ROWS, rows)
             yield TableBlock({name: np.asarray(columns[name][start:stop], float)
                               for name in names},
-                             _row_places(path, start), done=stop / rows, cut=cut)
+                             _row_places(path, start), info, stop / rows, cut)
 
     return Table(path, tuple(columns), blocks, **about)
 
@@ -91,7 +97,7 @@ def _open_npz(path: str) -> Table:
     if not columns:
         raise UserError(f'{path}: holds no array of numbers with several rows')
     rows = Counter(map(len, columns.values())).most_common(1)[0][0]
-    return _in_memory(path, {name: values for name, values in columns.items()
+    return in_memory(path, {name: values for name, values in columns.items()
                              if len(values) == rows})
 
 
@@ -151,7 +157,7 @@ def _open_ulog(path: str, topic: str) -> Table:
     if 'temperature' not in columns:
         mapping = mapping.partition(',temperature=')[0]
     cut = f'{path}: is damaged; what can be read of it is used' * bool(log.file_corruption)
-    return _in_memory(path, columns, cut, default_mapping=mapping,
+    return in_memory(path, columns, cut, default_mapping=mapping,
                       units={'timestamp': 'us', 'timestamp_sample': 'us'})
 
 

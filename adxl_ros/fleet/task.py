@@ -17,11 +17,10 @@ from functools import cached_property
 import os
 from pathlib import Path
 from resource import getrusage, RUSAGE_SELF
-import shlex
 import shutil
 import tempfile
 from time import monotonic, time
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
@@ -44,10 +43,6 @@ from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
 from adxl_ros.signals.noise_parameters import recording_noise
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 import numpy as np
-
-if TYPE_CHECKING:
-    from adxl_ros.diagnose.diagnosis import Diagnosis
-
 
 _SPARE_MB = 64  # Space that stays free, MB. Chosen: a task writes some MB
 _LEFT_S = 86400.0
@@ -348,27 +343,20 @@ class _Job:
 
     def _diagnose(self) -> None:
         """Compare the recording with its simulation."""
-        from adxl_ros.diagnose import page
-        from adxl_ros.diagnose.diagnosis import diagnose
-        from adxl_ros.diagnose.report import as_json
-        read = self._recording
-        sensor, _ = measure_unstated(load_sensor(self._params, read), read)
-        diagnosis = diagnose([read], sensor)
-        report = as_json(diagnosis)
-        self._put_verdict(diagnosis, report)
-        params = ['--params', self._parameters.name] if self._params else []
-        again = ['ros2', 'run', 'adxl_ros', 'diagnose', self._source.url, *params, '-o', 'gap']
-        run = page.Run(self._source.url, self._parameters.name, [], command=shlex.join(again))
-        self.files |= {name: text.encode() for name, text in page.documents(
-            diagnosis, report, [report['summary']],
-            run if report['verdict']['status'] in _PAGES else None).items()}
+        from adxl_ros.api.gap import diagnose  # the client needs none
+        found = diagnose(self._recording, self._params)
+        # The report names the file, and not the copy of the task.
+        found = found.with_params(self._parameters.name if self._params else '')
+        self._put_verdict(found.to_dict())
+        self.files |= {name: text.encode() for name, text in found.documents(
+            'gap', has_page=found.verdict in _PAGES).items()}
 
-    def _put_verdict(self, diagnosis: Diagnosis, report: dict[str, Any]) -> None:
+    def _put_verdict(self, report: dict[str, Any]) -> None:
         """Put a diagnosis into the row."""
         gap = report['gap']
         self.row |= {name: report['verdict'][name]
                      for name in ('status', 'effects', 'groups', 'data_fault', 'probability')}
-        if gap is None or diagnosis.report is None:
+        if gap is None:
             return
         self.row['gap_floor_source'] = gap['floor_source']
         for name, unit in (('before', '_mps2'), ('after', '_mps2'), ('floor', '_mps2'),

@@ -23,13 +23,11 @@ from enum import Enum
 from itertools import accumulate, chain, count
 import os
 from pathlib import Path
-import shlex
 import shutil
 
+from adxl_ros.api.gap import diagnose, Gap
 from adxl_ros.diagnose import next_experiment
-from adxl_ros.diagnose.diagnosis import diagnose, Diagnosis
 from adxl_ros.diagnose.linear_model import LinearModel
-from adxl_ros.diagnose.report import as_json
 from adxl_ros.diagnose.verdict import normalised, UNKNOWN, WeightedHypothesis
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording as recording_files
@@ -106,27 +104,27 @@ class Answer:
 
 
 def run_round(question: Question, recordings: Sequence[Recording], sensor: Sensor,
-              limits: StageLimits, seed: int = 0) -> tuple[Answer, Diagnosis | None]:
+              limits: StageLimits, seed: int = 0) -> tuple[Answer, Gap | None]:
     """Diagnose the samples so far, and choose the next manoeuvre."""
-    diagnosis = diagnose(recordings, sensor, seed=seed) if recordings else None
-    report = diagnosis.report if diagnosis else None
+    gap = diagnose(recordings, sensor, seed=seed) if recordings else None
+    report = gap.diagnosis.report if gap else None
     # The prior probabilities, where the samples are too few.
     hypotheses = report.verdict.hypotheses if report else normalised(
         {(): _NOTHING, (UNKNOWN,): 1 - _NOTHING})
-    fault = diagnosis.fault if diagnosis else None
+    fault = gap.diagnosis.fault if gap else None
     if fault is not None and fault.status != 'insufficient':
-        return Answer(hypotheses, Outcome.INSEPARABLE, fault=fault.message), diagnosis
+        return Answer(hypotheses, Outcome.INSEPARABLE, fault=fault.message), gap
     verdict = ' '.join([report.verdict.status, *report.verdict.effects]) if report else ''
     best = hypotheses[0]
     if best.effects and best.probability >= CERTAIN:
         # Effects that were not seen so far only take probability from no gap, so that the
         # manoeuvres need not be simulated.
-        return decide(hypotheses, (), question, True, verdict), diagnosis
+        return decide(hypotheses, (), question, True, verdict), gap
     manoeuvres = plan_all(limits, question.pose, 60 * question.minutes)
     in_time = [m for m in manoeuvres if m.minutes <= question.remaining_minutes]
     ranked = rank(hypotheses, report.linear_model if report else None, sensor,
                   in_time or manoeuvres)
-    return decide(*ranked, question, bool(in_time), verdict), diagnosis
+    return decide(*ranked, question, bool(in_time), verdict), gap
 
 
 def rank(hypotheses: Hypotheses, model: LinearModel | None, sensor: Sensor,
@@ -267,19 +265,13 @@ def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, see
     os.nice(_NICENESS)
     sensor = parameter_file.load(folder.baseline)
     recordings = [recording_files.read(folder.bag)] if question.has_samples else []
-    answer, diagnosis = run_round(question, recordings, sensor, limits, seed)
-    if diagnosis is None:
-        return answer
-    from adxl_ros.diagnose.page import documents, Run
-    report = as_json(diagnosis)
-    subject = f'{folder.bag}  minus  simulation of {folder.baseline.name}'
-    command = shlex.join(['ros2', 'run', 'adxl_ros', 'diagnose', str(folder.bag), '--params',
-                          str(folder.baseline), '-o', f'{folder.path}_again'])
-    # The page is that of the end.
-    run = None if answer.outcome is Outcome.GO_ON else \
-        Run(subject, folder.baseline.name, [], command=command)
-    for name, text in documents(diagnosis, report, [report['summary']], run).items():
-        write_text(folder.path / name, text)
+    answer, gap = run_round(question, recordings, sensor, limits, seed)
+    if gap is not None:
+        # The page is that of the end.
+        texts = gap.with_params(str(folder.baseline)).documents(
+            folder.path, has_page=answer.outcome is not Outcome.GO_ON)
+        for name, text in texts.items():
+            write_text(folder.path / name, text)
     return answer
 
 

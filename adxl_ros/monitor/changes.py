@@ -25,16 +25,14 @@ from datetime import datetime, timezone
 import json
 import os
 from pathlib import Path
-import shlex
 import time
 from typing import NamedTuple
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
-from adxl_ros.files.atomic_write import append_line, write_text
+from adxl_ros.files.atomic_write import append_line
 from adxl_ros.files.recording_columns import ACCEL, Recording
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.simulate.trajectories import motion_from_force
 from adxl_ros.workers import in_background
 import numpy as np
 import scipy
@@ -280,29 +278,21 @@ class DiagnosisRun:
 
 def _diagnose(folder: Path, given: DiagnosisInput) -> DiagnosisResult:
     """Diagnose; write the samples, the baseline, and the files of the diagnosis."""
-    from adxl_ros.diagnose.diagnosis import diagnose  # the node itself needs none
-    from adxl_ros.diagnose.page import documents, Run
-    from adxl_ros.diagnose.report import as_json
+    from adxl_ros.api.gap import diagnose  # the node itself needs none
     os.nice(_NICENESS)
     folder.mkdir(parents=True, exist_ok=True)
-    samples, sim = replace(given.recording, path=str(folder / 'recording.csv')), None
+    samples = replace(given.recording, path=str(folder / 'recording.csv'))
     recording.write(samples.path, samples, given.sensor)
-    parameter_file.save(folder / 'baseline.yaml', given.sensor)
-    command = ['ros2', 'run', 'adxl_ros', 'diagnose', samples.path, '--params',
-               str(folder / 'baseline.yaml')]
+    baseline = folder / 'baseline.yaml'
+    parameter_file.save(baseline, given.sensor)
+    ideal = None
     if given.force is not None:
         time_s, force_mps2 = given.force
-        ideal = Recording(str(folder / 'reference.csv'), time_s, dict(zip(ACCEL, force_mps2.T)))
+        ideal = Recording(str(folder / 'reference.csv'), time_s, dict(zip(ACCEL, force_mps2.T)),
+                          epoch_ns=samples.epoch_ns)
         recording.write(ideal.path, ideal, given.sensor)
-        command += ['--sim', ideal.path]
-        sim, _ = motion_from_force(ideal, False)
-    diagnosis = diagnose([samples], given.sensor, sim)
-    report = as_json(diagnosis)
-    run = Run(f'{samples.path}  minus  simulation of {given.sensor.serial}', 'baseline.yaml', [],
-              command=shlex.join([*command, '-o', str(folder / 'again')]))
-    for name, text in documents(diagnosis, report, [report['summary']], run).items():
-        write_text(folder / name, text)
-    verdict = report['verdict']
-    likely = [effect for group in verdict['groups'] for effect in group]
-    return DiagnosisResult(True, report['summary'], str(folder / 'report.html'),
-                           tuple(verdict['effects'] or likely), verdict['probability'] or 0.0)
+    gap = diagnose(samples, given.sensor, sim=ideal).with_params(str(baseline))
+    page, *_ = gap.save(folder, gap.command(folder / 'again'))
+    certain = tuple(effect.name for effect in gap.effects if not effect.rivals)
+    likely = tuple(effect.name for effect in gap.effects)
+    return DiagnosisResult(True, gap.summary, str(page), certain or likely, gap.probability)

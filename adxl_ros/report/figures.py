@@ -7,7 +7,8 @@ Plain objects serve every version of plotly. Its Python classes would cost a sec
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from io import BytesIO
 from typing import Any
 
@@ -97,20 +98,33 @@ def whisker(value: float, low: float, high: float, bounds: tuple[float, float], 
             'line': (place(low), place(high) - place(low)), 'beyond': beyond}
 
 
-def pyplot() -> Any:
-    """Return matplotlib's drawing functions, without a display."""
+def new_figure(**options: Any) -> Any:
+    """Return a figure of matplotlib for a file; no display shows it."""
+    with _matplotlib():
+        from matplotlib.figure import Figure
+    return Figure(layout='constrained', **options)
+
+
+def axes_for(ax: Any) -> Any:
+    """Return axes of matplotlib to draw into: those given, or new ones that a display shows."""
+    if ax is not None:
+        return ax
+    with _matplotlib():
+        from matplotlib import pyplot
+    return pyplot.subplots()[1]
+
+
+@contextmanager
+def _matplotlib() -> Iterator[None]:
+    """Name the package that is missing."""
     try:
-        import matplotlib
+        yield
     except ImportError:
         raise UserError(f'plots need matplotlib; {install_hint("matplotlib")}') from None
-    matplotlib.use('Agg')
-    import matplotlib.pyplot
-    return matplotlib.pyplot
 
 
 def png(figure: Any, dpi: int = _FILE_DPI) -> bytes:
-    """Return a matplotlib figure as a PNG picture, and close it."""
+    """Return a matplotlib figure as a PNG picture."""
     out = BytesIO()
     figure.savefig(out, dpi=dpi, format='png', metadata={'Software': None})
-    pyplot().close(figure)
     return out.getvalue()

@@ -57,7 +57,7 @@ def command_of_this_process() -> str:
 
 
 def picture_url(figure: Any) -> str:
-    """Close a matplotlib figure and return it as the URL of an image that is part of the page."""
+    """Return a matplotlib figure as the URL of an image that is part of the page."""
     return f'data:image/png;base64,{b64encode(png(figure, _DPI)).decode()}'
 
 

@@ -23,8 +23,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 import scipy
 
 
-def load_sensor(params: str | None, read: Recording) -> Sensor:
-    """Load the parameter file of a recording."""
+def load_sensor(params: Sensor | str | None, read: Recording) -> Sensor:
+    """Load the parameter file of a recording, unless the sensor itself is given."""
+    if isinstance(params, Sensor):
+        return params
     if params is None:
         is_of_nominal = read.sensor_columns[0] in VOLTS or \
             read.stream_info.nominal_values(read.axes)

@@ -17,21 +17,15 @@ import sys
 import textwrap
 from typing import TYPE_CHECKING
 
+from adxl_ros.api import recordings
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
-from adxl_ros.files.column_mapping import (
-    AS_IT_IS,
-    parse_mapping,
-    parse_mounting,
-    parse_unit,
-    ReadingOptions,
-)
+from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Effect
 from adxl_ros.model.sensor import neutral, Sensor, typical
 from adxl_ros.process import ended_by_closed_output
-from adxl_ros.report.quantities import column_unit
 from adxl_ros.report.screen import bar, COLUMNS, end_lines, entry_list, NextStep, program_parser
 import numpy as np
 
@@ -74,8 +68,6 @@ def effect_list(effects: Iterable[Effect]) -> str:
 
 RECORDING_HELP = 'rosbag2 directory, .mcap, CSV or another table'
 """Help text of the argument that names a recording."""
-
-_HIGHEST_RATE_HZ = 1e5  # Largest sample rate, Hz: that of a parameter file
 
 
 def add_recording_options(parse: argparse.ArgumentParser) -> None:
@@ -126,15 +118,9 @@ def robot_path(options: argparse.Namespace, read: Recording, sensor: Sensor) -> 
 
 def reading_options(options: argparse.Namespace) -> ReadingOptions:
     """Return how recordings are to be read."""
-    if options.rate is not None and not 0 < options.rate <= _HIGHEST_RATE_HZ:
-        raise UserError(f'--rate {options.rate:g}: expected samples a second, at most '
-                        f'{_HIGHEST_RATE_HZ:g}')
-    return ReadingOptions(
-        options.topic, parse_mapping(options.columns) if options.columns else None,
-        parse_unit(options.unit),
-        _counts('--lsb-per-g', options.lsb_per_g, 0.0),
-        _counts('--lsb-at-0g', options.lsb_at_0g, -math.inf), options.rate,
-        options.drop_bad_stamps, parse_mounting(options.axes) if options.axes else None)
+    return recordings.reading_options(
+        options.topic, options.columns, options.unit, options.rate, options.axes,
+        options.lsb_per_g, options.lsb_at_0g, options.drop_bad_stamps)
 
 
 def reading_text(options: argparse.Namespace) -> str:
@@ -145,17 +131,6 @@ def reading_text(options: argparse.Namespace) -> str:
             words += [f'--{name.replace("_", "-")}', str(value)]
     words += ['--drop-bad-stamps'] * options.drop_bad_stamps
     return f' {shlex.join(words)}' if words else ''
-
-
-def _counts(option: str, text: str, above: float) -> tuple[float, ...]:
-    try:
-        values = tuple(float(word) for word in text.split(',')) if text else ()
-    except ValueError:
-        values = (math.nan,)
-    if not all(above < value < math.inf for value in values):
-        raise UserError(f'{option} {text}: expected counts, for example 16384 or '
-                        '16384,16384,16500')
-    return values
 
 
 SYNTAX = ('NAME alone has typical values, KEY=VALUE sets a parameter for all its axes, '
@@ -261,13 +236,13 @@ def refuse_same_file(output: str, source: str) -> None:
 
 def report_reading(tool: str, recording: Recording) -> None:
     """Report on stderr what was assumed in reading, the cut, and the alignment of references."""
-    for line in (*recording.remarks, *[recording.cut] * bool(recording.cut)):
+    report_notes(tool, recording.notes)
+
+
+def report_notes(tool: str, notes: Iterable[str]) -> None:
+    """Report on stderr what is noteworthy of an input."""
+    for line in notes:
         note(f'{tool}: {line}')
-    for name, residual in recording.alignments.items():
-        # References with the stamps of the samples need no alignment.
-        if residual:
-            note(f'{tool}: {recording.path}: {name} aligned by its stamps: residual '
-                 f'{residual:.3g} {column_unit(name)} rms')
 
 
 def read(tool: str, path: str, reading: ReadingOptions = AS_IT_IS) -> Recording:

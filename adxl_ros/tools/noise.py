@@ -17,7 +17,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.figures import png, pyplot
+from adxl_ros.report.figures import new_figure, png
 from adxl_ros.report.quantities import duration
 from adxl_ros.report.screen import row
 from adxl_ros.signals import noise_parameters
@@ -121,9 +121,8 @@ _INCHES = (5.0, 4.4)
 
 
 def _plot(result: RecordingNoise) -> Any:
-    figure, axes = pyplot().subplots(1, len(result.axes), squeeze=False, sharey=True,
-                                     figsize=(_INCHES[0] * len(result.axes), _INCHES[1]),
-                                     layout='constrained')
+    figure = new_figure(figsize=(_INCHES[0] * len(result.axes), _INCHES[1]))
+    axes = figure.subplots(1, len(result.axes), squeeze=False, sharey=True)
     tau_s, error = result.rest.allan.tau_s, result.rest.allan.relative_error
     for i, (noise, plot) in enumerate(zip(result.axes, axes[0])):
         measured = result.rest.allan.deviation[:, i] * MICRO_G

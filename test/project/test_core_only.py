@@ -50,7 +50,7 @@ from adxl_ros.nodes.calibration import open_screen
 from adxl_ros.report import figures, page
 sensor = parameter_file.load(parameter_file.nominal_path())
 for use in (lambda: tables.open_table('log.ulg'), lambda: tables.open_table('log.parquet'),
-            bag_messages.import_rosbags, figures.pyplot, page.check_libraries,
+            bag_messages.import_rosbags, figures.new_figure, page.check_libraries,
             lambda: serial.open_link(sensor, serial.Settings(port='/dev/null')),
             lambda: iio.open_link(sensor, iio.Settings())):
     try:

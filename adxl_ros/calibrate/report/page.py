@@ -215,7 +215,8 @@ def draw_sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:
     force_g = np.column_stack(reference) / G0_MPS2
     predicted = np.column_stack(signal_chain.static_response(fitted)(
         reference, swept.environment))
-    figure, grid = figures.pyplot().subplots(2, 4, figsize=(17.6, 9), layout='constrained')
+    figure = figures.new_figure(figsize=(17.6, 9))
+    grid = figure.subplots(2, 4)
     for d, (row, regression) in enumerate(zip(grid, regressions)):
         linear_v = line.zero_g_v[d] + line.scale_v_per_g[d] * force_g[:, d]
         deviation_mv, model_mv = (1e3 * (volts[:, d] - linear_v)

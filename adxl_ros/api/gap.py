@@ -1,0 +1,392 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Diagnosis of the front door: where recordings differ from their simulation, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+import os
+from pathlib import Path
+import shlex
+from typing import Any, NamedTuple
+
+from adxl_ros.api.recordings import as_recordings, read_ideal, RecordingInput
+from adxl_ros.api.result import (
+    FirstScreen,
+    make_folder,
+    no_progress,
+    Progress,
+    require_least,
+    Result,
+)
+from adxl_ros.api.sensors import sensor_of, SensorInput
+from adxl_ros.diagnose import diagnosis as core, report as words
+from adxl_ros.diagnose.diagnosis import Diagnosis
+from adxl_ros.diagnose.next_experiment import CouldShow
+from adxl_ros.diagnose.residual_map import gap_in, GapInUnit, quantity as quantity_named
+from adxl_ros.diagnose.verdict import MATERIAL_MG
+from adxl_ros.errors import UserError
+from adxl_ros.files import parameter_file
+from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.recording_columns import NO_UNIT, Recording
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import command
+from adxl_ros.report.figures import axes_for
+from adxl_ros.report.quantities import Interval, mg
+from adxl_ros.report.screen import NextStep
+from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.trajectories import motion_from_force
+
+PAGE, PARAMETERS, REPORT = 'report.html', 'params.yaml', 'report.json'
+"""Files of a diagnosis."""
+_NO_VERDICT = ('bad_data', 'insufficient')
+"""Outcomes without a verdict: a fault of a recording, or too little in it."""
+
+
+class FoundParameter(NamedTuple):
+    """The size of an effect, or what shapes it."""
+
+    value: float | list[float] | None  # In `unit`; a list by axis; None if not determined
+    low: float | None  # Low end of the 90 % interval, in `unit`; None without one
+    high: float | None  # High end of the same
+    unit: str  # Unit of the parameter file
+
+
+class FoundEffect(NamedTuple):
+    """An effect that the simulator lacks."""
+
+    name: str  # Name in the library of effects
+    probability: float  # Probability that the sensor has it, 0 to 1
+    share: float | None  # Share of the squared gap that it closes, 0 to 1; None for noise
+    parameters: Mapping[str, FoundParameter]  # By name, such as 'offset_v.x'
+    rivals: tuple[str, ...]  # Effects that the recordings do not separate from it
+    cause: str  # What causes it, and what to do
+
+
+class GapFigures(NamedTuple):
+    """The figures from which the verdict follows; intervals hold 90 %."""
+
+    before_mps2: Interval  # Recording minus simulation, rms, m/s²
+    after_mps2: Interval  # The same with the effects, on parts that were not fitted, m/s²
+    floor_mps2: Interval  # Noise, which no simulation predicts, rms, m/s²
+    closed: Interval  # (before² − after²) / (before² − floor²); NaN without a gap
+    upper_limit_mps2: float  # A gap of any kind above it would have shown, m/s²
+    material_mps2: float  # Smaller amplitudes are no gap, rms, m/s²
+    reference_mps2: float  # Error of the reference that returns with each pose, rms, m/s²
+
+
+class Compared(NamedTuple):
+    """What was compared with what, for the page and for commands."""
+
+    recordings: tuple[str, ...]  # Names or paths of the recordings
+    params: str  # What names the sensor on a command line; '' for the nominal one
+    params_name: str  # Name of its file
+    sim: str  # Path of the recording of another simulator; '' for none
+    urdf: str  # Path of the robot; '' for none
+    frame: str  # Its frame that carries the sensor
+    subject: str  # All of it in one line
+
+
+@dataclass(frozen=True, repr=False)
+class Gap(Result):
+    """
+    The gap between recordings and their simulation.
+
+    `print` shows the screen of the tool `diagnose`, a notebook the top of its page.
+    """
+
+    verdict: str
+    """no_gap, explained, partly, inseparable or unknown; without a verdict insufficient or
+    bad_data."""
+    probability: float
+    """How often such verdicts were right in the working cases, 0 to 1."""
+    effects: tuple[FoundEffect, ...]
+    """Effects of the verdict, those with the largest share of the gap first."""
+    figures: GapFigures | None
+    """The figures from which the verdict follows; None after `fault`."""
+    could_show: tuple[CouldShow, ...]
+    """Smallest size of each effect that would have shown, in the unit of its parameter."""
+    sensor: Sensor
+    """What the simulator shall model: the given sensor with the effects that were found."""
+    fault: str
+    """Why a recording cannot be compared; '' where it can."""
+    summary: str
+    """Verdict and figures in a few sentences."""
+    notes: tuple[str, ...]
+    """What was corrected or left out."""
+    in_unit: GapInUnit | None
+    """The gap in the unit that `quantity` names; None where none was asked for."""
+    remarks: tuple[str, ...]
+    """The prior, and the result of the self-check, where they were asked for."""
+    compared: Compared
+    """What was compared with what."""
+    diagnosis: Diagnosis
+    """All steps between the recordings and the verdict."""
+
+    def with_params(self, path: str) -> Gap:
+        """Name the parameter file of a sensor that was given as such; '' is the nominal one."""
+        name = Path(path or parameter_file.nominal_path()).name
+        return replace(self, compared=self.compared._replace(params=path, params_name=name))
+
+    @property
+    def has_verdict(self) -> bool:
+        """Return whether the recordings allow a verdict."""
+        return self.verdict not in _NO_VERDICT
+
+    @property
+    def screen(self) -> list[str]:
+        """Return the lines of the tool's screen."""
+        lines = words.screen_lines(self.diagnosis, self.compared.subject)
+        for remark in self.remarks:
+            lines += ['', f' {remark}']
+        return [*lines, '', f' in      {self.in_unit.text}'] if self.in_unit else lines
+
+    @property
+    def first_screen(self) -> FirstScreen:
+        """Return the top of the page."""
+        from adxl_ros.diagnose.page import COLOURS, TILES
+        rows = [] if self.fault else words.figure_rows(self.diagnosis)[:TILES]
+        return FirstScreen(COLOURS[self.verdict], words.badge(self.diagnosis),
+                           words.headline(self.diagnosis), rows)
+
+    @cached_property
+    def _report(self) -> dict[str, Any]:
+        return words.as_json(self.diagnosis)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return report.json; docs/reference/report_json.md has its keys."""
+        return self._report | ({'gap_in': self.in_unit._asdict()} if self.in_unit else {})
+
+    def to_pandas(self) -> Any:
+        """Return a DataFrame with a row for each parameter of each effect of the verdict."""
+        from pandas import DataFrame
+        rows = [(effect.name, name, *parameter, effect.probability, effect.share)
+                for effect in self.effects for name, parameter in effect.parameters.items()]
+        return DataFrame(rows, columns=['effect', 'parameter', *FoundParameter._fields,
+                                        'probability', 'share'])
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw gap, gap with the effects, and noise floor, mg, into axes of matplotlib."""
+        if self.figures is None:
+            raise UserError(f'no figures to draw: {self.fault}')
+        ax, figures = axes_for(ax), self.figures
+        bars = {'gap': figures.before_mps2, 'with the effects': figures.after_mps2,
+                'noise floor': figures.floor_mps2}
+        ax.barh(list(bars), [mg(bar.value) for bar in bars.values()],
+                color=['#c0392b', '#2a8a43', '#7b8794'])
+        ax.invert_yaxis()
+        ax.set(xlabel='rms, mg', title=words.badge(self.diagnosis))
+        return ax
+
+    def save(self, folder: str | os.PathLike, made_by: str = '') -> list[Path]:
+        """
+        Write report.html, report.json and params.yaml into a folder; return their paths.
+
+        A fault leaves params.yaml out. `made_by` is the command that the page shows, by default
+        one that repeats the diagnosis.
+        """
+        path = make_folder(folder)
+        texts = self.documents(folder, made_by)
+        for name, text in texts.items():
+            write_text(path / name, text)
+        return [path / name for name in (PAGE, PARAMETERS, REPORT) if name in texts]
+
+    def documents(self, folder: str | os.PathLike, made_by: str = '', has_page: bool = True
+                  ) -> dict[str, str]:
+        """Return the files that `save` writes, by name."""
+        from adxl_ros.diagnose import page
+        run = page.Run(self.compared.subject, self.compared.params_name, self.next_steps(folder),
+                       made_by or self.command(folder))
+        return page.documents(self.diagnosis, self.to_dict(), self.screen, run if has_page
+                              else None)
+
+    def command(self, folder: str | os.PathLike) -> str:
+        """Return the command line that repeats the diagnosis into a folder."""
+        given = {'--params': self.compared.params, '--sim': self.compared.sim,
+                 '--urdf': self.compared.urdf, '--frame': self._frame, '-o': str(folder)}
+        return _command(self.compared.recordings, given)
+
+    def next_steps(self, folder: str | os.PathLike) -> list[NextStep]:
+        """Return what to record, how to diagnose that, and how to simulate what was found."""
+        report, compared = self.diagnosis.report, self.compared
+        if report is None:
+            return []
+        params, proposal = str(Path(folder) / PARAMETERS), report.next_experiment
+        steps = []
+        if proposal is not None:
+            both = ', and next_simulated.csv in the simulator' if compared.sim else ''
+            steps.append(NextStep(f'record next.csv{both}: {proposal.manoeuvre}, {proposal.why}',
+                                  '' if proposal.beside_simulator else proposal.command))
+        if proposal is not None and not proposal.concerns_reference:
+            is_closed = self.verdict in ('explained', 'partly')
+            is_alone = bool(is_closed or compared.sim or compared.urdf)
+            given = {'--params': params if is_closed else compared.params,
+                     '--sim': 'next_simulated.csv' if compared.sim else '',
+                     '--urdf': compared.urdf, '--frame': self._frame, '-o': f'{folder}_2'}
+            before = () if is_alone else compared.recordings
+            steps.append(NextStep(
+                'diagnose it' if is_alone else 'diagnose it together with this one',
+                _command((*before, 'next.csv'), given)))
+        simulate = command('simulate', f'rich --params {shlex.quote(params)} -o sim.csv')
+        return [*steps, NextStep('simulate the sensor as it was found', simulate)]
+
+    @property
+    def _frame(self) -> str:
+        return self.compared.frame if self.compared.urdf else ''
+
+
+def _command(recordings: Sequence[str], given: Mapping[str, str]) -> str:
+    """Return the command of a diagnosis; options without a value are left out."""
+    options = [word for option in given.items() if option[1] for word in option]
+    return command('diagnose', shlex.join([*recordings, *options]))
+
+
+def diagnose(recordings: RecordingInput | Sequence[RecordingInput],
+             sensor: SensorInput | None = None, *,
+             sim: RecordingInput | Motion | None = None,
+             urdf: str | os.PathLike | None = None, frame: str = 'imu_link', joints: str = '',
+             align: bool = False, material: float = MATERIAL_MG,
+             prior: str | os.PathLike | None = None, quantity: str | None = None,
+             self_check: int = 0, seed: int = 0, progress: Progress = no_progress) -> Gap:
+    """
+    Find where recordings of one unit differ from their simulation, and which effects cause it.
+
+    Parameters
+    ----------
+    recordings
+        One or more recordings of one unit; the path of a recording is read as it is. The motion
+        is that of `alpha_rad` and `beta_rad` of a stage, or that of `sim` or `urdf`.
+    sensor
+        What the simulator models: a Sensor, a `Fit`, a datasheet's name or the path of a
+        parameter file. None for the nominal sensor, or any IMU.
+    sim
+        Ideal specific force of the same motion by another simulator, with `ax_mps2, ay_mps2,
+        az_mps2`, m/s², in the frame of the sensor: a Recording or its path.
+    urdf
+        Path of the robot that carries the sensor; its joints are in the bag of the recording.
+    frame, joints
+        Frame of the robot that carries the sensor, and topic of its joints; '' for the only one.
+    align
+        Whether `sim` is shifted in time where its motion is late or early.
+    material
+        Amplitude that matters, mg rms; smaller effects are no gap. At least a tenth of the noise.
+    prior
+        Path of the population.yaml of a fleet: prior of zero-g and scale factor.
+    quantity
+        States the gap in another unit, too: 'tilt' (deg), 'velocity' (m/s after 10 s), or
+        'MODULE:FUNCTION'.
+    self_check
+        Number of recordings that are simulated from the verdict, to see how often it returns.
+    seed
+        Seed of the bootstraps.
+    progress
+        Called with the share of the work that is done, 0 to 1, and the name of the stage.
+
+    Returns
+    -------
+    Gap
+        Verdict, effects with sizes and intervals, figures, and the sensor to simulate with.
+
+    Raises
+    ------
+    UserError
+        A recording is of another unit, or its reference cannot be followed.
+
+    """
+    for name, value, least in (('seed', seed, 0), ('self-check', self_check, 0),
+                               ('material', material, 1e-6)):
+        require_least(name, value, least)
+    several = [recordings] if isinstance(recordings, (Recording, str, os.PathLike)) \
+        else list(recordings)
+    if (sim is not None or urdf) and (len(several) > 1 or (sim is not None and urdf)):
+        raise UserError(f'{_name_of(sim) or urdf}: --sim or --urdf, one of them, goes with one '
+                        f'recording, but {len(several)} are given')
+    if align and sim is None and not urdf:
+        raise UserError('--align: shifts --sim or a robot, and neither is given')
+    unit = quantity_named(quantity) if quantity else None
+    read = as_recordings(several)
+    given = sensor_of(sensor, read[0])
+    baseline, remarks = given.sensor, []
+    motion = _motion(read[0], baseline, sim, urdf, frame, joints)
+    if prior:
+        from adxl_ros.files import calibration_store
+        from adxl_ros.model.population import posterior
+        baseline, line, _ = posterior(baseline, calibration_store.read_population(prior))
+        remarks.append(f'prior: {line}')
+    diagnosis = core.diagnose(read, baseline, motion, seed,
+                              lambda stage, done: progress(done, stage), align, material)
+    in_unit, found = None, diagnosis.report
+    if self_check and found:
+        remarks.append(core.self_check(diagnosis, read, motion, self_check, seed,
+                                       lambda done: progress(done, 'self-check')))
+    if unit and found:
+        in_unit = gap_in(unit, diagnosis.full_rate, found.baseline, found.sensor, seed)
+    reference = _name_of(sim) or os.fspath(urdf or '')
+    compared = Compared(tuple(r.path for r in read), given.file, given.file_name, _name_of(sim),
+                        os.fspath(urdf or ''), frame, _subject(read, baseline, reference))
+    return _gap(diagnosis, baseline, compared, in_unit, remarks)
+
+
+def _name_of(sim: RecordingInput | Motion | None) -> str:
+    """Return the name of another simulator's recording; '' for none."""
+    if isinstance(sim, Recording):
+        return sim.path
+    return os.fspath(sim) if isinstance(sim, (str, os.PathLike)) else ''
+
+
+def _motion(read: Recording, sensor: Sensor, sim: RecordingInput | Motion | None,
+            urdf: str | os.PathLike | None, frame: str, joints: str) -> Motion | None:
+    """Return the motion of another simulator, or of a robot; None for that of the stage."""
+    if urdf:
+        from adxl_ros.simulate import robot
+        return robot.robot_path(urdf, frame, read.path, read.epoch_ns, sensor.local_gravity_mps2,
+                                joints).as_motion()
+    if sim is None or isinstance(sim, Motion):
+        return sim
+    return motion_from_force(read_ideal(sim, read.epoch_ns), False)[0]
+
+
+def _subject(recordings: Sequence[Recording], sensor: Sensor, sim: str) -> str:
+    """Return what is compared with what."""
+    first, count = recordings[0], len(recordings)
+    name = Path(first.path).name if count == 1 else f'{count} recordings'
+    span_s = sum(float(r.time_s[-1] - r.time_s[0]) for r in recordings if len(r))
+    unit = 'the nominal sensor' if sensor.serial == NO_UNIT else f'unit {sensor.serial}'
+    simulated = f'{Path(sim).name} through the chain of {unit}' if sim \
+        else f'simulation of {unit}'
+    return (f'{name} ({span_s:.0f} s, {first.rate_hz:.4g} Hz, {" ".join(first.axes)})  minus  '
+            f'{simulated}')
+
+
+def _gap(diagnosis: Diagnosis, baseline: Sensor, compared: Compared, in_unit: GapInUnit | None,
+         remarks: Sequence[str]) -> Gap:
+    """Collect what a user reads of a diagnosis."""
+    objects, report = words.as_json(diagnosis), diagnosis.report
+    effects: tuple[FoundEffect, ...] = ()
+    figures = None
+    if report is not None:
+        candidates = {c['effect']: c for c in objects['candidates']}
+        effects = tuple(_effect(candidates[name])
+                        for name in words.named_effects(report, objects))
+        figures = GapFigures(*report.closure, report.verdict.upper_limit_mps2,
+                             report.verdict.material_mps2, report.verdict.reference_mps2)
+    return Gap(
+        verdict=objects['verdict']['status'], probability=objects['verdict']['probability'],
+        effects=effects, figures=figures,
+        could_show=report.could_show if report else (),
+        sensor=report.sensor if report else baseline,
+        fault=diagnosis.fault.message if diagnosis.fault else '', summary=objects['summary'],
+        notes=tuple(objects['notes']), in_unit=in_unit, remarks=tuple(remarks), compared=compared,
+        diagnosis=diagnosis)
+
+
+def _effect(candidate: Mapping[str, Any]) -> FoundEffect:
+    """Return an effect as report.json has it."""
+    parameters = {}
+    for name, parameter in candidate['parameters'].items():
+        low, high = parameter.get('ci') or (None, None)
+        parameters[name] = FoundParameter(parameter['value'], low, high, parameter['unit'])
+    return FoundEffect(candidate['effect'], candidate['probability'], candidate['share'],
+                       parameters, tuple(candidate['inseparable_from']), candidate['cause'])

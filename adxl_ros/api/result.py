@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""What all results share: they print as the screen of their tool, and show in a notebook."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from html import escape
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from adxl_ros.errors import UserError
+from adxl_ros.report.screen import end_lines
+
+Progress = Callable[[float, str], None]
+"""Called with the share of the work that is done, 0 to 1, and the name of the stage."""
+
+_COLOURS = {'green': '#2a8a43', 'grey': '#7b8794', 'amber': '#d9930d', 'red': '#c0392b'}
+"""Colours of the badge, as on the pages."""
+
+
+def no_progress(done: float, stage: str) -> None:
+    """Show nothing."""
+
+
+class Tile(NamedTuple):
+    """A figure at the top of a page."""
+
+    label: str
+    text: str  # Value with its unit
+    note: str = ''
+
+
+class FirstScreen(NamedTuple):
+    """The top of a page."""
+
+    colour: str  # green, grey, amber or red
+    word: str  # The outcome
+    sentence: str
+    tiles: Sequence[tuple[str, ...]] = ()  # Label, value with unit, and perhaps a note
+
+
+class Result:
+    """A result that prints as its tool does."""
+
+    @property
+    def screen(self) -> list[str]:
+        """Return the lines of the tool's screen."""
+        raise NotImplementedError
+
+    @property
+    def first_screen(self) -> FirstScreen:
+        """Return the top of the page."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return '\n'.join(end_lines(self.screen, []))
+
+    def __repr__(self) -> str:
+        return f'<{type(self).__name__}: {self.first_screen.word}>'
+
+    def _repr_html_(self) -> str:
+        """Return the top of the page for a notebook."""
+        top = self.first_screen
+        tiles = ''.join('<td style="text-align:left">' + '<br>'.join(map(escape, tile)) + '</td>'
+                        for tile in top.tiles)
+        return (f'<div style="border-left:7px solid {_COLOURS[top.colour]};padding:.5em .9em">'
+                f'<b>{escape(top.word)}</b> {escape(top.sentence)}</div>'
+                f'<table><tr>{tiles}</tr></table>')
+
+
+def require_least(name: str, value: float | None, least: float) -> None:
+    """Refuse a number that is too small; None is not given."""
+    if value is not None and not value >= least:
+        raise UserError(f'--{name} {value}: must be at least {least:g}')
+
+
+def make_folder(folder: str | os.PathLike) -> Path:
+    """Create a folder for the output, if it does not exist, and return it."""
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f'{path}: cannot be made: {error.strerror}') from None
+    return path
