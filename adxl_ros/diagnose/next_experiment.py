@@ -49,9 +49,6 @@ _SMALLEST_PROBABILITY, _MOST_HYPOTHESES = 1e-3, 40
 together are far below the 5 % that remain at the end; run time."""
 _EVIDENCE_FACTOR = 0.3
 """Factor of the information, because no model of a sensor is exact (Miller and Dunson 2019)."""
-_OTHER_REFERENCE = 'next.csv --sim next_simulated.csv -o next'
-"""Arguments of `diagnose` for another recording beside another reference."""
-
 
 class CouldShow(NamedTuple):
     """Smallest size of one parameter of an effect that recordings would have shown."""
@@ -337,7 +334,7 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor
     if any(effect_named(e).concern is Concern.REFERENCE for e in verdict.named):
         return NextExperiment(
             'the motion beside another reference, or one with less smoothing',
-            'because the error may be of the reference', _OTHER_REFERENCE,
+            'because the error may be of the reference', _beside_other_reference(),
             concerns_reference=True)
     if verdict.groups:
         ranked = _ranked_menu(verdict, sensor, model, seed)
@@ -377,12 +374,17 @@ def _experiment(manoeuvre: Manoeuvre, why: str, no_stage: bool) -> NextExperimen
     """Describe a manoeuvre with its command."""
     described, option = MENU[manoeuvre], ''
     if no_stage:
-        return NextExperiment(described.text, why, command('diagnose', _OTHER_REFERENCE),
+        return NextExperiment(described.text, why, _beside_other_reference(),
                               beside_simulator=True)
     if described.remounted:
         option = f' --effect {":".join(_half_turn())}={np.pi:.6f}'
     return NextExperiment(described.text, why, command(
         'simulate', f'{described.trajectory}{option} -o next.csv'))
+
+
+def _beside_other_reference() -> str:
+    """Return the command for another recording beside another reference."""
+    return command('diagnose', 'next.csv --sim next_simulated.csv -o next')
 
 
 def _half_turn() -> tuple[str, str]:
