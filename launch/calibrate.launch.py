@@ -14,8 +14,8 @@ Calibrate a sensor: start the driver, the stage and the calibration, and end wit
 A log line says how long it takes. The launch ends with the calibration: status 0 where it wrote
 its file, else 1. After an interruption the same command resumes. In mode `gravity` there is no
 stage, and `ros2 service call /calibration/finish std_srvs/srv/Trigger` fits the rests so far. A
-driver or stage that is killed is started again; one that refuses to start three times ends the
-launch with an error.
+driver or stage that is killed is started again; one that refuses to start ends the launch with an
+error.
 """
 
 from typing import Any

@@ -10,7 +10,7 @@ Start a realistic sensor in another simulator: the driver on its ideal Imu.
 
 The simulator publishes sensor_msgs/Imu with specific force, and /clock. The sensor of the
 parameter file appears on imu/data_raw with the stamps of the simulator. A driver that ends is
-started again. The launch ends with an error when the driver refuses to start three times.
+started again. The launch ends with an error when the driver refuses to start.
 """
 
 from adxl_ros.nodes import launch_nodes

@@ -14,8 +14,7 @@ Start a calibrated sensor on a robot: the driver and the compensation.
 
 The second line also publishes the static transform from the robot to the case. The third one
 corrects the IMU of another driver, and publishes 50 samples a second. A node that ends is started
-again, unless `respawn` is false. The launch ends with an error when a node refuses to start three
-times, or once without `respawn`.
+again, unless `respawn` is false. The launch ends with an error when a node refuses to start.
 """
 
 from adxl_ros.errors import UserError

@@ -5,7 +5,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-import time
+from difflib import get_close_matches
+from itertools import pairwise
+from pathlib import Path
+import sys
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
@@ -18,17 +21,18 @@ from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutd
 from launch.events.process import ProcessExited
 from launch.launch_context import LaunchContext
 from launch.launch_description import LaunchDescription
+from launch.logging import get_logger
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.utilities import prefix_namespace
 
+_PACKAGE = 'adxl_ros'
 _REFUSED_START = (1, 2)
-"""Exit statuses of a node that does not start; a signal ends it with 0 or a negative one."""
-_MOST_REFUSALS = 3
-"""Failed starts of a node after which a launch ends; chosen: a device may come late once."""
-_REFUSALS_S = 60.0
-"""Time within which failed starts count, s; chosen: three starts on a slow machine."""
+"""Exit statuses of a node whose parameters are wrong. A signal or a failure later has others."""
+_LIKENESS = 0.85
+"""Likeness, 0 to 1, from which on an argument that is not known here seems to be misspelt; chosen:
+one letter of seven is missing or wrong, and other words are less alike."""
 _PUSHED = 'ros_namespace'
 """Where launch_ros keeps the namespace that a launch file around this one has pushed."""
 
@@ -113,7 +117,33 @@ def common_arguments(*own: Argument) -> list[DeclareLaunchArgument]:
 def describe(arguments: Sequence[DeclareLaunchArgument],
              make_nodes: Callable[[LaunchContext], list[Action]]) -> LaunchDescription:
     """Describe a launch by its arguments and what makes its nodes."""
-    return LaunchDescription([*arguments, OpaqueFunction(function=make_nodes)])
+    names = [argument.name for argument in arguments]
+    return LaunchDescription([*arguments, OpaqueFunction(function=check_names, args=[names]),
+                              OpaqueFunction(function=make_nodes)])
+
+
+def check_names(context: LaunchContext, names: Sequence[str]) -> None:
+    """
+    Refuse arguments that this launch does not have; `ros2 launch` ignores them.
+
+    A launch file that includes this one has arguments of its own. What is like one of ours is
+    then a warning.
+    """
+    path = context.get_locals_as_dict().get('current_launch_file_path')
+    is_own = bool(path) and _is_on_command_line(path)
+    for name in sorted(context.launch_configurations.keys() - {*names, _PUSHED}):
+        near = get_close_matches(name, names, 1, 0.0 if is_own else _LIKENESS)
+        text = f'{name}:=...: this launch has no such argument; did you mean {"".join(near)}?'
+        if is_own:
+            raise UserError(f'{text} --show-args lists all')
+        if near:
+            get_logger('launch.user').warning(text)
+
+
+def _is_on_command_line(path: str) -> bool:
+    """Return whether the command of this process names a launch file, by package or path."""
+    return (_PACKAGE, Path(path).name) in pairwise(sys.argv) or \
+        Path(path).resolve() in [Path(word).resolve() for word in sys.argv]
 
 
 def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, Any],
@@ -135,12 +165,11 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
              for key, value in {**given_parameters(context, link), **overrides}.items()}
     options.setdefault('output', 'screen')
     if 'on_exit' not in options:
-        most_refusals = _MOST_REFUSALS if respawn else 1
-        options |= {'respawn': respawn, 'respawn_delay': 2.0, 'on_exit': give_up(most_refusals)}
+        options |= {'respawn': respawn, 'respawn_delay': 2.0, 'on_exit': end_with_refusal}
     # The nominal sensor is what a node without a file has; a file would name it for any stream.
     is_named &= path != str(parameter_file.nominal_path())
     # With its name a node gets the parameters in a section of its own, which counts before others.
-    return Node(package='adxl_ros', executable=executable, name=executable,
+    return Node(package=_PACKAGE, executable=executable, name=executable,
                 namespace=text(context, 'namespace'),
                 parameters=[path] * is_named + [given] * bool(given),
                 ros_arguments=[*_enclave(context, executable),
@@ -209,19 +238,10 @@ def simulated_link(context: LaunchContext, speed: Mapping[str, Any]) -> dict[str
     return {'link.type': link or 'sim', **speed} if speed else {}
 
 
-def give_up(most_refusals: int) -> Callable[[ProcessExited, LaunchContext], None]:
-    """Return a function that ends a launch when a node refuses to start again and again."""
-    refusals_s: list[float] = []
-
-    def count(event: ProcessExited, context: LaunchContext) -> None:
-        if context.is_shutdown or event.returncode not in _REFUSED_START:
-            return
-        refusals_s.append(time.monotonic())
-        if sum(refusals_s[-1] - s < _REFUSALS_S for s in refusals_s) >= most_refusals:
-            times = f' {most_refusals} times' if most_refusals > 1 else ''
-            raise UserError(f'{event.process_name} has refused to start{times}; its own line '
-                            'above says why')
-    return count
+def end_with_refusal(event: ProcessExited, context: LaunchContext) -> None:
+    """End a launch when a node refuses to start: another start would be refused, too."""
+    if not context.is_shutdown and event.returncode in _REFUSED_START:
+        raise UserError(f'{event.process_name} has refused to start; its own line above says why')
 
 
 def end_with(success: str, failure: str) -> Callable[[ProcessExited, LaunchContext], list[Action]]:

@@ -12,6 +12,7 @@ from pathlib import Path
 import re
 import signal
 import sys
+import traceback
 from typing import Any
 
 from adxl_ros.errors import one_line, UserError
@@ -70,6 +71,8 @@ _TIMER_SLACK = Path('/proc/self/timerslack_ns')
 _SLACK_NS = '1000'
 """Largest such delay, ns; chosen: far below the period of samples. The default is 50 µs."""
 _PLACE = r', at /\S+:\d+'  # Places in rcl within the text of its refusals
+_RULE = 'parameter override rule'  # Words of rcl's refusal of an argument -p
+_QUOTES = """; a text with a colon needs quotes of its own: -p 'NAME:="a:b"'"""
 
 
 @ended_by_closed_output()
@@ -117,9 +120,16 @@ def run(make_node: Callable[[], Node], description: str | None, examples: Mappin
         if not isinstance(error, UserError) and not type(error).__module__.startswith('rclpy'):
             raise
         text = re.sub(_PLACE, '', one_line(error))
+        if _RULE in text:
+            text += _QUOTES
         print(f'{name}: {text}', file=sys.stderr)
         return 2 if 'ROSArgs' in type(error).__name__ else 1
-    _spin(node, work)
+    try:
+        _spin(node, work)
+    except Exception:
+        # A launch starts the node again; a refused start, with the status 1, ends it.
+        traceback.print_exc()
+        return os.EX_SOFTWARE
     return 0
 
 
