@@ -40,8 +40,13 @@ Kind = Parameter.Type  # Types of ROS parameters
 LINK = 'link.'  # Begin of the names of all parameters of a link; the driver alone has them
 SEEDS = (0, 2 ** 31 - 1)  # Range of seeds
 _ANY_NODE = ('use_sim_time', 'start_type_description_service')  # Parameters of every node of rclpy
-_FREE_PREFIXES = ('provenance.', 'qos_overrides.', LINK)
-"""Prefixes whose names are not known here: free keys, topics, and what the driver checks."""
+_QOS = 'qos_overrides.'  # Begin of the names of parameters that override the QoS of a topic
+_FREE_PREFIXES = ('provenance.', LINK)
+"""Prefixes whose names are not known here: free keys, and what the driver checks."""
+QOS_POLICIES = ('history', 'depth', 'reliability', 'durability')
+"""Policies that parameters can override: those that a publisher and a subscription share."""
+_QOS_NAME = re.compile(rf'{_QOS}(/.+)\.(publisher|subscription)\.({"|".join(QOS_POLICIES)})')
+_DIAGNOSTICS = '/diagnostics'  # The only topic of a node that is not configured
 _FILE_FLAG = '--params-file'  # Argument of rcl before a parameter file
 _RULE_FLAGS = ('-p', '--param')  # Arguments of rcl before one parameter
 _OF_LAUNCH = 'launch_params_'
@@ -139,7 +144,10 @@ def check_given(node: Node) -> None:
     broken: list[str] = []
     others = _names_of_nodes(broken)
     for name in given_parameters(node):
-        if name in known or name.startswith(_FREE_PREFIXES):
+        if name.startswith(_QOS) and not _QOS_NAME.fullmatch(name):
+            raise parameter_error(name, f'expected {_QOS}/TOPIC.ENTITY.POLICY, ENTITY publisher '
+                                  f'or subscription, POLICY {", ".join(QOS_POLICIES)}')
+        if name in known or name.startswith((*_FREE_PREFIXES, _QOS)):
             continue
         for other in others:
             known.add(other)
@@ -162,6 +170,16 @@ def _names_of_nodes(broken: list[str]) -> Iterator[str]:
             broken.append(f'{node} does not load: {one_line(error)}')
             continue
         yield from (spec.name for spec in node_specs(module))
+
+
+def warn_of_unused_qos(node: Node) -> None:
+    """Warn of the given QoS of topics that a node does not have; other nodes may have them."""
+    given, own = ({match[1] for name in names if (match := _QOS_NAME.fullmatch(name))}
+                  for names in (given_parameters(node), node._parameters))
+    if own != {_DIAGNOSTICS} and given - own:
+        node.get_logger().warning(
+            f'qos_overrides of {", ".join(sorted(given - own))}: not used; the topics of this '
+            f'node are {", ".join(sorted(own))}')
 
 
 def declare_all(node: Node, settings: type[T]) -> T:
@@ -189,7 +207,8 @@ def declare(node: Node, spec: Spec) -> Any:
     except ParameterException:
         given = given_parameters(node).get(name)
         expected = ', '.join(filter(None, (kind.name, spec.limits, spec.unit)))
-        hint = f'; write {given}.0' if kind == Kind.DOUBLE and isinstance(given, int) else ''
+        hint = f'; write {given}.0' if kind == Kind.DOUBLE and isinstance(given, int) else \
+            f"""; write '{name}:="{given}"'""" if kind == Kind.STRING else ''
         raise parameter_error(name, f'{given!r} is refused; expected {expected}{hint}') from None
     if value is None:
         # rclpy answers a request for several parameters with nothing when one of them has no

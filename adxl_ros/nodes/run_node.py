@@ -71,8 +71,9 @@ _TIMER_SLACK = Path('/proc/self/timerslack_ns')
 _SLACK_NS = '1000'
 """Largest such delay, ns; chosen: far below the period of samples. The default is 50 µs."""
 _PLACE = r', at /\S+:\d+'  # Places in rcl within the text of its refusals
-_RULE = 'parameter override rule'  # Words of rcl's refusal of an argument -p
-_QUOTES = """; a text with a colon needs quotes of its own: -p 'NAME:="a:b"'"""
+_WITH_COLON = r"rule: '-p ([^:]+):=(.*:.*)'\. Error"
+"""An argument in the text of rcl's refusal, whose value has a colon: name and value."""
+_QUOTES = """; a text with a colon needs quotes of its own: -p '{}:="{}"'"""
 
 
 @ended_by_closed_output()
@@ -112,6 +113,7 @@ def run(make_node: Callable[[], Node], description: str | None, examples: Mappin
             # The signal came before rclpy's handler.
             rclpy.try_shutdown()
         node = make_node()
+        parameters.warn_of_unused_qos(node)
     except Exception as error:
         if is_initialised and not rclpy.ok():
             # A signal has ended the context during the start.
@@ -120,8 +122,8 @@ def run(make_node: Callable[[], Node], description: str | None, examples: Mappin
         if not isinstance(error, UserError) and not type(error).__module__.startswith('rclpy'):
             raise
         text = re.sub(_PLACE, '', one_line(error))
-        if _RULE in text:
-            text += _QUOTES
+        if with_colon := re.search(_WITH_COLON, text):
+            text += _QUOTES.format(*with_colon.groups())
         print(f'{name}: {text}', file=sys.stderr)
         return 2 if 'ROSArgs' in type(error).__name__ else 1
     try:

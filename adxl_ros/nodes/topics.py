@@ -23,6 +23,7 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.recording_columns import StreamInfo
 from adxl_ros.links.support.base import Level
+from adxl_ros.nodes.parameters import QOS_POLICIES
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
@@ -43,9 +44,8 @@ from std_srvs.srv import Trigger
 # templates: a tenth of the time in which a node starts. The package can do without it.
 sys.modules.setdefault('rosidl_generator_py.generate_py_impl', None)  # type: ignore[arg-type]
 
-_OVERRIDING = QoSOverridingOptions((QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH,
-                                    QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY))
-"""Policies that parameters can override."""
+_OVERRIDING = QoSOverridingOptions([QoSPolicyKind[name.upper()] for name in QOS_POLICIES])
+"""What parameters can override."""
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # The clock of intervals
 _SILENT_S = 3.0  # Time without messages after which a topic is silent, s; chosen
 _LONGEST_WAIT_NS = 100_000_000

@@ -104,12 +104,20 @@ def test_a_parameter_of_another_link_is_refused(refusal, link, parameter, words)
     ('link.type:=seral', "driver: link.type: 'seral' is not one of sim, iio, replay, serial"),
     ('driver:sensor.rate_hz:=-4.0',
      'driver: sensor.rate_hz: -4.0 is refused; expected DOUBLE, 0.01 to 1'),
+    ('sensor.serial:=7', """expected STRING; write 'sensor.serial:="7"'"""),
+    ('qos_overrides./imu/data_raw.publisher.depht:=5', 'data_raw.publisher.depht: expected '
+     'qos_overrides./TOPIC.ENTITY.POLICY'),
     ('stamp_offset:=1', 'driver: stamp_offset: 1 is refused; expected DOUBLE, -10 to 10, s; '
      'write 1.0')])
 def test_the_error_of_an_argument_names_no_file(refusal, unit, rule, words):
     line = refusal('driver', ROS, '--params-file', unit, '-p', 'link.type:=sim', '-p', rule)
     assert words in line
     assert 'unit.yaml' not in line
+
+
+def test_a_text_with_a_colon_gets_the_hint_of_its_quotes(refusal):
+    assert """needs quotes of its own: -p 'link.uri:="usb:"'""" in refusal(
+        'driver', ROS, '-p', 'link.uri:=usb:', status=2)
 
 
 @pytest.mark.parametrize('node', [
