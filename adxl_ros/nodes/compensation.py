@@ -167,7 +167,7 @@ class Compensation(Node):
         paper = settings.inverse == 'paper'
         self._heard_ns: dict[str, int] = {}
         self._named: tuple[Sensor, str]
-        self._obstacle = ''
+        self._obstacle = self._told = ''  # Why the sensor is unknown; the newest line on it
         self._reported: Counter[str] = Counter()
         self._reported_ns = STEADY.now().nanoseconds
         topics.DiagnosticsReporter(self, 'compensation', self._status)
@@ -216,6 +216,7 @@ class Compensation(Node):
 
     def _exchange(self, loaded: tuple[Sensor, str] | None) -> None:
         if loaded is not None:
+            self._told = ''
             self._use(*loaded)
 
     def _use(self, sensor: Sensor, source: str) -> None:
@@ -231,8 +232,10 @@ class Compensation(Node):
     def _correct_by(self, sensor: Sensor, source: str) -> None:
         text = self._policy.use(sensor, source)
         self._stream.use(sensor, self._policy.rate_hz)
-        if self._stream.unknown is None:
+        parameters.show_sensor(self, sensor)
+        if self._stream.unknown is None and text != self._told:
             self.get_logger().info(text)
+            self._told = text
         self._assess()
 
     def _look(self) -> None:

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file
+from adxl_ros.files.atomic_write import write_text
 from adxl_ros.links.support import base
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient
@@ -46,6 +47,7 @@ _FREE_PREFIXES = ('provenance.', LINK)
 QOS_POLICIES = ('history', 'depth', 'reliability', 'durability')
 """Policies that parameters can override: those that a publisher and a subscription share."""
 _QOS_NAME = re.compile(rf'{_QOS}(/.+)\.(publisher|subscription)\.({"|".join(QOS_POLICIES)})')
+_READ_ONLY = 'read-only'  # Word of rclpy's refusal
 _DIAGNOSTICS = '/diagnostics'  # The only topic of a node that is not configured
 _FILE_FLAG = '--params-file'  # Argument of rcl before a parameter file
 _RULE_FLAGS = ('-p', '--param')  # Arguments of rcl before one parameter
@@ -182,6 +184,22 @@ def warn_of_unused_qos(node: Node) -> None:
             f'node are {", ".join(sorted(own))}')
 
 
+def explain_read_only(node: Node) -> None:
+    """Let the refusal of a read-only parameter say how it can be given; rclpy's does not."""
+    refuse_or_set = node.set_parameters_atomically
+    calibration = '; set calibration to FILE for a whole calibration' \
+        if node.has_parameter('calibration') else ''
+
+    def set_parameters_atomically(given: list[Parameter]) -> msg.SetParametersResult:
+        result = refuse_or_set(given)
+        if _READ_ONLY in result.reason:
+            result.reason += f' Start the node with it, or with --params-file FILE{calibration}.'
+        return result
+
+    # The services call it by the node.
+    node.set_parameters_atomically = set_parameters_atomically  # type: ignore[method-assign]
+
+
 def declare_all(node: Node, settings: type[T]) -> T:
     """Declare the parameters of a dataclass, and return it with their values."""
     return settings(*(declare(node, spec) for spec in specs_of(settings)))
@@ -211,14 +229,20 @@ def declare(node: Node, spec: Spec) -> Any:
             f"""; write '{name}:="{given}"'""" if kind == Kind.STRING else ''
         raise parameter_error(name, f'{given!r} is refused; expected {expected}{hint}') from None
     if value is None:
-        # rclpy answers a request for several parameters with nothing when one of them has no
-        # value, and takes an empty list as a list of bytes when it declares a parameter.
-        empty: dict[Kind, Any] = {Kind.STRING: '', Kind.INTEGER: round(spec.empty),
-                                  Kind.DOUBLE: float(spec.empty)}
-        node._parameters[name] = Parameter(name, kind, empty.get(kind, []))
+        _show(node, spec, None)
     elif spec.choices and value not in spec.choices:
         raise parameter_error(name, f'{value!r} is not {spec.limits}')
     return value
+
+
+def _show(node: Node, spec: Spec, value: Any) -> None:
+    """Show a value as that of a declared parameter; None is shown as what stands for no value."""
+    # rclpy answers a request for several parameters with nothing when one of them has no value,
+    # and takes an empty list as a list of bytes when it declares a parameter.
+    empty: dict[Kind, Any] = {Kind.STRING: '', Kind.INTEGER: round(spec.empty),
+                              Kind.DOUBLE: float(spec.empty)}
+    node._parameters[spec.name] = Parameter(
+        spec.name, spec.kind, empty.get(spec.kind, []) if value is None else value)
 
 
 def numbers(name: str, given: Any, example: str) -> list[float]:
@@ -248,18 +272,28 @@ def _place_of(key: str) -> str:
     """
     Return the place of a parameter in the files: 'file:line:column: ', or ''.
 
-    The last argument that gives a parameter counts. A parameter that none gives belongs to the
-    last file.
+    A parameter that no argument gives belongs to the last file.
+    """
+    path = file_of(key)
+    if path:
+        mark = next(value.start_mark for _, name, value in _entries(path) if name == key)
+        return f'{path}:{mark.line + 1}:{mark.column + 1}: '
+    return f'{_paths()[-1]}: ' if _paths() and path is None else ''
+
+
+def file_of(key: str) -> str | None:
+    """
+    Return the file that gives a parameter, '' where another argument does, None where none does.
+
+    The last argument that gives a parameter counts.
     """
     for flag, value in reversed(list(pairwise(sys.argv))):
         # A rule is [NODE:]NAME:=VALUE.
         if flag in _RULE_FLAGS and value.split(':=')[0].rsplit(':')[-1] == key:
             return ''
-        marks = [found.start_mark for _, name, found in _entries(value) if name == key] \
-            if flag == _FILE_FLAG else []
-        if marks:
-            return f'{value}:{marks[0].line + 1}:{marks[0].column + 1}: ' * (value in _paths())
-    return f'{_paths()[-1]}: ' if _paths() else ''
+        if flag == _FILE_FLAG and any(name == key for _, name, _ in _entries(value)):
+            return value if value in _paths() else ''
+    return None
 
 
 def _paths() -> list[str]:
@@ -270,14 +304,47 @@ def _paths() -> list[str]:
 
 def _entries(path: str) -> Iterator[tuple[str, str, yaml.Node]]:
     """Yield the pattern of the node's name, the parameter's name and its value in a file."""
-    def inside(tree: yaml.Node | None, keys: list[str]) -> Iterator[tuple[str, str, yaml.Node]]:
+    def inside(tree: yaml.Node, keys: list[str]) -> Iterator[tuple[str, yaml.Node]]:
         if isinstance(tree, yaml.MappingNode):
             for key, value in tree.value:
                 yield from inside(value, [*keys, key.value])
-        elif tree is not None and 'ros__parameters' in keys:
-            i = keys.index('ros__parameters')
-            yield ''.join(f'/{key.strip("/")}' for key in keys[:i]), '.'.join(keys[i + 1:]), tree
+        else:
+            yield '.'.join(keys), tree
+    for section, parameters in _sections(path):
+        for name, value in inside(parameters, []):
+            yield section, name, value
+
+
+def _sections(path: str) -> Iterator[tuple[str, yaml.MappingNode]]:
+    """Yield the pattern of the node's name and the parameters of each section of a file."""
+    def inside(tree: yaml.Node | None, keys: list[str]) -> Iterator[tuple[str, yaml.MappingNode]]:
+        for key, value in tree.value if isinstance(tree, yaml.MappingNode) else ():
+            if key.value != 'ros__parameters':
+                yield from inside(value, [*keys, key.value.strip('/')])
+            elif isinstance(value, yaml.MappingNode):
+                yield ''.join(f'/{part}' for part in keys), value
     return inside(parameter_file.compose(path), [])
+
+
+def write_into(path: str, node_name: str, values: Mapping[str, str]) -> None:
+    """
+    Write parameters of a node into its file; all else in the file stays as it is.
+
+    values: YAML of the values by name. Raises `UserError` where the file cannot be written.
+    """
+    text = Path(path).read_text(encoding='utf-8')
+    section = next(parameters for pattern, parameters in _sections(path)
+                   if _matches(pattern, node_name))
+    present = {name: value for pattern, name, value in _entries(path)
+               if _matches(pattern, node_name)}
+    begin = section.value[0][0].start_mark
+    after = ', ' if section.flow_style else f'\n{" " * begin.column}'
+    edits = [(present[name].start_mark.index, present[name].end_mark.index, value)
+             if name in present else (begin.index, begin.index, f'{name}: {value}{after}')
+             for name, value in values.items()]
+    for start, stop, new in sorted(edits, reverse=True):
+        text = text[:start] + new + text[stop:]
+    write_text(Path(path).resolve(), text)
 
 
 def check_params_files() -> None:
@@ -356,6 +423,13 @@ def sensor_specs() -> Iterator[Spec]:
         yield Spec(f'envelope.{name}', kind, description)
     for name, description in parameter_file.DATASHEET.items():
         yield Spec(f'datasheet.{name}', _DATASHEET_KINDS.get(name, Kind.DOUBLE_ARRAY), description)
+
+
+def show_sensor(node: Node, sensor: Sensor) -> None:
+    """Let the parameters of a node be those of the sensor in force: `ros2 param dump` has them."""
+    flat = parameter_file.to_flat(sensor)
+    for spec in sensor_specs():
+        _show(node, spec, flat.get(spec.name))
 
 
 def make_sensor(flat: Mapping[str, Any], may_measure: bool = False) -> Sensor:

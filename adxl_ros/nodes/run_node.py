@@ -114,6 +114,7 @@ def run(make_node: Callable[[], Node], description: str | None, examples: Mappin
             rclpy.try_shutdown()
         node = make_node()
         parameters.warn_of_unused_qos(node)
+        parameters.explain_read_only(node)
     except Exception as error:
         if is_initialised and not rclpy.ok():
             # A signal has ended the context during the start.
