@@ -52,8 +52,8 @@ DATASHEET = {
 }
 """Meaning of the keys `datasheet.*`; a file has all of them or none."""
 
-_LINK = 'link.'
-"""Begin of the driver's keys, which a file carries unchecked: the driver checks them."""
+_LINK, _MOUNTING = 'link.', 'mounting.'
+"""Begins of keys that a file carries unchecked: driver and compensation check them."""
 
 _SMALLEST_VARIANCE = 1e-300
 """Smaller variances count as this in the check of a covariance (chosen: near the smallest
@@ -137,6 +137,7 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
             value = getattr(sensor, field.name)
             flat[key] = value.tolist() if isinstance(value, np.ndarray) else value
     flat |= {f'{_LINK}{name}': value for name, value in sensor.link.items()}
+    flat |= {f'{_MOUNTING}{name}': value for name, value in sensor.mounting.items()}
     if sensor.effects:
         flat['effects'] = list(sensor.effects)
     for name in sensor.effects:
@@ -277,7 +278,8 @@ class _FlatReader:
                                   for key, value in self._below('provenance.').items()},
                       datasheet_name=str(self.flat.get('datasheet.name', '')),
                       datasheet=self._datasheet(),
-                      link=self._below(_LINK), unstated=tuple(unstated))
+                      link=self._below(_LINK), mounting=self._below(_MOUNTING),
+                      unstated=tuple(unstated))
 
     def _require(self, is_right: Any, key: str, reason: str) -> None:
         if not is_right:

@@ -167,6 +167,8 @@ class Sensor:
     datasheet: dict[Coefficient, tuple[float, float]] = field(default_factory=dict)
     # How the driver reaches the unit: values of `link.*` by name. Its file carries them.
     link: dict[str, Any] = field(default_factory=dict)
+    # How the case sits on the robot: values of `mounting.*` by name, which its file carries, too
+    mounting: dict[str, Any] = field(default_factory=dict)
     # Names of the nominal values that the parameter file leaves out. Their fields hold
     # placeholders until `signals.recorded_sensor` measures them.
     unstated: tuple[str, ...] = ()

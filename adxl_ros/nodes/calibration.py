@@ -359,9 +359,11 @@ class Calibration(Node):
     def __init__(self) -> None:
         super().__init__('calibration')
         parameters.check_given(self)
-        flat, link = parameters.declare_sensor(self), parameters.given_link(self)
-        sensor = replace(parameters.make_sensor(flat, may_measure=True), link=link)
-        anonymous = replace(parameters.anonymous_sensor(self, flat), link=link)
+        flat = parameters.declare_sensor(self)
+        carried: dict[str, Any] = {
+            name: parameters.given_below(self, f'{name}.') for name in ('link', 'mounting')}
+        sensor = replace(parameters.make_sensor(flat, may_measure=True), **carried)
+        anonymous = replace(parameters.anonymous_sensor(self, flat), **carried)
         self._own = own = parameters.declare_all(self, CalibrationSettings)
         settings = _session_settings(own)
         self._captures: list[object] = []  # Requests that wait for the end of a capture

@@ -9,9 +9,10 @@ The topic tilt has three angles in a Vector3Stamped, so tf2 must not transform i
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from math import isfinite
+from pathlib import Path
 from typing import Any
 
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval
@@ -65,7 +66,8 @@ class CompensationSettings:
                                        'case is turned', name='mounting.frame_id')
 
 
-_RPY = 'mounting.rpy_rad'  # Parameter of the rotation
+_MOUNTING = 'mounting.'  # Begin of the names of the parameters of the mounting
+_RPY = f'{_MOUNTING}rpy_rad'  # Parameter of the rotation
 _LEVEL_S = 1.0
 """Time over which a rest is averaged, s; chosen: the noise of a sample then is negligible."""
 _FEWEST_SAMPLES = 10
@@ -80,12 +82,26 @@ class MountingParameters:
 
     def __init__(self, node: Node, stream: LiveStream, settings: CompensationSettings) -> None:
         self._node, self._stream = node, stream
-        self._frame_id = settings.mounting_frame_id
+        self._frame_id, self._path = settings.mounting_frame_id, ''
+        # What was given counts before the file of a calibration.
+        self._is_given = _RPY in parameters.given_parameters(node)
         self._mount(_mounting(settings.rpy_rad))
         parameters.on_change(node, _RPY, _mounting, self._mount)
         # The answer comes after a second of samples, which the node takes meanwhile.
         node.create_service(Trigger, '~/level', self._on_level,
                             callback_group=ReentrantCallbackGroup())
+
+    def take(self, path: str, sensor: Sensor) -> None:
+        """Use the mounting that the file of a calibration has, unless one was given."""
+        self._path = path
+        mounting = _mounting_of(path, sensor)
+        if mounting is None:
+            return
+        if not self._is_given:
+            self._node.set_parameters([Parameter(_RPY, value=list(mounting.rpy_rad))])
+        elif mounting != self._mounting:
+            self._node.get_logger().warning(
+                f'{_RPY} is given, and counts before that of {path}: {list(mounting.rpy_rad)}')
 
     def _mount(self, mounting: Mounting) -> None:
         self._mounting = mounting
@@ -102,13 +118,30 @@ class MountingParameters:
         except UserError as error:
             response.message = f'{error}'
             return response
+        before_rad = list(self._mounting.rpy_rad)
         rpy_rad = [round(angle, 6) for angle in levelled.rpy_rad]
         self._node.set_parameters([Parameter(_RPY, value=rpy_rad)])
         response.success = True
-        response.message = ("level, until this node ends; to keep it, start it with -p '"
-                            f"{_RPY}:={rpy_rad}'")
+        response.message = self._kept(rpy_rad, before_rad)
         self._node.get_logger().info(response.message)
         return response
+
+    def _kept(self, rpy_rad: list[float], before_rad: list[float]) -> str:
+        """Write a new mounting where the next start finds it; return where that is."""
+        path = parameters.file_of(_RPY) if self._is_given else \
+            self._path or parameters.file_of('format')
+        begin = f'level: {_RPY} is {rpy_rad}'
+        option = f"to keep it, start the node with -p '{_RPY}:={rpy_rad}'"
+        if not path:
+            return f'{begin} until this node ends; {option}'
+        date = datetime.now(timezone.utc).isoformat(timespec='seconds')
+        try:
+            parameters.write_into(path, self._node.get_fully_qualified_name(), {
+                _RPY: f'[{", ".join(map(parameter_file.float_text, rpy_rad))}]',
+                'provenance.levelled': f"'{date}, {_RPY} before: {before_rad}'"})
+        except UserError as error:
+            return f'{begin} until this node ends: {error}; {option}'
+        return f'{begin}, written into {Path(path).resolve()}, which the next start reads'
 
 
 def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounting:
@@ -135,13 +168,24 @@ def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounti
     return mounting.levelled(mean_mps2.tolist())
 
 
-def _mounting(rpy_rad: Sequence[float]) -> Mounting:
-    """Return the mounting of a parameter; refuse what is not three angles in rad."""
-    if len(rpy_rad) != 3 or not np.abs(rpy_rad).max() <= 2 * np.pi:
-        raise parameters.parameter_error(_RPY, f'{list(rpy_rad)} is not roll, pitch and yaw in '
-                                         'rad, each within a turn')
-    roll, pitch, yaw = map(float, rpy_rad)
+def _mounting(rpy_rad: Any, make_error: parameter_file.MakeError = parameters.parameter_error
+              ) -> Mounting:
+    """Return the mounting of three angles, rad; refuse what is none."""
+    try:
+        roll, pitch, yaw = map(float, rpy_rad)
+        is_right = bool(np.abs([roll, pitch, yaw]).max() <= 2 * np.pi)
+    except (TypeError, ValueError):
+        is_right = False
+    if not is_right:
+        raise make_error(_RPY, f'{rpy_rad} is not roll, pitch and yaw in rad, each within a turn')
     return Mounting((roll, pitch, yaw))
+
+
+def _mounting_of(path: str, sensor: Sensor) -> Mounting | None:
+    """Return the mounting that the file of a calibration has, None where it has none."""
+    rpy_rad = sensor.mounting.get(_RPY.removeprefix(_MOUNTING))
+    return None if rpy_rad is None else _mounting(
+        rpy_rad, lambda key, reason: UserError(f'{path}: {key}: {reason}'))
 
 
 _DEPTH = 100  # Samples that are kept while the node is busy: 0.1 s at 1 kHz
@@ -187,9 +231,12 @@ class Compensation(Node):
         own = parameters.make_sensor(self._flat, may_measure=True), (
             'the parameters given' if parameters.is_from_file(self) else
             f'the nominal {parameter_file.nominal_path()}')
-        self._use(*(self._load(settings.calibration) or own))
+        loaded = self._load(settings.calibration)
+        self._use(*(loaded or own))
+        self._mounting = MountingParameters(self, self._stream, settings)
+        if loaded:
+            self._mounting.take(settings.calibration, loaded[0])
         parameters.on_change(self, 'calibration', self._load, self._exchange)
-        MountingParameters(self, self._stream, settings)
         self.create_timer(_LOOK_S, self._look, clock=STEADY)
         topics.create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
                                    latched=True)
@@ -212,12 +259,15 @@ class Compensation(Node):
             return None
         sensor = parameter_file.load(path)
         self._policy.check(sensor)
+        _mounting_of(path, sensor)
         return sensor, path
 
     def _exchange(self, loaded: tuple[Sensor, str] | None) -> None:
         if loaded is not None:
             self._told = ''
             self._use(*loaded)
+            sensor, path = loaded
+            self._mounting.take(path, sensor)
 
     def _use(self, sensor: Sensor, source: str) -> None:
         """Correct samples by a sensor from the next one on; `source` says where it is from."""

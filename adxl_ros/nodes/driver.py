@@ -106,7 +106,7 @@ class Driver(LifecycleNode):
 
     def _refuse_silent_simulation(self) -> None:
         """Refuse a driver of a real unit without a link: no real unit gets simulated data."""
-        given, serial = [*parameters.given_link(self)], self._sensor.serial
+        given, serial = [*parameters.given_below(self, LINK)], self._sensor.serial
         reason = f'{LINK}{given[0]} is given' if given else \
             f'the sensor is the unit {serial}' if serial != NO_UNIT else ''
         if reason and 'type' not in given:
@@ -118,7 +118,7 @@ class Driver(LifecycleNode):
     def _declare_link(self) -> Any:
         """Declare the parameters of the link; refuse those of another one."""
         specs = {spec.name.removeprefix(LINK): spec for spec in parameters.link_specs(self._link)}
-        for name in parameters.given_link(self):
+        for name in parameters.given_below(self, LINK):
             if name not in ('type', *specs):
                 raise parameter_error(f'{LINK}{name}', f'the link {self._link} has no such '
                                       'parameter; it has link.type, '

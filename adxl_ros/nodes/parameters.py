@@ -125,10 +125,10 @@ def given_parameters(node: Node) -> dict[str, Any]:
     return {name: given.value for name, given in node._parameter_overrides.items()}
 
 
-def given_link(node: Node) -> dict[str, Any]:
-    """Return the given parameters of the link by name, for a file that carries them."""
-    return {name.removeprefix(LINK): value for name, value in given_parameters(node).items()
-            if name.startswith(LINK)}
+def given_below(node: Node, begin: str) -> dict[str, Any]:
+    """Return the given parameters whose names have a begin, by the rest of the name."""
+    return {name.removeprefix(begin): value for name, value in given_parameters(node).items()
+            if name.startswith(begin)}
 
 
 def check_given(node: Node) -> None:
@@ -197,7 +197,7 @@ def explain_read_only(node: Node) -> None:
         return result
 
     # The services call it by the node.
-    node.set_parameters_atomically = set_parameters_atomically  # type: ignore[method-assign]
+    node.set_parameters_atomically = set_parameters_atomically  # type: ignore[assignment]
 
 
 def declare_all(node: Node, settings: type[T]) -> T:

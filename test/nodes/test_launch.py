@@ -29,8 +29,7 @@ def launch(start: Callable[..., Started]) -> Callable[..., Started]:
 
 
 @pytest.mark.parametrize('name, argument, words', [
-    ('robot', 'parms_file:=none.yaml', 'parms_file:=...: this launch has no such argument; did you '
-     'mean params_file?'),
+    ('robot', 'parms_file:=none.yaml', 'no such argument; did you mean params_file?'),
     ('robot', 'params_file:=none.yaml', 'none.yaml: cannot be read'),
     ('calibrate', 'params_file:=other.yaml', 'other.yaml: has no parameters of the node /driver'),
     ('robot', 'link_type:=seral', '"seral" is not valid'),
