@@ -80,12 +80,12 @@ _MAX_GRAVITY_ERROR = 0.1
 class MountingParameters:
     """The parameters `mounting.*` and the service `~/level` of a node."""
 
-    def __init__(self, node: Node, stream: LiveStream, settings: CompensationSettings) -> None:
+    def __init__(self, node: Node, stream: LiveStream, mounting: Mounting, frame_id: str) -> None:
         self._node, self._stream = node, stream
-        self._frame_id, self._path = settings.mounting_frame_id, ''
+        self._frame_id, self._path = frame_id, ''
         # What was given counts before the file of a calibration.
         self._is_given = _RPY in parameters.given_parameters(node)
-        self._mount(_mounting(settings.rpy_rad))
+        self._mount(mounting)
         parameters.on_change(node, _RPY, _mounting, self._mount)
         # The answer comes after a second of samples, which the node takes meanwhile.
         node.create_service(Trigger, '~/level', self._on_level,
@@ -208,7 +208,7 @@ class Compensation(Node):
         super().__init__('compensation')
         parameters.check_given(self)
         self._settings = settings = parameters.declare_all(self, CompensationSettings)
-        paper = settings.inverse == 'paper'
+        paper, mounting = settings.inverse == 'paper', _mounting(settings.rpy_rad)
         self._heard_ns: dict[str, int] = {}
         self._named: tuple[Sensor, str]
         self._obstacle = self._told = ''  # Why the sensor is unknown; the newest line on it
@@ -233,7 +233,8 @@ class Compensation(Node):
             f'the nominal {parameter_file.nominal_path()}')
         loaded = self._load(settings.calibration)
         self._use(*(loaded or own))
-        self._mounting = MountingParameters(self, self._stream, settings)
+        self._mounting = MountingParameters(self, self._stream, mounting,
+                                            settings.mounting_frame_id)
         if loaded:
             self._mounting.take(settings.calibration, loaded[0])
         parameters.on_change(self, 'calibration', self._load, self._exchange)

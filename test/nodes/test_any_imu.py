@@ -3,6 +3,7 @@
 """The nodes on the stream of any IMU, which publishes no sensor_info."""
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 from geometry_msgs.msg import Vector3Stamped
 from graph import accel, Graph, stamp_ns
@@ -85,14 +86,21 @@ def test_compensation_takes_any_imu(camera: Camera, start: Start) -> None:
     assert abs(message.orientation.x) < 0.01, 'the tilt, not what the camera states'
 
 
-def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(camera: Camera, start: Start
-                                                                ) -> None:
-    """Acceleration, covariance, gyroscope and tilt are those of the robot, after ~/level, too."""
+def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(
+        camera: Camera, start: Start, tmp_path: Path) -> None:
+    """
+    Acceleration, covariance, gyroscope and tilt are those of the robot, after ~/level, too.
+
+    The level is written into the file of the mounting.
+    """
+    mounted = tmp_path / 'mounted.yaml'
+    mounted.write_text('compensation:\n  ros__parameters:\n    mounting: {rpy_rad: '
+                       '[3.141592653589793, 0.0, 0.0]}  # upside down\n')
     graph = camera.graph
     data, tilt = graph.listen(Imu, 'imu/data'), graph.listen(Vector3Stamped, 'tilt')
     free = graph.listen(Vector3Stamped, 'imu/linear_acceleration_free')
-    start('compensation', '--ros-args', '-r', f'imu/data_raw:={TOPIC}', '-p',
-          'mounting.rpy_rad:=[3.141592653589793, 0.0, 0.0]', '-p', 'free_acceleration:=true')
+    start('compensation', '--ros-args', '-r', f'imu/data_raw:={TOPIC}', '--params-file', mounted,
+          '-p', 'free_acceleration:=true')
     camera.connected()
 
     def until(condition: Callable[[], bool], purpose: str) -> None:
@@ -114,7 +122,9 @@ def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(camera: Camera, 
     answer = client.call_async(Trigger.Request())
     until(answer.done, 'the answer of ~/level')
     assert answer.result().success, answer.result().message
-    assert "to keep it, start it with -p 'mounting.rpy_rad:=[" in answer.result().message
+    assert f'written into {mounted}' in answer.result().message
+    written = mounted.read_text()
+    assert '# upside down' in written and '3.14159265' not in written.split('rpy_rad: ', 1)[1][:30]
     until(lambda: abs(tilt[-1].vector.x) < 0.01, 'a level robot')
     # The orientation that the camera states is 2·atan2(0.6, 0.8) about x, whatever it measures.
     quaternion = data[-1].orientation

@@ -234,12 +234,14 @@ def test_calibration_loads_a_complete_file_or_nothing(robot: Robot, start: Start
     robot.graph.spin_until(lambda: robot.graph.value(NODE, 'calibration') == str(other), 10.0,
                            'calibration in diagnostics')
     assert robot.graph.value(NODE, 'provenance.date') == '2026-02-03'
-    assert 'read-only' in robot.assign(bias__offset_v=[0.0, 0.0])
+    reason = robot.assign(bias__offset_v=[0.0, 0.0])
+    assert 'read-only' in reason and 'set calibration to FILE' in reason
 
 
 def test_parameters_are_described_and_best_effort_publishers_received(
         robot: Robot, start: Start, tmp_path: Path) -> None:
-    start(NODE, '--ros-args', '-p', f'calibration:={_saved(tmp_path, unit())}')
+    sensor = replace(unit(), mounting={'rpy_rad': [0.1, -0.2, 0.3]})
+    start(NODE, '--ros-args', '-p', f'calibration:={_saved(tmp_path, sensor)}')
     robot._raw = robot.graph.node.create_publisher(Imu, 'imu/data_raw', QoSProfile(
         depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
     robot.connected()
@@ -251,6 +253,9 @@ def test_parameters_are_described_and_best_effort_publishers_received(
     assert [d.name for d in descriptors if not d.read_only] == ['calibration']
     assert descriptors[1].additional_constraints == '-2 to 2'
     assert descriptors[3].floating_point_range[0].to_value == 1e5
+    # The parameters are those in force, as the file has them.
+    assert robot.get('mounting.rpy_rad', 'effects', 'bias.offset_v') == [
+        [0.1, -0.2, 0.3], list(sensor.effects), sensor.values['bias']['offset_v'].tolist()]
 
 
 @pytest.mark.parametrize(('right', 'wrong', 'message'), [
@@ -258,6 +263,7 @@ def test_parameters_are_described_and_best_effort_publishers_received(
     ('units: V, V/g, 1/g, rad', 'units: mV', ":4:12: units: 'mV', but coefficients are in"),
     ('[2.0e-06, 1.0e-06, 1.0e-06, 3.0e-06]', '[2.0e-06, 9.0e-06, 9.0e-06, 3.0e-06]',
      'covariance: not symmetric and positive'), ('rate_hz: 1000.0', 'rate_hz: 1000', 'rate_hz'),
+    ('model: physical', 'mounting.rpy_rad: [1.0, 2.0]\n    model: physical', 'not roll, pitch'),
     ('effects: [', 'effects: [[', 'not YAML')])
 def test_a_bad_file_ends_it_with_one_line(refusal: Callable, tmp_path: Path, right: str,
                                           wrong: str, message: str) -> None:

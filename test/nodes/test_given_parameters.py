@@ -7,7 +7,12 @@ from pathlib import Path
 import sys
 
 from adxl_ros.files import parameter_file
-from adxl_ros.nodes.parameters import has_section, node_specs, sensor_specs
+from adxl_ros.nodes.parameters import (
+    has_section,
+    node_specs,
+    sensor_specs,
+    write_into,
+)
 from adxl_ros.process import NODES
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph
@@ -150,6 +155,19 @@ def test_the_sections_of_a_file_are_those_of_ros(ros_env, tmp_path, section, nam
     assert has_section(path, node.get_fully_qualified_name()) == (frame == 'case')
     node.destroy_node()
     context.shutdown()
+
+
+@pytest.mark.parametrize('text, written', [
+    ('/**:\n  ros__parameters:\n    format: 1 # as it was\n',
+     '/**:\n  ros__parameters:\n    a.b: [1.0]\n    format: 1 # as it was\n'),
+    ('driver: {ros__parameters: {c: 1}}\n/arm/*: {ros__parameters: {a: {b: [7.0]}, d: 2}}\n',
+     'driver: {ros__parameters: {c: 1}}\n/arm/*: {ros__parameters: {a: {b: [1.0]}, d: 2}}\n'),
+    ('/**: {ros__parameters: {c: 1}}\n', '/**: {ros__parameters: {a.b: [1.0], c: 1}}\n')])
+def test_a_parameter_is_written_into_a_file_whose_rest_stays(tmp_path, text, written):
+    path = tmp_path / 'own.yaml'
+    path.write_text(text)
+    write_into(str(path), '/arm/node', {'a.b': '[1.0]'})
+    assert path.read_text() == written
 
 
 def test_all_nodes_with_one_file(start, tmp_path):
