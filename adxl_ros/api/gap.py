@@ -31,6 +31,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.recording_columns import NO_UNIT, Recording
+from adxl_ros.files.surroundings import assumed
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import command
 from adxl_ros.report.figures import axes_for
@@ -119,7 +120,8 @@ class Gap(Result):
     in_unit: GapInUnit | None
     """The gap in the unit that `quantity` names; None where none was asked for."""
     remarks: tuple[str, ...]
-    """The prior, and the result of the self-check, where they were asked for."""
+    """What was assumed of temperature, supply and power-on; and the prior, and the result of the
+    self-check, where they were asked for."""
     compared: Compared
     """What was compared with what."""
     diagnosis: Diagnosis
@@ -315,6 +317,7 @@ def diagnose(recordings: RecordingInput | Sequence[RecordingInput],
         from adxl_ros.model.population import posterior
         baseline, line, _ = posterior(baseline, calibration_store.read_population(prior))
         remarks.append(f'prior: {line}')
+    remarks += [f'assumed: {text}' for each in read for text in assumed(each, baseline.effects)]
     diagnosis = core.diagnose(read, baseline, motion, seed,
                               lambda stage, done: progress(done, stage), align, material)
     in_unit, found = None, diagnosis.report

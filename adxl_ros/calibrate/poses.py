@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -263,6 +263,20 @@ def recorded_settings(rests: np.ndarray, readings_rad: np.ndarray | None,
     return settings
 
 
+def _surroundings(recording: Recording, name: str, rests: Sequence[Rest],
+                  means: Callable[[np.ndarray | None], np.ndarray]) -> np.ndarray:
+    """Return the mean of a column at each rest, (k,); between others where a rest has none."""
+    values = recording.columns.get(name)
+    at_rest = means(values)
+    is_missing = np.isnan(at_rest)
+    if values is not None and np.isfinite(values).any():
+        known = np.isfinite(values)
+        middle_s = np.array([(rest.time_start_s + rest.time_stop_s) / 2 for rest in rests])
+        at_rest[is_missing] = np.interp(middle_s[is_missing], recording.time_s[known],
+                                        values[known])
+    return at_rest
+
+
 def _mean_of_finite(values: np.ndarray) -> float:
     """Return the mean of the finite values; NaN without any."""
     finite = values[np.isfinite(values)]
@@ -380,8 +394,8 @@ def extract_poses(recording: Recording, sensor: Sensor,
                                           rest_detection.datasheet_noise(sensor))
     measured = {'volts': mean, 'std_v': std,
                 'time_s': np.array([[rest.time_start_s, rest.time_stop_s] for rest in rests]),
-                'temperature_c': means(recording.columns.get('temperature_c')),
-                'supply_v': means(recording.columns.get('supply_v'))}
+                **{name: _surroundings(recording, name, rests, means)
+                   for name in ('temperature_c', 'supply_v')}}
     if records is not None:
         return replace(Poses.from_records(records), **measured)
     alpha_rad, beta_rad = (means(None if angles is None else angles[:, joint])

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from adxl_ros.compensate.inversions import noise_variance_v2, paper_inverse, undo_filter_blocks
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.model import covariance as force_errors, noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
@@ -56,6 +57,7 @@ class RecordingEstimator:
         if 'temperature_c' not in first.columns:
             sensor = sensor.without_temperature_range()
         self._sensor, self._undo_filter = sensor, undo_filter
+        self._surroundings = Surroundings()
         self._begin_s = float(first.time_s[0])
         self._inverse = (paper_inverse if paper else signal_chain.inverse)(sensor)
         self._measured_covariance = force_errors.measured_covariance(
@@ -70,13 +72,15 @@ class RecordingEstimator:
         for (block, volts), input_v in before_filter:
             yield block, self._estimate(volts, input_v, self._environment(block))
 
+    @property
+    def assumed(self) -> list[str]:
+        """What was assumed of temperature and supply so far, one line each, for people."""
+        return self._surroundings.assumed(self._sensor.effects)
+
     def _environment(self, block: Recording) -> Environment:
-        """Return the surroundings of the samples; nominal where they are not measured."""
-        measured = {name: block.columns[name] for name in ('temperature_c', 'supply_v')
-                    if name in block.columns}
-        return NOMINAL_ENVIRONMENT._replace(time_s=block.time_s - self._begin_s, **{
-            name: np.where(np.isfinite(values), values, getattr(NOMINAL_ENVIRONMENT, name))
-            for name, values in measured.items()})
+        """Return the surroundings of the samples."""
+        return NOMINAL_ENVIRONMENT._replace(time_s=block.time_s - self._begin_s,
+                                            **self._surroundings(block))
 
     def _estimate(self, volts: np.ndarray, input_v: np.ndarray, environment: Environment
                   ) -> Estimates:

@@ -335,8 +335,12 @@ class Topics(NamedTuple):
     command: str | None = None  # Commands of the stage
 
 
-def find_topics(bag: Bag, topic: str = '') -> Topics:
-    """Find the topics by their names, in any namespace, and their types."""
+def find_topics(bag: Bag, topic: str = '', has_stage: bool = True) -> Topics:
+    """
+    Find the topics by their names, in any namespace, and their types.
+
+    has_stage: whether joints, commands and `sensor_info` are looked for, too.
+    """
     imu = find_imu(bag, topic)
     is_own = imu.endswith('imu/data_raw')
     space = imu.removesuffix('imu/data_raw') if is_own else imu[:imu.rfind('/') + 1]
@@ -345,13 +349,15 @@ def find_topics(bag: Bag, topic: str = '') -> Topics:
         """Return a topic in the namespace of the sensor; other nodes use these names, too."""
         return space + name if (space + name, kind) in bag.types else None
 
+    temperature, supply = beside('temperature', TEMPERATURE), beside('supply', BATTERY_STATE)
+    if not has_stage:
+        return Topics(imu, temperature=temperature, supply=supply)
     joints = beside('stage/joint_states', JOINT_STATE) or _only(bag, 'stage/joint_states',
                                                                 JOINT_STATE)
     info = beside('sensor_info', DIAGNOSTIC_STATUS)
     # With several sensors, the only sensor_info may be that of another one.
     if info is None and (is_own or [kind for _, kind in bag.types].count(IMU) == 1):
         info = _only(bag, 'sensor_info', DIAGNOSTIC_STATUS)
-    temperature, supply = beside('temperature', TEMPERATURE), beside('supply', BATTERY_STATE)
     space = joints.removesuffix('joint_states') if joints else f'{space}stage/'
     return Topics(imu, joints, info, temperature, supply, beside('command', JOINT_STATE))
 

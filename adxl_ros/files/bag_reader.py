@@ -54,7 +54,7 @@ def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
         if reading.mapping is not None:
             raise UserError(f'{bag.path}: is a bag, which has no columns; leave --columns out: '
                             '--topic names a topic, and --unit states its unit')
-        topics = Topics(find_imu(bag)) if ideal else find_topics(bag, reading.topic)
+        topics = find_topics(bag, reading.topic, has_stage=not ideal)
         info = read_info(bag, topics.info)
         tracks, commands = _tracks(bag, topics), _commands(bag, topics)
         samples = _Samples(f'{bag.path}: topic {topics.imu}', AXES if ideal else info.get('axes'),

@@ -251,7 +251,8 @@ def motion_from_force(ideal: Recording, resampled: bool) -> tuple[Motion, float]
     rate_hz = stamped_rate_hz(time_s)
     return Motion(
         float(time_s[-1] - begin_s) + 1 / rate_hz, force=ForcePath(time_s, force_mps2),
-        internal_rate_hz=rate_hz if resampled else max(rate_hz, INTERNAL_RATE_HZ)), begin_s
+        internal_rate_hz=rate_hz if resampled else max(rate_hz, INTERNAL_RATE_HZ),
+        **environment_paths(ideal)), begin_s
 
 
 def motion_from_references(read: Recording, sensor: Sensor) -> Motion:

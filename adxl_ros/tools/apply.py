@@ -75,7 +75,7 @@ def apply(options: argparse.Namespace) -> int:
     if not sensor.effects:
         sensor = with_axes(sensor, first.axes)
     check_unit(first.stream_info, first.axes, sensor)
-    _report_effects(first, sensor, options.undo_filter)
+    _report_effects(sensor, options.undo_filter)
     estimator = RecordingEstimator(sensor, first, options.inverse == 'paper', options.undo_filter)
     block, beyond = first, BeyondRange()
     with _output(options.output) as write, cli.progress('apply') as show:
@@ -96,8 +96,8 @@ def apply(options: argparse.Namespace) -> int:
     by_what = f'the {sensor.model} calibration of {sensor.serial}' if sensor.effects else \
         'the datasheet values: the sensor is not calibrated'
     following = ('compensation', f'--ros-args -p calibration:={cli.quoted(options.params or "")}')
-    cli.print_end([f'Corrected {counts["rows"]} samples by {by_what}.', *listed(measured)],
-                  [options.output], cli.command(
+    cli.print_end([f'Corrected {counts["rows"]} samples by {by_what}.',
+                   *estimator.assumed, *listed(measured)], [options.output], cli.command(
         *following if sensor.effects else ('fit', 'SWEEP -o unit.yaml')))
     return 0
 
@@ -116,8 +116,8 @@ def _output(path: str) -> Iterator[Callable[[Recording, Estimates], None]]:
                                                   *fields(estimates))
 
 
-def _report_effects(block: Recording, sensor: Sensor, undo_filter: bool) -> None:
-    """Name the effects that are not undone, or undone for nominal surroundings."""
+def _report_effects(sensor: Sensor, undo_filter: bool) -> None:
+    """Name the effects that are not undone."""
     for effect in map(effect_named, sensor.effects):
         acts_on_samples = effect.acts_on is base.ActsOn.MEAN and effect.place < base.Place.CLOCK \
             and effect.concern is not base.Concern.STAGE
@@ -125,10 +125,6 @@ def _report_effects(block: Recording, sensor: Sensor, undo_filter: bool) -> None
         if acts_on_samples and not is_undone:
             cli.note(f'apply: {effect.name} is not undone: a single sample does not determine '
                      'it')
-        for name in effect.follows:
-            if name != 'time_s' and not np.isfinite(block.columns.get(name, np.nan)).all():
-                cli.note(f'apply: {block.path}: {name} is missing or has gaps: {effect.name} is '
-                         f'taken at {getattr(base.NOMINAL_ENVIRONMENT, name):g} there')
 
 
 def _columns(estimates: Estimates) -> dict[str, np.ndarray]:

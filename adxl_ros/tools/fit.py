@@ -17,6 +17,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.calibration_store import sha256
 from adxl_ros.files.recording_columns import recorded_unit, Recording
+from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.sensor import Sensor, with_axes
@@ -87,6 +88,7 @@ def fit(options: argparse.Namespace) -> int:
     unit: Sensor | None = None
     recordings: list[calibration.RecordedPoses] = []
     thermal: Poses | None = None
+    surroundings: list[Surroundings] = []  # Those of each recording
     reading = cli.reading_options(options)
     with cli.progress('fit') as show:
         for number, path in enumerate(options.recording):
@@ -95,6 +97,8 @@ def fit(options: argparse.Namespace) -> int:
                 unit, lines = measure_unstated(load_sensor(options.params, read), read)
                 base, measured = unit, listed(lines)
             unit = recorded_unit(unit, read)
+            surroundings.append(Surroundings())
+            surroundings[-1](read)
             if options.urdf:
                 robot = cli.robot_path(options, read, unit)
                 read = robot.with_angles(read)
@@ -124,7 +128,10 @@ def fit(options: argparse.Namespace) -> int:
                                        population) \
             if thermal is None else calibration.calibrate_thermal(
                 with_axes(base, unit.axes), thermal, Path(options.recording[0]).name, sha)
-        result = replace(result, details=[*result.details, *measured])
+        effects = result.fitted.effects
+        assumed = [line for each in surroundings for line in each.interpolated(effects)]
+        result = replace(result, warnings=[*result.warnings, *assumed],
+                         details=[*result.details, *measured])
         if options.dcc:
             gum.write(options.dcc, result)
         if options.report:

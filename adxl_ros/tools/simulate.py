@@ -5,21 +5,23 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 import sys
+from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.surroundings import assumed
 from adxl_ros.links.support import emulated_board
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.screen import entry_list
-from adxl_ros.simulate.motion import INTERNAL_RATE_HZ
+from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion
 from adxl_ros.simulate.response import Columns, simulate_blocks
 from adxl_ros.simulate.trajectories import (
     motion_from_force,
@@ -84,28 +86,37 @@ def simulate(options: argparse.Namespace) -> int:
                 raise UserError(f'--effect {name}: acts on the specific force of a recording; say '
                                 'simulate imu --force RECORDING, or leave the effect out')
             cli.note(f'simulate: {name} is an error of the reference, and is left out')
-    sensor, begin_s, duration_s, blocks = _samples(sensor, options)
+    source = _source(sensor, options)
+    sensor = source.sensor
     with ExitStack() as stack:
         send = _board_output(stack, sensor, options.port) if options.port else None
         write = stack.enter_context(recording.writer(options.output, sensor)) \
             if options.output else None
         show = stack.enter_context(cli.progress('simulate'))
-        for columns in blocks:
+        for columns in source.blocks(options.seed):
             if send:
                 send(columns)
             time_s = columns.pop('time_s')
             if write:
                 write(Recording(options.output, time_s, columns, sensor_info(sensor)))
-            if duration_s:
-                show(min((time_s[-1] - begin_s) / duration_s, 1.0))
-    result = (f'Simulated {options.trajectory}: {duration_s:.4g} s at {sensor.rate_hz:.4g} Hz, '
-              f'axes {sensor.axes}. Sensor {sensor.serial}, effects: '
+            if source.motion.duration_s:
+                show(min((time_s[-1] - source.begin_s) / source.motion.duration_s, 1.0))
+    result = (f'Simulated {options.trajectory}: {source.motion.duration_s:.4g} s at '
+              f'{sensor.rate_hz:.4g} Hz, axes {sensor.axes}. Sensor {sensor.serial}, effects: '
               f'{", ".join(sensor.effects) or "none"}.')
-    params = f' --params {cli.quoted(options.params)}' if options.params else ''
-    tool, output = ('fit', 'unit.yaml') if options.trajectory == 'sweep' else ('diagnose', 'gap')
-    cli.print_end([result], filter(None, [options.output]), cli.command(
-        tool, f'{cli.quoted(options.output)}{params} -o {output}') if options.output else '')
+    cli.print_end([result, *source.assumed], filter(None, [options.output]),
+                  _next_step(options) if options.output else '')
     return 0
+
+
+def _next_step(options: argparse.Namespace) -> str:
+    """Return the command that evaluates the simulated recording."""
+    words = [options.output]
+    words += ['--params', options.params] if options.params else []
+    # Without a stage, the force that the sensor felt is the reference.
+    words += ['--sim', options.force] if options.force else []
+    tool, output = ('fit', 'unit.yaml') if options.trajectory == 'sweep' else ('diagnose', 'gap')
+    return cli.command(tool, cli.quoted(*words, '-o', output))
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -129,27 +140,39 @@ def _check(options: argparse.Namespace) -> None:
                         'simulate imu --force RECORDING')
 
 
-def _samples(sensor: Sensor, options: argparse.Namespace
-             ) -> tuple[Sensor, float, float, Iterator[Columns]]:
-    """Return the sensor at its rate, begin and duration, s, and the samples of a trajectory."""
-    begin_s, like = 0.0, None
+class _Source(NamedTuple):
+    """What is simulated."""
+
+    sensor: Sensor  # The sensor, at its rate
+    motion: Motion
+    begin_s: float = 0.0  # Begin of the motion, s
+    like: Recording | None = None  # A recording that has the stamps of the samples
+    assumed: Sequence[str] = ()  # What was assumed of the surroundings, one line each
+
+    def blocks(self, seed: int) -> Iterator[Columns]:
+        """Yield the samples."""
+        return simulate_blocks(self.sensor, self.motion, seed, self.begin_s, self.like)
+
+
+def _source(sensor: Sensor, options: argparse.Namespace) -> _Source:
+    """Return what the options name."""
     if options.trajectory in TRAJECTORIES:
-        motion = TRAJECTORIES[options.trajectory](np.random.default_rng(options.seed))
-    elif options.trajectory == 'imu':
+        return _Source(sensor, TRAJECTORIES[options.trajectory](
+            np.random.default_rng(options.seed)))
+    if options.trajectory == 'imu':
         # The specific force of another simulator, at its rate or another.
-        motion, begin_s = motion_from_force(recording.read_ideal(options.force),
-                                            options.rate is None)
+        ideal = recording.read_ideal(options.force)
+        motion, begin_s = motion_from_force(ideal, options.rate is None)
         if options.rate is None:
             sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
             motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, INTERNAL_RATE_HZ))
-    else:
-        # The references of a recording, at its stamps or at another rate.
-        read = cli.read('simulate', options.trajectory)
-        motion, begin_s = motion_from_references(read, sensor), float(read.time_s[0])
-        if options.rate is None:
-            sensor, like = replace(sensor, rate_hz=read.rate_hz), read
-    return (sensor, begin_s, motion.duration_s,
-            simulate_blocks(sensor, motion, options.seed, begin_s, like))
+        return _Source(sensor, motion, begin_s, assumed=assumed(ideal, sensor.effects))
+    # The references of a recording, at its stamps or at another rate.
+    read = cli.read('simulate', options.trajectory)
+    motion, like = motion_from_references(read, sensor), None
+    if options.rate is None:
+        sensor, like = replace(sensor, rate_hz=read.rate_hz), read
+    return _Source(sensor, motion, float(read.time_s[0]), like, assumed(read, sensor.effects))
 
 
 def _board_output(stack: ExitStack, sensor: Sensor, port: str) -> Callable[[Columns], None]:

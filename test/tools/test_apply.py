@@ -13,9 +13,10 @@ import sys
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.model import signal_chain
+from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
-from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2, typical
 import numpy as np
 from processes import executable, PATIENCE
 import pytest
@@ -257,3 +258,18 @@ def test_a_bag_holds_the_estimates_of_the_table(run_tool: RunTool, tmp_path: Pat
             q = message.orientation
             assert 2 * np.arctan2(q.x, q.w) == pytest.approx(roll, abs=1e-9)
             assert 2 * (q.w * q.y - q.x * q.z) == pytest.approx(np.sin(pitch), abs=1e-9)
+
+
+def test_a_temperature_that_ends_is_held_and_said(run_tool: RunTool, tmp_path: Path) -> None:
+    """A gap behind the first block is no step, and stands in the result."""
+    sensor = replace(unit().without_covariance(), effects=('temperature_bias',), values={
+        'temperature_bias': typical(effect_named('temperature_bias'), 'xy')})
+    count = 20000
+    path = record(tmp_path, sensor, np.tile(volts_of(sensor)[:1], (count, 1)))
+    read = recording.read(path)
+    read.columns['temperature_c'] = np.where(np.arange(count) < 15000, 45.0, np.nan)
+    recording.write(path, read, sensor)
+    force = numbers(applied(run_tool, path)[0], 'ax_mps2')[0]
+    np.testing.assert_allclose(force, force[0], atol=1e-9)
+    done = run_tool('apply', path, '--params', path.with_name('unit.yaml'), '-o', 'again.csv')
+    assert '5000 of 20000' in done.stdout

@@ -1,6 +1,7 @@
 """`simulate` and `fit` through the front door: what they write, repeat and refuse."""
 
 import re
+import shlex
 
 from adxl_ros.files import parameter_file, recording
 import numpy as np
@@ -55,6 +56,28 @@ def test_a_resting_recording_is_fitted_over_temperature(run_tool, tmp_path):
                     '--dcc', 'certificate.xml')
     assert done.returncode == 1 and 'a certificate states errors at stage' in done.stderr
     assert not (tmp_path / 'b.yaml').exists()
+
+
+def test_the_force_of_another_simulator_brings_its_temperature_and_is_the_reference(
+        run_tool, tmp_path):
+    """The temperature acts, what it lacks is said, and the proposed command has a reference."""
+    time_s = np.arange(0, 40, 0.02)
+    moves = np.clip((time_s - 10) / 5, 0, 1)
+    columns = {'time_s': time_s, 'ax_mps2': moves * np.sin(3 * time_s),
+               'ay_mps2': moves * np.cos(2 * time_s), 'az_mps2': 9.8 + 0 * time_s}
+    for name, further in (('cold', {}), ('warm', {'temperature_c': 45 + 0 * time_s})):
+        table = {**columns, **further}
+        np.savetxt(tmp_path / f'{name}.csv', np.column_stack(list(table.values())),
+                   delimiter=',', header=','.join(table), comments='')
+        done = run_tool('simulate', 'imu', '--force', f'{name}.csv', '-o', f'{name}_sim.csv',
+                        '--effect', 'temperature_bias:per_k=1e-3')
+        assert done.returncode == 0, done.stderr
+        assert ('temperature_c is not recorded' in done.stdout) == (name == 'cold')
+    cold, warm = (recording.read(tmp_path / f'{name}_sim.csv') for name in ('cold', 'warm'))
+    np.testing.assert_allclose(warm.columns['x_v'] - cold.columns['x_v'], 0.02, atol=2e-3)
+    following = shlex.split(done.stdout[done.stdout.index('ros2 run'):].replace('\\\n', ' '))
+    done = run_tool(*following[3:])
+    assert done.returncode == 0 and 'BAD DATA' not in done.stdout, done.stderr
 
 
 def test_several_recordings_of_one_unit_are_fitted_together(run_tool, tmp_path):
