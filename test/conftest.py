@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 import fcntl
-from functools import partial
+from functools import cache, partial
 import os
 from pathlib import Path
 import shutil
@@ -23,7 +23,7 @@ from domain import BY_UDP, own_domain
 from hypothesis import settings
 import needs
 from pages import opener, running_browser
-from processes import executable, REPO, run_executable, run_in_process, Started
+from processes import executable, REPO, run_in_process, Started
 import pytest
 
 # Each run has the same examples. New ones: make test ARGS='--hypothesis-profile search'
@@ -37,6 +37,8 @@ SHARED = {'committed_check', 'evaluations', 'report_folder', 'two_effects'}
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    # Nodes state this folder in their help as they are loaded; it can hold no file.
+    os.environ['ROS_HOME'] = os.devnull
     # After SIGTERM a run stops the processes that it has started, as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     # A background job of a shell ignores SIGINT, and its processes would inherit this.
@@ -194,16 +196,14 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 
 @pytest.fixture(scope='session')
-def help_of(made_once: Callable[..., Path]) -> Callable[[str], str]:
-    """Give a function that returns the help of an executable, which runs once for all tests."""
-    def fill(folder: Path) -> None:
-        # A path has no place to wrap at; no file of this one is written.
-        done = run_executable(folder.name.removeprefix('help_'), '--help',
-                              env=os.environ | {'ROS_HOME': '/ros'})
+def help_of() -> Callable[[str], str]:
+    """Give a function that returns the help of an executable, made in this process."""
+    @cache
+    def text(name: str) -> str:
+        done = run_in_process(name, '--help', cwd=REPO)
         assert (done.returncode, done.stderr) == (0, '')
-        (folder / 'help.txt').write_text(done.stdout)
-
-    return lambda name: (made_once(f'help_{name}', fill) / 'help.txt').read_text()
+        return done.stdout
+    return text
 
 
 @pytest.fixture(scope='session')
