@@ -350,11 +350,14 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
     fitted = thermal_fit.applied(base, fit, calibrated_c)
     has_scale = any(name.effect == 'temperature_scale' for name in fit.names)
     low_c, high_c = range_c or fit.span_c
-    misfit_mps2 = float(np.sqrt(np.mean(fit.residual_g ** 2))) * G0_MPS2
+    misfit_mps2 = float(np.sqrt(np.mean(fit.rms_g ** 2))) * G0_MPS2
     fitted = replace(fitted, envelope=replace(
         base.envelope, temperature_c=fit.span_c, zero_g_per_k=0.0,
         scale_per_k=0.0 if has_scale else base.envelope.scale_per_k,
-        misfit_mps2=float(np.hypot(base.envelope.misfit_mps2, misfit_mps2))))
+        misfit_mps2=float(np.hypot(base.envelope.misfit_mps2, misfit_mps2)),
+        zero_g_nodes_c=tuple(fit.further.nodes_c.tolist()),
+        zero_g_next=tuple(fit.further.size.tolist()),
+        zero_g_at_c=calibrated_c))
     fitted = with_provenance(fitted, source, poses, data_sha256, {
         'reference': 'rest over temperature', 'base': base.provenance.get('id', base.serial),
         'residual_mg': f'{mg(misfit_mps2):.4f}'})
@@ -370,7 +373,7 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
           f'{with_half_width(k2 * 1e6, std[curvature] * 1e6)} µg/K²'
           for slope, curvature in pairs for k, k2 in [get(fitted, [slope, curvature])]),
         'residual ' + ', '.join(f'{axis} {value * 1e3:.2g}' for axis, value in zip(
-            base.axes, fit.residual_g)) + ' mg rms',
+            base.axes, fit.rms_g)) + ' mg rms',
         f'warming and cooling differ: {fit.history} ({fit.shape:.3g} '
         f'{"s" if fit.history == "thermal_lag" else "K"})' if fit.history else
         'no thermal_lag or thermal_hysteresis shows',

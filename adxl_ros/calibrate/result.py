@@ -10,8 +10,9 @@ from datetime import datetime, timezone
 import hashlib
 import os
 
+from adxl_ros.calibrate.fits.extrapolation import next_degree, NextDegree
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
-from adxl_ros.calibrate.poses import planes, Poses
+from adxl_ros.calibrate.poses import planes, Poses, predicted_volts
 from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.errors import UserError
@@ -140,12 +141,29 @@ def _mean_text(values: np.ndarray, digits: str) -> str:
 def envelope(fitted: Sensor, force: np.ndarray, poses: Poses, misfit_mps2: float) -> Envelope:
     """Return the validity range by the specific force of all poses, m/s², (k, 3)."""
     finite_c = poses.temperature_c[np.isfinite(poses.temperature_c)]
+    further = _next_degree(fitted, poses)
+    nodes_c = further.nodes_c.tolist() if further else [0.0]
     return Envelope((float(finite_c.min()), float(finite_c.max())) if finite_c.size else None,
                     zero_g_per_k=_unmodelled_slope(fitted, 'temperature_bias'),
                     scale_per_k=_unmodelled_slope(fitted, 'temperature_scale'),
-                    misfit_mps2=misfit_mps2,
+                    zero_g_nodes_c=tuple(nodes_c) if further else (),
+                    zero_g_next=tuple(further.size.tolist()) if further else (),
+                    # The zero-g is that of all poses, which agree at each of the nodes.
+                    zero_g_at_c=nodes_c[0], misfit_mps2=misfit_mps2,
                     force_low_mps2=tuple(force.min(axis=0).tolist()),
                     force_high_mps2=tuple(force.max(axis=0).tolist()))
+
+
+def _next_degree(fitted: Sensor, poses: Poses) -> NextDegree | None:
+    """Return what a fit lacks that follows temperature by slope and curvature; else None."""
+    order = np.argsort(poses.time_s[:, 0])
+    known = poses.subset(order[np.isfinite(poses.temperature_c[order])])
+    if 'temperature_bias' not in fitted.effects or not len(known) \
+            or not np.ptp(known.temperature_c):
+        return None
+    residual_g = (known.volts - predicted_volts(fitted, known)) / fitted.scale_v_per_g
+    curvature_k2 = fitted.values['temperature_bias']['per_k2']
+    return next_degree(known.temperature_c, residual_g, curvature_k2)
 
 
 def _unmodelled_slope(fitted: Sensor, effect: str) -> float:

@@ -35,14 +35,18 @@ ENVELOPE = {
     'temperature_c': 'lowest and highest temperature of the poses, degC',
     'zero_g_per_k': 'drift of the zero-g beyond them, g/K',
     'scale_per_k': 'drift of the scale factor beyond them, 1/K',
+    'zero_g_nodes_c': 'temperatures at which the next degree of the zero-g departs by 0, degC',
+    'zero_g_next': 'size of that next degree by axis, g/K^n for n such temperatures',
+    'zero_g_at_c': 'temperature at which the zero-g is known, degC',
     'misfit_mps2': 'error of held-out poses beyond noise and stage, m/s^2',
     'force_low_mps2': 'lowest specific force of the poses by component, m/s^2',
     'force_high_mps2': 'highest specific force of the poses by component, m/s^2',
 }
 """Meaning of the keys `envelope.*`, those of `model.sensor.Envelope`; each may be missing."""
 
-ENVELOPE_LISTS = {'temperature_c': 2, 'force_low_mps2': 3, 'force_high_mps2': 3}
-"""Number of values of the keys `envelope.*` that have more than one."""
+ENVELOPE_LISTS = {'temperature_c': 2, 'force_low_mps2': 3, 'force_high_mps2': 3,
+                  'zero_g_nodes_c': 3, 'zero_g_next': 0}
+"""Number of values of the keys `envelope.*` that have more than one; 0 is one for each axis."""
 
 DATASHEET = {
     'name': 'datasheet that the values are from',
@@ -404,7 +408,7 @@ class _FlatReader:
             key = f'envelope.{name}'
             if key in self.flat:
                 values = self._numbers(key, self.flat[key])
-                count = ENVELOPE_LISTS.get(name, 1)
+                count = ENVELOPE_LISTS.get(name, 1) or len(self.flat['sensor.axes'])
                 self._require(len(values) == count, key, f'{self.flat[key]} is not the {meaning}')
                 stated[name] = values[0].item() if count == 1 else tuple(values.tolist())
         return Envelope(**stated)

@@ -87,7 +87,9 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
         extrapolation = envelope.extrapolation(force)
         for d, axis in enumerate(sensor.axes):
             measured[d, d] += envelope.added_variance(
-                force[AXES.index(axis)], environment.temperature_c, extrapolation, G0_MPS2)
+                force[AXES.index(axis)], environment.temperature_c, extrapolation)
+        for d, std_g in enumerate(envelope.zero_g_std_g(environment.temperature_c)):
+            measured[d, d] += (G0_MPS2 * std_g) ** 2
         return measured, tangent
 
     return covariance

@@ -24,6 +24,14 @@ MARGIN_MPS2 = 2.0
 leave 1.3 m/s² to level, and nearby forces share one result."""
 
 
+def departure_k(temperature_c: Any, nodes_c: Iterable[float]) -> Any:
+    """Return (T − T_1)···(T − T_n), K^n, for temperatures T and nodes T_i, °C."""
+    product: Any = 1.0
+    for node_c in nodes_c:
+        product = product * (temperature_c - node_c)
+    return product
+
+
 @dataclass(frozen=True)
 class Envelope:
     """
@@ -33,7 +41,10 @@ class Envelope:
     as the datasheet states. By ΔT more than `MARGIN_K` outside, an axis with specific force f gets
     the variance (g·k_zero·ΔT)² + (f·k_scale·ΔT)², with the typical slopes k of zero-g and scale
     factor, one standard deviation each. A model that follows temperature has slopes of its own,
-    whose covariance grows by itself.
+    whose covariance grows by itself. What it lacks is of the next degree of the polynomial. Fitted
+    to a unit that has this term c·T^n, the model agrees with it at n temperatures T_i, and departs
+    elsewhere by p(T) = c·(T − T_1)···(T − T_n), less p at the temperature of the zero-g. The size
+    of c, one standard deviation, is what the poses leave open, and what they show of it.
 
     Pose. The extrapolation ρ of a force is the square of its distance from the middle of the
     poses' forces, divided by half of their range plus `MARGIN_MPS2`, in the component where it is
@@ -49,6 +60,10 @@ class Envelope:
     zero_g_per_k: float = 0.0
     # Typical slope of the scale factor, 1/K, by the datasheet; 0 if the model follows it
     scale_per_k: float = 0.0
+    # Temperatures T_i, °C, (n,); empty if the model does not follow temperature
+    zero_g_nodes_c: tuple[float, ...] = ()
+    zero_g_next: tuple[float, ...] = ()  # Size of c by axis, g/K^n, (m,)
+    zero_g_at_c: float = 0.0  # Temperature at which the zero-g is known, °C
     # Misfit of held-out poses beyond noise and stage error, by axis, m/s²
     misfit_mps2: float = 0.0
     # force_low_mps2, force_high_mps2: Lowest and highest specific force of the poses by component,
@@ -72,11 +87,18 @@ class Envelope:
             rho = np.maximum(rho, distance ** 2)
         return rho
 
-    def added_variance(self, axis_mps2: Any, temperature_c: Any, extrapolation: Any,
-                       gravity_mps2: float) -> Any:
-        """Return the variance, (m/s²)², that an axis gets outside; see above."""
+    def zero_g_std_g(self, temperature_c: Any) -> list[Any]:
+        """Return what the next degree over temperature may add, g, by axis; none if unknown."""
+        if self.temperature_c is None:
+            return []
+        departure = departure_k(temperature_c, self.zero_g_nodes_c) - departure_k(
+            self.zero_g_at_c, self.zero_g_nodes_c)
+        return [size * departure for size in self.zero_g_next]
+
+    def added_variance(self, axis_mps2: Any, temperature_c: Any, extrapolation: Any) -> Any:
+        """Return the variance, (m/s²)², that each axis gets outside; see above."""
         beyond_k = self.beyond_k(temperature_c)
-        return ((gravity_mps2 * self.zero_g_per_k * beyond_k) ** 2
+        return ((G0_MPS2 * self.zero_g_per_k * beyond_k) ** 2
                 + (axis_mps2 * self.scale_per_k * beyond_k) ** 2
                 + self.misfit_mps2 ** 2 * (extrapolation ** 2 - 1))
 

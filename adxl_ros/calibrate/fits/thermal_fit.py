@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
+from adxl_ros.calibrate.fits.extrapolation import next_degree, NextDegree
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
@@ -54,21 +55,29 @@ class ThermalFit:
     covariance: np.ndarray  # (p, p)
     history: str  # `thermal_lag` or `thermal_hysteresis`, where the blocks support one, else ''
     shape: float  # Its time constant, s, or its reach, K
-    residual_g: np.ndarray  # Rms residual of each axis, (m,)
+    residual_g: np.ndarray  # Residuals by axis, (k, m)
+    further: NextDegree  # What the fit lacks
     span_c: tuple[float, float]  # Lowest and highest temperature
 
+    @property
+    def rms_g(self) -> np.ndarray:
+        """Rms residual of each axis, g, (m,)."""
+        return np.asarray(self.residual_g.std(axis=0))
+
     def error_g(self, temperatures_c: np.ndarray, calibrated_c: float) -> np.ndarray:
-        """Return the standard deviation of the zero-g of the worst axis, (n,)."""
+        """Return the standard deviation of the zero-g of the worst axis, g, (n,)."""
         warmer_k = temperatures_c - NOMINAL_TEMPERATURE_C
         base_k = calibrated_c - NOMINAL_TEMPERATURE_C
         slopes = np.column_stack([warmer_k - base_k, warmer_k ** 2 - base_k ** 2])
         variances, axes = [], dict.fromkeys(name.axis for name in self.names if name.axis)
-        for axis, residual_g in zip(axes, self.residual_g):
+        for axis, residual_g in zip(axes, self.rms_g):
             places = [self.names.index(Coefficient('temperature_bias', parameter, axis))
                       for parameter in ('per_k', 'per_k2')]
             part = self.covariance[np.ix_(places, places)]
             variances.append(np.einsum('ni,ij,nj->n', slopes, part, slopes) + residual_g ** 2)
-        return np.sqrt(np.max(variances, axis=0))
+        variances_g2 = np.array(variances) + self.further.error_g(
+            temperatures_c, calibrated_c) ** 2
+        return np.asarray(np.sqrt(variances_g2.max(axis=0)))
 
 
 def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
@@ -117,11 +126,14 @@ def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
             if -search.fun > highest:
                 best, highest = (history, float(np.exp(search.x))), -search.fun
     solved = fitted(*best)
+    residual_g = np.column_stack([axis.residual_g for axis in solved])
+    curvature_k2 = np.array([value for axis in solved for name, value in zip(
+        axis.names, axis.values) if name.parameter == 'per_k2'])
     return ThermalFit(
         tuple(name for axis in solved for name in axis.names),
         np.concatenate([axis.values for axis in solved]),
         scipy.linalg.block_diag(*(axis.covariance for axis in solved)), *best,
-        np.array([axis.residual_g for axis in solved]),
+        residual_g, next_degree(temperature_c, residual_g, curvature_k2),
         (float(temperature_c.min()), float(temperature_c.max())))
 
 
@@ -141,12 +153,12 @@ def _history_output(blocks: Poses, effect: str, shape: float) -> np.ndarray:
 
 
 class _Axis(NamedTuple):
-    """Coefficients of one axis with their covariance, and the rms residual."""
+    """Coefficients of one axis with their covariance, and the residuals."""
 
     names: list[Coefficient]
     values: np.ndarray
     covariance: np.ndarray
-    residual_g: float
+    residual_g: np.ndarray  # (k,)
     log_likelihood: float
 
 
@@ -193,7 +205,7 @@ def _fit_axis(axis: str, temperature_c: np.ndarray, output_g: np.ndarray, orient
     precision = white.T @ white / variance_g2 + np.diag([
         (PRIOR_WIDTH * parameter_of(name).scale) ** -2.0 for name in names])
     likelihood = -0.5 * len(output_g) * np.log(variance_g2) + 0.5 * np.log(1 - correlation ** 2)
-    return _Axis(names, values[:len(names)], np.linalg.inv(precision), float(np.std(residual_g)),
+    return _Axis(names, values[:len(names)], np.linalg.inv(precision), residual_g,
                  float(likelihood))
 
 
