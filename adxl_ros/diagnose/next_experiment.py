@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -211,7 +210,7 @@ def predict(name: str, motion: Motion, begin_s: float, sensor: Sensor, effects: 
 
     begin_s: time of its motion at which it begins, s.
     """
-    at_rate = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
+    at_rate = sensor.computed_at(min(sensor.rate_hz, _RATE_HZ))
     columns = simulate(at_rate, motion, 0, begin_s)
     recording = Recording(name, columns.pop('time_s'), columns)
     comparison = beside.at_search_rate(beside.compare(recording, at_rate))

@@ -68,7 +68,9 @@ class Axis:
     zero_g_mps2: float  # Output at 0 g by the nominal conversion, m/s²
     noise_std_mps2: float  # Noise of one sample before the ADC, m/s²
     sample_variance: float  # Variance of one sample with the rounding of the ADC, (m/s²)²
-    noise_density: float  # Density of the white noise over positive frequencies, m/s²/√Hz
+    # Density of the samples at low, positive frequencies with the rounding of the ADC, m/s²/√Hz. It
+    # is that at the rate of the file: noise above half of it aliases.
+    noise_density: float
     walk_density: float  # Density of the random walk of the zero-g, m/s²/√s; 0 without `bias_walk`
     # Inverse correlation time of a walk that has bounds, 1/s; 0 without them
     walk_return_per_s: float
@@ -80,11 +82,9 @@ def axes(sensor: Sensor) -> list[Axis]:
     mps2_per_v = G0_MPS2 / sensor.nominal_scale_v_per_g
     at_zero_v = np.array([signal_chain.analog_response(sensor)([0.0, 0.0, 0.0])])
     zero_g = to_nominal_mps2(at_zero_v, sensor)[0]
-    lost = sensor.values.get('quantisation', {})
-    lost_bits = np.asarray(lost.get('lost_bits', 0.0)) + lost.get('axis_lost_bits', 0.0)
-    step = sensor.lsb_v * 2.0 ** lost_bits * mps2_per_v
+    step = noise.electronics(sensor).lsb_v * mps2_per_v
     std = noise.analog_std_v(sensor) * mps2_per_v
-    density = (noise.electronics(sensor).noise_ratio * sensor.noise_density_g_per_rthz * G0_MPS2)
+    density = np.sqrt(noise.density_v2_per_hz(sensor, np.zeros(1)))[0] * mps2_per_v
     walk, returns = (np.broadcast_to(sensor.values.get('bias_walk', {}).get(name, 0.0),
                                      len(sensor.axes))
                      for name in ('density_g_per_rts', 'return_per_s'))
@@ -143,7 +143,8 @@ def _head(export: Export, software: str, prefix: str = '# ') -> str:
     stated = sensor.datasheet_name or 'the parameter file'
     origin = f'measured in {noise_from}' if noise_from else \
         f'the figure of {stated}; nobody measured it'
-    lines += ['', *wrap(f'White noise: {origin}.', _COLUMNS), '',
+    lines += ['', *wrap(f'White noise: {origin}. All figures hold at {sensor.rate_hz:.5g} Hz.',
+                        _COLUMNS), '',
               'Sizes: change of the output in the manoeuvre rich (7 minutes of turns,',
               'shaking, warming and a step of the supply), by simulation.',
               'All that is not held, but for noise and steps: '
@@ -202,11 +203,10 @@ def kalibr_settings(white: float, walk: float, rate_hz: float) -> list[tuple[str
 
 def _white_density(export: Export, software: str) -> float:
     """Return the density of the white noise of the noisiest axis over both signs."""
-    white = max(by_axis(export.sensor, 'noise_density')) / ONE_SIDED
-    if not white:
+    if not export.sensor.noise_density_g_per_rthz.any():
         raise UserError(f'{export.source}: sensor.noise_density_g_per_rthz is 0, and {software} '
                         'needs noise; measure it: ros2 run adxl_ros noise RECORDING -o FILE.yaml')
-    return white
+    return max(by_axis(export.sensor, 'noise_density')) / ONE_SIDED
 
 
 def _largest_mps2(sensor: Sensor) -> float:
@@ -272,9 +272,9 @@ FORMATS = {
         'lever_arm': 'position_m', **_at('axes.step_mps2', *_ROUNDING),
         **_at('filter_s', FILTER, 'bandwidth')}),
     'kalibr': Format('the part of the accelerometer in imu.yaml of Kalibr', {
-        **_at('accelerometer_noise_density', *_NOISE), 'bias_walk': 'accelerometer_random_walk'}),
+        **_at('accelerometer_noise_density', *_SAMPLE), 'bias_walk': 'accelerometer_random_walk'}),
     'okvis2': Format('the part of the accelerometer in the configuration of OKVIS2', {
-        **_at('sigma_a_c', *_NOISE), 'bias': 'a0', 'bias_walk': 'sigma_aw_c',
+        **_at('sigma_a_c', *_SAMPLE), 'bias': 'a0', 'bias_walk': 'sigma_aw_c',
         'saturation': 'a_max'}),
     'point_lio': Format('the part of the accelerometer in the configuration of Point-LIO', {
         **_at('imu_meas_acc_cov', *_SAMPLE), 'bias_walk': 'b_acc_cov', 'saturation': 'satu_acc'}),

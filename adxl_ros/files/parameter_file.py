@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, Field, fields
+from dataclasses import dataclass, Field, fields, MISSING
 import os
 from pathlib import Path
 from typing import Any
@@ -137,8 +137,9 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
     """Return the parameters of a sensor's file by dotted key, plain Python values, in order."""
     flat: dict[str, Any] = {'format': FORMAT, 'units': UNITS, 'model': sensor.model}
     for key, field in SENSOR_FIELDS.items():
-        if field.name not in sensor.unstated:
-            value = getattr(sensor, field.name)
+        value = getattr(sensor, field.name)
+        is_default = field.default is not MISSING and value == field.default
+        if field.name not in sensor.unstated and not is_default:
             flat[key] = value.tolist() if isinstance(value, np.ndarray) else value
     flat |= {f'{_LINK}{name}': value for name, value in sensor.link.items()}
     flat |= {f'{_MOUNTING}{name}': value for name, value in sensor.mounting.items()}
@@ -270,7 +271,7 @@ class _FlatReader:
                 unstated.append(field.name)
                 is_array = field.type == 'np.ndarray'
                 values[field.name] = np.full(len(axes), value) if is_array else value
-            else:
+            elif key in self.flat or field.default is MISSING:
                 values[field.name] = self._field(field, axes)
         self._require(values['z_sign'], 'sensor.z_sign', '0, but must be 1 (upright) or -1')
         effects = self._names('effects')

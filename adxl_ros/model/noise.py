@@ -7,53 +7,63 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Need, NOMINAL_ENVIRONMENT, Place, Signals
+from adxl_ros.model.effects.base import Environment, NOMINAL_ENVIRONMENT, Place
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.signal_chain import Chain
 import numpy as np
 
 ONE_SIDED = float(np.sqrt(2))
 """Noise density of a datasheet, over positive frequencies alone, divided by the same over both
 signs: N of IEEE Std 952 and `accelerometer_noise_density` of Kalibr, whose sample has the variance
 N²·rate (ethz-asl/kalibr, wiki/IMU-Noise-Model)."""
+_NO_RC_S = 1e-9  # Smallest time constant, s. Chosen: no accelerometer has a filter of 160 MHz
 _HARMONICS = 50  # Harmonics of rounding that are summed. Chosen: the others hold 1 %
 
 
 class Electronics(NamedTuple):
-    """RC filter and white noise of a unit."""
+    """RC filter, white noise and steps of a unit at its sample rate, by axis, (m,)."""
 
-    rc_s: np.ndarray  # Time constant of the RC filter by axis, s, (m,)
-    noise_ratio: np.ndarray  # Noise density divided by the nominal one, by axis, (m,)
+    rc_s: np.ndarray  # Time constant of the RC filter, s
+    noise_ratio: np.ndarray  # Noise density divided by the nominal one
+    lsb_v: np.ndarray  # Step of the ADC, V; 0 where it does not quantise
 
 
 def electronics(sensor: Sensor) -> Electronics:
-    """Return filter and white noise of a unit by its effects."""
-    count = len(sensor.axes)
-    signals = Signals(NOMINAL_ENVIRONMENT, rc_s=[sensor.rc_s] * count, noise_ratio=[1.0] * count,
-                      zero_g_v=sensor.nominal_zero_g_v.tolist(), output=[0.0] * count,
-                      scale_v_per_g=sensor.nominal_scale_v_per_g.tolist())
-    for effect in map(effect_named, sensor.effects):
-        # They change nothing else, so that the rest of the chain need not run.
-        if effect.needs in ((Need.FILTER,), (Need.NOISE,)) and effect.place is Place.ELECTRONICS:
-            effect.apply(signals, sensor.parameters(effect.name))
-    return Electronics(np.array(signals.rc_s), np.array(signals.noise_ratio))
+    """Return filter, white noise and steps of a unit by all its effects, of any package."""
+    names = [name for name in sensor.effects if effect_named(name).place is Place.ELECTRONICS]
+    chain, count = Chain(sensor, names), len(sensor.axes)
+    # Arrays of one sample: effects with a memory take no floats.
+    around = Environment(*(np.full(1, value) for value in NOMINAL_ENVIRONMENT))
+    signals = chain.signals(around, time_s=around.time_s, dt_s=1 / sensor.rate_hz,
+                            force=[np.zeros(1)] * 3, sensed=[np.zeros(1)] * 3,
+                            output=[np.zeros(1)] * 3)
+    with np.errstate(all='ignore'):
+        chain(Place.ELECTRONICS, signals)
+    return Electronics(*(np.array([float(np.ravel(value)[0]) for value in values]) for values in (
+        signals.rc_s[:count], signals.noise_ratio[:count],
+        signals.lsb_v * np.array(signals.lsb_ratio))))
+
+
+def filtered_bandwidth_hz(rc_s: np.ndarray, rate_hz: float) -> np.ndarray:
+    """
+    Return the noise bandwidth of white noise behind an RC filter, Hz, (m,).
+
+    A first-order filter of time constant RC has the noise bandwidth 1/(4·RC) = f_c·π/2, however
+    slow the ADC is: what is above half of its rate aliases. Without a filter it is half the rate.
+    """
+    return np.where(rc_s > 0, 0.25 / np.where(rc_s > 0, rc_s, 1.0), rate_hz / 2)
 
 
 def analog_std_v(sensor: Sensor) -> np.ndarray:
-    """
-    Return the standard deviation of the analog noise by axis, V, (m,).
-
-    The noise is white before the RC filter. A first-order filter of time constant RC has the
-    noise bandwidth 1/(4·RC) = f_c·π/2. Without a filter it is half the sample rate.
-    """
-    rc_s, noise_ratio = electronics(sensor)
-    bandwidth_hz = np.where(rc_s > 0, 0.25 / np.where(rc_s > 0, rc_s, 1.0), sensor.rate_hz / 2)
-    density = noise_ratio * sensor.noise_density_g_per_rthz * sensor.nominal_scale_v_per_g
-    return density * np.sqrt(bandwidth_hz)
+    """Return the standard deviation of the noise behind the filter by axis, V, (m,)."""
+    unit = electronics(sensor)
+    density = unit.noise_ratio * sensor.noise_density_g_per_rthz * sensor.nominal_scale_v_per_g
+    return density * np.sqrt(filtered_bandwidth_hz(unit.rc_s, sensor.rate_hz))
 
 
 def sample_std_v(sensor: Sensor) -> np.ndarray:
     """Return the standard deviation of one sample by axis, V, (m,): analog noise and LSB²/12."""
-    return np.hypot(analog_std_v(sensor), sensor.lsb_v / np.sqrt(12))
+    return np.hypot(analog_std_v(sensor), electronics(sensor).lsb_v / np.sqrt(12))
 
 
 def held_rounding(sensor: Sensor) -> np.ndarray:
@@ -68,9 +78,28 @@ def held_rounding(sensor: Sensor) -> np.ndarray:
     if not sensor.lsb_v:
         return np.zeros(len(sensor.axes))
     harmonics = np.arange(1, _HARMONICS + 1)[:, None]
-    sigma_steps = analog_std_v(sensor) / sensor.lsb_v
+    sigma_steps = analog_std_v(sensor) / electronics(sensor).lsb_v
     return np.sum(6 / (np.pi * harmonics) ** 2
                   * np.exp(-(2 * np.pi * harmonics * sigma_steps) ** 2), axis=0)
+
+
+def density_for_variance(variance: np.ndarray, rc_s: np.ndarray, rate_hz: float) -> np.ndarray:
+    """Return the squared density before the filter, of samples' analog variance, by axis, (m,)."""
+    return variance / filtered_bandwidth_hz(rc_s, rate_hz)
+
+
+def white_share(rc_s: np.ndarray, rate_hz: float) -> np.ndarray:
+    """
+    Return the variance of samples behind a filter by that of white ones of the same low end, (m,).
+
+    It is (1 − a)/(1 + a) = tanh(1/(2·RC·rate)) of the AR(1) sequence, and 1 without a filter.
+    """
+    return np.tanh(0.5 / (rate_hz * np.maximum(rc_s, _NO_RC_S)))
+
+
+def rc_of_white_share(share: float, rate_hz: float) -> float:
+    """Return the time constant, s, whose filter leaves a share of the variance; 0 for 1."""
+    return 0.5 / (rate_hz * float(np.arctanh(share))) if share < 1 else 0.0
 
 
 def density_v2_per_hz(sensor: Sensor, frequency_hz: np.ndarray) -> np.ndarray:
@@ -80,11 +109,11 @@ def density_v2_per_hz(sensor: Sensor, frequency_hz: np.ndarray) -> np.ndarray:
     The noise is the sum of an AR(1) sequence (Percival and Walden 1993, section 9.2) and of the
     ADC's quantisation, which is white.
     """
-    rc_s = electronics(sensor).rc_s
+    rc_s, _, lsb_v = electronics(sensor)
     decay = np.where(rc_s > 0, np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1.0))), 0.0)
     turn = np.exp(-2j * np.pi * frequency_hz / sensor.rate_hz)[:, None]
     shape = (1 - decay ** 2) / np.abs(1 - decay * turn) ** 2
-    return 2 / sensor.rate_hz * (analog_std_v(sensor) ** 2 * shape + sensor.lsb_v ** 2 / 12)
+    return 2 / sensor.rate_hz * (analog_std_v(sensor) ** 2 * shape + lsb_v ** 2 / 12)
 
 
 def effective_samples(count: int | np.ndarray, dt_s: float, rc_s: float) -> np.ndarray:

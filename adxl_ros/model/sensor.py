@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, MISSING, replace
 from typing import Any
 
 from adxl_ros.errors import UserError
@@ -122,14 +122,16 @@ class Envelope:
 
 def _nominal(key: str, doc: str, unit: str = '', lower: float | None = None,
              upper: float | None = None, choices: tuple[str, ...] = (),
-             placeholder: float | None = None) -> Any:
+             placeholder: float | None = None, default: Any = MISSING) -> Any:
     """
     Declare a nominal value: its key in the parameter file, meaning, unit and bounds.
 
-    A file may leave a value with a `placeholder` out; the value is then in `Sensor.unstated`.
+    A file may leave a value with a `placeholder` out; the value is then in `Sensor.unstated`. One
+    with a `default` has that value where a file leaves it out.
     """
-    return field(metadata={'key': key, 'doc': doc, 'unit': unit, 'lower': lower,
-                           'upper': upper, 'choices': choices, 'placeholder': placeholder})
+    return field(default=default, metadata={
+        'key': key, 'doc': doc, 'unit': unit, 'lower': lower, 'upper': upper, 'choices': choices,
+        'placeholder': placeholder})
 
 
 @dataclass(frozen=True)
@@ -173,6 +175,10 @@ class Sensor:
         'stage.resolution_rad', "step of the stage's encoder, or of the scale read by hand",
         'rad', 0.0, 1.0)
     model: str = _nominal('model', 'what was fitted', choices=MODELS)
+    filter_rate_hz: float = _nominal(
+        'sensor.filter_rate_hz', 'sample rate at which the filter is the stated one, because it '
+        'is digital and its bandwidth is a fixed share of the rate; 0 is an analog filter', 'Hz',
+        0.0, 100000.0, default=0.0)
     effects: tuple[str, ...] = ()  # Names of the effects
     # Values by effect and parameter, (m,) or (), each in the unit of its parameter
     values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
@@ -214,8 +220,14 @@ class Sensor:
 
     @property
     def rc_s(self) -> float:
-        """Time constant of the output filter, s."""
-        return self.rc_resistance_ohm * self.rc_capacitance_f
+        """
+        Time constant of the output filter at the sample rate, s.
+
+        An analog filter is the same at each rate, so that its noise aliases where the ADC is slow.
+        A digital one decimates: its bandwidth is a fixed share of the rate.
+        """
+        stated_s = self.rc_resistance_ohm * self.rc_capacitance_f
+        return stated_s * self.filter_rate_hz / self.rate_hz if self.filter_rate_hz else stated_s
 
     @property
     def lsb_v(self) -> float:
@@ -234,6 +246,11 @@ class Sensor:
         if self.adc_bits:
             beyond |= (volts <= 0) | (volts >= self.adc_vref_v - self.lsb_v)
         return beyond
+
+    def computed_at(self, rate_hz: float) -> Sensor:
+        """Return the sensor for a computation at another rate, Hz; its filter stays as it is."""
+        return replace(self, rate_hz=rate_hz,
+                       filter_rate_hz=self.filter_rate_hz * rate_hz / self.rate_hz)
 
     def without_covariance(self) -> Sensor:
         """Return the sensor with coefficients that count as exact."""
@@ -320,6 +337,16 @@ def with_neutral(sensor: Sensor, effects: Iterable[str]) -> Sensor:
     added = [name for name in dict.fromkeys(effects) if name not in sensor.effects]
     values = {name: neutral(effect_named(name), sensor.axes) for name in added}
     return replace(sensor, effects=(*sensor.effects, *added), values={**sensor.values, **values})
+
+
+def without_effect(sensor: Sensor, effect: str) -> Sensor:
+    """Return the sensor without an effect and its covariance; it may not have it."""
+    kept = [i for i, name in enumerate(sensor.covariance_names) if name.effect != effect]
+    return replace(
+        sensor, effects=tuple(name for name in sensor.effects if name != effect),
+        values={name: value for name, value in sensor.values.items() if name != effect},
+        covariance=sensor.covariance[np.ix_(kept, kept)],
+        covariance_names=tuple(sensor.covariance_names[i] for i in kept))
 
 
 def get(sensor: Sensor, names: Sequence[Coefficient]) -> np.ndarray:

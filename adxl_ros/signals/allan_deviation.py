@@ -14,6 +14,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import gap_s
+from adxl_ros.signals.recorded_sensor import BeyondRange
 from adxl_ros.signals.rest_detection import RecordedRests, Rest
 import numpy as np
 
@@ -120,11 +121,21 @@ class StillStretch:
     resolution: np.ndarray  # Smallest change of a sample by axis, m/s², (m,)
     recorded_s: float  # Time of the whole recording, s
     motion_s: list[tuple[float, float]]  # Times at which it moves or has long gaps, s, (j, 2)
+    beyond_range: str  # Readings of the whole recording beyond the stated range, for people, or ''
 
     @property
     def span_s(self) -> float:
         """Time of the rest, s."""
         return self.count / self.rate_hz
+
+    @property
+    def window_octaves(self) -> int:
+        """Number of octaves of the Allan deviation that `sample_std` is of."""
+        return min(_window_octaves(self.rate_hz), len(self.allan.tau_s))
+
+
+def _window_octaves(rate_hz: float) -> int:
+    return max(int(np.ceil(np.log2(_WINDOW_S * rate_hz))), 1)
 
 
 def shortest_rest_s(rate_hz: float) -> float:
@@ -138,8 +149,10 @@ def longest_rest(read: Callable[[], Iterable[Recording]], unit: Sensor, first: R
     if len(first) < 2:
         raise UserError(f'{first.path}: {len(first)} samples; record longer')
     survey, first_s = RecordedRests(unit, first), float(first.time_s[0])
+    beyond = BeyondRange()
     for block in read():
         survey.feed(block)
+        beyond.add(block.volts(unit), unit)
         last_s = float(block.time_s[-1])
     survey.take()
     rests = [rest for rest, _ in survey.detected]
@@ -158,7 +171,7 @@ def longest_rest(read: Callable[[], Iterable[Recording]], unit: Sensor, first: R
         samples = _Samples(first, file)
         for block in read():
             samples.feed(block, unit, rest)
-        return samples.stretch(last_s - first_s, motion_s)
+        return samples.stretch(last_s - first_s, motion_s, beyond.describe(unit))
 
 
 class _Samples:
@@ -169,7 +182,7 @@ class _Samples:
         self._phase = Phase(columns, file)
         self._resolution = np.full(columns, np.inf)
         self._start_s = self._stop_s = 0.0  # Stamps of the first and the newest sample
-        self._gaps_s = 0.0  # Time of the gaps
+        self._gaps, self._gaps_s = 0, 0.0  # Number and time of the gaps
 
     def feed(self, block: Recording, unit: Sensor, rest: Rest) -> None:
         """Add the samples of a block that are part of the rest."""
@@ -183,14 +196,17 @@ class _Samples:
         if not self._phase.count:
             self._start_s = self._stop_s = float(time_s[0])
         steps_s = np.diff(time_s, prepend=self._stop_s)
-        self._gaps_s += float(steps_s[steps_s > gap_s(self._first.rate_hz)].sum())
+        gaps_s = steps_s[steps_s > gap_s(self._first.rate_hz)]
+        self._gaps += len(gaps_s)
+        self._gaps_s += float(gaps_s.sum())
         self._stop_s = float(time_s[-1])
         changes = np.abs(np.diff(rows, axis=0))
         self._resolution = np.minimum(self._resolution, np.where(
             changes > 0, changes, np.inf).min(axis=0, initial=np.inf))
         self._phase.feed(rows)
 
-    def stretch(self, recorded_s: float, motion_s: list[tuple[float, float]]) -> StillStretch:
+    def stretch(self, recorded_s: float, motion_s: list[tuple[float, float]], beyond_range: str
+                ) -> StillStretch:
         """Return the samples as a rest; refuse an axis that never changes."""
         for name, resolution in zip(self._first.sensor_columns, self._resolution):
             if not np.isfinite(resolution):
@@ -198,12 +214,13 @@ class _Samples:
                                 f'{self._start_s:.4g} s to {self._stop_s:.4g} s; the axis is '
                                 'stuck, or not connected')
         count = self._phase.count
-        rate_hz = (count - 1) / (self._stop_s - self._start_s - self._gaps_s)
+        steps_s = self._stop_s - self._start_s - self._gaps_s
+        rate_hz = (count - 1 - self._gaps) / steps_s
         allan, (size, means) = self._phase.allan_deviation(rate_hz), self._phase.cells()
         # The variance within 2^k samples is that of the octaves of Haar's wavelets in it.
-        octaves = max(int(np.ceil(np.log2(_WINDOW_S * rate_hz))), 1)
+        octaves = _window_octaves(rate_hz)
         variance = (allan.deviation[:octaves] ** 2).sum(axis=0) / 2 / (1 - 0.5 ** octaves)
         return StillStretch(
             self._start_s, self._stop_s, rate_hz, count, allan,
             size / rate_hz, means, np.sqrt(variance), self._resolution, recorded_s,
-            motion_s)
+            motion_s, beyond_range)

@@ -21,8 +21,14 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.exports import kalibr_settings
 from adxl_ros.files.recording_columns import Recording, unit_of
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.noise import ONE_SIDED
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.noise import (
+    density_for_variance,
+    electronics,
+    ONE_SIDED,
+    rc_of_white_share,
+    white_share,
+)
+from adxl_ros.model.sensor import Sensor, without_effect
 from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
 from adxl_ros.signals.recorded_sensor import load_sensor, RESISTANCE_OHM
 import numpy as np
@@ -35,12 +41,20 @@ _ROUNDS = 60  # Largest number of rounds of a fit. Chosen: usual are ten
 _HALVINGS = 20  # Largest number of halvings of a step that does not raise the likelihood
 _CONVERGED = 1e-9  # Change of twice the log likelihood at which a fit ends
 _SMALLEST = 1e-4  # Square, by a dominant one, from which a limit is searched. Chosen: never seen
-_OCTAVE_PROBABILITY = 1e-3  # Chance from which a filter or line shows. Chosen: 1 % of logs
+_LINE_PROBABILITY = 1e-3  # Chance from which a line shows. Chosen: 1 % of logs
+_OCTAVE_PROBABILITY = 0.05
+"""Chance from which a filter shows in an octave. Chosen: an octave less costs little, but one that
+is kept because the others are low by chance makes N too small."""
 _BOUND_PROBABILITY = 1e-2  # Chance from which a walk has bounds. Chosen: 1 of 100 healthy logs
 _BOUND_STEP = 2 ** 0.5  # Ratio of tried correlation times. Chosen: the likelihood changes little
 _SHORTEST_BOUND = 10.0  # Shortest T, by the highest frequency. Chosen: below, it is a filter
-_MARGIN_OCTAVES = 2  # Octaves left out below a filter. Chosen: its power falls by 16
+_SHORTEST_BOUND_S = 1.0  # Shortest T, s: filters have 0.3 s at most (ADXL203 Rev. E, table 4)
+_MARGIN_OCTAVES = 1  # Octaves left out below a filter or line. Chosen: a line leaks less far
+_FILTER_LOSSES = (0.0, *(4.0 ** n for n in range(-2, 2)))
+"""Power that tried filters take at the end of the fit, by what they leave. Chosen: less than the
+first does not show in a thousand coefficients, more than the last ends the fit earlier."""
 _FEWEST = 32  # Fewest coefficients of a fit. Chosen: white noise is then known within 20 %
+_MOST = 0.5  # Share of white noise from which a slope is not that of a filter: most of the power
 _SEEN = 2.0  # Standard deviations of a square that is seen. Chosen: as 90 % intervals exclude 0
 
 FLOOR = float(np.sqrt(2 * np.log(2) / np.pi))  # Allan deviation of B / B (IEEE Std 952, C.15)
@@ -139,6 +153,12 @@ class _Groups:
         return replace(self, shapes=self.shapes * np.column_stack(
             [np.ones((len(cycle), 2)), 1 / (1 + cycle ** -2.0)]))
 
+    def filtered(self, strength: float, step_rad: float) -> _Groups:
+        """Return the groups behind an AR(1) filter, which divides by 1 + strength·sin²."""
+        angle_rad = step_rad * (self.first + (self.count - 1) / 2)
+        gain = 1 / (1 + strength * np.sin(angle_rad) ** 2)
+        return replace(self, shapes=self.shapes * gain[:, None])
+
 
 def coefficients(means: np.ndarray) -> np.ndarray:
     """Return the cosine coefficients 1 to n − 1 of means, (n,); coefficient k is at k/(2·T)."""
@@ -172,14 +192,20 @@ def coefficient_variances(count: int, step_s: float) -> np.ndarray:
     return np.column_stack([np.full(count - 1, 1 / step_s), flicker, walk])
 
 
-def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = None) -> NoiseFit:
-    """Fit the terms to means of neighbouring cells, (n,), by their `coefficient_variances`."""
+def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = None,
+              rounding: float = 0.0) -> NoiseFit:
+    """
+    Fit the terms to means of neighbouring cells, (n,), by their `coefficient_variances`.
+
+    rounding: the part of N, u/√Hz, that is known to come from behind the filter.
+    """
     if variances is None:
         variances = coefficient_variances(len(means), step_s)
     groups = _grouped(np.square(coefficients(means)), variances)
     span_s = len(means) * step_s
-    highest = _highest(groups, len(means), span_s)
-    models, bound_s = _walks(groups.below(highest), span_s, highest)
+    highest = _highest(groups, len(means), span_s, rounding)
+    walks, bound_s = _walks(groups.below(highest), span_s, highest)
+    models = _filters(walks, np.pi * highest / (2 * len(means)), np.pi / (2 * len(means)))
     theta, likelihood = _best(models)
     white, instability, walk = (_interval(models, theta, likelihood, term) for term in range(3))
     return NoiseFit(white, instability, walk, bound_s, highest, highest / (2 * span_s))
@@ -187,7 +213,8 @@ def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = N
 
 def _walks(groups: _Groups, span_s: float, highest: int) -> tuple[list[_Groups], float]:
     """Return the groups with each bound of the walk that is likely, and the likeliest bound, s."""
-    count = int(np.log(highest / _SHORTEST_BOUND) / np.log(_BOUND_STEP))
+    shortest = min(highest / _SHORTEST_BOUND, span_s / _SHORTEST_BOUND_S)
+    count = int(np.log(shortest) / np.log(_BOUND_STEP))
     times_s = span_s * _BOUND_STEP ** np.arange(-count, 5.0)
     models = [groups.bounded(time_s, span_s) for time_s in times_s]
     likelihoods = np.array([_fit(model)[1] for model in models])
@@ -196,6 +223,14 @@ def _walks(groups: _Groups, span_s: float, highest: int) -> tuple[list[_Groups],
         return [groups], np.inf
     likely = 2 * (best - likelihoods) < _DROP
     return [models[i] for i in np.flatnonzero(likely)], float(times_s[likelihoods.argmax()])
+
+
+def _filters(models: list[_Groups], end_rad: float, step_rad: float) -> list[_Groups]:
+    """Return the models behind each filter that is likely; angles are half a turn a sample."""
+    filtered = [model.filtered(loss / np.sin(end_rad) ** 2, step_rad)
+                for loss in _FILTER_LOSSES for model in models]
+    likelihoods = np.array([_fit(model)[1] for model in filtered])
+    return [filtered[i] for i in np.flatnonzero(2 * (likelihoods.max() - likelihoods) < _DROP)]
 
 
 def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0
@@ -278,8 +313,13 @@ def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term:
     return Estimate(*(float(np.sqrt(square)) for square in (best, low, high)))
 
 
-def _highest(groups: _Groups, count: int, span_s: float) -> int:
-    """Return at which coefficient the fit stops: where a filter or a line shows."""
+def _highest(groups: _Groups, count: int, span_s: float, rounding: float) -> int:
+    """
+    Return at which coefficient the fit stops: where a filter or a line shows.
+
+    Behind a filter, white noise has the spectrum of a walk with bounds, and no fit tells the two
+    apart. The fit therefore ends in an octave in which white noise prevails.
+    """
     stop = count
     while stop > 2 * _FEWEST:
         lower = groups.below(max(stop // 2, _FEWEST))
@@ -287,11 +327,22 @@ def _highest(groups: _Groups, count: int, span_s: float) -> int:
         used, lower = (part.bounded(bound_s, span_s) for part in (groups.below(stop), lower))
         theta = _fit(lower)[0]
         chances = scipy.stats.chi2.sf(used.count * used.power / (used.shapes @ theta), used.count)
-        if (_is_expected(used.where(used.first >= stop // 2), lower, theta)
-                and chances.min() * len(chances) > _OCTAVE_PROBABILITY):
+        octave = used.where(used.first >= stop // 2)
+        is_without_line = chances.min() * len(chances) > _LINE_PROBABILITY
+        if (_white_share(octave, theta, rounding) > _MOST and is_without_line
+                and _is_expected(octave, lower, theta)):
             break
         stop //= 2
     return max(stop >> _MARGIN_OCTAVES, min(count, _FEWEST))
+
+
+def _white_share(groups: _Groups, theta: np.ndarray, rounding: float) -> float:
+    """Return the share of white noise, without the rounding, in the power of a fit, 0 to 1."""
+    if not len(groups.count):
+        return 0.0
+    white = max(float(theta[0]) - rounding ** 2, 0.0)
+    share = groups.shapes[:, 0] * white / (groups.shapes @ theta)
+    return float(np.average(share, weights=groups.count))
 
 
 def _is_expected(octave: _Groups, lower: _Groups, theta: np.ndarray) -> bool:
@@ -307,11 +358,21 @@ def _is_expected(octave: _Groups, lower: _Groups, theta: np.ndarray) -> bool:
     return bool(scipy.stats.chi2.sf(excess ** 2 / variance, 1) > _OCTAVE_PROBABILITY)
 
 
-_UNFILTERED = 0.8  # Share of white variance without a filter. Chosen: one at rate/3
+_CERTAIN_STDS = 2.576  # Standard deviations that refute a filter: 1 of 100 healthy logs is beyond
+_FORM_TOLERANCE = 0.2  # Logarithm within which noise has the form of an RC filter. Chosen: 20 %
 _DITHERED_STEPS = 0.6
 """Noise from which rounding adds step²/12, steps. Chosen: exact within 0.4 % by the first harmonic
 of the rounding error (Widrow and Kollár 2008, section 4.4)."""
 _DENSITY = 'noise_density_g_per_rthz'  # Field of a sensor that holds its white noise
+
+
+class FilterEvidence(NamedTuple):
+    """What the noise of an axis shows of its filter."""
+
+    # Logarithm of the variance of a sample by that of white noise with the same N
+    log_share: float
+    std: float  # Standard deviation of this logarithm
+    change: float  # Half of the mean square of neighbouring differences, by the variance
 
 
 @dataclass(frozen=True)
@@ -323,6 +384,10 @@ class AxisNoise:
     sample_std: float  # Standard deviation of a sample, m/s²
     resolution: float  # Smallest change of a sample, m/s²
     rounding: float  # N of the rounding to this resolution, m/s²/√Hz, which `fit` does not contain
+    # Variance of a sample without rounding, bias instability and random walk, (m/s²)²
+    white_variance: float
+    # Half of the mean square of the differences of neighbouring samples without rounding, (m/s²)²
+    change_variance: float
 
     @property
     def estimates(self) -> tuple[Estimate, Estimate, Estimate]:
@@ -333,6 +398,20 @@ class AxisNoise:
     def is_coarse(self) -> bool:
         """Whether rounding hides the noise."""
         return _is_coarse(self.sample_std, self.resolution)
+
+    def filter_evidence(self, rest: StillStretch) -> FilterEvidence | None:
+        """Return what the noise shows of a filter; None where slow noise or rounding hides it."""
+        white = self.fit.white
+        is_clear = self.white_variance > _MOST * (self.sample_std ** 2)
+        if not white.is_seen or not is_clear:
+            return None
+        share = self.white_variance / (white.value ** 2 * rest.rate_hz)
+        repeat = np.clip(1 - self.change_variance / self.white_variance, 0.0, 1.0)
+        independent = rest.count * (1 - repeat ** 2) / (1 + repeat ** 2)
+        # 90 % of a normal distribution are within 1.645 standard deviations.
+        white_std = 2 * np.log(white.high / white.low) / (2 * np.sqrt(_DROP))
+        return FilterEvidence(np.log(share), float(np.hypot(white_std, np.sqrt(2 / independent))),
+                              self.change_variance / self.white_variance)
 
     @property
     def sample_white(self) -> float:
@@ -364,11 +443,18 @@ def recording_noise(read: Callable[[], Iterable[Recording]], params: str | None,
     variances = coefficient_variances(len(rest.means), rest.step_s)
     noises = []
     for i, axis in enumerate(unit.axes):
-        fit = fit_noise(rest.means[:, i], rest.step_s, variances)
         std, resolution = float(rest.sample_std[i]), float(rest.resolution[i])
         rounding = resolution / float(np.sqrt(12 * rest.rate_hz))
-        noises.append(AxisNoise(axis, without_rounding(fit, std, resolution, rounding), std,
-                                resolution, rounding))
+        fit = fit_noise(rest.means[:, i], rest.step_s, variances, rounding)
+        rounding_variance = rounding ** 2 * rest.rate_hz
+        tau_s = rest.allan.tau_s[:rest.window_octaves]
+        slow_lines = [line for line, term in zip(fit.lines(tau_s)[1:], (fit.instability, fit.walk))
+                      if term.is_seen]
+        slow = float(np.sum(np.square(slow_lines)) / 2 / (1 - 0.5 ** len(tau_s)))
+        noises.append(AxisNoise(
+            axis, without_rounding(fit, std, resolution, rounding), std, resolution, rounding,
+            max(std ** 2 - slow - rounding_variance, 0.0),
+            max(float(rest.allan.deviation[0, i]) ** 2 - rounding_variance, 0.0)))
         show((i + 1) / len(unit.axes))
     return RecordingNoise(first.path, sensor, unit, rest, noises)
 
@@ -394,31 +480,28 @@ def _is_coarse(std: float, resolution: float) -> bool:
     return std ** 2 < resolution ** 2 * (_DITHERED_STEPS ** 2 + 1 / 12)
 
 
-def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
+def with_noise(sensor: Sensor, noises: list[AxisNoise], rest: StillStretch) -> Sensor:
     """
-    Give a sensor the measured noise.
+    Give a sensor the measured noise, so that its simulation repeats it at the recorded rate.
 
-    White noise is its density. Bias instability is the effect `flicker`, whose density over
-    positive frequencies is B²/(π·f), and random walk is `bias_walk`. A term that is not seen on
-    an axis keeps the value of `sensor` up to its upper limit. White noise that neither shows stays
-    unstated, so that nobody takes it for 0. It has the rounding where `sensor` has no ADC.
+    Bias instability is the effect `flicker`, whose density over positive frequencies is B²/(π·f),
+    and random walk is `bias_walk`. A term that is not seen on an axis keeps the value of `sensor`
+    up to its upper limit. White noise that neither shows stays unstated, so that nobody takes it
+    for 0. It has the rounding where `sensor` has no ADC.
 
-    Where the filter is not stated, it is the first-order one that gives a sample the measured
-    noise: white noise of the density 2·N² over positive frequencies has the variance N²/(2·RC)
-    behind it. A rest shows neither range nor resolution: where they are not stated, the
-    placeholders of `Sensor` stay, which limit and round nothing.
+    White noise is the density before the filter that gives a sample the measured variance. The
+    filter is the stated one unless the noise refutes it: see `_with_filter`. A rest shows neither
+    range nor resolution: where they are not stated, the placeholders of `Sensor` stay, which limit
+    and round nothing.
     """
     values = {name: value for name, value in sensor.values.items() if name != 'noise_excess'}
     to_g = np.array([ONE_SIDED, 1 / np.sqrt(np.pi), 1.0])[:, None] / G0_MPS2
     # By field of an estimate, term and axis.
     value, low, high = (np.array([noise.estimates for noise in noises]) * to_g).T
-
-    def merged(term: int, before: np.ndarray | float) -> np.ndarray:
-        return np.where(low[term] > 0, value[term], np.minimum(before, high[term]))
-
     for term, (effect, name) in enumerate((('flicker', 'density_g_per_rthz'),
                                            ('bias_walk', 'density_g_per_rts')), 1):
-        sizes = merged(term, sensor.values.get(effect, {}).get(name, 0.0))
+        before = sensor.values.get(effect, {}).get(name, 0.0)
+        sizes = np.where(low[term] > 0, value[term], np.minimum(before, high[term]))
         values.pop(effect, None)
         if sizes.any():
             values[effect] = {name: sizes}
@@ -426,30 +509,70 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise]) -> Sensor:
         values['bias_walk']['return_per_s'] = np.array(
             [1 / noise.fit.bound_s for noise in noises])
     kept = [name for name in sensor.effects if name in values]
-    changed: dict[str, Any] = {
-        'effects': (*kept, *(name for name in values if name not in kept)), 'values': values,
-        'unstated': (_DENSITY,)}
-    if _DENSITY not in sensor.unstated or (low[0] > 0).all():
-        before = sensor.noise_density_g_per_rthz
-        density = merged(0, np.where(before > 0, before, np.inf))
-        if not sensor.adc_bits:
-            rounding = [ONE_SIDED * noise.rounding / G0_MPS2 for noise in noises]
-            density = np.where(low[0] > 0, np.hypot(density, rounding), density)
-        changed |= {_DENSITY: density, 'unstated': ()}
-    if 'rc_capacitance_f' in sensor.unstated:
-        changed |= {'rc_resistance_ohm': RESISTANCE_OHM,
-                    'rc_capacitance_f': _filter_s(noises, sensor.rate_hz) / RESISTANCE_OHM}
-    return replace(sensor, **changed)
+    sensor = replace(sensor, values=values,
+                     effects=(*kept, *(name for name in values if name not in kept)))
+    filtered, is_repeated = _with_filter(sensor, noises, rest)
+    is_seen = low[0] > 0
+    changed: dict[str, Any] = {'unstated': (_DENSITY,)}
+    if _DENSITY not in sensor.unstated or is_seen.all():
+        changed = {_DENSITY: _density(filtered, noises, is_repeated), 'unstated': ()}
+    return replace(filtered, **changed)
 
 
-def _filter_s(noises: list[AxisNoise], rate_hz: float) -> float:
-    """Return the time constant that the noise of a sample shows, s; 0 for no filter."""
-    seen = [noise for noise in noises if noise.fit.white.is_seen]
+def _density(sensor: Sensor, noises: list[AxisNoise], is_repeated: bool) -> np.ndarray:
+    """
+    Return the white noise before the filter by axis, g/√Hz over positive frequencies, (m,).
+
+    is_repeated: whether the variance of a sample is that of white noise behind the filter.
+    """
+    unit, rate_hz = electronics(sensor), sensor.rate_hz
+    share = white_share(unit.rc_s, rate_hz)
+    variances = []
+    for noise, axis_share in zip(noises, share):
+        white = noise.fit.white
+        largest = white.value if white.is_seen else white.high
+        variance = noise.white_variance if is_repeated and white.is_seen else \
+            largest ** 2 * rate_hz * axis_share
+        if not sensor.adc_bits and white.is_seen:
+            variance += noise.rounding ** 2 * rate_hz
+        variances.append(variance / G0_MPS2 ** 2)
+    measured = np.sqrt(density_for_variance(np.array(variances), unit.rc_s, rate_hz))
+    measured /= unit.noise_ratio
+    before = sensor.noise_density_g_per_rthz
+    stated = np.where(before > 0, before, np.inf)
+    is_seen = [noise.fit.white.is_seen for noise in noises]
+    return np.where(is_seen, measured, np.minimum(stated, measured))
+
+
+def _with_filter(sensor: Sensor, noises: list[AxisNoise], rest: StillStretch
+                 ) -> tuple[Sensor, bool]:
+    """
+    Return the sensor with a filter that agrees with the noise, and whether one does.
+
+    White noise behind an RC filter has a variance that follows from N and the filter. Less of it
+    refutes the stated filter. So does more, but only if the differences of neighbouring samples
+    have the form of a filter: vibration and mains add to the variance, too.
+    """
+    seen = [each for noise in noises if (each := noise.filter_evidence(rest))]
     if not seen:
-        return 0.0
-    white = float(np.mean([noise.sample_white ** 2 for noise in seen]))
-    variance = float(np.mean([noise.sample_std ** 2 for noise in seen]))
-    return white / (2 * variance) if variance < _UNFILTERED * white * rate_hz else 0.0
+        return sensor, False
+    weights = np.array([each.std ** -2 for each in seen])
+    log_share = float(np.average([each.log_share for each in seen], weights=weights))
+    limit = _CERTAIN_STDS / float(np.sqrt(weights.sum()))
+    is_stated = 'rc_capacitance_f' not in sensor.unstated
+    stated_share = white_share(electronics(sensor).rc_s, sensor.rate_hz)
+    excess = log_share - float(np.mean(np.log(stated_share)))
+    if is_stated and abs(excess) < limit:
+        return sensor, True
+    share = 1.0 if log_share > -limit else float(np.exp(log_share))
+    change = float(np.average([each.change for each in seen], weights=weights))
+    has_form = abs(np.log(change * (1 + share) / (2 * share))) < limit + _FORM_TOLERANCE
+    if is_stated and excess > 0 and not has_form:
+        return sensor, False
+    return replace(
+        without_effect(sensor, 'bandwidth'), rc_resistance_ohm=RESISTANCE_OHM,
+        rc_capacitance_f=rc_of_white_share(share, sensor.rate_hz) / RESISTANCE_OHM,
+        filter_rate_hz=sensor.rate_hz), True
 
 
 _PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000

@@ -121,7 +121,7 @@ def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = 
     values = {'noise_density_g_per_rthz': np.minimum(noise_g / np.sqrt(bandwidth_hz),
                                                      _MAX_NOISE_G_PER_RTHZ),
               'range_g': range_g, 'rc_resistance_ohm': RESISTANCE_OHM,
-              'rc_capacitance_f': rc_s / RESISTANCE_OHM}
+              'rc_capacitance_f': rc_s / RESISTANCE_OHM, 'filter_rate_hz': unit.rate_hz}
     texts = {
         'noise_density_g_per_rthz': 'noise of a sample: ' + _by_axis(unit, noise_g),
         'adc_bits': 'resolution: ' + _by_axis(unit, step_v / scale_v_per_g),
@@ -129,7 +129,10 @@ def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = 
                             'filter: the noise at rest shows none',
         'range_g': f'range: ±{range_g:g} g (largest reading {largest_g:.3g} g)'}
     lines = [text for name, text in texts.items() if name in unit.unstated]
-    used = {name: value for name, value in values.items() if name in unit.unstated}
+    unknown = {*unit.unstated}
+    if 'rc_capacitance_f' in unknown:
+        unknown.add('filter_rate_hz')  # The measured filter is that at this rate.
+    used = {name: value for name, value in values.items() if name in unknown}
     return replace(unit, unstated=(), measured=unit.unstated, **used), lines
 
 

@@ -309,7 +309,7 @@ _SHORT_RC_S = 1e-9  # RC of a filter that does nothing, s; chosen: not 0
 def change_mg(sensor: Sensor, motion: Motion, memo: ChainMemo, effects: Collection[str],
               is_filtered: bool = True) -> float:
     """Return the rms of what some effects change, and the filter, too, if it is left out."""
-    sensor = replace(sensor, rate_hz=min(sensor.rate_hz, _RATE_HZ))
+    sensor = sensor.computed_at(min(sensor.rate_hz, _RATE_HZ))
     motion = replace(motion, internal_rate_hz=sensor.rate_hz)
     stamps_s = np.arange(int(motion.duration_s * sensor.rate_hz)) / sensor.rate_hz
     needs = [set(effect_named(name).needs) for name in effects]
@@ -319,7 +319,8 @@ def change_mg(sensor: Sensor, motion: Motion, memo: ChainMemo, effects: Collecti
     other = replace(sensor, values={**sensor.values, **{
         name: neutral(effect_named(name), sensor.axes) for name in effects}})
     if other.rc_s and not is_filtered:
-        other = replace(other, rc_resistance_ohm=_SHORT_RC_S / other.rc_capacitance_f)
+        other = replace(other, rc_resistance_ohm=_SHORT_RC_S / other.rc_capacitance_f,
+                        filter_rate_hz=0.0)
     volts = [Response(unit, motion, _SEED).whole(stamps_s, memo) for unit in (sensor, other)]
     change_g = (volts[0] - volts[1]) / sensor.nominal_scale_v_per_g
     return float(1e3 * np.sqrt(np.mean(change_g ** 2)))

@@ -88,6 +88,8 @@ def _paste_lines(result: RecordingNoise) -> list[str]:
 
 def _warnings(result: RecordingNoise) -> list[str]:
     rest, texts = result.rest, []
+    if rest.beyond_range:
+        texts.append(f'{rest.beyond_range}.')
     if rest.motion_s:
         begin_s, end_s = rest.motion_s[0][:2]
         texts.append(f'not still or interrupted {len(rest.motion_s)} times, first from '
@@ -97,6 +99,15 @@ def _warnings(result: RecordingNoise) -> list[str]:
     for noise in result.axes:
         texts += [f'{noise.axis}: {text}' for text in _axis_warnings(rest.span_s, noise)]
     return texts
+
+
+def _filter_warning(stated: Sensor, fresh: Sensor) -> list[str]:
+    """Say that the noise refutes the stated filter, and what the file states in its place."""
+    if 'rc_capacitance_f' in stated.unstated or fresh.rc_s == stated.rc_s:
+        return []
+    found = f'a filter of {fresh.rc_s * 1e3:.3g} ms' if fresh.rc_s else 'no filter'
+    return [f'the noise at {fresh.rate_hz:.5g} Hz shows {found}, not the stated one of '
+            f'{stated.rc_s * 1e3:.3g} ms. The new file states what the noise shows.']
 
 
 def _axis_warnings(span_s: float, noise: AxisNoise) -> list[str]:
@@ -179,7 +190,7 @@ def noise(options: argparse.Namespace) -> int:
 
         result = noise_parameters.recording_noise(blocks, options.params,
                                                   lambda done: show(done, 'fit'))
-    rest = result.rest
+    rest, warnings = result.rest, _warnings(result)
     cli.report_reading('noise', *newest)
     files: list[Path] = []
     if options.report:
@@ -188,14 +199,16 @@ def noise(options: argparse.Namespace) -> int:
         write_bytes(files[0], png(_plot(result)))
     if options.output:
         name = Path(options.recording).name
-        fresh = noise_parameters.with_noise(_sensor(result), result.axes)
+        stated = _sensor(result)
+        fresh = noise_parameters.with_noise(stated, result.axes, rest)
+        warnings += _filter_warning(stated, fresh)
         parameter_file.save(options.output, replace(fresh, provenance={
             **fresh.provenance, 'noise_from': name, 'rate_from': name}), [
                 f'Noise measured in {duration(rest.span_s)} at rest of {result.path}.',
                 'Density: over positive frequencies, as datasheets state it.', *_tables(result)])
         files.insert(0, Path(options.output))
     print('\n'.join([*_head(result), '', *_tables(result), '', *_paste_lines(result), '']))
-    warnings = [f'WARNING {text}' for text in _warnings(result)]
+    warnings = [f'WARNING {text}' for text in warnings]
     following = cli.command('diagnose', f'RECORDING --params {cli.quoted(options.output)} '
                             '-o gap') if options.output else cli.command(
         'noise', f'{cli.quoted(options.recording)}{cli.reading_text(options)} -o noise.yaml')

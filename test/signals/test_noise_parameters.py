@@ -65,3 +65,19 @@ def test_a_line_leaves_the_truth_in_the_interval(amplitude: float) -> None:
         line = amplitude * np.sin(2 * np.pi * 0.55 * time_s + seed)
         white = fit_noise(N * (rng.standard_normal(6000) / 0.1 ** 0.5 + line), 0.1).white
         assert 0.98 * white.low <= N <= 1.02 * white.high
+
+
+@pytest.mark.parametrize('seconds', [10, 12])
+def test_a_filter_is_no_walk(seconds: int) -> None:
+    """White noise behind a filter has the spectrum of a walk with bounds, above its corner."""
+    rate_hz, rc_s, step = 1000.0, 0.01056, 0.07 * N
+    decay = np.exp(-1 / (rate_hz * rc_s))
+    std = N / np.sqrt(2 * rc_s)
+    for seed in range(3):
+        drawn = np.random.default_rng(seed).standard_normal(seconds * 1000 + 200)
+        samples = std * lfilter([np.sqrt(1 - decay ** 2)], [1.0, -decay], drawn)[200:]
+        rounded = np.round(samples / step) * step
+        fit = fit_noise(rounded, 1 / rate_hz, rounding=step / np.sqrt(12 * rate_hz))
+        assert fit.white.low > 0
+        assert fit.white.value == pytest.approx(N, rel=0.4)
+        assert (fit.instability.low, fit.walk.low) == (0.0, 0.0)

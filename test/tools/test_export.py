@@ -311,13 +311,15 @@ def test_kalibr(exported):
     Kalibr reads these keys with PyYAML, and refuses values that are not positive floats.
 
     A sample of its noise has the variance N²·rate (ethz-asl/kalibr, wiki/IMU-Noise-Model), and
-    white noise of the density d of a datasheet has d²·rate/2.
+    white noise of the density d of a datasheet has d²·rate/2. The rounding of the ADC adds to it.
     """
     values = yaml.safe_load(exported['kalibr'].text)
+    white_v2_per_hz = noise.density_v2_per_hz(unit(), np.zeros(1)).max() / 2
+    assert np.sqrt(2 * white_v2_per_hz) == pytest.approx(
+        unit().noise_density_g_per_rthz.max() * unit().nominal_scale_v_per_g.max(), rel=1e-3)
     assert values == {
         'rostopic': '/imu/data_raw', 'update_rate': unit().rate_hz,
-        'accelerometer_noise_density': pytest.approx(
-            unit().noise_density_g_per_rthz.max() * G0_MPS2 / np.sqrt(2)),
+        'accelerometer_noise_density': pytest.approx(mps2(np.sqrt(white_v2_per_hz)).max()),
         'accelerometer_random_walk': pytest.approx(3e-5 * G0_MPS2)}
 
 

@@ -27,8 +27,8 @@ import numpy as np
 
 _UNIT_FIELDS = (
     'serial', 'axes', 'rate_hz', 'nominal_zero_g_v', 'nominal_scale_v_per_g',
-    'noise_density_g_per_rthz', 'rc_resistance_ohm', 'rc_capacitance_f', 'adc_bits',
-    'adc_vref_v', 'range_g', 'local_gravity_mps2', 'stage_resolution_rad')
+    'noise_density_g_per_rthz', 'rc_resistance_ohm', 'rc_capacitance_f', 'filter_rate_hz',
+    'adc_bits', 'adc_vref_v', 'range_g', 'local_gravity_mps2', 'stage_resolution_rad')
 """Fields of the sensor that must be the same for a calibration to be resumed."""
 
 
