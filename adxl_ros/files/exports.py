@@ -67,9 +67,8 @@ class Axis:
     name: str  # x, y or z
     zero_g_mps2: float  # Output at 0 g by the nominal conversion, m/s²
     noise_std_mps2: float  # Noise of one sample before the ADC, m/s²
-    sample_variance: float  # Variance of one sample with the rounding of the ADC, (m/s²)²
-    # Density of the samples at low, positive frequencies with the rounding of the ADC, m/s²/√Hz. It
-    # is that at the rate of the file: noise above half of it aliases.
+    # Density of the samples at low, positive frequencies with the rounding of the ADC, m/s²/√Hz.
+    # Noise above half of the rate of the file aliases into it.
     noise_density: float
     walk_density: float  # Density of the random walk of the zero-g, m/s²/√s; 0 without `bias_walk`
     # Inverse correlation time of a walk that has bounds, 1/s; 0 without them
