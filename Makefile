@@ -48,7 +48,8 @@ endif
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 # .venv/.ready says what the venv was made for. If that was another ROS or place, or if it is
-# missing because an installation was cut short, the venv is made anew.
+# missing because an installation was cut short, the venv is made anew. A recent pip finds versions
+# that fit each other in seconds; that of Python 3.10 looks for half an hour.
 made_for := $(mode) $(CURDIR)
 ifneq ($(made_for),$(shell test -x .venv/bin/python && cat .venv/.ready 2>/dev/null))
 .venv/.ready: FORCE
@@ -58,6 +59,7 @@ make_venv = python='$(base_python)'; \
     echo "making .venv with $$python, ROS 2 from: $(mode)"; \
     rm -rf .venv && \
     "$$python" -m venv $(if $(ros_python),--system-site-packages) .venv && \
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check 'pip>=24' && \
     { .venv/bin/python -m pip freeze | grep -E '^(numpy|scipy|pytest)==' || :; } \
         > .venv/constraints.txt
 endif
