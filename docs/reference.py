@@ -9,6 +9,7 @@ Write docs/reference from the package: tools, nodes, effects, files and the libr
 
 from collections.abc import Iterable, Iterator
 import dataclasses
+from functools import cache
 import html
 import importlib
 from importlib.metadata import entry_points
@@ -141,17 +142,18 @@ def main(target: Path) -> None:
         (target / f'{name}.md').write_text(f'{title}\n\n{MADE}\n{body}\n', 'utf-8')
 
 
-def help_of(name: str) -> str:
-    """Return the help of an executable, which does not depend on the home of its user."""
+@cache
+def helps() -> dict[str, str]:
+    """Return the help of each executable, which does not depend on the home of its user."""
     home = Path('/tmp/adxl_ros_reference')
     home.mkdir(exist_ok=True)
     environment = {key: value for key, value in os.environ.items() if key != 'ROS_HOME'}
-    made = subprocess.run([DOCS.parent / 'install/adxl_ros/lib/adxl_ros' / name, '--help'],
-                          text=True, capture_output=True, stdin=subprocess.DEVNULL,
+    made = subprocess.run([sys.executable, DOCS / 'helps.py', *TOOLS, *NODES], text=True,
+                          capture_output=True, stdin=subprocess.DEVNULL,
                           env={**environment, 'HOME': str(home), 'COLUMNS': '80'})
     if made.returncode:
-        sys.exit(f'{name} --help: {made.stderr}')
-    return made.stdout.replace(str(home), '~')
+        sys.exit(f'--help: {made.stderr}')
+    return json.loads(made.stdout.replace(str(home), '~'))
 
 
 def without(text: str, *begins: str) -> str:
@@ -186,7 +188,7 @@ def tools() -> Iterator[str]:
                 'written file and does not damage an earlier one.', '']
     shared = ''
     for name in TOOLS:
-        text = help_of(name)
+        text = helps()[name]
         found = re.search(r'\n(recordings of other software:\n.*?)(?=\n\S|\Z)', text, re.DOTALL)
         shared = shared or (found[1] if found else '')
         yield from [f'## {name}', *block(without(text, 'recordings of other', 'effects:')), '']
@@ -205,7 +207,7 @@ def nodes() -> Iterator[str]:
         (f'`{topic}` ({kind})', content, *ends) for topic, kind, content, *ends in TOPICS))
     sensor = ''
     for name in NODES:
-        text = help_of(name)
+        text = helps()[name]
         found = re.search(r'\n(parameters of the sensor.*?)(?=\n\n\w)', text, re.DOTALL)
         sensor = sensor or (found[1] if found else '')
         services = ', '.join(f'`~/{part}`' for part in SERVICES.get(name, '').split(', ') if part)

@@ -18,6 +18,7 @@ from units import nominal
 PAGE = REPO / 'docs' / 'howto' / 'own_effect.md'
 
 
+@pytest.mark.long
 def test_the_documented_package_works(tmp_path, monkeypatch, run_tool):
     pytest.importorskip('plotly')
     blocks = re.findall(r'`([a-z_.]+)`:\n\n```\w+\n(.*?)```', PAGE.read_text(), re.DOTALL)

@@ -36,6 +36,7 @@ def test_the_posterior_is_that_of_two_normal_densities():
         precision @ [0.04, 0.02] + prior @ [0.02, 0.01]))
 
 
+@pytest.mark.long
 def test_intervals_are_smaller_and_still_true():
     rng = np.random.default_rng(0)
     covariance = np.array([[4e-4, 1e-4], [1e-4, 2e-4]])

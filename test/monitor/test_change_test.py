@@ -32,6 +32,7 @@ def run(test: ChangeTest, values: np.ndarray, moves: bool = False) -> list[tuple
     return [(i, change) for i, row in enumerate(values) for change in test.add(row, moves)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('kind', ['white', 'all'])
 def test_false_alarms_are_no_more_than_stated(kind: str) -> None:
     """Ten sensors of four series for six hours, with one false alarm a day each."""

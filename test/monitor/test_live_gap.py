@@ -104,6 +104,7 @@ def test_the_gap_of_the_right_parameters_is_the_floor(kind: ReferenceKind, ampli
     assert world.live.obstacle == ''
 
 
+@pytest.mark.long
 def test_a_robot_is_a_reference(tmp_path: Path) -> None:
     """Readings of its coarse encoders come in pieces, between those of another device."""
     pytest.importorskip('pinocchio')
@@ -139,6 +140,7 @@ def test_a_change_of_the_mean_and_of_the_noise() -> None:
     assert all(change.size > 2 for change in noise if change.quantity == 'noise')
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('mg_per_min', [0.02, 10.0])
 def test_a_ramp_from_the_first_second_is_a_change_if_no_healthy_unit_drifts_so(
         mg_per_min: float) -> None:

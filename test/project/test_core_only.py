@@ -11,6 +11,7 @@ from pathlib import Path
 import re
 
 from adxl_ros.errors import install_hint
+import pytest
 from without_extras import run_without_extras
 
 IMPORT_ALL = """
@@ -73,6 +74,7 @@ open_screen('/calibration', print)
         'no screen, plain lines: it needs prompt_toolkit; pip install prompt_toolkit'
 
 
+@pytest.mark.long
 def test_a_csv_is_fitted(tmp_path: Path) -> None:
     """`simulate` and `fit` on CSV need only numpy and scipy. A page names the missing package."""
     run = 'from adxl_ros.tools.{0} import main\nsys.argv[0] = {0!r}\nsys.exit(main())'

@@ -24,6 +24,7 @@ def run_module(name: str, *args: str) -> None:
     assert done.returncode == 0, f'{name}:\n{done.stdout}'
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(('linter', 'paths'), [
     ('ament_flake8', PYTHON_SOURCES),
     ('ament_pep257', PYTHON_SOURCES),

@@ -18,6 +18,7 @@ def cells(seed: int, count: int = 7200, terms: tuple[float, float, float] = (N, 
     return samples.reshape(count, 10).mean(axis=1)
 
 
+@pytest.mark.long
 def test_nine_of_ten_intervals_hold_the_truth() -> None:
     """docs/measurements/noise_coverage.md has 200 draws of more cases."""
     variances = coefficient_variances(7200, STEP_S)

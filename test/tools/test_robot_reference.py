@@ -63,6 +63,7 @@ def robot(tmp_path_factory):
     return record
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(('effects', 'offset_rad', 'status', 'named'), [
     ((), 0.0, 'no_gap', []),
     (('scale_factor:offset_v_per_g=0.01',), 0.0, 'explained', ['scale_factor']),

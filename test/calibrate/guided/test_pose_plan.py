@@ -26,6 +26,7 @@ def test_the_guided_order_has_smaller_errors_on_a_stage_with_errors_by_setting(a
     assert expected_error_deg(axes, guided) < 0.5 * expected_error_deg(axes, paper)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
 @pytest.mark.parametrize('kind', pose_plan.KINDS)
 def test_fits_have_the_standard_deviations_that_a_plan_predicts(axes, kind):
