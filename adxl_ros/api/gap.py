@@ -29,7 +29,7 @@ from adxl_ros.diagnose.residual_map import gap_in, GapInUnit, quantity as quanti
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.atomic_write import free_name, write_text
 from adxl_ros.files.recording_columns import NO_UNIT, Recording
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.model.sensor import Sensor
@@ -231,7 +231,9 @@ class Gap(Result):
             steps.append(NextStep(
                 'diagnose it' if is_alone else 'diagnose it together with this one',
                 _command((*before, 'next.csv'), given)))
-        simulate = command('simulate', f'rich --params {shlex.quote(params)} -o sim.csv')
+        # A new name: sim.csv may be the reference of this comparison.
+        words = 'rich', '--params', params, '-o', str(free_name('sim.csv'))
+        simulate = command('simulate', shlex.join(words))
         return [*steps, NextStep('simulate the sensor as it was found', simulate)]
 
     @property

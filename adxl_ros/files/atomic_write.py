@@ -6,10 +6,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+import ctypes
 import errno
 import fcntl
 from glob import escape
 from io import FileIO
+from itertools import chain, count
 import os
 from pathlib import Path
 import shutil
@@ -42,16 +44,67 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
             yield fresh
             for written in [*fresh.rglob('*'), fresh]:
                 sync(written)
+            _mark(fresh)
             if fresh.is_dir() and target.is_dir():
-                # No directory can be renamed over one that holds files.
-                os.replace(target, Path(folder, 'old'))
-            os.replace(fresh, target)
+                _exchange(fresh, target)
+            else:
+                os.replace(fresh, target)
             sync(target.parent)
     except OSError as error:
         raise UserError(f'{target}: cannot write: {error.strerror or error}') from None
     finally:
         if folder:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # Of renameat2: paths of this process; swap both names
+
+
+def _exchange(fresh: Path, target: Path) -> None:
+    """
+    Swap two directories, of which none can be renamed over the other.
+
+    Linux does it in one step. Where a file system or a C library cannot, it takes two: a kill
+    between them leaves the earlier directory as `old` beside the new one.
+    """
+    try:
+        swap = ctypes.CDLL(None, use_errno=True).renameat2
+        failed = swap(_AT_FDCWD, os.fsencode(fresh), _AT_FDCWD, os.fsencode(target),
+                      _RENAME_EXCHANGE)
+    except AttributeError:
+        failed = True
+    if failed:
+        os.replace(target, fresh.with_name('old'))
+        os.replace(fresh, target)
+
+
+_MARK = 'user.adxl_ros.written'
+"""Extended attribute of what this package wrote: the time of the last change, ns, as text."""
+
+
+def _mark(path: Path) -> None:
+    """Mark what this package wrote, where the file system keeps attributes."""
+    with suppress(OSError):
+        os.setxattr(path, _MARK, str(path.stat().st_mtime_ns).encode())
+
+
+def is_own(path: str | os.PathLike) -> bool:
+    """
+    Return whether this package wrote a file or directory that nobody has changed since.
+
+    A copy has no mark, nor has a file on a file system without extended attributes.
+    """
+    try:
+        return os.getxattr(path, _MARK) == str(os.stat(path).st_mtime_ns).encode()
+    except OSError:
+        return False
+
+
+def free_name(path: str | os.PathLike) -> Path:
+    """Return a path at which nothing is: the given one, or one with a number."""
+    wanted = Path(path)
+    names = (wanted.with_stem(f'{wanted.stem}_{number}') for number in count(2))
+    return next(name for name in chain([wanted], names) if not name.exists())
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:

@@ -13,6 +13,7 @@ from textwrap import wrap
 import time
 from typing import Any
 
+from adxl_ros.files.atomic_write import free_name
 from adxl_ros.files.bag_writer import LiveBag
 from adxl_ros.investigate import investigation
 from adxl_ros.investigate.investigation import Answer, Investigation, OutputFolder, State
@@ -69,8 +70,9 @@ def closing_lines(ended: Investigation, folder: OutputFolder) -> list[str]:
     files = [str(path) for path in (folder.report, folder.parameters, folder.bag) if path.exists()]
     if ended.state is State.STOPPED:
         return ['', *end_lines([f'Stopped without a verdict: {ended.reason}'], files)]
-    return ['', *end_lines([ended.answers[-1][1].sentence], files, 'ros2 run adxl_ros simulate '
-                           f'rich --params {shlex.quote(str(folder.parameters))} -o sim.csv')]
+    words = 'rich', '--params', str(folder.parameters), '-o', str(free_name('sim.csv'))
+    return ['', *end_lines([ended.answers[-1][1].sentence], files,
+                           f'ros2 run adxl_ros simulate {shlex.join(words)}')]
 
 
 _SAMPLES, _STAGE = 'imu/data_raw', 'stage/joint_states'

@@ -59,6 +59,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('-o', dest='output', metavar='OUT', required=True,
                        help='acceleration and tilt, with standard deviations: OUT.csv is a table; '
                             'OUT.mcap, or a folder OUT, is a bag with imu/data and tilt')
+    cli.add_overwrite_option(parse)
     cli.add_recording_options(parse)
     return parse
 
@@ -66,6 +67,7 @@ def parser() -> argparse.ArgumentParser:
 def apply(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     cli.refuse_same_file(options.output, options.recording)
+    cli.check_outputs(options, options.output)
     counts: Counter[str] = Counter()
     blocks = recording.blocks(options.recording, _BLOCK_ROWS, cli.reading_options(options))
     first = next(blocks, None)

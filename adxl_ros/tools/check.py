@@ -32,6 +32,7 @@ _SHOWS_HEAD = ('effect', 'from', 'typical', '')
 _SHOWS_COLUMNS = (24, 16, 14)
 _MOST_SHOWN = 1_000_000
 """Samples up to which it is listed what `diagnose` could show. Chosen: a minute, and 1 GB."""
+_PAGE = 'check.html'  # Name of the page in the folder of the report
 _LABEL_COLUMNS = 12  # Columns of the label of a line below a recording
 
 
@@ -132,6 +133,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='the sensor, for recordings in volts (default: the nominal sensor)')
     parse.add_argument('--report', metavar='DIR', help='write the page check.html there')
+    cli.add_overwrite_option(parse)
     parse.add_argument('--json', action='store_true', help='print the result as JSON')
     cli.add_robot_options(parse)
     cli.add_recording_options(parse)
@@ -141,6 +143,7 @@ def parser() -> argparse.ArgumentParser:
 def check(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     reading = replace(cli.reading_options(options), drop_bad_stamps=True)
+    cli.check_outputs(options, options.report and Path(options.report, _PAGE))
     if options.report:
         html_page.check_libraries()
     results, count = [], len(options.recording)
@@ -155,7 +158,7 @@ def check(options: argparse.Namespace) -> int:
     page = []
     if options.report:
         cli.make_folder(Path(options.report))
-        page = [Path(options.report) / 'check.html']
+        page = [Path(options.report, _PAGE)]
         write_text(page[0], _page(results))
     if options.json:
         print(json.dumps([_as_json(result) for result in results], indent=1))

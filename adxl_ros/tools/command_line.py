@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from adxl_ros.api import recordings
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
+from adxl_ros.files.atomic_write import is_own
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects import effect_named
@@ -226,6 +227,23 @@ def check_least(options: argparse.Namespace, **least: float) -> None:
         value = getattr(options, name)
         if value is not None and not value >= lowest:
             raise UserError(f'--{name.replace("_", "-")} {value}: must be at least {lowest:g}')
+
+
+def add_overwrite_option(parse: argparse.ArgumentParser, name: str = '--force') -> None:
+    """Add the option that replaces files of others; `name` is its other name."""
+    parse.add_argument(*dict.fromkeys(('--overwrite', name)), dest='overwrite',
+                       action='store_true',
+                       help='replace files that this package did not write, or that were changed '
+                            'since')
+
+
+def check_outputs(options: argparse.Namespace, *paths: str | os.PathLike | None) -> None:
+    """Refuse to replace a file or folder of others; a path that is not given is None or ''."""
+    for path in filter(None, paths):
+        if Path(path).exists() and not options.overwrite and not is_own(path):
+            raise UserError(f'{path}: is there already, and was not written by this package, or '
+                            'was changed since; choose another name, or replace it with '
+                            '--overwrite')
 
 
 def refuse_same_file(output: str, source: str) -> None:

@@ -8,7 +8,7 @@ import argparse
 from pathlib import Path
 from time import monotonic
 
-from adxl_ros.api.gap import diagnose as find_gap, REPORT
+from adxl_ros.api.gap import diagnose as find_gap, PAGE, PARAMETERS, REPORT
 from adxl_ros.diagnose.report import as_text
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.model.effects import library
@@ -49,6 +49,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--json', action='store_true', help='print the report as JSON')
     parse.add_argument('-o', dest='output', metavar='DIR', required=True,
                        help='report.json, report.html and params.yaml')
+    cli.add_overwrite_option(parse)
     cli.add_robot_options(parse)
     cli.add_recording_options(parse)
     return parse
@@ -64,6 +65,8 @@ def _details() -> str:
 def diagnose(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     begin_s = monotonic()
+    cli.check_outputs(options, *(Path(options.output, name)
+                                 for name in (PAGE, PARAMETERS, REPORT)))
     html_page.check_libraries()
     reading = cli.reading_options(options)
     with cli.progress('reading') as show:

@@ -37,12 +37,14 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--to', dest='format', required=True, choices=list(FORMATS),
                        metavar='FORMAT', help=f'{", ".join(FORMATS)}')
     parse.add_argument('-o', dest='output', required=True, metavar='FILE', help='the new file')
+    cli.add_overwrite_option(parse)
     return parse
 
 
 def export(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     cli.refuse_same_file(options.output, options.params)
+    cli.check_outputs(options, options.output)
     sensor = parameter_file.load(options.params)
     exporter = FORMATS[options.format]
     with cli.progress('sizes of the effects') as show:

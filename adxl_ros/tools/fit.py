@@ -65,6 +65,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--store', metavar='DIR', default=str(calibration_store.default_folder()),
                        help='the calibration store, which gets a copy (default: %(default)s); '
                             'empty for none')
+    cli.add_overwrite_option(parse)
     cli.add_robot_options(parse)
     cli.add_recording_options(parse)
     return parse
@@ -80,6 +81,8 @@ def fit(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     if sum(map(bool, (options.journal, options.poses, options.recording[1:]))) > 1:
         raise UserError('--journal and --poses: one of them names the rests of one recording')
+    cli.check_outputs(options, options.output, options.dcc,
+                      options.report and Path(options.report, page.PAGE))
     if options.report or options.dcc:
         html_page.check_libraries()
     population = calibration_store.read_population(options.prior) if options.prior else None

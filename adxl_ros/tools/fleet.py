@@ -19,7 +19,9 @@ from adxl_ros.fleet.row import (
     as_date,
     make_recipe,
     OUTCOMES,
+    PAGE,
     Row,
+    TABLE,
     task_names,
     TASKS,
 )
@@ -52,6 +54,7 @@ def parser() -> argparse.ArgumentParser:
                        help='tasks, with commas (default: %(default)s)')
     parse.add_argument('-o', dest='output', metavar='DIR', required=True,
                        help='rows, table, page and single reports; an interrupted run continues')
+    cli.add_overwrite_option(parse)
     parse.add_argument('--params', metavar='FILE', default=None,
                        help='parameter file of all recordings (default: the calibration of each '
                             'unit at the date of the recording, else the nominal sensor)')
@@ -91,6 +94,7 @@ def fleet(options: argparse.Namespace) -> int:
     recipe = make_recipe(tasks, options.params, (source.params for source in sources),
                          options.store, cli.reading_options(options))
     folder = Path(options.output)
+    cli.check_outputs(options, folder / TABLE, folder / PAGE)
     selection = (options.only_failed, since, options.limit)
     if options.dry_run:
         results = Results(folder)

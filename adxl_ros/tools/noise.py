@@ -152,6 +152,7 @@ def _plot(result: RecordingNoise) -> Any:
     return figure
 
 
+_PLOT = 'allan.png'  # Name of the curve in the folder of the report
 _BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 _EXAMPLES = {
     'noise of each axis, with its Allan deviation': 'still.mcap --report noise',
@@ -173,12 +174,15 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('-o', dest='output', metavar='FILE.yaml',
                        help='a parameter file with the measured noise')
     parse.add_argument('--report', metavar='DIR', help='write the curve allan.png there')
+    cli.add_overwrite_option(parse)
     cli.add_recording_options(parse)
     return parse
 
 
 def noise(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
+    cli.check_outputs(options, options.output,
+                      options.report and Path(options.report, _PLOT))
     reading = cli.reading_options(options)
     newest: list[Recording] = []
     with cli.progress('noise') as show:
@@ -194,7 +198,7 @@ def noise(options: argparse.Namespace) -> int:
     cli.report_reading('noise', *newest)
     files: list[Path] = []
     if options.report:
-        files = [Path(options.report) / 'allan.png']
+        files = [Path(options.report, _PLOT)]
         cli.make_folder(files[0].parent)
         write_bytes(files[0], png(_plot(result)))
     if options.output:

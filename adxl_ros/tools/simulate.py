@@ -60,6 +60,7 @@ def parser() -> argparse.ArgumentParser:
                        'or to a new pseudo-terminal of this name')
     parse.add_argument('-o', dest='output', metavar='RECORDING',
                        help='.csv, .mcap or a rosbag2 directory (optional with --port)')
+    cli.add_overwrite_option(parse, '--overwrite')  # --force is the specific force
     return parse
 
 
@@ -135,6 +136,7 @@ def _check(options: argparse.Namespace) -> None:
     source = options.force if options.trajectory in names else options.trajectory
     if options.output and source:
         cli.refuse_same_file(options.output, source)
+    cli.check_outputs(options, options.output)
     if (options.trajectory == 'imu') != bool(options.force):
         raise UserError('--force RECORDING and the trajectory imu need each other: '
                         'simulate imu --force RECORDING')
