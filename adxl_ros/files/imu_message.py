@@ -12,6 +12,8 @@ from collections.abc import Sequence
 import struct
 
 from adxl_ros.files import cdr
+from adxl_ros.files.column_mapping import GRAVITY
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import Mounting
 
 _STAMP_OFFSET, _FRAME_LENGTH = 4, slice(12, 16)
@@ -42,6 +44,16 @@ def read(raw: bytes) -> tuple[float, Sequence[float]]:
     order, begin = _numbers_begin(raw)
     sec, nanosec = struct.unpack_from(order + 'iI', raw, _STAMP_OFFSET)
     return sec + nanosec * 1e-9, struct.unpack_from(order + '3d', raw, begin + _ACCELERATION)
+
+
+def in_mps2(raw: bytes, unit: str) -> bytes:
+    """Return an Imu with the acceleration in m/s² that has it in a unit, a key of `GRAVITY`."""
+    order, begin = _numbers_begin(raw)
+    message, place = bytearray(raw), begin + _ACCELERATION
+    values = struct.unpack_from(order + '3d', message, place)
+    factor = G0_MPS2 / GRAVITY[unit]
+    struct.pack_into(order + '3d', message, place, *(factor * value for value in values))
+    return bytes(message)
 
 
 def has_orientation(raw: bytes) -> bool:

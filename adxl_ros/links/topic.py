@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from math import ceil, inf
 import time
 
+from adxl_ros.errors import UserError
+from adxl_ros.files.column_mapping import GRAVITY, Quantity, unit_name
 from adxl_ros.files.stamps import is_even, stamped_rate_hz
 from adxl_ros.links.support import base
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
@@ -53,6 +55,7 @@ class Settings(base.SimulatorSettings):
 
     topic: str = base.option('imu/ideal', 'topic of the ideal sensor_msgs/Imu of a simulator: '
                              'specific force')
+    unit: str = base.option('mps2', 'unit of its accelerations: mps2, g, mg or mmps2')
     temperature_topic: str = base.option('temperature', 'topic of the temperature of the sensor, '
                                          'sensor_msgs/Temperature; 25 °C until it comes')
     seed: int = base.option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)
@@ -117,6 +120,10 @@ class EmulatedSensor(base.Link):
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         self.imu_topic, self.temperature_topic = settings.topic, settings.temperature_topic
+        self.imu_unit = unit_name(settings.unit, Quantity.OUTPUT) or ''
+        if self.imu_unit not in GRAVITY:
+            raise UserError(f'link.unit is {settings.unit!r}, expected one of '
+                            f'{", ".join(GRAVITY)}')
         self._seed = settings.seed
         self._temperature_c = NOMINAL_TEMPERATURE_C
         left_out = SensorModel(sensor).left_out

@@ -28,7 +28,7 @@ from adxl_ros.files import calibration_store, cdr
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.jobs import executable, held_output
-from adxl_ros.nodes.parameters import parameter
+from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import create_publisher, Level, Status, status_message, STEADY
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -64,6 +64,7 @@ class CalibrationSettings:
                                  name='stage.timeout_s')
     stage_mode: str = parameter('commanded', 'commanded turns itself, the others by hand',
                                 name='stage.mode', choices=('commanded', 'encoder', 'manual'))
+    samples_unit: str = sample_unit()
     near_deg: float = parameter(2.0, 'a stage turned by hand is captured within this of the pose',
                                 'deg', 0.01, 30.0, name='stage.near_deg')
     temperature_span_c: float = parameter(3.0, 'largest temperature change since the first pose',
@@ -285,12 +286,12 @@ _SAMPLES_QUEUE = 20000  # Samples that are kept: 20 s at 1 kHz, longer than a fi
 class Samples:
     """Takes the serialized messages that wait, and decodes many at once."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, unit: str) -> None:
         self._node = node
         self._raw: list[bytes] = []
         self._begun_ns = 0  # Steady time of the first sample, ns; 0 before it
         self.fault = ''  # Why the newest samples cannot be used, or ''
-        self._inbox = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE)
+        self._inbox = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE, unit)
         self.silence = self._inbox.silence  # Why or for how long no sample has come
         self.mixture = self._inbox.fault  # That several nodes publish the samples, or ''
 
@@ -370,7 +371,7 @@ class Calibration(Node):
         announcer = Announcer(self, own.mode == 'stage')
         # What the controller asks of a node
         self.announce, self.withdraw_pose = announcer.announce, announcer.withdraw
-        self._samples = Samples(self)
+        self._samples = Samples(self, own.samples_unit)
         self._controller = controller.Controller(
             settings, sensor, own.resume, self._samples, self, anonymous)
         if own.autostart:

@@ -26,7 +26,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import Mounting
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import parameters, topics
-from adxl_ros.nodes.parameters import parameter
+from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.sample_output import age_report, MOST_AGES
 from adxl_ros.nodes.topics import Level, Status, STEADY
@@ -60,6 +60,7 @@ class CompensationSettings:
                                       'faster vibration folds; 0: all', 'Hz', 0.0, 1e5)
     free_acceleration: bool = parameter(False, 'publish imu/linear_acceleration_free of samples '
                                         'that state an orientation')
+    samples_unit: str = sample_unit()
     rpy_rad: Any = parameter([0.0, 0.0, 0.0], 'roll, pitch and yaw of the case on the robot, as '
                              'in a URDF joint', 'rad', name='mounting.rpy_rad', live=True)
     mounting_frame_id: str = parameter('base_link', 'frame of the robot, in the header where the '
@@ -226,7 +227,8 @@ class Compensation(Node):
             settings.orientation == 'keep', free.publish if free else None,
             settings.output_rate_hz)
         self._policy = CompensationPolicy(paper, settings.store, self.resolve_topic_name)
-        self._samples = topics.Inbox(self, Imu, 'imu/data_raw', _DEPTH)
+        self._samples = topics.Inbox(self, Imu, 'imu/data_raw', _DEPTH,
+                                     settings.samples_unit)
         self._flat = parameters.given_sensor(self)
         own = parameters.make_sensor(self._flat, may_measure=True), (
             'the parameters given' if parameters.is_from_file(self) else

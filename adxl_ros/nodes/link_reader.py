@@ -34,7 +34,8 @@ class SimulatorInput:
         self._node, self._link = node, link
         self.frame_id = ''  # Frame of the newest samples
         self._due_s = self._looked_s = time.monotonic()
-        self._inbox = topics.Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE)
+        self._inbox = topics.Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE,
+                                   link.imu_unit)
         self._temperature = topics.create_subscription(
             node, Temperature, link.temperature_topic,
             lambda message: link.sense_temperature(message.temperature), 1)

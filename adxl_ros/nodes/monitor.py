@@ -18,7 +18,7 @@ from adxl_ros.monitor.changes import DiagnosisResult, DiagnosisRun, iso_time
 from adxl_ros.monitor.live_gap import AxisGap, GapSettings, LiveGap
 from adxl_ros.monitor.reference_stream import ReferenceKind, ReferenceStream, RobotForce
 from adxl_ros.nodes import parameters, topics
-from adxl_ros.nodes.parameters import parameter
+from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Inbox, Level, Status
 from adxl_ros.report.quantities import percent
@@ -39,6 +39,7 @@ class MonitorSettings:
                                      'imu/ideal, or joint_states')
     urdf: str = parameter('', 'file of the robot; its base rests')
     frame: str = parameter('imu_link', 'frame of the robot that carries the sensor')
+    samples_unit: str = sample_unit()
     window_s: float = parameter(60.0, 'time over which gap and floor are taken', 's', 5.0, 3600.0)
     false_alarms_per_day: float = parameter(0.0333, 'largest rate of reported changes that are '
                                             'none', '1/day', 1e-5, 10.0)
@@ -136,7 +137,8 @@ class Monitor(Node):
         self._changed_ns = 0  # Begin of a change that is not diagnosed yet, ns; 0 without one
         self._diagnosed_s = -_PAUSE_S
         self._begun_s = 0.0
-        self._samples = Inbox(self, Imu, 'imu/data_raw', _INPUT_QUEUE)
+        self._samples = Inbox(self, Imu, 'imu/data_raw', _INPUT_QUEUE,
+                              own.samples_unit)
         self._reference = Inbox(self, Imu if self._kind is ReferenceKind.IMU else JointState,
                                 self._reference_topic, _INPUT_QUEUE)
         self._surroundings = topics.Surroundings(self, _INPUT_QUEUE)

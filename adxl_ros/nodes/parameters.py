@@ -24,6 +24,7 @@ from typing import Any, NamedTuple, TypeVar
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.column_mapping import GRAVITY
 from adxl_ros.links.support import base
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient
@@ -95,6 +96,15 @@ class Spec(NamedTuple):
 def parameter(*spec: Any, name: str = '', **options: Any) -> Any:
     """Declare a parameter as `Spec` has it by a field of a dataclass, which gives it its name."""
     return field(metadata={'spec': Spec(name, *spec, **options)})
+
+
+SI = 'mps2'  # Unit of the accelerations of a sensor_msgs/Imu by its definition
+
+
+def sample_unit() -> Any:
+    """Declare the unit of the samples of a foreign IMU by a field of a dataclass."""
+    return parameter(SI, 'unit of the samples on imu/data_raw, as some drivers publish g',
+                     choices=tuple(GRAVITY), name='samples.unit')
 
 
 def specs_of(settings: Any) -> list[Spec]:

@@ -20,10 +20,10 @@ import time
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import one_line, UserError
-from adxl_ros.files import cdr
+from adxl_ros.files import cdr, imu_message
 from adxl_ros.files.recording_columns import StreamInfo
 from adxl_ros.links.support.base import Level
-from adxl_ros.nodes.parameters import QOS_POLICIES
+from adxl_ros.nodes.parameters import QOS_POLICIES, SI
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
@@ -221,8 +221,14 @@ class Inbox:
     was started again, and over and over where two send by turns.
     """
 
-    def __init__(self, node: Node, kind: Any, topic: str, depth: int, **options: bool) -> None:
-        """Subscribe; `reliable` and `latched` are those of `create_subscription`."""
+    def __init__(self, node: Node, kind: Any, topic: str, depth: int, unit: str = SI,
+                 **options: bool) -> None:
+        """
+        Subscribe; `reliable` and `latched` are those of `create_subscription`.
+
+        unit: that of the accelerations of a sensor_msgs/Imu, which are taken in m/s².
+        """
+        self._unit = unit
         self._node, self._kind, self._depth = node, kind, depth
         self.heard_s = time.monotonic()  # When messages came last
         self._topic = node.resolve_topic_name(topic)
@@ -254,7 +260,14 @@ class Inbox:
         messages = [*take_messages(self._subscription, self._kind, True, self._depth, *accept)]
         if messages:
             self.heard_s = time.monotonic()
-        return messages
+        return messages if self._unit == SI else [*map(self._in_si, messages)]
+
+    def _in_si(self, raw: bytes) -> bytes:
+        """Return samples in m/s²; damaged ones as they are, for those who count them."""
+        try:
+            return imu_message.in_mps2(raw, self._unit)
+        except cdr.CdrError:
+            return raw
 
     def _accepts(self, number: int | None) -> bool:
         """Return whether to take a message of a sequence number; None where the RMW has none."""

@@ -239,8 +239,8 @@ def add_overwrite_option(parse: argparse.ArgumentParser, name: str = '--force') 
 
 def check_outputs(options: argparse.Namespace, *paths: str | os.PathLike | None) -> None:
     """Refuse to replace a file or folder of others; a path that is not given is None or ''."""
-    for path in filter(None, paths):
-        if Path(path).exists() and not options.overwrite and not is_own(path):
+    for path in paths:
+        if path and Path(path).exists() and not options.overwrite and not is_own(path):
             raise UserError(f'{path}: is there already, and was not written by this package, or '
                             'was changed since; choose another name, or replace it with '
                             '--overwrite')

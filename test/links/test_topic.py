@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.links import topic
 from adxl_ros.links.support.base import Level, Samples
@@ -124,3 +125,11 @@ def test_the_status_names_what_is_missing() -> None:
     assert '2 nodes publish it' in link.status().text and link.status().level is Level.ERROR
     link.sense_publishers(1)
     assert 'lever_arm' in link.status().events[0].message and link.status().events[0].count == 1
+
+
+def test_the_unit_of_the_samples_is_one_of_acceleration() -> None:
+    sensor = nominal('xyz')
+    assert topic.open_link(sensor, topic.Settings(unit='m/s^2')).imu_unit == 'mps2'
+    for wrong in ('v', 'lsb', 'furlongs'):
+        with pytest.raises(UserError, match=f'link.unit is .{wrong}.'):
+            topic.open_link(sensor, topic.Settings(unit=wrong))

@@ -10,6 +10,7 @@ import signal
 from adxl_ros.files import parameter_file
 from adxl_ros.files.recording_columns import sensor_info
 from adxl_ros.model import signal_chain
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
@@ -174,6 +175,17 @@ def test_corrected_stream(robot: Robot, start: Start, tmp_path: Path) -> None:
     assert process.wait() == 0
     assert 'Traceback' not in process.output()
     assert stamp_ns(message) == 10 ** 9
+
+
+def test_samples_in_g_become_mps2(robot: Robot, start: Start, tmp_path: Path) -> None:
+    """A parameter states the unit of a foreign IMU."""
+    sensor = unit()
+    started(start, tmp_path, sensor, '-p', 'samples.unit:=g')
+    robot.inform(sensor)
+    robot.connected()
+    force = pose(0.7, -1.2)
+    message = robot.answer([value / G0_MPS2 for value in output_of(sensor, force)])
+    np.testing.assert_allclose(accel(message), force, atol=1e-7)
 
 
 def test_without_a_file_the_nominal_sensor_applies(robot: Robot, start: Start) -> None:

@@ -189,6 +189,7 @@ class ImuLink(Protocol):
     """A link that gets the ideal samples of a simulator."""
 
     imu_topic: str  # Topic of the ideal sensor_msgs/Imu
+    imu_unit: str  # Unit of its accelerations, a key of `GRAVITY`
     temperature_topic: str  # Topic of the temperature of the sensor
 
     def sense_imu(self, stamp_ns: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
