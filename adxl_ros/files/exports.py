@@ -67,6 +67,7 @@ class Axis:
     name: str  # x, y or z
     zero_g_mps2: float  # Output at 0 g by the nominal conversion, m/s²
     noise_std_mps2: float  # Noise of one sample before the ADC, m/s²
+    sample_variance: float  # Variance of one sample with the rounding of the ADC, (m/s²)²
     # Density of the samples at low, positive frequencies with the rounding of the ADC, m/s²/√Hz.
     # Noise above half of the rate of the file aliases into it.
     noise_density: float

@@ -11,6 +11,7 @@ import subprocess
 import sys
 
 from adxl_ros.files import parameter_file, recording
+from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.model import signal_chain
 from adxl_ros.model.effects import effect_named
@@ -147,7 +148,7 @@ def test_another_unit_is_refused(run_tool: RunTool, tmp_path: Path, key: str, va
 def test_bad_input_leaves_the_earlier_output(run_tool: RunTool, tmp_path: Path) -> None:
     sensor = unit()
     path = record(tmp_path, sensor, volts_of(sensor))
-    (tmp_path / 'out.csv').write_text('earlier')
+    write_text(tmp_path / 'out.csv', 'earlier')
     text = path.read_text(encoding='utf-8')
     path.write_text(text + '10.004,nan,2.5\n', encoding='utf-8')
     line = text.count('\n') + 1
