@@ -19,6 +19,7 @@ import time
 from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
+from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.links.support import base, stamping, wire_format
 from adxl_ros.links.support.stamping import ClockMap, Stamper
 from adxl_ros.links.support.wire_format import BoardInfo, SampleFrame
@@ -37,6 +38,9 @@ _INFO_WAIT_S = 1.5
 """Longest time without an info frame after opening, s. Derived: a board sends one each second."""
 _COMMAND_PAUSE_S = 0.5
 """Shortest time between two commands, s. Chosen: a board has answered by then."""
+_DEAD_S = 3.0
+"""Time without a sample after which a board counts as failed, s. Chosen: a reset and its info
+frame take less."""
 _SILENT_FRAMES = 3  # A board also counts as silent only after this many times its longest frame
 _MAX_BYTES_PER_S = 4e6
 """Bytes that are read per second at most. Chosen: more than USB full speed carries."""
@@ -123,6 +127,48 @@ class _Conversion:
                               lost)
 
 
+_RATE_SAMPLES = 50
+"""Samples over which the clock of a board is compared with its stated rate. Chosen: at 1 kHz both
+comparisons are over before the first stamp, and a time that is wrong by a period makes 2 %."""
+_MAX_RATE_ERROR = 0.05
+"""Largest relative difference of both. Chosen: above the error of any oscillator."""
+_CONTRADICTIONS = 2  # Comparisons in a row that must differ: a clock may step once
+
+
+class _ClockRate:
+    """The rate of the samples by the clock of a board, where it is not the stated one."""
+
+    def __init__(self, stated_hz: float) -> None:
+        self.stated_hz, self.used_hz = stated_hz, stated_hz
+        self._contradictions = 0
+        self._first: SampleFrame | None = None
+
+    @property
+    def fault(self) -> str:
+        """Return that clock and stated rate contradict each other, or ''."""
+        return '' if self.used_hz == self.stated_hz else (
+            f'states {self.stated_hz:g} Hz, but its clock shows {self.used_hz:.4g} samples a '
+            'second, which is used; correct the rate in its info frame')
+
+    def compare(self, frame: SampleFrame) -> bool:
+        """Take a frame; return whether it shows that the stated rate is wrong."""
+        first = self._first or frame
+        # The numbers of samples wrap at 2^32.
+        count = (frame.index - first.index) % 2 ** 32
+        if first is frame or count >= _RATE_SAMPLES:
+            self._first = frame
+        if count < _RATE_SAMPLES or self.used_hz != self.stated_hz:
+            return False
+        clock_hz = count / max(frame.time_us - first.time_us, 1) * 1e6
+        is_off = abs(clock_hz / self.stated_hz - 1) > _MAX_RATE_ERROR
+        self._contradictions = self._contradictions + 1 if is_off else 0
+        is_wrong = self._contradictions >= _CONTRADICTIONS \
+            and wire_format.RATES_HZ[0] <= clock_hz <= wire_format.RATES_HZ[1]
+        if is_wrong:
+            self.used_hz = clock_hz
+        return is_wrong
+
+
 class SerialLink(base.Link):
     """
     The samples of a board, each once and in order, stamped by the clock of the board.
@@ -144,14 +190,15 @@ class SerialLink(base.Link):
         self._arrivals: deque[tuple[BoardInfo | SampleFrame, int]] = deque()
         self._info: BoardInfo | None = None
         self._conversion: _Conversion | None = None
-        self._misfit = ''
+        self._misfit = self._other = ''  # Why samples cannot be read, or are of another unit
+        self._rate = _ClockRate(_UNSTATED_RATE_HZ)
         self._counter = wire_format.FrameCounter()
         self._stamper = Stamper(ClockMap(settings.delay), self.references)
         self._frame_s = 0.0  # Duration of the newest frame, s
         self._unjudged = self._commands = 0  # Samples of a frame that is new; commands so far
         self._command_due_s = 0.0
         self._counts: Counter[str] = Counter()
-        self._last_frame_s = self._created_s = time.monotonic()
+        self._last_frame_s = self._last_sample_s = self._created_s = time.monotonic()
         self._busy_until_s = self._unpaid_s = 0.0
 
     def read(self, now_ns: int) -> base.Samples:
@@ -193,26 +240,33 @@ class SerialLink(base.Link):
         self._port.close()
 
     def _condition(self) -> tuple[base.Level, str]:
-        """Return level and text of the status: the first fault of port, frames and channels."""
+        """Return level and text of the status: the first fault of port, frames and board."""
+        port, info = self._settings.port, self._info
         if self._port.error:
             return base.Level.ERROR, self._port.error
-        now_s, port, info = time.monotonic(), self._settings.port, self._info
-        opened_s = max(self._port.opened_s, self._created_s)
-        if info is None and now_s - opened_s < _INFO_WAIT_S:
+        now_s = time.monotonic()
+        if info is None and now_s - max(self._port.opened_s, self._created_s) < _INFO_WAIT_S:
             return base.Level.OK, 'connecting'
-        long_s = _SILENT_FRAMES * self._frame_s
-        silent_s = now_s - max(self._port.last_byte_s, self._created_s)
-        if silent_s > max(_SILENT_S, long_s):
-            return base.Level.WARN, f'{port}: {_SILENT}'
-        if now_s - self._last_frame_s > max(_NO_FRAME_S, long_s):
-            return base.Level.WARN, (
-                f'{port}: bytes, but no frame of wire format 1: is link.baud '
-                f'({self._settings.baud}) that of the board, and its firmware of this version?')
+        if obstacle := self._obstacle(now_s):
+            if now_s - self._last_sample_s > _DEAD_S:
+                return base.Level.ERROR, f'{port}: {obstacle}; no sample for more than ' \
+                                         f'{_DEAD_S:g} s'
+            return base.Level.WARN, f'{port}: {obstacle}'
         if self._misfit:
             return base.Level.ERROR, self._misfit
-        if info is None:
-            return base.Level.WARN, f'{port}: waiting for the info frame of the board'
+        if contradiction := self._other or self._rate.fault:
+            return base.Level.ERROR, f'{port}: the board {contradiction}'
         return base.Level.OK, 'streaming'
+
+    def _obstacle(self, now_s: float) -> str:
+        """Return why no samples come at a monotonic time, s, or ''."""
+        long_s = _SILENT_FRAMES * self._frame_s
+        if now_s - max(self._port.last_byte_s, self._created_s) > max(_SILENT_S, long_s):
+            return _SILENT
+        if now_s - self._last_frame_s > max(_NO_FRAME_S, long_s):
+            return (f'bytes, but no frame of wire format 1: is link.baud ({self._settings.baud}) '
+                    'that of the board, and its firmware of this version?')
+        return 'waiting for the info frame of the board' if self._info is None else ''
 
     def _ask_for_short_frames(self) -> None:
         """
@@ -273,7 +327,15 @@ class SerialLink(base.Link):
         changed = info != self._info
         if not changed and not info.flags & wire_format.AFTER_RESET:
             return
-        self._info, self._conversion, self._misfit = info, None, ''
+        self._info, self._rate = info, _ClockRate(info.rate_hz)
+        unit, declared = info.serial, self._declared.serial
+        self._other = (f'is the unit {unit}, but the parameters are those of {declared}; give '
+                       f'the file of {unit}') if unit and declared not in (unit, NO_UNIT) else ''
+        self._use(info, changed)
+
+    def _use(self, info: BoardInfo, changed: bool = True) -> None:
+        """Read further samples by a description of the board; its sensor may have changed."""
+        self._conversion, self._misfit = None, ''
         self._counter.restart(info.rate_hz)
         axes = self._declared.axes
         roles = self._stated_roles or [
@@ -302,10 +364,15 @@ class SerialLink(base.Link):
                 or max(map(max, frame.codes.tolist())) > conversion.max_code:
             self._counts['bad_frames'] += 1  # whole, but it contradicts the info frame
             return
+        self._last_sample_s = time.monotonic()
+        is_other_rate = self._rate.compare(frame)
+        if is_other_rate:
+            self._use(replace(info, rate_hz=self._rate.used_hz))
+            conversion = self._conversion or conversion
         for accepted in self._counter.accept(frame, arrived_ns):
             if accepted.lost is None:
-                self._counts['resets'] += self._stamper.period_ns > 0
-                self._stamper.restart(1e9 / info.rate_hz)
+                self._counts['resets'] += self._stamper.period_ns > 0 and not is_other_rate
+                self._stamper.restart(1e9 / self._rate.used_hz)
             elif accepted.stepped:
                 self._stamper.step()
             self._counts['rail_frames'] += accepted.frame.flags & wire_format.RAIL

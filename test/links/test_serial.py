@@ -236,11 +236,15 @@ def test_frames_that_contradict_the_info_frame_are_not_published(connect):
     assert board.value('bad_frames') == 2
 
 
-def test_silence_and_bytes_without_a_frame_are_distinguished(connect):
+def test_silence_and_bytes_without_a_frame_are_distinguished(connect, monkeypatch):
+    monkeypatch.setattr(serial, '_DEAD_S', 0.7)
     board = connect()
     board.send_info()
     board.send_frames(3)
     board.wait_for('silent')
+    assert board.link.status().level == base.Level.WARN
+    board.wait_for('silent, the board sends nothing; no sample for more than 0.7 s')
+    assert board.link.status().level == base.Level.ERROR
     board.wait_for('is link.baud (115200) that of the board',
                    lambda: board.send(os.urandom(50).replace(b'\0', b'\1') + b'\0'))
     board.wait_for('streaming', board.send_frames)
@@ -401,6 +405,33 @@ def test_another_board_on_the_port_is_another_sensor(connect):
     parts = board.read_samples(30)
     assert board.link.sensor.serial == 'Z1'
     assert volts_of(parts) == pytest.approx(1.25)
+
+
+def test_a_board_of_another_unit_than_the_parameters_is_an_error(connect):
+    board = connect(sensor=nominal(serial='U73'))
+    board.send_info()
+    board.send_frames(3)
+    assert sample_count(board.read_samples(30)) == 30
+    status = board.link.status()
+    assert status.level == base.Level.ERROR
+    assert 'is the unit A7, but the parameters are those of U73' in status.text
+
+
+@pytest.mark.parametrize('stated_hz', [500.0, 2000.0])
+def test_a_rate_that_contradicts_the_clock_is_named_and_no_stamp_is_ahead(connect, stated_hz):
+    board = connect(info=BoardInfo(stated_hz, 16, 2, 5.0, ''))
+    board.send_info()
+    stamps = []
+    for _ in range(50):
+        board.send_frames(1, 0.01)
+        stamps += [part.stamp_ns for part in board.read(0.001)]
+        assert not stamps or stamps[-1][-1] <= time.time_ns()
+    steps_ns = np.diff(np.concatenate(stamps))
+    assert len(steps_ns) > 200 and (steps_ns > 0).all()
+    assert np.median(steps_ns) == pytest.approx(1e6, rel=0.1)
+    board.wait_for(f'states {stated_hz:g} Hz, but its clock shows 1000 samples a second')
+    assert board.link.status().level == base.Level.ERROR
+    assert board.link.sensor.rate_hz == pytest.approx(1000)
 
 
 def test_a_board_that_waits_for_its_info_is_asked_at_once(connect):
