@@ -25,6 +25,7 @@ from adxl_ros.calibrate.guided.screen_contents import KeyAction, Phase, StageMod
 from adxl_ros.calibrate.guided.session import SessionSettings
 from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
 from adxl_ros.files import calibration_store, cdr
+from adxl_ros.files.recording_columns import JOINTS
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.jobs import executable, held_output
@@ -378,6 +379,7 @@ class Calibration(Node):
             self._controller.start()
         self._connect()
         self._has_run, self._busy_ns = False, 0
+        self._names_joints = False  # Whether a line has named joints that no stage has
         self._display = DisplayPublisher(self, self._controller, own.screen)
         self.show_fit = self._display.show_fit
         if not own.autostart and not self._controller.may_ask:
@@ -464,6 +466,12 @@ class Calibration(Node):
                     stage.read_command(*reading.angles)
                 elif stage is not None and np.isfinite(reading.angles).all():
                     stage.read_encoder(reading.stamp_ns, *reading.angles)
+                elif not reading.position.keys() & JOINTS.keys() and not self._names_joints:
+                    self._names_joints = True
+                    self.log('WARNING', f'{self.resolve_topic_name(topic)} has the joints '
+                             f'{", ".join(reading.position)}, but calibration needs alpha and '
+                             'beta; the node stage gives them, by bridge.alpha.joint and '
+                             'bridge.beta.joint')
 
     def _service(self, request: Callable[[], Answer]) -> Callable[..., Trigger.Response]:
         """Make the callback of a service that calls a request of the controller."""

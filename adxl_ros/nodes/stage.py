@@ -217,7 +217,9 @@ class StageBridge:
         self._speed_rad_s = own.speed_rad_s
         self._angles_rad, self._goal_rad = np.full(2, np.nan), np.full(2, np.nan)
         self._heard_ns = self._resend_ns = 0
-        self._refusal = ''
+        self._begun_ns = STEADY.now().nanoseconds
+        self._refusal = self._fault = ''
+        self._seen: set[str] = set()  # Names of the controller's joints
         self._positions = topics.create_publisher(node, JointState, 'stage/joint_states',
                                                   _BRIDGE_QUEUE)
         self._commands = topics.create_publisher(
@@ -275,6 +277,7 @@ class StageBridge:
 
     def _on_states(self, message: JointState) -> None:
         positions = dict(zip(message.name, message.position))
+        self._seen.update(message.name)
         angles_rad = self._offsets_rad + self._signs * [
             positions.get(name, np.nan) for name in self._names]
         # A controller that counts from −π to π jumps where the stage turns on.
@@ -292,15 +295,27 @@ class StageBridge:
     def _status(self) -> Status:
         values = {name: angle for name, angle in zip(_ANGLES, self._angles_rad.tolist())
                   if np.isfinite(angle)}
-        return Status(*self._state(), self._kind, values)
+        level, text = self._state()
+        if level is Level.ERROR and text != self._fault:
+            self._node.get_logger().error(text)
+            self._fault = text
+        return Status(level, text, self._kind, values)
 
     def _state(self) -> tuple[Level, str]:
         """Return the level and one line: the motion, or why there is none."""
+        now_ns = STEADY.now().nanoseconds
+        unknown = [name for name in self._names if name not in self._seen]
+        # The joints of a robot may come in several messages.
+        if self._seen and unknown and now_ns - self._begun_ns > _SILENT_NS:
+            return Level.ERROR, (f'{self._states_topic} has the joints '
+                                 f'{", ".join(sorted(self._seen))}, but no '
+                                 f'{" and no ".join(unknown)}; correct bridge.alpha.joint and '
+                                 'bridge.beta.joint')
         if self._refusal:
             return Level.WARN, f'refused {self._refusal}'
-        if STEADY.now().nanoseconds - self._heard_ns > _SILENT_NS:
+        if now_ns - self._heard_ns > _SILENT_NS:
             return Level.WARN, (f'nothing on {self._states_topic} of {" and ".join(self._names)}; '
-                                'is the controller running, and has it these joints?')
+                                'is the controller running?')
         is_there = self._arrived() or np.isnan(self._goal_rad).any()
         return Level.OK, 'at rest' if is_there else 'on the way'
 

@@ -100,6 +100,8 @@ def test_a_command_that_is_lost_is_sent_again(start):
     with Controller('trajectory') as graph:
         start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES, '-p',
               'bridge.speed_rad_s:=10.0')
+        start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES, '-p',
+              'bridge.alpha.joint:=tlit', '-r', '__node:=misspelt')
         graph.spin_until(graph.at, 30, 'the stage')
 
         def commanded_twice():
@@ -107,6 +109,9 @@ def test_a_command_that_is_lost_is_sent_again(start):
             return len(graph.commands) >= 2
         graph.spin_until(commanded_twice, 20, 'a second time')
         graph.spin_until(lambda: graph.reports('stage', 'on the way'), 20, 'the state')
+        graph.spin_until(lambda: graph.reports(
+            'misspelt', '/joint_states has the joints gripper, tilt, turn, but no tlit'), 20,
+            'the name of the joint')
 
 
 @pytest.mark.parametrize('options, words', [
