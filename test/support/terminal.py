@@ -95,4 +95,8 @@ class Terminal:
             os.killpg(self.popen.pid, signal.SIGKILL)
             self.popen.wait()
         os.close(self.slave)
-        os.close(self._master)
+        # The reader ends with the last process on the terminal. After a close its number could be
+        # that of another file, from which a reader that still runs would take.
+        self._thread.join(PATIENCE * 5.0)
+        if not self._thread.is_alive():
+            os.close(self._master)
