@@ -11,9 +11,12 @@ import ast
 from functools import cache
 from pathlib import Path
 
+from needs import lack
 import pytest
 
-tomllib = pytest.importorskip('tomllib', reason='Python 3.10 has none')
+tomllib = pytest.importorskip('tomllib', reason=lack('Python 3.11'))
+# The modules are read once.
+pytestmark = pytest.mark.xdist_group('budget')
 ROOT = Path(__file__).parents[2]
 BUDGET = tomllib.loads((ROOT / 'pyproject.toml').read_text())['tool']['adxl_ros']['budget']
 BRANCHES = (ast.If, ast.For, ast.While, ast.ExceptHandler, ast.IfExp, ast.comprehension,
