@@ -165,8 +165,8 @@ def test_a_system_manager_changes_the_state_of_the_driver(start, tmp_path):
             if state == 'active':
                 rig.wait_for_samples(300, 20)
                 continue
-            rig.collect()
-            rig.graph.spin(0.3)
+            # Samples of the active driver may be under way.
+            graph.wait_for_silence('imu/data_raw', 0.3)
             rig.collect()
             before = len(rig.numbers)
             graph.diagnostics.clear()
@@ -214,7 +214,7 @@ def test_a_measured_supply_corrects_the_supply_effect(start, tmp_path):
             start('driver', ROS, '-p', 'link.type:=serial', '-p', f'link.port:={path}', '-p',
                   'link.channels:=x,y,supply,temperature', '-p', 'link.supply_scale:=2.0')
             start('compensation', ROS, '--params-file', tmp_path / 'unit.yaml')
-            graph.spin_until(lambda: supply and temperature and corrected, 30, 'all of it')
+            graph.spin_until(lambda: supply and temperature and raw and corrected, 30, 'all of it')
             # A constant supply is published once a second: the compensation may not have it yet.
             graph.spin_until(lambda: accel(corrected[-1])[:2] == pytest.approx(
                 [0, 0.5 * 9.80665], abs=0.01), 10, 'the correction')

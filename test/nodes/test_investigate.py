@@ -22,7 +22,8 @@ pytestmark = pytest.mark.long
 SIM = ('-p', 'use_sim_time:=true')
 FAST = ('-p', 'limits.rate_deg_s:=60.0', '-p', 'limits.beta_deg:=[-90.0,90.0]', '-p',
         'qos_overrides./imu/data_raw.subscription.reliability:=reliable', '-p',
-        'qos_overrides./imu/data_raw.subscription.depth:=100000')
+        'qos_overrides./imu/data_raw.subscription.depth:=100000', '-p',
+        'qos_overrides./stage/command.publisher.depth:=10000')
 RATE_RAD_S = np.radians(60)
 LONG = '-p', 'limits.rate_deg_s:=10.0', '-p', 'limits.minutes:=0.9'
 """Manoeuvres that take long enough to be seen and ended."""
