@@ -143,6 +143,8 @@ class CompensationPolicy:
              f'{counts.get("dropped")} samples dropped that no force explains'),
             (counts.get('saturated'),
              f'{counts.get("saturated")} samples with the ADC at its rail'),
+            (counts.get('backward'), f'{counts.get("backward")} samples whose stamp steps back; '
+             f'one driver must stamp {samples} in order'),
             (self.info is None, f'unit not confirmed: {no_info}'),
             (unknown, unknown),
             (not self.sensor.effects, 'not calibrated: the datasheet values apply'),

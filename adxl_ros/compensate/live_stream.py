@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from math import inf
 from typing import Any, NamedTuple
 
 from adxl_ros.compensate.estimators import Estimate, Estimates, LiveEstimator
@@ -24,7 +25,7 @@ from adxl_ros.model.kinematics import (
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-COUNTS = ('received', 'published', 'dropped', 'saturated', 'outside')
+COUNTS = ('received', 'published', 'dropped', 'saturated', 'outside', 'backward')
 """What a stream counts: samples, and those to which something happened."""
 
 _MAX_UNKNOWN = 5000  # Largest number of samples that wait for their sensor; chosen: 5 s at 1 kHz
@@ -62,6 +63,7 @@ class LiveStream:
         self._publish_imu, self._publish_tilt = publish_imu, publish_tilt
         self._chain: _Chain
         self._angles_rad = [0.0, 0.0, 0.0]
+        self._newest_s = -inf  # Stamp of the newest sample, s
         self.counts: Counter[str] = Counter()  # Samples since the start, by the names of `COUNTS`
         # What the newest sample outside of the calibrated range exceeds, in words
         self.outside: tuple[str, ...] = ()
@@ -131,6 +133,8 @@ class LiveStream:
         except CdrError:
             self.counts['dropped'] += 1
             return
+        self.counts['backward'] += time_s < self._newest_s
+        self._newest_s = time_s
         # Read once: another thread may replace the chain at any time.
         chain = self._chain
         volts = chain.live.volts(accel_mps2)

@@ -342,9 +342,11 @@ def write_into(path: str, node_name: str, values: Mapping[str, str]) -> None:
 
     values: YAML of the values by name. Raises `UserError` where the file cannot be written.
     """
+    section = next((parameters for pattern, parameters in _sections(path)
+                    if _matches(pattern, node_name)), None)
+    if section is None:
+        raise UserError(f'{path}: has no parameters of the node {node_name}')
     text = Path(path).read_text(encoding='utf-8')
-    section = next(parameters for pattern, parameters in _sections(path)
-                   if _matches(pattern, node_name))
     present = {name: value for pattern, name, value in _entries(path)
                if _matches(pattern, node_name)}
     begin = section.value[0][0].start_mark

@@ -108,6 +108,7 @@ def test_a_newer_calibration_is_announced_unless_one_was_named(tmp_path: Path) -
     ({'received': 0}, 'no samples on /imu/data_raw'),
     ({'received': 9, 'dropped': 5}, '5 samples dropped'),
     ({'received': 9, 'saturated': 2}, '2 samples with the ADC at its rail'),
+    ({'received': 9, 'backward': 4}, '4 samples whose stamp steps back'),
     ({'received': 9, 'outside': 3}, '3 samples outside of what was calibrated')])
 def test_states_of_the_samples(counts: dict[str, int], expected: str) -> None:
     interval = replace(QUIET, counts=counts, outside=('temperature 40.0 degC',))

@@ -59,6 +59,14 @@ def test_invalid_messages_are_dropped() -> None:
     assert (stream.counts['dropped'], stream.data) == (3, [])
 
 
+def test_stamps_that_step_back_are_counted() -> None:
+    stream = Stream(unit())
+    for period_ns in (10, 10, -5, 20):
+        stream.period_ns = period_ns * 1_000_000
+        stream.send(unit(), 0.7, 0.4)
+    assert (stream.counts['backward'], len(stream.data)) == (1, 4)
+
+
 def test_temperature_and_supply_apply_from_the_next_sample_on() -> None:
     sensor = put(with_neutral(unit(), ['temperature_bias']),
                  [Coefficient('temperature_bias', 'per_k', 'x')], [1e-3])
