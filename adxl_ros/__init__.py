@@ -16,6 +16,7 @@ from importlib import import_module
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from adxl_ros.api.calibration import fit
     from adxl_ros.api.gap import diagnose
     from adxl_ros.api.recordings import from_arrays, read
     from adxl_ros.api.sensors import load
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 _MODULES = {
     'diagnose': 'api.gap',
+    'fit': 'api.calibration',
     'from_arrays': 'api.recordings',
     'load': 'api.sensors',
     'read': 'api.recordings',
@@ -32,7 +34,7 @@ _MODULES = {
 }
 """Module of each name that `import adxl_ros` gives."""
 
-__all__ = ['SensorModel', 'UserError', 'diagnose', 'from_arrays', 'load', 'read']
+__all__ = ['SensorModel', 'UserError', 'diagnose', 'fit', 'from_arrays', 'load', 'read']
 
 
 # Two verbs have the names of packages. A package becomes an attribute when it is first imported:

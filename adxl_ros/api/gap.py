@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 import os
@@ -12,7 +12,7 @@ from pathlib import Path
 import shlex
 from typing import Any, NamedTuple
 
-from adxl_ros.api.recordings import as_recordings, read_ideal, RecordingInput
+from adxl_ros.api.recordings import as_recordings, read_ideal, RecordingInput, RobotInput
 from adxl_ros.api.result import (
     FirstScreen,
     make_folder,
@@ -247,7 +247,7 @@ def _command(recordings: Sequence[str], given: Mapping[str, str]) -> str:
     return command('diagnose', shlex.join([*recordings, *options]))
 
 
-def diagnose(recordings: RecordingInput | Sequence[RecordingInput],
+def diagnose(recordings: RecordingInput | Iterable[RecordingInput],
              sensor: SensorInput | None = None, *,
              sim: RecordingInput | Motion | None = None,
              urdf: str | os.PathLike | None = None, frame: str = 'imu_link', joints: str = '',
@@ -302,18 +302,17 @@ def diagnose(recordings: RecordingInput | Sequence[RecordingInput],
     for name, value, least in (('seed', seed, 0), ('self-check', self_check, 0),
                                ('material', material, 1e-6)):
         require_least(name, value, least)
-    several = [recordings] if isinstance(recordings, (Recording, str, os.PathLike)) \
-        else list(recordings)
-    if (sim is not None or urdf) and (len(several) > 1 or (sim is not None and urdf)):
-        raise UserError(f'{_name_of(sim) or urdf}: --sim or --urdf, one of them, goes with one '
-                        f'recording, but {len(several)} are given')
     if align and sim is None and not urdf:
         raise UserError('--align: shifts --sim or a robot, and neither is given')
     unit = quantity_named(quantity) if quantity else None
-    read = as_recordings(several)
+    read = as_recordings(recordings)
+    if (sim is not None or urdf) and (len(read) > 1 or (sim is not None and urdf)):
+        raise UserError(f'{_name_of(sim) or urdf}: --sim or --urdf, one of them, goes with one '
+                        f'recording, but {len(read)} are given')
     given = sensor_of(sensor, read[0])
     baseline, remarks = given.sensor, []
-    motion = _motion(read[0], baseline, sim, urdf, frame, joints)
+    motion = RobotInput(urdf, frame, joints).path(read[0], baseline).as_motion() if urdf else \
+        _motion(read[0], sim)
     if prior:
         from adxl_ros.files import calibration_store
         from adxl_ros.model.population import posterior
@@ -341,13 +340,8 @@ def _name_of(sim: RecordingInput | Motion | None) -> str:
     return os.fspath(sim) if isinstance(sim, (str, os.PathLike)) else ''
 
 
-def _motion(read: Recording, sensor: Sensor, sim: RecordingInput | Motion | None,
-            urdf: str | os.PathLike | None, frame: str, joints: str) -> Motion | None:
-    """Return the motion of another simulator, or of a robot; None for that of the stage."""
-    if urdf:
-        from adxl_ros.simulate import robot
-        return robot.robot_path(urdf, frame, read.path, read.epoch_ns, sensor.local_gravity_mps2,
-                                joints).as_motion()
+def _motion(read: Recording, sim: RecordingInput | Motion | None) -> Motion | None:
+    """Return the motion of another simulator; None for that of the stage."""
     if sim is None or isinstance(sim, Motion):
         return sim
     return motion_from_force(read_ideal(sim, read.epoch_ns), False)[0]

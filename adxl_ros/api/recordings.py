@@ -4,10 +4,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 import math
 import os
-from typing import Any
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording as recording_files
@@ -22,7 +22,11 @@ from adxl_ros.files.column_mapping import (
 )
 from adxl_ros.files.recording_columns import ACCEL, Recording, REFERENCES, TIME, VOLTS
 from adxl_ros.files.tables import in_memory
+from adxl_ros.model.sensor import Sensor
 import numpy as np
+
+if TYPE_CHECKING:
+    from adxl_ros.simulate.robot import RobotPath
 
 RecordingInput = Recording | str | os.PathLike
 """A recording, or the path of one that is read as it is."""
@@ -187,13 +191,32 @@ def _table(columns: Mapping[str, np.ndarray], name: str, serial: str = '') -> Ta
     return in_memory(name, columns, info={'serial': serial} if serial else {})
 
 
-def as_recordings(given: RecordingInput | Sequence[RecordingInput]) -> list[Recording]:
-    """Return recordings, those that are named by their path read as they are."""
-    several = [given] if isinstance(given, (Recording, str, os.PathLike)) else list(given)
+def each_recording(given: RecordingInput | Iterable[RecordingInput]) -> Iterator[Recording]:
+    """Yield recordings, those that are named by their path read as they are."""
+    for each in [given] if isinstance(given, (Recording, str, os.PathLike)) else given:
+        yield each if isinstance(each, Recording) else recording_files.read(each)
+
+
+def as_recordings(given: RecordingInput | Iterable[RecordingInput]) -> list[Recording]:
+    """Return one or more recordings."""
+    several = list(each_recording(given))
     if not several:
         raise UserError('no recording is given')
-    return [each if isinstance(each, Recording) else recording_files.read(each)
-            for each in several]
+    return several
+
+
+class RobotInput(NamedTuple):
+    """A robot in place of a stage."""
+
+    urdf: str | os.PathLike  # Path of the robot
+    frame: str  # Its frame that carries the sensor
+    joints: str  # Topic of its joints; '' for the only one
+
+    def path(self, read: Recording, sensor: Sensor) -> RobotPath:
+        """Return the motion of the robot in a recording."""
+        from adxl_ros.simulate import robot
+        return robot.robot_path(self.urdf, self.frame, read.path, read.epoch_ns,
+                                sensor.local_gravity_mps2, self.joints)
 
 
 def read_ideal(given: RecordingInput, epoch_ns: int) -> Recording:

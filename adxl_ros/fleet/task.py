@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.calibration_store import sha256
-from adxl_ros.files.recording_columns import NO_UNIT, recorded_unit, Recording
+from adxl_ros.files.recording_columns import NO_UNIT, Recording
 from adxl_ros.fleet import inputs
 from adxl_ros.fleet.inputs import begin_of, Source
 from adxl_ros.fleet.row import (
@@ -41,7 +41,6 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.process import code_version, package_version
 from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
 from adxl_ros.signals.noise_parameters import recording_noise
-from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 import numpy as np
 
 _SPARE_MB = 64  # Space that stays free, MB. Chosen: a task writes some MB
@@ -319,16 +318,9 @@ class _Job:
 
     def _fit(self) -> None:
         """Fit a calibration to the recording alone."""
-        from adxl_ros.calibrate import calibration  # the client needs none
-        from adxl_ros.calibrate.poses import estimate_filters, extract_poses
-        read = self._recording
-        sensor, _ = measure_unstated(load_sensor(self._params, read), read)
-        unit = recorded_unit(sensor, read)
-        poses = extract_poses(read, unit, None)
-        recorded = calibration.RecordedPoses(
-            Path(self._source.url).name, poses, estimate_filters(read, unit, poses))
-        result = calibration.calibrate(unit, [recorded], None, (), self._staged.content)
-        fitted = result.fitted
+        from adxl_ros.api.calibration import fit  # the client needs none
+        found = fit(self._recording, self._params, data_sha256=self._staged.content)
+        fitted = found.sensor
         stds = dict(zip(fitted.covariance_names, np.sqrt(np.diag(fitted.covariance)).tolist()))
         for name, unit_name, coefficient, values in (
                 ('zero_g', 'v', ('bias', 'offset_v'), fitted.zero_g_v),
@@ -337,9 +329,9 @@ class _Job:
                 self.row |= {f'{name}_{axis}_{unit_name}': float(value),
                              f'{name}_std_{axis}_{unit_name}':
                              stds.get(Coefficient(*coefficient, axis))}
-        self.row |= {'fit_model': fitted.model, 'fit_poses': int(result.inliers.sum())}
+        self.row |= {'fit_model': fitted.model, 'fit_poses': found.poses}
         self.files['unit.yaml'] = parameter_file.as_text(
-            fitted, result.report_lines).encode('utf-8')
+            fitted, found.result.report_lines).encode('utf-8')
 
     def _diagnose(self) -> None:
         """Compare the recording with its simulation."""

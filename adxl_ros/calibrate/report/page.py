@@ -81,8 +81,8 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     return html_page.render('adxl_ros.calibrate.report', 'calibration.html', {
         'title': f'Calibration of {fitted.serial}, {fitted.provenance["date"][:10]}',
         'about': [f'{fitted.model} model', f'{len(result.poses)} poses', f'axes {fitted.axes}'],
-        'badge': _badge(fitted),
-        'tiles': _tiles(result, assessment),
+        'badge': badge(fitted),
+        'tiles': tiles(result, assessment),
         'advice': f'Limited by {acceptance.LIMITS[assessment.accel.limited_by]}.'
         if assessment else 'Take more poses: too few were held out to assess this calibration.',
         'file_name': re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml',
@@ -105,7 +105,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
                        for key, value in fitted.provenance.items()]})
 
 
-def _badge(fitted: Sensor) -> dict[str, str]:
+def badge(fitted: Sensor) -> dict[str, str]:
     """Return the acceptance and its colour."""
     outcome, lines = acceptance.acceptance(fitted)
     sentence = '. '.join(line.rstrip('.') for line in lines)
@@ -113,7 +113,7 @@ def _badge(fitted: Sensor) -> dict[str, str]:
             'sentence': f'{sentence[0].upper()}{sentence[1:]}.'}
 
 
-def _tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict[str, str]]:
+def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict[str, str]]:
     """Return tilt and acceleration error before and after, and what limits them."""
     tiles = []
     if (fit := result.gravity_fit) is not None:

@@ -1,0 +1,332 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Calibration of the front door: from recordings of one unit to its parameter file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from adxl_ros.api.recordings import each_recording, RecordingInput, RobotInput
+from adxl_ros.api.result import FirstScreen, make_folder, no_progress, Progress, Result
+from adxl_ros.api.sensors import GivenSensor, sensor_of, SensorInput
+from adxl_ros.calibrate import calibration
+from adxl_ros.calibrate.fits import thermal_fit
+from adxl_ros.calibrate.poses import estimate_filters, extract_poses, Poses, with_table_angles
+from adxl_ros.calibrate.report import acceptance, gum, page
+from adxl_ros.calibrate.report.held_out import HeldOutErrors
+from adxl_ros.calibrate.result import CalibrationResult, compare, errors_in_words
+from adxl_ros.errors import UserError
+from adxl_ros.files import calibration_store, sweep_journal
+from adxl_ros.files.recording_columns import recorded_unit, Recording
+from adxl_ros.files.surroundings import Surroundings
+from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.report.figures import axes_for, AXIS_COLOURS
+from adxl_ros.report.quantities import mg
+from adxl_ros.signals.recorded_sensor import BeyondRange, FilterNoise, listed
+
+_READING = 0.3  # Share of the work until the fit begins (chosen: a sweep of minutes)
+
+
+class FittedCoefficient(NamedTuple):
+    """A coefficient of a calibration."""
+
+    name: str  # 'effect.parameter', as in the parameter file
+    axis: str  # x, y or z; '' for a coefficient of all axes
+    label: str  # The coefficient in words
+    value: float  # In `unit`; zero-g and scale factor are absolute, V and V/g
+    half_width: float  # Half of its 90 % interval, in `unit`
+    unit: str  # Degrees for an angle, else the unit of the parameter file
+
+
+@dataclass(frozen=True, repr=False)
+class Fit(Result):
+    """
+    A calibrated unit.
+
+    `print` shows the screen of the tool `fit`, a notebook the top of its page. Other verbs take
+    it in place of the sensor.
+    """
+
+    sensor: Sensor
+    """The unit with its fitted coefficients, their covariance and its validity range."""
+    outcome: str
+    """PASS, NOT SHOWN or FAIL: the calibration error against the limit of the datasheet."""
+    coefficients: tuple[FittedCoefficient, ...]
+    """Fitted coefficients with the halves of their 90 % intervals."""
+    held_out: tuple[HeldOutErrors, ...]
+    """Errors on poses that the fit has not seen, by model, the datasheet's first: rms, largest
+    and 90 % interval of `tilt_deg`, degrees, and of `accel_mg`, mg. Empty against gravity."""
+    poses: int
+    """Number of poses that were used."""
+    outliers: tuple[int, ...]
+    """Indices of the poses that the fit leaves out."""
+    warnings: tuple[str, ...]
+    """What is wrong with the poses or the fit, and why no richer model was fitted."""
+    measured: tuple[str, ...]
+    """What was measured, as no parameter file states it."""
+    notes: tuple[str, ...]
+    """Readings beyond the stated range, by recording."""
+    is_over_temperature: bool
+    """Whether temperature effects were fitted to a sensor at rest."""
+    result: CalibrationResult
+    """All steps between the poses and the coefficients."""
+
+    @property
+    def screen(self) -> list[str]:
+        """Return the lines of the tool's screen."""
+        fitted = self.sensor
+        # What was wrong with the unit, and what is fitted
+        head = [] if self.is_over_temperature else [
+            errors_in_words(fitted), '',
+            f'{fitted.serial}: {fitted.model} model of {self.poses} poses, '
+            f'{len(fitted.covariance_names)} coefficients', '']
+        return [*head, *self.result.summary, *self.warnings, *listed([*self.measured])]
+
+    @property
+    def first_screen(self) -> FirstScreen:
+        """Return the top of the page."""
+        badge, assessments = page.badge(self.sensor), self.result.assessments
+        tiles = page.tiles(self.result, assessments[-1] if assessments else None)
+        return FirstScreen(badge['colour'], badge['word'], badge['sentence'],
+                           [(tile['label'], tile['text'], tile['note']) for tile in tiles])
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the parameter file; that of another fit becomes NAME.previous."""
+        self.result.save(path)
+
+    def report(self, folder: str | os.PathLike, store: str | os.PathLike = '') -> Path:
+        """
+        Write the page report.html into a folder, and return its path.
+
+        It compares with the earlier calibrations of the unit in `store`.
+        """
+        if self.is_over_temperature:
+            raise UserError(f'--report {folder}: a fit over temperature has no page; leave it out')
+        path = make_folder(folder)
+        page.write(path, self.result, store)
+        return path / page.PAGE
+
+    def certificate(self, path: str | os.PathLike) -> None:
+        """Write a Digital Calibration Certificate (DCC of PTB) of a calibration on a stage."""
+        gum.write(path, self.result)
+
+    def keep(self, store: str | os.PathLike) -> str:
+        """Copy the calibration to a store; return one line on it."""
+        return self.result.keep(store)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return coefficients, errors and provenance as objects of JSON."""
+        errors = self.held_out[-1] if self.held_out else None
+        return {
+            'schema': 1, 'serial': self.sensor.serial, 'model': self.sensor.model,
+            'outcome': self.outcome, 'poses': self.poses, 'outliers': list(self.outliers),
+            'coefficients': [row._asdict() for row in self.coefficients],
+            'held_out_tilt_deg': errors and errors.tilt_deg.rms,
+            'held_out_accel_mg': errors and errors.accel_mg.rms,
+            'warnings': list(self.warnings), 'measured': list(self.measured),
+            'provenance': dict(self.sensor.provenance)}
+
+    def to_pandas(self) -> Any:
+        """Return a DataFrame with a row for each coefficient."""
+        from pandas import DataFrame
+        return DataFrame(self.coefficients, columns=FittedCoefficient._fields)
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the errors on held-out poses, mg, into axes of matplotlib."""
+        ax, gravity = axes_for(ax), self.result.gravity_fit
+        if gravity is not None:
+            ax.plot(mg(gravity.held_out_mps2), 'o', label='magnitude minus gravity')
+        elif self.held_out:
+            for axis, errors in zip(self.sensor.axes, self.held_out[-1].errors.accel_mps2.T):
+                ax.plot(mg(errors), 'o', label=axis, color=AXIS_COLOURS[axis])
+        ax.set(xlabel='held-out pose', ylabel='error of acceleration, mg')
+        ax.axhline(0.0, lw=0.8, color='#7b8794')
+        ax.legend()
+        return ax
+
+
+def fit(recordings: RecordingInput | Iterable[RecordingInput],
+        sensor: SensorInput | None = None, *, model: str | None = None,
+        effects: Sequence[str] = (), prior: str | os.PathLike | None = None,
+        journal: str | os.PathLike | None = None, poses: str | os.PathLike | None = None,
+        urdf: str | os.PathLike | None = None, frame: str = 'imu_link', joints: str = '',
+        data_sha256: str = '', progress: Progress = no_progress) -> Fit:
+    """
+    Calibrate one unit: against stage angles where there are any, else against gravity.
+
+    Parameters
+    ----------
+    recordings
+        One or more recordings of rests in several poses, all of one unit; the path of a
+        recording is read as it is. With `alpha_rad` and `beta_rad` the reference is the stage.
+        Without, it is the length of gravity, which needs three axes and ten poses.
+    sensor
+        What is not fitted: a Sensor, a datasheet's name or the path of a parameter file. None
+        for the nominal sensor, or any IMU; what a file leaves out is measured.
+    model
+        'linear', 'physical' or 'full' against the stage; None for the richest that the poses
+        determine.
+    effects
+        Further effects of the full model, by name. Temperature effects alone are fitted to a
+        sensor that rests while its temperature changes.
+    prior
+        Path of the population.yaml of a fleet: prior of zero-g and scale factor.
+    journal, poses
+        Path of the journal of the sweep that names the rests, or of a table with `alpha_deg` and
+        `beta_deg` of each rest; for one recording.
+    urdf, frame, joints
+        Path of a robot as the stage, its frame that carries the sensor, topic of its joints.
+    data_sha256
+        Hash of the recordings for the provenance; '' for that of their files.
+    progress
+        Called with the share of the work that is done, 0 to 1, and the name of the stage.
+
+    Returns
+    -------
+    Fit
+        The calibrated unit: `save('unit.yaml')`, `report('folder')`, `print(fit)`.
+
+    Raises
+    ------
+    UserError
+        The poses do not determine the model, or recordings contradict each other.
+
+    """
+    rests = _Rests(journal, poses)
+    population = calibration_store.read_population(prior) if prior else None
+    robot = RobotInput(urdf, frame, joints) if urdf else None
+    unit = _Unit(sensor, robot)
+    several: Iterable[Recording] = each_recording(recordings)
+    blocks: Poses | None = None
+    if effects and set(effects) <= set(thermal_fit.EFFECTS) and not (model or journal or poses):
+        several = list(several)
+        blocks = unit.thermal_blocks(several)
+    if blocks is not None:
+        if prior:
+            raise UserError(f'--prior {prior}: a fit over temperature takes none; leave it out')
+        progress(_READING, 'fit')
+        result = calibration.calibrate_thermal(
+            with_axes(unit.base, unit.sensor.axes), blocks, unit.names[0],
+            data_sha256 or unit.sha256)
+        return _fit(result, unit, True)
+    recorded = []
+    for number, read in enumerate(several):
+        read = unit.add(read)
+        progress(_READING * (number + 1) / (number + 2), 'reading')
+        recorded.append(calibration.RecordedPoses(unit.names[-1], *rests.of(read, unit, number)))
+    if not recorded:
+        raise UserError('no recording is given')
+    progress(_READING, 'fit')
+    result = calibration.calibrate(unit.sensor, recorded, model, effects,
+                                   data_sha256 or unit.sha256, population)
+    return _fit(result, unit, False)
+
+
+class _Unit:
+    """The unit, while its recordings are read one after the other."""
+
+    def __init__(self, sensor: SensorInput | None, robot: RobotInput | None) -> None:
+        self._stated, self._robot = sensor, robot
+        self._given: GivenSensor | None = None
+        self._paths: list[str] = []
+        self.notes: list[str] = []  # Readings beyond the stated range
+        self._surroundings: list[Surroundings] = []  # Those of each recording
+
+    def add(self, read: Recording) -> Recording:
+        """Take the next recording; return it, with the angles of a robot if there is one."""
+        if self._given is None:
+            self._given = sensor_of(self._stated, read)
+            self.sensor = self._given.sensor  # The nominal sensor of the newest recording
+        self.sensor = recorded_unit(self.sensor, read)
+        self._paths.append(read.path)
+        self._surroundings.append(Surroundings())
+        self._surroundings[-1](read)
+        if self._robot is not None:
+            path = self._robot.path(read, self.sensor)
+            read = path.with_angles(read)
+            self.sensor = replace(self.sensor, stage_resolution_rad=max(
+                self.sensor.stage_resolution_rad, path.step_rad))
+        beyond = BeyondRange()
+        beyond.add(read.volts(self.sensor), self.sensor)
+        text = beyond.describe(self.sensor)
+        if text and 'range_g' not in self.sensor.measured:  # but stated by the parameter file
+            self.notes.append(f'{read.path}: {text}')
+        return read
+
+    def thermal_blocks(self, several: Sequence[Recording]) -> Poses | None:
+        """Return the blocks of one recording at rest over temperature; None for others."""
+        if len(several) != 1:
+            return None
+        return thermal_fit.rest_blocks(self.add(several[0]), self.sensor)
+
+    @property
+    def base(self) -> Sensor:
+        """Return the sensor as it was given, with what was measured."""
+        assert self._given is not None
+        return self._given.sensor
+
+    def assumed(self, effects: Sequence[str]) -> list[str]:
+        """Return what was assumed of temperature and supply, which effects follow."""
+        return [line for each in self._surroundings for line in each.interpolated(effects)]
+
+    @property
+    def measured(self) -> Sequence[str]:
+        """Return what was measured, as no parameter file states it."""
+        return self._given.measured if self._given else ()
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of the recordings so far."""
+        return [Path(path).name for path in self._paths]
+
+    @property
+    def sha256(self) -> str:
+        """Return the hash of the files of the recordings; '' where there are none."""
+        is_stored = all(Path(path).exists() for path in self._paths)
+        return calibration_store.sha256(self._paths) if is_stored else ''
+
+
+class _Rests:
+    """Where the rests of a recording are, and what their angles are."""
+
+    def __init__(self, journal: str | os.PathLike | None, table: str | os.PathLike | None
+                 ) -> None:
+        if journal and table:
+            raise UserError(_ONE_RECORDING)
+        self._table, self._is_one = table, bool(journal or table)
+        self._records = sweep_journal.poses_to_fit(sweep_journal.read(journal).entries) \
+            if journal else None
+
+    def of(self, read: Recording, unit: _Unit, number: int
+           ) -> tuple[Poses, Sequence[FilterNoise | None]]:
+        """Return the poses of a recording, and the filter of each axis in their noise."""
+        if number and self._is_one:
+            raise UserError(_ONE_RECORDING)
+        poses = extract_poses(read, unit.sensor, self._records)
+        if self._table:
+            poses = with_table_angles(poses, str(self._table))
+        return poses, estimate_filters(read, unit.sensor, poses)
+
+
+_ONE_RECORDING = '--journal and --poses: one of them names the rests of one recording'
+"""Message where rests of several recordings are named."""
+
+
+def _fit(result: CalibrationResult, unit: _Unit, is_over_temperature: bool) -> Fit:
+    """Collect what a user reads of a calibration."""
+    measured = listed([*unit.measured])
+    fitted = result.fitted
+    result = replace(result, warnings=[*result.warnings, *unit.assumed(fitted.effects)],
+                     details=[*result.details, *measured])
+    coefficients = tuple(
+        FittedCoefficient(row.name, row.axis, row.label, row.fitted, row.half_width, row.unit)
+        for row in compare(fitted, fitted))
+    return Fit(
+        sensor=fitted, outcome=acceptance.acceptance(fitted)[0], coefficients=coefficients,
+        held_out=result.held_out, poses=int(result.inliers.sum()), outliers=result.outliers,
+        warnings=tuple(result.warnings), measured=tuple(unit.measured), notes=tuple(unit.notes),
+        is_over_temperature=is_over_temperature, result=result)
