@@ -17,6 +17,7 @@ from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from adxl_ros.api.calibration import fit
+    from adxl_ros.api.correction import apply
     from adxl_ros.api.gap import diagnose
     from adxl_ros.api.recordings import from_arrays, read
     from adxl_ros.api.sensors import load
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from adxl_ros.simulate.sensor_model import SensorModel
 
 _MODULES = {
+    'apply': 'api.correction',
     'diagnose': 'api.gap',
     'fit': 'api.calibration',
     'from_arrays': 'api.recordings',
@@ -34,7 +36,7 @@ _MODULES = {
 }
 """Module of each name that `import adxl_ros` gives."""
 
-__all__ = ['SensorModel', 'UserError', 'diagnose', 'fit', 'from_arrays', 'load', 'read']
+__all__ = ['SensorModel', 'UserError', 'apply', 'diagnose', 'fit', 'from_arrays', 'load', 'read']
 
 
 # Two verbs have the names of packages. A package becomes an attribute when it is first imported:

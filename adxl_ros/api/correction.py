@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Compensation of the front door: acceleration and tilt from the sensor alone."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+import os
+from pathlib import Path
+from typing import Any
+
+from adxl_ros.api.recordings import as_recordings, RecordingInput
+from adxl_ros.api.result import FirstScreen, Result
+from adxl_ros.api.sensors import sensor_of, SensorInput
+from adxl_ros.compensate.estimators import Estimates, RecordingEstimator
+from adxl_ros.compensate.live_stream import ImuFields
+from adxl_ros.errors import UserError
+from adxl_ros.files.bag_writer import tilt_bag
+from adxl_ros.files.csv_file import csv_writer
+from adxl_ros.files.recording_columns import check_unit, Recording
+from adxl_ros.model.constants import AXES
+from adxl_ros.model.covariance import UNMEASURED_VARIANCE
+from adxl_ros.model.effects import base, effect_named
+from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.report.figures import axes_for
+from adxl_ros.signals.recorded_sensor import BeyondRange, listed
+import numpy as np
+
+BLOCK_ROWS = 8192  # Samples that are corrected at a time (chosen: their arrays stay in the cache)
+INVERSES = ('exact', 'paper')
+_COUNTED = {
+    'unsolved': 'have no solution: their cells are empty, and a bag leaves them out',
+    'outside': 'lie outside of the validity range (temperature or force): their standard '
+               'deviations are raised',
+    'at_rail': 'have the ADC at its rail: their standard deviations are inf, in a bag '
+               f'their variances {UNMEASURED_VARIANCE:g}'}
+"""What is said of counted samples, by the field of `Estimates`."""
+
+
+class Correction:
+    """Corrects a recording block by block, and counts what its user must know."""
+
+    def __init__(self, first: Recording, sensor: SensorInput | None, inverse: str = INVERSES[0],
+                 undo_filter: bool = False) -> None:
+        """Prepare for the recording that begins with a block; see `apply`."""
+        if inverse not in INVERSES:
+            raise UserError(f'--inverse {inverse}: expected {" or ".join(INVERSES)}')
+        given = sensor_of(sensor, first)
+        self.sensor = given.sensor if given.sensor.effects else \
+            with_axes(given.sensor, first.axes)
+        self.measured = given.measured
+        check_unit(first.stream_info, first.axes, self.sensor)
+        self._before = list(_effects_that_stay(self.sensor, undo_filter))
+        self._estimator = RecordingEstimator(self.sensor, first, inverse == 'paper', undo_filter)
+        self._counts: Counter[str] = Counter()
+        self._beyond = BeyondRange()
+
+    def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
+        """Yield each block of the recording with its estimates."""
+        for block, estimates in self._estimator.blocks(recording):
+            yield block, estimates
+            explained = ~(estimates.unsolved | estimates.at_rail)
+            self._beyond.add(estimates.volts[explained], self.sensor)
+            self._counts['rows'] += len(block)
+            for name in _COUNTED:
+                self._counts[name] += int(getattr(estimates, name).sum())
+
+    @property
+    def notes(self) -> list[str]:
+        """Return what a user must know of the samples so far, one line each."""
+        counted = [f'{self._counts[name]} of {self._counts["rows"]} samples {statement}'
+                   for name, statement in _COUNTED.items() if self._counts[name]]
+        beyond = self._beyond.describe(self.sensor)
+        return [*self._before, *counted, *[beyond] * bool(beyond)]
+
+    @property
+    def screen(self) -> list[str]:
+        """Return the lines of the tool's screen."""
+        by_what = f'the {self.sensor.model} calibration of {self.sensor.serial}' \
+            if self.sensor.effects else 'the datasheet values: the sensor is not calibrated'
+        return [f'Corrected {self._counts["rows"]} samples by {by_what}.',
+                *self._estimator.assumed, *listed([*self.measured])]
+
+
+def _effects_that_stay(sensor: Sensor, undo_filter: bool) -> Iterator[str]:
+    """Name the effects that are not undone."""
+    for effect in map(effect_named, sensor.effects):
+        acts_on_samples = effect.acts_on is base.ActsOn.MEAN and effect.place < base.Place.CLOCK \
+            and effect.concern is not base.Concern.STAGE
+        is_undone = effect.invertible or (undo_filter and base.Need.FILTER in effect.needs)
+        if acts_on_samples and not is_undone:
+            yield f'{effect.name} is not undone: a single sample does not determine it'
+
+
+@contextmanager
+def writer(path: str | os.PathLike) -> Iterator[Callable[[Recording, Estimates], None]]:
+    """Open a CSV file or a bag, and yield a function that appends a block with its estimates."""
+    if Path(path).suffix == '.csv':
+        with csv_writer(path) as append_rows:
+            yield lambda block, estimates: append_rows(
+                {'time_s': block.epoch_ns * 1e-9 + block.time_s, **_columns(estimates)})
+    else:
+        fields = ImuFields()
+        with tilt_bag(path) as append:
+            yield lambda block, estimates: append(block.stamp_ns[~estimates.unsolved],
+                                                  *fields(estimates))
+
+
+def _columns(estimates: Estimates) -> dict[str, np.ndarray]:
+    """Return the columns of a table of estimates, (n,) each."""
+    columns = {f'a{axis}{name}_mps2': values for name, force in (
+        ('', estimates.force_mps2), ('_std', estimates.force_std_mps2))
+        for axis, values in zip(AXES, force)}
+    for names in (('roll', 'pitch', 'inclination'), ('alpha', 'beta')):
+        columns |= {f'{name}_rad': getattr(estimates.tilt, name) for name in names}
+        columns |= {f'{name}_std_rad': getattr(estimates.tilt, f'{name}_std') for name in names}
+    return columns
+
+
+@dataclass(frozen=True, repr=False)
+class Corrected(Result):
+    """
+    Acceleration and tilt of n samples, with their standard deviations.
+
+    What a sample does not determine is NaN, and its standard deviation is inf. The standard
+    deviations hold noise, quantisation, and the uncertainty of the calibration.
+    """
+
+    time_s: np.ndarray
+    """Stamps, s since `epoch_ns`, (n,)."""
+    epoch_ns: int
+    """Origin of the stamps, ns since 1970; 0 where they count from a start."""
+    force_mps2: np.ndarray
+    """Specific force in the frame of the case (REP-103), m/s², (n, 3): +g upward at rest."""
+    force_std_mps2: np.ndarray
+    """Its standard deviations, m/s², (n, 3)."""
+    force_covariance: np.ndarray
+    """Its covariance, (m/s²)², (n, 3, 3); very large for an axis that is not measured."""
+    angles: Mapping[str, np.ndarray]
+    """`roll_rad`, `pitch_rad`, `inclination_rad`, and `alpha_rad`, `beta_rad` as a stage has
+    them, with `roll_std_rad`, ...: rad, (n,) each. They hold at rest."""
+    at_rail: np.ndarray
+    """Whether the ADC is at a rail, (n,) bool."""
+    outside: np.ndarray
+    """Whether temperature or force lie outside of the calibrated range, (n,) bool."""
+    unsolved: np.ndarray
+    """Whether no force explains the sample, (n,) bool."""
+    sensor: Sensor
+    """The sensor that the samples were corrected by."""
+    notes: tuple[str, ...]
+    """Effects that stay, and how many samples are at a rail, outside or without a solution."""
+    screen_lines: tuple[str, ...]
+    """What the tool shows."""
+    parts: tuple[tuple[Recording, Estimates], ...]
+    """Samples and estimates, block by block."""
+
+    @property
+    def screen(self) -> list[str]:
+        """Return the lines of the tool's screen."""
+        return [*self.screen_lines, *self.notes]
+
+    @property
+    def first_screen(self) -> FirstScreen:
+        """Return what a notebook shows."""
+        std_mg = 1e3 * np.median(self.force_std_mps2, axis=0) / 9.80665
+        tiles = [(f'{axis}, standard deviation', f'{value:.2g} mg')
+                 for axis, value in zip(AXES, std_mg) if np.isfinite(value)]
+        return FirstScreen('grey', f'{len(self.time_s)} samples', ' '.join(self.screen), tiles)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the columns of `to_pandas` as lists, with the notes."""
+        columns = {name: values.tolist() for name, values in self._table().items()}
+        return {'schema': 1, 'serial': self.sensor.serial, 'notes': list(self.notes), **columns}
+
+    def to_pandas(self) -> Any:
+        """Return a DataFrame with the columns of the tool's table, m/s² and rad."""
+        from pandas import DataFrame
+        return DataFrame(self._table())
+
+    def _table(self) -> dict[str, np.ndarray]:
+        force = {f'a{axis}{name}_mps2': values for name, each in (
+            ('', self.force_mps2), ('_std', self.force_std_mps2))
+            for axis, values in zip(AXES, each.T)}
+        return {'time_s': self.time_s, **force, **self.angles}
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw roll and pitch over time, degrees, into axes of matplotlib."""
+        ax = axes_for(ax)
+        for name in ('roll', 'pitch'):
+            ax.plot(self.time_s, np.degrees(self.angles[f'{name}_rad']), lw=0.8, label=name)
+        ax.set(xlabel='time, s', ylabel='tilt, °')
+        ax.legend()
+        return ax
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write a table NAME.csv, or a bag NAME.mcap or a folder with imu/data and tilt."""
+        with writer(path) as append:
+            for block, estimates in self.parts:
+                append(block, estimates)
+
+
+def apply(recording: RecordingInput, sensor: SensorInput | None = None, *,
+          inverse: str = INVERSES[0], undo_filter: bool = False) -> Corrected:
+    """
+    Correct a recording by a calibration: acceleration and tilt from the sensor alone.
+
+    Parameters
+    ----------
+    recording
+        The recording; the path of one is read as it is. Stage angles in it are not used,
+        temperature and supply are.
+    sensor
+        The calibrated sensor: a `Fit`, a Sensor, or the path of a parameter file. None for the
+        nominal sensor, or any IMU.
+    inverse
+        'exact', or 'paper' for the approximation of the paper (equations 14 to 21).
+    undo_filter
+        Whether the RC filter is undone, amplitude and phase, for a sensor that moves.
+
+    Returns
+    -------
+    Corrected
+        Specific force in the frame of the case, m/s², and tilt, rad, with standard deviations.
+
+    Raises
+    ------
+    UserError
+        The recording is of another unit, or has no samples.
+
+    """
+    (read,) = as_recordings([recording])
+    if not len(read):
+        raise UserError(f'{read.path}: has no samples to correct')
+    correction = Correction(read, sensor, inverse, undo_filter)
+    parts = tuple(correction.blocks(
+        read.rows(start, start + BLOCK_ROWS) for start in range(0, len(read), BLOCK_ROWS)))
+
+    def joined(name: str) -> np.ndarray:
+        """Return a field of the estimates of all blocks; its last axis becomes the first."""
+        return np.moveaxis(np.concatenate([getattr(each, name) for _, each in parts], -1), -1, 0)
+
+    tables = [_columns(estimates) for _, estimates in parts]
+    angles = {name: np.concatenate([table[name] for table in tables])
+              for name in tables[0] if name.endswith('rad')}
+    return Corrected(
+        time_s=read.time_s, epoch_ns=read.epoch_ns, force_mps2=joined('force_mps2'),
+        force_std_mps2=joined('force_std_mps2'), force_covariance=joined('covariance'),
+        angles=angles, at_rail=joined('at_rail'), outside=joined('outside'),
+        unsolved=joined('unsolved'), sensor=correction.sensor, notes=tuple(correction.notes),
+        screen_lines=tuple(correction.screen), parts=parts)
