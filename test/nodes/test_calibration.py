@@ -1,6 +1,7 @@
 """The guided calibration through the live graph: stage, rests, journal, verdict, file."""
 
 from dataclasses import replace
+from itertools import count
 
 from adxl_ros.calibrate.poses import extract_poses
 from adxl_ros.files import parameter_file, recording, sweep_journal
@@ -244,13 +245,14 @@ def test_a_compensated_stream_and_a_wrong_rate_are_refused(start, tmp_path):
               'journal:=other.journal')
         raw = graph.listen(Imu, 'imu/data_raw')
         half = graph.node.create_publisher(Imu, 'half', 1000)
-        dead = []
+        dead, numbers = [], count()
 
         def feed_half():
-            for message in raw[::2]:
+            for message in raw:
                 if dead:
                     message.linear_acceleration.x = float('nan')
-                half.publish(message)
+                if next(numbers) % 2:
+                    half.publish(message)
             raw.clear()
 
         graph.node.create_timer(0.1, feed_half)
