@@ -16,10 +16,11 @@ from adxl_ros.diagnose import data_checks, next_experiment, noise_effects, verdi
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.data_checks import CheckedRecording, DataFault
 from adxl_ros.diagnose.evidence import drifts_among, estimate_floor, NoiseFloor, used_by_block
+from adxl_ros.diagnose.flexible_functions import flexible_bases
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
 from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemainder
-from adxl_ros.diagnose.residual_map import flexible_bases, not_covered, residual_map, ResidualCell
+from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
 from adxl_ros.diagnose.search import Hypothesis, linearise, Search
 from adxl_ros.diagnose.verdict import HEALTHY, HeldOutFits, MATERIAL_MG, Verdict
 from adxl_ros.files.recording_columns import check_unit, Recording

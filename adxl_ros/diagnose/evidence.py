@@ -477,54 +477,113 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Iterable[int],
                 prior_std: np.ndarray, blocks: np.ndarray | None = None,
                 start: LinearFit | None = None, drifts: Sequence[str] = ()) -> LinearFit:
     """
-    Fit the coefficients of some columns, and the noise.
+    Fit the coefficients of k columns, and the noise of each channel.
 
-    blocks: blocks that are used, (blocks,) bool; None for all. The noise has the drift of given
-    effects, or that of a healthy unit.
+    Coefficients and noise are fitted in turn: the coefficients by generalised least squares with
+    their normal priors, then the filter and the variance of each channel by the likelihood of the
+    residual. The evidence integrates the coefficients out (Bishop 2006, equation 3.86).
+
+    column_ids: numbers of the columns, (k,); prior_std: prior standard deviation of the
+    coefficient of every column; blocks: blocks that are used, (blocks,) bool, None for all;
+    start: a fit whose filters are the first ones; drifts: effects whose drift the noise may have.
     """
     ids = np.array(sorted(column_ids), int)
-    chosen = np.ones(BLOCKS, bool) if blocks is None else blocks
-    # By channel: places of its columns among all, products, count of samples, log scales, and
-    # log priors of the filters
-    selected, filters = [], []
-    for channel in channels:
-        columns = np.flatnonzero(np.isin(channel.column_ids, ids))
-        rows = np.concatenate([[0], 1 + columns])
-        grams = channel.total_grams if blocks is None \
-            else channel.block_grams[:, blocks].sum(axis=1)
-        allowed = np.isin(channel.drift_effects, ('', *drifts))
-        log_priors = np.where(allowed | ~allowed.any(), channel.log_priors, -np.inf)
-        selected.append((np.searchsorted(ids, channel.column_ids[columns]),
-                         grams[:, rows[:, None], rows],
-                         max(float(channel.counts[chosen].sum()), 1.0),
-                         channel.log_scales[:, chosen].sum(axis=1), log_priors))
-        filters.append(int(np.argmax(log_priors)))
+    selected = [_SelectedChannel.of(channel, ids, blocks, drifts) for channel in channels]
+    filters = [int(np.argmax(channel.log_priors)) for channel in selected]
     if start is not None:
         filters = list(start.filter_indices)
-    variance_v2 = np.array([grams[f, 0, 0] / count
-                            for (_, grams, count, *_), f in zip(selected, filters)])
+    variance_v2 = np.array([channel.grams[f, 0, 0] / channel.count
+                            for channel, f in zip(selected, filters)])
     prior_precision = prior_std[ids] ** -2.0
     for _ in range(_ITERATIONS):
-        precision, information = np.diag(prior_precision), np.zeros(len(ids))
-        for (places, grams, *_), f, variance in zip(selected, filters, variance_v2):
-            precision[np.ix_(places, places)] += grams[f, 1:, 1:] / variance
-            information[places] += grams[f, 1:, 0] / variance
-        # The columns are scaled, so that different sizes or nearly equal columns cause no
-        # rounding errors.
+        posterior = _Posterior.of(selected, filters, variance_v2, prior_precision)
+        for i, channel in enumerate(selected):
+            squares_v2 = channel.squares_v2(posterior.mean)
+            log_likelihood = -channel.count / 2 * np.log(squares_v2) + channel.log_scales
+            filters[i] = int(np.argmax(log_likelihood + channel.log_priors))
+            variance_v2[i] = squares_v2[filters[i]] / channel.count
+    log_evidence = posterior.log_occam_factor(prior_precision)
+    for channel, variance, f in zip(selected, variance_v2, filters):
+        log_evidence += channel.log_likelihood(f, variance)
+    return LinearFit(ids, posterior.mean, posterior.covariance(), log_evidence, tuple(filters),
+                     variance_v2)
+
+
+@dataclass(frozen=True)
+class _SelectedChannel:
+    """The products of the chosen columns of one channel, summed over the chosen blocks."""
+
+    places: np.ndarray  # Places of its columns among the k chosen ones
+    # Products of the whitened residual (first) and columns by filter, V², (filters, c + 1, c + 1)
+    grams: np.ndarray
+    count: float  # Number of samples
+    log_scales: np.ndarray  # What the filter for errors adds to the log likelihood, (filters,)
+    log_priors: np.ndarray  # Log prior probability of each filter; −inf where not allowed
+
+    @classmethod
+    def of(cls, channel: WhitenedChannel, ids: np.ndarray, blocks: np.ndarray | None,
+           drifts: Sequence[str]) -> _SelectedChannel:
+        """Choose the columns, blocks and filters of a channel."""
+        columns = np.flatnonzero(np.isin(channel.column_ids, ids))
+        rows = np.concatenate([[0], 1 + columns])
+        if blocks is None:
+            grams, chosen = channel.total_grams, np.ones(BLOCKS, bool)
+        else:
+            grams, chosen = channel.block_grams[:, blocks].sum(axis=1), blocks
+        allowed = np.isin(channel.drift_effects, ('', *drifts))
+        return cls(
+            places=np.searchsorted(ids, channel.column_ids[columns]),
+            grams=grams[:, rows[:, None], rows],
+            count=max(float(channel.counts[chosen].sum()), 1.0),
+            log_scales=channel.log_scales[:, chosen].sum(axis=1),
+            log_priors=np.where(allowed | ~allowed.any(), channel.log_priors, -np.inf))
+
+    def squares_v2(self, values: np.ndarray) -> np.ndarray:
+        """Return the sum of squares of the whitened residual by filter, V², (filters,)."""
+        combination = np.concatenate([[1.0], -values[self.places]])
+        squares_v2 = np.einsum('i,wij,j->w', combination, self.grams, combination)
+        return np.maximum(squares_v2, _SMALLEST_SQUARES_V2)
+
+    def log_likelihood(self, chosen_filter: int, variance_v2: float) -> float:
+        """Return the log likelihood at the best variance of a filter, up to a constant."""
+        return float(-self.count / 2 * (np.log(variance_v2) + 1)
+                     + self.log_scales[chosen_filter] + self.log_priors[chosen_filter])
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    """The normal posterior of k coefficients. Columns are scaled against rounding errors."""
+
+    mean: np.ndarray  # (k,)
+    size: np.ndarray  # Scale of each coefficient, by which its precision is 1, (k,)
+    factor: np.ndarray  # Cholesky factor of the scaled precision, (k, k)
+
+    @classmethod
+    def of(cls, channels: Sequence[_SelectedChannel], filters: Sequence[int],
+           variance_v2: np.ndarray, prior_precision: np.ndarray) -> _Posterior:
+        """Combine prior and channels, each whitened by its present filter."""
+        precision, information = np.diag(prior_precision), np.zeros(len(prior_precision))
+        for channel, f, variance in zip(channels, filters, variance_v2):
+            places = channel.places
+            precision[np.ix_(places, places)] += channel.grams[f, 1:, 1:] / variance
+            information[places] += channel.grams[f, 1:, 0] / variance
         size = 1 / np.sqrt(np.diag(precision))
-        factor = np.linalg.cholesky(precision * size[:, None] * size + _RIDGE * np.eye(len(ids)))
-        values = size * scipy.linalg.cho_solve((factor, True), size * information)
-        for i, (places, grams, count, log_scales, log_priors) in enumerate(selected):
-            v = np.concatenate([[1.0], -values[places]])
-            squares_v2 = np.maximum(np.einsum('i,wij,j->w', v, grams, v), _SMALLEST_SQUARES_V2)
-            filters[i] = int(np.argmax(-count / 2 * np.log(squares_v2) + log_scales + log_priors))
-            variance_v2[i] = squares_v2[filters[i]] / count
-    covariance = scipy.linalg.cho_solve((factor, True), np.eye(len(ids))) * size[:, None] * size
-    log_evidence = -0.5 * float(np.sum(prior_precision * values ** 2)) \
-        - float(np.log(np.diag(factor) / size).sum()) + 0.5 * float(np.log(prior_precision).sum())
-    for (*_, count, log_scales, log_priors), variance, f in zip(selected, variance_v2, filters):
-        log_evidence += float(-count / 2 * (np.log(variance) + 1) + log_scales[f] + log_priors[f])
-    return LinearFit(ids, values, covariance, log_evidence, tuple(filters), variance_v2)
+        scaled = precision * size[:, None] * size + _RIDGE * np.eye(len(size))
+        factor = np.linalg.cholesky(scaled)
+        return cls(size * scipy.linalg.cho_solve((factor, True), size * information), size,
+                   factor)
+
+    def covariance(self) -> np.ndarray:
+        """Return the covariance of the coefficients, (k, k)."""
+        inverse = scipy.linalg.cho_solve((self.factor, True), np.eye(len(self.size)))
+        return inverse * self.size[:, None] * self.size
+
+    def log_occam_factor(self, prior_precision: np.ndarray) -> float:
+        """Return the log prior at the mean, plus the log ratio of posterior and prior volume."""
+        log_prior = -0.5 * float(np.sum(prior_precision * self.mean ** 2))
+        log_posterior_volume = -float(np.log(np.diag(self.factor) / self.size).sum())
+        log_prior_volume = -0.5 * float(np.log(prior_precision).sum())
+        return log_prior + log_posterior_volume - log_prior_volume
 
 
 class ChannelColumns(NamedTuple):

@@ -14,7 +14,7 @@ effect, they may therefore change by as much.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, product
@@ -34,12 +34,15 @@ larger than typical values."""
 _SHAPE_FACTORS = (0.2, 1.0, 5.0)
 """Values of a shape parameter that states no starts, divided by its typical value. Chosen: fits
 reach the values between."""
-_SMOOTH_STEP, _ROUGH_STEPS = 0.2, (1.0, 4.0, 16.0)
-"""Steps of a smooth parameter, and of one that is not, divided by its typical size. Chosen: the
-derivative at a play of 1 mrad does not predict a play of 15 mrad."""
-_FIT_STEP, _ROUGH_FIT_STEP = 0.02, 0.3
-"""The same at fitted values. Chosen: small enough for a derivative, and wide enough for a steady
-one."""
+_SMOOTH_STEP = 0.2
+"""Step of a smooth parameter, divided by its typical size. Chosen: a straight line is close."""
+_ROUGH_STEPS = (1.0, 4.0, 16.0)
+"""Steps of a parameter that is not smooth, divided by its typical size. Chosen: the derivative at
+a play of 1 mrad does not predict a play of 15 mrad."""
+_FIT_STEP = 0.02
+"""Step of a smooth parameter at its fitted value, in typical sizes. Chosen: a derivative."""
+_ROUGH_FIT_STEP = 0.3
+"""Step of another parameter at its fitted value, in typical sizes. Chosen: a steady derivative."""
 _CLIPPED_SHARES = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3)
 """Shares of the samples that are clipped by the limits that are tried. Chosen: neighbours differ
 by factors of 1.5 to 2.5."""
@@ -96,23 +99,40 @@ def variants(comparison: BaselineComparison, effect: Effect, baseline_v: np.ndar
         if not modelled:
             yield from _limit_variants(comparison, effect, effect.limits[0], baseline_v)
         return
-    # An effect with a shape parameter is nearly linear in its sizes. An effect of the baseline
-    # keeps its shape.
-    shaped = any(p.role is Role.SHAPE for p in effect.parameters)
-    steps = [start / p.scale for p in effect.parameters if p.is_size for start in p.starts] \
-        or list((_SMOOTH_STEP,) if effect.smooth or shaped else _ROUGH_STEPS)
+    for shape, parameters in _tried_shapes(effect, modelled):
+        for step in _steps(effect):
+            try:
+                variant = _variant(comparison, effect, parameters, shape, step, baseline_v)
+            except UserError:
+                return
+            if variant is not None:
+                yield variant
+
+
+def _steps(effect: Effect) -> list[float]:
+    """Return the steps of the derivatives by the sizes of an effect, in typical sizes."""
+    starts = [start / p.scale for p in effect.parameters if p.is_size for start in p.starts]
+    if starts:
+        return starts
+    # An effect with a shape parameter is nearly linear in its sizes.
+    has_shape = any(p.role is Role.SHAPE for p in effect.parameters)
+    return [_SMOOTH_STEP] if effect.smooth or has_shape else list(_ROUGH_STEPS)
+
+
+def _tried_shapes(effect: Effect, modelled: bool
+                  ) -> list[tuple[dict[str, float], list[Parameter]]]:
+    """
+    Return shapes, and the parameters of which derivatives are taken there.
+
+    An effect of the baseline keeps its shape. Sizes without a shape are tried once.
+    """
     sizes = [p for p in effect.parameters if p.role is not Role.SHAPE]
-    unshaped = [] if modelled else [p for p in sizes if not p.shaped]
-    tried: list[tuple[dict[str, float], list[Parameter]]] = [({}, unshaped)] if unshaped else []
-    tried += [(shape, [p for p in sizes if p not in unshaped])
-              for shape in ([{}] if modelled else _shapes(effect))]
-    for (shape, parameters), step in product(tried, steps):
-        try:
-            variant = _variant(comparison, effect, parameters, shape, step, baseline_v)
-        except UserError:
-            return
-        if variant is not None:
-            yield variant
+    if modelled:
+        return [({}, sizes)]
+    unshaped = [p for p in sizes if not p.shaped]
+    shaped = [p for p in sizes if p.shaped]
+    once: list[tuple[dict[str, float], list[Parameter]]] = [({}, unshaped)] if unshaped else []
+    return once + [(shape, shaped) for shape in _shapes(effect)]
 
 
 def _shapes(effect: Effect) -> list[dict[str, float]]:
@@ -344,49 +364,104 @@ def build_linear_model(comparisons: Sequence[BaselineComparison],
     filters = filters or [evidence.whiteners(c, axis) for c in comparisons
                           for axis in range(len(c.sensor.axes))]
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
-    # The same variant of several recordings, by the number of the recording.
-    every: dict[tuple, dict[int, Variant]] = {}
+    table = _ColumnTable(comparisons)
+    for by_recording in _variants_by_key(comparisons, baseline_v, _tried_effects(
+            comparisons, only), show_progress):
+        table.add(by_recording)
+    channels = _whitened(comparisons, table.channels, filters)
+    show_progress(1.0)
+    nuisance_columns = [table.nuisances(channel) for channel in table.channels]
+    return LinearModel(list(comparisons), baseline_v, table.variants, table.ids, table.names,
+                       table.prior_std(), channels, list(filters), table.channels,
+                       nuisance_columns, parts_at_rest(comparisons, nuisance_columns,
+                                                       table.channels, len(table.names)))
+
+
+def _tried_effects(comparisons: Sequence[BaselineComparison], only: Sequence[str] | None
+                   ) -> list[Effect]:
+    """Return the effects by which a baseline is differentiated; the nuisances are among them."""
     fades = any(c.fading_hz is not None for c in comparisons)
-    # What shows in the fast motion that a smooth reference lacks would be found in that.
-    effects = [e for e in candidates() if (
-        only is None or e.name in only or e.diagnosis.nuisance) and not (
-        fades and e.diagnosis.revealed_by is base.Manoeuvre.SHAKE and not e.exact
-        and e.concern is not Concern.REFERENCE)]
+
+    def is_asked_for(effect: Effect) -> bool:
+        return only is None or effect.name in only or effect.diagnosis.nuisance
+
+    def would_fit_lost_motion(effect: Effect) -> bool:
+        """Whether an effect would be found in the fast motion that a smooth reference lacks."""
+        shows_in_fast_motion = effect.diagnosis.revealed_by is base.Manoeuvre.SHAKE
+        return fades and shows_in_fast_motion and not effect.exact \
+            and effect.concern is not Concern.REFERENCE
+
+    return [e for e in candidates() if is_asked_for(e) and not would_fit_lost_motion(e)]
+
+
+def _variants_by_key(comparisons: Sequence[BaselineComparison], baseline_v: Sequence[np.ndarray],
+                     effects: Sequence[Effect], show_progress: Callable[[float], None]
+                     ) -> Iterable[dict[int, Variant]]:
+    """Return each variant in all recordings that show it, by the number of the recording."""
+    every: dict[tuple, dict[int, Variant]] = {}
     for i, (comparison, output_v) in enumerate(zip(comparisons, baseline_v)):
         for k, effect in enumerate(effects):
             for variant in variants(comparison, effect, output_v):
                 every.setdefault(variant.key, {})[i] = variant
-            show_progress(_SIMULATED_SHARE * (i + (k + 1) / len(effects)) / len(comparisons))
-    names: list[Coefficient] = []
-    kept: list[Variant] = []
-    column_ids: list[list[int]] = []
-    columns: list[list[dict[int, np.ndarray]]] = [[{} for _ in c.sensor.axes] for c in comparisons]
-    for by_recording in every.values():
+            done = (i + (k + 1) / len(effects)) / len(comparisons)
+            show_progress(_SIMULATED_SHARE * done)
+    return every.values()
+
+
+class _ColumnTable:
+    """The columns of all variants, numbered over all recordings."""
+
+    def __init__(self, comparisons: Sequence[BaselineComparison]) -> None:
+        self.names: list[Coefficient] = []  # Coefficient of each column
+        self.variants: list[Variant] = []
+        self.ids: list[list[int]] = []  # Numbers of the columns of each variant
+        # By recording and axis: sensitivities by number of the column, V per unit, (n,)
+        self._columns: list[list[dict[int, np.ndarray]]] = [
+            [{} for _ in c.sensor.axes] for c in comparisons]
+
+    def add(self, by_recording: dict[int, Variant]) -> None:
+        """Add one variant in the recordings that show it."""
         own = dict.fromkeys(chain(*(v.names for v in by_recording.values())))
-        numbers = {name: len(names) + i for i, name in enumerate(own)}
-        names += own
+        numbers = {name: len(self.names) + i for i, name in enumerate(own)}
+        self.names += own
         for i, variant in by_recording.items():
-            for of_channel, of_axis in zip(columns[i], variant.columns):
+            for of_channel, of_axis in zip(self._columns[i], variant.columns):
                 of_channel |= {numbers[name]: values for name, values in of_axis.items()}
-        kept.append(replace(next(iter(by_recording.values())), names=tuple(own)))
-        column_ids.append(list(numbers.values()))
-    # The columns of a limit are the change by its first value.
-    prior_std = [1.0 if v.limit_start else PRIOR_WIDTH * parameter_of(name).scale
-                 for v in kept for name in v.names]
-    by_channel = list(chain(*columns))
+        first = next(iter(by_recording.values()))
+        self.variants.append(replace(first, names=tuple(own)))
+        self.ids.append(list(numbers.values()))
+
+    @property
+    def channels(self) -> list[dict[int, np.ndarray]]:
+        """Return the sensitivities of each channel by number of the column, V per unit, (n,)."""
+        return list(chain(*self._columns))
+
+    def prior_std(self) -> np.ndarray:
+        """Return the prior standard deviation of each column's coefficient."""
+        stds: list[float] = []
+        for variant in self.variants:
+            # The columns of a limit are the change by its first value.
+            stds += [1.0 if variant.limit_start else PRIOR_WIDTH * parameter_of(name).scale
+                     for name in variant.names]
+        return np.array(stds)
+
+    def nuisances(self, channel: Mapping[int, np.ndarray]) -> dict[Coefficient, np.ndarray]:
+        """Return the nuisance columns of a channel; of several, that of the smallest start."""
+        return {self.names[k]: values for k, values in reversed(channel.items())
+                if hints_of(self.names[k]).nuisance}
+
+
+def _whitened(comparisons: Sequence[BaselineComparison],
+              columns: Sequence[Mapping[int, np.ndarray]], filters: Sequence[list[Whitener]]
+              ) -> list[evidence.WhitenedChannel]:
+    """Whiten residual and columns of each channel for noise that the baseline may have."""
     residuals_v = [v for c in comparisons for v in c.residual_v(c.sensor).T]
     used = [c.used for c in comparisons for _ in c.sensor.axes]
-    channels = [evidence.whiten_channel(
-        residual_v, np.array([*own.values()]).T, np.array([*own]), of_channel, chosen, False)
-        for residual_v, own, of_channel, chosen in zip(
-            residuals_v, by_channel, used, filters_for(filters, comparisons[0].sensor.effects))]
-    show_progress(1.0)
-    # The first column of an effect is that of its smallest start.
-    nuisance_columns = [{names[k]: values for k, values in reversed(channel.items())
-                         if hints_of(names[k]).nuisance} for channel in by_channel]
-    return LinearModel(list(comparisons), baseline_v, kept, column_ids, names,
-                       np.array(prior_std), channels, list(filters), by_channel, nuisance_columns,
-                       parts_at_rest(comparisons, nuisance_columns, by_channel, len(names)))
+    chosen = filters_for(filters, comparisons[0].sensor.effects)
+    return [evidence.whiten_channel(residual_v, np.array([*own.values()]).T, np.array([*own]),
+                                    of_channel, of_filters, False)
+            for residual_v, own, of_channel, of_filters in zip(
+                residuals_v, columns, used, chosen)]
 
 
 def filters_for(filters: Sequence[list[Whitener]], effects: Sequence[str]
@@ -415,26 +490,37 @@ def parts_at_rest(comparisons: Sequence[BaselineComparison],
     parts: dict[Coefficient, np.ndarray] = {}
     resting = [c.at_rest & c.used for c in comparisons for _ in c.sensor.axes]
     for nuisances, channel_columns, rests in zip(nuisance_columns, columns, resting):
-        rows = rests if rests.any() else np.ones(len(rests), bool)
         lines = {name: c for name, c in nuisances.items() if hints_of(name).straight_line}
         if not lines or not channel_columns:
             continue
-        matrix = np.column_stack(list(lines.values()))
-        others = np.column_stack(list(channel_columns.values()))
-        rms = np.sqrt(np.mean(others[rows] ** 2, axis=0))
-        at_rests = np.abs(np.linalg.lstsq(matrix[rows], others[rows])[0])
-        in_all = np.linalg.lstsq(matrix, others)[0]
-        # A calibration with an effect that is a straight line would have left nothing of it.
-        bent = (others - matrix @ in_all).std(axis=0) \
-            > _SMALLEST_BENT_SHARE * np.sqrt(np.mean(others ** 2, axis=0))
+        rows = rests if rests.any() else np.ones(len(rests), bool)
         ids = list(channel_columns)
-        for j, (name, line) in enumerate(lines.items()):
-            size = max(float(np.sqrt(np.mean(line ** 2))), np.finfo(float).tiny)
-            # The poses of a calibration may reach further than the rests of the recording.
-            reach = np.abs(others).max(axis=0) / np.abs(line).max() if np.ptp(line) else 0.0
-            straight = np.maximum(at_rests[j], np.minimum(np.maximum(np.abs(in_all[j]), reach),
-                                                          2 * rms / size))
-            part = parts.setdefault(name, np.zeros(count))
-            part[ids] = np.maximum(part[ids], bent * np.hypot(straight,
-                                                              _OTHER_RESTS_SHARE * rms / size))
+        others = np.column_stack(list(channel_columns.values()))
+        for name, part in zip(lines, _straight_parts(
+                np.column_stack(list(lines.values())), others, rows)):
+            largest = parts.setdefault(name, np.zeros(count))
+            largest[ids] = np.maximum(largest[ids], part)
+    return parts
+
+
+def _straight_parts(lines: np.ndarray, others: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
+    """
+    Return how much of k other columns a calibration can take for each straight line, (k,) each.
+
+    lines, others: columns of one channel, (n, l) and (n, k); rows: samples at rest, (n,).
+    """
+    rms = np.sqrt(np.mean(others[rows] ** 2, axis=0))
+    at_rests = np.abs(np.linalg.lstsq(lines[rows], others[rows])[0])
+    in_all = np.linalg.lstsq(lines, others)[0]
+    # A calibration with an effect that is a straight line would have left nothing of it.
+    bent = (others - lines @ in_all).std(axis=0) \
+        > _SMALLEST_BENT_SHARE * np.sqrt(np.mean(others ** 2, axis=0))
+    parts = []
+    for j, line in enumerate(lines.T):
+        size = max(float(np.sqrt(np.mean(line ** 2))), np.finfo(float).tiny)
+        # The poses of a calibration may reach further than the rests of the recording.
+        reach = np.abs(others).max(axis=0) / np.abs(line).max() if np.ptp(line) else 0.0
+        beyond_rests = np.minimum(np.maximum(np.abs(in_all[j]), reach), 2 * rms / size)
+        straight = np.maximum(at_rests[j], beyond_rests)
+        parts.append(bent * np.hypot(straight, _OTHER_RESTS_SHARE * rms / size))
     return parts

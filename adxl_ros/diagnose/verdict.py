@@ -22,8 +22,8 @@ import warnings
 
 from adxl_ros.diagnose import evidence as linear
 from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis, Whitener
+from adxl_ros.diagnose.flexible_functions import Basis
 from adxl_ros.diagnose.linear_model import LinearModel
-from adxl_ros.diagnose.residual_map import Basis
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import FormDimension, ProofVariable

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""With white noise the linear fit is Bayesian least squares, which has a closed form."""
+
+from adxl_ros.diagnose.evidence import BLOCKS, fit_columns, whiten_channel, Whitener
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+COUNT = 480
+PRIOR_STD = np.array([0.5, 2.0, 1.0])
+PASSES_ALL = np.array([[1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+"""Second-order section of a filter that changes nothing."""
+
+
+def white_filter():
+    return Whitener(PASSES_ALL, 'bias_walk', 1e-7)
+
+
+def problem(true=(0.3, -1.0, 0.0), noise_v=0.2, seed=1):
+    """Return a residual, V, and three columns; the first sample, a step from zero, is 0."""
+    rng = np.random.default_rng(seed)
+    columns = rng.normal(size=(COUNT, 3))
+    columns[0] = 0.0
+    residual_v = columns @ np.array(true) + noise_v * rng.normal(size=COUNT)
+    residual_v[0] = 0.0
+    return residual_v, columns
+
+
+def fitted(residual_v, columns, ids=(0, 1, 2), used=None, blocks=None):
+    used = np.ones(COUNT, bool) if used is None else used
+    channel = whiten_channel(residual_v, columns, np.arange(3), used, [white_filter()])
+    return fit_columns([channel], ids, PRIOR_STD, blocks)
+
+
+def test_the_posterior_is_that_of_bayesian_least_squares():
+    residual_v, columns = problem()
+    fit = fitted(residual_v, columns)
+    variance_v2 = fit.innovation_variance_v2[0]
+    precision = columns.T @ columns / variance_v2 + np.diag(PRIOR_STD ** -2)
+    assert fit.values == pytest.approx(
+        np.linalg.solve(precision, columns.T @ residual_v / variance_v2), rel=1e-6)
+    assert fit.covariance == pytest.approx(np.linalg.inv(precision), rel=1e-5)
+    left = residual_v - columns @ fit.values
+    assert variance_v2 == pytest.approx(np.mean(left ** 2), rel=1e-5)
+
+
+def test_the_evidence_integrates_the_coefficients_out():
+    """Two sets of columns differ by the ratio of their marginal likelihoods."""
+    residual_v, columns = problem()
+    evidence, marginal = [], []
+    for ids in ((0, 1, 2), (0, 1), (1,)):
+        fit = fitted(residual_v, columns, ids)
+        chosen = columns[:, ids]
+        covariance = fit.innovation_variance_v2[0] * np.eye(COUNT) \
+            + chosen * PRIOR_STD[list(ids)] ** 2 @ chosen.T
+        evidence.append(fit.log_evidence)
+        marginal.append(multivariate_normal.logpdf(residual_v, np.zeros(COUNT), covariance))
+    assert np.diff(evidence) == pytest.approx(np.diff(marginal), abs=0.1)
+
+
+def test_blocks_that_are_left_out_do_not_count():
+    residual_v, columns = problem()
+    blocks = np.arange(BLOCKS) < BLOCKS // 2
+    spoilt_v = residual_v.copy()
+    spoilt_v[COUNT // 2:] += 100.0
+    assert fitted(spoilt_v, columns, blocks=blocks).values == pytest.approx(
+        fitted(residual_v, columns, blocks=blocks).values, rel=1e-9)
+
+
+def test_samples_that_are_not_used_do_not_count():
+    residual_v, columns = problem()
+    used = np.ones(COUNT, bool)
+    used[100:140] = False
+    spoilt_v = np.where(used, residual_v, 50.0)
+    assert fitted(spoilt_v, columns, used=used).values == pytest.approx(
+        fitted(residual_v, columns, used=used).values, abs=0.02)
+
+
+@pytest.mark.parametrize('value', [0.0, 0.4])
+def test_a_given_coefficient_moves_the_others_by_their_covariance(value):
+    """The conditional mean of a normal distribution."""
+    residual_v, columns = problem()
+    fit = fitted(residual_v, columns)
+    conditional = fit.given(np.array([0]), np.array([value]))
+    slope = fit.covariance[1:, 0] / fit.covariance[0, 0]
+    assert conditional == pytest.approx(
+        [value, *(fit.values[1:] + slope * (value - fit.values[0]))])
+
+
+def test_the_loss_is_half_the_squared_distance():
+    residual_v, columns = problem()
+    fit = fitted(residual_v, columns)
+    std = np.sqrt(fit.covariance[0, 0])
+    assert fit.loss(np.array([fit.values[0] + 2 * std])) == pytest.approx(2.0, rel=1e-6)
