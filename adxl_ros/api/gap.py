@@ -24,8 +24,8 @@ from adxl_ros.api.result import (
 from adxl_ros.api.sensors import sensor_of, SensorInput
 from adxl_ros.diagnose import diagnosis as core, report as words
 from adxl_ros.diagnose.diagnosis import Diagnosis
-from adxl_ros.diagnose.next_experiment import CouldShow
 from adxl_ros.diagnose.gap_in_unit import gap_in, GapInUnit, quantity as quantity_named
+from adxl_ros.diagnose.next_experiment import CouldShow
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
