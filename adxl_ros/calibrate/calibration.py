@@ -307,6 +307,8 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
         sensor, model='gravity', effects=('bias', 'scale_factor', 'misalignment'),
         values=fit.values, covariance=fit.covariance, covariance_names=gravity_fit.NAMES)
     warnings = [] if fit.converged else [full_model.NOT_CONVERGED]
+    if fit.note:
+        warnings.append(fit.note)
     if population is not None:
         combined = posterior(fitted, population)
         fitted = combined.sensor
@@ -314,6 +316,9 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
     force = np.column_stack(signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment))
     budgets = acceptance.gravity_error_budgets(fit, fitted, force, kept)
     assessment = acceptance.assess('gravity', budgets, fitted, fit.converged)
+    if fit.step.left_out:
+        assessment = acceptance.with_open(assessment, acceptance.gravity_error_budgets(
+            fit, _without(fitted, fit.step.left_out), force, kept), fitted)
     fitted = replace(fitted, envelope=envelope(fitted, force[kept], poses,
                                                float(np.sqrt(budgets.accel.model))))
     fitted = with_provenance(fitted, source, poses, data_sha256, {
@@ -326,6 +331,13 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
     return CalibrationResult(
         nominal=sensor, fitted=fitted, summary=summary, poses=poses, assessments=(assessment,),
         gravity_fit=fit, warnings=warnings)
+
+
+def _without(sensor: Sensor, names: Sequence[Coefficient]) -> Sensor:
+    """Return a sensor for which some of the coefficients count as exact."""
+    kept = [i for i, name in enumerate(sensor.covariance_names) if name not in names]
+    return replace(sensor, covariance=sensor.covariance[np.ix_(kept, kept)],
+                   covariance_names=tuple(sensor.covariance_names[i] for i in kept))
 
 
 def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:

@@ -250,7 +250,7 @@ _MOVED_RAD = 0.01  # Range from which a stage moves, rad. Chosen: beyond jitter 
 _FOLLOWED = {'temperature_c': ('temperature', 1.0), 'supply_v': ('supply', 0.1)}
 """Name of a reference and its smallest range, °C and V, that shows effects at rest. Chosen: a
 typical drift of the zero-g is then 0.1 mg."""
-FEWEST_GRAVITY_POSES = 10  # Orientations of a fit against gravity: one more than coefficients
+FEWEST_GRAVITY_POSES = 7  # Orientations of a fit of six parameters against gravity: one more
 SHORTEST_MOTION_S = 30.0  # Shortest recording on a moving stage that `diagnose` compares, s
 _FEWEST_STAGE_POSES = 4  # Orientations of a linear fit. Chosen: both ends of two axes
 

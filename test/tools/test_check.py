@@ -35,7 +35,7 @@ def samples(seconds: float = 60.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_the_needs_of_other_tools_are_theirs() -> None:
-    assert findings.FEWEST_GRAVITY_POSES == gravity_fit.MIN_RESTS
+    assert gravity_fit.SIX.min_rests == findings.FEWEST_GRAVITY_POSES
     assert findings.SHORTEST_MOTION_S == data_checks.SHORTEST_S
 
 

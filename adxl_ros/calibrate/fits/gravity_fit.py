@@ -8,6 +8,9 @@ and three angles between the sensing axes are fitted: V = zero-g + scale·(Θ·f
 equations 18 and 19. A common turn of all three axes, which has three angles, does not change the
 magnitude. The gauge therefore holds Θx on the case's x and Θy in its x-y plane.
 
+Rests that determine zero-g and scale factor, but not the angles, give a fit of these six. The
+angles then stay as their prior says, and their uncertainty is that of the prior.
+
 Somebody who turns a sensor by hand is asked for the faces, edges and corners of a cube.
 """
 
@@ -20,7 +23,7 @@ from typing import NamedTuple
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import parameter_of, Sensor
 import numpy as np
 import scipy
 
@@ -41,6 +44,31 @@ _ROUNDING_STD_G = 1e-9  # Std of a mean by rounding alone, so that no weight is 
 _MAX_VALUE = 0.5  # Largest magnitude of a parameter in an iteration; chosen: five prior stds
 _PRIOR_INFORMATION = np.eye(len(NAMES)) / PRIOR_STD ** 2
 """Inverse covariance of the prior about 0, (9, 9)."""
+
+
+class Step(NamedTuple):
+    """A step of the ladder of fits: which parameters the rests determine."""
+
+    text: str  # The parameters, for people
+    determined: int  # The first ones of `NAMES`, as many as the rests determine
+    precision: np.ndarray  # Inverse variance of the prior of the others, (9,); 0 without one
+
+    @property
+    def min_rests(self) -> int:
+        """Fewest rests: one more than parameters, so that residuals show the error."""
+        return self.determined + 1
+
+    @property
+    def left_out(self) -> tuple[Coefficient, ...]:
+        """Coefficients that are known by their prior alone."""
+        return NAMES[self.determined:]
+
+
+NINE = Step('nine parameters', len(NAMES), np.zeros(len(NAMES)))
+SIX = Step('zero-g and scale factor', 6, np.array(
+    [0.0] * 6 + [parameter_of(name).scale ** -2.0 for name in NAMES[6:]]))
+LADDER = (NINE, SIX)
+"""Fits from the one with the most parameters on."""
 
 
 @dataclass(frozen=True)
@@ -174,8 +202,6 @@ def points_up(candidate: int) -> str:
     return f'{axes[0]} points up' if len(axes) == 1 else f'{" and ".join(axes)} point up equally'
 
 
-MIN_RESTS = len(NAMES) + 1
-"""Smallest count of rests: one more than coefficients, so that residuals show the error."""
 _TOLERANCE = 1e-12  # Relative tolerance of `leastsq` in cost, parameters and gradient
 _UNSCALED = np.ones(len(NAMES))  # Weights of the parameters in the trust region of `leastsq`: none
 _CONVERGED = (1, 2, 3, 4)  # States of `leastsq` in which it has converged (MINPACK, lmder)
@@ -191,6 +217,7 @@ _MAX_OUTLIERS = 0.25
 """Largest share of outliers. Chosen: more of them are a fault of the recording."""
 _MAX_DEVIATIONS = 5.0  # Largest residual of a rest with which the search for outliers begins, stds
 _MIN_REMAINDER = 1e-9  # Lower bound of 1 − leverage, as a divisor
+_NAMED = 3  # Directions between the axes that advice names; chosen: a line holds them
 _MIN_GRAVITY_RATIO = 0.5
 """Smallest ratio of the measured magnitude to local gravity; a smaller one is a wrong unit."""
 _MAX_GRAVITY_RATIO = 2.0
@@ -209,6 +236,8 @@ class GravityFit:
     expected_mps2: np.ndarray  # Standard deviation of a magnitude: noise of the mean and excess
     excess_mps2: float  # Part of it that the noise of the means does not explain
     outliers: tuple[int, ...]  # Indices of the outliers, which the fit leaves out
+    step: Step  # Which parameters the rests determine
+    note: str  # What is left out and what would determine it, for people; '' if nothing is
     converged: bool = True  # Whether parameters and excess variance have converged
 
 
@@ -218,7 +247,7 @@ _Estimate = tuple[np.ndarray, float, bool]
 
 def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> GravityFit:
     """
-    Fit the nine parameters by maximum likelihood of the magnitudes.
+    Fit nine parameters, or as many as the rests determine, by the likelihood of the magnitudes.
 
     Errors across gravity do not change the magnitude to first order. Real rests scatter by more
     than the noise of their means (flicker, hysteresis, effects beyond nine parameters). A common
@@ -239,32 +268,71 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> Gravit
     Raises
     ------
     UserError
-        The rests do not determine the parameters, or do not read gravity. The message names the
-        coefficients.
+        The rests do not determine zero-g and scale factor, or do not read gravity. The message
+        names the coefficients, and the directions that are missing.
 
     """
     rests = nominal_rests(mean_v, std_v, sensor)
-    _require_determined(rests, np.zeros(len(NAMES)), 0.0)
-    kept = _inliers(rests)
-    parameters, excess_g2, converged = _fit(rests[kept])
-    _require_determined(rests[kept], parameters, excess_g2)
+    _require_gravity(rests, np.zeros(len(NAMES)))
+    for step in LADDER:
+        try:
+            return _fitted(rests, sensor, step)
+        except _UndeterminedError as error:
+            refusal = error
+    raise refusal
+
+
+class _UndeterminedError(UserError):
+    """The rests do not determine the parameters of a step."""
+
+
+def _fitted(rests: NominalRests, sensor: Sensor, step: Step) -> GravityFit:
+    """Fit the parameters of one step."""
+    _require_determined(rests, np.zeros(len(NAMES)), 0.0, step)
+    kept = _inliers(rests, step)
+    parameters, excess_g2, converged = _fit(rests[kept], step)
+    _require_gravity(rests[kept], parameters)
+    _require_determined(rests[kept], parameters, excess_g2, step)
     variance = magnitude_variance(rests, parameters) + excess_g2
-    covariance = np.linalg.inv(
-        fisher_information(rests[kept], parameters, excess_g2))
+    information = fisher_information(rests[kept], parameters, excess_g2)
     # An excess that ν rests determine widens its share of the variance by ν/(ν − 2).
-    covariance *= 1 + excess_g2 / variance[kept].mean() * 2 / max(
-        kept.sum() - len(NAMES) - 2, 1)
+    widened = 1 + excess_g2 / variance[kept].mean() * 2 / max(
+        kept.sum() - step.determined - 2, 1)
+    covariance = np.linalg.inv(information / widened + np.diag(step.precision)) \
+        + _second_order(step)
     values, units = effect_values(parameters, sensor)
     residual = _residual(rests, parameters)
     return GravityFit(
         values=values, covariance=covariance * np.outer(units, units),
         before_mps2=G0_MPS2 * (np.linalg.norm(rests.mean, axis=1) - rests.gravity_g),
         residual_mps2=G0_MPS2 * residual,
-        held_out_mps2=G0_MPS2 * _held_out(rests, kept, parameters, variance, residual),
+        held_out_mps2=G0_MPS2 * _held_out(rests, kept, parameters, variance, residual, step),
         expected_mps2=G0_MPS2 * np.sqrt(variance),
         excess_mps2=G0_MPS2 * float(np.sqrt(excess_g2)),
         outliers=tuple(int(i) for i in np.flatnonzero(~kept)),
-        converged=converged)
+        step=step, note=_note(rests[kept], parameters, step), converged=converged)
+
+
+def _second_order(step: Step) -> np.ndarray:
+    """
+    Return the covariance by the squares of angles that the rests do not determine, (9, 9).
+
+    Turned by β a sensing axis reads gravity along it by cos β = 1 − β²/2 too small, as by its
+    scale factor. The mean square of β²/2 is 3σ⁴/4, that of two such angles 2σ⁴.
+    """
+    squares = np.zeros(len(NAMES))
+    if step.left_out:
+        variance = 1 / step.precision[-1]
+        squares[4:6] = 0.75 * variance ** 2, 2 * variance ** 2
+    return np.diag(squares)
+
+
+def _note(rests: NominalRests, parameters: np.ndarray, step: Step) -> str:
+    if not step.left_out:
+        return ''
+    names, std_deg = ', '.join(map(str, step.left_out)), np.degrees(step.precision[-1] ** -0.5)
+    return (f'the rests determine {step.text} only; left out, by their prior of 0 ± '
+            f'{std_deg:.2g}° (standard deviation): {names}; {_advice(rests, parameters)}')
 
 
 def _residual(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
@@ -272,25 +340,25 @@ def _residual(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
     return magnitude(rests.mean, parameters) - rests.gravity_g
 
 
-def _solve(rests: NominalRests, start: np.ndarray, variance: np.ndarray
+def _solve(rests: NominalRests, start: np.ndarray, variance: np.ndarray, step: Step
            ) -> tuple[np.ndarray, bool]:
     """Fit with given variances of the magnitudes, g², (k,); also return whether it converged."""
-    std = np.sqrt(variance)
+    std, prior = np.sqrt(variance), np.diag(np.sqrt(step.precision))
     # `least_squares` calls the same routine of MINPACK, and takes twice the time around it.
     parameters, _, _, _, status = scipy.optimize.leastsq(
-        lambda p: _residual(rests, p) / std, start,
-        Dfun=lambda p: linearised(rests.mean, p).jacobian / std[:, None],
+        lambda p: np.concatenate([_residual(rests, p) / std, prior @ p]), start,
+        Dfun=lambda p: np.vstack([linearised(rests.mean, p).jacobian / std[:, None], prior]),
         full_output=True, xtol=_TOLERANCE, ftol=_TOLERANCE, gtol=_TOLERANCE, diag=_UNSCALED)
     return parameters, status in _CONVERGED
 
 
-def _fit(rests: NominalRests) -> _Estimate:
+def _fit(rests: NominalRests, step: Step) -> _Estimate:
     """Fit the parameters, and the excess variance that makes χ² equal its degrees of freedom."""
     parameters, excess_g2 = np.zeros(len(NAMES)), 0.0
-    freedom = len(rests.mean) - len(NAMES)
+    freedom = len(rests.mean) - step.determined
     for _ in range(_MAX_ROUNDS):
         variance = magnitude_variance(rests, parameters)
-        parameters, converged = _solve(rests, parameters, variance + excess_g2)
+        parameters, converged = _solve(rests, parameters, variance + excess_g2, step)
         squares = _residual(rests, parameters) ** 2
         before_g2, excess_g2 = excess_g2, _excess(squares, variance, freedom)
         if abs(excess_g2 - before_g2) <= _EXCESS_TOLERANCE * (excess_g2 + variance.min()):
@@ -308,7 +376,7 @@ def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
                                        xtol=1e-30))
 
 
-def _inliers(rests: NominalRests) -> np.ndarray:
+def _inliers(rests: NominalRests, step: Step) -> np.ndarray:
     """
     Mark the rests that fit the others, (k,) bool.
 
@@ -318,21 +386,22 @@ def _inliers(rests: NominalRests) -> np.ndarray:
     not.
     """
     count = len(rests.mean)
-    max_outliers = min(int(_MAX_OUTLIERS * count), count - MIN_RESTS)
+    max_outliers = min(int(_MAX_OUTLIERS * count), count - step.min_rests)
     if max_outliers < 1:
         return np.ones(count, bool)
+    prior = TRIAL_STD_G * np.diag(np.sqrt(step.precision))
     robust = scipy.optimize.least_squares(
-        lambda p: _residual(rests, p), np.zeros(len(NAMES)),
-        lambda p: linearised(rests.mean, p).jacobian, loss='soft_l1',
+        lambda p: np.concatenate([_residual(rests, p), prior @ p]), np.zeros(len(NAMES)),
+        lambda p: np.vstack([linearised(rests.mean, p).jacobian, prior]), loss='soft_l1',
         f_scale=TRIAL_STD_G)
-    size = np.abs(robust.fun)
-    freedom = max(count - max_outliers - len(NAMES), 1)
+    size = np.abs(robust.fun[:count])
+    freedom = max(count - max_outliers - step.determined, 1)
     variance = np.sum(np.sort(size)[:count - max_outliers] ** 2) / freedom
     kept = size <= _MAX_DEVIATIONS * np.sqrt(
         variance + magnitude_variance(rests, robust.x).mean())
     for _ in range(2 * max_outliers):
-        distance = _studentised(rests, kept, _fit(rests[kept]))
-        limit = -scipy.special.stdtrit(max(kept.sum() - MIN_RESTS, 1),
+        distance = _studentised(rests, kept, _fit(rests[kept], step), step)
+        limit = -scipy.special.stdtrit(max(kept.sum() - step.min_rests, 1),
                                        _OUTLIER_CHANCE / (2 * count))
         excluded, included = np.where(kept, np.inf, distance), np.where(kept, distance, 0)
         if excluded.min() <= limit:
@@ -344,56 +413,81 @@ def _inliers(rests: NominalRests) -> np.ndarray:
     return kept
 
 
-def _studentised(rests: NominalRests, kept: np.ndarray, estimate: _Estimate) -> np.ndarray:
+def _studentised(rests: NominalRests, kept: np.ndarray, estimate: _Estimate, step: Step
+                 ) -> np.ndarray:
     """Return the distance of each rest from the fit to the others by its std, (k,)."""
     parameters, excess_g2, _ = estimate
     variance = magnitude_variance(rests, parameters) + excess_g2
-    covariance = np.linalg.inv(
-        posterior_information(rests[kept], parameters, excess_g2))
+    covariance = np.linalg.inv(posterior_information(
+        rests[kept], parameters, excess_g2) + np.diag(step.precision))
     jacobian = linearised(rests.mean, parameters).jacobian
     leverage = np.einsum('ki,ij,kj->k', jacobian, covariance, jacobian) / variance
     distance = np.abs(_residual(rests, parameters)) / np.sqrt(variance)
     inside = distance / np.sqrt(np.maximum(1 - leverage, _MIN_REMAINDER))
     # χ² per degree of freedom of the other rests, at least that of the noise of the means.
-    freedom = kept.sum() - len(NAMES)
+    freedom = kept.sum() - step.determined
     others = (max((distance[kept] ** 2).sum(), freedom) - inside ** 2) / max(freedom - 1, 1)
     inside = inside / np.sqrt(np.maximum(others, np.median(1 - excess_g2 / variance)))
     return np.where(kept, inside, distance / np.sqrt(1 + leverage))
 
 
 def _held_out(rests: NominalRests, kept: np.ndarray, parameters: np.ndarray,
-              variance: np.ndarray, residual: np.ndarray) -> np.ndarray:
+              variance: np.ndarray, residual: np.ndarray, step: Step) -> np.ndarray:
     """Return magnitude minus gravity by the fit to the other stretches of rests, g, (k,)."""
     errors, used = residual.copy(), rests[kept]
     count = len(used.mean)
     stretch = np.arange(count) * _STRETCHES // count
     for number in np.unique(stretch):
         others = stretch != number
-        # Of nine rests the other eight determine no fit.
-        without = parameters if others.sum() < len(NAMES) else _solve(
-            used[others], parameters, variance[kept][others])[0]
+        # A stretch may hold the only rests that determine a parameter.
+        is_open = _undetermined(used[others], parameters, 0.0, step)
+        without = parameters if is_open or others.sum() < step.determined else _solve(
+            used[others], parameters, variance[kept][others], step)[0]
         errors[np.flatnonzero(kept)[~others]] = _residual(used[~others], without)
     return errors
 
 
-def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: float) -> None:
-    """Refuse rests that do not determine a coefficient, or that do not read gravity."""
-    count = len(rests.mean)
-    measured = np.median(_residual(rests, parameters)) + rests.gravity_g if count else \
+def _require_gravity(rests: NominalRests, parameters: np.ndarray) -> None:
+    """Refuse rests that do not read gravity."""
+    measured_g = np.median(magnitude(rests.mean, parameters)) if len(rests.mean) else \
         rests.gravity_g
-    if not _MIN_GRAVITY_RATIO < measured / rests.gravity_g < _MAX_GRAVITY_RATIO:
-        raise UserError(f'gravity: the rests read {measured * G0_MPS2:.3g} m/s², not '
+    if not _MIN_GRAVITY_RATIO < measured_g / rests.gravity_g < _MAX_GRAVITY_RATIO:
+        raise UserError(f'gravity: the rests read {measured_g * G0_MPS2:.3g} m/s², not '
                         f'{rests.gravity_g * G0_MPS2:.3g}: correct nominal_zero_g_v, '
                         'nominal_scale_v_per_g or local_gravity_mps2')
-    covariance = np.linalg.inv(posterior_information(rests, parameters, excess_g2))
-    missing = [name for name, variance in zip(NAMES, np.diag(covariance))
-               if variance > DETERMINED_STD ** 2]
-    if count >= MIN_RESTS and not missing:
+
+
+def _undetermined(rests: NominalRests, parameters: np.ndarray, excess_g2: float, step: Step
+                  ) -> list[Coefficient]:
+    """Return the coefficients of a step that rests do not determine."""
+    covariance = np.linalg.inv(posterior_information(rests, parameters, excess_g2)
+                               + np.diag(step.precision))
+    return [name for name, variance in zip(NAMES[:step.determined], np.diag(covariance))
+            if variance > DETERMINED_STD ** 2]
+
+
+def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: float, step: Step
+                        ) -> None:
+    """Refuse rests that do not determine a coefficient of a step; say what is missing."""
+    count, missing = len(rests.mean), _undetermined(rests, parameters, excess_g2, step)
+    if count >= step.min_rests and not missing:
         return
-    names = 'all nine coefficients' if len(missing) == len(NAMES) else \
-        ', '.join(map(str, missing))
-    reason = f'do not determine {names}' if missing else f'are too few, at least {MIN_RESTS}'
+    reason = f'do not determine {", ".join(map(str, missing))}' if missing else \
+        f'are too few, at least {step.min_rests} in different directions are needed'
     scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
-    raise UserError(f'gravity: without their angles (fit --poses), the {count} rests {reason}'
-                    f'{scatter}; add rests with each axis up and down, and with two axes '
-                    'equally up; if they have them, --params needs the file of this sensor')
+    raise _UndeterminedError(
+        f'gravity: without their angles (fit --poses), the {count} rests {reason}{scatter}; '
+        f'{_advice(rests, parameters)}; if they have them, --params needs the file of this sensor')
+
+
+def _advice(rests: NominalRests, parameters: np.ndarray) -> str:
+    """Return which directions are missing among rests, for people: faces first, then others."""
+    force = force_g(rests.mean, parameters)
+    has = covered(force / np.linalg.norm(force, axis=1, keepdims=True))
+    faces, edges = (np.flatnonzero(~has & (axes == AXES_UP)) for axes in (1, 2))
+    if len(faces):
+        return f'add rests in which {", or ".join(map(points_up, faces.tolist()))}'
+    if len(edges):
+        return f'add rests with two axes equally up, such as those in which ' \
+            f'{", or ".join(map(points_up, edges[:_NAMED].tolist()))}'
+    return 'add rests with each axis up and down, and with two axes equally up'

@@ -7,7 +7,7 @@ from __future__ import annotations
 from enum import auto, Enum
 from typing import Literal, NamedTuple, Protocol, TypeAlias
 
-from adxl_ros.calibrate.fits.gravity_fit import MIN_RESTS
+from adxl_ros.calibrate.fits.gravity_fit import NINE
 from adxl_ros.calibrate.guided.guide import NewestSamples, NextPose, STALE_NS
 from adxl_ros.calibrate.guided.rest_guides import ENOUGH_RESTS
 from adxl_ros.calibrate.guided.screen_contents import Phase, Status
@@ -371,7 +371,7 @@ class Controller:
             return
         self.state, self.outcome = ControllerState.RUNNING, ()
         self._samples.restart_silence()
-        task = self.stream.outlook or f'rest in {MIN_RESTS} or more directions (at best in ' \
+        task = self.stream.outlook or f'rest in {NINE.min_rests} or more directions (at best in ' \
             f'{ENOUGH_RESTS}), then call ~/finish'
         check = ' (the last one first, to see that the mounting is as it was)' \
             if session.guide.to_verify else ''

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import math
 
 from adxl_ros.calibrate.fits import gravity_fit, thermal_fit
-from adxl_ros.calibrate.fits.gravity_fit import force_g, MIN_RESTS, NAMES, nominal_rests
+from adxl_ros.calibrate.fits.gravity_fit import force_g, NAMES, NINE, nominal_rests, SIX
 from adxl_ros.calibrate.fits.thermal_fit import PARTS
 from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate
 from adxl_ros.calibrate.guided.guide import Dwell, Guide, NextPose
@@ -194,8 +194,10 @@ class HandGuide(HandRests):
     def status(self) -> Status:
         """Return what the guide waits for, with the values that matter."""
         count, stillness = len(self.accepted), self._finder.stillness()
-        advice = f'{MIN_RESTS - count} more at least' if count < MIN_RESTS else \
-            'more make it better' if count < ENOUGH_RESTS else 'call finish when done'
+        advice = next((text for needed, text in (
+            (SIX.min_rests, f'{SIX.min_rests - count} more at least'),
+            (NINE.min_rests, f'{SIX.text} only; {NINE.min_rests - count} more for the angles'),
+            (ENOUGH_RESTS, 'more make it better')) if count < needed), 'call finish when done')
         rests = f'{count} rests ({advice})'
         if stillness is None:
             return Status(Phase.REST, f'{rests}; waiting for samples', False)
