@@ -131,7 +131,8 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
         tuple(fitting[list(full.outliers)].tolist()))
     errors, assessments = _assessed(
         sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit)
-    assessment = assessments[-1] if assessments else None
+    assessment = acceptance.judged(assessments[-1], fitted) if assessments else None
+    assessments = (*assessments[:-1], assessment) if assessment else ()
     force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
     residual_mg = ((poses.volts - predicted_volts(fitted, poses)) / fitted.scale_v_per_g
                    * 1e3)[fitting]
@@ -319,6 +320,7 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
     if fit.step.left_out:
         assessment = acceptance.with_open(assessment, acceptance.gravity_error_budgets(
             fit, _without(fitted, fit.step.left_out), force, kept), fitted)
+    assessment = acceptance.judged(assessment, fitted)
     fitted = replace(fitted, envelope=envelope(fitted, force[kept], poses,
                                                float(np.sqrt(budgets.accel.model))))
     fitted = with_provenance(fitted, source, poses, data_sha256, {

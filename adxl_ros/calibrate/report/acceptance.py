@@ -28,6 +28,13 @@ _NONLINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
 """Parameter whose typical datasheet value limits the error of acceleration."""
 
 
+_ZERO_G, _SCALE = Coefficient('bias', 'offset_v'), Coefficient('scale_factor', 'offset_v_per_g')
+_ANY_TOLERANCE = {_ZERO_G: 0.25, _SCALE: 0.1}
+"""Tolerances of any accelerometer: of the zero-g, g, and of the scale factor, as a share. Chosen:
+the widest ones of the datasheets of consumer parts."""
+_FAR = 2.0
+"""Multiple of a tolerance that is far outside. Chosen: solder, housing and age shift a sound unit
+beyond its datasheet, but by less than the datasheet's width."""
 _OPEN = 0.9
 """Share of the variance of a prior above which it alone says what a coefficient is. Chosen: the
 poses then determine its standard deviation by a twentieth at most."""
@@ -89,6 +96,11 @@ def with_open(assessment: Assessment, determined: ErrorBudgets, sensor: Sensor) 
                    tilt_outcome=outcomes.tilt_outcome)
 
 
+def judged(assessment: Assessment, fitted: Sensor) -> Assessment:
+    """Return an assessment that fails if the fitted unit is implausible, however well it fits."""
+    return replace(assessment, accel_outcome=FAIL) if implausible(fitted) else assessment
+
+
 def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, kept: np.ndarray
                           ) -> ErrorBudgets:
     """
@@ -138,6 +150,7 @@ def _two_digits(value: float) -> str:
 
 
 LIMITS = {
+    'open': 'coefficients that the poses do not determine',
     'noise': 'the noise of the means; longer rests reduce it',
     'stage': 'the angles of the stage; further poses reduce it',
     'model': 'the model, which does not have the form of this unit',
@@ -150,8 +163,9 @@ def summary_lines(fitted: Sensor, assessment: Assessment | None, errors: Sequenc
     """Return verdict, errors as given, and limits: what a terminal and the head of a file show."""
     lines = [*acceptance_lines(fitted), '', *errors]
     if assessment is not None:
+        cause = 'open' if open_coefficients(fitted) else assessment.accel.limited_by
         lines += ['', *limit_table(assessment, fitted),
-                  f' limited by               {LIMITS[assessment.accel.limited_by]}']
+                  f' limited by               {LIMITS[cause]}']
     return lines
 
 
@@ -233,6 +247,9 @@ def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutEr
 def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
     """Compare the error with the datasheet, or with the noise where it states none."""
     provenance = fitted.provenance
+    if fault := implausible(fitted):
+        return FAIL, [f'{fault}.', 'Check the unit of the readings, the range setting, and the '
+                      'parameter file; do not use this file.']
     if 'own_accel_mg' not in provenance:
         return NOT_SHOWN, ['no pose was kept out of the fit to assess it']
     limit_mps2, origin = limit(fitted)
@@ -255,6 +272,23 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
         lines.append(f'By rests within {duration(float(provenance["span_s"]))}; a longer drift is '
                      'not in this figure.')
     return outcome, lines
+
+
+def implausible(fitted: Sensor) -> str:
+    """Return a fitted zero-g or scale factor that no sound unit has, for people; '' if none."""
+    for name, unit in (_ZERO_G, 'V'), (_SCALE, 'V/g'):
+        typical, largest = fitted.datasheet.get(name, (0.0, 0.0))
+        shifts = fitted.values.get(name.effect, {}).get(name.parameter, np.zeros(0))
+        nominal = fitted.nominal_zero_g_v if name == _ZERO_G else fitted.nominal_scale_v_per_g
+        tolerances = np.full(len(nominal), largest or 2 * typical) if largest or typical else \
+            _ANY_TOLERANCE[name] * fitted.nominal_scale_v_per_g
+        origin = 'its datasheet' if largest or typical else 'the width of any accelerometer'
+        for axis, shift, middle, tolerance in zip(fitted.axes, shifts, nominal, tolerances):
+            if abs(shift) > _FAR * tolerance:
+                what = 'zero-g' if name == _ZERO_G else 'scale factor'
+                return (f'the {what} of {axis} is {middle + shift:.3g} {unit}, far outside of '
+                        f'{middle - tolerance:.3g} to {middle + tolerance:.3g} {unit} by {origin}')
+    return ''
 
 
 def open_coefficients(fitted: Sensor) -> list[Coefficient]:
