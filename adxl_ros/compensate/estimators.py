@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp
 from typing import NamedTuple
 
@@ -61,7 +61,7 @@ class RecordingEstimator:
         self._begin_s = float(first.time_s[0])
         self._inverse = (paper_inverse if paper else signal_chain.inverse)(sensor)
         self._measured_covariance = force_errors.measured_covariance(
-            sensor, noise_variance_v2(sensor) if undo_filter else None)
+            sensor, noise_variance_v2(sensor) if undo_filter else None, bool(sensor.z_sign))
 
     def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
         """Yield each block of the recording with its estimates."""
@@ -74,8 +74,12 @@ class RecordingEstimator:
 
     @property
     def assumed(self) -> list[str]:
-        """What was assumed of temperature and supply so far, one line each, for people."""
-        return self._surroundings.assumed(self._sensor.effects)
+        """What was assumed of the surroundings so far, one line each, for people."""
+        sensor, lines = self._sensor, self._surroundings.assumed(self._sensor.effects)
+        if sensor.axes == 'xy' and sensor.effects and not sensor.z_sign:
+            lines = [*lines, 'the sensor is taken as upright, and the deviations of x and y hold '
+                     'that it may not be; sensor.z_sign states which way up it is']
+        return lines
 
     def _environment(self, block: Recording) -> Environment:
         """Return the surroundings of the samples."""
@@ -173,6 +177,9 @@ class LiveEstimator:
     def __init__(self, sensor: Sensor, paper: bool = False, undo_filter: bool = False,
                  mounting: Mounting | None = None) -> None:
         """Prepare for a unit."""
+        if mounting is not None and not sensor.z_sign:
+            # A robot stands upright, so that its mounting says which way up the case is.
+            sensor = replace(sensor, z_sign=-1 if mounting.rows[2, 2] < 0 else 1)
         self.sensor, self.mounting = sensor, mounting
         self._paper_inverse = paper_inverse(sensor, FLOATS) if paper else None
         self._variance_v2 = noise_variance_v2(sensor) if undo_filter \
@@ -239,7 +246,8 @@ class LiveEstimator:
 
     def _use(self, sensor: Sensor) -> None:
         """Take covariance and validity range from the unit, with or without temperature range."""
-        self._measured_covariance = force_errors.measured_covariance(sensor, self._variance_v2)
+        self._measured_covariance = force_errors.measured_covariance(
+            sensor, self._variance_v2, bool(self.sensor.z_sign))
         self._envelope = sensor.envelope
         self._knows_temperature = sensor is self.sensor
 
@@ -254,7 +262,7 @@ class LiveEstimator:
         for _ in range(_MAX_STEPS):
             previous, previous_change = force, change
             force = self._newton_step([v - r for v, r in zip(input_v, response)], previous,
-                                      tangent, self.sensor.z_sign)
+                                      tangent, self.sensor.up)
             change = max(abs(f - p) for f, p in zip(force, previous))
             # Steps shrink by the same factor or faster, which bounds the next one.
             if change * change <= _TOLERANCE_MPS2 * previous_change:

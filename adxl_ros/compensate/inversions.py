@@ -182,7 +182,7 @@ def paper_inverse(sensor: Sensor, maths: Maths = ARRAYS) -> Callable[..., Compon
             linear[d] = (v - v0) / (v1 - v0)                                        # (3)
         if 2 not in measured:
             z2 = gravity_g ** 2 - linear[0] ** 2 - linear[1] ** 2
-            linear[2] = sensor.z_sign * maths.sqrt(maths.maximum(z2, 0.0))          # (5)
+            linear[2] = sensor.up * maths.sqrt(maths.maximum(z2, 0.0))          # (5)
         sensed = list(linear)
         for d in measured:
             inputs = list(linear)

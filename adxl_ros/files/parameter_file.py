@@ -273,7 +273,6 @@ class _FlatReader:
                 values[field.name] = np.full(len(axes), value) if is_array else value
             elif key in self.flat or field.default is MISSING:
                 values[field.name] = self._field(field, axes)
-        self._require(values['z_sign'], 'sensor.z_sign', '0, but must be 1 (upright) or -1')
         effects = self._names('effects')
         coefficients = {name: self._coefficients(name, axes) for name in effects}
         covariance, covariance_names = self._covariance(effects, axes)

@@ -62,13 +62,16 @@ def of_three_axes(sensor: Sensor, force: Components, measured: np.ndarray,
     return covariance
 
 
-def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = None
+def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = None,
+                        is_upright_certain: bool = True
                         ) -> Callable[..., tuple[np.ndarray, signal_chain.Tangent]]:
     """
     Prepare the covariance of the measured axes, given the others; see `force_covariance`.
 
     It maps specific force and an `Environment` (nominal unless given) to the covariance, (m/s²)²,
-    (m, m, n), and the tangent of the inverse at the force.
+    (m, m, n), and the tangent of the inverse at the force. Where it is not certain which way up a
+    sensor is whose z is derived, half the square of what x and y are for the other sign is added,
+    because either may be true.
     """
     if sample_variance_v2 is None:
         sample_variance_v2 = noise.sample_std_v(sensor) ** 2
@@ -88,6 +91,12 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
         for d, axis in enumerate(sensor.axes):
             measured[d, d] += envelope.added_variance(
                 force[AXES.index(axis)], environment.temperature_c, extrapolation)
+        if tangent.slope and not is_upright_certain:
+            other_v = respond([*force[:2], -force[2]], environment)
+            change_v = np.array([np.subtract(v, o) for v, o in zip(
+                respond(force, environment), other_v)]).reshape(2, -1)
+            apart = np.einsum('ijn,jn->in', np.asarray(tangent.back).reshape(2, 2, -1), change_v)
+            measured += np.einsum('in,jn->ijn', apart, apart) / 2
         for d, std_g in enumerate(envelope.zero_g_std_g(environment.temperature_c)):
             measured[d, d] += (G0_MPS2 * std_g) ** 2
         return measured, tangent

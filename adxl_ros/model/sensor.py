@@ -170,7 +170,8 @@ class Sensor:
     local_gravity_mps2: float = _nominal(
         'sensor.local_gravity_mps2', 'gravity where the sensor is', 'm/s^2', 9.7, 9.9)
     z_sign: int = _nominal(
-        'sensor.z_sign', 'which way up, for the z of equation 5: 1 or -1', '', -1, 1)
+        'sensor.z_sign', 'which way up, for the z of equation 5: 1, -1, or 0 where not known', '',
+        -1, 1)
     stage_resolution_rad: float = _nominal(
         'stage.resolution_rad', "step of the stage's encoder, or of the scale read by hand",
         'rad', 0.0, 1.0)
@@ -212,6 +213,11 @@ class Sensor:
     def scale_v_per_g(self) -> np.ndarray:
         """Scale factor of this unit, V/g, (m,)."""
         return self.nominal_scale_v_per_g + self._value('scale_factor', 'offset_v_per_g')
+
+    @property
+    def up(self) -> int:
+        """Sign of a derived z, 1 or −1: upright where it is not known."""
+        return self.z_sign or 1
 
     @property
     def stage_std_rad(self) -> float:

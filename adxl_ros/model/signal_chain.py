@@ -307,13 +307,13 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., C
     noise puts the in-plane force beyond g, the z of the smallest |f| is taken: there is no jump
     and no NaN at alpha = ±90°. A sensor of one axis gets 0 for the others.
 
-    z_sign: sign of z by sample, (n,), where it is known better than by `sensor.z_sign`; returns:
+    z_sign: sign of z by sample, (n,), where it is known better than by `sensor.up`; returns:
     maps the volts of each axis, arrays (n,) or floats, and an `Environment` (nominal unless given)
     to three components, m/s². Samples without a solution are NaN.
     """
     search = _Search(sensor)
     undo_adc = adc_inverse(sensor)
-    up = np.asarray(sensor.z_sign if z_sign is None else z_sign)
+    up = np.asarray(sensor.up if z_sign is None else z_sign)
 
     def invert(volts: Components, environment: Environment = NOMINAL_ENVIRONMENT) -> Components:
         input_v = np.array(undo_adc(list(np.array(volts, float).reshape(len(volts), -1))))

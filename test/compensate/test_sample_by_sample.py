@@ -10,7 +10,7 @@ from adxl_ros.files import imu_message
 from adxl_ros.model import signal_chain
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.kinematics import specific_force, tilt
+from adxl_ros.model.kinematics import Mounting, specific_force, tilt
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from geometry_msgs.msg import Vector3Stamped
 import numpy as np
@@ -156,3 +156,32 @@ def test_written_bytes_equal_the_serialized_messages(frame_id: str, order: str) 
     if order == 'little' and frame_id == 'abc':  # without padding, whose bytes are arbitrary
         assert made == serialize_message(message)
         assert tilted == serialize_message(expected)
+
+
+@pytest.mark.parametrize('alpha_deg', [100.0, 125.0, 150.0])
+def test_x_and_y_cover_both_signs_of_z_unless_it_is_given(alpha_deg: float) -> None:
+    """Upside down, a sensor that is taken for upright is wrong by its own z in x and y."""
+    inside, certain = [], []
+    for seed in range(20):
+        known = drawn(np.random.default_rng(seed), nominal('xy'))
+        force = specific_force(np.radians(alpha_deg), 0.7, G)
+        volts = signal_chain.static_response(known)(force)
+        for sensor, results in ((replace(known, z_sign=0), inside),
+                                (replace(known, z_sign=-1), certain)):
+            estimate = LiveEstimator(sensor)([float(v) for v in volts], 0.0)
+            assert estimate is not None
+            error = np.abs(np.array(estimate.force[:2]) - np.ravel(force[:2]))
+            std = np.sqrt([estimate.covariance[0], estimate.covariance[3]])
+            results.append(error <= 1.645 * std)
+            if sensor.z_sign:
+                assert (std < 0.02).all()
+    assert np.mean(inside) >= 0.87 and np.mean(certain) >= 0.87
+
+
+def test_a_mounting_says_which_way_up_the_case_is() -> None:
+    sensor = replace(drawn(np.random.default_rng(3), nominal('xy')), z_sign=0)
+    live = LiveEstimator(sensor, mounting=Mounting((np.pi, 0.0, 0.0)))
+    volts = signal_chain.static_response(sensor)(specific_force(np.radians(150), 0.7, G))
+    estimate = live([float(v) for v in volts], 0.0)
+    assert estimate is not None and estimate.force[2] > 0
+    assert np.sqrt(estimate.covariance[0]) < 0.02

@@ -76,7 +76,7 @@ BAD = {
     'another axis': ('axes: xy', 'axes: xz', r":8:13: sensor.axes: 'xz' is not one of x, xy, xyz"),
     'too few figures': ('nominal_zero_g_v: [2.5, 2.5]', 'nominal_zero_g_v: [2.5]',
                         r':9:25: sensor.nominal_zero_g_v: 1 values for 2 axes'),
-    'z_sign': ('z_sign: 1', 'z_sign: 0', r':19:15: sensor.z_sign: 0, but must be 1'),
+    'z_sign': ('z_sign: 1', 'z_sign: 2', r':19:15: sensor.z_sign: 2'),
     'unknown format': ('format: 1', 'format: 7',
                        r':3:13: format: version 7, but this package reads version 1'),
     'no format': ('    format: 1\n', '', r':3:5: format: version None'),

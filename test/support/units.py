@@ -26,7 +26,7 @@ def nominal(axes='xy', **changes):
     count = len(axes)
     arrays = {name: np.full(count, getattr(sensor, name)[0]) for name in (
         'nominal_zero_g_v', 'nominal_scale_v_per_g', 'noise_density_g_per_rthz')}
-    return replace(sensor, axes=axes, **{**arrays, **changes})
+    return replace(sensor, axes=axes, **{'z_sign': 1, **arrays, **changes})
 
 
 def drawn(rng, sensor, effects=EFFECTS):
