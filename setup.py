@@ -5,6 +5,7 @@
 from glob import glob
 from pathlib import Path
 import subprocess
+import sys
 
 from setuptools import find_packages, setup
 
@@ -24,6 +25,19 @@ def executables(package: str, end: str = '') -> list[str]:
         f'*{end}.py'))
     return [f'{path.stem.removesuffix(end)} = {package}.{path.stem}:main' for path in modules
             if '\ndef main(' in path.read_text(encoding='utf-8')]
+
+
+def scripts() -> list[str]:
+    """
+    Return the executables.
+
+    `ros2 run` looks for one of each name in lib/adxl_ros, where colcon and bloom put them. pip
+    puts those of a wheel on the PATH, where `check` or `export` could be anybody's: it has one.
+    """
+    if {'bdist_wheel', 'dist_info', 'editable_wheel'} & {*sys.argv}:
+        return [f'{PACKAGE} = {PACKAGE}.__main__:main']
+    return [*executables(f'{PACKAGE}.nodes'), *executables(f'{PACKAGE}.tools'),
+            *executables(f'{PACKAGE}_validation', '_command')]
 
 
 def state_commit() -> None:
@@ -69,9 +83,5 @@ setup(
     maintainer_email='adxl-ros-maintainers@users.noreply.github.com',
     description='Driver, calibration and compensation of low-g analog MEMS accelerometers',
     license='Apache-2.0',
-    entry_points={
-        'console_scripts': [
-            *executables(f'{PACKAGE}.nodes'), *executables(f'{PACKAGE}.tools'),
-            *executables(f'{PACKAGE}_validation', '_command')],
-    },
+    entry_points={'console_scripts': scripts()},
 )

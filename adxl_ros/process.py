@@ -47,6 +47,15 @@ STARTED_BY = 'ADXL_ROS_COMMAND'
 """Environment variable with the words before the name of a tool, as its user wrote them."""
 
 
+ONE_COMMAND = 'adxl_ros'  # The command of a package that pip has installed
+
+
+def program(tool: str) -> str:
+    """Return how messages call a tool: with the one command, where it was started by that."""
+    started_by = os.environ.get(STARTED_BY, '')
+    return f'{started_by} {tool}' if started_by.endswith(ONE_COMMAND) else tool
+
+
 def command(tool: str, arguments: str = '') -> str:
     """Return the command line that runs a tool in the way in which this process was started."""
     usual = 'ros2 run adxl_ros' if 'AMENT_PREFIX_PATH' in os.environ else 'adxl_ros'

@@ -28,7 +28,7 @@ from adxl_ros.files.parameter_file import compose
 from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.model.population import PooledCoefficient, Population
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import package_version
+from adxl_ros.process import command, package_version
 import yaml
 
 _DATE, _DATE_LETTERS = '%Y%m%dT%H%M%SZ', 16
@@ -192,7 +192,7 @@ _DIGITS = 9  # Significant digits of the values (chosen: far below any uncertain
 _HEAD = """\
 # Mean and spread of each coefficient over the units of a fleet, written by fleet.
 # prediction_std is the standard deviation of a further unit about the mean.
-# Use it: ros2 run adxl_ros fit NEW.mcap --prior {name} -o unit.yaml
+# Use it: {command}
 """
 """Comments at the begin of the file."""
 
@@ -205,7 +205,8 @@ def write_population(path: str | os.PathLike, population: Population) -> None:
             name: {**{key: float(f'{value:.{_DIGITS}g}') for key, value in asdict(pooled).items()},
                    'units': pooled.units} for name, pooled in population.coefficients.items()}}
     text = yaml.safe_dump(contents, sort_keys=False, allow_unicode=True, default_flow_style=None)
-    write_text(path, _HEAD.format(name=Path(path).name) + text)
+    use = command('fit', f'NEW.mcap --prior {Path(path).name} -o unit.yaml')
+    write_text(path, _HEAD.format(command=use) + text)
 
 
 def read_population(path: str | os.PathLike) -> Population:

@@ -26,7 +26,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.process import package_version
+from adxl_ros.process import command, package_version
 from adxl_ros.report import templates
 import numpy as np
 
@@ -205,7 +205,8 @@ def _white_density(export: Export, software: str) -> float:
     """Return the density of the white noise of the noisiest axis over both signs."""
     if not export.sensor.noise_density_g_per_rthz.any():
         raise UserError(f'{export.source}: sensor.noise_density_g_per_rthz is 0, and {software} '
-                        'needs noise; measure it: ros2 run adxl_ros noise RECORDING -o FILE.yaml')
+                        'needs noise; measure it: '
+                        + command('noise', 'RECORDING -o FILE.yaml'))
     return max(by_axis(export.sensor, 'noise_density')) / ONE_SIDED
 
 

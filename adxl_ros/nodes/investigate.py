@@ -23,6 +23,7 @@ from adxl_ros.nodes.jobs import LiveLine
 from adxl_ros.nodes.parameters import low_and_high, parameter, SEEDS
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Level, Status
+from adxl_ros.process import command
 from adxl_ros.report.quantities import percent
 from adxl_ros.report.screen import COLUMNS, end_lines
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -72,7 +73,7 @@ def closing_lines(ended: Investigation, folder: OutputFolder) -> list[str]:
         return ['', *end_lines([f'Stopped without a verdict: {ended.reason}'], files)]
     words = 'rich', '--params', str(folder.parameters), '-o', str(free_name('sim.csv'))
     return ['', *end_lines([ended.answers[-1][1].sentence], files,
-                           f'ros2 run adxl_ros simulate {shlex.join(words)}')]
+                           command('simulate', shlex.join(words)))]
 
 
 _SAMPLES, _STAGE = 'imu/data_raw', 'stage/joint_states'

@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import unquote_plus
 
 from adxl_ros.errors import install_hint, UserError
-from adxl_ros.process import package_version
+from adxl_ros.process import command, package_version
 from adxl_ros.report import templates
 from adxl_ros.report.figures import png
 
@@ -53,7 +53,7 @@ def render(package: str, template: str, values: Mapping[str, Any]) -> str:
 def command_of_this_process() -> str:
     """Return the command line that started this executable, without the secrets of URLs."""
     words = [without_secrets(as_utf_8(word)) for word in sys.argv[1:]]
-    return shlex.join(['ros2', 'run', 'adxl_ros', Path(sys.argv[0]).name, *words])
+    return command(Path(sys.argv[0]).name, shlex.join(words))
 
 
 def picture_url(figure: Any) -> str:

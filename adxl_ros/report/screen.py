@@ -12,7 +12,7 @@ import sys
 import textwrap
 from typing import Any, NamedTuple, TextIO, TypeVar
 
-from adxl_ros.process import package_version
+from adxl_ros.process import command, package_version, program
 
 P = TypeVar('P', bound=argparse.ArgumentParser)
 COLUMNS = 79  # Columns of a terminal that a tool uses
@@ -43,10 +43,9 @@ def program_parser(kind: type[P], name: str, description: str | None,
     """Make the parser of an executable, which has `--help` with examples, and `--version`."""
     lines = ['examples:']
     for purpose, arguments in examples.items():
-        command = f'ros2 run adxl_ros {name} {arguments}'.rstrip()
-        lines += [f'  {purpose}:', *command_lines(command, 4 * ' ')]
+        lines += [f'  {purpose}:', *command_lines(command(name, arguments), 4 * ' ')]
     parser = kind(
-        prog=name, description='\n'.join(wrapped(' '.join((description or '').split()))),
+        prog=program(name), description='\n'.join(wrapped(' '.join((description or '').split()))),
         formatter_class=partial(argparse.RawDescriptionHelpFormatter, width=COLUMNS),
         epilog='\n'.join(lines))
     parser.add_argument('--version', action='version', version=f'adxl_ros {package_version()}',

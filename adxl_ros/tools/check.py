@@ -18,6 +18,7 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.column_mapping import ReadingOptions
+from adxl_ros.process import command
 from adxl_ros.report import page as html_page
 from adxl_ros.report.quantities import column_unit, duration, short_time
 from adxl_ros.report.screen import COLUMNS, row, wrapped
@@ -207,7 +208,7 @@ def _with_what_shows(result: Findings, options: argparse.Namespace, reading: Rea
 def _next_command(results: list[Findings], options: argparse.Namespace) -> str:
     able = [(result.path, ability.tool) for result in results if result.is_sound
             for ability in result.abilities if ability.is_able and ability.tool != 'diagnose']
-    return cli.command(able[0][1], f'{cli.quoted(able[0][0])}{cli.reading_text(options)} '
+    return command(able[0][1], f'{cli.quoted(able[0][0])}{cli.reading_text(options)} '
                        '-o unit.yaml') if able else ''
 
 

@@ -56,11 +56,6 @@ def argument_parser(tool: str, description: str | None, examples: Mapping[str, s
     return parse
 
 
-def command(tool: str, arguments: str) -> str:
-    """Return the command line that runs a tool, for examples and next steps."""
-    return f'ros2 run adxl_ros {tool} {arguments}'
-
-
 def effect_list(effects: Iterable[Effect]) -> str:
     """Return a list of effects with their causes for a help text, by name."""
     causes = {effect.name: effect.cause.partition(';')[0].rstrip('.') for effect in effects}

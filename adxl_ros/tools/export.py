@@ -12,6 +12,7 @@ from pathlib import Path
 from adxl_ros.files import exports, parameter_file
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import command
 from adxl_ros.report.quantities import mg
 from adxl_ros.report.screen import entry_list
 from adxl_ros.simulate.response import ChainMemo, change_mg
@@ -54,7 +55,7 @@ def export(options: argparse.Namespace) -> int:
     lost = [name for name in exported.sizes_mg if name not in exported.holds]
     lines = [f'Sensor {sensor.serial} for {options.format}. The file holds: {", ".join(held)}.']
     lines += [f'It lacks: {", ".join(lost)}; its head has their sizes.'] * bool(lost)
-    cli.print_end(lines, [options.output], cli.command(
+    cli.print_end(lines, [options.output], command(
         'simulate', f'rich --params {cli.quoted(options.params)} -o rich.csv'))
     return 0
 

@@ -17,6 +17,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import command
 from adxl_ros.report.figures import new_figure, png
 from adxl_ros.report.quantities import duration
 from adxl_ros.report.screen import row
@@ -213,8 +214,8 @@ def noise(options: argparse.Namespace) -> int:
         files.insert(0, Path(options.output))
     print('\n'.join([*_head(result), '', *_tables(result), '', *_paste_lines(result), '']))
     warnings = [f'WARNING {text}' for text in warnings]
-    following = cli.command('diagnose', f'RECORDING --params {cli.quoted(options.output)} '
-                            '-o gap') if options.output else cli.command(
+    following = command('diagnose', f'RECORDING --params {cli.quoted(options.output)} '
+                            '-o gap') if options.output else command(
         'noise', f'{cli.quoted(options.recording)}{cli.reading_text(options)} -o noise.yaml')
     cli.print_end([*warnings, *[''] * bool(warnings)], files, following)
     return 0

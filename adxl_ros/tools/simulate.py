@@ -20,6 +20,7 @@ from adxl_ros.links.support import emulated_board
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import command
 from adxl_ros.report.screen import entry_list
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion
 from adxl_ros.simulate.response import Columns, simulate_blocks
@@ -117,7 +118,7 @@ def _next_step(options: argparse.Namespace) -> str:
     # Without a stage, the force that the sensor felt is the reference.
     words += ['--sim', options.force] if options.force else []
     tool, output = ('fit', 'unit.yaml') if options.trajectory == 'sweep' else ('diagnose', 'gap')
-    return cli.command(tool, cli.quoted(*words, '-o', output))
+    return command(tool, cli.quoted(*words, '-o', output))
 
 
 def _check(options: argparse.Namespace) -> None:

@@ -21,6 +21,7 @@ from adxl_ros.files.atomic_write import write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import get, Sensor
+from adxl_ros.process import command
 from adxl_ros.report import figures, page as html_page
 from adxl_ros.report.figures import AXIS_COLOURS, Figure
 from adxl_ros.report.quantities import mg
@@ -73,6 +74,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
         drawn['errors'] = _error_figure(
             held_out.determining_alpha(errors.errors), mg(errors.errors.accel_mps2), half_mg,
             fitted.axes, 'held-out pose', 'error of acceleration, mg')
+    file_name = re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml'
     picture, fault = '', ''
     try:
         picture = html_page.picture_url(paper_figure(result))
@@ -85,7 +87,8 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
         'tiles': tiles(result, assessment),
         'advice': f'Limited by {acceptance.LIMITS[assessment.accel.limited_by]}.'
         if assessment else 'Take more poses: too few were held out to assess this calibration.',
-        'file_name': re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml',
+        'file_name': file_name,
+        'apply_command': command('apply', f'RECORDING --params {file_name} -o tilt.csv'),
         'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
         'figures': drawn,
         'sphere': _sphere(result),

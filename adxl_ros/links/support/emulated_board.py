@@ -16,6 +16,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.links.support import base, wire_format
 from adxl_ros.links.support.base import samples_within
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import command
 import numpy as np
 
 _FRAME_S = 0.002  # Duration of the samples of a frame, s: the usual latency of a driver
@@ -98,7 +99,7 @@ def driver_command(port: str, roles: list[str]) -> str:
     options = [f'-p link.type:=serial -p link.port:={port} -p link.channels:={",".join(roles)}']
     if base.SUPPLY in roles:
         options.append(f'-p link.supply_scale:={_SUPPLY_SCALE}')
-    return f'ros2 run adxl_ros driver --ros-args {" ".join(options)}'
+    return command('driver', f'--ros-args {" ".join(options)}')
 
 
 def check_sensor(sensor: Sensor) -> None:
