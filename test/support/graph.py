@@ -131,7 +131,7 @@ class Graph:
     def wait_for_silence(self, topic, seconds=1.0, timeout_s=20.0):
         """Listen until a topic has sent nothing for a time, s: what was under way has come."""
         def is_silent():
-            last_ns = max(began_ns, *self.arrived_ns[topic][-1:])
+            last_ns = max([began_ns, *self.arrived_ns[topic][-1:]])
             return time.monotonic_ns() - last_ns > seconds * 1e9
         began_ns = time.monotonic_ns()
         self.spin_until(is_silent, timeout_s, f'silence on {topic}')
