@@ -16,9 +16,15 @@ from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.model import covariance as force_errors, noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
-from adxl_ros.model.effects.base import Components, Environment, FLOATS, NOMINAL_ENVIRONMENT
+from adxl_ros.model.effects.base import (
+    Coefficient,
+    Components,
+    Environment,
+    FLOATS,
+    NOMINAL_ENVIRONMENT,
+)
 from adxl_ros.model.kinematics import angles, Mounting, Tilt, tilt
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import parameter_of, Sensor
 import numpy as np
 
 
@@ -152,6 +158,13 @@ class Estimate(NamedTuple):
     outside: tuple[str, ...]
 
 
+def alignment_std_rad(sensor: Sensor) -> float:
+    """Return the alignment of the sensing axes in the case, rad, of the datasheet or typical."""
+    name = Coefficient('misalignment', 'beta_rad', 'x')
+    typical, _ = sensor.datasheet.get(name.without_axis, (0.0, 0.0))
+    return typical or parameter_of(name).scale
+
+
 class _Cell(NamedTuple):
     """What the forces of one cell of the grid share."""
 
@@ -181,6 +194,9 @@ class LiveEstimator:
             # A robot stands upright, so that its mounting says which way up the case is.
             sensor = replace(sensor, z_sign=-1 if mounting.rows[2, 2] < 0 else 1)
         self.sensor, self.mounting = sensor, mounting
+        # Only a stage shows the yaw of the axes in the case. Gravity and a level robot do not.
+        self._yaw_rad2 = 0.0 if sensor.provenance.get('reference') == 'stage' else \
+            alignment_std_rad(sensor) ** 2
         self._paper_inverse = paper_inverse(sensor, FLOATS) if paper else None
         self._variance_v2 = noise_variance_v2(sensor) if undo_filter \
             else noise.sample_std_v(sensor) ** 2
@@ -226,9 +242,9 @@ class LiveEstimator:
             covariance[0] + motion, covariance[1], covariance[2], covariance[3] + motion,
             covariance[4], covariance[5] if self._derives_z else covariance[5] + motion)
         if self.mounting is not None:
-            force, covariance, moved = (
-                self.mounting.rotate(force), self.mounting.rotate_covariance(covariance),
-                self.mounting.rotate_covariance(moved))
+            force = self.mounting.rotate(force)
+            covariance, moved = (self._with_yaw(force, self.mounting.rotate_covariance(part))
+                                 for part in (covariance, moved))
         roll, pitch, inclination, _ = angles(force, moved, FLOATS)
         return Estimate(force, covariance, roll, pitch, inclination, saturated, cell.outside)
 
@@ -286,6 +302,13 @@ class LiveEstimator:
             self._variance[d] = kept * (self._variance[d] + (1 - kept) * deviation * deviation)
             excess = max(excess, self._variance[d] - _NOISE_FACTOR * noise_variance)
         return excess
+
+    def _with_yaw(self, force: Components, covariance: tuple[float, ...]) -> tuple[float, ...]:
+        """Add the error of a turn ψ about the robot's vertical, ψ·(−y, x, 0), to a covariance."""
+        xx, xy, xz, yy, yz, zz = covariance
+        x, y, _ = force
+        variance = self._yaw_rad2
+        return xx + variance * y * y, xy - variance * x * y, xz, yy + variance * x * x, yz, zz
 
     def _covariance(self, force: Components, cell: _Cell, unknown: float, motion: float
                     ) -> tuple[float, ...]:

@@ -179,9 +179,34 @@ def test_x_and_y_cover_both_signs_of_z_unless_it_is_given(alpha_deg: float) -> N
 
 
 def test_a_mounting_says_which_way_up_the_case_is() -> None:
-    sensor = replace(drawn(np.random.default_rng(3), nominal('xy')), z_sign=0)
+    sensor = replace(drawn(np.random.default_rng(3), nominal('xy')), z_sign=0,
+                     provenance={'reference': 'stage'})
     live = LiveEstimator(sensor, mounting=Mounting((np.pi, 0.0, 0.0)))
     volts = signal_chain.static_response(sensor)(specific_force(np.radians(150), 0.7, G))
     estimate = live([float(v) for v in volts], 0.0)
     assert estimate is not None and estimate.force[2] > 0
     assert np.sqrt(estimate.covariance[0]) < 0.02
+
+
+def test_the_yaw_that_a_level_leaves_is_in_the_covariance() -> None:
+    """A level shows roll and pitch of the axes in the case; their yaw turns roll into pitch."""
+    sensor, rng = nominal('xyz'), np.random.default_rng(4)
+    live = LiveEstimator(sensor, mounting=Mounting((0.02, -0.03, 0.0)))
+    inside = []
+    for _ in range(60):
+        yaw, roll, pitch = rng.normal(0, 0.0175), *rng.uniform(-0.8, 0.8, 2)
+        robot = G * np.array([-np.sin(pitch), np.cos(pitch) * np.sin(roll),
+                              np.cos(pitch) * np.cos(roll)])
+        turned = [np.cos(yaw) * robot[0] + np.sin(yaw) * robot[1],
+                  np.cos(yaw) * robot[1] - np.sin(yaw) * robot[0], robot[2]]
+        volts = signal_chain.static_response(sensor)(list(live.mounting.rows.T @ turned))
+        estimate = live([float(v) for v in volts], 10.0 * len(inside))
+        for (angle, variance), true in ((estimate.roll, roll), (estimate.pitch, pitch)):
+            inside.append(abs(angle - true) <= 1.645 * np.sqrt(variance))
+    assert np.mean(inside) >= 0.87
+    level = live([float(v) for v in signal_chain.static_response(sensor)(
+        list(live.mounting.rows.T @ [0.0, 0.0, G]))], 1e4)
+    staged = LiveEstimator(replace(sensor, provenance={'reference': 'stage'}),
+                           mounting=live.mounting)
+    assert max(np.sqrt([level.roll[1], level.pitch[1]])) < 1e-3
+    assert staged([float(v) for v in volts], 0.0).roll[1] < estimate.roll[1]
