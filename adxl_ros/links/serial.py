@@ -132,14 +132,15 @@ _RATE_SAMPLES = 50
 comparisons are over before the first stamp, and a time that is wrong by a period makes 2 %."""
 _MAX_RATE_ERROR = 0.05
 """Largest relative difference of both. Chosen: above the error of any oscillator."""
-_CONTRADICTIONS = 2  # Comparisons in a row that must differ: a clock may step once
+_CONTRADICTIONS = 2
+"""Comparisons in a row that must differ, and agree with each other: a clock may step once."""
 
 
 class _ClockRate:
     """The rate of the samples by the clock of a board, where it is not the stated one."""
 
     def __init__(self, stated_hz: float) -> None:
-        self.stated_hz, self.used_hz = stated_hz, stated_hz
+        self.stated_hz = self.used_hz = self._clock_hz = stated_hz
         self._contradictions = 0
         self._first: SampleFrame | None = None
 
@@ -161,7 +162,10 @@ class _ClockRate:
             return False
         clock_hz = count / max(frame.time_us - first.time_us, 1) * 1e6
         is_off = abs(clock_hz / self.stated_hz - 1) > _MAX_RATE_ERROR
-        self._contradictions = self._contradictions + 1 if is_off else 0
+        # A late sample makes one span too long and the next one too short: they do not agree.
+        agree = abs(clock_hz / self._clock_hz - 1) < _MAX_RATE_ERROR
+        self._clock_hz = clock_hz
+        self._contradictions = (agree and self._contradictions) + 1 if is_off else 0
         is_wrong = self._contradictions >= _CONTRADICTIONS \
             and wire_format.RATES_HZ[0] <= clock_hz <= wire_format.RATES_HZ[1]
         if is_wrong:

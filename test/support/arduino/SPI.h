@@ -3,7 +3,8 @@
 /* What the sketch needs of an Arduino, on this machine, for the tests of the firmware.
  *
  * The program gets the open file of a terminal and the baud rate of its UART, 0 for USB. A thread is
- * the timer. Channel c has the code (k + 20000 c) mod 65534 + 1 at sample k. */
+ * the timer; in it the time is that for which it was set, because an interrupt is not late where a
+ * thread of a busy machine is. Channel c has the code (k + 20000 c) mod 65534 + 1 at sample k. */
 
 #include <poll.h>
 #include <stdint.h>
@@ -24,7 +25,8 @@ static uint64_t host_us() {
     clock_gettime(CLOCK_MONOTONIC, &now);
     return (uint64_t)now.tv_sec * 1000000u + now.tv_nsec / 1000u;
 }
-static uint32_t micros() { return (uint32_t)host_us(); }
+static thread_local uint64_t interrupt_us; /* 0 outside of the timer */
+static uint32_t micros() { return (uint32_t)(interrupt_us ? interrupt_us : host_us()); }
 static uint32_t millis() { return (uint32_t)(host_us() / 1000u); }
 
 struct SPISettings {
@@ -56,6 +58,8 @@ struct IntervalTimer {
             for (;;) {
                 due += std::chrono::nanoseconds((int64_t)(period_us * 1e3f));
                 std::this_thread::sleep_until(due);
+                interrupt_us = (uint64_t)std::chrono::duration_cast<std::chrono::microseconds>(
+                    due.time_since_epoch()).count();
                 call();
             }
         }).detach();
