@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from math import inf
 from typing import Any, NamedTuple
 
@@ -86,14 +87,15 @@ class LiveStream:
         self.unknown, self.may_be_foreign = None, False
 
     def use(self, sensor: Sensor, rate_hz: float) -> None:
-        """Correct by a sensor from the next sample on."""
+        """Correct by a sensor, at the rate of the stream, from the next sample on."""
         self._sensor = sensor, rate_hz
-        live = LiveEstimator(sensor, self._paper, self._undo_filter,
+        at_rate = replace(sensor, rate_hz=rate_hz)
+        live = LiveEstimator(at_rate, self._paper, self._undo_filter,
                              self._mounting if self._mounting.turns else None)
         live.set_environment(**self.surroundings)
         stride = max(1, round(rate_hz / self._output_rate_hz)) if self._output_rate_hz else 1
         self._chain = _Chain(
-            live, DelayedInversion(noise.electronics(sensor).rc_s, rate_hz), stride)
+            live, DelayedInversion(noise.electronics(at_rate).rc_s, rate_hz), stride)
 
     @property
     def sensor(self) -> Sensor:
