@@ -11,20 +11,24 @@ from typing import Any
 import numpy as np
 
 ORDER = 6  # Newest samples of the polynomial; chosen: an error of order 6
+_LINE = 2  # Newest samples of a straight line
+_MOST_MISSED = 0.25  # Distance from the polynomial, by the change. Chosen: half of that of a step
 _QUADRATURE_NODES = 24  # Nodes of Gauss-Legendre; chosen: exact for |z| < `_STIFF`
 _FEW_INPUTS = 512  # Most inputs that are filtered one by one; chosen: 50 µs
 _STIFF = 8.0  # |z| from which weights are integrated by parts; chosen: stable there only
 
 
-def low_pass(x: np.ndarray, tau_s: float, dt_s: float, memory: dict[str, Any]) -> np.ndarray:
+def low_pass(x: np.ndarray, tau_s: float, dt_s: float, memory: dict[str, Any],
+             may_step: bool = False) -> np.ndarray:
     """
     Filter inputs, (n,), by 1/(1 + τ·s); τ = 0 passes them on.
 
     Before the first block, with an empty memory, the filter is at rest at its first input.
+    may_step: see `pole`.
     """
     if not tau_s:
         return x
-    return pole(x, -1 / tau_s, dt_s, memory) / tau_s
+    return pole(x, -1 / tau_s, dt_s, memory, may_step) / tau_s
 
 
 def resonator(x: np.ndarray, frequency_hz: float, damping_ratio: float, dt_s: float,
@@ -40,7 +44,8 @@ def resonator(x: np.ndarray, frequency_hz: float, damping_ratio: float, dt_s: fl
     return omega ** 2 / damped * mode.imag
 
 
-def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> np.ndarray:
+def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any],
+         may_step: bool = False) -> np.ndarray:
     """
     Solve w' = rate·w + x, exactly for x a polynomial through the newest `ORDER` samples.
 
@@ -48,6 +53,9 @@ def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> n
     Adams-Moulton method (Hochbruck and Ostermann 2010, section 2.6). The polynomial uses past
     samples only, so that the filter does not look ahead. Inputs are (n,), or (n, k) for k filters;
     the real part of the rate is negative. With an empty memory w is at rest at the first input.
+
+    may_step: whether inputs may step. A polynomial rings there, so that the newest two inputs are
+    then joined by a straight line.
     """
     if not len(x):
         return x
@@ -55,8 +63,10 @@ def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> n
     previous = memory['inputs'] if memory else np.repeat(x[:1], ORDER - 1, axis=0)
     last_w = memory.get('w', -x[0] / rate)
     inputs = np.concatenate([previous, x])
-    weights = _weights(rate * dt_s) * dt_s
-    if x.ndim == 1:
+    weights = _weights(rate * dt_s, ORDER) * dt_s
+    if may_step:
+        drive = _stepping(inputs, _step_rows(rate * dt_s, dt_s))
+    elif x.ndim == 1:
         drive = np.convolve(inputs, weights, 'valid')
     else:
         drive = sum(weight * inputs[ORDER - 1 - j:len(inputs) - j]
@@ -67,6 +77,36 @@ def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any]) -> n
     w = first_order_recursion(1.0, decay, drive, last_w)
     memory['inputs'], memory['w'] = inputs[-(ORDER - 1):], w[-1]
     return w
+
+
+def _stepping(inputs: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """
+    Return what inputs, (n + ORDER − 1, ...), drive a pole with, by the sums of `_step_rows`.
+
+    It is the line where the newest input is far from the polynomial through those before it. That
+    of a sine of 10 samples a period is near; the first input after a step misses it by the step.
+    """
+    drive = np.empty(inputs[ORDER - 1:].shape)
+    for newest in range(len(drive)):
+        smooth, straight, missed, slope, bend = rows @ inputs[newest:newest + ORDER]
+        change = np.abs(slope) + np.abs(bend)
+        drive[newest] = np.where(np.abs(missed) <= _MOST_MISSED * change, smooth, straight)
+    return drive
+
+
+@lru_cache(maxsize=64)
+def _step_rows(z: float, dt_s: float) -> np.ndarray:
+    """
+    Return weights of inputs, oldest first, (5, ORDER).
+
+    They give the drive by a polynomial and by a line, the distance of the newest input from the
+    polynomial through the others, and the change of the inputs, straight and bent.
+    """
+    line = np.zeros(ORDER)
+    line[-_LINE:] = _weights(z, _LINE)[::-1]
+    missed = np.poly(np.ones(ORDER - 1))[::-1]
+    return np.array([_weights(z, ORDER)[::-1] * dt_s, line * dt_s, missed,
+                     [-1, 0, 0, 0, 0, 1], [1, 0, -1, -1, 0, 1]])
 
 
 def first_order_recursion(gain: float, decay: complex, inputs: np.ndarray,
@@ -86,11 +126,11 @@ def first_order_recursion(gain: float, decay: complex, inputs: np.ndarray,
 
 
 @lru_cache(maxsize=64)
-def _weights(z: complex) -> np.ndarray:
+def _weights(z: complex, order: int) -> np.ndarray:
     """Return weights of the newest inputs, newest first: ∫ exp(z·(1 − s))·Lⱼ(s) ds, 0 to 1."""
-    nodes = 1.0 - np.arange(ORDER)
+    nodes = 1.0 - np.arange(order)
     lagrange = [np.poly(np.delete(nodes, j)) / np.prod(nodes[j] - np.delete(nodes, j))
-                for j in range(ORDER)]
+                for j in range(order)]
     if abs(z) < _STIFF:
         s, weight = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
         s, weight = (s + 1) / 2, weight / 2
@@ -98,7 +138,7 @@ def _weights(z: complex) -> np.ndarray:
         return np.array([np.sum(growth * np.polyval(c, s)) for c in lagrange])
     # Integrals of exp(z·(1 − s))·s^k, by parts.
     moments = [(np.exp(z) - 1) / z]
-    for k in range(1, ORDER):
+    for k in range(1, order):
         moments.append((k * moments[-1] - 1) / z)
     return np.array([np.dot(c[::-1], moments) for c in lagrange])
 

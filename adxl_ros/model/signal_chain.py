@@ -62,8 +62,25 @@ class RunningEffect:
         self.key = (name, *sorted(self.parameters.items()))
         self.memory: dict[str, Any] = {}
         # An invertible effect is a function of one sample, and draws nothing.
-        self.rng = None if effect.invertible else np.random.default_rng(
-            [seed, zlib.crc32(name.encode())])
+        self.rng = None if effect.invertible else _generator(seed, name)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a pickle holds: the function of an effect has no name of its own there."""
+        return {key: value for key, value in vars(self).items() if key != 'apply'}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the content of a pickle."""
+        vars(self).update(state)
+        self.apply = effect_named(self.name).apply
+
+    def seed(self, seed: int) -> None:
+        """Begin the random numbers of the effect anew."""
+        if self.rng is not None:
+            self.rng = _generator(seed, self.name)
+
+
+def _generator(seed: int, name: str) -> np.random.Generator:
+    return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
 class Chain:
@@ -132,6 +149,11 @@ class Chain:
         for effect in new._running():
             effect.memory, effect.parameters = {}, dict(effect.parameters)
         return new
+
+    def seed(self, seed: int) -> None:
+        """Begin all random numbers anew."""
+        for effect in self._running():
+            effect.seed(seed)
 
     def memories(self) -> list[dict[Any, Any]]:
         """Return what each effect remembers."""

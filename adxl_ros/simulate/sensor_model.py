@@ -139,7 +139,7 @@ class SensorModel:
         check_needs(replace(self.sensor, effects=kept), Motion(0.0))
         # Drawn coefficients of the sensors, (n, k); None before the first step, or without draws
         self.coefficients: np.ndarray | None = None
-        self._units_rng, self._white = (np.random.default_rng([seed, n]) for n in (1, 0))
+        self._units_rng, self._white = _generators(seed)
         simulated = self.sensor
         if self.draws:
             # An effect with neutral values is skipped, and here they are replaced.
@@ -158,17 +158,23 @@ class SensorModel:
             'steps': np.zeros(count), 'filters': [{} for _ in self.sensor.axes]}
         self._reset = np.zeros(0, int)  # Sensors that begin anew in the next step
 
-    def reset(self, env_ids: Any = None) -> None:
+    def reset(self, env_ids: Any = None, seed: int | None = None) -> None:
         """
         Begin anew: the sensors are other units, and their noise and filters have no past.
 
         Parameters
         ----------
         env_ids
-            Numbers of the sensors, a mask or a slice; None for all. Before the first step it has
-            nothing to do.
+            Numbers of the sensors, a mask or a slice; None for all. Before the first step no
+            sensor has a past.
+        seed
+            Seed from which all random numbers begin anew, as those of a new `SensorModel`; None
+            lets them go on.
 
         """
+        if seed is not None:
+            self._units_rng, self._white = _generators(seed)
+            self._chain.seed(seed)
         if count := len(self._memory['steps']):
             rows = np.arange(count)[slice(None) if env_ids is None else env_ids if isinstance(
                 env_ids, slice | list) else _on_host(env_ids)]
@@ -206,8 +212,8 @@ class SensorModel:
         -------
         array
             Readings by the nominal conversion, m/s², as in `imu/data_raw`: an array of the same
-            library, shape, type and device as the force; 0 for an axis that the sensor does not
-            have.
+            library, shape, device and floating type as the force; 0 for an axis that the sensor
+            does not have. For whole numbers it is float64 of numpy, and float32 of others.
 
         Raises
         ------
@@ -261,7 +267,9 @@ class SensorModel:
             raise UserError('the specific force is not finite; check the simulation')
         if not len(self._memory['steps']):
             self._shape, self._dt_s = force.shape, float(dt_s)
+            # A digital filter follows the rate, which here is that of the time steps.
             self._std_v = noise.analog_std_v(replace(self.sensor, rate_hz=1 / self._dt_s))
+            self._chain.sensor = replace(self._chain.sensor, rate_hz=1 / self._dt_s)
             self._switch_on(force.size // 3)
             self._draw(np.arange(force.size // 3))
         if force.shape != self._shape:
@@ -290,7 +298,7 @@ class SensorModel:
         signals = self._chain.signals(now, time_s=now.time_s, dt_s=self._dt_s, force=force)
         self._chain(Place.FORCE, signals)
         analog_v = self._chain.volts(signals)
-        signals.input_v = [low_pass(np.asarray(volts), rc_s, self._dt_s, memory)
+        signals.input_v = [low_pass(np.asarray(volts), rc_s, self._dt_s, memory, may_step=True)
                            for volts, rc_s, memory in zip(analog_v, signals.rc_s,
                                                           self._memory['filters'])]
         if self._std_v.any():
@@ -342,15 +350,25 @@ def _on_host(array: Any) -> np.ndarray:
 
 
 def _like(values: np.ndarray, like: Any) -> Any:
-    """Return values as an array of the same library, type and device as another one."""
-    if isinstance(like, np.ndarray | list | tuple):
+    """Return values as an array of the same library, floating type and device as another one."""
+    if isinstance(like, np.ndarray):
+        return values.astype(like.dtype) if np.issubdtype(like.dtype, np.floating) else values
+    if isinstance(like, list | tuple):
         return values
     try:
         from array_api_compat import array_namespace, device
     except ImportError:
         raise UserError('arrays of other libraries than numpy need array-api-compat; '
                         f'{install_hint("array-api-compat")}') from None
-    return array_namespace(like).asarray(values, dtype=like.dtype, device=device(like))
+    space = array_namespace(like)
+    is_floating = space.isdtype(like.dtype, 'real floating')
+    return space.asarray(values, dtype=like.dtype if is_floating else space.float32,
+                         device=device(like))
+
+
+def _generators(seed: int) -> list[np.random.Generator]:
+    """Return the random generators of the units and of the white noise."""
+    return [np.random.default_rng([seed, part]) for part in (1, 0)]
 
 
 def _put_rows(whole: Any, part: Any, rows: np.ndarray) -> None:

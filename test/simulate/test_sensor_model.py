@@ -2,7 +2,9 @@
 
 """The chain as a call for simulators, compared with a simulated recording."""
 
+from copy import deepcopy
 from dataclasses import replace
+import pickle
 from time import process_time
 
 from adxl_ros.errors import UserError
@@ -38,14 +40,15 @@ def quiet(*effects):
 
 
 def swing(count=300, late_s=0.0):
-    """Return specific force of a swinging body, m/s², (n, 3)."""
-    time_s = np.arange(count) / RATE_HZ - late_s
+    """Return specific force of a body that begins to swing smoothly, m/s², (n, 3)."""
+    time_s = np.maximum(np.arange(count) / RATE_HZ - late_s, 1e-9)
+    time_s = time_s * np.exp(-1 / time_s)
     return G0_MPS2 * np.column_stack([np.sin(7 * time_s), np.cos(5 * time_s),
                                       np.sin(3 * time_s + 1)])
 
 
 def temperature_c(count=300):
-    return 25 + 10 * np.sin(np.arange(count) / 40)
+    return 25 + 10 * (1 - np.cos(np.arange(count) / 40))
 
 
 def recorded(sensor, seed):
@@ -224,3 +227,60 @@ def test_arrays_of_other_libraries_have_the_same_numbers(library_name):
         assert type(readings) is type(given) and readings.dtype == given.dtype
         assert np.asarray(readings) == pytest.approx(
             model(f.astype(np.float32), 1 / RATE_HZ), abs=1e-6)
+
+
+def test_the_filter_does_not_ring_after_a_step():
+    """A foot in contact: between two steps the force is a straight line."""
+    dt_s, steps = 1 / RATE_HZ, 6
+    sensor = quiet()
+    sensor = replace(sensor, adc_bits=0)
+    model, force = SensorModel(sensor), np.array([0.0, 0.0, 1.0])
+    for _ in range(10):
+        model(force, dt_s)
+    readings = [float(model(force * 0, dt_s)[2]) for _ in range(steps)]
+    fine = np.arange(0, steps * dt_s, dt_s / 1000)
+    falling = np.interp(fine, [0, dt_s], [1.0, 0.0])
+    expected, output = [], 1.0
+    for i, value in enumerate(falling):
+        output += (value - output) * dt_s / 1000 / sensor.rc_s
+        if i % 1000 == 999:
+            expected.append(output)
+    assert readings == pytest.approx(expected, abs=2e-3)
+
+
+def test_a_filter_that_is_digital_follows_the_time_steps():
+    sensor = quiet()
+    at_file, at_slow = (SensorModel(replace(sensor, adc_bits=0, filter_rate_hz=RATE_HZ))
+                        for _ in range(2))
+    for value in (0.0, 0.0, 1.0, 1.0, 0.0):
+        force = np.array([value, 0.0, 0.0])
+        assert at_file(force, 1 / RATE_HZ) == pytest.approx(at_slow(force, 10 / RATE_HZ))
+
+
+@pytest.mark.parametrize('effect', ['temperature_bias', 'hysteresis', 'flicker', 'stuck'])
+def test_a_copy_goes_on_as_the_original(effect):
+    model = SensorModel(unit(effect))
+    force = swing(20)
+    for row in force[:10]:
+        model(row, 1 / RATE_HZ)
+    copies = pickle.loads(pickle.dumps(model)), deepcopy(model)
+    for row in force[10:]:
+        expected = model(row, 1 / RATE_HZ)
+        assert all(np.array_equal(other(row, 1 / RATE_HZ), expected) for other in copies)
+
+
+def test_the_type_of_the_readings_is_that_of_the_force():
+    for kind, expected in (('float32', 'float32'), ('float64', 'float64'), ('int64', 'float64')):
+        assert SensorModel(unit())(np.ones((2, 3), kind), 0.01).dtype == expected
+
+
+@pytest.mark.parametrize('units', [None, 'datasheet'])
+def test_a_seed_of_reset_is_that_of_a_new_model(units):
+    """As gymnasium's check_env asks for."""
+    sensor, force = unit('flicker', 'bias_walk'), np.tile(swing(1), (3, 1))
+    model, new = SensorModel(sensor, 1, units), SensorModel(sensor, 5, units)
+    model(force, 0.01)
+    expected = [new(force, 0.01) for _ in range(5)]
+    for _ in range(2):
+        model.reset(seed=5)
+        assert np.array_equal([model(force, 0.01) for _ in range(5)], expected)
