@@ -15,13 +15,19 @@ from adxl_ros.api.result import FirstScreen, make_folder, no_progress, Progress,
 from adxl_ros.api.sensors import GivenSensor, sensor_of, SensorInput
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits import thermal_fit
-from adxl_ros.calibrate.poses import estimate_filters, extract_poses, Poses, with_table_angles
+from adxl_ros.calibrate.poses import (
+    estimate_filters,
+    extract_poses,
+    Poses,
+    poses_of_means,
+    with_table_angles,
+)
 from adxl_ros.calibrate.report import acceptance, gum, page
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.calibrate.result import CalibrationResult, compare, errors_in_words
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
-from adxl_ros.files.recording_columns import recorded_unit, Recording
+from adxl_ros.files.recording_columns import recorded_unit, Recording, unit_of
 from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
@@ -29,6 +35,10 @@ from adxl_ros.report.quantities import mg
 from adxl_ros.signals.recorded_sensor import BeyondRange, FilterNoise, listed
 
 _READING = 0.3  # Share of the work until the fit begins (chosen: a sweep of minutes)
+
+
+_MEANS_LACK = ('a table of means shows no noise, filter or range: they are measured from the '
+               'first recording that the file corrects')
 
 
 class FittedCoefficient(NamedTuple):
@@ -69,7 +79,7 @@ class Fit(Result):
     measured: tuple[str, ...]
     """What was measured, as no parameter file states it."""
     notes: tuple[str, ...]
-    """Readings beyond the stated range, by recording."""
+    """Readings beyond the stated range, by recording, and what a table of means lacks."""
     is_over_temperature: bool
     """Whether temperature effects were fitted to a sensor at rest."""
     result: CalibrationResult
@@ -154,7 +164,7 @@ def fit(recordings: RecordingInput | Iterable[RecordingInput],
         effects: Sequence[str] = (), prior: str | os.PathLike | None = None,
         journal: str | os.PathLike | None = None, poses: str | os.PathLike | None = None,
         urdf: str | os.PathLike | None = None, frame: str = 'imu_link', joints: str = '',
-        data_sha256: str = '', progress: Progress = no_progress) -> Fit:
+        means: bool = False, data_sha256: str = '', progress: Progress = no_progress) -> Fit:
     """
     Calibrate one unit: against stage angles where there are any, else against gravity.
 
@@ -178,6 +188,8 @@ def fit(recordings: RecordingInput | Iterable[RecordingInput],
     journal, poses
         Path of the journal of the sweep that names the rests, or of a table with `alpha_deg` and
         `beta_deg` of each rest; for one recording.
+    means
+        Whether each row of the one recording is the mean of a rest; its stamps are not used.
     urdf, frame, joints
         Path of a robot as the stage, its frame that carries the sensor, topic of its joints.
     data_sha256
@@ -196,13 +208,14 @@ def fit(recordings: RecordingInput | Iterable[RecordingInput],
         The poses do not determine the model, or recordings contradict each other.
 
     """
-    rests = _Rests(journal, poses)
+    rests = _Rests(journal, poses, means)
     population = calibration_store.read_population(prior) if prior else None
     robot = RobotInput(urdf, frame, joints) if urdf else None
-    unit = _Unit(sensor, robot)
+    unit = _Unit(sensor, robot, means)
     several: Iterable[Recording] = each_recording(recordings)
     blocks: Poses | None = None
-    if effects and set(effects) <= set(thermal_fit.EFFECTS) and not (model or journal or poses):
+    if effects and set(effects) <= set(thermal_fit.EFFECTS) and not (
+            model or journal or poses or means):
         several = list(several)
         blocks = unit.thermal_blocks(several)
     if blocks is not None:
@@ -229,19 +242,23 @@ def fit(recordings: RecordingInput | Iterable[RecordingInput],
 class _Unit:
     """The unit, while its recordings are read one after the other."""
 
-    def __init__(self, sensor: SensorInput | None, robot: RobotInput | None) -> None:
-        self._stated, self._robot = sensor, robot
+    def __init__(self, sensor: SensorInput | None, robot: RobotInput | None, has_means: bool
+                 ) -> None:
+        self._stated, self._robot, self._has_means = sensor, robot, has_means
         self._given: GivenSensor | None = None
         self._paths: list[str] = []
-        self.notes: list[str] = []  # Readings beyond the stated range
+        self.notes: list[str] = []  # Readings beyond the stated range, and what means lack
         self._surroundings: list[Surroundings] = []  # Those of each recording
 
     def add(self, read: Recording) -> Recording:
         """Take the next recording; return it, with the angles of a robot if there is one."""
         if self._given is None:
-            self._given = sensor_of(self._stated, read)
+            self._given = sensor_of(self._stated, read, has_noise=not self._has_means)
             self.sensor = self._given.sensor  # The nominal sensor of the newest recording
-        self.sensor = recorded_unit(self.sensor, read)
+            if self.sensor.unstated:
+                self.notes.append(_MEANS_LACK)
+        self.sensor = unit_of(self.sensor, read.stream_info, read.axes) if self._has_means \
+            else recorded_unit(self.sensor, read)
         self._paths.append(read.path)
         self._surroundings.append(Surroundings())
         self._surroundings[-1](read)
@@ -293,11 +310,12 @@ class _Unit:
 class _Rests:
     """Where the rests of a recording are, and what their angles are."""
 
-    def __init__(self, journal: str | os.PathLike | None, table: str | os.PathLike | None
-                 ) -> None:
-        if journal and table:
+    def __init__(self, journal: str | os.PathLike | None, table: str | os.PathLike | None,
+                 are_rows: bool) -> None:
+        ways = [bool(way) for way in (journal, table, are_rows)]
+        if sum(ways) > 1:
             raise UserError(_ONE_RECORDING)
-        self._table, self._is_one = table, bool(journal or table)
+        self._table, self._are_rows, self._is_one = table, are_rows, any(ways)
         self._records = sweep_journal.poses_to_fit(sweep_journal.read(journal).entries) \
             if journal else None
 
@@ -306,13 +324,15 @@ class _Rests:
         """Return the poses of a recording, and the filter of each axis in their noise."""
         if number and self._is_one:
             raise UserError(_ONE_RECORDING)
+        if self._are_rows:
+            return poses_of_means(read, unit.sensor), ()
         poses = extract_poses(read, unit.sensor, self._records)
         if self._table:
             poses = with_table_angles(poses, str(self._table))
         return poses, estimate_filters(read, unit.sensor, poses)
 
 
-_ONE_RECORDING = '--journal and --poses: one of them names the rests of one recording'
+_ONE_RECORDING = '--journal, --poses and --means: one of them names the rests of one recording'
 """Message where rests of several recordings are named."""
 
 

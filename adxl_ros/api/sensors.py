@@ -54,10 +54,16 @@ class GivenSensor(NamedTuple):
         return os.path.basename(self.file or parameter_file.nominal_path())
 
 
-def sensor_of(given: SensorInput | None, read: Recording) -> GivenSensor:
-    """Return the sensor of a recording; None is the one that the recording most likely has."""
+def sensor_of(given: SensorInput | None, read: Recording, has_noise: bool = True) -> GivenSensor:
+    """
+    Return the sensor of a recording; None is the one that the recording most likely has.
+
+    has_noise: whether what is not stated can be measured; else it stays unstated.
+    """
     stated = as_input(given)
-    sensor, measured = measure_unstated(load_sensor(stated, read), read)
+    sensor, measured = load_sensor(stated, read), []
+    if has_noise:
+        sensor, measured = measure_unstated(sensor, read)
     if isinstance(stated, Sensor):
         stated = '' if sensor.serial == NO_UNIT else f'{sensor.serial}.yaml'
     return GivenSensor(sensor, stated or '', measured)

@@ -325,7 +325,8 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
                                                float(np.sqrt(budgets.accel.model))))
     fitted = with_provenance(fitted, source, poses, data_sha256, {
         'reference': 'gravity', **({'prior': population.name} if population else {}),
-        'residual_mg': f'{after:.4f}', 'held_out_mg': f'{unseen:.4f}', 'span_s': f'{span_s:.1f}',
+        'residual_mg': f'{after:.4f}', 'held_out_mg': f'{unseen:.4f}',
+        **({'span_s': f'{span_s:.1f}'} if span_s else {}),
         'converged': 'yes' if fit.converged else 'no',
         **acceptance.provenance_entries(assessment, ())})
     summary = acceptance.summary_lines(

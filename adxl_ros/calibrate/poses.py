@@ -263,6 +263,21 @@ def recorded_settings(rests: np.ndarray, readings_rad: np.ndarray | None,
     return settings
 
 
+def poses_of_means(recording: Recording, sensor: Sensor) -> Poses:
+    """
+    Return the poses of a table of which each row is the mean of a rest.
+
+    The noise of the means is not known: 0 stands for it, and the residuals of a fit show it.
+    """
+    volts = recording.volts(sensor)
+    missing = np.full(len(recording), np.nan)
+    angles, columns = recording.stage_angles, recording.columns
+    alpha_rad, beta_rad = (missing, missing) if angles is None else angles.T
+    return Poses(volts, np.zeros_like(volts), alpha_rad, beta_rad,
+                 np.zeros((len(recording), 2)), np.zeros(len(recording), bool),
+                 columns.get('temperature_c', missing), columns.get('supply_v', missing))
+
+
 def _surroundings(recording: Recording, name: str, rests: Sequence[Rest],
                   means: Callable[[np.ndarray | None], np.ndarray]) -> np.ndarray:
     """Return the mean of a column at each rest, (k,); between others where a rest has none."""

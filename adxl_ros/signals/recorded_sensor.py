@@ -102,9 +102,12 @@ def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = 
         gaps = stats.gap_s(unit.rate_hz)
         why = f'; they come with gaps of up to {np.diff(time_s).max():.2g} s' \
             if np.diff(time_s).max() > gaps else ''
+        keys = [key for key, field in parameter_file.SENSOR_FIELDS.items()
+                if field.name in unit.unstated]
         raise UserError(f'{where}{len(time_s)} samples at {unit.rate_hz:g} Hz do not show the '
                         f'noise of the sensor{why}; record at least {needed_s:.3g} s without '
-                        'gaps, or state sensor.noise_density_g_per_rthz in the parameter file')
+                        f'gaps, or state {", ".join(keys)} in the parameter file; fit '
+                        '--means takes a table of which each row is the mean of a rest')
     step_v = stats.adc_step(blocks)
     variance_v2, limit_v2 = stats.quiet_variance(blocks, windows, step_v)
     rc_s = unit.rc_s

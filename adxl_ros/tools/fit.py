@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from adxl_ros.api.calibration import fit as fit_unit
@@ -48,6 +49,9 @@ def parser() -> argparse.ArgumentParser:
                        help='use the rests that the journal of this sweep names')
     parse.add_argument('--poses', metavar='FILE',
                        help='table with alpha_deg and beta_deg of each rest, in their order')
+    parse.add_argument('--means', action='store_true',
+                       help='each row of the table is the mean of a rest, in any order; its '
+                            'stamps are not used')
     parse.add_argument('-o', dest='output', metavar='FILE.yaml', required=True,
                        help='the parameter file of the calibrated sensor')
     parse.add_argument('--report', metavar='DIR',
@@ -70,6 +74,9 @@ def _details() -> str:
                            if effect.invertible or effect.place is Place.STAGE)
 
 
+_MEANS_RATE_HZ = 1.0  # Stamps of a table of means, which have no meaning
+
+
 def fit(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     cli.check_outputs(options, options.output, options.dcc,
@@ -77,13 +84,15 @@ def fit(options: argparse.Namespace) -> int:
     if options.report or options.dcc:
         html_page.check_libraries()
     reading = cli.reading_options(options)
+    if options.means:
+        reading = replace(reading, rate_hz=_MEANS_RATE_HZ)
     report: list[str | Path] = []
     with cli.progress('fit') as show:
         fitted = fit_unit(
             (cli.read('fit', path, reading) for path in options.recording), options.params,
             model=options.model, effects=options.effect, prior=options.prior,
-            journal=options.journal, poses=options.poses, urdf=options.urdf, frame=options.frame,
-            joints=options.joints, progress=show)
+            journal=options.journal, poses=options.poses, means=options.means,
+            urdf=options.urdf, frame=options.frame, joints=options.joints, progress=show)
         cli.report_notes('fit', fitted.notes)
         if options.report:
             show(0.6, 'report')
@@ -93,9 +102,11 @@ def fit(options: argparse.Namespace) -> int:
             report.append(options.dcc)
     fitted.save(options.output)
     cli.note(f'fit: {fitted.keep(options.store)}')
+    # No samples of a table of means can be corrected.
+    applied = 'RECORDING' if options.means else \
+        f'{cli.quoted(options.recording[0])}{cli.reading_text(options)}'
     cli.print_end([*fitted.screen, ''], [options.output, *report], command(
-        'apply', f'{cli.quoted(options.recording[0])}{cli.reading_text(options)} --params '
-        f'{cli.quoted(options.output)} -o tilt.csv'))
+        'apply', f'{applied} --params {cli.quoted(options.output)} -o tilt.csv'))
     return 0
 
 

@@ -154,6 +154,7 @@ LIMITS = {
     'noise': 'the noise of the means; longer rests reduce it',
     'stage': 'the angles of the stage; further poses reduce it',
     'model': 'the model, which does not have the form of this unit',
+    'noise or model': 'noise or model; a table of means does not separate them',
     'stage or model': 'the stage or the model; poses that are visited twice separate them'}
 """What limits a calibration, and what helps, by cause."""
 
@@ -163,7 +164,8 @@ def summary_lines(fitted: Sensor, assessment: Assessment | None, errors: Sequenc
     """Return verdict, errors as given, and limits: what a terminal and the head of a file show."""
     lines = [*acceptance_lines(fitted), '', *errors]
     if assessment is not None:
-        cause = 'open' if open_coefficients(fitted) else assessment.accel.limited_by
+        cause = 'open' if open_coefficients(fitted) else \
+            assessment.accel.limited_by if limit(fitted)[0] else 'noise or model'
         lines += ['', *limit_table(assessment, fitted),
                   f' limited by               {LIMITS[cause]}']
     return lines
@@ -209,7 +211,7 @@ def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
              assessment.accel_outcome, assessment.tilt_outcome))
     return [f' {name:24} {"-" if np.isnan(value_deg) else _two_digits(value_deg):>7} ° {tilt:9} '
             f'{_two_digits(value_mg):>8} mg {accel}'.rstrip()
-            for name, value_mg, value_deg, accel, tilt in rows]
+            for name, value_mg, value_deg, accel, tilt in rows[:2 if limit_mps2 else 1]]
 
 
 def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:
@@ -253,6 +255,9 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
     if 'own_accel_mg' not in provenance:
         return NOT_SHOWN, ['no pose was kept out of the fit to assess it']
     limit_mps2, origin = limit(fitted)
+    if not limit_mps2:
+        return NOT_SHOWN, [f'calibration error {_two_digits(float(provenance["own_accel_mg"]))} '
+                           'mg; neither a datasheet nor the noise of a sample states a limit']
     limit_text = f'{_two_digits(mg(limit_mps2))} mg'
     accel = provenance.get('verdict', '')
     outcomes = accel, provenance.get('verdict_tilt', '')
