@@ -39,8 +39,8 @@ _HIGHEST_RATE_HZ = 1e5  # Largest sample rate, Hz: that of a parameter file
 def read(source: str | os.PathLike | Any, *, topic: str = '',
          columns: str | Mapping[str, str | tuple[str, str]] | None = None,
          unit: str = '', rate: float | None = None, axes: str | None = None,
-         lsb_per_g: Counts = (), lsb_at_0g: Counts = (), drop_bad_stamps: bool = False
-         ) -> Recording:
+         lsb_per_g: Counts = (), lsb_at_0g: Counts = (), drop_bad_stamps: bool = False,
+         drop_bad_samples: bool = False) -> Recording:
     """
     Read a recording.
 
@@ -66,6 +66,8 @@ def read(source: str | os.PathLike | Any, *, topic: str = '',
         Counts of 1 g, and at 0 g, of columns in LSB: one number, or one for each axis.
     drop_bad_stamps
         Whether samples are left out whose stamp does not increase; else they are refused.
+    drop_bad_samples
+        Whether samples are left out that have no number as their stamp or on an axis.
 
     Returns
     -------
@@ -80,7 +82,7 @@ def read(source: str | os.PathLike | Any, *, topic: str = '',
 
     """
     options = reading_options(topic, columns, unit, rate, axes, lsb_per_g, lsb_at_0g,
-                              drop_bad_stamps)
+                              drop_bad_stamps, drop_bad_samples)
     if isinstance(source, (str, os.PathLike)):
         return recording_files.read(source, options)
     return recording_files.of_table(_table(_numbers(source), 'DataFrame'), options)
@@ -88,8 +90,8 @@ def read(source: str | os.PathLike | Any, *, topic: str = '',
 
 def reading_options(topic: str = '', columns: str | Mapping[str, Any] | None = None,
                     unit: str = '', rate: float | None = None, axes: str | None = None,
-                    lsb_per_g: Counts = (), lsb_at_0g: Counts = (), drop_bad_stamps: bool = False
-                    ) -> ReadingOptions:
+                    lsb_per_g: Counts = (), lsb_at_0g: Counts = (), drop_bad_stamps: bool = False,
+                    drop_bad_samples: bool = False) -> ReadingOptions:
     """Check how a recording is to be read; see `read`."""
     if rate is not None and not 0 < rate <= _HIGHEST_RATE_HZ:
         raise UserError(f'--rate {rate:g}: expected samples a second, at most '
@@ -97,7 +99,7 @@ def reading_options(topic: str = '', columns: str | Mapping[str, Any] | None = N
     return ReadingOptions(
         topic, parse_mapping(_mapping_text(columns)) if columns else None, parse_unit(unit),
         _counts('--lsb-per-g', lsb_per_g, 0.0), _counts('--lsb-at-0g', lsb_at_0g, -math.inf),
-        rate, drop_bad_stamps, parse_mounting(axes) if axes else None)
+        rate, drop_bad_stamps, drop_bad_samples, parse_mounting(axes) if axes else None)
 
 
 def _mapping_text(columns: str | Mapping[str, str | tuple[str, str]]) -> str:

@@ -267,15 +267,22 @@ def poses_of_means(recording: Recording, sensor: Sensor) -> Poses:
     """
     Return the poses of a table of which each row is the mean of a rest.
 
-    The noise of the means is not known: 0 stands for it, and the residuals of a fit show it.
+    The noise of the means is not known. Against gravity, 0 stands for it, and the residuals show
+    it; against a stage, it is at most that of a sample.
     """
-    volts = recording.volts(sensor)
-    missing = np.full(len(recording), np.nan)
-    angles, columns = recording.stage_angles, recording.columns
+    volts, columns = recording.volts(sensor), recording.columns
+    missing, std_v = np.full(len(recording), np.nan), np.zeros_like(volts)
+    angles = recording.stage_angles
     alpha_rad, beta_rad = (missing, missing) if angles is None else angles.T
-    return Poses(volts, np.zeros_like(volts), alpha_rad, beta_rad,
-                 np.zeros((len(recording), 2)), np.zeros(len(recording), bool),
-                 columns.get('temperature_c', missing), columns.get('supply_v', missing))
+    if angles is not None:
+        std_v += sample_std_v(sensor)
+    if angles is not None and not std_v.any():
+        raise UserError(f'{recording.path}: nothing states the noise of means with stage angles; '
+                        'state sensor.noise_density_g_per_rthz in the file of --params, or leave '
+                        'alpha and beta out')
+    return Poses(volts, std_v, alpha_rad, beta_rad, np.zeros((len(recording), 2)),
+                 np.zeros(len(recording), bool), columns.get('temperature_c', missing),
+                 columns.get('supply_v', missing))
 
 
 def _surroundings(recording: Recording, name: str, rests: Sequence[Rest],

@@ -21,6 +21,7 @@ from adxl_ros.files.bag_messages import (
 )
 from adxl_ros.files.column_mapping import (
     AS_IT_IS,
+    DROP_SAMPLES,
     GRAVITY,
     LSB,
     Quantity,
@@ -78,6 +79,7 @@ class _Samples:
         self.axes = axes
         self.epoch_ns = 0  # Origin of the times, ns
         self.count = 0  # Messages so far
+        self.incomplete = 0  # Those of them that were left out, because an axis has no number
         self.stamp_ns = np.zeros(0, np.int64)  # Stamps of the waiting samples, ns, (n,)
         self.force = np.zeros((0, 3))  # Their specific force, m/s², (n, 3)
         self._reading = reading
@@ -104,16 +106,28 @@ class _Samples:
             number = self.count + row + 1
             return f'{self.where}: message {number}, stamped {seconds(stamp_ns[row])}'
 
-        is_kept = self.stamps.increasing((stamp_ns - self.epoch_ns) / 1e9,
-                                         np.ones(len(stamp_ns), bool), place)
+        is_sample = np.ones(len(stamp_ns), bool)
+        if self._reading.drop_bad_samples:
+            is_sample = np.isfinite(force).all(axis=1)
+            self.incomplete += int((~is_sample).sum())
+        is_kept = self.stamps.increasing((stamp_ns - self.epoch_ns) / 1e9, is_sample, place)
         wrong = is_kept[:, None] & ~(np.abs(force) <= LIMIT)
         if wrong.any():
             row, axis = np.argwhere(wrong)[0]
+            advice = '' if np.isfinite(force[row, axis]) else f'; {DROP_SAMPLES}'
             raise UserError(f'{place(row)}: linear_acceleration.{AXES[axis]} is '
-                            f'{force[row, axis]:g} m/s², expected a number within ±{LIMIT:g}')
+                            f'{force[row, axis]:g} m/s², expected a number within ±{LIMIT:g}'
+                            f'{advice}')
         self.count += len(stamp_ns)
         self.stamp_ns = np.concatenate([self.stamp_ns, stamp_ns[is_kept]])
         self.force = np.concatenate([self.force, force[is_kept]])
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Return what was left out, for people."""
+        left_out = f'{self.where}: left out, samples without a number on each axis: ' \
+                   f'{self.incomplete}'
+        return (*[left_out] * bool(self.incomplete), *self.stamps.remarks)
 
     def _begin(self, first: Raws, stamp_ns: int) -> None:
         self._first_ns = stamp_ns
@@ -230,7 +244,7 @@ def _block(bag: Bag, samples: _Samples, tracks: Mapping[str, Track],
     time_s = (stamp_ns - samples.epoch_ns) / 1e9
     cut = f'{bag.cut}; the last sample read is at {seconds(stamp_ns[-1])}' if bag.cut else ''
     return Recording(bag.path, time_s, columns, dict(info), alignments, cut, samples.epoch_ns,
-                     bag.done, samples.stamps.remarks, samples.stamps.bad)
+                     bag.done, samples.remarks, samples.stamps.bad)
 
 
 def log_times(path: str | os.PathLike, topic: str) -> Iterator[np.ndarray]:

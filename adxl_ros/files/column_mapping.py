@@ -265,6 +265,9 @@ def unit_in_name(column: str, quantity: Quantity) -> str | None:
     return next((name for name in (unit_name(word, quantity) for word in words) if name), None)
 
 
+DROP_SAMPLES = '--drop-bad-samples leaves such samples out'  # For messages
+
+
 @dataclass(frozen=True)
 class ReadingOptions:
     """How a recording is to be read."""
@@ -276,6 +279,8 @@ class ReadingOptions:
     lsb_at_0g: tuple[float, ...] = ()  # Counts at 0 g by axis; none for 0
     rate_hz: float | None = None  # Sample rate, Hz, that replaces the stamps; None keeps them
     drop_bad_stamps: bool = False  # Whether samples are left out whose stamp does not increase
+    # Whether samples are left out that have no number as their stamp or on an axis
+    drop_bad_samples: bool = False
     mounting: Mounting | None = None  # How the axes of the file are those of the sensor frame
 
     def __post_init__(self) -> None:

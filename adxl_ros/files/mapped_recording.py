@@ -14,6 +14,7 @@ import re
 from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import (
     ColumnMapping,
+    DROP_SAMPLES,
     GRAVITY,
     is_sensor_step,
     likely_unit,
@@ -136,7 +137,8 @@ class _Converter:
         self._remarks: list[str] = []
         self._epoch_ns: int | None = None
         self._begin = 0.0  # Origin of the times in the unit of the stamps
-        self._empty = 0  # Rows without a reading
+        self._empty = self._incomplete = 0  # Rows without a reading, and with a part of one
+        self._rows = 0  # Rows with a reading or a part of one so far
         self._last_beta_rad = 0.0
 
     def _source(self, table: Table, role: str, source: Source) -> Source:
@@ -171,12 +173,16 @@ class _Converter:
     def convert(self, block: TableBlock) -> Recording:
         """Return the samples of a block."""
         outputs = self._outputs(block)
-        is_sample = ~np.isnan(outputs).all(axis=1)
-        self._empty += int((~is_sample).sum())
+        is_row = ~np.isnan(outputs).all(axis=1)
+        self._empty += int((~is_row).sum())
+        is_sample = is_row & self._is_complete(block, outputs) \
+            if self._reading.drop_bad_samples else is_row
+        self._incomplete += int((is_row & ~is_sample).sum())
         for source, values in zip(self._axes, outputs.T):
             _refuse(block, source, is_sample & ~(np.abs(values) <= LIMIT),
-                    f'no reading of a sensor in {source.unit}', 'every sample needs it')
-        time_s, is_kept = self._times(block, is_sample)
+                    f'no reading of a sensor in {source.unit}',
+                    f'every sample needs it; {DROP_SAMPLES}')
+        time_s, is_kept = self._times(block, is_row, is_sample)
         columns = dict(zip(VOLTS if self._is_volts else ACCEL, outputs.T))
         columns |= self._references(block)
         if self._is_native:
@@ -188,11 +194,21 @@ class _Converter:
             self._look_at_first(time_s[is_kept])
         self.count += int(is_kept.sum())
         info = {key: text for key, text in block.info.items() if key != 'epoch_ns'}
-        left_out = f'{self._path}: left out, lines without a reading of the sensor: {self._empty}'
+        left_out = {'lines without a reading of the sensor': self._empty,
+                    'samples without a number on each axis, or without a time': self._incomplete}
         return Recording(self._path, time_s[is_kept], columns, info, cut=block.cut,
                          epoch_ns=self._epoch_ns or 0, done=block.done,
-                         remarks=(*self._remarks, *[left_out] * bool(self._empty),
-                                  *self._stamps.remarks), bad_stamps=self._stamps.bad)
+                         remarks=(*self._remarks, *(
+                             f'{self._path}: left out, {kind}: {count}'
+                             for kind, count in left_out.items() if count),
+                             *self._stamps.remarks), bad_stamps=self._stamps.bad)
+
+    def _is_complete(self, block: TableBlock, outputs: np.ndarray) -> np.ndarray:
+        """Return which rows have a number on each axis, and a time where stamps are used, (n,)."""
+        is_complete = np.isfinite(outputs).all(axis=1)
+        if self._reading.rate_hz is None:
+            is_complete &= np.isfinite(block.columns[self.sources['time'].column])
+        return np.asarray(is_complete)
 
     def _outputs(self, block: TableBlock) -> np.ndarray:
         """Return the output of the sensor, (n, m), V or m/s²."""
@@ -219,16 +235,19 @@ class _Converter:
             values['beta'] = beta_rad
         return {name: values[role] for name, role in _NATIVE.items() if role in values}
 
-    def _times(self, block: TableBlock, is_sample: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return stamps, s, (n,), and which rows are kept, (n,)."""
+    def _times(self, block: TableBlock, is_row: np.ndarray, is_sample: np.ndarray
+               ) -> tuple[np.ndarray, np.ndarray]:
+        """Return stamps, s, (n,), and which rows are kept, (n,); a part of a reading has one."""
         if self._reading.rate_hz is not None:
-            number = self.count + np.cumsum(is_sample) - 1
+            number = self._rows + np.cumsum(is_row) - 1
+            self._rows += int(is_row.sum())
             return number / self._reading.rate_hz, is_sample
         source, unit = self.sources['time'], self._unit('time')
         stamps = block.columns[source.column]
         _refuse(block, source, is_sample & ~(np.abs(unit.convert(stamps)) < _TIME_LIMIT_S),
                 f'no time in {source.unit} (200 years at most)',
-                'every sample needs a time: delete the line, or give --rate HZ to stamp by index')
+                'every sample needs a time: give --rate HZ to stamp by index, or delete the line; '
+                f'{DROP_SAMPLES}')
         if self._epoch_ns is None and is_sample.any():
             text = block.info.get('epoch_ns', '0')
             if not re.fullmatch(r'-?\d{1,18}|-?[1-8]\d{18}', text):

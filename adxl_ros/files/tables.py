@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tables of any format: delimited text, NumPy's .npz, Apache Parquet, and logs of PX4 (.ulg)."""
+"""Tables of any format: delimited text, .npz, MATLAB's .mat, Parquet, and logs of PX4 (.ulg)."""
 
 from __future__ import annotations
 
@@ -73,6 +73,8 @@ def _library(path: str, kind: str, package: str) -> Iterator[None]:
     """Name a package that is missing, and refuse a file that it cannot read."""
     try:
         yield
+    except UserError:
+        raise
     except ImportError:
         raise UserError(f'{path}: {kind} needs the Python package {package}: '
                         f'{install_hint(package)}') from None
@@ -83,22 +85,38 @@ def _library(path: str, kind: str, package: str) -> Iterator[None]:
 
 
 def _open_npz(path: str) -> Table:
-    """Read the arrays of a file; those of another length than most are left out."""
-    columns: dict[str, np.ndarray] = {}
     with _library(path, '.npz of plain arrays', 'numpy'), \
             np.load(path, allow_pickle=False) as arrays:
-        for name, values in arrays.items():
-            if values.dtype.kind in 'iuf' and values.ndim in (1, 2) and values.size > 1:
-                series = np.atleast_2d(values)
-                if series.shape[0] > series.shape[1]:
-                    series = series.T  # MATLAB and others keep a vector as a row
-                columns |= {f'{name}[{i}]' if len(series) > 1 else name: each
-                            for i, each in enumerate(series)}
+        return _of_arrays(path, arrays, 'save each column as an array')
+
+
+_MATLAB = "save plain vectors with save('run.mat', 't', 'x', 'y', 'z', '-v7'), or a " \
+          "table with writetable(T, 'run.csv')"
+"""How MATLAB writes what can be read, for messages: no struct, timetable or HDF5 (-v7.3)."""
+
+
+def _open_mat(path: str) -> Table:
+    with _library(path, f'a MATLAB file; {_MATLAB}; its format', 'scipy'):
+        from scipy.io import loadmat
+        return _of_arrays(path, loadmat(path), f'in MATLAB, {_MATLAB}')
+
+
+def _of_arrays(path: str, arrays: Mapping[str, Any], advice: str) -> Table:
+    """Return the arrays of numbers of a file; those of another length than most are left out."""
+    columns: dict[str, np.ndarray] = {}
+    for name, values in arrays.items():
+        values = np.asarray(values)
+        if values.dtype.kind in 'iuf' and values.ndim in (1, 2) and values.size > 1:
+            series = np.atleast_2d(values)
+            if series.shape[0] > series.shape[1]:
+                series = series.T  # MATLAB and others keep a vector as a row
+            columns |= {f'{name}[{i}]' if len(series) > 1 else name: each
+                        for i, each in enumerate(series)}
     if not columns:
-        raise UserError(f'{path}: holds no array of numbers with several rows')
+        raise UserError(f'{path}: holds no array of numbers with several rows; {advice}')
     rows = Counter(map(len, columns.values())).most_common(1)[0][0]
     return in_memory(path, {name: values for name, values in columns.items()
-                             if len(values) == rows})
+                            if len(values) == rows})
 
 
 def _open_parquet(path: str) -> Table:
@@ -162,7 +180,7 @@ def _open_ulog(path: str, topic: str) -> Table:
 
 
 _FORMATS: Mapping[str, Callable[[str], Table]] = {
-    '.npz': _open_npz, '.parquet': _open_parquet, '.pq': _open_parquet}
+    '.npz': _open_npz, '.mat': _open_mat, '.parquet': _open_parquet, '.pq': _open_parquet}
 """Formats besides text and logs by the ends of their files' names."""
 
 TABLE_ENDINGS = (*_FORMATS, '.ulg')  # Ends of the names of tables that are no text

@@ -89,6 +89,9 @@ def add_recording_options(parse: argparse.ArgumentParser) -> None:
                        help='stamp the samples by their index at this rate')
     group.add_argument('--drop-bad-stamps', action='store_true',
                        help='leave out samples whose stamp does not increase, and count them')
+    group.add_argument('--drop-bad-samples', action='store_true',
+                       help='leave out samples that have no number as their stamp or on an axis, '
+                            'and count them')
     group.add_argument('--axes', metavar='x=-y,y=x,z=z',
                        help='axes of the sensor by those of the file, for a documented mounting')
 
@@ -116,7 +119,7 @@ def reading_options(options: argparse.Namespace) -> ReadingOptions:
     """Return how recordings are to be read."""
     return recordings.reading_options(
         options.topic, options.columns, options.unit, options.rate, options.axes,
-        options.lsb_per_g, options.lsb_at_0g, options.drop_bad_stamps)
+        options.lsb_per_g, options.lsb_at_0g, options.drop_bad_stamps, options.drop_bad_samples)
 
 
 def reading_text(options: argparse.Namespace) -> str:
@@ -125,7 +128,8 @@ def reading_text(options: argparse.Namespace) -> str:
     for name in ('topic', 'columns', 'unit', 'lsb_per_g', 'lsb_at_0g', 'rate', 'axes'):
         if value := getattr(options, name):
             words += [f'--{name.replace("_", "-")}', str(value)]
-    words += ['--drop-bad-stamps'] * options.drop_bad_stamps
+    for name in ('drop_bad_stamps', 'drop_bad_samples'):
+        words += [f'--{name.replace("_", "-")}'] * getattr(options, name)
     return f' {shlex.join(words)}' if words else ''
 
 

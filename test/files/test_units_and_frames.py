@@ -14,6 +14,7 @@ from bags import bag_of, EPOCH_NS, imu
 from foreign_logs import lines
 import numpy as np
 import pytest
+import scipy.io
 
 FORCE_MPS2 = np.tile([1.0, -2.0, 9.5], (50, 1)) + 0.1 * np.sin(np.arange(50.0))[:, None]
 TIME_S = 0.01 * np.arange(50)
@@ -103,3 +104,38 @@ def test_dates_before_1970_rise(tmp_path: Path, offset: str) -> None:
     read = recording.read(path, ReadingOptions(
         mapping=parse_mapping('time=date:s,x=x:g,y=y:g,z=z:g')))
     np.testing.assert_allclose(np.diff(read.time_s), 0.25, atol=1e-9)
+
+
+def test_a_sample_without_a_number_is_left_out_by_an_option_and_counted(tmp_path: Path) -> None:
+    """Its neighbours keep their times, also where stamps are those of an index."""
+    force = FORCE_MPS2.copy()
+    force[7, 1] = np.nan
+    bag_of(tmp_path / 'bag', [imu(EPOCH_NS + round(1e9 * time_s), row, variance=(0, 0, 0))
+                              for time_s, row in zip(TIME_S, force)])
+    table = tmp_path / 'table.csv'
+    table.write_text('time_s,ax_mps2,ay_mps2,az_mps2\n'
+                     + lines([TIME_S, *force.T], ['%.3f'] + ['%.9f'] * 3))
+    for path in (tmp_path / 'bag', table):
+        with pytest.raises(UserError, match='--drop-bad-samples'):
+            recording.read(path)
+        for rate_hz in (None, 100.0):
+            read = recording.read(path, ReadingOptions(drop_bad_samples=True, rate_hz=rate_hz))
+            assert len(read) == 49
+            np.testing.assert_allclose(read.time_s - read.time_s[0], np.delete(TIME_S, 7))
+            assert any(': 1' in remark for remark in read.remarks), read.remarks
+
+
+def test_vectors_of_matlab_are_a_table(tmp_path: Path) -> None:
+    """What cannot be read is named, with the commands that write it as a table."""
+    path = tmp_path / 'run.mat'
+    x, y, z = FORCE_MPS2.T
+    scipy.io.savemat(path, {'t': TIME_S[:, None], 'x': x, 'y': y, 'z': z[:, None], 'note': 'a'})
+    read = recording.read(path, ReadingOptions(
+        mapping=parse_mapping('time=t:s,x=x:mps2,y=y:mps2,z=z:mps2')))
+    np.testing.assert_array_equal(read.columns['az_mps2'], z)
+    scipy.io.savemat(path, {'log': {'t': TIME_S, 'x': x}})
+    with pytest.raises(UserError, match='writetable'):
+        recording.read(path)
+    path.write_bytes(b'MATLAB 7.3 MAT-file' + bytes(200))
+    with pytest.raises(UserError, match=r'MATLAB file.*-v7'):
+        recording.read(path)

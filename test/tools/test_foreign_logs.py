@@ -38,7 +38,7 @@ def proposed(error: str) -> list[str]:
 
 
 def check_errors(path: Path, atol_g: float = 2e-3) -> None:
-    fitted = parameter_file.load(path)
+    fitted = parameter_file.load(path, may_measure=True)
     scale = fitted.nominal_scale_v_per_g
     np.testing.assert_allclose((fitted.zero_g_v - fitted.nominal_zero_g_v) / scale, BIAS_G,
                                atol=atol_g)
@@ -158,6 +158,38 @@ def test_a_table_of_poses_is_the_reference(run_tool, tmp_path) -> None:
     done = run_tool('fit', 'log.csv', '--columns', XYZ_G, '--poses', 'poses.csv', '-o', 'v.yaml')
     assert 'poses.csv: has 31 poses, but the recording has 32 rests, which begin at 0.' \
         in done.stderr
+
+
+@pytest.mark.parametrize('angles', ['', 'alpha_deg,beta_deg'])
+def test_each_row_may_be_the_mean_of_a_rest(run_tool, tmp_path, angles) -> None:
+    """Without the option the refusal names it; with it, the coefficients have an uncertainty."""
+    starts = np.flatnonzero(np.diff(np.isfinite(LOG.angles_rad[:, 0]).astype(int), prepend=0) > 0)
+    means = [LOG.output_g[start:start + 150].mean(axis=0) for start in starts]
+    table = np.hstack([means, np.degrees(LOG.angles_rad[starts])])[:, :5 if angles else 3]
+    header = ','.join(filter(None, ['x', 'y', 'z', angles]))
+    np.savetxt(tmp_path / 'means.csv', table, delimiter=',', header=header, comments='')
+    columns = 'x=x:g,y=y:g,z=z:g' + ',alpha=alpha_deg,beta=beta_deg' * bool(angles)
+    command = 'fit', 'means.csv', '--columns', columns, '-o', 'u.yaml'
+    assert 'fit --means' in run_tool(*command, '--rate', 1).stderr
+    done = run_tool(*command, '--means')
+    if angles:
+        assert done.returncode == 1 and 'sensor.noise_density_g_per_rthz' in done.stderr
+        text = parameter_file.any_imu_path().read_text().replace(
+            'rate_hz:', 'noise_density_g_per_rthz: [4.0e-4, 4.0e-4, 4.0e-4]\n      rate_hz:')
+        written(tmp_path, 'stated.yaml', text)
+        done = run_tool(*command, '--means', '--params', 'stated.yaml')
+    assert done.returncode == 0, done.stderr
+    check_errors(tmp_path / 'u.yaml', 5e-3)
+    fitted = parameter_file.load(tmp_path / 'u.yaml', may_measure=True)
+    assert fitted.provenance['reference'] == ('stage' if angles else 'gravity')
+    assert (np.diag(fitted.covariance) > 0).all() and 'range_g' in fitted.unstated
+    done = run_tool('apply', *written_log(tmp_path), '--params', 'u.yaml', '-o', 'tilt.csv')
+    assert done.returncode == 0 and 'Measured' in done.stdout, done.stderr
+
+
+def written_log(folder: Path) -> list[str]:
+    written(folder, 'log.csv', plain_text([LOG.time_s, *LOG.output_g.T]))
+    return ['log.csv', '--columns', XYZ_G]
 
 
 def test_stamps_in_bursts(run_tool, tmp_path) -> None:
