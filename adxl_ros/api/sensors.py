@@ -61,7 +61,8 @@ def sensor_of(given: SensorInput | None, read: Recording, has_noise: bool = True
     has_noise: whether what is not stated can be measured; else it stays unstated.
     """
     stated = as_input(given)
-    sensor, measured = load_sensor(stated, read), []
+    sensor = load_sensor(stated, read)
+    measured: Sequence[str] = []
     if has_noise:
         sensor, measured = measure_unstated(sensor, read)
     if isinstance(stated, Sensor):
