@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from adxl_ros.api.gap import diagnose
     from adxl_ros.api.recordings import from_arrays, read
     from adxl_ros.api.sensors import load
+    from adxl_ros.api.simulation import simulate
     from adxl_ros.errors import UserError
     from adxl_ros.simulate.sensor_model import SensorModel
 
@@ -31,12 +32,16 @@ _MODULES = {
     'from_arrays': 'api.recordings',
     'load': 'api.sensors',
     'read': 'api.recordings',
+    'simulate': 'api.simulation',
     'SensorModel': 'simulate.sensor_model',
     'UserError': 'errors',
 }
 """Module of each name that `import adxl_ros` gives."""
 
-__all__ = ['SensorModel', 'UserError', 'apply', 'diagnose', 'fit', 'from_arrays', 'load', 'read']
+__all__ = [
+    'SensorModel', 'UserError', 'apply', 'diagnose', 'fit', 'from_arrays', 'load', 'read',
+    'simulate',
+]
 
 
 # Two verbs have the names of packages. A package becomes an attribute when it is first imported:

@@ -6,9 +6,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import replace
-import math
+from contextlib import contextmanager
 import os
 from pathlib import Path
 import shlex
@@ -23,14 +21,13 @@ from adxl_ros.files import recording
 from adxl_ros.files.atomic_write import is_own
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Effect
-from adxl_ros.model.sensor import neutral, Sensor, typical
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import ended_by_closed_output
 from adxl_ros.report.screen import bar, COLUMNS, end_lines, entry_list, NextStep, program_parser
-import numpy as np
 
 if TYPE_CHECKING:
+    from adxl_ros.api.simulation import EffectInput
     from adxl_ros.simulate.robot import RobotPath
 
 _BAR_COLUMNS = 24
@@ -138,42 +135,23 @@ SYNTAX = ('NAME alone has typical values, KEY=VALUE sets a parameter for all its
 """What an option may be, for help texts."""
 
 
-def with_effects(sensor: Sensor, texts: Sequence[str]) -> Sensor:
-    """Add effects to a sensor, or change their parameters."""
+def effect_inputs(texts: Iterable[str]) -> list[EffectInput]:
+    """Return effects and their values as they are written: NAME, or NAME:KEY=VALUE,..."""
+    inputs: list[EffectInput] = []
     for text in texts:
         name, _, rest = text.partition(':')
-        try:
-            effect = effect_named(name)
-            values = dict(sensor.values.get(name) or neutral(effect, sensor.axes)) \
-                if rest else typical(effect, sensor.axes)
-            for part in filter(None, rest.split(',')):
-                _put(effect, values, sensor.axes, part)
-        except UserError as error:
-            raise UserError(f'--effect {text}: {error}') from None
-        effects = sensor.effects if name in sensor.effects else (*sensor.effects, name)
-        sensor = replace(sensor, effects=effects, values={**sensor.values, name: values})
-    return sensor
+        values = {}
+        for part in filter(None, rest.split(',')):
+            key, _, number = part.partition('=')
+            values[key.strip()] = number.strip()
+        inputs.append((name, values))
+    return inputs
 
 
-def _put(effect: Effect, values: dict[str, np.ndarray], axes: str, text: str) -> None:
-    """Set a parameter for all its axes, or for one, by a text such as `gain.x = 0.01`."""
-    key, _, number = (word.strip() for word in text.partition('='))
-    name, _, axis = key.partition('.')
-    parameters = {parameter.name: parameter for parameter in effect.parameters}
-    if name not in parameters:
-        raise UserError(f'{effect.name} has no parameter {name!r}, but {", ".join(parameters)}')
-    parameter, value = parameters[name], math.nan
-    with suppress(ValueError):
-        value = float(number)
-    if not parameter.lower <= value <= parameter.upper:
-        raise UserError(f'{number!r} is not a number from {parameter.lower:g} to '
-                        f'{parameter.upper:g} ({parameter.unit}); a typical {name} is '
-                        f'{parameter.scale:g}')
-    chosen = [a in parameter.axes and axis in ('', a) for a in axes]
-    if not any(chosen) and (parameter.axes or axis):
-        raise UserError(f'no axis {axis!r} to act on; the sensor has {axes}, {name} acts on '
-                        f'{parameter.axes or "none, it is one number"}')
-    values[name] = np.where(chosen if parameter.axes else True, value, values[name])
+def with_effects(sensor: Sensor, texts: Iterable[str]) -> Sensor:
+    """Add effects to a sensor, or change their parameters."""
+    from adxl_ros.api import simulation
+    return simulation.with_effects(sensor, effect_inputs(texts))
 
 
 def print_end(result: Sequence[str], files: Iterable[str | os.PathLike],

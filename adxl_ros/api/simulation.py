@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Simulation of the front door: a recording of a manoeuvre by a sensor with effects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+import math
+from pathlib import Path
+from typing import Any
+
+from adxl_ros.api.recordings import as_recordings, read_ideal, RecordingInput
+from adxl_ros.api.result import no_progress, Progress, require_least
+from adxl_ros.api.sensors import as_input, SensorInput
+from adxl_ros.errors import UserError
+from adxl_ros.files import parameter_file
+from adxl_ros.files.recording_columns import concatenate, Recording, sensor_info, TIME
+from adxl_ros.files.surroundings import assumed
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Concern, Effect
+from adxl_ros.model.sensor import neutral, Sensor, typical
+from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion
+from adxl_ros.simulate.response import simulate_blocks
+from adxl_ros.simulate.trajectories import (
+    motion_from_force,
+    motion_from_references,
+    TRAJECTORIES,
+)
+import numpy as np
+
+IMU = 'imu'  # Trajectory of the specific force of another simulator
+EffectInput = tuple[str, Mapping[str, Any]]
+"""Name of an effect, and values by parameter, such as 'gain' or 'gain.x'; none for typical."""
+
+
+def with_effects(sensor: Sensor, effects: Iterable[EffectInput]) -> Sensor:
+    """Add effects to a sensor, or change their parameters."""
+    for name, given in effects:
+        try:
+            effect = effect_named(name)
+            values = dict(sensor.values.get(name) or neutral(effect, sensor.axes)) \
+                if given else typical(effect, sensor.axes)
+            for key, number in given.items():
+                _put(effect, values, sensor.axes, key, number)
+        except UserError as error:
+            parts = ','.join(f'{key}={number}' for key, number in given.items())
+            raise UserError(f'--effect {name}{":" * bool(given)}{parts}: {error}') from None
+        names = sensor.effects if name in sensor.effects else (*sensor.effects, name)
+        sensor = replace(sensor, effects=names, values={**sensor.values, name: values})
+    return sensor
+
+
+def _put(effect: Effect, values: dict[str, np.ndarray], axes: str, key: str, number: Any) -> None:
+    """Set a parameter for all its axes, or for one, as `gain.x`; the number may be a text."""
+    name, _, axis = key.partition('.')
+    parameters = {parameter.name: parameter for parameter in effect.parameters}
+    if name not in parameters:
+        raise UserError(f'{effect.name} has no parameter {name!r}, but {", ".join(parameters)}')
+    parameter, value = parameters[name], math.nan
+    with suppress(ValueError, TypeError):
+        value = float(number)
+    if not parameter.lower <= value <= parameter.upper:
+        raise UserError(f'{number!r} is not a number from {parameter.lower:g} to '
+                        f'{parameter.upper:g} ({parameter.unit}); a typical {name} is '
+                        f'{parameter.scale:g}')
+    chosen = [a in parameter.axes and axis in ('', a) for a in axes]
+    if not any(chosen) and (parameter.axes or axis):
+        raise UserError(f'no axis {axis!r} to act on; the sensor has {axes}, {name} acts on '
+                        f'{parameter.axes or "none, it is one number"}')
+    values[name] = np.where(chosen if parameter.axes else True, value, values[name])
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What is simulated."""
+
+    name: str  # The trajectory, or the recording that is followed
+    sensor: Sensor  # The sensor, at its rate
+    motion: Motion
+    begin_s: float = 0.0  # Begin of the motion, s
+    like: Recording | None = None  # A recording that has the stamps of the samples
+    # What was assumed of the surroundings, one line each
+    assumed: Sequence[str] = ()
+    left_out: Sequence[str] = ()  # Effects of the sensor that cannot act here, one line each
+
+    def blocks(self, seed: int) -> Iterator[Recording]:
+        """Yield the samples in blocks."""
+        samples = simulate_blocks(self.sensor, self.motion, seed, self.begin_s, self.like)
+        duration_s = self.motion.duration_s
+        for columns in samples:
+            time_s = columns.pop(TIME)
+            done = min((time_s[-1] - self.begin_s) / duration_s, 1.0) if duration_s else 1.0
+            yield Recording(self.name, time_s, columns, sensor_info(self.sensor), done=done)
+
+    @property
+    def screen(self) -> list[str]:
+        """Return the lines of the tool's screen."""
+        sensor = self.sensor
+        return [f'Simulated {self.name}: {self.motion.duration_s:.4g} s at '
+                f'{sensor.rate_hz:.4g} Hz, axes {sensor.axes}. Sensor {sensor.serial}, effects: '
+                f'{", ".join(sensor.effects) or "none"}.', *self.assumed]
+
+
+def prepare(trajectory: RecordingInput, sensor: SensorInput | None = None,
+            effects: Sequence[EffectInput] = (), force: RecordingInput | None = None,
+            rate: float | None = None, seed: int = 0) -> Simulation:
+    """Check what is to be simulated, and return it; see `simulate`."""
+    require_least('seed', seed, 0)
+    bounds = parameter_file.SENSOR_FIELDS['sensor.rate_hz'].metadata
+    if rate is not None and not bounds['lower'] <= rate <= bounds['upper']:
+        raise UserError(f'--rate {rate:g}: outside {bounds["lower"]:g} to '
+                        f'{bounds["upper"]:g} Hz')
+    if (trajectory == IMU) != (force is not None):
+        raise UserError('--force RECORDING and the trajectory imu need each other: '
+                        'simulate imu --force RECORDING')
+    unit = _stated(sensor)
+    unit = with_effects(unit if rate is None else replace(unit, rate_hz=rate), effects)
+    left_out = [] if force is not None else _left_out(unit, {name for name, _ in effects})
+    if force is not None:
+        made = _by_force(read_ideal(force, 0), unit, rate)
+    elif isinstance(trajectory, str) and trajectory in TRAJECTORIES:
+        motion = TRAJECTORIES[trajectory](np.random.default_rng(seed))
+        made = Simulation(trajectory, unit, motion)
+    else:
+        made = _by_references(as_recordings(_existing(trajectory))[0], unit, rate)
+    return replace(made, left_out=left_out)
+
+
+def _stated(given: SensorInput | None) -> Sensor:
+    """Return a sensor that states all that a simulation needs."""
+    sensor = as_input(given)
+    if not isinstance(sensor, Sensor):
+        return parameter_file.load(sensor or parameter_file.nominal_path())
+    if sensor.unstated:
+        raise UserError(f'{sensor.serial}: states no {", ".join(sensor.unstated)}, which a '
+                        'simulation needs; name a sensor that does')
+    return sensor
+
+
+def _left_out(sensor: Sensor, asked: set[str]) -> list[str]:
+    """Name the effects of the reference, which is exact; refuse those that are asked for."""
+    lines = []
+    for name in sensor.effects:
+        if effect_named(name).concern is Concern.REFERENCE:
+            if name in asked:
+                raise UserError(f'--effect {name}: acts on the specific force of a recording; say '
+                                'simulate imu --force RECORDING, or leave the effect out')
+            lines.append(f'{name} is an error of the reference, and is left out')
+    return lines
+
+
+def _existing(trajectory: RecordingInput) -> RecordingInput:
+    """Refuse a text that is neither a recording nor a trajectory."""
+    if not isinstance(trajectory, Recording) and not Path(trajectory).exists():
+        raise UserError(f'{trajectory}: neither a recording nor one of the trajectories '
+                        f'{", ".join((*TRAJECTORIES, IMU))}')
+    return trajectory
+
+
+def _by_force(ideal: Recording, sensor: Sensor, rate_hz: float | None) -> Simulation:
+    """Follow the specific force of another simulator, at its rate or another."""
+    motion, begin_s = motion_from_force(ideal, rate_hz is None)
+    if rate_hz is None:
+        sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
+        motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, INTERNAL_RATE_HZ))
+    return Simulation(IMU, sensor, motion, begin_s, assumed=assumed(ideal, sensor.effects))
+
+
+def _by_references(read: Recording, sensor: Sensor, rate_hz: float | None) -> Simulation:
+    """Follow the references of a recording, at its stamps or at another rate."""
+    motion, like = motion_from_references(read, sensor), None
+    if rate_hz is None:
+        sensor, like = replace(sensor, rate_hz=read.rate_hz), read
+    return Simulation(read.path, sensor, motion, float(read.time_s[0]), like,
+                      assumed(read, sensor.effects))
+
+
+def simulate(trajectory: RecordingInput, sensor: SensorInput | None = None, *,
+             effects: Mapping[str, Mapping[str, Any] | None] | Sequence[str] = (),
+             force: RecordingInput | None = None, rate: float | None = None, seed: int = 0,
+             progress: Progress = no_progress) -> Recording:
+    """
+    Simulate a recording of a manoeuvre by a sensor with effects.
+
+    Parameters
+    ----------
+    trajectory
+        sweep, tilt_alpha, tilt_beta, tilt_both, motion, shaker, soak, tumble or rich; 'imu' for
+        the specific force of `force`; or a recording whose stage angles are followed.
+    sensor
+        The sensor: a Sensor, a `Fit` or a `Gap`, a datasheet's name or the path of a parameter
+        file. None for the nominal sensor.
+    effects
+        Effects that are added: names for typical values, or a dict of values by parameter, as
+        `{'lever_arm': {'z_m': 0.03}, 'bias': {'offset_v.x': 1e-3}, 'hysteresis': None}`. A
+        parameter is for all axes, with `.x` for one; those without a value are neutral.
+    force
+        Ideal specific force of another simulator for 'imu', with `ax_mps2, ay_mps2, az_mps2`,
+        m/s², in the frame of the sensor: a Recording or its path.
+    rate
+        Sample rate, Hz; None for that of the sensor, or of what is followed.
+    seed
+        Seed of noise and manoeuvre.
+    progress
+        Called with the share of the work that is done, 0 to 1, and the name of the stage.
+
+    Returns
+    -------
+    Recording
+        Volts `x_v, ...`, V, and what encoders, thermometer and supply read; `notes` say what
+        was assumed, and which effects of the sensor cannot act.
+
+    Raises
+    ------
+    UserError
+        An effect, a parameter or a trajectory is unknown, or a value is out of bounds.
+
+    """
+    given = effects if isinstance(effects, Mapping) else dict.fromkeys(effects)
+    made = prepare(trajectory, sensor, [(name, _flat(values or {}))
+                                        for name, values in given.items()], force, rate, seed)
+    blocks = []
+    for block in made.blocks(seed):
+        blocks.append(block)
+        progress(block.done, 'simulate')
+    return replace(concatenate(blocks), remarks=(*made.screen, *made.left_out))
+
+
+def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values with one number a key: those by axis get the axis behind their names."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= {f'{key}.{axis}': number for axis, number in value.items()}
+        else:
+            flat[key] = value
+    return flat
