@@ -19,7 +19,6 @@ import time
 from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
-from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.links.support import base, stamping, wire_format
 from adxl_ros.links.support.stamping import ClockMap, Stamper
 from adxl_ros.links.support.wire_format import BoardInfo, SampleFrame
@@ -194,7 +193,7 @@ class SerialLink(base.Link):
         self._arrivals: deque[tuple[BoardInfo | SampleFrame, int]] = deque()
         self._info: BoardInfo | None = None
         self._conversion: _Conversion | None = None
-        self._misfit = self._other = ''  # Why samples cannot be read, or are of another unit
+        self._misfit = ''
         self._rate = _ClockRate(_UNSTATED_RATE_HZ)
         self._counter = wire_format.FrameCounter()
         self._stamper = Stamper(ClockMap(settings.delay), self.references)
@@ -258,7 +257,7 @@ class SerialLink(base.Link):
             return base.Level.WARN, f'{port}: {obstacle}'
         if self._misfit:
             return base.Level.ERROR, self._misfit
-        if contradiction := self._other or self._rate.fault:
+        if contradiction := self._rate.fault:
             return base.Level.ERROR, f'{port}: the board {contradiction}'
         return base.Level.OK, 'streaming'
 
@@ -332,9 +331,6 @@ class SerialLink(base.Link):
         if not changed and not info.flags & wire_format.AFTER_RESET:
             return
         self._info, self._rate = info, _ClockRate(info.rate_hz)
-        unit, declared = info.serial, self._declared.serial
-        self._other = (f'is the unit {unit}, but the parameters are those of {declared}; give '
-                       f'the file of {unit}') if unit and declared not in (unit, NO_UNIT) else ''
         self._use(info, changed)
 
     def _use(self, info: BoardInfo, changed: bool = True) -> None:

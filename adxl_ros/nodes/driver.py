@@ -5,13 +5,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import traceback
 from typing import Any
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.links.support import base
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import parameters
 from adxl_ros.nodes.link_reader import LinkReader
 from adxl_ros.nodes.parameters import LINK, parameter, parameter_error
@@ -54,6 +55,14 @@ def _transition(goal: str, *acts: str) -> Callable[..., TransitionCallbackReturn
     return callback
 
 
+def other_unit(given: Sensor, found: Sensor) -> str:
+    """Return that a link has found another unit than the parameters name, or ''."""
+    if NO_UNIT in (given.serial, found.serial) or given.serial == found.serial:
+        return ''
+    return (f'the samples are of the unit {found.serial}, but the parameters are those of '
+            f'{given.serial}; give the file of {found.serial}')
+
+
 class Driver(LifecycleNode):
     """
     The node of the driver.
@@ -91,7 +100,7 @@ class Driver(LifecycleNode):
             settings, base.SimulatorSettings) else Clock(clock_type=ClockType.SYSTEM_TIME)
         self._simulates = self._link == base.DEFAULT_LINK
         self._tally = Tally(STEADY.now().nanoseconds)
-        self._fault = ''
+        self._fault = self._told = ''  # Why there are no samples; the unit that was named last
         self._announces = not own.autostart
         self._output: SampleOutput | None = None
         self._reader: LinkReader | None = None
@@ -225,7 +234,13 @@ class Driver(LifecycleNode):
             return base.LinkStatus(Level.ERROR, self._fault)
         if self._reader is None:
             return base.LinkStatus(Level.WARN, 'inactive, no samples are published')
-        return self._reader.status()
+        status = self._reader.status()
+        found = self._output.sensor if self._output else self._sensor
+        fault = '' if status.level is Level.ERROR else other_unit(self._sensor, found)
+        if fault and fault != self._told:
+            self.get_logger().error(fault)
+            self._told = fault
+        return replace(status, level=Level.ERROR, text=fault) if fault else status
 
 
 def main() -> int:

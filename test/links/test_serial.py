@@ -407,16 +407,6 @@ def test_another_board_on_the_port_is_another_sensor(connect):
     assert volts_of(parts) == pytest.approx(1.25)
 
 
-def test_a_board_of_another_unit_than_the_parameters_is_an_error(connect):
-    board = connect(sensor=nominal(serial='U73'))
-    board.send_info()
-    board.send_frames(3)
-    assert sample_count(board.read_samples(30)) == 30
-    status = board.link.status()
-    assert status.level == base.Level.ERROR
-    assert 'is the unit A7, but the parameters are those of U73' in status.text
-
-
 @pytest.mark.parametrize('stated_hz', [500.0, 2000.0])
 def test_a_rate_that_contradicts_the_clock_is_named_and_no_stamp_is_ahead(connect, stated_hz):
     board = connect(info=BoardInfo(stated_hz, 16, 2, 5.0, ''))
