@@ -32,6 +32,7 @@ from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
 from adxl_ros.report.quantities import mg
+from adxl_ros.signals.neighbouring_samples import neighbour_faults
 from adxl_ros.signals.recorded_sensor import BeyondRange, FilterNoise, listed
 
 _READING = 0.3  # Share of the work until the fit begins (chosen: a sweep of minutes)
@@ -320,8 +321,8 @@ class _Rests:
             if journal else None
 
     def of(self, read: Recording, unit: _Unit, number: int
-           ) -> tuple[Poses, Sequence[FilterNoise | None]]:
-        """Return the poses of a recording, and the filter of each axis in their noise."""
+           ) -> tuple[Poses, Sequence[FilterNoise | None], list[str]]:
+        """Return the poses of a recording, their filters, and faults between its samples."""
         if number and self._is_one:
             raise UserError(_ONE_RECORDING)
         if self._are_rows:
@@ -329,7 +330,8 @@ class _Rests:
         poses = extract_poses(read, unit.sensor, self._records)
         if self._table:
             poses = with_table_angles(poses, str(self._table))
-        return poses, estimate_filters(read, unit.sensor, poses)
+        return (poses, estimate_filters(read, unit.sensor, poses),
+                neighbour_faults(read, unit.sensor))
 
 
 _ONE_RECORDING = '--journal, --poses and --means: one of them names the rests of one recording'

@@ -26,6 +26,8 @@ from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects import base, effect_named
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.report.figures import axes_for
+from adxl_ros.signals.gravity_at_rest import require_unit
+from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import BeyondRange, listed
 import numpy as np
 
@@ -57,16 +59,21 @@ class Correction:
         self._estimator = RecordingEstimator(self.sensor, first, inverse == 'paper', undo_filter)
         self._counts: Counter[str] = Counter()
         self._beyond = BeyondRange()
+        self._look, self._path = RecordingLook(self.sensor, first), first.path
+        self._doubts: list[str] = []  # What is wrong with gravity, or between samples
 
     def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
-        """Yield each block of the recording with its estimates."""
+        """Yield each block with its estimates; refuse readings in another unit at the end."""
         for block, estimates in self._estimator.blocks(recording):
             yield block, estimates
             explained = ~(estimates.unsolved | estimates.at_rail)
             self._beyond.add(estimates.volts[explained], self.sensor)
+            self._look.feed(block)
             self._counts['rows'] += len(block)
             for name in _COUNTED:
                 self._counts[name] += int(getattr(estimates, name).sum())
+        self._doubts = [*require_unit(self._look.gravity(), self._path),
+                        *self._look.neighbour_faults()]
 
     @property
     def notes(self) -> list[str]:
@@ -82,7 +89,8 @@ class Correction:
         by_what = f'the {self.sensor.model} calibration of {self.sensor.serial}' \
             if self.sensor.effects else 'the datasheet values: the sensor is not calibrated'
         return [f'Corrected {self._counts["rows"]} samples by {by_what}.',
-                *self._estimator.assumed, *listed([*self.measured])]
+                *(f'WARNING {text}' for text in self._doubts), *self._estimator.assumed,
+                *listed([*self.measured])]
 
 
 def _effects_that_stay(sensor: Sensor, undo_filter: bool) -> Iterator[str]:

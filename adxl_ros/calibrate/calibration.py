@@ -24,6 +24,7 @@ from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import get, Sensor
 from adxl_ros.report.quantities import mg, with_half_width
 from adxl_ros.signals import recorded_sensor
+from adxl_ros.signals.gravity_at_rest import of_volts, require_unit
 import numpy as np
 
 STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': full_model.fit}
@@ -38,6 +39,7 @@ class RecordedPoses:
     poses: Poses  # With angles or without
     # Estimated output filter of each axis
     filters: Sequence[recorded_sensor.FilterNoise | None] = ()
+    faults: Sequence[str] = ()  # What is wrong between the samples, one line each
 
 
 def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None = None,
@@ -84,11 +86,13 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
         recordings = [replace(recording, poses=recording.poses.subset(
             ~at_a_rail(sensor, recording.poses))) for recording in recordings]
         poses = poses.subset(~at_rail)
+    doubts = require_unit(of_volts(poses.volts, poses.std_v, sensor), source, True)
+    doubts += [fault for recording in recordings for fault in recording.faults]
     if poses.has_angles.any():
         with_angles = [replace(recording, poses=recording.poses.subset(recording.poses.has_angles))
                        for recording in recordings]
         result = _against_stage(sensor, with_angles, model or ('full' if effects else None),
-                                effects, source, data_sha256, population)
+                                effects, source, data_sha256, population, doubts)
         starts_s = poses.time_s[~poses.has_angles, 0]
         if len(starts_s):
             lines.append(f'rests without angles, left out: {len(starts_s)} (the first one from '
@@ -102,7 +106,7 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
                         'magnitude of gravity needs x, y and z; record alpha_rad and beta_rad')
     else:
         span_s = sum(float(np.ptp(recording.poses.time_s)) for recording in recordings)
-        result = _against_gravity(sensor, poses, source, span_s, data_sha256, population)
+        result = _against_gravity(sensor, poses, source, span_s, data_sha256, population, doubts)
     lines += _turn_on_lines(result.fitted, [recording.poses for recording in recordings])
     return replace(result, warnings=(*result.warnings, *lines))
 
@@ -118,7 +122,7 @@ class _StageFit:
 
 def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
                    effects: Sequence[str], source: str, data_sha256: str,
-                   population: Population | None) -> CalibrationResult:
+                   population: Population | None, doubts: list[str]) -> CalibrationResult:
     poses = Poses.joined([recording.poses for recording in recordings])
     _check_polarity(sensor, poses)
     fit = _richest_fit(sensor, poses.subset(~poses.check), recordings, model, effects)
@@ -130,7 +134,7 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
         full_model.warnings(full, poses.subset(fitting)),
         tuple(fitting[list(full.outliers)].tolist()))
     errors, assessments = _assessed(
-        sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit)
+        sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit, not doubts)
     assessment = acceptance.judged(assessments[-1], fitted) if assessments else None
     assessments = (*assessments[:-1], assessment) if assessment else ()
     force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
@@ -146,12 +150,12 @@ def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: s
         'reference': 'stage', **({'prior': population.name} if population else {}),
         'residual_mg': f'{np.sqrt(np.mean(residual_mg ** 2)):.4f}',
         **({'converged': 'yes' if full.converged else 'no'} if full else {}),
-        **acceptance.provenance_entries(assessment, errors)})
+        **acceptance.provenance_entries(assessment, errors, doubts)})
     summary = acceptance.summary_lines(
         fitted, assessment, acceptance.held_out_lines(errors, len(poses) - len(outliers)))
     return CalibrationResult(
         nominal=sensor, fitted=fitted, summary=summary, poses=poses, assessments=assessments,
-        held_out=errors, outliers=outliers, warnings=[*warnings, *fit.notes],
+        held_out=errors, outliers=outliers, warnings=[*doubts, *warnings, *fit.notes],
         details=fit_lines)
 
 
@@ -181,7 +185,7 @@ def _with_population(fit: _StageFit, population: Population) -> _StageFit:
                    notes=[f'prior: {combined.line}', *fit.notes])
 
 
-def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit
+def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit, is_sound: bool
               ) -> tuple[tuple[HeldOutErrors, ...], tuple[Assessment, ...]]:
     """Return held-out errors and acceptance of the fit and of all simpler models."""
     # The reference of all models is the stage with its fitted errors.
@@ -191,13 +195,13 @@ def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit
     errors = held_out.cross_validate(
         {'nominal': lambda sensor, _: sensor, **simpler, fit.fitted.model: fit.refit},
         sensor, inliers, stage)
-    is_certain = (fit.full is None or fit.full.converged) and \
+    is_certain = is_sound and (fit.full is None or fit.full.converged) and \
         not acceptance.open_coefficients(fit.fitted)
     if not errors or errors[-1].model != fit.fitted.model:
         return (), ()
     return tuple(errors), tuple(
         acceptance.assess(row.model, held_out.error_budgets(row, inliers, stage), sensor,
-                          is_certain or row.model != fit.fitted.model)
+                          is_certain or (is_sound and row.model != fit.fitted.model))
         for row in errors if row.model != 'nominal')
 
 
@@ -299,7 +303,7 @@ def _turn_and_shifts(full: full_model.FullFit, poses: Poses) -> tuple[np.ndarray
 
 
 def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, data_sha256: str,
-                     population: Population | None) -> CalibrationResult:
+                     population: Population | None, doubts: list[str]) -> CalibrationResult:
     fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
     after, unseen = (rms_mg(np.mean(values[kept] ** 2))
@@ -307,7 +311,7 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
     fitted = replace(
         sensor, model='gravity', effects=('bias', 'scale_factor', 'misalignment'),
         values=fit.values, covariance=fit.covariance, covariance_names=gravity_fit.NAMES)
-    warnings = [] if fit.converged else [full_model.NOT_CONVERGED]
+    warnings = [*doubts, *([] if fit.converged else [full_model.NOT_CONVERGED])]
     if fit.note:
         warnings.append(fit.note)
     if population is not None:
@@ -316,7 +320,7 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
         warnings.append(f'prior: {combined.line}')
     force = np.column_stack(signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment))
     budgets = acceptance.gravity_error_budgets(fit, fitted, force, kept)
-    assessment = acceptance.assess('gravity', budgets, fitted, fit.converged)
+    assessment = acceptance.assess('gravity', budgets, fitted, fit.converged and not doubts)
     if fit.step.left_out:
         assessment = acceptance.with_open(assessment, acceptance.gravity_error_budgets(
             fit, _without(fitted, fit.step.left_out), force, kept), fitted)
@@ -328,7 +332,7 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
         'residual_mg': f'{after:.4f}', 'held_out_mg': f'{unseen:.4f}',
         **({'span_s': f'{span_s:.1f}'} if span_s else {}),
         'converged': 'yes' if fit.converged else 'no',
-        **acceptance.provenance_entries(assessment, ())})
+        **acceptance.provenance_entries(assessment, (), doubts)})
     summary = acceptance.summary_lines(
         fitted, assessment, acceptance.gravity_lines(fit, poses.time_s[:, 0]))
     return CalibrationResult(
@@ -359,6 +363,7 @@ def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
 def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str = '',
                       range_c: tuple[float, float] | None = None) -> CalibrationResult:
     """Fit zero-g over temperature, and the slope of the scale factor where orientations allow."""
+    doubts = require_unit(of_volts(poses.volts, poses.std_v, base), source, True)
     blocks = thermal_fit.blocks_of(poses)
     fit = thermal_fit.fit(base, blocks)
     calibrated_c = thermal_fit.calibrated_temperature_c(base)
@@ -396,4 +401,5 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
         f'zero-g stays as calibrated at {calibrated_c:.1f} °C']
     if not has_scale:
         lines.append('scale factor over temperature: not fitted, it needs a second orientation')
-    return CalibrationResult(nominal=base, fitted=fitted, summary=lines, poses=poses)
+    return CalibrationResult(nominal=base, fitted=fitted, summary=lines, poses=poses,
+                             warnings=doubts)

@@ -47,8 +47,9 @@ class CompensationPolicy:
     A calibration that is named stands. Otherwise the newest one of the unit in the store applies,
     as soon as the stream states its serial number.
 
-    mixture: that several nodes publish the samples, so that none counts, or ''; refusal: why the
-    sensor cannot correct the stream, or ''.
+    mixture: that several nodes publish the samples, so that none counts, or ''; no_gravity: that
+    the rests of the stream are in another unit or without gravity, or ''; wrong_gravity: that they
+    are off by less, or ''; refusal: why the sensor cannot correct the stream, or ''.
     """
 
     sensor: Sensor  # The sensor whose coefficients are used
@@ -61,7 +62,7 @@ class CompensationPolicy:
         self.stored_path = ''  # File that was taken from the store, '' if none was
         # What the stream states of itself (`sensor_info`), None before it does
         self.info: StreamInfo | None = None
-        self.refusal = self.mixture = ''
+        self.refusal = self.mixture = self.no_gravity = self.wrong_gravity = ''
 
     @property
     def rate_hz(self) -> float:
@@ -90,7 +91,7 @@ class CompensationPolicy:
 
     def assess(self) -> bool:
         """Update `refusal` by the sensor and the stream; return whether it has changed."""
-        before, self.refusal = self.refusal, self.mixture
+        before, self.refusal = self.refusal, self.mixture or self.no_gravity
         try:
             self.check(self.sensor)
         except UserError as error:
@@ -131,6 +132,8 @@ class CompensationPolicy:
         """Return level (OK, WARN, ERROR) and text of the state: the first one that holds."""
         if self.refusal:
             return 'ERROR', f'publishing nothing: {self.refusal}'
+        if self.wrong_gravity:
+            return 'ERROR', f'the tilt is uncertain: {self.wrong_gravity}'
         counts, samples = interval.counts, self._full_name('imu/data_raw')
         no_info = f'nothing on {self._full_name("sensor_info")}'
         is_silent = not counts.get('received') and interval.duration_s > _SHORTEST_SILENCE_S

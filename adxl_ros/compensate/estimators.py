@@ -17,11 +17,14 @@ from adxl_ros.model import covariance as force_errors, noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects.base import (
+    ARRAYS,
     Coefficient,
     Components,
     Environment,
     FLOATS,
+    Maths,
     NOMINAL_ENVIRONMENT,
+    Value,
 )
 from adxl_ros.model.kinematics import angles, Mounting, Tilt, tilt
 from adxl_ros.model.sensor import parameter_of, Sensor
@@ -65,6 +68,7 @@ class RecordingEstimator:
         self._sensor, self._undo_filter = sensor, undo_filter
         self._surroundings = Surroundings()
         self._begin_s = float(first.time_s[0])
+        self._gravity_mps2 = signal_chain.gravity_mps2(sensor)
         self._inverse = (paper_inverse if paper else signal_chain.inverse)(sensor)
         self._measured_covariance = force_errors.measured_covariance(
             sensor, noise_variance_v2(sensor) if undo_filter else None, bool(sensor.z_sign))
@@ -104,7 +108,8 @@ class RecordingEstimator:
             outside = np.isfinite(force[0]) & sensor.envelope.is_outside(
                 environment.temperature_c, force)
             covariance[:, :, at_rail] = np.inf
-            angles = tilt(force, covariance, 'z' in sensor.axes)
+            tilting = covariance + self._excess_variance(force, covariance) * np.eye(3)[:, :, None]
+            angles = tilt(force, tilting, 'z' in sensor.axes)
         force_mps2 = np.array(force)
         force_std_mps2 = np.sqrt([covariance[d, d] for d in range(3)])
         if sensor.axes == 'x':
@@ -112,6 +117,29 @@ class RecordingEstimator:
         force_std_mps2[np.isnan(force_mps2)] = np.inf
         return Estimates(force_mps2, force_std_mps2, covariance, angles, at_rail, outside, volts)
 
+    def _excess_variance(self, force: Components, covariance: np.ndarray) -> np.ndarray:
+        """Return the square of what a force is beyond gravity and its error, (m/s²)², (n,)."""
+        if self._sensor.axes != AXES:
+            return np.zeros(len(force[0]))
+        error2 = np.max([covariance[d, d] for d in range(3)], axis=0)
+        return np.asarray(length_excess(np.linalg.norm(force, axis=0), error2,
+                                        self._gravity_mps2, ARRAYS) ** 2)
+
+
+def length_excess(length_mps2: Value, error2: Value, gravity_mps2: float, maths: Maths) -> Value:
+    """
+    Return how much the length of a force departs from gravity beyond its error, m/s².
+
+    The tilt is that of gravity. A force whose length is not gravity's is in motion, in another
+    unit, or has lost gravity, and at least this much of it is no gravity. error2: the largest
+    variance of an axis, (m/s²)².
+    """
+    departure = length_mps2 - gravity_mps2
+    beyond = maths.maximum(departure, -departure) - _LENGTH_STDS * maths.sqrt(error2)
+    return maths.maximum(beyond, 0.0)
+
+
+_LENGTH_STDS = 3.0  # Error of a length that is usual, in standard deviations of an axis
 
 _CELL_MPS2 = 0.5
 """Width of a cell of the grid of forces, m/s²; chosen: tangent and covariance hardly vary within
@@ -214,6 +242,7 @@ class LiveEstimator:
         noise_mps2 = np.sqrt(self._variance_v2) / sensor.scale_v_per_g * G0_MPS2
         self._noise_variance = (noise_mps2[:2] ** 2).tolist()
         self._derives_z = sensor.axes == 'xy'
+        self._gravity_mps2 = signal_chain.gravity_mps2(sensor)
         # The last force, and the volts at the ADC's input that respond to it.
         self._force: Components = [0.0, 0.0, 0.0]
         self._environment = NOMINAL_ENVIRONMENT
@@ -238,6 +267,8 @@ class LiveEstimator:
         cell = self._cell(force)
         covariance = self._covariance(force, cell, unknown, motion)
         # The angles are those of gravity, so that motion adds to the variance of each axis.
+        if self.sensor.axes == AXES:
+            motion += self._excess_variance(force, covariance)
         moved: tuple[float, ...] = (
             covariance[0] + motion, covariance[1], covariance[2], covariance[3] + motion,
             covariance[4], covariance[5] if self._derives_z else covariance[5] + motion)
@@ -309,6 +340,13 @@ class LiveEstimator:
         x, y, _ = force
         variance = self._yaw_rad2
         return xx + variance * y * y, xy - variance * x * y, xz, yy + variance * x * x, yz, zz
+
+    def _excess_variance(self, force: Components, covariance: tuple[float, ...]) -> float:
+        """Return the square of what a force is beyond gravity and its error, (m/s²)²."""
+        x, y, z = force
+        error2 = max(covariance[0], covariance[3], covariance[5])
+        excess = length_excess((x * x + y * y + z * z) ** 0.5, error2, self._gravity_mps2, FLOATS)
+        return float(excess) ** 2
 
     def _covariance(self, force: Components, cell: _Cell, unknown: float, motion: float
                     ) -> tuple[float, ...]:

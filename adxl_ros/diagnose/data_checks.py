@@ -20,12 +20,16 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose import comparison as baseline, noise_effects
 from adxl_ros.diagnose.comparison import BaselineComparison, compare, Reference, SMALLEST_MOTION_G
-from adxl_ros.files.recording_columns import JOINTS, Recording
+from adxl_ros.files.recording_columns import JOINTS, Recording, stamped_rate_hz
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals import gravity_at_rest
+from adxl_ros.signals.gravity_at_rest import RestReadings
+from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import find_polarity_fault
+from adxl_ros.signals.rest_detection import find_rests, rest_means
 from adxl_ros.simulate.motion import ForcePath, Motion
 import numpy as np
 import scipy
@@ -105,6 +109,33 @@ class DataFault(Exception):
     message: str  # What is wrong and what to do, one line
     status: str = 'bad_data'  # Status of the verdict: 'bad_data' or 'insufficient'
     comparisons: tuple[BaselineComparison, ...] = ()
+
+
+def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> None:
+    """
+    Refuse a recording, or the force of another simulator, whose rests do not read gravity.
+
+    A wrong zero-g or scale factor is an effect that the diagnosis finds, and no fault.
+    """
+    if len(recording) > 1:
+        look = RecordingLook(sensor, recording)
+        look.feed(recording)
+        fault = look.gravity().fault
+        if fault is not None and fault.is_clear:
+            raise DataFault(fault.data_fault, f'{basename(recording.path)}: {fault.text}')
+    if sim is not None and isinstance(sim.force, ForcePath):
+        time_s = sim.force.time_s
+        force_mps2 = np.column_stack(sim.force(time_s))
+        rate_hz = stamped_rate_hz(time_s)
+        rests = find_rests(time_s, force_mps2, rate_hz)
+        shape = len(rests), force_mps2.shape[1]
+        mean, std = (np.reshape(values, shape) for values in rest_means(
+            time_s, force_mps2, rests, rate_hz))
+        gravity = gravity_at_rest.look(RestReadings(mean, std), gravity_at_rest.IDEAL,
+                                       sensor.local_gravity_mps2)
+        if gravity.fault is not None and gravity.fault.is_clear:
+            raise DataFault(gravity.fault.data_fault, f'{sim.force.name}: '
+                            f'{gravity.fault.reason}; {gravity.fault.conversion}')
 
 
 def _align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bool

@@ -171,6 +171,7 @@ def check(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = 
         sensor = with_axes(sensor, recordings[0].axes)
     for recording in recordings:
         check_unit(recording.stream_info, recording.axes, sensor)
+        data_checks.check_gravity(recording, sensor, sim)
     compared = [data_checks.compare_checked(r, sensor, sim, align) for r in recordings]
     data_checks.check_length(compared)
     return [data_checks.check_recording(comparison) for comparison in compared]

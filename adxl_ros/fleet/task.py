@@ -234,6 +234,12 @@ class _Job:
         if findings.contents is None:
             self.refuse('check', self.plain(findings.faults[0]))
             return
+        fault = findings.contents.gravity.fault
+        if fault is not None and fault.is_clear:
+            # No figure from such readings counts, so that no task begins.
+            self.row |= {'status': 'bad_data', 'data_fault': fault.data_fault}
+            self.refuse('check', fault.text)
+            return
         tasks = self._recipe.tasks
         skipped = {ability.tool: self.plain(ability.reason) for ability in findings.abilities
                    if not ability.is_able and ability.tool in tasks}

@@ -30,6 +30,7 @@ from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.sample_output import age_report, MOST_AGES
 from adxl_ros.nodes.topics import Level, Status, STEADY
+from adxl_ros.signals.recorded_gravity import LIVE_WINDOW_S, LiveLook
 from adxl_ros.signals.recorded_sensor import unit_of_stream
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
@@ -227,6 +228,7 @@ class Compensation(Node):
             settings.orientation == 'keep', free.publish if free else None,
             settings.output_rate_hz)
         self._policy = CompensationPolicy(paper, settings.store, self.resolve_topic_name)
+        self._look_at_gravity = LiveLook()
         self._samples = topics.Inbox(self, Imu, 'imu/data_raw', _DEPTH,
                                      settings.samples_unit)
         self._flat = parameters.given_sensor(self)
@@ -285,6 +287,8 @@ class Compensation(Node):
     def _correct_by(self, sensor: Sensor, source: str) -> None:
         text = self._policy.use(sensor, source)
         self._stream.use(sensor, self._policy.rate_hz)
+        self._newest: deque[bytes] = deque(maxlen=round(
+            max(LIVE_WINDOW_S * self._policy.rate_hz, _FEWEST_SAMPLES)))
         parameters.show_sensor(self, sensor)
         if self._stream.unknown is None and text != self._told:
             self.get_logger().info(text)
@@ -294,6 +298,7 @@ class Compensation(Node):
     def _look(self) -> None:
         """Refuse samples of several nodes; measure the sensor of a stream that states none."""
         self._policy.mixture = self._samples.fault()
+        self._check_gravity()
         self._assess()
         samples = self._stream.unknown
         if samples is None:
@@ -308,6 +313,18 @@ class Compensation(Node):
         self.get_logger().info(f'measured from the stream: {"; ".join(lines)}')
         self._stream.release()
         self._correct_by(unit, 'what the stream shows')
+
+    def _check_gravity(self) -> None:
+        """Look whether the newest rests read gravity."""
+        newest = [*self._newest]
+        if self._stream.unknown is not None or not newest:
+            return
+        fault = self._look_at_gravity(self._policy.sensor, self._policy.rate_hz,
+                                      *topics.finite_samples(newest)).fault
+        text = '' if fault is None else \
+            f'{self.resolve_topic_name("imu/data_raw")}: {fault.live_text}'
+        self._policy.no_gravity = text if fault is not None and fault.is_clear else ''
+        self._policy.wrong_gravity = '' if self._policy.no_gravity else text
 
     def _on_info(self, message: DiagnosticStatus) -> None:
         self._policy.info = topics.stream_info(message, self.resolve_topic_name('sensor_info'))
@@ -350,6 +367,7 @@ class Compensation(Node):
                 self._stream.surround(COLUMNS[topic], value)
                 self._heard_ns[COLUMNS[topic]] = self.get_clock().now().nanoseconds
         for sample in self._samples.take():
+            self._newest.append(sample)
             self._stream(sample)
 
     def _status(self) -> Status:

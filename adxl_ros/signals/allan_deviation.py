@@ -14,8 +14,9 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import gap_s
+from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import BeyondRange
-from adxl_ros.signals.rest_detection import RecordedRests, Rest
+from adxl_ros.signals.rest_detection import Rest
 import numpy as np
 
 _MOST_CELLS = 1 << 17
@@ -143,19 +144,18 @@ def shortest_rest_s(rate_hz: float) -> float:
     return max(SHORTEST_S, _FEWEST_SAMPLES / rate_hz) - 1 / rate_hz
 
 
-def longest_rest(read: Callable[[], Iterable[Recording]], unit: Sensor, first: Recording
-                 ) -> StillStretch:
-    """Find the longest rest of a recording, which is read twice; the memory is bounded."""
+def longest_rest(read: Callable[[], Iterable[Recording]], unit: Sensor, first: Recording,
+                 look: RecordingLook) -> StillStretch:
+    """Find the longest rest of a recording, which is read twice; `look` is fed meanwhile."""
     if len(first) < 2:
         raise UserError(f'{first.path}: {len(first)} samples; record longer')
-    survey, first_s = RecordedRests(unit, first), float(first.time_s[0])
-    beyond = BeyondRange()
+    first_s, beyond = float(first.time_s[0]), BeyondRange()
     for block in read():
-        survey.feed(block)
+        look.feed(block)
         beyond.add(block.volts(unit), unit)
         last_s = float(block.time_s[-1])
-    survey.take()
-    rests = [rest for rest, _ in survey.detected]
+    look.rests.take()
+    rests = [found.rest for found in look.rests.detected]
     rest = max(rests, key=lambda rest: rest.span_s, default=Rest(0, 0, 0.0, 0.0))
     shortest_s = shortest_rest_s(first.rate_hz)
     if rest.span_s < shortest_s:

@@ -15,12 +15,11 @@ from itertools import chain
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
 from adxl_ros.files.bag_reader import log_times
-from adxl_ros.files.column_mapping import likely_unit, ReadingOptions
+from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import (
     BadStamps,
     Recording,
     REFERENCES,
-    uncalibrated,
 )
 from adxl_ros.files.stamps import burst_samples, lacks_samples, period_s
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -28,8 +27,9 @@ from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.report.quantities import counted, duration
 from adxl_ros.signals.allan_deviation import shortest_rest_s
 from adxl_ros.signals.block_statistics import true_runs
+from adxl_ros.signals.gravity_at_rest import GravityAtRest
+from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import load_sensor
-from adxl_ros.signals.rest_detection import RecordedRests
 import numpy as np
 
 _SAME_POSE_G = 0.1  # Distance of the means of two rests of one orientation, g. Chosen: 6° of tilt
@@ -79,8 +79,8 @@ class RecordingContents:
     longest_rest_s: float  # Longest rest, s
     rests: int  # Number of rests
     poses: int  # Number of different orientations among them
-    # Median length of the specific force at rest, g; None without three axes or rests
-    length_g: float | None
+    gravity: GravityAtRest  # The length of gravity over the rests
+    neighbour_faults: tuple[str, ...]  # What is wrong between neighbouring samples
     # Lowest and highest value of each reference, by column
     reference_ranges: dict[str, tuple[float, float]]
     reference_means: dict[str, float]  # Mean of each reference, by column
@@ -90,16 +90,17 @@ class RecordingContents:
     cut: str  # Where a damaged file ends; empty if it is whole
 
 
-def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
+def examine(blocks: Iterable[Recording], sensor_of: Callable[[Recording], Sensor],
             log_delay_s: float | None) -> RecordingContents:
-    """Find what a recording holds."""
+    """Find what a recording holds; `sensor_of` returns its sensor, calibrated or not."""
     blocks = iter(blocks)
     first = next((block for block in blocks if len(block)), None)
     if first is None:
         raise UserError('the recording holds no samples')
-    unit, stamps = unit_of(first), _Stamps(first)
+    sensor, stamps = sensor_of(first), _Stamps(first)
+    look = RecordingLook(sensor, first)
+    unit = look.unit
     axes = [_Axis(name, stamps.period_s) for name in first.sensor_columns]
-    rests = RecordedRests(unit, first)
     # Lowest and highest value, sum and count of each reference by block
     references: dict[str, list[tuple[float, float, float, int]]] = {}
     for block in chain([first], blocks):
@@ -108,18 +109,18 @@ def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
         stamps.feed(block.time_s)
         for axis, values in zip(axes, block.accel_mps2(unit).T):
             axis.feed(values)
-        rests.feed(block)
+        look.feed(block)
         for name, values in block.columns.items():
             read = values[np.isfinite(values)]
             if name in REFERENCES and len(read):
                 references.setdefault(name, []).append(
                     (float(read.min()), float(read.max()), float(read.sum()), len(read)))
-    rests.take()
+    gravity = look.gravity()
     # By reference: lowest and highest values, sums, counts
     parts = {name: list(zip(*rows)) for name, rows in references.items()}
-    spans_s = [rest.span_s for rest, _ in rests.detected]
-    means_mps2 = [to_nominal_mps2(mean_v, unit) for _, mean_v in rests.detected]
-    lengths_g = np.linalg.norm(means_mps2, axis=-1) / G0_MPS2
+    rests = look.rests.detected
+    spans_s = [found.rest.span_s for found in rests]
+    means_mps2 = [to_nominal_mps2(found.mean_v, unit) for found in rests]
     span_s = stamps.last_s - stamps.first_s
     return RecordingContents(
         path=block.path, samples=stamps.count, span_s=span_s,
@@ -128,7 +129,7 @@ def examine(blocks: Iterable[Recording], unit_of: Callable[[Recording], Sensor],
         bad_stamps=block.bad_stamps, axes=tuple(axis.result() for axis in axes),
         rest_share=min(sum(spans_s) / span_s, 1.0), longest_rest_s=max(spans_s, default=0.0),
         rests=len(spans_s), poses=_count_poses(means_mps2),
-        length_g=float(np.median(lengths_g)) if spans_s and len(unit.axes) == len(AXES) else None,
+        gravity=gravity, neighbour_faults=tuple(look.neighbour_faults()),
         reference_ranges={name: (min(low), max(high)) for name, (low, high, *_) in parts.items()},
         reference_means={name: sum(total) / sum(count)
                          for name, (_, _, total, count) in parts.items()},
@@ -244,7 +245,6 @@ _LARGEST_MISSING = 0.01  # Share of missing samples of a sound log. Chosen: a lo
 _LONGEST_GAP_S = 1.0  # Longest gap of a sound log, s. Chosen: a longer one may hide a turn
 _LARGEST_JITTER = 0.3  # Jitter of a sound log, periods. Chosen: samples still show
 _FEWEST_CLIPPED = 3  # Clippings from which a log is not sound. Chosen: one may be a knock
-_LENGTHS_G = (0.8, 1.25)  # Bounds of gravity, g. Chosen: zero-g and scale stay within
 _LARGEST_DELAY_S = 0.1  # Mentioned delay of the log time, s. Chosen: recorders are faster
 _MOVED_RAD = 0.01  # Range from which a stage moves, rad. Chosen: beyond jitter of encoders
 _FOLLOWED = {'temperature_c': ('temperature', 1.0), 'supply_v': ('supply', 0.1)}
@@ -324,13 +324,9 @@ def _sample_faults(contents: RecordingContents) -> list[str]:
     faults += [f'{axis.name} stays at its extreme value {axis.clipped} times in motion; its range '
                f'ends at {axis.lowest_mps2 / G0_MPS2:.3g} or {axis.highest_mps2 / G0_MPS2:.3g} g'
                for axis in contents.axes if axis.clipped >= _FEWEST_CLIPPED]
-    length_g = contents.length_g
-    if length_g is not None and not _LENGTHS_G[0] < length_g < _LENGTHS_G[1]:
-        unit = likely_unit(length_g * G0_MPS2)
-        hint = f'the readings seem to be in {unit}: state it by --columns' if unit else \
-            'check unit and scale factor'
-        faults.append(f'at rest the specific force is {length_g * G0_MPS2:.3g} m/s², expected '
-                      f'{G0_MPS2:.3g}; {hint}')
+    faults += contents.neighbour_faults
+    if contents.gravity.fault:
+        faults.append(contents.gravity.fault.text)
     return faults
 
 
@@ -406,12 +402,8 @@ def check_recording(path: str, params: str | None, reading: ReadingOptions,
         if reading.rate_hz is None and recording.is_bag(path):
             delay_s = log_delay_s(log_times(path, reading.topic))
 
-        def unit_of(block: Recording) -> Sensor:
-            sensor = load_sensor(params, block)
-            return uncalibrated(sensor, block.stream_info, block.axes, sensor.rate_hz)
-
         blocks = recording.blocks(path, BLOCK_ROWS, reading)
-        contents = examine(_shown(blocks, show), unit_of, delay_s)
+        contents = examine(_shown(blocks, show), lambda block: load_sensor(params, block), delay_s)
     except UserError as error:
         reason = one_line(error).removeprefix(f'{path}: ')
         return Findings(path, None, (reason,), paste=error.paste)

@@ -30,6 +30,8 @@ from adxl_ros.model.noise import (
 )
 from adxl_ros.model.sensor import Sensor, without_effect
 from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
+from adxl_ros.signals.gravity_at_rest import require_unit
+from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import load_sensor, RESISTANCE_OHM
 import numpy as np
 import scipy
@@ -429,6 +431,8 @@ class RecordingNoise:
     unit: Sensor  # The nominal sensor that it comes from
     rest: StillStretch  # Its samples at rest
     axes: list[AxisNoise]  # The noise by axis
+    # What is wrong with the length of gravity and between neighbouring samples, one line each
+    doubts: tuple[str, ...] = ()
 
 
 def recording_noise(read: Callable[[], Iterable[Recording]], params: str | None,
@@ -439,7 +443,9 @@ def recording_noise(read: Callable[[], Iterable[Recording]], params: str | None,
         raise UserError('the recording holds no samples')
     sensor = load_sensor(params, first)
     unit = unit_of(sensor, first.stream_info, first.axes)
-    rest = longest_rest(read, unit, first)
+    look = RecordingLook(sensor, first)
+    rest = longest_rest(read, unit, first, look)
+    doubts = require_unit(look.gravity(), first.path)
     variances = coefficient_variances(len(rest.means), rest.step_s)
     noises = []
     for i, axis in enumerate(unit.axes):
@@ -456,7 +462,8 @@ def recording_noise(read: Callable[[], Iterable[Recording]], params: str | None,
             max(std ** 2 - slow - rounding_variance, 0.0),
             max(float(rest.allan.deviation[0, i]) ** 2 - rounding_variance, 0.0)))
         show((i + 1) / len(unit.axes))
-    return RecordingNoise(first.path, sensor, unit, rest, noises)
+    return RecordingNoise(first.path, sensor, unit, rest, noises,
+                          (*doubts, *look.neighbour_faults()))
 
 
 def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: float) -> NoiseFit:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 from adxl_ros.files.recording_columns import JOINTS, Recording
 from adxl_ros.model.constants import G0_MPS2
@@ -395,6 +396,14 @@ def recording_finder(unit: Sensor, has_angles: bool) -> RestFinder:
     return RestFinder(unit.rate_hz, len(unit.axes), noise, True, tolerance_rad)
 
 
+class RestMean(NamedTuple):
+    """A rest of a recording with the mean of its samples."""
+
+    rest: Rest
+    mean_v: np.ndarray  # Mean, V, (m,)
+    std_v: np.ndarray  # Standard deviation of the mean by noise, V, (m,)
+
+
 class RecordedRests:
     """Finds the rests of a recording of any length; the memory is that of an hour."""
 
@@ -403,8 +412,7 @@ class RecordedRests:
         self._has_angles = set(_ANGLES) <= set(first.columns)
         self._finder = recording_finder(self._unit, self._has_angles)
         self._taken_s = float(first.time_s[0])
-        # Rests of all blocks up to the last `take`, each with its mean, V
-        self.detected: list[tuple[Rest, np.ndarray]] = []
+        self.detected: list[RestMean] = []  # Rests of all blocks up to the last `take`
 
     def feed(self, block: Recording) -> None:
         """Add a block of the recording."""
@@ -419,15 +427,16 @@ class RecordedRests:
     def take(self) -> None:
         """Add the newest rests to `detected`; what was found twice is one rest."""
         rests = self._finder.rests()
-        for rest, mean_v in zip(rests, self._finder.means(rests)[0]):
-            last, last_mean_v = self.detected[-1] if self.detected else (None, mean_v)
-            if last is None or rest.time_start_s > last.time_stop_s:
-                self.detected.append((rest, mean_v))
+        for rest, mean_v, std_v in zip(rests, *self._finder.means(rests)):
+            newest = self.detected[-1] if self.detected else None
+            if newest is None or rest.time_start_s > newest.rest.time_stop_s:
+                self.detected.append(RestMean(rest, mean_v, std_v))
                 continue
+            last = newest.rest
             later = [span for span in rest.disturbed_s if span[0] >= last.time_stop_s]
             joined = replace(last, stop=rest.stop, time_stop_s=rest.time_stop_s,
                              disturbed_s=(*last.disturbed_s, *later))
-            self.detected[-1] = joined, last_mean_v
+            self.detected[-1] = newest._replace(rest=joined)
 
 
 def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,

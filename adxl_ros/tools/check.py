@@ -101,7 +101,8 @@ def _value_lines(contents: RecordingContents) -> list[str]:
              ', '.join(f'{axis.name} {axis.lowest_mps2:.3g} to {axis.highest_mps2:.3g} m/s²'
                        for axis in contents.axes),
              *(f'{name} {low:.4g} to {high:.4g} {column_unit(name)}'
-               for name, (low, high) in contents.reference_ranges.items())]
+               for name, (low, high) in contents.reference_ranges.items()),
+             contents.gravity.text]
     if contents.log_delay_s is not None:
         texts.append(f'log time minus header time {short_time(contents.log_delay_s)}')
     return texts
@@ -216,7 +217,8 @@ def _as_json(result: Findings) -> dict[str, Any]:
     values: dict[str, Any] = {}
     if result.contents is not None:
         values = {name: value for name, value in asdict(result.contents).items()
-                  if name not in ('path', 'remarks', 'cut')}
+                  if name not in ('path', 'remarks', 'cut', 'gravity', 'neighbour_faults')}
+        values['gravity'] = result.contents.gravity.as_json()
         values['bad_stamps'] = result.contents.bad_stamps._asdict()
     return {'schema': 1, 'recording': result.path, 'sound': result.is_sound,
             'faults': list(result.faults), 'remarks': list(result.remarks), 'contents': values,

@@ -88,7 +88,7 @@ def _paste_lines(result: RecordingNoise) -> list[str]:
 
 
 def _warnings(result: RecordingNoise) -> list[str]:
-    rest, texts = result.rest, []
+    rest, texts = result.rest, [*result.doubts]
     if rest.beyond_range:
         texts.append(f'{rest.beyond_range}.')
     if rest.motion_s:

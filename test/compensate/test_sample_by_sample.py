@@ -5,8 +5,9 @@
 from collections.abc import Callable
 from dataclasses import replace
 
-from adxl_ros.compensate.estimators import Estimate, LiveEstimator
+from adxl_ros.compensate.estimators import Estimate, LiveEstimator, RecordingEstimator
 from adxl_ros.files import imu_message
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import signal_chain
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
@@ -98,6 +99,25 @@ def test_motion_raises_the_variance_of_z_and_angles_while_it_lasts() -> None:
         last = three_axes(a, i / 1000)
     assert last.covariance[5] < 1e-3
     assert np.sqrt(last.pitch[1]) > 0.15
+
+
+@pytest.mark.parametrize('change', [
+    lambda force: force / G, lambda force: force / 1000, lambda force: 0.02 * force,
+    lambda force: 0.68 * force])
+def test_the_tilt_of_a_force_whose_length_is_not_gravity_states_a_deviation_that_covers(
+        change: Callable[[np.ndarray], np.ndarray]) -> None:
+    sensor, true_rad = unit('xyz'), 0.6
+    force = change(np.array(specific_force(true_rad, 1.0, G)))
+    accel = samples(sensor, [np.full(50, f) for f in force])
+    follow = follower(sensor)
+    live = [follow(a, i / 1000) for i, a in enumerate(accel)][-1]
+    columns = dict(zip(('ax_mps2', 'ay_mps2', 'az_mps2'), np.array(accel).T))
+    block = Recording('made.csv', np.arange(50) / 1000, columns)
+    (_, estimates), = RecordingEstimator(sensor, block).blocks([block])
+    length_error = abs(float(np.linalg.norm(force)) - G) / G
+    for variance in (live.roll[1], live.pitch[1], float(estimates.tilt.roll_std[-1]) ** 2,
+                     float(estimates.tilt.pitch_std[-1]) ** 2):
+        assert np.sqrt(variance) > 0.8 * length_error
 
 
 @pytest.mark.parametrize('bad', [float('nan'), float('inf'), -1e300])

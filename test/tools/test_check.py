@@ -63,7 +63,7 @@ def test_a_sound_recording(tmp_path: Path) -> None:
     assert (contents['samples'], contents['missing'], contents['gaps']) == (6000, 0, 0)
     assert contents['rests'] >= 10
     assert 0.5 < contents['rest_share'] < 0.9
-    assert contents['length_g'] == pytest.approx(1.0, abs=0.01)
+    assert contents['gravity']['length_mps2'] == pytest.approx(9.81, abs=0.1)
     assert contents['reference_ranges']['temperature_c'] == pytest.approx([25.0, 26.0], abs=0.01)
     assert contents['reference_ranges']['supply_v'] == [5.0, 5.0]
     assert result['can']['fit']['able']
@@ -103,7 +103,7 @@ ROW = np.arange(6000)
      'az_mps2 does not change for 15 s'),
     (lambda t, a: (t, a[np.where(ROW // 600 == 5, 2999, ROW)]), 3,
      'ay_mps2 does not change for 6 s'),
-    (lambda t, a: (t, a / G), None, 'seem to be in g')])
+    (lambda t, a: (t, a / G), None, 'values in g')])
 def test_each_fault_is_named(tmp_path: Path, change: Callable, count: int | None, fault: str
                              ) -> None:
     write_csv(tmp_path / 'faulty.csv', *change(*samples()))

@@ -11,7 +11,7 @@ from adxl_ros.calibrate.fits.gravity_fit import NINE
 from adxl_ros.calibrate.guided.guide import NewestSamples, NextPose, STALE_NS
 from adxl_ros.calibrate.guided.rest_guides import ENOUGH_RESTS
 from adxl_ros.calibrate.guided.screen_contents import Phase, Status
-from adxl_ros.calibrate.guided.session import Session, SessionSettings
+from adxl_ros.calibrate.guided.session import GravityError, Session, SessionSettings
 from adxl_ros.calibrate.guided.stage_guide import MountingError
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import StreamInfo, unit_of
@@ -161,7 +161,7 @@ class Controller:
         self._starts_over = self._by_default
         self._sensor, self._samples, self._outputs = sensor, samples, outputs
         self._last = self._warned = ''  # The newest line, and the newest obstacle
-        self._accepted = 0
+        self._accepted, self._has_doubt = 0, False
 
     def start(self, start_over: bool | None = None) -> Answer:
         """Begin a calibration, or resume an interrupted one, as soon as the sensor is known."""
@@ -296,12 +296,15 @@ class Controller:
             for text in session.take_poses():
                 self._say('INFO', text)
                 self._outputs.answer_captures(Answer(True, text))
-        except MountingError as error:
+        except (MountingError, GravityError) as error:
             self._stop('ERROR', f'{error}')
             return
         except UserError as error:
             self._say('ERROR', f'{error}')
             self._outputs.answer_captures(Answer(False, f'{error}'))
+        if session.doubt and not self._has_doubt:
+            self._say('WARNING', f'imu/data_raw: {session.doubt}')
+        self._has_doubt = bool(session.doubt)
         if refusal := session.guide.new_refusal():
             self._say('WARNING', refusal)
             self._outputs.answer_captures(Answer(False, refusal))

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import os
 from pathlib import Path
@@ -23,6 +23,7 @@ from adxl_ros.files.atomic_write import remove_unfinished
 from adxl_ros.files.sweep_journal import MountingUnchecked, PoseRecord
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.signals.gravity_at_rest import of_volts
 import numpy as np
 
 _UNIT_FIELDS = (
@@ -117,6 +118,10 @@ def _degrees(angle_rad: float) -> float:
     return round(float(np.degrees(angle_rad)), 9)
 
 
+class GravityError(UserError):
+    """The rests do not read gravity, so that no calibration follows from them."""
+
+
 class Session:
     """One calibration of one unit: a guide, its journal, and the fit."""
 
@@ -136,6 +141,7 @@ class Session:
                                  rate_hz=unit.rate_hz)
         self.unit, self.settings = unit, settings
         self.fault = ''  # What is wrong with the samples, or ''
+        self.doubt = ''  # What is wrong with the length of gravity, but by less than a unit
         # The accepted poses on disk
         self.journal = sweep_journal.Journal(settings.journal, settings.head(unit), start_over)
         # A process that was killed while it wrote has left unfinished files.
@@ -177,6 +183,7 @@ class Session:
         """Take the poses that are complete."""
         unverified = len(self.guide.to_verify)
         while (record := self.guide.accept()) is not None:
+            self._check_gravity([*self.guide.accepted.values(), record])
             try:
                 self.journal.append(record)
             except UserError:
@@ -187,6 +194,14 @@ class Session:
             yield f'pose {record.pose + 1} is on disk'
         if unverified > len(self.guide.to_verify):
             yield 'the sensor is mounted as it was'
+
+    def _check_gravity(self, records: Sequence[PoseRecord]) -> None:
+        """Refuse rests in another unit, or without gravity, from the first one on."""
+        poses = Poses.from_records(records)
+        fault = of_volts(poses.volts, poses.std_v, self._base).fault
+        if fault is not None and fault.is_clear:
+            raise GravityError(f'imu/data_raw: {fault.live_text}')
+        self.doubt = '' if fault is None else fault.live_text
 
     def rows(self) -> tuple[list[Row], list[Row]]:
         """Return rows and coefficients for the screen; estimated once for each pose."""

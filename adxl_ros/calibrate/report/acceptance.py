@@ -229,11 +229,12 @@ def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:
     return lines
 
 
-def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutErrors]
-                       ) -> dict[str, str]:
-    """Return the entries of the provenance about the saved model, without NaN."""
+def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutErrors],
+                       doubts: Sequence[str] = ()) -> dict[str, str]:
+    """Return the entries about the saved model, and why it cannot pass, without NaN."""
+    doubt = {'doubt': doubts[0]} if doubts else {}
     if assessment is None:
-        return {}
+        return doubt
     numbers: dict[str, float] = {'own_accel_mg': assessment.error_mg,
                                  'own_tilt_deg': assessment.error_deg}
     for errors in models[-1:]:
@@ -243,7 +244,7 @@ def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutEr
     entries = {**{key: f'{value:.4g}' for key, value in numbers.items() if np.isfinite(value)},
                'verdict': assessment.accel_outcome, 'verdict_tilt': assessment.tilt_outcome,
                'limited_by': assessment.accel.limited_by}
-    return {key: entry for key, entry in entries.items() if entry}
+    return {key: entry for key, entry in entries.items() if entry} | doubt
 
 
 def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
@@ -269,6 +270,9 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
             tilt_deg = float(provenance['own_tilt_deg'])
             lines = [f'tilt error {tilt_deg:.2g}°, more than {limit_text} causes']
         lines.append('Take more poses or a richer model; else do not use this file.')
+    elif 'doubt' in provenance:
+        outcome = NOT_SHOWN
+        lines.append('The recording is not sound: see the warning.')
     elif outcome == NOT_SHOWN:
         open_names = ', '.join(map(str, open_coefficients(fitted)))
         lines.append(f'Other poses may have a larger error: {open_names} not determined.'

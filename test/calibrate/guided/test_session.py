@@ -5,7 +5,7 @@
 from dataclasses import replace
 
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, StageMode
-from adxl_ros.calibrate.guided.session import Session, SessionSettings
+from adxl_ros.calibrate.guided.session import GravityError, Session, SessionSettings
 from adxl_ros.errors import UserError
 from adxl_ros.files import atomic_write, sweep_journal
 from adxl_ros.model import signal_chain
@@ -130,3 +130,32 @@ def test_a_calibration_resumes_only_with_equal_values_and_settings(begin, mode):
     before = settings.head(unit)
     for other, sensor in changed:
         assert len([key for key, value in other.head(sensor).items() if value != before[key]]) == 1
+
+
+def gravity_session(begin, monkeypatch, factor):
+    """Begin a calibration by hand whose first two rests have readings times a factor."""
+    unit = nominal('xyz', serial='S1')
+    monkeypatch.setattr('test_session.UNIT', unit)
+    session = begin(mode='gravity')
+    rests = iter([pose_record(
+        i, start_ns=2 * i, stop_ns=2 * i + 1, std_v=(5e-5,) * 3,
+        mean_v=tuple((unit.nominal_zero_g_v + factor * np.array(up)).tolist()))
+        for i, up in enumerate(([0, 0, 1.0], [0, 1.0, 0]))])
+    monkeypatch.setattr(session.guide, 'accept', lambda: next(rests, None))
+    return session
+
+
+@pytest.mark.parametrize(('factor', 'reason'), [
+    (1 / 9.80665, 'as values in g'), (1000.0, 'mm/s²'), (0.0, 'gravity is missing')])
+def test_the_first_rest_in_another_unit_ends_the_calibration(begin, monkeypatch, factor, reason):
+    session = gravity_session(begin, monkeypatch, factor)
+    with pytest.raises(GravityError, match=reason):
+        list(session.take_poses())
+    assert poses_on_disk(session) == []
+
+
+def test_a_scale_that_is_wrong_by_less_is_a_doubt(begin, monkeypatch):
+    assert gravity_session(begin, monkeypatch, 1.0).doubt == ''
+    session = gravity_session(begin, monkeypatch, 0.6)
+    assert len(list(session.take_poses())) == 2
+    assert '5.88 m/s²' in session.doubt

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Faults between neighbouring samples, which means over a rest do not show.
+
+They are readings that stand for several samples each, the rows of several sensors in turn, counts
+that wrap at the end of their range, and readings that jump from one rest to another at once.
+"""
+
+from __future__ import annotations
+
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.sensor import Sensor
+import numpy as np
+
+_FEWEST_RUNS = 20
+"""Fewest runs of equal samples that are judged. Chosen: at most half of the runs of a reading that
+repeats by chance have an even length, so that twenty of them never do."""
+_REGULAR_SHARE = 0.9  # Share of the runs that have the common length. Chosen: some are cut
+_MOST_REPEATS = 64  # Most samples that one reading stands for. Chosen: 1 kHz of a sensor at 16 Hz
+_EVEN_RUNS = 0.4
+"""Scatter of the lengths of runs by their mean, up to which a slower clock makes them: lengths of
+one and two in turn have 0.33, and chance has at least 0.58 about the same mean."""
+_ONE_CODE = 1.5  # Change by more than one code, in codes: halfway to two
+_FEWEST_EVEN = 1.45  # Mean length of such runs: below, single readings are repeated
+
+_PHASES = (2, 3, 4)  # Numbers of sensors whose rows alternate
+_WINDOW = 96  # Samples in which rows are compared: a multiple of all these numbers. Chosen: quick
+_TWO_VALUES = 2.0
+"""Distance of the means of two rows, by the scatter within each, from which both are seen as two
+values: two normal distributions in equal parts have two maxima from there on."""
+_MEAN_STDS = 6.0  # Distance of two means, in their standard deviations, that is no chance
+
+_RANGES_G = (4.0, 8.0, 16.0, 32.0, 64.0)  # Whole ranges of digital sensors: ±2 g to ±32 g
+_FEWEST_WRAPS = 3  # Fewest jumps across the range. Chosen: a single one may be a shock
+_CLIPPED = 3  # Most samples at the end of a range that does not clip. Chosen: by chance one is
+_FILLED = 0.005  # Largest distance of the samples from both ends of a range that they fill, by it
+_ROUNDING = 1e-3  # Relative error of a resolution that is found among rounded values
+_BIN_G, _LARGEST_STEP_G = 0.05, 70.0  # Width and end of the bins of steps, g. Chosen: fine enough
+
+_TURN_RAD_PER_S = np.radians(2000.0)
+"""Fastest turn of a sensor, rad/s: the range of common gyroscopes, and above any hand or robot."""
+_SIDE = 8  # Samples on either side of a jump that must be steady. Chosen: a knock rings longer
+_NEAREST = 3  # Samples on either side whose mean is compared
+_STEADY = 0.2  # Largest step among them, by the jump. Chosen: noise and slow motion are smaller
+_SMALLEST_JUMP_G = 0.3  # Smallest jump, g. Chosen: 17° of tilt, above any offset of the sensor
+
+
+class NeighbouringSamples:
+    """Looks at neighbouring samples of a stream, in blocks of any length."""
+
+    def __init__(self, axes: str, rate_hz: float) -> None:
+        self._axes, self._rate_hz = axes, rate_hz
+        self._left = np.zeros((0, len(axes)))  # Newest samples, which later ones are compared with
+        self._left_s = np.zeros(0)
+        self._run = 1  # Length of the newest run of equal samples
+        self._runs = np.zeros(4 * _MOST_REPEATS, int)  # Number of runs by their length
+        self._wide = 0  # Changes by more than one code, as slow motion of coarse codes has none
+        self._windows = 0  # Windows that were compared
+        self._alternating = dict.fromkeys(_PHASES, 0)  # Those in which rows alternate
+        self._distance_mps2 = dict.fromkeys(_PHASES, 0.0)  # Largest distance of their means
+        self._ends = [_Ends() for _ in axes]
+        self._jumps: list[tuple[float, float]] = []  # Times, s, and sizes, m/s², of jumps
+
+    def feed(self, time_s: np.ndarray, samples: np.ndarray) -> None:
+        """Add samples, m/s², (n, m), with their stamps, s, (n,)."""
+        if not len(samples):
+            return
+        joined = np.concatenate([self._left, samples])
+        joined_s = np.concatenate([self._left_s, time_s])
+        with_last = joined[max(len(self._left) - 1, 0):]
+        for ends, values in zip(self._ends, with_last.T):
+            ends.feed(values)
+        self._count_runs(with_last)
+        self._compare_rows(samples)
+        # The sides of the last jumps come with the next block.
+        self._find_jumps(joined_s, joined)
+        self._left, self._left_s = joined[-2 * _SIDE:], joined_s[-2 * _SIDE:]
+
+    def faults(self) -> list[str]:
+        """Return what is wrong, one line each."""
+        found = (self._repeats(), self._alternates(), self._wraps(), self._jumped())
+        return [text for text in found if text]
+
+    def _count_runs(self, samples: np.ndarray) -> None:
+        """Count runs of samples that are equal on all axes; the first sample is counted before."""
+        changes = np.abs(np.diff(samples, axis=0))
+        begins = 1 + np.flatnonzero((changes != 0).any(axis=1))
+        codes = np.array([ends.step_mps2 for ends in self._ends])
+        self._wide += int((changes > _ONE_CODE * codes).any(axis=1).sum())
+        if not len(begins):
+            self._run += len(samples) - 1
+            return
+        lengths = np.append(self._run + begins[0] - 1, np.diff(begins))
+        self._run = len(samples) - int(begins[-1])
+        self._runs += np.bincount(lengths.clip(max=len(self._runs) - 1),
+                                  minlength=len(self._runs))
+
+    def _repeats(self) -> str:
+        """Return how often each reading stands, where that is no chance."""
+        count, lengths = int(self._runs.sum()), np.arange(len(self._runs))
+        if count < _FEWEST_RUNS:
+            return ''
+        mean = float((lengths * self._runs).sum() / count)
+        scatter = float(np.sqrt((self._runs * (lengths - mean) ** 2).sum() / count))
+        regular = [n for n in range(2, _MOST_REPEATS + 1)
+                   if self._runs[n::n].sum() >= _REGULAR_SHARE * count]
+        if regular:
+            mean = float(regular[-1])
+        elif mean < _FEWEST_EVEN or scatter > _EVEN_RUNS * mean or 2 * self._wide < count:
+            return ''
+        return (f'each reading stands for {mean:.3g} samples: the sensor has '
+                f'{self._rate_hz / mean:.4g} readings a second, and the file {self._rate_hz:.4g}; '
+                'record each reading once')
+
+    def _compare_rows(self, samples: np.ndarray) -> None:
+        """Compare every second, third and fourth row within windows of some rows."""
+        count = len(samples) // _WINDOW
+        windows = samples[:count * _WINDOW].reshape(count, _WINDOW, samples.shape[1])
+        self._windows += count
+        for phases in _PHASES if count else ():
+            parts = windows.reshape(count, _WINDOW // phases, phases, samples.shape[1])
+            means = parts.mean(axis=1)  # (count, phases, m)
+            within = np.sqrt(((parts - means[:, None]) ** 2).mean(axis=(1, 2)))
+            distance = np.ptp(means, axis=1)
+            smallest = np.maximum(_TWO_VALUES, _MEAN_STDS * np.sqrt(2 * phases / _WINDOW)) * within
+            apart = ((distance > smallest) & (distance > 0)).any(axis=1)
+            self._alternating[phases] += int(apart.sum())
+            self._distance_mps2[phases] = max(self._distance_mps2[phases],
+                                              float(distance[apart].max(initial=0.0)))
+
+    def _alternates(self) -> str:
+        """Return after how many rows the readings come back, where they alternate."""
+        for phases in _PHASES:
+            if 2 * self._alternating[phases] > self._windows > 0:
+                return (f'rows alternate between {phases} values up to '
+                        f'{self._distance_mps2[phases]:.3g} m/s² apart: {phases} sensors in one '
+                        f'file, or a disturbance at 1/{phases} of the sample rate; separate them')
+        return ''
+
+    def _wraps(self) -> str:
+        """Return on which axis counts wrap at the end of their range."""
+        return next((f'{name} {text}' for name, ends in zip(self._axes, self._ends)
+                     if (text := ends.wraps())), '')
+
+    def _find_jumps(self, time_s: np.ndarray, samples: np.ndarray) -> None:
+        """Find steps from one steady part to another that no turn explains."""
+        size = np.linalg.norm(np.diff(samples, axis=0), axis=1)
+        # Steps whose both sides are known; those before were found in the block before.
+        both = size[_SIDE - 1:len(size) - _SIDE + 1]
+        places = _SIDE - 1 + np.flatnonzero(both > _SMALLEST_JUMP_G * G0_MPS2)
+        for i in places.tolist():
+            beside = np.concatenate([size[i - _SIDE + 1:i], size[i + 1:i + _SIDE]])
+            if beside.max() > _STEADY * size[i]:
+                continue
+            before = samples[i - _NEAREST + 1:i + 1].mean(axis=0)
+            after = samples[i + 1:i + 1 + _NEAREST].mean(axis=0)
+            step_s = max(float(time_s[i + 1] - time_s[i]), 1 / self._rate_hz)
+            if _turn_rad(before, after) > _TURN_RAD_PER_S * step_s:
+                self._jumps.append((float(time_s[i]), float(size[i])))
+
+    def _jumped(self) -> str:
+        if not self._jumps:
+            return ''
+        at_s, jump_mps2 = self._jumps[0]
+        return (f'the readings jump by {jump_mps2 / G0_MPS2:.3g} g at {at_s:.6g} s from one '
+                'steady value to another, faster than a sensor turns: it was turned over, '
+                'exchanged or read in another way; use the parts')
+
+
+def neighbour_faults(read: Recording, unit: Sensor) -> list[str]:
+    """Return what is wrong between the samples of a whole recording, one line each."""
+    neighbours = NeighbouringSamples(unit.axes, read.rate_hz)
+    neighbours.feed(read.time_s, read.accel_mps2(unit))
+    return neighbours.faults()
+
+
+def _turn_rad(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the angle between two forces, (m,), rad; 0 where their lengths differ: no turn."""
+    lengths = np.linalg.norm([first, second], axis=1)
+    if lengths.min() < (1 - _STEADY) * lengths.max():
+        return 0.0
+    return float(np.arccos(np.clip(first @ second / lengths.prod(), -1.0, 1.0)))
+
+
+class _Ends:
+    """The ends of the range of one axis, and the steps between its neighbouring samples."""
+
+    def __init__(self) -> None:
+        # Largest value of minus the samples and of the samples, m/s², and number of samples there
+        self._largest_mps2, self._at_end = [-np.inf, -np.inf], [0, 0]
+        self.step_mps2 = np.inf  # Smallest change
+        self._sizes = np.zeros(int(_LARGEST_STEP_G / _BIN_G) + 1, int)  # Number of steps by size
+
+    def feed(self, values: np.ndarray) -> None:
+        """Add values, m/s², (n,); the first one ends those before."""
+        steps = np.abs(np.diff(values))
+        self.step_mps2 = min(self.step_mps2, float(steps[steps > 0].min(initial=np.inf)))
+        bins = (steps / (_BIN_G * G0_MPS2)).astype(int).clip(max=len(self._sizes) - 1)
+        self._sizes += np.bincount(bins, minlength=len(self._sizes))
+        for side, signed in enumerate((-values, values)):
+            largest = float(signed.max())
+            if largest > self._largest_mps2[side]:
+                self._largest_mps2[side], self._at_end[side] = largest, 0
+            self._at_end[side] += int((signed == self._largest_mps2[side]).sum())
+
+    def wraps(self) -> str:
+        """
+        Return how counts wrap at the end of a range, after the name of the axis; '' if not.
+
+        Steps within a range get rarer the larger they are. Those of counts that wrap get more
+        frequent, because a small step across the end reads as one of nearly the whole range. In
+        rough motion only the ends show it: a sensor that reaches both of them clips there.
+        """
+        low_g, high_g = -self._largest_mps2[0] / G0_MPS2, self._largest_mps2[1] / G0_MPS2
+        if max(self._at_end) > _CLIPPED or not high_g > low_g:
+            return ''
+        step_g, sizes_g = self.step_mps2 / G0_MPS2, _BIN_G * np.arange(len(self._sizes))
+        by_counts_g = step_g * 2.0 ** np.ceil(np.log2((high_g - low_g) / step_g))
+        for range_g in (by_counts_g, *_RANGES_G):
+            is_full, is_half = sizes_g > 0.75 * range_g, sizes_g > 0.5 * range_g
+            full = int(self._sizes[is_full].sum())
+            half = int(self._sizes[is_half & ~is_full].sum())
+            fills = max(abs(low_g + range_g / 2), abs(high_g - range_g / 2)) < _FILLED * range_g
+            is_range = high_g - low_g < (1 + _ROUNDING) * range_g
+            if is_range and full >= _FEWEST_WRAPS and (full > half or fills):
+                return (f'jumps by nearly {range_g:.3g} g between neighbouring samples {full} '
+                        f'times: its counts wrap at the end of the range, {low_g:.3g} to '
+                        f'{high_g:.3g} g; record with a larger range')
+        return ''

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""The look at gravity while a recording is read, and while a live stream goes on."""
+
+from __future__ import annotations
+
+from adxl_ros.files.recording_columns import Recording, uncalibrated
+from adxl_ros.model.sensor import Sensor, to_volts
+from adxl_ros.signals.gravity_at_rest import GravityAtRest, of_volts, TURNED_COS
+from adxl_ros.signals.neighbouring_samples import NeighbouringSamples
+from adxl_ros.signals.rest_detection import datasheet_noise, RecordedRests, RestFinder, RestMean
+import numpy as np
+
+
+class RecordingLook:
+    """Looks at gravity and at neighbouring samples while a recording is read."""
+
+    def __init__(self, sensor: Sensor, first: Recording) -> None:
+        """Prepare for a recording of a sensor, calibrated or not, by its first block."""
+        self._sensor = sensor
+        # The same without coefficients, as the recording states it
+        self.unit = uncalibrated(sensor, first.stream_info, first.axes, first.rate_hz)
+        self.rests = RecordedRests(self.unit, first)
+        self._neighbours = NeighbouringSamples(self.unit.axes, first.rate_hz)
+
+    def feed(self, block: Recording) -> None:
+        """Add a block of the recording."""
+        self.rests.feed(block)
+        self._neighbours.feed(block.time_s, block.accel_mps2(self.unit))
+
+    def gravity(self) -> GravityAtRest:
+        """Return the length of gravity over the rests so far."""
+        self.rests.take()
+        rests = self.rests.detected
+        shape = len(rests), len(self.unit.axes)
+        mean_v = np.reshape([rest.mean_v for rest in rests], shape)
+        std_v = np.reshape([rest.std_v for rest in rests], shape)
+        is_calibrated = self._sensor.effects and self._sensor.axes == self.unit.axes
+        return of_volts(mean_v, std_v, self._sensor if is_calibrated else self.unit)
+
+    def neighbour_faults(self) -> list[str]:
+        """Return what is wrong between neighbouring samples, one line each."""
+        return self._neighbours.faults()
+
+
+LIVE_WINDOW_S = 4.0  # Newest samples in which a live stream may rest, s. Chosen: two short rests
+_OTHER_STREAM = 1.5  # Ratio of two lengths in one pose from which the driver has changed its unit
+_MOST_POSES = 20  # Newest poses of a live stream that are kept. Chosen: a tumble by hand
+
+
+class LiveLook:
+    """
+    Looks at gravity over the newest rests of a live stream.
+
+    The noise of readings in another unit is not that of the sensor, so that rests by the noise
+    that the stream shows tell the unit. In a vehicle such a rest may be a steady acceleration:
+    smaller errors count where the stream is as quiet as the sensor.
+    """
+
+    def __init__(self) -> None:
+        self._sensor: Sensor | None = None
+        # Rests of different poses, by whether their noise was learned from the stream
+        self._rests: dict[bool, list[RestMean]] = {}
+
+    def __call__(self, sensor: Sensor, rate_hz: float, stamps_ns: np.ndarray,
+                 accel_mps2: np.ndarray) -> GravityAtRest:
+        """
+        Return the look at the rests so far.
+
+        sensor: what the samples are corrected by, at a rate, Hz; stamps_ns, accel_mps2: the
+        newest `LIVE_WINDOW_S` of the stream, ns, (n,), and m/s², (n, 3).
+        """
+        if sensor is not self._sensor:
+            self._sensor, self._rests = sensor, {True: [], False: []}
+        time_s = (stamps_ns - stamps_ns[:1].sum()) * 1e-9
+        volts = to_volts(accel_mps2[:, :len(sensor.axes)], sensor)
+        by_stream = self._look(sensor, RestFinder(
+            rate_hz, len(sensor.axes), datasheet_noise(sensor), learn=True), time_s, volts)
+        if by_stream.fault is not None and by_stream.fault.is_clear:
+            return by_stream
+        return self._look(sensor, RestFinder(
+            rate_hz, len(sensor.axes), datasheet_noise(sensor), learn=False), time_s, volts)
+
+    def _look(self, sensor: Sensor, finder: RestFinder, time_s: np.ndarray, volts: np.ndarray
+              ) -> GravityAtRest:
+        """Add the rests of a window to those before, and look at all of them."""
+        finder.feed(time_s, volts)
+        rests = finder.rests()
+        for found in map(RestMean, rests, *finder.means(rests)):
+            self._rests[finder.learn] = _with_rest(self._rests[finder.learn], found, sensor)
+        kept = self._rests[finder.learn]
+        shape = len(kept), len(sensor.axes)
+        return of_volts(np.reshape([rest.mean_v for rest in kept], shape),
+                        np.reshape([rest.std_v for rest in kept], shape), sensor)
+
+
+def _with_rest(rests: list[RestMean], found: RestMean, sensor: Sensor) -> list[RestMean]:
+    """Add a rest: one in the pose of an earlier one replaces it; a new length replaces all."""
+    def force_v(rest: RestMean) -> np.ndarray:
+        return rest.mean_v - sensor.nominal_zero_g_v
+
+    length_v = max(float(np.linalg.norm(force_v(found))), np.finfo(float).tiny)
+    others = []
+    for rest in rests:
+        other_v = max(float(np.linalg.norm(force_v(rest))), np.finfo(float).tiny)
+        if force_v(rest) @ force_v(found) < TURNED_COS * length_v * other_v:
+            others.append(rest)
+        elif not 1 / _OTHER_STREAM < length_v / other_v < _OTHER_STREAM:
+            return [found]
+    return [*others[1 - _MOST_POSES:], found]

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Faults between neighbouring samples: repeats, alternating rows, counts that wrap, jumps."""
+
+from adxl_ros.model.constants import G0_MPS2 as G
+from adxl_ros.signals.neighbouring_samples import NeighbouringSamples
+import numpy as np
+import pytest
+
+RATE_HZ = 100.0
+
+
+def faults(samples: np.ndarray, block: int = 10_000) -> list[str]:
+    looked = NeighbouringSamples('xyz'[:samples.shape[1]], RATE_HZ)
+    time_s = np.arange(len(samples)) / RATE_HZ
+    for i in range(0, len(samples), block):
+        looked.feed(time_s[i:i + block], samples[i:i + block])
+    return looked.faults()
+
+
+def turning(count: int = 4000, noise_mps2: float = 0.02) -> np.ndarray:
+    """Return a sensor that turns slowly about x."""
+    angle = np.linspace(0, 6, count)
+    force = G * np.column_stack([0 * angle, np.sin(angle), np.cos(angle)])
+    return force + np.random.default_rng(1).normal(0, noise_mps2, force.shape)
+
+
+@pytest.mark.parametrize('block', [50, 333, 10_000])
+def test_a_sound_sensor(block: int) -> None:
+    assert faults(turning(), block) == []
+
+
+@pytest.mark.parametrize(('step_mps2', 'noise_mps2'), [(0.04, 0.001), (0.04, 0.02), (0.3, 0.05)])
+def test_coarse_codes_repeat_by_chance(step_mps2: float, noise_mps2: float) -> None:
+    assert faults(np.round(turning(noise_mps2=noise_mps2) / step_mps2) * step_mps2) == []
+
+
+@pytest.mark.parametrize('block', [50, 333, 10_000])
+@pytest.mark.parametrize('times', [2, 7, 50])
+def test_readings_that_stand_for_several_samples(times: int, block: int) -> None:
+    found, = faults(np.repeat(turning(2000), times, axis=0), block)
+    assert f'{times} samples' in found and f'{RATE_HZ / times:.4g} readings' in found
+
+
+def test_a_host_that_polls_faster_than_the_sensor() -> None:
+    polled = turning()[(np.arange(8000) / 2.5).astype(int)]
+    found, = faults(polled)
+    assert '2.5 samples' in found
+
+
+@pytest.mark.parametrize('sensors', [2, 3])
+@pytest.mark.parametrize('differ', [[0.3, -0.2, 0.1], [G, 0, -G]])
+def test_rows_of_several_sensors_in_turn(sensors: int, differ: list[float]) -> None:
+    samples = turning()
+    for phase in range(sensors):
+        samples[phase::sensors] += phase * np.array(differ)
+    found, = [text for text in faults(samples) if 'alternate' in text]
+    assert f'{sensors} sensors' in found
+
+
+@pytest.mark.parametrize('shake_g', [0.4, 0.9])
+def test_counts_that_wrap(shake_g: float) -> None:
+    true_g = np.random.default_rng(3).normal(0, shake_g, (6000, 3)) + [0, 0, 1]
+    true_g[:2000] = [0, 0, 1]
+    true_g += np.random.default_rng(4).normal(0, 0.004, true_g.shape)
+    counts = (np.round(true_g * 16384) + 32768) % 65536 - 32768
+    found, = [text for text in faults(counts / 16384 * G) if 'wrap' in text]
+    assert '4 g' in found
+
+
+def test_shocks_and_a_sensor_that_clips_do_not_wrap() -> None:
+    true_g = turning(6000) / G
+    true_g[1000::500, 2] += 2.5
+    assert faults(np.clip(true_g, -2, 2 - 1 / 16384) * G) == []
+    shaken_g = true_g + np.random.default_rng(3).normal(0, 1.5, true_g.shape)
+    assert faults(np.clip(shaken_g, -2, 2 - 1 / 16384) * G) == []
+    assert faults(true_g * G) == []
+
+
+@pytest.mark.parametrize('signs', [[-1, -1, -1], [1, -1, -1]])
+@pytest.mark.parametrize('block', [50, 333, 10_000])
+def test_a_sensor_that_is_turned_over_between_two_samples(signs: list[int], block: int) -> None:
+    samples = turning()
+    samples[2000:] *= signs
+    found, = faults(samples, block)
+    assert 'at 19.99 s' in found
