@@ -326,7 +326,7 @@ class _Rests:
         if number and self._is_one:
             raise UserError(_ONE_RECORDING)
         if self._are_rows:
-            return poses_of_means(read, unit.sensor), ()
+            return poses_of_means(read, unit.sensor), (), []
         poses = extract_poses(read, unit.sensor, self._records)
         if self._table:
             poses = with_table_angles(poses, str(self._table))
