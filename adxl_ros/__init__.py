@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from adxl_ros.api.calibration import fit
     from adxl_ros.api.correction import apply
     from adxl_ros.api.gap import diagnose
+    from adxl_ros.api.noise import noise
     from adxl_ros.api.recordings import from_arrays, read
     from adxl_ros.api.sensors import load
     from adxl_ros.api.simulation import simulate
@@ -31,6 +32,7 @@ _MODULES = {
     'fit': 'api.calibration',
     'from_arrays': 'api.recordings',
     'load': 'api.sensors',
+    'noise': 'api.noise',
     'read': 'api.recordings',
     'simulate': 'api.simulation',
     'SensorModel': 'simulate.sensor_model',
@@ -39,7 +41,7 @@ _MODULES = {
 """Module of each name that `import adxl_ros` gives."""
 
 __all__ = [
-    'SensorModel', 'UserError', 'apply', 'diagnose', 'fit', 'from_arrays', 'load', 'read',
+    'SensorModel', 'UserError', 'apply', 'diagnose', 'fit', 'from_arrays', 'load', 'noise', 'read',
     'simulate',
 ]
 

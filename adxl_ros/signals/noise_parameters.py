@@ -435,7 +435,7 @@ class RecordingNoise:
     doubts: tuple[str, ...] = ()
 
 
-def recording_noise(read: Callable[[], Iterable[Recording]], params: str | None,
+def recording_noise(read: Callable[[], Iterable[Recording]], params: Sensor | str | None,
                     show: Callable[[float], None] = lambda done: None) -> RecordingNoise:
     """Fit the noise of all axes in the longest rest; `read` yields the blocks of a recording."""
     first = next(iter(read()), None)
