@@ -192,6 +192,16 @@ def written_log(folder: Path) -> list[str]:
     return ['log.csv', '--columns', XYZ_G]
 
 
+def test_the_advice_for_readings_in_g_works(run_tool, tmp_path) -> None:
+    text = plain_text([LOG.time_s, *LOG.output_g.T])
+    written(tmp_path, 'log.csv', text.replace('t,x,y,z', 'time_s,ax_mps2,ay_mps2,az_mps2', 1))
+    refused = run_tool('fit', 'log.csv', '-o', 'u.yaml')
+    assert refused.returncode == 1 and '--unit g' in refused.stderr
+    done = run_tool('fit', 'log.csv', '--unit', 'g', '-o', 'u.yaml')
+    assert done.returncode == 0, done.stderr
+    check_errors(tmp_path / 'u.yaml')
+
+
 def test_stamps_in_bursts(run_tool, tmp_path) -> None:
     """Eight samples share a stamp: refused and named; an index gives their times."""
     stamps = 0.08 * np.floor(LOG.time_s / 0.08 + 1e-9)
