@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from datetime import datetime, timedelta, timezone
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import write_text
@@ -31,6 +32,7 @@ _MATRIX_HEAD_PIXELS = 150
 """Heights of the matrix: of a unit with a name, of all units, and of the names of effects."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _SHOWN = 12  # Number of units in the first table and with a plot. Chosen: they fit on one screen
+_NAMED = 3  # Number of drifting units that a screen names. Chosen: some lines
 _MOST_ROWS = 50  # Largest count of outliers and of reasons on the page; the table holds them all
 _MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))
 """Columns that tell whether a unit is within the tolerance."""
@@ -105,7 +107,14 @@ def _matrix_figure(table: fleet.FleetTable, share: pd.DataFrame) -> plotly.Figur
                                 'title': {'text': 'unit'}})
 
 
-def write(folder: Path) -> list[Path]:
+class Written(NamedTuple):
+    """What a page is made of, for the end of a run."""
+
+    files: list[Path]  # The page, and the population
+    findings: list[str]  # Bad batches and drifts, the most urgent first, for people
+
+
+def write(folder: Path) -> Written:
     """Write page and population of a fleet beside its table."""
     html_page.check_libraries()
     table = fleet.read(folder / TABLE)
@@ -114,7 +123,26 @@ def write(folder: Path) -> list[Path]:
         result.quantity.column: result.population for result in results
         if result.population is not None and result.population.prediction_std > 0}))
     write_text(folder / PAGE, page(table, results, folder))
-    return [folder / name for name in (PAGE, POPULATION)]
+    return Written([folder / name for name in (PAGE, POPULATION)],
+                   [*_batches(results), *_drifting(fleet.rank(table, results))])
+
+
+def _batches(results: Sequence[fleet.QuantityResult]) -> list[str]:
+    """Return a sentence for each bad batch."""
+    return [f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
+            f'{result.quantity.label} that differs by '
+            + result.quantity.text(batch.difference, batch.low, batch.high) +
+            f' from that of the {(~batch.members).sum()} others: a bad batch.'
+            for result in results if (batch := result.batch) is not None]
+
+
+def _drifting(units: Sequence[fleet.UnitState]) -> list[str]:
+    """Return a sentence for the most urgent units that drift, and the number of all."""
+    drifting = [unit for unit in units if unit.drifts]
+    lines = [f'{unit.serial} drifts: {unit.drifts[0].text}.' for unit in drifting[:_NAMED]]
+    if len(drifting) > _NAMED:
+        lines.append(f'{len(drifting) - _NAMED} more units drift; the page has them.')
+    return lines
 
 
 def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folder: Path) -> str:
@@ -134,11 +162,6 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
     years = table.years[np.isfinite(table.years)]
     about = [f'{len(table)} recordings', f'{len(table.serials)} units',
              *([f'{date_text(years.min())} to {date_text(years.max())}'] if len(years) else [])]
-    batches = [f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
-               f'{result.quantity.label} that differs by '
-               + result.quantity.text(batch.difference, batch.low, batch.high) +
-               f' from that of the {(~batch.members).sum()} others: a bad batch.'
-               for result in results if (batch := result.batch) is not None]
     return html_page.render('adxl_ros.fleet', 'fleet.html', {
         'title': 'Fleet', 'about': about, 'badge': _badge(table, units, counts),
         'tiles': _tiles(table, counts), 'shown': _SHOWN, 'figures': figures,
@@ -147,7 +170,7 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
         'trends': [{'figure': f'trend-{i}', 'title': f'{unit.serial}: {result.quantity.label}',
                     'text': f'{unit.drifts[0].text}.' if unit.drifts else 'No slope is claimed.'}
                    for i, (unit, result) in enumerate(plotted)],
-        'batches': batches, 'has_effects': 'matrix' in figures, 'judged': len(share),
+        'batches': _batches(results), 'has_effects': 'matrix' in figures, 'judged': len(share),
         'outliers': _outlier_rows(table, results),
         'outlier_count': sum(int(result.is_outlier.sum()) for result in results),
         'refusals': _refusal_rows(table), 'most_rows': _MOST_ROWS,

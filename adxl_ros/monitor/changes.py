@@ -7,8 +7,9 @@ Changes of a running sensor: how they are found, recorded and diagnosed.
 false alarms. The mean of the newest blocks is compared with the mean of the blocks before, at many
 lengths. Such a difference is stationary for white noise, for flicker and for a random walk, as the
 Allan deviation is. So each length learns the usual size of its difference from the series itself,
-and correlated samples need no model. At rest, this size is at most that of a healthy walk: a ramp
-from the beginning would else be learnt as usual. The difference over its usual size follows
+and correlated samples need no model. At rest, this size is at most that of a healthy walk, which
+has bounds: a ramp from the beginning would else be learnt as usual, and one that takes hours would
+be less than an endless walk. The difference over its usual size follows
 Student's t. Its limit divides the permitted false alarms among all comparisons of a day
 (Bonferroni), so the rate is at most the stated one.
 
@@ -38,11 +39,13 @@ import numpy as np
 import scipy
 
 _DAY_S = 86400.0  # One day, s
-_LENGTHS = 10
-"""Number of lengths, each twice the one before. Chosen: of blocks of 1 s, 1 s to 8.5 minutes."""
+_LENGTHS = 14
+"""Number of lengths, each twice the one before. Chosen: of blocks of 1 s, 1 s to 2.3 hours: a
+drift is then seen that takes half a day."""
 _BEFORE = 4
 """Length of the mean before, divided by that of the newest mean. Chosen: white noise of a longer
 one adds less than an eighth; flicker grows with it."""
+LONGEST_BLOCKS = (1 + _BEFORE) * 2 ** (_LENGTHS - 1)  # Blocks of the longest comparison
 _PER_LENGTH = 4
 """Comparisons within a length of the newest mean. Chosen: more find a change a few percent
 earlier, and share the false alarms."""
@@ -84,16 +87,19 @@ class ChangeTest:
 
     false_alarms_per_day: largest permitted rate, of all series together; block_s: length of a
     block, s; walks: random walk of a healthy series, in its unit a root of a second, by series;
-    infinite where every drift is usual.
+    drifts: standard deviation that such a walk does not exceed, in the unit of the series. Both
+    are infinite where every drift is usual.
     """
 
     def __init__(self, channels: int, false_alarms_per_day: float, block_s: float = 1.0,
-                 walks: Sequence[float] = (np.inf,)) -> None:
-        self._channels, self._block_s, self._walks = channels, block_s, np.array(walks)
+                 walks: Sequence[float] = (np.inf,), drifts: Sequence[float] = (np.inf,)
+                 ) -> None:
+        self._channels, self._block_s = channels, block_s
+        self._walks, self._drifts = np.array(walks), np.array(drifts)
         comparisons = sum(_DAY_S / block_s / _stride(2 ** j) for j in range(_LENGTHS))
         # Permitted probability of a false alarm in one comparison
         self._p = min(_RESERVE * false_alarms_per_day / (comparisons * channels), 0.5)
-        self._size = (1 + _BEFORE) * 2 ** (_LENGTHS - 1) + 1
+        self._size = LONGEST_BLOCKS + 1
         # Sums up to each block; the place of a block is its number modulo the size.
         self._sums = np.zeros((self._size, channels))
         self._moves = np.zeros(self._size, int)
@@ -138,7 +144,8 @@ class ChangeTest:
             # The variance of the difference of a walk's means is L/3 + 4·L/3 steps.
             walk = self._walks * np.sqrt((1 + _BEFORE) / 3 * length * self._block_s)
             shortest_std, shortest_factor = self._usual(kind, 0)
-            limit = np.minimum(limit, shortest_factor * np.hypot(shortest_std, walk))
+            drift = np.minimum(walk, self._drifts)
+            limit = np.minimum(limit, shortest_factor * np.hypot(shortest_std, drift))
         changed = valid & (np.abs(difference) > limit)
         self._waiting[j].append((self._count, kind, difference, valid & ~changed))
         return np.flatnonzero(changed).tolist()

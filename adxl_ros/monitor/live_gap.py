@@ -21,7 +21,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.monitor import reference_stream
-from adxl_ros.monitor.changes import ChangeTest, DiagnosisInput, GapChange
+from adxl_ros.monitor.changes import ChangeTest, DiagnosisInput, GapChange, LONGEST_BLOCKS
 from adxl_ros.monitor.reference_stream import Block, ReferenceKind
 from adxl_ros.report.quantities import Interval
 import numpy as np
@@ -46,8 +46,7 @@ independent, and Student's t is then near the normal."""
 _FEWEST_BLOCKS = 5  # Fewest blocks of a report; chosen: an interval needs some
 _CONFIDENCE = 0.9  # Probability of the intervals, as in all reports of the package
 _MG = 1e-3 * G0_MPS2  # One mg, m/s²
-_MEMORY = 4096
-"""Blocks whose stamps are known; chosen: more than the longest comparison of the test."""
+_HEALTHY_S = 100.0  # Time over which the drift of a healthy unit is stated, s: its bounds
 _MOST_CHANGES = 100  # Changes in memory; chosen: the record on disk has all
 _OPEN = 1.1
 """Rms of the gap, divided by the floor, from which it is open. Chosen: the intervals alone would
@@ -108,13 +107,17 @@ class LiveGap:
         self.changes: list[GapChange] = []  # Changes so far, the newest last
         self._blocks: deque[Block] = deque(
             maxlen=max(round(settings.window_s * 1e9 / BLOCK_NS), _FEWEST_BLOCKS))
-        self._ends_ns: deque[int] = deque(maxlen=_MEMORY)
-        # Random walk of a healthy unit, or of its file if that is larger.
+        self._ends_ns: deque[int] = deque(maxlen=LONGEST_BLOCKS + 1)
+        # Random walk of a healthy unit, or of its file if that is larger: that of a file goes on.
+        healthy_g = effect_named('bias_walk').diagnosis.healthy_density
         walk_g = float(np.max(sensor.values.get('bias_walk', {}).get('density_g_per_rts', ()),
-                              initial=effect_named('bias_walk').diagnosis.healthy_density))
+                              initial=healthy_g))
+        drift_g = healthy_g * _HEALTHY_S ** 0.5 if walk_g == healthy_g else np.inf
         count = len(sensor.axes)
+        any_noise = (np.inf,) * count
         self._test = ChangeTest(2 * count, settings.false_alarms_per_day, BLOCK_NS * 1e-9,
-                                (G0_MPS2 * walk_g,) * count + (np.inf,) * count)
+                                (G0_MPS2 * walk_g,) * count + any_noise,
+                                (G0_MPS2 * drift_g,) * count + any_noise)
         self._changed_ns: dict[str, int] = {}
         self._prediction = reference_stream.Prediction(sensor, self.reference)
         self.left_out = self._prediction.left_out  # Effects that the reference cannot drive

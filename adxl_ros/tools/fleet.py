@@ -114,23 +114,24 @@ def fleet(options: argparse.Namespace) -> int:
                         rows.append({name: row[name] for name in _SHOWN})
         finally:
             # Ctrl-C leaves table and page of what is done.
-            files = _written(folder, results)
+            files, findings = _written(folder, results)
     is_repeated = any(row['outcome'] == 'crashed' or row['refused_by'] == 'stage' for row in rows)
-    cli.print_end([*_result_lines(rows, to_do), ''], files,
+    cli.print_end([*_result_lines(rows, to_do), '', *findings, *[''] * bool(findings)], files,
                   f'{command_of_this_process()} --only-failed' if is_repeated else '',
                   monotonic() - begin_s)
     return 1 if rows and not any(row['outcome'] == 'done' for row in rows) else 0
 
 
-def _written(folder: Path, results: Results) -> list[Path]:
-    """Write table and page, and return their files; a page that is not possible is reported."""
+def _written(folder: Path, results: Results) -> tuple[list[Path], list[str]]:
+    """Write table and page; return files and findings, or report that a page is not possible."""
     from adxl_ros.fleet import page  # only the end of a run needs it
-    files = [results.write_table()]
+    files, findings = [results.write_table()], list[str]()
     try:
-        files = [*page.write(folder), *files]
+        written = page.write(folder)
+        files, findings = [*written.files, *files], written.findings
     except UserError as error:
         cli.note(f'{PROG}: no page: {error}')
-    return [*files, folder / 'reports']
+    return [*files, folder / 'reports'], findings
 
 
 def _plan_lines(to_do: Plan, results: Results) -> list[str]:

@@ -42,6 +42,19 @@ def page_without(column, fleet, folder):
     return (folder / 'fleet.html').read_text()
 
 
+def test_the_end_of_a_run_names_batch_and_drifts(tmp_path):
+    fleets = {'batch': MadeUpFleet(units=24, per_unit=3, batch=6, batch_scale=1.05),
+              'drift': FLEETS['bad'], 'sound': FLEETS['sound']}
+    findings = {}
+    for name, fleet in fleets.items():
+        (tmp_path / name).mkdir()
+        fleet.write(tmp_path / name, seed=1)
+        findings[name] = ' '.join(fleet_page.write(tmp_path / name).findings)
+    assert '6 units with a serial number B… have a scale factor x' in findings['batch']
+    assert 'A-0003 drifts' in findings['drift']
+    assert findings['sound'] == ''
+
+
 @pytest.fixture
 def page(opened, folders):
     drawn, _ = opened(folders['bad'] / 'fleet.html', 1280)

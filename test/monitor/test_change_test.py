@@ -62,3 +62,38 @@ def test_motion_is_compared_with_motion() -> None:
     assert not run(test, rng.standard_normal((3000, 1)))
     assert not run(test, 30 * rng.standard_normal((40, 1)), moves=True)
     assert not run(test, rng.standard_normal((3000, 1)))
+
+
+WALK, DRIFT = 30.0, 300.0  # Of a healthy ADXL203, µg/√s and µg
+BLOCK_S = 10.0
+HOUR = 360  # Blocks of an hour
+
+
+def slow_series(blocks: int, channels: int, seed: int) -> np.ndarray:
+    """Return means of 10 s, µg, (blocks, channels): white noise, flicker, walk and daily swing."""
+    rng = np.random.default_rng(seed)
+    values = 78 / np.sqrt(BLOCK_S) * rng.standard_normal((blocks, channels))
+    values += np.column_stack([100 * flicker(rng, blocks) for _ in range(channels)])
+    values += np.sqrt(BLOCK_S) * np.cumsum(rng.standard_normal((blocks, channels)), axis=0)
+    day = np.arange(blocks)[:, None] / (24 * HOUR)
+    return values + 300 * np.sin(2 * np.pi * (day + rng.random(channels)))
+
+
+@pytest.mark.long
+def test_false_alarms_of_a_test_that_knows_slow_ramps() -> None:
+    """Ten sensors for two days, with one false alarm a day each."""
+    sensors, rate, days = 10, 1.0, 2
+    test = ChangeTest(3 * sensors, rate * sensors, BLOCK_S, walks=(WALK,), drifts=(DRIFT,))
+    alarms = run(test, slow_series(days * 24 * HOUR, 3 * sensors, 7))
+    assert len(alarms) <= poisson.isf(1e-3, rate * sensors * days)
+
+
+@pytest.mark.parametrize('mg_per_hour', [1.0, 4.0])
+def test_a_ramp_that_takes_hours_is_found(mg_per_hour: float) -> None:
+    """It goes on from the first second, so that nothing else is usual."""
+    test = ChangeTest(2, 1 / 30, BLOCK_S, walks=(WALK,), drifts=(DRIFT,))
+    values = slow_series(8 * HOUR, 2, 4)
+    values[:, 1] += np.arange(8 * HOUR) * mg_per_hour * 1e3 / HOUR
+    found = run(test, values)
+    assert {change.channel for _, change in found} == {1}
+    assert all(change.size > 1000 for _, change in found)
