@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -88,7 +89,7 @@ def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
     are correlated (AR(1), by Cochrane and Orcutt). An effect of the history, `thermal_lag` or
     `thermal_hysteresis`, is kept where it gains enough, and only after a reversal.
     """
-    temperature_c, axes = blocks.temperature_c, sensor.axes
+    temperature_c = blocks.temperature_c
     if len(temperature_c) < _FEWEST_BLOCKS:
         raise UserError(f'thermal: {len(temperature_c)} blocks at rest with a temperature, at '
                         f'least {_FEWEST_BLOCKS} are needed; record for longer')
@@ -99,33 +100,12 @@ def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
     turned = np.abs(np.diff(outputs_g, axis=0)).max(axis=1) > _TURN_G
     orientation = np.concatenate([[0], np.cumsum(turned)])
     span_k = float(np.ptp(temperature_c))
-
-    def fitted(history: str, shape: float) -> list[_Axis]:
-        # The output of a history, and its derivative by the shape.
-        low, output, high = (_history_output(blocks, history, shape * (1 + step))
-                             for step in (-_STEP, 0.0, _STEP)) if history else np.zeros((3, 1))
-        by_shape = (high - low) / (2 * _STEP * shape) if history else output
-        return [_fit_axis(axis, temperature_c, output_g, orientation, history, output, by_shape)
-                for axis, output_g in zip(axes, outputs_g.T)]
-
-    def score(history: str, shape: float) -> float:
-        """Return half of the BIC, as a gain."""
-        penalty = 0.5 * np.log(outputs_g.size) * (len(axes) + 1 if history else 0)
-        return sum(axis.log_likelihood for axis in fitted(history, shape)) - float(penalty)
-
-    best, highest = ('', 0.0), score('', 0.0) + _SMALLEST_GAIN
+    solver = _Solver(sensor.axes, blocks, outputs_g, orientation)
+    best = ('', 0.0)
     branch = stop(temperature_c, span_k * _REACHES[1], {})
     if with_history and branch.max() > 0.5 and branch.min() < -0.5:
-        for history, shapes in (('thermal_lag', _LAGS_S),
-                                ('thermal_hysteresis', _REACHES * span_k)):
-            likeliest = int(np.argmax([score(history, shape) for shape in shapes]))
-            bounds = np.log(shapes[[max(likeliest - 1, 0), min(likeliest + 1, len(shapes) - 1)]])
-            search = scipy.optimize.minimize_scalar(
-                lambda logarithm, history=history: -score(history, float(np.exp(logarithm))),
-                bounds=bounds, method='bounded', options={'xatol': 0.01})
-            if -search.fun > highest:
-                best, highest = (history, float(np.exp(search.x))), -search.fun
-    solved = fitted(*best)
+        best = solver.likeliest({'thermal_lag': _LAGS_S, 'thermal_hysteresis': _REACHES * span_k})
+    solved = solver(*best)
     residual_g = np.column_stack([axis.residual_g for axis in solved])
     curvature_k2 = np.array([value for axis in solved for name, value in zip(
         axis.names, axis.values) if name.parameter == 'per_k2'])
@@ -135,6 +115,44 @@ def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
         scipy.linalg.block_diag(*(axis.covariance for axis in solved)), *best,
         residual_g, next_degree(temperature_c, residual_g, curvature_k2),
         (float(temperature_c.min()), float(temperature_c.max())))
+
+
+@dataclass(frozen=True)
+class _Solver:
+    """Fits k blocks for an effect of the history and its shape; '' and 0 for none."""
+
+    axes: str
+    blocks: Poses
+    outputs_g: np.ndarray  # (k, m)
+    orientation: np.ndarray  # Number of the orientation of each block, (k,)
+
+    def __call__(self, history: str, shape: float) -> list[_Axis]:
+        """Return the fit of each axis."""
+        # The output of a history, and its derivative by the shape.
+        low, output, high = (_history_output(self.blocks, history, shape * (1 + step))
+                             for step in (-_STEP, 0.0, _STEP)) if history else np.zeros((3, 1))
+        by_shape = (high - low) / (2 * _STEP * shape) if history else output
+        return [_fit_axis(axis, self.blocks.temperature_c, output_g, self.orientation, history,
+                          output, by_shape) for axis, output_g in zip(self.axes, self.outputs_g.T)]
+
+    def score(self, history: str, shape: float) -> float:
+        """Return half of the BIC, as a gain."""
+        count = len(self.axes) + 1 if history else 0
+        penalty = 0.5 * float(np.log(self.outputs_g.size)) * count
+        return sum(axis.log_likelihood for axis in self(history, shape)) - penalty
+
+    def likeliest(self, shapes_of: Mapping[str, np.ndarray]) -> tuple[str, float]:
+        """Return the effect that gains enough, and its shape; the shapes are those to try."""
+        best, highest = ('', 0.0), self.score('', 0.0) + _SMALLEST_GAIN
+        for history, shapes in shapes_of.items():
+            place = int(np.argmax([self.score(history, shape) for shape in shapes]))
+            bounds = np.log(shapes[[max(place - 1, 0), min(place + 1, len(shapes) - 1)]])
+            search = scipy.optimize.minimize_scalar(
+                lambda logarithm, history=history: -self.score(history, float(np.exp(logarithm))),
+                bounds=bounds, method='bounded', options={'xatol': 0.01})
+            if -search.fun > highest:
+                best, highest = (history, float(np.exp(search.x))), -search.fun
+        return best
 
 
 def _history_output(blocks: Poses, effect: str, shape: float) -> np.ndarray:
