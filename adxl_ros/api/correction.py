@@ -56,6 +56,9 @@ class Correction:
         self.measured = given.measured
         check_unit(first.stream_info, first.axes, self.sensor)
         self._before = list(_effects_that_stay(self.sensor, undo_filter))
+        if self.sensor.mounting.get('rpy_rad'):
+            self._before.append('force and angles are those of the case: only the compensation '
+                                'turns them by mounting.rpy_rad of the parameters')
         self._estimator = RecordingEstimator(self.sensor, first, inverse == 'paper', undo_filter)
         self._counts: Counter[str] = Counter()
         self._beyond = BeyondRange()

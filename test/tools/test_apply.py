@@ -92,9 +92,10 @@ def test_force_and_angles_are_recovered(run_tool: RunTool, tmp_path: Path, axes:
 
 
 def test_unobservable_angles_are_empty_cells(run_tool: RunTool, tmp_path: Path) -> None:
-    sensor = unit()
-    table, _ = applied(run_tool, record(tmp_path, sensor, volts_of(
+    sensor = replace(unit(), mounting={'rpy_rad': [0.1, 0.0, 0.0]})
+    table, messages = applied(run_tool, record(tmp_path, sensor, volts_of(
         sensor, np.array([0.0, np.pi / 2, np.pi / 2]), np.array([1.0, 0.0, np.pi]))))
+    assert 'those of the case: only the compensation turns them' in messages
     assert [text == '' for text in table['beta_rad']] == [True, False, False]
     assert [text == 'inf' for text in table['beta_std_rad']] == [True, False, False]
     assert table['roll_rad'][1:] == ['', '']
