@@ -445,7 +445,7 @@ class _ColumnTable:
                      for name in variant.names]
         return np.array(stds)
 
-    def nuisances(self, channel: Mapping[int, np.ndarray]) -> dict[Coefficient, np.ndarray]:
+    def nuisances(self, channel: dict[int, np.ndarray]) -> dict[Coefficient, np.ndarray]:
         """Return the nuisance columns of a channel; of several, that of the smallest start."""
         return {self.names[k]: values for k, values in reversed(channel.items())
                 if hints_of(self.names[k]).nuisance}

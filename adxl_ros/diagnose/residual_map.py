@@ -66,7 +66,7 @@ class _Cell(NamedTuple):
     low: float
     high: float
     sums_mps2: np.ndarray  # Sum of the residual in each block of time, m/s², (blocks,)
-    count: float  # Number of samples
+    samples: float  # Number of samples
 
 
 def dimensions(comparison: BaselineComparison) -> dict[str, np.ndarray]:
@@ -108,7 +108,7 @@ def residual_map(comparison: BaselineComparison, seed: int) -> list[ResidualCell
     if not cells:
         return []
     sums = np.array([cell.sums_mps2 for cell in cells])
-    counts = np.array([cell.count for cell in cells])
+    counts = np.array([cell.samples for cell in cells])
     means = sums.sum(axis=1) / counts
     shares = np.minimum(means ** 2 * counts / max(float(np.sum(residual_mps2 ** 2)), 1e-300), 1.0)
     significant = [
