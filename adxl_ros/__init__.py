@@ -17,6 +17,7 @@ from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from adxl_ros.api.calibration import fit
+    from adxl_ros.api.checking import check
     from adxl_ros.api.correction import apply
     from adxl_ros.api.gap import diagnose
     from adxl_ros.api.noise import noise
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 _MODULES = {
     'apply': 'api.correction',
+    'check': 'api.checking',
     'diagnose': 'api.gap',
     'fit': 'api.calibration',
     'from_arrays': 'api.recordings',
@@ -41,8 +43,8 @@ _MODULES = {
 """Module of each name that `import adxl_ros` gives."""
 
 __all__ = [
-    'SensorModel', 'UserError', 'apply', 'diagnose', 'fit', 'from_arrays', 'load', 'noise', 'read',
-    'simulate',
+    'SensorModel', 'UserError', 'apply', 'check', 'diagnose', 'fit', 'from_arrays', 'load',
+    'noise', 'read', 'simulate',
 ]
 
 

@@ -7,6 +7,7 @@ import argparse
 import json
 from pathlib import Path
 
+from adxl_ros.api.result import make_folder
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.report import page
 from adxl_ros.tools import command_line as cli
@@ -59,7 +60,7 @@ def _check(options: argparse.Namespace, folder: Path) -> int:
     """Draw and seal the trials, diagnose and score them, and write the report."""
     with open_pool(options.scheduler, options.jobs) as pool:
         if not options.open:
-            cli.make_folder(folder)
+            make_folder(folder)
             arguments = options.seed, options.trials, pool, cli.progress
             digest = real_sensors.seal(folder, Path(options.real).resolve(), *arguments) \
                 if options.real else trials.seal(folder, trials.plans, trials.draw_trial,

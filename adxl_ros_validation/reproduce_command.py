@@ -10,6 +10,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+from adxl_ros.api.result import make_folder
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.poses import extract_poses
 from adxl_ros.calibrate.report import acceptance, page as unit_page
@@ -57,7 +58,7 @@ def reproduce(options: argparse.Namespace) -> int:
     folder = Path(options.output)
     page, screen = _of_recordings(sensor, options.recording, folder) if options.recording \
         else _simulated(sensor, options, folder)
-    cli.make_folder(folder)
+    make_folder(folder)
     write_text(folder / 'reproduction.md', page)
     further = cli.quoted(f'{folder}_coverage')
     cli.print_end([*screen, ''], [folder / 'reproduction.md', folder / FIGURES], '' if
@@ -79,7 +80,7 @@ def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> _Repro
         recordings.append(calibration.RecordedPoses(
             Path(path).name, extract_poses(read, unit)))
     result = calibration.calibrate(unit, recordings, 'full')
-    cli.make_folder(folder / FIGURES)
+    make_folder(folder / FIGURES)
     write_bytes(folder / FIGURES / 'sweep.png', png(unit_page.paper_figure(result)))
     lines = '\n'.join(result.comments())
     paper = f'The paper: alpha {in_words("alpha")}; beta {in_words("beta")}.'
@@ -102,7 +103,7 @@ def _simulated(sensor: Sensor, options: argparse.Namespace, folder: Path) -> _Re
                              np.random.default_rng([first, 0]))
     unit = experiments.calibrated(truth, first)
     pictures = folder / FIGURES
-    cli.make_folder(pictures)
+    make_folder(pictures)
     for name, figure in (('sweep', unit_page.draw_sweep(
                              experiments.bare(truth), unit.fitted['physical'], unit.poses)),
                          ('misalignment', draw_misalignment(*results['paper'][0].directions)),

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
+import os
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
@@ -394,9 +395,14 @@ def _noise(contents: RecordingContents) -> Ability:
 BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 
 
-def check_recording(path: str, params: str | None, reading: ReadingOptions,
-                    show: Callable[[float], None] = lambda done: None) -> Findings:
-    """Return the findings of a recording; one that cannot be read is not sound."""
+def check_recording(given: str | os.PathLike | Recording, params: Sensor | str | None,
+                    reading: ReadingOptions, show: Callable[[float], None] = lambda done: None
+                    ) -> Findings:
+    """Return the findings of a recording, or of its path; what cannot be read is not sound."""
+    if isinstance(given, Recording):
+        contents = examine([given], lambda block: load_sensor(params, block), None)
+        return replace(assess(contents), path=given.path)
+    path = os.fspath(given)
     try:
         delay_s = None
         if reading.rate_hz is None and recording.is_bag(path):

@@ -16,6 +16,7 @@ import textwrap
 from typing import TYPE_CHECKING
 
 from adxl_ros.api import recordings
+from adxl_ros.api.result import require_least
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
 from adxl_ros.files.atomic_write import is_own
@@ -28,7 +29,6 @@ from adxl_ros.report.screen import bar, COLUMNS, end_lines, entry_list, NextStep
 
 if TYPE_CHECKING:
     from adxl_ros.api.simulation import EffectInput
-    from adxl_ros.simulate.robot import RobotPath
 
 _BAR_COLUMNS = 24
 """Columns of a progress bar: names of stages and times stand beside it in 80 columns."""
@@ -103,13 +103,6 @@ def add_robot_options(parse: argparse.ArgumentParser) -> None:
                        help='its frame that carries the sensor (default: imu_link)')
     group.add_argument('--joints', metavar='TOPIC', default='',
                        help='topic of its joints (default: joint_states, or the only one)')
-
-
-def robot_path(options: argparse.Namespace, read: Recording, sensor: Sensor) -> RobotPath:
-    """Return the motion of the robot of a recording; the options name a URDF."""
-    from adxl_ros.simulate import robot
-    return robot.robot_path(options.urdf, options.frame, read.path, read.epoch_ns,
-                            sensor.local_gravity_mps2, options.joints)
 
 
 def reading_options(options: argparse.Namespace) -> ReadingOptions:
@@ -190,20 +183,10 @@ def note(text: str, paste: str = '') -> None:
     print(text, file=sys.stderr)
 
 
-def make_folder(folder: Path) -> None:
-    """Create a folder for the output of a tool, if it does not exist."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f'{folder}: cannot be made: {error.strerror}') from None
-
-
 def check_least(options: argparse.Namespace, **least: float) -> None:
     """Refuse numbers of options that are too small; an option that is not given has none."""
     for name, lowest in least.items():
-        value = getattr(options, name)
-        if value is not None and not value >= lowest:
-            raise UserError(f'--{name.replace("_", "-")} {value}: must be at least {lowest:g}')
+        require_least(name.replace('_', '-'), getattr(options, name), lowest)
 
 
 def add_overwrite_option(parse: argparse.ArgumentParser, name: str = '--force') -> None:

@@ -11,6 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic
 
+from adxl_ros.api.result import make_folder
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.recording_columns import NO_UNIT
@@ -101,7 +102,7 @@ def fleet(options: argparse.Namespace) -> int:
         cli.print_end(_plan_lines(plan(sources, recipe, results, *selection), results), [],
                       command_of_this_process().replace(' --dry-run', ''))
         return 0
-    cli.make_folder(folder)
+    make_folder(folder)
     with only_client(folder):
         results = Results(folder)
         to_do, rows = plan(sources, recipe, results, *selection), []
