@@ -9,6 +9,7 @@ from pathlib import Path
 
 from adxl_ros.api.result import make_folder
 from adxl_ros.files.atomic_write import write_text
+from adxl_ros.process import command
 from adxl_ros.report import page
 from adxl_ros.tools import command_line as cli
 from adxl_ros.workers import open_pool
@@ -67,7 +68,7 @@ def _check(options: argparse.Namespace, folder: Path) -> int:
                                                  *arguments)
             print(f'SHA-256 of salt and labels: {digest}', flush=True)
         if options.seal:
-            cli.print_end([], [folder], cli.command(PROG, f'--open {cli.quoted(folder)}'))
+            cli.print_end([], [folder], command(PROG, f'--open {cli.quoted(folder)}'))
             return 0
         page.check_libraries()
         is_real = (folder / 'baseline').exists()

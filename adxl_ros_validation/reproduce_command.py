@@ -21,7 +21,7 @@ from adxl_ros.files.recording_columns import recorded_unit
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import package_version
+from adxl_ros.process import command, package_version
 from adxl_ros.report.figures import new_figure, png
 from adxl_ros.tools import command_line as cli
 from adxl_ros_validation import coverage, experiments
@@ -62,7 +62,7 @@ def reproduce(options: argparse.Namespace) -> int:
     write_text(folder / 'reproduction.md', page)
     further = cli.quoted(f'{folder}_coverage')
     cli.print_end([*screen, ''], [folder / 'reproduction.md', folder / FIGURES], '' if
-                  options.draws else cli.command('reproduce',
+                  options.draws else command('reproduce',
                                                  f'--draws 300 --units 0 -o {further}'))
     return 0
 
