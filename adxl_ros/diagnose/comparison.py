@@ -3,7 +3,8 @@
 A recording beside the simulation of its baseline, on the recording's own reference motion.
 
 Samples are left out where the reference is not known: its cells are empty, or it moves faster
-than its readings show.
+than its readings show. Others are left out because the sensor did not measure: they stand alone,
+repeat, or are no numbers. Each kind is counted, with its reason and its size.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.quantities import acceleration_text
 from adxl_ros.signals.block_statistics import held_values, true_runs
 from adxl_ros.simulate.motion import BAND_LIMITED_DEGREE, ForcePath, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import ChainMemo, Response
@@ -72,6 +74,7 @@ some periods of a shaker."""
 _LARGEST_ERROR = 0.3
 """Error of the force by the spline, divided by the noise, up to which a window is used. Chosen: it
 adds 4 % to the noise."""
+_USUAL_STEP = 1.5  # Largest step between two readings, in medians of all: halfway to two steps
 _SAME_MOTION = 2.0
 """Ratio of recorded and simulated motion from which one is an alias. Chosen: an alias below 0.2 of
 the rate has a ratio of 4."""
@@ -86,6 +89,24 @@ _JERK_S, _LARGEST_JERK = 0.1, 4.0
 """Time around a jerk of a robot that is left out, s, and error of the force, divided by the noise,
 from which it is one. Chosen: that of the splines' knots; the error of what stays is below the
 noise, rms, and the filter for errors weighs it."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Samples of a recording that are not compared, for one reason."""
+
+    reason: str  # For people
+    samples: int
+    duration_s: float
+    rms_mps2: float  # Recording minus baseline over them, m/s²; NaN where it is not known
+    # Effect of the sensor that they may show, '' where the library has none; None where the sensor
+    # measured, and the reference is not known
+    effect: str | None = None
+
+    @property
+    def power_mps2(self) -> float:
+        """Sum of their squares, mean over axes, (m/s²)²."""
+        return float(np.nan_to_num(self.samples * self.rms_mps2 ** 2))
 
 
 class Reference(Enum):
@@ -111,7 +132,10 @@ class BaselineComparison:
     # Samples that are used, (n,) bool; the others are missing, repeated or outliers, or their
     # reference is not known
     used: np.ndarray
+    # Samples of the sensor that stand alone or repeat, (n,) bool: no motion shows in them
+    disturbed: np.ndarray
     notes: tuple[str, ...] = ()  # What was corrected or left out, one line each, for people
+    left_out: tuple[LeftOut, ...] = ()  # What is not among `used`, by reason
     # Frequency above which the reference lacks half of the motion's power, Hz; None for none
     fading_hz: float | None = None
     # Signals that simulations of this recording share
@@ -140,6 +164,17 @@ class BaselineComparison:
     def joints(self) -> tuple[Path, Path] | None:
         """Paths of alpha and beta; None without a stage."""
         return (self.motion.alpha, self.motion.beta) if self.reference is Reference.STAGE else None
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Samples that are numbers and do not stand alone or repeat, (n,) bool."""
+        return np.isfinite(self.volts).all(axis=1) & ~self.disturbed
+
+    @property
+    def out_of_range(self) -> np.ndarray:
+        """Where measured samples are at a rail or beyond the stated range, (n, m) bool."""
+        return self.sensor.saturated(np.where(self.measured[:, None], self.volts,
+                                              self.sensor.nominal_zero_g_v))
 
     @property
     def surroundings(self) -> dict[str, np.ndarray]:
@@ -229,7 +264,7 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
     # Where another simulator moves from its first sample on, the filter has not settled.
     used = at_rest | (time_s > time_s[0] + SETTLING_S) | (reference is not Reference.SIMULATOR)
     return BaselineComparison(recording.path, time_s, volts, motion, sensor, reference, at_rest,
-                              used)
+                              used, np.zeros(len(time_s), bool))
 
 
 def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
@@ -243,7 +278,7 @@ def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
     return replace(comparison, motion=motion, memo=ChainMemo(), sensor=replace(
         comparison.sensor, rate_hz=rate_hz / every), **{
             name: getattr(comparison, name)[::every]
-            for name in ('time_s', 'volts', 'at_rest', 'used')})
+            for name in ('time_s', 'volts', 'at_rest', 'used', 'disturbed')})
 
 
 def _motion(recording: Recording, sensor: Sensor, volts: np.ndarray, sim: Motion | None
@@ -322,16 +357,40 @@ def _in_gaps(time_s: np.ndarray, read_s: np.ndarray, longest_s: float
                                    else 'left')))
 
 
-def leave_out(comparison: BaselineComparison, rows: np.ndarray, reason: str
-              ) -> BaselineComparison:
-    """Return a comparison that does not use some samples, and notes why and when."""
+def leave_out(comparison: BaselineComparison, rows: np.ndarray, reason: str,
+              effect: str | None = None) -> BaselineComparison:
+    """
+    Return a comparison that does not use some samples, and notes why, when and how many.
+
+    Samples that are left out for another reason already keep that one.
+    """
+    rows = rows & comparison.used
     if not rows.any():
         return comparison
     time_s, runs = comparison.time_s, true_runs(rows)
-    parts = ', '.join(f'{time_s[a]:.5g} to {time_s[b - 1]:.5g} s' for a, b in runs[:_NAMED_PARTS])
-    note = (f'left out: {comparison.dt_s * rows.sum():.3g} s '
-            f'({parts}{", ..." * (len(runs) > _NAMED_PARTS)}): {reason}')
-    return replace(comparison, used=comparison.used & ~rows, notes=(*comparison.notes, note))
+    residual_v = comparison.residual_v(comparison.sensor)[rows]
+    squares = (residual_v / comparison.scale_v_per_mps2)[np.isfinite(residual_v)] ** 2
+    left_out = LeftOut(reason, int(rows.sum()), float(comparison.dt_s * rows.sum()),
+                       float(np.sqrt(squares.mean())) if len(squares) else np.nan, effect)
+    parts = ', '.join(_span_text(time_s[a], time_s[b - 1]) for a, b in runs[:_NAMED_PARTS])
+    size = f'; they differ by {acceleration_text(left_out.rms_mps2)} rms' * bool(len(squares))
+    note = (f'left out: {left_out.samples} samples, {left_out.duration_s:.3g} s '
+            f'({parts}{", ..." * (len(runs) > _NAMED_PARTS)}): {reason}{size}')
+    return replace(comparison, used=comparison.used & ~rows, notes=(*comparison.notes, note),
+                   left_out=(*comparison.left_out, left_out))
+
+
+def _span_text(begin_s: float, end_s: float) -> str:
+    """Return a span of time, or the instant of one sample, for people."""
+    return f'{begin_s:.5g} to {end_s:.5g} s' if end_s > begin_s else f'{begin_s:.5g} s'
+
+
+def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Replace rows, (n, k), that are not used by straight lines between those that are."""
+    if used.all() or not used.any():
+        return data
+    number, kept = np.arange(len(used)), np.flatnonzero(used)
+    return np.column_stack([np.interp(number, kept, column[kept]) for column in data.T])
 
 
 def without_gaps(comparison: BaselineComparison) -> BaselineComparison:
@@ -427,55 +486,104 @@ def _without_jerks(comparison: BaselineComparison, force: Any, noise_g: float
         'mg); move more smoothly, or record the joints at a higher rate')
 
 
-def without_fast_motion(comparison: BaselineComparison, columns: dict[str, np.ndarray]
-                        ) -> BaselineComparison:
-    """Leave out samples at which the reference moves faster than its readings show."""
+@dataclass(frozen=True)
+class _Readings:
+    """The readings of a reference, and the splines that follow them."""
+
+    name: str  # For people
+    time_s: np.ndarray  # Times of the readings, s, (k,)
+    values: np.ndarray  # Readings, (k, components)
+    degrees: tuple[int, int]  # Degrees of two splines: where they agree, they show the motion
+    order: int  # Derivative of the splines that is the force, g
+    step_g: float  # Step of the readings
+
+    def error_g(self, time_s: np.ndarray) -> np.ndarray:
+        """Return the difference between the splines, g, (n,), by that between readings."""
+        middle_s = (self.time_s[1:] + self.time_s[:-1]) / 2
+        first, second = (scipy.interpolate.make_interp_spline(
+            self.time_s, self.values, degree)(middle_s, self.order) for degree in self.degrees)
+        return np.interp(time_s, middle_s, np.abs(first - second).max(axis=1))
+
+    def lacks(self, time_s: np.ndarray) -> np.ndarray:
+        """Return where readings are missing between their neighbours, (n,) bool."""
+        steps_s = np.diff(self.time_s)
+        after = np.clip(np.searchsorted(self.time_s, time_s, 'right') - 1, 0, len(steps_s) - 1)
+        return (steps_s > _USUAL_STEP * np.median(steps_s))[after]
+
+
+def _readings(comparison: BaselineComparison, columns: dict[str, np.ndarray]) -> list[_Readings]:
+    """Return the readings of another simulator, or of the joints that move."""
     sensor, time_s, force = comparison.sensor, comparison.time_s, comparison.motion.force
-    noise_g = float(np.min(noise.analog_std_v(sensor) / sensor.scale_v_per_g))
-    limit_g = _LARGEST_ERROR * max(noise_g, float(np.min(sensor.lsb_v / sensor.scale_v_per_g)))
-    # Name, times and readings of each reference, degrees of its splines, derivative and step.
-    references: list[tuple] = []
+    axes = len(sensor.axes)
     if isinstance(force, ForcePath):
-        if force.is_robot:
-            return _without_jerks(comparison, force, noise_g)
-        references = [(force.name, force.time_s, np.array(force(force.time_s)) / G0_MPS2,
-                       (3, 5), 0, 0.0)]
+        force_g = np.array(force(force.time_s)) / G0_MPS2
+        return [_Readings(force.name, force.time_s, force_g[:axes].T, (3, 5), 0, 0.0)]
+    found = []
     for joint, name in JOINTS.items() if comparison.joints else ():
         values = columns.get(name, np.zeros(0))
         read = np.isfinite(values)
-        if read.sum() > BAND_LIMITED_DEGREE and np.ptp(values[read]):
-            how = ((BAND_LIMITED_DEGREE - 2, BAND_LIMITED_DEGREE), 2, 0.0) if joint == 'shift' \
-                else ((3, 5), 0, sensor.stage_resolution_rad)
-            unit = G0_MPS2 if joint == 'shift' else 1.0
-            references.append((name, time_s[read], values[None, read] / unit, *how))
+        if read.sum() <= BAND_LIMITED_DEGREE or not np.ptp(values[read]):
+            continue
+        if joint == 'shift':
+            found.append(_Readings(name, time_s[read], values[read, None] / G0_MPS2, (
+                BAND_LIMITED_DEGREE - 2, BAND_LIMITED_DEGREE), 2, 0.0))
+        else:
+            found.append(_Readings(name, time_s[read], values[read, None], (3, 5), 0,
+                                   sensor.stage_resolution_rad))
+    return found
+
+
+def without_fast_motion(comparison: BaselineComparison, columns: dict[str, np.ndarray]
+                        ) -> BaselineComparison:
+    """
+    Leave out samples at which the reference moves faster than its readings show.
+
+    Rests that the sensor shows stay; a stage may move at an alias of its readings where it seems
+    to rest. Where readings are missing, or the output is beyond the range, that is the reason.
+    """
+    sensor, force = comparison.sensor, comparison.motion.force
+    noise_g = float(np.min(noise.analog_std_v(sensor) / sensor.scale_v_per_g))
+    if isinstance(force, ForcePath) and force.is_robot:
+        return _without_jerks(comparison, force, noise_g)
+    limit_g = _LARGEST_ERROR * max(noise_g, float(np.min(sensor.lsb_v / sensor.scale_v_per_g)))
     margin = np.ones(2 * round(_WINDOW_S / 2 * sensor.rate_hz) + 1)
-    for name, read_s, readings, degrees, order, step_g in references:
-        # Between the readings, where both splines agree, they show the motion.
-        middle_s = (read_s[1:] + read_s[:-1]) / 2
-        first, second = (scipy.interpolate.make_interp_spline(
-            read_s, readings[:len(sensor.axes)].T, k)(middle_s, order) for k in degrees)
-        error_g = np.interp(time_s, middle_s, np.abs(first - second).max(axis=1))
-        coarse = comparison.used & (error_g > np.hypot(limit_g, step_g))
-        if coarse.any():
-            coarse = np.convolve(_with_aliases(comparison, coarse, noise_g), margin, 'same') > 0.5
-            rate_hz = stamped_rate_hz(read_s)
-            comparison = leave_out(
-                comparison, coarse, f'{name} moves too fast for its {rate_hz:.4g} readings a '
-                f'second (error up to {1e3 * error_g[coarse].max():.2g} mg); read it at a higher '
-                'rate')
+
+    def near(rows: np.ndarray) -> np.ndarray:
+        return np.convolve(rows, margin, 'same') > 0.5
+
+    beyond = near(comparison.out_of_range.any(axis=1))
+    rests = comparison.at_rest if comparison.reference is Reference.SIMULATOR \
+        else np.zeros(len(comparison), bool)
+    for readings in _readings(comparison, columns):
+        error_g = readings.error_g(comparison.time_s)
+        coarse = comparison.used & ~rests & (error_g > np.hypot(limit_g, readings.step_g))
+        if not coarse.any():
+            continue
+        rows = near(_with_aliases(comparison, coarse, noise_g)) & ~rests
+        lacks = near(readings.lacks(comparison.time_s))
+        error = f'(error up to {1e3 * error_g[rows].max():.2g} mg)'
+        rate_hz = stamped_rate_hz(readings.time_s)
+        comparison = leave_out(comparison, rows & beyond, 'the output is beyond the range of '
+                               f'{sensor.range_g:g} g that the parameter file states, in motion '
+                               f'that {readings.name} does not follow {error}')
+        comparison = leave_out(comparison, rows & lacks,
+                               f'{readings.name} lacks readings there {error}')
+        comparison = leave_out(comparison, rows, f'{readings.name} moves too fast for its '
+                               f'{rate_hz:.4g} readings a second {error}; read it at a higher '
+                               'rate')
     return comparison
 
 
 def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: float
                   ) -> np.ndarray:
     """Extend samples to the seconds beside them that move otherwise than simulated, (n,) bool."""
-    sensor, signals_v = comparison.sensor, (comparison.volts,
-                                            comparison.simulated_v(comparison.sensor))
+    sensor, measured = comparison.sensor, comparison.measured
     length = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
     part = np.minimum(np.arange(len(coarse)) // length, max(len(coarse) // length - 1, 0))
     recorded, simulated = (np.sqrt([
-        noise_g ** 2 + np.bincount(part, c ** 2) / np.bincount(part) for c in np.nan_to_num(
-            np.diff(v / sensor.scale_v_per_g, axis=0, prepend=0.0)).T]) for v in signals_v)
+        noise_g ** 2 + np.bincount(part, c ** 2) / np.bincount(part) for c in np.diff(
+            bridged(v, measured) / sensor.scale_v_per_g, axis=0, prepend=0.0).T])
+        for v in (comparison.volts, comparison.simulated_v(sensor)))
     differs = np.any(np.abs(np.log(recorded / simulated)) > np.log(_SAME_MOTION), axis=0)
     touched = np.bincount(part, coarse) > 0
     extended = coarse.copy()
@@ -491,8 +599,9 @@ def fading_frequency_hz(comparison: BaselineComparison) -> float | None:
         return None
     sensor = comparison.sensor
     size = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
-    recorded_g, simulated_g = (np.nan_to_num(v / sensor.scale_v_per_g) for v in (
-        comparison.volts, comparison.simulated_v(sensor)))
+    recorded_g, simulated_g = (
+        bridged(v, comparison.measured) / sensor.scale_v_per_g
+        for v in (comparison.volts, comparison.simulated_v(sensor)))
     if len(recorded_g) < _FEWEST_WINDOWS * size // 2:
         return None
 

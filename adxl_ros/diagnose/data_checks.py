@@ -18,14 +18,16 @@ from itertools import product
 from os.path import basename
 from typing import NamedTuple
 
-from adxl_ros.diagnose import comparison as baseline, noise_effects
+from adxl_ros.diagnose import comparison as baseline, noise_effects, reference_checks
 from adxl_ros.diagnose.comparison import BaselineComparison, compare, Reference, SMALLEST_MOTION_G
 from adxl_ros.files.recording_columns import JOINTS, Recording, stamped_rate_hz
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.effects.base import Detector
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import gravity_at_rest
+from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.signals.gravity_at_rest import RestReadings
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import find_polarity_fault
@@ -93,6 +95,7 @@ jumps may have. Chosen: gaps of a lossy link are no fault of the clock."""
 _SMALLEST_RANGE_V, _SMALLEST_STEP_V, _DEAD_SHARE = 0.05, 1e-9, 1e-4
 """Range of an output that moves, V; step of an ADC that stands for none, V; and share of its
 simulated range that a wired axis covers. Chosen: 50 mg; rounding errors; any wrong unit."""
+_LONGEST_HOLD_S = 1.0  # Longest time that an output may keep one value in motion, s. Chosen
 _LARGEST_LEVEL_G = 1e3  # Largest median output, g. Chosen: above that of any sensor on a stage
 _UNIT_TOLERANCE = 0.1
 """Relative deviation of a gain from the ratio of two units. Chosen: above any scale error."""
@@ -293,16 +296,65 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
             comparison = evenly
             notes.append(f'stamps are uneven, and an even rate of {evenly.sensor.rate_hz:.6g} '
                          'Hz explains them: it is used')
+    comparison = replace(comparison, notes=tuple(notes))
+    try:
+        _check_output(comparison)
+        _check_simulator(comparison)
+    except DataFault as fault:
+        raise replace(fault, comparisons=(comparison,)) from None
     for rows, reason in left_out if comparison.joints else ():
         comparison = baseline.leave_out(comparison, rows, reason)
+    comparison = baseline.without_gaps(_without_disturbed(comparison))
     # What moves too fast is looked for where the reference is stated.
-    comparison = baseline.without_fast_motion(baseline.without_gaps(comparison), recording.columns)
+    comparison = baseline.without_fast_motion(comparison, recording.columns)
     fading_hz = baseline.fading_frequency_hz(comparison)
     if fading_hz is not None:
-        notes.append(f'the reference is smoother than the sensor: above {fading_hz:.3g} Hz it '
-                     'lacks motion that the recording has; effects that show in fast motion are '
-                     'not named')
-    return replace(comparison, notes=(*notes, *comparison.notes), fading_hz=fading_hz)
+        smoother = (f'the reference is smoother than the sensor: above {fading_hz:.3g} Hz it '
+                    'lacks motion that the recording has; effects that show in fast motion are '
+                    'not named')
+        comparison = replace(comparison, notes=(smoother, *comparison.notes))
+    return replace(comparison, fading_hz=fading_hz)
+
+
+def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
+    """Leave out what the sensor did not measure: no numbers, repeated, lone or stuck samples."""
+    faults, sensor = noise_effects.sample_faults(comparison), comparison.sensor
+    comparison = replace(comparison, disturbed=faults.repeated | faults.isolated)
+    comparison = baseline.leave_out(
+        comparison, ~np.isfinite(comparison.volts).all(axis=1), 'they are no numbers')
+    comparison = baseline.leave_out(comparison, faults.repeated, 'they repeat the one before',
+                                    noise_effects.effect_of(Detector.REPEATED_SAMPLES))
+    comparison = baseline.leave_out(
+        comparison, faults.isolated, 'they stand alone, away from the samples around them',
+        noise_effects.effect_of(Detector.ISOLATED_SAMPLES))
+    stuck = _stuck(comparison)
+    for axis, rows in zip(sensor.axes, stuck.T):
+        comparison = baseline.leave_out(
+            comparison, rows, f'{axis} does not change there, though the motion does', '')
+    beyond = comparison.out_of_range
+    for d in np.flatnonzero(beyond.any(axis=0)):
+        output_g = (comparison.volts[beyond[:, d], d] - sensor.zero_g_v[d]) \
+            / sensor.scale_v_per_g[d]
+        comparison = replace(comparison, notes=(
+            *comparison.notes, f'{sensor.axes[d]}: {len(output_g)} samples, up to '
+            f'{np.abs(output_g).max():.3g} g, are at a rail or beyond the range of '
+            f'{sensor.range_g:g} g that the parameter file states; set the range of the sensor'))
+    return comparison
+
+
+def _stuck(comparison: BaselineComparison) -> np.ndarray:
+    """Return where an axis keeps one value in motion that it should follow, (n, m) bool."""
+    volts, simulated_v = comparison.volts, comparison.simulated_v(comparison.sensor)
+    longest = max(round(_LONGEST_HOLD_S * comparison.sensor.rate_hz), 2)
+    stuck = np.zeros(volts.shape, bool)
+    for d, (values, expected) in enumerate(zip(volts.T, simulated_v.T)):
+        # An output that clips, or coarse codes in an extreme pose, hold the largest value.
+        held = np.diff(values, prepend=np.nan) == 0
+        held &= (values < np.nanmax(values)) & (values > np.nanmin(values))
+        for begin, end in true_runs(held & comparison.used):
+            if end - begin > longest and np.ptp(expected[begin:end]) > _SMALLEST_RANGE_V:
+                stuck[begin:end, d] = True
+    return stuck
 
 
 def _roughness(comparison: BaselineComparison) -> float:
@@ -419,29 +471,23 @@ class CheckedRecording(NamedTuple):
 
 def check_recording(comparison: BaselineComparison) -> CheckedRecording:
     """
-    Check a recording, and mark the samples that are not used; raise DataFault.
+    Check a recording beside its reference; raise DataFault.
 
     Where the codes of the ADC are coarser than stated, the baseline gets their number of bits.
     """
     search_comparison = baseline.at_search_rate(comparison)
-    _check_samples(comparison, search_comparison)
-    volts, time_s, sensor = comparison.volts, comparison.time_s, comparison.sensor
-    used = comparison.used & np.isfinite(volts).all(axis=1)
-    coarse = noise_effects.coarse_codes(volts, sensor)
-    if coarse is None:
-        used, detections = noise_effects.repeated_samples(volts, time_s, used, sensor)
+    if comparison.reference is Reference.NONE:
+        _check_rest(comparison, np.isfinite(comparison.volts).all(axis=1))
     else:
-        # Coarse codes repeat by themselves.
-        detections = [coarse]
-        bits = round(sensor.adc_bits - float(coarse.values['lost_bits']))
+        _check_axes(search_comparison)
+    faults, stated_bits = noise_effects.sample_faults(comparison), comparison.sensor.adc_bits
+    coarse = noise_effects.effect_of(Detector.COARSE_CODES)
+    for detection in [d for d in faults.detections if d.effect == coarse]:
         comparison, search_comparison = (
-            replace(c, sensor=replace(c.sensor, adc_bits=bits))
+            replace(c, sensor=noise_effects.with_bits(c.sensor, detection))
             for c in (comparison, search_comparison))
-    used, spikes = noise_effects.isolated_samples(volts, time_s, used, comparison.sensor)
-    every = round(sensor.rate_hz / search_comparison.sensor.rate_hz)
-    return CheckedRecording(replace(comparison, used=used),
-                            replace(search_comparison, used=used[::every]),
-                            tuple(detections), spikes, sensor.adc_bits)
+    return CheckedRecording(comparison, search_comparison, tuple(faults.detections),
+                            faults.possible_spikes, stated_bits)
 
 
 def check_length(comparisons: Sequence[BaselineComparison]) -> None:
@@ -449,13 +495,13 @@ def check_length(comparisons: Sequence[BaselineComparison]) -> None:
     used_s = sum(c.span_s * float(c.used.mean()) for c in comparisons)
     if used_s < SHORTEST_S and any(c.reference is not Reference.NONE for c in comparisons):
         raise DataFault('too_short', f'{used_s:.3g} of {sum(c.span_s for c in comparisons):.3g} s '
-                        'have a usable reference, which is too short for a verdict; record at '
+                        'can be compared, which is too short for a verdict; record at '
                         'least one minute, or see the note on what is left out', 'insufficient',
                         tuple(comparisons))
 
 
-def _check_samples(comparison: BaselineComparison, search_comparison: BaselineComparison) -> None:
-    """Refuse what makes a diagnosis of effects meaningless."""
+def _check_output(comparison: BaselineComparison) -> None:
+    """Refuse an output that no sensor has, before any sample is left out."""
     if len(comparison) < _FEWEST_SAMPLES:
         raise DataFault('too_short', f'{len(comparison)} samples are too few; a recording needs '
                         f'{_FEWEST_SAMPLES}', 'insufficient')
@@ -464,10 +510,6 @@ def _check_samples(comparison: BaselineComparison, search_comparison: BaselineCo
         raise DataFault('missing', f'{100 * (1 - finite.mean()):.0f} % of the samples are not '
                         'numbers; record again')
     _check_range(comparison, finite)
-    if comparison.reference is Reference.NONE:
-        _check_rest(comparison, finite)
-    else:
-        _check_axes(search_comparison)
     # No sensor can output more.
     level_g = np.abs(np.median(comparison.volts[finite], axis=0) - sensor.zero_g_v) \
         / sensor.scale_v_per_g
@@ -475,6 +517,16 @@ def _check_samples(comparison: BaselineComparison, search_comparison: BaselineCo
     if level_g[worst] >= _LARGEST_LEVEL_G:
         raise DataFault('unit', f'{sensor.axes[worst]} is at {level_g[worst]:.3g} g; correct the '
                         'unit of its column, or --params')
+
+
+def _check_simulator(comparison: BaselineComparison) -> None:
+    """Refuse another simulator whose errors no effect of the sensor describes."""
+    factor = reference_checks.wrong_dynamic_factor(comparison)
+    if factor is not None:
+        raise DataFault('reference', factor)
+    step = reference_checks.clock_step(comparison)
+    if step is not None:
+        raise DataFault('clock_jump', step)
 
 
 def _check_range(comparison: BaselineComparison, finite: np.ndarray) -> None:
@@ -499,6 +551,11 @@ def _check_range(comparison: BaselineComparison, finite: np.ndarray) -> None:
     if dead.any():
         raise DataFault('constant', f'{sensor.axes[int(np.argmax(dead))]} does not change with '
                         'motion or noise; check its wiring')
+    stuck = _stuck(comparison).mean(axis=0)
+    if stuck.max() > _LARGEST_MISSING_SHARE:
+        raise DataFault('constant', f'{sensor.axes[int(np.argmax(stuck))]} does not change for '
+                        f'{100 * stuck.max():.0f} % of the recording, though the motion does; '
+                        'check its wiring')
 
 
 def _check_rest(comparison: BaselineComparison, finite: np.ndarray) -> None:

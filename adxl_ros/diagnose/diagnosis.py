@@ -15,7 +15,14 @@ from typing import Any, NamedTuple
 from adxl_ros.diagnose import data_checks, next_experiment, noise_effects, verdict as rule
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.data_checks import CheckedRecording, DataFault
-from adxl_ros.diagnose.evidence import drifts_among, estimate_floor, NoiseFloor, used_by_block
+from adxl_ros.diagnose.evidence import (
+    block_edges,
+    BLOCKS,
+    drifts_among,
+    estimate_floor,
+    NoiseFloor,
+    used_by_block,
+)
 from adxl_ros.diagnose.flexible_functions import flexible_bases
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
@@ -29,6 +36,7 @@ from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_axes, with_neutral
 from adxl_ros.report.quantities import Interval
+from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate
 import numpy as np
@@ -150,7 +158,8 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     bases = [b for c, v in zip(compared, model.baseline_v) for b in flexible_bases(c, v)]
     verdict = rule.decide(
         evidence, lambda effects, drift: rule.reproducible_rest(fits[effects][drift], bases),
-        [d.effect for d in detections])
+        [d.effect for d in detections],
+        lambda effects: _simulate_again(model, search, effects))
     show_progress('5/5 report', 0.9)
     if verdict.status == 'no_gap' and not any(
             c.reference is Reference.SIMULATOR or (c.joints and not c.at_rest.all()) or any(
@@ -172,9 +181,16 @@ def check(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = 
     for recording in recordings:
         check_unit(recording.stream_info, recording.axes, sensor)
         data_checks.check_gravity(recording, sensor, sim)
-    compared = [data_checks.compare_checked(r, sensor, sim, align) for r in recordings]
-    data_checks.check_length(compared)
-    return [data_checks.check_recording(comparison) for comparison in compared]
+    compared: list[BaselineComparison] = []
+    try:
+        for recording in recordings:
+            compared.append(data_checks.compare_checked(recording, sensor, sim, align))
+        data_checks.check_length(compared)
+        return [data_checks.check_recording(comparison) for comparison in compared]
+    except DataFault as fault:
+        # The notes of all recordings say what was corrected or left out before.
+        of_fault = [c for c in fault.comparisons if not any(c is other for other in compared)]
+        raise replace(fault, comparisons=(*compared, *of_fault)) from None
 
 
 def material_mps2(model: LinearModel, floor: NoiseFloor, material_mg: float = MATERIAL_MG
@@ -204,6 +220,37 @@ def _held_out(model: LinearModel, search: Search, floor: NoiseFloor, count: floa
             d: f for d, f in fits.items()
             if f.drift_mps2 ** 2 <= _DRIFT_LIMIT * max(left, 0.0)}
     return out
+
+
+def _simulate_again(model: LinearModel, search: Search, effects: frozenset[str]
+                    ) -> rule.SimulatedAgain:
+    """Simulate a set as it is printed in all recordings, and as it was fitted at their rests."""
+    hypothesis = search.found[effects]
+    printed = _as_printed(hypothesis, with_neutral(model.baseline, hypothesis.effects))
+    squares, more_at_rest, resting = np.zeros(BLOCKS), list[float](), 0
+    for c in model.comparisons:
+        left, fitted, without = (
+            np.mean((c.residual_v(s) / c.scale_v_per_mps2) ** 2, axis=1) * c.used
+            for s in (printed, hypothesis.sensor, search.found[frozenset()].sensor))
+        left[~c.used] = 0.0
+        squares += np.add.reduceat(left, block_edges(len(c))[:-1])
+        rests = true_runs(c.at_rest & c.used) if c.reference is not Reference.NONE else []
+        more_at_rest += [float(np.sum((fitted - without)[a:b])) for a, b in rests]
+        resting += sum(b - a for a, b in rests)
+    return rule.SimulatedAgain(squares, np.array(more_at_rest), float(resting),
+                               hypothesis.at_bound)
+
+
+def _as_printed(hypothesis: Hypothesis, sensor: Sensor) -> Sensor:
+    """
+    Give a sensor, which has the effects of a hypothesis, their fitted values.
+
+    A size that these recordings do not determine would be a guess in others.
+    """
+    hidden = [name for name, is_open in zip(hypothesis.names, hypothesis.undetermined)
+              if is_open and parameter_of(name).is_size]
+    fitted = {e: hypothesis.sensor.values[e] for e in hypothesis.effects}
+    return put(replace(sensor, values={**sensor.values, **fitted}), hidden, get(sensor, hidden))
 
 
 def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline: Sensor,
@@ -248,12 +295,8 @@ def _named_sensor(verdict: Verdict, best: Hypothesis, detections: Sequence[Detec
                         np.abs(value - from_file.values[e][p]).max() > smallest_v
                         for p, value in fitted.values[e].items()))]
         sensor = with_neutral(sensor, straight)
-        # A size that these recordings do not determine would be a guess in others.
-        hidden = [name for name, is_open in zip(best.names, best.undetermined)
-                  if is_open and parameter_of(name).is_size]
-        before = get(sensor, hidden)
-        sensor = put(replace(sensor, values={**sensor.values, **{
-            e: fitted.values[e] for e in (*best.effects, *straight)}}), hidden, before)
+        sensor = _as_printed(best, replace(sensor, values={
+            **sensor.values, **{e: fitted.values[e] for e in straight}}))
     in_noise = {d.effect: d.values for d in detections}
     for drift in [e for e in drifts_among(library()) if e in verdict.named][:1]:
         densities = fits[drift].drift_densities()[:len(sensor.axes)]

@@ -33,7 +33,7 @@ from itertools import pairwise
 from math import sqrt
 from typing import NamedTuple
 
-from adxl_ros.diagnose.comparison import BaselineComparison, gravity_slopes
+from adxl_ros.diagnose.comparison import BaselineComparison, bridged, gravity_slopes
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named, library
@@ -429,14 +429,6 @@ def plain_grams(columns: np.ndarray, used: np.ndarray) -> np.ndarray:
 def block_edges(count: int) -> np.ndarray:
     """Return where the blocks of so many samples begin and end, (blocks + 1,)."""
     return np.linspace(0, count, BLOCKS + 1).astype(int)
-
-
-def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Replace rows, (n, k), that are not used by straight lines between those that are."""
-    if used.all() or not used.any():
-        return data
-    number, kept = np.arange(len(used)), np.flatnonzero(used)
-    return np.column_stack([np.interp(number, kept, column[kept]) for column in data.T])
 
 
 @dataclass(frozen=True)

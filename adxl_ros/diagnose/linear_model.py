@@ -481,16 +481,19 @@ def parts_at_rest(comparisons: Sequence[BaselineComparison],
     A calibration uses rests. It takes the straight-line part of an effect at its own rests for an
     error of zero-g and scale factor, and nothing of an effect that only acts in motion. The rests
     of the calibration differ from those of the recording, so that a share of the whole effect is
-    added.
+    added. Zero-g and scale factor that the baseline does not hold were not calibrated, and took
+    up nothing.
 
     columns: other columns of each channel by numbers below `count`; returns: by coefficient of
     zero-g or scale factor: the standard deviation of its part in one unit of each other column,
     in its own unit, (count,).
     """
     parts: dict[Coefficient, np.ndarray] = {}
+    calibrated = {*comparisons[0].sensor.effects}
     resting = [c.at_rest & c.used for c in comparisons for _ in c.sensor.axes]
     for nuisances, channel_columns, rests in zip(nuisance_columns, columns, resting):
-        lines = {name: c for name, c in nuisances.items() if hints_of(name).straight_line}
+        lines = {name: c for name, c in nuisances.items()
+                 if hints_of(name).straight_line and name.effect in calibrated}
         if not lines or not channel_columns:
             continue
         rows = rests if rests.any() else np.ones(len(rests), bool)

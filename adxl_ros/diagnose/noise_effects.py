@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from adxl_ros.diagnose.comparison import BaselineComparison, code_step_v
-from adxl_ros.diagnose.evidence import bridged
+from adxl_ros.diagnose.comparison import BaselineComparison, bridged, code_step_v
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD
 from adxl_ros.model.effects import effect_named, library
@@ -77,11 +76,16 @@ class Detection:
     power_mps2: float
 
 
+def effect_of(detector: Detector) -> str:
+    """Return the name of the effect that a detector finds."""
+    return next(e.name for e in library().values() if e.diagnosis.detector is detector)
+
+
 def _detection(detector: Detector, power_v2: np.ndarray | float, sensor: Sensor,
                **values: np.ndarray | float) -> Detection:
     """Return the detection of a detector's effect, with its mean square, V², (m,) or ()."""
-    name = next(e.name for e in library().values() if e.diagnosis.detector is detector)
-    return Detection(name, {key: np.asarray(value) for key, value in values.items()},
+    arrays = {key: np.asarray(value) for key, value in values.items()}
+    return Detection(effect_of(detector), arrays,
                      float(np.mean(power_v2 * (G0_MPS2 / sensor.scale_v_per_g) ** 2)))
 
 
@@ -114,10 +118,15 @@ def shortest_repeat(volts: np.ndarray, axes: int) -> int:
     return max(_REPEAT_SHORTEST, by_chance)
 
 
-def isolated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
-                     ) -> tuple[np.ndarray, list[Detection]]:
-    """Find single samples that deviate from the straight line between their neighbours."""
-    spikes, size_v = _spikes(volts, used, sensor)
+def isolated_samples(volts: np.ndarray, residual_v: np.ndarray, time_s: np.ndarray,
+                     used: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, list[Detection]]:
+    """
+    Find single samples that deviate from the straight line between their neighbours.
+
+    The residual does so, V, (n, m), and the recording itself, or the reference would be wrong.
+    """
+    spikes, size_v = _spikes(residual_v, code_step_v(volts), used, sensor)
+    spikes &= 2 * _deviation_v(volts) > _deviation_v(residual_v)
     if not spikes.any():
         return used, []
     rate_hz = spikes.sum() / len(sensor.axes) / float(time_s[-1] - time_s[0])
@@ -133,36 +142,75 @@ def residual_shows_spikes(spikes: Detection, residual_v: np.ndarray, used: np.nd
 
     Without this check, motion of the sensor may look like spikes, which are not among `used`.
     """
-    isolated, _ = _spikes(residual_v, np.isfinite(residual_v).all(axis=1), sensor)
+    isolated, _ = _spikes(residual_v, code_step_v(residual_v),
+                          np.isfinite(residual_v).all(axis=1), sensor)
     expected = float(spikes.values['rate_hz']) * len(sensor.axes) * len(used) / sensor.rate_hz
     return bool(isolated[~used].sum() > expected / 2)
 
 
-def _spikes(volts: np.ndarray, used: np.ndarray, sensor: Sensor
+def _deviation_v(volts: np.ndarray) -> np.ndarray:
+    """Return by how much each sample deviates from the line between its neighbours, V, (n, m)."""
+    around_v = np.roll(volts, _SPIKE_NEIGHBOUR, 0) + np.roll(volts, -_SPIKE_NEIGHBOUR, 0)
+    return np.nan_to_num(np.abs(volts - around_v / 2))
+
+
+def _spikes(volts: np.ndarray, steps_v: np.ndarray, used: np.ndarray, sensor: Sensor
             ) -> tuple[np.ndarray, np.ndarray]:
-    """Return isolated samples, (n, m) bool, and their median size by axis, V, (m,)."""
-    near, count = _SPIKE_NEIGHBOUR, len(volts)
-    deviation_v = np.abs(volts - (np.roll(volts, near, 0) + np.roll(volts, -near, 0)) / 2)
+    """
+    Return isolated samples, (n, m) bool, and their median size by axis, V, (m,).
+
+    steps_v: smallest change of the recorded output by axis, V, (m,): rounding is no spike.
+    """
+    near, count, deviation_v = _SPIKE_NEIGHBOUR, len(volts), _deviation_v(volts)
     isolated, size_v = np.zeros(volts.shape, bool), np.zeros(volts.shape[1])
     # The first samples after repeated or missing ones may step, which is no spike.
     undisturbed = np.convolve(used, np.ones(4 * near + 1), 'same') > 4 * near
     undisturbed[:near] = undisturbed[-near:] = False
     width = round(max(sensor.rate_hz * _SPIKE_LOCAL_S, _SPIKE_LOCAL_FEWEST))
     blocks = max(count // width, 1)
-    for d, (deviation, step_v) in enumerate(zip(deviation_v.T, code_step_v(volts))):
-        # The rounding of a file makes steps, which are no spikes.
-        std_v = max(MAD_TO_STD * np.nanmedian(deviation[used]), step_v, sensor.lsb_v)
+    for d, (deviation, step_v) in enumerate(zip(deviation_v.T, steps_v)):
+        std_v = max(MAD_TO_STD * np.median(deviation[used]), step_v, sensor.lsb_v)
         # Motion also deviates from the line, so that a spike must exceed its surroundings, too.
-        local_v = MAD_TO_STD * np.median(np.nan_to_num(deviation)[
-            :blocks * width].reshape(blocks, -1), axis=1)
+        local_v = MAD_TO_STD * np.median(
+            deviation[:blocks * width].reshape(blocks, -1), axis=1)
         local_v = np.interp(np.arange(count), (np.arange(blocks) + 0.5) * width, local_v)
         # The neighbours of a spike deviate by half of it.
         spikes = (deviation > SPIKE_STDS * np.maximum(local_v, std_v)) & undisturbed & (
-            deviation >= scipy.ndimage.maximum_filter1d(np.nan_to_num(deviation), 2 * near + 1))
+            deviation >= scipy.ndimage.maximum_filter1d(deviation, 2 * near + 1))
         if spikes.sum() >= _SPIKE_FEWEST:
             isolated[:, d] = spikes
             size_v[d] = float(np.median(deviation[spikes]))
     return isolated, size_v
+
+
+class SampleFaults(NamedTuple):
+    """What the samples themselves show of a sensor, before any effect on the mean is known."""
+
+    repeated: np.ndarray  # Samples that repeat the one before, (n,) bool
+    isolated: np.ndarray  # Samples that stand alone, (n,) bool
+    detections: list[Detection]  # Repeated samples or coarse codes
+    # Isolated samples; the residual of the best hypothesis must show them, too
+    possible_spikes: list[Detection]
+
+
+def sample_faults(comparison: BaselineComparison) -> SampleFaults:
+    """Find coarse codes, else repeated samples, and isolated samples of a recording."""
+    volts, time_s, sensor = comparison.volts, comparison.time_s, comparison.sensor
+    finite = np.isfinite(volts).all(axis=1)
+    coarse = coarse_codes(volts, sensor)
+    # Coarse codes repeat by themselves.
+    changing, detections = (finite, [coarse]) if coarse else \
+        repeated_samples(volts, time_s, finite, sensor)
+    if coarse:
+        sensor = with_bits(sensor, coarse)
+    regular, spikes = isolated_samples(volts, comparison.residual_v(comparison.sensor), time_s,
+                                       changing, sensor)
+    return SampleFaults(finite & ~changing, changing & ~regular, detections, spikes)
+
+
+def with_bits(sensor: Sensor, coarse: Detection) -> Sensor:
+    """Return the sensor with the number of bits that its codes show."""
+    return replace(sensor, adc_bits=round(sensor.adc_bits - float(coarse.values['lost_bits'])))
 
 
 def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
@@ -358,10 +406,11 @@ def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sen
     # By effect, quantity and unit: pairs of recorded and simulated values, one of each recording
     values: dict[tuple[str, str, str], list] = {}
     for c in comparisons if detections else ():
-        signals = [(c.volts, bridged(c.residual_v(mean_sensor), c.used)),
+        residual_v = c.residual_v(mean_sensor)
+        signals = [_Series(c.volts, residual_v, bridged(residual_v, c.used)),
                    _simulated(c, named_sensor, seed)]
         for detection in detections:
-            recorded, simulated = (list(_statistics(c, detection, *s)) for s in signals)
+            recorded, simulated = (list(_statistics(c, detection, s)) for s in signals)
             for (quantity, unit, value), (*_, other) in zip(recorded, simulated):
                 values.setdefault((detection.effect, quantity, unit), []).append((value, other))
     remainders: list[NoiseRemainder] = []
@@ -374,20 +423,29 @@ def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sen
     return remainders
 
 
-def _simulated(comparison: BaselineComparison, sensor: Sensor, seed: int
-               ) -> tuple[np.ndarray, np.ndarray]:
-    """Simulate the recording with noise: output, and noise about its mean, V, (n, m) each."""
+class _Series(NamedTuple):
+    """A recording, or a simulation with noise, V, (n, m) each."""
+
+    volts: np.ndarray  # Output
+    residual_v: np.ndarray  # Output minus the mean output
+    noise_v: np.ndarray  # The same without samples that repeat or stand alone
+
+
+def _simulated(comparison: BaselineComparison, sensor: Sensor, seed: int) -> _Series:
+    """Simulate the recording with noise."""
     at_rate, time_s = replace(sensor, rate_hz=comparison.sensor.rate_hz), comparison.time_s
     volts = Response(at_rate, comparison.motion, seed, float(time_s[0]))(time_s)
     # Spikes and repeated samples are left out, as those of the recording are.
     used, _ = repeated_samples(volts, time_s, np.ones(len(volts), bool), at_rate)
-    used, _ = isolated_samples(volts, time_s, used, at_rate)
-    return volts, bridged(volts - comparison.simulated_v(at_rate), used)
+    residual_v = volts - comparison.simulated_v(at_rate)
+    used, _ = isolated_samples(volts, residual_v, time_s, used, at_rate)
+    return _Series(volts, residual_v, bridged(residual_v, used))
 
 
-def _statistics(comparison: BaselineComparison, detection: Detection, volts: np.ndarray,
-                noise_v: np.ndarray) -> Iterator[tuple[str, str, np.ndarray]]:
+def _statistics(comparison: BaselineComparison, detection: Detection, series: _Series
+                ) -> Iterator[tuple[str, str, np.ndarray]]:
     """Yield quantity, unit and values by axis of what a detection shows, in one series."""
+    volts, residual_v, noise_v = series
     sensor, time_s, scale = comparison.sensor, comparison.time_s, comparison.scale_v_per_mps2
     detector = effect_named(detection.effect).diagnosis.detector
     finite = np.isfinite(volts).all(axis=1)
@@ -397,7 +455,7 @@ def _statistics(comparison: BaselineComparison, detection: Detection, volts: np.
     elif detector is Detector.NOISE_LEVEL:
         yield 'white noise', 'm/s^2', white_noise_v(noise_v, sensor) / scale
     elif detector is Detector.ISOLATED_SAMPLES:
-        spikes = isolated_samples(volts, time_s, finite, sensor)[1]
+        spikes = isolated_samples(volts, residual_v, time_s, finite, sensor)[1]
         values = spikes[0].values if spikes else {
             'rate_hz': np.zeros(1), 'amplitude_v': np.zeros(len(scale))}
         yield 'spikes per second and axis', '1/s', np.atleast_1d(values['rate_hz'])

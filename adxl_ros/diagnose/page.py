@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from adxl_ros.diagnose import report as words
-from adxl_ros.diagnose.comparison import BaselineComparison
+from adxl_ros.diagnose.comparison import BaselineComparison, bridged
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
-from adxl_ros.diagnose.evidence import bridged
 from adxl_ros.diagnose.residual_map import BLOCK_S, ResidualCell
 from adxl_ros.files import parameter_file
 from adxl_ros.model import noise

@@ -9,7 +9,7 @@ held-out figures.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, combinations
 from typing import NamedTuple
@@ -56,6 +56,7 @@ _LARGEST_GAIN_RATIO = 5.0  # What a fit in full may gain, divided by what the li
 _NEAR_START = 1.4
 """Largest ratio of the start of a size to the one at which the effect was simulated: the starts
 differ by factors of two."""
+_AT_BOUND = 1e-4  # Distance from a bound, as a share of the range, that is at it. Chosen: rounding
 _TIME_CONSTANTS = 4.0
 """Length of a recording that shows a time constant: its response is then complete to 2 %."""
 
@@ -81,6 +82,19 @@ class Hypothesis:
         sizes = [(name.effect, shows) for name, shows, is_open in zip(
             self.names, differs, self.undetermined) if parameter_of(name).is_size and not is_open]
         return frozenset(e for e, _ in sizes) - {e for e, shows in sizes if shows}
+
+
+    @property
+    def at_bound(self) -> bool:
+        """Whether a determined size is at the end of what its parameter can have: no result."""
+        for name, value, is_open in zip(self.names, get(self.sensor, self.names),
+                                        self.undetermined):
+            p = parameter_of(name)
+            margin = _AT_BOUND * (p.upper - p.lower)
+            within = p.lower + margin < value < p.upper - margin
+            if p.is_size and not is_open and not within and abs(value - p.neutral) > margin:
+                return True
+        return False
 
 
 def linearise(linear_model: LinearModel, effects: Sequence[str], sensor: Sensor,
@@ -266,8 +280,8 @@ class Search:
                     best.log_evidence - self.model.null_fit.log_evidence):
                 break
         best = self.best
-        for effect in {self.model.variants[i].effect for i in straight} - {*best.effects}:
-            if 0 < len(best.effects) < LARGEST_SET:
+        for effect in dict.fromkeys(self.model.variants[i].effect for i in straight):
+            if effect not in best.effects and 0 < len(best.effects) < LARGEST_SET:
                 self._add((*best.effects, effect), dict(zip(best.names, best.values)), {})
         show_share(0.8)
         for pair in self._rank(self.model, (), list(combinations(sorted(
@@ -278,15 +292,15 @@ class Search:
             self._complete(hypothesis.effects)
         show_share(1.0)
 
-    def _complete(self, effects: Iterable[str]) -> None:
+    def _complete(self, effects: Sequence[str]) -> None:
         """Fit a set without each of its effects, and these without each, and so on."""
         for effect in effects:
-            rest = frozenset(effects) - {effect}
-            if rest not in self.found:
+            fewer = tuple(e for e in effects if e != effect)
+            if frozenset(fewer) not in self.found:
                 start = self.found.get(frozenset(effects), self.best)
-                self._add(rest, dict(zip(start.names, start.values)), {}, -np.inf)
-            if rest in self.found:
-                self._complete(rest)
+                self._add(fewer, dict(zip(start.names, start.values)), {}, -np.inf)
+            if frozenset(fewer) in self.found:
+                self._complete(fewer)
 
     def _extend(self, best: Hypothesis) -> None:
         """Fit the further effects that gain most beside a set, ranked at its values."""
@@ -340,11 +354,11 @@ class Search:
             shapes |= {Coefficient(variant.effect, p): v for p, v in variant.shape.items()}
         self._add(effects, start, shapes)
 
-    def _add(self, effects: Iterable[str], start: Mapping[Coefficient, float],
+    def _add(self, effects: Sequence[str], start: Mapping[Coefficient, float],
              shapes: Mapping[Coefficient, float], lowest: float | None = None) -> None:
         """Fit and keep a set, unless it cannot be simulated, is singular or does not show."""
         try:
-            fitted = fit_hypothesis(self.model, tuple(effects), start, shapes,
+            fitted = fit_hypothesis(self.model, effects, start, shapes,
                                     self._lowest if lowest is None else lowest)
         except (UserError, np.linalg.LinAlgError):
             return

@@ -39,6 +39,9 @@ MATERIAL_SHARE_OF_NOISE = 0.1
 _SHARE_OF_SET, _SHARE_OF_FORM = 0.03, 0.1
 """Share of the explained power that each effect of a set must hold, and the same beside an effect
 whose form is not exact over the same variables."""
+_FORM_AT_REST, _REST_ERRORS = _SHARE_OF_FORM ** 2, 2.0
+"""Share of the explained power by which a set may make rests worse, and the same in standard
+errors: a tenth of its amplitude may be an error of its form."""
 _NATS = 3.0  # Held-out log likelihood that a further effect must gain
 _SMALLEST_P = 0.001
 """Probability of the increments of a drift below which they are of something else. Chosen: one
@@ -330,6 +333,17 @@ class Verdict:
 _NOTHING: frozenset[str] = frozenset()
 
 
+class SimulatedAgain(NamedTuple):
+    """What a set leaves when it is simulated; sums over samples, mean over axes, (m/s²)²."""
+
+    # Squares with the sizes that are printed, without its nuisance parameters, by block, (blocks,)
+    printed: np.ndarray
+    # Increase of the squares of the rests beside a simulation without effects, by rest, (rests,)
+    more_at_rest: np.ndarray
+    resting: float  # Number of samples at rest
+    at_bound: bool  # Whether a size is at the end of what its parameter can have
+
+
 @dataclass(frozen=True)
 class Evidence:
     """What the rule weighs; its methods return one value for each draw of the blocks."""
@@ -348,6 +362,8 @@ class Evidence:
     floor_mps2: float  # Noise floor, m/s²; infinite where it is assumed
     # Effects of each set none of whose sizes differs from 0
     sizeless: Mapping[frozenset[str], frozenset[str]] = field(default_factory=dict)
+    # The sets that could be the answer, simulated again, not linearised
+    again: Mapping[frozenset[str], SimulatedAgain] = field(default_factory=dict)
 
     def left(self, effects: frozenset[str]) -> np.ndarray:
         """Return the power above the noise floor that a set leaves."""
@@ -361,6 +377,28 @@ class Evidence:
     def mean(self, by_block: np.ndarray) -> np.ndarray:
         """Return the mean over samples of sums by block."""
         return self.weights @ by_block / np.maximum(self.weights @ self.counts, 1.0)
+
+    def is_refuted(self, effects: frozenset[str]) -> bool:
+        """
+        Determine whether a set cannot be, however much it explains.
+
+        The rests of the same recording contradict it, or a size is at its bound.
+        """
+        if not effects or effects not in self.again:
+            return False
+        again = self.again[effects]
+        more, count = again.more_at_rest, max(again.resting, 1.0)
+        error = float(np.sqrt(np.sum(more ** 2))) / count
+        explained = max(float(self.gain(effects, _NOTHING)[0]), 0.0)
+        smallest = max(self.material_power(1.0), _FORM_AT_REST * explained)
+        return again.at_bound or float(more.sum()) / count > smallest + _REST_ERRORS * error
+
+    def leaves_more(self, effects: frozenset[str], other: frozenset[str]) -> bool:
+        """Determine whether a set, as it is printed, leaves materially more than another."""
+        if not {effects, other} <= {*self.again}:
+            return False
+        more = self.mean(self.again[effects].printed - self.again[other].printed)
+        return float(more[0]) > self.material_power(1.0) and _low(more) > 0
 
     def gain(self, more: frozenset[str], less: frozenset[str]) -> np.ndarray:
         """Return by how much one set explains more power than another."""
@@ -407,11 +445,21 @@ def is_needed(evidence: Evidence, effects: frozenset[str], effect: str) -> bool:
 
 
 def minimal_sets(evidence: Evidence) -> list[frozenset[str]]:
-    """Return the sets all of whose effects are needed, the most probable first."""
+    """
+    Return the sets all of whose effects are needed, the most probable first.
+
+    Those that the rests refute are dropped; so is an alternative to the first one, or the first
+    one itself, that as it is printed leaves materially more than the other.
+    """
     kept = [effects for effects in evidence.candidates
             if all(effects - {e} in evidence.candidates and is_needed(evidence, effects, e)
-                   for e in effects)]
-    return sorted(kept, key=lambda effects: -evidence.nats(effects, _NOTHING)[0])
+                   for e in effects) and not evidence.is_refuted(effects)]
+    kept.sort(key=lambda effects: -evidence.nats(effects, _NOTHING)[0])
+    first = kept[0]
+    alternatives = [first, *(other for other in kept[1:] if len(other) == len(first)
+                             and not _predicts(evidence.nats(first, other)))]
+    dropped = [a for a in alternatives if any(evidence.leaves_more(a, b) for b in alternatives)]
+    return [effects for effects in kept if effects not in dropped]
 
 
 def drifts_beside(evidence: Evidence, effects: frozenset[str], rest: Rest) -> list[str]:
@@ -469,7 +517,8 @@ def _answer(evidence: Evidence, rest: Rest, rest_material: float, drifts: Sequen
     # the rest that the best set leaves; or that of errors of the reference in motion.
     smallest = max(left, evidence.errs_in_motion * evidence.reference_mps2 ** 2)
     rivals = [other for other in minimal[1:] if len(other) == len(best) and not (
-        _predicts(evidence.nats(best, other)) and float(evidence.gain(best, other)[0]) > smallest)]
+        _predicts(evidence.nats(best, other)) and float(evidence.gain(best, other)[0]) > smallest)
+        and not evidence.leaves_more(other, best)]
     groups = {group for e in best if len(group := frozenset({e}).union(
         *(other - best for other in rivals if e not in other))) > 1}
     certain = best.difference(*groups) | detected | {*named[:1]}
@@ -486,8 +535,16 @@ def _answer(evidence: Evidence, rest: Rest, rest_material: float, drifts: Sequen
 
 
 def decide(evidence: Evidence, rest_of: Callable[[frozenset[str], str], Rest],
-           detected: Sequence[str]) -> Verdict:
-    """Apply the rule to the figures, and to draws of their blocks."""
+           detected: Sequence[str],
+           simulate_again: Callable[[frozenset[str]], SimulatedAgain] | None = None) -> Verdict:
+    """
+    Apply the rule to the figures, and to draws of their blocks.
+
+    simulate_again: simulates a set that could be the answer.
+    """
+    if simulate_again is not None:
+        evidence = replace(evidence, again={
+            effects: simulate_again(effects) for effects in minimal_sets(evidence) if effects})
     best = minimal_sets(evidence)[0]
     rest = rest_of(best, HEALTHY)
     drifts = drifts_beside(evidence, best, rest)

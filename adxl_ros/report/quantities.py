@@ -98,6 +98,12 @@ def mg_text(value_mps2: float) -> str:
     return f'{value:.{2 if abs(value) < 10 else 1 if abs(value) < 100 else 0}f} mg'
 
 
+def acceleration_text(value_mps2: float) -> str:
+    """Return an acceleration, m/s², in mg, or in g where it is large."""
+    value_g = abs(value_mps2) / G0_MPS2
+    return f'{value_g:.3g} g' if value_g >= 1 else mg_text(value_mps2)
+
+
 def amplitude_text(power: float) -> str:
     """Return the root of a power, (m/s²)², in mg; a negative power counts as 0."""
     return mg_text(float(np.sqrt(max(power, 0.0))))

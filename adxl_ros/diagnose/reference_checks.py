@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""
+Errors of another simulator that come before any effect of the sensor.
+
+With a the acceleration of the case and g gravity, the specific force in the turned frame R is
+f = R·(a + g), and a simulator with k times the dynamic part states s = R·(k·a + g). Then
+(k·f − s)/(k − 1) = R·g has the length of gravity at all times, whatever the rotation was. Only
+the right k does so, where the recording has dynamics at all.
+
+A clock that steps gives its two sides different delays.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from adxl_ros.diagnose.comparison import BaselineComparison, bridged, Reference, SMALLEST_MOTION_G
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.report.quantities import mg_text
+from adxl_ros.simulate.motion import ForcePath
+import numpy as np
+import scipy
+
+_SMOOTHED_S = 0.1
+"""Length of the means in which the length of gravity is taken, s. Chosen: shorter than a move, and
+the noise of a sensor is then below a mg."""
+_FACTORS = (0.05, 20.0)  # Smallest and largest factor of the dynamic part that is looked for
+_RIGHT_FACTOR = 0.1
+"""Deviation from 1, relative, from which the factor of a dynamic part is wrong. Chosen: less may
+be the filter of a reference, which is an effect."""
+_SAME_LENGTH = 0.3
+"""Error of the length of gravity with the factor, divided by that without any dynamic part and by
+the gap, up to which the factor explains both. Chosen: filters and noise leave a part."""
+_SMALLEST_DYNAMICS_G = 5e-3
+"""Rms of the length of a force about that of gravity from which it has dynamics, g. Chosen: the
+errors of a healthy, uncalibrated sensor's zero-g are larger, but those of its length are less."""
+_BLOCK_S, _LARGEST_STEP_S = 5.0, 1.0
+"""Length of the parts whose delay is taken, s, and largest delay. Chosen: some moves; what the
+effect of a time offset covers."""
+_FEWEST_PARTS = 3
+"""Fewest parts on each side of a step of the clock. Chosen: they show their spread."""
+_SMALLEST_STEP_S, _STEP_STDS = 5e-3, 6.0
+"""Smallest step of a clock, s, and the same in standard deviations of the delays of the parts
+about their levels. Chosen: less is jitter; a drift has three."""
+_FOLLOWS = 0.95  # Correlation of a part with its reference from which its delay counts. Chosen
+
+
+def _smoothed_g(comparison: BaselineComparison, volts: np.ndarray) -> np.ndarray:
+    """Return means of an output of the sensor, g, (k, m), of samples that are used."""
+    sensor = comparison.sensor
+    length = max(round(_SMOOTHED_S * sensor.rate_hz), 1)
+    force_g = (bridged(volts, comparison.measured) - sensor.zero_g_v) / sensor.scale_v_per_g
+    return force_g[:len(force_g) // length * length].reshape(-1, length, len(sensor.axes)).mean(1)
+
+
+def wrong_dynamic_factor(comparison: BaselineComparison) -> str | None:
+    """Return what is wrong with the factor of a simulator's dynamic part; None if it is right."""
+    sensor, force = comparison.sensor, comparison.motion.force
+    if comparison.reference is not Reference.SIMULATOR or not isinstance(force, ForcePath) \
+            or force.is_robot or len(sensor.axes) < len(AXES):
+        return None
+    measured_g = _smoothed_g(comparison, comparison.volts)
+    stated_g = _smoothed_g(comparison, comparison.simulated_v(sensor))
+    gravity_g = sensor.local_gravity_mps2 / G0_MPS2
+
+    def length_error_g(log_factor: float) -> float:
+        """Return the rms error of the length of gravity, as a part of the difference."""
+        factor = np.exp(log_factor)
+        turned_g = np.linalg.norm(factor * measured_g - stated_g, axis=1)
+        return rms(turned_g - abs(factor - 1) * gravity_g)
+
+    def rms(values: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(np.square(values))))
+
+    gap_g = rms(measured_g - stated_g)
+    dynamics_g = min(rms(np.linalg.norm(g, axis=1) - gravity_g) for g in (measured_g, stated_g))
+    if min(gap_g, dynamics_g) < _SMALLEST_DYNAMICS_G:
+        return None
+    grid = np.linspace(np.log(_FACTORS[0]), np.log(_FACTORS[1]), 120)
+    start = float(min(grid, key=lambda v: length_error_g(v) / abs(np.expm1(v))))
+    step = float(grid[1] - grid[0])
+    best = float(scipy.optimize.minimize_scalar(
+        lambda v: length_error_g(v) / abs(np.expm1(v)),
+        bounds=(start - step, start + step), method='bounded').x)
+    factor = float(np.exp(best))
+    left_g = length_error_g(best) / abs(factor - 1)
+    if abs(factor - 1) < _RIGHT_FACTOR or left_g > _SAME_LENGTH * dynamics_g \
+            or length_error_g(best) > _SAME_LENGTH * gap_g:
+        return None
+    return (f'the dynamic part of {force.name} is {factor:.3g} times that of the recording, while '
+            f'its gravity agrees: with that factor, both hold a gravity of {gravity_g:.4g} g to '
+            f'{mg_text(left_g * G0_MPS2)} rms; check how the simulator differentiates its '
+            'velocity, and its time step')
+
+
+class _Delay(NamedTuple):
+    """The delay of a recording behind another simulator, in one part."""
+
+    time_s: float
+    delay_s: float
+
+
+def clock_step(comparison: BaselineComparison) -> str | None:
+    """Return when and how far the clock of a simulator steps; None where it does not."""
+    force = comparison.motion.force
+    if comparison.reference is not Reference.SIMULATOR or not isinstance(force, ForcePath) \
+            or force.is_robot:
+        return None
+    delays = _delays(comparison)
+    if len(delays) < 2 * _FEWEST_PARTS:
+        return None
+    delay_s = np.array([d.delay_s for d in delays])
+    places = range(_FEWEST_PARTS, len(delays) - _FEWEST_PARTS + 1)
+
+    def about_levels_s(place: int) -> np.ndarray:
+        return np.concatenate([part - np.median(part) for part in np.split(delay_s, [place])])
+
+    place = min(places, key=lambda k: float(np.abs(about_levels_s(k)).sum()))
+    before_s, after_s = (float(np.median(part)) for part in np.split(delay_s, [place]))
+    spread_s = 1.4826 * float(np.median(np.abs(about_levels_s(place))))
+    drift = np.polynomial.Polynomial.fit([d.time_s for d in delays], delay_s, 1)
+    about_drift_s = np.abs(delay_s - drift(np.array([d.time_s for d in delays]))).sum()
+    step_s = after_s - before_s
+    if abs(step_s) < max(_SMALLEST_STEP_S, _STEP_STDS * spread_s) \
+            or np.abs(about_levels_s(place)).sum() > about_drift_s / 2:
+        return None
+    return (f'the clock of {force.name} steps by {abs(step_s):.3g} s between '
+            f'{delays[place - 1].time_s:.4g} and {delays[place].time_s:.4g} s: the recording is '
+            f'{before_s:+.3g} s behind it before, and {after_s:+.3g} s after; simulate with one '
+            'clock, or cut both there and diagnose the parts')
+
+
+def _delays(comparison: BaselineComparison) -> list[_Delay]:
+    """Return the delays of the parts of a recording that move."""
+    sensor, measured = comparison.sensor, comparison.measured
+    every = max(1, round(sensor.rate_hz * 0.01))
+    rate_hz = sensor.rate_hz / every
+    measured_g, stated_g = (
+        (bridged(v, measured) / sensor.scale_v_per_g)[::every]
+        for v in (comparison.volts, comparison.simulated_v(sensor)))
+    time_s = comparison.time_s[::every]
+    length, margin = round(_BLOCK_S * rate_hz), round(_LARGEST_STEP_S * rate_hz)
+    delays = []
+    for begin in range(margin, len(time_s) - length - margin, length):
+        own = measured_g[begin:begin + length]
+        other = stated_g[begin - margin:begin + length + margin]
+        found = _delay_samples(own - own.mean(axis=0), other)
+        if found is not None:
+            delays.append(_Delay(float(time_s[begin + length // 2]), (margin - found) / rate_hz))
+    return delays
+
+
+def _delay_samples(own: np.ndarray, other: np.ndarray) -> float | None:
+    """Return the place in `other`, samples, where `own`, g, fits best; None where none fits."""
+    if np.sqrt(np.mean(own ** 2)) < SMALLEST_MOTION_G:
+        return None
+    window = np.ones(len(own))
+    products, squares = np.zeros((2, len(other) - len(own) + 1))
+    for a, b in zip(own.T, other.T):
+        b = b - b.mean()
+        products += scipy.signal.correlate(b, a, 'valid')
+        sums, powers = (scipy.signal.correlate(v, window, 'valid') for v in (b, b * b))
+        squares += powers - sums ** 2 / len(own)
+    # What is left after the best line: its smallest value shows the delay.
+    correlation = products / np.sqrt(np.maximum(squares, 1e-12) * np.sum(own ** 2))
+    best = int(np.argmax(correlation))
+    if correlation[best] < _FOLLOWS or not 0 < best < len(correlation) - 1:
+        return None
+    left, middle, right = 1 - correlation[best - 1:best + 2]
+    return best + float((left - right) / (2 * (left - 2 * middle + right)))
