@@ -32,6 +32,8 @@ from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import free_name, write_text
 from adxl_ros.files.recording_columns import NO_UNIT, Recording
 from adxl_ros.files.surroundings import assumed
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import command
 from adxl_ros.report.figures import axes_for
@@ -218,23 +220,28 @@ class Gap(Result):
         params, proposal = str(Path(folder) / PARAMETERS), report.next_experiment
         steps = []
         if proposal is not None:
-            both = ', and next_simulated.csv in the simulator' if compared.sim else ''
-            steps.append(NextStep(f'record next.csv{both}: {proposal.manoeuvre}, {proposal.why}',
+            both = f', and {proposal.stem}_simulated.csv in the simulator' \
+                if compared.sim else ''
+            steps.append(NextStep(f'record {proposal.stem}.csv{both}: {proposal.manoeuvre}, '
+                                  f'{proposal.why}',
                                   '' if proposal.beside_simulator else proposal.command))
         if proposal is not None and not proposal.concerns_reference:
             is_closed = self.verdict in ('explained', 'partly')
             is_alone = bool(is_closed or compared.sim or compared.urdf)
             given = {'--params': params if is_closed else compared.params,
-                     '--sim': 'next_simulated.csv' if compared.sim else '',
+                     '--sim': f'{proposal.stem}_simulated.csv' if compared.sim else '',
                      '--urdf': compared.urdf, '--frame': self._frame, '-o': f'{folder}_2'}
             before = () if is_alone else compared.recordings
             steps.append(NextStep(
                 'diagnose it' if is_alone else 'diagnose it together with this one',
-                _command((*before, 'next.csv'), given)))
-        # A new name: sim.csv may be the reference of this comparison.
-        words = 'rich', '--params', params, '-o', str(free_name('sim.csv'))
-        simulate = command('simulate', shlex.join(words))
-        return [*steps, NextStep('simulate the sensor as it was found', simulate)]
+                _command((*before, f'{proposal.stem}.csv'), given)))
+        if not any(effect_named(e).concern is Concern.REFERENCE for e in report.sensor.effects):
+            # The folder is of the diagnosis, so that no input is replaced.
+            simulated = free_name(Path(folder) / 'simulated.csv')
+            words = 'rich', '--params', params, '-o', str(simulated)
+            steps.append(NextStep('simulate the sensor as it was found',
+                                  command('simulate', shlex.join(words))))
+        return steps
 
     @property
     def _frame(self) -> str:

@@ -104,9 +104,14 @@ class LeftOut:
     effect: str | None = None
 
     @property
-    def power_mps2(self) -> float:
+    def squares_mps2(self) -> float:
         """Sum of their squares, mean over axes, (m/s²)²."""
         return float(np.nan_to_num(self.samples * self.rms_mps2 ** 2))
+
+    @property
+    def why(self) -> str:
+        """The reason without its figures."""
+        return self.reason.partition(' (')[0]
 
 
 class Reference(Enum):
@@ -548,7 +553,7 @@ def without_fast_motion(comparison: BaselineComparison, columns: dict[str, np.nd
     limit_g = _LARGEST_ERROR * max(noise_g, float(np.min(sensor.lsb_v / sensor.scale_v_per_g)))
     margin = np.ones(2 * round(_WINDOW_S / 2 * sensor.rate_hz) + 1)
 
-    def near(rows: np.ndarray) -> np.ndarray:
+    def near(rows: Any) -> np.ndarray:
         return np.convolve(rows, margin, 'same') > 0.5
 
     beyond = near(comparison.out_of_range.any(axis=1))

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from adxl_ros.diagnose import data_checks, next_experiment, noise_effects, verdict as rule
-from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
+from adxl_ros.diagnose.comparison import BaselineComparison, LeftOut, Reference, with_values
 from adxl_ros.diagnose.data_checks import CheckedRecording, DataFault
 from adxl_ros.diagnose.evidence import (
     block_edges,
@@ -83,6 +83,9 @@ class Report:
     baseline: Sensor  # The baseline
     sensor: Sensor  # The baseline with the effects whose closing is stated, ready for `simulate`
     linear_model: LinearModel  # The linear model of the recordings
+    # What was not compared and is larger than what is material, by reason; without the samples of
+    # effects that the verdict names
+    left_out: tuple[LeftOut, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -167,10 +170,29 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
                 for name, values in c.surroundings.items()) for c in model.comparisons):
         # Neither the sensor moves, nor does its temperature or supply change.
         verdict = replace(verdict, status='insufficient')
+    left_out = _material_left_out(checked, verdict)
+    if verdict.status == 'no_gap' and any(part.effect is not None for part in left_out):
+        # A fault of the sensor is no absence of a gap because its samples were removed.
+        verdict = replace(verdict, status='unknown')
     report = _report(checked, model, search, verdict, detections, floor, evidence,
                      fits[verdict.best], seed)
     show_progress('5/5 report', 1.0)
-    return Diagnosis(tuple(model.comparisons), tuple(c.comparison for c in checked), None, report)
+    return Diagnosis(tuple(model.comparisons), tuple(c.comparison for c in checked), None,
+                     replace(report, left_out=left_out))
+
+
+def _material_left_out(checked: Sequence[CheckedRecording], verdict: Verdict
+                       ) -> tuple[LeftOut, ...]:
+    """Return what was left out and is material, but for what the verdict names or explains."""
+    parts = []
+    for comparison in (c.comparison for c in checked):
+        for part in comparison.left_out:
+            # Knocks look like lone samples, and a reference that is smoother lacks them.
+            is_knock = bool(part.effect) and comparison.fading_hz is not None
+            if part.effect not in verdict.named and not is_knock and \
+                    part.squares_mps2 > verdict.material_mps2 ** 2 * len(comparison):
+                parts.append(part)
+    return tuple(parts)
 
 
 def check(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None,
@@ -309,11 +331,16 @@ def _named_sensor(verdict: Verdict, best: Hypothesis, detections: Sequence[Detec
 
 
 def _closure(verdict: Verdict, evidence: rule.Evidence, floor: NoiseFloor,
-             remainders: Sequence[NoiseRemainder], sensor: Sensor, seed: int) -> GapClosure:
-    """Return the gap before and after the best set, above the floor without noise-like effects."""
+             remainders: Sequence[NoiseRemainder], sensor: Sensor, removed_power: float,
+             seed: int) -> GapClosure:
+    """
+    Return the gap before and after the best set, above the floor without noise-like effects.
+
+    removed_power: mean square, (m/s²)², of samples that the sensor did not measure.
+    """
     best = verdict.best if verdict.closes else frozenset[str]()
     before, after = (evidence.mean(evidence.candidates[e][HEALTHY].figures.squares)
-                     for e in (frozenset[str](), best))
+                     + removed_power for e in (frozenset[str](), best))
     stated = noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2)
     stated_mps2 = float(np.sqrt(np.mean(stated ** 2)))
     draws = floor.draws_mps2(seed, len(before) - 1)
@@ -349,8 +376,12 @@ def _report(checked: Sequence[CheckedRecording], model: LinearModel, search: Sea
                                                       detections, seed))
     ranked = sorted(search.found.values(), key=lambda h: -h.log_evidence)
     sensors = {'before': (baseline, baseline), 'after': (best.sensor, sensor)}
+    removed = sum(part.squares_mps2 for c in comparisons for part in c.left_out
+                  if part.effect is not None)
+    removed_power = removed / sum(len(c) for c in comparisons)
     return Report(
-        verdict, _closure(verdict, evidence, floor, remainders, baseline, seed), floor,
+        verdict, _closure(verdict, evidence, floor, remainders, baseline, removed_power, seed),
+        floor,
         (best, *(h for h in ranked if h is not best)), tuple(detections), remainders,
         tuple(compare_noise(c, sensors, seed) for c in comparisons),
         tuple(residual_map(model.comparisons[0], seed)), lacking,

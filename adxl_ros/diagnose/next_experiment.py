@@ -19,7 +19,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from contextlib import suppress
-from itertools import combinations
+from itertools import combinations, count
+from pathlib import Path
 from typing import NamedTuple
 
 from adxl_ros.diagnose import comparison as beside, linear_model as linear, noise_effects
@@ -319,6 +320,7 @@ class NextExperiment(NamedTuple):
     # Whether the reference has to change, so that nothing can be simulated
     concerns_reference: bool = False
     beside_simulator: bool = False  # Whether another simulator makes its motion
+    stem: str = 'next'  # Name of its recording, without the extension, that no input has
 
 
 def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor: Sensor,
@@ -330,17 +332,18 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor
     """
     no_stage = model is not None and all(
         c.reference is Reference.SIMULATOR for c in model.comparisons)
+    stem = _free_stem([c.name for c in model.comparisons] if model else ())
     if any(effect_named(e).concern is Concern.REFERENCE for e in verdict.named):
         return NextExperiment(
             'the motion beside another reference, or one with less smoothing',
-            'because the error may be of the reference', _beside_other_reference(),
-            concerns_reference=True)
+            'because the error may be of the reference', _beside_other_reference(stem),
+            concerns_reference=True, stem=stem)
     if verdict.groups:
         ranked = _ranked_menu(verdict, sensor, model, seed)
         group, best = verdict.groups[0], ranked[0].name
         why = f'to separate {listed(group, "and")}'
         return _experiment(next(m for m, d in MENU.items() if d.text == best), why,
-                           no_stage)._replace(menu=ranked)
+                           no_stage, stem)._replace(menu=ranked)
     if verdict.status == 'no_gap' and not not_covered:
         return None
     why = 'to confirm the verdict on another recording'
@@ -351,7 +354,14 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor
     revealed_by = [effect_named(e).diagnosis.revealed_by for e in verdict.effects]
     usual = Manoeuvre.SPEEDS if verdict.status == 'unknown' or not not_covered \
         else Manoeuvre.PLANES
-    return _experiment(next(filter(None, revealed_by), usual), why, no_stage)
+    return _experiment(next(filter(None, revealed_by), usual), why, no_stage, stem)
+
+
+def _free_stem(recordings: Sequence[str]) -> str:
+    """Return the name of another recording, without its extension, that no input has."""
+    taken = {Path(name).stem for name in recordings}
+    return next(stem for number in count(1)
+                if (stem := 'next' if number == 1 else f'next_{number}') not in taken)
 
 
 def _ranked_menu(verdict: Verdict, sensor: Sensor, model: LinearModel | None, seed: int
@@ -369,21 +379,21 @@ def _ranked_menu(verdict: Verdict, sensor: Sensor, model: LinearModel | None, se
     return rank_responses(responses, verdict.hypotheses, model)
 
 
-def _experiment(manoeuvre: Manoeuvre, why: str, no_stage: bool) -> NextExperiment:
+def _experiment(manoeuvre: Manoeuvre, why: str, no_stage: bool, stem: str) -> NextExperiment:
     """Describe a manoeuvre with its command."""
     described, option = MENU[manoeuvre], ''
     if no_stage:
-        return NextExperiment(described.text, why, _beside_other_reference(),
-                              beside_simulator=True)
+        return NextExperiment(described.text, why, _beside_other_reference(stem),
+                              beside_simulator=True, stem=stem)
     if described.remounted:
         option = f' --effect {":".join(_half_turn())}={np.pi:.6f}'
     return NextExperiment(described.text, why, command(
-        'simulate', f'{described.trajectory}{option} -o next.csv'))
+        'simulate', f'{described.trajectory}{option} -o {stem}.csv'), stem=stem)
 
 
-def _beside_other_reference() -> str:
+def _beside_other_reference(stem: str) -> str:
     """Return the command for another recording beside another reference."""
-    return command('diagnose', 'next.csv --sim next_simulated.csv -o next')
+    return command('diagnose', f'{stem}.csv --sim {stem}_simulated.csv -o {stem}')
 
 
 def _half_turn() -> tuple[str, str]:

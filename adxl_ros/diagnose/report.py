@@ -14,10 +14,10 @@ from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.next_experiment import CouldShow, MENU
 from adxl_ros.diagnose.search import Hypothesis
 from adxl_ros.diagnose.verdict import Verdict
-from adxl_ros.model.constants import Z_90
+from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern
-from adxl_ros.model.sensor import fitted_of, get, parameter_of
+from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern, Need
+from adxl_ros.model.sensor import fitted_of, get, parameter_of, with_neutral
 from adxl_ros.report import quantities
 from adxl_ros.report.quantities import amplitude_text, Interval, listed, mg_text, percent
 from adxl_ros.report.screen import COLUMNS, wrapped
@@ -209,8 +209,9 @@ def badge(diagnosis: Diagnosis) -> str:
         assert diagnosis.fault is not None
         return 'BAD DATA' if diagnosis.fault.status == 'bad_data' else 'TOO LITTLE DATA'
     verdict = diagnosis.report.verdict
-    if verdict.status == 'explained' and concern(verdict) == Concern.REFERENCE.value:
-        return 'ERROR OF THE REFERENCE'
+    if verdict.status in ('explained', 'partly') and concern(verdict) == Concern.REFERENCE.value:
+        share = f', {percent(verdict.explained_share)}' if verdict.status == 'partly' else ''
+        return f'ERROR OF THE REFERENCE{share}'
     return {'no_gap': f'NO GAP above {mg_text(verdict.upper_limit_mps2)}',
             'insufficient': 'TOO LITTLE DATA', 'unknown': 'UNKNOWN CAUSE',
             'inseparable': 'CAUSES NOT SEPARATED',
@@ -232,17 +233,29 @@ def headline(diagnosis: Diagnosis) -> str:
     follows = f' It follows {listed(where, "and")}.' if where and verdict.rest.low > 0 else ''
     separate = ': the data do not separate them' if verdict.groups else ''
     noise = f' {NOISE_STAYS}' if is_only_noise(diagnosis.report) else ''
-    of_reference = ' This is an error of the reference, not of the sensor.' \
-        if concern(verdict) == Concern.REFERENCE.value else ''
+    in_reference = [e for e in verdict.effects
+                    if effect_named(e).concern is Concern.REFERENCE]
+    in_words = listed(in_reference, 'and')
+    of_reference = f' Error of the reference, not of the sensor: {in_words}.' if in_words else ''
     explained = f'Explained {sure} by {named}{separate}.{noise}{of_reference}'
-    return {'no_gap': f'No gap {sure}: one above {mg_text(verdict.upper_limit_mps2)} would have '
-                      'shown.',
-            'insufficient': 'No verdict: neither motion nor temperature nor supply changes, so '
-                            'that no effect can show.',
-            'unknown': f'Unknown {sure}: no effect of the library explains {rest}.{follows}',
-            'partly': f'Partly explained {sure}: {percent(share)} of the gap is {named}; '
-                      f'{percent(1 - share)} ({rest}) is something else.{follows}'
-                      f'{of_reference}'}.get(verdict.status, explained)
+    limit = mg_text(verdict.upper_limit_mps2)
+    sentence = {
+        'no_gap': f'No gap {sure}: one above {limit} would have shown.',
+        'insufficient': 'No verdict: neither motion nor temperature nor supply changes, so that '
+                        'no effect can show.',
+        'unknown': f'Unknown {sure}: no effect of the library explains {rest}.{follows}',
+        'partly': f'Partly explained {sure}: {percent(share)} of the gap is {named}; '
+                  f'{percent(1 - share)} ({rest}) is something else.{follows}{of_reference}'
+    }.get(verdict.status, explained)
+    return sentence + _left_out_text(diagnosis.report)
+
+
+def _left_out_text(report: Report) -> str:
+    """Say which samples a verdict is not about, where they would matter; empty for none."""
+    size = quantities.acceleration_text
+    texts = [f'{part.samples} samples ({size(part.rms_mps2)} rms), {part.why}'
+             for part in report.left_out]
+    return f' Not compared: {"; ".join(texts)}.' if texts else ''
 
 
 def concern(verdict: Verdict) -> str | None:
@@ -281,6 +294,7 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
     else:
         rows.append(Row('explained', quantities.power_text(verdict.explained), 'by ' + listed(
             sorted(verdict.best), 'and') if verdict.best else 'no effect on the mean'))
+    rows += beside_rows(report)
     rows.append(Row('repeats, not explained', quantities.power_text(verdict.rest),
                     'by flexible functions, held out'))
     rows += [Row('material', f'from {mg_text(verdict.material_mps2)}', 'smaller is no gap'),
@@ -295,6 +309,28 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
             amplitude_text(p) for p in (power.low, power.high)))
             for effect, power in verdict.lost_without.items()]
     return rows
+
+
+def beside_rows(report: Report) -> list[Row]:
+    """
+    Return how zero-g and scale factor changed beside the effects, where that is material.
+
+    A calibration may have taken them up of the effects, so that both belong together.
+    """
+    verdict, sensor, texts = report.verdict, report.sensor, list[str]()
+    straight = [e for e in library().values() if e.diagnosis.straight_line
+                and e.name in sensor.effects and e.name not in verdict.best]
+    for effect in straight if verdict.closes else ():
+        names = fitted_of(effect, sensor.axes)
+        before = get(with_neutral(report.baseline, sensor.effects), names)
+        for name, change_v, scale in zip(names, get(sensor, names) - before,
+                                         report.baseline.scale_v_per_g.tolist()):
+            if abs(change_v) / scale * G0_MPS2 > verdict.material_mps2:
+                size = quantities.parameter_text(
+                    {'value': change_v, 'unit': parameter_of(name).unit}, scale)
+                texts.append(f'{effect.name} {name.axis} {size}')
+    return [Row('with them', ', '.join(texts), 'a calibration may have taken this up of them')
+            ] if texts else []
 
 
 def remainder_rows(report: Report) -> list[Row]:
@@ -330,7 +366,8 @@ def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]
     if row.shows:
         return effect.name, smallest, typical, ''
     revealed_by = effect.diagnosis.revealed_by
-    missing = 'needs --sim' if effect.concern is Concern.REFERENCE else \
+    reference = 'needs --urdf' if Need.ROBOT in effect.needs else 'needs --sim'
+    missing = reference if effect.concern is Concern.REFERENCE else \
         f'needs: {MENU[revealed_by].text}' if revealed_by else 'no manoeuvre shows it'
     return effect.name, 'cannot show', typical, missing
 

@@ -20,7 +20,7 @@ from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.effects.base import Coefficient, StraightLine
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import fitted_of, get, parameter_of, put, Sensor, with_neutral
 import numpy as np
@@ -28,6 +28,7 @@ import numpy as np
 _EVALUATIONS, _HALVINGS = 8, 2
 """Largest number of simulations of a hypothesis, and of halvings of a step. Chosen: most need
 five, and a quarter of a step is enough for the library."""
+_REFITS = 3  # Largest number of fits with another noise. Chosen: a step of the grid of drifts each
 _EVIDENCE_TOLERANCE = 1e-3  # A step may lower the log evidence by this. Chosen: far below one unit
 _SMALLEST_STEP, _SMALLEST_GAIN, _SMALLEST_GAIN_SHARE = 1e-3, 0.5, 1e-4
 """Step, in prior standard deviations, and gain of log evidence, also divided by that of all steps,
@@ -57,6 +58,7 @@ _NEAR_START = 1.4
 """Largest ratio of the start of a size to the one at which the effect was simulated: the starts
 differ by factors of two."""
 _AT_BOUND = 1e-4  # Distance from a bound, as a share of the range, that is at it. Chosen: rounding
+_CONSTANT = 1e-6  # Range of a constant column, relative. Chosen: rounding errors
 _TIME_CONSTANTS = 4.0
 """Length of a recording that shows a time constant: its response is then complete to 2 %."""
 
@@ -173,6 +175,46 @@ class _HypothesisIterate(Iterate):
     fit: LinearFit
 
 
+@dataclass(frozen=True)
+class _Refit:
+    """The fit of a set of effects by re-simulation, for one noise."""
+
+    linear_model: LinearModel
+    effects: Sequence[str]
+    names: list[Coefficient]  # Coefficients of the effects, (k,)
+    sensor: Sensor  # The baseline with neutral effects
+    filter_indices: Sequence[int]  # Number of the whitening filter of each channel
+    lowest_log_evidence: float  # Log evidence below which the set is hopeless
+
+    def run(self, values: np.ndarray) -> Sensor:
+        """Iterate from values, (k,), until the log evidence no longer gains."""
+        last = gauss_newton(self._linearised_at, values, self._has_ended, _EVALUATIONS,
+                            _HALVINGS, _EVIDENCE_TOLERANCE)
+        return last.linearised.sensor
+
+    def _linearised_at(self, values: np.ndarray) -> _HypothesisIterate:
+        within = np.clip(values, [parameter_of(n).lower for n in self.names],
+                         [parameter_of(n).upper for n in self.names]) if self.names else values
+        filters = [[f[i]] for f, i in zip(self.linear_model.usual_filters, self.filter_indices)]
+        linearised = linearise(self.linear_model, self.effects,
+                               put(self.sensor, self.names, within), filters)
+        fit, j = linearised.fit(), len(linearised.values)
+        step = linearised.departures(fit)[:j] + linearised.prior_mean[:j] - linearised.values
+        loss = fit.loss(linearised.values - linearised.prior_mean[:j])
+        return _HypothesisIterate(linearised.values, step, loss - fit.log_evidence, linearised,
+                                  fit)
+
+    def _has_ended(self, first: _HypothesisIterate, previous: _HypothesisIterate | None,
+                   present: _HypothesisIterate) -> bool:
+        if previous is not None and (present.fit.log_evidence < self.lowest_log_evidence
+                                     or previous.cost - present.cost < _SMALLEST_GAIN):
+            return True
+        smallest = max(_SMALLEST_GAIN, _SMALLEST_GAIN_SHARE * (first.cost - present.cost))
+        return present.fit.log_evidence + present.cost < smallest or bool(np.all(
+            np.abs(present.step) < _SMALLEST_STEP
+            * present.linearised.prior_std[:len(self.names)]))
+
+
 def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
                    start: Mapping[Coefficient, float], shapes: Mapping[Coefficient, float],
                    lowest_log_evidence: float = -np.inf) -> Hypothesis:
@@ -182,38 +224,34 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
     Each Gauss-Newton step simulates, differentiates, whitens and fits at the present values. The
     iteration ends where the log evidence no longer gains, or where even the maximum of the linear
     model is hopelessly low. `start` has departures of sizes from the prior mean.
+
+    The first iteration has the noise of no gap. A slow effect looks like a drift in it, which
+    leaves its shape open; where the set needs another noise, it is fitted again with that.
     """
-    neutral_sensor = with_neutral(linear_model.baseline, effects)
+    sensor = with_neutral(linear_model.baseline, effects)
     names = _fitted_names(linear_model, effects)
-    # The iteration has the noise of no gap; only its end is compared for every noise.
-    fixed = [[f[i]] for f, i in zip(linear_model.usual_filters,
-                                    linear_model.null_fit.filter_indices)]
-
-    def linearised_at(values: np.ndarray) -> _HypothesisIterate:
-        within = np.clip(values, [parameter_of(n).lower for n in names],
-                         [parameter_of(n).upper for n in names]) if names else values
-        linearised = linearise(linear_model, effects, put(neutral_sensor, names, within), fixed)
-        fit, j = linearised.fit(), len(linearised.values)
-        step = linearised.departures(fit)[:j] + linearised.prior_mean[:j] - linearised.values
-        loss = fit.loss(linearised.values - linearised.prior_mean[:j])
-        return _HypothesisIterate(linearised.values, step, loss - fit.log_evidence, linearised,
-                                  fit)
-
-    def has_ended(first: _HypothesisIterate, previous: _HypothesisIterate | None,
-                  present: _HypothesisIterate) -> bool:
-        if previous is not None and (present.fit.log_evidence < lowest_log_evidence
-                                     or previous.cost - present.cost < _SMALLEST_GAIN):
-            return True
-        smallest = max(_SMALLEST_GAIN, _SMALLEST_GAIN_SHARE * (first.cost - present.cost))
-        return present.fit.log_evidence + present.cost < smallest or bool(np.all(
-            np.abs(present.step) < _SMALLEST_STEP * present.linearised.prior_std[:len(names)]))
-
-    first = _prior_mean(neutral_sensor, names) + [start.get(name, 0.0) for name in names]
+    first = _prior_mean(sensor, names) + [start.get(name, 0.0) for name in names]
     first = np.array([shapes.get(name.without_axis, value) for name, value in zip(names, first)])
-    last = gauss_newton(linearised_at, first, has_ended, _EVALUATIONS, _HALVINGS,
-                        _EVIDENCE_TOLERANCE)
-    linearised = linearise(linear_model, effects, last.linearised.sensor)
-    fit, j = linearised.fit(), len(names)
+    refit = _Refit(linear_model, effects, names, sensor, linear_model.null_fit.filter_indices,
+                   lowest_log_evidence)
+    linearised = linearise(linear_model, effects, refit.run(first))
+    fit = linearised.fit()
+    for _ in range(_REFITS if names else 0):
+        if fit.filter_indices == refit.filter_indices or fit.log_evidence < lowest_log_evidence:
+            break
+        refit = replace(refit, filter_indices=fit.filter_indices)
+        again = linearise(linear_model, effects, refit.run(linearised.values))
+        if again.fit().log_evidence <= fit.log_evidence:
+            break
+        linearised, fit = again, again.fit()
+    return _fitted_hypothesis(linear_model, linearised, fit)
+
+
+def _fitted_hypothesis(linear_model: LinearModel, linearised: LinearisedHypothesis,
+                       fit: LinearFit) -> Hypothesis:
+    """Return a hypothesis at the values at which it was linearised, with their deviations."""
+    j = len(linearised.values)
+    names = linearised.names[:j]
     at_values = linearised.values - linearised.prior_mean[:j]
     std = np.sqrt(np.diag(fit.covariance)[:j])
     # Neither the encoder nor the form of an effect is exact.
@@ -225,8 +263,8 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
     low, high = ([getattr(parameter_of(n), end) for n in linearised.names]
                  for end in ('lower', 'upper'))
     return Hypothesis(
-        tuple(effects), put(linearised.sensor, linearised.names, np.clip(fitted, low, high)),
-        linearised.names[:j], at_values, np.sqrt(std ** 2 + form ** 2 + np.where(
+        linearised.effects, put(linearised.sensor, linearised.names, np.clip(fitted, low, high)),
+        names, at_values, np.sqrt(std ** 2 + form ** 2 + np.where(
             in_rad, linear_model.smallest_angle_rad(), 0.0) ** 2),
         std > evidence.UNDETERMINED_SHARE * np.maximum(linearised.prior_std[:j],
                                                        np.abs(at_values)),
@@ -279,10 +317,11 @@ class Search:
             if self.best.log_evidence - best.log_evidence < _IMMATERIAL * (
                     best.log_evidence - self.model.null_fit.log_evidence):
                 break
-        best = self.best
-        for effect in dict.fromkeys(self.model.variants[i].effect for i in straight):
-            if effect not in best.effects and 0 < len(best.effects) < LARGEST_SET:
-                self._add((*best.effects, effect), dict(zip(best.names, best.values)), {})
+        # Zero-g and scale factor of a unit are rarely exact, and may hide behind another effect.
+        singles_found = [h for h in self.found.values() if len(h.effects) == 1]
+        best_single = max(singles_found, key=lambda h: h.log_evidence, default=self.best)
+        for beside in (self.best, best_single):
+            self._add_straight(beside, [self.model.variants[i].effect for i in straight])
         show_share(0.8)
         for pair in self._rank(self.model, (), list(combinations(sorted(
                 ranked.chosen[0] for ranked in singles[:_SINGLES]), 2)))[:_FURTHER]:
@@ -291,6 +330,16 @@ class Search:
         for hypothesis in sorted(self.found.values(), key=lambda h: -h.log_evidence)[:_COMPLETED]:
             self._complete(hypothesis.effects)
         show_share(1.0)
+
+    def _add_straight(self, beside: Hypothesis, straight: Sequence[str]) -> None:
+        """Fit zero-g and scale factor beside a set."""
+        if not 0 < len(beside.effects) < LARGEST_SET:
+            return
+        start = dict(zip(beside.names, beside.values))
+        for effect in dict.fromkeys(straight):
+            effects = (*beside.effects, effect)
+            if effect not in beside.effects and frozenset(effects) not in self.found:
+                self._add(effects, start, {})
 
     def _complete(self, effects: Sequence[str]) -> None:
         """Fit a set without each of its effects, and these without each, and so on."""
@@ -371,9 +420,23 @@ class Search:
 
 
 def _identifiable(model: LinearModel) -> list[int]:
-    """Return the variants that can show: no zero-g or scale factor without a known pose."""
-    return [i for i, v in enumerate(model.variants) if model.pose_known
-            or not effect_named(v.effect).diagnosis.straight_line]
+    """
+    Return the variants that can show.
+
+    Without a known pose zero-g and scale factor cannot. What is constant in all recordings, as a
+    scale factor is in one pose, is the zero-g.
+    """
+    return [i for i, v in enumerate(model.variants)
+            if (model.pose_known or not effect_named(v.effect).diagnosis.straight_line)
+            and (effect_named(v.effect).diagnosis.straight_line is StraightLine.ZERO_G
+                 or not _is_constant(model, i))]
+
+
+def _is_constant(model: LinearModel, variant: int) -> bool:
+    """Determine whether a variant changes the output of each axis by a constant alone."""
+    columns = [channel[k] for channel in model.columns for k in model.column_ids[variant]
+               if k in channel]
+    return all(np.ptp(column) <= _CONSTANT * np.abs(column).max() for column in columns)
 
 
 def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""What is wrong with another simulator, or was not measured, is named for its own reason."""
+
+from dataclasses import replace
+
+from adxl_ros.diagnose.data_checks import compare_checked, DataFault
+from adxl_ros.files import recording
+from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.sensor import to_volts
+from adxl_ros.simulate.trajectories import motion_from_force
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from units import nominal
+
+RATE_HZ, SECONDS, REST_S = 100.0, 60.0, 8.0
+NOISE_MPS2 = 0.02
+
+
+class Carried:
+    """A sensor that rests, is carried about, and rests again, and its simulator."""
+
+    def __init__(self, seed=3):
+        rng = np.random.default_rng(seed)
+        self.time_s = np.arange(int(SECONDS * RATE_HZ)) / RATE_HZ
+        begin = np.clip((self.time_s - REST_S) / 3, 0, 1)
+        end = np.clip((SECONDS - REST_S - self.time_s) / 3, 0, 1)
+        envelope = begin ** 2 * (3 - 2 * begin) * end ** 2 * (3 - 2 * end)
+
+        def wander(highest_hz, rms):
+            hz, phase, size = (rng.uniform(0.05, highest_hz, 16), rng.uniform(0, 6.28, 16),
+                               rng.normal(0, 0.25, 16))
+            waves = np.sin(2 * np.pi * hz * self.time_s[:, None] + phase)
+            return rms * np.sqrt(2) * envelope * (waves @ size)
+
+        turned = Rotation.from_euler('ZYX', np.column_stack([wander(0.3, 0.5) for _ in range(3)]))
+        self.frame = turned.inv()
+        self.acceleration = np.column_stack([wander(0.8, 0.4) for _ in range(3)])
+        self.noise = rng.normal(0, NOISE_MPS2, self.acceleration.shape)
+
+    def force(self, factor=1.0):
+        """Return the specific force, m/s², (n, 3), whose dynamic part has a factor."""
+        return self.frame.apply(factor * self.acceleration + [0, 0, G0_MPS2])
+
+    def recorded(self, change=lambda force: force):
+        """Return the recording of a sensor."""
+        sensor = replace(nominal('xyz'), rate_hz=RATE_HZ)
+        volts = to_volts(change(self.force() + self.noise), sensor)
+        columns = {f'{axis}_v': v for axis, v in zip('xyz', volts.T)}
+        return Recording('carried', self.time_s, columns, sensor_info(sensor))
+
+    def beside(self, folder, recorded, force=None, time_s=None):
+        """Put a recording beside a simulator."""
+        rows = [self.time_s if time_s is None else time_s, self.force() if force is None else force]
+        np.savetxt(folder / 'sim.csv', np.column_stack(rows), '%.6f', ',', comments='',
+                   header='time_s,ax_mps2,ay_mps2,az_mps2')
+        sim = motion_from_force(recording.read_ideal(folder / 'sim.csv'), False)[0]
+        return compare_checked(recorded, replace(nominal('xyz'), rate_hz=RATE_HZ), sim, False)
+
+
+@pytest.mark.parametrize('factor', [0.5, 1.5, 4.0])
+def test_a_wrong_dynamic_part_is_an_error_of_the_simulator(tmp_path, factor):
+    carried = Carried()
+    with pytest.raises(DataFault) as raised:
+        carried.beside(tmp_path, carried.recorded(), carried.force(factor))
+    assert raised.value.name == 'reference'
+    assert f'{factor:g} times' in raised.value.message
+
+
+@pytest.mark.parametrize('change', [
+    lambda force: force, lambda force: 1.03 * force, lambda force: force + [0.2, -0.1, 0.3]])
+def test_a_right_simulator_is_compared(tmp_path, change):
+    """Errors of the sensor are none of the simulator, and no rest is left out."""
+    carried = Carried()
+    comparison = carried.beside(tmp_path, carried.recorded(change))
+    assert comparison.used[comparison.at_rest].all() and comparison.used.mean() > 0.9
+
+
+@pytest.mark.parametrize('step_s, fault', [(0.05, 'clock_jump'), (0.0, None)])
+def test_a_step_of_the_simulators_clock_is_named(tmp_path, step_s, fault):
+    """A constant delay, which an effect describes, is no step."""
+    carried = Carried()
+    late_s = np.where(carried.time_s > SECONDS / 2, 0.02 + step_s, 0.02)
+    try:
+        carried.beside(tmp_path, carried.recorded(), time_s=carried.time_s + late_s)
+    except DataFault as raised:
+        assert raised.name == fault and f'{step_s:g} s' in raised.message
+    else:
+        assert fault is None
+
+
+@pytest.mark.parametrize('size_g, count', [(24.0, 8), (2.0, 60), (0.2, 30)])
+def test_samples_that_stand_alone_are_counted_with_their_size(tmp_path, size_g, count):
+    rng = np.random.default_rng(4)
+    carried = Carried()
+    rows = rng.choice(np.arange(10, len(carried.time_s) - 10, 9), count, False)
+
+    def struck(force):
+        force = 1.01 * force
+        force[rows] += size_g * G0_MPS2 * rng.choice([-1, 1], (count, 3))
+        return force
+
+    comparison = carried.beside(tmp_path, carried.recorded(struck))
+    part, = [part for part in comparison.left_out if part.effect is not None]
+    assert part.samples == pytest.approx(count, abs=0.1 * count)
+    assert part.rms_mps2 == pytest.approx(size_g * G0_MPS2, rel=0.1)
+    # They make no motion that the simulator would lack.
+    assert comparison.fading_hz is None
+    assert comparison.used.mean() > 0.9
+
+
+@pytest.mark.parametrize('stuck_s, fault', [(SECONDS, 'constant'), (5.0, None)])
+def test_an_axis_that_sticks_is_not_fast_motion(tmp_path, stuck_s, fault):
+    carried = Carried()
+
+    def sticks(force):
+        begin = round(20 * RATE_HZ) if stuck_s < SECONDS else 0
+        force[begin:begin + round(stuck_s * RATE_HZ), 1] = force[begin, 1]
+        return force
+
+    try:
+        comparison = carried.beside(tmp_path, carried.recorded(sticks))
+    except DataFault as raised:
+        assert raised.name == fault
+    else:
+        assert fault is None
+        part, = comparison.left_out
+        assert 'y does not change' in part.reason
+        assert part.duration_s == pytest.approx(stuck_s, abs=0.1)
+
+
+def test_pulses_beyond_the_range_are_named(tmp_path):
+    carried = Carried()
+    sensor = replace(nominal('xyz'), rate_hz=RATE_HZ)
+
+    def pulses(force):
+        for place in (2000, 3000, 4000):
+            force[place:place + 4, 0] = (sensor.range_g + 0.5) * G0_MPS2
+        return force
+
+    notes = ' '.join(carried.beside(tmp_path, carried.recorded(pulses)).notes)
+    assert f'range of {sensor.range_g:g} g' in notes and '12 samples' in notes
+    assert 'too fast' not in notes
