@@ -604,8 +604,9 @@ def fading_frequency_hz(comparison: BaselineComparison) -> float | None:
         return None
     sensor = comparison.sensor
     size = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
+    within = comparison.measured & ~comparison.out_of_range.any(axis=1)
     recorded_g, simulated_g = (
-        bridged(v, comparison.measured) / sensor.scale_v_per_g
+        bridged(v, within) / sensor.scale_v_per_g
         for v in (comparison.volts, comparison.simulated_v(sensor)))
     if len(recorded_g) < _FEWEST_WINDOWS * size // 2:
         return None

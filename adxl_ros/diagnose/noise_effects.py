@@ -174,8 +174,12 @@ def _spikes(volts: np.ndarray, steps_v: np.ndarray, used: np.ndarray, sensor: Se
         local_v = MAD_TO_STD * np.median(
             deviation[:blocks * width].reshape(blocks, -1), axis=1)
         local_v = np.interp(np.arange(count), (np.arange(blocks) + 0.5) * width, local_v)
+        before_v, after_v = (np.abs(volts[:, d] - np.roll(volts[:, d], shift))
+                             for shift in (near, -near))
+        # A spike differs from the samples on both sides, and a pulse from those on one.
+        stands_out = undisturbed & (2 * np.minimum(before_v, after_v) > deviation)
         # The neighbours of a spike deviate by half of it.
-        spikes = (deviation > SPIKE_STDS * np.maximum(local_v, std_v)) & undisturbed & (
+        spikes = (deviation > SPIKE_STDS * np.maximum(local_v, std_v)) & stands_out & (
             deviation >= scipy.ndimage.maximum_filter1d(deviation, 2 * near + 1))
         if spikes.sum() >= _SPIKE_FEWEST:
             isolated[:, d] = spikes

@@ -87,7 +87,7 @@ def wrong_dynamic_factor(comparison: BaselineComparison) -> str | None:
     if abs(factor - 1) < _RIGHT_FACTOR or left_g > _SAME_LENGTH * dynamics_g \
             or length_error_g(best) > _SAME_LENGTH * gap_g:
         return None
-    return (f'the dynamic part of {force.name} is {factor:.3g} times that of the recording, while '
+    return (f'the dynamic part of {force.name} is {factor:.2g} times that of the recording, while '
             f'its gravity agrees: with that factor, both hold a gravity of {gravity_g:.4g} g to '
             f'{mg_text(left_g * G0_MPS2)} rms; check how the simulator differentiates its '
             'velocity, and its time step')
@@ -124,10 +124,9 @@ def clock_step(comparison: BaselineComparison) -> str | None:
     if abs(step_s) < max(_SMALLEST_STEP_S, _STEP_STDS * spread_s) \
             or np.abs(about_levels_s(place)).sum() > about_drift_s / 2:
         return None
-    return (f'the clock of {force.name} steps by {abs(step_s):.3g} s between '
-            f'{delays[place - 1].time_s:.4g} and {delays[place].time_s:.4g} s: the recording is '
-            f'{before_s:+.3g} s behind it before, and {after_s:+.3g} s after; simulate with one '
-            'clock, or cut both there and diagnose the parts')
+    return (f'the clock of {force.name} steps by {abs(step_s):.2g} s between '
+            f'{delays[place - 1].time_s:.4g} and {delays[place].time_s:.4g} s, beside that of '
+            'the recording; simulate with one clock, or cut both there and diagnose the parts')
 
 
 def _delays(comparison: BaselineComparison) -> list[_Delay]:

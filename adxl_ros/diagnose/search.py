@@ -28,7 +28,6 @@ import numpy as np
 _EVALUATIONS, _HALVINGS = 8, 2
 """Largest number of simulations of a hypothesis, and of halvings of a step. Chosen: most need
 five, and a quarter of a step is enough for the library."""
-_REFITS = 3  # Largest number of fits with another noise. Chosen: a step of the grid of drifts each
 _EVIDENCE_TOLERANCE = 1e-3  # A step may lower the log evidence by this. Chosen: far below one unit
 _SMALLEST_STEP, _SMALLEST_GAIN, _SMALLEST_GAIN_SHARE = 1e-3, 0.5, 1e-4
 """Step, in prior standard deviations, and gain of log evidence, also divided by that of all steps,
@@ -224,9 +223,7 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
     Each Gauss-Newton step simulates, differentiates, whitens and fits at the present values. The
     iteration ends where the log evidence no longer gains, or where even the maximum of the linear
     model is hopelessly low. `start` has departures of sizes from the prior mean.
-
-    The first iteration has the noise of no gap. A slow effect looks like a drift in it, which
-    leaves its shape open; where the set needs another noise, it is fitted again with that.
+    The iteration has the noise of no gap; only its end is compared for every noise.
     """
     sensor = with_neutral(linear_model.baseline, effects)
     names = _fitted_names(linear_model, effects)
@@ -235,16 +232,7 @@ def fit_hypothesis(linear_model: LinearModel, effects: Sequence[str],
     refit = _Refit(linear_model, effects, names, sensor, linear_model.null_fit.filter_indices,
                    lowest_log_evidence)
     linearised = linearise(linear_model, effects, refit.run(first))
-    fit = linearised.fit()
-    for _ in range(_REFITS if names else 0):
-        if fit.filter_indices == refit.filter_indices or fit.log_evidence < lowest_log_evidence:
-            break
-        refit = replace(refit, filter_indices=fit.filter_indices)
-        again = linearise(linear_model, effects, refit.run(linearised.values))
-        if again.fit().log_evidence <= fit.log_evidence:
-            break
-        linearised, fit = again, again.fit()
-    return _fitted_hypothesis(linear_model, linearised, fit)
+    return _fitted_hypothesis(linear_model, linearised, linearised.fit())
 
 
 def _fitted_hypothesis(linear_model: LinearModel, linearised: LinearisedHypothesis,

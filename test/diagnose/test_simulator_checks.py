@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from units import nominal
 
 RATE_HZ, SECONDS, REST_S = 100.0, 60.0, 8.0
-NOISE_MPS2 = 0.02
+NOISE_MPS2 = 0.006
 
 
 class Carried:
@@ -53,7 +53,8 @@ class Carried:
 
     def beside(self, folder, recorded, force=None, time_s=None):
         """Put a recording beside a simulator."""
-        rows = [self.time_s if time_s is None else time_s, self.force() if force is None else force]
+        time_s = self.time_s if time_s is None else time_s
+        rows = [time_s, self.force() if force is None else force]
         np.savetxt(folder / 'sim.csv', np.column_stack(rows), '%.6f', ',', comments='',
                    header='time_s,ax_mps2,ay_mps2,az_mps2')
         sim = motion_from_force(recording.read_ideal(folder / 'sim.csv'), False)[0]
