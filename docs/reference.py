@@ -22,8 +22,10 @@ import re
 import subprocess
 import sys
 import tempfile
+import textwrap
 from typing import Any
 
+import adxl_ros
 from adxl_ros.files import parameter_file
 from adxl_ros.files.column_mapping import UNITS
 from adxl_ros.fleet.row import COLUMNS
@@ -91,9 +93,26 @@ SERVICES = {
     'calibration': 'start, resume, start_over, capture, redo, skip, finish, abort',
     'compensation': 'level', 'monitor': 'diagnose', 'investigate': 'abort'}
 """Services (std_srvs/Trigger) by node."""
+VERBS = ('read', 'from_arrays', 'load', 'fit', 'apply', 'diagnose', 'check', 'noise', 'simulate')
+"""The verbs of the front door, in the order of the page."""
+RESULTS = ('adxl_ros.files.recording_columns:Recording', 'adxl_ros.api.calibration:Fit',
+           'adxl_ros.api.calibration:FittedCoefficient', 'adxl_ros.api.correction:Corrected',
+           'adxl_ros.api.gap:Gap', 'adxl_ros.api.gap:FoundEffect',
+           'adxl_ros.api.gap:FoundParameter', 'adxl_ros.api.gap:GapFigures',
+           'adxl_ros.diagnose.next_experiment:CouldShow', 'adxl_ros.api.checking:Check',
+           'adxl_ros.signals.findings:RecordingContents', 'adxl_ros.api.noise:Noise',
+           'adxl_ros.signals.noise_parameters:Estimate')
+"""What the verbs return."""
+FIVE_LINES = """\
+import adxl_ros as adxl
+recording = adxl.from_arrays(time_s=t, x_v=x, y_v=y, alpha_rad=alpha, beta_rad=beta)
+fit = adxl.fit(recording, 'adxl203')                  # print(fit); fit.save('unit.yaml')
+corrected = adxl.apply(recording, fit)                # corrected.to_pandas()
+gap = adxl.diagnose(recording, fit)                   # gap.verdict, gap.effects; gap.save('gap')
+"""
+"""The way from arrays to a diagnosis."""
 LIBRARY = ('adxl_ros.simulate.sensor_model:SensorModel', 'adxl_ros.model.effects.base:Effect',
-           'adxl_ros.model.effects.base:Parameter', 'adxl_ros.links.support.base:Link',
-           'adxl_ros.diagnose.diagnosis:diagnose')
+           'adxl_ros.model.effects.base:Parameter', 'adxl_ros.links.support.base:Link')
 """The import paths that stay."""
 REPORT = {
     'schema': 'version of the format: 1', 'summary': 'the sentence of terminal and page',
@@ -167,9 +186,9 @@ def without(text: str, *begins: str) -> str:
     return '\n'.join(kept)
 
 
-def block(text: str) -> list[str]:
+def block(text: str, language: str = 'text') -> list[str]:
     """Return a text as a block of a page."""
-    return ['', '```text', text.strip('\n'), '```', '']
+    return ['', f'```{language}', text.strip('\n'), '```', '']
 
 
 def table(head: str, rows: Iterable[Iterable[object]]) -> list[str]:
@@ -325,24 +344,57 @@ def fleet_columns() -> Iterator[str]:
 
 
 def documented_classes() -> Iterator[str]:
-    """Show the fields of documented classes, and signature and docstring of what is called."""
-    yield from ['# Library', '', 'What other programs import; these paths stay. [Add an effect]'
-                '(../howto/own_effect.md) and [add a link](../howto/own_link.md) use them.', '']
+    """Show the verbs with their results, then what other programs extend."""
+    yield from ['# Library', '', '`import adxl_ros as adxl` gives the verbs below, without ROS. A '
+                'result prints as the screen of its tool, and shows the top of its page in a '
+                'notebook. Errors are `adxl.UserError`. [calibrate_arrays.py]'
+                '(../examples/calibrate_arrays.py) and the files beside it run as they are.',
+                *block(FIVE_LINES, 'python')]
+    for name in VERBS:
+        yield from verb(name)
+    yield from ['## Results', '', 'Recordings are arrays with names; the other results also have '
+                '`print`, and `plot(ax=None)` draws with matplotlib.', '']
+    for path in RESULTS:
+        yield from described(path, 3)
+    yield from ['## What programs extend', '', '[Add an effect](../howto/own_effect.md) and [add '
+                'a link](../howto/own_link.md) use them; these paths stay.', '']
     for path in LIBRARY:
-        module, name = path.split(':')
-        item = getattr(importlib.import_module(module), name)
-        lines = [f'from {module} import {name}', '']
-        if dataclasses.is_dataclass(item) or getattr(item, '_is_protocol', False):
-            # The fields have their meaning beside them; the functions follow.
-            lines += inspect.getsource(item).split('\n    def ')[0].rstrip().splitlines()
-        else:
-            signature = re.sub(r'<function \S+ at 0x\w+>', '...', str(inspect.signature(item)))
-            lines += [f'{name}{signature}', '', inspect.getdoc(item) or '']
-        yield from [f'## {name}', *block('\n'.join(lines).removesuffix('@property').rstrip())]
-        for part, member in inspect.getmembers(item, inspect.isfunction):
-            if (part == '__call__' or not part.startswith('_')) and member.__doc__:
-                yield from block(f'{name}.{part}{inspect.signature(member)}\n\n'
-                                 f'{inspect.getdoc(member)}')
+        yield from described(path, 3)
+
+
+def verb(name: str) -> Iterator[str]:
+    """Show signature and docstring of a verb."""
+    item = getattr(adxl_ros, name)
+    yield from [f'## {name}', *block(f'adxl.{name}{signature(item)}\n\n{inspect.getdoc(item)}')]
+
+
+def signature(item: Any) -> str:
+    """Return the parameters of a callable, without the quotes of annotations."""
+    text = re.sub(r'<function \S+ at 0x\w+>', '...', str(inspect.signature(item)))
+    text = re.sub(r"(: |-> )'([^']*)'", r'\1\2', text)
+    return '\n'.join(textwrap.wrap(text, 95, subsequent_indent='    ', break_long_words=False,
+                                   break_on_hyphens=False))
+
+
+def described(path: str, level: int) -> Iterator[str]:
+    """Show the fields of a dataclass or protocol, or a signature, and the public functions."""
+    module, name = path.split(':')
+    item = getattr(importlib.import_module(module), name)
+    lines = [f'from {module} import {name}', '']
+    if dataclasses.is_dataclass(item) or getattr(item, '_is_protocol', False) \
+            or hasattr(item, '_fields'):
+        # The fields have their meaning beside them; the functions follow.
+        source = inspect.getsource(item).split('\n    def ')[0].rstrip()
+        lines += re.sub(r'(\n    @\w+)+$', '', source).rstrip().splitlines()
+    else:
+        lines += [f'{name}{signature(item)}', '', inspect.getdoc(item) or '']
+    yield from [f'{"#" * level} {name}', *block('\n'.join(lines))]
+    for part, member in inspect.getmembers(item):
+        function = getattr(member, 'fget', None) or getattr(member, 'func', None) or member
+        is_shown = part == '__call__' or not part.startswith('_')
+        if is_shown and inspect.isfunction(function) and function.__doc__:
+            call = signature(function) if function is member else ''
+            yield from block(f'{name}.{part}{call}\n\n{inspect.getdoc(function)}')
 
 
 def figures() -> dict[Path, str]:

@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Noise of a sensor at rest: its Allan deviation, and a parameter file for simulation."""
+
+import adxl_ros as adxl
+import numpy as np
+
+RATE_HZ = 100
+rng = np.random.default_rng(4)
+white_mps2 = rng.normal(0.0, 0.02, (60 * RATE_HZ, 3))
+walk_mps2 = np.cumsum(rng.normal(0.0, 1e-5, (60 * RATE_HZ, 3)), axis=0)
+samples_mps2 = white_mps2 + walk_mps2 + [0.0, 0.0, 9.80665]
+
+recording = adxl.from_arrays(rate=RATE_HZ, ax_mps2=samples_mps2[:, 0],
+                             ay_mps2=samples_mps2[:, 1], az_mps2=samples_mps2[:, 2])
+noise = adxl.noise(recording)
+print(noise)
+noise.plot().figure.savefig('allan.png')
+noise.save('noise.yaml')

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""The verbs of `import adxl_ros` on a simulated unit: what results hold, show and write."""
+
+import json
+
+import adxl_ros as adxl
+from matplotlib.figure import Figure
+import numpy as np
+import pandas as pd
+import pytest
+
+G_MPS2 = 9.80665
+BIAS_V = 0.01  # Largest departure of the zero-g that is simulated, 10 mg
+
+
+@pytest.fixture(scope='module')
+def recording() -> object:
+    """Make a recording of arrays, as a stranger has them."""
+    made = adxl.simulate('tilt_both', 'adxl203', rate=25, seed=1, effects={
+        'bias': {'offset_v': {'x': BIAS_V, 'y': -BIAS_V / 2}}})
+    columns = {name: made.columns[name] for name in ('x_v', 'y_v', 'alpha_rad', 'beta_rad')}
+    return adxl.from_arrays(time_s=made.time_s, **columns)
+
+
+@pytest.fixture(scope='module')
+def fit(recording: object) -> object:
+    return adxl.fit(recording, 'adxl203', model='linear')
+
+
+@pytest.fixture(scope='module')
+def gap(recording: object) -> object:
+    return adxl.diagnose(recording, 'adxl203')
+
+
+def test_a_fit_finds_the_zero_g_and_saves_itself(fit, tmp_path) -> None:
+    (zero_g,) = [row for row in fit.coefficients if (row.name, row.axis) == ('bias.offset_v', 'x')]
+    nominal = adxl.load('adxl203').nominal_zero_g_v[0]
+    assert abs(zero_g.value - nominal - BIAS_V) < 3 * zero_g.half_width
+    assert fit.poses + len(fit.outliers) == len(fit.result.poses)
+    fit.save(tmp_path / 'unit.yaml')
+    np.testing.assert_allclose(adxl.load(tmp_path / 'unit.yaml').zero_g_v, fit.sensor.zero_g_v,
+                               rtol=1e-6)
+    table = fit.to_pandas()
+    assert len(table) == len(fit.coefficients) and set(table.unit) == {'V', 'V/g'}
+    assert fit.to_dict()['coefficients'][0]['unit'] == 'V'
+
+
+def test_corrected_arrays_follow_the_stage(recording, fit, tmp_path) -> None:
+    corrected = adxl.apply(recording, fit)
+    assert corrected.force_mps2.shape == corrected.force_std_mps2.shape == (len(recording), 3)
+    assert corrected.force_covariance.shape == (len(recording), 3, 3)
+    length_mps2 = np.linalg.norm(corrected.force_mps2, axis=1)
+    assert abs(np.nanmedian(length_mps2) - G_MPS2) < 0.01
+    corrected.save(tmp_path / 'tilt.csv')
+    written, table = pd.read_csv(tmp_path / 'tilt.csv', comment='#'), corrected.to_pandas()
+    assert list(written) == list(table)
+    np.testing.assert_allclose(written['roll_rad'], table['roll_rad'], atol=1e-6)
+
+
+def test_a_gap_is_explained_by_what_was_simulated(gap) -> None:
+    assert (gap.verdict, [effect.name for effect in gap.effects]) == ('explained', ['bias'])
+    found = gap.effects[0].parameters['offset_v.x']
+    assert found.low < BIAS_V < found.high and found.unit == 'V'
+    figures = gap.figures
+    assert figures.after_mps2.value < figures.before_mps2.value
+    assert figures.floor_mps2.value == pytest.approx(figures.after_mps2.value, rel=0.2)
+    assert gap.sensor.values['bias']['offset_v'][0] == pytest.approx(found.value, rel=1e-3)
+
+
+def test_a_gap_writes_what_it_returns(gap, tmp_path) -> None:
+    files = gap.save(tmp_path / 'gap')
+    assert [path.name for path in files] == ['report.html', 'params.yaml', 'report.json']
+    report = json.loads((tmp_path / 'gap' / 'report.json').read_text())
+    assert report == json.loads(json.dumps(gap.to_dict()))
+    assert report['verdict']['status'] == gap.verdict
+    assert gap.command('again').endswith('diagnose arrays --params adxl203 -o again')
+
+
+def test_results_print_their_screen_and_show_in_a_notebook(fit, gap, recording) -> None:
+    assert 'GAP EXPLAINED by 1 effect' in str(gap)
+    assert fit.outcome in str(fit)
+    for result in (fit, gap, adxl.apply(recording, fit)):
+        assert max(map(len, str(result).splitlines())) < 80
+        assert '<b>' in result._repr_html_()
+        axes = Figure().subplots()
+        assert result.plot(axes) is axes
+
+
+def test_a_verb_prints_nothing_and_leaves_the_global_seed(recording, fit, capsys) -> None:
+    np.random.seed(3)  # noqa: NPY002 a verb must not change it
+    before = np.random.get_state()[1].tolist()  # noqa: NPY002
+    adxl.apply(recording, fit)
+    adxl.simulate('tilt_both', fit, rate=25)
+    adxl.check(recording)
+    assert capsys.readouterr() == ('', '')
+    assert np.random.get_state()[1].tolist() == before  # noqa: NPY002
+
+
+def test_noise_of_white_samples_is_within_its_interval() -> None:
+    rng = np.random.default_rng(5)
+    std_mps2, rate_hz = 0.02, 100
+    noise = adxl.noise(adxl.from_arrays(
+        rate=rate_hz, **{f'a{axis}_mps2': value + rng.normal(0, std_mps2, 20_000)
+                         for axis, value in zip('xyz', (0, 0, G_MPS2))}))
+    for axis in noise.axes:
+        white = axis.fit.white
+        assert white.low * 0.95 < std_mps2 / np.sqrt(rate_hz) < white.high * 1.05
+    assert noise.sensor.noise_density_g_per_rthz.shape == (3,)
+    assert len(noise.to_pandas()) == 9
+
+
+def test_an_axis_that_is_stuck_is_not_sound() -> None:
+    time_s = np.arange(2000) / 100
+    checked = adxl.check(adxl.from_arrays(
+        time_s=time_s, ax_mps2=np.sin(time_s), ay_mps2=np.zeros(2000), az_mps2=np.cos(time_s)))
+    assert not checked.is_sound and any('ay_mps2' in fault for fault in checked.faults)
+    assert 'NOT SOUND' in str(checked)
+
+
+def test_a_simulation_has_its_effects_and_its_seed() -> None:
+    first, same, other = (adxl.simulate('motion', rate=50, seed=seed, effects={
+        'bias': {'offset_v.y': 0.02}}) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first.columns['y_v'], same.columns['y_v'])
+    assert (first.columns['y_v'] != other.columns['y_v']).any()
+    plain = adxl.simulate('motion', rate=50, seed=1)
+    shift_v = np.mean(first.columns['y_v'] - plain.columns['y_v'])
+    assert shift_v == pytest.approx(0.02, abs=1e-3)
+
+
+@pytest.mark.parametrize('call, named', [
+    (lambda: adxl.simulate('no_such_motion'), 'no_such_motion'),
+    (lambda: adxl.simulate('motion', effects=['no_such_effect']), 'no_such_effect'),
+    (lambda: adxl.simulate('motion', effects={'bias': {'offset_v': 99}}), '99'),
+    (lambda: adxl.simulate('imu'), '--force'),
+    (lambda: adxl.load('no_such_sensor'), 'no_such_sensor'),
+    (lambda: adxl.fit([]), 'no recording'),
+    (lambda: adxl.read('no_such_file.csv'), 'no_such_file.csv')])
+def test_errors_name_what_is_wrong(call, named) -> None:
+    with pytest.raises(adxl.UserError, match=named):
+        call()
