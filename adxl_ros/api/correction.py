@@ -150,9 +150,10 @@ class Corrected(Result):
     """Its standard deviations, m/s², (n, 3)."""
     force_covariance: np.ndarray
     """Its covariance, (m/s²)², (n, 3, 3); very large for an axis that is not measured."""
-    angles: Mapping[str, np.ndarray]
-    """`roll_rad`, `pitch_rad`, `inclination_rad`, and `alpha_rad`, `beta_rad` as a stage has
-    them, with `roll_std_rad`, ...: rad, (n,) each. They hold at rest."""
+    columns: Mapping[str, np.ndarray]
+    """Columns of the tool's table, (n,) each: the force as `ax_mps2`, `ax_std_mps2`, ..., m/s²,
+    and the angles `roll_rad`, `pitch_rad`, `inclination_rad`, and `alpha_rad`, `beta_rad` as a
+    stage has them, with `roll_std_rad`, ..., rad. Angles hold at rest."""
     at_rail: np.ndarray
     """Whether the ADC is at a rail, (n,) bool."""
     outside: np.ndarray
@@ -183,25 +184,19 @@ class Corrected(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the columns of `to_pandas` as lists, with the notes."""
-        columns = {name: values.tolist() for name, values in self._table().items()}
+        columns = {name: values.tolist() for name, values in self.columns.items()}
         return {'schema': 1, 'serial': self.sensor.serial, 'notes': list(self.notes), **columns}
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with the columns of the tool's table, m/s² and rad."""
         from pandas import DataFrame
-        return DataFrame(self._table())
-
-    def _table(self) -> dict[str, np.ndarray]:
-        force = {f'a{axis}{name}_mps2': values for name, each in (
-            ('', self.force_mps2), ('_std', self.force_std_mps2))
-            for axis, values in zip(AXES, each.T)}
-        return {'time_s': self.time_s, **force, **self.angles}
+        return DataFrame({'time_s': self.time_s, **self.columns})
 
     def plot(self, ax: Any = None) -> Any:
         """Draw roll and pitch over time, degrees, into axes of matplotlib."""
         ax = axes_for(ax)
         for name in ('roll', 'pitch'):
-            ax.plot(self.time_s, np.degrees(self.angles[f'{name}_rad']), lw=0.8, label=name)
+            ax.plot(self.time_s, np.degrees(self.columns[f'{name}_rad']), lw=0.8, label=name)
         ax.set(xlabel='time, s', ylabel='tilt, °')
         ax.legend()
         return ax
@@ -254,11 +249,10 @@ def apply(recording: RecordingInput, sensor: SensorInput | None = None, *,
         return np.moveaxis(np.concatenate([getattr(each, name) for _, each in parts], -1), -1, 0)
 
     tables = [_columns(estimates) for _, estimates in parts]
-    angles = {name: np.concatenate([table[name] for table in tables])
-              for name in tables[0] if name.endswith('rad')}
+    columns = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     return Corrected(
         time_s=read.time_s, epoch_ns=read.epoch_ns, force_mps2=joined('force_mps2'),
         force_std_mps2=joined('force_std_mps2'), force_covariance=joined('covariance'),
-        angles=angles, at_rail=joined('at_rail'), outside=joined('outside'),
+        columns=columns, at_rail=joined('at_rail'), outside=joined('outside'),
         unsolved=joined('unsolved'), sensor=correction.sensor, notes=tuple(correction.notes),
         screen_lines=tuple(correction.screen), parts=parts)

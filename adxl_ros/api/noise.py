@@ -216,13 +216,9 @@ class Noise(Result):
     def plot(self, ax: Any = None) -> Any:
         """Draw the Allan deviations, µg, and what is fitted, into axes of matplotlib."""
         ax = axes_for(ax)
-        for noise, deviation in zip(self.axes, self.allan_deviation_mps2.T):
-            colour = AXIS_COLOURS[noise.axis]
-            ax.plot(self.tau_s, deviation * MICRO_G, 'o', ms=4, color=colour, label=noise.axis)
-            ax.plot(self.tau_s, noise.fit.allan_deviation(self.tau_s) * MICRO_G, color=colour)
-        ax.set(xscale='log', yscale='log', xlabel='averaging time τ, s',
-               ylabel='Allan deviation, µg')
-        ax.legend()
+        for number, noise in enumerate(self.axes):
+            _draw(ax, self.result, number, noise.axis)
+        ax.set_ylabel('Allan deviation, µg')
         return ax
 
 
@@ -274,24 +270,31 @@ _INCHES = (5.0, 4.4)
 
 
 def _plot(result: RecordingNoise) -> Any:
+    """Draw the axes beside each other."""
     figure = new_figure(figsize=(_INCHES[0] * len(result.axes), _INCHES[1]))
-    axes = figure.subplots(1, len(result.axes), squeeze=False, sharey=True)
-    tau_s, error = result.rest.allan.tau_s, result.rest.allan.relative_error
-    for i, (noise, plot) in enumerate(zip(result.axes, axes[0])):
-        measured = result.rest.allan.deviation[:, i] * MICRO_G
-        plot.errorbar(tau_s, measured, yerr=measured * error.clip(max=0.9), fmt='o', ms=4,
-                      color='#36c', label='measured')
-        for name, line, estimate in zip(_NAMES, noise.fit.lines(tau_s), noise.estimates):
-            if estimate.is_seen:
-                plot.plot(tau_s, line * MICRO_G, '--', lw=1, label=name)
-        plot.plot(tau_s, noise.fit.allan_deviation(tau_s) * MICRO_G, color='#222',
-                  lw=1, label='all three')
-        plot.set(xscale='log', yscale='log', title=f'axis {noise.axis}',
-                 xlabel='averaging time τ, s', ylim=(measured.min() / 3, measured.max() * 2))
-        plot.grid(True, which='both', alpha=0.3)
-        plot.legend(fontsize=8)
-    axes[0][0].set_ylabel('Allan deviation, µg')
+    plots = figure.subplots(1, len(result.axes), squeeze=False, sharey=True)[0]
+    for number, (noise, plot) in enumerate(zip(result.axes, plots)):
+        _draw(plot, result, number, 'measured')
+        plot.set_title(f'axis {noise.axis}')
+    plots[0].set_ylabel('Allan deviation, µg')
     return figure
+
+
+def _draw(plot: Any, result: RecordingNoise, number: int, label: str) -> None:
+    """Draw the Allan deviation of an axis with the terms that are seen."""
+    allan, noise = result.rest.allan, result.axes[number]
+    tau_s, measured = allan.tau_s, allan.deviation[:, number] * MICRO_G
+    plot.errorbar(tau_s, measured, yerr=measured * allan.relative_error.clip(max=0.9), fmt='o',
+                  ms=4, color=AXIS_COLOURS[noise.axis], label=label)
+    for name, line, estimate in zip(_NAMES, noise.fit.lines(tau_s), noise.estimates):
+        if estimate.is_seen:
+            plot.plot(tau_s, line * MICRO_G, '--', lw=1, label=name)
+    plot.plot(tau_s, noise.fit.allan_deviation(tau_s) * MICRO_G, color='#222', lw=1,
+              label='all three')
+    plot.set(xscale='log', yscale='log', xlabel='averaging time τ, s',
+             ylim=(measured.min() / 3, measured.max() * 2))
+    plot.grid(True, which='both', alpha=0.3)
+    plot.legend(fontsize=8)
 
 
 def _sensor(result: RecordingNoise) -> Sensor:

@@ -24,14 +24,6 @@ def no_progress(done: float, stage: str) -> None:
     """Show nothing."""
 
 
-class Tile(NamedTuple):
-    """A figure at the top of a page."""
-
-    label: str
-    text: str  # Value with its unit
-    note: str = ''
-
-
 class FirstScreen(NamedTuple):
     """The top of a page."""
 

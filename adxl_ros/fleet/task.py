@@ -40,7 +40,6 @@ from adxl_ros.fleet.row import (
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.process import code_version, package_version
 from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
-from adxl_ros.signals.noise_parameters import recording_noise
 import numpy as np
 
 _SPARE_MB = 64  # Space that stays free, MB. Chosen: a task writes some MB
@@ -312,14 +311,15 @@ class _Job:
 
     def _noise(self) -> None:
         """Find the noise of the longest rest."""
-        result = recording_noise(
+        from adxl_ros.api.noise import noise  # the client needs none
+        found = noise(
             lambda: recording.blocks(self._staged.path, BLOCK_ROWS, self._recipe.reading),
             self._params)
-        for noise in result.axes:
-            for (letter, _, unit, _), estimate in zip(NOISE, noise.estimates):
+        for of_axis in found.axes:
+            for (letter, _, unit, _), estimate in zip(NOISE, of_axis.estimates):
                 values = (estimate.value if estimate.is_seen else None, estimate.low,
                           estimate.high)
-                self.row |= {f'noise_{letter}{end}_{noise.axis}_{unit}': value
+                self.row |= {f'noise_{letter}{end}_{of_axis.axis}_{unit}': value
                              for end, value in zip(('', '_low', '_high'), values)}
 
     def _fit(self) -> None:

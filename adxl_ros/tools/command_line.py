@@ -23,7 +23,6 @@ from adxl_ros.files.atomic_write import is_own
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects.base import Effect
-from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import ended_by_closed_output
 from adxl_ros.report.screen import bar, COLUMNS, end_lines, entry_list, NextStep, program_parser
 
@@ -139,12 +138,6 @@ def effect_inputs(texts: Iterable[str]) -> list[EffectInput]:
             values[key.strip()] = number.strip()
         inputs.append((name, values))
     return inputs
-
-
-def with_effects(sensor: Sensor, texts: Iterable[str]) -> Sensor:
-    """Add effects to a sensor, or change their parameters."""
-    from adxl_ros.api import simulation
-    return simulation.with_effects(sensor, effect_inputs(texts))
 
 
 def print_end(result: Sequence[str], files: Iterable[str | os.PathLike],

@@ -7,8 +7,8 @@ import numpy as np
 
 recording = adxl.simulate('tilt_beta', 'adxl355', rate=50, seed=2)
 corrected = adxl.apply(recording, 'adxl355')
-roll_deg = np.degrees(corrected.angles['roll_rad'])
-std_deg = np.degrees(corrected.angles['roll_std_rad'])
+roll_deg = np.degrees(corrected.columns['roll_rad'])
+std_deg = np.degrees(corrected.columns['roll_std_rad'])
 covariance = corrected.force_covariance  # (m/s²)², (n, 3, 3), as sensor_msgs/Imu has it
 
 for row in range(0, len(roll_deg), 1000):

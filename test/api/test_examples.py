@@ -9,6 +9,7 @@ import sys
 from processes import PATIENCE, REPO
 import pytest
 
+pytestmark = pytest.mark.long
 FILES = {
     'allan_of_a_log': ['allan.png', 'noise.yaml'],
     'calibrate_arrays': ['unit.yaml'],

@@ -16,11 +16,10 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Need
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Held, Knots, Motion
-from adxl_ros.tools.command_line import with_effects
 from gaps import simulated, turning, unit, warm
 import numpy as np
 import pytest
-from units import nominal
+from units import nominal, with_effects
 
 pytestmark = pytest.mark.long
 

@@ -11,11 +11,10 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.simulate.response import simulate
 from adxl_ros.simulate.trajectories import rich
-from adxl_ros.tools.command_line import with_effects
 import numpy as np
 from pace import STANDARD_S, standard_work
 import pytest
-from units import nominal
+from units import nominal, with_effects
 
 pytestmark = pytest.mark.perf
 

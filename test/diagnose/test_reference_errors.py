@@ -10,13 +10,12 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.simulate.motion import ForcePath, Motion
 from adxl_ros.simulate.response import Response
-from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import butter, sosfilt, sosfiltfilt
 from scipy.spatial.transform import Rotation
-from units import nominal
+from units import nominal, with_effects
 
 pytestmark = pytest.mark.long
 

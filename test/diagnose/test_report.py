@@ -13,10 +13,9 @@ from adxl_ros.report.quantities import parameter_text
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate
-from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest
-from units import nominal
+from units import nominal, with_effects
 
 pytestmark = pytest.mark.long
 

@@ -11,10 +11,9 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.links import topic
 from adxl_ros.links.support.base import Level, Samples
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest
-from units import nominal
+from units import nominal, with_effects
 
 STEP_NS = 5_000_000
 START_NS = 40 * 10 ** 9

@@ -14,11 +14,10 @@ from adxl_ros.monitor.reference_stream import ReferenceKind, RobotForce
 from adxl_ros.simulate.motion import ForcePath, Held, Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.robot import Robot
-from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest
 from robots import encoded, urdf
-from units import nominal
+from units import nominal, with_effects
 
 RATE_HZ = 200.0
 UNIT = nominal('xyz', rate_hz=RATE_HZ, stage_resolution_rad=0.0)

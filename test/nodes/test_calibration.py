@@ -9,7 +9,6 @@ from adxl_ros.files.recording_columns import recorded_unit
 from adxl_ros.model.sensor import with_neutral
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.response import simulate
-from adxl_ros.tools.command_line import with_effects
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph, QUEUE, RELIABLE
 from lifecycle_msgs.msg import Transition
@@ -17,7 +16,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Imu, JointState
 from std_srvs.srv import Trigger
-from units import drawn, nominal
+from units import drawn, nominal, with_effects
 
 FAST = ('-p', 'use_sim_time:=true')
 # At many times real time a best-effort subscriber, or one with a short queue, loses samples on a

@@ -15,7 +15,6 @@ from adxl_ros.files.recording_columns import sensor_info
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
-from adxl_ros.tools.command_line import with_effects
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from graph import Graph, RELIABLE
@@ -25,7 +24,7 @@ import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
-from units import nominal
+from units import nominal, with_effects
 
 RATE_HZ = 100.0
 STEP_NS = 10_000_000

@@ -17,10 +17,9 @@ from adxl_ros.model.sensor import put, to_nominal_mps2
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.sensor_model import SensorModel
-from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest
-from units import nominal
+from units import nominal, with_effects
 
 RATE_HZ = 200.0
 STAGE = {'backlash', 'base_tilt', 'gravity', 'lever_arm', 'stage_eccentricity', 'stage_offset',

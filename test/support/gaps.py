@@ -9,9 +9,8 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Knots, Motion
 from adxl_ros.simulate.response import simulate
-from adxl_ros.tools.command_line import with_effects
 import numpy as np
-from units import nominal
+from units import nominal, with_effects
 
 
 def unit(axes='xy'):

@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 
+from adxl_ros.api import simulation
 from adxl_ros.calibrate.fits.linear import EFFECTS
 from adxl_ros.calibrate.guided.pose_plan import sweep
 from adxl_ros.calibrate.poses import Poses, stage_force
@@ -14,6 +15,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
+from adxl_ros.tools.command_line import effect_inputs
 import numpy as np
 from processes import REPO
 
@@ -27,6 +29,11 @@ def nominal(axes='xy', **changes):
     arrays = {name: np.full(count, getattr(sensor, name)[0]) for name in (
         'nominal_zero_g_v', 'nominal_scale_v_per_g', 'noise_density_g_per_rthz')}
     return replace(sensor, axes=axes, **{'z_sign': 1, **arrays, **changes})
+
+
+def with_effects(sensor, texts):
+    """Add effects to a sensor as the option --effect of simulate does."""
+    return simulation.with_effects(sensor, effect_inputs(texts))
 
 
 def drawn(rng, sensor, effects=EFFECTS):

@@ -10,12 +10,11 @@ from adxl_ros.model.sensor import get, to_nominal_mps2
 from adxl_ros.simulate.motion import ForcePath, Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.robot import Robot
-from adxl_ros.tools.command_line import with_effects
 from bags import bag_of, EPOCH_NS, imu, joints
 import numpy as np
 import pytest
 from robots import encoded, urdf
-from units import nominal
+from units import nominal, with_effects
 
 pytest.importorskip('pinocchio')
 RATE_HZ, STEP_RAD, SPAN_S = 50.0, 1e-5, 60.0

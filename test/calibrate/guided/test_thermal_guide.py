@@ -13,10 +13,9 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Envelope, with_neutral
 from adxl_ros.simulate.motion import Held, Motion
 from adxl_ros.simulate.response import simulate
-from adxl_ros.tools.command_line import with_effects
 import numpy as np
 import pytest
-from units import nominal
+from units import nominal, with_effects
 
 RATE_HZ = 10.0
 UNIT = nominal('xyz', serial='S1', rate_hz=RATE_HZ)
