@@ -113,7 +113,7 @@ class SensorModel:
         Parameters
         ----------
         params
-            The unit, or its parameter file.
+            The unit, a result that has one (`Fit`, `Gap`), or its parameter file.
         seed
             Seed of units and noise.
         units
@@ -127,6 +127,7 @@ class SensorModel:
             A file cannot be read, or states no distribution of units.
 
         """
+        params = getattr(params, 'sensor', params)
         # The unit
         self.sensor = params if isinstance(params, Sensor) else parameter_file.load(params)
         self.draws = unit_draws(self.sensor, units) if units is not None else None

@@ -128,6 +128,13 @@ def test_a_simulation_has_its_effects_and_its_seed() -> None:
     assert shift_v == pytest.approx(0.02, abs=1e-3)
 
 
+def test_a_fit_is_a_sensor_of_a_simulator(fit) -> None:
+    model = adxl.SensorModel(fit, seed=1)
+    readings = model(np.tile([0.0, 0.0, G_MPS2], (500, 1)), 0.01)
+    assert readings[:, 0].mean() / G_MPS2 == pytest.approx(
+        BIAS_V / fit.sensor.nominal_scale_v_per_g[0], abs=2e-3)
+
+
 @pytest.mark.parametrize('call, named', [
     (lambda: adxl.simulate('no_such_motion'), 'no_such_motion'),
     (lambda: adxl.simulate('motion', effects=['no_such_effect']), 'no_such_effect'),
