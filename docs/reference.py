@@ -95,13 +95,26 @@ SERVICES = {
 """Services (std_srvs/Trigger) by node."""
 VERBS = ('read', 'from_arrays', 'load', 'fit', 'apply', 'diagnose', 'check', 'noise', 'simulate')
 """The verbs of the front door, in the order of the page."""
-RESULTS = ('adxl_ros.files.recording_columns:Recording', 'adxl_ros.api.calibration:Fit',
-           'adxl_ros.api.calibration:FittedCoefficient', 'adxl_ros.api.correction:Corrected',
-           'adxl_ros.api.gap:Gap', 'adxl_ros.api.gap:FoundEffect',
-           'adxl_ros.api.gap:FoundParameter', 'adxl_ros.api.gap:GapFigures',
-           'adxl_ros.diagnose.next_experiment:CouldShow', 'adxl_ros.api.checking:Check',
-           'adxl_ros.signals.findings:RecordingContents', 'adxl_ros.api.noise:Noise',
-           'adxl_ros.signals.noise_parameters:Estimate')
+RESULTS = (
+    'adxl_ros.files.recording_columns:Recording',
+    'adxl_ros.api.calibration:Fit',
+    'adxl_ros.api.calibration:FittedCoefficient',
+    'adxl_ros.calibrate.report.held_out:HeldOutErrors',
+    'adxl_ros.calibrate.report.held_out:ErrorStatistic',
+    'adxl_ros.api.correction:Corrected',
+    'adxl_ros.api.gap:Gap',
+    'adxl_ros.api.gap:FoundEffect',
+    'adxl_ros.api.gap:FoundParameter',
+    'adxl_ros.api.gap:GapFigures',
+    'adxl_ros.report.quantities:Interval',
+    'adxl_ros.diagnose.next_experiment:CouldShow',
+    'adxl_ros.api.checking:Check',
+    'adxl_ros.signals.findings:Findings',
+    'adxl_ros.signals.findings:RecordingContents',
+    'adxl_ros.api.noise:Noise',
+    'adxl_ros.signals.noise_parameters:AxisNoise',
+    'adxl_ros.signals.noise_parameters:Estimate',
+)
 """What the verbs return."""
 FIVE_LINES = """\
 import adxl_ros as adxl
@@ -389,12 +402,16 @@ def described(path: str, level: int) -> Iterator[str]:
     else:
         lines += [f'{name}{signature(item)}', '', inspect.getdoc(item) or '']
     yield from [f'{"#" * level} {name}', *block('\n'.join(lines))]
+    functions = []
     for part, member in inspect.getmembers(item):
         function = getattr(member, 'fget', None) or getattr(member, 'func', None) or member
         is_shown = part == '__call__' or not part.startswith('_')
         if is_shown and inspect.isfunction(function) and function.__doc__:
             call = signature(function) if function is member else ''
-            yield from block(f'{name}.{part}{call}\n\n{inspect.getdoc(function)}')
+            functions.append(f'{name}.{part}{call}\n'
+                             + textwrap.indent(inspect.getdoc(function) or '', '    '))
+    if functions:
+        yield from block('\n\n'.join(functions))
 
 
 def figures() -> dict[Path, str]:

@@ -26,6 +26,7 @@ from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects import base, effect_named
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.report.figures import axes_for
+from adxl_ros.report.quantities import mg
 from adxl_ros.signals.gravity_at_rest import require_unit
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import BeyondRange, listed
@@ -177,7 +178,7 @@ class Corrected(Result):
     @property
     def first_screen(self) -> FirstScreen:
         """Return what a notebook shows."""
-        std_mg = 1e3 * np.median(self.force_std_mps2, axis=0) / 9.80665
+        std_mg = mg(np.median(self.force_std_mps2, axis=0))
         tiles = [(f'{axis}, standard deviation', f'{value:.2g} mg')
                  for axis, value in zip(AXES, std_mg) if np.isfinite(value)]
         return FirstScreen('grey', f'{len(self.time_s)} samples', ' '.join(self.screen), tiles)

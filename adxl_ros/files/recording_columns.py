@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+import os
 from pathlib import Path
 import re
 from typing import Any, NamedTuple
@@ -149,6 +150,13 @@ class Recording:
         further = [name for name in self.columns if name not in self.sensor_columns]
         return (f'{Path(self.path).name}: {span_s:.4g} s{rate}, axes {" ".join(self.axes)}'
                 + f', with {", ".join(further)}' * bool(further))
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write a CSV file NAME.csv, a bag NAME.mcap, or a rosbag2 directory."""
+        from adxl_ros.files import recording
+        unit = uncalibrated(recording.likely_sensor(self), self.stream_info, self.axes,
+                            self.rate_hz)
+        recording.write(path, self, unit)
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with the stamps as index, s, and a column for each of `columns`."""

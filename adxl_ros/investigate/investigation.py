@@ -24,8 +24,8 @@ from itertools import accumulate, chain, count
 import os
 from pathlib import Path
 import shutil
+from typing import TYPE_CHECKING
 
-from adxl_ros.api.gap import diagnose, Gap
 from adxl_ros.diagnose import next_experiment
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.verdict import normalised, UNKNOWN, WeightedHypothesis
@@ -47,6 +47,9 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import quantities
 from adxl_ros.workers import in_background
 import numpy as np
+
+if TYPE_CHECKING:
+    from adxl_ros.api.gap import Gap
 
 CERTAIN = 0.9
 """Probability of a hypothesis at which an investigation ends. Chosen: one error in ten."""
@@ -106,6 +109,7 @@ class Answer:
 def run_round(question: Question, recordings: Sequence[Recording], sensor: Sensor,
               limits: StageLimits, seed: int = 0) -> tuple[Answer, Gap | None]:
     """Diagnose the samples so far, and choose the next manoeuvre."""
+    from adxl_ros.api.gap import diagnose  # the node itself needs none
     gap = diagnose(recordings, sensor, seed=seed) if recordings else None
     report = gap.diagnosis.report if gap else None
     # The prior probabilities, where the samples are too few.

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.files.recording_columns import Recording, VOLTS
+from adxl_ros.files.recording import likely_sensor
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stamps import halves, late_by, stamped_rate_hz
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 from adxl_ros.model.effects import effect_named
@@ -28,10 +29,7 @@ def load_sensor(params: Sensor | str | None, read: Recording) -> Sensor:
     if isinstance(params, Sensor):
         return params
     if params is None:
-        is_of_nominal = read.sensor_columns[0] in VOLTS or \
-            read.stream_info.nominal_values(read.axes)
-        params = str(parameter_file.nominal_path() if is_of_nominal
-                     else parameter_file.any_imu_path())
+        return likely_sensor(read)
     return parameter_file.load(params, may_measure=True)
 
 

@@ -65,6 +65,17 @@ def test_axes_are_drawn_into_those_that_are_given() -> None:
     assert len(axes.lines) == 3 and axes.get_xlabel() == 'time, s'
 
 
+@pytest.mark.parametrize('name', ['log.csv', 'log.mcap'])
+def test_a_recording_saves_itself(name: str, tmp_path) -> None:
+    recording = adxl.from_arrays(time_s=TIME_S, temperature_c=25 + TIME_S, **ACCEL)
+    recording.save(tmp_path / name)
+    again = adxl.read(tmp_path / name)
+    np.testing.assert_allclose(again.time_s, TIME_S, atol=1e-9)
+    for column in (*ACCEL, 'temperature_c'):
+        np.testing.assert_allclose(again.columns[column], recording.columns[column], rtol=1e-6,
+                                   atol=1e-9)
+
+
 @pytest.mark.parametrize('arrays, named', [
     ({'ax_mps2': [1.0, 2.0]}, 'time'),
     ({'time_s': [0.0, 1.0, 2.0], 'ax_mps2': [1.0, 2.0]}, 'ax_mps2'),
