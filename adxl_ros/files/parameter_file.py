@@ -122,6 +122,11 @@ def load(path: str | os.PathLike, may_measure: bool = False) -> Sensor:
     return from_flat(flat, make_error, may_measure)
 
 
+def usual(is_nominal: bool) -> Sensor:
+    """Return the nominal sensor, or any IMU."""
+    return load(nominal_path() if is_nominal else any_imu_path(), may_measure=True)
+
+
 def from_flat(flat: Mapping[str, Any], make_error: MakeError, may_measure: bool = False
               ) -> Sensor:
     """Make a `Sensor` of flat parameters by dotted key, which keys of nodes may be among."""

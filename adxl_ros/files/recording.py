@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import mapped_recording, parameter_file
+from adxl_ros.files import mapped_recording
 from adxl_ros.files.column_mapping import (
     AS_IT_IS,
     Mounting,
@@ -203,13 +203,6 @@ def write(path: str | os.PathLike, recording: Recording, sensor: Sensor) -> None
     """
     with writer(path, sensor) as append:
         append(recording)
-
-
-def likely_sensor(read: Recording) -> Sensor:
-    """Return the nominal sensor for a recording that is in volts or names one, else any IMU."""
-    is_of_nominal = read.sensor_columns[0] in VOLTS or read.stream_info.nominal_values(read.axes)
-    return parameter_file.load(parameter_file.nominal_path() if is_of_nominal
-                               else parameter_file.any_imu_path(), may_measure=True)
 
 
 def is_bag(path: str | os.PathLike) -> bool:

@@ -153,8 +153,8 @@ class Recording:
 
     def save(self, path: str | os.PathLike) -> None:
         """Write a CSV file NAME.csv, a bag NAME.mcap, or a rosbag2 directory."""
-        from adxl_ros.files import recording
-        unit = uncalibrated(recording.likely_sensor(self), self.stream_info, self.axes,
+        from adxl_ros.files import parameter_file, recording
+        unit = uncalibrated(parameter_file.usual(self.is_of_nominal), self.stream_info, self.axes,
                             self.rate_hz)
         recording.write(path, self, unit)
 
@@ -192,6 +192,12 @@ class Recording:
     def sensor_columns(self) -> tuple[str, ...]:
         """Columns of the sensor's output, in the order of the axes."""
         return sensor_columns(self.columns, self.path)
+
+    @property
+    def is_of_nominal(self) -> bool:
+        """Return whether it is in volts or states a conversion, as those of this package do."""
+        return self.sensor_columns[0] in VOLTS or bool(
+            self.stream_info.nominal_values(self.axes))
 
     @property
     def axes(self) -> str:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.files.recording import likely_sensor
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stamps import halves, late_by, stamped_rate_hz
 from adxl_ros.model.constants import AXES, MEASURED_AXES
@@ -29,7 +28,7 @@ def load_sensor(params: Sensor | str | None, read: Recording) -> Sensor:
     if isinstance(params, Sensor):
         return params
     if params is None:
-        return likely_sensor(read)
+        return parameter_file.usual(read.is_of_nominal)
     return parameter_file.load(params, may_measure=True)
 
 
