@@ -108,7 +108,7 @@ def test_an_output_may_have_the_name_of_a_trajectory_but_not_that_of_the_input(r
 def test_fit_refuses_a_bad_recording(run_tool, tmp_path, text, words):
     (tmp_path / 'bad.csv').write_text(text)
     (tmp_path / 'unit.yaml').write_text('before')
-    done = run_tool('fit', 'bad.csv', '-o', 'unit.yaml')
+    done = run_tool('fit', 'bad.csv', '-o', 'unit.yaml', '--overwrite')
     assert done.returncode == 1
     assert words in done.stderr and done.stderr.count('\n') == 1, done.stderr
     assert (tmp_path / 'unit.yaml').read_text() == 'before'
