@@ -417,7 +417,8 @@ def test_a_rate_that_contradicts_the_clock_is_named_and_no_stamp_is_ahead(connec
     for _ in range(500 // samples):
         board.send_frames(1, samples * 1e-3)
         stamps += [part.stamp_ns for part in board.read(0.001)]
-        assert not stamps or stamps[-1][-1] <= time.time_ns()
+        # A busy machine moves the map of the clocks by milliseconds; the stated rate by 500.
+        assert not stamps or stamps[-1][-1] <= time.time_ns() + 50_000_000
     steps_ns = np.diff(np.concatenate(stamps))
     assert len(steps_ns) > 200 and (steps_ns > 0).all()
     assert np.median(steps_ns) == pytest.approx(1e6, rel=0.1)
