@@ -149,10 +149,10 @@ def parameter_text(parameter: Mapping[str, Any], scale_v_per_g: float = 1.0, dig
 
 
 def _for_people(values: np.ndarray, unit: str, scale_v_per_g: float) -> tuple[np.ndarray, str]:
-    """Return values in a unit with prefix; volts of the output as the acceleration they feign."""
+    """Return values in a unit with prefix; volts of the output as an acceleration."""
     if unit == 'rad':
         return np.degrees(values), 'deg'
-    if unit in ('V', 'V/g') and np.abs(values).max() < scale_v_per_g:
+    if unit in ('V', 'V/g'):
         values, unit = values / scale_v_per_g, 'g' if unit == 'V' else '1'
     if unit == 'm/s^2':
         values, unit = values / G0_MPS2, 'g'

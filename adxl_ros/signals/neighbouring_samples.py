@@ -65,6 +65,8 @@ class NeighbouringSamples:
 
     def feed(self, time_s: np.ndarray, samples: np.ndarray) -> None:
         """Add samples, m/s², (n, m), with their stamps, s, (n,)."""
+        finite = np.isfinite(samples).all(axis=1)
+        time_s, samples = time_s[finite], samples[finite]
         if not len(samples):
             return
         joined = np.concatenate([self._left, samples])

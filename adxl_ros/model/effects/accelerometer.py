@@ -300,7 +300,7 @@ _SCALE_EXPONENT = 1.135
         Parameter('scale_exponent', '1', -3.0, 3.0, _SCALE_EXPONENT,
                   'ADXL203 datasheet: 560 mV/g at 3 V, not 600',
                   'exponent of the supply voltage in the scale factor; 0 is independent of it'),
-        Parameter('nominal_v', 'V', 1.0, 30.0, NOMINAL_SUPPLY_V,
+        Parameter('nominal_v', 'V of the supply', 1.0, 30.0, NOMINAL_SUPPLY_V,
                   'ADXL203 datasheet: values at 5 V',
                   'supply voltage of the datasheet values', '',
                   neutral=NOMINAL_SUPPLY_V, held=True, role=Role.SHAPE),
