@@ -146,39 +146,56 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     search.run(lambda share: show_progress('3/5 effects', 0.3 + 0.5 * share))
     show_progress('4/5 held-out figures', 0.8)
     floor = estimate_floor([c.comparison for c in checked])
-    counts = np.sum([used_by_block(c.used) for c in model.comparisons], axis=0)
-    fits = _held_out(model, search, floor, max(counts.sum(), 1.0))
     smallest_mps2 = material_mps2(model, floor, material_mg)
-    robot_mps2 = max(c.robot_error_mps2 for c in model.comparisons)
-    wanders = any(getattr(c.motion.force, 'wanders', False) for c in model.comparisons)
-    evidence = rule.Evidence(
-        fits, counts, rule.block_weights(seed), smallest_mps2,
-        max(model.smallest_angle_rad() * G0_MPS2, robot_mps2), robot_mps2 > 0,
-        any(c.fading_hz is not None for c in model.comparisons), wanders,
-        np.inf if floor.source == 'assumed' else floor.rms_mps2,
-        {effects: h.sizeless for effects, h in search.found.items()})
+    evidence = _evidence(model, search, floor, smallest_mps2, seed)
     detections = _detections(checked, search.best, model.baseline, smallest_mps2)
-    bases = [b for c, v in zip(compared, model.baseline_v) for b in flexible_bases(c, v)]
+    bases = [basis for comparison, baseline_v in zip(compared, model.baseline_v)
+             for basis in flexible_bases(comparison, baseline_v)]
     verdict = rule.decide(
-        evidence, lambda effects, drift: rule.reproducible_rest(fits[effects][drift], bases),
+        evidence, lambda effects, drift: rule.reproducible_rest(
+            evidence.candidates[effects][drift], bases),
         [d.effect for d in detections],
         lambda effects: _simulate_again(model, search, effects))
-    show_progress('5/5 report', 0.9)
-    if verdict.status == 'no_gap' and not any(
-            c.reference is Reference.SIMULATOR or (c.joints and not c.at_rest.all()) or any(
-                np.ptp(values) > _SMALLEST_RANGES[name]
-                for name, values in c.surroundings.items()) for c in model.comparisons):
-        # Neither the sensor moves, nor does its temperature or supply change.
-        verdict = replace(verdict, status='insufficient')
     left_out = _material_left_out(checked, verdict)
-    if verdict.status == 'no_gap' and any(part.effect is not None for part in left_out):
+    if verdict.status == 'no_gap' and not any(map(_could_show, model.comparisons)):
+        verdict = replace(verdict, status='insufficient')
+    elif verdict.status == 'no_gap' and any(part.effect is not None for part in left_out):
         # A fault of the sensor is no absence of a gap because its samples were removed.
         verdict = replace(verdict, status='unknown')
-    report = _report(checked, model, search, verdict, detections, floor, evidence,
-                     fits[verdict.best], seed)
+    show_progress('5/5 report', 0.9)
+    report = _report(checked, model, search, verdict, detections, floor, evidence, seed)
     show_progress('5/5 report', 1.0)
     return Diagnosis(tuple(model.comparisons), tuple(c.comparison for c in checked), None,
                      replace(report, left_out=left_out))
+
+
+def _could_show(comparison: BaselineComparison) -> bool:
+    """Return whether a sensor moves, or its temperature or supply changes."""
+    if comparison.reference is Reference.SIMULATOR:
+        return True
+    if comparison.joints and not comparison.at_rest.all():
+        return True
+    return any(np.ptp(values) > _SMALLEST_RANGES[name]
+               for name, values in comparison.surroundings.items())
+
+
+def _evidence(model: LinearModel, search: Search, floor: NoiseFloor, smallest_mps2: float,
+              seed: int) -> rule.Evidence:
+    """Fit all sets of effects to blocks, and predict those that were held out."""
+    comparisons = model.comparisons
+    counts = np.sum([used_by_block(c.used) for c in comparisons], axis=0)
+    robot_mps2 = max(c.robot_error_mps2 for c in comparisons)
+    return rule.Evidence(
+        candidates=_held_out(model, search, floor, max(counts.sum(), 1.0)),
+        counts=counts,
+        weights=rule.block_weights(seed),
+        material_mps2=smallest_mps2,
+        reference_mps2=max(model.smallest_angle_rad() * G0_MPS2, robot_mps2),
+        errs_in_motion=robot_mps2 > 0,
+        fades=any(c.fading_hz is not None for c in comparisons),
+        wanders=any(getattr(c.motion.force, 'wanders', False) for c in comparisons),
+        floor_mps2=np.inf if floor.source == 'assumed' else floor.rms_mps2,
+        sizeless={effects: h.sizeless for effects, h in search.found.items()})
 
 
 def _material_left_out(checked: Sequence[CheckedRecording], verdict: Verdict
@@ -368,12 +385,13 @@ def _interval(draws: np.ndarray) -> Interval:
 
 def _report(checked: Sequence[CheckedRecording], model: LinearModel, search: Search,
             verdict: Verdict, detections: Sequence[Detection], floor: NoiseFloor,
-            evidence: rule.Evidence, fits: dict[str, HeldOutFits], seed: int) -> Report:
+            evidence: rule.Evidence, seed: int) -> Report:
     """Add to a verdict the other parts of the report."""
     comparisons, best = [c.comparison for c in checked], search.found[verdict.best]
     # Coarse codes are an effect of the verdict, and not of its baseline.
     baseline = replace(comparisons[0].sensor, adc_bits=checked[0].stated_bits)
-    sensor = _named_sensor(verdict, best, detections, baseline, fits)
+    sensor = _named_sensor(verdict, best, detections, baseline,
+                           evidence.candidates[verdict.best])
     lacking = tuple(not_covered(model.comparisons))
     remainders = tuple(noise_effects.noise_remainders(comparisons, best.sensor, sensor,
                                                       detections, seed))
