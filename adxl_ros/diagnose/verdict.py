@@ -400,6 +400,11 @@ class Evidence:
         more = self.mean(self.again[effects].printed - self.again[other].printed)
         return float(more[0]) > self.material_power(1.0) and _low(more) > 0
 
+    def drift_power(self, effects: frozenset[str], drifts: Sequence[str]) -> float:
+        """Return the power of the first drift beside a set, (m/s²)²; 0 where its noise has none."""
+        fits = self.candidates[effects]
+        return fits[drifts[0]].drift_mps2 ** 2 if drifts and drifts[0] in fits else 0.0
+
     def gain(self, more: frozenset[str], less: frozenset[str]) -> np.ndarray:
         """Return by how much one set explains more power than another."""
         a, b = (self.candidates[e][HEALTHY].figures for e in (more, less))
@@ -501,7 +506,7 @@ def _answer(evidence: Evidence, rest: Rest, rest_material: float, drifts: Sequen
     explained, above = (float(v[0]) for v in (evidence.gain(best, _NOTHING), evidence.left(best)))
     repeats, steady = map(evidence.mean, (rest.squares, rest.steady_squares))
     left = float(repeats[0]) if _low(repeats) > rest_material else 0.0
-    drift = evidence.candidates[best][drifts[0]].drift_mps2 ** 2 if drifts else 0.0
+    drift = evidence.drift_power(best, drifts)
     follows = _low(steady) > rest_material and float(steady[0]) > _SHARE_OF_FORM * drift
     if drifts and (follows or rest.drift_p < _SMALLEST_P):
         # A drift follows time alone, and at random; its fit takes up what does not, too.
