@@ -401,9 +401,11 @@ class Evidence:
         return float(more[0]) > self.material_power(1.0) and _low(more) > 0
 
     def drift_power(self, effects: frozenset[str], drifts: Sequence[str]) -> float:
-        """Return the power of the first drift beside a set, (m/s²)²; 0 where its noise has none."""
+        """Return the power of the first drift beside a set, (m/s²)²; 0 without one."""
         fits = self.candidates[effects]
-        return fits[drifts[0]].drift_mps2 ** 2 if drifts and drifts[0] in fits else 0.0
+        if not drifts or drifts[0] not in fits:
+            return 0.0
+        return fits[drifts[0]].drift_mps2 ** 2
 
     def gain(self, more: frozenset[str], less: frozenset[str]) -> np.ndarray:
         """Return by how much one set explains more power than another."""

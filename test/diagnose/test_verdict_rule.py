@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""The rule of the verdict on figures that are made by hand: 48 blocks of 100 samples."""
+
+from types import SimpleNamespace
+
+from adxl_ros.diagnose.evidence import BLOCKS
+from adxl_ros.diagnose.verdict import block_weights, decide, Evidence, HEALTHY, HeldOut, Rest
+import numpy as np
+import pytest
+
+SAMPLES = 100.0
+FLOOR = 1.0
+"""Mean square of the noise; all powers below are in its unit."""
+NOTHING = frozenset()
+BIAS = frozenset({'bias'})
+LEVER_ARM = frozenset({'lever_arm'})
+
+
+def fits(left, drift_mps2=None, seed=1):
+    """Return held-out figures of a set that leaves a power above the floor, with some scatter."""
+    scatter = 1 + 0.01 * np.random.default_rng(seed).normal(size=BLOCKS)
+    squares = (FLOOR + left) * SAMPLES * scatter
+    figures = HeldOut(squares, -squares / FLOOR / 2)
+    made = {HEALTHY: SimpleNamespace(figures=figures)}
+    if drift_mps2 is not None:
+        likely = HeldOut(squares, figures.log_likelihood + 10.0)
+        made['bias_walk'] = SimpleNamespace(figures=likely, drift_mps2=drift_mps2)
+    return made
+
+
+def rest(power=0.0, dimension='force'):
+    """Return what flexible functions explain beyond the best set."""
+    squares = np.full(BLOCKS, power * SAMPLES)
+    return Rest(squares, squares, squares / FLOOR / 2, {dimension: squares})
+
+
+def decided(candidates, left_over=0.0, detected=(), material=0.1, dimension='force'):
+    evidence = Evidence(
+        candidates=candidates, counts=np.full(BLOCKS, SAMPLES), weights=block_weights(0),
+        material_mps2=material ** 0.5, reference_mps2=0.0, errs_in_motion=False, fades=False,
+        wanders=False, floor_mps2=FLOOR ** 0.5)
+    return decide(evidence, lambda effects, drift: rest(left_over, dimension), detected)
+
+
+def test_nothing_above_the_noise_is_no_gap():
+    verdict = decided({NOTHING: fits(0.0), BIAS: fits(0.0)})
+    assert (verdict.status, verdict.effects) == ('no_gap', ())
+
+
+def test_one_effect_that_explains_all_is_named():
+    verdict = decided({NOTHING: fits(5.0), BIAS: fits(0.0), LEVER_ARM: fits(4.0)})
+    assert (verdict.status, verdict.effects) == ('explained', ('bias',))
+    assert verdict.explained.value == pytest.approx(5.0, rel=0.02)
+
+
+def test_two_effects_that_explain_alike_are_inseparable():
+    verdict = decided({NOTHING: fits(5.0), BIAS: fits(0.0), LEVER_ARM: fits(0.001)})
+    assert (verdict.status, verdict.groups) == ('inseparable', (('bias', 'lever_arm'),))
+
+
+def test_a_second_effect_must_explain_more_than_what_is_material():
+    pair = BIAS | LEVER_ARM
+    alone = {NOTHING: fits(5.0), BIAS: fits(0.05), LEVER_ARM: fits(4.9), pair: fits(0.0)}
+    assert decided(alone).effects == ('bias',)
+    both = {**alone, BIAS: fits(2.0), LEVER_ARM: fits(3.0)}
+    assert decided(both).effects == ('bias', 'lever_arm')
+
+
+def test_what_repeats_beside_an_effect_is_said():
+    verdict = decided({NOTHING: fits(5.0), BIAS: fits(1.0)}, left_over=1.0)
+    assert (verdict.status, verdict.effects) == ('partly', ('bias',))
+    assert verdict.rest.value == pytest.approx(1.0)
+
+
+def test_what_repeats_and_no_effect_explains_is_unknown():
+    verdict = decided({NOTHING: fits(5.0), BIAS: fits(4.5)}, left_over=4.0)
+    assert (verdict.status, verdict.effects) == ('unknown', ())
+
+
+def test_an_effect_of_the_noise_is_named_beside_no_gap_of_the_mean():
+    verdict = decided({NOTHING: fits(0.0)}, detected=['spikes'])
+    assert (verdict.status, verdict.effects) == ('explained', ('spikes',))
+
+
+def test_a_set_without_a_drift_may_be_the_best_of_a_draw():
+    """Two equal sets take turns in the draws; noise with a drift was fitted beside one only."""
+    verdict = decided({NOTHING: fits(5.0), BIAS: fits(0.0, drift_mps2=1.0),
+                       LEVER_ARM: fits(0.0, seed=2)}, dimension='time')
+    assert verdict.status in ('explained', 'inseparable', 'partly')
+
+
+def test_the_probabilities_sum_to_one_and_the_answer_has_the_largest():
+    verdict = decided({NOTHING: fits(5.0), BIAS: fits(0.0), LEVER_ARM: fits(0.02)})
+    probabilities = [hypothesis.probability for hypothesis in verdict.hypotheses]
+    assert sum(probabilities) == pytest.approx(1.0)
+    assert probabilities == sorted(probabilities, reverse=True)
