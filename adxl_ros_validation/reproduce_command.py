@@ -63,7 +63,7 @@ def reproduce(options: argparse.Namespace) -> int:
     further = cli.quoted(f'{folder}_coverage')
     cli.print_end([*screen, ''], [folder / 'reproduction.md', folder / FIGURES], '' if
                   options.draws else command('reproduce',
-                                                 f'--draws 300 --units 0 -o {further}'))
+                                             f'--draws 300 --units 0 -o {further}'))
     return 0
 
 

@@ -50,6 +50,7 @@ together are far below the 5 % that remain at the end; run time."""
 _EVIDENCE_FACTOR = 0.3
 """Factor of the information, because no model of a sensor is exact (Miller and Dunson 2019)."""
 
+
 class CouldShow(NamedTuple):
     """Smallest size of one parameter of an effect that recordings would have shown."""
 

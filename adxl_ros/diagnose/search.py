@@ -84,7 +84,6 @@ class Hypothesis:
             self.names, differs, self.undetermined) if parameter_of(name).is_size and not is_open]
         return frozenset(e for e, _ in sizes) - {e for e, shows in sizes if shows}
 
-
     @property
     def at_bound(self) -> bool:
         """Whether a determined size is at the end of what its parameter can have: no result."""

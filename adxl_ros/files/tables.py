@@ -176,7 +176,7 @@ def _open_ulog(path: str, topic: str) -> Table:
         mapping = mapping.partition(',temperature=')[0]
     cut = f'{path}: is damaged; what can be read of it is used' * bool(log.file_corruption)
     return in_memory(path, columns, cut, default_mapping=mapping,
-                      units={'timestamp': 'us', 'timestamp_sample': 'us'})
+                     units={'timestamp': 'us', 'timestamp_sample': 'us'})
 
 
 _FORMATS: Mapping[str, Callable[[str], Table]] = {

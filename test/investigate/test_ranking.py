@@ -61,9 +61,11 @@ def test_a_manoeuvre_that_does_not_fit_in_the_time_is_not_chosen():
     pose = Pose(0.0, 0.0)
     minutes = {m.name: m.minutes for m in plan_all(LIMITS, pose)}
     shortest = min(minutes, key=minutes.get)
-    assert shortest != first_round()[0].manoeuvre
-    answer, _ = run_round(Question(pose, 0.0, minutes[shortest] + 1e-6, False), [], SENSOR, LIMITS)
-    assert answer.manoeuvre == shortest
+    fits, _ = run_round(Question(pose, 0.0, minutes[shortest] + 1e-6, False), [], SENSOR, LIMITS)
+    none_fits, _ = run_round(Question(pose, 0.0, minutes[shortest] - 1e-6, False), [], SENSOR,
+                             LIMITS)
+    assert fits.manoeuvre == shortest
+    assert (none_fits.manoeuvre, none_fits.outcome) == ('', Outcome.TIME_OVER)
     assert decide(between((), ('hysteresis',)), (told_nothing(1.0),), FIRST, False
                   ).outcome is Outcome.TIME_OVER
 

@@ -409,7 +409,7 @@ def test_another_board_on_the_port_is_another_sensor(connect):
 
 @pytest.mark.parametrize('stated_hz, samples', [(500.0, 10), (500.0, 2), (2000.0, 10)])
 def test_a_rate_that_contradicts_the_clock_is_named_and_no_stamp_is_ahead(connect, stated_hz,
-                                                                           samples):
+                                                                          samples):
     board = connect(info=BoardInfo(stated_hz, 16, 2, 5.0, ''))
     board.codes = board.codes[:samples]
     board.send_info()
