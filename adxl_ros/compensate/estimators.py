@@ -84,7 +84,7 @@ class RecordingEstimator:
 
     @property
     def assumed(self) -> list[str]:
-        """What was assumed of the surroundings so far, one line each, for people."""
+        """Return what was assumed of the surroundings so far, one line each, for people."""
         sensor, lines = self._sensor, self._surroundings.assumed(self._sensor.effects)
         if sensor.axes == 'xy' and sensor.effects and not sensor.z_sign:
             lines = [*lines, 'the sensor is taken as upright, and the deviations of x and y hold '

@@ -110,7 +110,7 @@ class LeftOut:
 
     @property
     def why(self) -> str:
-        """The reason without its figures."""
+        """Return the reason without its figures."""
         return self.reason.partition(' (')[0]
 
 
@@ -172,7 +172,7 @@ class BaselineComparison:
 
     @property
     def measured(self) -> np.ndarray:
-        """Samples that are numbers and do not stand alone or repeat, (n,) bool."""
+        """Return which samples are numbers and do not stand alone or repeat, (n,) bool."""
         return np.isfinite(self.volts).all(axis=1) & ~self.disturbed
 
     @property

@@ -131,7 +131,7 @@ class StillStretch:
 
     @property
     def window_octaves(self) -> int:
-        """Number of octaves of the Allan deviation that `sample_std` is of."""
+        """Return the number of octaves of the Allan deviation that `sample_std` is of."""
         return min(_window_octaves(self.rate_hz), len(self.allan.tau_s))
 
 

@@ -177,7 +177,7 @@ class _Stamps:
 
     @property
     def rate_hz(self) -> float:
-        """Samples over their time, gaps left out, Hz."""
+        """Return samples over their time, gaps left out, Hz."""
         return round(self._usual / self._usual_s if self._usual_s else 1 / self.period_s, 6)
 
     @property
