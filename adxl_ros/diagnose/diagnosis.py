@@ -8,7 +8,7 @@ the figures. What the report adds comes last.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -319,7 +319,7 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline:
 
 
 def _named_sensor(verdict: Verdict, best: Hypothesis, detections: Sequence[Detection],
-                  baseline: Sensor, fits: dict[str, HeldOutFits]) -> Sensor:
+                  baseline: Sensor, fits: Mapping[str, HeldOutFits]) -> Sensor:
     """
     Return the baseline with exactly the effects whose closing the verdict states.
 
