@@ -41,6 +41,7 @@ _BIN_G, _LARGEST_STEP_G = 0.05, 70.0  # Width and end of the bins of steps, g. C
 
 _TURN_RAD_PER_S = np.radians(2000.0)
 """Fastest turn of a sensor, rad/s: the range of common gyroscopes, and above any hand or robot."""
+_MOST_TURNS = 2  # Most jumps of a sensor that was turned over: there, and back
 _SIDE = 8  # Samples on either side of a jump that must be steady. Chosen: a knock rings longer
 _NEAREST = 3  # Samples on either side whose mean is compared
 _STEADY = 0.2  # Largest step among them, by the jump. Chosen: noise and slow motion are smaller
@@ -163,7 +164,8 @@ class NeighbouringSamples:
                 self._jumps.append((float(time_s[i]), float(size[i])))
 
     def _jumped(self) -> str:
-        if not self._jumps:
+        # Rests that were cut out of a recording and joined jump at each of their ends.
+        if not 0 < len(self._jumps) <= _MOST_TURNS:
             return ''
         at_s, jump_mps2 = self._jumps[0]
         return (f'the readings jump by {jump_mps2 / G0_MPS2:.3g} g at {at_s:.6g} s from one '

@@ -84,3 +84,11 @@ def test_a_sensor_that_is_turned_over_between_two_samples(signs: list[int], bloc
     samples[2000:] *= signs
     found, = faults(samples, block)
     assert 'at 19.99 s' in found
+
+
+def test_rests_that_were_joined_are_no_turns() -> None:
+    """A table of rests that were cut out of a recording jumps at each of their ends."""
+    directions = np.random.default_rng(3).normal(size=(12, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    rests = np.repeat(G * directions, 300, axis=0)
+    assert faults(rests + np.random.default_rng(4).normal(0, 0.02, rests.shape)) == []
