@@ -63,4 +63,4 @@ def test_the_documented_package_works(tmp_path, monkeypatch, run_tool):
     assert run.returncode == 0, run.stderr
     report = json.loads((tmp_path / 'gap' / 'report.json').read_text())
     assert report['verdict']['status'] in ('explained', 'inseparable')
-    assert 'cable_sag' in [candidate['effect'] for candidate in report['candidates']]
+    assert 'cable_sag' in [row['effect'] for row in report['could_show']]
