@@ -306,25 +306,21 @@ def diagnose(recordings: RecordingInput | Iterable[RecordingInput],
         A recording is of another unit, or its reference cannot be followed.
 
     """
-    for name, value, least in (('seed', seed, 0), ('self-check', self_check, 0),
-                               ('material', material, 1e-6)):
-        require_least(name, value, least)
+    require_least('seed', seed, 0)
+    require_least('self-check', self_check, 0)
+    require_least('material', material, 1e-6)
     if align and sim is None and not urdf:
         raise UserError('--align: shifts --sim or a robot, and neither is given')
     unit = quantity_named(quantity) if quantity else None
     read = as_recordings(recordings)
-    if (sim is not None or urdf) and (len(read) > 1 or (sim is not None and urdf)):
-        raise UserError(f'{_name_of(sim) or urdf}: --sim or --urdf, one of them, goes with one '
-                        f'recording, but {len(read)} are given')
+    _require_one_reference(sim, urdf, len(read))
     given = sensor_of(sensor, read[0])
     baseline, remarks = given.sensor, []
     motion = RobotInput(urdf, frame, joints).path(read[0], baseline).as_motion() if urdf else \
         _motion(read[0], sim)
     if prior:
-        from adxl_ros.files import calibration_store
-        from adxl_ros.model.population import posterior
-        baseline, line, _ = posterior(baseline, calibration_store.read_population(prior))
-        remarks.append(f'prior: {line}')
+        baseline, remark = _with_prior(baseline, prior)
+        remarks.append(remark)
     remarks += [f'assumed: {text}' for each in read for text in assumed(each, baseline.effects)]
     diagnosis = core.diagnose(read, baseline, motion, seed,
                               lambda stage, done: progress(done, stage), align, material)
@@ -338,6 +334,24 @@ def diagnose(recordings: RecordingInput | Iterable[RecordingInput],
     compared = Compared(tuple(r.path for r in read), given.file, given.file_name, _name_of(sim),
                         os.fspath(urdf or ''), frame, _subject(read, baseline, reference))
     return _gap(diagnosis, baseline, compared, in_unit, remarks)
+
+
+def _require_one_reference(sim: RecordingInput | Motion | None, urdf: str | os.PathLike | None,
+                           count: int) -> None:
+    """Refuse a simulator and a robot together, and one of them for several recordings."""
+    if sim is None and not urdf:
+        return
+    if count > 1 or (sim is not None and urdf):
+        raise UserError(f'{_name_of(sim) or urdf}: --sim or --urdf, one of them, goes with one '
+                        f'recording, but {count} are given')
+
+
+def _with_prior(sensor: Sensor, population: str | os.PathLike) -> tuple[Sensor, str]:
+    """Return a sensor with the zero-g and scale factor of its fleet, and a remark on them."""
+    from adxl_ros.files import calibration_store
+    from adxl_ros.model.population import posterior
+    informed, line, _ = posterior(sensor, calibration_store.read_population(population))
+    return informed, f'prior: {line}'
 
 
 def _name_of(sim: RecordingInput | Motion | None) -> str:

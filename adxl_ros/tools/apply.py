@@ -56,7 +56,7 @@ def apply(options: argparse.Namespace) -> int:
             write(block, estimates)
             show(block.done)
     cli.report_notes('apply', correction.notes)
-    cli.report_reading('apply', block)
+    cli.report_notes('apply', block.notes)
     following = ('compensation', f'--ros-args -p calibration:={cli.quoted(options.params or "")}')
     cli.print_end(correction.screen, [options.output], command(
         *following if correction.sensor.effects else ('fit', 'SWEEP -o unit.yaml')))

@@ -205,13 +205,8 @@ def refuse_same_file(output: str, source: str) -> None:
         raise UserError(f'{output}: is the input itself; choose another output')
 
 
-def report_reading(tool: str, recording: Recording) -> None:
-    """Report on stderr what was assumed in reading, the cut, and the alignment of references."""
-    report_notes(tool, recording.notes)
-
-
 def report_notes(tool: str, notes: Iterable[str]) -> None:
-    """Report on stderr what is noteworthy of an input."""
+    """Report on stderr what was assumed or left out of an input."""
     for line in notes:
         note(f'{tool}: {line}')
 
@@ -219,7 +214,7 @@ def report_notes(tool: str, notes: Iterable[str]) -> None:
 def read(tool: str, path: str, reading: ReadingOptions = AS_IT_IS) -> Recording:
     """Read a recording, and report on stderr how."""
     read = recording.read(path, reading)
-    report_reading(tool, read)
+    report_notes(tool, read.notes)
     return read
 
 

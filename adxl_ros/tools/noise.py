@@ -52,7 +52,7 @@ def noise(options: argparse.Namespace) -> int:
                 show(block.done, 'read')
 
         found = find_noise(blocks, options.params, progress=show)
-    cli.report_reading('noise', *newest)
+    cli.report_notes('noise', newest[-1].notes)
     files = [found.report(options.report)] if options.report else []
     lines = found.screen
     if options.output:

@@ -23,6 +23,16 @@ IN_UNIT = {'g': 1 / G0_MPS2, 'mg': 1e3 / G0_MPS2, 'mps2': 1.0, 'mmps2': 1e3,
 """Reading of 1 m/s² by the name of a unit."""
 
 
+def bag_and_table(folder: Path, readings: np.ndarray) -> tuple[Path, Path]:
+    """Write readings, named as if in m/s², as a bag and as a table."""
+    bag_of(folder / 'bag', [imu(EPOCH_NS + round(1e9 * time_s), reading, variance=(0, 0, 0))
+                            for time_s, reading in zip(TIME_S, readings)])
+    table = folder / 'table.csv'
+    table.write_text('time_s,ax_mps2,ay_mps2,az_mps2\n'
+                     + lines([TIME_S, *readings.T], ['%.3f'] + ['%.9f'] * 3))
+    return folder / 'bag', table
+
+
 def read_in(path: Path, unit: str) -> recording.Recording:
     counts = (16384.0,) if unit == 'lsb' else ()
     return recording.read(path, ReadingOptions(unit=unit, lsb_per_g=counts))
@@ -32,12 +42,7 @@ def read_in(path: Path, unit: str) -> recording.Recording:
 def test_one_option_states_the_unit_of_a_bag_and_of_a_table(tmp_path: Path, unit: str) -> None:
     """Bags and tables whose columns are named as if in m/s² become m/s² by the same option."""
     readings = FORCE_MPS2 * IN_UNIT[unit]
-    bag_of(tmp_path / 'bag', [imu(EPOCH_NS + round(1e9 * time_s), reading, variance=(0, 0, 0))
-                              for time_s, reading in zip(TIME_S, readings)])
-    table = tmp_path / 'table.csv'
-    table.write_text('time_s,ax_mps2,ay_mps2,az_mps2\n'
-                     + lines([TIME_S, *readings.T], ['%.3f'] + ['%.9f'] * 3))
-    for path in (tmp_path / 'bag', table):
+    for path in bag_and_table(tmp_path, readings):
         read = read_in(path, unit)
         force = np.column_stack([read.columns[name] for name in read.sensor_columns])
         np.testing.assert_allclose(force, FORCE_MPS2, atol=1e-6)
@@ -110,12 +115,7 @@ def test_a_sample_without_a_number_is_left_out_by_an_option_and_counted(tmp_path
     """Its neighbours keep their times, also where stamps are those of an index."""
     force = FORCE_MPS2.copy()
     force[7, 1] = np.nan
-    bag_of(tmp_path / 'bag', [imu(EPOCH_NS + round(1e9 * time_s), row, variance=(0, 0, 0))
-                              for time_s, row in zip(TIME_S, force)])
-    table = tmp_path / 'table.csv'
-    table.write_text('time_s,ax_mps2,ay_mps2,az_mps2\n'
-                     + lines([TIME_S, *force.T], ['%.3f'] + ['%.9f'] * 3))
-    for path in (tmp_path / 'bag', table):
+    for path in bag_and_table(tmp_path, force):
         with pytest.raises(UserError, match='--drop-bad-samples'):
             recording.read(path)
         for rate_hz in (None, 100.0):

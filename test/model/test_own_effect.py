@@ -55,7 +55,7 @@ def test_the_documented_package_works(tmp_path, monkeypatch, run_tool):
     ax = [np.genfromtxt(tmp_path / name, delimiter=',', names=True)['ax_mps2']
           for name in ('out.csv', 'bare.csv')]
     assert abs(np.mean(ax[0] - ax[1])) < 2e-4
-    # The diagnosis tries it; what grows so little with the output is a zero-g as well.
+    # The diagnosis knows it; what grows so little with the output is a zero-g as well.
     run = run_executable(*line[0].split()[:2], *line[1].split()[1:], '--rate', '50',
                          '-o', 'c.csv', cwd=tmp_path)
     assert run.returncode == 0, run.stderr
