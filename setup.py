@@ -44,8 +44,9 @@ def state_commit() -> None:
     """Write the commit that is built into the package, so that pages and figures can name it."""
     here = Path(__file__).resolve().parent
     if (here / '.git').exists():
-        made = subprocess.run(['git', 'describe', '--always', '--dirty=_changed', '--exclude', '*'],
-                              cwd=here, capture_output=True, text=True)
+        made = subprocess.run(
+            ['git', 'describe', '--always', '--dirty=_changed', '--exclude', '*'],
+            cwd=here, capture_output=True, text=True)
         if made.returncode == 0:
             (here / PACKAGE / 'commit.txt').write_text(made.stdout, encoding='utf-8')
 

@@ -28,7 +28,6 @@ from adxl_ros.diagnose.gap_in_unit import gap_in, GapInUnit, quantity as quantit
 from adxl_ros.diagnose.next_experiment import CouldShow
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
-from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import free_name, write_text
 from adxl_ros.files.recording_columns import NO_UNIT, Recording
 from adxl_ros.files.surroundings import assumed
@@ -130,8 +129,8 @@ class Gap(Result):
     """All steps between the recordings and the verdict."""
 
     def with_params(self, path: str) -> Gap:
-        """Name the parameter file of a sensor that was given as such; '' is the nominal one."""
-        name = Path(path or parameter_file.nominal_path()).name
+        """Name the parameter file of a sensor that was given as such; '' is the usual one."""
+        name = Path(path).name or self.compared.params_name
         return replace(self, compared=self.compared._replace(params=path, params_name=name))
 
     @property
@@ -330,9 +329,9 @@ def diagnose(recordings: RecordingInput | Iterable[RecordingInput],
                                        lambda done: progress(done, 'self-check')))
     if unit and found:
         in_unit = gap_in(unit, diagnosis.full_rate, found.baseline, found.sensor, seed)
-    reference = _name_of(sim) or os.fspath(urdf or '')
-    compared = Compared(tuple(r.path for r in read), given.file, given.file_name, _name_of(sim),
-                        os.fspath(urdf or ''), frame, _subject(read, baseline, reference))
+    simulator, robot = _name_of(sim), os.fspath(urdf or '')
+    compared = Compared(tuple(r.path for r in read), given.file, given.file_name, simulator,
+                        robot, frame, _subject(read, baseline, simulator or robot))
     return _gap(diagnosis, baseline, compared, in_unit, remarks)
 
 

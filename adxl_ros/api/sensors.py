@@ -46,12 +46,8 @@ class GivenSensor(NamedTuple):
 
     sensor: Sensor  # With the rate of the recording, and with what was measured
     file: str  # What names it on a command line; '' for the nominal sensor
+    file_name: str  # Name of its parameter file, that of the nominal sensor or any IMU, too
     measured: Sequence[str]  # What was measured, as no parameter file states it, for people
-
-    @property
-    def file_name(self) -> str:
-        """Return the name of its parameter file."""
-        return os.path.basename(self.file or parameter_file.nominal_path())
 
 
 def sensor_of(given: SensorInput | None, read: Recording, has_noise: bool = True) -> GivenSensor:
@@ -67,7 +63,8 @@ def sensor_of(given: SensorInput | None, read: Recording, has_noise: bool = True
         sensor, measured = measure_unstated(sensor, read)
     if isinstance(stated, Sensor):
         stated = '' if sensor.serial == NO_UNIT else f'{sensor.serial}.yaml'
-    return GivenSensor(sensor, stated or '', measured)
+    usual = parameter_file.usual_path(read.is_of_nominal)
+    return GivenSensor(sensor, stated or '', os.path.basename(stated or usual), measured)
 
 
 def as_input(given: SensorInput | None) -> Sensor | str | None:

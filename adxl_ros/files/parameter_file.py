@@ -122,9 +122,14 @@ def load(path: str | os.PathLike, may_measure: bool = False) -> Sensor:
     return from_flat(flat, make_error, may_measure)
 
 
+def usual_path(is_nominal: bool) -> Path:
+    """Return the path of the nominal sensor, or of any IMU."""
+    return nominal_path() if is_nominal else any_imu_path()
+
+
 def usual(is_nominal: bool) -> Sensor:
     """Return the nominal sensor, or any IMU."""
-    return load(nominal_path() if is_nominal else any_imu_path(), may_measure=True)
+    return load(usual_path(is_nominal), may_measure=True)
 
 
 def from_flat(flat: Mapping[str, Any], make_error: MakeError, may_measure: bool = False

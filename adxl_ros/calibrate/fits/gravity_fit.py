@@ -21,7 +21,6 @@ from itertools import product
 from typing import NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.column_mapping import likely_unit
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import parameter_of, Sensor
@@ -449,16 +448,13 @@ def _held_out(rests: NominalRests, kept: np.ndarray, parameters: np.ndarray,
 
 
 def _require_gravity(rests: NominalRests, parameters: np.ndarray) -> None:
-    """Refuse rests that do not read gravity."""
+    """Refuse rests that do not read gravity; readings in another unit were refused before."""
     measured_g = np.median(magnitude(rests.mean, parameters)) if len(rests.mean) else \
         rests.gravity_g
     if not _MIN_GRAVITY_RATIO < measured_g / rests.gravity_g < _MAX_GRAVITY_RATIO:
-        read_mps2 = float(measured_g * G0_MPS2)
-        unit = likely_unit(read_mps2)
-        advice = f'state the unit of the readings: --unit {unit}, or samples.unit of a node' \
-            if unit else 'correct nominal_zero_g_v, nominal_scale_v_per_g or local_gravity_mps2'
-        raise UserError(f'gravity: the rests read {read_mps2:.3g} m/s², not '
-                        f'{rests.gravity_g * G0_MPS2:.3g}: {advice}')
+        raise UserError(f'gravity: the rests read {float(measured_g * G0_MPS2):.3g} m/s², not '
+                        f'{rests.gravity_g * G0_MPS2:.3g}: correct nominal_zero_g_v, '
+                        'nominal_scale_v_per_g or local_gravity_mps2')
 
 
 def _undetermined(rests: NominalRests, parameters: np.ndarray, excess_g2: float, step: Step
