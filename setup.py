@@ -21,10 +21,14 @@ def requirements(name: str) -> list[str]:
 
 def executables(package: str, end: str = '') -> list[str]:
     """Make an executable of each module in a package that has a main(); `end` of its name goes."""
-    modules = sorted(Path(__file__).resolve().parent.joinpath(*package.split('.')).glob(
-        f'*{end}.py'))
-    return [f'{path.stem.removesuffix(end)} = {package}.{path.stem}:main' for path in modules
-            if '\ndef main(' in path.read_text(encoding='utf-8')]
+    modules = sorted(
+        Path(__file__).resolve().parent.joinpath(*package.split('.')).glob(f'*{end}.py')
+    )
+    return [
+        f'{path.stem.removesuffix(end)} = {package}.{path.stem}:main'
+        for path in modules
+        if '\ndef main(' in path.read_text(encoding='utf-8')
+    ]
 
 
 def scripts() -> list[str]:
@@ -36,8 +40,11 @@ def scripts() -> list[str]:
     """
     if {'bdist_wheel', 'dist_info', 'editable_wheel'} & {*sys.argv}:
         return [f'{PACKAGE} = {PACKAGE}.__main__:main']
-    return [*executables(f'{PACKAGE}.nodes'), *executables(f'{PACKAGE}.tools'),
-            *executables(f'{PACKAGE}_validation', '_command')]
+    return [
+        *executables(f'{PACKAGE}.nodes'),
+        *executables(f'{PACKAGE}.tools'),
+        *executables(f'{PACKAGE}_validation', '_command'),
+    ]
 
 
 def state_commit() -> None:
@@ -46,7 +53,10 @@ def state_commit() -> None:
     if (here / '.git').exists():
         made = subprocess.run(
             ['git', 'describe', '--always', '--dirty=_changed', '--exclude', '*'],
-            cwd=here, capture_output=True, text=True)
+            cwd=here,
+            capture_output=True,
+            text=True,
+        )
         if made.returncode == 0:
             (here / PACKAGE / 'commit.txt').write_text(made.stdout, encoding='utf-8')
 
@@ -56,28 +66,41 @@ setup(
     name=PACKAGE,
     version='0.1.0',
     # The parameter files are part of the package, too: a cluster node has no ROS to locate them.
-    packages=[*find_packages(include=[PACKAGE, f'{PACKAGE}.*', f'{PACKAGE}_validation*']),
-              f'{PACKAGE}.params'],
+    packages=[
+        *find_packages(include=[PACKAGE, f'{PACKAGE}.*', f'{PACKAGE}_validation*']),
+        f'{PACKAGE}.params',
+    ],
     package_dir={f'{PACKAGE}.params': 'params'},
-    package_data={PACKAGE: ['commit.txt', 'py.typed', 'api/*.html', 'calibrate/report/*.html',
-                            'calibrate/report/*.js', 'calibrate/report/*.xml', 'diagnose/*.html',
-                            'files/export_templates/*', 'fleet/*.html',
-                            'report/page_templates/*'],
-                  f'{PACKAGE}_validation': ['*.yaml', 'blind/*.yaml', 'pages/*'],
-                  f'{PACKAGE}.params': ['*.yaml']},
+    package_data={
+        PACKAGE: [
+            'commit.txt',
+            'py.typed',
+            'api/*.html',
+            'calibrate/report/*.html',
+            'calibrate/report/*.js',
+            'calibrate/report/*.xml',
+            'diagnose/*.html',
+            'files/export_templates/*',
+            'fleet/*.html',
+            'report/page_templates/*',
+        ],
+        f'{PACKAGE}_validation': ['*.yaml', 'blind/*.yaml', 'pages/*'],
+        f'{PACKAGE}.params': ['*.yaml'],
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
         (f'share/{PACKAGE}/launch', glob('launch/*.launch.py')),
         (f'share/{PACKAGE}/params', glob('params/*.yaml')),
         (f'share/{PACKAGE}/security', glob('security/*.xml')),
-        *((f'share/{PACKAGE}/{name}', glob(f'share/{name}/*'))
-          for name in ('completion', 'layouts', 'udev', 'urdf')),
+        *(
+            (f'share/{PACKAGE}/{name}', glob(f'share/{name}/*'))
+            for name in ('completion', 'layouts', 'udev', 'urdf')
+        ),
     ],
     python_requires='>=3.10',
     install_requires=['setuptools', *requirements('core')],
-    extras_require={name: requirements(name)
-                    for name in ('extras', 'fleet', 'robot', 'test')},
+    extras_require={name: requirements(name) for name in ('extras', 'fleet', 'robot', 'test')},
     zip_safe=True,
     maintainer='the adxl_ros authors',
     maintainer_email='adxl-ros-maintainers@users.noreply.github.com',

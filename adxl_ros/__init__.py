@@ -43,8 +43,17 @@ _MODULES = {
 """Module of each name that `import adxl_ros` gives."""
 
 __all__ = [
-    'SensorModel', 'UserError', 'apply', 'check', 'diagnose', 'fit', 'from_arrays', 'load',
-    'noise', 'read', 'simulate',
+    'SensorModel',
+    'UserError',
+    'apply',
+    'check',
+    'diagnose',
+    'fit',
+    'from_arrays',
+    'load',
+    'noise',
+    'read',
+    'simulate',
 ]
 
 
@@ -59,6 +68,7 @@ def __getattr__(name: str) -> Any:
     """Load a verb when it is used first."""
     if name == '__version__':
         from adxl_ros.process import package_version
+
         return package_version()
     if name not in _MODULES:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

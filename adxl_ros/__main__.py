@@ -11,8 +11,16 @@ import sys
 
 from adxl_ros.process import ended_by_closed_output, ONE_COMMAND, package_version, STARTED_BY
 
-_NODES = ('demo', 'driver', 'stage', 'calibration', 'compensation', 'investigate', 'monitor',
-          'screen')
+_NODES = (
+    'demo',
+    'driver',
+    'stage',
+    'calibration',
+    'compensation',
+    'investigate',
+    'monitor',
+    'screen',
+)
 """What needs ROS 2."""
 
 
@@ -25,8 +33,10 @@ def main() -> int:
     if not package:
         return _answer(name)
     if package == 'nodes' and find_spec('rclpy') is None:
-        print(f'{ONE_COMMAND}: {name} needs ROS 2; install it, and source its setup.bash',
-              file=sys.stderr)
+        print(
+            f'{ONE_COMMAND}: {name} needs ROS 2; install it, and source its setup.bash',
+            file=sys.stderr,
+        )
         return 1
     sys.argv = [name, *sys.argv[2:]]
     return import_module(f'adxl_ros.{package}.{name}').main()
@@ -41,17 +51,24 @@ def _answer(word: str) -> int:
     if word == '--version':
         print(f'adxl_ros {package_version()}')
         return 0
-    print(f'{ONE_COMMAND}: no tool {word!r}; the tools are {", ".join(_tools())}',
-          file=sys.stderr)
+    print(f'{ONE_COMMAND}: no tool {word!r}; the tools are {", ".join(_tools())}', file=sys.stderr)
     return 2
 
 
 def _help() -> list[str]:
     """Return the tools with what they do."""
-    return [f'usage: {ONE_COMMAND} TOOL ...', '', __doc__, '', 'tools:',
-            *(f'  {name:10}{about}' for name, about in _tools().items()), '',
-            f'with ROS 2 also: {", ".join(_NODES)}', '',
-            f'{ONE_COMMAND} TOOL --help shows options and examples.']
+    return [
+        f'usage: {ONE_COMMAND} TOOL ...',
+        '',
+        __doc__,
+        '',
+        'tools:',
+        *(f'  {name:10}{about}' for name, about in _tools().items()),
+        '',
+        f'with ROS 2 also: {", ".join(_NODES)}',
+        '',
+        f'{ONE_COMMAND} TOOL --help shows options and examples.',
+    ]
 
 
 def _tools() -> dict[str, str]:

@@ -38,8 +38,10 @@ def package_version() -> str:
 @lru_cache(maxsize=1)
 def code_version() -> str:
     """Return the SHA-256 of version and code of this package."""
-    code = [path.name.encode() + path.read_bytes()
-            for path in sorted(Path(__file__).parent.rglob('*.py'))]
+    code = [
+        path.name.encode() + path.read_bytes()
+        for path in sorted(Path(__file__).parent.rglob('*.py'))
+    ]
     return hashlib.sha256(release_version().encode() + b''.join(code)).hexdigest()
 
 

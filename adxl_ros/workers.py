@@ -66,8 +66,9 @@ class Pool(Executor):
 
 
 @contextmanager
-def open_pool(scheduler: str | None, jobs: int | None = None, shared: tuple = ()
-              ) -> Iterator[Pool]:
+def open_pool(
+    scheduler: str | None, jobs: int | None = None, shared: tuple = ()
+) -> Iterator[Pool]:
     """
     Open a pool; the values of `shared` are the first arguments of all its tasks.
 
@@ -139,8 +140,7 @@ class Processes(Pool):
         self._threads.shutdown(wait, cancel_futures=cancel_futures)
 
 
-def in_background(work: Callable[..., Any], *arguments: Any
-                  ) -> tuple[Future, Callable[[], None]]:
+def in_background(work: Callable[..., Any], *arguments: Any) -> tuple[Future, Callable[[], None]]:
     """Start a task in a process of its own; return its end, and what ends it at once."""
     pool = Processes(1)
     end = pool.submit(work, *arguments)
@@ -155,6 +155,7 @@ def _work(pipe: Connection, shared: tuple) -> None:
     Ctrl-C is left to the parent. A terminated worker ends by an exception, so that it removes its
     files and its own processes. A worker ends with its parent, however that ended.
     """
+
     def end_with_parent() -> None:
         cast(Any, parent_process()).join()
         os.kill(os.getpid(), signal.SIGTERM)
@@ -183,16 +184,21 @@ class Cluster(Pool):
         except ImportError:
             raise UserError(f'--scheduler needs Dask; {install_hint("distributed")}') from None
         # A lost scheduler is reported by this module, in one line.
-        for name in ('distributed', 'distributed.client', 'distributed.utils',
-                     'tornado.application'):
+        for name in (
+            'distributed',
+            'distributed.client',
+            'distributed.utils',
+            'tornado.application',
+        ):
             logging.getLogger(name).setLevel(logging.CRITICAL)
         warnings.filterwarnings('ignore', 'Sending large graph')
         self._address, self._slots = address, _FEWEST_TASKS
         try:
             self._client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise UserError(f'--scheduler {address}: no scheduler answers: {one_line(error)}'
-                            ) from None
+            raise UserError(
+                f'--scheduler {address}: no scheduler answers: {one_line(error)}'
+            ) from None
         # The cluster makes it again where all workers that have it end.
         self._shared = self._client.submit(tuple, shared, key=f'shared-{uuid4().hex}')
 
@@ -207,15 +213,20 @@ class Cluster(Pool):
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
         """Give a task to the scheduler."""
         from distributed.client import ClosedClientError
+
         try:
-            return self._client.submit(lambda shared: fn(*shared, *args, **kwargs), self._shared,
-                                       key=f'task-{uuid4().hex}')
+            return self._client.submit(
+                lambda shared: fn(*shared, *args, **kwargs),
+                self._shared,
+                key=f'task-{uuid4().hex}',
+            )
         except (OSError, RuntimeError, ClosedClientError):
             raise self._lost() from None
 
     def end(self, future: Any) -> tuple[Any, BaseException | None]:
         """Return what a task returned and raised."""
         from distributed.scheduler import KilledWorker
+
         try:
             return future.result(timeout=_FETCH_S), None
         except (Exception, asyncio.CancelledError) as error:
@@ -224,8 +235,10 @@ class Cluster(Pool):
             return None, WorkerDied(_DIED) if isinstance(error, KilledWorker) else error
 
     def _lost(self) -> UserError:
-        return UserError(f'--scheduler {self._address}: was lost; start it again, and the same '
-                         'command continues')
+        return UserError(
+            f'--scheduler {self._address}: was lost; start it again, and the same '
+            'command continues'
+        )
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Leave the cluster, which runs on; tasks are given up."""
@@ -242,8 +255,9 @@ class Finished(NamedTuple):
     attempts: int  # Number of attempts
 
 
-def finished_tasks(pool: Pool, work: Callable[..., Any], tasks: Iterable[tuple],
-                   retries: int = RETRIES) -> Generator[Finished, None, None]:
+def finished_tasks(
+    pool: Pool, work: Callable[..., Any], tasks: Iterable[tuple], retries: int = RETRIES
+) -> Generator[Finished, None, None]:
     """
     Run tasks in parallel; each gives one result, in the order in which they end.
 
@@ -258,7 +272,8 @@ def finished_tasks(pool: Pool, work: Callable[..., Any], tasks: Iterable[tuple],
         while True:
             slots = pool.slots
             while len(running) < slots and (
-                    item := next(todo, None) or (again.popleft() if again else None)):
+                item := next(todo, None) or (again.popleft() if again else None)
+            ):
                 future = pool.submit(work, *item[0])
                 running[future] = item
                 future.add_done_callback(ended.put)
@@ -278,8 +293,14 @@ def finished_tasks(pool: Pool, work: Callable[..., Any], tasks: Iterable[tuple],
                 future.cancel()
 
 
-def for_each(pool: Pool, work: Callable[..., Any], jobs: Iterable[Callable[[], tuple]],
-             keep: Callable[..., None], show: Callable[[float], None], done: int = 0) -> None:
+def for_each(
+    pool: Pool,
+    work: Callable[..., Any],
+    jobs: Iterable[Callable[[], tuple]],
+    keep: Callable[..., None],
+    show: Callable[[float], None],
+    done: int = 0,
+) -> None:
     """Run jobs in parallel and keep each result as soon as it is there."""
     todo = list(jobs)
     for number, end in enumerate(finished_tasks(pool, work, (job() for job in todo)), done + 1):

@@ -116,10 +116,15 @@ class _Subject(NamedTuple):
 
 def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
     """Print rate, loss, age on arrival and processor time of each subject, of some rounds."""
-    print(f'{RATE_HZ:g} Hz, {rounds} x {seconds:g} s: medians (range). '
-          f'Load of the machine before: {os.getloadavg()[0]:.1f}')
-    print(f'{"":27} {"Hz":>6} {"lost":>4} {"p50 ms":>16} {"p99 ms":>17} {"first, s":>17}  CPU, %\n'
-          'first: from the start of the last process of a row to its first sample', flush=True)
+    print(
+        f'{RATE_HZ:g} Hz, {rounds} x {seconds:g} s: medians (range). '
+        f'Load of the machine before: {os.getloadavg()[0]:.1f}'
+    )
+    print(
+        f'{"":27} {"Hz":>6} {"lost":>4} {"p50 ms":>16} {"p99 ms":>17} {"first, s":>17}  CPU, %\n'
+        'first: from the start of the last process of a row to its first sample',
+        flush=True,
+    )
     rows = []
     with ExitStack() as stack:
         for subject in _subjects(stack, iiod) * rounds:
@@ -133,36 +138,68 @@ def measure_live(seconds: float, rounds: int, iiod: str | None) -> None:
         if len(good := table[table.error.isna()]):
             load[label] = good.loads.map(sum).median()
             loads = ' + '.join(f'{100 * load:.1f}' for load in np.median([*good.loads], axis=0))
-            print(f'{label:27} {good.rate_hz.median():6.0f} {good.missing.median():4.0f} '
-                  f'{spread(good.p50_ms, ".2f"):>16} {spread(good.p99_ms, ".2f"):>17} '
-                  f'{spread(good.first_s, ".2f"):>17}  {loads}')
+            print(
+                f'{label:27} {good.rate_hz.median():6.0f} {good.missing.median():4.0f} '
+                f'{spread(good.p50_ms, ".2f"):>16} {spread(good.p99_ms, ".2f"):>17} '
+                f'{spread(good.first_s, ".2f"):>17}  {loads}'
+            )
         if len(bad := table.error.dropna()):
             print(f'{label:27} failed in {len(bad)} of {rounds} rounds: {bad.iloc[-1]}')
     for label in load:
         if 'compensation' in label:
-            print(f'CPU of {label} by that of the {_RELAY}: '
-                  f'{load[label] / load.get(_RELAY, np.nan):.2f}')
+            print(
+                f'CPU of {label} by that of the {_RELAY}: '
+                f'{load[label] / load.get(_RELAY, np.nan):.2f}'
+            )
     print(f'Load of the machine after: {os.getloadavg()[0]:.1f}', flush=True)
 
 
 def _subjects(stack: ExitStack, iiod: str | None) -> list[_Subject]:
     """Return what is measured; `stack` ends the devices."""
-    bare = [[sys.executable, '-c', f'from adxl_ros_validation import bench_command as bench; '
-             f'bench.spin(bench.{node.__name__})'] for node in (BarePublisher, BareRelay)]
+    bare = [
+        [
+            sys.executable,
+            '-c',
+            f'from adxl_ros_validation import bench_command as bench; '
+            f'bench.spin(bench.{node.__name__})',
+        ]
+        for node in (BarePublisher, BareRelay)
+    ]
     port = stack.enter_context(_emulated_board())
     driver, compensation = executable('driver'), executable('compensation')
-    drivers = {'sim': [driver], 'serial': [
-        driver, '--ros-args', '-p', 'link.type:=serial', '-p', f'link.port:={port}', '-p',
-        'link.channels:=x,y,supply,temperature']}
+    drivers = {
+        'sim': [driver],
+        'serial': [
+            driver,
+            '--ros-args',
+            '-p',
+            'link.type:=serial',
+            '-p',
+            f'link.port:={port}',
+            '-p',
+            'link.channels:=x,y,supply,temperature',
+        ],
+    }
     if iiod is not None:
         uri = stack.enter_context(_iio_server(iiod))
         drivers['iio'] = [driver, '--ros-args', '-p', 'link.type:=iio', '-p', f'link.uri:={uri}']
     return [
-        _Subject('bare publisher', 'bare', bare[:1]), _Subject(_RELAY, 'relayed', bare, 'bare'),
-        *(_Subject(f'driver, {link}', 'imu/data_raw', [command])
-          for link, command in drivers.items()),
-        *(_Subject(f'driver, {link}, compensation', 'imu/data', [command, [compensation]],
-                   'imu/data_raw') for link, command in drivers.items())]
+        _Subject('bare publisher', 'bare', bare[:1]),
+        _Subject(_RELAY, 'relayed', bare, 'bare'),
+        *(
+            _Subject(f'driver, {link}', 'imu/data_raw', [command])
+            for link, command in drivers.items()
+        ),
+        *(
+            _Subject(
+                f'driver, {link}, compensation',
+                'imu/data',
+                [command, [compensation]],
+                'imu/data_raw',
+            )
+            for link, command in drivers.items()
+        ),
+    ]
 
 
 def cpu_time_s(pid: int) -> float:
@@ -181,8 +218,9 @@ def _emulated_board() -> Iterator[str]:
             end_s = time.monotonic() + _START_S
             while not port.exists():
                 if time.monotonic() > end_s:
-                    raise UserError(f'{port}: the emulated board has not begun after '
-                                    f'{_START_S:g} s')
+                    raise UserError(
+                        f'{port}: the emulated board has not begun after {_START_S:g} s'
+                    )
                 time.sleep(0.05)
             yield str(port)
 
@@ -229,8 +267,11 @@ def _measure(subject: _Subject, seconds: float) -> dict[str, Any]:
             duration_s = time.monotonic() - began_s
             loads = (cpu_times_s() - before_s) / duration_s
         except UserError as error:
-            ended = [f'{process.args!r} ended with status {process.returncode}'
-                     for process in processes if process.poll() is not None]
+            ended = [
+                f'{process.args!r} ended with status {process.returncode}'
+                for process in processes
+                if process.poll() is not None
+            ]
             raise UserError(', '.join([*ended, str(error)])) from None
     arrived_ns, raw = zip(*listener.messages)
     stamps_ns = np.concatenate([table.stamp_ns() for table in cdr.tables(raw, cdr.imu)])
@@ -239,24 +280,43 @@ def _measure(subject: _Subject, seconds: float) -> dict[str, Any]:
     # The stamps of a bare timer wander: only steps of two periods and more are a loss.
     missing = int(np.sum(np.maximum(periods - 1, 0)))
     p50_ms, p99_ms = np.percentile(age_ms, [50, 99])
-    return {'first_s': first_s, 'rate_hz': len(stamps_ns) / duration_s, 'missing': missing,
-            'p50_ms': p50_ms, 'p99_ms': p99_ms, 'loads': tuple(loads)}
+    return {
+        'first_s': first_s,
+        'rate_hz': len(stamps_ns) / duration_s,
+        'missing': missing,
+        'p50_ms': p50_ms,
+        'p99_ms': p99_ms,
+        'loads': tuple(loads),
+    }
 
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = cli.argument_parser('bench', __doc__, {
-        'all measurements, ten minutes': '',
-        'with recordings of 10 minutes, not 8 hours': '--hours 0.17',
-        'only the live nodes': '--live',
-        'a short look': '--live --seconds 5 --rounds 1'})
-    parse.add_argument('--seconds', type=float, default=10.0,
-                       help='duration of each live measurement, s (default 10)')
-    parse.add_argument('--rounds', type=int, default=3,
-                       help='measurements of each row (default 3)')
-    parse.add_argument('--hours', type=float, default=8.0,
-                       help='duration of the recordings of the rows "apply, … h" (default 8: '
-                            '30 GB of disk)')
+    parse = cli.argument_parser(
+        'bench',
+        __doc__,
+        {
+            'all measurements, ten minutes': '',
+            'with recordings of 10 minutes, not 8 hours': '--hours 0.17',
+            'only the live nodes': '--live',
+            'a short look': '--live --seconds 5 --rounds 1',
+        },
+    )
+    parse.add_argument(
+        '--seconds',
+        type=float,
+        default=10.0,
+        help='duration of each live measurement, s (default 10)',
+    )
+    parse.add_argument(
+        '--rounds', type=int, default=3, help='measurements of each row (default 3)'
+    )
+    parse.add_argument(
+        '--hours',
+        type=float,
+        default=8.0,
+        help='duration of the recordings of the rows "apply, … h" (default 8: 30 GB of disk)',
+    )
     parse.add_argument('--live', action='store_true', help='measure only the live nodes')
     parse.add_argument('--iiod', metavar='FILE', help="the tests' IIOD, for the link iio")
     return parse

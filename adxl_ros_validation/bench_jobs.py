@@ -68,11 +68,14 @@ class Job:
 
 def print_table(jobs: Iterable[Job], rounds: int) -> None:
     """Measure each job and its rivals in turns, and print a table."""
-    print(f'\n{date.today()}, adxl_ros {version("adxl-ros")}, CPython '
-          f'{platform.python_version()}, {platform.machine()}, {os.cpu_count()} cores')
+    print(
+        f'\n{date.today()}, adxl_ros {version("adxl-ros")}, CPython '
+        f'{platform.python_version()}, {platform.machine()}, {os.cpu_count()} cores'
+    )
     print(', '.join(f'{name} {version(name)}' for name in _PACKAGES if find_spec(name)))
-    print(f'\nProcessor time, s, and ratio: median (least to greatest) of {rounds} rounds in '
-          'turns\n')
+    print(
+        f'\nProcessor time, s, and ratio: median (least to greatest) of {rounds} rounds in turns\n'
+    )
     print('| job | s | beside | ratio | goal |\n|---|---|---|---|---|', flush=True)
     for job in jobs:
         try:
@@ -101,10 +104,14 @@ def rows_of(job: Job, rounds: int) -> list[str]:
     head = f'| {job.name}{detail} | {spread(measured, ".2g")} |'
     if not job.rivals:
         return [f'{head} – | – | {limit} s |'.replace('– s', '–')]
-    ratios = [spread(measured / np.array(theirs), '.2g') if theirs else 'not installed'
-              for theirs in seconds.values()]
-    return [f'{head} {name} | {ratio} | {limit if i == 0 else "–"} |'
-            for i, (name, ratio) in enumerate(zip(seconds, ratios))]
+    ratios = [
+        spread(measured / np.array(theirs), '.2g') if theirs else 'not installed'
+        for theirs in seconds.values()
+    ]
+    return [
+        f'{head} {name} | {ratio} | {limit if i == 0 else "–"} |'
+        for i, (name, ratio) in enumerate(zip(seconds, ratios))
+    ]
 
 
 def spread(values: Sequence[float] | np.ndarray, form: str) -> str:
@@ -120,15 +127,16 @@ _LONG_BLOCK = 100_000
 """Rows of a block of the long recording; chosen: a few MB."""
 _ROW_BYTES = 1100
 """Largest room that a sample of a long recording and its corrected bag take, measured."""
-_MEASURE = ('import resource, subprocess, sys; '
-            'status = subprocess.call(sys.argv[1:], stdout=subprocess.DEVNULL); '
-            'print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss); sys.exit(status)')
+_MEASURE = (
+    'import resource, subprocess, sys; '
+    'status = subprocess.call(sys.argv[1:], stdout=subprocess.DEVNULL); '
+    'print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss); sys.exit(status)'
+)
 """Runs a command and prints its largest memory, kB. A child of the benchmark itself would count
 the memory of the benchmark, which it has until it becomes the command."""
 _RATE_HZ = 1000.0
 """Sample rate of all recordings, Hz."""
-_EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z',
-            'scale_factor_z')
+_EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z', 'scale_factor_z')
 """Effects of the units that `apply` corrects, with twenty coefficients on two axes."""
 _TOOLS = ('simulate', 'fit', 'apply', 'noise', 'check', 'diagnose', 'export', 'blind', 'reproduce')
 """Tools whose `--help` is measured."""
@@ -148,18 +156,33 @@ def offline_jobs(hours: float) -> Iterator[Job]:
         yield from _reading_and_writing(folder, sensor, _recording(sensor, columns, _ROWS))
         yield _applying(folder, sensor, columns)
         values = {name: sensors.typical(effect, 'xyz') for name, effect in library().items()}
-        full = replace(with_axes(sensor, 'xyz'), rate_hz=_RATE_HZ, effects=tuple(values),
-                       values=values)
+        full = replace(
+            with_axes(sensor, 'xyz'), rate_hz=_RATE_HZ, effects=tuple(values), values=values
+        )
         motion = replace(rich(np.random.default_rng(0)), duration_s=600.0)
-        yield Job(f'simulate, {motion.duration_s:g} s at 1 kHz, 3 axes, {len(values)} effects',
-                  lambda: simulate(full, motion, 0), 1.0, rounds=3)
+        yield Job(
+            f'simulate, {motion.duration_s:g} s at 1 kHz, 3 axes, {len(values)} effects',
+            lambda: simulate(full, motion, 0),
+            1.0,
+            rounds=3,
+        )
         yield from (make() for make in (_gravity_fit, _allan, _frames, _in_the_loop))
         commands = [[executable(name), '--help'] for name in _TOOLS]
-        yield Job(f'--help of {len(commands)} tools', lambda: [
-            subprocess.run(command, check=True, capture_output=True) for command in commands],
-            0.4 * len(commands), rounds=3)
-        yield Job('demo, elapsed time', partial(_program, 'demo', '-o', folder / 'demo'), 60.0,
-                  rounds=1, clock=time.monotonic)
+        yield Job(
+            f'--help of {len(commands)} tools',
+            lambda: [
+                subprocess.run(command, check=True, capture_output=True) for command in commands
+            ],
+            0.4 * len(commands),
+            rounds=3,
+        )
+        yield Job(
+            'demo, elapsed time',
+            partial(_program, 'demo', '-o', folder / 'demo'),
+            60.0,
+            rounds=1,
+            clock=time.monotonic,
+        )
         for kind in ('csv', 'mcap'):
             yield from _long_applying(folder, sensor, kind, hours)
 
@@ -186,14 +209,27 @@ def _reading_and_writing(folder: Path, sensor: Sensor, samples: Recording) -> It
             for connection, _, raw in reader.messages():
                 store.deserialize_cdr(raw, connection.msgtype)
 
-    yield Job(f'read CSV, {_ROWS} rows', lambda: recording.read(csv), 1.5, {
-        'pyarrow': lambda: import_module('pyarrow.csv').read_csv(csv),
-        'polars': lambda: import_module('polars').read_csv(csv)})
-    yield Job(f'write CSV, {_ROWS} rows',
-              lambda: recording.write(folder / 'ours.csv', samples, sensor), 0.0,
-              {'pyarrow': write_by_pyarrow})
-    yield Job(f'read MCAP, {2 * _ROWS} messages', lambda: recording.read(mcap), 0.25,
-              {'rosbags': read_by_rosbags})
+    yield Job(
+        f'read CSV, {_ROWS} rows',
+        lambda: recording.read(csv),
+        1.5,
+        {
+            'pyarrow': lambda: import_module('pyarrow.csv').read_csv(csv),
+            'polars': lambda: import_module('polars').read_csv(csv),
+        },
+    )
+    yield Job(
+        f'write CSV, {_ROWS} rows',
+        lambda: recording.write(folder / 'ours.csv', samples, sensor),
+        0.0,
+        {'pyarrow': write_by_pyarrow},
+    )
+    yield Job(
+        f'read MCAP, {2 * _ROWS} messages',
+        lambda: recording.read(mcap),
+        0.25,
+        {'rosbags': read_by_rosbags},
+    )
 
 
 def _applying(folder: Path, sensor: Sensor, columns: dict[str, np.ndarray]) -> Job:
@@ -201,8 +237,12 @@ def _applying(folder: Path, sensor: Sensor, columns: dict[str, np.ndarray]) -> J
     unit, path = _unit(sensor, 'xy'), folder / 'long.csv'
     recording.write(path, _recording(unit, columns, _APPLIED_ROWS), unit)
     count = len(unit.covariance)
-    return Job(f'apply, {_APPLIED_ROWS} rows, 6 effects, {count} x {count} covariance',
-               _apply(unit, path, folder / 'applied.csv'), 5.0, rounds=1)
+    return Job(
+        f'apply, {_APPLIED_ROWS} rows, 6 effects, {count} x {count} covariance',
+        _apply(unit, path, folder / 'applied.csv'),
+        5.0,
+        rounds=1,
+    )
 
 
 def _apply(unit: Sensor, path: Path, output: Path) -> Callable[[], str]:
@@ -215,8 +255,11 @@ def _apply(unit: Sensor, path: Path, output: Path) -> Callable[[], str]:
 def _program(name: str, *arguments: str | Path) -> str:
     """Run an executable of the package; return its elapsed time and its memory in words."""
     began_s = time.monotonic()
-    done = subprocess.run([sys.executable, '-c', _MEASURE, executable(name), *arguments],
-                          stdout=subprocess.PIPE, text=True)
+    done = subprocess.run(
+        [sys.executable, '-c', _MEASURE, executable(name), *arguments],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     if done.returncode:
         raise UserError(f'{executable(name)} ended with status {done.returncode}')
     return f' ({time.monotonic() - began_s:.0f} s elapsed, {int(done.stdout) / 1e3:.0f} MB)'
@@ -225,19 +268,25 @@ def _program(name: str, *arguments: str | Path) -> str:
 def _unit(sensor: Sensor, axes: str) -> Sensor:
     """Return a unit with six effects and a covariance of their coefficients."""
     unit = sensors.with_neutral(with_axes(sensor, axes), _EFFECTS)
-    names = tuple(name for effect in _EFFECTS
-                  for name in sensors.names_of(library()[effect], unit.axes))
+    names = tuple(
+        name for effect in _EFFECTS for name in sensors.names_of(library()[effect], unit.axes)
+    )
     scales = np.array([sensors.parameter_of(name).scale for name in names])
-    return replace(sensors.put(unit, names, 0.5 * scales), covariance_names=names,
-                   covariance=np.diag((0.05 * scales) ** 2))
+    return replace(
+        sensors.put(unit, names, 0.5 * scales),
+        covariance_names=names,
+        covariance=np.diag((0.05 * scales) ** 2),
+    )
 
 
 def _long_applying(folder: Path, sensor: Sensor, kind: str, hours: float) -> Iterator[Job]:
     """Apply six effects to a recording of three axes of many hours, in the format of its name."""
     needed, free = hours * 3600 * _RATE_HZ * _ROW_BYTES, shutil.disk_usage(folder).free
     if needed > free:
-        raise UserError(f'{folder}: {free / 1e9:.1f} GB free; recordings of {hours:g} h need '
-                        f'{needed / 1e9:.1f} GB: set TMPDIR to a larger disk, or --hours')
+        raise UserError(
+            f'{folder}: {free / 1e9:.1f} GB free; recordings of {hours:g} h need '
+            f'{needed / 1e9:.1f} GB: set TMPDIR to a larger disk, or --hours'
+        )
     unit = _unit(sensor, 'xyz').without_covariance()
     path, output = folder / f'in.{kind}', folder / f'out.{kind}'
     columns = simulate(unit, sweep(np.random.default_rng(0)), 0)
@@ -245,10 +294,19 @@ def _long_applying(folder: Path, sensor: Sensor, kind: str, hours: float) -> Ite
     with recording.writer(path, unit) as append:
         for begin in range(0, rows := round(hours * 3600 * _RATE_HZ), _LONG_BLOCK):
             count = min(_LONG_BLOCK, rows - begin)
-            append(replace(block, time_s=(begin + np.arange(count)) / _RATE_HZ, columns={
-                name: values[:count] for name, values in block.columns.items()}))
-    yield Job(f'apply, {hours:g} h at 1 kHz, {kind.upper()} to {kind.upper()}',
-              _apply(unit, path, output), hours * 60 / 8, rounds=1)
+            append(
+                replace(
+                    block,
+                    time_s=(begin + np.arange(count)) / _RATE_HZ,
+                    columns={name: values[:count] for name, values in block.columns.items()},
+                )
+            )
+    yield Job(
+        f'apply, {hours:g} h at 1 kHz, {kind.upper()} to {kind.upper()}',
+        _apply(unit, path, output),
+        hours * 60 / 8,
+        rounds=1,
+    )
     path.unlink()
     output.unlink()
 
@@ -275,9 +333,12 @@ def _gravity_fit() -> Job:
         for _ in range(fits):
             scipy.optimize.least_squares(residual, np.zeros(9), x_scale=[0.1] * 3 + [0.01] * 6)
 
-    return Job(f'{fits} gravity fits with covariance, {rests} rests',
-               lambda: [fit_gravity(mean_v, std_v, sensor) for _ in range(fits)], 10.0,
-               {'least squares': by_least_squares})
+    return Job(
+        f'{fits} gravity fits with covariance, {rests} rests',
+        lambda: [fit_gravity(mean_v, std_v, sensor) for _ in range(fits)],
+        10.0,
+        {'least squares': by_least_squares},
+    )
 
 
 def _allan() -> Job:
@@ -286,12 +347,19 @@ def _allan() -> Job:
     def ours() -> None:
         stream = Phase(1, BytesIO())
         for begin in range(0, len(samples), block):
-            stream.feed(samples[begin:begin + block, None])
+            stream.feed(samples[begin : begin + block, None])
         stream.allan_deviation(_RATE_HZ), stream.cells()
 
-    return Job(f'Allan deviation, {len(samples)} samples', ours, 1.0, {
-        'allantools': lambda: import_module('allantools').oadev(
-            samples, rate=_RATE_HZ, data_type='freq', taus='octave')})
+    return Job(
+        f'Allan deviation, {len(samples)} samples',
+        ours,
+        1.0,
+        {
+            'allantools': lambda: import_module('allantools').oadev(
+                samples, rate=_RATE_HZ, data_type='freq', taus='octave'
+            )
+        },
+    )
 
 
 def _frames() -> Job:

@@ -21,28 +21,54 @@ PROG = 'blind'
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = cli.argument_parser(PROG, __doc__, {
-        'a whole check': '--trials 200 -o check',
-        'only draw the trials, and publish the hash of their labels': '--trials 200 --seal check',
-        'defects put into recordings of real sensors': '--real recordings --trials 200 -o real',
-        'diagnose the sealed trials and score them': '--open check'})
-    parse.add_argument('--trials', type=int, default=600,
-                       help='number of trials (default 600); a twelfth more has strength zero')
-    parse.add_argument('--seed', type=int, default=None,
-                       help='seed of the trials (default: drawn; the report states it)')
-    parse.add_argument('--real', metavar='FOLDER_OR_MANIFEST',
-                       help='put defects into recordings of real sensors: CSV files, each with '
-                            'NAME_sim.csv where another simulator knows its force')
+    parse = cli.argument_parser(
+        PROG,
+        __doc__,
+        {
+            'a whole check': '--trials 200 -o check',
+            'only draw the trials, and publish the hash of their labels': (
+                '--trials 200 --seal check'
+            ),
+            'defects put into recordings of real sensors': (
+                '--real recordings --trials 200 -o real'
+            ),
+            'diagnose the sealed trials and score them': '--open check',
+        },
+    )
+    parse.add_argument(
+        '--trials',
+        type=int,
+        default=600,
+        help='number of trials (default 600); a twelfth more has strength zero',
+    )
+    parse.add_argument(
+        '--seed',
+        type=int,
+        default=None,
+        help='seed of the trials (default: drawn; the report states it)',
+    )
+    parse.add_argument(
+        '--real',
+        metavar='FOLDER_OR_MANIFEST',
+        help='put defects into recordings of real sensors: CSV files, each with '
+        'NAME_sim.csv where another simulator knows its force',
+    )
     pool = parse.add_mutually_exclusive_group()
     pool.add_argument('--scheduler', metavar='ADDRESS', help='of a Dask cluster to run on')
-    pool.add_argument('--jobs', metavar='N', type=int,
-                      help='processes of this machine (default: one for each core)')
+    pool.add_argument(
+        '--jobs',
+        metavar='N',
+        type=int,
+        help='processes of this machine (default: one for each core)',
+    )
     where = parse.add_mutually_exclusive_group(required=True)
     where.add_argument('-o', dest='output', metavar='DIR', help='draw, diagnose and score')
-    where.add_argument('--seal', metavar='DIR',
-                       help='only draw the trials and publish the hash of their labels')
-    where.add_argument('--open', metavar='DIR',
-                       help='diagnose all recordings without a report, and score')
+    where.add_argument(
+        '--seal', metavar='DIR', help='only draw the trials and publish the hash of their labels'
+    )
+    where.add_argument(
+        '--open', metavar='DIR', help='diagnose all recordings without a report, and score'
+    )
     return parse
 
 
@@ -63,9 +89,11 @@ def _check(options: argparse.Namespace, folder: Path) -> int:
         if not options.open:
             make_folder(folder)
             arguments = options.seed, options.trials, pool, cli.progress
-            digest = real_sensors.seal(folder, Path(options.real).resolve(), *arguments) \
-                if options.real else trials.seal(folder, trials.plans, trials.draw_trial,
-                                                 *arguments)
+            digest = (
+                real_sensors.seal(folder, Path(options.real).resolve(), *arguments)
+                if options.real
+                else trials.seal(folder, trials.plans, trials.draw_trial, *arguments)
+            )
             print(f'SHA-256 of salt and labels: {digest}', flush=True)
         if options.seal:
             cli.print_end([], [folder], command(PROG, f'--open {cli.quoted(folder)}'))
@@ -76,10 +104,17 @@ def _check(options: argparse.Namespace, folder: Path) -> int:
     said = (real_sensors.report if is_real else report.of_simulated)(made)
     write_text(folder / 'blind.json', json.dumps(made, indent=1, allow_nan=False) + '\n')
     write_text(folder / 'blind.md', said.markdown())
-    write_text(folder / 'blind.html', page.render('adxl_ros_validation', 'pages/blind.html', {
-        **said._asdict(), 'about': [], 'badge': None, 'figures': {}}))
-    cli.print_end([*said.screen(), ''],
-                  [folder / f'blind.{suffix}' for suffix in ('html', 'md', 'json')])
+    write_text(
+        folder / 'blind.html',
+        page.render(
+            'adxl_ros_validation',
+            'pages/blind.html',
+            {**said._asdict(), 'about': [], 'badge': None, 'figures': {}},
+        ),
+    )
+    cli.print_end(
+        [*said.screen(), ''], [folder / f'blind.{suffix}' for suffix in ('html', 'md', 'json')]
+    )
     return 0
 
 

@@ -37,16 +37,19 @@ BINS = 10
 """Number of bins of the ranks; chosen."""
 
 
-def draw_all(nominal: Sensor, draws: int, seed: int, show: Callable[[float], None]
-             ) -> pd.DataFrame:
+def draw_all(
+    nominal: Sensor, draws: int, seed: int, show: Callable[[float], None]
+) -> pd.DataFrame:
     """Draw and fit units on all kinds of stage, over the cores; see `draw`."""
     kinds = list(product(STAGES, AXES, pose_plan.KINDS))
-    return pd.concat(experiments.in_parallel(partial(draw, nominal, kinds=kinds, seed=seed), show,
-                                             range(draws)))
+    return pd.concat(
+        experiments.in_parallel(partial(draw, nominal, kinds=kinds, seed=seed), show, range(draws))
+    )
 
 
-def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], seed: int
-         ) -> pd.DataFrame:
+def draw(
+    nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], seed: int
+) -> pd.DataFrame:
     """
     Draw one unit and one stage, sweep, and fit; return a row for each error.
 
@@ -64,8 +67,11 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     terms = (*full_model.default_terms(axes), *['stage_eccentricity'] * (stage == 'eccentric'))
     truth = _unit(sensor, terms, stage, rng)
     step = float(stated * np.exp(rng.uniform(*np.log((0.5, 2.0)))))
-    targets = pose_plan.guided(pose_plan.default_planes_rad(axes), pose_plan.STEP_RAD, 0) \
-        if kind == 'full' else running_estimate.quick(sensor, _DWELL_S, float(np.radians(0.1)), 0)
+    targets = (
+        pose_plan.guided(pose_plan.default_planes_rad(axes), pose_plan.STEP_RAD, 0)
+        if kind == 'full'
+        else running_estimate.quick(sensor, _DWELL_S, float(np.radians(0.1)), 0)
+    )
     poses, true_rad = _swept(truth, targets, stage == STAGES[0], step, rng)
     fit, _ = full_model.fit_selected(sensor, poses)
     names = fit.fitted.covariance_names
@@ -74,35 +80,56 @@ def draw(nominal: Sensor, number: int, kinds: Sequence[tuple[str, str, str]], se
     sigma = step / np.sqrt(12)
     levels = StageError(0.0, sigma) if stage == STAGES[0] else StageError(sigma)
     bound = experiments.sweep_bound(truth, poses, true_rad, levels, terms)
-    angles = np.column_stack([np.arccos(rng.uniform(-1, 1, _HELD_OUT)),
-                              rng.uniform(0, 2 * np.pi, _HELD_OUT)])
+    angles = np.column_stack(
+        [np.arccos(rng.uniform(-1, 1, _HELD_OUT)), rng.uniform(0, 2 * np.pi, _HELD_OUT)]
+    )
     held_out = _measured(truth, angles, angles, rng), angles
     tilt = experiments.angle_errors(fit.fitted, bound, *held_out)
     force, force_std = experiments.force_errors(fit.fitted, truth, *held_out)
     bound_std = dict(zip(bound.covariance_names, np.sqrt(np.diag(bound.covariance))))
     by_bound = [bound_std[name] for name in names] if set(names) == set(bound_std) else np.nan
-    return pd.concat([
-        pd.DataFrame({'of': 'coefficients', 'name': list(map(str, names)), 'by_bound':
-                      error / by_bound, 'z': error / np.sqrt(np.diag(fit.fitted.covariance))}),
-        pd.DataFrame({'of': 'tilt', 'z': (tilt.error / tilt['std'])[tilt.counts]}),
-        pd.DataFrame({'of': 'acceleration', 'z': (force / force_std).ravel()})]).assign(
-            draw=number, stage=stage, axes=axes, plan=kind, converged=fit.converged)
+    return pd.concat(
+        [
+            pd.DataFrame(
+                {
+                    'of': 'coefficients',
+                    'name': list(map(str, names)),
+                    'by_bound': error / by_bound,
+                    'z': error / np.sqrt(np.diag(fit.fitted.covariance)),
+                }
+            ),
+            pd.DataFrame({'of': 'tilt', 'z': (tilt.error / tilt['std'])[tilt.counts]}),
+            pd.DataFrame({'of': 'acceleration', 'z': (force / force_std).ravel()}),
+        ]
+    ).assign(draw=number, stage=stage, axes=axes, plan=kind, converged=fit.converged)
 
 
 def _unit(sensor: Sensor, terms: Sequence[str], stage: str, rng: np.random.Generator) -> Sensor:
     """Draw a unit: each coefficient is normal with its typical size, in the gauge of the fit."""
     effects = (*terms, 'base_tilt')
     unit = with_neutral(replace(sensor, effects=(), values={}), effects)
-    names = [name for name in full_model.fitted_coefficients(sensor.axes, effects)
-             if full_model.term_of(name) not in full_model.GAUGE
-             and (stage == 'tilted base' or name.effect != 'base_tilt')]
-    sizes = np.array([full_model.LEVEL_STD_RAD if name.effect == 'base_tilt' else
-                      parameter_of(name).scale for name in names])
+    names = [
+        name
+        for name in full_model.fitted_coefficients(sensor.axes, effects)
+        if full_model.term_of(name) not in full_model.GAUGE
+        and (stage == 'tilted base' or name.effect != 'base_tilt')
+    ]
+    sizes = np.array(
+        [
+            full_model.LEVEL_STD_RAD if name.effect == 'base_tilt' else parameter_of(name).scale
+            for name in names
+        ]
+    )
     return put(unit, names, sizes * rng.normal(size=len(names)))
 
 
-def _swept(truth: Sensor, targets: Sequence[pose_plan.Target], per_pose: bool, step_rad: float,
-           rng: np.random.Generator) -> tuple[Poses, np.ndarray]:
+def _swept(
+    truth: Sensor,
+    targets: Sequence[pose_plan.Target],
+    per_pose: bool,
+    step_rad: float,
+    rng: np.random.Generator,
+) -> tuple[Poses, np.ndarray]:
     """Return the poses of a sweep, and where the stage really stood, rad, (k, 2)."""
     read = np.array([[t.alpha_rad, t.beta_rad] for t in targets])
     poses = Poses.without_volts(read[:, 0], read[:, 1], noise.sample_std_v(truth))
@@ -113,15 +140,18 @@ def _swept(truth: Sensor, targets: Sequence[pose_plan.Target], per_pose: bool, s
     return _measured(truth, read, read + error, rng), read + error
 
 
-def _measured(truth: Sensor, read_rad: np.ndarray, true_rad: np.ndarray, rng: np.random.Generator
-              ) -> Poses:
+def _measured(
+    truth: Sensor, read_rad: np.ndarray, true_rad: np.ndarray, rng: np.random.Generator
+) -> Poses:
     """Return the poses that the stage reads, with the voltages of where it really stands."""
     samples = round(_DWELL_S * truth.rate_hz)
     count = noise.effective_samples(samples, 1 / truth.rate_hz, truth.rc_s)
-    poses = Poses.without_volts(read_rad[:, 0], read_rad[:, 1],
-                                noise.sample_std_v(truth) / np.sqrt(count))
-    volts = predicted_volts(truth, replace(poses, alpha_rad=true_rad[:, 0],
-                                           beta_rad=true_rad[:, 1]))
+    poses = Poses.without_volts(
+        read_rad[:, 0], read_rad[:, 1], noise.sample_std_v(truth) / np.sqrt(count)
+    )
+    volts = predicted_volts(
+        truth, replace(poses, alpha_rad=true_rad[:, 0], beta_rad=true_rad[:, 1])
+    )
     return replace(poses, volts=volts + poses.std_v * rng.normal(size=volts.shape))
 
 
@@ -129,34 +159,51 @@ def page(errors: pd.DataFrame, made: str) -> str:
     """Return the section about coverage."""
     fitted = errors[errors.of == 'coefficients']
     compared, draws = fitted.dropna(subset='by_bound'), fitted.groupby('draw')
-    rows = _rows(errors) + [_row(f'{key} {value}: coefficients', part)
-                            for key in ('stage', 'axes', 'plan')
-                            for value, part in fitted.groupby(key, sort=False)]
+    rows = _rows(errors) + [
+        _row(f'{key} {value}: coefficients', part)
+        for key in ('stage', 'axes', 'plan')
+        for value, part in fitted.groupby(key, sort=False)
+    ]
     single = []
     for name, part in fitted.groupby('name', sort=False):
         inside = scipy.stats.binomtest(int(np.sum(part.z.abs() < Z_90)), len(part))
-        single.append(_row(f'{name} ({len(part)})', part, (
-            inside.statistic, *inside.proportion_ci(0.9, 'exact'))))
+        single.append(
+            _row(
+                f'{name} ({len(part)})',
+                part,
+                (inside.statistic, *inside.proportion_ci(0.9, 'exact')),
+            )
+        )
     head = ['coverage, %', 'rms of error / stated', 'ranks', 'p']
-    return filled('coverage.md', {
-        'made': made, 'draws': len(draws), 'converged': draws.converged.all().sum(),
-        'compared': len(compared), 'fits': compared.draw.nunique(),
-        'by_bound': np.sqrt(np.mean(compared.by_bound ** 2)),
-        'groups': markdown_table(['', *head], rows),
-        'coefficients': markdown_table(['coefficient', *head], single)})
+    return filled(
+        'coverage.md',
+        {
+            'made': made,
+            'draws': len(draws),
+            'converged': draws.converged.all().sum(),
+            'compared': len(compared),
+            'fits': compared.draw.nunique(),
+            'by_bound': np.sqrt(np.mean(compared.by_bound**2)),
+            'groups': markdown_table(['', *head], rows),
+            'coefficients': markdown_table(['coefficient', *head], single),
+        },
+    )
 
 
 def screen_lines(errors: pd.DataFrame) -> list[str]:
     """Return the coverage of all intervals as lines for a terminal."""
     return terminal_table(
         [f'Coverage of 90 % intervals over {errors.draw.nunique()} drawn units and stages', '%'],
-        [row[:2] for row in _rows(errors)])
+        [row[:2] for row in _rows(errors)],
+    )
 
 
 def _rows(errors: pd.DataFrame) -> list[list[str]]:
     """Return the rows of all draws."""
-    return [_row(f'all {what}' if what == 'coefficients' else str(what), part)
-            for what, part in errors.groupby('of', sort=False)]
+    return [
+        _row(f'all {what}' if what == 'coefficients' else str(what), part)
+        for what, part in errors.groupby('of', sort=False)
+    ]
 
 
 def mean_with_interval(values: pd.Series, groups: pd.Series) -> tuple[float, float, float]:
@@ -172,6 +219,10 @@ def _row(label: str, errors: pd.DataFrame, covered: Sequence[float] = ()) -> lis
     """Return a row; `covered` has the share and its interval, else they are over draws."""
     share, low, high = covered or mean_with_interval(errors.z.abs() < Z_90, errors.draw)
     counts = np.histogram(scipy.special.ndtr(errors.z), BINS, (0, 1))[0]
-    return [label, f'{100 * share:.1f} ({100 * low:.1f} to {100 * high:.1f})',
-            f'{np.sqrt(np.mean(errors.z ** 2)):.2f}', ' '.join(map(str, counts)),
-            f'{scipy.stats.chisquare(counts).pvalue:.2f}']
+    return [
+        label,
+        f'{100 * share:.1f} ({100 * low:.1f} to {100 * high:.1f})',
+        f'{np.sqrt(np.mean(errors.z**2)):.2f}',
+        ' '.join(map(str, counts)),
+        f'{scipy.stats.chisquare(counts).pvalue:.2f}',
+    ]

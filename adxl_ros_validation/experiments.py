@@ -49,18 +49,23 @@ def search(truth: Sensor, seed: int) -> tuple[dict[str, float], np.ndarray]:
         read = np.column_stack([np.full(len(SEARCH_RAD), np.pi / 2), middle + SEARCH_RAD])
         poses: Poses = poses_at(truth, read, seed + (10 + i) * 1_000_003)[0]
         volts[name] = (poses.volts[:, 0] - truth.nominal_zero_g_v[0]) / (
-            truth.nominal_scale_v_per_g[0] * truth.local_gravity_mps2 / G0_MPS2)
+            truth.nominal_scale_v_per_g[0] * truth.local_gravity_mps2 / G0_MPS2
+        )
     top = volts['top']
     curve = np.polyfit(SEARCH_RAD, top, 2)
     # The output near ±90° is ∓s·(turn − u) + zero-g, so that the difference is 0 at u.
     slope, level = np.polyfit(SEARCH_RAD, (volts['left'] - volts['right']) / 2, 1)
     # β_x of (18) with the linear cross-axis term, which equals it to first order.
-    direction = sum(float(truth.values.get(effect, {}).get(name, [0.0])[0]) for effect, name in (
-        ('misalignment', 'beta_rad'), ('cross_axis', 'linear')))
+    direction = sum(
+        float(truth.values.get(effect, {}).get(name, [0.0])[0])
+        for effect, name in (('misalignment', 'beta_rad'), ('cross_axis', 'linear'))
+    )
     return {
-        'truth': direction, 'largest output': -float(SEARCH_RAD[np.argmax(top)]),
+        'truth': direction,
+        'largest output': -float(SEARCH_RAD[np.argmax(top)]),
         'parabola through the outputs': float(curve[1] / (2 * curve[0])),
-        'null crossings at ±90°': float(level / slope)}, top
+        'null crossings at ±90°': float(level / slope),
+    }, top
 
 
 MAX_BOUND_RAD = np.radians(1.0)
@@ -71,8 +76,9 @@ _BUTTERWORTH = 2, 20.0
 """Order and corner, Hz, of the low-pass of the motion experiment; the paper's."""
 
 
-def sweep_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageError,
-                terms: Sequence[str]) -> Sensor:
+def sweep_bound(
+    truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageError, terms: Sequence[str]
+) -> Sensor:
     """Return the true unit with the Cramér-Rao bound of a sweep as its covariance."""
     names = full_model.fitted_coefficients(truth.axes, terms)
     unit = with_neutral(truth, (*map(full_model.effect_of, terms), 'base_tilt'))
@@ -80,15 +86,19 @@ def sweep_bound(truth: Sensor, swept: Poses, true_rad: np.ndarray, stage: StageE
     at_truth = replace(swept, alpha_rad=true_rad[:, 0], beta_rad=true_rad[:, 1])
     information = full_model.fisher_information(unit, at_truth, names, stage)
     base = [i for i, name in enumerate(names) if name.effect == 'base_tilt']
-    information[base, base] += 1 / level ** 2 - 1 / full_model.LEVEL_STD_RAD ** 2
+    information[base, base] += 1 / level**2 - 1 / full_model.LEVEL_STD_RAD**2
     covariance = np.linalg.inv(information)
     of_sensor = [i for i, name in enumerate(names) if not full_model.belongs_to_stage(name)]
-    return replace(truth, covariance=covariance[np.ix_(of_sensor, of_sensor)],
-                   covariance_names=tuple(names[i] for i in of_sensor))
+    return replace(
+        truth,
+        covariance=covariance[np.ix_(of_sensor, of_sensor)],
+        covariance_names=tuple(names[i] for i in of_sensor),
+    )
 
 
-def angle_errors(fitted: Sensor, bound: Sensor, poses: Poses, true_rad: np.ndarray
-                 ) -> pd.DataFrame:
+def angle_errors(
+    fitted: Sensor, bound: Sensor, poses: Poses, true_rad: np.ndarray
+) -> pd.DataFrame:
     """
     Compare the tilt by a calibrated unit with the truth; a row for alpha and beta of each pose.
 
@@ -112,44 +122,63 @@ def angle_errors(fitted: Sensor, bound: Sensor, poses: Poses, true_rad: np.ndarr
     error[:, 1] = (error[:, 1] + np.pi) % (2 * np.pi) - np.pi
     error[:, 1] = np.where(np.isfinite(error[:, 1]), error[:, 1], 0.0)
     inclined = np.arctan2(np.hypot(force[0], force[1]), np.abs(force[2]))
-    found = pd.DataFrame({name: values.ravel() for name, values in (
-        ('error', error), ('std', measured[1]), ('pose_bound', pose_only[1]), ('bound', true[1]))})
+    found = pd.DataFrame(
+        {
+            name: values.ravel()
+            for name, values in (
+                ('error', error),
+                ('std', measured[1]),
+                ('pose_bound', pose_only[1]),
+                ('bound', true[1]),
+            )
+        }
+    )
     return found.assign(
-        angle=np.tile(['alpha', 'beta'], len(error)), counts=found.bound < MAX_BOUND_RAD,
-        near_vertical=np.repeat(np.pi / 2 - inclined < NEAR_VERTICAL_RAD, 2))
+        angle=np.tile(['alpha', 'beta'], len(error)),
+        counts=found.bound < MAX_BOUND_RAD,
+        near_vertical=np.repeat(np.pi / 2 - inclined < NEAR_VERTICAL_RAD, 2),
+    )
 
 
-def _angles(sensor: Sensor, force: Components, up: np.ndarray, variance_v2: np.ndarray
-            ) -> tuple[np.ndarray, np.ndarray]:
+def _angles(
+    sensor: Sensor, force: Components, up: np.ndarray, variance_v2: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return alpha and beta, and their standard deviations, rad, (k, 2) each."""
     covariance = force_covariance(sensor, force, variance_v2)
     measured = tilt(force, covariance, 'z' in sensor.axes)
-    return (np.column_stack([measured.alpha, measured.beta]),
-            np.column_stack([measured.alpha_std, measured.beta_std]))
+    return (
+        np.column_stack([measured.alpha, measured.beta]),
+        np.column_stack([measured.alpha_std, measured.beta_std]),
+    )
 
 
-def force_errors(fitted: Sensor, truth: Sensor, poses: Poses, true_rad: np.ndarray
-                 ) -> tuple[np.ndarray, np.ndarray]:
+def force_errors(
+    fitted: Sensor, truth: Sensor, poses: Poses, true_rad: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of the measured axes and their standard deviations by the calibration."""
     true = stage_force(truth, *true_rad.T)
     up = np.where(np.asarray(true[2]) < 0, -1, 1)
     measured = signal_chain.inverse(fitted, up)(list(poses.volts.T))
     covariance = force_covariance(fitted, measured, np.mean(poses.std_v, axis=0) ** 2)
     axes = [AXES.index(axis) for axis in fitted.axes]
-    return (np.column_stack([measured[d] - true[d] for d in axes]),
-            np.sqrt(np.column_stack([covariance[d, d] for d in axes])))
+    return (
+        np.column_stack([measured[d] - true[d] for d in axes]),
+        np.sqrt(np.column_stack([covariance[d, d] for d in axes])),
+    )
 
 
-def motion_errors(fitted: Sensor, time_s: np.ndarray, volts: np.ndarray, reference_mps2: np.ndarray
-                  ) -> tuple[tuple[float, float], np.ndarray, np.ndarray]:
+def motion_errors(
+    fitted: Sensor, time_s: np.ndarray, volts: np.ndarray, reference_mps2: np.ndarray
+) -> tuple[tuple[float, float], np.ndarray, np.ndarray]:
     """
     Compare the acceleration of a calibrated unit in motion with the reference.
 
     The RC filter is inverted. Estimate and reference then pass the same Butterworth filter. Return
     the rms of the residual about its mean and this mean, mm/s², the estimate and the reference.
     """
-    unfiltered = inversions.undo_filter(volts, time_s, noise.electronics(fitted).rc_s,
-                                        fitted.rate_hz)
+    unfiltered = inversions.undo_filter(
+        volts, time_s, noise.electronics(fitted).rc_s, fitted.rate_hz
+    )
     estimate = signal_chain.inverse(fitted)(list(unfiltered.T))[0]
     b, a = scipy.signal.butter(*_BUTTERWORTH, fs=fitted.rate_hz)
     smooth, expected = (scipy.signal.lfilter(b, a, v) for v in (estimate, reference_mps2))
@@ -163,7 +192,7 @@ def motion_bound_mmps2(nominal: Sensor) -> float:
     b, a = scipy.signal.butter(*_BUTTERWORTH, fs=nominal.rate_hz)
     impulse = scipy.signal.lfilter(b, a, np.eye(1, round(nominal.rate_hz))[0])
     density = nominal.noise_density_g_per_rthz[0] * G0_MPS2
-    return float(1e3 * density * np.sqrt(nominal.rate_hz / 2 * np.sum(impulse ** 2)))
+    return float(1e3 * density * np.sqrt(nominal.rate_hz / 2 * np.sum(impulse**2)))
 
 
 MODELS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': full_model.fit}
@@ -198,8 +227,13 @@ def draw(nominal: Sensor, stage: tuple[float, float], rng: np.random.Generator) 
     step_rad, level_rad = stage
     unit = replace(nominal, stage_resolution_rad=step_rad, local_gravity_mps2=GRAVITY_MPS2)
     if not nominal.effects:
-        values = {name: {p: rng.normal(size=np.shape(v)) * v for p, v in typical(
-            effect_named(name), unit.axes).items()} for name in full_model.TERMS}
+        values = {
+            name: {
+                p: rng.normal(size=np.shape(v)) * v
+                for p, v in typical(effect_named(name), unit.axes).items()
+            }
+            for name in full_model.TERMS
+        }
         ratio = rng.uniform(-0.25, 0.25, len(unit.axes))
         values['bandwidth'] = {'resistance_ratio': ratio}
         unit = replace(unit, effects=tuple(values), values=values)
@@ -213,8 +247,9 @@ def bare(truth: Sensor) -> Sensor:
     return replace(truth.without_covariance(), effects=(), values={}, model='nominal')
 
 
-def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
-             ) -> tuple[Poses, np.ndarray, Recording]:
+def poses_at(
+    truth: Sensor, read_rad: np.ndarray, seed: int
+) -> tuple[Poses, np.ndarray, Recording]:
     """Simulate rests of 5 s at given angles of the encoder, and average."""
     rng = np.random.default_rng([seed, 1])
     step = truth.stage_resolution_rad
@@ -234,10 +269,18 @@ def poses_at(truth: Sensor, read_rad: np.ndarray, seed: int
     recording = Recording('simulated', time_s, columns, sensor_info(truth))
     samples = round(trajectories.DWELL_S * truth.rate_hz)
     records = [
-        PoseRecord(pose=number, start_ns=round((end_s - trajectories.DWELL_S) * 1e9),
-                   stop_ns=round(end_s * 1e9), samples=samples, mean_v=(), std_v=(),
-                   alpha_rad=alpha_rad, beta_rad=beta_rad)
-        for number, (end_s, (alpha_rad, beta_rad)) in enumerate(zip(ends_s, on_grid))]
+        PoseRecord(
+            pose=number,
+            start_ns=round((end_s - trajectories.DWELL_S) * 1e9),
+            stop_ns=round(end_s * 1e9),
+            samples=samples,
+            mean_v=(),
+            std_v=(),
+            alpha_rad=alpha_rad,
+            beta_rad=beta_rad,
+        )
+        for number, (end_s, (alpha_rad, beta_rad)) in enumerate(zip(ends_s, on_grid))
+    ]
     return extract_poses(recording, bare(truth), records), true, recording
 
 
@@ -245,7 +288,8 @@ def calibrated(truth: Sensor, seed: int, models: Sequence[str] = tuple(MODELS)) 
     """Sweep a unit (the paper's experiments 1 and 2) and fit the models."""
     targets = sweep(PLANES_RAD, float(np.radians(30.0)), 0)
     poses, true, recording = poses_at(
-        truth, np.array([[t.alpha_rad, t.beta_rad] for t in targets]), seed)
+        truth, np.array([[t.alpha_rad, t.beta_rad] for t in targets]), seed
+    )
     nominal = bare(truth)
     fitted = {name: MODELS[name](nominal, poses) for name in models}
     if 'full' in fitted:
@@ -260,8 +304,10 @@ def shaken(truth: Sensor, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
     nominal_motion = trajectories.motion(rng)
     joint_error_rad = truth.stage_resolution_rad * rng.uniform(-0.5, 0.5, 2)
     at_rest = np.zeros(1)
-    alpha, beta = (Held(float(joint(at_rest)[0] + error)) for joint, error in zip(
-        (nominal_motion.alpha, nominal_motion.beta), joint_error_rad))
+    alpha, beta = (
+        Held(float(joint(at_rest)[0] + error))
+        for joint, error in zip((nominal_motion.alpha, nominal_motion.beta), joint_error_rad)
+    )
     motion = replace(nominal_motion, alpha=alpha, beta=beta)
     columns = simulate(truth, motion, seed)
     volts = np.column_stack([columns[f'{axis}_v'] for axis in truth.axes])
@@ -296,38 +342,54 @@ def evaluate(nominal: Sensor, stage: tuple[float, float], seed: int) -> Unit:
     truth = draw(nominal, stage, rng)
     run = calibrated(truth, seed)
     bound = sweep_bound(
-        truth, run.poses, run.true_rad, StageError(truth.stage_std_rad),
-        (*full_model.default_terms(truth.axes), *full_model.GAUGE))
-    random_rad = np.column_stack([np.arccos(rng.uniform(-1, 1, 40)),
-                                  rng.uniform(0, 2 * np.pi, 40)])
+        truth,
+        run.poses,
+        run.true_rad,
+        StageError(truth.stage_std_rad),
+        (*full_model.default_terms(truth.axes), *full_model.GAUGE),
+    )
+    random_rad = np.column_stack(
+        [np.arccos(rng.uniform(-1, 1, 40)), rng.uniform(0, 2 * np.pi, 40)]
+    )
     angles_rad = {'random': random_rad, **{name: np.radians(deg) for name, deg in RUNS.items()}}
-    poses_of = {name: poses_at(truth, rad, seed + (i + 1) * 1_000_003)[:2]
-                for i, (name, rad) in enumerate(angles_rad.items())}
+    poses_of = {
+        name: poses_at(truth, rad, seed + (i + 1) * 1_000_003)[:2]
+        for i, (name, rad) in enumerate(angles_rad.items())
+    }
     moved, angles, acceleration, coefficients = shaken(truth, seed), [], {}, {}
     for model, fitted in run.fitted.items():
-        angles += [angle_errors(fitted, bound, *poses).assign(model=model, run=name)
-                   for name, poses in poses_of.items()]
+        angles += [
+            angle_errors(fitted, bound, *poses).assign(model=model, run=name)
+            for name, poses in poses_of.items()
+        ]
         acceleration[model] = np.divide(*force_errors(fitted, truth, *poses_of['random']))
         names, coefficients[model] = fitted.covariance_names, np.zeros(0)
         if all(name.effect in truth.effects for name in names):
             coefficients[model] = (get(fitted, names) - get(truth, names)) / np.sqrt(
-                np.diag(fitted.covariance))
-    return Unit(pd.concat(angles), acceleration, coefficients, {
-        model: motion_errors(fitted, *moved)[0] for model, fitted in run.fitted.items()},
-        search(truth, seed))
+                np.diag(fitted.covariance)
+            )
+    return Unit(
+        pd.concat(angles),
+        acceleration,
+        coefficients,
+        {model: motion_errors(fitted, *moved)[0] for model, fitted in run.fitted.items()},
+        search(truth, seed),
+    )
 
 
-def evaluate_all(nominal: Sensor, units: int, seed: int, show: Callable[[float], None]
-                 ) -> dict[str, list[Unit]]:
+def evaluate_all(
+    nominal: Sensor, units: int, seed: int, show: Callable[[float], None]
+) -> dict[str, list[Unit]]:
     """Evaluate several units on each stage, in parallel."""
     seeds = [*range(1000 * seed, 1000 * seed + units)]
     stages = [stage for stage in STAGES.values() for _ in seeds]
     found = in_parallel(partial(evaluate, nominal), show, stages, seeds * len(STAGES))
-    return {name: found[i * units:(i + 1) * units] for i, name in enumerate(STAGES)}
+    return {name: found[i * units : (i + 1) * units] for i, name in enumerate(STAGES)}
 
 
-def in_parallel(work: Callable[..., Any], show: Callable[[float], None], *arguments: Sequence[Any]
-                ) -> list[Any]:
+def in_parallel(
+    work: Callable[..., Any], show: Callable[[float], None], *arguments: Sequence[Any]
+) -> list[Any]:
     """Return the results of a function for sequences of its arguments, over the cores."""
     results = []
     with open_pool(None) as pool:

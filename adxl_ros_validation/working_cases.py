@@ -59,49 +59,76 @@ def draw(seed: int, number: int, only: str | None = None) -> Case:
     rng = np.random.default_rng([7_000_001, seed, number])
     group = only or str(rng.choice(GROUPS, p=_SHARES))
     turn = np.random.default_rng([7_000_001, seed, number // len(world.LISTED)]).permutation(
-        world.LISTED)
+        world.LISTED
+    )
     first = str(turn[number % len(turn)])
-    names = {'null': [], 'single': [first], 'outside': [str(rng.choice(world.UNLISTED))],
-             'pair': [first, str(rng.choice([n for n in world.LISTED if n != first]))]}[group]
+    names = {
+        'null': [],
+        'single': [first],
+        'outside': [str(rng.choice(world.UNLISTED))],
+        'pair': [first, str(rng.choice([n for n in world.LISTED if n != first]))],
+    }[group]
     kinds = [world.KINDS[name] for name in names]
     unit = world.draw_unit(rng)
     moves = world.draw_motion(rng, unit, {kind.needs for kind in kinds if kind.needs})
-    scene = Scene(unit, moves, int(rng.integers(2 ** 31)))
+    scene = Scene(unit, moves, int(rng.integers(2**31)))
     force = scene.force()
     noise_g = float(np.mean(unit.noise_g_per_rthz)) * math.sqrt(
-        min(unit.corner_hz * math.pi / 2, unit.rate_hz / 2))
+        min(unit.corner_hz * math.pi / 2, unit.rate_hz / 2)
+    )
     # 3 to 12 % of the noise are coloured.
-    background = Fault(world.COLOUR, noise_g * rng.uniform(0.03, 0.12),
-                       world.COLOUR.draw(rng, unit))
+    background = Fault(
+        world.COLOUR, noise_g * rng.uniform(0.03, 0.12), world.COLOUR.draw(rng, unit)
+    )
     faults, rows, at_rest = [], [], []
     for kind in kinds:
         fault, strength, _, change = trials.sized(
-            rng, kind, unit, _STRENGTHS_MG, partial(trials.measured, scene, force), 1e-3 * G0)
+            rng, kind, unit, _STRENGTHS_MG, partial(trials.measured, scene, force), 1e-3 * G0
+        )
         # Half of the faults that show at rest were there when the unit was calibrated.
         calibrated = kind.at_rest and bool(rng.random() < 0.5)
         stated = unit
         if calibrated:
             left = _strength(unit, world.recalibrated(unit, [fault]), change, force)
-            fault = replace(fault, size=min(fault.size * min(strength / max(left, 1e-9), 5.0),
-                                            kind.largest))
+            fault = replace(
+                fault, size=min(fault.size * min(strength / max(left, 1e-9), 5.0), kind.largest)
+            )
             change = scene.response([fault], coarse=True)
             stated = world.recalibrated(unit, [fault])
             at_rest.append(fault)
         faults.append(fault)
-        rows.append({**trials.described(fault, _strength(unit, stated, change, force)),
-                     'calibrated': calibrated})
+        rows.append(
+            {
+                **trials.described(fault, _strength(unit, stated, change, force)),
+                'calibrated': calibrated,
+            }
+        )
     if at_rest:
         scene = replace(scene, unit=world.recalibrated(unit, at_rest))
-    label = Label(f'w{seed}_{number:04d}', {'null': 'none'}.get(group, group), tuple(names),
-                  (seed, number), (moves.seconds, moves.seconds), moves.kind, unit.axes,
-                  noise_g * G0, rows)
+    label = Label(
+        f'w{seed}_{number:04d}',
+        {'null': 'none'}.get(group, group),
+        tuple(names),
+        (seed, number),
+        (moves.seconds, moves.seconds),
+        moves.kind,
+        unit.axes,
+        noise_g * G0,
+        rows,
+    )
     acting = [background, *faults]
-    return Case(label, scene, acting, scene.recording(acting, _DIGITS),
-                simulator.parameter_file(scene.unit, label.name))
+    return Case(
+        label,
+        scene,
+        acting,
+        scene.recording(acting, _DIGITS),
+        simulator.parameter_file(scene.unit, label.name),
+    )
 
 
-def _strength(unit: simulator.Unit, stated: simulator.Unit, change: np.ndarray,
-              force: np.ndarray) -> float:
+def _strength(
+    unit: simulator.Unit, stated: simulator.Unit, change: np.ndarray, force: np.ndarray
+) -> float:
     """Return the rms of a change, m/s², beyond what a calibration has taken up of it."""
     zero = (stated.stated_zero_v - unit.stated_zero_v) / unit.stated_scale_v_per_g
     scale = stated.stated_scale_v_per_g / unit.stated_scale_v_per_g - 1
@@ -115,8 +142,11 @@ def _harm(case: Case, fitted: str | None) -> bool:
         return False
     rng = np.random.default_rng([7_000_002, *case.label.seed])
     needs = {world.KINDS[name].needs for name in case.label.effects} - {''}
-    scene = replace(case.scene, seed=case.scene.seed + 1,
-                    manoeuvre=world.draw_motion(rng, case.scene.unit, needs))
+    scene = replace(
+        case.scene,
+        seed=case.scene.seed + 1,
+        manoeuvre=world.draw_motion(rng, case.scene.unit, needs),
+    )
     compared = diagnosis_runs.Comparison(scene, case.faults, case.parameters, fitted)
     before, after = compared.before, compared.after
     return compared.interval(after - before)[0] > _HARM * float(before.mean())
@@ -135,8 +165,12 @@ class Row(NamedTuple):
         """Return the answer without the effects that it may name, too."""
         given = grading.answer(self.result)
         certain = given.certain - self.tolerated
-        if given.certain and not certain and not given.groups \
-                and given.status in ('explained', 'partly'):
+        if (
+            given.certain
+            and not certain
+            and not given.groups
+            and given.status in ('explained', 'partly')
+        ):
             return replace(given, certain=certain, status='no_gap', limit_mps2=None)
         return replace(given, certain=certain)
 
@@ -147,13 +181,20 @@ def diagnosed(seed: int, number: int, only: str | None, folder: Path) -> tuple[R
     place = folder / case.label.name
     trials.save(place, case.label.name, (case.recording, case.parameters))
     write(place / f'{case.label.name}.json', json.dumps(asdict(case.label), indent=1).encode())
-    result = diagnosis_runs.diagnose(case.label.name, case.recording.encode(),
-                                     case.parameters.encode())[1]
+    result = diagnosis_runs.diagnose(
+        case.label.name, case.recording.encode(), case.parameters.encode()
+    )[1]
     write(place / 'result.json', json.dumps(result).encode())
     unit = case.scene.unit
     noisy = bool(np.any(unit.noise_g_per_rthz > _NOTICED * unit.stated_noise_g_per_rthz))
-    return (Row(case.label, result, frozenset(['noise_excess'] if noisy else []) - frozenset(
-        case.label.effects), _harm(case, result['parameters'])),)
+    return (
+        Row(
+            case.label,
+            result,
+            frozenset(['noise_excess'] if noisy else []) - frozenset(case.label.effects),
+            _harm(case, result['parameters']),
+        ),
+    )
 
 
 def line(row: Row) -> str:
@@ -162,18 +203,37 @@ def line(row: Row) -> str:
     report = row.result['report'] or {}
     gap = report.get('gap') or {}
     figures = ' '.join(
-        f'{name} {1e3 * gap[key] / G0:.3f}' for name, key in (
-            ('gap', 'before'), ('left', 'after'), ('floor', 'floor'), ('P', 'explained'),
-            ('U', 'rest'), ('limit', 'upper_limit')) if isinstance(gap.get(key), (int, float)))
-    truth = ' + '.join(f'{fault["effect"]} {1e3 * fault["strength_mps2"] / G0:.2f} mg'
-                       f'{" calibrated" if fault.get("calibrated") else ""}'
-                       for fault in label.faults) or 'nothing'
-    said = ', '.join([*sorted(grading.answer(row.result).certain),
-                      *(f'({" | ".join(sorted(group))})' for group in answer.groups)])
+        f'{name} {1e3 * gap[key] / G0:.3f}'
+        for name, key in (
+            ('gap', 'before'),
+            ('left', 'after'),
+            ('floor', 'floor'),
+            ('P', 'explained'),
+            ('U', 'rest'),
+            ('limit', 'upper_limit'),
+        )
+        if isinstance(gap.get(key), (int, float))
+    )
+    truth = (
+        ' + '.join(
+            f'{fault["effect"]} {1e3 * fault["strength_mps2"] / G0:.2f} mg'
+            f'{" calibrated" if fault.get("calibrated") else ""}'
+            for fault in label.faults
+        )
+        or 'nothing'
+    )
+    said = ', '.join(
+        [
+            *sorted(grading.answer(row.result).certain),
+            *(f'({" | ".join(sorted(group))})' for group in answer.groups),
+        ]
+    )
     mark = 'ok  ' if right(row) else 'set ' if in_set(row) else 'MISS'
-    return f'{mark} {label.name} {label.axes:3} {label.manoeuvre:6} {truth}: {answer.status} ' \
-           f'{answer.probability:.2f} {said or row.result["error"] or "-"}; {figures} mg; ' \
-           f'{row.result["cpu_s"]:.1f} s{" HARM" if row.harm else ""}'
+    return (
+        f'{mark} {label.name} {label.axes:3} {label.manoeuvre:6} {truth}: {answer.status} '
+        f'{answer.probability:.2f} {said or row.result["error"] or "-"}; {figures} mg; '
+        f'{row.result["cpu_s"]:.1f} s{" HARM" if row.harm else ""}'
+    )
 
 
 def right(row: Row) -> bool:
@@ -185,12 +245,15 @@ def right(row: Row) -> bool:
 
 def in_set(row: Row) -> bool:
     """Return whether a verdict names every true effect, perhaps in groups."""
-    return right(row) or any(effects and effects <= row.answer.named for effects in grading.right(
-        row.label, row.answer.material_mps2))
+    return right(row) or any(
+        effects and effects <= row.answer.named
+        for effects in grading.right(row.label, row.answer.material_mps2)
+    )
 
 
 def table(rows: Sequence[Row]) -> str:
     """Return the scores with Wilson's intervals, and how often verdicts of a probability hold."""
+
     def group(name: str) -> list[Row]:
         return [row for row in rows if row.label.group == name]
 
@@ -200,29 +263,48 @@ def table(rows: Sequence[Row]) -> str:
         ('single effect, in the named set', [in_set(row) for row in group('single')]),
         ('pair, exactly', [right(row) for row in group('pair')]),
         ('outside the library: unknown or partly', [right(row) for row in group('outside')]),
-        ('upper limit of no gap holds', [held for held in (
-            grading.limit_holds(row.answer, row.label) for row in rows) if held is not None]),
+        (
+            'upper limit of no gap holds',
+            [
+                held
+                for held in (grading.limit_holds(row.answer, row.label) for row in rows)
+                if held is not None
+            ],
+        ),
         ('harm: another recording made worse', [row.harm for row in rows]),
         ('no verdict', [row.answer.status == 'failed' for row in rows]),
-        ('tracebacks', [str(row.result['error']).startswith('traceback') for row in rows])]
+        ('tracebacks', [str(row.result['error']).startswith('traceback') for row in rows]),
+    ]
     cpu = [row.result['cpu_s'] for row in rows]
-    right_by_probability = scores.reliability([
-        (row.answer.probability, grading.verdict_right(row.answer, row.label)) for row in rows])
-    return '\n'.join([
-        *(f'{name:40} {scores.in_words(scores.share(hits))}' for name, hits in cells if hits),
-        f'{"processor time, s":40} median {np.median(cpu):.1f}, longest {max(cpu):.1f}', '',
-        *terminal_table(*reliability(right_by_probability))])
+    right_by_probability = scores.reliability(
+        [(row.answer.probability, grading.verdict_right(row.answer, row.label)) for row in rows]
+    )
+    return '\n'.join(
+        [
+            *(f'{name:40} {scores.in_words(scores.share(hits))}' for name, hits in cells if hits),
+            f'{"processor time, s":40} median {np.median(cpu):.1f}, longest {max(cpu):.1f}',
+            '',
+            *terminal_table(*reliability(right_by_probability)),
+        ]
+    )
 
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = cli.argument_parser('working', __doc__, {
-        'a development loop of one group': '--count 20 --seed 3 --only pair'})
-    parse.add_argument('-o', dest='output', metavar='DIR', default='working_output',
-                       help='files of the cases (default: working_output)')
+    parse = cli.argument_parser(
+        'working', __doc__, {'a development loop of one group': '--count 20 --seed 3 --only pair'}
+    )
+    parse.add_argument(
+        '-o',
+        dest='output',
+        metavar='DIR',
+        default='working_output',
+        help='files of the cases (default: working_output)',
+    )
     parse.add_argument('--count', type=int, default=80, help='number of cases (default 80)')
-    parse.add_argument('--first', type=int, default=0, metavar='N',
-                       help='number of the first case (default 0)')
+    parse.add_argument(
+        '--first', type=int, default=0, metavar='N', help='number of the first case (default 0)'
+    )
     parse.add_argument('--seed', type=int, default=1, help='seed of the cases (default 1)')
     parse.add_argument('--only', choices=GROUPS, help='cases of one group only')
     parse.add_argument('--jobs', type=int, default=2, help='processes at once (default 2)')
@@ -240,9 +322,13 @@ def working(options: argparse.Namespace) -> int:
         print(line(row), flush=True)
 
     with open_pool(None, options.jobs) as pool:
-        for_each(pool, diagnosed, [
-            partial(tuple, (options.seed, number, options.only, folder)) for number in numbers],
-            keep, lambda done: None)
+        for_each(
+            pool,
+            diagnosed,
+            [partial(tuple, (options.seed, number, options.only, folder)) for number in numbers],
+            keep,
+            lambda done: None,
+        )
     print(f'\n{table(rows)}')
     return 0
 

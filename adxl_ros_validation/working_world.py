@@ -32,16 +32,27 @@ def draw_unit(rng: np.random.Generator) -> Unit:
     stated = rng.uniform(60e-6, 250e-6) * rng.uniform(0.9, 1.1, n)
     off = 1 + rng.choice([-1, 1]) * rng.uniform(0.05, 0.2)
     resolution = math.radians(rng.choice([0.001, 0.005, 0.02]))
-    return Unit(axes, zero, scale, zero + sim.ZERO_G_STD_G * scale * rng.normal(size=n),
-                scale * (1 + sim.SCALE_STD * rng.normal(size=n)), off * stated, stated,
-                rate / rng.uniform(2.0, 6.0), 10 ** rng.uniform(-6.3, -5.3, n),
-                10 ** rng.uniform(-5.5, -4.8, n), resolution, np.zeros(6), rate)
+    return Unit(
+        axes,
+        zero,
+        scale,
+        zero + sim.ZERO_G_STD_G * scale * rng.normal(size=n),
+        scale * (1 + sim.SCALE_STD * rng.normal(size=n)),
+        off * stated,
+        stated,
+        rate / rng.uniform(2.0, 6.0),
+        10 ** rng.uniform(-6.3, -5.3, n),
+        10 ** rng.uniform(-5.5, -4.8, n),
+        resolution,
+        np.zeros(6),
+        rate,
+    )
 
 
 def trapezoidal(u: np.ndarray) -> np.ndarray:
     """Return the share of a move whose velocity is a trapezium."""
     ramp, edge = 0.2, np.minimum(u, 1 - u)
-    part = np.where(edge < ramp, edge ** 2 / (2 * ramp), edge - ramp / 2) / (1 - ramp)
+    part = np.where(edge < ramp, edge**2 / (2 * ramp), edge - ramp / 2) / (1 - ramp)
     return np.where(u < 0.5, part, 1 - part)
 
 
@@ -73,8 +84,10 @@ def draw_motion(rng: np.random.Generator, unit: Unit, needs: set[str]) -> Manoeu
     script.rest(2.0)
     warm = 'heat' in needs or rng.random() < 0.5
     heat = (rng.uniform(20, 28), rng.uniform(6, 20) * warm, rng.uniform(8, 30))
-    sag = (rng.uniform(0.02, 0.08) * ('supply' in needs or rng.random() < 0.4),
-           rng.uniform(17, 50))
+    sag = (
+        rng.uniform(0.02, 0.08) * ('supply' in needs or rng.random() < 0.4),
+        rng.uniform(17, 50),
+    )
     script.kind = blocks[0] if len(blocks) == 1 else 'mixed'
     script.climate = partial(_climate, script.seconds, heat, sag)
     return script
@@ -90,8 +103,11 @@ def _block(script: Manoeuvre, block: str, rng: np.random.Generator, unit: Unit) 
             script.rest(rng.uniform(0.5, 1.5))
     elif block == 'poses':
         for _ in range(6):
-            script.go(seconds=rng.uniform(1.5, 4), alpha=math.acos(rng.uniform(-0.98, 0.98)),
-                      beta=script.beta[-1] + rng.uniform(-2, 2))
+            script.go(
+                seconds=rng.uniform(1.5, 4),
+                alpha=math.acos(rng.uniform(-0.98, 0.98)),
+                beta=script.beta[-1] + rng.uniform(-2, 2),
+            )
             script.rest(rng.uniform(0.8, 2.5))
     elif block == 'fast':
         for i in range(8):
@@ -104,13 +120,19 @@ def _block(script: Manoeuvre, block: str, rng: np.random.Generator, unit: Unit) 
         for _ in range(2):
             peak_mps2, first_hz = rng.uniform(1, 4), rng.uniform(low, high)
             last_hz = rng.uniform(low, high)
-            script.swing('shift', peak_mps2 / (2 * np.pi * first_hz) ** 2, first_hz,
-                         rng.uniform(5, 9), last_hz)
+            script.swing(
+                'shift',
+                peak_mps2 / (2 * np.pi * first_hz) ** 2,
+                first_hz,
+                rng.uniform(5, 9),
+                last_hz,
+            )
             script.rest(0.5)
 
 
-def _climate(seconds: float, heat: tuple[float, float, float], sag: tuple[float, float],
-             t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _climate(
+    seconds: float, heat: tuple[float, float, float], sag: tuple[float, float], t: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return temperature, °C, and supply, V: a heater goes on and off, a load switches."""
     start_c, rise_c, lag_s = heat
     on, off = (np.clip(t - part * seconds, 0, None) for part in (0.15, 0.6))
@@ -129,15 +151,21 @@ def recalibrated(unit: Unit, acting: list[Fault]) -> Unit:
             ends.append(script.seconds)
     still = replace(unit, rate_hz=50.0)
     scene = Scene(still, script, 0)
-    with_faults, without = (scene.volts(kept, noise=False, fine_hz=200.0)
-                            for kept in (acting, []))
+    with_faults, without = (scene.volts(kept, noise=False, fine_hz=200.0) for kept in (acting, []))
     t = scene.stamps()
     rest = np.any([(t > end - 0.2) & (t < end) for end in ends], axis=0)
     u = (without - unit.zero_v[:, None]) / unit.scale_v_per_g[:, None]
-    zero, scale = np.transpose([ideal_observer.line(along[rest], change[rest])
-                                for along, change in zip(u, with_faults - without)])
-    return replace(unit, stated_zero_v=unit.stated_zero_v + zero,
-                   stated_scale_v_per_g=unit.stated_scale_v_per_g + scale)
+    zero, scale = np.transpose(
+        [
+            ideal_observer.line(along[rest], change[rest])
+            for along, change in zip(u, with_faults - without)
+        ]
+    )
+    return replace(
+        unit,
+        stated_zero_v=unit.stated_zero_v + zero,
+        stated_scale_v_per_g=unit.stated_scale_v_per_g + scale,
+    )
 
 
 bias = scale_factor = time_offset = sim.constant
@@ -178,15 +206,18 @@ def backlash(run: Run, size: float, shape: Shape) -> None:
     """Follow by three dead bands of different widths, rad, as flanks that yield."""
     for joint, w in ((run.alpha, shape['w'][0]), (run.beta, shape['w'][1])):
         if w:
-            joint[:] = np.mean([_play(run, joint, part * abs(size * w) / 2)
-                                for part in (0.5, 0.9, 1.3)], axis=0)
+            joint[:] = np.mean(
+                [_play(run, joint, part * abs(size * w) / 2) for part in (0.5, 0.9, 1.3)], axis=0
+            )
 
 
 def late(law: sim.Law) -> sim.Act:
     """Read the output late by a law, s."""
+
     def act(run: Run, size: float, shape: Shape) -> None:
         late_s = size * shape['w'][0] * law(run, shape)
         run.volts = np.stack([np.interp(run.t - late_s, run.t, row) for row in run.volts])
+
     return act
 
 
@@ -195,7 +226,8 @@ def misalignment(run: Run, size: float, shape: Shape) -> None:
     turn = size * np.asarray(shape['w']).reshape(-1, 3)
     for d, angles in zip(run.unit.axis_indices, turn):
         run.directions[d] = scipy.spatial.transform.Rotation.from_rotvec(angles).apply(
-            run.directions[d])
+            run.directions[d]
+        )
     run.u = (run.directions @ run.force)[run.unit.axis_indices] / G0
 
 
@@ -204,8 +236,9 @@ def mount_resonance(run: Run, size: float, shape: Shape) -> None:
     force = run.force.copy()
     for ratio, part in ((1.0, 1.0), (2.2, 0.2)):
         w0 = 2 * np.pi * shape['hertz'] * ratio
-        b, a = scipy.signal.bilinear([w0 * w0], [1, 2 * shape['damping'] * w0, w0 * w0],
-                                     1 / run.dt)
+        b, a = scipy.signal.bilinear(
+            [w0 * w0], [1, 2 * shape['damping'] * w0, w0 * w0], 1 / run.dt
+        )
         moved = scipy.signal.lfilter(b, a, force - force[:, :1]) + force[:, :1]
         run.force += size * part * (moved - force)
 
@@ -224,15 +257,17 @@ def cross_axis(run: Run, shape: Shape) -> np.ndarray:
 def cross_axis_z(run: Run, shape: Shape) -> np.ndarray:
     """Follow z by an even law with an odd part."""
     c = run.force[2] / G0
-    return _PLANE[:len(run.u)] * (np.log(np.cosh(1.5 * c)) + shape['odd'] * c)
+    return _PLANE[: len(run.u)] * (np.log(np.cosh(1.5 * c)) + shape['odd'] * c)
 
 
 def hysteresis(run: Run, size: float, shape: Shape) -> None:
     """Lag by stops of uneven thresholds and weights, more at positive force, g."""
     for row, w in zip(run.u, shape['w']):
         if w:
-            lag = sum(part * (row - _play(run, row, reach * shape['reach'])) / (
-                reach * shape['reach']) for reach, part in ((0.15, 0.5), (0.45, 0.2), (1.4, 0.3)))
+            lag = sum(
+                part * (row - _play(run, row, reach * shape['reach'])) / (reach * shape['reach'])
+                for reach, part in ((0.15, 0.5), (0.45, 0.2), (1.4, 0.3))
+            )
             row -= size * w * lag * (1 + shape['skew'] * row)
 
 
@@ -302,8 +337,9 @@ def flicker(run: Run, shape: Shape) -> np.ndarray:
 def bias_walk(run: Run, shape: Shape) -> np.ndarray:
     """Add a walk whose power changes from part to part."""
     rng, n = run.random('walk'), len(run.t)
-    power = np.interp(np.linspace(0, 7, n), np.arange(8), np.exp(shape['uneven'] * rng.normal(
-        size=8)))
+    power = np.interp(
+        np.linspace(0, 7, n), np.arange(8), np.exp(shape['uneven'] * rng.normal(size=8))
+    )
     return _unit_rms(np.cumsum(power * rng.normal(size=run.volts.shape), axis=1))
 
 
@@ -318,8 +354,9 @@ def spikes(run: Run, size: float, shape: Shape) -> None:
     rng, like = run.random('spikes'), run.volts.shape
     hit = rng.random(like) < shape['rate_hz'] * run.dt
     sign = np.where(rng.random(like) < shape['up'], 1.0, -1.0)
-    run.volts += size * np.abs(sim.column(shape)) * hit * sign * (0.4 + 0.6 * rng.exponential(
-        size=like))
+    run.volts += (
+        size * np.abs(sim.column(shape)) * hit * sign * (0.4 + 0.6 * rng.exponential(size=like))
+    )
 
 
 def stuck(run: Run, size: float, shape: Shape) -> None:
@@ -327,7 +364,7 @@ def stuck(run: Run, size: float, shape: Shape) -> None:
     rng = run.random('stuck')
     for start in np.flatnonzero(rng.random(len(run.t)) < shape['rate_hz'] * run.dt):
         held = max(int(size * rng.uniform(0.5, 1.5) / run.dt), 1)
-        run.volts[:, start:start + held + 1] = run.volts[:, start:start + 1]
+        run.volts[:, start : start + held + 1] = run.volts[:, start : start + 1]
 
 
 def quantisation(run: Run, size: float, shape: Shape) -> None:
@@ -341,22 +378,23 @@ def quantisation(run: Run, size: float, shape: Shape) -> None:
 
 def adc_inl(run: Run, size: float, shape: Shape) -> None:
     """Bend the converter, V: some wrong bits, two sines, or a bow."""
-    share, (law, phase, cycles, *bits) = run.volts / (sim.LSB_V * 2 ** sim.ADC_BITS), shape['w']
+    share, (law, phase, cycles, *bits) = run.volts / (sim.LSB_V * 2**sim.ADC_BITS), shape['w']
     if law < 0.5:
-        run.volts += size * sum((bit > 0.5) * (np.floor(share * 2 ** (i + 1)) % 2 - 0.5)
-                                for i, bit in enumerate(bits))
+        run.volts += size * sum(
+            (bit > 0.5) * (np.floor(share * 2 ** (i + 1)) % 2 - 0.5) for i, bit in enumerate(bits)
+        )
     elif law < 0.85:
-        angle = 2 * np.pi * 2 * 15 ** cycles * share
+        angle = 2 * np.pi * 2 * 15**cycles * share
         run.volts += size * (np.sin(angle + 6 * phase) + 0.4 * np.sin(2.6 * angle))
     else:
         x = 4 * (share - 0.5)
-        run.volts += size * (x - x ** 3 + 0.5 * x ** 5)
+        run.volts += size * (x - x**3 + 0.5 * x**5)
 
 
 def aftermath(run: Run, shape: Shape) -> np.ndarray:
     """Shift zero-g while and after a joint turns: charge of a mass, or current of a motor."""
     rate = np.hypot(np.gradient(run.alpha, run.dt), np.gradient(run.beta, run.dt))
-    return low_pass(1 - np.exp(-(rate / 0.3) ** 2), shape['late_s'], run.dt)
+    return low_pass(1 - np.exp(-((rate / 0.3) ** 2)), shape['late_s'], run.dt)
 
 
 motor_current = aftermath
@@ -375,7 +413,8 @@ _LAWS: dict[str, sim.Law] = {
     'scale_factor_cross': lambda run, shape: np.tanh(1.2 * _other(run)),
     # Scale with z.
     'scale_factor_z': lambda run, shape: (
-        _PLANE[:len(run.u)] * (np.tanh(1.2 * run.force[2] / G0 + 0.4) - np.tanh(0.4))),
+        _PLANE[: len(run.u)] * (np.tanh(1.2 * run.force[2] / G0 + 0.4) - np.tanh(0.4))
+    ),
     # Yield less and less.
     'nonlinearity': lambda run, shape: np.arctan(shape['bend'] * run.u) / shape['bend'] - run.u,
     # Follow a power of the force that is not quite 2.
@@ -390,7 +429,8 @@ _LAWS: dict[str, sim.Law] = {
     'ripple': lambda run, shape: np.sin(2 * np.pi * run.u / shape['period_g'] + shape['phase']),
     # Follow the direction in the room, beyond its first harmonics.
     'magnet': lambda run, shape: (
-        np.sin(3 * run.beta + shape['phase']) * (1 + 0.5 * np.cos(2 * run.alpha))),
+        np.sin(3 * run.beta + shape['phase']) * (1 + 0.5 * np.cos(2 * run.alpha))
+    ),
     # Lose scale factor steadily, as by leakage into a reference.
     'fading_gain': lambda run, shape: run.t / 100,
 }
@@ -398,6 +438,13 @@ _LAWS: dict[str, sim.Law] = {
 _LISTED, _UNLISTED = sim.load_kinds('working_faults.yaml', globals() | _LAWS)
 LISTED, UNLISTED, KINDS = tuple(_LISTED), tuple(_UNLISTED), _LISTED | _UNLISTED
 """Faults of which the package's library has an effect, the others, and all by name."""
-COLOUR = Kind('colour', sim.added_at_output(_colour), 1e-4, 1e-2, place=Place.ELECTRONICS,
-              random=True, bounds={'lag_s': (0.02, 0.3)})
+COLOUR = Kind(
+    'colour',
+    sim.added_at_output(_colour),
+    1e-4,
+    1e-2,
+    place=Place.ELECTRONICS,
+    random=True,
+    bounds={'lag_s': (0.02, 0.3)},
+)
 """What every recording has: noise that is not quite white."""

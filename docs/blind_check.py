@@ -22,17 +22,22 @@ def main() -> None:
     check = report.of_simulated(made)
     replace(log, run, check.markdown())
     # The page has the score, its figure, its bar and whether it is met; the log has the rest.
-    narrow = [re.sub(r'^((\|[^|]*){4}).*', r'\1|', line)
-              for line in check.markdown(['Result']).splitlines()]
+    narrow = [
+        re.sub(r'^((\|[^|]*){4}).*', r'\1|', line)
+        for line in check.markdown(['Result']).splitlines()
+    ]
     replace(DOCS / 'maintain' / 'blind_check.md', 'result', '\n'.join(narrow))
 
 
 def replace(path: Path, mark: str, text: str) -> None:
     """Replace the text between two marks of a page."""
     page = path.read_text(encoding='utf-8')
-    page, count = re.subn(f'<!-- {mark} -->.*<!-- /{mark} -->',
-                          lambda match: f'<!-- {mark} -->\n{text}\n<!-- /{mark} -->',
-                          page, flags=re.DOTALL)
+    page, count = re.subn(
+        f'<!-- {mark} -->.*<!-- /{mark} -->',
+        lambda match: f'<!-- {mark} -->\n{text}\n<!-- /{mark} -->',
+        page,
+        flags=re.DOTALL,
+    )
     if not count:
         sys.exit(f'{path}: has no place for {mark!r}')
     path.write_text(page, encoding='utf-8')

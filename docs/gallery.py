@@ -57,28 +57,45 @@ def turning(alpha_deg: float, seconds: float = 36.0) -> Motion:
     seconds: duration, s.
     """
     half, rate = seconds / 2, TURN / (seconds / 2 - 1)
-    return Motion(seconds, Held(np.radians(alpha_deg)), Knots(
-        [0, 1, half - 1, half, half + 1, seconds - 1, seconds],
-        [0, rate / 2, TURN - rate / 2, TURN, TURN - rate / 2, rate / 2, 0],
-        [0, rate, rate, 0, -rate, -rate, 0]))
+    return Motion(
+        seconds,
+        Held(np.radians(alpha_deg)),
+        Knots(
+            [0, 1, half - 1, half, half + 1, seconds - 1, seconds],
+            [0, rate / 2, TURN - rate / 2, TURN, TURN - rate / 2, rate / 2, 0],
+            [0, rate, rate, 0, -rate, -rate, 0],
+        ),
+    )
 
 
 def plane(alpha_deg: float, axes: str = 'xy') -> Scene:
     """Draw the output over beta in one plane."""
-    return Scene(turning(alpha_deg), 'beta_rad', f'beta at alpha = {alpha_deg:g}°, deg',
-                 180 / np.pi, axes=axes)
+    return Scene(
+        turning(alpha_deg),
+        'beta_rad',
+        f'beta at alpha = {alpha_deg:g}°, deg',
+        180 / np.pi,
+        axes=axes,
+    )
 
 
 REST = Motion(300.0, Held(np.radians(60)), Held(np.radians(30)), internal_rate_hz=1000.0)
 SWING = Motion(6.0, Held(np.pi / 2), Knots([0, 1, 2, 3, 4, 5, 6], [0, 0, 1.5, 0, -1.5, 0, 0]))
 SHAKE = Motion(44.0, Held(np.pi / 2), Held(np.pi / 2), swept_sine(2.0))
-WARM = replace(REST, duration_s=1200.0, internal_rate_hz=10.0,
-               temperature_c=Steps(25.0, ((200, 45), (700, 10)), 60.0))
-CYCLE = replace(WARM, temperature_c=Knots([0, 600, 1200], [5.0, 65.0, 5.0],
-                                          [0.1, 0.0, -0.1]))
+WARM = replace(
+    REST,
+    duration_s=1200.0,
+    internal_rate_hz=10.0,
+    temperature_c=Steps(25.0, ((200, 45), (700, 10)), 60.0),
+)
+CYCLE = replace(WARM, temperature_c=Knots([0, 600, 1200], [5.0, 65.0, 5.0], [0.1, 0.0, -0.1]))
 SUPPLY = replace(REST, duration_s=60.0, supply_v=Steps(5.0, ((15, 4.8), (30, 5.2), (45, 5.0)), 1))
-TILTING = Scene(Motion(18.0, turning(0.0).beta, Held(np.radians(30))), 'alpha_rad',
-                'alpha at beta = 30°, deg', 180 / np.pi)
+TILTING = Scene(
+    Motion(18.0, turning(0.0).beta, Held(np.radians(30))),
+    'alpha_rad',
+    'alpha at beta = 30°, deg',
+    180 / np.pi,
+)
 CARRIED_S = np.arange(0.0, 4.0, 0.01)
 
 
@@ -91,8 +108,10 @@ class Arm(ForcePath):
         """Take the swing of a joint."""
         super().__init__(CARRIED_S, self.force(self.turn(0.0)))
         q, force = self.turn(0.0), self.force(self.turn(0.0))
-        self.modes = {'joint1': (self.force(q + 1e-4) - force) / 1e-4,
-                      'flexible': (self.force(self.turn(1e-5)) - force) / 1e-5}
+        self.modes = {
+            'joint1': (self.force(q + 1e-4) - force) / 1e-4,
+            'flexible': (self.force(self.turn(1e-5)) - force) / 1e-5,
+        }
 
     def turn(self, compliance_s2: float) -> np.ndarray:
         """Return the angle of the joint, rad, with links that yield."""
@@ -102,41 +121,69 @@ class Arm(ForcePath):
     def force(self, q: np.ndarray) -> np.ndarray:
         """Return the specific force, m/s², (n, 3)."""
         rate = np.gradient(q, CARRIED_S)
-        return np.column_stack([
-            -0.5 * rate ** 2 - 9.80665 * np.sin(q), 0 * q,
-            -0.5 * np.gradient(rate, CARRIED_S) + 9.80665 * np.cos(q)])
+        return np.column_stack(
+            [
+                -0.5 * rate**2 - 9.80665 * np.sin(q),
+                0 * q,
+                -0.5 * np.gradient(rate, CARRIED_S) + 9.80665 * np.cos(q),
+            ]
+        )
 
 
 SWUNG = Motion(4.0, force=Arm())
-CARRIED = Motion(4.0, force=ForcePath(CARRIED_S, 9.80665 * np.column_stack([
-    0.2 * np.sin(2 * CARRIED_S) + 0.05 * np.sin(25 * CARRIED_S),
-    0.3 * np.sin(3 * CARRIED_S) + 0.02 * np.sin(50 * CARRIED_S), np.ones(len(CARRIED_S))])))
+CARRIED = Motion(
+    4.0,
+    force=ForcePath(
+        CARRIED_S,
+        9.80665
+        * np.column_stack(
+            [
+                0.2 * np.sin(2 * CARRIED_S) + 0.05 * np.sin(25 * CARRIED_S),
+                0.3 * np.sin(3 * CARRIED_S) + 0.02 * np.sin(50 * CARRIED_S),
+                np.ones(len(CARRIED_S)),
+            ]
+        ),
+    ),
+)
 OVER_TIME = Scene(REST, noisy=True, axes='x')
 SCENES = {
-    'cross_axis_z': TILTING, 'scale_factor_z': plane(30),
-    'gravity': plane(45, 'xyz'), 'base_tilt': plane(90, 'xyz'), 'stage_offset': plane(45, 'xyz'),
+    'cross_axis_z': TILTING,
+    'scale_factor_z': plane(30),
+    'gravity': plane(45, 'xyz'),
+    'base_tilt': plane(90, 'xyz'),
+    'stage_offset': plane(45, 'xyz'),
     'saturation': Scene(turning(90), 'beta_rad', 'beta at alpha = 90°, deg', 180 / np.pi),
-    'lever_arm': Scene(SWING), 'time_offset': Scene(SWING), 'bandwidth': Scene(SWING),
+    'lever_arm': Scene(SWING),
+    'time_offset': Scene(SWING),
+    'bandwidth': Scene(SWING),
     'clock_skew': Scene(turning(90, 120.0)),
     'thermal_hysteresis': Scene(CYCLE, 'temperature_c', 'temperature, °C'),
     'reference_filter': Scene(CARRIED),
-    'joint_offset': Scene(SWUNG), 'flexible_link': Scene(SWUNG),
-    'reference_delay': Scene(CARRIED), 'reference_frame': Scene(CARRIED),
-    'bias_walk': Scene(replace(REST, duration_s=1200.0)), 'spikes': replace(
-        OVER_TIME, motion=replace(REST, duration_s=20.0)),
+    'joint_offset': Scene(SWUNG),
+    'flexible_link': Scene(SWUNG),
+    'reference_delay': Scene(CARRIED),
+    'reference_frame': Scene(CARRIED),
+    'bias_walk': Scene(replace(REST, duration_s=1200.0)),
+    'spikes': replace(OVER_TIME, motion=replace(REST, duration_s=20.0)),
     'stuck': Scene(replace(SWING, duration_s=6.0), noisy=True, axes='x'),
-    'mains_hum': replace(OVER_TIME, kind='spectrum'), 'flicker': replace(OVER_TIME,
-                                                                         kind='spectrum'),
+    'mains_hum': replace(OVER_TIME, kind='spectrum'),
+    'flicker': replace(OVER_TIME, kind='spectrum'),
     'noise_excess': replace(OVER_TIME, kind='spectrum'),
-    'quantisation': replace(OVER_TIME, kind='codes')}
+    'quantisation': replace(OVER_TIME, kind='codes'),
+}
 SCENES_BY_MANOEUVRE = {
-    Manoeuvre.HEAT: Scene(WARM), Manoeuvre.SUPPLY: Scene(SUPPLY),
-    Manoeuvre.SHAKE: Scene(SHAKE, axes='x')}
+    Manoeuvre.HEAT: Scene(WARM),
+    Manoeuvre.SUPPLY: Scene(SUPPLY),
+    Manoeuvre.SHAKE: Scene(SHAKE, axes='x'),
+}
 """Scenes of other effects by the manoeuvre that reveals them; `plane(90)` for the rest."""
-LOUDER = {Coefficient('stuck', 'rate_hz'): 1.0, Coefficient('stuck', 'duration_s'): 0.2,
-          **{Coefficient('saturation', 'limit_g', axis): 0.9 for axis in AXES},
-          Coefficient('clock_skew', 'ratio'): 1e-3,
-          Coefficient('mount_resonance', 'frequency_hz'): 25.0}
+LOUDER = {
+    Coefficient('stuck', 'rate_hz'): 1.0,
+    Coefficient('stuck', 'duration_s'): 0.2,
+    **{Coefficient('saturation', 'limit_g', axis): 0.9 for axis in AXES},
+    Coefficient('clock_skew', 'ratio'): 1e-3,
+    Coefficient('mount_resonance', 'frequency_hz'): 25.0,
+}
 """Values of parameters whose typical value does not show in the plot."""
 
 
@@ -152,18 +199,25 @@ def main(output: Path) -> None:
 def draw(nominal: Sensor, effect: Effect, path: Path) -> None:
     """Draw one effect."""
     scene = SCENES.get(effect.name) or SCENES_BY_MANOEUVRE.get(
-        effect.diagnosis.revealed_by, plane(90))
-    sensor = nominal if scene.noisy else replace(
-        nominal, noise_density_g_per_rthz=np.zeros(3),
-        adc_bits=nominal.adc_bits if Need.ADC in effect.needs else 0)
-    changed = replace(sensor, effects=(effect.name,),
-                      values={effect.name: typical(effect, AXES)})
+        effect.diagnosis.revealed_by, plane(90)
+    )
+    sensor = (
+        nominal
+        if scene.noisy
+        else replace(
+            nominal,
+            noise_density_g_per_rthz=np.zeros(3),
+            adc_bits=nominal.adc_bits if Need.ADC in effect.needs else 0,
+        )
+    )
+    changed = replace(sensor, effects=(effect.name,), values={effect.name: typical(effect, AXES)})
     louder = {name: value for name, value in LOUDER.items() if name.effect == effect.name}
     changed = put(changed, list(louder), list(louder.values()))
     pair = Pair(sensor, simulate(sensor, scene.motion, 0), simulate(changed, scene.motion, 0))
     figure, (above, below) = plt.subplots(2, 1, figsize=(7.5, 4.6), constrained_layout=True)
     {'lines': draw_lines, 'spectrum': draw_spectrum, 'codes': draw_codes}[scene.kind](
-        above, below, scene, pair)
+        above, below, scene, pair
+    )
     above.set_title(effect.name, loc='left', fontweight='bold')
     figure.savefig(path, dpi=85)
     plt.close(figure)
@@ -174,11 +228,12 @@ def draw_lines(above: plt.Axes, below: plt.Axes, scene: Scene, pair: Pair) -> No
     across = pair.clean[scene.across] * scene.unit
     forth = np.ones(len(across), bool)
     if np.ptp(np.sign(np.diff(across))) == 2:
-        forth[len(across) // 2:] = False
+        forth[len(across) // 2 :] = False
     scale, zero = pair.sensor.nominal_scale_v_per_g[0], pair.sensor.nominal_zero_g_v[0]
     for axis in scene.axes:
-        clean_g, changed_g = ((columns[f'{axis}_v'] - zero) / scale
-                              for columns in (pair.clean, pair.changed))
+        clean_g, changed_g = (
+            (columns[f'{axis}_v'] - zero) / scale for columns in (pair.clean, pair.changed)
+        )
         above.plot(across[forth], clean_g[forth], color='0.7', lw=3)
         above.plot(across[forth], changed_g[forth], color=COLOURS[axis], lw=1, label=axis)
         difference_mg = (changed_g - clean_g) * 1e3
@@ -201,8 +256,10 @@ def draw_lines(above: plt.Axes, below: plt.Axes, scene: Scene, pair: Pair) -> No
 def draw_spectrum(above: plt.Axes, below: plt.Axes, _: Scene, pair: Pair) -> None:
     """Draw a part of the output, and the noise densities."""
     part = slice(0, 1000)
-    for columns, colour, width, label in ((pair.clean, '0.7', 3, 'clean'),
-                                          (pair.changed, COLOURS['x'], 1, 'with it')):
+    for columns, colour, width, label in (
+        (pair.clean, '0.7', 3, 'clean'),
+        (pair.changed, COLOURS['x'], 1, 'with it'),
+    ):
         volts = columns['x_v'] - columns['x_v'].mean()
         above.plot(columns['time_s'][part], volts[part] * 1e3, color=colour, lw=width / 2)
         f, density = welch(volts, pair.sensor.rate_hz, nperseg=16384)
@@ -219,8 +276,10 @@ def draw_spectrum(above: plt.Axes, below: plt.Axes, _: Scene, pair: Pair) -> Non
 def draw_codes(above: plt.Axes, below: plt.Axes, _: Scene, pair: Pair) -> None:
     """Draw a part of the output, and the share of each code."""
     part = slice(0, 150)
-    for columns, colour, width, label in ((pair.clean, '0.7', 3, 'clean'),
-                                          (pair.changed, COLOURS['x'], 1.2, 'with it')):
+    for columns, colour, width, label in (
+        (pair.clean, '0.7', 3, 'clean'),
+        (pair.changed, COLOURS['x'], 1.2, 'with it'),
+    ):
         above.step(columns['time_s'][part], columns['x_v'][part] * 1e3, color=colour, lw=width)
         code, count = np.unique(np.rint(columns['x_v'] / pair.sensor.lsb_v), return_counts=True)
         below.vlines(code, 0, count / count.sum(), color=colour, lw=width * 1.5, label=label)

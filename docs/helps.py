@@ -11,7 +11,7 @@ import sys
 
 def help_of(name: str) -> str:
     """Return what `name --help` prints."""
-    entry, = entry_points(group='console_scripts', name=name)
+    (entry,) = entry_points(group='console_scripts', name=name)
     main = entry.load()
     sys.argv = [name, '--help']
     with redirect_stdout(StringIO()) as out, suppress(SystemExit):

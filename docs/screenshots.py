@@ -30,8 +30,9 @@ COLUMNS, LINES = 80, 50
 """Size of the terminal; empty lines at its end are cut off."""
 PAGE = {'width': 1280, 'height': 900}
 """Size of the window of the browser, pixels."""
-CHROMIUM = next(filter(None, map(shutil.which, (
-    'chromium', 'chromium-browser', 'google-chrome'))), None)
+CHROMIUM = next(
+    filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), None
+)
 """The browser; None for that of `playwright install chromium`."""
 LARGEST_BYTES = 300_000
 """Largest size of a picture."""
@@ -54,9 +55,15 @@ class Terminal:
         self._master, slave = pty.openpty()
         fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack('HHHH', lines, COLUMNS, 0, 0))
         self.process = subprocess.Popen(
-            command, cwd=folder, env={**os.environ, 'TERM': 'xterm-256color'}, stdin=slave,
-            stdout=slave, stderr=slave, start_new_session=True,
-            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0))
+            command,
+            cwd=folder,
+            env={**os.environ, 'TERM': 'xterm-256color'},
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+        )
         os.close(slave)
 
     def read_until(self, condition: Callable[[], bool]) -> None:
@@ -84,10 +91,14 @@ class Terminal:
 
 def style_of(cell: Char) -> Style:
     """Return the style of a cell of the screen."""
-    colours = [None if colour == 'default' else f'#{colour}' if len(colour) == 6
-               and set(colour) <= set('0123456789abcdef') else
-               colour.replace('brown', 'yellow').replace('bright', 'bright_')
-               for colour in (cell.fg, cell.bg)]
+    colours = [
+        None
+        if colour == 'default'
+        else f'#{colour}'
+        if len(colour) == 6 and set(colour) <= set('0123456789abcdef')
+        else colour.replace('brown', 'yellow').replace('bright', 'bright_')
+        for colour in (cell.fg, cell.bg)
+    ]
     return Style(color=colours[0], bgcolor=colours[1], bold=cell.bold, reverse=cell.reverse)
 
 
@@ -104,8 +115,13 @@ def draw(terminal: Terminal, title: str, path: Path) -> None:
         lines.append(line)
     while lines and not lines[-1].plain:
         lines.pop()
-    console = Console(record=True, width=COLUMNS, file=io.StringIO(),
-                      color_system='truecolor', force_terminal=True)
+    console = Console(
+        record=True,
+        width=COLUMNS,
+        file=io.StringIO(),
+        color_system='truecolor',
+        force_terminal=True,
+    )
     console.print(Text('\n').join(lines), soft_wrap=True)
     console.save_svg(str(path), title=title)
     print(path)
@@ -132,9 +148,15 @@ def executable(name: str) -> Path:
 @contextmanager
 def nodes(commands: Sequence[Sequence[str]], folder: Path) -> Iterator[None]:
     """Run nodes until the end of the block."""
-    processes = [subprocess.Popen([str(executable(command[0])), *command[1:]], cwd=folder,
-                                  stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-                 for command in commands]
+    processes = [
+        subprocess.Popen(
+            [str(executable(command[0])), *command[1:]],
+            cwd=folder,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for command in commands
+    ]
     try:
         yield
     finally:
@@ -147,16 +169,29 @@ def nodes(commands: Sequence[Sequence[str]], folder: Path) -> Iterator[None]:
 def calibration_screen(folder: Path, picture: Path) -> None:
     """Draw the screen of a guided calibration in the middle of a sweep."""
     journal = folder / 'unit.yaml.journal'
-    simulated = [['driver', *SWEEP_ARGUMENTS, '-p', f'link.speed:={SPEED}', '-p',
-                  'link.type:=sim'],
-                 ['stage', *SWEEP_ARGUMENTS]]
+    simulated = [
+        ['driver', *SWEEP_ARGUMENTS, '-p', f'link.speed:={SPEED}', '-p', 'link.type:=sim'],
+        ['stage', *SWEEP_ARGUMENTS],
+    ]
     with nodes(simulated, folder):
-        terminal = Terminal([str(executable('calibration')), *SWEEP_ARGUMENTS, '-p',
-                             'autostart:=true', '-p', 'output:=unit.yaml', '-p', 'store:=""'],
-                            folder, 30)
+        terminal = Terminal(
+            [
+                str(executable('calibration')),
+                *SWEEP_ARGUMENTS,
+                '-p',
+                'autostart:=true',
+                '-p',
+                'output:=unit.yaml',
+                '-p',
+                'store:=""',
+            ],
+            folder,
+            30,
+        )
         try:
-            terminal.read_until(lambda: journal.exists()
-                                and journal.read_bytes().count(b'\n') > POSES)
+            terminal.read_until(
+                lambda: journal.exists() and journal.read_bytes().count(b'\n') > POSES
+            )
             draw(terminal, 'ros2 launch adxl_ros calibrate.launch.py', picture)
         finally:
             terminal.close()
@@ -169,8 +204,21 @@ def record_fleet(folder: Path) -> None:
         for month in range(4):
             offset_v = 0.02 * (unit * 0.61 % 1 - 0.5) + 0.004 * month * (unit == 2)
             name = f'R{unit:02d}_{month}.csv'
-            run(['simulate', 'sweep', '--rate', '25', '--effect', f'bias:offset_v={offset_v:.4f}',
-                 '--seed', str(10 * unit + month), '-o', name], folder)
+            run(
+                [
+                    'simulate',
+                    'sweep',
+                    '--rate',
+                    '25',
+                    '--effect',
+                    f'bias:offset_v={offset_v:.4f}',
+                    '--seed',
+                    str(10 * unit + month),
+                    '-o',
+                    name,
+                ],
+                folder,
+            )
             lines.append(f'{name},R{unit:02d},2026-{2 * month + 1:02d}-{unit + 1:02d}')
     (folder / 'manifest.csv').write_text('\n'.join(lines) + '\n')
 
@@ -202,8 +250,19 @@ def main() -> None:
     folder = Path(tempfile.mkdtemp())
     try:
         if 'diagnose' in wanted:
-            run(['simulate', 'rich', '--effect', 'lever_arm:z_m=0.03', '--effect',
-                 'temperature_bias', '-o', 'rich.mcap'], folder)
+            run(
+                [
+                    'simulate',
+                    'rich',
+                    '--effect',
+                    'lever_arm:z_m=0.03',
+                    '--effect',
+                    'temperature_bias',
+                    '-o',
+                    'rich.mcap',
+                ],
+                folder,
+            )
             run(['diagnose', 'rich.mcap', '-o', 'gap'], folder, target / 'diagnose.svg')
             page(folder / 'gap' / 'report.html', target / 'diagnose_page.png')
         if 'calibration' in wanted:
@@ -214,8 +273,7 @@ def main() -> None:
             page(folder / 'results' / 'fleet.html', target / 'fleet_page.png')
         if 'demo' in wanted:
             run(['demo'], folder, target / 'demo.svg')
-            page(folder / 'demo_output' / 'sweep' / 'report.html',
-                 target / 'calibration_page.png')
+            page(folder / 'demo_output' / 'sweep' / 'report.html', target / 'calibration_page.png')
     finally:
         shutil.rmtree(folder)
 

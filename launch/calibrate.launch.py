@@ -28,20 +28,45 @@ from launch.action import Action
 from launch.actions import LogInfo
 
 SWEEP = arguments(
-    CalibrationSettings, 'stage.mode', 'report', 'resume', 'sweep.plan', 'sweep.planes_deg',
-    'sweep.step_deg', 'sweep.dwell_s', 'sweep.check_poses', 'sweep.tilt_error_deg')
+    CalibrationSettings,
+    'stage.mode',
+    'report',
+    'resume',
+    'sweep.plan',
+    'sweep.planes_deg',
+    'sweep.step_deg',
+    'sweep.dwell_s',
+    'sweep.check_poses',
+    'sweep.tilt_error_deg',
+)
 RESUMES = 'its line above says why; accepted poses are kept, and the same command resumes'
 
 
 def generate_launch_description() -> LaunchDescription:
-    return launch_nodes.describe([
-        *launch_nodes.common_arguments(*LINK, *STAGE, *SWEEP, *launch_nodes.SPEED),
-        launch_nodes.declared('output', 'calibrated.yaml',
-                              'parameter file that the calibration writes'),
-        launch_nodes.declared('mode', 'stage', 'poses of a stage, rests of a hand-held sensor, or '
-                              'one rest over temperature', 'stage', 'gravity', 'thermal'),
-        launch_nodes.declared('screen', 'false', 'show the calibration screen in this terminal; '
-                              'logs then go to files', 'true', 'false')], make_nodes)
+    return launch_nodes.describe(
+        [
+            *launch_nodes.common_arguments(*LINK, *STAGE, *SWEEP, *launch_nodes.SPEED),
+            launch_nodes.declared(
+                'output', 'calibrated.yaml', 'parameter file that the calibration writes'
+            ),
+            launch_nodes.declared(
+                'mode',
+                'stage',
+                'poses of a stage, rests of a hand-held sensor, or one rest over temperature',
+                'stage',
+                'gravity',
+                'thermal',
+            ),
+            launch_nodes.declared(
+                'screen',
+                'false',
+                'show the calibration screen in this terminal; logs then go to files',
+                'true',
+                'false',
+            ),
+        ],
+        make_nodes,
+    )
 
 
 def make_nodes(context: LaunchContext) -> list[Action]:
@@ -51,32 +76,60 @@ def make_nodes(context: LaunchContext) -> list[Action]:
     shows_screen = text(context, 'screen') == 'true'
     # A line on the terminal would tear the screen.
     log = {'output': 'log'} if shows_screen else {}
-    stage = [make_node(context, 'stage', sim_time | launch_nodes.given_parameters(context, STAGE),
-                       **log)] if has_stage(context) else []
+    stage = (
+        [
+            make_node(
+                context, 'stage', sim_time | launch_nodes.given_parameters(context, STAGE), **log
+            )
+        ]
+        if has_stage(context)
+        else []
+    )
     output, report = text(context, 'output'), text(context, 'report')
     files = ' and '.join(filter(None, (output, report and f'{report}/report.html')))
     success = f'wrote {files}; next: ros2 launch adxl_ros robot.launch.py params_file:={output}'
     sweep: dict[str, Any] = launch_nodes.given_parameters(context, SWEEP)
     return [
         show_screen(context, shows_screen),
-        make_node(context, 'driver', launch_nodes.simulated_link(context, speed) | sim_time,
-                  **log),
+        make_node(
+            context, 'driver', launch_nodes.simulated_link(context, speed) | sim_time, **log
+        ),
         *stage,
-        make_node(context, 'calibration', {
-            **sim_time, **sweep, 'autostart': True, 'exit_when_done': True, 'screen': False,
-            'mode': text(context, 'mode'), 'output': output}, **log,
-            on_exit=launch_nodes.end_with(success, RESUMES))]
+        make_node(
+            context,
+            'calibration',
+            {
+                **sim_time,
+                **sweep,
+                'autostart': True,
+                'exit_when_done': True,
+                'screen': False,
+                'mode': text(context, 'mode'),
+                'output': output,
+            },
+            **log,
+            on_exit=launch_nodes.end_with(success, RESUMES),
+        ),
+    ]
 
 
 def show_screen(context: LaunchContext, is_here: bool) -> Action:
     """Show the screen in the terminal of the launch, or say how to show it in another one."""
     name = launch_nodes.full_name(context, 'calibration')
     if is_here:
-        return make_node(context, 'screen', {'node': name}, on_exit=launch_nodes.end_with(
-            'the screen has ended; accepted poses are kept, and the same command resumes',
-            RESUMES))
-    return LogInfo(msg='its screen, in a second terminal: ros2 run adxl_ros screen --ros-args -p '
-                   f'node:={name}')
+        return make_node(
+            context,
+            'screen',
+            {'node': name},
+            on_exit=launch_nodes.end_with(
+                'the screen has ended; accepted poses are kept, and the same command resumes',
+                RESUMES,
+            ),
+        )
+    return LogInfo(
+        msg='its screen, in a second terminal: ros2 run adxl_ros screen --ros-args -p '
+        f'node:={name}'
+    )
 
 
 def has_stage(context: LaunchContext) -> bool:
@@ -85,7 +138,10 @@ def has_stage(context: LaunchContext) -> bool:
         return False
     is_real = given_anywhere(context, 'link.type', 'driver') not in ('', 'sim')
     if given_anywhere(context, 'stage.mode', 'calibration') not in ('encoder', 'manual'):
-        launch_nodes.refuse_simulated_stage(context, 'stage_mode:=encoder or manual for one '
-                                            'turned by hand, mode:=gravity for a hand-held '
-                                            'sensor, ')
+        launch_nodes.refuse_simulated_stage(
+            context,
+            'stage_mode:=encoder or manual for one '
+            'turned by hand, mode:=gravity for a hand-held '
+            'sensor, ',
+        )
     return bool(given_anywhere(context, 'stage.type', 'stage')) or not is_real

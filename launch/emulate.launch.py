@@ -19,22 +19,39 @@ from adxl_ros.nodes.launch_nodes import arguments, text
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
 
-LINK = arguments(DriverSettings, 'frame_id', in_topic='link.topic',
-                 temperature_topic='link.temperature_topic', seed='link.seed')
+LINK = arguments(
+    DriverSettings,
+    'frame_id',
+    in_topic='link.topic',
+    temperature_topic='link.temperature_topic',
+    seed='link.seed',
+)
 
 
 def generate_launch_description() -> LaunchDescription:
-    return launch_nodes.describe([
-        *launch_nodes.common_arguments(*LINK),
-        launch_nodes.declared('out_topic', 'imu/data_raw', 'topic of the realistic samples'),
-        launch_nodes.declared('use_sim_time', 'true', 'follow the clock of the simulator', 'true',
-                              'false')], make_nodes)
+    return launch_nodes.describe(
+        [
+            *launch_nodes.common_arguments(*LINK),
+            launch_nodes.declared('out_topic', 'imu/data_raw', 'topic of the realistic samples'),
+            launch_nodes.declared(
+                'use_sim_time', 'true', 'follow the clock of the simulator', 'true', 'false'
+            ),
+        ],
+        make_nodes,
+    )
 
 
 def make_nodes(context: LaunchContext) -> list[Action]:
     """Return the driver."""
-    return [launch_nodes.make_node(
-        context, 'driver', {
-            'link.type': 'topic', **launch_nodes.given_parameters(context, LINK),
-            'use_sim_time': text(context, 'use_sim_time') == 'true'},
-        remappings=[('imu/data_raw', text(context, 'out_topic'))])]
+    return [
+        launch_nodes.make_node(
+            context,
+            'driver',
+            {
+                'link.type': 'topic',
+                **launch_nodes.given_parameters(context, LINK),
+                'use_sim_time': text(context, 'use_sim_time') == 'true',
+            },
+            remappings=[('imu/data_raw', text(context, 'out_topic'))],
+        )
+    ]

@@ -28,14 +28,24 @@ OUTPUT_RATE = arguments(CompensationSettings, 'output_rate_hz')
 
 
 def generate_launch_description() -> LaunchDescription:
-    return launch_nodes.describe([
-        *launch_nodes.common_arguments(*LINK, *OUTPUT_RATE), *launch_nodes.TRANSFORM,
-        launch_nodes.declared('imu_topic', '', "topic of another driver's sensor_msgs/Imu, such "
-                              'as /camera/imu, which is corrected in place of that of our driver; '
-                              'empty: start our driver'),
-        launch_nodes.declared('use_sim_time', 'false', 'follow /clock', 'true', 'false'),
-        launch_nodes.declared('respawn', 'true', 'start a node again that ends', 'true',
-                              'false')], make_nodes)
+    return launch_nodes.describe(
+        [
+            *launch_nodes.common_arguments(*LINK, *OUTPUT_RATE),
+            *launch_nodes.TRANSFORM,
+            launch_nodes.declared(
+                'imu_topic',
+                '',
+                "topic of another driver's sensor_msgs/Imu, such "
+                'as /camera/imu, which is corrected in place of that of our driver; '
+                'empty: start our driver',
+            ),
+            launch_nodes.declared('use_sim_time', 'false', 'follow /clock', 'true', 'false'),
+            launch_nodes.declared(
+                'respawn', 'true', 'start a node again that ends', 'true', 'false'
+            ),
+        ],
+        make_nodes,
+    )
 
 
 def make_nodes(context: LaunchContext) -> list[Action]:
@@ -47,8 +57,16 @@ def make_nodes(context: LaunchContext) -> list[Action]:
     if not imu_topic:
         nodes = {'driver': {}} | nodes
     sim_time = {'use_sim_time': True} if text(context, 'use_sim_time') == 'true' else {}
-    return [*launch_nodes.static_transform(context), *(
-        launch_nodes.make_node(
-            context, executable, parameters | sim_time, respawn=respawn,
-            remappings=[('imu/data_raw', imu_topic)] if imu_topic else [])
-        for executable, parameters in nodes.items())]
+    return [
+        *launch_nodes.static_transform(context),
+        *(
+            launch_nodes.make_node(
+                context,
+                executable,
+                parameters | sim_time,
+                respawn=respawn,
+                remappings=[('imu/data_raw', imu_topic)] if imu_topic else [],
+            )
+            for executable, parameters in nodes.items()
+        ),
+    ]

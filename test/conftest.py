@@ -57,13 +57,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for fixture in SHARED & fixtures:
             item.add_marker(pytest.mark.xdist_group(fixture))
     # The longest first, so that no worker waits for the others at the end.
-    items.sort(key=lambda item: [item.get_closest_marker(mark) is None
-                                 for mark in ('xdist_group', 'long')])
+    items.sort(
+        key=lambda item: [
+            item.get_closest_marker(mark) is None for mark in ('xdist_group', 'long')
+        ]
+    )
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    for line in needs.summary(report.longrepr[2].removeprefix('Skipped: ')
-                              for report in terminalreporter.stats.get('skipped', ())):
+    for line in needs.summary(
+        report.longrepr[2].removeprefix('Skipped: ')
+        for report in terminalreporter.stats.get('skipped', ())
+    ):
         terminalreporter.write_line(line)
 
 
@@ -112,9 +117,14 @@ def start(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Sta
         log = tmp_path / f'{len(started)}_{Path(name).name}.log'
         with open(log, 'wb') as file:
             popen = subprocess.Popen(
-                [executable(name), *map(str, args)], env=ros_env, cwd=tmp_path,
-                stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
-                start_new_session=True)
+                [executable(name), *map(str, args)],
+                env=ros_env,
+                cwd=tmp_path,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
         started.append(Started(name, popen, log))
         return started[-1]
 
@@ -131,6 +141,7 @@ def start(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable[..., Sta
 def in_terminal(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable]:
     """Give a function that starts an executable, as `start` does, in a terminal of its own."""
     from terminal import Terminal
+
     opened: list[Terminal] = []
 
     def begin(name: str, *args: object, **size: int) -> Terminal:
@@ -144,8 +155,12 @@ def in_terminal(ros_env: dict[str, str], tmp_path: Path) -> Iterator[Callable]:
 
 
 @pytest.fixture
-def refusal(ros_env: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-            capfd: pytest.CaptureFixture) -> Iterator[Callable[..., str]]:
+def refusal(
+    ros_env: dict[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture,
+) -> Iterator[Callable[..., str]]:
     """Give a function that runs a node in this process, which must refuse to start."""
     import rclpy
 
@@ -192,17 +207,20 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
                 fill(folder)
                 done.touch()
         return folder
+
     return make
 
 
 @pytest.fixture(scope='session')
 def help_of() -> Callable[[str], str]:
     """Give a function that returns the help of an executable, made in this process."""
+
     @cache
     def text(name: str) -> str:
         done = run_in_process(name, '--help', cwd=REPO)
         assert (done.returncode, done.stderr) == (0, '')
         return done.stdout
+
     return text
 
 

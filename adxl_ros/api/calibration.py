@@ -38,8 +38,10 @@ from adxl_ros.signals.recorded_sensor import BeyondRange, FilterNoise, listed
 _READING = 0.3  # Share of the work until the fit begins (chosen: a sweep of minutes)
 
 
-_MEANS_LACK = ('a table of means shows no noise, filter or range: they are measured from the '
-               'first recording that the file corrects')
+_MEANS_LACK = (
+    'a table of means shows no noise, filter or range: they are measured from the '
+    'first recording that the file corrects'
+)
 
 
 class FittedCoefficient(NamedTuple):
@@ -91,10 +93,17 @@ class Fit(Result):
         """Return the lines of the tool's screen."""
         fitted = self.sensor
         # What was wrong with the unit, and what is fitted
-        head = [] if self.is_over_temperature else [
-            errors_in_words(fitted), '',
-            f'{fitted.serial}: {fitted.model} model of {self.poses} poses, '
-            f'{len(fitted.covariance_names)} coefficients', '']
+        head = (
+            []
+            if self.is_over_temperature
+            else [
+                errors_in_words(fitted),
+                '',
+                f'{fitted.serial}: {fitted.model} model of {self.poses} poses, '
+                f'{len(fitted.covariance_names)} coefficients',
+                '',
+            ]
+        )
         return [*head, *self.result.summary, *self.warnings, *listed([*self.measured])]
 
     @property
@@ -102,8 +111,12 @@ class Fit(Result):
         """Return the top of the page."""
         badge, assessments = page.badge(self.sensor), self.result.assessments
         tiles = page.tiles(self.result, assessments[-1] if assessments else None)
-        return FirstScreen(badge['colour'], badge['word'], badge['sentence'],
-                           [(tile['label'], tile['text'], tile['note']) for tile in tiles])
+        return FirstScreen(
+            badge['colour'],
+            badge['word'],
+            badge['sentence'],
+            [(tile['label'], tile['text'], tile['note']) for tile in tiles],
+        )
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the parameter file; that of another fit becomes NAME.previous."""
@@ -133,17 +146,24 @@ class Fit(Result):
         """Return coefficients, errors and provenance as objects of JSON."""
         errors = self.held_out[-1] if self.held_out else None
         return {
-            'schema': 1, 'serial': self.sensor.serial, 'model': self.sensor.model,
-            'outcome': self.outcome, 'poses': self.poses, 'outliers': list(self.outliers),
+            'schema': 1,
+            'serial': self.sensor.serial,
+            'model': self.sensor.model,
+            'outcome': self.outcome,
+            'poses': self.poses,
+            'outliers': list(self.outliers),
             'coefficients': [row._asdict() for row in self.coefficients],
             'held_out_tilt_deg': errors and errors.tilt_deg.rms,
             'held_out_accel_mg': errors and errors.accel_mg.rms,
-            'warnings': list(self.warnings), 'measured': list(self.measured),
-            'provenance': dict(self.sensor.provenance)}
+            'warnings': list(self.warnings),
+            'measured': list(self.measured),
+            'provenance': dict(self.sensor.provenance),
+        }
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with a row for each coefficient."""
         from pandas import DataFrame
+
         return DataFrame(self.coefficients, columns=FittedCoefficient._fields)
 
     def plot(self, ax: Any = None) -> Any:
@@ -160,12 +180,22 @@ class Fit(Result):
         return ax
 
 
-def fit(recordings: RecordingInput | Iterable[RecordingInput],
-        sensor: SensorInput | None = None, *, model: str | None = None,
-        effects: Sequence[str] = (), prior: str | os.PathLike | None = None,
-        journal: str | os.PathLike | None = None, poses: str | os.PathLike | None = None,
-        urdf: str | os.PathLike | None = None, frame: str = 'imu_link', joints: str = '',
-        means: bool = False, data_sha256: str = '', progress: Progress = no_progress) -> Fit:
+def fit(
+    recordings: RecordingInput | Iterable[RecordingInput],
+    sensor: SensorInput | None = None,
+    *,
+    model: str | None = None,
+    effects: Sequence[str] = (),
+    prior: str | os.PathLike | None = None,
+    journal: str | os.PathLike | None = None,
+    poses: str | os.PathLike | None = None,
+    urdf: str | os.PathLike | None = None,
+    frame: str = 'imu_link',
+    joints: str = '',
+    means: bool = False,
+    data_sha256: str = '',
+    progress: Progress = no_progress,
+) -> Fit:
     """
     Calibrate one unit: against stage angles where there are any, else against gravity.
 
@@ -215,8 +245,11 @@ def fit(recordings: RecordingInput | Iterable[RecordingInput],
     unit = _Unit(sensor, robot, means)
     several: Iterable[Recording] = each_recording(recordings)
     blocks: Poses | None = None
-    if effects and set(effects) <= set(thermal_fit.EFFECTS) and not (
-            model or journal or poses or means):
+    if (
+        effects
+        and set(effects) <= set(thermal_fit.EFFECTS)
+        and not (model or journal or poses or means)
+    ):
         several = list(several)
         blocks = unit.thermal_blocks(several)
     if blocks is not None:
@@ -224,8 +257,11 @@ def fit(recordings: RecordingInput | Iterable[RecordingInput],
             raise UserError(f'--prior {prior}: a fit over temperature takes none; leave it out')
         progress(_READING, 'fit')
         result = calibration.calibrate_thermal(
-            with_axes(unit.base, unit.sensor.axes), blocks, unit.names[0],
-            data_sha256 or unit.sha256)
+            with_axes(unit.base, unit.sensor.axes),
+            blocks,
+            unit.names[0],
+            data_sha256 or unit.sha256,
+        )
         return _fit(result, unit, True)
     recorded = []
     for number, read in enumerate(several):
@@ -235,16 +271,18 @@ def fit(recordings: RecordingInput | Iterable[RecordingInput],
     if not recorded:
         raise UserError('no recording is given')
     progress(_READING, 'fit')
-    result = calibration.calibrate(unit.sensor, recorded, model, effects,
-                                   data_sha256 or unit.sha256, population)
+    result = calibration.calibrate(
+        unit.sensor, recorded, model, effects, data_sha256 or unit.sha256, population
+    )
     return _fit(result, unit, False)
 
 
 class _Unit:
     """The unit, while its recordings are read one after the other."""
 
-    def __init__(self, sensor: SensorInput | None, robot: RobotInput | None, has_means: bool
-                 ) -> None:
+    def __init__(
+        self, sensor: SensorInput | None, robot: RobotInput | None, has_means: bool
+    ) -> None:
         self._stated, self._robot, self._has_means = sensor, robot, has_means
         self._given: GivenSensor | None = None
         self._paths: list[str] = []
@@ -258,16 +296,21 @@ class _Unit:
             self.sensor = self._given.sensor  # The nominal sensor of the newest recording
             if self.sensor.unstated:
                 self.notes.append(_MEANS_LACK)
-        self.sensor = unit_of(self.sensor, read.stream_info, read.axes) if self._has_means \
+        self.sensor = (
+            unit_of(self.sensor, read.stream_info, read.axes)
+            if self._has_means
             else recorded_unit(self.sensor, read)
+        )
         self._paths.append(read.path)
         self._surroundings.append(Surroundings())
         self._surroundings[-1](read)
         if self._robot is not None:
             path = self._robot.path(read, self.sensor)
             read = path.with_angles(read)
-            self.sensor = replace(self.sensor, stage_resolution_rad=max(
-                self.sensor.stage_resolution_rad, path.step_rad))
+            self.sensor = replace(
+                self.sensor,
+                stage_resolution_rad=max(self.sensor.stage_resolution_rad, path.step_rad),
+            )
         beyond = BeyondRange()
         beyond.add(read.volts(self.sensor), self.sensor)
         text = beyond.describe(self.sensor)
@@ -311,17 +354,20 @@ class _Unit:
 class _Rests:
     """Where the rests of a recording are, and what their angles are."""
 
-    def __init__(self, journal: str | os.PathLike | None, table: str | os.PathLike | None,
-                 are_rows: bool) -> None:
+    def __init__(
+        self, journal: str | os.PathLike | None, table: str | os.PathLike | None, are_rows: bool
+    ) -> None:
         ways = [bool(way) for way in (journal, table, are_rows)]
         if sum(ways) > 1:
             raise UserError(_ONE_RECORDING)
         self._table, self._are_rows, self._is_one = table, are_rows, any(ways)
-        self._records = sweep_journal.poses_to_fit(sweep_journal.read(journal).entries) \
-            if journal else None
+        self._records = (
+            sweep_journal.poses_to_fit(sweep_journal.read(journal).entries) if journal else None
+        )
 
-    def of(self, read: Recording, unit: _Unit, number: int
-           ) -> tuple[Poses, Sequence[FilterNoise | None], list[str]]:
+    def of(
+        self, read: Recording, unit: _Unit, number: int
+    ) -> tuple[Poses, Sequence[FilterNoise | None], list[str]]:
         """Return the poses of a recording, their filters, and faults between its samples."""
         if number and self._is_one:
             raise UserError(_ONE_RECORDING)
@@ -330,8 +376,11 @@ class _Rests:
         poses = extract_poses(read, unit.sensor, self._records)
         if self._table:
             poses = with_table_angles(poses, str(self._table))
-        return (poses, estimate_filters(read, unit.sensor, poses),
-                neighbour_faults(read, unit.sensor))
+        return (
+            poses,
+            estimate_filters(read, unit.sensor, poses),
+            neighbour_faults(read, unit.sensor),
+        )
 
 
 _ONE_RECORDING = '--journal, --poses and --means: one of them names the rests of one recording'
@@ -342,13 +391,25 @@ def _fit(result: CalibrationResult, unit: _Unit, is_over_temperature: bool) -> F
     """Collect what a user reads of a calibration."""
     measured = listed([*unit.measured])
     fitted = result.fitted
-    result = replace(result, warnings=[*result.warnings, *unit.assumed(fitted.effects)],
-                     details=[*result.details, *measured])
+    result = replace(
+        result,
+        warnings=[*result.warnings, *unit.assumed(fitted.effects)],
+        details=[*result.details, *measured],
+    )
     coefficients = tuple(
         FittedCoefficient(row.name, row.axis, row.label, row.fitted, row.half_width, row.unit)
-        for row in compare(fitted, fitted))
+        for row in compare(fitted, fitted)
+    )
     return Fit(
-        sensor=fitted, outcome=acceptance.acceptance(fitted)[0], coefficients=coefficients,
-        held_out=result.held_out, poses=int(result.inliers.sum()), outliers=result.outliers,
-        warnings=tuple(result.warnings), measured=tuple(unit.measured), notes=tuple(unit.notes),
-        is_over_temperature=is_over_temperature, result=result)
+        sensor=fitted,
+        outcome=acceptance.acceptance(fitted)[0],
+        coefficients=coefficients,
+        held_out=result.held_out,
+        poses=int(result.inliers.sum()),
+        outliers=result.outliers,
+        warnings=tuple(result.warnings),
+        measured=tuple(unit.measured),
+        notes=tuple(unit.notes),
+        is_over_temperature=is_over_temperature,
+        result=result,
+    )

@@ -42,7 +42,7 @@ def _lines(results: Sequence[Findings]) -> list[str]:
     """Return a line for each recording, then the details of one, or of those with a fault."""
     rows = []
     for name, *cells, verdict in (_HEAD, *map(_cells, results)):
-        short = name if len(name) < _NAME_COLUMNS else f'{name[:_NAME_COLUMNS - 2]}…'
+        short = name if len(name) < _NAME_COLUMNS else f'{name[: _NAME_COLUMNS - 2]}…'
         rows.append(' ' + row((short, *cells, f'  {verdict}'), _COLUMNS))
     for result in results:
         if len(results) == 1 or not result.is_sound:
@@ -61,20 +61,29 @@ def _cells(result: Findings) -> list[str]:
     name, contents = Path(result.path).name, result.contents
     if contents is None:
         return [name, *['–'] * 5, 'unreadable']
-    return [name, duration(contents.span_s), f'{contents.rate_hz:.4g} Hz', str(contents.missing),
-            f'{100 * contents.rest_share:.0f} %', 'xyz'[:len(contents.axes)],
-            'sound' if result.is_sound else 'NOT SOUND']
+    return [
+        name,
+        duration(contents.span_s),
+        f'{contents.rate_hz:.4g} Hz',
+        str(contents.missing),
+        f'{100 * contents.rest_share:.0f} %',
+        'xyz'[: len(contents.axes)],
+        'sound' if result.is_sound else 'NOT SOUND',
+    ]
 
 
 def _entries(result: Findings) -> list[tuple[str, str]]:
     """Return faults, values, remarks and abilities of a recording, each with its label."""
-    entries = [('NOT SOUND' if result.contents else 'unreadable', fault)
-               for fault in result.faults]
+    entries = [
+        ('NOT SOUND' if result.contents else 'unreadable', fault) for fault in result.faults
+    ]
     if result.contents is not None:
         entries += [('values', text) for text in _value_lines(result.contents)]
     entries += [('remark', remark) for remark in result.remarks]
-    return entries + [(ability.tool, f'{"yes" if ability.is_able else "no"}: {ability.reason}')
-                      for ability in result.abilities]
+    return entries + [
+        (ability.tool, f'{"yes" if ability.is_able else "no"}: {ability.reason}')
+        for ability in result.abilities
+    ]
 
 
 def _details(result: Findings) -> list[str]:
@@ -83,14 +92,21 @@ def _details(result: Findings) -> list[str]:
     for label, text in _entries(result):
         paste = result.paste if result.paste and text.endswith(result.paste) else ''
         rows += textwrap.wrap(
-            f'  {label:{_LABEL_COLUMNS - 3}} {text.removesuffix(paste).rstrip()}', COLUMNS,
-            subsequent_indent=_LABEL_COLUMNS * ' ', break_on_hyphens=False)
+            f'  {label:{_LABEL_COLUMNS - 3}} {text.removesuffix(paste).rstrip()}',
+            COLUMNS,
+            subsequent_indent=_LABEL_COLUMNS * ' ',
+            break_on_hyphens=False,
+        )
         rows += [_LABEL_COLUMNS * ' ' + paste] if paste else []
     shown = [cells for cells in result.shows if not cells[3]]
     if result.shows:
-        rows += ['', f'  {len(shown)} of {len(result.shows)} effects could show to diagnose',
-                 *('  ' + row(cells, _SHOWS_COLUMNS) for cells in (_SHOWS_HEAD, *shown)),
-                 '', '  the others cannot show']
+        rows += [
+            '',
+            f'  {len(shown)} of {len(result.shows)} effects could show to diagnose',
+            *('  ' + row(cells, _SHOWS_COLUMNS) for cells in (_SHOWS_HEAD, *shown)),
+            '',
+            '  the others cannot show',
+        ]
     for missing in dict.fromkeys(cells[3] for cells in result.shows if cells[3]):
         effects = ', '.join(cells[0] for cells in result.shows if cells[3] == missing)
         rows += wrapped(f'  {missing}: {effects}', 4)
@@ -98,12 +114,18 @@ def _details(result: Findings) -> list[str]:
 
 
 def _value_lines(contents: RecordingContents) -> list[str]:
-    texts = [f'{contents.samples} samples, jitter {short_time(contents.jitter_s)} rms',
-             ', '.join(f'{axis.name} {axis.lowest_mps2:.3g} to {axis.highest_mps2:.3g} m/s²'
-                       for axis in contents.axes),
-             *(f'{name} {low:.4g} to {high:.4g} {column_unit(name)}'
-               for name, (low, high) in contents.reference_ranges.items()),
-             contents.gravity.text]
+    texts = [
+        f'{contents.samples} samples, jitter {short_time(contents.jitter_s)} rms',
+        ', '.join(
+            f'{axis.name} {axis.lowest_mps2:.3g} to {axis.highest_mps2:.3g} m/s²'
+            for axis in contents.axes
+        ),
+        *(
+            f'{name} {low:.4g} to {high:.4g} {column_unit(name)}'
+            for name, (low, high) in contents.reference_ranges.items()
+        ),
+        contents.gravity.text,
+    ]
     if contents.log_delay_s is not None:
         texts.append(f'log time minus header time {short_time(contents.log_delay_s)}')
     return texts
@@ -111,14 +133,29 @@ def _value_lines(contents: RecordingContents) -> list[str]:
 
 def _page(results: Sequence[Findings]) -> str:
     is_sound = all(result.is_sound for result in results)
-    badge = {'colour': 'green' if is_sound else 'red', 'sentence': _sentence(results),
-             'word': 'Sound.' if is_sound else 'Not sound.'}
-    recordings = [{'path': result.path, 'entries': _entries(result), 'shows': result.shows}
-                  for result in results]
-    return html_page.render('adxl_ros.api', PAGE, {
-        'title': 'Check of recordings', 'about': [], 'badge': badge,
-        'figures': {}, 'columns': _HEAD, 'rows': list(map(_cells, results)),
-        'recordings': recordings, 'shows_head': _SHOWS_HEAD})
+    badge = {
+        'colour': 'green' if is_sound else 'red',
+        'sentence': _sentence(results),
+        'word': 'Sound.' if is_sound else 'Not sound.',
+    }
+    recordings = [
+        {'path': result.path, 'entries': _entries(result), 'shows': result.shows}
+        for result in results
+    ]
+    return html_page.render(
+        'adxl_ros.api',
+        PAGE,
+        {
+            'title': 'Check of recordings',
+            'about': [],
+            'badge': badge,
+            'figures': {},
+            'columns': _HEAD,
+            'rows': list(map(_cells, results)),
+            'recordings': recordings,
+            'shows_head': _SHOWS_HEAD,
+        },
+    )
 
 
 @dataclass(frozen=True, repr=False)
@@ -165,6 +202,7 @@ class Check(Result):
     def to_pandas(self) -> Any:
         """Return a DataFrame with a row for each recording, as the screen has them."""
         from pandas import DataFrame
+
         return DataFrame(map(_cells, self.recordings), columns=_HEAD)
 
     def save(self, folder: str | os.PathLike) -> Path:
@@ -174,10 +212,16 @@ class Check(Result):
         return path
 
 
-def check(recordings: RecordingInput | Iterable[RecordingInput],
-          sensor: SensorInput | None = None, *, urdf: str | os.PathLike | None = None,
-          frame: str = 'imu_link', joints: str = '', reading: ReadingOptions = AS_IT_IS,
-          progress: Progress = no_progress) -> Check:
+def check(
+    recordings: RecordingInput | Iterable[RecordingInput],
+    sensor: SensorInput | None = None,
+    *,
+    urdf: str | os.PathLike | None = None,
+    frame: str = 'imu_link',
+    joints: str = '',
+    reading: ReadingOptions = AS_IT_IS,
+    progress: Progress = no_progress,
+) -> Check:
     """
     Check whether recordings are sound, and what the verbs can do with them.
 
@@ -206,8 +250,9 @@ def check(recordings: RecordingInput | Iterable[RecordingInput],
         The parameter file of the sensor cannot be read.
 
     """
-    several = [recordings] if isinstance(recordings, (Recording, str, os.PathLike)) \
-        else list(recordings)
+    several = (
+        [recordings] if isinstance(recordings, (Recording, str, os.PathLike)) else list(recordings)
+    )
     reading = replace(reading, drop_bad_stamps=True)
     results = []
     for number, each in enumerate(several):
@@ -228,16 +273,27 @@ def _path(recording: RecordingInput) -> str:
     return recording.path if isinstance(recording, Recording) else os.fspath(recording)
 
 
-def _with_what_shows(result: Findings, given: RecordingInput, sensor: SensorInput | None,
-                     robot: RobotInput | None, reading: ReadingOptions) -> Findings:
+def _with_what_shows(
+    result: Findings,
+    given: RecordingInput,
+    sensor: SensorInput | None,
+    robot: RobotInput | None,
+    reading: ReadingOptions,
+) -> Findings:
     """Add which effects `diagnose` could show in a recording, and from which size."""
-    if not result.is_sound or not (robot or any(
-            a.tool == 'diagnose' and a.is_able for a in result.abilities)):
+    if not result.is_sound or not (
+        robot or any(a.tool == 'diagnose' and a.is_able for a in result.abilities)
+    ):
         return result
     if result.contents is None or result.contents.samples > _MOST_SHOWN:
-        return replace(result, remarks=(
-            *result.remarks, 'what diagnose could show is listed for recordings of '
-            f'{_MOST_SHOWN} samples at most; check a part'))
+        return replace(
+            result,
+            remarks=(
+                *result.remarks,
+                'what diagnose could show is listed for recordings of '
+                f'{_MOST_SHOWN} samples at most; check a part',
+            ),
+        )
     reason, sim = 'against the joints of the robot', None
     try:
         read = given if isinstance(given, Recording) else recording_files.read(given, reading)
@@ -250,30 +306,48 @@ def _with_what_shows(result: Findings, given: RecordingInput, sensor: SensorInpu
         if isinstance(shown, DataFault):
             reason = shown.message
         else:
-            result = replace(result, shows=tuple(
-                shows_row(effect, float(unit.scale_v_per_g.mean()))
-                for effect in sorted(shown, key=lambda effect: not effect.shows)))
+            result = replace(
+                result,
+                shows=tuple(
+                    shows_row(effect, float(unit.scale_v_per_g.mean()))
+                    for effect in sorted(shown, key=lambda effect: not effect.shows)
+                ),
+            )
     except UserError as error:
         reason = one_line(error)
         if robot:
             result = replace(result, faults=(*result.faults, reason))
     if robot or not result.shows:
         ability = Ability('diagnose', bool(result.shows), reason)
-        result = replace(result, abilities=tuple(
-            ability if a.tool == ability.tool else a for a in result.abilities))
+        result = replace(
+            result,
+            abilities=tuple(ability if a.tool == ability.tool else a for a in result.abilities),
+        )
     return result
 
 
 def _as_json(result: Findings) -> dict[str, Any]:
     values: dict[str, Any] = {}
     if result.contents is not None:
-        values = {name: value for name, value in asdict(result.contents).items()
-                  if name not in ('path', 'remarks', 'cut', 'gravity', 'neighbour_faults')}
+        values = {
+            name: value
+            for name, value in asdict(result.contents).items()
+            if name not in ('path', 'remarks', 'cut', 'gravity', 'neighbour_faults')
+        }
         values['gravity'] = result.contents.gravity.as_json()
         values['bad_stamps'] = result.contents.bad_stamps._asdict()
-    return {'schema': 1, 'recording': result.path, 'sound': result.is_sound,
-            'faults': list(result.faults), 'remarks': list(result.remarks), 'contents': values,
-            'can': {ability.tool: {'able': ability.is_able, 'reason': ability.reason}
-                    for ability in result.abilities},
-            'could_show': [dict(zip(('effect', 'from', 'typical', 'missing'), row))
-                           for row in result.shows]}
+    return {
+        'schema': 1,
+        'recording': result.path,
+        'sound': result.is_sound,
+        'faults': list(result.faults),
+        'remarks': list(result.remarks),
+        'contents': values,
+        'can': {
+            ability.tool: {'able': ability.is_able, 'reason': ability.reason}
+            for ability in result.abilities
+        },
+        'could_show': [
+            dict(zip(('effect', 'from', 'typical', 'missing'), row)) for row in result.shows
+        ],
+    }

@@ -37,29 +37,36 @@ INVERSES = ('exact', 'paper')
 _COUNTED = {
     'unsolved': 'have no solution: their cells are empty, and a bag leaves them out',
     'outside': 'lie outside of the validity range (temperature or force): their standard '
-               'deviations are raised',
+    'deviations are raised',
     'at_rail': 'have the ADC at its rail: their standard deviations are inf, in a bag '
-               f'their variances {UNMEASURED_VARIANCE:g}'}
+    f'their variances {UNMEASURED_VARIANCE:g}',
+}
 """What is said of counted samples, by the field of `Estimates`."""
 
 
 class Correction:
     """Corrects a recording block by block, and counts what its user must know."""
 
-    def __init__(self, first: Recording, sensor: SensorInput | None, inverse: str = INVERSES[0],
-                 undo_filter: bool = False) -> None:
+    def __init__(
+        self,
+        first: Recording,
+        sensor: SensorInput | None,
+        inverse: str = INVERSES[0],
+        undo_filter: bool = False,
+    ) -> None:
         """Prepare for the recording that begins with a block; see `apply`."""
         if inverse not in INVERSES:
             raise UserError(f'--inverse {inverse}: expected {" or ".join(INVERSES)}')
         given = sensor_of(sensor, first)
-        self.sensor = given.sensor if given.sensor.effects else \
-            with_axes(given.sensor, first.axes)
+        self.sensor = given.sensor if given.sensor.effects else with_axes(given.sensor, first.axes)
         self.measured = given.measured
         check_unit(first.stream_info, first.axes, self.sensor)
         self._before = list(_effects_that_stay(self.sensor, undo_filter))
         if self.sensor.mounting.get('rpy_rad'):
-            self._before.append('force and angles are those of the case: only the compensation '
-                                'turns them by mounting.rpy_rad of the parameters')
+            self._before.append(
+                'force and angles are those of the case: only the compensation '
+                'turns them by mounting.rpy_rad of the parameters'
+            )
         self._estimator = RecordingEstimator(self.sensor, first, inverse == 'paper', undo_filter)
         self._counts: Counter[str] = Counter()
         self._beyond = BeyondRange()
@@ -76,32 +83,46 @@ class Correction:
             self._counts['rows'] += len(block)
             for name in _COUNTED:
                 self._counts[name] += int(getattr(estimates, name).sum())
-        self._doubts = [*require_unit(self._look.gravity(), self._path),
-                        *self._look.neighbour_faults()]
+        self._doubts = [
+            *require_unit(self._look.gravity(), self._path),
+            *self._look.neighbour_faults(),
+        ]
 
     @property
     def notes(self) -> list[str]:
         """Return what a user must know of the samples so far, one line each."""
-        counted = [f'{self._counts[name]} of {self._counts["rows"]} samples {statement}'
-                   for name, statement in _COUNTED.items() if self._counts[name]]
+        counted = [
+            f'{self._counts[name]} of {self._counts["rows"]} samples {statement}'
+            for name, statement in _COUNTED.items()
+            if self._counts[name]
+        ]
         beyond = self._beyond.describe(self.sensor)
         return [*self._before, *counted, *[beyond] * bool(beyond)]
 
     @property
     def screen(self) -> list[str]:
         """Return the lines of the tool's screen."""
-        by_what = f'the {self.sensor.model} calibration of {self.sensor.serial}' \
-            if self.sensor.effects else 'the datasheet values: the sensor is not calibrated'
-        return [f'Corrected {self._counts["rows"]} samples by {by_what}.',
-                *(f'WARNING {text}' for text in self._doubts), *self._estimator.assumed,
-                *listed([*self.measured])]
+        by_what = (
+            f'the {self.sensor.model} calibration of {self.sensor.serial}'
+            if self.sensor.effects
+            else 'the datasheet values: the sensor is not calibrated'
+        )
+        return [
+            f'Corrected {self._counts["rows"]} samples by {by_what}.',
+            *(f'WARNING {text}' for text in self._doubts),
+            *self._estimator.assumed,
+            *listed([*self.measured]),
+        ]
 
 
 def _effects_that_stay(sensor: Sensor, undo_filter: bool) -> Iterator[str]:
     """Name the effects that are not undone."""
     for effect in map(effect_named, sensor.effects):
-        acts_on_samples = effect.acts_on is base.ActsOn.MEAN and effect.place < base.Place.CLOCK \
+        acts_on_samples = (
+            effect.acts_on is base.ActsOn.MEAN
+            and effect.place < base.Place.CLOCK
             and effect.concern is not base.Concern.STAGE
+        )
         is_undone = effect.invertible or (undo_filter and base.Need.FILTER in effect.needs)
         if acts_on_samples and not is_undone:
             yield f'{effect.name} is not undone: a single sample does not determine it'
@@ -113,19 +134,23 @@ def writer(path: str | os.PathLike) -> Iterator[Callable[[Recording, Estimates],
     if Path(path).suffix == '.csv':
         with csv_writer(path) as append_rows:
             yield lambda block, estimates: append_rows(
-                {'time_s': block.epoch_ns * 1e-9 + block.time_s, **_columns(estimates)})
+                {'time_s': block.epoch_ns * 1e-9 + block.time_s, **_columns(estimates)}
+            )
     else:
         fields = ImuFields()
         with tilt_bag(path) as append:
-            yield lambda block, estimates: append(block.stamp_ns[~estimates.unsolved],
-                                                  *fields(estimates))
+            yield lambda block, estimates: append(
+                block.stamp_ns[~estimates.unsolved], *fields(estimates)
+            )
 
 
 def _columns(estimates: Estimates) -> dict[str, np.ndarray]:
     """Return the columns of a table of estimates, (n,) each."""
-    columns = {f'a{axis}{name}_mps2': values for name, force in (
-        ('', estimates.force_mps2), ('_std', estimates.force_std_mps2))
-        for axis, values in zip(AXES, force)}
+    columns = {
+        f'a{axis}{name}_mps2': values
+        for name, force in (('', estimates.force_mps2), ('_std', estimates.force_std_mps2))
+        for axis, values in zip(AXES, force)
+    }
     for names in (('roll', 'pitch', 'inclination'), ('alpha', 'beta')):
         columns |= {f'{name}_rad': getattr(estimates.tilt, name) for name in names}
         columns |= {f'{name}_std_rad': getattr(estimates.tilt, f'{name}_std') for name in names}
@@ -179,8 +204,11 @@ class Corrected(Result):
     def first_screen(self) -> FirstScreen:
         """Return what a notebook shows."""
         std_mg = mg(np.median(self.force_std_mps2, axis=0))
-        tiles = [(f'{axis}, standard deviation', f'{value:.2g} mg')
-                 for axis, value in zip(AXES, std_mg) if np.isfinite(value)]
+        tiles = [
+            (f'{axis}, standard deviation', f'{value:.2g} mg')
+            for axis, value in zip(AXES, std_mg)
+            if np.isfinite(value)
+        ]
         return FirstScreen('grey', f'{len(self.time_s)} samples', ' '.join(self.screen), tiles)
 
     def to_dict(self) -> dict[str, Any]:
@@ -191,6 +219,7 @@ class Corrected(Result):
     def to_pandas(self) -> Any:
         """Return a DataFrame with the columns of the tool's table, m/s² and rad."""
         from pandas import DataFrame
+
         return DataFrame({'time_s': self.time_s, **self.columns})
 
     def plot(self, ax: Any = None) -> Any:
@@ -209,8 +238,13 @@ class Corrected(Result):
                 append(block, estimates)
 
 
-def apply(recording: RecordingInput, sensor: SensorInput | None = None, *,
-          inverse: str = INVERSES[0], undo_filter: bool = False) -> Corrected:
+def apply(
+    recording: RecordingInput,
+    sensor: SensorInput | None = None,
+    *,
+    inverse: str = INVERSES[0],
+    undo_filter: bool = False,
+) -> Corrected:
     """
     Correct a recording by a calibration: acceleration and tilt from the sensor alone.
 
@@ -242,8 +276,11 @@ def apply(recording: RecordingInput, sensor: SensorInput | None = None, *,
     if not len(read):
         raise UserError(f'{read.path}: has no samples to correct')
     correction = Correction(read, sensor, inverse, undo_filter)
-    parts = tuple(correction.blocks(
-        read.rows(start, start + BLOCK_ROWS) for start in range(0, len(read), BLOCK_ROWS)))
+    parts = tuple(
+        correction.blocks(
+            read.rows(start, start + BLOCK_ROWS) for start in range(0, len(read), BLOCK_ROWS)
+        )
+    )
 
     def joined(name: str) -> np.ndarray:
         """Return a field of the estimates of all blocks; its last axis becomes the first."""
@@ -252,8 +289,17 @@ def apply(recording: RecordingInput, sensor: SensorInput | None = None, *,
     tables = [_columns(estimates) for _, estimates in parts]
     columns = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     return Corrected(
-        time_s=read.time_s, epoch_ns=read.epoch_ns, force_mps2=joined('force_mps2'),
-        force_std_mps2=joined('force_std_mps2'), force_covariance=joined('covariance'),
-        columns=columns, at_rail=joined('at_rail'), outside=joined('outside'),
-        unsolved=joined('unsolved'), sensor=correction.sensor, notes=tuple(correction.notes),
-        screen_lines=tuple(correction.screen), parts=parts)
+        time_s=read.time_s,
+        epoch_ns=read.epoch_ns,
+        force_mps2=joined('force_mps2'),
+        force_std_mps2=joined('force_std_mps2'),
+        force_covariance=joined('covariance'),
+        columns=columns,
+        at_rail=joined('at_rail'),
+        outside=joined('outside'),
+        unsolved=joined('unsolved'),
+        sensor=correction.sensor,
+        notes=tuple(correction.notes),
+        screen_lines=tuple(correction.screen),
+        parts=parts,
+    )

@@ -150,9 +150,14 @@ class Gap(Result):
     def first_screen(self) -> FirstScreen:
         """Return the top of the page."""
         from adxl_ros.diagnose.page import COLOURS, TILES
+
         rows = [] if self.fault else words.figure_rows(self.diagnosis)[:TILES]
-        return FirstScreen(COLOURS[self.verdict], words.badge(self.diagnosis),
-                           words.headline(self.diagnosis), rows)
+        return FirstScreen(
+            COLOURS[self.verdict],
+            words.badge(self.diagnosis),
+            words.headline(self.diagnosis),
+            rows,
+        )
 
     @cached_property
     def _report(self) -> dict[str, Any]:
@@ -165,20 +170,31 @@ class Gap(Result):
     def to_pandas(self) -> Any:
         """Return a DataFrame with a row for each parameter of each effect of the verdict."""
         from pandas import DataFrame
-        rows = [(effect.name, name, *parameter, effect.probability, effect.share)
-                for effect in self.effects for name, parameter in effect.parameters.items()]
-        return DataFrame(rows, columns=['effect', 'parameter', *FoundParameter._fields,
-                                        'probability', 'share'])
+
+        rows = [
+            (effect.name, name, *parameter, effect.probability, effect.share)
+            for effect in self.effects
+            for name, parameter in effect.parameters.items()
+        ]
+        return DataFrame(
+            rows, columns=['effect', 'parameter', *FoundParameter._fields, 'probability', 'share']
+        )
 
     def plot(self, ax: Any = None) -> Any:
         """Draw gap, gap with the effects, and noise floor, mg, into axes of matplotlib."""
         if self.figures is None:
             raise UserError(f'no figures to draw: {self.fault}')
         ax, figures = axes_for(ax), self.figures
-        bars = {'gap': figures.before_mps2, 'with the effects': figures.after_mps2,
-                'noise floor': figures.floor_mps2}
-        ax.barh(list(bars), [mg(bar.value) for bar in bars.values()],
-                color=['#c0392b', '#2a8a43', '#7b8794'])
+        bars = {
+            'gap': figures.before_mps2,
+            'with the effects': figures.after_mps2,
+            'noise floor': figures.floor_mps2,
+        }
+        ax.barh(
+            list(bars),
+            [mg(bar.value) for bar in bars.values()],
+            color=['#c0392b', '#2a8a43', '#7b8794'],
+        )
         ax.invert_yaxis()
         ax.set(xlabel='rms, mg', title=words.badge(self.diagnosis))
         return ax
@@ -196,19 +212,31 @@ class Gap(Result):
             write_text(path / name, text)
         return [path / name for name in (PAGE, PARAMETERS, REPORT) if name in texts]
 
-    def documents(self, folder: str | os.PathLike, made_by: str = '', has_page: bool = True
-                  ) -> dict[str, str]:
+    def documents(
+        self, folder: str | os.PathLike, made_by: str = '', has_page: bool = True
+    ) -> dict[str, str]:
         """Return the files that `save` writes, by name."""
         from adxl_ros.diagnose import page
-        run = page.Run(self.compared.subject, self.compared.params_name, self.next_steps(folder),
-                       made_by or self.command(folder))
-        return page.documents(self.diagnosis, self.to_dict(), self.screen, run if has_page
-                              else None)
+
+        run = page.Run(
+            self.compared.subject,
+            self.compared.params_name,
+            self.next_steps(folder),
+            made_by or self.command(folder),
+        )
+        return page.documents(
+            self.diagnosis, self.to_dict(), self.screen, run if has_page else None
+        )
 
     def command(self, folder: str | os.PathLike) -> str:
         """Return the command line that repeats the diagnosis into a folder."""
-        given = {'--params': self.compared.params, '--sim': self.compared.sim,
-                 '--urdf': self.compared.urdf, '--frame': self._frame, '-o': str(folder)}
+        given = {
+            '--params': self.compared.params,
+            '--sim': self.compared.sim,
+            '--urdf': self.compared.urdf,
+            '--frame': self._frame,
+            '-o': str(folder),
+        }
         return _command(self.compared.recordings, given)
 
     def next_steps(self, folder: str | os.PathLike) -> list[NextStep]:
@@ -219,27 +247,39 @@ class Gap(Result):
         params, proposal = str(Path(folder) / PARAMETERS), report.next_experiment
         steps = []
         if proposal is not None:
-            both = f', and {proposal.stem}_simulated.csv in the simulator' \
-                if compared.sim else ''
-            steps.append(NextStep(f'record {proposal.stem}.csv{both}: {proposal.manoeuvre}, '
-                                  f'{proposal.why}',
-                                  '' if proposal.beside_simulator else proposal.command))
+            both = f', and {proposal.stem}_simulated.csv in the simulator' if compared.sim else ''
+            steps.append(
+                NextStep(
+                    f'record {proposal.stem}.csv{both}: {proposal.manoeuvre}, {proposal.why}',
+                    '' if proposal.beside_simulator else proposal.command,
+                )
+            )
         if proposal is not None and not proposal.concerns_reference:
             is_closed = self.verdict in ('explained', 'partly')
             is_alone = bool(is_closed or compared.sim or compared.urdf)
-            given = {'--params': params if is_closed else compared.params,
-                     '--sim': f'{proposal.stem}_simulated.csv' if compared.sim else '',
-                     '--urdf': compared.urdf, '--frame': self._frame, '-o': f'{folder}_2'}
+            given = {
+                '--params': params if is_closed else compared.params,
+                '--sim': f'{proposal.stem}_simulated.csv' if compared.sim else '',
+                '--urdf': compared.urdf,
+                '--frame': self._frame,
+                '-o': f'{folder}_2',
+            }
             before = () if is_alone else compared.recordings
-            steps.append(NextStep(
-                'diagnose it' if is_alone else 'diagnose it together with this one',
-                _command((*before, f'{proposal.stem}.csv'), given)))
+            steps.append(
+                NextStep(
+                    'diagnose it' if is_alone else 'diagnose it together with this one',
+                    _command((*before, f'{proposal.stem}.csv'), given),
+                )
+            )
         if not any(effect_named(e).concern is Concern.REFERENCE for e in report.sensor.effects):
             # The folder is of the diagnosis, so that no input is replaced.
             simulated = free_name(Path(folder) / 'simulated.csv')
             words = 'rich', '--params', params, '-o', str(simulated)
-            steps.append(NextStep('simulate the sensor as it was found',
-                                  command('simulate', shlex.join(words))))
+            steps.append(
+                NextStep(
+                    'simulate the sensor as it was found', command('simulate', shlex.join(words))
+                )
+            )
         return steps
 
     @property
@@ -253,13 +293,22 @@ def _command(recordings: Sequence[str], given: Mapping[str, str]) -> str:
     return command('diagnose', shlex.join([*recordings, *options]))
 
 
-def diagnose(recordings: RecordingInput | Iterable[RecordingInput],
-             sensor: SensorInput | None = None, *,
-             sim: RecordingInput | Motion | None = None,
-             urdf: str | os.PathLike | None = None, frame: str = 'imu_link', joints: str = '',
-             align: bool = False, material: float = MATERIAL_MG,
-             prior: str | os.PathLike | None = None, quantity: str | None = None,
-             self_check: int = 0, seed: int = 0, progress: Progress = no_progress) -> Gap:
+def diagnose(
+    recordings: RecordingInput | Iterable[RecordingInput],
+    sensor: SensorInput | None = None,
+    *,
+    sim: RecordingInput | Motion | None = None,
+    urdf: str | os.PathLike | None = None,
+    frame: str = 'imu_link',
+    joints: str = '',
+    align: bool = False,
+    material: float = MATERIAL_MG,
+    prior: str | os.PathLike | None = None,
+    quantity: str | None = None,
+    self_check: int = 0,
+    seed: int = 0,
+    progress: Progress = no_progress,
+) -> Gap:
     """
     Find where recordings of one unit differ from their simulation, and which effects cause it.
 
@@ -315,40 +364,63 @@ def diagnose(recordings: RecordingInput | Iterable[RecordingInput],
     _require_one_reference(sim, urdf, len(read))
     given = sensor_of(sensor, read[0])
     baseline, remarks = given.sensor, []
-    motion = RobotInput(urdf, frame, joints).path(read[0], baseline).as_motion() if urdf else \
-        _motion(read[0], sim)
+    motion = (
+        RobotInput(urdf, frame, joints).path(read[0], baseline).as_motion()
+        if urdf
+        else _motion(read[0], sim)
+    )
     if prior:
         baseline, remark = _with_prior(baseline, prior)
         remarks.append(remark)
     remarks += [f'assumed: {text}' for each in read for text in assumed(each, baseline.effects)]
-    diagnosis = core.diagnose(read, baseline, motion, seed,
-                              lambda stage, done: progress(done, stage), align, material)
+    diagnosis = core.diagnose(
+        read, baseline, motion, seed, lambda stage, done: progress(done, stage), align, material
+    )
     in_unit, found = None, diagnosis.report
     if self_check and found:
-        remarks.append(core.self_check(diagnosis, read, motion, self_check, seed,
-                                       lambda done: progress(done, 'self-check')))
+        remarks.append(
+            core.self_check(
+                diagnosis,
+                read,
+                motion,
+                self_check,
+                seed,
+                lambda done: progress(done, 'self-check'),
+            )
+        )
     if unit and found:
         in_unit = gap_in(unit, diagnosis.full_rate, found.baseline, found.sensor, seed)
     simulator, robot = _name_of(sim), os.fspath(urdf or '')
-    compared = Compared(tuple(r.path for r in read), given.file, given.file_name, simulator,
-                        robot, frame, _subject(read, baseline, simulator or robot))
+    compared = Compared(
+        tuple(r.path for r in read),
+        given.file,
+        given.file_name,
+        simulator,
+        robot,
+        frame,
+        _subject(read, baseline, simulator or robot),
+    )
     return _gap(diagnosis, baseline, compared, in_unit, remarks)
 
 
-def _require_one_reference(sim: RecordingInput | Motion | None, urdf: str | os.PathLike | None,
-                           count: int) -> None:
+def _require_one_reference(
+    sim: RecordingInput | Motion | None, urdf: str | os.PathLike | None, count: int
+) -> None:
     """Refuse a simulator and a robot together, and one of them for several recordings."""
     if sim is None and not urdf:
         return
     if count > 1 or (sim is not None and urdf):
-        raise UserError(f'{_name_of(sim) or urdf}: --sim or --urdf, one of them, goes with one '
-                        f'recording, but {count} are given')
+        raise UserError(
+            f'{_name_of(sim) or urdf}: --sim or --urdf, one of them, goes with one '
+            f'recording, but {count} are given'
+        )
 
 
 def _with_prior(sensor: Sensor, population: str | os.PathLike) -> tuple[Sensor, str]:
     """Return a sensor with the zero-g and scale factor of its fleet, and a remark on them."""
     from adxl_ros.files import calibration_store
     from adxl_ros.model.population import posterior
+
     informed, line, _ = posterior(sensor, calibration_store.read_population(population))
     return informed, f'prior: {line}'
 
@@ -373,32 +445,48 @@ def _subject(recordings: Sequence[Recording], sensor: Sensor, sim: str) -> str:
     name = Path(first.path).name if count == 1 else f'{count} recordings'
     span_s = sum(float(r.time_s[-1] - r.time_s[0]) for r in recordings if len(r))
     unit = 'the nominal sensor' if sensor.serial == NO_UNIT else f'unit {sensor.serial}'
-    simulated = f'{Path(sim).name} through the chain of {unit}' if sim \
-        else f'simulation of {unit}'
-    return (f'{name} ({span_s:.0f} s, {first.rate_hz:.4g} Hz, {" ".join(first.axes)})  minus  '
-            f'{simulated}')
+    simulated = f'{Path(sim).name} through the chain of {unit}' if sim else f'simulation of {unit}'
+    return (
+        f'{name} ({span_s:.0f} s, {first.rate_hz:.4g} Hz, {" ".join(first.axes)})  minus  '
+        f'{simulated}'
+    )
 
 
-def _gap(diagnosis: Diagnosis, baseline: Sensor, compared: Compared, in_unit: GapInUnit | None,
-         remarks: Sequence[str]) -> Gap:
+def _gap(
+    diagnosis: Diagnosis,
+    baseline: Sensor,
+    compared: Compared,
+    in_unit: GapInUnit | None,
+    remarks: Sequence[str],
+) -> Gap:
     """Collect what a user reads of a diagnosis."""
     objects, report = words.as_json(diagnosis), diagnosis.report
     effects: tuple[FoundEffect, ...] = ()
     figures = None
     if report is not None:
         candidates = {c['effect']: c for c in objects['candidates']}
-        effects = tuple(_effect(candidates[name])
-                        for name in words.named_effects(report, objects))
-        figures = GapFigures(*report.closure, report.verdict.upper_limit_mps2,
-                             report.verdict.material_mps2, report.verdict.reference_mps2)
+        effects = tuple(_effect(candidates[name]) for name in words.named_effects(report, objects))
+        figures = GapFigures(
+            *report.closure,
+            report.verdict.upper_limit_mps2,
+            report.verdict.material_mps2,
+            report.verdict.reference_mps2,
+        )
     return Gap(
-        verdict=objects['verdict']['status'], probability=objects['verdict']['probability'],
-        effects=effects, figures=figures,
+        verdict=objects['verdict']['status'],
+        probability=objects['verdict']['probability'],
+        effects=effects,
+        figures=figures,
         could_show=report.could_show if report else (),
         sensor=report.sensor if report else baseline,
-        fault=diagnosis.fault.message if diagnosis.fault else '', summary=objects['summary'],
-        notes=tuple(objects['notes']), in_unit=in_unit, remarks=tuple(remarks), compared=compared,
-        diagnosis=diagnosis)
+        fault=diagnosis.fault.message if diagnosis.fault else '',
+        summary=objects['summary'],
+        notes=tuple(objects['notes']),
+        in_unit=in_unit,
+        remarks=tuple(remarks),
+        compared=compared,
+        diagnosis=diagnosis,
+    )
 
 
 def _effect(candidate: Mapping[str, Any]) -> FoundEffect:
@@ -407,5 +495,11 @@ def _effect(candidate: Mapping[str, Any]) -> FoundEffect:
     for name, parameter in candidate['parameters'].items():
         low, high = parameter.get('ci') or (None, None)
         parameters[name] = FoundParameter(parameter['value'], low, high, parameter['unit'])
-    return FoundEffect(candidate['effect'], candidate['probability'], candidate['share'],
-                       parameters, tuple(candidate['inseparable_from']), candidate['cause'])
+    return FoundEffect(
+        candidate['effect'],
+        candidate['probability'],
+        candidate['share'],
+        parameters,
+        tuple(candidate['inseparable_from']),
+        candidate['cause'],
+    )

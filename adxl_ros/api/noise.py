@@ -45,19 +45,33 @@ def _head(result: RecordingNoise) -> list[str]:
 def _tables(result: RecordingNoise) -> list[str]:
     """Return the terms with intervals, then in SI units and by sample, 79 columns at most."""
     wide, narrow = (6, 25, 25, 25), (6, 12, 12, 12, 13, 13, 9)
-    rows = [row((' axis', *_NAMES), wide),
-            row(('', 'µg/√Hz (90 %)', 'µg (90 %)', 'µg/√s (90 %)'), wide),
-            *(row((f' {noise.axis}', *_micro_g_intervals(noise)), wide) for noise in result.axes),
-            *_walk_lines(result), '',
-            row(('', 'N', 'B', 'K', 'N by sample', 'K by sample', 'datasheet'), narrow),
-            row((' axis', 'm/s²/√Hz', 'm/s²', 'm/s²/√s', 'm/s²', 'm/s²', 'µg/√Hz'), narrow)]
+    rows = [
+        row((' axis', *_NAMES), wide),
+        row(('', 'µg/√Hz (90 %)', 'µg (90 %)', 'µg/√s (90 %)'), wide),
+        *(row((f' {noise.axis}', *_micro_g_intervals(noise)), wide) for noise in result.axes),
+        *_walk_lines(result),
+        '',
+        row(('', 'N', 'B', 'K', 'N by sample', 'K by sample', 'datasheet'), narrow),
+        row((' axis', 'm/s²/√Hz', 'm/s²', 'm/s²/√s', 'm/s²', 'm/s²', 'µg/√Hz'), narrow),
+    ]
     rate = np.sqrt(result.rest.rate_hz)
     for noise in result.axes:
         white, _, walk = noise.estimates
-        shown = (*noise.estimates, white.scaled(rate), walk.scaled(1 / rate),
-                 white.scaled(1e6 * ONE_SIDED / G0_MPS2))
-        rows.append(row((f' {noise.axis}', *(f'{e.value:.3g}' if e.is_seen else f'< {e.high:.3g}'
-                                             for e in shown)), narrow))
+        shown = (
+            *noise.estimates,
+            white.scaled(rate),
+            walk.scaled(1 / rate),
+            white.scaled(1e6 * ONE_SIDED / G0_MPS2),
+        )
+        rows.append(
+            row(
+                (
+                    f' {noise.axis}',
+                    *(f'{e.value:.3g}' if e.is_seen else f'< {e.high:.3g}' for e in shown),
+                ),
+                narrow,
+            )
+        )
     return rows
 
 
@@ -67,15 +81,19 @@ def _walk_lines(result: RecordingNoise) -> list[str]:
     for noise in result.axes:
         time_s, k = noise.fit.bound_s, MICRO_G * noise.fit.walk.value
         if np.isfinite(time_s):
-            rows.append(f' {noise.axis}: the walk has bounds, {k * np.sqrt(time_s / 2):.3g} µg '
-                        f'rms; correlation time {time_s:.3g} s')
+            rows.append(
+                f' {noise.axis}: the walk has bounds, {k * np.sqrt(time_s / 2):.3g} µg '
+                f'rms; correlation time {time_s:.3g} s'
+            )
     return rows
 
 
 def _micro_g_intervals(noise: AxisNoise) -> list[str]:
     """Return the estimates with their intervals, or their upper limits."""
-    return [f'{e.value:.3g} ({e.low:.3g} to {e.high:.3g})' if e.is_seen else f'below {e.high:.3g}'
-            for e in (estimate.scaled(MICRO_G) for estimate in noise.estimates)]
+    return [
+        f'{e.value:.3g} ({e.low:.3g} to {e.high:.3g})' if e.is_seen else f'below {e.high:.3g}'
+        for e in (estimate.scaled(MICRO_G) for estimate in noise.estimates)
+    ]
 
 
 def _paste_lines(result: RecordingNoise) -> list[str]:
@@ -86,9 +104,14 @@ def _paste_lines(result: RecordingNoise) -> list[str]:
         for name, values, unit in entries:
             rounded = [float(f'{value:.{6 if value >= 1 else 3}g}') for value in values]
             is_one = len(rounded) == 1
-            lines += [f'# {unit}', *yaml.safe_dump(
-                {name: rounded[0] if is_one else rounded}, width=_YAML_COLUMNS,
-                default_flow_style=False if is_one else None).splitlines()]
+            lines += [
+                f'# {unit}',
+                *yaml.safe_dump(
+                    {name: rounded[0] if is_one else rounded},
+                    width=_YAML_COLUMNS,
+                    default_flow_style=False if is_one else None,
+                ).splitlines(),
+            ]
     return lines
 
 
@@ -98,10 +121,12 @@ def _warnings(result: RecordingNoise) -> list[str]:
         texts.append(f'{rest.beyond_range}.')
     if rest.motion_s:
         begin_s, end_s = rest.motion_s[0][:2]
-        texts.append(f'not still or interrupted {len(rest.motion_s)} times, first from '
-                     f'{begin_s:.5g} s to {end_s:.5g} s. Used is the longest rest, '
-                     f'{duration(rest.span_s)} of {duration(rest.recorded_s)}. Record again '
-                     'without touching the sensor.')
+        texts.append(
+            f'not still or interrupted {len(rest.motion_s)} times, first from '
+            f'{begin_s:.5g} s to {end_s:.5g} s. Used is the longest rest, '
+            f'{duration(rest.span_s)} of {duration(rest.recorded_s)}. Record again '
+            'without touching the sensor.'
+        )
     for noise in result.axes:
         texts += [f'{noise.axis}: {text}' for text in _axis_warnings(rest.span_s, noise)]
     return texts
@@ -112,8 +137,10 @@ def _filter_warning(stated: Sensor, fresh: Sensor) -> list[str]:
     if 'rc_capacitance_f' in stated.unstated or fresh.rc_s == stated.rc_s:
         return []
     found = f'a filter of {fresh.rc_s * 1e3:.3g} ms' if fresh.rc_s else 'no filter'
-    return [f'the noise at {fresh.rate_hz:.5g} Hz shows {found}, not the stated one of '
-            f'{stated.rc_s * 1e3:.3g} ms. The new file states what the noise shows.']
+    return [
+        f'the noise at {fresh.rate_hz:.5g} Hz shows {found}, not the stated one of '
+        f'{stated.rc_s * 1e3:.3g} ms. The new file states what the noise shows.'
+    ]
 
 
 def _axis_warnings(span_s: float, noise: AxisNoise) -> list[str]:
@@ -121,15 +148,24 @@ def _axis_warnings(span_s: float, noise: AxisNoise) -> list[str]:
     for term, name in enumerate(_NAMES):
         if not (noise.estimates[term].is_seen or noise.is_coarse):
             needed_s = noise.fit.needed_s(term)
-            texts.append(f'{duration(span_s)} is too short to see the {name}. ' + (
-                'The other terms hide it, in longer recordings, too.' if np.isinf(needed_s) else
-                f'To see half of the limit above, record about {duration(needed_s)}.'))
+            texts.append(
+                f'{duration(span_s)} is too short to see the {name}. '
+                + (
+                    'The other terms hide it, in longer recordings, too.'
+                    if np.isinf(needed_s)
+                    else f'To see half of the limit above, record about {duration(needed_s)}.'
+                )
+            )
     if noise.is_coarse:
-        texts.append(f'samples change in steps of {noise.resolution * MICRO_G:.3g} µg, which hide '
-                     'the noise. N, B and K are upper limits. Choose a smaller range.')
+        texts.append(
+            f'samples change in steps of {noise.resolution * MICRO_G:.3g} µg, which hide '
+            'the noise. N, B and K are upper limits. Choose a smaller range.'
+        )
     if not noise.fit.white.is_seen:
-        texts.append('N is not determined. A parameter file keeps the figure of --params, or '
-                     'states no white noise.')
+        texts.append(
+            'N is not determined. A parameter file keeps the figure of --params, or '
+            'states no white noise.'
+        )
     return texts
 
 
@@ -163,8 +199,9 @@ class Noise(Result):
         """Return the sensor of the parameter file with the measured noise."""
         stated, name = _sensor(self.result), Path(self.result.path).name
         fresh = noise_parameters.with_noise(stated, self.result.axes, self.result.rest)
-        return replace(fresh, provenance={**fresh.provenance, 'noise_from': name,
-                                          'rate_from': name})
+        return replace(
+            fresh, provenance={**fresh.provenance, 'noise_from': name, 'rate_from': name}
+        )
 
     @property
     def refuted_filter(self) -> list[str]:
@@ -175,23 +212,39 @@ class Noise(Result):
     def screen(self) -> list[str]:
         """Return the lines of the tool's screen."""
         warnings = [f'WARNING {text}' for text in self.warnings]
-        return [*_head(self.result), '', *_tables(self.result), '', *_paste_lines(self.result),
-                '', *warnings, *[''] * bool(warnings)]
+        return [
+            *_head(self.result),
+            '',
+            *_tables(self.result),
+            '',
+            *_paste_lines(self.result),
+            '',
+            *warnings,
+            *[''] * bool(warnings),
+        ]
 
     @property
     def first_screen(self) -> FirstScreen:
         """Return what a notebook shows."""
-        tiles = [(f'white noise of {noise.axis}',
-                  f'{_micro_g_intervals(noise)[0]} µg/√Hz') for noise in self.axes]
-        return FirstScreen('amber' if self.warnings else 'green', 'Noise',
-                           _head(self.result)[1], tiles)
+        tiles = [
+            (f'white noise of {noise.axis}', f'{_micro_g_intervals(noise)[0]} µg/√Hz')
+            for noise in self.axes
+        ]
+        return FirstScreen(
+            'amber' if self.warnings else 'green', 'Noise', _head(self.result)[1], tiles
+        )
 
     def save(self, path: str | os.PathLike) -> None:
         """Write a parameter file with the measured noise."""
-        parameter_file.save(path, self.sensor, [
-            f'Noise measured in {duration(self.span_s)} at rest of {self.result.path}.',
-            'Density: over positive frequencies, as datasheets state it.',
-            *_tables(self.result)])
+        parameter_file.save(
+            path,
+            self.sensor,
+            [
+                f'Noise measured in {duration(self.span_s)} at rest of {self.result.path}.',
+                'Density: over positive frequencies, as datasheets state it.',
+                *_tables(self.result),
+            ],
+        )
 
     def report(self, folder: str | os.PathLike) -> Path:
         """Write the curve allan.png into a folder, and return its path."""
@@ -201,16 +254,29 @@ class Noise(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return terms with their intervals, m/s² and s, as objects of JSON."""
-        return {'schema': 1, 'recording': self.result.path, 'span_s': self.span_s,
-                'rate_hz': self.rate_hz, 'warnings': list(self.warnings),
-                'axes': {noise.axis: {name: estimate._asdict() for name, estimate in zip(
-                    _FIELDS, noise.estimates)} for noise in self.axes}}
+        return {
+            'schema': 1,
+            'recording': self.result.path,
+            'span_s': self.span_s,
+            'rate_hz': self.rate_hz,
+            'warnings': list(self.warnings),
+            'axes': {
+                noise.axis: {
+                    name: estimate._asdict() for name, estimate in zip(_FIELDS, noise.estimates)
+                }
+                for noise in self.axes
+            },
+        }
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with a row for each axis and term: value and 90 % interval."""
         from pandas import DataFrame
-        rows = [(noise.axis, name, *estimate) for noise in self.axes
-                for name, estimate in zip(_FIELDS, noise.estimates)]
+
+        rows = [
+            (noise.axis, name, *estimate)
+            for noise in self.axes
+            for name, estimate in zip(_FIELDS, noise.estimates)
+        ]
         return DataFrame(rows, columns=['axis', 'term', 'value', 'low', 'high'])
 
     def plot(self, ax: Any = None) -> Any:
@@ -222,8 +288,12 @@ class Noise(Result):
         return ax
 
 
-def noise(recording: RecordingInput | Callable[[], Iterable[Recording]],
-          sensor: SensorInput | None = None, *, progress: Progress = no_progress) -> Noise:
+def noise(
+    recording: RecordingInput | Callable[[], Iterable[Recording]],
+    sensor: SensorInput | None = None,
+    *,
+    progress: Progress = no_progress,
+) -> Noise:
     """
     Find the noise of a sensor that rests.
 
@@ -258,11 +328,19 @@ def noise(recording: RecordingInput | Callable[[], Iterable[Recording]],
         read = partial(recording_files.blocks, recording, BLOCK_ROWS)
     else:
         read = recording
-    result = noise_parameters.recording_noise(read, as_input(sensor),
-                                              lambda done: progress(done, 'fit'))
+    result = noise_parameters.recording_noise(
+        read, as_input(sensor), lambda done: progress(done, 'fit')
+    )
     rest = result.rest
-    return Noise(tuple(result.axes), rest.span_s, rest.rate_hz, rest.allan.tau_s,
-                 rest.allan.deviation, tuple(_warnings(result)), result)
+    return Noise(
+        tuple(result.axes),
+        rest.span_s,
+        rest.rate_hz,
+        rest.allan.tau_s,
+        rest.allan.deviation,
+        tuple(_warnings(result)),
+        result,
+    )
 
 
 _INCHES = (5.0, 4.4)
@@ -284,15 +362,27 @@ def _draw(plot: Any, result: RecordingNoise, number: int, label: str) -> None:
     """Draw the Allan deviation of an axis with the terms that are seen."""
     allan, noise = result.rest.allan, result.axes[number]
     tau_s, measured = allan.tau_s, allan.deviation[:, number] * MICRO_G
-    plot.errorbar(tau_s, measured, yerr=measured * allan.relative_error.clip(max=0.9), fmt='o',
-                  ms=4, color=AXIS_COLOURS[noise.axis], label=label)
+    plot.errorbar(
+        tau_s,
+        measured,
+        yerr=measured * allan.relative_error.clip(max=0.9),
+        fmt='o',
+        ms=4,
+        color=AXIS_COLOURS[noise.axis],
+        label=label,
+    )
     for name, line, estimate in zip(_NAMES, noise.fit.lines(tau_s), noise.estimates):
         if estimate.is_seen:
             plot.plot(tau_s, line * MICRO_G, '--', lw=1, label=name)
-    plot.plot(tau_s, noise.fit.allan_deviation(tau_s) * MICRO_G, color='#222', lw=1,
-              label='all three')
-    plot.set(xscale='log', yscale='log', xlabel='averaging time τ, s',
-             ylim=(measured.min() / 3, measured.max() * 2))
+    plot.plot(
+        tau_s, noise.fit.allan_deviation(tau_s) * MICRO_G, color='#222', lw=1, label='all three'
+    )
+    plot.set(
+        xscale='log',
+        yscale='log',
+        xlabel='averaging time τ, s',
+        ylim=(measured.min() / 3, measured.max() * 2),
+    )
     plot.grid(True, which='both', alpha=0.3)
     plot.legend(fontsize=8)
 
@@ -301,8 +391,13 @@ def _sensor(result: RecordingNoise) -> Sensor:
     """Return the sensor of the parameter file, with the axes and rate of the recording."""
     sensor, unit = result.sensor, result.unit
     if sensor.effects and sensor.axes != unit.axes:
-        raise UserError(f'{result.path}: has the axes {unit.axes}, but the parameters of '
-                        f'{sensor.serial} are for {sensor.axes}; name the parameter file of this '
-                        'sensor')
-    return replace(sensor if sensor.effects else unit, serial=unit.serial,
-                   rate_hz=round(result.rest.rate_hz, 6))
+        raise UserError(
+            f'{result.path}: has the axes {unit.axes}, but the parameters of '
+            f'{sensor.serial} are for {sensor.axes}; name the parameter file of this '
+            'sensor'
+        )
+    return replace(
+        sensor if sensor.effects else unit,
+        serial=unit.serial,
+        rate_hz=round(result.rest.rate_hz, 6),
+    )

@@ -36,11 +36,19 @@ Counts = float | Sequence[float] | str
 _HIGHEST_RATE_HZ = 1e5  # Largest sample rate, Hz: that of a parameter file
 
 
-def read(source: str | os.PathLike | Any, *, topic: str = '',
-         columns: str | Mapping[str, str | tuple[str, str]] | None = None,
-         unit: str = '', rate: float | None = None, axes: str | None = None,
-         lsb_per_g: Counts = (), lsb_at_0g: Counts = (), drop_bad_stamps: bool = False,
-         drop_bad_samples: bool = False) -> Recording:
+def read(
+    source: str | os.PathLike | Any,
+    *,
+    topic: str = '',
+    columns: str | Mapping[str, str | tuple[str, str]] | None = None,
+    unit: str = '',
+    rate: float | None = None,
+    axes: str | None = None,
+    lsb_per_g: Counts = (),
+    lsb_at_0g: Counts = (),
+    drop_bad_stamps: bool = False,
+    drop_bad_samples: bool = False,
+) -> Recording:
     """
     Read a recording.
 
@@ -81,34 +89,53 @@ def read(source: str | os.PathLike | Any, *, topic: str = '',
         The file cannot be read, or is not understood; the message proposes `columns`.
 
     """
-    options = reading_options(topic, columns, unit, rate, axes, lsb_per_g, lsb_at_0g,
-                              drop_bad_stamps, drop_bad_samples)
+    options = reading_options(
+        topic, columns, unit, rate, axes, lsb_per_g, lsb_at_0g, drop_bad_stamps, drop_bad_samples
+    )
     if isinstance(source, (str, os.PathLike)):
         return recording_files.read(source, options)
     return recording_files.of_table(_table(_numbers(source), 'DataFrame'), options)
 
 
-def reading_options(topic: str = '', columns: str | Mapping[str, Any] | None = None,
-                    unit: str = '', rate: float | None = None, axes: str | None = None,
-                    lsb_per_g: Counts = (), lsb_at_0g: Counts = (), drop_bad_stamps: bool = False,
-                    drop_bad_samples: bool = False) -> ReadingOptions:
+def reading_options(
+    topic: str = '',
+    columns: str | Mapping[str, Any] | None = None,
+    unit: str = '',
+    rate: float | None = None,
+    axes: str | None = None,
+    lsb_per_g: Counts = (),
+    lsb_at_0g: Counts = (),
+    drop_bad_stamps: bool = False,
+    drop_bad_samples: bool = False,
+) -> ReadingOptions:
     """Check how a recording is to be read; see `read`."""
     if rate is not None and not 0 < rate <= _HIGHEST_RATE_HZ:
-        raise UserError(f'--rate {rate:g}: expected samples a second, at most '
-                        f'{_HIGHEST_RATE_HZ:g}')
+        raise UserError(
+            f'--rate {rate:g}: expected samples a second, at most {_HIGHEST_RATE_HZ:g}'
+        )
     return ReadingOptions(
-        topic, parse_mapping(_mapping_text(columns)) if columns else None, parse_unit(unit),
-        _counts('--lsb-per-g', lsb_per_g, 0.0), _counts('--lsb-at-0g', lsb_at_0g, -math.inf),
-        rate, drop_bad_stamps, drop_bad_samples, parse_mounting(axes) if axes else None)
+        topic,
+        parse_mapping(_mapping_text(columns)) if columns else None,
+        parse_unit(unit),
+        _counts('--lsb-per-g', lsb_per_g, 0.0),
+        _counts('--lsb-at-0g', lsb_at_0g, -math.inf),
+        rate,
+        drop_bad_stamps,
+        drop_bad_samples,
+        parse_mounting(axes) if axes else None,
+    )
 
 
 def _mapping_text(columns: str | Mapping[str, str | tuple[str, str]]) -> str:
     """Return a mapping as text; a tuple is column and unit."""
     if isinstance(columns, str):
         return columns
-    return ','.join(f'{role}={source}' if isinstance(source, str) else
-                    str(ColumnMapping({role: Source(*source)}))
-                    for role, source in columns.items())
+    return ','.join(
+        f'{role}={source}'
+        if isinstance(source, str)
+        else str(ColumnMapping({role: Source(*source)}))
+        for role, source in columns.items()
+    )
 
 
 def _counts(option: str, given: Counts, above: float) -> tuple[float, ...]:
@@ -119,14 +146,22 @@ def _counts(option: str, given: Counts, above: float) -> tuple[float, ...]:
     except ValueError:
         values = (math.nan,)
     if not all(above < value < math.inf for value in values):
-        raise UserError(f'{option} {given}: expected counts, for example 16384 or '
-                        '16384,16384,16500')
+        raise UserError(
+            f'{option} {given}: expected counts, for example 16384 or 16384,16384,16500'
+        )
     return values
 
 
-def from_arrays(table: Mapping[str, Any] | Any = None, /, *, rate: float | None = None,
-                serial: str = '', name: str = 'arrays', drop_bad_stamps: bool = False,
-                **columns: Any) -> Recording:
+def from_arrays(
+    table: Mapping[str, Any] | Any = None,
+    /,
+    *,
+    rate: float | None = None,
+    serial: str = '',
+    name: str = 'arrays',
+    drop_bad_stamps: bool = False,
+    **columns: Any,
+) -> Recording:
     """
     Make a recording of arrays.
 
@@ -161,17 +196,22 @@ def from_arrays(table: Mapping[str, Any] | Any = None, /, *, rate: float | None 
     arrays = _numbers({} if table is None else table)
     for key, values in columns.items():
         if key not in (TIME, *VOLTS, *ACCEL, *REFERENCES):
-            raise UserError(f'{name}: no array {key!r} is known, but '
-                            f'{", ".join((TIME, *ACCEL, *VOLTS, *REFERENCES))}')
+            raise UserError(
+                f'{name}: no array {key!r} is known, but '
+                f'{", ".join((TIME, *ACCEL, *VOLTS, *REFERENCES))}'
+            )
         arrays[key] = np.asarray(values, float)
     lengths = {key: values.shape for key, values in arrays.items()}
     if len(set(lengths.values())) > 1 or any(len(shape) != 1 for shape in lengths.values()):
-        raise UserError(f'{name}: arrays must have one dimension and the same length, but have '
-                        + ', '.join(f'{key} {shape}' for key, shape in lengths.items()))
+        raise UserError(
+            f'{name}: arrays must have one dimension and the same length, but have '
+            + ', '.join(f'{key} {shape}' for key, shape in lengths.items())
+        )
     if rate is not None and arrays:
         arrays = {TIME: np.arange(next(iter(arrays.values())).size) / rate, **arrays}
-    return recording_files.of_table(_table(arrays, name, serial),
-                                    reading_options(rate=rate, drop_bad_stamps=drop_bad_stamps))
+    return recording_files.of_table(
+        _table(arrays, name, serial), reading_options(rate=rate, drop_bad_stamps=drop_bad_stamps)
+    )
 
 
 def _numbers(table: Any) -> dict[str, np.ndarray]:
@@ -217,8 +257,10 @@ class RobotInput(NamedTuple):
     def path(self, read: Recording, sensor: Sensor) -> RobotPath:
         """Return the motion of the robot in a recording."""
         from adxl_ros.simulate import robot
-        return robot.robot_path(self.urdf, self.frame, read.path, read.epoch_ns,
-                                sensor.local_gravity_mps2, self.joints)
+
+        return robot.robot_path(
+            self.urdf, self.frame, read.path, read.epoch_ns, sensor.local_gravity_mps2, self.joints
+        )
 
 
 def read_ideal(given: RecordingInput, epoch_ns: int) -> Recording:

@@ -55,11 +55,15 @@ class Result:
     def _repr_html_(self) -> str:
         """Return the top of the page for a notebook."""
         top = self.first_screen
-        tiles = ''.join('<td style="text-align:left">' + '<br>'.join(map(escape, tile)) + '</td>'
-                        for tile in top.tiles)
-        return (f'<div style="border-left:7px solid {_COLOURS[top.colour]};padding:.5em .9em">'
-                f'<b>{escape(top.word)}</b> {escape(top.sentence)}</div>'
-                f'<table><tr>{tiles}</tr></table>')
+        tiles = ''.join(
+            '<td style="text-align:left">' + '<br>'.join(map(escape, tile)) + '</td>'
+            for tile in top.tiles
+        )
+        return (
+            f'<div style="border-left:7px solid {_COLOURS[top.colour]};padding:.5em .9em">'
+            f'<b>{escape(top.word)}</b> {escape(top.sentence)}</div>'
+            f'<table><tr>{tiles}</tr></table>'
+        )
 
 
 def require_least(name: str, value: float | None, least: float) -> None:

@@ -40,8 +40,11 @@ def with_effects(sensor: Sensor, effects: Iterable[EffectInput]) -> Sensor:
     for name, given in effects:
         try:
             effect = effect_named(name)
-            values = dict(sensor.values.get(name) or neutral(effect, sensor.axes)) \
-                if given else typical(effect, sensor.axes)
+            values = (
+                dict(sensor.values.get(name) or neutral(effect, sensor.axes))
+                if given
+                else typical(effect, sensor.axes)
+            )
             for key, number in given.items():
                 _put(effect, values, sensor.axes, key, number)
         except UserError as error:
@@ -62,13 +65,17 @@ def _put(effect: Effect, values: dict[str, np.ndarray], axes: str, key: str, num
     with suppress(ValueError, TypeError):
         value = float(number)
     if not parameter.lower <= value <= parameter.upper:
-        raise UserError(f'{number!r} is not a number from {parameter.lower:g} to '
-                        f'{parameter.upper:g} ({parameter.unit}); a typical {name} is '
-                        f'{parameter.scale:g}')
+        raise UserError(
+            f'{number!r} is not a number from {parameter.lower:g} to '
+            f'{parameter.upper:g} ({parameter.unit}); a typical {name} is '
+            f'{parameter.scale:g}'
+        )
     chosen = [a in parameter.axes and axis in ('', a) for a in axes]
     if not any(chosen) and (parameter.axes or axis):
-        raise UserError(f'no axis {axis!r} to act on; the sensor has {axes}, {name} acts on '
-                        f'{parameter.axes or "none, it is one number"}')
+        raise UserError(
+            f'no axis {axis!r} to act on; the sensor has {axes}, {name} acts on '
+            f'{parameter.axes or "none, it is one number"}'
+        )
     values[name] = np.where(chosen if parameter.axes else True, value, values[name])
 
 
@@ -98,23 +105,32 @@ class Simulation:
     def screen(self) -> list[str]:
         """Return the lines of the tool's screen."""
         sensor = self.sensor
-        return [f'Simulated {self.name}: {self.motion.duration_s:.4g} s at '
-                f'{sensor.rate_hz:.4g} Hz, axes {sensor.axes}. Sensor {sensor.serial}, effects: '
-                f'{", ".join(sensor.effects) or "none"}.', *self.assumed]
+        return [
+            f'Simulated {self.name}: {self.motion.duration_s:.4g} s at '
+            f'{sensor.rate_hz:.4g} Hz, axes {sensor.axes}. Sensor {sensor.serial}, effects: '
+            f'{", ".join(sensor.effects) or "none"}.',
+            *self.assumed,
+        ]
 
 
-def prepare(trajectory: RecordingInput, sensor: SensorInput | None = None,
-            effects: Sequence[EffectInput] = (), force: RecordingInput | None = None,
-            rate: float | None = None, seed: int = 0) -> Simulation:
+def prepare(
+    trajectory: RecordingInput,
+    sensor: SensorInput | None = None,
+    effects: Sequence[EffectInput] = (),
+    force: RecordingInput | None = None,
+    rate: float | None = None,
+    seed: int = 0,
+) -> Simulation:
     """Check what is to be simulated, and return it; see `simulate`."""
     require_least('seed', seed, 0)
     bounds = parameter_file.SENSOR_FIELDS['sensor.rate_hz'].metadata
     if rate is not None and not bounds['lower'] <= rate <= bounds['upper']:
-        raise UserError(f'--rate {rate:g}: outside {bounds["lower"]:g} to '
-                        f'{bounds["upper"]:g} Hz')
+        raise UserError(f'--rate {rate:g}: outside {bounds["lower"]:g} to {bounds["upper"]:g} Hz')
     if (trajectory == IMU) != (force is not None):
-        raise UserError('--force RECORDING and the trajectory imu need each other: '
-                        'simulate imu --force RECORDING')
+        raise UserError(
+            '--force RECORDING and the trajectory imu need each other: '
+            'simulate imu --force RECORDING'
+        )
     unit = _stated(sensor)
     unit = with_effects(unit if rate is None else replace(unit, rate_hz=rate), effects)
     left_out = [] if force is not None else _left_out(unit, {name for name, _ in effects})
@@ -134,8 +150,10 @@ def _stated(given: SensorInput | None) -> Sensor:
     if not isinstance(sensor, Sensor):
         return parameter_file.load(sensor or parameter_file.nominal_path())
     if sensor.unstated:
-        raise UserError(f'{sensor.serial}: states no {", ".join(sensor.unstated)}, which a '
-                        'simulation needs; name a sensor that does')
+        raise UserError(
+            f'{sensor.serial}: states no {", ".join(sensor.unstated)}, which a '
+            'simulation needs; name a sensor that does'
+        )
     return sensor
 
 
@@ -145,8 +163,10 @@ def _left_out(sensor: Sensor, asked: set[str]) -> list[str]:
     for name in sensor.effects:
         if effect_named(name).concern is Concern.REFERENCE:
             if name in asked:
-                raise UserError(f'--effect {name}: acts on the specific force of a recording; say '
-                                'simulate imu --force RECORDING, or leave the effect out')
+                raise UserError(
+                    f'--effect {name}: acts on the specific force of a recording; say '
+                    'simulate imu --force RECORDING, or leave the effect out'
+                )
             lines.append(f'{name} is an error of the reference, and is left out')
     return lines
 
@@ -154,8 +174,10 @@ def _left_out(sensor: Sensor, asked: set[str]) -> list[str]:
 def _existing(trajectory: RecordingInput) -> RecordingInput:
     """Refuse a text that is neither a recording nor a trajectory."""
     if not isinstance(trajectory, Recording) and not Path(trajectory).exists():
-        raise UserError(f'{trajectory}: neither a recording nor one of the trajectories '
-                        f'{", ".join((*TRAJECTORIES, IMU))}')
+        raise UserError(
+            f'{trajectory}: neither a recording nor one of the trajectories '
+            f'{", ".join((*TRAJECTORIES, IMU))}'
+        )
     return trajectory
 
 
@@ -173,14 +195,21 @@ def _by_references(read: Recording, sensor: Sensor, rate_hz: float | None) -> Si
     motion, like = motion_from_references(read, sensor), None
     if rate_hz is None:
         sensor, like = replace(sensor, rate_hz=read.rate_hz), read
-    return Simulation(read.path, sensor, motion, float(read.time_s[0]), like,
-                      assumed(read, sensor.effects))
+    return Simulation(
+        read.path, sensor, motion, float(read.time_s[0]), like, assumed(read, sensor.effects)
+    )
 
 
-def simulate(trajectory: RecordingInput, sensor: SensorInput | None = None, *,
-             effects: Mapping[str, Mapping[str, Any] | None] | Sequence[str] = (),
-             force: RecordingInput | None = None, rate: float | None = None, seed: int = 0,
-             progress: Progress = no_progress) -> Recording:
+def simulate(
+    trajectory: RecordingInput,
+    sensor: SensorInput | None = None,
+    *,
+    effects: Mapping[str, Mapping[str, Any] | None] | Sequence[str] = (),
+    force: RecordingInput | None = None,
+    rate: float | None = None,
+    seed: int = 0,
+    progress: Progress = no_progress,
+) -> Recording:
     """
     Simulate a recording of a manoeuvre by a sensor with effects.
 
@@ -219,8 +248,14 @@ def simulate(trajectory: RecordingInput, sensor: SensorInput | None = None, *,
 
     """
     given = effects if isinstance(effects, Mapping) else dict.fromkeys(effects)
-    made = prepare(trajectory, sensor, [(name, _flat(values or {}))
-                                        for name, values in given.items()], force, rate, seed)
+    made = prepare(
+        trajectory,
+        sensor,
+        [(name, _flat(values or {})) for name, values in given.items()],
+        force,
+        rate,
+        seed,
+    )
     blocks = []
     for block in made.blocks(seed):
         blocks.append(block)

@@ -42,9 +42,14 @@ class RecordedPoses:
     faults: Sequence[str] = ()  # What is wrong between the samples, one line each
 
 
-def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None = None,
-              effects: Sequence[str] = (), data_sha256: str = '',
-              population: Population | None = None) -> CalibrationResult:
+def calibrate(
+    sensor: Sensor,
+    recordings: Sequence[RecordedPoses],
+    model: str | None = None,
+    effects: Sequence[str] = (),
+    data_sha256: str = '',
+    population: Population | None = None,
+) -> CalibrationResult:
     """
     Fit the poses of one unit: against the stage where there are angles, else against gravity.
 
@@ -83,27 +88,45 @@ def calibrate(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | 
         if at_rail.all():
             raise UserError(f'{source}: {text}: no other is left; check supply and wiring')
         lines = [f'{text}, left out: check supply and wiring']
-        recordings = [replace(recording, poses=recording.poses.subset(
-            ~at_a_rail(sensor, recording.poses))) for recording in recordings]
+        recordings = [
+            replace(recording, poses=recording.poses.subset(~at_a_rail(sensor, recording.poses)))
+            for recording in recordings
+        ]
         poses = poses.subset(~at_rail)
     doubts = require_unit(of_volts(poses.volts, poses.std_v, sensor), source, True)
     doubts += [fault for recording in recordings for fault in recording.faults]
     if poses.has_angles.any():
-        with_angles = [replace(recording, poses=recording.poses.subset(recording.poses.has_angles))
-                       for recording in recordings]
-        result = _against_stage(sensor, with_angles, model or ('full' if effects else None),
-                                effects, source, data_sha256, population, doubts)
+        with_angles = [
+            replace(recording, poses=recording.poses.subset(recording.poses.has_angles))
+            for recording in recordings
+        ]
+        result = _against_stage(
+            sensor,
+            with_angles,
+            model or ('full' if effects else None),
+            effects,
+            source,
+            data_sha256,
+            population,
+            doubts,
+        )
         starts_s = poses.time_s[~poses.has_angles, 0]
         if len(starts_s):
-            lines.append(f'rests without angles, left out: {len(starts_s)} (the first one from '
-                         f'{starts_s[0]:.1f} s)')
+            lines.append(
+                f'rests without angles, left out: {len(starts_s)} (the first one from '
+                f'{starts_s[0]:.1f} s)'
+            )
     elif model not in (None, 'full'):
-        raise UserError(f'{source}: the {model} model is fitted against stage angles (alpha_rad '
-                        'and beta_rad), which are missing; leave --model out to calibrate a '
-                        'three-axis sensor against gravity')
+        raise UserError(
+            f'{source}: the {model} model is fitted against stage angles (alpha_rad '
+            'and beta_rad), which are missing; leave --model out to calibrate a '
+            'three-axis sensor against gravity'
+        )
     elif sensor.axes != AXES:
-        raise UserError(f'{source}: no stage angles and only the axes {sensor.axes}: the '
-                        'magnitude of gravity needs x, y and z; record alpha_rad and beta_rad')
+        raise UserError(
+            f'{source}: no stage angles and only the axes {sensor.axes}: the '
+            'magnitude of gravity needs x, y and z; record alpha_rad and beta_rad'
+        )
     else:
         span_s = sum(float(np.ptp(recording.poses.time_s)) for recording in recordings)
         result = _against_gravity(sensor, poses, source, span_s, data_sha256, population, doubts)
@@ -120,43 +143,74 @@ class _StageFit:
     notes: Sequence[str] = ()  # What to know about the choice of the model
 
 
-def _against_stage(sensor: Sensor, recordings: Sequence[RecordedPoses], model: str | None,
-                   effects: Sequence[str], source: str, data_sha256: str,
-                   population: Population | None, doubts: list[str]) -> CalibrationResult:
+def _against_stage(
+    sensor: Sensor,
+    recordings: Sequence[RecordedPoses],
+    model: str | None,
+    effects: Sequence[str],
+    source: str,
+    data_sha256: str,
+    population: Population | None,
+    doubts: list[str],
+) -> CalibrationResult:
     poses = Poses.joined([recording.poses for recording in recordings])
     _check_polarity(sensor, poses)
     fit = _richest_fit(sensor, poses.subset(~poses.check), recordings, model, effects)
     if population is not None:
         fit = _with_population(fit, population)
     full, fitted, fitting = fit.full, fit.fitted, np.flatnonzero(~poses.check)
-    fit_lines, warnings, outliers = ([], [], ()) if full is None else (
-        full_model.report_lines(full, poses.subset(fitting), fit.terms),
-        full_model.warnings(full, poses.subset(fitting)),
-        tuple(fitting[list(full.outliers)].tolist()))
+    fit_lines, warnings, outliers = (
+        ([], [], ())
+        if full is None
+        else (
+            full_model.report_lines(full, poses.subset(fitting), fit.terms),
+            full_model.warnings(full, poses.subset(fitting)),
+            tuple(fitting[list(full.outliers)].tolist()),
+        )
+    )
     errors, assessments = _assessed(
-        sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit, not doubts)
+        sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit, not doubts
+    )
     assessment = acceptance.judged(assessments[-1], fitted) if assessments else None
     assessments = (*assessments[:-1], assessment) if assessment else ()
     force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
-    residual_mg = ((poses.volts - predicted_volts(fitted, poses)) / fitted.scale_v_per_g
-                   * 1e3)[fitting]
+    residual_mg = ((poses.volts - predicted_volts(fitted, poses)) / fitted.scale_v_per_g * 1e3)[
+        fitting
+    ]
     if fitted.model == 'full':
         fitted, filter_lines = recorded_sensor.with_filter(
-            fitted, [recording.filters for recording in recordings if recording.filters])
+            fitted, [recording.filters for recording in recordings if recording.filters]
+        )
         fit_lines += filter_lines
     error_mps2 = np.nan_to_num(np.sqrt(assessment.accel.calibration)).item() if assessment else 0.0
     fitted = replace(fitted, envelope=envelope(fitted, force, poses, error_mps2))
-    fitted = with_provenance(fitted, source, poses, data_sha256, {
-        'reference': 'stage', **({'prior': population.name} if population else {}),
-        'residual_mg': f'{np.sqrt(np.mean(residual_mg ** 2)):.4f}',
-        **({'converged': 'yes' if full.converged else 'no'} if full else {}),
-        **acceptance.provenance_entries(assessment, errors, doubts)})
+    fitted = with_provenance(
+        fitted,
+        source,
+        poses,
+        data_sha256,
+        {
+            'reference': 'stage',
+            **({'prior': population.name} if population else {}),
+            'residual_mg': f'{np.sqrt(np.mean(residual_mg**2)):.4f}',
+            **({'converged': 'yes' if full.converged else 'no'} if full else {}),
+            **acceptance.provenance_entries(assessment, errors, doubts),
+        },
+    )
     summary = acceptance.summary_lines(
-        fitted, assessment, acceptance.held_out_lines(errors, len(poses) - len(outliers)))
+        fitted, assessment, acceptance.held_out_lines(errors, len(poses) - len(outliers))
+    )
     return CalibrationResult(
-        nominal=sensor, fitted=fitted, summary=summary, poses=poses, assessments=assessments,
-        held_out=errors, outliers=outliers, warnings=[*doubts, *warnings, *fit.notes],
-        details=fit_lines)
+        nominal=sensor,
+        fitted=fitted,
+        summary=summary,
+        poses=poses,
+        assessments=assessments,
+        held_out=errors,
+        outliers=outliers,
+        warnings=[*doubts, *warnings, *fit.notes],
+        details=fit_lines,
+    )
 
 
 def _check_polarity(sensor: Sensor, poses: Poses) -> None:
@@ -165,10 +219,12 @@ def _check_polarity(sensor: Sensor, poses: Poses) -> None:
         return
     reference = reference_force(poses, sensor.local_gravity_mps2)
     with np.errstate(invalid='ignore', divide='ignore'):
-        correlation = np.array([[np.corrcoef(volts, force)[0, 1] for force in reference]
-                                for volts in poses.volts.T])
+        correlation = np.array(
+            [[np.corrcoef(volts, force)[0, 1] for force in reference] for volts in poses.volts.T]
+        )
     fault = recorded_sensor.find_polarity_fault(
-        correlation, [AXES.index(a) for a in sensor.axes], recorded_sensor.CERTAIN_CORRELATION)
+        correlation, [AXES.index(a) for a in sensor.axes], recorded_sensor.CERTAIN_CORRELATION
+    )
     if fault is not None:
         raise UserError(fault.describe(sensor.axes[fault.axis], AXES[fault.follows]))
 
@@ -181,33 +237,53 @@ def _with_population(fit: _StageFit, population: Population) -> _StageFit:
         fitted = fit.refit(sensor, poses)
         return fitted if combined.is_stranger else posterior(fitted, population).sensor
 
-    return replace(fit, fitted=combined.sensor, refit=refit,
-                   notes=[f'prior: {combined.line}', *fit.notes])
+    return replace(
+        fit, fitted=combined.sensor, refit=refit, notes=[f'prior: {combined.line}', *fit.notes]
+    )
 
 
-def _assessed(sensor: Sensor, inliers: Poses, fit: _StageFit, is_sound: bool
-              ) -> tuple[tuple[HeldOutErrors, ...], tuple[Assessment, ...]]:
+def _assessed(
+    sensor: Sensor, inliers: Poses, fit: _StageFit, is_sound: bool
+) -> tuple[tuple[HeldOutErrors, ...], tuple[Assessment, ...]]:
     """Return held-out errors and acceptance of the fit and of all simpler models."""
     # The reference of all models is the stage with its fitted errors.
     stage = fit.full.unit if fit.full else None
     models = list(STAGE_FITS)
-    simpler = {name: STAGE_FITS[name] for name in models[:models.index(fit.fitted.model)]}
+    simpler = {name: STAGE_FITS[name] for name in models[: models.index(fit.fitted.model)]}
     errors = held_out.cross_validate(
         {'nominal': lambda sensor, _: sensor, **simpler, fit.fitted.model: fit.refit},
-        sensor, inliers, stage)
-    is_certain = is_sound and (fit.full is None or fit.full.converged) and \
-        not acceptance.open_coefficients(fit.fitted)
+        sensor,
+        inliers,
+        stage,
+    )
+    is_certain = (
+        is_sound
+        and (fit.full is None or fit.full.converged)
+        and not acceptance.open_coefficients(fit.fitted)
+    )
     if not errors or errors[-1].model != fit.fitted.model:
         return (), ()
     return tuple(errors), tuple(
-        acceptance.assess(row.model, held_out.error_budgets(row, inliers, stage), sensor,
-                          is_certain or (is_sound and row.model != fit.fitted.model))
-        for row in errors if row.model != 'nominal')
+        acceptance.assess(
+            row.model,
+            held_out.error_budgets(row, inliers, stage),
+            sensor,
+            is_certain or (is_sound and row.model != fit.fitted.model),
+        )
+        for row in errors
+        if row.model != 'nominal'
+    )
 
 
-def _richest_fit(sensor: Sensor, poses: Poses, recordings: Sequence[RecordedPoses],
-                 model: str | None, effects: Sequence[str]) -> _StageFit:
+def _richest_fit(
+    sensor: Sensor,
+    poses: Poses,
+    recordings: Sequence[RecordedPoses],
+    model: str | None,
+    effects: Sequence[str],
+) -> _StageFit:
     """Fit a model, or the richest one that the poses determine; also note why no richer one."""
+
     def fitted(name: str) -> _StageFit:
         if name != 'full':
             return _StageFit(STAGE_FITS[name](sensor, poses), STAGE_FITS[name])
@@ -237,11 +313,15 @@ def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
     """Fit the twelve coefficients of a three-axis unit to poses that determine no more."""
     full = full_model.fit_full(sensor, poses, linear.AFFINE, full_model.MAX_OPEN)
     still_open = acceptance.open_coefficients(full.fitted)
-    notes = [f'{len(poses)} poses determine zero-g, scale factor and misalignment, no further '
-             'terms; more poses show those']
+    notes = [
+        f'{len(poses)} poses determine zero-g, scale factor and misalignment, no further '
+        'terms; more poses show those'
+    ]
     if still_open:
-        notes.append(f'open, by its prior alone: {", ".join(map(str, still_open))}; add poses '
-                     'with this axis up and down')
+        notes.append(
+            f'open, by its prior alone: {", ".join(map(str, still_open))}; add poses '
+            'with this axis up and down'
+        )
 
     def refit(sensor: Sensor, poses: Poses) -> Sensor:
         # With more open coefficients it would be another fit, whose errors are not those of this.
@@ -277,40 +357,59 @@ def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[Recorde
         worst = int(np.argmax(deviations))
         if deviations[worst] <= _MIN_DEVIATIONS:
             continue
-        change = f'case is turned by {np.degrees(changes[worst]):.2f} deg about {AXES[worst]}' \
-            if worst < 3 else \
-            f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
+        change = (
+            f'case is turned by {np.degrees(changes[worst]):.2f} deg about {AXES[worst]}'
+            if worst < 3
+            else f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
+        )
         raise _ContradictionError(
             f'{recording.source}: {change} from the fit of all recordings '
             f'({deviations[worst]:.0f} standard deviations): another unit or another '
-            'mounting; fit this recording separately')
+            'mounting; fit this recording separately'
+        )
 
 
 def _turn_and_shifts(full: full_model.FullFit, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
     """Fit turn, rad, (3,), and zero-g shifts, g, (m,), to residuals; return values and std."""
     unit = full.unit
     force = reference_force(poses, unit.local_gravity_mps2)
-    by_force = np.moveaxis(signal_chain.jacobian(
-        signal_chain.analog_response(unit), force, poses.environment), 2, 0)
+    by_force = np.moveaxis(
+        signal_chain.jacobian(signal_chain.analog_response(unit), force, poses.environment), 2, 0
+    )
     turned = np.stack([np.cross(axis, np.column_stack(force)) for axis in np.eye(3)], axis=2)
-    shifted = np.broadcast_to(np.diag(unit.scale_v_per_g),
-                              (len(poses), len(unit.axes), len(unit.axes)))
+    shifted = np.broadcast_to(
+        np.diag(unit.scale_v_per_g), (len(poses), len(unit.axes), len(unit.axes))
+    )
     information, gradient = volts_covariance(unit, poses, full.stage).normal_equations(
         np.concatenate([by_force @ turned, shifted], axis=2),
-        poses.volts - predicted_volts(unit, poses))
+        poses.volts - predicted_volts(unit, poses),
+    )
     covariance = np.linalg.pinv(information, rcond=_MIN_EIGENVALUE_RATIO)
     return covariance @ gradient, np.sqrt(np.maximum(np.diag(covariance), _MIN_VARIANCE))
 
 
-def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, data_sha256: str,
-                     population: Population | None, doubts: list[str]) -> CalibrationResult:
+def _against_gravity(
+    sensor: Sensor,
+    poses: Poses,
+    source: str,
+    span_s: float,
+    data_sha256: str,
+    population: Population | None,
+    doubts: list[str],
+) -> CalibrationResult:
     fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
-    after, unseen = (rms_mg(np.mean(values[kept] ** 2))
-                     for values in (fit.residual_mps2, fit.held_out_mps2))
+    after, unseen = (
+        rms_mg(np.mean(values[kept] ** 2)) for values in (fit.residual_mps2, fit.held_out_mps2)
+    )
     fitted = replace(
-        sensor, model='gravity', effects=('bias', 'scale_factor', 'misalignment'),
-        values=fit.values, covariance=fit.covariance, covariance_names=gravity_fit.NAMES)
+        sensor,
+        model='gravity',
+        effects=('bias', 'scale_factor', 'misalignment'),
+        values=fit.values,
+        covariance=fit.covariance,
+        covariance_names=gravity_fit.NAMES,
+    )
     warnings = [*doubts, *([] if fit.converged else [full_model.NOT_CONVERGED])]
     if fit.note:
         warnings.append(fit.note)
@@ -322,29 +421,54 @@ def _against_gravity(sensor: Sensor, poses: Poses, source: str, span_s: float, d
     budgets = acceptance.gravity_error_budgets(fit, fitted, force, kept)
     assessment = acceptance.assess('gravity', budgets, fitted, fit.converged and not doubts)
     if fit.step.left_out:
-        assessment = acceptance.with_open(assessment, acceptance.gravity_error_budgets(
-            fit, _without(fitted, fit.step.left_out), force, kept), fitted)
+        assessment = acceptance.with_open(
+            assessment,
+            acceptance.gravity_error_budgets(
+                fit, _without(fitted, fit.step.left_out), force, kept
+            ),
+            fitted,
+        )
     assessment = acceptance.judged(assessment, fitted)
-    fitted = replace(fitted, envelope=envelope(fitted, force[kept], poses,
-                                               float(np.sqrt(budgets.accel.model))))
-    fitted = with_provenance(fitted, source, poses, data_sha256, {
-        'reference': 'gravity', **({'prior': population.name} if population else {}),
-        'residual_mg': f'{after:.4f}', 'held_out_mg': f'{unseen:.4f}',
-        **({'span_s': f'{span_s:.1f}'} if span_s else {}),
-        'converged': 'yes' if fit.converged else 'no',
-        **acceptance.provenance_entries(assessment, (), doubts)})
+    fitted = replace(
+        fitted, envelope=envelope(fitted, force[kept], poses, float(np.sqrt(budgets.accel.model)))
+    )
+    fitted = with_provenance(
+        fitted,
+        source,
+        poses,
+        data_sha256,
+        {
+            'reference': 'gravity',
+            **({'prior': population.name} if population else {}),
+            'residual_mg': f'{after:.4f}',
+            'held_out_mg': f'{unseen:.4f}',
+            **({'span_s': f'{span_s:.1f}'} if span_s else {}),
+            'converged': 'yes' if fit.converged else 'no',
+            **acceptance.provenance_entries(assessment, (), doubts),
+        },
+    )
     summary = acceptance.summary_lines(
-        fitted, assessment, acceptance.gravity_lines(fit, poses.time_s[:, 0]))
+        fitted, assessment, acceptance.gravity_lines(fit, poses.time_s[:, 0])
+    )
     return CalibrationResult(
-        nominal=sensor, fitted=fitted, summary=summary, poses=poses, assessments=(assessment,),
-        gravity_fit=fit, warnings=warnings)
+        nominal=sensor,
+        fitted=fitted,
+        summary=summary,
+        poses=poses,
+        assessments=(assessment,),
+        gravity_fit=fit,
+        warnings=warnings,
+    )
 
 
 def _without(sensor: Sensor, names: Sequence[Coefficient]) -> Sensor:
     """Return a sensor for which some of the coefficients count as exact."""
     kept = [i for i, name in enumerate(sensor.covariance_names) if name not in names]
-    return replace(sensor, covariance=sensor.covariance[np.ix_(kept, kept)],
-                   covariance_names=tuple(sensor.covariance_names[i] for i in kept))
+    return replace(
+        sensor,
+        covariance=sensor.covariance[np.ix_(kept, kept)],
+        covariance_names=tuple(sensor.covariance_names[i] for i in kept),
+    )
 
 
 def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
@@ -352,16 +476,28 @@ def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
     on_stage = [poses.subset(poses.has_angles) for poses in recordings if poses.has_angles.any()]
     if len(on_stage) < 2:
         return []
-    changes_mg = [1e3 * np.mean((poses.volts - predicted_volts(fitted, poses))
-                                / fitted.scale_v_per_g, axis=0) for poses in on_stage]
-    by_axis = ', '.join(f'{axis} {value:.2g}' for axis, value in zip(
-        fitted.axes, np.std(changes_mg, axis=0, ddof=1)))
-    return [f'turn-on to turn-on: the zero-g scatters by {by_axis} mg (standard deviation over '
-            f'{len(on_stage)} recordings)']
+    changes_mg = [
+        1e3
+        * np.mean((poses.volts - predicted_volts(fitted, poses)) / fitted.scale_v_per_g, axis=0)
+        for poses in on_stage
+    ]
+    by_axis = ', '.join(
+        f'{axis} {value:.2g}'
+        for axis, value in zip(fitted.axes, np.std(changes_mg, axis=0, ddof=1))
+    )
+    return [
+        f'turn-on to turn-on: the zero-g scatters by {by_axis} mg (standard deviation over '
+        f'{len(on_stage)} recordings)'
+    ]
 
 
-def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str = '',
-                      range_c: tuple[float, float] | None = None) -> CalibrationResult:
+def calibrate_thermal(
+    base: Sensor,
+    poses: Poses,
+    source: str,
+    data_sha256: str = '',
+    range_c: tuple[float, float] | None = None,
+) -> CalibrationResult:
     """Fit zero-g over temperature, and the slope of the scale factor where orientations allow."""
     doubts = require_unit(of_volts(poses.volts, poses.std_v, base), source, True)
     blocks = thermal_fit.blocks_of(poses)
@@ -370,36 +506,59 @@ def calibrate_thermal(base: Sensor, poses: Poses, source: str, data_sha256: str 
     fitted = thermal_fit.applied(base, fit, calibrated_c)
     has_scale = any(name.effect == 'temperature_scale' for name in fit.names)
     low_c, high_c = range_c or fit.span_c
-    misfit_mps2 = float(np.sqrt(np.mean(fit.rms_g ** 2))) * G0_MPS2
-    fitted = replace(fitted, envelope=replace(
-        base.envelope, temperature_c=fit.span_c, zero_g_per_k=0.0,
-        scale_per_k=0.0 if has_scale else base.envelope.scale_per_k,
-        misfit_mps2=float(np.hypot(base.envelope.misfit_mps2, misfit_mps2)),
-        zero_g_nodes_c=tuple(fit.further.nodes_c.tolist()),
-        zero_g_next=tuple(fit.further.size.tolist()),
-        zero_g_at_c=calibrated_c))
-    fitted = with_provenance(fitted, source, poses, data_sha256, {
-        'reference': 'rest over temperature', 'base': base.provenance.get('id', base.serial),
-        'residual_mg': f'{mg(misfit_mps2):.4f}'})
+    misfit_mps2 = float(np.sqrt(np.mean(fit.rms_g**2))) * G0_MPS2
+    fitted = replace(
+        fitted,
+        envelope=replace(
+            base.envelope,
+            temperature_c=fit.span_c,
+            zero_g_per_k=0.0,
+            scale_per_k=0.0 if has_scale else base.envelope.scale_per_k,
+            misfit_mps2=float(np.hypot(base.envelope.misfit_mps2, misfit_mps2)),
+            zero_g_nodes_c=tuple(fit.further.nodes_c.tolist()),
+            zero_g_next=tuple(fit.further.size.tolist()),
+            zero_g_at_c=calibrated_c,
+        ),
+    )
+    fitted = with_provenance(
+        fitted,
+        source,
+        poses,
+        data_sha256,
+        {
+            'reference': 'rest over temperature',
+            'base': base.provenance.get('id', base.serial),
+            'residual_mg': f'{mg(misfit_mps2):.4f}',
+        },
+    )
     covered = thermal_fit.passed(blocks.temperature_c, (low_c, high_c))
     error_mg = thermal_fit.expected_error_mg(fit, covered, calibrated_c)
     std = dict(zip(fit.names, Z_90 * np.sqrt(np.diag(fit.covariance))))
-    pairs = [[Coefficient('temperature_bias', name, axis) for name in ('per_k', 'per_k2')]
-             for axis in fitted.axes]
+    pairs = [
+        [Coefficient('temperature_bias', name, axis) for name in ('per_k', 'per_k2')]
+        for axis in fitted.axes
+    ]
     lines = [
         f'zero-g over temperature: {len(blocks)} blocks at rest, '
         f'{fit.span_c[0]:.1f} to {fit.span_c[1]:.1f} °C',
-        *(f'  {slope.axis}  {with_half_width(k * 1e3, std[slope] * 1e3)} mg/K at 25 °C, '
-          f'{with_half_width(k2 * 1e6, std[curvature] * 1e6)} µg/K²'
-          for slope, curvature in pairs for k, k2 in [get(fitted, [slope, curvature])]),
-        'residual ' + ', '.join(f'{axis} {value * 1e3:.2g}' for axis, value in zip(
-            base.axes, fit.rms_g)) + ' mg rms',
+        *(
+            f'  {slope.axis}  {with_half_width(k * 1e3, std[slope] * 1e3)} mg/K at 25 °C, '
+            f'{with_half_width(k2 * 1e6, std[curvature] * 1e6)} µg/K²'
+            for slope, curvature in pairs
+            for k, k2 in [get(fitted, [slope, curvature])]
+        ),
+        'residual '
+        + ', '.join(f'{axis} {value * 1e3:.2g}' for axis, value in zip(base.axes, fit.rms_g))
+        + ' mg rms',
         f'warming and cooling differ: {fit.history} ({fit.shape:.3g} '
-        f'{"s" if fit.history == "thermal_lag" else "K"})' if fit.history else
-        'no thermal_lag or thermal_hysteresis shows',
+        f'{"s" if fit.history == "thermal_lag" else "K"})'
+        if fit.history
+        else 'no thermal_lag or thermal_hysteresis shows',
         f'expected error of the zero-g over {low_c:.0f} to {high_c:.0f} °C: {error_mg:.2g} mg',
-        f'zero-g stays as calibrated at {calibrated_c:.1f} °C']
+        f'zero-g stays as calibrated at {calibrated_c:.1f} °C',
+    ]
     if not has_scale:
         lines.append('scale factor over temperature: not fitted, it needs a second orientation')
-    return CalibrationResult(nominal=base, fitted=fitted, summary=lines, poses=poses,
-                             warnings=doubts)
+    return CalibrationResult(
+        nominal=base, fitted=fitted, summary=lines, poses=poses, warnings=doubts
+    )

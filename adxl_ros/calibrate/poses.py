@@ -52,41 +52,67 @@ class Poses:
                 object.__setattr__(self, name, np.full(len(self.volts), np.nan))
         for joint in ('alpha', 'beta'):
             if getattr(self, f'{joint}_setting') is None:
-                object.__setattr__(self, f'{joint}_setting', _settings_by_angle(
-                    getattr(self, f'{joint}_rad'), self.time_s[:, 0]))
+                object.__setattr__(
+                    self,
+                    f'{joint}_setting',
+                    _settings_by_angle(getattr(self, f'{joint}_rad'), self.time_s[:, 0]),
+                )
 
     def __len__(self) -> int:
         """Return the number of poses."""
         return len(self.volts)
 
     @classmethod
-    def without_volts(cls, alpha_rad: np.ndarray, beta_rad: np.ndarray, std_v: np.ndarray
-                      ) -> Poses:
+    def without_volts(
+        cls, alpha_rad: np.ndarray, beta_rad: np.ndarray, std_v: np.ndarray
+    ) -> Poses:
         """Make poses that have not been measured, with a noise, (m,) or (k, m), of their means."""
         count = len(alpha_rad)
         noise_v = np.broadcast_to(std_v, (count, np.shape(std_v)[-1])).copy()
-        return cls(np.zeros_like(noise_v), noise_v, alpha_rad, beta_rad, np.zeros((count, 2)),
-                   np.zeros(count, bool))
+        return cls(
+            np.zeros_like(noise_v),
+            noise_v,
+            alpha_rad,
+            beta_rad,
+            np.zeros((count, 2)),
+            np.zeros(count, bool),
+        )
 
     @staticmethod
     def from_records(records: Sequence[PoseRecord]) -> Poses:
         """Return the poses of a journal."""
+
         def column(name: str) -> np.ndarray:
             return np.array([getattr(record, name) for record in records])
 
         stamps_ns = np.column_stack([column('start_ns'), column('stop_ns')])
-        poses = Poses(column('mean_v'), column('std_v'), column('alpha_rad'), column('beta_rad'),
-                      stamps_ns * 1e-9, column('check').astype(bool), column('temperature_c'),
-                      column('supply_v'))
+        poses = Poses(
+            column('mean_v'),
+            column('std_v'),
+            column('alpha_rad'),
+            column('beta_rad'),
+            stamps_ns * 1e-9,
+            column('check').astype(bool),
+            column('temperature_c'),
+            column('supply_v'),
+        )
         # Poses of earlier versions have no numbers of settings: they get those by the angles.
-        return replace(poses, **{name: column(name).astype(int) for name in (
-            'alpha_setting', 'beta_setting') if None not in column(name)})
+        return replace(
+            poses,
+            **{
+                name: column(name).astype(int)
+                for name in ('alpha_setting', 'beta_setting')
+                if None not in column(name)
+            },
+        )
 
     @staticmethod
     def joined(parts: Sequence[Poses]) -> Poses:
         """Join the poses of several recordings of one unit, each with settings of its own."""
-        joined = {field.name: np.concatenate([getattr(part, field.name) for part in parts])
-                  for field in fields(Poses)}
+        joined = {
+            field.name: np.concatenate([getattr(part, field.name) for part in parts])
+            for field in fields(Poses)
+        }
         for name in ('alpha_setting', 'beta_setting'):
             settings = [getattr(part, name) for part in parts]
             first = np.cumsum([0, *(int(n.max(initial=-1)) + 1 for n in settings[:-1])])
@@ -101,9 +127,12 @@ class Poses:
     def environment(self) -> Environment:
         """Return temperature and supply of each rest; nominal ones where not measured."""
         measured = {name: getattr(self, name) for name in ('temperature_c', 'supply_v')}
-        return NOMINAL_ENVIRONMENT._replace(**{
-            name: np.where(np.isfinite(values), values, getattr(NOMINAL_ENVIRONMENT, name))
-            for name, values in measured.items()})
+        return NOMINAL_ENVIRONMENT._replace(
+            **{
+                name: np.where(np.isfinite(values), values, getattr(NOMINAL_ENVIRONMENT, name))
+                for name, values in measured.items()
+            }
+        )
 
     @property
     def has_angles(self) -> np.ndarray:
@@ -151,9 +180,18 @@ def with_table_angles(poses: Poses, path: str) -> Poses:
         raise UserError(
             f'{path}: has {len(angles)} poses, but the recording has {len(poses)} rests, which '
             f'begin at {starts}; write a row for each rest (with empty angles where they are not '
-            'known)')
-    return Poses(poses.volts, poses.std_v, angles[:, 0], angles[:, 1], poses.time_s, poses.check,
-                 poses.temperature_c, poses.supply_v)
+            'known)'
+        )
+    return Poses(
+        poses.volts,
+        poses.std_v,
+        angles[:, 0],
+        angles[:, 1],
+        poses.time_s,
+        poses.check,
+        poses.temperature_c,
+        poses.supply_v,
+    )
 
 
 _ANGLE_STEP_RAD = 1e-4
@@ -164,22 +202,32 @@ _COEFFICIENT_STEP = 1e-3
 linear over a thousandth of a typical size."""
 
 
-def predicted_volts(unit: Sensor, poses: Poses, shift_rad: tuple[float, float] = (0.0, 0.0),
-                    force: Components | None = None) -> np.ndarray:
+def predicted_volts(
+    unit: Sensor,
+    poses: Poses,
+    shift_rad: tuple[float, float] = (0.0, 0.0),
+    force: Components | None = None,
+) -> np.ndarray:
     """Predict the mean output of a unit in poses, V, (k, m); `force` is that of `stage_force`."""
-    force = force or stage_force(unit, poses.alpha_rad + shift_rad[0],
-                                 poses.beta_rad + shift_rad[1])
+    force = force or stage_force(
+        unit, poses.alpha_rad + shift_rad[0], poses.beta_rad + shift_rad[1]
+    )
     return np.column_stack(signal_chain.static_response(unit)(force, poses.environment))
 
 
 def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Components:
     """Return the specific force at rest on a stage with the stage effects of a unit."""
     signals = base.Signals(
-        NOMINAL_ENVIRONMENT, alpha=base.Joint(alpha_rad), beta=base.Joint(beta_rad),
-        up=list(UPRIGHT), gravity_mps2=unit.local_gravity_mps2)
+        NOMINAL_ENVIRONMENT,
+        alpha=base.Joint(alpha_rad),
+        beta=base.Joint(beta_rad),
+        up=list(UPRIGHT),
+        gravity_mps2=unit.local_gravity_mps2,
+    )
     signal_chain.Chain(unit, filter(_is_of_stage, unit.effects))(base.Place.STAGE, signals)
-    return specific_force(signals.alpha.position, signals.beta.position, signals.gravity_mps2,
-                          0.0, signals.up)
+    return specific_force(
+        signals.alpha.position, signals.beta.position, signals.gravity_mps2, 0.0, signals.up
+    )
 
 
 def _is_of_stage(effect: str) -> bool:
@@ -188,6 +236,7 @@ def _is_of_stage(effect: str) -> bool:
 
 def angle_jacobian(unit: Sensor, poses: Poses) -> np.ndarray:
     """Differentiate the predicted volts by alpha and beta, V/rad, (k, m, 2)."""
+
     def slope(alpha_rad: float, beta_rad: float) -> np.ndarray:
         above = predicted_volts(unit, poses, (alpha_rad, beta_rad))
         below = predicted_volts(unit, poses, (-alpha_rad, -beta_rad))
@@ -203,8 +252,10 @@ def coefficient_jacobian(unit: Sensor, poses: Poses, names: Sequence[Coefficient
     def slope(name: Coefficient) -> np.ndarray:
         value, step = get(unit, [name]), _COEFFICIENT_STEP * parameter_of(name).scale
         shared = None if _is_of_stage(name.effect) else force
-        above, below = (predicted_volts(put(unit, [name], value + change), poses, force=shared)
-                        for change in (step, -step))
+        above, below = (
+            predicted_volts(put(unit, [name], value + change), poses, force=shared)
+            for change in (step, -step)
+        )
         return (above - below) / (2 * step)
 
     return np.stack([slope(name) for name in names], axis=2)
@@ -223,8 +274,13 @@ def angle_tolerance_rad(sensor: Sensor) -> float:
     return max(ENCODER_STEPS * sensor.stage_resolution_rad, SAME_ANGLE_RAD)
 
 
-def _moved(readings_rad: np.ndarray, before_rad: Any, commands_rad: np.ndarray, held_rad: Any,
-           tolerance_rad: float) -> Any:
+def _moved(
+    readings_rad: np.ndarray,
+    before_rad: Any,
+    commands_rad: np.ndarray,
+    held_rad: Any,
+    tolerance_rad: float,
+) -> Any:
     """
     Return whether joints have moved from one pose to the next, by their encoder or their command.
 
@@ -233,15 +289,23 @@ def _moved(readings_rad: np.ndarray, before_rad: Any, commands_rad: np.ndarray, 
     and the one before. NaN where there is none.
     """
     low, high = (extreme(readings_rad, axis=0) for extreme in (np.fmin.reduce, np.fmax.reduce))
-    first, last = (extreme(commands_rad, axis=0, initial=np.nan)
-                   for extreme in (np.fmin.reduce, np.fmax.reduce))
-    return ((np.fmax(high - before_rad, before_rad - low) > tolerance_rad)
-            | (np.fmax(last - held_rad, held_rad - first) > COMMAND_RAD)
-            | (np.isnan(held_rad) & np.isfinite(last)))
+    first, last = (
+        extreme(commands_rad, axis=0, initial=np.nan)
+        for extreme in (np.fmin.reduce, np.fmax.reduce)
+    )
+    return (
+        (np.fmax(high - before_rad, before_rad - low) > tolerance_rad)
+        | (np.fmax(last - held_rad, held_rad - first) > COMMAND_RAD)
+        | (np.isnan(held_rad) & np.isfinite(last))
+    )
 
 
-def recorded_settings(rests: np.ndarray, readings_rad: np.ndarray | None,
-                      commands_rad: np.ndarray | None, tolerance_rad: float) -> np.ndarray:
+def recorded_settings(
+    rests: np.ndarray,
+    readings_rad: np.ndarray | None,
+    commands_rad: np.ndarray | None,
+    tolerance_rad: float,
+) -> np.ndarray:
     """
     Return the number of the setting of one joint in each rest of a recording, (k,) int.
 
@@ -254,12 +318,21 @@ def recorded_settings(rests: np.ndarray, readings_rad: np.ndarray | None,
     start, stop = rests[order].T
     middle, settings = (start + stop) // 2, np.zeros(len(rests), int)
     means_rad = np.array([_mean_of_finite(readings[a:b]) for a, b in zip(start, stop)])
-    before_rad, held_rad = (block_statistics.held_values(v, np.isfinite(v))
-                            for v in (means_rad, commands))
-    settings[order[1:]] = np.cumsum([
-        _moved(np.append(readings[middle[i]:middle[i + 1]], means_rad[i + 1]), before_rad[i],
-               commands[start[i] + 1:start[i + 1] + 1], held_rad[start[i]], tolerance_rad)
-        for i in range(len(rests) - 1)])
+    before_rad, held_rad = (
+        block_statistics.held_values(v, np.isfinite(v)) for v in (means_rad, commands)
+    )
+    settings[order[1:]] = np.cumsum(
+        [
+            _moved(
+                np.append(readings[middle[i] : middle[i + 1]], means_rad[i + 1]),
+                before_rad[i],
+                commands[start[i] + 1 : start[i + 1] + 1],
+                held_rad[start[i]],
+                tolerance_rad,
+            )
+            for i in range(len(rests) - 1)
+        ]
+    )
     return settings
 
 
@@ -277,16 +350,29 @@ def poses_of_means(recording: Recording, sensor: Sensor) -> Poses:
     if angles is not None:
         std_v += sample_std_v(sensor)
     if angles is not None and not std_v.any():
-        raise UserError(f'{recording.path}: nothing states the noise of means with stage angles; '
-                        'state sensor.noise_density_g_per_rthz in the file of --params, or leave '
-                        'alpha and beta out')
-    return Poses(volts, std_v, alpha_rad, beta_rad, np.zeros((len(recording), 2)),
-                 np.zeros(len(recording), bool), columns.get('temperature_c', missing),
-                 columns.get('supply_v', missing))
+        raise UserError(
+            f'{recording.path}: nothing states the noise of means with stage angles; '
+            'state sensor.noise_density_g_per_rthz in the file of --params, or leave '
+            'alpha and beta out'
+        )
+    return Poses(
+        volts,
+        std_v,
+        alpha_rad,
+        beta_rad,
+        np.zeros((len(recording), 2)),
+        np.zeros(len(recording), bool),
+        columns.get('temperature_c', missing),
+        columns.get('supply_v', missing),
+    )
 
 
-def _surroundings(recording: Recording, name: str, rests: Sequence[Rest],
-                  means: Callable[[np.ndarray | None], np.ndarray]) -> np.ndarray:
+def _surroundings(
+    recording: Recording,
+    name: str,
+    rests: Sequence[Rest],
+    means: Callable[[np.ndarray | None], np.ndarray],
+) -> np.ndarray:
     """Return the mean of a column at each rest, (k,); between others where a rest has none."""
     values = recording.columns.get(name)
     at_rest = means(values)
@@ -294,8 +380,9 @@ def _surroundings(recording: Recording, name: str, rests: Sequence[Rest],
     if values is not None and np.isfinite(values).any():
         known = np.isfinite(values)
         middle_s = np.array([(rest.time_start_s + rest.time_stop_s) / 2 for rest in rests])
-        at_rest[is_missing] = np.interp(middle_s[is_missing], recording.time_s[known],
-                                        values[known])
+        at_rest[is_missing] = np.interp(
+            middle_s[is_missing], recording.time_s[known], values[known]
+        )
     return at_rest
 
 
@@ -310,8 +397,13 @@ class SettingTracker:
 
     def __init__(self, tolerance_rad: float, taken: Sequence[PoseRecord] = ()) -> None:
         self._tolerance_rad = tolerance_rad
-        numbers = [[-1 if number is None else number for number in (
-            record.alpha_setting, record.beta_setting)] for record in taken]
+        numbers = [
+            [
+                -1 if number is None else number
+                for number in (record.alpha_setting, record.beta_setting)
+            ]
+            for record in taken
+        ]
         self._settings = np.max([[-1, -1], *numbers], axis=0)
         self._mean_rad = np.full(2, np.nan)
         self._readings, self._commands = (deque[_Stamped](maxlen=_MAX_READINGS) for _ in range(2))
@@ -341,8 +433,9 @@ class SettingTracker:
         self._commands.clear()
         self._commands.extend(held)
 
-    def settings(self, start_ns: int, stop_ns: int, alpha_rad: float, beta_rad: float
-                 ) -> tuple[int, int]:
+    def settings(
+        self, start_ns: int, stop_ns: int, alpha_rad: float, beta_rad: float
+    ) -> tuple[int, int]:
         """Return the numbers of the settings of alpha and beta in the next pose."""
         moved = np.ones(2, bool)
         if self._newest_ns is not None:
@@ -350,8 +443,13 @@ class SettingTracker:
             seen = _between(self._readings, sum(self._newest_ns) // 2, (start_ns + stop_ns) // 2)
             seen = np.vstack([seen, (alpha_rad, beta_rad)])
             held = np.vstack([(np.nan, np.nan), _between(self._commands, -np.inf, first_ns)])[-1]
-            moved = _moved(seen, self._mean_rad, _between(self._commands, first_ns, start_ns),
-                           held, self._tolerance_rad)
+            moved = _moved(
+                seen,
+                self._mean_rad,
+                _between(self._commands, first_ns, start_ns),
+                held,
+                self._tolerance_rad,
+            )
         alpha, beta = self._settings + moved
         return int(alpha), int(beta)
 
@@ -369,8 +467,9 @@ _Stamped = tuple[float, tuple[float, ...]]
 
 def _between(kept: Iterable[_Stamped], after_ns: float, last_ns: float) -> np.ndarray:
     """Return the angles after a stamp, up to another one, rad, (n, 2)."""
-    return np.array([angles for stamp_ns, angles in kept
-                     if after_ns < stamp_ns <= last_ns]).reshape(-1, 2)
+    return np.array(
+        [angles for stamp_ns, angles in kept if after_ns < stamp_ns <= last_ns]
+    ).reshape(-1, 2)
 
 
 _MAX_PERIODS = 1.5
@@ -386,16 +485,20 @@ def _named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Re
         start = int(np.searchsorted(stamps_ns, record.start_ns, 'left'))
         stop = int(np.searchsorted(stamps_ns, record.stop_ns, 'right'))
         if stop - start < _MIN_SAMPLES * record.samples:
-            raise UserError(f'{recording.path}: has {stop - start} samples between the stamps of '
-                            f'pose {number} of the journal, which has {record.samples}; give '
-                            'the recording of the same run')
-        rests.append(Rest(start, stop, float(recording.time_s[start]),
-                          float(recording.time_s[stop - 1])))
+            raise UserError(
+                f'{recording.path}: has {stop - start} samples between the stamps of '
+                f'pose {number} of the journal, which has {record.samples}; give '
+                'the recording of the same run'
+            )
+        rests.append(
+            Rest(start, stop, float(recording.time_s[start]), float(recording.time_s[stop - 1]))
+        )
     return rests
 
 
-def extract_poses(recording: Recording, sensor: Sensor,
-                  records: Sequence[PoseRecord] | None = None) -> Poses:
+def extract_poses(
+    recording: Recording, sensor: Sensor, records: Sequence[PoseRecord] | None = None
+) -> Poses:
     """Find the rests of a recording, or take those of a journal, and average each."""
     volts, angles = recording.volts(sensor), recording.stage_angles
     if records is None:
@@ -405,42 +508,64 @@ def extract_poses(recording: Recording, sensor: Sensor,
     else:
         rests = _named_rests(recording, records)
     if not rests:
-        raise UserError(f'{recording.path}: the sensor is nowhere at rest; hold it still for at '
-                        'least 1 s in each pose')
+        raise UserError(
+            f'{recording.path}: the sensor is nowhere at rest; hold it still for at '
+            'least 1 s in each pose'
+        )
 
     def means(values: np.ndarray | None) -> np.ndarray:
-        return np.array([np.nan if values is None else
-                         _mean_of_finite(values[rest.start:rest.stop]) for rest in rests])
+        return np.array(
+            [
+                np.nan if values is None else _mean_of_finite(values[rest.start : rest.stop])
+                for rest in rests
+            ]
+        )
 
-    mean, std = rest_detection.rest_means(recording.time_s, volts, rests, sensor.rate_hz,
-                                          rest_detection.datasheet_noise(sensor))
-    measured = {'volts': mean, 'std_v': std,
-                'time_s': np.array([[rest.time_start_s, rest.time_stop_s] for rest in rests]),
-                **{name: _surroundings(recording, name, rests, means)
-                   for name in ('temperature_c', 'supply_v')}}
+    mean, std = rest_detection.rest_means(
+        recording.time_s, volts, rests, sensor.rate_hz, rest_detection.datasheet_noise(sensor)
+    )
+    measured = {
+        'volts': mean,
+        'std_v': std,
+        'time_s': np.array([[rest.time_start_s, rest.time_stop_s] for rest in rests]),
+        **{
+            name: _surroundings(recording, name, rests, means)
+            for name in ('temperature_c', 'supply_v')
+        },
+    }
     if records is not None:
         return replace(Poses.from_records(records), **measured)
-    alpha_rad, beta_rad = (means(None if angles is None else angles[:, joint])
-                           for joint in range(2))
+    alpha_rad, beta_rad = (
+        means(None if angles is None else angles[:, joint]) for joint in range(2)
+    )
     for joint in ('alpha', 'beta'):
-        readings, commands = (recording.columns.get(name)
-                              for name in (JOINTS[joint], COMMANDS[joint]))
+        readings, commands = (
+            recording.columns.get(name) for name in (JOINTS[joint], COMMANDS[joint])
+        )
         if readings is not None or commands is not None:
             measured[f'{joint}_setting'] = recorded_settings(
-                np.array([[rest.start, rest.stop] for rest in rests]), readings, commands,
-                angle_tolerance_rad(sensor))
-    return Poses(alpha_rad=alpha_rad, beta_rad=beta_rad, check=np.zeros(len(rests), bool),
-                 **measured)
+                np.array([[rest.start, rest.stop] for rest in rests]),
+                readings,
+                commands,
+                angle_tolerance_rad(sensor),
+            )
+    return Poses(
+        alpha_rad=alpha_rad, beta_rad=beta_rad, check=np.zeros(len(rests), bool), **measured
+    )
 
 
-def estimate_filters(recording: Recording, sensor: Sensor, poses: Poses
-                     ) -> list[recorded_sensor.FilterNoise | None]:
+def estimate_filters(
+    recording: Recording, sensor: Sensor, poses: Poses
+) -> list[recorded_sensor.FilterNoise | None]:
     """Estimate the output filter of each axis from the noise of the poses."""
     volts, gapless = recording.volts(sensor), []
     for begin, end in zip(*np.searchsorted(recording.time_s, poses.time_s.T)):
-        steps_s = np.diff(recording.time_s[begin:end + 1])
+        steps_s = np.diff(recording.time_s[begin : end + 1])
         if steps_s.size and steps_s.max() * sensor.rate_hz < _MAX_PERIODS:
-            gapless.append(volts[begin:end + 1])
-    return [recorded_sensor.estimate_filter([rest[:, d] for rest in gapless], sensor.rate_hz,
-                                            sensor.rc_s, sensor.lsb_v)
-            for d in range(len(sensor.axes))]
+            gapless.append(volts[begin : end + 1])
+    return [
+        recorded_sensor.estimate_filter(
+            [rest[:, d] for rest in gapless], sensor.rate_hz, sensor.rc_s, sensor.lsb_v
+        )
+        for d in range(len(sensor.axes))
+    ]

@@ -72,13 +72,17 @@ class CalibrationResult:
             return 'not kept in a store'
         stored = calibration_store.history(folder, self.fitted.serial).calibrations
         try:
-            path = next((path for path, _ in stored if self._is_in(path)), None) or \
-                calibration_store.put(folder, self.fitted, self.comments())
+            path = next(
+                (path for path, _ in stored if self._is_in(path)), None
+            ) or calibration_store.put(folder, self.fitted, self.comments())
         except UserError as error:
             return f'no copy in the store: {error}'
-        return f'kept as {path}' if path else \
-            f'not kept in {folder}: the serial number {NO_UNIT} names no unit; set ' \
+        return (
+            f'kept as {path}'
+            if path
+            else f'not kept in {folder}: the serial number {NO_UNIT} names no unit; set '
             'sensor.serial'
+        )
 
     def _is_in(self, path: str | os.PathLike) -> bool:
         """Return whether a file holds this fit: the same data, model and coefficients."""
@@ -87,10 +91,12 @@ class CalibrationResult:
         except UserError:
             return False
         fitted, names = self.fitted, self.fitted.covariance_names
-        return (saved.model, saved.effects, saved.covariance_names) == (
-            fitted.model, fitted.effects, names) and \
-            saved.provenance.get('data_sha256') == fitted.provenance['data_sha256'] and \
-            bool(np.allclose(get(saved, names), get(fitted, names), rtol=_SAME_FIT_TOLERANCE))
+        return (
+            (saved.model, saved.effects, saved.covariance_names)
+            == (fitted.model, fitted.effects, names)
+            and saved.provenance.get('data_sha256') == fitted.provenance['data_sha256']
+            and bool(np.allclose(get(saved, names), get(fitted, names), rtol=_SAME_FIT_TOLERANCE))
+        )
 
     @property
     def inliers(self) -> np.ndarray:
@@ -100,13 +106,19 @@ class CalibrationResult:
 
 def coefficient_lines(sensor: Sensor) -> list[str]:
     """Return the fitted coefficients with their 90 % intervals as text."""
-    return [f'{sensor.serial}: {sensor.model} model, coefficient +- half of its 90 % interval',
-            *(f'  {row.label:{_LONGEST_LABEL}} {row.axis:1} {rounded(row, row.fitted):>10} +- '
-              f'{rounded(row, row.half_width)} {row.unit}' for row in compare(sensor, sensor))]
+    return [
+        f'{sensor.serial}: {sensor.model} model, coefficient +- half of its 90 % interval',
+        *(
+            f'  {row.label:{_LONGEST_LABEL}} {row.axis:1} {rounded(row, row.fitted):>10} +- '
+            f'{rounded(row, row.half_width)} {row.unit}'
+            for row in compare(sensor, sensor)
+        ),
+    ]
 
 
-def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,
-                    results: Mapping[str, str]) -> Sensor:
+def with_provenance(
+    fitted: Sensor, source: str, poses: Poses, data_sha256: str, results: Mapping[str, str]
+) -> Sensor:
     """Add date, sources, sweep, data hash, results and id to a fitted unit."""
     alpha_rad = poses.alpha_rad[~poses.check]
     sweep = f'{len(planes(alpha_rad))} planes alpha' if np.isfinite(alpha_rad).all() else 'rests'
@@ -114,11 +126,16 @@ def with_provenance(fitted: Sensor, source: str, poses: Poses, data_sha256: str,
         **{key: text for key, text in fitted.provenance.items() if key.endswith('_from')},
         # A text of YAML, where +00:00 makes a date, which ros2 param cannot set.
         'date': f'{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%S}+0000',
-        'package_version': package_version(), 'source': source,
+        'package_version': package_version(),
+        'source': source,
         'data_sha256': data_sha256 or _sha256(poses),
-        'poses': str(int((~poses.check).sum())), 'check_poses': str(int(poses.check.sum())),
-        'sweep': sweep, 'temperature_c': _mean_text(poses.temperature_c, '.2f'),
-        'supply_v': _mean_text(poses.supply_v, '.4f'), **results}
+        'poses': str(int((~poses.check).sum())),
+        'check_poses': str(int(poses.check.sum())),
+        'sweep': sweep,
+        'temperature_c': _mean_text(poses.temperature_c, '.2f'),
+        'supply_v': _mean_text(poses.supply_v, '.4f'),
+        **results,
+    }
     calibration_id = calibration_store.calibration_id(replace(fitted, provenance=entries))
     return replace(fitted, provenance={'id': calibration_id, **entries})
 
@@ -143,23 +160,29 @@ def envelope(fitted: Sensor, force: np.ndarray, poses: Poses, misfit_mps2: float
     finite_c = poses.temperature_c[np.isfinite(poses.temperature_c)]
     further = _next_degree(fitted, poses)
     nodes_c = further.nodes_c.tolist() if further else [0.0]
-    return Envelope((float(finite_c.min()), float(finite_c.max())) if finite_c.size else None,
-                    zero_g_per_k=_unmodelled_slope(fitted, 'temperature_bias'),
-                    scale_per_k=_unmodelled_slope(fitted, 'temperature_scale'),
-                    zero_g_nodes_c=tuple(nodes_c) if further else (),
-                    zero_g_next=tuple(further.size.tolist()) if further else (),
-                    # The zero-g is that of all poses, which agree at each of the nodes.
-                    zero_g_at_c=nodes_c[0], misfit_mps2=misfit_mps2,
-                    force_low_mps2=tuple(force.min(axis=0).tolist()),
-                    force_high_mps2=tuple(force.max(axis=0).tolist()))
+    return Envelope(
+        (float(finite_c.min()), float(finite_c.max())) if finite_c.size else None,
+        zero_g_per_k=_unmodelled_slope(fitted, 'temperature_bias'),
+        scale_per_k=_unmodelled_slope(fitted, 'temperature_scale'),
+        zero_g_nodes_c=tuple(nodes_c) if further else (),
+        zero_g_next=tuple(further.size.tolist()) if further else (),
+        # The zero-g is that of all poses, which agree at each of the nodes.
+        zero_g_at_c=nodes_c[0],
+        misfit_mps2=misfit_mps2,
+        force_low_mps2=tuple(force.min(axis=0).tolist()),
+        force_high_mps2=tuple(force.max(axis=0).tolist()),
+    )
 
 
 def _next_degree(fitted: Sensor, poses: Poses) -> NextDegree | None:
     """Return what a fit lacks that follows temperature by slope and curvature; else None."""
     order = np.argsort(poses.time_s[:, 0])
     known = poses.subset(order[np.isfinite(poses.temperature_c[order])])
-    if 'temperature_bias' not in fitted.effects or not len(known) \
-            or not np.ptp(known.temperature_c):
+    if (
+        'temperature_bias' not in fitted.effects
+        or not len(known)
+        or not np.ptp(known.temperature_c)
+    ):
         return None
     residual_g = (known.volts - predicted_volts(fitted, known)) / fitted.scale_v_per_g
     curvature_k2 = fitted.values['temperature_bias']['per_k2']
@@ -174,8 +197,10 @@ def _unmodelled_slope(fitted: Sensor, effect: str) -> float:
     return typical or effect_named(effect).parameters[0].scale
 
 
-_ABSOLUTE = {'bias.offset_v': 'nominal_zero_g_v',
-             'scale_factor.offset_v_per_g': 'nominal_scale_v_per_g'}
+_ABSOLUTE = {
+    'bias.offset_v': 'nominal_zero_g_v',
+    'scale_factor.offset_v_per_g': 'nominal_scale_v_per_g',
+}
 """Parameters that are departures from a nominal value, and the field of that value."""
 _LABELS = {
     'bias.offset_v': 'zero-g',
@@ -231,9 +256,15 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
             unit, scale = '°', float(np.degrees(1.0))
         acts = name.axis and name.effect in OTHER_AXIS
         other = AXES[OTHER_AXIS[name.effect][AXES.index(name.axis)]] if acts else ''
-        rows.append(Comparison(
-            key, name.axis, _LABELS.get(key, key).format(other=other), unit.replace('^2', '²'),
-            *(float(scale * value) for value in values)))
+        rows.append(
+            Comparison(
+                key,
+                name.axis,
+                _LABELS.get(key, key).format(other=other),
+                unit.replace('^2', '²'),
+                *(float(scale * value) for value in values),
+            )
+        )
     return rows
 
 
@@ -241,8 +272,10 @@ def errors_in_words(fitted: Sensor) -> str:
     """Return the largest zero-g error of the uncalibrated sensor, for people."""
     offset_g = (fitted.zero_g_v - fitted.nominal_zero_g_v) / fitted.nominal_scale_v_per_g
     axis = int(np.argmax(np.abs(offset_g)))
-    return (f'Uncalibrated, {fitted.axes[axis]} reads {mg_text(abs(offset_g[axis]) * G0_MPS2)} '
-            f'too {"much" if offset_g[axis] > 0 else "little"}.')
+    return (
+        f'Uncalibrated, {fitted.axes[axis]} reads {mg_text(abs(offset_g[axis]) * G0_MPS2)} '
+        f'too {"much" if offset_g[axis] > 0 else "little"}.'
+    )
 
 
 _LONGEST_LABEL = 26  # Columns that a coefficient's name may take, so that its line has at most 79
@@ -257,12 +290,17 @@ def truth_table(comparisons: Sequence[Comparison]) -> list[str]:
     lines = [f' {"coefficient":{width}}     fitted (90 %) {"":16}true']
     for row in comparisons:
         truth = '0' if row.truth == 0 else rounded(row, row.truth)
-        lines.append(f' {row.label[:width]:{width}} {row.axis:1} {rounded(row, row.fitted):>10} ± '
-                     f'{rounded(row, row.half_width):8} {row.unit:5} {truth:>10}   '
-                     f'{"ok" if row.inside else "MISSED"}')
+        lines.append(
+            f' {row.label[:width]:{width}} {row.axis:1} {rounded(row, row.fitted):>10} ± '
+            f'{rounded(row, row.half_width):8} {row.unit:5} {truth:>10}   '
+            f'{"ok" if row.inside else "MISSED"}'
+        )
     inside = sum(row.inside for row in comparisons)
-    return [*lines, f' ({inside} of {len(comparisons)} inside their 90 % intervals; about '
-            f'{_COVERED * len(comparisons):.0f} are expected)']
+    return [
+        *lines,
+        f' ({inside} of {len(comparisons)} inside their 90 % intervals; about '
+        f'{_COVERED * len(comparisons):.0f} are expected)',
+    ]
 
 
 def rounded(row: Comparison, value: float) -> str:
@@ -271,16 +309,26 @@ def rounded(row: Comparison, value: float) -> str:
     return f'{round(value, places) + 0.0:.{places}f}'
 
 
-def history(newest: Sensor, stored: Sequence[Sensor]
-            ) -> tuple[list[str], list[list[str]]] | None:
+def history(newest: Sensor, stored: Sequence[Sensor]) -> tuple[list[str], list[list[str]]] | None:
     """Return head and rows of the calibrations of a unit; None without an earlier one."""
-    rows = [[sensor.provenance.get('date', '-')[:16].replace('T', ' '),
-             calibration_store.calibration_id(sensor), sensor.model,
-             sensor.provenance.get('temperature_c', '-'),
-             *(f'{value:.5f}' for value in (*sensor.zero_g_v, *sensor.scale_v_per_g))]
-            for sensor in (*stored, newest) if sensor.axes == newest.axes]
+    rows = [
+        [
+            sensor.provenance.get('date', '-')[:16].replace('T', ' '),
+            calibration_store.calibration_id(sensor),
+            sensor.model,
+            sensor.provenance.get('temperature_c', '-'),
+            *(f'{value:.5f}' for value in (*sensor.zero_g_v, *sensor.scale_v_per_g)),
+        ]
+        for sensor in (*stored, newest)
+        if sensor.axes == newest.axes
+    ]
     if len(rows) < 2:
         return None
-    head = ['date', 'id', 'model', 'temperature, °C',
-            *(f'{label} {axis}' for label in ('zero-g', 'scale factor') for axis in newest.axes)]
+    head = [
+        'date',
+        'id',
+        'model',
+        'temperature, °C',
+        *(f'{label} {axis}' for label in ('zero-g', 'scale factor') for axis in newest.axes),
+    ]
     return head, rows

@@ -85,8 +85,11 @@ class CompensationPolicy:
     def use(self, sensor: Sensor, source: str) -> str:
         """Apply a sensor from now on."""
         self.sensor, self.source = sensor, source
-        model = f'{sensor.serial}, model {sensor.model}' if sensor.effects else \
-            f'{sensor.serial}, which is not calibrated'
+        model = (
+            f'{sensor.serial}, model {sensor.model}'
+            if sensor.effects
+            else f'{sensor.serial}, which is not calibrated'
+        )
         return f'compensating by {source}: {model}'
 
     def assess(self) -> bool:
@@ -127,8 +130,7 @@ class CompensationPolicy:
             return None
         return calibration_store.newer(self._store, sensor)
 
-    def status(self, interval: Interval, newer: Path | None, calibration: str
-               ) -> tuple[str, str]:
+    def status(self, interval: Interval, newer: Path | None, calibration: str) -> tuple[str, str]:
         """Return level (OK, WARN, ERROR) and text of the state: the first one that holds."""
         if self.refusal:
             return 'ERROR', f'publishing nothing: {self.refusal}'
@@ -140,22 +142,38 @@ class CompensationPolicy:
         unknown = self._unknown_surroundings(interval)
         warnings = (
             (is_silent, f'no samples on {samples}'),
-            (interval.obstacle, f'publishing nothing yet: {no_info}, and {samples} does not show '
-             f'its sensor: {interval.obstacle}'),
-            (counts.get('dropped'),
-             f'{counts.get("dropped")} samples dropped that no force explains'),
-            (counts.get('saturated'),
-             f'{counts.get("saturated")} samples with the ADC at its rail'),
-            (counts.get('backward'), f'{counts.get("backward")} samples whose stamp steps back; '
-             f'one driver must stamp {samples} in order'),
+            (
+                interval.obstacle,
+                f'publishing nothing yet: {no_info}, and {samples} does not show '
+                f'its sensor: {interval.obstacle}',
+            ),
+            (
+                counts.get('dropped'),
+                f'{counts.get("dropped")} samples dropped that no force explains',
+            ),
+            (
+                counts.get('saturated'),
+                f'{counts.get("saturated")} samples with the ADC at its rail',
+            ),
+            (
+                counts.get('backward'),
+                f'{counts.get("backward")} samples whose stamp steps back; '
+                f'one driver must stamp {samples} in order',
+            ),
             (self.info is None, f'unit not confirmed: {no_info}'),
             (unknown, unknown),
             (not self.sensor.effects, 'not calibrated: the datasheet values apply'),
-            (counts.get('outside'), f'{counts.get("outside")} samples outside of what was '
-             f'calibrated, their covariance raised: {"; ".join(interval.outside)}'),
-            (newer is not None and not self.is_named(calibration),
-             f'a newer calibration is in the store: {newer}; set calibration to it, or start '
-             'again'))
+            (
+                counts.get('outside'),
+                f'{counts.get("outside")} samples outside of what was '
+                f'calibrated, their covariance raised: {"; ".join(interval.outside)}',
+            ),
+            (
+                newer is not None and not self.is_named(calibration),
+                f'a newer calibration is in the store: {newer}; set calibration to it, or start '
+                'again',
+            ),
+        )
         return next((('WARN', text) for holds, text in warnings if holds), ('OK', 'compensating'))
 
     def _unknown_surroundings(self, interval: Interval) -> str:
@@ -165,8 +183,10 @@ class CompensationPolicy:
             for name in topics.keys() & set(effect.follows):
                 if interval.ages_s.get(name, inf) > _STALE_S:
                     value = interval.surroundings.get(name, getattr(NOMINAL_ENVIRONMENT, name))
-                    return (f'{effect.name} is taken at {value:g}: nothing on '
-                            f'{self._full_name(topics[name])}')
+                    return (
+                        f'{effect.name} is taken at {value:g}: nothing on '
+                        f'{self._full_name(topics[name])}'
+                    )
         return ''
 
     def values(self, interval: Interval, newer: Path | None) -> dict[str, Any]:
@@ -175,19 +195,28 @@ class CompensationPolicy:
         date = calibration_store.date_of(sensor) if sensor.effects else None
         age = datetime.now(timezone.utc) - date if date else None
         return {
-            'unit': self._unit(), 'calibration': self.source, 'serial': sensor.serial,
-            'axes': sensor.axes, 'model': sensor.model, 'effects': ', '.join(sensor.effects),
+            'unit': self._unit(),
+            'calibration': self.source,
+            'serial': sensor.serial,
+            'axes': sensor.axes,
+            'model': sensor.model,
+            'effects': ', '.join(sensor.effects),
             'calibration_id': calibration_store.calibration_id(sensor) if sensor.effects else '',
             'age_days': '' if age is None else round(age / timedelta(days=1), 3),
-            'validity': self._validity(interval), 'newer': str(newer or ''),
-            **{f'provenance.{key}': value for key, value in sensor.provenance.items()}}
+            'validity': self._validity(interval),
+            'newer': str(newer or ''),
+            **{f'provenance.{key}': value for key, value in sensor.provenance.items()},
+        }
 
     def _unit(self) -> str:
         if self.refusal or self.info is None:
             return 'other' if self.refusal else 'not confirmed'
         # A stream or a file without a serial number goes with every unit.
-        return 'no serial number' if NO_UNIT in (self.info.serial, self.sensor.serial) \
+        return (
+            'no serial number'
+            if NO_UNIT in (self.info.serial, self.sensor.serial)
             else 'confirmed'
+        )
 
     def _validity(self, interval: Interval) -> str:
         if not self.sensor.effects:
@@ -196,6 +225,8 @@ class CompensationPolicy:
             return self.refusal
         if interval.counts.get('outside'):
             return f'outside: {"; ".join(interval.outside)}'
-        knows_temperature = self.sensor.envelope.temperature_c is not None \
+        knows_temperature = (
+            self.sensor.envelope.temperature_c is not None
             and interval.ages_s.get('temperature_c', inf) <= _STALE_S
+        )
         return 'valid' if knows_temperature else 'valid, temperature not known'

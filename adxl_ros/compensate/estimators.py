@@ -57,12 +57,14 @@ class Estimates:
 class RecordingEstimator:
     """Estimates force and tilt of the samples of one recording."""
 
-    def __init__(self, sensor: Sensor, first: Recording, paper: bool = False,
-                 undo_filter: bool = False) -> None:
+    def __init__(
+        self, sensor: Sensor, first: Recording, paper: bool = False, undo_filter: bool = False
+    ) -> None:
         """Prepare for a recording."""
         if paper and sensor.axes == 'x':
-            raise UserError('--inverse paper: needs the axes x and y, the sensor has x; leave it '
-                            'out')
+            raise UserError(
+                '--inverse paper: needs the axes x and y, the sensor has x; leave it out'
+            )
         if 'temperature_c' not in first.columns:
             sensor = sensor.without_temperature_range()
         self._sensor, self._undo_filter = sensor, undo_filter
@@ -71,14 +73,21 @@ class RecordingEstimator:
         self._gravity_mps2 = signal_chain.gravity_mps2(sensor)
         self._inverse = (paper_inverse if paper else signal_chain.inverse)(sensor)
         self._measured_covariance = force_errors.measured_covariance(
-            sensor, noise_variance_v2(sensor) if undo_filter else None, bool(sensor.z_sign))
+            sensor, noise_variance_v2(sensor) if undo_filter else None, bool(sensor.z_sign)
+        )
 
     def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
         """Yield each block of the recording with its estimates."""
         measured = ((block, block.volts(self._sensor)) for block in recording)
-        before_filter = ((pair, pair[1]) for pair in measured) if not self._undo_filter else \
-            undo_filter_blocks(((pair, pair[0].time_s, pair[1]) for pair in measured),
-                               noise.electronics(self._sensor).rc_s, self._sensor.rate_hz)
+        before_filter = (
+            ((pair, pair[1]) for pair in measured)
+            if not self._undo_filter
+            else undo_filter_blocks(
+                ((pair, pair[0].time_s, pair[1]) for pair in measured),
+                noise.electronics(self._sensor).rc_s,
+                self._sensor.rate_hz,
+            )
+        )
         for (block, volts), input_v in before_filter:
             yield block, self._estimate(volts, input_v, self._environment(block))
 
@@ -87,26 +96,33 @@ class RecordingEstimator:
         """Return what was assumed of the surroundings so far, one line each, for people."""
         sensor, lines = self._sensor, self._surroundings.assumed(self._sensor.effects)
         if sensor.axes == 'xy' and sensor.effects and not sensor.z_sign:
-            lines = [*lines, 'the sensor is taken as upright, and the deviations of x and y hold '
-                     'that it may not be; sensor.z_sign states which way up it is']
+            lines = [
+                *lines,
+                'the sensor is taken as upright, and the deviations of x and y hold '
+                'that it may not be; sensor.z_sign states which way up it is',
+            ]
         return lines
 
     def _environment(self, block: Recording) -> Environment:
         """Return the surroundings of the samples."""
-        return NOMINAL_ENVIRONMENT._replace(time_s=block.time_s - self._begin_s,
-                                            **self._surroundings(block))
+        return NOMINAL_ENVIRONMENT._replace(
+            time_s=block.time_s - self._begin_s, **self._surroundings(block)
+        )
 
-    def _estimate(self, volts: np.ndarray, input_v: np.ndarray, environment: Environment
-                  ) -> Estimates:
+    def _estimate(
+        self, volts: np.ndarray, input_v: np.ndarray, environment: Environment
+    ) -> Estimates:
         """Estimate from volts of the ADC and before the filter; rails determine no quantity."""
         sensor = self._sensor
         at_rail = signal_chain.at_a_rail(volts, sensor)
         with np.errstate(all='ignore'):  # some volts have no solution
             force = self._inverse(list(input_v.T), environment)
             covariance = force_errors.of_three_axes(
-                sensor, force, *self._measured_covariance(force, environment))
+                sensor, force, *self._measured_covariance(force, environment)
+            )
             outside = np.isfinite(force[0]) & sensor.envelope.is_outside(
-                environment.temperature_c, force)
+                environment.temperature_c, force
+            )
             covariance[:, :, at_rail] = np.inf
             tilting = covariance + self._excess_variance(force, covariance) * np.eye(3)[:, :, None]
             angles = tilt(force, tilting, 'z' in sensor.axes)
@@ -122,8 +138,9 @@ class RecordingEstimator:
         if self._sensor.axes != AXES:
             return np.zeros(len(force[0]))
         error2 = np.max([covariance[d, d] for d in range(3)], axis=0)
-        return np.asarray(length_excess(np.linalg.norm(force, axis=0), error2,
-                                        self._gravity_mps2, ARRAYS) ** 2)
+        return np.asarray(
+            length_excess(np.linalg.norm(force, axis=0), error2, self._gravity_mps2, ARRAYS) ** 2
+        )
 
 
 def length_excess(length_mps2: Value, error2: Value, gravity_mps2: float, maths: Maths) -> Value:
@@ -215,19 +232,28 @@ class LiveEstimator:
     noise. A derived z also gets the noise variance of a measured axis.
     """
 
-    def __init__(self, sensor: Sensor, paper: bool = False, undo_filter: bool = False,
-                 mounting: Mounting | None = None) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        paper: bool = False,
+        undo_filter: bool = False,
+        mounting: Mounting | None = None,
+    ) -> None:
         """Prepare for a unit."""
         if mounting is not None and not sensor.z_sign:
             # A robot stands upright, so that its mounting says which way up the case is.
             sensor = replace(sensor, z_sign=-1 if mounting.rows[2, 2] < 0 else 1)
         self.sensor, self.mounting = sensor, mounting
         # Only a stage shows the yaw of the axes in the case. Gravity and a level robot do not.
-        self._yaw_rad2 = 0.0 if sensor.provenance.get('reference') == 'stage' else \
-            alignment_std_rad(sensor) ** 2
+        self._yaw_rad2 = (
+            0.0
+            if sensor.provenance.get('reference') == 'stage'
+            else alignment_std_rad(sensor) ** 2
+        )
         self._paper_inverse = paper_inverse(sensor, FLOATS) if paper else None
-        self._variance_v2 = noise_variance_v2(sensor) if undo_filter \
-            else noise.sample_std_v(sensor) ** 2
+        self._variance_v2 = (
+            noise_variance_v2(sensor) if undo_filter else noise.sample_std_v(sensor) ** 2
+        )
         self._zero_g_v = sensor.nominal_zero_g_v.tolist()
         self._v_per_mps2 = (sensor.nominal_scale_v_per_g / G0_MPS2).tolist()
         self._rails_v = 0.0, sensor.adc_vref_v - sensor.lsb_v
@@ -235,7 +261,8 @@ class LiveEstimator:
         self._respond = signal_chain.analog_response(sensor)
         self._undo_adc = signal_chain.adc_inverse(sensor)
         self._newton_step = signal_chain.newton_step(
-            sensor.axes, signal_chain.gravity_mps2(sensor), FLOATS)
+            sensor.axes, signal_chain.gravity_mps2(sensor), FLOATS
+        )
         self._invert = signal_chain.inverse(sensor)
         self._use(sensor.without_temperature_range())
         self._cells: dict[tuple[int, ...], _Cell] = {}
@@ -252,8 +279,11 @@ class LiveEstimator:
 
     def volts(self, accel_mps2: Sequence[float]) -> Components:
         """Undo the nominal conversion; an empty list if a value exceeds that of any sensor."""
-        volts = [zero + a * scale for zero, a, scale in
-                 zip(self._zero_g_v, accel_mps2, self._v_per_mps2) if abs(a) < _MAX_ACCEL_MPS2]
+        volts = [
+            zero + a * scale
+            for zero, a, scale in zip(self._zero_g_v, accel_mps2, self._v_per_mps2)
+            if abs(a) < _MAX_ACCEL_MPS2
+        ]
         return volts if len(volts) == len(self._v_per_mps2) else []
 
     def __call__(self, volts: Components, time_s: float) -> Estimate | None:
@@ -270,17 +300,25 @@ class LiveEstimator:
         if self.sensor.axes == AXES:
             motion += self._excess_variance(force, covariance)
         moved: tuple[float, ...] = (
-            covariance[0] + motion, covariance[1], covariance[2], covariance[3] + motion,
-            covariance[4], covariance[5] if self._derives_z else covariance[5] + motion)
+            covariance[0] + motion,
+            covariance[1],
+            covariance[2],
+            covariance[3] + motion,
+            covariance[4],
+            covariance[5] if self._derives_z else covariance[5] + motion,
+        )
         if self.mounting is not None:
             force = self.mounting.rotate(force)
-            covariance, moved = (self._with_yaw(force, self.mounting.rotate_covariance(part))
-                                 for part in (covariance, moved))
+            covariance, moved = (
+                self._with_yaw(force, self.mounting.rotate_covariance(part))
+                for part in (covariance, moved)
+            )
         roll, pitch, inclination, _ = angles(force, moved, FLOATS)
         return Estimate(force, covariance, roll, pitch, inclination, saturated, cell.outside)
 
-    def set_environment(self, temperature_c: float | None = None, supply_v: float | None = None
-                        ) -> None:
+    def set_environment(
+        self, temperature_c: float | None = None, supply_v: float | None = None
+    ) -> None:
         """Set the surroundings of the samples that follow."""
         if temperature_c is not None:
             if not self._knows_temperature:
@@ -294,7 +332,8 @@ class LiveEstimator:
     def _use(self, sensor: Sensor) -> None:
         """Take covariance and validity range from the unit, with or without temperature range."""
         self._measured_covariance = force_errors.measured_covariance(
-            sensor, self._variance_v2, bool(self.sensor.z_sign))
+            sensor, self._variance_v2, bool(self.sensor.z_sign)
+        )
         self._envelope = sensor.envelope
         self._knows_temperature = sensor is self.sensor
 
@@ -308,8 +347,9 @@ class LiveEstimator:
         response, input_v = self._last_volts, self._undo_adc(volts)
         for _ in range(_MAX_STEPS):
             previous, previous_change = force, change
-            force = self._newton_step([v - r for v, r in zip(input_v, response)], previous,
-                                      tangent, self.sensor.up)
+            force = self._newton_step(
+                [v - r for v, r in zip(input_v, response)], previous, tangent, self.sensor.up
+            )
             change = max(abs(f - p) for f, p in zip(force, previous))
             # Steps shrink by the same factor or faster, which bounds the next one.
             if change * change <= _TOLERANCE_MPS2 * previous_change:
@@ -348,8 +388,9 @@ class LiveEstimator:
         excess = length_excess((x * x + y * y + z * z) ** 0.5, error2, self._gravity_mps2, FLOATS)
         return float(excess) ** 2
 
-    def _covariance(self, force: Components, cell: _Cell, unknown: float, motion: float
-                    ) -> tuple[float, ...]:
+    def _covariance(
+        self, force: Components, cell: _Cell, unknown: float, motion: float
+    ) -> tuple[float, ...]:
         """
         Return the covariance of a force: xx, xy, xz, yy, yz, zz, (m/s²)².
 
@@ -359,15 +400,20 @@ class LiveEstimator:
         further = unknown
         if self._derives_z:
             xx, xy, xz, yy, yz, zz = force_errors.derived_z_covariance(
-                force, (xx, xy, yy), cell.tangent.slope, FLOATS)
+                force, (xx, xy, yy), cell.tangent.slope, FLOATS
+            )
             further = self._noise_variance[0] + motion
         return xx + unknown, xy, xz, yy + unknown, yz, zz + further
 
     def _cell(self, force: Components) -> _Cell:
         around = self._environment
-        key = (round(force[0] / _CELL_MPS2), round(force[1] / _CELL_MPS2),
-               round(force[2] / _CELL_MPS2), round(around.temperature_c / _CELL_C),
-               round(around.supply_v / _CELL_V))
+        key = (
+            round(force[0] / _CELL_MPS2),
+            round(force[1] / _CELL_MPS2),
+            round(force[2] / _CELL_MPS2),
+            round(around.temperature_c / _CELL_C),
+            round(around.supply_v / _CELL_V),
+        )
         cell = self._cells.get(key)
         if cell is None:
             if len(self._cells) >= _MAX_CELLS:
@@ -379,5 +425,6 @@ class LiveEstimator:
             axes = [AXES.index(axis) for axis in self.sensor.axes]
             covariance[np.ix_(axes, axes)] = measured[:, :, 0]
             cell = self._cells[key] = _Cell(
-                tangent, tuple(covariance[np.triu_indices(3)].tolist()), outside)
+                tangent, tuple(covariance[np.triu_indices(3)].tolist()), outside
+            )
         return cell

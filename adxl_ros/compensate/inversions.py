@@ -46,13 +46,16 @@ between one and two periods."""
 
 def derivative_weights(half: int) -> np.ndarray:
     """Return the weights of the samples −half … half in a derivative by index, (2·half + 1,)."""
-    one_side = [-(-1) ** k * factorial(half) ** 2
-                / (k * factorial(half - k) * factorial(half + k)) for k in range(1, half + 1)]
+    one_side = [
+        -((-1) ** k) * factorial(half) ** 2 / (k * factorial(half - k) * factorial(half + k))
+        for k in range(1, half + 1)
+    ]
     return np.array([*(-w for w in reversed(one_side)), 0.0, *one_side])
 
 
-def undo_filter(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz: float
-                ) -> np.ndarray:
+def undo_filter(
+    volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz: float
+) -> np.ndarray:
     """
     Undo the filter of consecutive samples.
 
@@ -61,8 +64,9 @@ def undo_filter(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz
     constants (m,).
     """
     distance = np.diff(time_s) * rate_hz
-    breaks = np.concatenate([[0], np.flatnonzero(~((distance > 0) & (distance < MAX_GAP))) + 1,
-                             [len(time_s)]])
+    breaks = np.concatenate(
+        [[0], np.flatnonzero(~((distance > 0) & (distance < MAX_GAP))) + 1, [len(time_s)]]
+    )
     run = np.searchsorted(breaks, np.arange(len(time_s)), 'right')
     row = np.arange(len(time_s))
     reach = np.minimum(HALF, np.minimum(row - breaks[run - 1], breaks[run] - 1 - row))
@@ -75,13 +79,15 @@ def undo_filter(volts: np.ndarray, time_s: np.ndarray, rc_s: np.ndarray, rate_hz
     return volts + rc_s * rate_hz * slope
 
 
-def undo_filter_blocks(blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]],
-                       rc_s: np.ndarray, rate_hz: float) -> Iterator[tuple[Token, np.ndarray]]:
+def undo_filter_blocks(
+    blocks: Iterable[tuple[Token, np.ndarray, np.ndarray]], rc_s: np.ndarray, rate_hz: float
+) -> Iterator[tuple[Token, np.ndarray]]:
     """Undo the filter block by block (token, stamps, volts), as `undo_filter` of the whole."""
     none: tuple[Any, ...] = None, np.empty(0), np.empty((0, len(rc_s)))
     _, before_s, before_v = none
     for (token, time_s, volts), (_, after_s, after_v) in itertools.pairwise(
-            itertools.chain(blocks, [none])):
+        itertools.chain(blocks, [none])
+    ):
         near_s = np.concatenate([before_s, time_s, after_s[:HALF]])
         near_v = np.concatenate([before_v, volts, after_v[:HALF]])
         begin, end = len(before_s), len(before_s) + len(time_s)
@@ -102,8 +108,9 @@ def noise_variance_v2(sensor: Sensor) -> np.ndarray:
         weights = rc * sensor.rate_hz * derivative_weights(HALF)
         weights[HALF] += 1
         correlation = np.exp(-lag / (rc * sensor.rate_hz)) if rc else np.eye(len(weights))
-        variances.append(std_v ** 2 * weights @ correlation @ weights
-                         + sensor.lsb_v ** 2 / 12 * weights @ weights)
+        variances.append(
+            std_v**2 * weights @ correlation @ weights + sensor.lsb_v**2 / 12 * weights @ weights
+        )
     return np.array(variances)
 
 
@@ -116,11 +123,13 @@ class DelayedInversion:
         self._near: deque[tuple[float, list[float], object]] = deque()
         self._index = 0
         gain = rc_s * rate_hz
-        self._kernels = [[(gain * w).tolist() for w in derivative_weights(half)]
-                         for half in range(HALF + 1)]
+        self._kernels = [
+            [(gain * w).tolist() for w in derivative_weights(half)] for half in range(HALF + 1)
+        ]
 
-    def __call__(self, time_s: float, volts: list[float], token: object
-                 ) -> Iterator[tuple[float, list[float], object]]:
+    def __call__(
+        self, time_s: float, volts: list[float], token: object
+    ) -> Iterator[tuple[float, list[float], object]]:
         """Take a sample; yield those that are ready, before a gap all, before the filter."""
         near = self._near
         if near and not 0 < (time_s - near[-1][0]) * self._rate_hz < MAX_GAP:
@@ -137,8 +146,10 @@ class DelayedInversion:
         half = min(index, len(near) - 1 - index, HALF)
         stamp_s, volts, token = near[index]
         kernel = self._kernels[half]
-        undone_v = [v + sum(kernel[k][d] * near[index - half + k][1][d]
-                            for k in range(2 * half + 1)) for d, v in enumerate(volts)]
+        undone_v = [
+            v + sum(kernel[k][d] * near[index - half + k][1][d] for k in range(2 * half + 1))
+            for d, v in enumerate(volts)
+        ]
         if index >= HALF:
             near.popleft()
         else:
@@ -179,10 +190,10 @@ def paper_inverse(sensor: Sensor, maths: Maths = ARRAYS) -> Callable[..., Compon
         at_1_g = converted([0.0 * volts[0] + 1.0] * 3, environment)
         linear = [0.0 * volts[0]] * 3
         for d, v, v0, v1 in zip(measured, volts, at_0_g, at_1_g):
-            linear[d] = (v - v0) / (v1 - v0)                                        # (3)
+            linear[d] = (v - v0) / (v1 - v0)  # (3)
         if 2 not in measured:
-            z2 = gravity_g ** 2 - linear[0] ** 2 - linear[1] ** 2
-            linear[2] = sensor.up * maths.sqrt(maths.maximum(z2, 0.0))          # (5)
+            z2 = gravity_g**2 - linear[0] ** 2 - linear[1] ** 2
+            linear[2] = sensor.up * maths.sqrt(maths.maximum(z2, 0.0))  # (5)
         sensed = list(linear)
         for d in measured:
             inputs = list(linear)
@@ -190,9 +201,9 @@ def paper_inverse(sensor: Sensor, maths: Maths = ARRAYS) -> Callable[..., Compon
             bias = respond(inputs)[d]
             inputs[d] = linear[d] + 2 * _NEAR_ZERO_G * (abs(linear[d]) < _NEAR_ZERO_G)
             scale = (respond(inputs)[d] - bias) / inputs[d]
-            sensed[d] = (linear[d] - bias) / scale                                  # (14), (16)
+            sensed[d] = (linear[d] - bias) / scale  # (14), (16)
         force = list(sensed)
-        for d in measured:                                                          # (20), (21)
+        for d in measured:  # (20), (21)
             others = sum(directions[d][c] * force[c] for c in range(3) if c != d)
             force[d] = (sensed[d] - others) / directions[d][d]
         return [f * G0_MPS2 for f in force]

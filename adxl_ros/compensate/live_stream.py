@@ -51,10 +51,16 @@ class LiveStream:
     gravity of a sample with an orientation, each a serialized geometry_msgs/Vector3Stamped.
     """
 
-    def __init__(self, paper: bool, undo_filter: bool, publish_imu: Callable[[bytes], None],
-                 publish_tilt: Callable[[bytes], None], keep_orientation: bool = False,
-                 publish_free: Callable[[bytes], None] | None = None,
-                 output_rate_hz: float = 0.0) -> None:
+    def __init__(
+        self,
+        paper: bool,
+        undo_filter: bool,
+        publish_imu: Callable[[bytes], None],
+        publish_tilt: Callable[[bytes], None],
+        keep_orientation: bool = False,
+        publish_free: Callable[[bytes], None] | None = None,
+        output_rate_hz: float = 0.0,
+    ) -> None:
         self._paper, self._undo_filter = paper, undo_filter
         self._keep_orientation, self._publish_free = keep_orientation, publish_free
         self._output_rate_hz, self._corrected = output_rate_hz, 0
@@ -90,12 +96,17 @@ class LiveStream:
         """Correct by a sensor, at the rate of the stream, from the next sample on."""
         self._sensor = sensor, rate_hz
         at_rate = replace(sensor, rate_hz=rate_hz)
-        live = LiveEstimator(at_rate, self._paper, self._undo_filter,
-                             self._mounting if self._mounting.turns else None)
+        live = LiveEstimator(
+            at_rate,
+            self._paper,
+            self._undo_filter,
+            self._mounting if self._mounting.turns else None,
+        )
         live.set_environment(**self.surroundings)
         stride = max(1, round(rate_hz / self._output_rate_hz)) if self._output_rate_hz else 1
         self._chain = _Chain(
-            live, DelayedInversion(noise.electronics(at_rate).rc_s, rate_hz), stride)
+            live, DelayedInversion(noise.electronics(at_rate).rc_s, rate_hz), stride
+        )
 
     @property
     def sensor(self) -> Sensor:
@@ -140,7 +151,7 @@ class LiveStream:
         # Read once: another thread may replace the chain at any time.
         chain = self._chain
         volts = chain.live.volts(accel_mps2)
-        if self.may_be_foreign and any(accel_mps2[len(volts):]):
+        if self.may_be_foreign and any(accel_mps2[len(volts) :]):
             self.hold()
             return
         if not volts:
@@ -175,12 +186,21 @@ class LiveStream:
         if self._keep_orientation and imu_message.has_orientation(raw):
             orientation = None
             if self._publish_free is not None:
-                self._publish_free(imu_message.vector3_stamped(raw, free_acceleration(
-                    estimate.force, imu_message.orientation(raw),
-                    live.sensor.local_gravity_mps2)))
-        self._publish_imu(imu_message.corrected(
-            raw, orientation,
-            (*estimate.force, xx, xy, xz, xy, yy, yz, xz, yz, zz)))
+                self._publish_free(
+                    imu_message.vector3_stamped(
+                        raw,
+                        free_acceleration(
+                            estimate.force,
+                            imu_message.orientation(raw),
+                            live.sensor.local_gravity_mps2,
+                        ),
+                    )
+                )
+        self._publish_imu(
+            imu_message.corrected(
+                raw, orientation, (*estimate.force, xx, xy, xz, xy, yy, yz, xz, yz, zz)
+            )
+        )
         self._publish_tilt(imu_message.vector3_stamped(raw, self._angles_rad))
         self.counts['published'] += 1
 
@@ -191,19 +211,31 @@ class LiveStream:
         An angle that the pose does not show keeps its last value, with a very large variance.
         """
         variances = []
-        for i, (angle, variance) in enumerate((estimate.roll, estimate.pitch,
-                                               estimate.inclination)):
+        for i, (angle, variance) in enumerate(
+            (estimate.roll, estimate.pitch, estimate.inclination)
+        ):
             observable = variance < UNOBSERVABLE_RAD2
             if observable:
                 self._angles_rad[i] = angle
             variances.append(variance if observable else UNKNOWN_ANGLE_RAD2)
         roll, pitch, _ = variances
-        return (*quaternion(self._angles_rad[0], self._angles_rad[1], FLOATS),
-                roll, 0.0, 0.0, 0.0, pitch, 0.0, 0.0, 0.0, UNKNOWN_ANGLE_RAD2)
+        return (
+            *quaternion(self._angles_rad[0], self._angles_rad[1], FLOATS),
+            roll,
+            0.0,
+            0.0,
+            0.0,
+            pitch,
+            0.0,
+            0.0,
+            0.0,
+            UNKNOWN_ANGLE_RAD2,
+        )
 
 
-def free_acceleration(force_mps2: Components, quaternion: Sequence[float], gravity_mps2: float
-                      ) -> list[float]:
+def free_acceleration(
+    force_mps2: Components, quaternion: Sequence[float], gravity_mps2: float
+) -> list[float]:
     """Return the acceleration without gravity, m/s², three floats."""
     x, y, z, w = quaternion
     vertical = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
@@ -235,16 +267,19 @@ class ImuFields:
         std_rad = np.stack([tilt.roll_std, tilt.pitch_std])[:, solved]
         angles_rad = self._held(shown_rad)
         variances = np.zeros((9, len(force.T)))
-        variances[[0, 4]] = np.where(np.isfinite(std_rad), std_rad ** 2, UNKNOWN_ANGLE_RAD2)
+        variances[[0, 4]] = np.where(np.isfinite(std_rad), std_rad**2, UNKNOWN_ANGLE_RAD2)
         variances[8] = UNKNOWN_ANGLE_RAD2
-        return {'linear_acceleration': force.T,
-                'linear_acceleration_covariance': covariance.reshape(9, -1).T,
-                'orientation': np.stack(quaternion(angles_rad[0], angles_rad[1], ARRAYS)).T,
-                'orientation_covariance': variances.T}, angles_rad.T
+        return {
+            'linear_acceleration': force.T,
+            'linear_acceleration_covariance': covariance.reshape(9, -1).T,
+            'orientation': np.stack(quaternion(angles_rad[0], angles_rad[1], ARRAYS)).T,
+            'orientation_covariance': variances.T,
+        }, angles_rad.T
 
     def _held(self, angles_rad: np.ndarray) -> np.ndarray:
         """Return angles, rad, (3, n), with the last known value in place of NaN."""
         import pandas  # It would slow down the start of a node
+
         held = pandas.DataFrame(np.vstack([self._last_rad, angles_rad.T])).ffill().to_numpy()
         self._last_rad = held[-1]
         return held[1:].T

@@ -106,7 +106,7 @@ class LeftOut:
     @property
     def squares_mps2(self) -> float:
         """Sum of their squares, mean over axes, (m/s²)²."""
-        return float(np.nan_to_num(self.samples * self.rms_mps2 ** 2))
+        return float(np.nan_to_num(self.samples * self.rms_mps2**2))
 
     @property
     def why(self) -> str:
@@ -178,8 +178,9 @@ class BaselineComparison:
     @property
     def out_of_range(self) -> np.ndarray:
         """Where measured samples are at a rail or beyond the stated range, (n, m) bool."""
-        return self.sensor.saturated(np.where(self.measured[:, None], self.volts,
-                                              self.sensor.nominal_zero_g_v))
+        return self.sensor.saturated(
+            np.where(self.measured[:, None], self.volts, self.sensor.nominal_zero_g_v)
+        )
 
     @property
     def surroundings(self) -> dict[str, np.ndarray]:
@@ -224,9 +225,16 @@ class BaselineComparison:
         force = self.motion.force
         if not isinstance(force, ForcePath):
             return 0.0
-        return float(np.sqrt(np.mean([
-            np.square(force.errors(self.time_s, AXES.index(axis)).std[self.used])
-            for axis in self.sensor.axes])))
+        return float(
+            np.sqrt(
+                np.mean(
+                    [
+                        np.square(force.errors(self.time_s, AXES.index(axis)).std[self.used])
+                        for axis in self.sensor.axes
+                    ]
+                )
+            )
+        )
 
     def lost_motion_mps2(self) -> float:
         """Return the rms of the fast motion that a smooth reference lacks, m/s²."""
@@ -235,7 +243,8 @@ class BaselineComparison:
         residual_v = np.where(self.used[:, None], self.residual_v(self.sensor), 0.0)
         frequency_hz, power = scipy.signal.periodogram(residual_v, self.sensor.rate_hz, axis=0)
         lost = (power - noise.density_v2_per_hz(self.sensor, frequency_hz))[
-            frequency_hz > self.fading_hz / 2] / self.scale_v_per_mps2 ** 2
+            frequency_hz > self.fading_hz / 2
+        ] / self.scale_v_per_mps2**2
         return float(np.sqrt(max(lost.mean(axis=1).sum() * frequency_hz[1], 0.0)))
 
 
@@ -244,8 +253,13 @@ def noiseless(sensor: Sensor) -> Sensor:
     mean = tuple(e for e in sensor.effects if effect_named(e).acts_on is ActsOn.MEAN)
     # Without an ADC there are no rails, and pseudo-volts may be negative.
     bits = 48 if sensor.adc_bits else 0
-    return replace(sensor, noise_density_g_per_rthz=np.zeros(len(sensor.axes)), adc_bits=bits,
-                   effects=mean, values={e: sensor.values[e] for e in mean})
+    return replace(
+        sensor,
+        noise_density_g_per_rthz=np.zeros(len(sensor.axes)),
+        adc_bits=bits,
+        effects=mean,
+        values={e: sensor.values[e] for e in mean},
+    )
 
 
 def with_values(sensor: Sensor, effect: str, values: Mapping[str, Any]) -> Sensor:
@@ -255,21 +269,34 @@ def with_values(sensor: Sensor, effect: str, values: Mapping[str, Any]) -> Senso
     return replace(sensor, values={**sensor.values, effect: {**before, **changed}})
 
 
-def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None
-            ) -> BaselineComparison:
+def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None) -> BaselineComparison:
     """Put a recording beside the simulator, at the full rate of the recording."""
     sensor = replace(sensor, rate_hz=recording.rate_hz)
     volts, time_s = recording.volts(sensor), recording.time_s
     motion, reference = _motion(recording, sensor, volts, sim)
     if reference is not Reference.NONE:
-        motion = replace(motion, internal_rate_hz=min(
-            max(_LOWEST_INTERNAL_RATE_HZ, sensor.rate_hz), INTERNAL_RATE_HZ,
-            _MOST_STEPS / max(float(np.ptp(time_s)), 1.0)))
+        motion = replace(
+            motion,
+            internal_rate_hz=min(
+                max(_LOWEST_INTERNAL_RATE_HZ, sensor.rate_hz),
+                INTERNAL_RATE_HZ,
+                _MOST_STEPS / max(float(np.ptp(time_s)), 1.0),
+            ),
+        )
     at_rest = _at_rest(motion, time_s, reference, volts)
     # Where another simulator moves from its first sample on, the filter has not settled.
     used = at_rest | (time_s > time_s[0] + SETTLING_S) | (reference is not Reference.SIMULATOR)
-    return BaselineComparison(recording.path, time_s, volts, motion, sensor, reference, at_rest,
-                              used, np.zeros(len(time_s), bool))
+    return BaselineComparison(
+        recording.path,
+        time_s,
+        volts,
+        motion,
+        sensor,
+        reference,
+        at_rest,
+        used,
+        np.zeros(len(time_s), bool),
+    )
 
 
 def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
@@ -278,40 +305,60 @@ def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
     motion = comparison.motion
     every = max(1, round(rate_hz / min(SEARCH_RATE_HZ, SEARCH_SAMPLES / span_s)))
     if comparison.reference is not Reference.NONE:
-        motion = replace(motion, internal_rate_hz=min(_LOWEST_INTERNAL_RATE_HZ,
-                                                      _MOST_STEPS / span_s))
-    return replace(comparison, motion=motion, memo=ChainMemo(), sensor=replace(
-        comparison.sensor, rate_hz=rate_hz / every), **{
+        motion = replace(
+            motion, internal_rate_hz=min(_LOWEST_INTERNAL_RATE_HZ, _MOST_STEPS / span_s)
+        )
+    return replace(
+        comparison,
+        motion=motion,
+        memo=ChainMemo(),
+        sensor=replace(comparison.sensor, rate_hz=rate_hz / every),
+        **{
             name: getattr(comparison, name)[::every]
-            for name in ('time_s', 'volts', 'at_rest', 'used', 'disturbed')})
+            for name in ('time_s', 'volts', 'at_rest', 'used', 'disturbed')
+        },
+    )
 
 
-def _motion(recording: Recording, sensor: Sensor, volts: np.ndarray, sim: Motion | None
-            ) -> tuple[Motion, Reference]:
+def _motion(
+    recording: Recording, sensor: Sensor, volts: np.ndarray, sim: Motion | None
+) -> tuple[Motion, Reference]:
     """Return the motion of a recording and what determines it."""
-    paths: dict[str, Any] = {'temperature_c': None, 'supply_v': None,
-                             **environment_paths(recording)}
+    paths: dict[str, Any] = {
+        'temperature_c': None,
+        'supply_v': None,
+        **environment_paths(recording),
+    }
     if sim is not None:
         return replace(sim, **paths), Reference.SIMULATOR
-    read = {joint: values[np.isfinite(values)] for joint, name in JOINTS.items()
-            if np.isfinite(values := recording.columns.get(name, np.zeros(0))).any()}
+    read = {
+        joint: values[np.isfinite(values)]
+        for joint, name in JOINTS.items()
+        if np.isfinite(values := recording.columns.get(name, np.zeros(0))).any()
+    }
     if {'alpha', 'beta'} <= {*read} and any(
-            np.ptp(values) > _SMALLEST_MOVES[joint] for joint, values in read.items()):
+        np.ptp(values) > _SMALLEST_MOVES[joint] for joint, values in read.items()
+    ):
         return motion_from_references(recording, sensor), Reference.STAGE
     # The median output stands for the unknown pose, and the simulator runs at the samples' rate.
     force = signal_chain.inverse(sensor)([float(v) for v in np.nanmedian(volts, axis=0)])
-    return Motion(float(recording.time_s[-1] - recording.time_s[0]), internal_rate_hz=1e-3,
-                  force=lambda time_s: [np.full(len(time_s), f) for f in force],
-                  **paths), Reference.NONE
+    return Motion(
+        float(recording.time_s[-1] - recording.time_s[0]),
+        internal_rate_hz=1e-3,
+        force=lambda time_s: [np.full(len(time_s), f) for f in force],
+        **paths,
+    ), Reference.NONE
 
 
-def _at_rest(motion: Motion, time_s: np.ndarray, reference: Reference, volts: np.ndarray
-             ) -> np.ndarray:
+def _at_rest(
+    motion: Motion, time_s: np.ndarray, reference: Reference, volts: np.ndarray
+) -> np.ndarray:
     """Return which samples rest, (n,) bool."""
     if reference is Reference.NONE:
         return np.ones(len(time_s), bool)
     if reference is Reference.SIMULATOR:
         from adxl_ros.signals.rest_detection import find_rests
+
         # The force of another simulator may be noisy, so that the sensor itself shows its rests.
         finite, at_rest = np.isfinite(volts).all(axis=1), np.zeros(len(time_s), bool)
         for rest in find_rests(time_s[finite], volts[finite], stamped_rate_hz(time_s)):
@@ -344,12 +391,17 @@ def gravity_slopes(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
     """Return the derivatives of gravity's direction in the sensor by both angles, (2, 3, n)."""
     sin_alpha, cos_alpha = np.sin(alpha_rad), np.cos(alpha_rad)
     sin_beta, cos_beta = np.sin(beta_rad), np.cos(beta_rad)
-    return np.array([[cos_alpha * cos_beta, -cos_alpha * sin_beta, -sin_alpha],
-                     [-sin_alpha * sin_beta, -sin_alpha * cos_beta, 0 * sin_alpha]])
+    return np.array(
+        [
+            [cos_alpha * cos_beta, -cos_alpha * sin_beta, -sin_alpha],
+            [-sin_alpha * sin_beta, -sin_alpha * cos_beta, 0 * sin_alpha],
+        ]
+    )
 
 
-def _in_gaps(time_s: np.ndarray, read_s: np.ndarray, longest_s: float
-             ) -> Iterable[tuple[int, int]]:
+def _in_gaps(
+    time_s: np.ndarray, read_s: np.ndarray, longest_s: float
+) -> Iterable[tuple[int, int]]:
     """
     Yield the samples, begin and end, in gaps between readings that are not bridged.
 
@@ -357,13 +409,17 @@ def _in_gaps(time_s: np.ndarray, read_s: np.ndarray, longest_s: float
     """
     ends_s = np.concatenate([[min(time_s[0], read_s[0])], read_s, [max(time_s[-1], read_s[-1])]])
     for i in np.flatnonzero(np.diff(ends_s) > longest_s):
-        yield (int(np.searchsorted(time_s, ends_s[i], 'right' if i else 'left')),
-               int(np.searchsorted(time_s, ends_s[i + 1], 'right' if i > len(read_s) - 1
-                                   else 'left')))
+        yield (
+            int(np.searchsorted(time_s, ends_s[i], 'right' if i else 'left')),
+            int(
+                np.searchsorted(time_s, ends_s[i + 1], 'right' if i > len(read_s) - 1 else 'left')
+            ),
+        )
 
 
-def leave_out(comparison: BaselineComparison, rows: np.ndarray, reason: str,
-              effect: str | None = None) -> BaselineComparison:
+def leave_out(
+    comparison: BaselineComparison, rows: np.ndarray, reason: str, effect: str | None = None
+) -> BaselineComparison:
     """
     Return a comparison that does not use some samples, and notes why, when and how many.
 
@@ -375,14 +431,25 @@ def leave_out(comparison: BaselineComparison, rows: np.ndarray, reason: str,
     time_s, runs = comparison.time_s, true_runs(rows)
     residual_v = comparison.residual_v(comparison.sensor)[rows]
     squares = (residual_v / comparison.scale_v_per_mps2)[np.isfinite(residual_v)] ** 2
-    left_out = LeftOut(reason, int(rows.sum()), float(comparison.dt_s * rows.sum()),
-                       float(np.sqrt(squares.mean())) if len(squares) else np.nan, effect)
+    left_out = LeftOut(
+        reason,
+        int(rows.sum()),
+        float(comparison.dt_s * rows.sum()),
+        float(np.sqrt(squares.mean())) if len(squares) else np.nan,
+        effect,
+    )
     parts = ', '.join(_span_text(time_s[a], time_s[b - 1]) for a, b in runs[:_NAMED_PARTS])
     size = f'; they differ by {acceleration_text(left_out.rms_mps2)} rms' * bool(len(squares))
-    note = (f'left out: {left_out.samples} samples, {left_out.duration_s:.3g} s '
-            f'({parts}{", ..." * (len(runs) > _NAMED_PARTS)}): {reason}{size}')
-    return replace(comparison, used=comparison.used & ~rows, notes=(*comparison.notes, note),
-                   left_out=(*comparison.left_out, left_out))
+    note = (
+        f'left out: {left_out.samples} samples, {left_out.duration_s:.3g} s '
+        f'({parts}{", ..." * (len(runs) > _NAMED_PARTS)}): {reason}{size}'
+    )
+    return replace(
+        comparison,
+        used=comparison.used & ~rows,
+        notes=(*comparison.notes, note),
+        left_out=(*comparison.left_out, left_out),
+    )
 
 
 def _span_text(begin_s: float, end_s: float) -> str:
@@ -407,14 +474,17 @@ def without_gaps(comparison: BaselineComparison) -> BaselineComparison:
     unknown = np.zeros(len(time_s), bool)
     for begin, end in _in_gaps(time_s, force.time_s, limit_s):
         if end > begin:
-            unknown |= (time_s >= time_s[begin] - _BEFORE_S) \
-                & (time_s <= time_s[end - 1] + _AFTER_S)
-    return leave_out(comparison, unknown,
-                     f'no reading of {force.name} for more than {limit_s:.3g} s')
+            unknown |= (time_s >= time_s[begin] - _BEFORE_S) & (
+                time_s <= time_s[end - 1] + _AFTER_S
+            )
+    return leave_out(
+        comparison, unknown, f'no reading of {force.name} for more than {limit_s:.3g} s'
+    )
 
 
-def stated_poses(recording: Recording, sensor: Sensor
-                 ) -> tuple[Recording, list[tuple[np.ndarray, str]]]:
+def stated_poses(
+    recording: Recording, sensor: Sensor
+) -> tuple[Recording, list[tuple[np.ndarray, str]]]:
     """
     Fill the gaps of the stage's joints; return samples that are not known there, and reasons.
 
@@ -431,19 +501,25 @@ def stated_poses(recording: Recording, sensor: Sensor
             continue
         step = 0.0 if joint == 'shift' else sensor.stage_resolution_rad
         filled = np.interp(time_s, time_s[read], values[read])
-        limit_s = max(_LONGEST_BRIDGE_S, min(USUAL_GAPS * float(np.median(np.diff(
-            time_s[read]))), _SLOWEST_S))
+        limit_s = max(
+            _LONGEST_BRIDGE_S,
+            min(USUAL_GAPS * float(np.median(np.diff(time_s[read]))), _SLOWEST_S),
+        )
         unknown, columns[name] = np.zeros(len(time_s), bool), values.copy()
         for begin, end in _in_gaps(time_s, time_s[read], _LONGEST_BRIDGE_S):
             inner = 0 < begin < end < len(time_s)
             gap_s = time_s[min(end, len(time_s) - 1)] - time_s[max(begin - 1, 0)]
-            holds = inner and _rests(output_g[begin:end], lag) and abs(
-                filled[end] - filled[begin - 1]) <= _SAME_STEPS * step + _SAME_POSE
+            holds = (
+                inner
+                and _rests(output_g[begin:end], lag)
+                and abs(filled[end] - filled[begin - 1]) <= _SAME_STEPS * step + _SAME_POSE
+            )
             if inner and (holds or gap_s > limit_s):
                 columns[name][begin:end] = filled[begin:end]
             if not holds and gap_s > limit_s:
-                unknown |= (time_s > time_s[begin] - _BEFORE_S) \
-                    & (time_s < time_s[end - 1] + _AFTER_S)
+                unknown |= (time_s > time_s[begin] - _BEFORE_S) & (
+                    time_s < time_s[end - 1] + _AFTER_S
+                )
         left_out.append((unknown, f'no reading of {name} for more than {limit_s:.3g} s'))
     return replace(recording, columns=columns), left_out
 
@@ -454,8 +530,9 @@ def _rests(output_g: np.ndarray, lag: int) -> bool:
     if len(output_g) <= 2 * lag:
         return True
     noise_g = np.sqrt(np.mean((output_g[lag:] - output_g[:-lag]) ** 2, axis=0) / 2)
-    return bool(np.all(output_g.std(axis=0) < np.minimum(SMALLEST_MOTION_G, _SLOW * noise_g)
-                       + _SAME_POSE))
+    return bool(
+        np.all(output_g.std(axis=0) < np.minimum(SMALLEST_MOTION_G, _SLOW * noise_g) + _SAME_POSE)
+    )
 
 
 def seen_step_rad(recording: Recording, sensor: Sensor) -> float:
@@ -471,24 +548,30 @@ def seen_step_rad(recording: Recording, sensor: Sensor) -> float:
         # Readings with decimals differ by one step more or less exactly.
         step_rad = float(few.sum() / np.rint(few / step_rad).sum())
         whole = np.abs(few / step_rad - np.rint(few / step_rad)) < _WHOLE
-        if whole.sum() >= _FEWEST_CHANGES and whole.mean() > _WHOLE_SHARE \
-                and _COARSER * largest_rad < step_rad < _LARGEST_STEP_RAD:
+        if (
+            whole.sum() >= _FEWEST_CHANGES
+            and whole.mean() > _WHOLE_SHARE
+            and _COARSER * largest_rad < step_rad < _LARGEST_STEP_RAD
+        ):
             largest_rad = step_rad
     return largest_rad
 
 
-def _without_jerks(comparison: BaselineComparison, force: Any, noise_g: float
-                   ) -> BaselineComparison:
+def _without_jerks(
+    comparison: BaselineComparison, force: Any, noise_g: float
+) -> BaselineComparison:
     """Leave out samples at which a robot jerks: its encoders do not show its acceleration."""
-    error_g = np.abs(force.smoothing_mps2[:, :len(comparison.sensor.axes)]).max(axis=1) / G0_MPS2
+    error_g = np.abs(force.smoothing_mps2[:, : len(comparison.sensor.axes)]).max(axis=1) / G0_MPS2
     time_s = comparison.time_s
     rows = np.interp(time_s, force.time_s, error_g) > _LARGEST_JERK * noise_g
     rows |= (time_s < force.time_s[0] + _JERK_S) | (time_s > force.time_s[-1] - _JERK_S)
     margin = round(_JERK_S * comparison.sensor.rate_hz)
     return leave_out(
-        comparison, np.convolve(rows, np.ones(2 * margin + 1), 'same') > 0.5,
+        comparison,
+        np.convolve(rows, np.ones(2 * margin + 1), 'same') > 0.5,
         f'the robot jerks, which its encoders do not show (error up to {1e3 * error_g.max():.2g} '
-        'mg); move more smoothly, or record the joints at a higher rate')
+        'mg); move more smoothly, or record the joints at a higher rate',
+    )
 
 
 @dataclass(frozen=True)
@@ -505,8 +588,12 @@ class _Readings:
     def error_g(self, time_s: np.ndarray) -> np.ndarray:
         """Return the difference between the splines, g, (n,), by that between readings."""
         middle_s = (self.time_s[1:] + self.time_s[:-1]) / 2
-        first, second = (scipy.interpolate.make_interp_spline(
-            self.time_s, self.values, degree)(middle_s, self.order) for degree in self.degrees)
+        first, second = (
+            scipy.interpolate.make_interp_spline(self.time_s, self.values, degree)(
+                middle_s, self.order
+            )
+            for degree in self.degrees
+        )
         return np.interp(time_s, middle_s, np.abs(first - second).max(axis=1))
 
     def lacks(self, time_s: np.ndarray) -> np.ndarray:
@@ -530,16 +617,28 @@ def _readings(comparison: BaselineComparison, columns: dict[str, np.ndarray]) ->
         if read.sum() <= BAND_LIMITED_DEGREE or not np.ptp(values[read]):
             continue
         if joint == 'shift':
-            found.append(_Readings(name, time_s[read], values[read, None] / G0_MPS2, (
-                BAND_LIMITED_DEGREE - 2, BAND_LIMITED_DEGREE), 2, 0.0))
+            found.append(
+                _Readings(
+                    name,
+                    time_s[read],
+                    values[read, None] / G0_MPS2,
+                    (BAND_LIMITED_DEGREE - 2, BAND_LIMITED_DEGREE),
+                    2,
+                    0.0,
+                )
+            )
         else:
-            found.append(_Readings(name, time_s[read], values[read, None], (3, 5), 0,
-                                   sensor.stage_resolution_rad))
+            found.append(
+                _Readings(
+                    name, time_s[read], values[read, None], (3, 5), 0, sensor.stage_resolution_rad
+                )
+            )
     return found
 
 
-def without_fast_motion(comparison: BaselineComparison, columns: dict[str, np.ndarray]
-                        ) -> BaselineComparison:
+def without_fast_motion(
+    comparison: BaselineComparison, columns: dict[str, np.ndarray]
+) -> BaselineComparison:
     """
     Leave out samples at which the reference moves faster than its readings show.
 
@@ -557,8 +656,11 @@ def without_fast_motion(comparison: BaselineComparison, columns: dict[str, np.nd
         return np.convolve(rows, margin, 'same') > 0.5
 
     beyond = near(comparison.out_of_range.any(axis=1))
-    rests = comparison.at_rest if comparison.reference is Reference.SIMULATOR \
+    rests = (
+        comparison.at_rest
+        if comparison.reference is Reference.SIMULATOR
         else np.zeros(len(comparison), bool)
+    )
     for readings in _readings(comparison, columns):
         error_g = readings.error_g(comparison.time_s)
         coarse = comparison.used & ~rests & (error_g > np.hypot(limit_g, readings.step_g))
@@ -568,27 +670,44 @@ def without_fast_motion(comparison: BaselineComparison, columns: dict[str, np.nd
         lacks = near(readings.lacks(comparison.time_s))
         error = f'(error up to {1e3 * error_g[rows].max():.2g} mg)'
         rate_hz = stamped_rate_hz(readings.time_s)
-        comparison = leave_out(comparison, rows & beyond, 'the output is beyond the range of '
-                               f'{sensor.range_g:g} g that the parameter file states, in motion '
-                               f'that {readings.name} does not follow {error}')
-        comparison = leave_out(comparison, rows & lacks,
-                               f'{readings.name} lacks readings there {error}')
-        comparison = leave_out(comparison, rows, f'{readings.name} moves too fast for its '
-                               f'{rate_hz:.4g} readings a second {error}; read it at a higher '
-                               'rate')
+        comparison = leave_out(
+            comparison,
+            rows & beyond,
+            'the output is beyond the range of '
+            f'{sensor.range_g:g} g that the parameter file states, in motion '
+            f'that {readings.name} does not follow {error}',
+        )
+        comparison = leave_out(
+            comparison, rows & lacks, f'{readings.name} lacks readings there {error}'
+        )
+        comparison = leave_out(
+            comparison,
+            rows,
+            f'{readings.name} moves too fast for its '
+            f'{rate_hz:.4g} readings a second {error}; read it at a higher '
+            'rate',
+        )
     return comparison
 
 
-def _with_aliases(comparison: BaselineComparison, coarse: np.ndarray, noise_g: float
-                  ) -> np.ndarray:
+def _with_aliases(
+    comparison: BaselineComparison, coarse: np.ndarray, noise_g: float
+) -> np.ndarray:
     """Extend samples to the seconds beside them that move otherwise than simulated, (n,) bool."""
     sensor, measured = comparison.sensor, comparison.measured
     length = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
     part = np.minimum(np.arange(len(coarse)) // length, max(len(coarse) // length - 1, 0))
-    recorded, simulated = (np.sqrt([
-        noise_g ** 2 + np.bincount(part, c ** 2) / np.bincount(part) for c in np.diff(
-            bridged(v, measured) / sensor.scale_v_per_g, axis=0, prepend=0.0).T])
-        for v in (comparison.volts, comparison.simulated_v(sensor)))
+    recorded, simulated = (
+        np.sqrt(
+            [
+                noise_g**2 + np.bincount(part, c**2) / np.bincount(part)
+                for c in np.diff(
+                    bridged(v, measured) / sensor.scale_v_per_g, axis=0, prepend=0.0
+                ).T
+            ]
+        )
+        for v in (comparison.volts, comparison.simulated_v(sensor))
+    )
     differs = np.any(np.abs(np.log(recorded / simulated)) > np.log(_SAME_MOTION), axis=0)
     touched = np.bincount(part, coarse) > 0
     extended = coarse.copy()
@@ -607,22 +726,28 @@ def fading_frequency_hz(comparison: BaselineComparison) -> float | None:
     within = comparison.measured & ~comparison.out_of_range.any(axis=1)
     recorded_g, simulated_g = (
         bridged(v, within) / sensor.scale_v_per_g
-        for v in (comparison.volts, comparison.simulated_v(sensor)))
+        for v in (comparison.volts, comparison.simulated_v(sensor))
+    )
     if len(recorded_g) < _FEWEST_WINDOWS * size // 2:
         return None
 
     frequency_hz = np.arange(size // 2 + 1) * sensor.rate_hz / size
     band = max(round(_BAND_HZ * size / sensor.rate_hz), 1)
     count = (size // 2) // band * band
-    stated = (noise.density_v2_per_hz(sensor, frequency_hz[1:]) / sensor.scale_v_per_g ** 2).sum(1)
+    stated = (noise.density_v2_per_hz(sensor, frequency_hz[1:]) / sensor.scale_v_per_g**2).sum(1)
     # Without its RC filter the sensor has this gain over its simulation.
     rc_s = float(np.max(noise.electronics(sensor).rc_s))
     unfiltered = 1 + (2 * np.pi * frequency_hz[1:] * rc_s) ** 2
-    recorded, simulated = (scipy.signal.welch(
-        v, sensor.rate_hz, nperseg=size, detrend='linear', axis=0)[1][1:].sum(axis=1)
-        for v in (recorded_g, simulated_g))
-    recorded, simulated, stated = (v[:count].reshape(-1, band).mean(axis=1) for v in (
-        recorded, simulated * unfiltered, stated))
+    recorded, simulated = (
+        scipy.signal.welch(v, sensor.rate_hz, nperseg=size, detrend='linear', axis=0)[1][1:].sum(
+            axis=1
+        )
+        for v in (recorded_g, simulated_g)
+    )
+    recorded, simulated, stated = (
+        v[:count].reshape(-1, band).mean(axis=1)
+        for v in (recorded, simulated * unfiltered, stated)
+    )
     moves = recorded > _MOTION * stated
     followed = np.flatnonzero(moves & (simulated >= _FADED * recorded))
     first = followed[-1] + 1 if len(followed) else 0

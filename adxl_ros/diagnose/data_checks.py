@@ -99,8 +99,12 @@ _LONGEST_HOLD_S = 1.0  # Longest time that an output may keep one value in motio
 _LARGEST_LEVEL_G = 1e3  # Largest median output, g. Chosen: above that of any sensor on a stage
 _UNIT_TOLERANCE = 0.1
 """Relative deviation of a gain from the ratio of two units. Chosen: above any scale error."""
-_UNIT_RATIOS = {9.80665: 'm/s² instead of g', 1e3: 'mV instead of V', 1e-3: 'kV instead of V',
-                1 / 9.80665: 'g instead of m/s²'}
+_UNIT_RATIOS = {
+    9.80665: 'm/s² instead of g',
+    1e3: 'mV instead of V',
+    1e-3: 'kV instead of V',
+    1 / 9.80665: 'g instead of m/s²',
+}
 """Gain of an output in the wrong unit, and which unit it has instead of which."""
 
 
@@ -132,17 +136,22 @@ def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> N
         rate_hz = stamped_rate_hz(time_s)
         rests = find_rests(time_s, force_mps2, rate_hz)
         shape = len(rests), force_mps2.shape[1]
-        mean, std = (np.reshape(values, shape) for values in rest_means(
-            time_s, force_mps2, rests, rate_hz))
-        gravity = gravity_at_rest.look(RestReadings(mean, std), gravity_at_rest.IDEAL,
-                                       sensor.local_gravity_mps2)
+        mean, std = (
+            np.reshape(values, shape) for values in rest_means(time_s, force_mps2, rests, rate_hz)
+        )
+        gravity = gravity_at_rest.look(
+            RestReadings(mean, std), gravity_at_rest.IDEAL, sensor.local_gravity_mps2
+        )
         if gravity.fault is not None and gravity.fault.is_clear:
-            raise DataFault(gravity.fault.data_fault, f'{sim.force.name}: '
-                            f'{gravity.fault.reason}; {gravity.fault.conversion}')
+            raise DataFault(
+                gravity.fault.data_fault,
+                f'{sim.force.name}: {gravity.fault.reason}; {gravity.fault.conversion}',
+            )
 
 
-def _align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: bool
-                 ) -> tuple[Recording, Motion, list[str]]:
+def _align_force(
+    recording: Recording, sensor: Sensor, sim: Motion, may_shift: bool
+) -> tuple[Recording, Motion, list[str]]:
     """
     Find the part of a recording that another simulator covers, and check their time.
 
@@ -154,34 +163,54 @@ def _align_force(recording: Recording, sensor: Sensor, sim: Motion, may_shift: b
     shift = f'{abs(late_s):.4f} s {"late" if late_s > 0 else "early"}' if late_s else ''
     if late_s and may_shift:
         force = force.shifted(-late_s)
-        notes = [f'--align: {force.name} was {shift}, and is shifted by {-late_s:+.6g} s; a '
-                 'latency of the sensor is a part of that and cannot show']
+        notes = [
+            f'--align: {force.name} was {shift}, and is shifted by {-late_s:+.6g} s; a '
+            'latency of the sensor is a part of that and cannot show'
+        ]
     elif may_shift:
-        notes = [f'--align: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may be an '
-                 'effect of the sensor (time_offset), and nothing is shifted']
+        notes = [
+            f'--align: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may be an '
+            'effect of the sensor (time_offset), and nothing is shifted'
+        ]
     covered, begin_s, end_s = _covered(recording, force)
     span = f'it is from {begin_s:.6g} to {end_s:.6g} s'
     if not len(covered):
-        advice = f'its motion fits, but is {shift}; use --align' if shift else \
-            'no shift makes its motion fit; give that of this recording'
-        raise DataFault('no_overlap', f'{force.name} does not overlap the recording in time: '
-                        f'{span}, {basename(recording.path)} from {recording.time_s[0]:.6g} to '
-                        f'{recording.time_s[-1]:.6g} s; {advice}')
+        advice = (
+            f'its motion fits, but is {shift}; use --align'
+            if shift
+            else 'no shift makes its motion fit; give that of this recording'
+        )
+        raise DataFault(
+            'no_overlap',
+            f'{force.name} does not overlap the recording in time: '
+            f'{span}, {basename(recording.path)} from {recording.time_s[0]:.6g} to '
+            f'{recording.time_s[-1]:.6g} s; {advice}',
+        )
     if late_s and not may_shift:
-        raise DataFault('time_misaligned', f'{force.name} is {shift}; use --align, or '
-                        f'shift its stamps by {-late_s:+.6g} s')
+        raise DataFault(
+            'time_misaligned',
+            f'{force.name} is {shift}; use --align, or shift its stamps by {-late_s:+.6g} s',
+        )
     if len(covered) < len(recording):
         outside_s = (1 - len(covered) / len(recording)) * float(np.ptp(recording.time_s))
-        notes.append(f'left out: {outside_s:.3g} s of the recording that {force.name} does not '
-                     f'cover ({span})')
+        notes.append(
+            f'left out: {outside_s:.3g} s of the recording that {force.name} does not '
+            f'cover ({span})'
+        )
     return covered, replace(sim, force=force), notes
 
 
 def _covered(recording: Recording, force: ForcePath) -> tuple[Recording, float, float]:
     """Return the part of a recording that a force covers, and begin and end of the force, s."""
     begin_s, end_s = force.time_s[0], force.time_s[-1]
-    return recording.rows(int(np.searchsorted(recording.time_s, begin_s)), int(
-        np.searchsorted(recording.time_s, end_s, 'right'))), begin_s, end_s
+    return (
+        recording.rows(
+            int(np.searchsorted(recording.time_s, begin_s)),
+            int(np.searchsorted(recording.time_s, end_s, 'right')),
+        ),
+        begin_s,
+        end_s,
+    )
 
 
 def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> float | None:
@@ -198,7 +227,7 @@ def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> float
     step_s = max(_SEARCH_STEP_S, (np.ptp(time_s) + np.ptp(sim_s)) / _LONGEST_SEARCH)
     first_s, second_s = (np.arange(t[0], t[-1], step_s) for t in (time_s, sim_s))
     first = np.column_stack([np.interp(first_s, time_s, g) for g in measured_g[finite].T])
-    second = np.column_stack(force(second_s))[:, :first.shape[1]] / G0_MPS2
+    second = np.column_stack(force(second_s))[:, : first.shape[1]] / G0_MPS2
     shortest_s = min(SHORTEST_S, np.ptp(time_s) / 2, np.ptp(sim_s) / 2)
     lags, overlap, correlation = _correlations(first, second, max(round(shortest_s / step_s), 2))
     lags_s = second_s[0] - first_s[0] + lags * step_s
@@ -207,21 +236,24 @@ def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> float
     best = int(np.argmax(np.where(np.abs(lags_s - longest_s) < 1.0, correlation, -1.0)))
     unshifted = int(np.argmin(np.abs(lags_s)))
     if correlation[best] < _CORRELATED or (
-            abs(lags_s[unshifted]) < step_s and 1 - correlation[best]
-            > _LARGEST_ERROR_RATIO * (1 - correlation[unshifted])):
+        abs(lags_s[unshifted]) < step_s
+        and 1 - correlation[best] > _LARGEST_ERROR_RATIO * (1 - correlation[unshifted])
+    ):
         return None
     late_s = _fine_shift(recording, sensor, force, float(lags_s[best]))
     return late_s if abs(late_s) > LARGEST_LATENCY_S else None
 
 
-def _correlations(first: np.ndarray, second: np.ndarray, smallest: int
-                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _correlations(
+    first: np.ndarray, second: np.ndarray, smallest: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
     Correlate two motions, g, (n, m) and (n', m), at all lags, each over the samples that overlap.
 
     Sample i of the first meets sample i + lag of the second. Return lags, counts of samples that
     overlap, and correlations, −1 where fewer than `smallest` overlap or one does not move.
     """
+
     def products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return scipy.signal.correlate(b, a, method='fft')
 
@@ -231,13 +263,16 @@ def _correlations(first: np.ndarray, second: np.ndarray, smallest: int
     for a, b in zip((first - first.mean(axis=0)).T, (second - second.mean(axis=0)).T):
         sum_a, sum_b = products(a, two), products(one, b)
         covariance += np.abs(products(a, b) - sum_a * sum_b / overlap)
-        squares[0] += products(a * a, two) - sum_a ** 2 / overlap
-        squares[1] += products(one, b * b) - sum_b ** 2 / overlap
-    smallest_square = SMALLEST_MOTION_G ** 2 * overlap
+        squares[0] += products(a * a, two) - sum_a**2 / overlap
+        squares[1] += products(one, b * b) - sum_b**2 / overlap
+    smallest_square = SMALLEST_MOTION_G**2 * overlap
     compared = (overlap >= smallest) & (squares > smallest_square).all(axis=0)
     correlation = covariance / np.sqrt(np.maximum(squares, smallest_square).prod(axis=0))
-    return (scipy.signal.correlation_lags(len(second), len(first)), overlap,
-            np.where(compared, correlation, -1.0))
+    return (
+        scipy.signal.correlation_lags(len(second), len(first)),
+        overlap,
+        np.where(compared, correlation, -1.0),
+    )
 
 
 def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: float) -> float:
@@ -248,26 +283,36 @@ def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: 
     time_s, volts = comparison.time_s, comparison.volts
     simulated_v = comparison.simulated_v(comparison.sensor)
     # The ends may need values from outside.
-    inside = np.isfinite(volts).all(axis=1) & (time_s > time_s[0] + LARGEST_LATENCY_S) \
+    inside = (
+        np.isfinite(volts).all(axis=1)
+        & (time_s > time_s[0] + LARGEST_LATENCY_S)
         & (time_s < time_s[-1] - LARGEST_LATENCY_S)
-    rows = np.flatnonzero(inside)[::max(1, len(recording) // _FINE_SAMPLES)]
+    )
+    rows = np.flatnonzero(inside)[:: max(1, len(recording) // _FINE_SAMPLES)]
 
     def left_v2(more_s: float) -> float:
         """Return what zero-g and scale factor leave after a further shift."""
         left = 0.0
         for measured, simulated in zip(volts[rows].T, simulated_v.T):
-            line = np.column_stack([np.ones(len(rows)), np.interp(
-                time_s[rows] + more_s, time_s, simulated)])
+            line = np.column_stack(
+                [np.ones(len(rows)), np.interp(time_s[rows] + more_s, time_s, simulated)]
+            )
             left += float(np.sum((measured - line @ np.linalg.lstsq(line, measured)[0]) ** 2))
         return left
 
-    return late_s + float(scipy.optimize.minimize_scalar(
-        left_v2, bounds=(-LARGEST_LATENCY_S, LARGEST_LATENCY_S), method='bounded',
-        options={'xatol': 1e-6}).x)
+    return late_s + float(
+        scipy.optimize.minimize_scalar(
+            left_v2,
+            bounds=(-LARGEST_LATENCY_S, LARGEST_LATENCY_S),
+            method='bounded',
+            options={'xatol': 1e-6},
+        ).x
+    )
 
 
-def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, may_shift: bool
-                    ) -> BaselineComparison:
+def compare_checked(
+    recording: Recording, sensor: Sensor, sim: Motion | None, may_shift: bool
+) -> BaselineComparison:
     """
     Put a recording beside the simulator, without the parts that have no reference.
 
@@ -284,8 +329,10 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
         step_rad = baseline.seen_step_rad(recording, sensor)
         if step_rad > sensor.stage_resolution_rad:
             stated_deg = np.degrees(sensor.stage_resolution_rad)
-            notes.append(f'the stage reads in steps of {np.degrees(step_rad):.3g}°, not of '
-                         f'{stated_deg:.3g}° as stated: this is used')
+            notes.append(
+                f'the stage reads in steps of {np.degrees(step_rad):.3g}°, not of '
+                f'{stated_deg:.3g}° as stated: this is used'
+            )
             sensor = replace(sensor, stage_resolution_rad=step_rad)
         recording, left_out = baseline.stated_poses(recording, sensor)
     comparison = compare(recording, sensor, sim)
@@ -294,8 +341,10 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
         evenly = compare(replace(recording, time_s=even_s), sensor, sim)
         if _roughness(evenly) < _SAME_ROUGHNESS * _roughness(comparison):
             comparison = evenly
-            notes.append(f'stamps are uneven, and an even rate of {evenly.sensor.rate_hz:.6g} '
-                         'Hz explains them: it is used')
+            notes.append(
+                f'stamps are uneven, and an even rate of {evenly.sensor.rate_hz:.6g} '
+                'Hz explains them: it is used'
+            )
     comparison = replace(comparison, notes=tuple(notes))
     try:
         _check_output(comparison)
@@ -309,9 +358,11 @@ def compare_checked(recording: Recording, sensor: Sensor, sim: Motion | None, ma
     comparison = baseline.without_fast_motion(comparison, recording.columns)
     fading_hz = baseline.fading_frequency_hz(comparison)
     if fading_hz is not None:
-        smoother = (f'the reference is smoother than the sensor: above {fading_hz:.3g} Hz it '
-                    'lacks motion that the recording has; effects that show in fast motion are '
-                    'not named')
+        smoother = (
+            f'the reference is smoother than the sensor: above {fading_hz:.3g} Hz it '
+            'lacks motion that the recording has; effects that show in fast motion are '
+            'not named'
+        )
         comparison = replace(comparison, notes=(smoother, *comparison.notes))
     return replace(comparison, fading_hz=fading_hz)
 
@@ -321,24 +372,40 @@ def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
     faults, sensor = noise_effects.sample_faults(comparison), comparison.sensor
     comparison = replace(comparison, disturbed=faults.repeated | faults.isolated)
     comparison = baseline.leave_out(
-        comparison, ~np.isfinite(comparison.volts).all(axis=1), 'they are no numbers')
-    comparison = baseline.leave_out(comparison, faults.repeated, 'they repeat the one before',
-                                    noise_effects.effect_of(Detector.REPEATED_SAMPLES))
+        comparison, ~np.isfinite(comparison.volts).all(axis=1), 'they are no numbers'
+    )
     comparison = baseline.leave_out(
-        comparison, faults.isolated, 'they stand alone, away from the samples around them',
-        noise_effects.effect_of(Detector.ISOLATED_SAMPLES))
+        comparison,
+        faults.repeated,
+        'they repeat the one before',
+        noise_effects.effect_of(Detector.REPEATED_SAMPLES),
+    )
+    comparison = baseline.leave_out(
+        comparison,
+        faults.isolated,
+        'they stand alone, away from the samples around them',
+        noise_effects.effect_of(Detector.ISOLATED_SAMPLES),
+    )
     stuck = _stuck(comparison)
     for axis, rows in zip(sensor.axes, stuck.T):
         comparison = baseline.leave_out(
-            comparison, rows, f'{axis} does not change there, though the motion does', '')
+            comparison, rows, f'{axis} does not change there, though the motion does', ''
+        )
     beyond = comparison.out_of_range
     for d in np.flatnonzero(beyond.any(axis=0)):
-        output_g = (comparison.volts[beyond[:, d], d] - sensor.zero_g_v[d]) \
-            / sensor.scale_v_per_g[d]
-        comparison = replace(comparison, notes=(
-            *comparison.notes, f'{sensor.axes[d]}: {len(output_g)} samples, up to '
-            f'{np.abs(output_g).max():.3g} g, are at a rail or beyond the range of '
-            f'{sensor.range_g:g} g that the parameter file states; set the range of the sensor'))
+        output_g = (comparison.volts[beyond[:, d], d] - sensor.zero_g_v[d]) / sensor.scale_v_per_g[
+            d
+        ]
+        comparison = replace(
+            comparison,
+            notes=(
+                *comparison.notes,
+                f'{sensor.axes[d]}: {len(output_g)} samples, up to '
+                f'{np.abs(output_g).max():.3g} g, are at a rail or beyond the range of '
+                f'{sensor.range_g:g} g that the parameter file states; set the '
+                f'range of the sensor',
+            ),
+        )
     return comparison
 
 
@@ -372,18 +439,32 @@ def _check_clock(recording: Recording) -> None:
     steps_s = np.diff(time_s)
     step_s, backward = float(np.median(steps_s)), np.flatnonzero(steps_s <= 0)
     if len(backward):
-        raise DataFault('clock_jump', f'the stamps run backwards at {time_s[backward[0]]:.6g} s; '
-                        'record again with a steady clock')
+        raise DataFault(
+            'clock_jump',
+            f'the stamps run backwards at {time_s[backward[0]]:.6g} s; '
+            'record again with a steady clock',
+        )
     wide = np.flatnonzero(steps_s > _JUMP_STEPS * step_s)
     if len(wide) and float(steps_s[wide].sum()) > _LARGEST_JUMP_SHARE * float(steps_s.sum()):
-        raise DataFault('clock_jump', f'the stamps jump by {steps_s[wide].max():.3g} s at '
-                        f'{time_s[wide[0]]:.6g} s; cut the recording there, and diagnose the '
-                        'parts together')
-    if step_s > _LONGEST_STEP_S and angles_rad is not None and np.any(
-            np.nanmax(angles_rad, axis=0) - np.nanmin(angles_rad, axis=0) >= _SMALLEST_MOVE_RAD):
-        raise DataFault('unit', f'time_s: {step_s:.3g} s between samples while the stage moves, '
-                        f'at most {_LONGEST_STEP_S:g} s are followed; divide stamps in '
-                        'milliseconds by 1000')
+        raise DataFault(
+            'clock_jump',
+            f'the stamps jump by {steps_s[wide].max():.3g} s at '
+            f'{time_s[wide[0]]:.6g} s; cut the recording there, and diagnose the '
+            'parts together',
+        )
+    if (
+        step_s > _LONGEST_STEP_S
+        and angles_rad is not None
+        and np.any(
+            np.nanmax(angles_rad, axis=0) - np.nanmin(angles_rad, axis=0) >= _SMALLEST_MOVE_RAD
+        )
+    ):
+        raise DataFault(
+            'unit',
+            f'time_s: {step_s:.3g} s between samples while the stage moves, '
+            f'at most {_LONGEST_STEP_S:g} s are followed; divide stamps in '
+            'milliseconds by 1000',
+        )
 
 
 def even_stamps(stamps_s: np.ndarray) -> np.ndarray | None:
@@ -410,9 +491,9 @@ def _check_encoder(recording: Recording, sensor: Sensor) -> None:
         return
     measured_g = (recording.volts(sensor) - sensor.zero_g_v) / sensor.scale_v_per_g
     rows = np.flatnonzero(np.isfinite(np.hstack([angles_rad, measured_g])).all(axis=1))
-    rows = rows[::max(1, len(rows) // _SAMPLES)]
+    rows = rows[:: max(1, len(rows) // _SAMPLES)]
     angles_rad, measured_g = angles_rad[rows], measured_g[rows]
-    if len(rows) < 2 or np.sum(np.var(measured_g, axis=0)) < SMALLEST_MOTION_G ** 2:
+    if len(rows) < 2 or np.sum(np.var(measured_g, axis=0)) < SMALLEST_MOTION_G**2:
         return
 
     def force_g(factors: Sequence[float]) -> np.ndarray:
@@ -421,15 +502,20 @@ def _check_encoder(recording: Recording, sensor: Sensor) -> None:
 
     def unexplained(factors: Sequence[float]) -> float:
         """Return the share of the variance that angles times factors do not explain."""
-        return float(np.var(measured_g - force_g(factors), axis=0).sum()
-                     / np.var(measured_g, axis=0).sum())
+        return float(
+            np.var(measured_g - force_g(factors), axis=0).sum() / np.var(measured_g, axis=0).sum()
+        )
 
     recorded, largest = unexplained((1.0, 1.0)), np.abs(angles_rad).max(axis=0)
     # The fewest changes come first, and of equal ones the first is the best.
-    factors = min(([s * u for s, u in zip(signs, units)]
-                   for units in product(*([1.0, np.pi / 180][:1 + (rad > 2 * np.pi)]
-                                          for rad in largest))
-                   for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))), key=unexplained)
+    factors = min(
+        (
+            [s * u for s, u in zip(signs, units)]
+            for units in product(*([1.0, np.pi / 180][: 1 + (rad > 2 * np.pi)] for rad in largest))
+            for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))
+        ),
+        key=unexplained,
+    )
     if recorded < _WRONG or unexplained(factors) > min(_RIGHT, recorded / 2):
         return
     correlation, joints = np.sqrt(1 - unexplained(factors)), list(JOINTS.values())
@@ -437,24 +523,34 @@ def _check_encoder(recording: Recording, sensor: Sensor) -> None:
     if in_degrees:
         joined = ' and '.join(joints[i] for i in in_degrees)
         reached = ' and '.join(f'{largest[i]:.4g}' for i in in_degrees)
-        raise DataFault('unit', f'{joined}: up to {reached}: degrees in a column of radians (as '
-                        f'degrees it fits the output, correlation {correlation:.2f}); multiply '
-                        f'{joined} by π/180')
+        raise DataFault(
+            'unit',
+            f'{joined}: up to {reached}: degrees in a column of radians (as '
+            f'degrees it fits the output, correlation {correlation:.2f}); multiply '
+            f'{joined} by π/180',
+        )
     names = [joints[i] for i in (0, 1) if factors[i] < 0]
-    mirrored = np.flatnonzero(np.std(force_g(factors) - force_g((1.0, 1.0)), axis=0)
-                              > SMALLEST_MOTION_G)
+    mirrored = np.flatnonzero(
+        np.std(force_g(factors) - force_g((1.0, 1.0)), axis=0) > SMALLEST_MOTION_G
+    )
     if len(mirrored) < len(names):
         return
     # The zero-g of an inverted axis is mirrored, too.
     zero_g = ((sensor.zero_g_v - sensor.nominal_zero_g_v) / sensor.scale_v_per_g)[mirrored[0]]
     offset_g = np.mean(measured_g - force_g(factors), axis=0)[mirrored[0]]
-    if len(mirrored) == len(names) and abs(zero_g) > _AGED_ZERO_G \
-            and abs(offset_g + 2 * zero_g) < abs(offset_g):
+    if (
+        len(mirrored) == len(names)
+        and abs(zero_g) > _AGED_ZERO_G
+        and abs(offset_g + 2 * zero_g) < abs(offset_g)
+    ):
         return
     joined, inverted = (' and '.join(n) for n in (names, [sensor.axes[d] for d in mirrored]))
-    raise DataFault('encoder_sign', f'{joined}: opposite sign of the encoder (correlation '
-                    f'{correlation:.2f} with the sign changed); change the sign of {joined}, '
-                    f'unless the axis {inverted} is inverted')
+    raise DataFault(
+        'encoder_sign',
+        f'{joined}: opposite sign of the encoder (correlation '
+        f'{correlation:.2f} with the sign changed); change the sign of {joined}, '
+        f'unless the axis {inverted} is inverted',
+    )
 
 
 class CheckedRecording(NamedTuple):
@@ -485,38 +581,58 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording:
     for detection in [d for d in faults.detections if d.effect == coarse]:
         comparison, search_comparison = (
             replace(c, sensor=noise_effects.with_bits(c.sensor, detection))
-            for c in (comparison, search_comparison))
-    return CheckedRecording(comparison, search_comparison, tuple(faults.detections),
-                            faults.possible_spikes, stated_bits)
+            for c in (comparison, search_comparison)
+        )
+    return CheckedRecording(
+        comparison,
+        search_comparison,
+        tuple(faults.detections),
+        faults.possible_spikes,
+        stated_bits,
+    )
 
 
 def check_length(comparisons: Sequence[BaselineComparison]) -> None:
     """Refuse recordings that are too short together; one at rest may have any length."""
     used_s = sum(c.span_s * float(c.used.mean()) for c in comparisons)
     if used_s < SHORTEST_S and any(c.reference is not Reference.NONE for c in comparisons):
-        raise DataFault('too_short', f'{used_s:.3g} of {sum(c.span_s for c in comparisons):.3g} s '
-                        'can be compared, which is too short for a verdict; record at '
-                        'least one minute, or see the note on what is left out', 'insufficient',
-                        tuple(comparisons))
+        raise DataFault(
+            'too_short',
+            f'{used_s:.3g} of {sum(c.span_s for c in comparisons):.3g} s '
+            'can be compared, which is too short for a verdict; record at '
+            'least one minute, or see the note on what is left out',
+            'insufficient',
+            tuple(comparisons),
+        )
 
 
 def _check_output(comparison: BaselineComparison) -> None:
     """Refuse an output that no sensor has, before any sample is left out."""
     if len(comparison) < _FEWEST_SAMPLES:
-        raise DataFault('too_short', f'{len(comparison)} samples are too few; a recording needs '
-                        f'{_FEWEST_SAMPLES}', 'insufficient')
+        raise DataFault(
+            'too_short',
+            f'{len(comparison)} samples are too few; a recording needs {_FEWEST_SAMPLES}',
+            'insufficient',
+        )
     finite, sensor = np.isfinite(comparison.volts).all(axis=1), comparison.sensor
     if finite.mean() < 1 - _LARGEST_MISSING_SHARE:
-        raise DataFault('missing', f'{100 * (1 - finite.mean()):.0f} % of the samples are not '
-                        'numbers; record again')
+        raise DataFault(
+            'missing',
+            f'{100 * (1 - finite.mean()):.0f} % of the samples are not numbers; record again',
+        )
     _check_range(comparison, finite)
     # No sensor can output more.
-    level_g = np.abs(np.median(comparison.volts[finite], axis=0) - sensor.zero_g_v) \
+    level_g = (
+        np.abs(np.median(comparison.volts[finite], axis=0) - sensor.zero_g_v)
         / sensor.scale_v_per_g
+    )
     worst = int(np.argmax(level_g))
     if level_g[worst] >= _LARGEST_LEVEL_G:
-        raise DataFault('unit', f'{sensor.axes[worst]} is at {level_g[worst]:.3g} g; correct the '
-                        'unit of its column, or --params')
+        raise DataFault(
+            'unit',
+            f'{sensor.axes[worst]} is at {level_g[worst]:.3g} g; correct the '
+            'unit of its column, or --params',
+        )
 
 
 def _check_simulator(comparison: BaselineComparison) -> None:
@@ -536,26 +652,43 @@ def _check_range(comparison: BaselineComparison, finite: np.ndarray) -> None:
     lsb_v, range_v = max(sensor.lsb_v, _SMALLEST_STEP_V), np.ptp(volts, axis=0)
     # Coarse codes repeat in an extreme pose, so that the simulation must differ, too.
     step_v = np.maximum(baseline.code_step_v(volts), lsb_v)
-    railed = max(float(np.mean((np.abs(volts - rail_v) < lsb_v / 2)
-                               & (np.abs(simulated_v - rail_v) > step_v), axis=0)[
-        range_v > _SMALLEST_RANGE_V].max(initial=0.0))
-        for rail_v in (volts.max(axis=0), volts.min(axis=0)))
+    railed = max(
+        float(
+            np.mean(
+                (np.abs(volts - rail_v) < lsb_v / 2) & (np.abs(simulated_v - rail_v) > step_v),
+                axis=0,
+            )[range_v > _SMALLEST_RANGE_V].max(initial=0.0)
+        )
+        for rail_v in (volts.max(axis=0), volts.min(axis=0))
+    )
     if railed > _LARGEST_MISSING_SHARE:
-        raise DataFault('saturated', f'{100 * railed:.0f} % of the samples are at the end of the '
-                        'range; check supply, range and wiring')
+        raise DataFault(
+            'saturated',
+            f'{100 * railed:.0f} % of the samples are at the end of the '
+            'range; check supply, range and wiring',
+        )
     expected_v = np.ptp(simulated_v, axis=0)
     # At rest, codes may all be the same where their step exceeds the noise.
     noisy = noise.analog_std_v(sensor) > sensor.lsb_v
-    dead = np.where(expected_v > _SMALLEST_RANGE_V, range_v < _DEAD_SHARE * expected_v,
-                    (range_v < _SMALLEST_STEP_V) & ((range_v > 0) | noisy))
+    dead = np.where(
+        expected_v > _SMALLEST_RANGE_V,
+        range_v < _DEAD_SHARE * expected_v,
+        (range_v < _SMALLEST_STEP_V) & ((range_v > 0) | noisy),
+    )
     if dead.any():
-        raise DataFault('constant', f'{sensor.axes[int(np.argmax(dead))]} does not change with '
-                        'motion or noise; check its wiring')
+        raise DataFault(
+            'constant',
+            f'{sensor.axes[int(np.argmax(dead))]} does not change with '
+            'motion or noise; check its wiring',
+        )
     stuck = _stuck(comparison).mean(axis=0)
     if stuck.max() > _LARGEST_MISSING_SHARE:
-        raise DataFault('constant', f'{sensor.axes[int(np.argmax(stuck))]} does not change for '
-                        f'{100 * stuck.max():.0f} % of the recording, though the motion does; '
-                        'check its wiring')
+        raise DataFault(
+            'constant',
+            f'{sensor.axes[int(np.argmax(stuck))]} does not change for '
+            f'{100 * stuck.max():.0f} % of the recording, though the motion does; '
+            'check its wiring',
+        )
 
 
 def _check_rest(comparison: BaselineComparison, finite: np.ndarray) -> None:
@@ -565,10 +698,13 @@ def _check_rest(comparison: BaselineComparison, finite: np.ndarray) -> None:
     range_g = np.subtract(*np.quantile(force_g, _RANGE_QUANTILES[::-1], axis=0))
     worst = int(np.argmax(range_g))
     if range_g[worst] >= _LARGEST_UNEXPLAINED_MOTION_G and step_g[worst] <= range_g[worst]:
-        raise DataFault('reference', f'{comparison.sensor.axes[worst]} moves by '
-                        f'{range_g[worst]:.2f} g, but no stage angles that change; give '
-                        'alpha_rad and beta_rad, or --sim with the specific force of the same '
-                        'manoeuvre')
+        raise DataFault(
+            'reference',
+            f'{comparison.sensor.axes[worst]} moves by '
+            f'{range_g[worst]:.2f} g, but no stage angles that change; give '
+            'alpha_rad and beta_rad, or --sim with the specific force of the same '
+            'manoeuvre',
+        )
 
 
 def _check_axes(comparison: BaselineComparison) -> None:
@@ -576,20 +712,27 @@ def _check_axes(comparison: BaselineComparison) -> None:
     sensor, finite = comparison.sensor, np.isfinite(comparison.volts).all(axis=1)
     simulated_g, measured_g = (
         (v - v[finite].mean(axis=0)) / sensor.scale_v_per_g
-        for v in (comparison.simulated_v(sensor), comparison.volts))
+        for v in (comparison.simulated_v(sensor), comparison.volts)
+    )
     moving = np.flatnonzero(simulated_g.std(axis=0) > SMALLEST_MOTION_G)
     if not len(moving):
         return
-    lags, _, by_lag = _correlations(simulated_g, np.nan_to_num(measured_g),
-                                    2 * len(simulated_g) // 3)
+    lags, _, by_lag = _correlations(
+        simulated_g, np.nan_to_num(measured_g), 2 * len(simulated_g) // 3
+    )
     by_lag = np.where(np.abs(lags) <= _LARGEST_DELAY_S * sensor.rate_hz, by_lag, -1.0)
     best = int(np.argmax(by_lag))
     delay_s = lags[best] / sensor.rate_hz
-    if by_lag[best] > max(_CORRELATED, by_lag[lags == 0][0] + _CORRELATION_GAIN) \
-            and abs(delay_s) > _SEARCHED_DELAY_S:
-        raise DataFault('time_misaligned', f'the sensor is {abs(delay_s):.2f} s '
-                        f'{"later" if delay_s > 0 else "earlier"} than the reference, but the '
-                        f'search covers {_SEARCHED_DELAY_S:g} s; shift its stamps')
+    if (
+        by_lag[best] > max(_CORRELATED, by_lag[lags == 0][0] + _CORRELATION_GAIN)
+        and abs(delay_s) > _SEARCHED_DELAY_S
+    ):
+        raise DataFault(
+            'time_misaligned',
+            f'the sensor is {abs(delay_s):.2f} s '
+            f'{"later" if delay_s > 0 else "earlier"} than the reference, but the '
+            f'search covers {_SEARCHED_DELAY_S:g} s; shift its stamps',
+        )
     simulated_g, measured_g = simulated_g[finite][:, moving], measured_g[finite][:, moving]
     count, axes = len(moving), [sensor.axes[d] for d in moving]
     with np.errstate(all='ignore'):
@@ -598,16 +741,24 @@ def _check_axes(comparison: BaselineComparison) -> None:
     if polarity is not None:
         raise DataFault(
             'axis_inverted' if polarity.axis == polarity.follows else 'axis_swapped',
-            polarity.describe(axes[polarity.axis], axes[polarity.follows]))
-    gains = [np.polyfit(simulated_g[:, d], measured_g[:, d], 1)[0]
-             for d in np.flatnonzero(np.diag(correlation) > _CORRELATED)]
+            polarity.describe(axes[polarity.axis], axes[polarity.follows]),
+        )
+    gains = [
+        np.polyfit(simulated_g[:, d], measured_g[:, d], 1)[0]
+        for d in np.flatnonzero(np.diag(correlation) > _CORRELATED)
+    ]
     for ratio, units in _UNIT_RATIOS.items() if gains else ():
         if abs(np.log(np.median(gains) / ratio)) < _UNIT_TOLERANCE:
-            raise DataFault('unit', f'the output is {np.median(gains):.4g} times the simulated '
-                            f'output, as values in {units} are; correct the unit of the columns')
+            raise DataFault(
+                'unit',
+                f'the output is {np.median(gains):.4g} times the simulated '
+                f'output, as values in {units} are; correct the unit of the columns',
+            )
     largest = float(np.max(np.abs(correlation)))
     if largest < _UNCORRELATED:
         raise DataFault(
-            'reference', f'the output does not follow the reference (correlation {largest:.2f}); '
+            'reference',
+            f'the output does not follow the reference (correlation {largest:.2f}); '
             'check that both belong to one recording, with clocks that differ by less than '
-            f'{_LARGEST_DELAY_S:g} s')
+            f'{_LARGEST_DELAY_S:g} s',
+        )

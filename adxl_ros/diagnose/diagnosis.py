@@ -100,9 +100,15 @@ class Diagnosis:
     report: Report | None = None  # The report where there is no fault
 
 
-def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None,
-             seed: int = 0, show_progress: ShowProgress = lambda stage, fraction: None,
-             align: bool = False, material_mg: float = MATERIAL_MG) -> Diagnosis:
+def diagnose(
+    recordings: Sequence[Recording],
+    sensor: Sensor,
+    sim: Motion | None = None,
+    seed: int = 0,
+    show_progress: ShowProgress = lambda stage, fraction: None,
+    align: bool = False,
+    material_mg: float = MATERIAL_MG,
+) -> Diagnosis:
     """
     Compare recordings of one unit with the simulator, and find which effects it lacks.
 
@@ -141,7 +147,8 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
         return Diagnosis(fault.comparisons, fault=fault)
     compared = [c.search_comparison for c in checked]
     model = build_linear_model(
-        compared, lambda share: show_progress('2/5 library of effects', 0.1 + 0.2 * share))
+        compared, lambda share: show_progress('2/5 library of effects', 0.1 + 0.2 * share)
+    )
     search = Search(model)
     search.run(lambda share: show_progress('3/5 effects', 0.3 + 0.5 * share))
     show_progress('4/5 held-out figures', 0.8)
@@ -149,13 +156,17 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     smallest_mps2 = material_mps2(model, floor, material_mg)
     evidence = _evidence(model, search, floor, smallest_mps2, seed)
     detections = _detections(checked, search.best, model.baseline, smallest_mps2)
-    bases = [basis for comparison, baseline_v in zip(compared, model.baseline_v)
-             for basis in flexible_bases(comparison, baseline_v)]
+    bases = [
+        basis
+        for comparison, baseline_v in zip(compared, model.baseline_v)
+        for basis in flexible_bases(comparison, baseline_v)
+    ]
     verdict = rule.decide(
-        evidence, lambda effects, drift: rule.reproducible_rest(
-            evidence.candidates[effects][drift], bases),
+        evidence,
+        lambda effects, drift: rule.reproducible_rest(evidence.candidates[effects][drift], bases),
         [d.effect for d in detections],
-        lambda effects: _simulate_again(model, search, effects))
+        lambda effects: _simulate_again(model, search, effects),
+    )
     left_out = _material_left_out(checked, verdict)
     if verdict.status == 'no_gap' and not any(map(_could_show, model.comparisons)):
         verdict = replace(verdict, status='insufficient')
@@ -165,8 +176,12 @@ def diagnose(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None
     show_progress('5/5 report', 0.9)
     report = _report(checked, model, search, verdict, detections, floor, evidence, seed)
     show_progress('5/5 report', 1.0)
-    return Diagnosis(tuple(model.comparisons), tuple(c.comparison for c in checked), None,
-                     replace(report, left_out=left_out))
+    return Diagnosis(
+        tuple(model.comparisons),
+        tuple(c.comparison for c in checked),
+        None,
+        replace(report, left_out=left_out),
+    )
 
 
 def _could_show(comparison: BaselineComparison) -> bool:
@@ -175,12 +190,14 @@ def _could_show(comparison: BaselineComparison) -> bool:
         return True
     if comparison.joints and not comparison.at_rest.all():
         return True
-    return any(np.ptp(values) > _SMALLEST_RANGES[name]
-               for name, values in comparison.surroundings.items())
+    return any(
+        np.ptp(values) > _SMALLEST_RANGES[name] for name, values in comparison.surroundings.items()
+    )
 
 
-def _evidence(model: LinearModel, search: Search, floor: NoiseFloor, smallest_mps2: float,
-              seed: int) -> rule.Evidence:
+def _evidence(
+    model: LinearModel, search: Search, floor: NoiseFloor, smallest_mps2: float, seed: int
+) -> rule.Evidence:
     """Fit all sets of effects to blocks, and predict those that were held out."""
     comparisons = model.comparisons
     counts = np.sum([used_by_block(c.used) for c in comparisons], axis=0)
@@ -195,25 +212,31 @@ def _evidence(model: LinearModel, search: Search, floor: NoiseFloor, smallest_mp
         fades=any(c.fading_hz is not None for c in comparisons),
         wanders=any(getattr(c.motion.force, 'wanders', False) for c in comparisons),
         floor_mps2=np.inf if floor.source == 'assumed' else floor.rms_mps2,
-        sizeless={effects: h.sizeless for effects, h in search.found.items()})
+        sizeless={effects: h.sizeless for effects, h in search.found.items()},
+    )
 
 
-def _material_left_out(checked: Sequence[CheckedRecording], verdict: Verdict
-                       ) -> tuple[LeftOut, ...]:
+def _material_left_out(
+    checked: Sequence[CheckedRecording], verdict: Verdict
+) -> tuple[LeftOut, ...]:
     """Return what was left out and is material, but for what the verdict names or explains."""
     parts = []
     for comparison in (c.comparison for c in checked):
         for part in comparison.left_out:
             # Knocks look like lone samples, and a reference that is smoother lacks them.
             is_knock = bool(part.effect) and comparison.fading_hz is not None
-            if part.effect not in verdict.named and not is_knock and \
-                    part.squares_mps2 > verdict.material_mps2 ** 2 * len(comparison):
+            if (
+                part.effect not in verdict.named
+                and not is_knock
+                and part.squares_mps2 > verdict.material_mps2**2 * len(comparison)
+            ):
                 parts.append(part)
     return tuple(parts)
 
 
-def check(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None,
-          align: bool = False) -> list[CheckedRecording]:
+def check(
+    recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None, align: bool = False
+) -> list[CheckedRecording]:
     """Put recordings beside their simulation; raise DataFault for the first fault."""
     if not sensor.effects:
         sensor = with_axes(sensor, recordings[0].axes)
@@ -235,37 +258,49 @@ def check(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = 
         raise replace(fault, comparisons=(*compared, *of_fault)) from None
 
 
-def material_mps2(model: LinearModel, floor: NoiseFloor, material_mg: float = MATERIAL_MG
-                  ) -> float:
+def material_mps2(
+    model: LinearModel, floor: NoiseFloor, material_mg: float = MATERIAL_MG
+) -> float:
     """Return the material amplitude: the stated one, or a share of the noise."""
     noise_mps2 = floor.noise_v / model.comparisons[0].scale_v_per_mps2
-    return max(1e-3 * material_mg * G0_MPS2, rule.MATERIAL_SHARE_OF_NOISE * float(
-        np.sqrt(np.mean(noise_mps2 ** 2) + model.lost_motion_mps2 ** 2)))
+    return max(
+        1e-3 * material_mg * G0_MPS2,
+        rule.MATERIAL_SHARE_OF_NOISE
+        * float(np.sqrt(np.mean(noise_mps2**2) + model.lost_motion_mps2**2)),
+    )
 
 
-def _held_out(model: LinearModel, search: Search, floor: NoiseFloor, count: float
-              ) -> dict[frozenset[str], dict[str, HeldOutFits]]:
+def _held_out(
+    model: LinearModel, search: Search, floor: NoiseFloor, count: float
+) -> dict[frozenset[str], dict[str, HeldOutFits]]:
     """Return held-out fits of all sets by the drift of their noise."""
     best = search.best
     beside = linearise(model, best.effects, best.sensor, model.filters)
-    drifts = drifts_among(library()) if beside.fit(drifts=drifts_among(library())).log_evidence \
-        > beside.fit().log_evidence else ()
+    drifts = (
+        drifts_among(library())
+        if beside.fit(drifts=drifts_among(library())).log_evidence > beside.fit().log_evidence
+        else ()
+    )
     out = {}
     for effects, hypothesis in search.found.items():
         healthy = HeldOutFits(hypothesis.linearised, model)
-        left = healthy.figures.squares.sum() / count - floor.rms_mps2 ** 2
-        linearised = linearise(model, hypothesis.effects, hypothesis.sensor, model.filters) \
-            if drifts else hypothesis.linearised
+        left = healthy.figures.squares.sum() / count - floor.rms_mps2**2
+        linearised = (
+            linearise(model, hypothesis.effects, hypothesis.sensor, model.filters)
+            if drifts
+            else hypothesis.linearised
+        )
         fits = {d: HeldOutFits(linearised, model, (d,)) for d in drifts}
         # A drift that should be far larger than what is left is none.
         out[effects] = {HEALTHY: healthy} | {
-            d: f for d, f in fits.items()
-            if f.drift_mps2 ** 2 <= _DRIFT_LIMIT * max(left, 0.0)}
+            d: f for d, f in fits.items() if f.drift_mps2**2 <= _DRIFT_LIMIT * max(left, 0.0)
+        }
     return out
 
 
-def _simulate_again(model: LinearModel, search: Search, effects: frozenset[str]
-                    ) -> rule.SimulatedAgain:
+def _simulate_again(
+    model: LinearModel, search: Search, effects: frozenset[str]
+) -> rule.SimulatedAgain:
     """Simulate a set as it is printed in all recordings, and as it was fitted at their rests."""
     hypothesis = search.found[effects]
     printed = _as_printed(hypothesis, with_neutral(model.baseline, hypothesis.effects))
@@ -273,14 +308,16 @@ def _simulate_again(model: LinearModel, search: Search, effects: frozenset[str]
     for c in model.comparisons:
         left, fitted, without = (
             np.mean((c.residual_v(s) / c.scale_v_per_mps2) ** 2, axis=1) * c.used
-            for s in (printed, hypothesis.sensor, search.found[frozenset()].sensor))
+            for s in (printed, hypothesis.sensor, search.found[frozenset()].sensor)
+        )
         left[~c.used] = 0.0
         squares += np.add.reduceat(left, block_edges(len(c))[:-1])
         rests = true_runs(c.at_rest & c.used) if c.reference is not Reference.NONE else []
         more_at_rest += [float(np.sum((fitted - without)[a:b])) for a, b in rests]
         resting += sum(b - a for a, b in rests)
-    return rule.SimulatedAgain(squares, np.array(more_at_rest), float(resting),
-                               hypothesis.at_bound)
+    return rule.SimulatedAgain(
+        squares, np.array(more_at_rest), float(resting), hypothesis.at_bound
+    )
 
 
 def _as_printed(hypothesis: Hypothesis, sensor: Sensor) -> Sensor:
@@ -289,14 +326,18 @@ def _as_printed(hypothesis: Hypothesis, sensor: Sensor) -> Sensor:
 
     A size that these recordings do not determine would be a guess in others.
     """
-    hidden = [name for name, is_open in zip(hypothesis.names, hypothesis.undetermined)
-              if is_open and parameter_of(name).is_size]
+    hidden = [
+        name
+        for name, is_open in zip(hypothesis.names, hypothesis.undetermined)
+        if is_open and parameter_of(name).is_size
+    ]
     fitted = {e: hypothesis.sensor.values[e] for e in hypothesis.effects}
     return put(replace(sensor, values={**sensor.values, **fitted}), hidden, get(sensor, hidden))
 
 
-def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline: Sensor,
-                smallest_mps2: float) -> list[Detection]:
+def _detections(
+    checked: Sequence[CheckedRecording], best: Hypothesis, baseline: Sensor, smallest_mps2: float
+) -> list[Detection]:
     """
     Return the material noise-like effects of recordings and residual, the strongest of each.
 
@@ -309,17 +350,27 @@ def _detections(checked: Sequence[CheckedRecording], best: Hypothesis, baseline:
         residual_v = comparison.residual_v(best.sensor)
         # In motion, a smooth reference lacks knocks that look like spikes.
         regular = used if comparison.fading_hz is None else used | ~comparison.at_rest
-        detections += [d for d in c.possible_spikes if noise_effects.residual_shows_spikes(
-            d, residual_v, regular, comparison.sensor)]
-        found, of_baseline = (noise_effects.residual_detections(comparison, residual_v, s)
-                              for s in (best.sensor, baseline))
+        detections += [
+            d
+            for d in c.possible_spikes
+            if noise_effects.residual_shows_spikes(d, residual_v, regular, comparison.sensor)
+        ]
+        found, of_baseline = (
+            noise_effects.residual_detections(comparison, residual_v, s)
+            for s in (best.sensor, baseline)
+        )
         detections += [d for d in found if d.effect in {o.effect for o in of_baseline}]
-    material = [d for d in detections if d.power_mps2 > smallest_mps2 ** 2]
+    material = [d for d in detections if d.power_mps2 > smallest_mps2**2]
     return list({d.effect: d for d in sorted(material, key=lambda d: d.power_mps2)}.values())
 
 
-def _named_sensor(verdict: Verdict, best: Hypothesis, detections: Sequence[Detection],
-                  baseline: Sensor, fits: Mapping[str, HeldOutFits]) -> Sensor:
+def _named_sensor(
+    verdict: Verdict,
+    best: Hypothesis,
+    detections: Sequence[Detection],
+    baseline: Sensor,
+    fits: Mapping[str, HeldOutFits],
+) -> Sensor:
     """
     Return the baseline with exactly the effects whose closing the verdict states.
 
@@ -332,48 +383,76 @@ def _named_sensor(verdict: Verdict, best: Hypothesis, detections: Sequence[Detec
     if best.effects:
         from_file = with_neutral(baseline, fitted.effects)
         smallest_v = verdict.material_mps2 / G0_MPS2 * baseline.scale_v_per_g.min()
-        straight = [e for e in fitted.effects if effect_named(e).diagnosis.straight_line
-                    and e not in best.effects and (e in baseline.effects or any(
-                        np.abs(value - from_file.values[e][p]).max() > smallest_v
-                        for p, value in fitted.values[e].items()))]
+        straight = [
+            e
+            for e in fitted.effects
+            if effect_named(e).diagnosis.straight_line
+            and e not in best.effects
+            and (
+                e in baseline.effects
+                or any(
+                    np.abs(value - from_file.values[e][p]).max() > smallest_v
+                    for p, value in fitted.values[e].items()
+                )
+            )
+        ]
         sensor = with_neutral(sensor, straight)
-        sensor = _as_printed(best, replace(sensor, values={
-            **sensor.values, **{e: fitted.values[e] for e in straight}}))
+        sensor = _as_printed(
+            best,
+            replace(sensor, values={**sensor.values, **{e: fitted.values[e] for e in straight}}),
+        )
     in_noise = {d.effect: d.values for d in detections}
     for drift in [e for e in drifts_among(library()) if e in verdict.named][:1]:
-        densities = fits[drift].drift_densities()[:len(sensor.axes)]
+        densities = fits[drift].drift_densities()[: len(sensor.axes)]
         in_noise[drift] = {effect_named(drift).parameters[0].name: densities}
     for effect, values in in_noise.items():
         sensor = with_values(with_neutral(sensor, [effect]), effect, values)
     kept = [i for i, name in enumerate(baseline.covariance_names) if name.effect in sensor.effects]
-    return replace(sensor, covariance=baseline.covariance[np.ix_(kept, kept)],
-                   covariance_names=tuple(baseline.covariance_names[i] for i in kept))
+    return replace(
+        sensor,
+        covariance=baseline.covariance[np.ix_(kept, kept)],
+        covariance_names=tuple(baseline.covariance_names[i] for i in kept),
+    )
 
 
-def _closure(verdict: Verdict, evidence: rule.Evidence, floor: NoiseFloor,
-             remainders: Sequence[NoiseRemainder], sensor: Sensor, removed_power: float,
-             seed: int) -> GapClosure:
+def _closure(
+    verdict: Verdict,
+    evidence: rule.Evidence,
+    floor: NoiseFloor,
+    remainders: Sequence[NoiseRemainder],
+    sensor: Sensor,
+    removed_power: float,
+    seed: int,
+) -> GapClosure:
     """
     Return the gap before and after the best set, above the floor without noise-like effects.
 
     removed_power: mean square, (m/s²)², of samples that the sensor did not measure.
     """
     best = verdict.best if verdict.closes else frozenset[str]()
-    before, after = (evidence.mean(evidence.candidates[e][HEALTHY].figures.squares)
-                     + removed_power for e in (frozenset[str](), best))
+    before, after = (
+        evidence.mean(evidence.candidates[e][HEALTHY].figures.squares) + removed_power
+        for e in (frozenset[str](), best)
+    )
     stated = noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2)
-    stated_mps2 = float(np.sqrt(np.mean(stated ** 2)))
+    stated_mps2 = float(np.sqrt(np.mean(stated**2)))
     draws = floor.draws_mps2(seed, len(before) - 1)
-    floors = np.append(floor.rms_mps2, np.full(len(before) - 1, floor.rms_mps2)
-                       if draws is None else draws)
-    lowest = np.array([noise_effects.floor_without(min(f, np.sqrt(a)), remainders, stated_mps2)
-                       for f, a in zip(floors, after)])
+    floors = np.append(
+        floor.rms_mps2, np.full(len(before) - 1, floor.rms_mps2) if draws is None else draws
+    )
+    lowest = np.array(
+        [
+            noise_effects.floor_without(min(f, np.sqrt(a)), remainders, stated_mps2)
+            for f, a in zip(floors, after)
+        ]
+    )
     with np.errstate(all='ignore'):
-        closed = (before - after) / np.where(before > lowest ** 2, before - lowest ** 2, np.nan)
+        closed = (before - after) / np.where(before > lowest**2, before - lowest**2, np.nan)
     if draws is None:
         lowest[1:] = np.nan
-    return GapClosure(*map(_interval, (np.sqrt(before), np.sqrt(after), lowest,
-                                       np.clip(closed, -1.0, 1.0))))
+    return GapClosure(
+        *map(_interval, (np.sqrt(before), np.sqrt(after), lowest, np.clip(closed, -1.0, 1.0)))
+    )
 
 
 def _interval(draws: np.ndarray) -> Interval:
@@ -383,37 +462,54 @@ def _interval(draws: np.ndarray) -> Interval:
     return Interval(float(draws[0]), float(low), float(high))
 
 
-def _report(checked: Sequence[CheckedRecording], model: LinearModel, search: Search,
-            verdict: Verdict, detections: Sequence[Detection], floor: NoiseFloor,
-            evidence: rule.Evidence, seed: int) -> Report:
+def _report(
+    checked: Sequence[CheckedRecording],
+    model: LinearModel,
+    search: Search,
+    verdict: Verdict,
+    detections: Sequence[Detection],
+    floor: NoiseFloor,
+    evidence: rule.Evidence,
+    seed: int,
+) -> Report:
     """Add to a verdict the other parts of the report."""
     comparisons, best = [c.comparison for c in checked], search.found[verdict.best]
     # Coarse codes are an effect of the verdict, and not of its baseline.
     baseline = replace(comparisons[0].sensor, adc_bits=checked[0].stated_bits)
-    sensor = _named_sensor(verdict, best, detections, baseline,
-                           evidence.candidates[verdict.best])
+    sensor = _named_sensor(verdict, best, detections, baseline, evidence.candidates[verdict.best])
     lacking = tuple(not_covered(model.comparisons))
-    remainders = tuple(noise_effects.noise_remainders(comparisons, best.sensor, sensor,
-                                                      detections, seed))
+    remainders = tuple(
+        noise_effects.noise_remainders(comparisons, best.sensor, sensor, detections, seed)
+    )
     ranked = sorted(search.found.values(), key=lambda h: -h.log_evidence)
     sensors = {'before': (baseline, baseline), 'after': (best.sensor, sensor)}
-    removed = sum(part.squares_mps2 for c in comparisons for part in c.left_out
-                  if part.effect is not None)
+    removed = sum(
+        part.squares_mps2 for c in comparisons for part in c.left_out if part.effect is not None
+    )
     removed_power = removed / sum(len(c) for c in comparisons)
     return Report(
-        verdict, _closure(verdict, evidence, floor, remainders, baseline, removed_power, seed),
+        verdict,
+        _closure(verdict, evidence, floor, remainders, baseline, removed_power, seed),
         floor,
-        (best, *(h for h in ranked if h is not best)), tuple(detections), remainders,
+        (best, *(h for h in ranked if h is not best)),
+        tuple(detections),
+        remainders,
         tuple(compare_noise(c, sensors, seed) for c in comparisons),
-        tuple(residual_map(model.comparisons[0], seed)), lacking,
-        tuple(next_experiment.could_show(model, comparisons[0], floor.noise_v,
-                                         verdict.material_mps2)),
+        tuple(residual_map(model.comparisons[0], seed)),
+        lacking,
+        tuple(
+            next_experiment.could_show(model, comparisons[0], floor.noise_v, verdict.material_mps2)
+        ),
         next_experiment.propose_next_experiment(verdict, lacking, baseline, model, seed),
-        baseline, sensor, model)
+        baseline,
+        sensor,
+        model,
+    )
 
 
-def what_shows(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None
-               ) -> list[CouldShow] | DataFault:
+def what_shows(
+    recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None
+) -> list[CouldShow] | DataFault:
     """Return what recordings can show, before any diagnosis; or why they cannot be compared."""
     try:
         checked = check(recordings, sensor, sim)
@@ -421,12 +517,19 @@ def what_shows(recordings: Sequence[Recording], sensor: Sensor, sim: Motion | No
         return fault
     model = build_linear_model([c.search_comparison for c in checked])
     floor = estimate_floor([c.comparison for c in checked])
-    return next_experiment.could_show(model, checked[0].comparison, floor.noise_v,
-                                      material_mps2(model, floor))
+    return next_experiment.could_show(
+        model, checked[0].comparison, floor.noise_v, material_mps2(model, floor)
+    )
 
 
-def self_check(diagnosis: Diagnosis, recordings: list[Recording], sim: Motion | None, count: int,
-               seed: int, show: Callable[[float], None] = lambda done: None) -> str:
+def self_check(
+    diagnosis: Diagnosis,
+    recordings: list[Recording],
+    sim: Motion | None,
+    count: int,
+    seed: int,
+    show: Callable[[float], None] = lambda done: None,
+) -> str:
     """
     Diagnose recordings that are simulated from a verdict; say how often the verdict comes back.
 
@@ -441,19 +544,30 @@ def self_check(diagnosis: Diagnosis, recordings: list[Recording], sim: Motion | 
         drawn = []
         for k, (c, recording) in enumerate(zip(diagnosis.full_rate, recordings)):
             sensor = replace(report.sensor, rate_hz=recording.rate_hz)
-            columns = simulate(sensor, c.motion, seed + 1 + i * len(recordings) + k,
-                               like=recording)
+            columns = simulate(
+                sensor, c.motion, seed + 1 + i * len(recordings) + k, like=recording
+            )
             drawn.append(replace(recording, time_s=columns.pop('time_s'), columns=columns))
         again = diagnose(drawn, report.baseline, sim, seed).report
         if again is not None:
             same += (again.verdict.effects, again.verdict.groups) == named
             fitted = again.hypotheses[0]
-            places = [j for j, name in enumerate(fitted.names) if report.verdict.closes
-                      and name.effect in report.verdict.best and not fitted.undetermined[j]]
+            places = [
+                j
+                for j, name in enumerate(fitted.names)
+                if report.verdict.closes
+                and name.effect in report.verdict.best
+                and not fitted.undetermined[j]
+            ]
             names = [fitted.names[j] for j in places]
-            inside += list(np.abs(get(fitted.sensor, names) - get(report.sensor, names))
-                           <= Z_90 * fitted.std[places])
+            inside += list(
+                np.abs(get(fitted.sensor, names) - get(report.sensor, names))
+                <= Z_90 * fitted.std[places]
+            )
         show((i + 1) / count)
-    sizes = f', {sum(inside)} of {len(inside)} intervals held the size (90 % expected)' \
-        if inside else ''
+    sizes = (
+        f', {sum(inside)} of {len(inside)} intervals held the size (90 % expected)'
+        if inside
+        else ''
+    )
     return f'self-check: {same} of {count} simulated recordings had the same verdict{sizes}'

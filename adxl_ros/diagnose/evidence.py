@@ -115,8 +115,11 @@ def estimate_floor(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
     The noise at rest is that about the mean of each second. The mean square of the encoder's steps
     is added: step²/12 times the squared slope of gravity, or what they leave open of a robot.
     """
-    sums: Squares = [part for c in comparisons for part in squares_at_rest(
-        c.volts, c.at_rest & c.used, c.sensor)]
+    sums: Squares = [
+        part
+        for c in comparisons
+        for part in squares_at_rest(c.volts, c.at_rest & c.used, c.sensor)
+    ]
     source, scale_v_per_mps2 = 'still', comparisons[0].scale_v_per_mps2
     if sum(count for _, count in sums) < FEWEST_SAMPLES:
         sums, source = _repeat_squares(comparisons), 'repeats'
@@ -125,62 +128,91 @@ def estimate_floor(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
         sums, noise_v, source = [], noise.sample_std_v(comparisons[0].sensor), 'assumed'
     else:
         noise_v = np.sqrt(np.sum([squares_v2 for squares_v2, _ in sums], axis=0) / count)
-    encoder = float(np.mean([c.robot_error_mps2 ** 2 for c in comparisons]))
+    encoder = float(np.mean([c.robot_error_mps2**2 for c in comparisons]))
     for c in comparisons:
         if c.joints:
             slopes = gravity_slopes(*(joint(c.time_s)[c.used] for joint in c.joints))
-            squares = np.mean((slopes[:, :len(c.sensor.axes)] ** 2).sum(axis=0))
-            encoder += float((c.sensor.local_gravity_mps2 * c.sensor.stage_std_rad) ** 2
-                             * squares / len(comparisons))
-    parts = np.array([(np.mean(squares_v2 / scale_v_per_mps2 ** 2) + count * encoder, count)
-                      for squares_v2, count in sums]).reshape(-1, 2).T
-    return NoiseFloor(noise_v, float(np.sqrt(np.mean((noise_v / scale_v_per_mps2) ** 2)
-                                             + encoder)), source, parts)
+            squares = np.mean((slopes[:, : len(c.sensor.axes)] ** 2).sum(axis=0))
+            encoder += float(
+                (c.sensor.local_gravity_mps2 * c.sensor.stage_std_rad) ** 2
+                * squares
+                / len(comparisons)
+            )
+    parts = (
+        np.array(
+            [
+                (np.mean(squares_v2 / scale_v_per_mps2**2) + count * encoder, count)
+                for squares_v2, count in sums
+            ]
+        )
+        .reshape(-1, 2)
+        .T
+    )
+    return NoiseFloor(
+        noise_v,
+        float(np.sqrt(np.mean((noise_v / scale_v_per_mps2) ** 2) + encoder)),
+        source,
+        parts,
+    )
 
 
 def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> Squares:
     """Sum the squares of an output, V, (n, m), about the mean of each second at rest."""
     length = max(round(_REST_S * sensor.rate_hz), 4)
     # The mean of correlated samples takes more out of their variance than one sample.
-    independent = length / float(noise.effective_samples(length, 1 / sensor.rate_hz,
-                                                         sensor.rc_s))
+    independent = length / float(noise.effective_samples(length, 1 / sensor.rate_hz, sensor.rc_s))
     squares: Squares = []
     for begin, end in true_runs(at_rest):
         for first in range(begin, end - length + 1, length):
-            part = volts[first:first + length]
+            part = volts[first : first + length]
             squares_v2 = (part - part.mean(axis=0)) ** 2 * length / (length - independent)
-            squares += [(piece.sum(axis=0), len(piece))
-                        for piece in np.array_split(squares_v2, _PARTS_OF_REST)]
+            squares += [
+                (piece.sum(axis=0), len(piece))
+                for piece in np.array_split(squares_v2, _PARTS_OF_REST)
+            ]
     return squares
 
 
 def _repeat_squares(comparisons: Sequence[BaselineComparison]) -> Squares:
     """Return half the squares of the differences between repeats of a trajectory on the stage."""
-    staged = [(c, force) for c in comparisons
-              if c.joints and (force := c.reference_force_g()) is not None]
+    staged = [
+        (c, force)
+        for c in comparisons
+        if c.joints and (force := c.reference_force_g()) is not None
+    ]
     squares: Squares = []
     for i, (first, force) in enumerate(staged):
         for second, other in staged[i:]:
             rate_hz = first.sensor.rate_hz
             if abs(rate_hz / second.sensor.rate_hz - 1) > 1e-3:
                 continue
-            found = find_repeat(force, other, rate_hz, first.sensor.stage_resolution_rad,
-                                first is second)
+            found = find_repeat(
+                force, other, rate_hz, first.sensor.stage_resolution_rad, first is second
+            )
             if found is None:
                 continue
             lag, count = found
-            used = first.used[:count] & second.used[lag:lag + count]
-            difference_v = (second.residual_v(second.sensor)[lag:lag + count]
-                            - first.residual_v(first.sensor)[:count])[used]
+            used = first.used[:count] & second.used[lag : lag + count]
+            difference_v = (
+                second.residual_v(second.sensor)[lag : lag + count]
+                - first.residual_v(first.sensor)[:count]
+            )[used]
             squares_v2 = (difference_v - difference_v.mean(axis=0)) ** 2 / 2
             length = max(round(_REST_S * rate_hz), 1)
-            squares += [(part.sum(axis=0), len(part)) for part in np.split(
-                squares_v2, range(length, len(squares_v2), length))]
+            squares += [
+                (part.sum(axis=0), len(part))
+                for part in np.split(squares_v2, range(length, len(squares_v2), length))
+            ]
     return squares
 
 
-def find_repeat(first: np.ndarray, second: np.ndarray, rate_hz: float, resolution_rad: float,
-                same_recording: bool) -> tuple[int, int] | None:
+def find_repeat(
+    first: np.ndarray,
+    second: np.ndarray,
+    rate_hz: float,
+    resolution_rad: float,
+    same_recording: bool,
+) -> tuple[int, int] | None:
     """
     Find the lag, and its overlap, by which the directions of gravity in two recordings agree best.
 
@@ -189,8 +221,9 @@ def find_repeat(first: np.ndarray, second: np.ndarray, rate_hz: float, resolutio
     products = sum(scipy.signal.correlate(b, a, method='fft') for a, b in zip(first, second))
     lags = scipy.signal.correlation_lags(second.shape[1], first.shape[1])
     overlap = np.minimum(first.shape[1], second.shape[1] - lags)
-    tried = (lags >= _REPEAT_DELAY_S * rate_hz * same_recording) \
-        & (overlap >= _REPEAT_SHORTEST_S * rate_hz)
+    tried = (lags >= _REPEAT_DELAY_S * rate_hz * same_recording) & (
+        overlap >= _REPEAT_SHORTEST_S * rate_hz
+    )
     if not tried.any():
         return None
     # |a − b|² of unit vectors is 2 − 2·a·b.
@@ -199,8 +232,9 @@ def find_repeat(first: np.ndarray, second: np.ndarray, rate_hz: float, resolutio
     lag, count = int(lags[best]), int(overlap[best])
     largest_rad = _REPEAT_STEPS * max(resolution_rad, _SMALLEST_RESOLUTION_RAD)
     moved = first[:, :count].std(axis=1).max()
-    return (lag, count) if mean_square[best] <= largest_rad ** 2 and moved >= _REPEAT_MOTION \
-        else None
+    return (
+        (lag, count) if mean_square[best] <= largest_rad**2 and moved >= _REPEAT_MOTION else None
+    )
 
 
 @dataclass(frozen=True)
@@ -220,8 +254,9 @@ class AngleErrorFilter:
         lower[1, :-1] = -self.transition[1:]
         changes = np.zeros_like(values)
         changes[:, 1:] = values[:, 1:] - self.pole * values[:, :-1]
-        estimates = scipy.linalg.lapack.dtbtrs(lower, (changes * self.gain).T, uplo='L',
-                                               diag='U')[0].T
+        estimates = scipy.linalg.lapack.dtbtrs(lower, (changes * self.gain).T, uplo='L', diag='U')[
+            0
+        ].T
         changes[:, 1:] -= self.weight[1:] * estimates[:, :-1]
         changes *= self.scale
         changes[:, 0] = values[:, 0]
@@ -250,8 +285,9 @@ class Whitener:
         return self.density <= effect_named(self.effect).diagnosis.healthy_density
 
 
-def _angle_error_filter(comparison: BaselineComparison, axis: int, pole: float, analog_v: float
-                        ) -> AngleErrorFilter | None:
+def _angle_error_filter(
+    comparison: BaselineComparison, axis: int, pole: float, analog_v: float
+) -> AngleErrorFilter | None:
     """
     Return the filter for one axis by the Riccati recursion of the Kalman filter.
 
@@ -263,10 +299,10 @@ def _angle_error_filter(comparison: BaselineComparison, axis: int, pole: float, 
         remembered_v2 += part_v2 * memory
     if not variance_v2.any():
         return None
-    noise_v2 = analog_v ** 2 * (1 - pole ** 2) \
-        + comparison.sensor.lsb_v ** 2 / 12 * (1 + pole ** 2)
-    memories = np.divide(remembered_v2, variance_v2, where=variance_v2 > 0,
-                         out=np.ones(len(comparison)))
+    noise_v2 = analog_v**2 * (1 - pole**2) + comparison.sensor.lsb_v**2 / 12 * (1 + pole**2)
+    memories = np.divide(
+        remembered_v2, variance_v2, where=variance_v2 > 0, out=np.ones(len(comparison))
+    )
     std_v = np.sqrt(variance_v2)
     rows, variance, previous_v = [], 1.0, float(std_v[0])
     for g, phi in zip(std_v.tolist(), memories.tolist()):
@@ -280,8 +316,9 @@ def _angle_error_filter(comparison: BaselineComparison, axis: int, pole: float, 
     return AngleErrorFilter(float(np.sqrt(np.mean(variance_v2))), pole, *np.array(rows).T)
 
 
-def _angle_errors(comparison: BaselineComparison, axis: int
-                  ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _angle_errors(
+    comparison: BaselineComparison, axis: int
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield variance, V², and memory from sample to sample, (n,) each, of errors of angles."""
     sensor, time_s, joints = comparison.sensor, comparison.time_s, comparison.joints or ()
     slopes = gravity_slopes(*(joint(time_s) for joint in joints))[:, axis] if joints else ()
@@ -306,31 +343,44 @@ def whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
     # Pole of the RC filter, and standard deviation of the analog noise.
     a = float(np.exp(-dt_s / rc_s)) if rc_s else 0.0
     std_v = max(float(noise.analog_std_v(sensor)[axis]), _LOWEST_NOISE_V)
-    errors, step_v2 = _angle_error_filter(comparison, axis, a, std_v), sensor.lsb_v ** 2 / 12
+    errors, step_v2 = _angle_error_filter(comparison, axis, a, std_v), sensor.lsb_v**2 / 12
     by_spectrum = {effect_named(e).diagnosis.drift: e for e in drifts_among(library())}
     pole, difference = np.array([1, -a]), np.array([1, -1.0])
     filters = []
     for density in RANDOM_WALKS_G_PER_RTS:
-        spectrum = (std_v ** 2 * (1 - a * a) * _power(difference, 2)
-                    + step_v2 * _power(np.convolve(pole, difference), 2)
-                    + (density * scale) ** 2 * dt_s * _power(pole, 2))
-        filters.append(Whitener(scipy.signal.tf2sos(np.convolve(pole, difference),
-                                                    _spectral_factor(spectrum, 2)),
-                                by_spectrum[DriftSpectrum.RANDOM_WALK], density))
+        spectrum = (
+            std_v**2 * (1 - a * a) * _power(difference, 2)
+            + step_v2 * _power(np.convolve(pole, difference), 2)
+            + (density * scale) ** 2 * dt_s * _power(pole, 2)
+        )
+        filters.append(
+            Whitener(
+                scipy.signal.tf2sos(np.convolve(pole, difference), _spectral_factor(spectrum, 2)),
+                by_spectrum[DriftSpectrum.RANDOM_WALK],
+                density,
+            )
+        )
     # Noise and ADC steps without drift are an ARMA(1, 1) sequence; this is the zero of its MA.
-    zero = -_spectral_factor(std_v ** 2 * (1 - a * a) * _power(np.ones(1), 1)
-                             + step_v2 * _power(pole, 1), 1)[1]
-    white_v2_per_hz = 2 * dt_s * (std_v ** 2 * (1 + a) / (1 - a) + step_v2)
+    zero = -_spectral_factor(
+        std_v**2 * (1 - a * a) * _power(np.ones(1), 1) + step_v2 * _power(pole, 1), 1
+    )[1]
+    white_v2_per_hz = 2 * dt_s * (std_v**2 * (1 + a) / (1 - a) + step_v2)
     for density in FLICKERS_G_PER_RTHZ:
         corner_hz = (density * scale) ** 2 / white_v2_per_hz
         top_hz = min(corner_hz, _TOP_OF_RATE / dt_s)
         # Zeros and poles, one pair a decade from the corner down: the gain of the filter rises
         # with the root of the frequency.
         decades = np.arange(int(np.ceil(max(np.log10(top_hz * comparison.span_s), 0.0))))
-        corners = 2 * np.pi * dt_s * top_hz * 10.0 ** -decades
-        filters.append(Whitener(scipy.signal.zpk2sos(
-            [a, *np.exp(-corners * 10 ** -0.5)], [zero, *np.exp(-corners)], 1.0),
-            by_spectrum[DriftSpectrum.FLICKER], density))
+        corners = 2 * np.pi * dt_s * top_hz * 10.0**-decades
+        filters.append(
+            Whitener(
+                scipy.signal.zpk2sos(
+                    [a, *np.exp(-corners * 10**-0.5)], [zero, *np.exp(-corners)], 1.0
+                ),
+                by_spectrum[DriftSpectrum.FLICKER],
+                density,
+            )
+        )
         if corner_hz > top_hz:
             break
     largest = np.inf if errors is None else errors.rms_v / scale
@@ -353,7 +403,7 @@ def _spectral_factor(spectrum: np.ndarray, order: int) -> np.ndarray:
     """Return the monic polynomial with all roots inside the unit circle and this spectrum."""
     trimmed = np.trim_zeros(np.where(np.abs(spectrum) > 1e-14 * spectrum.max(), spectrum, 0.0))
     roots = np.roots(trimmed)
-    inside = roots[np.argsort(np.abs(roots))[:len(roots) // 2]]
+    inside = roots[np.argsort(np.abs(roots))[: len(roots) // 2]]
     factor = np.atleast_1d(np.real(np.poly(inside)))
     return np.pad(factor, (0, order + 1 - len(factor)))
 
@@ -380,9 +430,14 @@ class WhitenedChannel:
     drift_effects: np.ndarray
 
 
-def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.ndarray,
-                   used: np.ndarray, filters: Sequence[Whitener], by_block: bool = True
-                   ) -> WhitenedChannel:
+def whiten_channel(
+    residual_v: np.ndarray,
+    columns: np.ndarray,
+    column_ids: np.ndarray,
+    used: np.ndarray,
+    filters: Sequence[Whitener],
+    by_block: bool = True,
+) -> WhitenedChannel:
     """
     Whiten one axis of one recording.
 
@@ -394,8 +449,10 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
     data[0], data[1:] = residual_v, columns.T
     if not used.all():
         data = bridged(data.T, used).T
-    before = {id(f.errors): data if f.errors is None else f.errors(data)
-              for f in {id(f.errors): f for f in filters}.values()}
+    before = {
+        id(f.errors): data if f.errors is None else f.errors(data)
+        for f in {id(f.errors): f for f in filters}.values()
+    }
     edges, dropped = block_edges(len(used)), np.append(np.flatnonzero(~used), 0)
     grams = np.zeros((len(filters), BLOCKS if by_block else 0, len(data), len(data)))
     total = np.zeros((len(filters), len(data), len(data)))
@@ -408,11 +465,23 @@ def whiten_channel(residual_v: np.ndarray, columns: np.ndarray, column_ids: np.n
                 grams[i, b] = white[:, begin:end] @ white[:, begin:end].T
         total[i] = grams[i].sum(axis=0) if by_block else white @ white.T
     # The log determinant of the filter for errors, sample by sample.
-    log_scales = np.array([np.zeros(BLOCKS) if f.errors is None else np.add.reduceat(
-        np.where(used, np.log(f.errors.scale), 0.0), edges[:-1]) for f in filters])
-    return WhitenedChannel(column_ids, grams, total, used_by_block(used), log_scales,
-                           np.array([f.log_prior for f in filters]),
-                           np.array(['' if f.healthy else f.effect for f in filters]))
+    log_scales = np.array(
+        [
+            np.zeros(BLOCKS)
+            if f.errors is None
+            else np.add.reduceat(np.where(used, np.log(f.errors.scale), 0.0), edges[:-1])
+            for f in filters
+        ]
+    )
+    return WhitenedChannel(
+        column_ids,
+        grams,
+        total,
+        used_by_block(used),
+        log_scales,
+        np.array([f.log_prior for f in filters]),
+        np.array(['' if f.healthy else f.effect for f in filters]),
+    )
 
 
 def used_by_block(used: np.ndarray) -> np.ndarray:
@@ -446,8 +515,10 @@ class LinearFit:
         """Return the posterior mean, (k,), where j coefficients at places have given values."""
         mean = self.values.copy()
         others = np.setdiff1d(np.arange(len(mean)), places)
-        mean[others] += self.covariance[np.ix_(others, places)] @ np.linalg.lstsq(
-            self.covariance[np.ix_(places, places)], values - mean[places])[0]
+        mean[others] += (
+            self.covariance[np.ix_(others, places)]
+            @ np.linalg.lstsq(self.covariance[np.ix_(places, places)], values - mean[places])[0]
+        )
         mean[places] = values
         return mean
 
@@ -461,13 +532,19 @@ class LinearFit:
         std = np.sqrt(np.diag(self.covariance)[:count])
         deviation = (values - self.values[:count]) / std
         correlation = self.covariance[:count, :count] / std / std[:, None]
-        return 0.5 * float(deviation @ np.linalg.solve(
-            correlation + _RIDGE * np.eye(count), deviation))
+        return 0.5 * float(
+            deviation @ np.linalg.solve(correlation + _RIDGE * np.eye(count), deviation)
+        )
 
 
-def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Iterable[int],
-                prior_std: np.ndarray, blocks: np.ndarray | None = None,
-                start: LinearFit | None = None, drifts: Sequence[str] = ()) -> LinearFit:
+def fit_columns(
+    channels: Sequence[WhitenedChannel],
+    column_ids: Iterable[int],
+    prior_std: np.ndarray,
+    blocks: np.ndarray | None = None,
+    start: LinearFit | None = None,
+    drifts: Sequence[str] = (),
+) -> LinearFit:
     """
     Fit the coefficients of k columns, and the noise of each channel.
 
@@ -484,8 +561,9 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Iterable[int],
     filters = [int(np.argmax(channel.log_priors)) for channel in selected]
     if start is not None:
         filters = list(start.filter_indices)
-    variance_v2 = np.array([channel.grams[f, 0, 0] / channel.count
-                            for channel, f in zip(selected, filters)])
+    variance_v2 = np.array(
+        [channel.grams[f, 0, 0] / channel.count for channel, f in zip(selected, filters)]
+    )
     prior_precision = prior_std[ids] ** -2.0
     for _ in range(_ITERATIONS):
         posterior = _Posterior.of(selected, filters, variance_v2, prior_precision)
@@ -497,8 +575,9 @@ def fit_columns(channels: Sequence[WhitenedChannel], column_ids: Iterable[int],
     log_evidence = posterior.log_occam_factor(prior_precision)
     for channel, variance, f in zip(selected, variance_v2, filters):
         log_evidence += channel.log_likelihood(f, variance)
-    return LinearFit(ids, posterior.mean, posterior.covariance(), log_evidence, tuple(filters),
-                     variance_v2)
+    return LinearFit(
+        ids, posterior.mean, posterior.covariance(), log_evidence, tuple(filters), variance_v2
+    )
 
 
 @dataclass(frozen=True)
@@ -513,8 +592,13 @@ class _SelectedChannel:
     log_priors: np.ndarray  # Log prior probability of each filter; −inf where not allowed
 
     @classmethod
-    def of(cls, channel: WhitenedChannel, ids: np.ndarray, blocks: np.ndarray | None,
-           drifts: Sequence[str]) -> _SelectedChannel:
+    def of(
+        cls,
+        channel: WhitenedChannel,
+        ids: np.ndarray,
+        blocks: np.ndarray | None,
+        drifts: Sequence[str],
+    ) -> _SelectedChannel:
         """Choose the columns, blocks and filters of a channel."""
         columns = np.flatnonzero(np.isin(channel.column_ids, ids))
         rows = np.concatenate([[0], 1 + columns])
@@ -528,7 +612,8 @@ class _SelectedChannel:
             grams=grams[:, rows[:, None], rows],
             count=max(float(channel.counts[chosen].sum()), 1.0),
             log_scales=channel.log_scales[:, chosen].sum(axis=1),
-            log_priors=np.where(allowed | ~allowed.any(), channel.log_priors, -np.inf))
+            log_priors=np.where(allowed | ~allowed.any(), channel.log_priors, -np.inf),
+        )
 
     def squares_v2(self, values: np.ndarray) -> np.ndarray:
         """Return the sum of squares of the whitened residual by filter, V², (filters,)."""
@@ -538,8 +623,11 @@ class _SelectedChannel:
 
     def log_likelihood(self, chosen_filter: int, variance_v2: float) -> float:
         """Return the log likelihood at the best variance of a filter, up to a constant."""
-        return float(-self.count / 2 * (np.log(variance_v2) + 1)
-                     + self.log_scales[chosen_filter] + self.log_priors[chosen_filter])
+        return float(
+            -self.count / 2 * (np.log(variance_v2) + 1)
+            + self.log_scales[chosen_filter]
+            + self.log_priors[chosen_filter]
+        )
 
 
 @dataclass(frozen=True)
@@ -551,8 +639,13 @@ class _Posterior:
     factor: np.ndarray  # Cholesky factor of the scaled precision, (k, k)
 
     @classmethod
-    def of(cls, channels: Sequence[_SelectedChannel], filters: Sequence[int],
-           variance_v2: np.ndarray, prior_precision: np.ndarray) -> _Posterior:
+    def of(
+        cls,
+        channels: Sequence[_SelectedChannel],
+        filters: Sequence[int],
+        variance_v2: np.ndarray,
+        prior_precision: np.ndarray,
+    ) -> _Posterior:
         """Combine prior and channels, each whitened by its present filter."""
         precision, information = np.diag(prior_precision), np.zeros(len(prior_precision))
         for channel, f, variance in zip(channels, filters, variance_v2):
@@ -562,8 +655,7 @@ class _Posterior:
         size = 1 / np.sqrt(np.diag(precision))
         scaled = precision * size[:, None] * size + _RIDGE * np.eye(len(size))
         factor = np.linalg.cholesky(scaled)
-        return cls(size * scipy.linalg.cho_solve((factor, True), size * information), size,
-                   factor)
+        return cls(size * scipy.linalg.cho_solve((factor, True), size * information), size, factor)
 
     def covariance(self) -> np.ndarray:
         """Return the covariance of the coefficients, (k, k)."""
@@ -572,7 +664,7 @@ class _Posterior:
 
     def log_occam_factor(self, prior_precision: np.ndarray) -> float:
         """Return the log prior at the mean, plus the log ratio of posterior and prior volume."""
-        log_prior = -0.5 * float(np.sum(prior_precision * self.mean ** 2))
+        log_prior = -0.5 * float(np.sum(prior_precision * self.mean**2))
         log_posterior_volume = -float(np.log(np.diag(self.factor) / self.size).sum())
         log_prior_volume = -0.5 * float(np.log(prior_precision).sum())
         return log_prior + log_posterior_volume - log_prior_volume
@@ -611,8 +703,13 @@ class LinearisedHypothesis:
 
     def fit(self, blocks: np.ndarray | None = None, drifts: Sequence[str] = ()) -> LinearFit:
         """Fit all coefficients to some blocks, (blocks,) bool, or to all."""
-        return fit_columns(self.channels, range(len(self.names)), self.prior_std, blocks,
-                           drifts=(*drifts, *drifts_among(self.sensor.effects)))
+        return fit_columns(
+            self.channels,
+            range(len(self.names)),
+            self.prior_std,
+            blocks,
+            drifts=(*drifts, *drifts_among(self.sensor.effects)),
+        )
 
     def departures(self, fit: LinearFit, full_fit: LinearFit | None = None) -> np.ndarray:
         """
@@ -630,21 +727,29 @@ class LinearisedHypothesis:
         undetermined = std > UNDETERMINED_SHARE * self.prior_std[:j]
         if full_fit is not None:
             undetermined |= std > _UNDETERMINED_RATIO * np.sqrt(np.diag(full_fit.covariance)[:j])
-        kept = np.array([not p.is_size or bool(effect_named(name.effect).limits)
-                         for p, name in zip(parameters, self.names)], bool)
+        kept = np.array(
+            [
+                not p.is_size or bool(effect_named(name.effect).limits)
+                for p, name in zip(parameters, self.names)
+            ],
+            bool,
+        )
         is_shape = np.array([p.role is Role.SHAPE for p in parameters], bool)
         fitted = self.prior_mean[:j] + fit.values[:j]
         values = np.where(undetermined & kept, self.values, fitted)
-        values = np.where(is_shape, np.clip(values, *np.sort([self.values / 2, self.values * 2],
-                                                             axis=0)), values)
+        values = np.where(
+            is_shape, np.clip(values, *np.sort([self.values / 2, self.values * 2], axis=0)), values
+        )
         given = np.concatenate([values != fitted, np.zeros(len(self.reach), bool)])
         target = np.concatenate([values - self.prior_mean[:j], np.zeros(len(self.reach))])
         departures = fit.given(np.flatnonzero(given), target[given])
         if full_fit is None:
             return departures
-        is_open = np.diag(fit.covariance)[j:] > _UNDETERMINED_RATIO ** 2 * np.diag(
-            full_fit.covariance)[j:]
-        nuisance = np.clip(np.where(is_open, full_fit.values[j:], departures[j:]),
-                           -self.reach, self.reach)
+        is_open = (
+            np.diag(fit.covariance)[j:] > _UNDETERMINED_RATIO**2 * np.diag(full_fit.covariance)[j:]
+        )
+        nuisance = np.clip(
+            np.where(is_open, full_fit.values[j:], departures[j:]), -self.reach, self.reach
+        )
         given[j:], target[j:] = nuisance != departures[j:], nuisance
         return fit.given(np.flatnonzero(given), target[given])

@@ -75,8 +75,12 @@ def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> li
         slopes = beside.gravity_slopes(*angles_rad)
     bases = []
     for axis, along_g in enumerate(force_g):
-        factors = {Form.TEMPERATURE: along_g, Form.SUPPLY: along_g,
-                   Form.ALPHA: slopes[0, axis], Form.BETA: slopes[1, axis]}
+        factors = {
+            Form.TEMPERATURE: along_g,
+            Form.SUPPLY: along_g,
+            Form.ALPHA: slopes[0, axis],
+            Form.BETA: slopes[1, axis],
+        }
         functions = dict(common)
         for dimension, factor in factors.items():
             if dimension in common:
@@ -93,8 +97,8 @@ def _normalised(functions: np.ndarray, used: np.ndarray) -> np.ndarray:
     count = max(int(used.sum()), 1)
     centred = functions - (functions @ used / count)[:, None]
     squares = np.einsum('kn,kn,n->k', centred, centred, used.astype(float)) / count
-    varying = squares > _SMALLEST_RMS ** 2
-    size = np.sqrt(max(squares[varying].sum(), _SMALLEST_RMS ** 2))
+    varying = squares > _SMALLEST_RMS**2
+    size = np.sqrt(max(squares[varying].sum(), _SMALLEST_RMS**2))
     return (centred[varying] / size).T
 
 
@@ -113,8 +117,9 @@ def _common(comparison: BaselineComparison) -> Basis:
     return basis
 
 
-def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, volts: np.ndarray
-             ) -> Basis:
+def _of_axis(
+    comparison: BaselineComparison, force_g: np.ndarray, axis: int, volts: np.ndarray
+) -> Basis:
     """Return functions of the force along and across one axis and of its history, (k, n) each."""
     along_g = force_g[axis]
     if np.ptp(along_g) < _SMALLEST_SPREAD:
@@ -134,9 +139,12 @@ def _of_axis(comparison: BaselineComparison, force_g: np.ndarray, axis: int, vol
 
 def _cross_force(force_g: np.ndarray, axis: int) -> np.ndarray:
     """Return products of the components of force, and functions of those across an axis."""
-    powers = [p for p in np.ndindex(*[_PRODUCT_DEGREE + 1] * len(force_g))
-              if 2 <= sum(p) <= _PRODUCT_DEGREE]
-    products = [prod(f ** k for f, k in zip(force_g, p)) for p in powers]
+    powers = [
+        p
+        for p in np.ndindex(*[_PRODUCT_DEGREE + 1] * len(force_g))
+        if 2 <= sum(p) <= _PRODUCT_DEGREE
+    ]
+    products = [prod(f**k for f, k in zip(force_g, p)) for p in powers]
     across = [_modes(f, Form.CROSS_FORCE) for f in np.delete(force_g, axis, axis=0)]
     return np.concatenate([np.array(products), *across])
 
@@ -144,7 +152,7 @@ def _cross_force(force_g: np.ndarray, axis: int) -> np.ndarray:
 def _codes(volts: np.ndarray, reference_v: float) -> np.ndarray:
     """Return harmonics over the codes of the ADC, and its heaviest bits."""
     turn_rad = 2 * np.pi * (volts - volts.min()) / np.ptp(volts)
-    bits = [np.floor(volts / reference_v * 2 ** bit) % 2 for bit in range(1, _HEAVY_BITS + 1)]
+    bits = [np.floor(volts / reference_v * 2**bit) % 2 for bit in range(1, _HEAVY_BITS + 1)]
     return np.array([*_harmonics(turn_rad, _CODE_HARMONICS, 0), *bits])
 
 
@@ -155,10 +163,19 @@ def _force_history(along_g: np.ndarray, dt_s: float) -> np.ndarray:
     # The level of a vibration: squares of the slope and of the fast force, smoothed.
     levels = []
     for fast in (slope, lagging[-1]):
-        levels += [low_pass(fast ** 2, tau_s, dt_s, {}) for tau_s in _LAG_S]
+        levels += [low_pass(fast**2, tau_s, dt_s, {}) for tau_s in _LAG_S]
     amplitudes = [np.sqrt(np.abs(level)) for level in levels]
-    return _same_size([slope, np.gradient(slope, dt_s), slope * along_g, slope ** 2,
-                       *lagging, *levels, *amplitudes])
+    return _same_size(
+        [
+            slope,
+            np.gradient(slope, dt_s),
+            slope * along_g,
+            slope**2,
+            *lagging,
+            *levels,
+            *amplitudes,
+        ]
+    )
 
 
 @dataclass(frozen=True)
@@ -172,8 +189,14 @@ class _Moves:
     def of(cls, comparison: BaselineComparison) -> _Moves:
         """Return the moves of a recording; no joint moves where it has none."""
         rates = [joint(comparison.time_s, 1) for joint in comparison.joints or ()]
-        return cls(rates, [rate / np.abs(rate).max() for rate in rates
-                           if np.abs(rate).max() > _SMALLEST_RATE_RAD_S])
+        return cls(
+            rates,
+            [
+                rate / np.abs(rate).max()
+                for rate in rates
+                if np.abs(rate).max() > _SMALLEST_RATE_RAD_S
+            ],
+        )
 
 
 def _of_moves(moves: _Moves, along_g: np.ndarray, comparison: BaselineComparison) -> Basis:
@@ -188,15 +211,20 @@ def _of_moves(moves: _Moves, along_g: np.ndarray, comparison: BaselineComparison
     for direction in directions:
         by_direction += [direction, direction * along_g]
     since_s = beside.time_since_move_s(comparison.time_s, moves.rates)
-    turning = np.sum([np.abs(rate) * (np.abs(rate) > _SMALLEST_RATE_RAD_S)
-                      for rate in moves.moving], axis=0)
+    turning = np.sum(
+        [np.abs(rate) * (np.abs(rate) > _SMALLEST_RATE_RAD_S) for rate in moves.moving], axis=0
+    )
     since_move = [np.exp(-since_s / tau_s) for tau_s in _RELAXATION_S]
     for tau_s in _RELAXATION_S:
-        since_move += [low_pass(past, tau_s, comparison.dt_s, {})
-                       for past in (turning, np.sign(turning))]
+        since_move += [
+            low_pass(past, tau_s, comparison.dt_s, {}) for past in (turning, np.sign(turning))
+        ]
     since_move += _lags(along_g, _CREEP_S, comparison.dt_s)
-    return {Form.RATE: np.array(by_rate), Form.DIRECTION: np.array(by_direction),
-            Form.SINCE_MOVE: _same_size(since_move)}
+    return {
+        Form.RATE: np.array(by_rate),
+        Form.DIRECTION: np.array(by_direction),
+        Form.SINCE_MOVE: _same_size(since_move),
+    }
 
 
 def _lags(values: np.ndarray, times_s: Iterable[float], dt_s: float) -> list[np.ndarray]:
@@ -206,8 +234,7 @@ def _lags(values: np.ndarray, times_s: Iterable[float], dt_s: float) -> list[np.
 
 def _thermal_history(temperature_c: np.ndarray, dt_s: float) -> np.ndarray:
     """Return lags of the temperature and branches of loops, plain and times it, (k, n)."""
-    branches = [loop(temperature_c, share * np.ptp(temperature_c), {})
-                for share in _THERMAL_REACH]
+    branches = [loop(temperature_c, share * np.ptp(temperature_c), {}) for share in _THERMAL_REACH]
     history = _same_size([*_lags(temperature_c, _THERMAL_LAG_S, dt_s), *branches])
     middle_c = (temperature_c.min() + temperature_c.max()) / 2
     return np.concatenate([history, _same_size(list(history * (temperature_c - middle_c)))])
@@ -222,7 +249,7 @@ def _harmonics(phase_rad: np.ndarray, count: int, decay: int = 1) -> np.ndarray:
     """Return sines and cosines of harmonics of a phase, the k-th of size k^(−decay), (2k, n)."""
     functions = []
     for k in range(1, count + 1):
-        functions += [np.sin(k * phase_rad) / k ** decay, np.cos(k * phase_rad) / k ** decay]
+        functions += [np.sin(k * phase_rad) / k**decay, np.cos(k * phase_rad) / k**decay]
     return np.array(functions)
 
 
@@ -236,4 +263,4 @@ def _modes(values: np.ndarray, dimension: Form, decay: float = 1.5) -> np.ndarra
     if high - low < _SMALLEST_SPREAD:
         return np.zeros((0, len(values)))
     order = np.arange(1, _MODES[dimension] + 1)[:, None]
-    return np.cos(np.pi * order * (values - low) / (high - low)) * order ** -decay
+    return np.cos(np.pi * order * (values - low) / (high - low)) * order**-decay

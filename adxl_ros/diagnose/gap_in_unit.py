@@ -42,33 +42,40 @@ class GapInUnit(NamedTuple):
     @property
     def text(self) -> str:
         """Return it for people."""
-        return (f'{self.quantity} {self.before:.3g} -> {self.after:.3g} {self.unit}; noise alone '
-                f'{self.floor:.3g}')
+        return (
+            f'{self.quantity} {self.before:.3g} -> {self.after:.3g} {self.unit}; noise alone '
+            f'{self.floor:.3g}'
+        )
 
 
 def tilt_deg(time_s: np.ndarray, recorded: np.ndarray, simulated: np.ndarray) -> float:
     """Return the rms angle between the recorded and the simulated vector, deg."""
     cross = np.linalg.norm(np.cross(recorded, simulated), axis=1)
     angle = np.arctan2(cross, np.sum(recorded * simulated, axis=1))
-    return float(np.degrees(np.sqrt(np.mean(angle ** 2))))
+    return float(np.degrees(np.sqrt(np.mean(angle**2))))
 
 
 def velocity_mps(time_s: np.ndarray, recorded: np.ndarray, simulated: np.ndarray) -> float:
     """Return the rms velocity, m/s, that the difference has become after `INTEGRATED_S`."""
     # Over a gap the difference counts as the mean of both sides.
-    velocity = scipy.integrate.cumulative_trapezoid(recorded - simulated, time_s, axis=0,
-                                                    initial=0)
+    velocity = scipy.integrate.cumulative_trapezoid(
+        recorded - simulated, time_s, axis=0, initial=0
+    )
     later = np.searchsorted(time_s, time_s + INTEGRATED_S)
     within = later < len(time_s)
     if not within.any():
-        raise UserError(f'--in velocity: integrates for {INTEGRATED_S:g} s, but the recording '
-                        f'has {np.ptp(time_s):.3g} s')
-    gained = velocity[later[within]] - velocity[:len(time_s)][within]
-    return float(np.sqrt(np.mean(np.sum(gained ** 2, axis=1))))
+        raise UserError(
+            f'--in velocity: integrates for {INTEGRATED_S:g} s, but the recording '
+            f'has {np.ptp(time_s):.3g} s'
+        )
+    gained = velocity[later[within]] - velocity[: len(time_s)][within]
+    return float(np.sqrt(np.mean(np.sum(gained**2, axis=1))))
 
 
-_QUANTITIES = {'tilt': Quantity('tilt', 'deg', tilt_deg),
-               'velocity': Quantity('velocity', f'm/s after {INTEGRATED_S:g} s', velocity_mps)}
+_QUANTITIES = {
+    'tilt': Quantity('tilt', 'deg', tilt_deg),
+    'velocity': Quantity('velocity', f'm/s after {INTEGRATED_S:g} s', velocity_mps),
+}
 
 
 def quantity(text: str) -> Quantity:
@@ -80,13 +87,21 @@ def quantity(text: str) -> Quantity:
         figure = getattr(import_module(module), name)
         return Quantity(name, getattr(figure, 'unit', ''), figure)
     except (ImportError, AttributeError, ValueError) as error:
-        raise UserError(f'--in {text}: {one_line(error)}; give {", ".join(_QUANTITIES)}, or '
-                        'MODULE:FUNCTION of a module that Python can import') from None
+        raise UserError(
+            f'--in {text}: {one_line(error)}; give {", ".join(_QUANTITIES)}, or '
+            'MODULE:FUNCTION of a module that Python can import'
+        ) from None
 
 
-def gap_in(chosen: Quantity, comparisons: Sequence[BaselineComparison], baseline: Sensor,
-           found: Sensor, seed: int) -> GapInUnit:
+def gap_in(
+    chosen: Quantity,
+    comparisons: Sequence[BaselineComparison],
+    baseline: Sensor,
+    found: Sensor,
+    seed: int,
+) -> GapInUnit:
     """Return the gap before and after what was found, and the same figure of noise alone."""
+
     def figure(comparison: BaselineComparison, recorded_v: np.ndarray, sensor: Sensor) -> float:
         used = comparison.used & np.isfinite(recorded_v).all(axis=1)
         recorded = _acceleration(recorded_v[used], baseline)
@@ -96,16 +111,19 @@ def gap_in(chosen: Quantity, comparisons: Sequence[BaselineComparison], baseline
         except UserError:
             raise
         except Exception as error:
-            raise UserError(f'--in {chosen.name}: {type(error).__name__}: {one_line(error)}'
-                            ) from None
+            raise UserError(
+                f'--in {chosen.name}: {type(error).__name__}: {one_line(error)}'
+            ) from None
 
     def rms(figures: list[float]) -> float:
         return float(np.sqrt(np.mean(np.square(figures))))
 
     before = [figure(c, c.volts, baseline) for c in comparisons]
     after = [figure(c, c.volts, found) for c in comparisons]
-    noise = [figure(c, c.simulated_v(found) + c.simulated_noise_v(found, seed), found)
-             for c in comparisons]
+    noise = [
+        figure(c, c.simulated_v(found) + c.simulated_noise_v(found, seed), found)
+        for c in comparisons
+    ]
     return GapInUnit(chosen.name, chosen.unit, rms(before), rms(after), rms(noise))
 
 

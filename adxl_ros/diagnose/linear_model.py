@@ -85,8 +85,9 @@ def candidates() -> list[Effect]:
     return [effect for effect in library().values() if effect.acts_on is base.ActsOn.MEAN]
 
 
-def variants(comparison: BaselineComparison, effect: Effect, baseline_v: np.ndarray
-             ) -> Iterator[Variant]:
+def variants(
+    comparison: BaselineComparison, effect: Effect, baseline_v: np.ndarray
+) -> Iterator[Variant]:
     """
     Differentiate the simulated output by the parameters of an effect, for each shape.
 
@@ -119,8 +120,9 @@ def _steps(effect: Effect) -> list[float]:
     return [_SMOOTH_STEP] if effect.smooth or has_shape else list(_ROUGH_STEPS)
 
 
-def _tried_shapes(effect: Effect, modelled: bool
-                  ) -> list[tuple[dict[str, float], list[Parameter]]]:
+def _tried_shapes(
+    effect: Effect, modelled: bool
+) -> list[tuple[dict[str, float], list[Parameter]]]:
     """
     Return shapes, and the parameters of which derivatives are taken there.
 
@@ -145,34 +147,53 @@ def _shapes(effect: Effect) -> list[dict[str, float]]:
     starts = [p.starts or (p.scale,) for p in parameters]
     if parameters and not any(p.starts for p in parameters):
         first = parameters[0]
-        starts[0] = tuple(dict.fromkeys(float(np.clip(first.scale * factor, first.lower,
-                                                      first.upper)) for factor in _SHAPE_FACTORS))
+        starts[0] = tuple(
+            dict.fromkeys(
+                float(np.clip(first.scale * factor, first.lower, first.upper))
+                for factor in _SHAPE_FACTORS
+            )
+        )
     return [dict(zip([p.name for p in parameters], values)) for values in product(*starts)]
 
 
-def _limit_variants(comparison: BaselineComparison, effect: Effect, limit: Parameter,
-                    baseline_v: np.ndarray) -> Iterator[Variant]:
+def _limit_variants(
+    comparison: BaselineComparison, effect: Effect, limit: Parameter, baseline_v: np.ndarray
+) -> Iterator[Variant]:
     """Try limits that clip small shares of the samples."""
     sensor = comparison.sensor
     axes, with_effect = sensor.axes, with_neutral(sensor, [effect.name])
     names = names_of(replace(effect, parameters=(limit,)), axes)
     # The other parameters have no effect until the limit clips; one-sided ones must leave 0.
-    start = {name: p.scale if p.lower == p.neutral else p.neutral
-             for p in effect.parameters if p.is_size
-             for name in names_of(replace(effect, parameters=(p,)), axes)}
+    start = {
+        name: p.scale if p.lower == p.neutral else p.neutral
+        for p in effect.parameters
+        if p.is_size
+        for name in names_of(replace(effect, parameters=(p,)), axes)
+    }
     magnitude_g = np.abs(baseline_v - sensor.zero_g_v) / sensor.scale_v_per_g
     for number, share in enumerate(_CLIPPED_SHARES):
         values = np.clip(np.quantile(magnitude_g, 1 - share, axis=0), limit.lower, limit.upper)
         change_v = comparison.simulated_v(put(with_effect, names, values)) - baseline_v
         clipped = [d for d in range(len(axes)) if np.any(np.abs(change_v[:, d]) > _SMALLEST_V)]
         if clipped:
-            yield Variant(effect.name, {}, float(number), tuple(names[d] for d in clipped),
-                          [{name: change_v[:, d]} if d in clipped else {}
-                           for d, name in enumerate(names)], dict(zip(names, values)) | start)
+            yield Variant(
+                effect.name,
+                {},
+                float(number),
+                tuple(names[d] for d in clipped),
+                [{name: change_v[:, d]} if d in clipped else {} for d, name in enumerate(names)],
+                dict(zip(names, values)) | start,
+            )
 
 
-def _variant(comparison: BaselineComparison, effect: Effect, parameters: Sequence[Parameter],
-             shape: dict[str, float], step: float, baseline_v: np.ndarray) -> Variant | None:
+def _variant(
+    comparison: BaselineComparison,
+    effect: Effect,
+    parameters: Sequence[Parameter],
+    shape: dict[str, float],
+    step: float,
+    baseline_v: np.ndarray,
+) -> Variant | None:
     """Differentiate by parameters of an effect at one shape; None where nothing changes."""
     axes = comparison.sensor.axes
     start = with_values(with_neutral(comparison.sensor, [effect.name]), effect.name, shape)
@@ -184,11 +205,15 @@ def _variant(comparison: BaselineComparison, effect: Effect, parameters: Sequenc
         if not p.lower <= highest + size <= p.upper:
             size = (p.upper - highest) or -size
         # A shape has no influence where the sizes are neutral, as in the baseline.
-        change = (comparison.simulated_v(with_values(start, effect.name, {p.name: values + size}))
-                  - baseline_v) / size
+        change = (
+            comparison.simulated_v(with_values(start, effect.name, {p.name: values + size}))
+            - baseline_v
+        ) / size
         # Without a known pose only changes show, except of the zero-g itself.
-        if comparison.reference is Reference.NONE \
-                and effect.diagnosis.straight_line is not base.StraightLine.ZERO_G:
+        if (
+            comparison.reference is Reference.NONE
+            and effect.diagnosis.straight_line is not base.StraightLine.ZERO_G
+        ):
             change -= change.mean(axis=0)
         for name in names_of(replace(effect, parameters=(p,)), axes):
             reached = [axes.index(name.axis)] if p.axes else list(range(len(axes)))
@@ -199,8 +224,13 @@ def _variant(comparison: BaselineComparison, effect: Effect, parameters: Sequenc
     return Variant(effect.name, shape, step, tuple(names), columns) if names else None
 
 
-def sensitivities_at(simulate: Simulate, sensor: Sensor, names: Sequence[Coefficient],
-                     values: np.ndarray, output_v: np.ndarray) -> np.ndarray:
+def sensitivities_at(
+    simulate: Simulate,
+    sensor: Sensor,
+    names: Sequence[Coefficient],
+    values: np.ndarray,
+    output_v: np.ndarray,
+) -> np.ndarray:
     """
     Differentiate the output by p coefficients at their values; return V per unit, (n, m, p).
 
@@ -300,14 +330,20 @@ class LinearModel:
         """Return prior standard deviations of all coefficients beside variants, (columns,)."""
         prior_std = self.prior_std.copy()
         effects = {self.variants[i].effect for i in chosen}
-        columns = [k for i in chosen if calibration_takes_up(self.variants[i].effect)
-                   for k in self.column_ids[i]]
+        columns = [
+            k
+            for i in chosen
+            if calibration_takes_up(self.variants[i].effect)
+            for k in self.column_ids[i]
+        ]
         for i in self.nuisance_ids:
             name = self.names[i]
             if name.effect not in effects:
-                parts = self.parts_at_rest.get(name, np.zeros(len(prior_std)))[columns] \
+                parts = (
+                    self.parts_at_rest.get(name, np.zeros(len(prior_std)))[columns]
                     * prior_std[columns]
-                prior_std[i] = np.hypot(self.tolerance(name), np.sqrt(np.sum(parts ** 2)))
+                )
+                prior_std[i] = np.hypot(self.tolerance(name), np.sqrt(np.sum(parts**2)))
         return prior_std
 
     def tolerance(self, name: Coefficient) -> float:
@@ -319,14 +355,17 @@ class LinearModel:
         hints, sensor = hints_of(name), self.baseline
         assert hints.healthy_std is not None
         if hints.straight_line is None:
-            return PRIOR_WIDTH * parameter_of(name).scale \
-                if {*hints.stated_by} & {*sensor.measured} else hints.healthy_std
+            return (
+                PRIOR_WIDTH * parameter_of(name).scale
+                if {*hints.stated_by} & {*sensor.measured}
+                else hints.healthy_std
+            )
         scale = float(sensor.scale_v_per_g[sensor.axes.index(name.axis)])
         zero_g = hints.straight_line is base.StraightLine.ZERO_G
         if zero_g and not self.pose_known:
             return scale
         # Converters round or cut off, which shifts the zero-g by a part of a step.
-        variance = sensor.lsb_v ** 2 / 12 if zero_g else 0.0
+        variance = sensor.lsb_v**2 / 12 if zero_g else 0.0
         if name in sensor.covariance_names:
             i = sensor.covariance_names.index(name)
             variance += float(sensor.covariance[i, i])
@@ -336,9 +375,16 @@ class LinearModel:
         """Fit a set of variants on the sensitivities at the baseline."""
         effects = {self.variants[i].effect for i in chosen}
         ids = {k for k in self.nuisance_ids if self.names[k].effect not in effects}.union(
-            *(self.column_ids[i] for i in chosen))
-        return evidence.fit_columns(self.channels, ids, self.prior(chosen), None, start,
-                                    evidence.drifts_among(self.baseline.effects))
+            *(self.column_ids[i] for i in chosen)
+        )
+        return evidence.fit_columns(
+            self.channels,
+            ids,
+            self.prior(chosen),
+            None,
+            start,
+            evidence.drifts_among(self.baseline.effects),
+        )
 
 
 def calibration_takes_up(effect: str) -> bool:
@@ -352,33 +398,47 @@ def calibration_takes_up(effect: str) -> bool:
     return not described.diagnosis.absorbed and described.concern is not Concern.REFERENCE
 
 
-def build_linear_model(comparisons: Sequence[BaselineComparison],
-                       show_progress: Callable[[float], None] = lambda fraction: None,
-                       only: Sequence[str] | None = None,
-                       filters: Sequence[list[Whitener]] = ()) -> LinearModel:
+def build_linear_model(
+    comparisons: Sequence[BaselineComparison],
+    show_progress: Callable[[float], None] = lambda fraction: None,
+    only: Sequence[str] | None = None,
+    filters: Sequence[list[Whitener]] = (),
+) -> LinearModel:
     """
     Differentiate the baseline by the whole library in all recordings.
 
     filters: whitening filters of each channel, where not all are tried.
     """
-    filters = filters or [evidence.whiteners(c, axis) for c in comparisons
-                          for axis in range(len(c.sensor.axes))]
+    filters = filters or [
+        evidence.whiteners(c, axis) for c in comparisons for axis in range(len(c.sensor.axes))
+    ]
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
     table = _ColumnTable(comparisons)
-    for by_recording in _variants_by_key(comparisons, baseline_v, _tried_effects(
-            comparisons, only), show_progress):
+    for by_recording in _variants_by_key(
+        comparisons, baseline_v, _tried_effects(comparisons, only), show_progress
+    ):
         table.add(by_recording)
     channels = _whitened(comparisons, table.channels, filters)
     show_progress(1.0)
     nuisance_columns = [table.nuisances(channel) for channel in table.channels]
-    return LinearModel(list(comparisons), baseline_v, table.variants, table.ids, table.names,
-                       table.prior_std(), channels, list(filters), table.channels,
-                       nuisance_columns, parts_at_rest(comparisons, nuisance_columns,
-                                                       table.channels, len(table.names)))
+    return LinearModel(
+        list(comparisons),
+        baseline_v,
+        table.variants,
+        table.ids,
+        table.names,
+        table.prior_std(),
+        channels,
+        list(filters),
+        table.channels,
+        nuisance_columns,
+        parts_at_rest(comparisons, nuisance_columns, table.channels, len(table.names)),
+    )
 
 
-def _tried_effects(comparisons: Sequence[BaselineComparison], only: Sequence[str] | None
-                   ) -> list[Effect]:
+def _tried_effects(
+    comparisons: Sequence[BaselineComparison], only: Sequence[str] | None
+) -> list[Effect]:
     """Return the effects by which a baseline is differentiated; the nuisances are among them."""
     fades = any(c.fading_hz is not None for c in comparisons)
 
@@ -388,15 +448,22 @@ def _tried_effects(comparisons: Sequence[BaselineComparison], only: Sequence[str
     def would_fit_lost_motion(effect: Effect) -> bool:
         """Whether an effect would be found in the fast motion that a smooth reference lacks."""
         shows_in_fast_motion = effect.diagnosis.revealed_by is base.Manoeuvre.SHAKE
-        return fades and shows_in_fast_motion and not effect.exact \
+        return (
+            fades
+            and shows_in_fast_motion
+            and not effect.exact
             and effect.concern is not Concern.REFERENCE
+        )
 
     return [e for e in candidates() if is_asked_for(e) and not would_fit_lost_motion(e)]
 
 
-def _variants_by_key(comparisons: Sequence[BaselineComparison], baseline_v: Sequence[np.ndarray],
-                     effects: Sequence[Effect], show_progress: Callable[[float], None]
-                     ) -> Iterable[dict[int, Variant]]:
+def _variants_by_key(
+    comparisons: Sequence[BaselineComparison],
+    baseline_v: Sequence[np.ndarray],
+    effects: Sequence[Effect],
+    show_progress: Callable[[float], None],
+) -> Iterable[dict[int, Variant]]:
     """Return each variant in all recordings that show it, by the number of the recording."""
     every: dict[tuple, dict[int, Variant]] = {}
     for i, (comparison, output_v) in enumerate(zip(comparisons, baseline_v)):
@@ -417,7 +484,8 @@ class _ColumnTable:
         self.ids: list[list[int]] = []  # Numbers of the columns of each variant
         # By recording and axis: sensitivities by number of the column, V per unit, (n,)
         self._columns: list[list[dict[int, np.ndarray]]] = [
-            [{} for _ in c.sensor.axes] for c in comparisons]
+            [{} for _ in c.sensor.axes] for c in comparisons
+        ]
 
     def add(self, by_recording: dict[int, Variant]) -> None:
         """Add one variant in the recordings that show it."""
@@ -441,40 +509,55 @@ class _ColumnTable:
         stds: list[float] = []
         for variant in self.variants:
             # The columns of a limit are the change by its first value.
-            stds += [1.0 if variant.limit_start else PRIOR_WIDTH * parameter_of(name).scale
-                     for name in variant.names]
+            stds += [
+                1.0 if variant.limit_start else PRIOR_WIDTH * parameter_of(name).scale
+                for name in variant.names
+            ]
         return np.array(stds)
 
     def nuisances(self, channel: dict[int, np.ndarray]) -> dict[Coefficient, np.ndarray]:
         """Return the nuisance columns of a channel; of several, that of the smallest start."""
-        return {self.names[k]: values for k, values in reversed(channel.items())
-                if hints_of(self.names[k]).nuisance}
+        return {
+            self.names[k]: values
+            for k, values in reversed(channel.items())
+            if hints_of(self.names[k]).nuisance
+        }
 
 
-def _whitened(comparisons: Sequence[BaselineComparison],
-              columns: Sequence[Mapping[int, np.ndarray]], filters: Sequence[list[Whitener]]
-              ) -> list[evidence.WhitenedChannel]:
+def _whitened(
+    comparisons: Sequence[BaselineComparison],
+    columns: Sequence[Mapping[int, np.ndarray]],
+    filters: Sequence[list[Whitener]],
+) -> list[evidence.WhitenedChannel]:
     """Whiten residual and columns of each channel for noise that the baseline may have."""
     residuals_v = [v for c in comparisons for v in c.residual_v(c.sensor).T]
     used = [c.used for c in comparisons for _ in c.sensor.axes]
     chosen = filters_for(filters, comparisons[0].sensor.effects)
-    return [evidence.whiten_channel(residual_v, np.array([*own.values()]).T, np.array([*own]),
-                                    of_channel, of_filters, False)
-            for residual_v, own, of_channel, of_filters in zip(
-                residuals_v, columns, used, chosen)]
+    return [
+        evidence.whiten_channel(
+            residual_v,
+            np.array([*own.values()]).T,
+            np.array([*own]),
+            of_channel,
+            of_filters,
+            False,
+        )
+        for residual_v, own, of_channel, of_filters in zip(residuals_v, columns, used, chosen)
+    ]
 
 
-def filters_for(filters: Sequence[list[Whitener]], effects: Sequence[str]
-                ) -> list[list[Whitener]]:
+def filters_for(filters: Sequence[list[Whitener]], effects: Sequence[str]) -> list[list[Whitener]]:
     """Return for each channel the filters of healthy units and of the drifts among effects."""
     drifts = evidence.drifts_among(effects)
     return [[f for f in every if f.healthy or f.effect in drifts] or every for every in filters]
 
 
-def parts_at_rest(comparisons: Sequence[BaselineComparison],
-                  nuisance_columns: Sequence[Mapping[Coefficient, np.ndarray]],
-                  columns: Sequence[Mapping[int, np.ndarray]], count: int
-                  ) -> dict[Coefficient, np.ndarray]:
+def parts_at_rest(
+    comparisons: Sequence[BaselineComparison],
+    nuisance_columns: Sequence[Mapping[Coefficient, np.ndarray]],
+    columns: Sequence[Mapping[int, np.ndarray]],
+    count: int,
+) -> dict[Coefficient, np.ndarray]:
     """
     Compute how much of other columns a calibration can take for zero-g or scale factor.
 
@@ -492,15 +575,19 @@ def parts_at_rest(comparisons: Sequence[BaselineComparison],
     calibrated = {*comparisons[0].sensor.effects}
     resting = [c.at_rest & c.used for c in comparisons for _ in c.sensor.axes]
     for nuisances, channel_columns, rests in zip(nuisance_columns, columns, resting):
-        lines = {name: c for name, c in nuisances.items()
-                 if hints_of(name).straight_line and name.effect in calibrated}
+        lines = {
+            name: c
+            for name, c in nuisances.items()
+            if hints_of(name).straight_line and name.effect in calibrated
+        }
         if not lines or not channel_columns:
             continue
         rows = rests if rests.any() else np.ones(len(rests), bool)
         ids = list(channel_columns)
         others = np.column_stack(list(channel_columns.values()))
-        for name, part in zip(lines, _straight_parts(
-                np.column_stack(list(lines.values())), others, rows)):
+        for name, part in zip(
+            lines, _straight_parts(np.column_stack(list(lines.values())), others, rows)
+        ):
             largest = parts.setdefault(name, np.zeros(count))
             largest[ids] = np.maximum(largest[ids], part)
     return parts
@@ -516,11 +603,12 @@ def _straight_parts(lines: np.ndarray, others: np.ndarray, rows: np.ndarray) -> 
     at_rests = np.abs(np.linalg.lstsq(lines[rows], others[rows])[0])
     in_all = np.linalg.lstsq(lines, others)[0]
     # A calibration with an effect that is a straight line would have left nothing of it.
-    bent = (others - lines @ in_all).std(axis=0) \
-        > _SMALLEST_BENT_SHARE * np.sqrt(np.mean(others ** 2, axis=0))
+    bent = (others - lines @ in_all).std(axis=0) > _SMALLEST_BENT_SHARE * np.sqrt(
+        np.mean(others**2, axis=0)
+    )
     parts = []
     for j, line in enumerate(lines.T):
-        size = max(float(np.sqrt(np.mean(line ** 2))), np.finfo(float).tiny)
+        size = max(float(np.sqrt(np.mean(line**2))), np.finfo(float).tiny)
         # The poses of a calibration may reach further than the rests of the recording.
         reach = np.abs(others).max(axis=0) / np.abs(line).max() if np.ptp(line) else 0.0
         beyond_rests = np.minimum(np.maximum(np.abs(in_all[j]), reach), 2 * rms / size)

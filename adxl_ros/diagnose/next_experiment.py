@@ -66,8 +66,9 @@ class CouldShow(NamedTuple):
         return bool(self.smallest <= p.upper - p.neutral)
 
 
-def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.ndarray,
-               material_mps2: float) -> list[CouldShow]:
+def could_show(
+    model: LinearModel, comparison: BaselineComparison, noise_v: np.ndarray, material_mps2: float
+) -> list[CouldShow]:
     """
     Return the smallest sizes by effect: material ones, that exceed their uncertainty.
 
@@ -80,16 +81,19 @@ def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.n
     # Products of the whitened columns in units of the noise, and their squares, (m/s²)²/unit².
     gram, plain, samples = np.zeros((count, count)), np.zeros(count), 0.0
     for c, f, variance, columns, (recorded, axis) in zip(
-            model.channels, fit.filter_indices, fit.innovation_variance_v2, model.columns,
-            model.places):
+        model.channels, fit.filter_indices, fit.innovation_variance_v2, model.columns, model.places
+    ):
         gram[np.ix_(c.column_ids, c.column_ids)] += c.total_grams[f][1:, 1:] / variance
         for k, values in columns.items():
-            plain[k] += float(np.sum(values[recorded.used] ** 2)) \
+            plain[k] += (
+                float(np.sum(values[recorded.used] ** 2))
                 / float(recorded.scale_v_per_mps2[axis]) ** 2
+            )
         samples += recorded.used.sum()
     precision = gram[np.ix_(free, free)] + np.diag(prior_std[free] ** -2.0)
-    marginal = np.diag(gram) - np.einsum('ij,ij->j', gram[free], np.linalg.solve(
-        precision, gram[free]))
+    marginal = np.diag(gram) - np.einsum(
+        'ij,ij->j', gram[free], np.linalg.solve(precision, gram[free])
+    )
     rows = _noise_could_show(comparison, noise_v, material_mps2)
     for variant, ids in zip(model.variants, model.column_ids):
         hints = effect_named(variant.effect).diagnosis
@@ -99,41 +103,62 @@ def could_show(model: LinearModel, comparison: BaselineComparison, noise_v: np.n
             information = gram[k, k] if hints.nuisance else marginal[k]
             share = float(np.clip(information / max(gram[k, k], 1e-300), 0.0, 1.0))
             power = plain[k] * share / max(samples, 1.0)
-            size = max(_SHOWN_STDS * information ** -0.5, material_mps2 * power ** -0.5) \
-                if information > 0 and power > 0 else np.inf
+            size = (
+                max(_SHOWN_STDS * information**-0.5, material_mps2 * power**-0.5)
+                if information > 0 and power > 0
+                else np.inf
+            )
             if hints.nuisance:
                 size = np.hypot(size, 3 * model.tolerance(model.names[k]))
             rows.append(CouldShow(model.names[k], float(size), share))
     seen = {r.name.effect for r in rows} | {v.effect for v in model.variants if v.limit_start}
-    rows += [CouldShow(Coefficient(e.name, e.parameters[0].name), np.inf, 0.0)
-             for e in linear.candidates() if e.name not in seen]
+    rows += [
+        CouldShow(Coefficient(e.name, e.parameters[0].name), np.inf, 0.0)
+        for e in linear.candidates()
+        if e.name not in seen
+    ]
     # The coefficient of each effect that shows best, by smallest over typical size.
-    best = {r.name.effect: r for r in sorted(rows, reverse=True, key=lambda r: (
-        r.smallest / parameter_of(r.name).scale, r.name))}
+    best = {
+        r.name.effect: r
+        for r in sorted(
+            rows, reverse=True, key=lambda r: (r.smallest / parameter_of(r.name).scale, r.name)
+        )
+    }
     return [best[effect] for effect in sorted(best)]
 
 
-def _noise_could_show(comparison: BaselineComparison, noise_v: np.ndarray, material_mps2: float
-                      ) -> list[CouldShow]:
+def _noise_could_show(
+    comparison: BaselineComparison, noise_v: np.ndarray, material_mps2: float
+) -> list[CouldShow]:
     """Return the smallest sizes of effects that show in the noise of one recording."""
     sensor, count = comparison.sensor, len(comparison)
     level_v, rate_hz = float(noise_v.max()), sensor.rate_hz
-    line_v = max(level_v * np.sqrt(8 * (noise_effects.LINE_LOG_EXCESS + np.log(count)) / count),
-                 np.sqrt(2) * material_mps2 * float(comparison.scale_v_per_mps2.max()))
-    sizes = {Detector.NOISE_LEVEL: ('ratio', noise_effects.NOISE_EXCESS - 1),
-             Detector.MAINS_LINE: ('amplitude_v', line_v),
-             Detector.ISOLATED_SAMPLES: ('amplitude_v', noise_effects.SPIKE_STDS * max(
-                 level_v, sensor.lsb_v)),
-             Detector.REPEATED_SAMPLES: ('duration_s', noise_effects.shortest_repeat(
-                 comparison.volts, len(sensor.axes)) / rate_hz),
-             Detector.COARSE_CODES: ('lost_bits', float(np.log2(noise_effects.COARSE_STEPS)))}
+    line_v = max(
+        level_v * np.sqrt(8 * (noise_effects.LINE_LOG_EXCESS + np.log(count)) / count),
+        np.sqrt(2) * material_mps2 * float(comparison.scale_v_per_mps2.max()),
+    )
+    sizes = {
+        Detector.NOISE_LEVEL: ('ratio', noise_effects.NOISE_EXCESS - 1),
+        Detector.MAINS_LINE: ('amplitude_v', line_v),
+        Detector.ISOLATED_SAMPLES: (
+            'amplitude_v',
+            noise_effects.SPIKE_STDS * max(level_v, sensor.lsb_v),
+        ),
+        Detector.REPEATED_SAMPLES: (
+            'duration_s',
+            noise_effects.shortest_repeat(comparison.volts, len(sensor.axes)) / rate_hz,
+        ),
+        Detector.COARSE_CODES: ('lost_bits', float(np.log2(noise_effects.COARSE_STEPS))),
+    }
     rows = []
     for effect in library().values():
         hints = effect.diagnosis
         if hints.drift is not None:
             unit_g = expected_drift_g(effect.name, 1.0, comparison)
-            parameter, size = effect.parameters[0].name, max(
-                material_mps2 / G0_MPS2 / unit_g, hints.healthy_density)
+            parameter, size = (
+                effect.parameters[0].name,
+                max(material_mps2 / G0_MPS2 / unit_g, hints.healthy_density),
+            )
         elif hints.detector in sizes:
             parameter, size = sizes[hints.detector]
         else:
@@ -149,8 +174,12 @@ class Belief(NamedTuple):
     covariance: np.ndarray  # Covariance, (k, k)
 
 
-def expected_information(gram: np.ndarray, probabilities: Sequence[float],
-                         beliefs: Sequence[Belief], factor: float = 1.0) -> float:
+def expected_information(
+    gram: np.ndarray,
+    probabilities: Sequence[float],
+    beliefs: Sequence[Belief],
+    factor: float = 1.0,
+) -> float:
     """
     Return a lower bound of the information that an experiment gives on the hypothesis, nat.
 
@@ -163,14 +192,18 @@ def expected_information(gram: np.ndarray, probabilities: Sequence[float],
     # A root of G, because all sensitivities with the same products respond alike.
     root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T / size[kept]
     means = [root @ b.mean[kept] for b in beliefs]
-    covariances = [np.eye(len(kept)) + root @ b.covariance[np.ix_(kept, kept)] @ root.T
-                   for b in beliefs]
+    covariances = [
+        np.eye(len(kept)) + root @ b.covariance[np.ix_(kept, kept)] @ root.T for b in beliefs
+    ]
     log_dets = np.linalg.slogdet(covariances)[1]
     overlap = np.eye(len(weights))
     for i, j in combinations(range(len(weights)), 2):
         both, difference = (covariances[i] + covariances[j]) / 2, means[i] - means[j]
-        distance = difference @ np.linalg.solve(both, difference) / 8 \
-            + np.linalg.slogdet(both)[1] / 2 - (log_dets[i] + log_dets[j]) / 4
+        distance = (
+            difference @ np.linalg.solve(both, difference) / 8
+            + np.linalg.slogdet(both)[1] / 2
+            - (log_dets[i] + log_dets[j]) / 4
+        )
         overlap[i, j] = overlap[j, i] = np.exp(-max(factor * distance, 0.0))
     positive = weights > 0
     return max(float(-weights[positive] @ np.log((overlap @ weights)[positive])), 0.0)
@@ -201,12 +234,14 @@ class PredictedResponse(NamedTuple):
 
 def leading(hypotheses: Sequence[WeightedHypothesis]) -> tuple[WeightedHypothesis, ...]:
     """Return the known hypotheses that lead the choice of a manoeuvre, the most probable first."""
-    return tuple(h for h in hypotheses if h.probability > _SMALLEST_PROBABILITY
-                 and UNKNOWN not in h.effects)[:_MOST_HYPOTHESES]
+    return tuple(
+        h for h in hypotheses if h.probability > _SMALLEST_PROBABILITY and UNKNOWN not in h.effects
+    )[:_MOST_HYPOTHESES]
 
 
-def predict(name: str, motion: Motion, begin_s: float, sensor: Sensor, effects: Sequence[str]
-            ) -> PredictedResponse:
+def predict(
+    name: str, motion: Motion, begin_s: float, sensor: Sensor, effects: Sequence[str]
+) -> PredictedResponse:
     """
     Simulate a manoeuvre with the baseline, and multiply its whitened sensitivities.
 
@@ -220,8 +255,9 @@ def predict(name: str, motion: Motion, begin_s: float, sensor: Sensor, effects: 
     keys = _keys(model)
     places = {key: place for place, key in enumerate(keys.values())}
     gram = np.zeros((len(places), len(places)))
-    for channel, f, variance in zip(model.channels, model.null_fit.filter_indices,
-                                    model.null_fit.innovation_variance_v2):
+    for channel, f, variance in zip(
+        model.channels, model.null_fit.filter_indices, model.null_fit.innovation_variance_v2
+    ):
         shown = [i for i, number in enumerate(channel.column_ids) if number in keys]
         ids = [places[keys[channel.column_ids[i]]] for i in shown]
         gram[np.ix_(ids, ids)] += channel.total_grams[f][1:, 1:][np.ix_(shown, shown)] / variance
@@ -230,30 +266,52 @@ def predict(name: str, motion: Motion, begin_s: float, sensor: Sensor, effects: 
 
 def _keys(model: LinearModel) -> dict[int, tuple]:
     """Return variant and coefficient of each column of a linear model by its number."""
-    return {number: (v.key, model.names[number])
-            for v, ids in zip(model.variants, model.column_ids) if not v.limit_start
-            for number in ids}
+    return {
+        number: (v.key, model.names[number])
+        for v, ids in zip(model.variants, model.column_ids)
+        if not v.limit_start
+        for number in ids
+    }
 
 
-def rank_responses(responses: Sequence[PredictedResponse],
-                   hypotheses: Sequence[WeightedHypothesis], model: LinearModel | None
-                   ) -> tuple[ManoeuvreWorth, ...]:
+def rank_responses(
+    responses: Sequence[PredictedResponse],
+    hypotheses: Sequence[WeightedHypothesis],
+    model: LinearModel | None,
+) -> tuple[ManoeuvreWorth, ...]:
     """Rank manoeuvres by their expected information per minute."""
     leaders, seen = leading(hypotheses), dict[str, int]()
     keys, fits = dict[int, tuple](), list[LinearFit | None]([None] * len(leaders))
     if model is not None:
         # The variant of each effect that fits the samples best.
-        seen = {effect: max(
-            numbers, key=lambda i: model.fit_variants([i], model.null_fit).log_evidence)
+        seen = {
+            effect: max(
+                numbers, key=lambda i: model.fit_variants([i], model.null_fit).log_evidence
+            )
             for effect in {e for h in leaders for e in h.effects}
-            if (numbers := _variants_of(model, effect))}
-        keys, fits = _keys(model), [model.fit_variants(
-            [seen[e] for e in h.effects if e in seen], model.null_fit) for h in leaders]
+            if (numbers := _variants_of(model, effect))
+        }
+        keys, fits = (
+            _keys(model),
+            [
+                model.fit_variants([seen[e] for e in h.effects if e in seen], model.null_fit)
+                for h in leaders
+            ],
+        )
     total = sum(h.probability for h in leaders)
-    worth = [ManoeuvreWorth(r.name, r.minutes, expected_information(
-        r.gram, [h.probability / total for h in leaders],
-        [_belief(r, keys, fit, {*h.effects} - {*seen}) for h, fit in zip(leaders, fits)],
-        _EVIDENCE_FACTOR)) for r in responses]
+    worth = [
+        ManoeuvreWorth(
+            r.name,
+            r.minutes,
+            expected_information(
+                r.gram,
+                [h.probability / total for h in leaders],
+                [_belief(r, keys, fit, {*h.effects} - {*seen}) for h, fit in zip(leaders, fits)],
+                _EVIDENCE_FACTOR,
+            ),
+        )
+        for r in responses
+    ]
     return tuple(sorted(worth, key=lambda w: -w.per_minute))
 
 
@@ -262,8 +320,12 @@ def _variants_of(model: LinearModel, effect: str) -> list[int]:
     return [i for i, v in enumerate(model.variants) if v.effect == effect and not v.limit_start]
 
 
-def _belief(response: PredictedResponse, fitted_keys: dict[int, tuple], fit: LinearFit | None,
-            unseen: Collection[str]) -> Belief:
+def _belief(
+    response: PredictedResponse,
+    fitted_keys: dict[int, tuple],
+    fit: LinearFit | None,
+    unseen: Collection[str],
+) -> Belief:
     """
     Return what a hypothesis knows of the columns of a manoeuvre.
 
@@ -272,8 +334,9 @@ def _belief(response: PredictedResponse, fitted_keys: dict[int, tuple], fit: Lin
     """
     places, model, keys = response.places, response.linear_model, _keys(response.linear_model)
     # The middle one of the shapes of an effect stands for all.
-    chosen = [numbers[len(numbers) // 2] for effect in unseen
-              if (numbers := _variants_of(model, effect))]
+    chosen = [
+        numbers[len(numbers) // 2] for effect in unseen if (numbers := _variants_of(model, effect))
+    ]
     prior_std, mean, variance = model.prior(chosen), np.zeros(len(places)), np.zeros(len(places))
     for k in {k for i in chosen for k in model.column_ids[i]}.union(model.nuisance_ids):
         variance[places[keys[k]]] = prior_std[k] ** 2
@@ -297,16 +360,19 @@ class ManoeuvreDescription(NamedTuple):
 
 
 MENU = {
-    Manoeuvre.SHAKE: ManoeuvreDescription(
-        'shake along x from 2 to 40 Hz', 'shaker'),
+    Manoeuvre.SHAKE: ManoeuvreDescription('shake along x from 2 to 40 Hz', 'shaker'),
     Manoeuvre.SPEEDS: ManoeuvreDescription(
-        'turn two planes at two speeds, forth and back, with reversals', 'rich'),
+        'turn two planes at two speeds, forth and back, with reversals', 'rich'
+    ),
     Manoeuvre.PLANES: ManoeuvreDescription(
-        'sweep a second plane, or tilt in all directions', 'tilt_both'),
+        'sweep a second plane, or tilt in all directions', 'tilt_both'
+    ),
     Manoeuvre.REMOUNT: ManoeuvreDescription(
-        'remount the sensor turned by 180 deg about z, and sweep again', 'tilt_both', True),
+        'remount the sensor turned by 180 deg about z, and sweep again', 'tilt_both', True
+    ),
     Manoeuvre.HEAT: ManoeuvreDescription('dwell, heat and cool', 'soak'),
-    Manoeuvre.SUPPLY: ManoeuvreDescription('step the supply at rest', 'soak')}
+    Manoeuvre.SUPPLY: ManoeuvreDescription('step the supply at rest', 'soak'),
+}
 """All manoeuvres. An effect names the one that reveals it best in its own file."""
 
 
@@ -324,27 +390,37 @@ class NextExperiment(NamedTuple):
     stem: str = 'next'  # Name of its recording, without the extension, that no input has
 
 
-def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor: Sensor,
-                            model: LinearModel | None, seed: int) -> NextExperiment | None:
+def propose_next_experiment(
+    verdict: Verdict,
+    not_covered: Sequence[str],
+    sensor: Sensor,
+    model: LinearModel | None,
+    seed: int,
+) -> NextExperiment | None:
     """
     Propose the manoeuvre that separates most of what is not separated.
 
     sensor: the baseline; model: linear model of the recordings, or None.
     """
     no_stage = model is not None and all(
-        c.reference is Reference.SIMULATOR for c in model.comparisons)
+        c.reference is Reference.SIMULATOR for c in model.comparisons
+    )
     stem = _free_stem([c.name for c in model.comparisons] if model else ())
     if any(effect_named(e).concern is Concern.REFERENCE for e in verdict.named):
         return NextExperiment(
             'the motion beside another reference, or one with less smoothing',
-            'because the error may be of the reference', _beside_other_reference(stem),
-            concerns_reference=True, stem=stem)
+            'because the error may be of the reference',
+            _beside_other_reference(stem),
+            concerns_reference=True,
+            stem=stem,
+        )
     if verdict.groups:
         ranked = _ranked_menu(verdict, sensor, model, seed)
         group, best = verdict.groups[0], ranked[0].name
         why = f'to separate {listed(group, "and")}'
-        return _experiment(next(m for m, d in MENU.items() if d.text == best), why,
-                           no_stage, stem)._replace(menu=ranked)
+        return _experiment(
+            next(m for m, d in MENU.items() if d.text == best), why, no_stage, stem
+        )._replace(menu=ranked)
     if verdict.status == 'no_gap' and not not_covered:
         return None
     why = 'to confirm the verdict on another recording'
@@ -353,20 +429,25 @@ def propose_next_experiment(verdict: Verdict, not_covered: Sequence[str], sensor
     elif not_covered:
         why = f'because the recordings have no {", no ".join(not_covered)}'
     revealed_by = [effect_named(e).diagnosis.revealed_by for e in verdict.effects]
-    usual = Manoeuvre.SPEEDS if verdict.status == 'unknown' or not not_covered \
-        else Manoeuvre.PLANES
+    usual = (
+        Manoeuvre.SPEEDS if verdict.status == 'unknown' or not not_covered else Manoeuvre.PLANES
+    )
     return _experiment(next(filter(None, revealed_by), usual), why, no_stage, stem)
 
 
 def _free_stem(recordings: Sequence[str]) -> str:
     """Return the name of another recording, without its extension, that no input has."""
     taken = {Path(name).stem for name in recordings}
-    return next(stem for number in count(1)
-                if (stem := 'next' if number == 1 else f'next_{number}') not in taken)
+    return next(
+        stem
+        for number in count(1)
+        if (stem := 'next' if number == 1 else f'next_{number}') not in taken
+    )
 
 
-def _ranked_menu(verdict: Verdict, sensor: Sensor, model: LinearModel | None, seed: int
-                 ) -> tuple[ManoeuvreWorth, ...]:
+def _ranked_menu(
+    verdict: Verdict, sensor: Sensor, model: LinearModel | None, seed: int
+) -> tuple[ManoeuvreWorth, ...]:
     """Rank the whole menu by its expected information."""
     effects = sorted({effect for h in leading(verdict.hypotheses) for effect in h.effects})
     responses = []
@@ -374,9 +455,15 @@ def _ranked_menu(verdict: Verdict, sensor: Sensor, model: LinearModel | None, se
         motion = trajectories.TRAJECTORIES[described.trajectory](np.random.default_rng(seed))
         # At rest the pose is unknown, so that a baseline with effects of the stage has no place.
         with suppress(UserError):
-            responses.append(predict(
-                described.text, motion, 0.0,
-                _remounted(sensor) if described.remounted else sensor, effects))
+            responses.append(
+                predict(
+                    described.text,
+                    motion,
+                    0.0,
+                    _remounted(sensor) if described.remounted else sensor,
+                    effects,
+                )
+            )
     return rank_responses(responses, verdict.hypotheses, model)
 
 
@@ -384,12 +471,17 @@ def _experiment(manoeuvre: Manoeuvre, why: str, no_stage: bool, stem: str) -> Ne
     """Describe a manoeuvre with its command."""
     described, option = MENU[manoeuvre], ''
     if no_stage:
-        return NextExperiment(described.text, why, _beside_other_reference(stem),
-                              beside_simulator=True, stem=stem)
+        return NextExperiment(
+            described.text, why, _beside_other_reference(stem), beside_simulator=True, stem=stem
+        )
     if described.remounted:
         option = f' --effect {":".join(_half_turn())}={np.pi:.6f}'
-    return NextExperiment(described.text, why, command(
-        'simulate', f'{described.trajectory}{option} -o {stem}.csv'), stem=stem)
+    return NextExperiment(
+        described.text,
+        why,
+        command('simulate', f'{described.trajectory}{option} -o {stem}.csv'),
+        stem=stem,
+    )
 
 
 def _beside_other_reference(stem: str) -> str:

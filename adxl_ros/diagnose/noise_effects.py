@@ -81,16 +81,21 @@ def effect_of(detector: Detector) -> str:
     return next(e.name for e in library().values() if e.diagnosis.detector is detector)
 
 
-def _detection(detector: Detector, power_v2: np.ndarray | float, sensor: Sensor,
-               **values: np.ndarray | float) -> Detection:
+def _detection(
+    detector: Detector, power_v2: np.ndarray | float, sensor: Sensor, **values: np.ndarray | float
+) -> Detection:
     """Return the detection of a detector's effect, with its mean square, V², (m,) or ()."""
     arrays = {key: np.asarray(value) for key, value in values.items()}
-    return Detection(effect_of(detector), arrays,
-                     float(np.mean(power_v2 * (G0_MPS2 / sensor.scale_v_per_g) ** 2)))
+    return Detection(
+        effect_of(detector),
+        arrays,
+        float(np.mean(power_v2 * (G0_MPS2 / sensor.scale_v_per_g) ** 2)),
+    )
 
 
-def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
-                     ) -> tuple[np.ndarray, list[Detection]]:
+def repeated_samples(
+    volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
+) -> tuple[np.ndarray, list[Detection]]:
     """Find samples that repeat the one before in all axes, in runs too long for chance."""
     same = np.concatenate([[False], (np.diff(volts, axis=0) == 0).all(axis=1)])
     # At their rails all axes repeat, too.
@@ -103,9 +108,15 @@ def repeated_samples(volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, se
     if not repeats:
         return used, []
     duration_s = float(np.median([time_s[end - 1] - time_s[begin] for begin, end in repeats]))
-    return used & ~repeated, [_detection(
-        Detector.REPEATED_SAMPLES, np.inf, sensor, rate_hz=len(repeats) / np.ptp(time_s),
-        duration_s=duration_s + 1 / sensor.rate_hz)]
+    return used & ~repeated, [
+        _detection(
+            Detector.REPEATED_SAMPLES,
+            np.inf,
+            sensor,
+            rate_hz=len(repeats) / np.ptp(time_s),
+            duration_s=duration_s + 1 / sensor.rate_hz,
+        )
+    ]
 
 
 def shortest_repeat(volts: np.ndarray, axes: int) -> int:
@@ -118,8 +129,9 @@ def shortest_repeat(volts: np.ndarray, axes: int) -> int:
     return max(_REPEAT_SHORTEST, by_chance)
 
 
-def isolated_samples(volts: np.ndarray, residual_v: np.ndarray, time_s: np.ndarray,
-                     used: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, list[Detection]]:
+def isolated_samples(
+    volts: np.ndarray, residual_v: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
+) -> tuple[np.ndarray, list[Detection]]:
     """
     Find single samples that deviate from the straight line between their neighbours.
 
@@ -130,20 +142,28 @@ def isolated_samples(volts: np.ndarray, residual_v: np.ndarray, time_s: np.ndarr
     if not spikes.any():
         return used, []
     rate_hz = spikes.sum() / len(sensor.axes) / float(time_s[-1] - time_s[0])
-    return used & ~spikes.any(axis=1), [_detection(
-        Detector.ISOLATED_SAMPLES, spikes.mean(axis=0) * size_v ** 2, sensor, rate_hz=rate_hz,
-        amplitude_v=size_v)]
+    return used & ~spikes.any(axis=1), [
+        _detection(
+            Detector.ISOLATED_SAMPLES,
+            spikes.mean(axis=0) * size_v**2,
+            sensor,
+            rate_hz=rate_hz,
+            amplitude_v=size_v,
+        )
+    ]
 
 
-def residual_shows_spikes(spikes: Detection, residual_v: np.ndarray, used: np.ndarray,
-                          sensor: Sensor) -> bool:
+def residual_shows_spikes(
+    spikes: Detection, residual_v: np.ndarray, used: np.ndarray, sensor: Sensor
+) -> bool:
     """
     Determine whether the residual of the best hypothesis shows the spikes of the recording.
 
     Without this check, motion of the sensor may look like spikes, which are not among `used`.
     """
-    isolated, _ = _spikes(residual_v, code_step_v(residual_v),
-                          np.isfinite(residual_v).all(axis=1), sensor)
+    isolated, _ = _spikes(
+        residual_v, code_step_v(residual_v), np.isfinite(residual_v).all(axis=1), sensor
+    )
     expected = float(spikes.values['rate_hz']) * len(sensor.axes) * len(used) / sensor.rate_hz
     return bool(isolated[~used].sum() > expected / 2)
 
@@ -154,8 +174,9 @@ def _deviation_v(volts: np.ndarray) -> np.ndarray:
     return np.nan_to_num(np.abs(volts - around_v / 2))
 
 
-def _spikes(volts: np.ndarray, steps_v: np.ndarray, used: np.ndarray, sensor: Sensor
-            ) -> tuple[np.ndarray, np.ndarray]:
+def _spikes(
+    volts: np.ndarray, steps_v: np.ndarray, used: np.ndarray, sensor: Sensor
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Return isolated samples, (n, m) bool, and their median size by axis, V, (m,).
 
@@ -171,16 +192,19 @@ def _spikes(volts: np.ndarray, steps_v: np.ndarray, used: np.ndarray, sensor: Se
     for d, (deviation, step_v) in enumerate(zip(deviation_v.T, steps_v)):
         std_v = max(MAD_TO_STD * np.median(deviation[used]), step_v, sensor.lsb_v)
         # Motion also deviates from the line, so that a spike must exceed its surroundings, too.
-        local_v = MAD_TO_STD * np.median(
-            deviation[:blocks * width].reshape(blocks, -1), axis=1)
+        local_v = MAD_TO_STD * np.median(deviation[: blocks * width].reshape(blocks, -1), axis=1)
         local_v = np.interp(np.arange(count), (np.arange(blocks) + 0.5) * width, local_v)
-        before_v, after_v = (np.abs(volts[:, d] - np.roll(volts[:, d], shift))
-                             for shift in (near, -near))
+        before_v, after_v = (
+            np.abs(volts[:, d] - np.roll(volts[:, d], shift)) for shift in (near, -near)
+        )
         # A spike differs from the samples on both sides, and a pulse from those on one.
         stands_out = undisturbed & (2 * np.minimum(before_v, after_v) > deviation)
         # The neighbours of a spike deviate by half of it.
-        spikes = (deviation > SPIKE_STDS * np.maximum(local_v, std_v)) & stands_out & (
-            deviation >= scipy.ndimage.maximum_filter1d(deviation, 2 * near + 1))
+        spikes = (
+            (deviation > SPIKE_STDS * np.maximum(local_v, std_v))
+            & stands_out
+            & (deviation >= scipy.ndimage.maximum_filter1d(deviation, 2 * near + 1))
+        )
         if spikes.sum() >= _SPIKE_FEWEST:
             isolated[:, d] = spikes
             size_v[d] = float(np.median(deviation[spikes]))
@@ -203,12 +227,14 @@ def sample_faults(comparison: BaselineComparison) -> SampleFaults:
     finite = np.isfinite(volts).all(axis=1)
     coarse = coarse_codes(volts, sensor)
     # Coarse codes repeat by themselves.
-    changing, detections = (finite, [coarse]) if coarse else \
-        repeated_samples(volts, time_s, finite, sensor)
+    changing, detections = (
+        (finite, [coarse]) if coarse else repeated_samples(volts, time_s, finite, sensor)
+    )
     if coarse:
         sensor = with_bits(sensor, coarse)
-    regular, spikes = isolated_samples(volts, comparison.residual_v(comparison.sensor), time_s,
-                                       changing, sensor)
+    regular, spikes = isolated_samples(
+        volts, comparison.residual_v(comparison.sensor), time_s, changing, sensor
+    )
     return SampleFaults(finite & ~changing, changing & ~regular, detections, spikes)
 
 
@@ -227,8 +253,12 @@ def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     fewest = float(np.nanmin(bits))
     common = fewest if fewest >= threshold else 0.0
     return _detection(
-        Detector.COARSE_CODES, (sensor.lsb_v * 2 ** np.nan_to_num(bits)) ** 2 / 12, sensor,
-        lost_bits=common, axis_lost_bits=np.where(bits - common >= threshold, bits - common, 0.0))
+        Detector.COARSE_CODES,
+        (sensor.lsb_v * 2 ** np.nan_to_num(bits)) ** 2 / 12,
+        sensor,
+        lost_bits=common,
+        axis_lost_bits=np.where(bits - common >= threshold, bits - common, 0.0),
+    )
 
 
 def _lost_bits(volts: np.ndarray, sensor: Sensor) -> float:
@@ -244,8 +274,9 @@ def _lost_bits(volts: np.ndarray, sensor: Sensor) -> float:
     return 0.0 if between > _BETWEEN_CODES_SHARE else float(np.log2(step_v / sensor.lsb_v))
 
 
-def residual_detections(comparison: BaselineComparison, residual_v: np.ndarray, sensor: Sensor
-                        ) -> list[Detection]:
+def residual_detections(
+    comparison: BaselineComparison, residual_v: np.ndarray, sensor: Sensor
+) -> list[Detection]:
     """Find lines and excess noise in a residual, V, (n, m), beside the noise of a sensor."""
     sensor = replace(sensor, rate_hz=comparison.sensor.rate_hz)
     residual_v = bridged(residual_v, comparison.used)
@@ -254,8 +285,13 @@ def residual_detections(comparison: BaselineComparison, residual_v: np.ndarray, 
     line = _line(white, residual_v, comparison.time_s, sensor)
     # In motion, effects that are not modelled would look like noise, so that rests are preferred.
     resting = at_rest.sum() > _RESTING_FEWEST
-    excess = _excess(residual_v, comparison.simulated_noise_v(sensor, 0), sensor,
-                     at_rest if resting else comparison.used, resting)
+    excess = _excess(
+        residual_v,
+        comparison.simulated_noise_v(sensor, 0),
+        sensor,
+        at_rest if resting else comparison.used,
+        resting,
+    )
     return [d for d in (line, excess) if d is not None]
 
 
@@ -266,8 +302,13 @@ def _innovations(volts: np.ndarray, sensor: Sensor) -> tuple[np.ndarray, np.ndar
     return volts[1:] - decay * volts[:-1], decay
 
 
-def _excess(residual_v: np.ndarray, simulated_v: np.ndarray, sensor: Sensor, rows: np.ndarray,
-            resting: bool) -> Detection | None:
+def _excess(
+    residual_v: np.ndarray,
+    simulated_v: np.ndarray,
+    sensor: Sensor,
+    rows: np.ndarray,
+    resting: bool,
+) -> Detection | None:
     """Find noise above the level of drawn noise in samples, (n,) bool, that may rest."""
     recorded, drawn = (white_noise_v(v, sensor, rows) for v in (residual_v, simulated_v))
     # The level of noise far below a step of the ADC does not show.
@@ -277,13 +318,21 @@ def _excess(residual_v: np.ndarray, simulated_v: np.ndarray, sensor: Sensor, row
         # Noise past the RC filter looks excessive in the innovations, but not in the samples.
         recorded_v, drawn_v = (np.std(v[rows], axis=0) for v in (residual_v, simulated_v))
         ratio = np.minimum(ratio, recorded_v / np.where(drawn_v > 0, drawn_v, np.inf))
-    return None if np.max(ratio) <= NOISE_EXCESS else _detection(
-        Detector.NOISE_LEVEL, np.maximum(ratio ** 2 - 1, 0.0) * noise.analog_std_v(sensor) ** 2,
-        sensor, ratio=ratio - 1)
+    return (
+        None
+        if np.max(ratio) <= NOISE_EXCESS
+        else _detection(
+            Detector.NOISE_LEVEL,
+            np.maximum(ratio**2 - 1, 0.0) * noise.analog_std_v(sensor) ** 2,
+            sensor,
+            ratio=ratio - 1,
+        )
+    )
 
 
-def white_noise_v(noise_v: np.ndarray, sensor: Sensor, rows: np.ndarray | None = None
-                  ) -> np.ndarray:
+def white_noise_v(
+    noise_v: np.ndarray, sensor: Sensor, rows: np.ndarray | None = None
+) -> np.ndarray:
     """
     Estimate the standard deviation of the white noise behind the RC filter, V, (m,).
 
@@ -294,13 +343,16 @@ def white_noise_v(noise_v: np.ndarray, sensor: Sensor, rows: np.ndarray | None =
     frequency_hz, power = scipy.signal.periodogram(innovations, sensor.rate_hz, 'hann', axis=0)
     level = np.median(power[frequency_hz > sensor.rate_hz / 4], axis=0) / np.log(2)
     changes = np.abs(np.diff(innovations, axis=0)) / np.sqrt(2)
-    std = np.minimum(np.sqrt(level * sensor.rate_hz / 2), MAD_TO_STD * np.median(
-        changes if rows is None else changes[rows[2:]], axis=0))
-    return std / np.sqrt(1 - decay ** 2)
+    std = np.minimum(
+        np.sqrt(level * sensor.rate_hz / 2),
+        MAD_TO_STD * np.median(changes if rows is None else changes[rows[2:]], axis=0),
+    )
+    return std / np.sqrt(1 - decay**2)
 
 
-def _line(white: np.ndarray, residual_v: np.ndarray, time_s: np.ndarray, sensor: Sensor
-          ) -> Detection | None:
+def _line(
+    white: np.ndarray, residual_v: np.ndarray, time_s: np.ndarray, sensor: Sensor
+) -> Detection | None:
     """Return the mains line that is the strongest of a whitened residual, or None."""
     frequency_hz, power = scipy.signal.periodogram(white, sensor.rate_hz, 'hann', axis=0)
     kept = frequency_hz > _LINE_LOWEST_HZ
@@ -310,7 +362,7 @@ def _line(white: np.ndarray, residual_v: np.ndarray, time_s: np.ndarray, sensor:
     # The local level is the mean of the ordinates around, by their median.
     width = min(_LOCAL_ORDINATES, len(power))
     blocks = len(power) // width
-    level = np.median(power[:blocks * width].reshape(blocks, width, -1), axis=1) / np.log(2)
+    level = np.median(power[: blocks * width].reshape(blocks, width, -1), axis=1) / np.log(2)
     middles = (np.arange(blocks) + 0.5) * width
     excess = sum(p / np.interp(np.arange(len(p)), middles, v) for p, v in zip(power.T, level.T))
     best = int(np.argmax(excess))
@@ -319,8 +371,14 @@ def _line(white: np.ndarray, residual_v: np.ndarray, time_s: np.ndarray, sensor:
     if not log_excess >= LINE_LOG_EXCESS or mains_hz is None:
         return None
     amplitude_v = line_amplitude_v(residual_v, time_s, mains_hz)
-    return _detection(Detector.MAINS_LINE, amplitude_v ** 2 / 2, sensor, amplitude_v=amplitude_v,
-                      frequency_hz=mains_hz, phase_rad=0.0)
+    return _detection(
+        Detector.MAINS_LINE,
+        amplitude_v**2 / 2,
+        sensor,
+        amplitude_v=amplitude_v,
+        frequency_hz=mains_hz,
+        phase_rad=0.0,
+    )
 
 
 def line_amplitude_v(values_v: np.ndarray, time_s: np.ndarray, line_hz: float) -> np.ndarray:
@@ -329,11 +387,10 @@ def line_amplitude_v(values_v: np.ndarray, time_s: np.ndarray, line_hz: float) -
 
     It is the rms of the amplitudes of short parts, without the power beside the line.
     """
-    parts = max(len(values_v) // max(int(np.searchsorted(
-        time_s, time_s[0] + _LINE_PART_S)), 1), 1)
+    parts = max(len(values_v) // max(int(np.searchsorted(time_s, time_s[0] + _LINE_PART_S)), 1), 1)
     length = len(values_v) // parts
     window = np.hanning(length + 2)[1:-1]
-    at_s, series = time_s[:parts * length].reshape(parts, length), values_v[:parts * length]
+    at_s, series = time_s[: parts * length].reshape(parts, length), values_v[: parts * length]
     squares = []
     for offset in (0.0, -_LINE_BESIDE, _LINE_BESIDE):
         turn = np.exp(-2j * np.pi * (line_hz + offset / _LINE_PART_S) * at_s) * window
@@ -352,8 +409,9 @@ def _mains_frequency_hz(line_hz: float, rate_hz: float) -> float | None:
     return None
 
 
-def compare_noise(comparison: BaselineComparison, sensors: Mapping[str, tuple[Sensor, Sensor]],
-                  seed: int) -> dict[str, Any]:
+def compare_noise(
+    comparison: BaselineComparison, sensors: Mapping[str, tuple[Sensor, Sensor]], seed: int
+) -> dict[str, Any]:
     """
     Return recorded noise relative to simulated noise, all axes together, by label of `sensors`.
 
@@ -370,25 +428,34 @@ def compare_noise(comparison: BaselineComparison, sensors: Mapping[str, tuple[Se
     log_likelihoods = []
     ratios: dict[str, Any] = {}
     for label, (mean, noisy) in sensors.items():
-        series = [bridged(v, comparison.used) / scale for v in (
-            comparison.residual_v(mean), comparison.simulated_noise_v(noisy, seed))]
+        series = [
+            bridged(v, comparison.used) / scale
+            for v in (comparison.residual_v(mean), comparison.simulated_noise_v(noisy, seed))
+        ]
         recorded, simulated = (scipy.signal.periodogram(v, rate_hz, axis=0)[1] for v in series)
         ratios[f'power_ratio_{label}'] = [
-            float(recorded[band].sum() / simulated[band].sum()) for band in bands]
+            float(recorded[band].sum() / simulated[band].sum()) for band in bands
+        ]
         allan = [[allan_deviation(v, round(t * rate_hz)) for v in series] for t in times_s]
         ratios[f'allan_ratio_{label}'] = [float(np.sqrt(np.mean((a / b) ** 2))) for a, b in allan]
         levels = [(recorded[band], simulated[band].mean(axis=0)) for band in bands if band.any()]
-        log_likelihoods.append(-sum(float(np.sum(power / level + np.log(level)))
-                                    for power, level in levels))
-    return {'recording': comparison.name, 'bands_hz': edges_hz.tolist(), 'allan_s': times_s,
-            'log_likelihood_gain': log_likelihoods[-1] - log_likelihoods[0], **ratios}
+        log_likelihoods.append(
+            -sum(float(np.sum(power / level + np.log(level))) for power, level in levels)
+        )
+    return {
+        'recording': comparison.name,
+        'bands_hz': edges_hz.tolist(),
+        'allan_s': times_s,
+        'log_likelihood_gain': log_likelihoods[-1] - log_likelihoods[0],
+        **ratios,
+    }
 
 
 def allan_deviation(values: np.ndarray, count: int) -> np.ndarray:
     """Return the overlapping Allan deviation of means of `count` samples (IEEE 1554), (m,)."""
     total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    second_difference = total[2 * count:] - 2 * total[count:-count] + total[:-2 * count]
-    return np.sqrt(np.mean(second_difference ** 2, axis=0) / 2) / count
+    second_difference = total[2 * count :] - 2 * total[count:-count] + total[: -2 * count]
+    return np.sqrt(np.mean(second_difference**2, axis=0) / 2) / count
 
 
 class NoiseRemainder(NamedTuple):
@@ -403,16 +470,22 @@ class NoiseRemainder(NamedTuple):
     mean_square: float  # Mean square over axes of the values in the recordings
 
 
-def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sensor,
-                     named_sensor: Sensor, detections: Sequence[Detection], seed: int
-                     ) -> list[NoiseRemainder]:
+def noise_remainders(
+    comparisons: Sequence[BaselineComparison],
+    mean_sensor: Sensor,
+    named_sensor: Sensor,
+    detections: Sequence[Detection],
+    seed: int,
+) -> list[NoiseRemainder]:
     """Compare the noise-like effects of the recordings with those of their simulation."""
     # By effect, quantity and unit: pairs of recorded and simulated values, one of each recording
     values: dict[tuple[str, str, str], list] = {}
     for c in comparisons if detections else ():
         residual_v = c.residual_v(mean_sensor)
-        signals = [_Series(c.volts, residual_v, bridged(residual_v, c.used)),
-                   _simulated(c, named_sensor, seed)]
+        signals = [
+            _Series(c.volts, residual_v, bridged(residual_v, c.used)),
+            _simulated(c, named_sensor, seed),
+        ]
         for detection in detections:
             recorded, simulated = (list(_statistics(c, detection, s)) for s in signals)
             for (quantity, unit, value), (*_, other) in zip(recorded, simulated):
@@ -421,9 +494,15 @@ def noise_remainders(comparisons: Sequence[BaselineComparison], mean_sensor: Sen
     for key, pairs in values.items():
         recorded, simulated = np.sqrt(np.mean(np.square(np.array(pairs, float)), axis=0))
         largest, axes = int(np.argmax(recorded)), named_sensor.axes
-        remainders.append(NoiseRemainder(
-            *key, axes[largest] if len(recorded) == len(axes) else '', float(recorded[largest]),
-            float(simulated[largest]), float(np.mean(recorded ** 2))))
+        remainders.append(
+            NoiseRemainder(
+                *key,
+                axes[largest] if len(recorded) == len(axes) else '',
+                float(recorded[largest]),
+                float(simulated[largest]),
+                float(np.mean(recorded**2)),
+            )
+        )
     return remainders
 
 
@@ -446,8 +525,9 @@ def _simulated(comparison: BaselineComparison, sensor: Sensor, seed: int) -> _Se
     return _Series(volts, residual_v, bridged(residual_v, used))
 
 
-def _statistics(comparison: BaselineComparison, detection: Detection, series: _Series
-                ) -> Iterator[tuple[str, str, np.ndarray]]:
+def _statistics(
+    comparison: BaselineComparison, detection: Detection, series: _Series
+) -> Iterator[tuple[str, str, np.ndarray]]:
     """Yield quantity, unit and values by axis of what a detection shows, in one series."""
     volts, residual_v, noise_v = series
     sensor, time_s, scale = comparison.sensor, comparison.time_s, comparison.scale_v_per_mps2
@@ -460,8 +540,11 @@ def _statistics(comparison: BaselineComparison, detection: Detection, series: _S
         yield 'white noise', 'm/s^2', white_noise_v(noise_v, sensor) / scale
     elif detector is Detector.ISOLATED_SAMPLES:
         spikes = isolated_samples(volts, residual_v, time_s, finite, sensor)[1]
-        values = spikes[0].values if spikes else {
-            'rate_hz': np.zeros(1), 'amplitude_v': np.zeros(len(scale))}
+        values = (
+            spikes[0].values
+            if spikes
+            else {'rate_hz': np.zeros(1), 'amplitude_v': np.zeros(len(scale))}
+        )
         yield 'spikes per second and axis', '1/s', np.atleast_1d(values['rate_hz'])
         yield 'size of a spike', 'm/s^2', values['amplitude_v'] / scale
     elif detector is Detector.REPEATED_SAMPLES:
@@ -470,21 +553,22 @@ def _statistics(comparison: BaselineComparison, detection: Detection, series: _S
     else:
         lost = coarse_codes(volts, sensor)
         bits = sum(lost.values.values()) if lost else np.zeros(len(scale))
-        yield 'distance of codes', 'm/s^2', sensor.lsb_v * 2 ** bits / scale
+        yield 'distance of codes', 'm/s^2', sensor.lsb_v * 2**bits / scale
 
 
-def floor_without(floor_mps2: float, remainders: Sequence[NoiseRemainder], stated_mps2: float
-                  ) -> float:
+def floor_without(
+    floor_mps2: float, remainders: Sequence[NoiseRemainder], stated_mps2: float
+) -> float:
     """
     Return the noise floor, m/s², without the line and the excess noise of the recordings.
 
     Both are effects that a model can have, so that they are a part of the gap.
     """
-    square = floor_mps2 ** 2
+    square = floor_mps2**2
     for r in remainders:
         detector = effect_named(r.effect).diagnosis.detector
         if detector is Detector.MAINS_LINE:
             square -= r.mean_square / 2
         elif detector is Detector.NOISE_LEVEL:
-            square -= r.mean_square - stated_mps2 ** 2
+            square -= r.mean_square - stated_mps2**2
     return float(np.sqrt(max(square, min(stated_mps2, floor_mps2) ** 2)))

@@ -41,16 +41,25 @@ _CONTRIBUTION = 'what the model of the effect predicts, mg'
 _SEGMENT, _POINTS_PER_OCTAVE = 4096, 12
 """Samples in a segment of a spectrum, and points of its plot in an octave. Chosen: 0.06 Hz at
 250 Hz, and lines stay visible."""
-COLOURS = {'explained': 'green', 'partly': 'amber', 'no_gap': 'grey', 'inseparable': 'amber',
-           'insufficient': 'amber', 'unknown': 'red', 'bad_data': 'red'}
+COLOURS = {
+    'explained': 'green',
+    'partly': 'amber',
+    'no_gap': 'grey',
+    'inseparable': 'amber',
+    'insufficient': 'amber',
+    'unknown': 'red',
+    'bad_data': 'red',
+}
 """Colour of the badge for each status."""
 TILES = 4  # Figures at the top of the page
 _PLOTTED_POINTS = 3000
 """Largest number of points of a line. Chosen: more than a wide screen has columns."""
 _INK, _EFFECT_COLOUR = '#1f2933', '#5b8fd6'
-_CURVE_COLOURS = {'recorded': _INK, 'stated noise': plots.QUIET_COLOUR} | dict.fromkeys(
-    ('before', 'without the effect'), plots.BEFORE_COLOUR) | dict.fromkeys(
-        ('after', 'with the effect'), plots.AFTER_COLOUR)
+_CURVE_COLOURS = (
+    {'recorded': _INK, 'stated noise': plots.QUIET_COLOUR}
+    | dict.fromkeys(('before', 'without the effect'), plots.BEFORE_COLOUR)
+    | dict.fromkeys(('after', 'with the effect'), plots.AFTER_COLOUR)
+)
 _WIDE = {'l': 8, 'r': 12, 't': 36, 'b': 8}  # Margins of a plot with a legend, pixels
 
 
@@ -69,8 +78,9 @@ class Run:
     command: str = ''
 
 
-def documents(diagnosis: Diagnosis, report: dict[str, Any], comments: Sequence[str],
-              run: Run | None) -> dict[str, str]:
+def documents(
+    diagnosis: Diagnosis, report: dict[str, Any], comments: Sequence[str], run: Run | None
+) -> dict[str, str]:
     """
     Return the files of a diagnosis by name.
 
@@ -88,11 +98,18 @@ def documents(diagnosis: Diagnosis, report: dict[str, Any], comments: Sequence[s
 def _page(diagnosis: Diagnosis, objects: dict[str, Any], run: Run, parameters: str) -> str:
     """Lay out the page; raise UserError where Plotly or jinja2 is not installed."""
     values: dict[str, Any] = {
-        'title': run.subject, 'about': [f'parameter file {run.parameter_file}'],
-        'badge': {'colour': COLOURS[objects['verdict']['status']],
-                  'word': words.badge(diagnosis), 'sentence': words.headline(diagnosis)},
-        'notes': words.notes(diagnosis), 'figures': {}, 'has_verdict': False,
-        'download': parameters and html_page.download_url(parameters)}
+        'title': run.subject,
+        'about': [f'parameter file {run.parameter_file}'],
+        'badge': {
+            'colour': COLOURS[objects['verdict']['status']],
+            'word': words.badge(diagnosis),
+            'sentence': words.headline(diagnosis),
+        },
+        'notes': words.notes(diagnosis),
+        'figures': {},
+        'has_verdict': False,
+        'download': parameters and html_page.download_url(parameters),
+    }
     if run.command:
         values['command'] = run.command
     if diagnosis.report is not None:
@@ -103,41 +120,69 @@ def _page(diagnosis: Diagnosis, objects: dict[str, Any], run: Run, parameters: s
 def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> dict[str, Any]:
     """Return what the template shows of a diagnosis with a verdict."""
     named, proposal = words.named_effects(report, objects), objects['next_experiment']
-    shown = [c for c in objects['candidates']
-             if c['effect'] in named or c['probability'] >= words.PROBABLE]
+    shown = [
+        c
+        for c in objects['candidates']
+        if c['effect'] in named or c['probability'] >= words.PROBABLE
+    ]
     shown.sort(key=lambda c: named.index(c['effect']) if c['effect'] in named else len(named))
     best = report.hypotheses[0]
     compared, full_rate = diagnosis.comparisons[0], diagnosis.full_rate[0]
     in_noise, proofs = {d.effect for d in report.detections} & {*report.sensor.effects}, {}
-    for name in (c['effect'] for c in shown
-                 if Over.STEP not in effect_named(c['effect']).diagnosis.proof):
-        sensors = [report.sensor] if name in in_noise else [
-            h.sensor for h in report.hypotheses if name in h.effects]
+    for name in (
+        c['effect'] for c in shown if Over.STEP not in effect_named(c['effect']).diagnosis.proof
+    ):
+        sensors = (
+            [report.sensor]
+            if name in in_noise
+            else [h.sensor for h in report.hypotheses if name in h.effects]
+        )
         if sensors:
             proofs[name] = _proof(name, compared, full_rate, sensors[0])
     rows, scale = words.figure_rows(diagnosis), float(report.baseline.scale_v_per_g.mean())
     return {
         'has_verdict': True,
-        'figures': {'waterfall': waterfall(report), 'signals': signals(compared, best.sensor),
-                    'spectrum': _spectra(full_rate, {
-                        'before': full_rate.residual_v(full_rate.sensor),
-                        'after': full_rate.residual_v(best.sensor)}),
-                    **{f'proof-{name}': drawn for name, (drawn, _) in proofs.items()}},
+        'figures': {
+            'waterfall': waterfall(report),
+            'signals': signals(compared, best.sensor),
+            'spectrum': _spectra(
+                full_rate,
+                {
+                    'before': full_rate.residual_v(full_rate.sensor),
+                    'after': full_rate.residual_v(best.sensor),
+                },
+            ),
+            **{f'proof-{name}': drawn for name, (drawn, _) in proofs.items()},
+        },
         'tiles': rows[:TILES],
-        'effects': [{
-            'name': c['effect'], 'sure': percent(c['probability']), 'cause': c['cause'],
-            'share': '' if c['share'] is None else f'{percent(c["share"])} of the gap',
-            'rivals': c['inseparable_from'], 'sizes': words.size_lines(report, c)}
-            for c in shown],
+        'effects': [
+            {
+                'name': c['effect'],
+                'sure': percent(c['probability']),
+                'cause': c['cause'],
+                'share': '' if c['share'] is None else f'{percent(c["share"])} of the gap',
+                'rivals': c['inseparable_from'],
+                'sizes': words.size_lines(report, c),
+            }
+            for c in shown
+        ],
         'proofs': [{'effect': name, 'text': text} for name, (_, text) in proofs.items()],
-        'figure_rows': rows, 'remainders': [row[:2] for row in words.remainder_rows(report)],
-        'hypotheses': [[', '.join(h['effects']) or 'no gap', percent(h['probability'])]
-                       for h in objects['hypotheses']],
+        'figure_rows': rows,
+        'remainders': [row[:2] for row in words.remainder_rows(report)],
+        'hypotheses': [
+            [', '.join(h['effects']) or 'no gap', percent(h['probability'])]
+            for h in objects['hypotheses']
+        ],
         'not_covered': objects['not_covered'],
         'where': [_cell(c) for c in report.residual_cells],
-        'menu': [[m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
-                 for m in proposal['menu']] if proposal else [],
-        'could_show': [(row.shows, *words.shows_row(row, scale)) for row in report.could_show]}
+        'menu': [
+            [m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
+            for m in proposal['menu']
+        ]
+        if proposal
+        else [],
+        'could_show': [(row.shows, *words.shows_row(row, scale)) for row in report.could_show],
+    }
 
 
 def _cell(cell: ResidualCell) -> list[str]:
@@ -146,13 +191,18 @@ def _cell(cell: ResidualCell) -> list[str]:
     if 'rad' in name:
         unit, factor = '°/s' if 'rate' in name else '°', float(np.degrees(1.0))
     places = decimals(factor * (cell.high - cell.low))
-    return [name.split('_rad')[0].replace('_', ' '),
-            f'{factor * cell.low:.{places}f} to {factor * cell.high:.{places}f} {unit}', cell.axis,
-            mg_text(cell.mean_mps2), percent(cell.share)]
+    return [
+        name.split('_rad')[0].replace('_', ' '),
+        f'{factor * cell.low:.{places}f} to {factor * cell.high:.{places}f} {unit}',
+        cell.axis,
+        mg_text(cell.mean_mps2),
+        percent(cell.share),
+    ]
 
 
-def _proof(effect: str, comparison: BaselineComparison, full_rate: BaselineComparison,
-           sensor: Sensor) -> tuple[Figure, str]:
+def _proof(
+    effect: str, comparison: BaselineComparison, full_rate: BaselineComparison, sensor: Sensor
+) -> tuple[Figure, str]:
     """
     Show an effect of a sensor, which has all effects of the verdict, in a recording.
 
@@ -164,34 +214,43 @@ def _proof(effect: str, comparison: BaselineComparison, full_rate: BaselineCompa
     without = replace(sensor, values={**sensor.values, effect: neutral})
     labelled = {'without the effect': without, 'with the effect': sensor}
     if acts_on_noise:
-        return _spectra(full_rate, {'recorded': full_rate.residual_v(sensor)} | {
-            label: full_rate.simulated_noise_v(s, 0) for label, s in labelled.items()}), \
-            'The effect is there if the recorded spectrum follows the green line, not the red one.'
+        return _spectra(
+            full_rate,
+            {'recorded': full_rate.residual_v(sensor)}
+            | {label: full_rate.simulated_noise_v(s, 0) for label, s in labelled.items()},
+        ), 'The effect is there if the recorded spectrum follows the green line, not the red one.'
     if Over.FREQUENCY in variables:
-        return _spectra(full_rate, {label: full_rate.residual_v(s)
-                                    for label, s in labelled.items()}), \
-            'The effect is there if the spectrum of the difference falls from red to green.'
-    return _binned(variables, comparison, sensor, without), \
-        'Points: recording minus a simulation with all other effects, with 90 % bars. ' \
-        'Line: the model of this effect.'
+        return _spectra(
+            full_rate, {label: full_rate.residual_v(s) for label, s in labelled.items()}
+        ), 'The effect is there if the spectrum of the difference falls from red to green.'
+    return (
+        _binned(variables, comparison, sensor, without),
+        'Points: recording minus a simulation with all other effects, with 90 % bars. '
+        'Line: the model of this effect.',
+    )
 
 
-def _binned(variables: Sequence[Over], comparison: BaselineComparison, sensor: Sensor,
-            without: Sensor) -> Figure:
+def _binned(
+    variables: Sequence[Over], comparison: BaselineComparison, sensor: Sensor, without: Sensor
+) -> Figure:
     """Draw means of the residual without an effect over the variable that shows it best."""
     import pandas as pd
+
     to_mg, used = mg(1 / comparison.scale_v_per_mps2), comparison.used
     residual_mg = (comparison.residual_v(without) * to_mg)[used]
     model_mg = residual_mg - (comparison.residual_v(sensor) * to_mg)[used]
 
     def share(values: np.ndarray) -> float:
         """Return the share of the model's squares between the ranges of a variable."""
-        between = [(pd.Series(m).groupby(_places(v)).transform('mean') ** 2).sum()
-                   for v, m in zip(values.T, model_mg.T)]
-        return float(sum(between) / max(np.sum(model_mg ** 2), 1e-300))
+        between = [
+            (pd.Series(m).groupby(_places(v)).transform('mean') ** 2).sum()
+            for v, m in zip(values.T, model_mg.T)
+        ]
+        return float(sum(between) / max(np.sum(model_mg**2), 1e-300))
 
-    known = {v.value: values[used] for v, values in _variables(comparison).items()
-             if v in variables}
+    known = {
+        v.value: values[used] for v, values in _variables(comparison).items() if v in variables
+    }
     best = max(known, key=lambda name: share(known[name]), default='')
     if not best or share(known[best]) <= _SMALLEST_SHARE:
         best, known = _CONTRIBUTION, {_CONTRIBUTION: model_mg}
@@ -199,19 +258,28 @@ def _binned(variables: Sequence[Over], comparison: BaselineComparison, sensor: S
     traces = []
     for d, axis in enumerate(comparison.sensor.axes):
         place, colour = _places(known[best][:, d]), plots.AXIS_COLOURS[axis]
-        groups = pd.DataFrame({'x': known[best][:, d], 'recorded': residual_mg[:, d],
-                               'model': model_mg[:, d]}).groupby(place)
+        groups = pd.DataFrame(
+            {'x': known[best][:, d], 'recorded': residual_mg[:, d], 'model': model_mg[:, d]}
+        ).groupby(place)
         means, count = groups.mean(), groups.size()
         # The noise is correlated, so that the sums of whole blocks give the error of a mean.
-        noise_mg = pd.Series((residual_mg - model_mg)[:, d]
-                             - (means.recorded - means.model)[place].to_numpy())
+        noise_mg = pd.Series(
+            (residual_mg - model_mg)[:, d] - (means.recorded - means.model)[place].to_numpy()
+        )
         squares = noise_mg.groupby([place, block]).sum() ** 2
         means['half'] = Z_90 * np.sqrt(squares.groupby(level=0).sum()) / count
         means = means[count >= min(_FEWEST_SAMPLES, count.max())].sort_values('x')
-        traces += [plots.points(means.x, means.recorded, means.half, f'{axis} recorded', colour),
-                   line(means.x, means.model, f'{axis} model', colour)]
-    return figure(traces, 300, xaxis={'title': {'text': best}}, margin=_WIDE,
-                  yaxis={'title': {'text': 'recording minus simulation, mg'}})
+        traces += [
+            plots.points(means.x, means.recorded, means.half, f'{axis} recorded', colour),
+            line(means.x, means.model, f'{axis} model', colour),
+        ]
+    return figure(
+        traces,
+        300,
+        xaxis={'title': {'text': best}},
+        margin=_WIDE,
+        yaxis={'title': {'text': 'recording minus simulation, mg'}},
+    )
 
 
 def _places(values: np.ndarray) -> np.ndarray:
@@ -234,16 +302,21 @@ def _variables(comparison: BaselineComparison) -> dict[Over, np.ndarray]:
     if 'supply_v' in surroundings:
         of_all[Over.SUPPLY] = surroundings['supply_v']
     if comparison.joints:
-        alpha, beta = ([np.degrees(joint(time_s, order)) for order in range(3)]
-                       for joint in comparison.joints)
+        alpha, beta = (
+            [np.degrees(joint(time_s, order)) for order in range(3)] for joint in comparison.joints
+        )
         of_all |= dict(zip((Over.ALPHA, Over.ALPHA_RATE, Over.ALPHA_ACCELERATION), alpha))
-        of_all |= dict(zip((Over.BETA, Over.BETA_RATE, Over.BETA_ACCELERATION),
-                           (beta[0] % 360, *beta[1:])))
+        of_all |= dict(
+            zip((Over.BETA, Over.BETA_RATE, Over.BETA_ACCELERATION), (beta[0] % 360, *beta[1:]))
+        )
     force_g, of_axes = comparison.reference_force_g(), {Over.OUTPUT: comparison.volts}
     if force_g is not None:
         own = force_g[[AXES.index(axis) for axis in axes]].T
-        of_axes |= {Over.OWN_FORCE: own, Over.FORCE_RATE: np.gradient(own, time_s, axis=0),
-                    Over.CROSS_FORCE: force_g[[1 if axis == AXES[0] else 0 for axis in axes]].T}
+        of_axes |= {
+            Over.OWN_FORCE: own,
+            Over.FORCE_RATE: np.gradient(own, time_s, axis=0),
+            Over.CROSS_FORCE: force_g[[1 if axis == AXES[0] else 0 for axis in axes]].T,
+        }
         of_all[Over.FORCE_Z] = force_g[2]
     return of_axes | {name: np.repeat(v[:, None], len(axes), axis=1) for name, v in of_all.items()}
 
@@ -255,11 +328,16 @@ def _spectra(comparison: BaselineComparison, signals_v: Mapping[str, np.ndarray]
     Points are equally dense per octave.
     """
     import pandas as pd
+
     sensor, scale, densities = comparison.sensor, comparison.scale_v_per_mps2, {}
     for label, signal_v in signals_v.items():
         signal_mg = np.nan_to_num(mg(bridged(signal_v, comparison.used) / scale))
-        all_hz, power = (v[1:] for v in scipy.signal.welch(
-            signal_mg, sensor.rate_hz, axis=0, nperseg=min(_SEGMENT, len(signal_mg))))
+        all_hz, power = (
+            v[1:]
+            for v in scipy.signal.welch(
+                signal_mg, sensor.rate_hz, axis=0, nperseg=min(_SEGMENT, len(signal_mg))
+            )
+        )
         octave = np.floor(np.log2(all_hz / all_hz[0]) * _POINTS_PER_OCTAVE)
         hz = pd.Series(all_hz).groupby(octave).mean().to_numpy()
         densities[label] = np.sqrt(pd.DataFrame(power).groupby(octave).mean().to_numpy())
@@ -267,64 +345,105 @@ def _spectra(comparison: BaselineComparison, signals_v: Mapping[str, np.ndarray]
     panels = []
     for d, axis in enumerate(sensor.axes):
         curves = {label: np.where(v[:, d] > 0, v[:, d], np.nan) for label, v in densities.items()}
-        panels.append(({'title': {'text': f'{axis}, mg/√Hz'}, 'type': 'log'},
-                       [line(hz, v, label, _CURVE_COLOURS[label]) for label, v in curves.items()]))
-    return _stacked(panels, 60 + 190 * len(panels), _WIDE,
-                    {'title': {'text': Over.FREQUENCY.value}, 'type': 'log'})
+        panels.append(
+            (
+                {'title': {'text': f'{axis}, mg/√Hz'}, 'type': 'log'},
+                [line(hz, v, label, _CURVE_COLOURS[label]) for label, v in curves.items()],
+            )
+        )
+    return _stacked(
+        panels,
+        60 + 190 * len(panels),
+        _WIDE,
+        {'title': {'text': Over.FREQUENCY.value}, 'type': 'log'},
+    )
 
 
 def waterfall(report: Report) -> Figure:
     """Draw the gap, what each effect takes off it, what stays, and the noise floor."""
     closure = report.closure
-    level, after, floor = (float(mg(v)) for v in (
-        closure.before.value, closure.after.value, closure.floor.value))
-    highest, above = max(level, after, floor), level ** 2 - floor ** 2
+    level, after, floor = (
+        float(mg(v)) for v in (closure.before.value, closure.after.value, closure.floor.value)
+    )
+    highest, above = max(level, after, floor), level**2 - floor**2
     bars = [('gap', 0.0, level, mg_text(closure.before.value), plots.BEFORE_COLOUR)]
     for name, share in sorted(words.shares_of_gap(report).items(), key=lambda item: -item[1]):
         if share > 0:
-            lower = max(level ** 2 - share * above, 0.0) ** 0.5
+            lower = max(level**2 - share * above, 0.0) ** 0.5
             bars.append((name, lower, level - lower, percent(share), _EFFECT_COLOUR))
             level = lower
     if len(bars) > 1:
         bars.append(('what is left', 0.0, after, mg_text(closure.after.value), plots.AFTER_COLOUR))
     bars.append(('noise floor', 0.0, floor, mg_text(closure.floor.value), plots.QUIET_COLOUR))
     labels, base, width, text, colours = zip(*bars)
-    trace = {'type': 'bar', 'width': 0.62, 'orientation': 'h', 'y': labels, 'x': rounded(width),
-             'base': rounded(base), 'text': text, 'textposition': 'outside', 'cliponaxis': False,
-             'marker': {'color': colours}, 'hovertemplate': '%{y}: %{text}<extra></extra>',
-             'showlegend': False}
-    return figure([trace], 60 + 38 * len(labels), xaxis={
-        'title': {'text': 'rms, mg'}, 'range': [0, 1.2 * highest]},
-        yaxis={'autorange': 'reversed', 'ticks': '', 'type': 'category'})
+    trace = {
+        'type': 'bar',
+        'width': 0.62,
+        'orientation': 'h',
+        'y': labels,
+        'x': rounded(width),
+        'base': rounded(base),
+        'text': text,
+        'textposition': 'outside',
+        'cliponaxis': False,
+        'marker': {'color': colours},
+        'hovertemplate': '%{y}: %{text}<extra></extra>',
+        'showlegend': False,
+    }
+    return figure(
+        [trace],
+        60 + 38 * len(labels),
+        xaxis={'title': {'text': 'rms, mg'}, 'range': [0, 1.2 * highest]},
+        yaxis={'autorange': 'reversed', 'ticks': '', 'type': 'category'},
+    )
 
 
-def _stacked(panels: Sequence[tuple[dict[str, Any], Sequence[Figure]]], height: int,
-             margin: dict[str, int], xaxis: dict[str, Any]) -> Figure:
+def _stacked(
+    panels: Sequence[tuple[dict[str, Any], Sequence[Figure]]],
+    height: int,
+    margin: dict[str, int],
+    xaxis: dict[str, Any],
+) -> Figure:
     """Put panels, an axis with its lines each, below each other; all zoom together."""
     traces: list[Figure] = []
     layout = {'xaxis': {'anchor': plots.axis_number('y', len(panels)), **xaxis}}
     part = 1.08 / len(panels)
     for i, (axis, lines) in enumerate(panels):
         layout[plots.axis_number('yaxis', i + 1)] = {
-            'domain': [max(1.08 - (i + 1) * part, 0.0), 1 - i * part], **axis}
-        traces += [{**drawn, 'xaxis': 'x', 'yaxis': plots.axis_number('y', i + 1),
-                    'legendgroup': drawn['name'], 'showlegend': not any(
-                        t['name'] == drawn['name'] for t in traces)} for drawn in lines]
+            'domain': [max(1.08 - (i + 1) * part, 0.0), 1 - i * part],
+            **axis,
+        }
+        traces += [
+            {
+                **drawn,
+                'xaxis': 'x',
+                'yaxis': plots.axis_number('y', i + 1),
+                'legendgroup': drawn['name'],
+                'showlegend': not any(t['name'] == drawn['name'] for t in traces),
+            }
+            for drawn in lines
+        ]
     return figure(traces, height, margin=margin, **layout)
 
 
 def signals(comparison: BaselineComparison, after: Sensor) -> Figure:
     """Draw recording, simulation and difference, before and after, with linked zoom."""
     time_s, scale = comparison.time_s - comparison.time_s[0], comparison.scale_v_per_mps2
-    before_mg, after_mg = (mg(comparison.residual_v(s) / scale)
-                           for s in (comparison.sensor, after))
+    before_mg, after_mg = (
+        mg(comparison.residual_v(s) / scale) for s in (comparison.sensor, after)
+    )
     recorded_g = mg((comparison.volts - comparison.sensor.zero_g_v) / scale) / 1e3
     contents = {
-        '{}, g': [('recording', recorded_g, _INK),
-                  ('simulation before', recorded_g - before_mg / 1e3, plots.BEFORE_COLOUR),
-                  ('simulation after', recorded_g - after_mg / 1e3, plots.AFTER_COLOUR)],
-        'difference {}, mg': [('difference before', before_mg, plots.BEFORE_COLOUR),
-                              ('difference after', after_mg, plots.AFTER_COLOUR)]}
+        '{}, g': [
+            ('recording', recorded_g, _INK),
+            ('simulation before', recorded_g - before_mg / 1e3, plots.BEFORE_COLOUR),
+            ('simulation after', recorded_g - after_mg / 1e3, plots.AFTER_COLOUR),
+        ],
+        'difference {}, mg': [
+            ('difference before', before_mg, plots.BEFORE_COLOUR),
+            ('difference after', after_mg, plots.AFTER_COLOUR),
+        ],
+    }
     panels = []
     for d, axis in enumerate(comparison.sensor.axes):
         for label, series in contents.items():
@@ -333,5 +452,6 @@ def signals(comparison: BaselineComparison, after: Sensor) -> Figure:
                 chosen = plots.extremes(values[:, d], _PLOTTED_POINTS)
                 lines.append(line(time_s[chosen], values[chosen, d], name, colour, opacity=0.8))
             panels.append(({'title': {'text': label.format(axis)}, 'nticks': 5}, lines))
-    return _stacked(panels, 80 + 150 * len(panels), {**_WIDE, 't': 60},
-                    {'title': {'text': 'time, s'}})
+    return _stacked(
+        panels, 80 + 150 * len(panels), {**_WIDE, 't': 60}, {'title': {'text': 'time, s'}}
+    )

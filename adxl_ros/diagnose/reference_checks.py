@@ -50,14 +50,18 @@ def _smoothed_g(comparison: BaselineComparison, volts: np.ndarray) -> np.ndarray
     sensor = comparison.sensor
     length = max(round(_SMOOTHED_S * sensor.rate_hz), 1)
     force_g = (bridged(volts, comparison.measured) - sensor.zero_g_v) / sensor.scale_v_per_g
-    return force_g[:len(force_g) // length * length].reshape(-1, length, len(sensor.axes)).mean(1)
+    return force_g[: len(force_g) // length * length].reshape(-1, length, len(sensor.axes)).mean(1)
 
 
 def wrong_dynamic_factor(comparison: BaselineComparison) -> str | None:
     """Return what is wrong with the factor of a simulator's dynamic part; None if it is right."""
     sensor, force = comparison.sensor, comparison.motion.force
-    if comparison.reference is not Reference.SIMULATOR or not isinstance(force, ForcePath) \
-            or force.is_robot or len(sensor.axes) < len(AXES):
+    if (
+        comparison.reference is not Reference.SIMULATOR
+        or not isinstance(force, ForcePath)
+        or force.is_robot
+        or len(sensor.axes) < len(AXES)
+    ):
         return None
     measured_g = _smoothed_g(comparison, comparison.volts)
     stated_g = _smoothed_g(comparison, comparison.simulated_v(sensor))
@@ -79,18 +83,27 @@ def wrong_dynamic_factor(comparison: BaselineComparison) -> str | None:
     grid = np.linspace(np.log(_FACTORS[0]), np.log(_FACTORS[1]), 120)
     start = float(min(grid, key=lambda v: length_error_g(v) / abs(np.expm1(v))))
     step = float(grid[1] - grid[0])
-    best = float(scipy.optimize.minimize_scalar(
-        lambda v: length_error_g(v) / abs(np.expm1(v)),
-        bounds=(start - step, start + step), method='bounded').x)
+    best = float(
+        scipy.optimize.minimize_scalar(
+            lambda v: length_error_g(v) / abs(np.expm1(v)),
+            bounds=(start - step, start + step),
+            method='bounded',
+        ).x
+    )
     factor = float(np.exp(best))
     left_g = length_error_g(best) / abs(factor - 1)
-    if abs(factor - 1) < _RIGHT_FACTOR or left_g > _SAME_LENGTH * dynamics_g \
-            or length_error_g(best) > _SAME_LENGTH * gap_g:
+    if (
+        abs(factor - 1) < _RIGHT_FACTOR
+        or left_g > _SAME_LENGTH * dynamics_g
+        or length_error_g(best) > _SAME_LENGTH * gap_g
+    ):
         return None
-    return (f'the dynamic part of {force.name} is {factor:.2g} times that of the recording, while '
-            f'its gravity agrees: with that factor, both hold a gravity of {gravity_g:.4g} g to '
-            f'{mg_text(left_g * G0_MPS2)} rms; check how the simulator differentiates its '
-            'velocity, and its time step')
+    return (
+        f'the dynamic part of {force.name} is {factor:.2g} times that of the recording, while '
+        f'its gravity agrees: with that factor, both hold a gravity of {gravity_g:.4g} g to '
+        f'{mg_text(left_g * G0_MPS2)} rms; check how the simulator differentiates its '
+        'velocity, and its time step'
+    )
 
 
 class _Delay(NamedTuple):
@@ -103,8 +116,11 @@ class _Delay(NamedTuple):
 def clock_step(comparison: BaselineComparison) -> str | None:
     """Return when and how far the clock of a simulator steps; None where it does not."""
     force = comparison.motion.force
-    if comparison.reference is not Reference.SIMULATOR or not isinstance(force, ForcePath) \
-            or force.is_robot:
+    if (
+        comparison.reference is not Reference.SIMULATOR
+        or not isinstance(force, ForcePath)
+        or force.is_robot
+    ):
         return None
     delays = _delays(comparison)
     if len(delays) < 2 * _FEWEST_PARTS:
@@ -121,12 +137,16 @@ def clock_step(comparison: BaselineComparison) -> str | None:
     drift = np.polynomial.Polynomial.fit([d.time_s for d in delays], delay_s, 1)
     about_drift_s = np.abs(delay_s - drift(np.array([d.time_s for d in delays]))).sum()
     step_s = after_s - before_s
-    if abs(step_s) < max(_SMALLEST_STEP_S, _STEP_STDS * spread_s) \
-            or np.abs(about_levels_s(place)).sum() > about_drift_s / 2:
+    if (
+        abs(step_s) < max(_SMALLEST_STEP_S, _STEP_STDS * spread_s)
+        or np.abs(about_levels_s(place)).sum() > about_drift_s / 2
+    ):
         return None
-    return (f'the clock of {force.name} steps by {abs(step_s):.2g} s between '
-            f'{delays[place - 1].time_s:.4g} and {delays[place].time_s:.4g} s, beside that of '
-            'the recording; simulate with one clock, or cut both there and diagnose the parts')
+    return (
+        f'the clock of {force.name} steps by {abs(step_s):.2g} s between '
+        f'{delays[place - 1].time_s:.4g} and {delays[place].time_s:.4g} s, beside that of '
+        'the recording; simulate with one clock, or cut both there and diagnose the parts'
+    )
 
 
 def _delays(comparison: BaselineComparison) -> list[_Delay]:
@@ -136,13 +156,14 @@ def _delays(comparison: BaselineComparison) -> list[_Delay]:
     rate_hz = sensor.rate_hz / every
     measured_g, stated_g = (
         (bridged(v, measured) / sensor.scale_v_per_g)[::every]
-        for v in (comparison.volts, comparison.simulated_v(sensor)))
+        for v in (comparison.volts, comparison.simulated_v(sensor))
+    )
     time_s = comparison.time_s[::every]
     length, margin = round(_BLOCK_S * rate_hz), round(_LARGEST_STEP_S * rate_hz)
     delays = []
     for begin in range(margin, len(time_s) - length - margin, length):
-        own = measured_g[begin:begin + length]
-        other = stated_g[begin - margin:begin + length + margin]
+        own = measured_g[begin : begin + length]
+        other = stated_g[begin - margin : begin + length + margin]
         found = _delay_samples(own - own.mean(axis=0), other)
         if found is not None:
             delays.append(_Delay(float(time_s[begin + length // 2]), (margin - found) / rate_hz))
@@ -151,7 +172,7 @@ def _delays(comparison: BaselineComparison) -> list[_Delay]:
 
 def _delay_samples(own: np.ndarray, other: np.ndarray) -> float | None:
     """Return the place in `other`, samples, where `own`, g, fits best; None where none fits."""
-    if np.sqrt(np.mean(own ** 2)) < SMALLEST_MOTION_G:
+    if np.sqrt(np.mean(own**2)) < SMALLEST_MOTION_G:
         return None
     window = np.ones(len(own))
     products, squares = np.zeros((2, len(other) - len(own) + 1))
@@ -159,11 +180,11 @@ def _delay_samples(own: np.ndarray, other: np.ndarray) -> float | None:
         b = b - b.mean()
         products += scipy.signal.correlate(b, a, 'valid')
         sums, powers = (scipy.signal.correlate(v, window, 'valid') for v in (b, b * b))
-        squares += powers - sums ** 2 / len(own)
+        squares += powers - sums**2 / len(own)
     # What is left after the best line: its smallest value shows the delay.
-    correlation = products / np.sqrt(np.maximum(squares, 1e-12) * np.sum(own ** 2))
+    correlation = products / np.sqrt(np.maximum(squares, 1e-12) * np.sum(own**2))
     best = int(np.argmax(correlation))
     if correlation[best] < _FOLLOWS or not 0 < best < len(correlation) - 1:
         return None
-    left, middle, right = 1 - correlation[best - 1:best + 2]
+    left, middle, right = 1 - correlation[best - 1 : best + 2]
     return best + float((left - right) / (2 * (left - 2 * middle + right)))

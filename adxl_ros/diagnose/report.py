@@ -27,15 +27,27 @@ _DIGITS = 6  # Significant digits of the report. Chosen: more than any of its nu
 PROBABLE = 0.05
 """Smallest probability of an effect that the page shows first. Chosen: that of a rival."""
 _WITHOUT_GAP = ('no_gap', 'insufficient')  # Verdicts in which there is no gap to close
-_FLOOR_SOURCES = {'still': 'from rests', 'repeats': 'from repeats of a trajectory',
-                  'assumed': 'assumed from the parameter file'}
+_FLOOR_SOURCES = {
+    'still': 'from rests',
+    'repeats': 'from repeats of a trajectory',
+    'assumed': 'assumed from the parameter file',
+}
 _DIMENSIONS = {
-    'force': 'the force along the axis', 'cross_force': 'the force across the axis',
-    'direction': 'the direction of the last move', 'rate': 'the rate of the joints',
-    'alpha_rad': 'alpha', 'beta_rad': 'beta', 'temperature_c': 'the temperature',
-    'warming': 'the history of the temperature', 'supply_v': 'the supply', 'time_s': 'the time',
-    'ageing': 'force and time together', 'since_move_s': 'the time since a move',
-    'code': 'the code of the ADC', 'lag': 'the recent history of the force'}
+    'force': 'the force along the axis',
+    'cross_force': 'the force across the axis',
+    'direction': 'the direction of the last move',
+    'rate': 'the rate of the joints',
+    'alpha_rad': 'alpha',
+    'beta_rad': 'beta',
+    'temperature_c': 'the temperature',
+    'warming': 'the history of the temperature',
+    'supply_v': 'the supply',
+    'time_s': 'the time',
+    'ageing': 'force and time together',
+    'since_move_s': 'the time since a move',
+    'code': 'the code of the ADC',
+    'lag': 'the recent history of the force',
+}
 """Dimensions of the reproducible rest, for people."""
 _MOST_DIMENSIONS = 2  # Dimensions that a sentence names. Chosen: the strongest ones
 NOISE_STAYS = 'The effects are noise, which no simulation repeats sample by sample.'
@@ -55,40 +67,93 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     fault, report = diagnosis.fault, diagnosis.report
     if report is None:
         assert fault is not None
-        return {'schema': 1, 'verdict': {
-            'status': fault.status, 'effects': [], 'groups': [], 'of': None,
-            'data_fault': fault.name if fault.status == 'bad_data' else None,
-            'probability': 1.0}, 'hypotheses': [], 'gap': None, 'where': [], 'candidates': [],
-            'notes': notes(diagnosis), 'next_experiment': None, 'summary': fault.message}
+        return {
+            'schema': 1,
+            'verdict': {
+                'status': fault.status,
+                'effects': [],
+                'groups': [],
+                'of': None,
+                'data_fault': fault.name if fault.status == 'bad_data' else None,
+                'probability': 1.0,
+            },
+            'hypotheses': [],
+            'gap': None,
+            'where': [],
+            'candidates': [],
+            'notes': notes(diagnosis),
+            'next_experiment': None,
+            'summary': fault.message,
+        }
     verdict, proposal = report.verdict, report.next_experiment
-    return _rounded({
-        'schema': 1,
-        'verdict': {'status': verdict.status, 'effects': verdict.effects,
-                    'groups': verdict.groups, 'of': concern(verdict), 'data_fault': None,
-                    'probability': verdict.probability},
-        'hypotheses': [h._asdict() for h in verdict.hypotheses],
-        'gap': _gap(report),
-        'explained': _power(verdict.explained), 'rest': _power(verdict.rest),
-        'rest_follows': verdict.rest_follows, 'material': verdict.material_mps2,
-        'lost_without': {e: _power(p) for e, p in verdict.lost_without.items()},
-        'where': [{'axis': c.axis, 'dimension': c.dimension, 'range': (c.low, c.high),
-                   'mean': c.mean_mps2, 'share': c.share, 'p': c.p}
-                  for c in report.residual_cells],
-        'not_covered': report.not_covered, 'notes': notes(diagnosis),
-        'could_show': [
-            {'effect': r.name.effect, 'parameter': r.name.parameter, 'axis': r.name.axis or None,
-             'unit': parameter_of(r.name).unit, 'smallest': r.smallest, 'could_show': r.shows}
-            for r in report.could_show],
-        'candidates': _candidates(report),
-        'noise_remainders': [
-            {'effect': r.effect, 'quantity': r.quantity, 'unit': r.unit, 'axis': r.axis or None,
-             'recorded': r.recorded, 'simulated': r.simulated,
-             'left': abs(r.recorded - r.simulated)} for r in report.noise_remainders],
-        'next_experiment': proposal and {
-            'manoeuvre': proposal.manoeuvre, 'why': proposal.why, 'command': proposal.command,
-            'menu': [{'manoeuvre': w.name, 'minutes': w.minutes, 'nats_per_minute': w.per_minute}
-                     for w in proposal.menu]},
-        'summary': summary(diagnosis)})
+    return _rounded(
+        {
+            'schema': 1,
+            'verdict': {
+                'status': verdict.status,
+                'effects': verdict.effects,
+                'groups': verdict.groups,
+                'of': concern(verdict),
+                'data_fault': None,
+                'probability': verdict.probability,
+            },
+            'hypotheses': [h._asdict() for h in verdict.hypotheses],
+            'gap': _gap(report),
+            'explained': _power(verdict.explained),
+            'rest': _power(verdict.rest),
+            'rest_follows': verdict.rest_follows,
+            'material': verdict.material_mps2,
+            'lost_without': {e: _power(p) for e, p in verdict.lost_without.items()},
+            'where': [
+                {
+                    'axis': c.axis,
+                    'dimension': c.dimension,
+                    'range': (c.low, c.high),
+                    'mean': c.mean_mps2,
+                    'share': c.share,
+                    'p': c.p,
+                }
+                for c in report.residual_cells
+            ],
+            'not_covered': report.not_covered,
+            'notes': notes(diagnosis),
+            'could_show': [
+                {
+                    'effect': r.name.effect,
+                    'parameter': r.name.parameter,
+                    'axis': r.name.axis or None,
+                    'unit': parameter_of(r.name).unit,
+                    'smallest': r.smallest,
+                    'could_show': r.shows,
+                }
+                for r in report.could_show
+            ],
+            'candidates': _candidates(report),
+            'noise_remainders': [
+                {
+                    'effect': r.effect,
+                    'quantity': r.quantity,
+                    'unit': r.unit,
+                    'axis': r.axis or None,
+                    'recorded': r.recorded,
+                    'simulated': r.simulated,
+                    'left': abs(r.recorded - r.simulated),
+                }
+                for r in report.noise_remainders
+            ],
+            'next_experiment': proposal
+            and {
+                'manoeuvre': proposal.manoeuvre,
+                'why': proposal.why,
+                'command': proposal.command,
+                'menu': [
+                    {'manoeuvre': w.name, 'minutes': w.minutes, 'nats_per_minute': w.per_minute}
+                    for w in proposal.menu
+                ],
+            },
+            'summary': summary(diagnosis),
+        }
+    )
 
 
 def as_text(values: dict[str, Any]) -> str:
@@ -98,8 +163,11 @@ def as_text(values: dict[str, Any]) -> str:
 
 def notes(diagnosis: Diagnosis) -> list[str]:
     """Return what was corrected or left out, with the file where there are several."""
-    return [f'{Path(c.name).name}: {note}' if len(diagnosis.comparisons) > 1 else note
-            for c in diagnosis.comparisons for note in c.notes]
+    return [
+        f'{Path(c.name).name}: {note}' if len(diagnosis.comparisons) > 1 else note
+        for c in diagnosis.comparisons
+        for note in c.notes
+    ]
 
 
 def _rounded(value: Any) -> Any:
@@ -128,9 +196,14 @@ def _gap(report: Report) -> dict[str, Any]:
         figures['closed'] = None
     if not np.isfinite(closure.floor.low):
         figures['floor_ci'] = None
-    return {**figures, 'floor_source': report.noise_floor.source,
-            'upper_limit': verdict.upper_limit_mps2, 'reference': verdict.reference_mps2,
-            'not_in_reference': report.linear_model.lost_motion_mps2, 'noise': report.noise}
+    return {
+        **figures,
+        'floor_source': report.noise_floor.source,
+        'upper_limit': verdict.upper_limit_mps2,
+        'reference': verdict.reference_mps2,
+        'not_in_reference': report.linear_model.lost_motion_mps2,
+        'noise': report.noise,
+    }
 
 
 def shares_of_gap(report: Report) -> dict[str, float]:
@@ -156,21 +229,29 @@ def _candidates(report: Report) -> list[dict[str, Any]]:
             continue
         if name in detected:
             values = detected[name].values
-            parameters = {p.name: {'value': np.asarray(values[p.name]).tolist(), 'unit': p.unit}
-                          for p in effect.parameters if p.name in values}
+            parameters = {
+                p.name: {'value': np.asarray(values[p.name]).tolist(), 'unit': p.unit}
+                for p in effect.parameters
+                if p.name in values
+            }
         else:
             parameters = _parameters(report, hypothesis, name)
         group = next((g for g in reversed(verdict.groups) if name in g), ())
-        out.append({
-            'effect': name, 'of': effect.concern.value,
-            'probability': min(sum(h.probability for h in sets), 1.0),
-            'closed': report.closure.closed.value if name in verdict.best else None,
-            # The rule weighs held-out figures, and no effect has a p of its own.
-            'p': None,
-            'parameters': parameters,
-            'share': shares.get(name), 'visibility': shown[name].share if name in shown else 1.0,
-            'inseparable_from': [other for other in group if other != name],
-            'cause': effect.cause})
+        out.append(
+            {
+                'effect': name,
+                'of': effect.concern.value,
+                'probability': min(sum(h.probability for h in sets), 1.0),
+                'closed': report.closure.closed.value if name in verdict.best else None,
+                # The rule weighs held-out figures, and no effect has a p of its own.
+                'p': None,
+                'parameters': parameters,
+                'share': shares.get(name),
+                'visibility': shown[name].share if name in shown else 1.0,
+                'inseparable_from': [other for other in group if other != name],
+                'cause': effect.cause,
+            }
+        )
     return sorted(out, key=lambda c: (-c['probability'], c['effect']))
 
 
@@ -183,18 +264,24 @@ def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> d
     names, sensor = fitted_of(effect_named(effect), report.sensor.axes), report.sensor
     if effect_named(effect).diagnosis.drift and effect in sensor.effects:
         # The density of a drift is chosen with the noise, on a grid.
-        return {_key(name): {'value': float(get(sensor, [name])[0]),
-                             'unit': parameter_of(name).unit} for name in names}
+        return {
+            _key(name): {'value': float(get(sensor, [name])[0]), 'unit': parameter_of(name).unit}
+            for name in names
+        }
     if hypothesis is None:
         return {}
     parameters, values = dict[str, dict[str, Any]](), get(hypothesis.sensor, hypothesis.names)
-    for name, value, std, is_open in zip(hypothesis.names, values.tolist(), hypothesis.std,
-                                         hypothesis.undetermined):
+    for name, value, std, is_open in zip(
+        hypothesis.names, values.tolist(), hypothesis.std, hypothesis.undetermined
+    ):
         if name in names:
             ci = value - Z_90 * std, value + Z_90 * std
             parameters[_key(name)] = {
-                'value': None if is_open else value, 'ci': None if is_open else ci,
-                'unit': parameter_of(name).unit, 'determined': not is_open}
+                'value': None if is_open else value,
+                'ci': None if is_open else ci,
+                'unit': parameter_of(name).unit,
+                'determined': not is_open,
+            }
     return parameters
 
 
@@ -212,12 +299,14 @@ def badge(diagnosis: Diagnosis) -> str:
     if verdict.status in ('explained', 'partly') and concern(verdict) == Concern.REFERENCE.value:
         share = f', {percent(verdict.explained_share)}' if verdict.status == 'partly' else ''
         return f'ERROR OF THE REFERENCE{share}'
-    return {'no_gap': f'NO GAP above {mg_text(verdict.upper_limit_mps2)}',
-            'insufficient': 'TOO LITTLE DATA', 'unknown': 'UNKNOWN CAUSE',
-            'inseparable': 'CAUSES NOT SEPARATED',
-            'partly': f'PARTLY EXPLAINED, {percent(verdict.explained_share)}',
-            'explained': f'GAP EXPLAINED by {quantities.counted(len(verdict.effects), "effect")}',
-            }[verdict.status]
+    return {
+        'no_gap': f'NO GAP above {mg_text(verdict.upper_limit_mps2)}',
+        'insufficient': 'TOO LITTLE DATA',
+        'unknown': 'UNKNOWN CAUSE',
+        'inseparable': 'CAUSES NOT SEPARATED',
+        'partly': f'PARTLY EXPLAINED, {percent(verdict.explained_share)}',
+        'explained': f'GAP EXPLAINED by {quantities.counted(len(verdict.effects), "effect")}',
+    }[verdict.status]
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -233,8 +322,7 @@ def headline(diagnosis: Diagnosis) -> str:
     follows = f' It follows {listed(where, "and")}.' if where and verdict.rest.low > 0 else ''
     separate = ': the data do not separate them' if verdict.groups else ''
     noise = f' {NOISE_STAYS}' if is_only_noise(diagnosis.report) else ''
-    in_reference = [e for e in verdict.effects
-                    if effect_named(e).concern is Concern.REFERENCE]
+    in_reference = [e for e in verdict.effects if effect_named(e).concern is Concern.REFERENCE]
     in_words = listed(in_reference, 'and')
     of_reference = f' Error of the reference, not of the sensor: {in_words}.' if in_words else ''
     explained = f'Explained {sure} by {named}{separate}.{noise}{of_reference}'
@@ -242,10 +330,10 @@ def headline(diagnosis: Diagnosis) -> str:
     sentence = {
         'no_gap': f'No gap {sure}: one above {limit} would have shown.',
         'insufficient': 'No verdict: neither motion nor temperature nor supply changes, so that '
-                        'no effect can show.',
+        'no effect can show.',
         'unknown': f'Unknown {sure}: no effect of the library explains {rest}.{follows}',
         'partly': f'Partly explained {sure}: {percent(share)} of the gap is {named}; '
-                  f'{percent(1 - share)} ({rest}) is something else.{follows}{of_reference}'
+        f'{percent(1 - share)} ({rest}) is something else.{follows}{of_reference}',
     }.get(verdict.status, explained)
     return sentence + _left_out_text(diagnosis.report)
 
@@ -253,24 +341,36 @@ def headline(diagnosis: Diagnosis) -> str:
 def _left_out_text(report: Report) -> str:
     """Say which samples a verdict is not about, where they would matter; empty for none."""
     size = quantities.acceleration_text
-    texts = [f'{part.samples} samples ({size(part.rms_mps2)} rms), {part.why}'
-             for part in report.left_out]
+    texts = [
+        f'{part.samples} samples ({size(part.rms_mps2)} rms), {part.why}'
+        for part in report.left_out
+    ]
     return f' Not compared: {"; ".join(texts)}.' if texts else ''
 
 
 def concern(verdict: Verdict) -> str | None:
     """Return what a verdict is about, joined by 'and', within a group by 'or'; None for none."""
     groups = (*((e,) for e in verdict.effects), *verdict.groups)
-    return ' and '.join(sorted({' or '.join(sorted({effect_named(e).concern.value for e in g}))
-                                for g in groups})) or None
+    return (
+        ' and '.join(
+            sorted(
+                {' or '.join(sorted({effect_named(e).concern.value for e in g})) for g in groups}
+            )
+        )
+        or None
+    )
 
 
 def summary(diagnosis: Diagnosis) -> str:
     """Return verdict and figures in a few sentences."""
     report = diagnosis.report
     rows = [] if report is None else [*figure_rows(diagnosis), *remainder_rows(report)]
-    return ' '.join([headline(diagnosis), *(f'{row.label[0].upper()}{row.label[1:]}: {row.text}.'
-                                            for row in rows)])
+    return ' '.join(
+        [
+            headline(diagnosis),
+            *(f'{row.label[0].upper()}{row.label[1:]}: {row.text}.' for row in rows),
+        ]
+    )
 
 
 def figure_rows(diagnosis: Diagnosis) -> list[Row]:
@@ -279,35 +379,80 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
     assert report is not None
     closure, verdict = report.closure, report.verdict
     compared = any(c.reference is not Reference.NONE for c in diagnosis.comparisons)
-    rows = [Row('gap', f'{mg_text(closure.before.value)} rms', 'recording minus simulation'
-                if compared else 'without its mean, because the pose is unknown')]
+    rows = [
+        Row(
+            'gap',
+            f'{mg_text(closure.before.value)} rms',
+            'recording minus simulation'
+            if compared
+            else 'without its mean, because the pose is unknown',
+        )
+    ]
     if closes(report):
         low, high = (percent(share) for share in (closure.closed.low, closure.closed.high))
         ci = '' if low == high else f', 90 % interval {low} to {high}'
-        rows.append(Row('with the effects', f'{mg_text(closure.after.value)} rms',
-                        f'{percent(closure.closed.value)} closed, held out{ci}'))
-    rows.append(Row('noise floor', f'{mg_text(closure.floor.value)} rms',
-                    _FLOOR_SOURCES[report.noise_floor.source]))
+        rows.append(
+            Row(
+                'with the effects',
+                f'{mg_text(closure.after.value)} rms',
+                f'{percent(closure.closed.value)} closed, held out{ci}',
+            )
+        )
+    rows.append(
+        Row(
+            'noise floor',
+            f'{mg_text(closure.floor.value)} rms',
+            _FLOOR_SOURCES[report.noise_floor.source],
+        )
+    )
     if verdict.status in _WITHOUT_GAP:
-        rows.append(Row('upper limit', mg_text(verdict.upper_limit_mps2),
-                        'a larger gap would have shown'))
+        rows.append(
+            Row('upper limit', mg_text(verdict.upper_limit_mps2), 'a larger gap would have shown')
+        )
     else:
-        rows.append(Row('explained', quantities.power_text(verdict.explained), 'by ' + listed(
-            sorted(verdict.best), 'and') if verdict.best else 'no effect on the mean'))
+        rows.append(
+            Row(
+                'explained',
+                quantities.power_text(verdict.explained),
+                'by ' + listed(sorted(verdict.best), 'and')
+                if verdict.best
+                else 'no effect on the mean',
+            )
+        )
     rows += beside_rows(report)
-    rows.append(Row('repeats, not explained', quantities.power_text(verdict.rest),
-                    'by flexible functions, held out'))
-    rows += [Row('material', f'from {mg_text(verdict.material_mps2)}', 'smaller is no gap'),
-             Row('errors of the reference', mg_text(verdict.reference_mps2),
-                 'what follows the pose must exceed them, too')]
+    rows.append(
+        Row(
+            'repeats, not explained',
+            quantities.power_text(verdict.rest),
+            'by flexible functions, held out',
+        )
+    )
+    rows += [
+        Row('material', f'from {mg_text(verdict.material_mps2)}', 'smaller is no gap'),
+        Row(
+            'errors of the reference',
+            mg_text(verdict.reference_mps2),
+            'what follows the pose must exceed them, too',
+        ),
+    ]
     fading_hz = [c.fading_hz for c in diagnosis.comparisons if c.fading_hz is not None]
     if report.linear_model.lost_motion_mps2:
-        rows.append(Row('not in the reference', f'{mg_text(report.linear_model.lost_motion_mps2)} '
-                        'rms', f'motion above {min(fading_hz) / 2:.2g} Hz'))
+        rows.append(
+            Row(
+                'not in the reference',
+                f'{mg_text(report.linear_model.lost_motion_mps2)} rms',
+                f'motion above {min(fading_hz) / 2:.2g} Hz',
+            )
+        )
     if len(verdict.lost_without) > 1 and closes(report):
-        rows += [Row(f'lost without {effect}', amplitude_text(power.value), ' to '.join(
-            amplitude_text(p) for p in (power.low, power.high)))
-            for effect, power in verdict.lost_without.items()]
+        rows += [
+            Row(
+                f'lost without {effect}',
+                amplitude_text(power.value),
+                ' to '.join(amplitude_text(p) for p in (power.low, power.high)),
+            )
+            for effect, power in verdict.lost_without.items()
+        ]
     return rows
 
 
@@ -318,57 +463,85 @@ def beside_rows(report: Report) -> list[Row]:
     A calibration may have taken them up of the effects, so that both belong together.
     """
     verdict, sensor, texts = report.verdict, report.sensor, list[str]()
-    straight = [e for e in library().values() if e.diagnosis.straight_line
-                and e.name in sensor.effects and e.name not in verdict.best]
+    straight = [
+        e
+        for e in library().values()
+        if e.diagnosis.straight_line and e.name in sensor.effects and e.name not in verdict.best
+    ]
     for effect in straight if verdict.closes else ():
         names = fitted_of(effect, sensor.axes)
         before = get(with_neutral(report.baseline, sensor.effects), names)
-        for name, change_v, scale in zip(names, get(sensor, names) - before,
-                                         report.baseline.scale_v_per_g.tolist()):
+        for name, change_v, scale in zip(
+            names, get(sensor, names) - before, report.baseline.scale_v_per_g.tolist()
+        ):
             if abs(change_v) / scale * G0_MPS2 > verdict.material_mps2:
                 size = quantities.parameter_text(
-                    {'value': change_v, 'unit': parameter_of(name).unit}, scale)
+                    {'value': change_v, 'unit': parameter_of(name).unit}, scale
+                )
                 texts.append(f'{effect.name} {name.axis} {size}')
-    return [Row('with them', ', '.join(texts), 'a calibration may have taken this up of them')
-            ] if texts else []
+    return (
+        [Row('with them', ', '.join(texts), 'a calibration may have taken this up of them')]
+        if texts
+        else []
+    )
 
 
 def remainder_rows(report: Report) -> list[Row]:
     """Return what remains of each noise-like effect."""
+
     def text(value: float, unit: str) -> str:
         if unit == 'm/s^2':
             return mg_text(value)
         return f'{100 * value:.2g} %' if unit == '1' else f'{value:.2g} a second'
 
-    return [Row(f'{r.effect}, {r.quantity}{f" on {r.axis}" if r.axis else ""}',
-                '{} recorded, {} simulated, {} left'.format(*(text(v, r.unit) for v in (
-                    r.recorded, r.simulated, abs(r.recorded - r.simulated)))))
-            for r in report.noise_remainders]
+    return [
+        Row(
+            f'{r.effect}, {r.quantity}{f" on {r.axis}" if r.axis else ""}',
+            '{} recorded, {} simulated, {} left'.format(
+                *(
+                    text(v, r.unit)
+                    for v in (r.recorded, r.simulated, abs(r.recorded - r.simulated))
+                )
+            ),
+        )
+        for r in report.noise_remainders
+    ]
 
 
 def is_only_noise(report: Report) -> bool:
     """Determine whether a verdict has effects, but none that acts on the mean."""
     return report.verdict.closes and not any(
-        effect_named(e).acts_on is ActsOn.MEAN for e in report.verdict.best)
+        effect_named(e).acts_on is ActsOn.MEAN for e in report.verdict.best
+    )
 
 
 def closes(report: Report) -> bool:
     """Determine whether there is a gap, and effects that change the mean."""
-    return report.verdict.closes and bool(np.isfinite(report.closure.closed.value)) \
+    return (
+        report.verdict.closes
+        and bool(np.isfinite(report.closure.closed.value))
         and not is_only_noise(report)
+    )
 
 
 def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]:
     """Return effect, smallest and typical size, and what is missing to show it; '' for nothing."""
     p, effect = parameter_of(row.name), effect_named(row.name.effect)
-    smallest, typical = (quantities.parameter_text({'value': v, 'unit': p.unit}, scale_v_per_g, 2)
-                         for v in (row.smallest, p.scale))
+    smallest, typical = (
+        quantities.parameter_text({'value': v, 'unit': p.unit}, scale_v_per_g, 2)
+        for v in (row.smallest, p.scale)
+    )
     if row.shows:
         return effect.name, smallest, typical, ''
     revealed_by = effect.diagnosis.revealed_by
     reference = 'needs --urdf' if Need.ROBOT in effect.needs else 'needs --sim'
-    missing = reference if effect.concern is Concern.REFERENCE else \
-        f'needs: {MENU[revealed_by].text}' if revealed_by else 'no manoeuvre shows it'
+    missing = (
+        reference
+        if effect.concern is Concern.REFERENCE
+        else f'needs: {MENU[revealed_by].text}'
+        if revealed_by
+        else 'no manoeuvre shows it'
+    )
     return effect.name, 'cannot show', typical, missing
 
 
@@ -382,39 +555,62 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     lines, word, report = [*wrapped(subject), ''], badge(diagnosis), diagnosis.report
     labelled = [('note', note) for note in notes(diagnosis)]
     if report is None:
-        return lines + wrapped(f'{word}  {headline(diagnosis)}', len(word) + 2) \
-            + _labelled(labelled)
+        return (
+            lines + wrapped(f'{word}  {headline(diagnosis)}', len(word) + 2) + _labelled(labelled)
+        )
     objects, rows = as_json(diagnosis), figure_rows(diagnosis)
     closure, first = report.closure, {row.label: row.note for row in rows}
     # The gap, with the effects, and the floor stand in the first line.
     after = f' -> {mg_text(closure.after.value)}' if closes(report) else ''
     gap = f'{mg_text(closure.before.value)}{after} rms'
-    lines.append(f'{word:{_BADGE_COLUMNS - 1}} {gap:{_GAP_COLUMNS - 1}} noise floor '
-                 f'{mg_text(closure.floor.value)}')
+    lines.append(
+        f'{word:{_BADGE_COLUMNS - 1}} {gap:{_GAP_COLUMNS - 1}} noise floor '
+        f'{mg_text(closure.floor.value)}'
+    )
     remark = first.get('with the effects', '' if 'sim' in first['gap'] else f'gap {first["gap"]}')
-    lines += [f'{"":{_BADGE_COLUMNS}}{line}'
-              for text in (remark, f'noise floor {first["noise floor"]}')
-              for line in wrap(text, COLUMNS - _BADGE_COLUMNS)]
+    lines += [
+        f'{"":{_BADGE_COLUMNS}}{line}'
+        for text in (remark, f'noise floor {first["noise floor"]}')
+        for line in wrap(text, COLUMNS - _BADGE_COLUMNS)
+    ]
     if report.verdict.status != 'explained' or 'REFERENCE' in word:
         lines += wrapped(headline(diagnosis))
     elif is_only_noise(report):
         lines += wrapped(NOISE_STAYS)
     shown = report.could_show
     hidden = ', '.join(row.name.effect for row in shown if not row.shows)
-    return [*lines, *_effect_table(report, objects), '', *_labelled([
-        ('figures', '; '.join(f'{row.label} {row.text}' for row in rows[2 + closes(report):])),
-        *(('noise', f'{row.label}: {row.text}') for row in remainder_rows(report)),
-        ('shows', f'{sum(row.shows for row in shown)} of {len(shown)} effects could show'
-         + f'; could not: {hidden}' * bool(hidden)),
-        *(('cause', f'{name}: {effect_named(name).cause}')
-          for name in named_effects(report, objects)), *labelled])]
+    return [
+        *lines,
+        *_effect_table(report, objects),
+        '',
+        *_labelled(
+            [
+                (
+                    'figures',
+                    '; '.join(f'{row.label} {row.text}' for row in rows[2 + closes(report) :]),
+                ),
+                *(('noise', f'{row.label}: {row.text}') for row in remainder_rows(report)),
+                (
+                    'shows',
+                    f'{sum(row.shows for row in shown)} of {len(shown)} effects could show'
+                    + f'; could not: {hidden}' * bool(hidden),
+                ),
+                *(
+                    ('cause', f'{name}: {effect_named(name).cause}')
+                    for name in named_effects(report, objects)
+                ),
+                *labelled,
+            ]
+        ),
+    ]
 
 
 def named_effects(report: Report, objects: dict[str, Any]) -> list[str]:
     """Return the effects of the verdict by their share of the gap."""
     shares = {c['effect']: c['share'] or 0.0 for c in objects['candidates']}
-    return sorted((name for name in report.verdict.named if name in shares),
-                  key=lambda name: -shares[name])
+    return sorted(
+        (name for name in report.verdict.named if name in shares), key=lambda name: -shares[name]
+    )
 
 
 def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
@@ -423,14 +619,26 @@ def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
     candidates = {c['effect']: c for c in objects['candidates']}
     width = max(map(len, ('effect', *named))) + 2
     size_columns = COLUMNS - 1 - width - _SURE_COLUMNS - _SHARE_COLUMNS
-    lines = ['', f' {"effect":{width}}{"sure":{_SURE_COLUMNS}}'
-             f'{"size (90 % interval)":{size_columns - 6}} share of gap'] if named else []
+    lines = (
+        [
+            '',
+            f' {"effect":{width}}{"sure":{_SURE_COLUMNS}}'
+            f'{"size (90 % interval)":{size_columns - 6}} share of gap',
+        ]
+        if named
+        else []
+    )
     for name in named:
         share, sure = candidates[name]['share'], percent(candidates[name]['probability'])
-        first, *more = [line for size in size_lines(report, candidates[name])
-                        for line in wrap(size, size_columns - 1, subsequent_indent='  ')] or ['']
-        lines.append(f' {name:{width}}{sure:{_SURE_COLUMNS}}{first:{size_columns}}'
-                     f'{"" if share is None else percent(share):>{_SHARE_COLUMNS}}'.rstrip())
+        first, *more = [
+            line
+            for size in size_lines(report, candidates[name])
+            for line in wrap(size, size_columns - 1, subsequent_indent='  ')
+        ] or ['']
+        lines.append(
+            f' {name:{width}}{sure:{_SURE_COLUMNS}}{first:{size_columns}}'
+            f'{"" if share is None else percent(share):>{_SHARE_COLUMNS}}'.rstrip()
+        )
         lines += [f'{"":{1 + width + _SURE_COLUMNS}}{size}' for size in more]
     return lines
 
@@ -446,10 +654,12 @@ def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
             zeros.append(label)
         else:
             scale = dict(zip(report.baseline.axes, all_v_per_g)).get(
-                key.partition('.')[2], all_v_per_g.mean())
+                key.partition('.')[2], all_v_per_g.mean()
+            )
             lines.append(f'{label} {quantities.parameter_text(parameter, float(scale))}'.strip())
-    return lines + ([f'{", ".join(zeros)}: not different from 0'.removeprefix(': ')]
-                    if zeros else [])
+    return lines + (
+        [f'{", ".join(zeros)}: not different from 0'.removeprefix(': ')] if zeros else []
+    )
 
 
 def _labelled(rows: Sequence[tuple[str, str]]) -> list[str]:

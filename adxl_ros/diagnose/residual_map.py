@@ -78,12 +78,16 @@ def dimensions(comparison: BaselineComparison) -> dict[str, np.ndarray]:
     if comparison.joints:
         alpha_rad, beta_rad = (joint(time_s) for joint in comparison.joints)
         rates = [joint(time_s, 1) for joint in comparison.joints]
-        values |= {'alpha_rad': alpha_rad, 'beta_rad': beta_rad % (2 * np.pi),
-                   'rate_rad_s': np.hypot(*rates),
-                   'direction_alpha': direction_of_last_move(rates[0]),
-                   'direction_beta': direction_of_last_move(rates[1]),
-                   'since_move_s': np.minimum(beside.time_since_move_s(time_s, rates),
-                                              _LONGEST_SINCE_MOVE_S)}
+        values |= {
+            'alpha_rad': alpha_rad,
+            'beta_rad': beta_rad % (2 * np.pi),
+            'rate_rad_s': np.hypot(*rates),
+            'direction_alpha': direction_of_last_move(rates[0]),
+            'direction_beta': direction_of_last_move(rates[1]),
+            'since_move_s': np.minimum(
+                beside.time_since_move_s(time_s, rates), _LONGEST_SINCE_MOVE_S
+            ),
+        }
     return {name: v for name, v in values.items() if np.ptp(v) > _SMALLEST_RANGE}
 
 
@@ -91,8 +95,11 @@ def not_covered(comparisons: Sequence[BaselineComparison]) -> list[str]:
     """Name, for people, the dimensions that no recording covers."""
     covered: set[str] = set()
     for comparison in comparisons:
-        covered |= {name for name, values in dimensions(comparison).items()
-                    if name != 'temperature_c' or np.ptp(values) >= _SMALLEST_WARMING_C}
+        covered |= {
+            name
+            for name, values in dimensions(comparison).items()
+            if name != 'temperature_c' or np.ptp(values) >= _SMALLEST_WARMING_C
+        }
     if all(c.reference is beside.Reference.SIMULATOR for c in comparisons):
         covered |= _STAGE_ONLY
     return [text for name, text in _COVERAGE.items() if name not in covered]
@@ -110,16 +117,18 @@ def residual_map(comparison: BaselineComparison, seed: int) -> list[ResidualCell
     sums = np.array([cell.sums_mps2 for cell in cells])
     counts = np.array([cell.samples for cell in cells])
     means = sums.sum(axis=1) / counts
-    shares = np.minimum(means ** 2 * counts / max(float(np.sum(residual_mps2 ** 2)), 1e-300), 1.0)
+    shares = np.minimum(means**2 * counts / max(float(np.sum(residual_mps2**2)), 1e-300), 1.0)
     significant = [
         ResidualCell(*cell[:4], float(mean), float(share), float(p))
         for cell, mean, share, p in zip(cells, means, shares, _family_wise_p(sums, seed))
-        if p < _SIGNIFICANT_P]
+        if p < _SIGNIFICANT_P
+    ]
     return sorted(significant, key=lambda cell: -cell.share)[:_MOST_CELLS]
 
 
-def _cells(comparison: BaselineComparison, residual_mps2: np.ndarray, block: np.ndarray
-           ) -> list[_Cell]:
+def _cells(
+    comparison: BaselineComparison, residual_mps2: np.ndarray, block: np.ndarray
+) -> list[_Cell]:
     """Sum the residual over each range of each dimension; block: number of each sample's, (n,)."""
     blocks = int(block[-1]) + 1
     cells = []
@@ -133,8 +142,9 @@ def _cells(comparison: BaselineComparison, residual_mps2: np.ndarray, block: np.
                 continue
             for d, axis in enumerate(comparison.sensor.axes):
                 sums = np.bincount(block[chosen], residual_mps2[chosen, d], blocks)
-                cells.append(_Cell(axis, name, float(low), float(high), sums,
-                                   float(by_block.sum())))
+                cells.append(
+                    _Cell(axis, name, float(low), float(high), sums, float(by_block.sum()))
+                )
     return cells
 
 
@@ -145,7 +155,7 @@ def _family_wise_p(sums_mps2: np.ndarray, seed: int) -> np.ndarray:
     sums_mps2: sums of the residual of each cell by block, (k, blocks). Whole blocks change sign at
     random, and the largest of all cells is the one that a mean must exceed (max-T).
     """
-    spread = np.maximum(np.sqrt((sums_mps2 ** 2).sum(axis=1)), 1e-300)
+    spread = np.maximum(np.sqrt((sums_mps2**2).sum(axis=1)), 1e-300)
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], (sums_mps2.shape[1], _DRAWS))
     largest = np.max(np.abs(sums_mps2 @ signs) / spread[:, None], axis=0)
     statistic = np.abs(sums_mps2.sum(axis=1)) / spread

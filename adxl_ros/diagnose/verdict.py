@@ -39,7 +39,7 @@ MATERIAL_SHARE_OF_NOISE = 0.1
 _SHARE_OF_SET, _SHARE_OF_FORM = 0.03, 0.1
 """Share of the explained power that each effect of a set must hold, and the same beside an effect
 whose form is not exact over the same variables."""
-_FORM_AT_REST, _REST_ERRORS = _SHARE_OF_FORM ** 2, 2.0
+_FORM_AT_REST, _REST_ERRORS = _SHARE_OF_FORM**2, 2.0
 """Share of the explained power by which a set may make rests worse, and the same in standard
 errors: a tenth of its amplitude may be an error of its form."""
 _NATS = 3.0  # Held-out log likelihood that a further effect must gain
@@ -52,8 +52,13 @@ _REPEATED, _RIGHT = (0.0, 0.5, 0.8, 0.95, 1.0), (0.2, 0.4, 0.6, 0.75, 0.9)
 40 working cases (seed 901): of those that all draws repeat, 21 of 25."""
 _POSE = {'force', 'cross_force', 'alpha_rad', 'beta_rad'}
 """Dimensions that only change with the pose."""
-_SHOWN_BY_POSE = {ProofVariable.OWN_FORCE, ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z,
-                  ProofVariable.ALPHA, ProofVariable.BETA}
+_SHOWN_BY_POSE = {
+    ProofVariable.OWN_FORCE,
+    ProofVariable.CROSS_FORCE,
+    ProofVariable.FORCE_Z,
+    ProofVariable.ALPHA,
+    ProofVariable.BETA,
+}
 """Variables over which an effect that only changes with the pose shows."""
 _DRAWS = 200  # Draws of blocks. Chosen: the 5 % quantile has 10 draws below it
 FOLDS, _RUN_BLOCKS = 4, 2
@@ -77,9 +82,12 @@ class WeightedHypothesis(NamedTuple):
 def normalised(weights: Mapping[tuple[str, ...], float]) -> tuple[WeightedHypothesis, ...]:
     """Return sets by falling probability, which sums to 1."""
     total = sum(weights.values())
-    return tuple(sorted((WeightedHypothesis(effects, weight / total)
-                         for effects, weight in weights.items()),
-                        key=lambda h: (-h.probability, h.effects)))
+    return tuple(
+        sorted(
+            (WeightedHypothesis(effects, weight / total) for effects, weight in weights.items()),
+            key=lambda h: (-h.probability, h.effects),
+        )
+    )
 
 
 class HeldOut(NamedTuple):
@@ -149,20 +157,25 @@ class HeldOutFits:
         linearised = self.linearised
         for held_out, _, fit, departures in self.by_fold:
             for columns, channel, f, variance in zip(
-                    linearised.columns, linearised.channels, fit.filter_indices,
-                    fit.innovation_variance_v2):
+                linearised.columns,
+                linearised.channels,
+                fit.filter_indices,
+                fit.innovation_variance_v2,
+            ):
                 v = np.concatenate([[1.0], -departures[columns.places]])
                 squares[held_out] += np.einsum('i,bij,j->b', v, columns.plain[held_out], v)
                 white = np.einsum('i,bij,j->b', v, channel.block_grams[f][held_out], v)
                 log_likelihood[held_out] += channel.log_scales[f][held_out] - 0.5 * (
-                    white / variance + channel.counts[held_out] * np.log(variance))
+                    white / variance + channel.counts[held_out] * np.log(variance)
+                )
         return HeldOut(squares, log_likelihood)
 
     @property
     def _whiteners(self) -> list[Whitener]:
         """Whitening filter of each channel."""
-        return [filters[f] for filters, f in zip(self.linearised.filters,
-                                                 self.full.filter_indices)]
+        return [
+            filters[f] for filters, f in zip(self.linearised.filters, self.full.filter_indices)
+        ]
 
     def drift_densities(self) -> np.ndarray:
         """Return the densities of the drift by channel; 0 for that of a healthy unit."""
@@ -171,9 +184,12 @@ class HeldOutFits:
     @cached_property
     def drift_mps2(self) -> float:
         """Return the expected rms of the drift that the fitted noise has, m/s²."""
-        sizes_g = [linear.expected_drift_g(w.effect, density, comparison)
-                   for w, density, (comparison, _) in zip(
-                       self._whiteners, self.drift_densities(), self.model.places)]
+        sizes_g = [
+            linear.expected_drift_g(w.effect, density, comparison)
+            for w, density, (comparison, _) in zip(
+                self._whiteners, self.drift_densities(), self.model.places
+            )
+        ]
         return float(G0_MPS2 * np.sqrt(np.mean(np.square(sizes_g))))
 
 
@@ -188,15 +204,20 @@ def reproducible_rest(fits: HeldOutFits, bases: Sequence[Basis]) -> Rest:
     linearised, model = fits.linearised, fits.model
     by_choice = {name: np.zeros(BLOCKS) for name in ('all', 'steady', 'nats')}
     whole = linearised.departures(fits.full, fits.full)
-    for number, (columns, filters, basis, (comparison, axis)) in enumerate(zip(
-            linearised.columns, linearised.filters, bases, model.places)):
+    for number, (columns, filters, basis, (comparison, axis)) in enumerate(
+        zip(linearised.columns, linearised.filters, bases, model.places)
+    ):
         if not basis:
             continue
         unit_v = _FIRST_LEVEL_G * float(comparison.sensor.scale_v_per_g[axis])
         design = np.concatenate([columns.values, *(unit_v * b for b in basis.values())], axis=1)
         white = linear.whiten_channel(
-            design[:, 0], design[:, 1:], np.arange(design.shape[1] - 1), comparison.used,
-            [filters[fits.full.filter_indices[number]]]).block_grams[0]
+            design[:, 0],
+            design[:, 1:],
+            np.arange(design.shape[1] - 1),
+            comparison.used,
+            [filters[fits.full.filter_indices[number]]],
+        ).block_grams[0]
         scale = float(comparison.scale_v_per_mps2[axis]) * len(comparison.sensor.axes) ** 0.5
         plain = linear.plain_grams(design / scale, comparison.used)
         variance = float(fits.full.innovation_variance_v2[number])
@@ -208,18 +229,32 @@ def reproducible_rest(fits: HeldOutFits, bases: Sequence[Basis]) -> Rest:
             active = np.flatnonzero(level)
             for held_out, fitted, _, departures in fits.by_fold if len(active) else ():
                 gram, residual = _products(white[fitted], departures[columns.places], active)
-                values = np.linalg.solve(gram / variance + np.diag(1 / level[active]),
-                                         residual / variance)
-                flat, gained = (np.array(
-                    [_gain(_products(block[None], departures[columns.places], active), values)
-                     for block in grams[held_out]]) for grams in (plain, white))
+                values = np.linalg.solve(
+                    gram / variance + np.diag(1 / level[active]), residual / variance
+                )
+                flat, gained = (
+                    np.array(
+                        [
+                            _gain(
+                                _products(block[None], departures[columns.places], active), values
+                            )
+                            for block in grams[held_out]
+                        ]
+                    )
+                    for grams in (plain, white)
+                )
                 by_choice.setdefault(name, np.zeros(BLOCKS))[held_out] += flat
                 if name == 'steady':
                     by_choice['nats'][held_out] += 0.5 * gained / variance
     together, steady, nats = (by_choice.pop(name) for name in ('all', 'steady', 'nats'))
-    p = [increments_p(c.values @ np.concatenate([[1.0], -whole[c.places]]), comparison.used,
-                      comparison.sensor.rate_hz)
-         for c, (comparison, _) in zip(linearised.columns if fits.drifts else (), model.places)]
+    p = [
+        increments_p(
+            c.values @ np.concatenate([[1.0], -whole[c.places]]),
+            comparison.used,
+            comparison.sensor.rate_hz,
+        )
+        for c, (comparison, _) in zip(linearised.columns if fits.drifts else (), model.places)
+    ]
     return Rest(together, steady, nats, by_choice, min([1.0, *(len(p) * v for v in p)]))
 
 
@@ -232,13 +267,15 @@ def increments_p(values: np.ndarray, used: np.ndarray, rate_hz: float) -> float:
     without a line (test of Fisher 1929); jumps between levels and slow oscillations have not.
     """
     longest = int(used.sum()) // _FEWEST_MEANS
-    lengths = np.unique(np.geomspace(max(1.0, _FIRST_MEAN_S * rate_hz), max(longest, 1), 12
-                                     ).astype(int))
+    lengths = np.unique(
+        np.geomspace(max(1.0, _FIRST_MEAN_S * rate_hz), max(longest, 1), 12).astype(int)
+    )
 
     def increments(length: int) -> np.ndarray:
         whole = len(values) // length * length
-        count, total = (v[:whole].reshape(-1, length).sum(axis=1)
-                        for v in (used, np.where(used, values, 0.0)))
+        count, total = (
+            v[:whole].reshape(-1, length).sum(axis=1) for v in (used, np.where(used, values, 0.0))
+        )
         means = np.where(count > length / 2, total / np.maximum(count, 1), np.nan)
         return np.diff(means)[np.isfinite(np.diff(means))]
 
@@ -246,7 +283,7 @@ def increments_p(values: np.ndarray, used: np.ndarray, rate_hz: float) -> float:
     steps = increments(min(2 * quietest, longest)) if len(lengths) > 1 else np.zeros(0)
     if len(steps) < _FEWEST_STEPS or not np.ptp(steps):
         return 1.0
-    power = np.abs(np.fft.rfft(steps - steps.mean())[1:(len(steps) + 1) // 2]) ** 2
+    power = np.abs(np.fft.rfft(steps - steps.mean())[1 : (len(steps) + 1) // 2]) ** 2
     line = len(power) * (1 - power.max() / power.sum()) ** (len(power) - 1)
     with warnings.catch_warnings():
         # Older versions warn below 20 increments, where the test is rougher.
@@ -254,8 +291,9 @@ def increments_p(values: np.ndarray, used: np.ndarray, rate_hz: float) -> float:
         return float(min(1.0, 2 * min(line, scipy.stats.kurtosistest(steps).pvalue)))
 
 
-def _products(grams: np.ndarray, departures: np.ndarray, chosen: np.ndarray | slice = slice(None)
-              ) -> tuple[np.ndarray, np.ndarray]:
+def _products(
+    grams: np.ndarray, departures: np.ndarray, chosen: np.ndarray | slice = slice(None)
+) -> tuple[np.ndarray, np.ndarray]:
     """Return products of functions with each other and with what effects leave, over blocks."""
     k, total = 1 + len(departures), grams.sum(axis=0)
     functions, residual = total[k:, k:], total[k:, :k] @ np.concatenate([[1.0], -departures])
@@ -267,21 +305,23 @@ def _gain(products: tuple[np.ndarray, np.ndarray], values: np.ndarray) -> float:
     return float(2 * products[1] @ values - values @ products[0] @ values)
 
 
-def _levels(products: tuple[np.ndarray, np.ndarray], names: np.ndarray, chosen: np.ndarray,
-            variance: float) -> np.ndarray:
+def _levels(
+    products: tuple[np.ndarray, np.ndarray], names: np.ndarray, chosen: np.ndarray, variance: float
+) -> np.ndarray:
     """Return the variance of each function's coefficient of the largest evidence, (functions,)."""
     level, (gram, residual) = np.where(chosen, 1.0, 0.0), products
     for _ in range(_ROUNDS):
         active = np.flatnonzero(level)
         if not len(active):
             break
-        covariance = np.linalg.inv(gram[np.ix_(active, active)] / variance
-                                   + np.diag(1 / level[active]))
+        covariance = np.linalg.inv(
+            gram[np.ix_(active, active)] / variance + np.diag(1 / level[active])
+        )
         squares = (covariance @ residual[active] / variance) ** 2 + np.diag(covariance)
         for name in np.unique(names[active]):
             of_name = names[active] == name
             level[active[of_name]] = squares[of_name].mean()
-        level[level <= _SMALLEST_LEVEL ** 2] = 0.0
+        level[level <= _SMALLEST_LEVEL**2] = 0.0
     return level
 
 
@@ -367,12 +407,12 @@ class Evidence:
 
     def left(self, effects: frozenset[str]) -> np.ndarray:
         """Return the power above the noise floor that a set leaves."""
-        return self.mean(self.candidates[effects][HEALTHY].figures.squares) - self.floor_mps2 ** 2
+        return self.mean(self.candidates[effects][HEALTHY].figures.squares) - self.floor_mps2**2
 
     def material_power(self, pose_share: float) -> float:
         """Return the power that a user would act on and that is not of the reference, (m/s²)²."""
         share = 1.0 if self.errs_in_motion else pose_share
-        return self.material_mps2 ** 2 + share * self.reference_mps2 ** 2
+        return self.material_mps2**2 + share * self.reference_mps2**2
 
     def mean(self, by_block: np.ndarray) -> np.ndarray:
         """Return the mean over samples of sums by block."""
@@ -388,7 +428,7 @@ class Evidence:
             return False
         again = self.again[effects]
         more, count = again.more_at_rest, max(again.resting, 1.0)
-        error = float(np.sqrt(np.sum(more ** 2))) / count
+        error = float(np.sqrt(np.sum(more**2))) / count
         explained = max(float(self.gain(effects, _NOTHING)[0]), 0.0)
         smallest = max(self.material_power(1.0), _FORM_AT_REST * explained)
         return again.at_bound or float(more.sum()) / count > smallest + _REST_ERRORS * error
@@ -412,8 +452,7 @@ class Evidence:
         a, b = (self.candidates[e][HEALTHY].figures for e in (more, less))
         return self.mean(b.squares - a.squares)
 
-    def nats(self, more: frozenset[str], less: frozenset[str], drift: str = HEALTHY
-             ) -> np.ndarray:
+    def nats(self, more: frozenset[str], less: frozenset[str], drift: str = HEALTHY) -> np.ndarray:
         """Return by how much a set, with its noise, makes the held-out samples more probable."""
         a, b = self.candidates[more][drift].figures, self.candidates[less][HEALTHY].figures
         return self.weights @ (a.log_likelihood - b.log_likelihood)
@@ -458,13 +497,25 @@ def minimal_sets(evidence: Evidence) -> list[frozenset[str]]:
     Those that the rests refute are dropped; so is an alternative to the first one, or the first
     one itself, that as it is printed leaves materially more than the other.
     """
-    kept = [effects for effects in evidence.candidates
-            if all(effects - {e} in evidence.candidates and is_needed(evidence, effects, e)
-                   for e in effects) and not evidence.is_refuted(effects)]
+    kept = [
+        effects
+        for effects in evidence.candidates
+        if all(
+            effects - {e} in evidence.candidates and is_needed(evidence, effects, e)
+            for e in effects
+        )
+        and not evidence.is_refuted(effects)
+    ]
     kept.sort(key=lambda effects: -evidence.nats(effects, _NOTHING)[0])
     first = kept[0]
-    alternatives = [first, *(other for other in kept[1:] if len(other) == len(first)
-                             and not _predicts(evidence.nats(first, other)))]
+    alternatives = [
+        first,
+        *(
+            other
+            for other in kept[1:]
+            if len(other) == len(first) and not _predicts(evidence.nats(first, other))
+        ),
+    ]
     dropped = [a for a in alternatives if any(evidence.leaves_more(a, b) for b in alternatives)]
     return [effects for effects in kept if effects not in dropped]
 
@@ -484,10 +535,14 @@ def drifts_beside(evidence: Evidence, effects: frozenset[str], rest: Rest) -> li
     best = nats[drifts[0]]
     explained = float(evidence.gain(effects, _NOTHING)[0])
     exact = all(effect_named(e).exact for e in effects)
-    smallest = max(evidence.material_mps2 ** 2,
-                   (_SHARE_OF_SET if exact else _SHARE_OF_FORM) * explained)
-    if candidate[drifts[0]].drift_mps2 ** 2 <= smallest or not _predicts(best) \
-            or not _predicts(best - evidence.weights @ rest.steady_log_likelihood):
+    smallest = max(
+        evidence.material_mps2**2, (_SHARE_OF_SET if exact else _SHARE_OF_FORM) * explained
+    )
+    if (
+        candidate[drifts[0]].drift_mps2 ** 2 <= smallest
+        or not _predicts(best)
+        or not _predicts(best - evidence.weights @ rest.steady_log_likelihood)
+    ):
         return []
     return [d for d in drifts if d == drifts[0] or not _predicts(best - nats[d])]
 
@@ -500,8 +555,13 @@ class _Answer(NamedTuple):
     groups: frozenset[frozenset[str]]
 
 
-def _answer(evidence: Evidence, rest: Rest, rest_material: float, drifts: Sequence[str],
-            detected: frozenset[str]) -> _Answer:
+def _answer(
+    evidence: Evidence,
+    rest: Rest,
+    rest_material: float,
+    drifts: Sequence[str],
+    detected: frozenset[str],
+) -> _Answer:
     """Apply the rule to the figures of all blocks, or of one draw of them."""
     minimal = minimal_sets(evidence)
     best = minimal[0]
@@ -518,16 +578,29 @@ def _answer(evidence: Evidence, rest: Rest, rest_material: float, drifts: Sequen
     named = () if evidence.wanders else drifts
     if not best and not detected and not named:
         # What neither repeats nor is noise at rest is no gap only while the noise is larger.
-        is_much = above > max(evidence.floor_mps2 ** 2, evidence.material_power(1.0))
+        is_much = above > max(evidence.floor_mps2**2, evidence.material_power(1.0))
         return _Answer('unknown' if is_much else 'no_gap', _NOTHING, frozenset())
     # The order of two sets could be that of their errors of form, where these are as large as
     # the rest that the best set leaves; or that of errors of the reference in motion.
-    smallest = max(left, evidence.errs_in_motion * evidence.reference_mps2 ** 2)
-    rivals = [other for other in minimal[1:] if len(other) == len(best) and not (
-        _predicts(evidence.nats(best, other)) and float(evidence.gain(best, other)[0]) > smallest)
-        and not evidence.leaves_more(other, best)]
-    groups = {group for e in best if len(group := frozenset({e}).union(
-        *(other - best for other in rivals if e not in other))) > 1}
+    smallest = max(left, evidence.errs_in_motion * evidence.reference_mps2**2)
+    rivals = [
+        other
+        for other in minimal[1:]
+        if len(other) == len(best)
+        and not (
+            _predicts(evidence.nats(best, other))
+            and float(evidence.gain(best, other)[0]) > smallest
+        )
+        and not evidence.leaves_more(other, best)
+    ]
+    groups = {
+        group
+        for e in best
+        if len(
+            group := frozenset({e}).union(*(other - best for other in rivals if e not in other))
+        )
+        > 1
+    }
     certain = best.difference(*groups) | detected | {*named[:1]}
     if len(named) > 1:
         groups, certain = groups | {frozenset(named)}, certain - {*named}
@@ -541,17 +614,24 @@ def _answer(evidence: Evidence, rest: Rest, rest_material: float, drifts: Sequen
     return _Answer(status, certain, frozenset(groups))
 
 
-def decide(evidence: Evidence, rest_of: Callable[[frozenset[str], str], Rest],
-           detected: Sequence[str],
-           simulate_again: Callable[[frozenset[str]], SimulatedAgain] | None = None) -> Verdict:
+def decide(
+    evidence: Evidence,
+    rest_of: Callable[[frozenset[str], str], Rest],
+    detected: Sequence[str],
+    simulate_again: Callable[[frozenset[str]], SimulatedAgain] | None = None,
+) -> Verdict:
     """
     Apply the rule to the figures, and to draws of their blocks.
 
     simulate_again: simulates a set that could be the answer.
     """
     if simulate_again is not None:
-        evidence = replace(evidence, again={
-            effects: simulate_again(effects) for effects in minimal_sets(evidence) if effects})
+        evidence = replace(
+            evidence,
+            again={
+                effects: simulate_again(effects) for effects in minimal_sets(evidence) if effects
+            },
+        )
     best = minimal_sets(evidence)[0]
     rest = rest_of(best, HEALTHY)
     drifts = drifts_beside(evidence, best, rest)
@@ -562,22 +642,33 @@ def decide(evidence: Evidence, rest_of: Callable[[frozenset[str], str], Rest],
     # What follows the pose may be of the reference.
     pose = max((power[d] for d in _POSE & {*power}), default=0.0)
     rest_material = evidence.material_power(
-        float(np.clip(pose / repeats.value, 0.0, 1.0)) if repeats.value > 0 else 0.0)
-    answer, *drawn = (_answer(replace(evidence, weights=weights), rest, rest_material, drifts,
-                              frozenset(detected))
-                      for weights in (evidence.weights, *evidence.weights[1:, None]))
+        float(np.clip(pose / repeats.value, 0.0, 1.0)) if repeats.value > 0 else 0.0
+    )
+    answer, *drawn = (
+        _answer(
+            replace(evidence, weights=weights), rest, rest_material, drifts, frozenset(detected)
+        )
+        for weights in (evidence.weights, *evidence.weights[1:, None])
+    )
     highest = max(evidence.interval(evidence.gain(e, _NOTHING)).high for e in evidence.candidates)
     probability, hypotheses = _probabilities(answer, drawn)
     strongest = sorted(power, key=lambda d: -power[d])
     return Verdict(
-        answer.status, tuple(sorted(answer.effects)),
-        tuple(sorted(tuple(sorted(g)) for g in answer.groups)), probability, hypotheses, best,
-        evidence.material_mps2, evidence.reference_mps2,
-        evidence.interval(evidence.gain(best, _NOTHING)), repeats,
+        answer.status,
+        tuple(sorted(answer.effects)),
+        tuple(sorted(tuple(sorted(g)) for g in answer.groups)),
+        probability,
+        hypotheses,
+        best,
+        evidence.material_mps2,
+        evidence.reference_mps2,
+        evidence.interval(evidence.gain(best, _NOTHING)),
+        repeats,
         evidence.interval(evidence.left(best)),
         float(np.sqrt(max(highest, repeats.high, evidence.material_power(1.0)))),
         {e: evidence.interval(evidence.gain(best, best - {e})) for e in sorted(best)},
-        tuple(d for d in strongest if power[d] > 0 and power[d] >= power[strongest[0]] / 2))
+        tuple(d for d in strongest if power[d] > 0 and power[d] >= power[strongest[0]] / 2),
+    )
 
 
 def _sets(answer: _Answer) -> list[frozenset[str]]:
@@ -587,8 +678,9 @@ def _sets(answer: _Answer) -> list[frozenset[str]]:
     return [answer.effects | set(choice) for choice in product(*answer.groups)]
 
 
-def _probabilities(answer: _Answer, drawn: Sequence[_Answer]
-                   ) -> tuple[float, tuple[WeightedHypothesis, ...]]:
+def _probabilities(
+    answer: _Answer, drawn: Sequence[_Answer]
+) -> tuple[float, tuple[WeightedHypothesis, ...]]:
     """Return the probability of the answer, and of all sets, none above the answer's."""
     named, votes = set(_sets(answer)), dict[frozenset[str], float]()
     for sets in map(_sets, drawn):
@@ -596,8 +688,11 @@ def _probabilities(answer: _Answer, drawn: Sequence[_Answer]
             votes[effects] = votes.get(effects, 0.0) + 1 / len(sets)
     agreed = sum(count for effects, count in votes.items() if effects in named)
     probability = float(np.interp(agreed / len(drawn), _REPEATED, _RIGHT))
-    weights = {e: min(count / (len(drawn) - agreed) * (1 - probability), probability)
-               for e, count in votes.items() if e not in named}
+    weights = {
+        e: min(count / (len(drawn) - agreed) * (1 - probability), probability)
+        for e, count in votes.items()
+        if e not in named
+    }
     weights |= {effects: probability / len(named) for effects in named}
     missing = 1.0 - sum(weights.values())
     remaining = frozenset(() if answer.status == 'unknown' else {UNKNOWN})

@@ -37,8 +37,10 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         try:
             folder = tempfile.mkdtemp(_SUFFIX, f'.{target.name}.', target.parent)
         except OSError as error:
-            raise UserError(f'{target}: cannot write into {target.parent}: {error.strerror}; '
-                            'choose a directory that exists and can be written') from None
+            raise UserError(
+                f'{target}: cannot write into {target.parent}: {error.strerror}; '
+                'choose a directory that exists and can be written'
+            ) from None
         fresh = Path(folder, target.name)
         with _locked(Path(folder)):
             yield fresh
@@ -69,8 +71,9 @@ def _exchange(fresh: Path, target: Path) -> None:
     """
     try:
         swap = ctypes.CDLL(None, use_errno=True).renameat2
-        failed = swap(_AT_FDCWD, os.fsencode(fresh), _AT_FDCWD, os.fsencode(target),
-                      _RENAME_EXCHANGE)
+        failed = swap(
+            _AT_FDCWD, os.fsencode(fresh), _AT_FDCWD, os.fsencode(target), _RENAME_EXCHANGE
+        )
     except AttributeError:
         failed = True
     if failed:

@@ -31,8 +31,16 @@ _RECORD_HEAD = struct.Struct('<BQ')  # Operation code and length of a record
 _CHUNK_HEAD = struct.Struct('<QQQII')
 """First and last time of a chunk, its size, CRC-32, and the length of its compression's name; the
 name and the 8 bytes of the length of its records follow."""
-_MESSAGE_HEAD = np.dtype([('code', 'u1'), ('size', '<u8'), ('channel', '<u2'), ('sequence', '<u4'),
-                          ('log_ns', '<u8'), ('publish_ns', '<u8')])
+_MESSAGE_HEAD = np.dtype(
+    [
+        ('code', 'u1'),
+        ('size', '<u8'),
+        ('channel', '<u2'),
+        ('sequence', '<u4'),
+        ('log_ns', '<u8'),
+        ('publish_ns', '<u8'),
+    ]
+)
 """Beginning of a message record; the CDR follows."""
 _INDEX_HEAD = struct.Struct('<BQHI')
 """Code and size of a message index record, its channel and the size of its entries, bytes."""
@@ -73,31 +81,46 @@ def _collected_pieces(messages: Iterable[tuple[str, bytes, int]]) -> Iterator[Pi
 
 def _in_order(storage: Any, topics: Mapping[int, str]) -> list[Any]:
     """Return the chunks with messages of some topics, if `_read_chunk` can read all of them."""
-    chunks = [chunk for chunk in getattr(storage, 'chunks', ())
-              if any(chunk.channel_count.get(channel, 0) for channel in topics)]
+    chunks = [
+        chunk
+        for chunk in getattr(storage, 'chunks', ())
+        if any(chunk.channel_count.get(channel, 0) for channel in topics)
+    ]
     chunks.sort(key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
-    is_ordered = all(first.message_end_time <= second.message_start_time
-                     and first.chunk_start_offset < second.chunk_start_offset
-                     for first, second in pairwise(chunks))
+    is_ordered = all(
+        first.message_end_time <= second.message_start_time
+        and first.chunk_start_offset < second.chunk_start_offset
+        for first, second in pairwise(chunks)
+    )
     return chunks if is_ordered and len(set(topics.values())) == len(topics) else []
 
 
 def _read_chunk(file: Any, chunk: Any, topics: Mapping[int, str]) -> Piece:
     """Read the messages of a chunk, each topic of one channel, by its message indices."""
     from rosbags.rosbag2.storage_mcap import decompress
+
     file.seek(chunk.chunk_start_offset + _RECORD_HEAD.size)
     *_, crc, name_bytes = _CHUNK_HEAD.unpack(file.read(_CHUNK_HEAD.size))
     file.seek(name_bytes + 8, os.SEEK_CUR)
-    data = np.frombuffer(decompress(file.read(chunk.compressed_size), chunk.compression,
-                                    chunk.uncompressed_size, crc), np.uint8)
+    data = np.frombuffer(
+        decompress(
+            file.read(chunk.compressed_size), chunk.compression, chunk.uncompressed_size, crc
+        ),
+        np.uint8,
+    )
     if os.fstat(file.fileno()).st_size > _LARGE_BYTES:
         # From its begin on, because the system keeps a large page that is only partly within.
         os.posix_fadvise(file.fileno(), 0, file.tell(), os.POSIX_FADV_DONTNEED)
-    indices = {channel: _index(file, chunk, channel) for channel in topics
-               if chunk.channel_count.get(channel, 0)}
+    indices = {
+        channel: _index(file, chunk, channel)
+        for channel in topics
+        if chunk.channel_count.get(channel, 0)
+    }
     raws = {topics[channel]: _messages(data, channel, index) for channel, index in indices.items()}
-    return Piece(raws, {topics[channel]: index['log_ns'].astype(np.int64)
-                        for channel, index in indices.items()})
+    return Piece(
+        raws,
+        {topics[channel]: index['log_ns'].astype(np.int64) for channel, index in indices.items()},
+    )
 
 
 def _index(file: Any, chunk: Any, channel: int) -> np.ndarray:
@@ -119,14 +142,19 @@ def _messages(data: np.ndarray, channel: int, entries: np.ndarray) -> Raws:
     heads = sliding_window_view(data, head_bytes)[offset].view(_MESSAGE_HEAD)[:, 0]
     begin = offset + head_bytes
     sizes = heads['size'].astype(np.int64) + _RECORD_HEAD.size - head_bytes
-    if ((heads['code'] != _MESSAGE) | (heads['channel'] != channel)
-            | (heads['log_ns'] != entries['log_ns']) | (sizes < 1)
-            | (begin + sizes > len(data))).any():
+    if (
+        (heads['code'] != _MESSAGE)
+        | (heads['channel'] != channel)
+        | (heads['log_ns'] != entries['log_ns'])
+        | (sizes < 1)
+        | (begin + sizes > len(data))
+    ).any():
         raise ValueError('a message index does not describe its chunk')
     if (sizes == sizes[0]).all():
         return sliding_window_view(data, int(sizes[0]))[begin]
-    return [data[first:last].tobytes()
-            for first, last in zip(begin.tolist(), (begin + sizes).tolist())]
+    return [
+        data[first:last].tobytes() for first, last in zip(begin.tolist(), (begin + sizes).tolist())
+    ]
 
 
 class Batch(NamedTuple):
@@ -143,10 +171,12 @@ def write_messages(writer: Any, batches: Sequence[Batch]) -> None:
         writer.storage.close_chunk()
     size = sum(batch.data.shape[1] + _MESSAGE_HEAD.itemsize for batch in batches)
     stamps = batches[0].stamp_ns
-    for begin, end in pairwise([*stamps[::max(_CHUNK_BYTES // size, 1)], stamps[-1] + 1]):
-        parts = [Batch(connection, stamp_ns[part], data[part])
-                 for connection, stamp_ns, data in batches
-                 for part in [slice(*np.searchsorted(stamp_ns, (begin, end)))]]
+    for begin, end in pairwise([*stamps[:: max(_CHUNK_BYTES // size, 1)], stamps[-1] + 1]):
+        parts = [
+            Batch(connection, stamp_ns[part], data[part])
+            for connection, stamp_ns, data in batches
+            for part in [slice(*np.searchsorted(stamp_ns, (begin, end)))]
+        ]
         _write_chunk(writer, [part for part in parts if len(part.data)])
 
 
@@ -176,14 +206,19 @@ def _write_chunk(writer: Any, batches: list[Batch]) -> None:
     begin, offsets = storage.bio.tell(), b''
     for channel, index in indices.items():
         offsets += _INDEX_OFFSET.pack(channel, storage.bio.tell())
-        storage.bio.write(_INDEX_HEAD.pack(_MESSAGE_INDEX, len(index) + 6, channel, len(index))
-                          + index)
+        storage.bio.write(
+            _INDEX_HEAD.pack(_MESSAGE_INDEX, len(index) + 6, channel, len(index)) + index
+        )
     # The entry of the chunk in the index of the file states no message index yet.
     entry = storage.chunks[-1]
     text = entry.getvalue()
     entry.seek(_INDEX_BYTE)
-    entry.write(len(offsets).to_bytes(4, 'little') + offsets
-                + (storage.bio.tell() - begin).to_bytes(8, 'little') + text[_INDEX_BYTE + 12:])
+    entry.write(
+        len(offsets).to_bytes(4, 'little')
+        + offsets
+        + (storage.bio.tell() - begin).to_bytes(8, 'little')
+        + text[_INDEX_BYTE + 12 :]
+    )
 
 
 _MAGIC = b'\x89MCAP0\r\n'  # First and last bytes of a whole file (specification, "Magic")
@@ -200,6 +235,7 @@ def _is_unfinished(path: Path) -> bool:
 def _open_unfinished(path: Path) -> tuple[Any, str]:
     """Return a reader of rosbags up to the last whole record of a file, and where that ends."""
     from rosbags.rosbag2.storage_mcap import McapReader
+
     reader = McapReader(path)
     reader.bio = file = open(path, 'rb')  # noqa: SIM115 (closed with the reader)
     size = os.fstat(file.fileno()).st_size
@@ -226,22 +262,31 @@ class Bag:
         self.path = path  # The file or directory, for messages
         self.cut = cut  # Where damaged files end; empty if all are whole
         # Topics that hold messages, each with its type
-        self.types = {(connection.topic, connection.msgtype) for storage in storages
-                      for connection in storage.connections if connection.msgcount}
+        self.types = {
+            (connection.topic, connection.msgtype)
+            for storage in storages
+            for connection in storage.connections
+            if connection.msgcount
+        }
         self.done = 0.0  # Fraction of the recording that has been read
         self._storages, self._is_packed = storages, is_packed
 
     def pieces(self, topics: Collection[str]) -> Iterator[Piece]:
         """Yield the messages of some topics in pieces, in the order of recording."""
         for number, storage in enumerate(self._storages):
-            connections = [connection for connection in storage.connections
-                           if connection.topic in topics and connection.msgcount]
+            connections = [
+                connection
+                for connection in storage.connections
+                if connection.topic in topics and connection.msgcount
+            ]
             names = {connection.id: connection.topic for connection in connections}
             chunks = [] if self._is_packed else _in_order(storage, names)
-            pieces = (_read_chunk(storage.bio, chunk, names) for chunk in chunks) \
-                if chunks else _collected_pieces(self._messages(storage, connections))
-            total = len(chunks) or \
-                sum(each.msgcount for each in connections) / _PIECE_MESSAGES
+            pieces = (
+                (_read_chunk(storage.bio, chunk, names) for chunk in chunks)
+                if chunks
+                else _collected_pieces(self._messages(storage, connections))
+            )
+            total = len(chunks) or sum(each.msgcount for each in connections) / _PIECE_MESSAGES
             with _readable(self.path):
                 for count, piece in enumerate(pieces, 1):
                     self.done = (number + min(count / total, 1.0)) / len(self._storages)
@@ -279,8 +324,10 @@ def import_rosbags() -> Any:
     try:
         import rosbags.rosbag2
     except ImportError:
-        raise UserError('rosbag2 recordings need the Python package rosbags: '
-                        + install_hint('rosbags>=0.11.8,<0.12')) from None
+        raise UserError(
+            'rosbag2 recordings need the Python package rosbags: '
+            + install_hint('rosbags>=0.11.8,<0.12')
+        ) from None
     return rosbags.rosbag2
 
 
@@ -314,8 +361,10 @@ def _files(path: Path) -> list[Path]:
         return [path]
     files = [file for file in path.iterdir() if file.suffix in _ENDINGS]
     if not files:
-        raise UserError(f'{path}: is a directory without metadata.yaml, .mcap or .db3 files; '
-                        'expected a rosbag2 recording; ros2 bag reindex writes metadata.yaml')
+        raise UserError(
+            f'{path}: is a directory without metadata.yaml, .mcap or .db3 files; '
+            'expected a rosbag2 recording; ros2 bag reindex writes metadata.yaml'
+        )
     return sorted(files, key=lambda file: (len(file.name), file.name))  # 10 comes behind 9
 
 
@@ -343,7 +392,7 @@ def find_topics(bag: Bag, topic: str = '', has_stage: bool = True) -> Topics:
     """
     imu = find_imu(bag, topic)
     is_own = imu.endswith('imu/data_raw')
-    space = imu.removesuffix('imu/data_raw') if is_own else imu[:imu.rfind('/') + 1]
+    space = imu.removesuffix('imu/data_raw') if is_own else imu[: imu.rfind('/') + 1]
 
     def beside(name: str, kind: str) -> str | None:
         """Return a topic in the namespace of the sensor; other nodes use these names, too."""
@@ -352,8 +401,9 @@ def find_topics(bag: Bag, topic: str = '', has_stage: bool = True) -> Topics:
     temperature, supply = beside('temperature', TEMPERATURE), beside('supply', BATTERY_STATE)
     if not has_stage:
         return Topics(imu, temperature=temperature, supply=supply)
-    joints = beside('stage/joint_states', JOINT_STATE) or _only(bag, 'stage/joint_states',
-                                                                JOINT_STATE)
+    joints = beside('stage/joint_states', JOINT_STATE) or _only(
+        bag, 'stage/joint_states', JOINT_STATE
+    )
     info = beside('sensor_info', DIAGNOSTIC_STATUS)
     # With several sensors, the only sensor_info may be that of another one.
     if info is None and (is_own or [kind for _, kind in bag.types].count(IMU) == 1):
@@ -367,13 +417,20 @@ def choose_topic(bag: Bag, kind: str, own: str, named: str, option: str = '--top
     topics = sorted(topic for topic, other in bag.types if other == kind)
     if not topics:
         held = ', '.join(f'{topic} ({kind})' for topic, kind in sorted(bag.types))
-        raise UserError(f'{bag.path}: no topic of type {kind}; it holds {held or "no messages"}'
-                        + f'; {bag.cut}' * bool(bag.cut))
-    chosen = [topic for topic in topics if topic.strip('/') == named.strip('/')] if named else \
-        [topic for topic in topics if f'/{topic}'.endswith(f'/{own}')] or topics
+        raise UserError(
+            f'{bag.path}: no topic of type {kind}; it holds {held or "no messages"}'
+            + f'; {bag.cut}' * bool(bag.cut)
+        )
+    chosen = (
+        [topic for topic in topics if topic.strip('/') == named.strip('/')]
+        if named
+        else [topic for topic in topics if f'/{topic}'.endswith(f'/{own}')] or topics
+    )
     if len(chosen) != 1:
-        raise UserError(f'{bag.path}: {len(chosen) or "no"} topics {named or kind}; choose one '
-                        f'with {option}: {", ".join(chosen or topics)}')
+        raise UserError(
+            f'{bag.path}: {len(chosen) or "no"} topics {named or kind}; choose one '
+            f'with {option}: {", ".join(chosen or topics)}'
+        )
     return chosen[0]
 
 
@@ -384,17 +441,21 @@ def find_imu(bag: Bag, named: str = '') -> str:
 
 def _only(bag: Bag, name: str, kind: str) -> str | None:
     """Return the topic of this name in any namespace; None if there is none."""
-    topics = sorted(topic for topic, other in bag.types
-                    if other == kind and f'/{topic}'.endswith(f'/{name}'))
+    topics = sorted(
+        topic for topic, other in bag.types if other == kind and f'/{topic}'.endswith(f'/{name}')
+    )
     if len(topics) > 1:
-        raise UserError(f'{bag.path}: several topics {name}: {", ".join(topics)}; record one '
-                        f'sensor, or choose one: --topic {topics[0]}')
+        raise UserError(
+            f'{bag.path}: several topics {name}: {", ".join(topics)}; record one '
+            f'sensor, or choose one: --topic {topics[0]}'
+        )
     return topics[0] if topics else None
 
 
 def typestore() -> Any:
     """Return the message definitions of ROS 2 Jazzy."""
     from rosbags.typesys import get_typestore, Stores
+
     return get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -410,10 +471,13 @@ def read_info(bag: Bag, topic: str | None) -> dict[str, str]:
         new = {pair.key: pair.value for pair in message.values}
         for key in ('serial', 'axes', *NOMINAL_KEYS):
             if info.get(key, new.get(key)) != new.get(key):
-                raise UserError(f'{bag.path}: topic {topic}: {key} changes from {info[key]} to '
-                                f'{new.get(key)}; record each sensor by itself')
+                raise UserError(
+                    f'{bag.path}: topic {topic}: {key} changes from {info[key]} to '
+                    f'{new.get(key)}; record each sensor by itself'
+                )
         info = new
     if info.get('axes', 'x') not in MEASURED_AXES:
-        raise UserError(f"{bag.path}: topic {topic}: axes is {info['axes']!r}, "
-                        'expected x, xy or xyz')
+        raise UserError(
+            f'{bag.path}: topic {topic}: axes is {info["axes"]!r}, expected x, xy or xyz'
+        )
     return info

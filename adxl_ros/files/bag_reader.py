@@ -48,18 +48,22 @@ _ABSENT_VARIANCE = 1e5
 _EXACT_NS = 1 << 53  # Largest time, ns, that float64 resolves to single nanoseconds
 
 
-def blocks(path: str | os.PathLike, rows: int, ideal: bool = False,
-           reading: ReadingOptions = AS_IT_IS) -> Generator[Recording, None, None]:
+def blocks(
+    path: str | os.PathLike, rows: int, ideal: bool = False, reading: ReadingOptions = AS_IT_IS
+) -> Generator[Recording, None, None]:
     """Read a bag in blocks of at most `rows` samples."""
     with open_bag(path) as bag:
         if reading.mapping is not None:
-            raise UserError(f'{bag.path}: is a bag, which has no columns; leave --columns out: '
-                            '--topic names a topic, and --unit states its unit')
+            raise UserError(
+                f'{bag.path}: is a bag, which has no columns; leave --columns out: '
+                '--topic names a topic, and --unit states its unit'
+            )
         topics = find_topics(bag, reading.topic, has_stage=not ideal)
         info = read_info(bag, topics.info)
         tracks, commands = _tracks(bag, topics), _commands(bag, topics)
-        samples = _Samples(f'{bag.path}: topic {topics.imu}', AXES if ideal else info.get('axes'),
-                           reading)
+        samples = _Samples(
+            f'{bag.path}: topic {topics.imu}', AXES if ideal else info.get('axes'), reading
+        )
         for piece in bag.pieces([topics.imu]):
             samples.add(piece.messages[topics.imu])
             while len(samples.stamp_ns) > rows:
@@ -85,15 +89,21 @@ class _Samples:
         self._reading = reading
         self._unit = reading.unit or 'mps2'  # Unit of the accelerations of the topic
         if UNITS[Quantity.OUTPUT][self._unit].is_volts:
-            raise UserError(f'--unit {self._unit}: {where} has accelerations; write one of '
-                            f'{", ".join((*GRAVITY, LSB))}')
+            raise UserError(
+                f'--unit {self._unit}: {where} has accelerations; write one of '
+                f'{", ".join((*GRAVITY, LSB))}'
+            )
         reading.check_counts(where, dict.fromkeys(ACCEL, self._unit))
         self._first_ns = 0
 
     def add(self, raws: Raws) -> None:
         """Decode and check further messages."""
-        stamp_ns, columns = _columns(self.where, raws, cdr.imu, lambda table: dict(
-            zip(ACCEL, table.numbers('linear_acceleration').T)))
+        stamp_ns, columns = _columns(
+            self.where,
+            raws,
+            cdr.imu,
+            lambda table: dict(zip(ACCEL, table.numbers('linear_acceleration').T)),
+        )
         force = self._reading.outputs(np.column_stack(list(columns.values())), 3 * [self._unit])
         if not self.count:
             self._begin(raws[:1], int(stamp_ns[0]))
@@ -115,9 +125,11 @@ class _Samples:
         if wrong.any():
             row, axis = np.argwhere(wrong)[0]
             advice = '' if np.isfinite(force[row, axis]) else f'; {DROP_SAMPLES}'
-            raise UserError(f'{place(row)}: linear_acceleration.{AXES[axis]} is '
-                            f'{force[row, axis]:g} m/s², expected a number within ±{LIMIT:g}'
-                            f'{advice}')
+            raise UserError(
+                f'{place(row)}: linear_acceleration.{AXES[axis]} is '
+                f'{force[row, axis]:g} m/s², expected a number within ±{LIMIT:g}'
+                f'{advice}'
+            )
         self.count += len(stamp_ns)
         self.stamp_ns = np.concatenate([self.stamp_ns, stamp_ns[is_kept]])
         self.force = np.concatenate([self.force, force[is_kept]])
@@ -125,8 +137,9 @@ class _Samples:
     @property
     def remarks(self) -> tuple[str, ...]:
         """Return what was left out, for people."""
-        left_out = f'{self.where}: left out, samples without a number on each axis: ' \
-                   f'{self.incomplete}'
+        left_out = (
+            f'{self.where}: left out, samples without a number on each axis: {self.incomplete}'
+        )
         return (*[left_out] * bool(self.incomplete), *self.stamps.remarks)
 
     def _begin(self, first: Raws, stamp_ns: int) -> None:
@@ -139,16 +152,19 @@ class _Samples:
             is_there = (variance < _ABSENT_VARIANCE) & (variance[0] != -1)
             self.axes = ''.join(np.array(list(AXES))[is_there])
         if self.axes not in MEASURED_AXES:
-            raise UserError(f'{self.where}: linear_acceleration_covariance gives the axes '
-                            f'{self.axes or "none"}, expected x, xy or xyz; record sensor_info')
+            raise UserError(
+                f'{self.where}: linear_acceleration_covariance gives the axes '
+                f'{self.axes or "none"}, expected x, xy or xyz; record sensor_info'
+            )
 
 
 Values = Callable[[cdr.Table], Mapping[str, np.ndarray]]
 """Returns the columns of messages, (k,) each, by name."""
 
 
-def _columns(where: str, raws: Raws, find: Callable[[bytes], cdr.Layout], values: Values
-             ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _columns(
+    where: str, raws: Raws, find: Callable[[bytes], cdr.Layout], values: Values
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return stamps, ns, (k,), and columns, (k,) each; NaN where a message has no value."""
     stamp_ns = np.empty(len(raws), np.int64)
     columns: dict[str, np.ndarray] = {}
@@ -162,18 +178,31 @@ def _columns(where: str, raws: Raws, find: Callable[[bytes], cdr.Layout], values
     return stamp_ns, columns
 
 
-def series(bag: Bag, topic: str, find: Callable[[bytes], cdr.Layout], values: Values
-           ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+def series(
+    bag: Bag, topic: str, find: Callable[[bytes], cdr.Layout], values: Values
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Return stamps and log times, ns, (k,), and columns, (k,), of all messages of a topic."""
-    logs, stamps, columns = zip(*((piece.log_ns[topic], *_columns(
-        f'{bag.path}: topic {topic}', piece.messages[topic], find, values))
-        for piece in bag.pieces([topic])))
+    logs, stamps, columns = zip(
+        *(
+            (
+                piece.log_ns[topic],
+                *_columns(f'{bag.path}: topic {topic}', piece.messages[topic], find, values),
+            )
+            for piece in bag.pieces([topic])
+        )
+    )
     log_ns = np.concatenate(logs)
     order = np.argsort(log_ns, kind='stable')  # A file that was cut off has no index by time
-    return np.concatenate(stamps)[order], log_ns[order], {
-        name: np.concatenate([part.get(name, np.full(len(log), np.nan))
-                              for part, log in zip(columns, logs)])[order]
-        for name in dict.fromkeys(name for part in columns for name in part)}
+    return (
+        np.concatenate(stamps)[order],
+        log_ns[order],
+        {
+            name: np.concatenate(
+                [part.get(name, np.full(len(log), np.nan)) for part, log in zip(columns, logs)]
+            )[order]
+            for name in dict.fromkeys(name for part in columns for name in part)
+        },
+    )
 
 
 def positions(table: cdr.Table, names: Mapping[str, str] | None = None) -> dict[str, np.ndarray]:
@@ -182,19 +211,31 @@ def positions(table: cdr.Table, names: Mapping[str, str] | None = None) -> dict[
         return {}
     joints = [text for key, text in table.layout.texts.items() if key != 'frame_id']
     values = dict(zip(joints, table.numbers('position').T))
-    return values if names is None else {
-        column: values[joint] for joint, column in names.items() if joint in values}
+    return (
+        values
+        if names is None
+        else {column: values[joint] for joint, column in names.items() if joint in values}
+    )
 
 
 def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
     """Return the references by column; none of a joint without a position."""
     tracks = {}
     for topic, find, longest_ns, values in (
-            (topics.joints, cdr.joint_state, LONGEST_MOVE_NS, partial(positions, names=JOINTS)),
-            (topics.temperature, cdr.temperature, np.inf,
-             lambda table: {'temperature_c': table.numbers('temperature')[:, 0]}),
-            (topics.supply, cdr.battery_state, np.inf,
-             lambda table: {'supply_v': table.numbers('voltage')[:, 0]})):
+        (topics.joints, cdr.joint_state, LONGEST_MOVE_NS, partial(positions, names=JOINTS)),
+        (
+            topics.temperature,
+            cdr.temperature,
+            np.inf,
+            lambda table: {'temperature_c': table.numbers('temperature')[:, 0]},
+        ),
+        (
+            topics.supply,
+            cdr.battery_state,
+            np.inf,
+            lambda table: {'supply_v': table.numbers('voltage')[:, 0]},
+        ),
+    ):
         if not topic:
             continue
         where = f'{bag.path}: topic {topic}'
@@ -202,8 +243,10 @@ def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
         for name, value in columns.items():
             wrong = np.abs(value) > LIMIT
             if wrong.any():
-                raise UserError(f'{where}: {name} is {value[wrong.argmax()]:g} at '
-                                f'{seconds(stamp_ns[wrong.argmax()])}, beyond ±{LIMIT:g}')
+                raise UserError(
+                    f'{where}: {name} is {value[wrong.argmax()]:g} at '
+                    f'{seconds(stamp_ns[wrong.argmax()])}, beyond ±{LIMIT:g}'
+                )
             tracks[name] = Track(where, stamp_ns, value, longest_ns)
     return tracks
 
@@ -217,8 +260,9 @@ def _commands(bag: Bag, topics: Topics) -> dict[str, tuple[np.ndarray, np.ndarra
     """
     if not topics.command:
         return {}
-    stamp_ns, log_ns, columns = series(bag, topics.command, cdr.joint_state,
-                                       partial(positions, names=COMMANDS))
+    stamp_ns, log_ns, columns = series(
+        bag, topics.command, cdr.joint_state, partial(positions, names=COMMANDS)
+    )
     stamp_ns = np.where(stamp_ns == 0, log_ns, stamp_ns)
     commands = {}
     for name, value in columns.items():
@@ -228,13 +272,18 @@ def _commands(bag: Bag, topics: Topics) -> dict[str, tuple[np.ndarray, np.ndarra
     return commands
 
 
-def _block(bag: Bag, samples: _Samples, tracks: Mapping[str, Track],
-           commands: Mapping[str, tuple[np.ndarray, np.ndarray]], info: Mapping[str, str],
-           rows: int) -> Recording:
+def _block(
+    bag: Bag,
+    samples: _Samples,
+    tracks: Mapping[str, Track],
+    commands: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    info: Mapping[str, str],
+    rows: int,
+) -> Recording:
     """Take a block of waiting samples, with references and commands at their stamps."""
     stamp_ns, samples.stamp_ns = samples.stamp_ns[:rows], samples.stamp_ns[rows:]
     force, samples.force = samples.force[:rows], samples.force[rows:]
-    columns = dict(zip(ACCEL[:len(samples.axes or '')], force.T.copy()))
+    columns = dict(zip(ACCEL[: len(samples.axes or '')], force.T.copy()))
     columns |= {name: track.interpolate(stamp_ns) for name, track in tracks.items()}
     alignments = {name: track.alignment for name, track in tracks.items()}
     for name, (begin_ns, value) in commands.items():
@@ -243,8 +292,18 @@ def _block(bag: Bag, samples: _Samples, tracks: Mapping[str, Track],
     # A division gives the float64 nearest to the decimal number, a product with 1e-9 does not.
     time_s = (stamp_ns - samples.epoch_ns) / 1e9
     cut = f'{bag.cut}; the last sample read is at {seconds(stamp_ns[-1])}' if bag.cut else ''
-    return Recording(bag.path, time_s, columns, dict(info), alignments, cut, samples.epoch_ns,
-                     bag.done, samples.remarks, samples.stamps.bad)
+    return Recording(
+        bag.path,
+        time_s,
+        columns,
+        dict(info),
+        alignments,
+        cut,
+        samples.epoch_ns,
+        bag.done,
+        samples.remarks,
+        samples.stamps.bad,
+    )
 
 
 def log_times(path: str | os.PathLike, topic: str) -> Iterator[np.ndarray]:
@@ -252,6 +311,7 @@ def log_times(path: str | os.PathLike, topic: str) -> Iterator[np.ndarray]:
     with open_bag(path) as bag:
         imu = find_imu(bag, topic)
         for piece in bag.pieces([imu]):
-            stamp_ns, _ = _columns(f'{bag.path}: topic {imu}', piece.messages[imu], cdr.header,
-                                   lambda table: {})
+            stamp_ns, _ = _columns(
+                f'{bag.path}: topic {imu}', piece.messages[imu], cdr.header, lambda table: {}
+            )
             yield np.column_stack([stamp_ns, piece.log_ns[imu]])

@@ -60,22 +60,29 @@ class _NewBag:
         """Return the connection of a topic; without a QoS, `ros2 bag play` takes its default."""
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(
-                topic, kind, typestore=self.types, offered_qos_profiles=qos)
+                topic, kind, typestore=self.types, offered_qos_profiles=qos
+            )
         return self.connections[topic]
 
-    def batch(self, topic: str, form: Form, stamp_ns: np.ndarray,
-              fields: Mapping[str, np.ndarray]) -> Batch:
+    def batch(
+        self, topic: str, form: Form, stamp_ns: np.ndarray, fields: Mapping[str, np.ndarray]
+    ) -> Batch:
         """Return the messages of a topic at stamps, ns, (n,), rising."""
-        return Batch(self.connection(topic, form.kind), stamp_ns,
-                     cdr.fill(form.template, form.find, stamp_ns, fields))
+        return Batch(
+            self.connection(topic, form.kind),
+            stamp_ns,
+            cdr.fill(form.template, form.find, stamp_ns, fields),
+        )
 
     def append(self, batches: Sequence[Batch]) -> None:
         """Append messages, those of the sensor first."""
         stamp_ns = batches[0].stamp_ns
         if stamp_ns[0] < 0 or stamp_ns[-1] >= _END_OF_TIME_NS:
-            raise UserError(f'{self.path}: times from {stamp_ns[0] / 1e9:g} to '
-                            f'{stamp_ns[-1] / 1e9:g} s cannot be stamps of ROS messages, '
-                            'which go from 0 to 2^31 s')
+            raise UserError(
+                f'{self.path}: times from {stamp_ns[0] / 1e9:g} to '
+                f'{stamp_ns[-1] / 1e9:g} s cannot be stamps of ROS messages, '
+                'which go from 0 to 2^31 s'
+            )
         write_messages(self.writer, batches)
         release_written(self.writer.storage.bio)
 
@@ -87,16 +94,18 @@ def _new_bag(path: str | os.PathLike) -> Iterator[_NewBag]:
     with atomic_path(path) as fresh:
         # rosbags writes directories; of a name.mcap, only the file inside is kept.
         folder = fresh.with_suffix('') if fresh.suffix == '.mcap' else fresh
-        with rosbag2.Writer(folder, version=9,
-                            storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+        with rosbag2.Writer(
+            folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
+        ) as writer:
             yield _NewBag(Path(path), writer)
         if folder != fresh:
             os.replace(folder / f'{folder.name}.mcap', fresh)
 
 
 @contextmanager
-def recording_bag(path: str | os.PathLike, sensor: Sensor
-                  ) -> Iterator[Callable[[Recording], None]]:
+def recording_bag(
+    path: str | os.PathLike, sensor: Sensor
+) -> Iterator[Callable[[Recording], None]]:
     """
     Open a new bag, and yield a function that appends samples of a recording.
 
@@ -105,9 +114,10 @@ def recording_bag(path: str | os.PathLike, sensor: Sensor
     """
     variance = np.full(3, UNMEASURED_VARIANCE)
     noise = sample_std_v(sensor) / sensor.nominal_scale_v_per_g * G0_MPS2
-    variance[:len(sensor.axes)] = noise ** 2
+    variance[: len(sensor.axes)] = noise**2
     imu = _imu_form(np.diag(variance).ravel())
     with _new_bag(path) as bag:
+
         def append(recording: Recording) -> None:
             if not bag.connections:
                 _write_info(bag, recording, sensor)
@@ -115,19 +125,23 @@ def recording_bag(path: str | os.PathLike, sensor: Sensor
                 part = recording.rows(start, start + _ROWS_AT_ONCE)
                 accel = part.accel_mps2(sensor)
                 force = np.zeros((len(part), 3))
-                force[:, :accel.shape[1]] = accel
-                batches = [bag.batch('/imu/data_raw', imu, part.stamp_ns,
-                                     {'linear_acceleration': force}),
-                           *_joint_batches(bag, part.stamp_ns, part.columns, JOINTS,
-                                           '/stage/joint_states'),
-                           *_joint_batches(bag, part.stamp_ns, _changes(part.columns), COMMANDS,
-                                           '/stage/command')]
+                force[:, : accel.shape[1]] = accel
+                batches = [
+                    bag.batch('/imu/data_raw', imu, part.stamp_ns, {'linear_acceleration': force}),
+                    *_joint_batches(
+                        bag, part.stamp_ns, part.columns, JOINTS, '/stage/joint_states'
+                    ),
+                    *_joint_batches(
+                        bag, part.stamp_ns, _changes(part.columns), COMMANDS, '/stage/command'
+                    ),
+                ]
                 for column, (topic, field, form) in _SCALARS.items():
                     values = part.columns.get(column, np.zeros(0))
                     if not np.isnan(values).all():
                         known = ~np.isnan(values)
-                        batches.append(bag.batch(topic, form, part.stamp_ns[known],
-                                                 {field: values[known]}))
+                        batches.append(
+                            bag.batch(topic, form, part.stamp_ns[known], {field: values[known]})
+                        )
                 bag.append(batches)
 
         yield append
@@ -136,23 +150,45 @@ def recording_bag(path: str | os.PathLike, sensor: Sensor
 def _write_info(bag: _NewBag, recording: Recording, sensor: Sensor) -> None:
     """Write what the sensor states, latched for late subscribers of `ros2 bag play`."""
     from rosbags import interfaces as ros
+
     kinds = bag.types.types
     info = converted_info(recording.info, sensor)
     message = kinds[DIAGNOSTIC_STATUS](
-        level=0, name='sensor_info', message='', hardware_id=info['serial'],
-        values=[kinds['diagnostic_msgs/msg/KeyValue'](key=key, value=value)
-                for key, value in info.items()])
+        level=0,
+        name='sensor_info',
+        message='',
+        hardware_id=info['serial'],
+        values=[
+            kinds['diagnostic_msgs/msg/KeyValue'](key=key, value=value)
+            for key, value in info.items()
+        ],
+    )
     forever = ros.QosTime(*divmod(_LONGEST_NS, 1_000_000_000))
-    latched = ros.Qos(ros.QosHistory.KEEP_LAST, 1, ros.QosReliability.RELIABLE,
-                      ros.QosDurability.TRANSIENT_LOCAL, forever, forever,
-                      ros.QosLiveliness.AUTOMATIC, forever, False)
-    bag.writer.write(bag.connection('/sensor_info', DIAGNOSTIC_STATUS, [latched]),
-                     int(recording.stamp_ns[0]),
-                     bag.types.serialize_cdr(message, DIAGNOSTIC_STATUS))
+    latched = ros.Qos(
+        ros.QosHistory.KEEP_LAST,
+        1,
+        ros.QosReliability.RELIABLE,
+        ros.QosDurability.TRANSIENT_LOCAL,
+        forever,
+        forever,
+        ros.QosLiveliness.AUTOMATIC,
+        forever,
+        False,
+    )
+    bag.writer.write(
+        bag.connection('/sensor_info', DIAGNOSTIC_STATUS, [latched]),
+        int(recording.stamp_ns[0]),
+        bag.types.serialize_cdr(message, DIAGNOSTIC_STATUS),
+    )
 
 
-def _joint_batches(bag: _NewBag, stamp_ns: np.ndarray, columns: Mapping[str, np.ndarray],
-                   names: Mapping[str, str], topic: str) -> Iterator[Batch]:
+def _joint_batches(
+    bag: _NewBag,
+    stamp_ns: np.ndarray,
+    columns: Mapping[str, np.ndarray],
+    names: Mapping[str, str],
+    topic: str,
+) -> Iterator[Batch]:
     """Yield one batch for each set of joints that were sampled together."""
     none = np.full(len(stamp_ns), np.nan)
     values = np.column_stack([columns.get(column, none) for column in names.values()])
@@ -160,37 +196,60 @@ def _joint_batches(bag: _NewBag, stamp_ns: np.ndarray, columns: Mapping[str, np.
     for pattern in np.unique(is_sampled, axis=0):
         rows = (is_sampled == pattern).all(axis=1)
         sampled = [joint for joint, is_there in zip(names, pattern) if is_there]
-        template = cdr.message('', len(sampled), *sampled, len(sampled), np.zeros(len(sampled)),
-                               0, 0)
+        template = cdr.message(
+            '', len(sampled), *sampled, len(sampled), np.zeros(len(sampled)), 0, 0
+        )
         if sampled:
-            yield bag.batch(topic, Form(JOINT_STATE, cdr.joint_state, template), stamp_ns[rows],
-                            {'position': values[rows][:, pattern]})
+            yield bag.batch(
+                topic,
+                Form(JOINT_STATE, cdr.joint_state, template),
+                stamp_ns[rows],
+                {'position': values[rows][:, pattern]},
+            )
 
 
 def _changes(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return commands where they change and in the first row, NaN elsewhere."""
-    return {name: np.where(np.append(True, columns[name][1:] != columns[name][:-1]),
-                           columns[name], np.nan)
-            for name in COMMANDS.values() if name in columns}
+    return {
+        name: np.where(
+            np.append(True, columns[name][1:] != columns[name][:-1]), columns[name], np.nan
+        )
+        for name in COMMANDS.values()
+        if name in columns
+    }
 
 
 def _imu_form(covariance: np.ndarray) -> Form:
     """Return the form of an Imu without orientation and rate, by its covariance, (9,)."""
     absent = [-1.0, *[0.0] * 8]
-    return Form(IMU, cdr.imu, cdr.message(FRAME, [0.0, 0.0, 0.0, 1.0], absent, np.zeros(3), absent,
-                                          np.zeros(3), covariance))
+    return Form(
+        IMU,
+        cdr.imu,
+        cdr.message(
+            FRAME, [0.0, 0.0, 0.0, 1.0], absent, np.zeros(3), absent, np.zeros(3), covariance
+        ),
+    )
 
 
 _VOLTAGE = np.array([0.0, *[np.nan] * 6], np.float32)
 """Voltage of a battery; temperature, current, charge, capacities and percentage are unknown."""
 
 _SCALARS = {
-    'temperature_c': ('/temperature', 'temperature', Form(
-        TEMPERATURE, cdr.temperature, cdr.message(FRAME, np.zeros(2)))),
-    'supply_v': ('/supply', 'voltage', Form(
-        # Three states, present, no cell voltages and temperatures, location, serial number.
-        BATTERY_STATE, cdr.battery_state, cdr.message(
-            FRAME, _VOLTAGE, np.array([0, 0, 0, 1], np.uint8), 0, 0, '', ''))),
+    'temperature_c': (
+        '/temperature',
+        'temperature',
+        Form(TEMPERATURE, cdr.temperature, cdr.message(FRAME, np.zeros(2))),
+    ),
+    'supply_v': (
+        '/supply',
+        'voltage',
+        Form(
+            # Three states, present, no cell voltages and temperatures, location, serial number.
+            BATTERY_STATE,
+            cdr.battery_state,
+            cdr.message(FRAME, _VOLTAGE, np.array([0, 0, 0, 1], np.uint8), 0, 0, '', ''),
+        ),
+    ),
 }
 """Topic, field and form of references that are one number, by column."""
 
@@ -203,18 +262,30 @@ def tilt_bag(path: str | os.PathLike) -> Iterator[Callable[..., None]]:
     Its arguments are stamps, ns, (n,), rising; fields of sensor_msgs/Imu by name, (n, k) each;
     and roll, pitch and inclination, rad, (n, 3).
     """
-    forms = {'/imu/data': _imu_form(np.zeros(9)),
-             '/tilt': Form('geometry_msgs/msg/Vector3Stamped', cdr.vector3_stamped,
-                           cdr.message(FRAME, np.zeros(3)))}
+    forms = {
+        '/imu/data': _imu_form(np.zeros(9)),
+        '/tilt': Form(
+            'geometry_msgs/msg/Vector3Stamped',
+            cdr.vector3_stamped,
+            cdr.message(FRAME, np.zeros(3)),
+        ),
+    }
     with _new_bag(path) as bag:
         for topic, form in forms.items():
             bag.connection(topic, form.kind)
 
-        def append(stamp_ns: np.ndarray, imu_fields: Mapping[str, np.ndarray],
-                   tilt_rad: np.ndarray) -> None:
+        def append(
+            stamp_ns: np.ndarray, imu_fields: Mapping[str, np.ndarray], tilt_rad: np.ndarray
+        ) -> None:
             if len(stamp_ns):
-                bag.append([bag.batch(topic, form, stamp_ns, fields) for (topic, form), fields
-                            in zip(forms.items(), (imu_fields, {'vector': tilt_rad}))])
+                bag.append(
+                    [
+                        bag.batch(topic, form, stamp_ns, fields)
+                        for (topic, form), fields in zip(
+                            forms.items(), (imu_fields, {'vector': tilt_rad})
+                        )
+                    ]
+                )
 
         yield append
 

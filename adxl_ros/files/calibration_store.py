@@ -117,8 +117,9 @@ def put(folder: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ())
     try:
         folder_of_unit.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise UserError(f'{folder_of_unit}: cannot be made: {error.strerror}; name another store'
-                        ) from None
+        raise UserError(
+            f'{folder_of_unit}: cannot be made: {error.strerror}; name another store'
+        ) from None
     path = folder_of_unit / f'{_name(sensor.serial)}-{_version(sensor)}.yaml'
     parameter_file.save(path, sensor, comments)
     return path
@@ -156,11 +157,15 @@ def newest(folder: str | os.PathLike, serial: str, check: Callable[[Sensor], Non
 def newer(folder: str | os.PathLike, sensor: Sensor) -> Path | None:
     """Return the newest file of a unit if its name has a later date; no file is read."""
     begin = f'{_name(sensor.serial)}-'
-    files = [path for path in unit_folder(folder, sensor.serial).glob('*.yaml')
-             if re.match(r'\d{8}T\d{6}Z', path.name.removeprefix(begin))]
+    files = [
+        path
+        for path in unit_folder(folder, sensor.serial).glob('*.yaml')
+        if re.match(r'\d{8}T\d{6}Z', path.name.removeprefix(begin))
+    ]
     last, date = max(files, default=None), date_of(sensor)
-    is_newer = last and (not date or last.name.removeprefix(begin)[:_DATE_LETTERS]
-                         > f'{date:{_DATE}}')
+    is_newer = last and (
+        not date or last.name.removeprefix(begin)[:_DATE_LETTERS] > f'{date:{_DATE}}'
+    )
     return last if is_newer else None
 
 
@@ -183,8 +188,11 @@ def sha256(paths: Sequence[str | os.PathLike]) -> str:
         except OSError as error:
             raise UserError(f'{path}: cannot be read: {error.strerror}') from None
         checksums.append(checksum.hexdigest())
-    return checksums[0] if len(checksums) == 1 else \
-        hashlib.sha256(''.join(f'{line}\n' for line in checksums).encode()).hexdigest()
+    return (
+        checksums[0]
+        if len(checksums) == 1
+        else hashlib.sha256(''.join(f'{line}\n' for line in checksums).encode()).hexdigest()
+    )
 
 
 FORMAT = 1  # Version of the format. A file of another version is refused
@@ -200,10 +208,16 @@ _HEAD = """\
 def write_population(path: str | os.PathLike, population: Population) -> None:
     """Write a population."""
     contents = {
-        'format': FORMAT, 'version': package_version(),
+        'format': FORMAT,
+        'version': package_version(),
         'coefficients': {
-            name: {**{key: float(f'{value:.{_DIGITS}g}') for key, value in asdict(pooled).items()},
-                   'units': pooled.units} for name, pooled in population.coefficients.items()}}
+            name: {
+                **{key: float(f'{value:.{_DIGITS}g}') for key, value in asdict(pooled).items()},
+                'units': pooled.units,
+            }
+            for name, pooled in population.coefficients.items()
+        },
+    }
     text = yaml.safe_dump(contents, sort_keys=False, allow_unicode=True, default_flow_style=None)
     use = command('fit', f'NEW.mcap --prior {Path(path).name} -o unit.yaml')
     write_text(path, _HEAD.format(command=use) + text)
@@ -213,10 +227,14 @@ def read_population(path: str | os.PathLike) -> Population:
     """Read and check a population."""
     node = compose(path)
     contents = yaml.constructor.SafeConstructor().construct_document(node) if node else None
-    if not isinstance(contents, dict) or contents.get('format') != FORMAT \
-            or not isinstance(contents.get('coefficients'), dict):
-        raise UserError(f'{path}: no population of format {FORMAT}; give the population.yaml '
-                        'that fleet writes')
+    if (
+        not isinstance(contents, dict)
+        or contents.get('format') != FORMAT
+        or not isinstance(contents.get('coefficients'), dict)
+    ):
+        raise UserError(
+            f'{path}: no population of format {FORMAT}; give the population.yaml that fleet writes'
+        )
     pooled = {}
     for name, values in contents['coefficients'].items():
         try:
@@ -225,7 +243,9 @@ def read_population(path: str | os.PathLike) -> Population:
         except TypeError:
             is_right = False
         if not is_right:
-            raise UserError(f'{path}: coefficients.{name}: {values!r} is no set of numbers '
-                            f'{", ".join(each.name for each in fields(PooledCoefficient))}, with '
-                            'a positive prediction_std')
+            raise UserError(
+                f'{path}: coefficients.{name}: {values!r} is no set of numbers '
+                f'{", ".join(each.name for each in fields(PooledCoefficient))}, with '
+                'a positive prediction_std'
+            )
     return Population(Path(path).name, pooled)

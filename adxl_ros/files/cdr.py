@@ -66,7 +66,7 @@ class Layout:
         size = self.length()
         start = self._take(1, size)
         self.fixed += range(start, start + size)
-        self.texts[name] = self._raw[start:start + size].rstrip(b'\0').decode(errors='replace')
+        self.texts[name] = self._raw[start : start + size].rstrip(b'\0').decode(errors='replace')
 
     def _take(self, size: int, count: int = 1) -> int:
         """Pass over numbers of a size, and return where they begin: at a multiple of it."""
@@ -107,6 +107,7 @@ def joint_state(raw: bytes) -> Layout:
 
 def _one_field(name: str, code: str, count: int = 1) -> Callable[[bytes], Layout]:
     """Return what finds the field that follows the header."""
+
     def find(raw: bytes) -> Layout:
         layout = header(raw)
         layout.numbers(name, code, count)
@@ -148,7 +149,7 @@ class Table:
         """Return a field of all messages as float64, (n, count)."""
         field = self.layout.fields[name]
         size = int(field.code[1:]) * field.count
-        part = np.ascontiguousarray(self.data[:, field.offset:field.offset + size])
+        part = np.ascontiguousarray(self.data[:, field.offset : field.offset + size])
         return part.view(self.layout.order + field.code).astype(np.float64)
 
     def stamp_ns(self) -> np.ndarray:
@@ -163,10 +164,16 @@ def tables(raws: Sequence[bytes] | np.ndarray, find: Callable[[bytes], Layout]) 
         groups = [(np.arange(len(raws)), raws)]
     else:
         sizes = np.array([len(raw) for raw in raws])
-        groups = [(rows, np.frombuffer(b''.join([raws[i] for i in rows.tolist()]), np.uint8)
-                   .reshape(len(rows), size))
-                  for size in dict.fromkeys(sizes.tolist())
-                  for rows in [np.flatnonzero(sizes == size)]]
+        groups = [
+            (
+                rows,
+                np.frombuffer(b''.join([raws[i] for i in rows.tolist()]), np.uint8).reshape(
+                    len(rows), size
+                ),
+            )
+            for size in dict.fromkeys(sizes.tolist())
+            for rows in [np.flatnonzero(sizes == size)]
+        ]
     for rows, data in groups:
         while len(rows):
             layout = find(data[0].tobytes())
@@ -178,8 +185,12 @@ def tables(raws: Sequence[bytes] | np.ndarray, find: Callable[[bytes], Layout]) 
             rows, data = rows[differs], data[differs]
 
 
-def fill(template: bytes, find: Callable[[bytes], Layout], stamp_ns: np.ndarray,
-         fields: Mapping[str, np.ndarray]) -> np.ndarray:
+def fill(
+    template: bytes,
+    find: Callable[[bytes], Layout],
+    stamp_ns: np.ndarray,
+    fields: Mapping[str, np.ndarray],
+) -> np.ndarray:
     """Return the bytes, (n, size), of messages with stamps, ns, (n,), and fields, (n, count)."""
     layout = find(template)
     data = np.tile(np.frombuffer(template, np.uint8), (len(stamp_ns), 1))
@@ -187,5 +198,5 @@ def fill(template: bytes, find: Callable[[bytes], Layout], stamp_ns: np.ndarray,
     for name, values in {'sec': sec, 'nanosec': nanosec, **fields}.items():
         place = layout.fields[name]
         numbers = values.reshape(-1, place.count).astype(layout.order + place.code, 'C')
-        data[:, place.offset:][:, :numbers.itemsize * place.count] = numbers.view(np.uint8)
+        data[:, place.offset :][:, : numbers.itemsize * place.count] = numbers.view(np.uint8)
     return data

@@ -18,8 +18,10 @@ import numpy as np
 
 _EXAMPLE = 'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg'  # A mapping, for messages
 
-_ENTRY = re.compile(r"""\s*([^=,\s]+)\s*=\s*(?:"([^"]*)"|'([^']*)'|([^,"'\n]*?))\s*"""
-                    r"""(?::\s*([^:,"'\n]*?))?\s*(?:,|\n|$)""")
+_ENTRY = re.compile(
+    r"""\s*([^=,\s]+)\s*=\s*(?:"([^"]*)"|'([^']*)'|([^,"'\n]*?))\s*"""
+    r"""(?::\s*([^:,"'\n]*?))?\s*(?:,|\n|$)"""
+)
 """An entry of a mapping: a role, its column in double, single or no quotes, and a unit."""
 
 
@@ -81,8 +83,10 @@ class ColumnMapping:
 
     def __str__(self) -> str:
         """Return the text that states the mapping."""
-        return ','.join(f'{role}={_quoted(column)}{":" * bool(unit)}{unit}'
-                        for role, (column, unit) in self.sources.items())
+        return ','.join(
+            f'{role}={_quoted(column)}{":" * bool(unit)}{unit}'
+            for role, (column, unit) in self.sources.items()
+        )
 
 
 def _quoted(column: str) -> str:
@@ -100,16 +104,19 @@ def parse_mapping(text: str) -> ColumnMapping:
         try:
             text = re.sub('#.*', '', Path(text).read_text(encoding='utf-8'))
         except (OSError, UnicodeDecodeError):
-            raise UserError(f'{where}: is neither a mapping nor a file that can be read; '
-                            f'write for example {_EXAMPLE}') from None
+            raise UserError(
+                f'{where}: is neither a mapping nor a file that can be read; '
+                f'write for example {_EXAMPLE}'
+            ) from None
     sources: dict[str, Source] = {}
     text = text.strip().rstrip(',')
     while text:
         entry = _ENTRY.match(text)
         if entry is None:
-            raise UserError(f'{where}: {text[:40]!r} is no role=column:unit; '
-                            f'write for example {_EXAMPLE}')
-        text = text[entry.end():]
+            raise UserError(
+                f'{where}: {text[:40]!r} is no role=column:unit; write for example {_EXAMPLE}'
+            )
+        text = text[entry.end() :]
         role, *columns, unit = entry.groups(default='')
         column = ''.join(columns).strip()
         if role not in ROLES:
@@ -118,18 +125,24 @@ def parse_mapping(text: str) -> ColumnMapping:
             raise UserError(f'{where}: {role} must name one column, once')
         name = unit_name(unit, ROLES[role]) if unit else ''
         if name is None:
-            raise UserError(f'{where}: {role}={column}:{unit}: unknown unit {unit!r}; write one '
-                            f'of {", ".join(UNITS[ROLES[role]])}, or quote a name that has a '
-                            'colon')
+            raise UserError(
+                f'{where}: {role}={column}:{unit}: unknown unit {unit!r}; write one '
+                f'of {", ".join(UNITS[ROLES[role]])}, or quote a name that has a '
+                'colon'
+            )
         sources[role] = Source(column, name)
     axes = ''.join(axis for axis in AXES if axis in sources)
     if axes not in MEASURED_AXES:
-        raise UserError(f'{where}: names the axes {axes or "none"}, expected x, x and y, or x, y '
-                        f'and z; write for example {_EXAMPLE}')
+        raise UserError(
+            f'{where}: names the axes {axes or "none"}, expected x, x and y, or x, y '
+            f'and z; write for example {_EXAMPLE}'
+        )
     given = {'roll', 'pitch', 'alpha', 'beta'} & set(sources)
     if given & {'roll', 'pitch'} and given != {'roll', 'pitch'}:
-        raise UserError(f'{where}: {", ".join(sorted(given))} are no reference; name roll and '
-                        'pitch, or alpha and beta')
+        raise UserError(
+            f'{where}: {", ".join(sorted(given))} are no reference; name roll and '
+            'pitch, or alpha and beta'
+        )
     return ColumnMapping(sources, where)
 
 
@@ -140,16 +153,20 @@ Mounting = tuple[tuple[int, int], ...]
 def parse_mounting(text: str) -> Mounting:
     """Parse a documented mounting, as in `x=-y,y=x,z=z`: x of the frame is −y of the file."""
     entries = re.findall(r'(?:^|,)\s*([xyz])\s*=\s*([-+]?)\s*([xyz])\s*(?=,|$)', text)
-    axes = AXES[:text.count(',') + 1]
+    axes = AXES[: text.count(',') + 1]
     mounting = {axis: (AXES.index(of), -1 if sign == '-' else 1) for axis, sign, of in entries}
     if set(mounting) != set(axes) or {AXES[index] for index, _ in mounting.values()} != set(axes):
-        raise UserError(f'--axes {text}: each axis of the sensor must stand once on both sides; '
-                        'write for example x=-y,y=x,z=z')
+        raise UserError(
+            f'--axes {text}: each axis of the sensor must stand once on both sides; '
+            'write for example x=-y,y=x,z=z'
+        )
     signed_axes = tuple(mounting[axis] for axis in axes)
     if len(axes) == len(AXES) and _is_mirror(signed_axes):
-        raise UserError(f'--axes {text}: no rotation of the sensor gives this, because it turns a '
-                        'right-handed frame into a left-handed one; correct one sign, or the '
-                        'order of two axes')
+        raise UserError(
+            f'--axes {text}: no rotation of the sensor gives this, because it turns a '
+            'right-handed frame into a left-handed one; correct one sign, or the '
+            'order of two axes'
+        )
     return signed_axes
 
 
@@ -209,34 +226,59 @@ class Unit:
 
 
 UNITS: Mapping[Quantity, Mapping[str, Unit]] = {
-    Quantity.TIME: {'s': Unit(), 'ms': Unit(1e3), 'us': Unit(1e6), 'ns': Unit(1e9),
-                    'epoch': Unit()},
-    Quantity.OUTPUT: {'g': Unit(factor=G0_MPS2), 'mg': Unit(1e3, G0_MPS2), 'mps2': Unit(),
-                      'mmps2': Unit(1e3),
-                      LSB: Unit(factor=G0_MPS2), UNSIGNED: Unit(factor=G0_MPS2),
-                      'v': Unit(is_volts=True), 'mv': Unit(1e3, is_volts=True)},
+    Quantity.TIME: {
+        's': Unit(),
+        'ms': Unit(1e3),
+        'us': Unit(1e6),
+        'ns': Unit(1e9),
+        'epoch': Unit(),
+    },
+    Quantity.OUTPUT: {
+        'g': Unit(factor=G0_MPS2),
+        'mg': Unit(1e3, G0_MPS2),
+        'mps2': Unit(),
+        'mmps2': Unit(1e3),
+        LSB: Unit(factor=G0_MPS2),
+        UNSIGNED: Unit(factor=G0_MPS2),
+        'v': Unit(is_volts=True),
+        'mv': Unit(1e3, is_volts=True),
+    },
     Quantity.ANGLE: {'rad': Unit(), 'deg': Unit(180.0, np.pi)},
     Quantity.LENGTH: {'m': Unit(), 'mm': Unit(1e3)},
-    Quantity.TEMPERATURE: {'c': Unit(), 'k': Unit(offset=-273.15),
-                           'f': Unit(9.0, 5.0, -160.0 / 9.0)},
+    Quantity.TEMPERATURE: {
+        'c': Unit(),
+        'k': Unit(offset=-273.15),
+        'f': Unit(9.0, 5.0, -160.0 / 9.0),
+    },
     Quantity.VOLTAGE: {'v': Unit(), 'mv': Unit(1e3)},
 }
 """Units by quantity and name."""
 
-GRAVITY = {name: G0_MPS2 * unit.divisor / unit.factor
-           for name, unit in UNITS[Quantity.OUTPUT].items()
-           if name not in (LSB, UNSIGNED) and not unit.is_volts}
+GRAVITY = {
+    name: G0_MPS2 * unit.divisor / unit.factor
+    for name, unit in UNITS[Quantity.OUTPUT].items()
+    if name not in (LSB, UNSIGNED) and not unit.is_volts
+}
 """Length of gravity in each unit of acceleration."""
 
 _SPELLINGS = {
-    's': 'sec secs second seconds', 'ms': 'msec millis milliseconds',
-    'us': 'µs μs usec micros microseconds', 'ns': 'nsec nanoseconds', 'epoch': 'unix posix',
+    's': 'sec secs second seconds',
+    'ms': 'msec millis milliseconds',
+    'us': 'µs μs usec micros microseconds',
+    'ns': 'nsec nanoseconds',
+    'epoch': 'unix posix',
     'mps2': 'm/s^2 m/s² m/s2 ms2 ms^2 m/s/s ms-2 ms^-2 m_s2 mss m·s⁻² m.s-2 m_s^-2 m_s-2',
     'mmps2': 'mm/s^2 mm/s² mm/s2 mms2 mm/s/s mms-2 mm_s2',
-    'mg': 'millig', 'g': 'gs', LSB: 'counts count raw digits',
-    'v': 'volt volts', 'mv': 'millivolt millivolts',
-    'deg': '° degree degrees', 'rad': 'radian radians',
-    'c': '°c degc celsius deg_c', 'f': '°f degf fahrenheit', 'k': 'kelvin',
+    'mg': 'millig',
+    'g': 'gs',
+    LSB: 'counts count raw digits',
+    'v': 'volt volts',
+    'mv': 'millivolt millivolts',
+    'deg': '° degree degrees',
+    'rad': 'radian radians',
+    'c': '°c degc celsius deg_c',
+    'f': '°f degf fahrenheit',
+    'k': 'kelvin',
 }
 _ALIASES = {word: name for name, words in _SPELLINGS.items() for word in words.split()}
 """Names of units by their other spellings, in lower case, with _ for a blank."""
@@ -288,8 +330,9 @@ class ReadingOptions:
         sources = self.mapping.sources if self.mapping else {}
         stated = {sources[axis].unit for axis in AXES if axis in sources}
         if self.unit and stated - {'', self.unit}:
-            raise UserError(f'--unit {self.unit}: --columns states another unit; leave one of '
-                            'them out')
+            raise UserError(
+                f'--unit {self.unit}: --columns states another unit; leave one of them out'
+            )
 
     def check_counts(self, where: str, units: Mapping[str, str]) -> None:
         """
@@ -299,14 +342,20 @@ class ReadingOptions:
         """
         counts = [column for column, unit in units.items() if unit in (LSB, UNSIGNED)]
         if counts and not self.lsb_per_g:
-            raise UserError(f'{where}: {counts[0]} is in LSB; add --lsb-per-g with the counts of '
-                            '1 g, as in the datasheet')
+            raise UserError(
+                f'{where}: {counts[0]} is in LSB; add --lsb-per-g with the counts of '
+                '1 g, as in the datasheet'
+            )
         if not counts and (self.lsb_per_g or self.lsb_at_0g):
-            raise UserError(f'--lsb-per-g: no column is in LSB; add --unit {LSB}, or leave '
-                            '--lsb-per-g and --lsb-at-0g out')
+            raise UserError(
+                f'--lsb-per-g: no column is in LSB; add --unit {LSB}, or leave '
+                '--lsb-per-g and --lsb-at-0g out'
+            )
         if not {len(self.lsb_per_g), len(self.lsb_at_0g)} <= {0, 1, len(units)}:
-            raise UserError(f'--lsb-per-g, --lsb-at-0g: write one value for all {len(units)} '
-                            'axes, or one for each')
+            raise UserError(
+                f'--lsb-per-g, --lsb-at-0g: write one value for all {len(units)} '
+                'axes, or one for each'
+            )
 
     def outputs(self, readings: np.ndarray, units: Sequence[str]) -> np.ndarray:
         """Return the output of the axes, (n, m), V or m/s², of readings in units, one an axis."""
@@ -339,8 +388,14 @@ def listed(names: Sequence[str]) -> str:
 
 def likely_unit(length: float) -> str:
     """Return the unit in which readings have the length of gravity; empty where none fits."""
-    return next((unit for unit, gravity in GRAVITY.items()
-                 if abs(np.log(max(length, 1e-12) / gravity)) < _NEAR), '')
+    return next(
+        (
+            unit
+            for unit, gravity in GRAVITY.items()
+            if abs(np.log(max(length, 1e-12) / gravity)) < _NEAR
+        ),
+        '',
+    )
 
 
 def is_sensor_step(step_s: float, is_whole: bool) -> bool:
@@ -350,16 +405,23 @@ def is_sensor_step(step_s: float, is_whole: bool) -> bool:
 
 def time_unit_of_step(step: float, is_whole: bool) -> str:
     """Return the likely unit of stamps."""
-    return next((unit for unit in ('s', 'ms', 'us', 'ns') if is_sensor_step(
-        step / UNITS[Quantity.TIME][unit].divisor, is_whole)), 's')
+    return next(
+        (
+            unit
+            for unit in ('s', 'ms', 'us', 'ns')
+            if is_sensor_step(step / UNITS[Quantity.TIME][unit].divisor, is_whole)
+        ),
+        's',
+    )
 
 
 def parse_unit(text: str) -> str:
     """Return the name of a unit of the sensor's output; empty for no text."""
     name = unit_name(text, Quantity.OUTPUT) if text else ''
     if name is None:
-        raise UserError(f'--unit {text}: unknown unit; write one of '
-                        f'{", ".join(UNITS[Quantity.OUTPUT])}')
+        raise UserError(
+            f'--unit {text}: unknown unit; write one of {", ".join(UNITS[Quantity.OUTPUT])}'
+        )
     return name
 
 

@@ -39,13 +39,17 @@ _DELIMITERS = ('\t', ';', ',', ' ')  # Delimiters; the first that fits is taken
 _INFO = re.compile(r'#+\s*([A-Za-z_][\w.]*)\s*:(?:\s+(.*))?$')  # A comment line with key and value
 _NO_MARKS = bytes(set(range(256)) - set(b',\n#\0'))
 """Bytes besides the ends of fields and lines, comments, and zeros, at which pandas ends a text."""
-_FIELD = re.compile(r'\s*([-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infinity))?\s*',
-                    re.ASCII | re.IGNORECASE)
+_FIELD = re.compile(
+    r'\s*([-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?(nan|inf|infinity))?\s*',
+    re.ASCII | re.IGNORECASE,
+)
 """A field that is a number, or empty."""
 _NUMBER = re.compile(r'[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf)', re.IGNORECASE)
 """A number with a decimal point or comma."""
-_DATE = re.compile(rb'"?(\d{4})[-/](\d\d)[-/](\d\d)[T ](\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)'
-                   rb'(?:Z|([-+]\d\d):?(\d\d))?"?')
+_DATE = re.compile(
+    rb'"?(\d{4})[-/](\d\d)[-/](\d\d)[T ](\d\d:\d\d:\d\d(?:[.,]\d{1,9})?)'
+    rb'(?:Z|([-+]\d\d):?(\d\d))?"?'
+)
 """A date and time by ISO 8601; without an offset it counts as UTC."""
 _LABEL = re.compile(rb'"?\b[A-Za-z_][\w ]{0,40}"?\s{0,4}[:=]\s*(?=[-+.]?\d)')
 """A label before a number, as in `x: 0.1` and `"x": 0.1`. Its length is bounded, because a search
@@ -79,8 +83,9 @@ class Form:
         return data.replace(self.delimiter.encode(), b',')
 
 
-def read_blocks(path: str, form: Form, names: Collection[str], required: Collection[str]
-                ) -> Iterator[TableBlock]:
+def read_blocks(
+    path: str, form: Form, names: Collection[str], required: Collection[str]
+) -> Iterator[TableBlock]:
     """
     Yield some columns of numbers in blocks of rows.
 
@@ -102,8 +107,11 @@ def read_blocks(path: str, form: Form, names: Collection[str], required: Collect
             marks = data.translate(None, _NO_MARKS)
             # An empty line, or one field, follows the end of a line.
             if b'#' in marks or b'\n\n' in marks or marks.startswith(b'\n'):
-                rows = [(line, number) for line, number in zip(data.split(b'\n'), numbers)
-                        if line.strip() and not _add_info(line, info)]
+                rows = [
+                    (line, number)
+                    for line, number in zip(data.split(b'\n'), numbers)
+                    if line.strip() and not _add_info(line, info)
+                ]
                 data = b''.join(line + b'\n' for line, _ in rows)
                 numbers = [number for _, number in rows]
             if not data:
@@ -151,23 +159,35 @@ def _in_utf_8(data: bytes) -> bytes:
     return data + b'\n' if data and not data.endswith(b'\n') else data
 
 
-def _by_pandas(data: bytes, rows: int, names: Sequence[str], used: Sequence[str]
-               ) -> dict[str, np.ndarray] | None:
+def _by_pandas(
+    data: bytes, rows: int, names: Sequence[str], used: Sequence[str]
+) -> dict[str, np.ndarray] | None:
     """Parse many lines at once; None where one of them must be parsed field by field."""
     # Pandas would fill a short line, and cut a long one.
-    if len(data) < _PANDAS_BYTES or \
-            data.translate(None, _NO_MARKS) != (b',' * (len(names) - 1) + b'\n') * rows:
+    if (
+        len(data) < _PANDAS_BYTES
+        or data.translate(None, _NO_MARKS) != (b',' * (len(names) - 1) + b'\n') * rows
+    ):
         return None
     import pandas
+
     # Newer versions always round correctly, and warn of the option.
     is_old = tuple(map(int, pandas.__version__.split('.')[:2])) < (3, 1)
     options = {'float_precision': 'round_trip'} if is_old else {}
     indices = [names.index(name) for name in used]
     try:
         frame = pandas.read_csv(
-            BytesIO(data), header=None, names=list(range(len(names))), usecols=indices,
-            index_col=False, dtype=float, keep_default_na=False, na_values=[''],
-            low_memory=False, **options)
+            BytesIO(data),
+            header=None,
+            names=list(range(len(names))),
+            usecols=indices,
+            index_col=False,
+            dtype=float,
+            keep_default_na=False,
+            na_values=[''],
+            low_memory=False,
+            **options,
+        )
     except (ValueError, OverflowError):
         return None
     if len(frame) != rows:
@@ -175,8 +195,13 @@ def _by_pandas(data: bytes, rows: int, names: Sequence[str], used: Sequence[str]
     return {name: frame[index].to_numpy() for name, index in zip(used, indices)}
 
 
-def _field_by_field(data: bytes, form: Form, used: Sequence[str], required: Collection[str],
-                    place: Callable[[int, int], str]) -> dict[str, np.ndarray]:
+def _field_by_field(
+    data: bytes,
+    form: Form,
+    used: Sequence[str],
+    required: Collection[str],
+    place: Callable[[int, int], str],
+) -> dict[str, np.ndarray]:
     """Parse with Python; refuse a field that is no number, and drop other columns with text."""
     rows = [_fields(line, ',') for line in data.decode().split('\n')[:-1]]
     expected = len(form.names)
@@ -185,8 +210,10 @@ def _field_by_field(data: bytes, form: Form, used: Sequence[str], required: Coll
     for i, row in enumerate(rows):
         if len(row) != expected:
             source = 'the header' if form.header_line else 'the first line'
-            raise UserError(f'{place(i, min(len(row), expected))}: {len(row)} fields, '
-                            f'but {source} has {expected}')
+            raise UserError(
+                f'{place(i, min(len(row), expected))}: {len(row)} fields, '
+                f'but {source} has {expected}'
+            )
     columns = {}
     for name in used:
         index = form.names.index(name)
@@ -195,8 +222,9 @@ def _field_by_field(data: bytes, form: Form, used: Sequence[str], required: Coll
         if wrong is None:
             columns[name] = np.array([float(cell or 'nan') for cell in cells])
         elif name in required:
-            raise UserError(f'{place(wrong, index)}: {name} is {cells[wrong][:24]!r}, not a '
-                            'number')
+            raise UserError(
+                f'{place(wrong, index)}: {name} is {cells[wrong][:24]!r}, not a number'
+            )
     return columns
 
 
@@ -215,8 +243,9 @@ def find_form(path: str) -> Form:
     if len(head) == _HEAD_BYTES:
         head, is_line, _ = head.rpartition(b'\n')  # The last line may be cut
         if not is_line:
-            raise UserError(f'{path}: a line is longer than {_HEAD_BYTES} bytes; this is no CSV '
-                            'recording')
+            raise UserError(
+                f'{path}: a line is longer than {_HEAD_BYTES} bytes; this is no CSV recording'
+            )
     lines = _in_utf_8(head).decode().split('\n')[:_HEAD_LINES]
     written = [line for line in lines if line.strip() and not line.lstrip().startswith('#')]
     if not written:
@@ -240,8 +269,10 @@ def find_form(path: str) -> Form:
         number = lines.index(written[0]) + 1  # a recording of the package without good samples
         return _named(_fields(written[0], ','), number, number + 1, ',', False)
     if form is None:
-        raise UserError(f'{path}: the first {_HEAD_LINES} lines hold no row of numbers; expected '
-                        'a header, and a line of numbers for each sample')
+        raise UserError(
+            f'{path}: the first {_HEAD_LINES} lines hold no row of numbers; expected '
+            'a header, and a line of numbers for each sample'
+        )
     return form
 
 
@@ -252,8 +283,10 @@ def _form(lines: Sequence[str], plain: Sequence[str], index: int, delimiter: str
     labels = _LABEL.findall(_DATE.sub(b'0', lines[index].encode()))
     if not header and len(labels) == count:
         header_line, header = index + 1, [label.decode().strip('":= ') for label in labels]
-    is_worded = any(line != bare and not _COMMENT.match(line)
-                    for line, bare in zip(lines[index:], plain[index:]))
+    is_worded = any(
+        line != bare and not _COMMENT.match(line)
+        for line, bare in zip(lines[index:], plain[index:])
+    )
     return _named(header or [''] * count, header_line, index + 1, delimiter, is_worded)
 
 
@@ -261,8 +294,13 @@ def _named(names: Sequence[str], *about: Any) -> Form:
     """Return a form with distinct names: one that is empty or stands twice gives its number."""
     names = [' '.join(name.split()) for name in names]
     repeated = next((name for name in names if name and names.count(name) > 1), '')
-    return Form(tuple(name if name and names.count(name) == 1 else str(i + 1)
-                      for i, name in enumerate(names)), repeated, *about)
+    return Form(
+        tuple(
+            name if name and names.count(name) == 1 else str(i + 1) for i, name in enumerate(names)
+        ),
+        repeated,
+        *about,
+    )
 
 
 def _header(lines: Sequence[str], delimiter: str, count: int) -> tuple[int, list[str]]:
@@ -279,8 +317,9 @@ def _header(lines: Sequence[str], delimiter: str, count: int) -> tuple[int, list
         number = index + 1
         # A row of units below the names has each in brackets, or empty.
         if units or not all(not name or re.fullmatch(r'[(\[].*[)\]]', name) for name in names):
-            return number, [f'{name} {unit}'.strip()
-                            for name, unit in zip(names, units or [''] * count)]
+            return number, [
+                f'{name} {unit}'.strip() for name, unit in zip(names, units or [''] * count)
+            ]
         units = names
     return number, units
 
@@ -322,8 +361,9 @@ def _plain(data: bytes) -> bytes:
 
 def _since_1970(date: re.Match[bytes]) -> bytes:
     """Return the seconds since 1970 of a date and time, in nanoseconds."""
-    year, month, day, time, hours, minutes = (part.decode() if part else '0'
-                                              for part in date.groups())
+    year, month, day, time, hours, minutes = (
+        part.decode() if part else '0' for part in date.groups()
+    )
     try:
         stamp = np.datetime64(f'{year}-{month}-{day}T{time.replace(",", ".")}', 'ns')
     except ValueError:
@@ -348,11 +388,15 @@ def csv_writer(path: str | os.PathLike) -> Iterator[Append]:
     Numbers have all the digits that bring back the same float64. NaN is written empty.
     """
     with atomic_path(path) as fresh, open(fresh, 'wb') as file:
-        def append(columns: Mapping[str, np.ndarray], info: Mapping[str, str] | None = None
-                   ) -> None:
+
+        def append(
+            columns: Mapping[str, np.ndarray], info: Mapping[str, str] | None = None
+        ) -> None:
             if not file.tell():
-                file.writelines(f'# {key}: {" ".join(value.split())}\n'.encode()
-                                for key, value in (info or {}).items())
+                file.writelines(
+                    f'# {key}: {" ".join(value.split())}\n'.encode()
+                    for key, value in (info or {}).items()
+                )
                 file.write((','.join(columns) + '\n').encode())
             file.write(_csv_rows(columns))
             release_written(file)
@@ -366,9 +410,11 @@ def _csv_rows(columns: Mapping[str, np.ndarray]) -> bytes:
         import pyarrow.csv
     except ImportError:
         import pandas
+
         return pandas.DataFrame(dict(columns)).to_csv(header=False, index=False).encode()
-    table = pyarrow.table({name: pyarrow.array(values, from_pandas=True)
-                           for name, values in columns.items()})
+    table = pyarrow.table(
+        {name: pyarrow.array(values, from_pandas=True) for name, values in columns.items()}
+    )
     sink = pyarrow.BufferOutputStream()
     pyarrow.csv.write_csv(table, sink, pyarrow.csv.WriteOptions(include_header=False))
     return sink.getvalue().to_pybytes()

@@ -85,12 +85,28 @@ def axes(sensor: Sensor) -> list[Axis]:
     step = noise.electronics(sensor).lsb_v * mps2_per_v
     std = noise.analog_std_v(sensor) * mps2_per_v
     density = np.sqrt(noise.density_v2_per_hz(sensor, np.zeros(1)))[0] * mps2_per_v
-    walk, returns = (np.broadcast_to(sensor.values.get('bias_walk', {}).get(name, 0.0),
-                                     len(sensor.axes))
-                     for name in ('density_g_per_rts', 'return_per_s'))
-    return [Axis(name, *(float(values[d]) for values in (
-        zero_g, std, std ** 2 + step ** 2 / 12, density, walk * G0_MPS2, returns, step)))
-        for d, name in enumerate(sensor.axes)]
+    walk, returns = (
+        np.broadcast_to(sensor.values.get('bias_walk', {}).get(name, 0.0), len(sensor.axes))
+        for name in ('density_g_per_rts', 'return_per_s')
+    )
+    return [
+        Axis(
+            name,
+            *(
+                float(values[d])
+                for values in (
+                    zero_g,
+                    std,
+                    std**2 + step**2 / 12,
+                    density,
+                    walk * G0_MPS2,
+                    returns,
+                    step,
+                )
+            ),
+        )
+        for d, name in enumerate(sensor.axes)
+    ]
 
 
 def by_axis(sensor: Sensor, field: str) -> tuple[float, ...]:
@@ -118,37 +134,54 @@ def delay_s(sensor: Sensor) -> float:
 
 def places(form: Format, sensor: Sensor) -> dict[str, str]:
     """Return the places of what a format holds of a sensor; none holds samples before time."""
-    return {part: place for part, place in form.holds.items()
-            if part != 'time_offset' or delay_s(sensor) >= 0}
+    return {
+        part: place
+        for part, place in form.holds.items()
+        if part != 'time_offset' or delay_s(sensor) >= 0
+    }
 
 
 def _head(export: Export, software: str, prefix: str = '# ') -> str:
     """Return the head of a file: what it holds of the sensor, and what it cannot hold."""
     sensor = export.sensor
     width = max(map(len, export.sizes_mg)) + 2
-    lines = [f'Sensor {sensor.serial}, axes {" ".join(sensor.axes)}, {sensor.rate_hz:.5g} Hz.',
-             *wrap(f'Written by adxl_ros {package_version()} for {software}, from '
-                   f'{export.source}.', _COLUMNS),
-             '',
-             f'{"part":{width}}{"size, mg rms":14}in this file']
+    lines = [
+        f'Sensor {sensor.serial}, axes {" ".join(sensor.axes)}, {sensor.rate_hz:.5g} Hz.',
+        *wrap(
+            f'Written by adxl_ros {package_version()} for {software}, from {export.source}.',
+            _COLUMNS,
+        ),
+        '',
+        f'{"part":{width}}{"size, mg rms":14}in this file',
+    ]
     for part, size_mg in sorted(export.sizes_mg.items(), key=lambda part: -part[1]):
         lines.append(f'{part:{width}}{size_text(size_mg):14}{export.holds.get(part, _NOT_HELD)}')
     missing = [axis for axis in AXES if axis not in sensor.axes]
     if missing:
         lines += ['', f'The sensor has no {" and no ".join(missing)}: do not use that output.']
     if stage := stage_effects(sensor):
-        lines += ['', *wrap('Left out, as errors of the stage or of another reference: '
-                            f'{", ".join(stage)}.', _COLUMNS)]
+        lines += [
+            '',
+            *wrap(
+                f'Left out, as errors of the stage or of another reference: {", ".join(stage)}.',
+                _COLUMNS,
+            ),
+        ]
     noise_from = sensor.provenance.get('noise_from')
     stated = sensor.datasheet_name or 'the parameter file'
-    origin = f'measured in {noise_from}' if noise_from else \
-        f'the figure of {stated}; nobody measured it'
-    lines += ['', *wrap(f'White noise: {origin}. All figures hold at {sensor.rate_hz:.5g} Hz.',
-                        _COLUMNS), '',
-              'Sizes: change of the output in the manoeuvre rich (7 minutes of turns,',
-              'shaking, warming and a step of the supply), by simulation.',
-              'All that is not held, but for noise and steps: '
-              f'{size_text(export.remaining_mg)} mg rms.']
+    origin = (
+        f'measured in {noise_from}'
+        if noise_from
+        else f'the figure of {stated}; nobody measured it'
+    )
+    lines += [
+        '',
+        *wrap(f'White noise: {origin}. All figures hold at {sensor.rate_hz:.5g} Hz.', _COLUMNS),
+        '',
+        'Sizes: change of the output in the manoeuvre rich (7 minutes of turns,',
+        'shaking, warming and a step of the supply), by simulation.',
+        f'All that is not held, but for noise and steps: {size_text(export.remaining_mg)} mg rms.',
+    ]
     text = indent('\n'.join(lines), prefix, lambda line: True)
     text = '\n'.join(map(str.rstrip, text.split('\n')))
     return text if prefix.startswith('#') else _without_double_dashes(text)
@@ -161,8 +194,11 @@ def _without_double_dashes(text: str) -> str:
 
 def stage_effects(sensor: Sensor) -> list[str]:
     """Return the effects that are errors of a reference, and do not go with the sensor."""
-    return [name for name in sensor.effects
-            if effect_named(name).place in (Place.REFERENCE, Place.STAGE)]
+    return [
+        name
+        for name in sensor.effects
+        if effect_named(name).place in (Place.REFERENCE, Place.STAGE)
+    ]
 
 
 def size_text(size_mg: float) -> str:
@@ -173,40 +209,60 @@ def size_text(size_mg: float) -> str:
 def _json(export: Export) -> str:
     """Return all values: the linear response with units, and the parameter file."""
     sensor = export.sensor
-    return json.dumps({
-        'schema': 1,
-        'source': export.source,
-        'adxl_ros': package_version(),
-        'serial': sensor.serial,
-        'rate_hz': sensor.rate_hz,
-        'axes': [asdict(axis) for axis in axes(sensor)],
-        'units': {'zero_g_mps2': 'm/s^2', 'noise_std_mps2': 'm/s^2',
-                  'sample_variance': '(m/s^2)^2', 'noise_density': 'm/s^2/sqrt(Hz), one-sided',
-                  'walk_density': 'm/s^2/sqrt(s)', 'walk_return_per_s': '1/s',
-                  'step_mps2': 'm/s^2'},
-        'gain': gain(sensor).tolist(),
-        'filter_s': noise.electronics(sensor).rc_s.tolist(),
-        'position_m': arm_m(sensor),
-        'parts': [{'name': name, 'size_mg': round(size, 6),
-                   'place': export.holds.get(name, _NOT_HELD)}
-                  for name, size in export.sizes_mg.items()],
-        'not_held_mg': round(export.remaining_mg, 6),
-        'parameter_file': parameter_file.to_flat(sensor),
-    }, indent=1) + '\n'
+    return (
+        json.dumps(
+            {
+                'schema': 1,
+                'source': export.source,
+                'adxl_ros': package_version(),
+                'serial': sensor.serial,
+                'rate_hz': sensor.rate_hz,
+                'axes': [asdict(axis) for axis in axes(sensor)],
+                'units': {
+                    'zero_g_mps2': 'm/s^2',
+                    'noise_std_mps2': 'm/s^2',
+                    'sample_variance': '(m/s^2)^2',
+                    'noise_density': 'm/s^2/sqrt(Hz), one-sided',
+                    'walk_density': 'm/s^2/sqrt(s)',
+                    'walk_return_per_s': '1/s',
+                    'step_mps2': 'm/s^2',
+                },
+                'gain': gain(sensor).tolist(),
+                'filter_s': noise.electronics(sensor).rc_s.tolist(),
+                'position_m': arm_m(sensor),
+                'parts': [
+                    {
+                        'name': name,
+                        'size_mg': round(size, 6),
+                        'place': export.holds.get(name, _NOT_HELD),
+                    }
+                    for name, size in export.sizes_mg.items()
+                ],
+                'not_held_mg': round(export.remaining_mg, 6),
+                'parameter_file': parameter_file.to_flat(sensor),
+            },
+            indent=1,
+        )
+        + '\n'
+    )
 
 
 def kalibr_settings(white: float, walk: float, rate_hz: float) -> list[tuple[str, float, str]]:
     """Return the settings of Kalibr, which are densities over both signs of the frequency."""
-    return [('accelerometer_noise_density', white, 'm/s^2/sqrt(Hz)'),
-            ('accelerometer_random_walk', walk, 'm/s^3/sqrt(Hz)'), ('update_rate', rate_hz, 'Hz')]
+    return [
+        ('accelerometer_noise_density', white, 'm/s^2/sqrt(Hz)'),
+        ('accelerometer_random_walk', walk, 'm/s^3/sqrt(Hz)'),
+        ('update_rate', rate_hz, 'Hz'),
+    ]
 
 
 def _white_density(export: Export, software: str) -> float:
     """Return the density of the white noise of the noisiest axis over both signs."""
     if not export.sensor.noise_density_g_per_rthz.any():
-        raise UserError(f'{export.source}: sensor.noise_density_g_per_rthz is 0, and {software} '
-                        'needs noise; measure it: '
-                        + command('noise', 'RECORDING -o FILE.yaml'))
+        raise UserError(
+            f'{export.source}: sensor.noise_density_g_per_rthz is 0, and {software} '
+            'needs noise; measure it: ' + command('noise', 'RECORDING -o FILE.yaml')
+        )
     return max(by_axis(export.sensor, 'noise_density')) / ONE_SIDED
 
 
@@ -232,24 +288,38 @@ def text(name: str, export: Export) -> str:
         return _json(export)
     sensor = export.sensor
     values = {field.name: by_axis(sensor, field.name) for field in fields(Axis)[1:]}
-    variance = [v if axis in sensor.axes else UNMEASURED_VARIANCE
-                for axis, v in zip(AXES, values['sample_variance'])]
+    variance = [
+        v if axis in sensor.axes else UNMEASURED_VARIANCE
+        for axis, v in zip(AXES, values['sample_variance'])
+    ]
     coupling = np.eye(3)
     coupling[[AXES.index(axis) for axis in sensor.axes]] = gain(sensor)
     walk, remark = max(values['walk_density']), 'Values are those of the noisiest axis.'
     if not walk:
         walk = effect_named('bias_walk').diagnosis.healthy_density * G0_MPS2
         remark += '\n# The random walk is that of a healthy unit: the file states none.'
-    formats = templates.environment(f'--to {name}', ('adxl_ros', 'files/export_templates'),
-                                    escapes=False)
+    formats = templates.environment(
+        f'--to {name}', ('adxl_ros', 'files/export_templates'), escapes=False
+    )
     formats.filters |= {'yaml': _yaml, 'single_dashes': _without_double_dashes}
     return formats.get_template(f'{name}.jinja').render(
-        head=partial(_head, export), white=partial(_white_density, export), walk=walk,
-        walk_remark=f'# {remark}', kalibr_settings=kalibr_settings, sensor=sensor,
-        source=export.source, axes=axes(sensor), by_axis=values, arm_m=arm_m(sensor),
-        delay_s=delay_s(sensor), gain=coupling.tolist(), absent=_ABSENT.ravel().tolist(),
-        walk_a_sample=tuple(density / sensor.rate_hz ** 0.5 for density in values['walk_density']),
-        largest_mps2=_largest_mps2(sensor), covariance=np.diag(variance).ravel().tolist())
+        head=partial(_head, export),
+        white=partial(_white_density, export),
+        walk=walk,
+        walk_remark=f'# {remark}',
+        kalibr_settings=kalibr_settings,
+        sensor=sensor,
+        source=export.source,
+        axes=axes(sensor),
+        by_axis=values,
+        arm_m=arm_m(sensor),
+        delay_s=delay_s(sensor),
+        gain=coupling.tolist(),
+        absent=_ABSENT.ravel().tolist(),
+        walk_a_sample=tuple(density / sensor.rate_hz**0.5 for density in values['walk_density']),
+        largest_mps2=_largest_mps2(sensor),
+        covariance=np.diag(variance).ravel().tolist(),
+    )
 
 
 def _at(place: str, *parts: str) -> dict[str, str]:
@@ -263,34 +333,77 @@ _GAUSSIAN = {**_at('std', *_NOISE), 'bias': 'mean'}  # Places of the parts in Ga
 
 FORMATS = {
     'broadcaster': Format(
-        'parameters of imu_sensor_broadcaster (ros2_controllers)', _at('covariance', *_SAMPLE)),
-    'fusioncore': Format('parameters of FusionCore 0.3', {
-        **_at('imu.accel_noise', *_SAMPLE), 'bias_walk': 'ukf.q_accel_bias',
-        'lever_arm': 'imu.lever_arm_x, _y, _z'}),
-    'json': Format('all values, for any program', {
-        **_at('axes.noise_std_mps2', *_NOISE), 'bias': 'axes.zero_g_mps2',
-        **_at('gain', 'scale_factor', 'misalignment'), 'bias_walk': 'axes.walk_density',
-        'lever_arm': 'position_m', **_at('axes.step_mps2', *_ROUNDING),
-        **_at('filter_s', FILTER, 'bandwidth')}),
-    'kalibr': Format('the part of the accelerometer in imu.yaml of Kalibr', {
-        **_at('accelerometer_noise_density', *_SAMPLE), 'bias_walk': 'accelerometer_random_walk'}),
-    'okvis2': Format('the part of the accelerometer in the configuration of OKVIS2', {
-        **_at('sigma_a_c', *_SAMPLE), 'bias': 'a0', 'bias_walk': 'sigma_aw_c',
-        'saturation': 'a_max'}),
-    'point_lio': Format('the part of the accelerometer in the configuration of Point-LIO', {
-        **_at('imu_meas_acc_cov', *_SAMPLE), 'bias_walk': 'b_acc_cov', 'saturation': 'satu_acc'}),
-    'genesis': Format('Python module with options of an IMU of Genesis 0.4 to 1.4', {
-        **_at('acc_noise', *_NOISE), 'bias': 'acc_bias', 'bias_walk': 'acc_random_walk',
-        **_at('CROSS_AXIS_COUPLING', 'scale_factor', 'misalignment'), 'lever_arm': 'pos_offset',
-        **_at('acc_resolution', *_ROUNDING), 'time_offset': 'delay'}),
-    'isaaclab': Format('Python module with configurations of Isaac Lab, 2.x and 3.0', {
-        **_GAUSSIAN, 'lever_arm': 'pos'}),
-    'mjlab': Format('Python module with configurations of mjlab 1.x', {
-        **_GAUSSIAN, 'lever_arm': 'POS'}),
-    'mujoco': Format('site and accelerometer of MuJoCo (MJCF)', {
-        'lever_arm': 'pos of the site', **_at('noise (MuJoCo does not add it)', *_NOISE)}),
-    'sdf': Format('imu of gz-sensors, Gazebo (SDFormat)', {
-        **_at('<stddev>', *_NOISE), 'bias': '<mean>', 'bias_walk': '<dynamic_bias_stddev>',
-        'lever_arm': '<pose>', **_at('<precision>', *_ROUNDING)}),
+        'parameters of imu_sensor_broadcaster (ros2_controllers)', _at('covariance', *_SAMPLE)
+    ),
+    'fusioncore': Format(
+        'parameters of FusionCore 0.3',
+        {
+            **_at('imu.accel_noise', *_SAMPLE),
+            'bias_walk': 'ukf.q_accel_bias',
+            'lever_arm': 'imu.lever_arm_x, _y, _z',
+        },
+    ),
+    'json': Format(
+        'all values, for any program',
+        {
+            **_at('axes.noise_std_mps2', *_NOISE),
+            'bias': 'axes.zero_g_mps2',
+            **_at('gain', 'scale_factor', 'misalignment'),
+            'bias_walk': 'axes.walk_density',
+            'lever_arm': 'position_m',
+            **_at('axes.step_mps2', *_ROUNDING),
+            **_at('filter_s', FILTER, 'bandwidth'),
+        },
+    ),
+    'kalibr': Format(
+        'the part of the accelerometer in imu.yaml of Kalibr',
+        {**_at('accelerometer_noise_density', *_SAMPLE), 'bias_walk': 'accelerometer_random_walk'},
+    ),
+    'okvis2': Format(
+        'the part of the accelerometer in the configuration of OKVIS2',
+        {
+            **_at('sigma_a_c', *_SAMPLE),
+            'bias': 'a0',
+            'bias_walk': 'sigma_aw_c',
+            'saturation': 'a_max',
+        },
+    ),
+    'point_lio': Format(
+        'the part of the accelerometer in the configuration of Point-LIO',
+        {**_at('imu_meas_acc_cov', *_SAMPLE), 'bias_walk': 'b_acc_cov', 'saturation': 'satu_acc'},
+    ),
+    'genesis': Format(
+        'Python module with options of an IMU of Genesis 0.4 to 1.4',
+        {
+            **_at('acc_noise', *_NOISE),
+            'bias': 'acc_bias',
+            'bias_walk': 'acc_random_walk',
+            **_at('CROSS_AXIS_COUPLING', 'scale_factor', 'misalignment'),
+            'lever_arm': 'pos_offset',
+            **_at('acc_resolution', *_ROUNDING),
+            'time_offset': 'delay',
+        },
+    ),
+    'isaaclab': Format(
+        'Python module with configurations of Isaac Lab, 2.x and 3.0',
+        {**_GAUSSIAN, 'lever_arm': 'pos'},
+    ),
+    'mjlab': Format(
+        'Python module with configurations of mjlab 1.x', {**_GAUSSIAN, 'lever_arm': 'POS'}
+    ),
+    'mujoco': Format(
+        'site and accelerometer of MuJoCo (MJCF)',
+        {'lever_arm': 'pos of the site', **_at('noise (MuJoCo does not add it)', *_NOISE)},
+    ),
+    'sdf': Format(
+        'imu of gz-sensors, Gazebo (SDFormat)',
+        {
+            **_at('<stddev>', *_NOISE),
+            'bias': '<mean>',
+            'bias_walk': '<dynamic_bias_stddev>',
+            'lever_arm': '<pose>',
+            **_at('<precision>', *_ROUNDING),
+        },
+    ),
 }
 """Formats by name."""

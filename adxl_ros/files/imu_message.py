@@ -31,7 +31,7 @@ def _numbers_begin(raw: bytes) -> tuple[str, int]:
     order = cdr.ORDERS.get(raw[:2])
     if order is None or len(raw) < _FRAME_LENGTH.stop:
         raise cdr.CdrError(f'{raw[:16].hex()} is no header in plain CDR')
-    length, = struct.unpack(order + 'I', raw[_FRAME_LENGTH])
+    (length,) = struct.unpack(order + 'I', raw[_FRAME_LENGTH])
     begin = _FRAME_LENGTH.stop + length
     begin += (_STAMP_OFFSET - begin) % 8  # a multiple of 8 bytes behind the encapsulation
     if len(raw) < begin + _END:
@@ -72,8 +72,13 @@ def with_frame(raw: bytes, frame_id: str) -> bytes:
     order, begin = _numbers_begin(raw)
     name = frame_id.encode() + b'\0'
     padding = (_STAMP_OFFSET - _FRAME_LENGTH.stop - len(name)) % 8
-    return (raw[:_FRAME_LENGTH.start] + struct.pack(order + 'I', len(name)) + name
-            + bytes(padding) + raw[begin:])
+    return (
+        raw[: _FRAME_LENGTH.start]
+        + struct.pack(order + 'I', len(name))
+        + name
+        + bytes(padding)
+        + raw[begin:]
+    )
 
 
 def turned(raw: bytes, mounting: Mounting) -> bytes:
@@ -81,12 +86,18 @@ def turned(raw: bytes, mounting: Mounting) -> bytes:
     order, begin = _numbers_begin(raw)
     message = bytearray(raw)
     if has_orientation(raw):
-        struct.pack_into(order + '4d', message, begin,
-                         *mounting.rotate_orientation(orientation(raw)))
+        struct.pack_into(
+            order + '4d', message, begin, *mounting.rotate_orientation(orientation(raw))
+        )
     rate = struct.unpack_from(order + '12d', raw, begin + _ANGULAR_VELOCITY)
     if rate[3] != -1.0:
-        struct.pack_into(order + '12d', message, begin + _ANGULAR_VELOCITY,
-                         *mounting.rotate(rate[:3]), *mounting.rotate_matrix(rate[3:]))
+        struct.pack_into(
+            order + '12d',
+            message,
+            begin + _ANGULAR_VELOCITY,
+            *mounting.rotate(rate[:3]),
+            *mounting.rotate_matrix(rate[3:]),
+        )
     return bytes(message)
 
 
@@ -96,8 +107,9 @@ def orientation(raw: bytes) -> tuple[float, ...]:
     return struct.unpack_from(order + '4d', raw, begin)
 
 
-def corrected(raw: bytes, orientation: Sequence[float] | None, acceleration: Sequence[float]
-              ) -> bytes:
+def corrected(
+    raw: bytes, orientation: Sequence[float] | None, acceleration: Sequence[float]
+) -> bytes:
     """
     Return an Imu with another orientation, if any, and acceleration.
 

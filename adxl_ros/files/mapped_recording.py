@@ -57,8 +57,12 @@ _TURN_RAD = 2 * np.pi  # Largest roll and pitch, rad
 _FEWEST_STAMPS = 8  # Stamps whose steps show their unit. Chosen: a lost sample hides no median
 _WHOLE = 1e-3  # Largest distance of a stamp from a whole number by rounding, in its unit
 
-_NATIVE = {TIME: 'time', **{column: joint for joint, column in JOINTS.items()},
-           'temperature_c': 'temperature', 'supply_v': 'supply'}
+_NATIVE = {
+    TIME: 'time',
+    **{column: joint for joint, column in JOINTS.items()},
+    'temperature_c': 'temperature',
+    'supply_v': 'supply',
+}
 """Role of the package's columns besides those of the sensor."""
 
 
@@ -76,37 +80,54 @@ def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
     if table.repeated:
         raise NotNativeError(f'{table.header}: column {table.repeated} stands twice; keep one')
     # Where one form of output is there, the other may stand there in any unit.
-    outputs = next((kind for kind in (output, VOLTS, ACCEL) if set(kind) & set(names)),
-                   (*VOLTS, *ACCEL))
+    outputs = next(
+        (kind for kind in (output, VOLTS, ACCEL) if set(kind) & set(names)), (*VOLTS, *ACCEL)
+    )
     roles = {**_NATIVE, **dict(zip(outputs, 2 * AXES))}
     stems = {column.rpartition('_')[0]: column for column in roles}
     for number, name in enumerate(names, 1):
         stem, _, unit = name.lower().rpartition('_')
         column = stems.get(stem, name)
         if column not in names and unit_name(unit, ROLES[roles[column]]):
-            raise NotNativeError(f'{table.header}:{number}: column {name} is in another unit; '
-                                 f'expected the column {column}')
+            raise NotNativeError(
+                f'{table.header}:{number}: column {name} is in another unit; '
+                f'expected the column {column}'
+            )
     missing = [column for column in (TIME, *output) if column not in names]
     if missing:
-        raise NotNativeError(f'{table.header}: no column {missing[0]}'
-                             + f'; the columns are {listed(names)}' * bool(output))
+        raise NotNativeError(
+            f'{table.header}: no column {missing[0]}'
+            + f'; the columns are {listed(names)}' * bool(output)
+        )
     try:
         outputs = output or sensor_columns(names, table.header)
     except UserError as error:
         raise NotNativeError(str(error)) from None
-    return ColumnMapping({role: Source(name, name.rpartition('_')[2]) for name, role in {
-        **_NATIVE, **dict(zip(outputs, AXES))}.items() if name in names}, table.path)
+    return ColumnMapping(
+        {
+            role: Source(name, name.rpartition('_')[2])
+            for name, role in {**_NATIVE, **dict(zip(outputs, AXES))}.items()
+            if name in names
+        },
+        table.path,
+    )
 
 
-def blocks(table: Table, mapping: ColumnMapping | None, reading: ReadingOptions, rows: int,
-           output: tuple[str, ...] = ()) -> Generator[Recording, None, None]:
+def blocks(
+    table: Table,
+    mapping: ColumnMapping | None,
+    reading: ReadingOptions,
+    rows: int,
+    output: tuple[str, ...] = (),
+) -> Generator[Recording, None, None]:
     """
     Read a table as a recording in blocks of at most `rows` samples.
 
     Without a mapping it must have the columns of the package, and further ones are kept, too.
     """
-    converter = _Converter(table, mapping or native_mapping(table, output), reading,
-                           mapping is None)
+    converter = _Converter(
+        table, mapping or native_mapping(table, output), reading, mapping is None
+    )
     names = list(dict.fromkeys(source.column for source in converter.sources.values()))
     for block in table.blocks(table.names if mapping is None else names, names):
         recording = converter.convert(block)
@@ -119,17 +140,21 @@ def blocks(table: Table, mapping: ColumnMapping | None, reading: ReadingOptions,
 class _Converter:
     """Converts the blocks of one table; the arguments are those of `blocks`."""
 
-    def __init__(self, table: Table, mapping: ColumnMapping, reading: ReadingOptions,
-                 is_native: bool) -> None:
+    def __init__(
+        self, table: Table, mapping: ColumnMapping, reading: ReadingOptions, is_native: bool
+    ) -> None:
         self.count = 0  # Samples so far
         self._path, self._where, self._reading = table.path, mapping.where, reading
         self._is_native = is_native  # Whether the columns are those of the package
         if 'time' not in mapping.sources and reading.rate_hz is None:
-            raise UserError(f'{mapping.where}: has no time; add time=COLUMN:UNIT, or give '
-                            '--rate HZ to stamp by index')
+            raise UserError(
+                f'{mapping.where}: has no time; add time=COLUMN:UNIT, or give '
+                '--rate HZ to stamp by index'
+            )
         # Column and unit by role
-        self.sources = {role: self._source(table, role, source)
-                        for role, source in mapping.sources.items()}
+        self.sources = {
+            role: self._source(table, role, source) for role, source in mapping.sources.items()
+        }
         self._axes = [self.sources[axis] for axis in AXES if axis in self.sources]
         self._is_volts = self._unit(AXES[0]).is_volts
         self._check_axes()
@@ -146,14 +171,22 @@ class _Converter:
         name, names = source.column, table.names
         if name not in names:
             if not name.isdecimal() or not 1 <= int(name) <= len(names):
-                raise UserError(f'{self._where}: {table.path} has no column {name!r} for {role}; '
-                                f'the columns are {listed(names)}')
+                raise UserError(
+                    f'{self._where}: {table.path} has no column {name!r} for {role}; '
+                    f'the columns are {listed(names)}'
+                )
             name = names[int(name) - 1]
-        unit = (self._reading.unit if role in AXES else '') or source.unit or \
-            table.units.get(name) or unit_in_name(name, ROLES[role])
+        unit = (
+            (self._reading.unit if role in AXES else '')
+            or source.unit
+            or table.units.get(name)
+            or unit_in_name(name, ROLES[role])
+        )
         if not unit:
-            raise UserError(f'{self._where}: nothing states the unit of {name}; write for example '
-                            f'{role}={source.column}:{ROLES[role].value}')
+            raise UserError(
+                f'{self._where}: nothing states the unit of {name}; write for example '
+                f'{role}={source.column}:{ROLES[role].value}'
+            )
         return Source(name, unit)
 
     def _unit(self, role: str) -> Unit:
@@ -161,13 +194,19 @@ class _Converter:
 
     def _check_axes(self) -> None:
         """Refuse units of the axes that do not fit each other, or the options."""
-        if any(self._unit(axis).is_volts != self._is_volts for axis in AXES[:len(self._axes)]):
-            raise UserError(f'{self._where}: some axes are in volts and others are not; state one '
-                            'kind')
-        if self._is_native and self._reading.unit and \
-                self._is_volts != (self._axes[0].column in VOLTS):
-            raise UserError(f'--unit {self._reading.unit}: {self._axes[0].column} of '
-                            f'{self._path} says another quantity; name the columns by --columns')
+        if any(self._unit(axis).is_volts != self._is_volts for axis in AXES[: len(self._axes)]):
+            raise UserError(
+                f'{self._where}: some axes are in volts and others are not; state one kind'
+            )
+        if (
+            self._is_native
+            and self._reading.unit
+            and self._is_volts != (self._axes[0].column in VOLTS)
+        ):
+            raise UserError(
+                f'--unit {self._reading.unit}: {self._axes[0].column} of '
+                f'{self._path} says another quantity; name the columns by --columns'
+            )
         self._reading.check_counts(self._where, {axis.column: axis.unit for axis in self._axes})
 
     def convert(self, block: TableBlock) -> Recording:
@@ -175,33 +214,54 @@ class _Converter:
         outputs = self._outputs(block)
         is_row = ~np.isnan(outputs).all(axis=1)
         self._empty += int((~is_row).sum())
-        is_sample = is_row & self._is_complete(block, outputs) \
-            if self._reading.drop_bad_samples else is_row
+        is_sample = (
+            is_row & self._is_complete(block, outputs)
+            if self._reading.drop_bad_samples
+            else is_row
+        )
         self._incomplete += int((is_row & ~is_sample).sum())
         for source, values in zip(self._axes, outputs.T):
-            _refuse(block, source, is_sample & ~(np.abs(values) <= LIMIT),
-                    f'no reading of a sensor in {source.unit}',
-                    f'every sample needs it; {DROP_SAMPLES}')
+            _refuse(
+                block,
+                source,
+                is_sample & ~(np.abs(values) <= LIMIT),
+                f'no reading of a sensor in {source.unit}',
+                f'every sample needs it; {DROP_SAMPLES}',
+            )
         time_s, is_kept = self._times(block, is_row, is_sample)
         columns = dict(zip(VOLTS if self._is_volts else ACCEL, outputs.T))
         columns |= self._references(block)
         if self._is_native:
             columns = {**block.columns, **columns}
             del columns[TIME]
-        columns = {name: np.ascontiguousarray(values[is_kept])
-                   for name, values in columns.items()}
+        columns = {name: np.ascontiguousarray(values[is_kept]) for name, values in columns.items()}
         if not self.count and is_kept.any():
             self._look_at_first(time_s[is_kept])
         self.count += int(is_kept.sum())
         info = {key: text for key, text in block.info.items() if key != 'epoch_ns'}
-        left_out = {'lines without a reading of the sensor': self._empty,
-                    'samples without a number on each axis, or without a time': self._incomplete}
-        return Recording(self._path, time_s[is_kept], columns, info, cut=block.cut,
-                         epoch_ns=self._epoch_ns or 0, done=block.done,
-                         remarks=(*self._remarks, *(
-                             f'{self._path}: left out, {kind}: {count}'
-                             for kind, count in left_out.items() if count),
-                             *self._stamps.remarks), bad_stamps=self._stamps.bad)
+        left_out = {
+            'lines without a reading of the sensor': self._empty,
+            'samples without a number on each axis, or without a time': self._incomplete,
+        }
+        return Recording(
+            self._path,
+            time_s[is_kept],
+            columns,
+            info,
+            cut=block.cut,
+            epoch_ns=self._epoch_ns or 0,
+            done=block.done,
+            remarks=(
+                *self._remarks,
+                *(
+                    f'{self._path}: left out, {kind}: {count}'
+                    for kind, count in left_out.items()
+                    if count
+                ),
+                *self._stamps.remarks,
+            ),
+            bad_stamps=self._stamps.bad,
+        )
 
     def _is_complete(self, block: TableBlock, outputs: np.ndarray) -> np.ndarray:
         """Return which rows have a number on each axis, and a time where stamps are used, (n,)."""
@@ -223,8 +283,12 @@ class _Converter:
                 continue
             stated = block.columns[source.column]
             is_tilt = role in ('roll', 'pitch') and source.unit == 'rad'
-            _refuse(block, source, np.abs(stated) > (_TURN_RAD if is_tilt else LIMIT),
-                    f'no {role} in {source.unit}')
+            _refuse(
+                block,
+                source,
+                np.abs(stated) > (_TURN_RAD if is_tilt else LIMIT),
+                f'no {role} in {source.unit}',
+            )
             values[role] = self._unit(role).convert(stated)
         if 'roll' in values:
             values['alpha'], beta_rad = stage_angles(values['roll'], values['pitch'])
@@ -235,8 +299,9 @@ class _Converter:
             values['beta'] = beta_rad
         return {name: values[role] for name, role in _NATIVE.items() if role in values}
 
-    def _times(self, block: TableBlock, is_row: np.ndarray, is_sample: np.ndarray
-               ) -> tuple[np.ndarray, np.ndarray]:
+    def _times(
+        self, block: TableBlock, is_row: np.ndarray, is_sample: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return stamps, s, (n,), and which rows are kept, (n,); a part of a reading has one."""
         if self._reading.rate_hz is not None:
             number = self._rows + np.cumsum(is_row) - 1
@@ -244,10 +309,14 @@ class _Converter:
             return number / self._reading.rate_hz, is_sample
         source, unit = self.sources['time'], self._unit('time')
         stamps = block.columns[source.column]
-        _refuse(block, source, is_sample & ~(np.abs(unit.convert(stamps)) < _TIME_LIMIT_S),
-                f'no time in {source.unit} (200 years at most)',
-                'every sample needs a time: give --rate HZ to stamp by index, or delete the line; '
-                f'{DROP_SAMPLES}')
+        _refuse(
+            block,
+            source,
+            is_sample & ~(np.abs(unit.convert(stamps)) < _TIME_LIMIT_S),
+            f'no time in {source.unit} (200 years at most)',
+            'every sample needs a time: give --rate HZ to stamp by index, or delete the line; '
+            f'{DROP_SAMPLES}',
+        )
         if self._epoch_ns is None and is_sample.any():
             text = block.info.get('epoch_ns', '0')
             if not re.fullmatch(r'-?\d{1,18}|-?[1-8]\d{18}', text):
@@ -258,8 +327,9 @@ class _Converter:
                 self._epoch_ns = int(first_s) * 1_000_000_000
                 self._begin = int(first_s) * unit.divisor
         time_s = unit.convert(stamps - self._begin)
-        return time_s, self._stamps.increasing(time_s, is_sample,
-                                               lambda row: block.where(row, source.column))
+        return time_s, self._stamps.increasing(
+            time_s, is_sample, lambda row: block.where(row, source.column)
+        )
 
     def _look_at_first(self, time_s: np.ndarray) -> None:
         """Refuse stamps that are in another unit, and note those in bursts."""
@@ -267,8 +337,10 @@ class _Converter:
             return
         self._check_step(time_s)
         if bursts := describe_bursts(time_s):
-            self._remarks.append(f'{self._path}: {bursts.removeprefix("; ")}; this rate is '
-                                 'used, and --rate HZ stamps by index')
+            self._remarks.append(
+                f'{self._path}: {bursts.removeprefix("; ")}; this rate is '
+                'used, and --rate HZ stamps by index'
+            )
 
     def _check_step(self, time_s: np.ndarray) -> None:
         """Refuse stamps whose steps no sensor has."""
@@ -283,45 +355,78 @@ class _Converter:
                 f'{self._path}: {source.column} has steps of {step:.4g}, which as '
                 f'{source.unit} are {rate_hz:.3g} Hz; if that is right, give --rate '
                 f'{rate_hz:.3g}, and if they are {unit}:',
-                f'--columns {shell_quoted(str(fitting))}')
+                f'--columns {shell_quoted(str(fitting))}',
+            )
 
 
-def _refuse(block: TableBlock, source: Source, wrong: np.ndarray, reason: str,
-            reason_of_none: str = '') -> None:
+def _refuse(
+    block: TableBlock, source: Source, wrong: np.ndarray, reason: str, reason_of_none: str = ''
+) -> None:
     """Refuse cells of a column, (n,): for a reason, or for another one where they are empty."""
     if wrong.any():
         row = int(wrong.argmax())
         value = block.columns[source.column][row]
-        text = f'empty or NaN; {reason_of_none}' if np.isnan(value) else \
-            f'{value:g}, {reason}; delete the line, or correct the unit'
+        text = (
+            f'empty or NaN; {reason_of_none}'
+            if np.isnan(value)
+            else f'{value:g}, {reason}; delete the line, or correct the unit'
+        )
         raise UserError(f'{block.where(row, source.column)} is {text}')
 
 
-_TIME_NAMES = re.compile(r'(?i).*(time|stamp|zeit|date|clock|elapsed|epoch|millis|micros).*|'
-                         r'\W*(t|m?s|ms|us|ns|secs?|seconds?|(t|sec)[_\W].*)\W*')
+_TIME_NAMES = re.compile(
+    r'(?i).*(time|stamp|zeit|date|clock|elapsed|epoch|millis|micros).*|'
+    r'\W*(t|m?s|ms|us|ns|secs?|seconds?|(t|sec)[_\W].*)\W*'
+)
 """Names of a time."""
 
 _COUNTER_WORDS = {
-    'packet', 'pkt', 'index', 'idx', 'count', 'counter', 'number', 'num', 'nr', 'no', 'seq',
-    'sequence', 'sample', 'frame', 'row', 'line', 'id'}
+    'packet',
+    'pkt',
+    'index',
+    'idx',
+    'count',
+    'counter',
+    'number',
+    'num',
+    'nr',
+    'no',
+    'seq',
+    'sequence',
+    'sample',
+    'frame',
+    'row',
+    'line',
+    'id',
+}
 """Words in the name of a counter, which is no time."""
 
 _OTHER_SENSORS = re.compile(
     r'(?i)gyr|mag(?!nit)|\bm[xyz]\b|(?<![a-z])(pos|dist|height|alt|lat|lon|hum)|'
     r'angular|omega|rate|\bw[xyz]\b|g[xyz]r|rot|orient|quat|press|baro|vel|\bg[xyz]\b|'
-    r'abs|total|norm|std|cov|user|gravity|without|\brad\b|dps|(deg|°)\s?/\s?s|angle')
+    r'abs|total|norm|std|cov|user|gravity|without|\brad\b|dps|(deg|°)\s?/\s?s|angle'
+)
 """Names of columns of other sensors."""
 
-_ACCEL_NAMES = tuple(map(re.compile, (
-    r'(?i)^acc(el(eration|erometer)?)?\b|acc', r'(?i)^(a|f|g_?f|ad)_?[xyz]',
-    r'(?i)^[xyz](\b|_|$)', r'(?i)[xyz]|^a\d')))
+_ACCEL_NAMES = tuple(
+    map(
+        re.compile,
+        (
+            r'(?i)^acc(el(eration|erometer)?)?\b|acc',
+            r'(?i)^(a|f|g_?f|ad)_?[xyz]',
+            r'(?i)^[xyz](\b|_|$)',
+            r'(?i)[xyz]|^a\d',
+        ),
+    )
+)
 """Names of acceleration, the surest first."""
 
 _VOLT_NAMES = re.compile(r'(?i)volt|analog|(?<![a-z])m?v(?![a-z])|^v_?[xyz]|[xyz]_?v$')
 """Names of volts."""
 
 _AXIS_WORD = re.compile(
-    r'(?i)(?:a|acc|accel|g_?f|f|ad|adc|raw|gf|v)?([xyz])|([xyz])(?:acc|accel|adc|raw|v)')
+    r'(?i)(?:a|acc|accel|g_?f|f|ad|adc|raw|gf|v)?([xyz])|([xyz])(?:acc|accel|adc|raw|v)'
+)
 """A word in which x, y or z is the axis."""
 
 _REFERENCES = {
@@ -353,15 +458,20 @@ def propose(table: Table) -> tuple[str, str]:
     """Describe the columns of a table, and the options that most likely read it."""
     seen = f'the columns are {listed(table.names)}'
     sample = next((block.columns for block in table.blocks(table.names, ())), {})
-    values = {name: np.where(np.abs(column) < _LARGEST, column, np.nan)
-              for name, column in sample.items() if np.isfinite(column).any()}
+    values = {
+        name: np.where(np.abs(column) < _LARGEST, column, np.nan)
+        for name, column in sample.items()
+        if np.isfinite(column).any()
+    }
     time = _time_column(table, values)
     outputs = _outputs(table, [name for name in values if name != time], values)
     readings = np.column_stack([values[name] for name in outputs]) if outputs else np.zeros((0, 1))
     unit, zero, length = _unit(table, outputs, readings[np.isfinite(readings).all(axis=1)])
     if not unit:
-        return (f'{seen}; none looks like an accelerometer: name the columns, for example',
-                "--columns 'time=COLUMN:s,x=COLUMN:g,y=COLUMN:g,z=COLUMN:g'")
+        return (
+            f'{seen}; none looks like an accelerometer: name the columns, for example',
+            "--columns 'time=COLUMN:s,x=COLUMN:g,y=COLUMN:g,z=COLUMN:g'",
+        )
     sources = {axis: Source(name, unit) for axis, name in zip(AXES, outputs)}
     stamps, note = '--rate HZ', ' (write the sample rate for HZ)'
     if time:
@@ -388,8 +498,13 @@ def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[s
     unit = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
     middle = (readings > _SIGN_GAP[0]) & (readings < _SIGN_GAP[1])
     is_whole = bool((readings == np.rint(readings)).all())
-    if unit in (None, LSB) and is_whole and readings.min() >= 0 \
-            and not middle.any() and _SIGN_GAP[1] < readings.max() < 1 << 16:
+    if (
+        unit in (None, LSB)
+        and is_whole
+        and readings.min() >= 0
+        and not middle.any()
+        and _SIGN_GAP[1] < readings.max() < 1 << 16
+    ):
         unit, readings = UNSIGNED, signed(readings)
     low, spread = readings.min(axis=0), np.ptp(readings, axis=0)
     zero = 0.0
@@ -399,11 +514,14 @@ def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[s
     length = float(np.median(lengths))
     if not unit:
         is_volts = table.has_names and all(map(_VOLT_NAMES.search, outputs))
-        unit = ('' if zero else _gravity_unit(length, is_whole)) or \
-            ('v' if is_volts and length < 9 else LSB)
+        unit = ('' if zero else _gravity_unit(length, is_whole)) or (
+            'v' if is_volts and length < 9 else LSB
+        )
         unit = '' if unit == LSB and length + zero < 40 else unit
-    is_gravity = np.median(np.abs(lengths - length)) <= _CONSTANT * length and \
-        0.5 < length / GRAVITY.get(unit, length) < 2
+    is_gravity = (
+        np.median(np.abs(lengths - length)) <= _CONSTANT * length
+        and 0.5 < length / GRAVITY.get(unit, length) < 2
+    )
     return (unit if is_gravity or len(outputs) < len(AXES) else ''), zero, length
 
 
@@ -473,8 +591,10 @@ def _outputs(table: Table, names: list[str], values: Mapping[str, np.ndarray]) -
     if table.has_names:
         own = [name for name in names if not _OTHER_SENSORS.search(name)]
         stated = [name for name in own if unit_in_name(name, Quantity.OUTPUT) in GRAVITY]
-        groups = [stated, *([name for name in own if pattern.search(name)]
-                            for pattern in _ACCEL_NAMES)]
+        groups = [
+            stated,
+            *([name for name in own if pattern.search(name)] for pattern in _ACCEL_NAMES),
+        ]
         return next(filter(None, map(_by_axis, groups)), [])
 
     def scatter(triple: list[str]) -> float:
@@ -482,7 +602,7 @@ def _outputs(table: Table, names: list[str], values: Mapping[str, np.ndarray]) -
         median = np.nanmedian(length)
         return float(np.nanmedian(np.abs(length - median)) / max(median, 1e-12))
 
-    return min((names[i:i + 3] for i in range(len(names) - 2)), key=scatter, default=[])
+    return min((names[i : i + 3] for i in range(len(names) - 2)), key=scatter, default=[])
 
 
 def _by_axis(names: Sequence[str]) -> list[str]:
@@ -494,10 +614,10 @@ def _by_axis(names: Sequence[str]) -> list[str]:
         if matches:
             by_letter.setdefault((matches[-1][1] or matches[-1][2]).lower(), name)
     if by_letter:
-        axes = AXES[:len(by_letter)]
+        axes = AXES[: len(by_letter)]
         return [by_letter[axis] for axis in axes] if set(axes) == set(by_letter) else []
     numbered = [name for name in names if re.search(r'(?<!\d)[0-3]\]?$', name)]
-    return numbered[:len(AXES)] if len(numbered) >= len(AXES) else []
+    return numbered[: len(AXES)] if len(numbered) >= len(AXES) else []
 
 
 def _references(values: Mapping[str, np.ndarray], used: set[str | None]) -> dict[str, Source]:

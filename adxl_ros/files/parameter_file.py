@@ -28,7 +28,8 @@ FORMAT = 1  # Version of the format. A file of another version is refused
 UNITS = 'V, V/g, 1/g, rad'  # Units of the coefficients: written into every file, and checked
 
 SENSOR_FIELDS: dict[str, Field[Any]] = {
-    field.metadata['key']: field for field in fields(Sensor) if field.metadata}
+    field.metadata['key']: field for field in fields(Sensor) if field.metadata
+}
 """Fields of `Sensor` by key; the metadata hold unit, bounds and meaning."""
 
 ENVELOPE = {
@@ -44,8 +45,13 @@ ENVELOPE = {
 }
 """Meaning of the keys `envelope.*`, those of `model.sensor.Envelope`; each may be missing."""
 
-ENVELOPE_LISTS = {'temperature_c': 2, 'force_low_mps2': 3, 'force_high_mps2': 3,
-                  'zero_g_nodes_c': 3, 'zero_g_next': 0}
+ENVELOPE_LISTS = {
+    'temperature_c': 2,
+    'force_low_mps2': 3,
+    'force_high_mps2': 3,
+    'zero_g_nodes_c': 3,
+    'zero_g_next': 0,
+}
 """Number of values of the keys `envelope.*` that have more than one; 0 is one for each axis."""
 
 DATASHEET = {
@@ -84,10 +90,13 @@ def _params_folder() -> Path:
     """Return the folder of the installed parameter files: as ROS has it, else the package's."""
     with suppress(ImportError, LookupError, OSError):
         from ament_index_python.packages import get_package_share_directory
+
         return Path(get_package_share_directory('adxl_ros')) / 'params'
     package = Path(__file__).resolve().parents[1]
-    return next((folder for folder in (package / 'params', package.parent / 'params')
-                 if folder.is_dir()), package / 'params')
+    return next(
+        (folder for folder in (package / 'params', package.parent / 'params') if folder.is_dir()),
+        package / 'params',
+    )
 
 
 def installed_path(name: str | os.PathLike) -> Path:
@@ -132,12 +141,14 @@ def usual(is_nominal: bool) -> Sensor:
     return load(usual_path(is_nominal), may_measure=True)
 
 
-def from_flat(flat: Mapping[str, Any], make_error: MakeError, may_measure: bool = False
-              ) -> Sensor:
+def from_flat(flat: Mapping[str, Any], make_error: MakeError, may_measure: bool = False) -> Sensor:
     """Make a `Sensor` of flat parameters by dotted key, which keys of nodes may be among."""
     if flat.get('format') != FORMAT:
-        raise make_error('format', f'version {flat.get("format")!r}, but this package reads '
-                         f'version {FORMAT}; fit the calibration again, or update the package')
+        raise make_error(
+            'format',
+            f'version {flat.get("format")!r}, but this package reads '
+            f'version {FORMAT}; fit the calibration again, or update the package',
+        )
     if flat.get('units', UNITS) != UNITS:
         raise make_error('units', f'{flat["units"]!r}, but coefficients are in {UNITS!r}')
     return _FlatReader(flat, make_error).sensor(may_measure)
@@ -169,9 +180,12 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
         flat[f'provenance.{key}'] = text
     if sensor.datasheet:
         typical, maximum = zip(*sensor.datasheet.values())
-        flat |= {'datasheet.name': sensor.datasheet_name,
-                 'datasheet.figures': [str(name) for name in sensor.datasheet],
-                 'datasheet.typical': list(typical), 'datasheet.maximum': list(maximum)}
+        flat |= {
+            'datasheet.name': sensor.datasheet_name,
+            'datasheet.figures': [str(name) for name in sensor.datasheet],
+            'datasheet.typical': list(typical),
+            'datasheet.maximum': list(maximum),
+        }
     return flat
 
 
@@ -189,8 +203,14 @@ def as_text(sensor: Sensor, comments: Iterable[str] = ()) -> str:
         for parent in parents:
             branch = branch.setdefault(parent, {})
         branch[leaf] = value
-    text = yaml.dump({'/**': {'ros__parameters': tree}}, Dumper=_Dumper, sort_keys=False,
-                     default_flow_style=None, width=99, allow_unicode=True)
+    text = yaml.dump(
+        {'/**': {'ros__parameters': tree}},
+        Dumper=_Dumper,
+        sort_keys=False,
+        default_flow_style=None,
+        width=99,
+        allow_unicode=True,
+    )
     return ''.join(f'# {line}\n' for line in comments) + text
 
 
@@ -204,8 +224,10 @@ def float_text(value: float) -> str:
     return text if '.' in text else text.replace('e', '.0e')
 
 
-_Dumper.add_representer(float, lambda dumper, value: dumper.represent_scalar(
-    'tag:yaml.org,2002:float', float_text(value)))
+_Dumper.add_representer(
+    float,
+    lambda dumper, value: dumper.represent_scalar('tag:yaml.org,2002:float', float_text(value)),
+)
 
 
 def compose(path: str | os.PathLike) -> yaml.Node | None:
@@ -229,8 +251,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         below = next((value for name, value in children if name.value == key), None)
         if not isinstance(below, yaml.MappingNode):
             place = _where(path, parameters and parameters.start_mark)
-            raise UserError(f'{place}: no {key!r} with parameters below it; a parameter file '
-                            "begins with '/**:' and 'ros__parameters:'")
+            raise UserError(
+                f'{place}: no {key!r} with parameters below it; a parameter file '
+                "begins with '/**:' and 'ros__parameters:'"
+            )
         parameters = below
     flat: dict[str, Any] = {}
     marks = {'': parameters.start_mark}
@@ -243,8 +267,9 @@ def _where(path: str | os.PathLike, mark: Any) -> str:
     return f'{path}:{mark.line + 1}:{mark.column + 1}' if mark else f'{path}'
 
 
-def _flatten(node: yaml.MappingNode, prefix: str, flat: dict[str, Any], marks: dict[str, Any],
-             path: Path) -> None:
+def _flatten(
+    node: yaml.MappingNode, prefix: str, flat: dict[str, Any], marks: dict[str, Any], path: Path
+) -> None:
     """Add the values and places below a node to `flat` and `marks`, by dotted key."""
     for name, value in node.value:
         key = f'{prefix}{name.value}'
@@ -286,14 +311,20 @@ class _FlatReader:
         effects = self._names('effects')
         coefficients = {name: self._coefficients(name, axes) for name in effects}
         covariance, covariance_names = self._covariance(effects, axes)
-        return Sensor(**values, effects=effects, values=coefficients, covariance=covariance,
-                      covariance_names=covariance_names, envelope=self._envelope(),
-                      provenance={key: str(value)
-                                  for key, value in self._below('provenance.').items()},
-                      datasheet_name=str(self.flat.get('datasheet.name', '')),
-                      datasheet=self._datasheet(),
-                      link=self._below(_LINK), mounting=self._below(_MOUNTING),
-                      unstated=tuple(unstated))
+        return Sensor(
+            **values,
+            effects=effects,
+            values=coefficients,
+            covariance=covariance,
+            covariance_names=covariance_names,
+            envelope=self._envelope(),
+            provenance={key: str(value) for key, value in self._below('provenance.').items()},
+            datasheet_name=str(self.flat.get('datasheet.name', '')),
+            datasheet=self._datasheet(),
+            link=self._below(_LINK),
+            mounting=self._below(_MOUNTING),
+            unstated=tuple(unstated),
+        )
 
     def _require(self, is_right: Any, key: str, reason: str) -> None:
         if not is_right:
@@ -301,8 +332,11 @@ class _FlatReader:
 
     def _below(self, begin: str) -> dict[str, Any]:
         """Return the values of the keys with this begin, by the rest of the key."""
-        return {key.removeprefix(begin): value for key, value in self.flat.items()
-                if key.startswith(begin)}
+        return {
+            key.removeprefix(begin): value
+            for key, value in self.flat.items()
+            if key.startswith(begin)
+        }
 
     def _field(self, field: Field[Any], axes: str = '') -> Any:
         """Return the value of a field of `Sensor`."""
@@ -315,37 +349,53 @@ class _FlatReader:
         elif kind == 'float':
             value = self._numbers(key, [value])[0].item()
         else:
-            self._require(type(value) is {'int': int, 'str': str}[kind], key,
-                          f'{value!r} is not {"a whole number" if kind == "int" else "text"}')
+            self._require(
+                type(value) is {'int': int, 'str': str}[kind],
+                key,
+                f'{value!r} is not {"a whole number" if kind == "int" else "text"}',
+            )
         choices = about['choices'] or [value]
-        self._require(about['choices'] is None or value in choices, key,
-                      f'{value!r} is not one of {", ".join(map(str, choices))}')
+        self._require(
+            about['choices'] is None or value in choices,
+            key,
+            f'{value!r} is not one of {", ".join(map(str, choices))}',
+        )
         if about['lower'] is not None:
             self._check_bounds(key, value, about['lower'], about['upper'], about['unit'])
         return value
 
     def _check_bounds(self, key: str, values: Any, lower: float, upper: float, unit: str) -> None:
         for value in np.ravel(values):
-            self._require(lower <= value <= upper, key,
-                          f'{value:g} {unit} is outside {lower:g} to {upper:g}')
+            self._require(
+                lower <= value <= upper, key, f'{value:g} {unit} is outside {lower:g} to {upper:g}'
+            )
 
     def _numbers(self, key: str, value: Any, axes: str = '') -> np.ndarray:
         """Return a number or a list of numbers, one for each of the axes, as an array."""
         numbers = value if isinstance(value, (list, tuple, np.ndarray)) else [value]
         for number in numbers:
-            self._require(isinstance(number, float), key,
-                          f'{number!r} is not a floating-point number; write it with a point, as '
-                          '1.0 and 1.0e-6')
+            self._require(
+                isinstance(number, float),
+                key,
+                f'{number!r} is not a floating-point number; write it with a point, as '
+                '1.0 and 1.0e-6',
+            )
             self._require(np.isfinite(number), key, f'{number} is not a finite number')
-        self._require(not axes or len(numbers) == len(axes), key,
-                      f'{len(numbers)} values for {len(axes)} axes ({axes})')
+        self._require(
+            not axes or len(numbers) == len(axes),
+            key,
+            f'{len(numbers)} values for {len(axes)} axes ({axes})',
+        )
         return np.array(numbers, float)
 
     def _names(self, key: str) -> tuple[str, ...]:
         """Return a list of different names; none where the key is missing."""
         names = self.flat.get(key) or []
-        self._require(isinstance(names, (list, tuple)) and all(isinstance(n, str) for n in names),
-                      key, f'{names!r} is not a list of names')
+        self._require(
+            isinstance(names, (list, tuple)) and all(isinstance(n, str) for n in names),
+            key,
+            f'{names!r} is not a list of names',
+        )
         self._require(len(set(names)) == len(names), key, 'a name stands twice')
         return tuple(names)
 
@@ -358,11 +408,16 @@ class _FlatReader:
     def _coefficients(self, name: str, axes: str) -> dict[str, np.ndarray]:
         """Return the values of an effect by parameter, (m,) or ()."""
         effect = self._effect('effects', name)
-        values = {parameter.name: self._values(effect, parameter, axes)
-                  for parameter in effect.parameters}
+        values = {
+            parameter.name: self._values(effect, parameter, axes)
+            for parameter in effect.parameters
+        }
         for parameter in self._below(f'{name}.'):
-            self._require(parameter in values, f'{name}.{parameter}',
-                          f'unknown parameter; {name} has {", ".join(sorted(values))}')
+            self._require(
+                parameter in values,
+                f'{name}.{parameter}',
+                f'unknown parameter; {name} has {", ".join(sorted(values))}',
+            )
         return values
 
     def _values(self, effect: Effect, parameter: Parameter, axes: str) -> np.ndarray:
@@ -370,45 +425,66 @@ class _FlatReader:
         key = str(Coefficient(effect.name, parameter.name))
         if key not in self.flat and parameter.role is Role.OPTIONAL:
             return neutral(effect, axes)[parameter.name]
-        self._require(key in self.flat, key, f'missing; it is the {parameter.doc}, '
-                      f'{parameter.unit}{", by axis" if parameter.axes else ""}')
+        self._require(
+            key in self.flat,
+            key,
+            f'missing; it is the {parameter.doc}, '
+            f'{parameter.unit}{", by axis" if parameter.axes else ""}',
+        )
         stated = self.flat[key]
-        self._require(parameter.axes or not isinstance(stated, (list, tuple)), key,
-                      f'{stated} is a list; it is one number without axes')
+        self._require(
+            parameter.axes or not isinstance(stated, (list, tuple)),
+            key,
+            f'{stated} is a list; it is one number without axes',
+        )
         values = self._numbers(key, stated, axes if parameter.axes else '')
         self._check_bounds(key, values, parameter.lower, parameter.upper, parameter.unit)
         if not parameter.axes:
             return values[0]
         for axis, value in zip(axes, values):
-            self._require(axis in parameter.axes or value == parameter.neutral, key,
-                          f'{value:g} for {axis}, which it does not act on; write '
-                          f'{parameter.neutral!r}')
+            self._require(
+                axis in parameter.axes or value == parameter.neutral,
+                key,
+                f'{value:g} for {axis}, which it does not act on; write {parameter.neutral!r}',
+            )
         return values
 
-    def _covariance(self, effects: Sequence[str], axes: str
-                    ) -> tuple[np.ndarray, tuple[Coefficient, ...]]:
+    def _covariance(
+        self, effects: Sequence[str], axes: str
+    ) -> tuple[np.ndarray, tuple[Coefficient, ...]]:
         """Return the covariance, (k, k), symmetric and positive, and its k coefficients."""
         key, names = 'covariance', self._names('covariance_names')
-        coefficients = {str(name): name for effect in effects
-                        for name in names_of(effect_named(effect), axes)}
+        coefficients = {
+            str(name): name for effect in effects for name in names_of(effect_named(effect), axes)
+        }
         for name in names:
-            self._require(name in coefficients, 'covariance_names',
-                          f'{name!r} is no parameter of the listed effects')
+            self._require(
+                name in coefficients,
+                'covariance_names',
+                f'{name!r} is no parameter of the listed effects',
+            )
         if not names:
             return np.zeros((0, 0)), ()
-        self._require(key in self.flat, key, f'missing; {len(names)} names stand in '
-                      'covariance_names')
+        self._require(
+            key in self.flat, key, f'missing; {len(names)} names stand in covariance_names'
+        )
         matrix = self._numbers(key, self.flat[key])
-        self._require(matrix.size == len(names) ** 2, key, f'{matrix.size} values, but '
-                      f'{len(names)} names need {len(names) ** 2}')
+        self._require(
+            matrix.size == len(names) ** 2,
+            key,
+            f'{matrix.size} values, but {len(names)} names need {len(names) ** 2}',
+        )
         matrix = matrix.reshape(len(names), -1)
         std = np.sqrt(np.maximum(np.diag(matrix), _SMALLEST_VARIANCE))
         correlation = matrix / np.outer(std, std)
         asymmetry = np.abs(correlation - correlation.T).max()
         smallest = np.linalg.eigvalsh(correlation).min()
-        self._require(asymmetry <= _ROUNDING and smallest >= -_ROUNDING, key,
-                      f'not symmetric and positive: its correlations differ by {asymmetry:.3g}, '
-                      f'their smallest eigenvalue is {smallest:.3g}; fit the calibration again')
+        self._require(
+            asymmetry <= _ROUNDING and smallest >= -_ROUNDING,
+            key,
+            f'not symmetric and positive: its correlations differ by {asymmetry:.3g}, '
+            f'their smallest eigenvalue is {smallest:.3g}; fit the calibration again',
+        )
         return matrix, tuple(coefficients[name] for name in names)
 
     def _envelope(self) -> Envelope:
@@ -429,12 +505,18 @@ class _FlatReader:
         for name in names:
             effect, _, parameter = name.partition('.')
             known = self._effect('datasheet.figures', effect).parameters
-            self._require(parameter in [each.name for each in known], 'datasheet.figures',
-                          f'{name!r} is no parameter of {effect}')
+            self._require(
+                parameter in [each.name for each in known],
+                'datasheet.figures',
+                f'{name!r} is no parameter of {effect}',
+            )
         departures = []
         for key in ('datasheet.typical', 'datasheet.maximum') if names else ():
             values = self._numbers(key, self.flat.get(key, []))
-            self._require(len(values) == len(names) and (values >= 0).all(), key,
-                          f'expected {len(names)} values of 0 or more, one for each name')
+            self._require(
+                len(values) == len(names) and (values >= 0).all(),
+                key,
+                f'expected {len(names)} values of 0 or more, one for each name',
+            )
             departures.append(values.tolist())
         return dict(zip(map(Coefficient.parse, names), zip(*departures)))

@@ -36,8 +36,12 @@ _BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 
 _MAGIC_BYTES = 16  # Bytes at the beginning of a file that show its format
 
-_ENDINGS = {b'\x89MCAP': '.mcap', b'SQLite format 3': '.db3', b'\x28\xb5\x2f\xfd': '.zstd',
-            b'#ROSBAG': '.bag'}
+_ENDINGS = {
+    b'\x89MCAP': '.mcap',
+    b'SQLite format 3': '.db3',
+    b'\x28\xb5\x2f\xfd': '.zstd',
+    b'#ROSBAG': '.bag',
+}
 """Usual ends of file names by the first bytes of the files."""
 
 
@@ -66,8 +70,9 @@ def read(path: str | os.PathLike, reading: ReadingOptions = AS_IT_IS) -> Recordi
     return concatenate(blocks(path, _BLOCK_ROWS, reading))
 
 
-def blocks(path: str | os.PathLike, rows: int, reading: ReadingOptions = AS_IT_IS
-           ) -> Generator[Recording, None, None]:
+def blocks(
+    path: str | os.PathLike, rows: int, reading: ReadingOptions = AS_IT_IS
+) -> Generator[Recording, None, None]:
     """
     Read a recording in blocks of at most `rows` samples; the memory is bounded by a block.
 
@@ -84,17 +89,21 @@ def of_table(table: Table, reading: ReadingOptions = AS_IT_IS) -> Recording:
     return concatenate(_table_blocks(table, _BLOCK_ROWS, reading))
 
 
-def _bag_blocks(path: str | os.PathLike, rows: int, **options: Any
-                ) -> Generator[Recording, None, None]:
+def _bag_blocks(
+    path: str | os.PathLike, rows: int, **options: Any
+) -> Generator[Recording, None, None]:
     from adxl_ros.files import bag_reader  # tables need none of it
+
     return bag_reader.blocks(path, rows, **options)
 
 
-def _table_blocks(table: Table, rows: int, reading: ReadingOptions
-                  ) -> Generator[Recording, None, None]:
+def _table_blocks(
+    table: Table, rows: int, reading: ReadingOptions
+) -> Generator[Recording, None, None]:
     """Yield the blocks of a table; propose a mapping where it has none."""
     mapping = reading.mapping or (
-        parse_mapping(table.default_mapping) if table.default_mapping else None)
+        parse_mapping(table.default_mapping) if table.default_mapping else None
+    )
     try:
         blocks = mapped_recording.blocks(table, mapping, reading, rows)
         yield from _mounted(blocks, reading.mounting)
@@ -103,8 +112,9 @@ def _table_blocks(table: Table, rows: int, reading: ReadingOptions
         raise UserError(f'{error}; {text}', options) from None
 
 
-def _mounted(blocks: Iterator[Recording], mounting: Mounting | None
-             ) -> Generator[Recording, None, None]:
+def _mounted(
+    blocks: Iterator[Recording], mounting: Mounting | None
+) -> Generator[Recording, None, None]:
     """Turn the blocks of a recording; they stay as they are without a mounting."""
     if mounting is None:
         yield from blocks
@@ -113,15 +123,19 @@ def _mounted(blocks: Iterator[Recording], mounting: Mounting | None
     for block in blocks:
         names = block.sensor_columns
         if len(names) != len(mounting):
-            raise UserError(f'--axes: names the axes {AXES[:len(mounting)]}, but {block.path} has '
-                            f'{block.axes}')
+            raise UserError(
+                f'--axes: names the axes {AXES[: len(mounting)]}, but {block.path} has '
+                f'{block.axes}'
+            )
         zero = np.zeros(1)
         if names[0] in VOLTS and min(signs) < 0:
             zero = block.stream_info.nominal_values(block.axes).get('nominal_zero_g_v', np.ones(0))
             if len(set(zero)) != 1:
-                raise UserError(f'--axes: inverts an axis of {block.path} in volts about an '
-                                'unknown zero; write a line "# nominal_zero_g_v: ..." with the '
-                                'same value for each axis')
+                raise UserError(
+                    f'--axes: inverts an axis of {block.path} in volts about an '
+                    'unknown zero; write a line "# nominal_zero_g_v: ..." with the '
+                    'same value for each axis'
+                )
         outputs = np.column_stack([block.columns[name] for name in names]) - zero
         turned = (outputs[:, columns] * signs + zero).T.copy()
         yield replace(block, columns={**block.columns, **dict(zip(names, turned))})
@@ -150,8 +164,11 @@ def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> Recording:
         The file cannot be read, or an axis is missing.
 
     """
-    parts = (_bag_blocks(path, _BLOCK_ROWS, ideal=True) if is_bag(path)
-             else mapped_recording.blocks(open_table(path), None, AS_IT_IS, _BLOCK_ROWS, ACCEL))
+    parts = (
+        _bag_blocks(path, _BLOCK_ROWS, ideal=True)
+        if is_bag(path)
+        else mapped_recording.blocks(open_table(path), None, AS_IT_IS, _BLOCK_ROWS, ACCEL)
+    )
     return at_epoch(concatenate(parts), epoch_ns)
 
 
@@ -171,10 +188,12 @@ def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Record
     """
     if Path(path).suffix != '.csv':
         from adxl_ros.files.bag_writer import recording_bag  # tables need none of it
+
         with recording_bag(path, sensor) as append:
             yield append
         return
     with csv_writer(path) as append:
+
         def write_block(block: Recording) -> None:
             epoch = {'epoch_ns': str(block.epoch_ns)} if block.epoch_ns else {}
             append({TIME: block.time_s, **block.columns}, {**block.info, **epoch})
@@ -217,11 +236,15 @@ def is_bag(path: str | os.PathLike) -> bool:
         raise UserError(f'{file_path}: cannot read: {error.strerror or error}') from None
     ending = next((ending for magic, ending in _ENDINGS.items() if head.startswith(magic)), None)
     if ending == '.bag':
-        raise UserError(f'{file_path}: is a bag of ROS 1; convert it: rosbags-convert --src '
-                        f'{file_path} --dst {file_path.with_suffix("")}')
+        raise UserError(
+            f'{file_path}: is a bag of ROS 1; convert it: rosbags-convert --src '
+            f'{file_path} --dst {file_path.with_suffix("")}'
+        )
     if ending == '.zstd':
-        raise UserError(f'{file_path}: is compressed; name the directory with its metadata.yaml, '
-                        f'or unpack it: zstd -d {file_path}')
+        raise UserError(
+            f'{file_path}: is compressed; name the directory with its metadata.yaml, '
+            f'or unpack it: zstd -d {file_path}'
+        )
     if ending and file_path.suffix != ending:
         raise UserError(f'{file_path}: is a bag; rename it so that it ends in {ending}')
     return file_path.suffix in ('.mcap', '.db3')

@@ -53,8 +53,9 @@ class StreamInfo:
             return None
         rate_hz = _numbers(self.texts['rate_hz'])
         if len(rate_hz) != 1 or not 0 < rate_hz[0] < _HIGHEST_RATE_HZ:
-            raise UserError(f'{self.where}: rate_hz is {self.texts["rate_hz"]!r}, expected '
-                            'samples a second')
+            raise UserError(
+                f'{self.where}: rate_hz is {self.texts["rate_hz"]!r}, expected samples a second'
+            )
         return float(rate_hz[0])
 
     def nominal_values(self, axes: str) -> dict[str, np.ndarray]:
@@ -64,8 +65,10 @@ class StreamInfo:
             if key in self.texts:
                 numbers = _numbers(self.texts[key])
                 if len(numbers) != len(axes) or not np.isfinite(numbers).all():
-                    raise UserError(f'{self.where}: {key} is {self.texts[key]!r}, expected '
-                                    f'{len(axes)} numbers, one for each axis')
+                    raise UserError(
+                        f'{self.where}: {key} is {self.texts[key]!r}, expected '
+                        f'{len(axes)} numbers, one for each axis'
+                    )
                 values[key] = numbers
         return values
 
@@ -81,9 +84,12 @@ def _numbers(text: str) -> np.ndarray:
 def sensor_info(sensor: Sensor) -> dict[str, str]:
     """Return the keys and values that a stream of `sensor` states."""
     return {
-        'serial': sensor.serial, 'axes': sensor.axes,
+        'serial': sensor.serial,
+        'axes': sensor.axes,
         **{key: ', '.join(map(repr, getattr(sensor, key).tolist())) for key in NOMINAL_KEYS},
-        'rate_hz': repr(float(sensor.rate_hz)), 'format': FORMAT}
+        'rate_hz': repr(float(sensor.rate_hz)),
+        'format': FORMAT,
+    }
 
 
 def converted_info(texts: Mapping[str, str], sensor: Sensor) -> dict[str, str]:
@@ -148,24 +154,30 @@ class Recording:
         span_s = float(self.time_s[-1] - self.time_s[0]) if len(self) else 0.0
         rate = f', {self.rate_hz:.4g} Hz' if len(self) > 1 else ''
         further = [name for name in self.columns if name not in self.sensor_columns]
-        return (f'{Path(self.path).name}: {span_s:.4g} s{rate}, axes {" ".join(self.axes)}'
-                + f', with {", ".join(further)}' * bool(further))
+        return (
+            f'{Path(self.path).name}: {span_s:.4g} s{rate}, axes {" ".join(self.axes)}'
+            + f', with {", ".join(further)}' * bool(further)
+        )
 
     def save(self, path: str | os.PathLike) -> None:
         """Write a CSV file NAME.csv, a bag NAME.mcap, or a rosbag2 directory."""
         from adxl_ros.files import parameter_file, recording
-        unit = uncalibrated(parameter_file.usual(self.is_of_nominal), self.stream_info, self.axes,
-                            self.rate_hz)
+
+        unit = uncalibrated(
+            parameter_file.usual(self.is_of_nominal), self.stream_info, self.axes, self.rate_hz
+        )
         recording.write(path, self, unit)
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with the stamps as index, s, and a column for each of `columns`."""
         from pandas import DataFrame, Index
+
         return DataFrame(self.columns, index=Index(self.time_s, name=TIME))
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the sensor's output over time into axes of matplotlib, new ones for None."""
         from adxl_ros.report.figures import axes_for, AXIS_COLOURS
+
         ax, unit = axes_for(ax), 'V' if self.sensor_columns[0] in VOLTS else 'm/s²'
         for axis, name in zip(self.axes, self.sensor_columns):
             ax.plot(self.time_s, self.columns[name], lw=0.8, label=axis, color=AXIS_COLOURS[axis])
@@ -177,16 +189,22 @@ class Recording:
     def notes(self) -> tuple[str, ...]:
         """Return what was assumed in reading, where it is cut, and how references are aligned."""
         # References with the stamps of the samples need no alignment.
-        aligned = [f'{self.path}: {name} aligned by its stamps: residual {residual:.3g} '
-                   f'{column_unit(name)} rms'
-                   for name, residual in self.alignments.items() if residual]
+        aligned = [
+            f'{self.path}: {name} aligned by its stamps: residual {residual:.3g} '
+            f'{column_unit(name)} rms'
+            for name, residual in self.alignments.items()
+            if residual
+        ]
         return (*self.remarks, *[self.cut] * bool(self.cut), *aligned)
 
     def rows(self, start: int, stop: int) -> Recording:
         """Return a part of the samples."""
         part = slice(start, stop)
-        return replace(self, time_s=self.time_s[part],
-                       columns={name: values[part] for name, values in self.columns.items()})
+        return replace(
+            self,
+            time_s=self.time_s[part],
+            columns={name: values[part] for name, values in self.columns.items()},
+        )
 
     @property
     def sensor_columns(self) -> tuple[str, ...]:
@@ -196,13 +214,12 @@ class Recording:
     @property
     def is_of_nominal(self) -> bool:
         """Return whether it is in volts or states a conversion, as those of this package do."""
-        return self.sensor_columns[0] in VOLTS or bool(
-            self.stream_info.nominal_values(self.axes))
+        return self.sensor_columns[0] in VOLTS or bool(self.stream_info.nominal_values(self.axes))
 
     @property
     def axes(self) -> str:
         """Return the measured axes: x, xy or xyz."""
-        return AXES[:len(self.sensor_columns)]
+        return AXES[: len(self.sensor_columns)]
 
     @property
     def stamp_ns(self) -> np.ndarray:
@@ -242,23 +259,28 @@ class Recording:
     def accel_mps2(self, sensor: Sensor) -> np.ndarray:
         """Return the specific force by the nominal values of `sensor`, m/s², (n, m)."""
         names, data = self._output(sensor)
-        if names[0] in ACCEL and all(np.array_equal(getattr(self._nominal(sensor), key),
-                                                    getattr(sensor, key)) for key in NOMINAL_KEYS):
+        if names[0] in ACCEL and all(
+            np.array_equal(getattr(self._nominal(sensor), key), getattr(sensor, key))
+            for key in NOMINAL_KEYS
+        ):
             return data
         return to_nominal_mps2(self.volts(sensor), sensor)
 
     def _output(self, sensor: Sensor) -> tuple[tuple[str, ...], np.ndarray]:
         names = self.sensor_columns
         if len(names) < len(sensor.axes):
-            raise UserError(f'{self.path}: has the axes {self.axes}, but the sensor '
-                            f'{sensor.serial} has {sensor.axes}; name its own parameter file')
-        names = names[:len(sensor.axes)]
+            raise UserError(
+                f'{self.path}: has the axes {self.axes}, but the sensor '
+                f'{sensor.serial} has {sensor.axes}; name its own parameter file'
+            )
+        names = names[: len(sensor.axes)]
         return names, np.column_stack([self.columns[name] for name in names])
 
     def _nominal(self, sensor: Sensor) -> Sensor:
         stated: dict[str, Any] = {
-            name: values[:len(sensor.axes)]
-            for name, values in self.stream_info.nominal_values(self.axes).items()}
+            name: values[: len(sensor.axes)]
+            for name, values in self.stream_info.nominal_values(self.axes).items()
+        }
         return replace(sensor, **stated)
 
 
@@ -268,9 +290,11 @@ def sensor_columns(names: Iterable[str], where: str) -> tuple[str, ...]:
     kind = VOLTS if any(name in names for name in VOLTS) else ACCEL
     present = tuple(name for name in kind if name in names)
     if not present:
-        raise UserError(f'{where}: no column of a sensor: needs x_v[, y_v][, z_v] or '
-                        'ax_mps2[, ay_mps2][, az_mps2]')
-    expected = kind[:len(present)]
+        raise UserError(
+            f'{where}: no column of a sensor: needs x_v[, y_v][, z_v] or '
+            'ax_mps2[, ay_mps2][, az_mps2]'
+        )
+    expected = kind[: len(present)]
     if present != expected:
         missing = next(name for name in expected if name not in present)
         raise UserError(f'{where}: no column {missing} beside {", ".join(present)}')
@@ -281,10 +305,12 @@ def concatenate(parts: Iterable[Recording]) -> Recording:
     """Join the blocks of a recording; its columns, info and cut are those of the last one."""
     blocks = list(parts)
     last = blocks[-1]
-    columns = {name: np.concatenate([block.columns[name] for block in blocks])
-               for name in last.columns}
-    return replace(last, time_s=np.concatenate([block.time_s for block in blocks]),
-                   columns=columns)
+    columns = {
+        name: np.concatenate([block.columns[name] for block in blocks]) for name in last.columns
+    }
+    return replace(
+        last, time_s=np.concatenate([block.time_s for block in blocks]), columns=columns
+    )
 
 
 class StampCheck:
@@ -295,11 +321,13 @@ class StampCheck:
         self._path, self._may_drop = path, may_drop
         self._last_s = -np.inf
 
-    def increasing(self, time_s: np.ndarray, is_sample: np.ndarray, where: Callable[[int], str]
-                   ) -> np.ndarray:
+    def increasing(
+        self, time_s: np.ndarray, is_sample: np.ndarray, where: Callable[[int], str]
+    ) -> np.ndarray:
         """Return which samples among rows, (n,), increase; `where` names the place of a row."""
-        latest = np.maximum.accumulate(np.concatenate([
-            [self._last_s], np.where(is_sample, time_s, -np.inf)]))
+        latest = np.maximum.accumulate(
+            np.concatenate([[self._last_s], np.where(is_sample, time_s, -np.inf)])
+        )
         self._last_s, latest = latest[-1], latest[:-1]
         wrong = is_sample & ~(time_s > latest)
         stands = wrong & (time_s == latest)
@@ -309,55 +337,77 @@ class StampCheck:
                 f'{where(row)}: time {"stands still" if stands[row] else "runs backwards"}, '
                 f'{latest[row] - time_s[row]:.3g} s before the newest sample'
                 f'{describe_bursts(time_s[is_sample])}; --drop-bad-stamps leaves such samples '
-                'out, --rate HZ stamps by index')
+                'out, --rate HZ stamps by index'
+            )
         duplicates = int(stands.sum())
-        self.bad = BadStamps(self.bad.duplicates + duplicates,
-                             self.bad.backward + int(wrong.sum()) - duplicates)
+        self.bad = BadStamps(
+            self.bad.duplicates + duplicates, self.bad.backward + int(wrong.sum()) - duplicates
+        )
         return is_sample & ~wrong
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Return what was left out, for people."""
         kinds = ('samples with the stamp of the one before', 'samples whose stamp steps back')
-        return tuple(f'{self._path}: left out, {kind}: {count}'
-                     for kind, count in zip(kinds, self.bad) if count)
+        return tuple(
+            f'{self._path}: left out, {kind}: {count}'
+            for kind, count in zip(kinds, self.bad)
+            if count
+        )
 
 
 def check_unit(info: StreamInfo, axes: str, sensor: Sensor) -> None:
     """Refuse samples that state another unit than the one that `sensor` describes."""
     version = info.texts.get('format', FORMAT)
     if version != FORMAT:
-        raise UserError(f'{info.where}: format version {version}, but this package reads version '
-                        f'{FORMAT}; update the package')
+        raise UserError(
+            f'{info.where}: format version {version}, but this package reads version '
+            f'{FORMAT}; update the package'
+        )
     _check_serial(info, sensor)
     if axes != sensor.axes:
-        raise UserError(f'{info.where}: samples of the axes {axes}, but the parameters of '
-                        f'{sensor.serial} are for {sensor.axes}; name the file of this sensor')
+        raise UserError(
+            f'{info.where}: samples of the axes {axes}, but the parameters of '
+            f'{sensor.serial} are for {sensor.axes}; name the file of this sensor'
+        )
     for key, stated in info.nominal_values(axes).items():
         expected = getattr(sensor, key)
         if not np.array_equal(stated, expected):
-            raise UserError(f'{info.where}: {key} is {stated.tolist()}, but {expected.tolist()} '
-                            f'in the parameters of {sensor.serial}; name the parameter file that '
-                            'the samples were made with')
+            raise UserError(
+                f'{info.where}: {key} is {stated.tolist()}, but {expected.tolist()} '
+                f'in the parameters of {sensor.serial}; name the parameter file that '
+                'the samples were made with'
+            )
 
 
 def _check_serial(info: StreamInfo, sensor: Sensor) -> None:
     if info.serial != sensor.serial and NO_UNIT not in (info.serial, sensor.serial):
-        raise UserError(f'{info.where}: is of the sensor {info.serial}, but the parameters are of '
-                        f'{sensor.serial}; give the parameters of that sensor, or nominal ones')
+        raise UserError(
+            f'{info.where}: is of the sensor {info.serial}, but the parameters are of '
+            f'{sensor.serial}; give the parameters of that sensor, or nominal ones'
+        )
 
 
 def uncalibrated(sensor: Sensor, info: StreamInfo, axes: str, rate_hz: float) -> Sensor:
     """Return the nominal sensor that a stream states, without a fitted coefficient."""
     measured = {key: text for key, text in sensor.provenance.items() if key == 'noise_from'}
-    bare = with_axes(replace(sensor.without_covariance(), model='nominal', effects=(), values={},
-                             provenance=measured), axes)
+    bare = with_axes(
+        replace(
+            sensor.without_covariance(),
+            model='nominal',
+            effects=(),
+            values={},
+            provenance=measured,
+        ),
+        axes,
+    )
     stated: dict[str, Any] = dict(info.nominal_values(axes))
     return replace(bare, serial=info.texts.get('serial', sensor.serial), rate_hz=rate_hz, **stated)
 
 
-def unit_of(sensor: Sensor, info: StreamInfo, axes: str | None = None,
-            rate_hz: float | None = None) -> Sensor:
+def unit_of(
+    sensor: Sensor, info: StreamInfo, axes: str | None = None, rate_hz: float | None = None
+) -> Sensor:
     """Return the nominal sensor of a stream, whose serial number must not contradict `sensor`."""
     _check_serial(info, sensor)
     axes = axes or info.axes or sensor.axes
@@ -395,8 +445,9 @@ class Track:
     nobody knows how.
     """
 
-    def __init__(self, where: str, stamp_ns: np.ndarray, value: np.ndarray,
-                 longest_ns: float = np.inf) -> None:
+    def __init__(
+        self, where: str, stamp_ns: np.ndarray, value: np.ndarray, longest_ns: float = np.inf
+    ) -> None:
         """
         Take the messages.
 
@@ -407,9 +458,11 @@ class Track:
         step = np.diff(stamps)
         if (step < 0).any():
             i = int((step < 0).argmax())
-            raise UserError(f'{where}: time runs backwards: {seconds(stamps[i + 1])} comes '
-                            f'after {seconds(stamps[i])}')
-        is_last = np.append(step > 0, True)[:len(stamps)]
+            raise UserError(
+                f'{where}: time runs backwards: {seconds(stamps[i + 1])} comes '
+                f'after {seconds(stamps[i])}'
+            )
+        is_last = np.append(step > 0, True)[: len(stamps)]
         self._stamp_ns, self._value = stamps[is_last], values[is_last]
         step = step[step > 0]
         self._usual_ns = float(np.median(step)) if len(step) else 0.0
@@ -427,8 +480,9 @@ class Track:
         result = np.interp(sample_ns, message_ns, values)
         is_known = (sample_ns >= -self._usual_ns) & (sample_ns <= message_ns[-1] + self._usual_ns)
         after = np.searchsorted(message_ns, sample_ns).clip(max=len(message_ns) - 1)
-        is_long = np.append(False, (np.diff(message_ns) > self._longest_ns)
-                            & (np.diff(values) != 0))
+        is_long = np.append(
+            False, (np.diff(message_ns) > self._longest_ns) & (np.diff(values) != 0)
+        )
         is_inside = (sample_ns > message_ns[0]) & (sample_ns < message_ns[after])
         result[~is_known | (is_inside & is_long[after])] = np.nan
         self._is_exact &= bool((sample_ns == message_ns[after])[is_known].all())
@@ -448,4 +502,4 @@ class Track:
         time_ns, value = self._stamp_ns - self._stamp_ns[0], self._value
         share = (time_ns[1:-1] - time_ns[:-2]) / (time_ns[2:] - time_ns[:-2])
         residual = value[1:-1] - (value[:-2] + share * (value[2:] - value[:-2]))
-        return float(np.sqrt(np.mean(residual ** 2)))
+        return float(np.sqrt(np.mean(residual**2)))

@@ -34,8 +34,13 @@ class Readings(NamedTuple):
     base: Track | None = None
 
 
-def read(path: str | os.PathLike, epoch_ns: int, topic: str = '', root: str = '',
-         needs_joints: bool = True) -> Readings:
+def read(
+    path: str | os.PathLike,
+    epoch_ns: int,
+    topic: str = '',
+    root: str = '',
+    needs_joints: bool = True,
+) -> Readings:
     """
     Read joints and base of a robot.
 
@@ -70,10 +75,15 @@ def read(path: str | os.PathLike, epoch_ns: int, topic: str = '', root: str = ''
         joints = {}
         if needs_joints:
             stamp_ns, _, columns = series(
-                bag, choose_topic(bag, JOINT_STATE, 'joint_states', topic, '--joints'),
-                cdr.joint_state, positions)
-            joints = {name: _track((stamp_ns - epoch_ns) / 1e9, values)
-                      for name, values in columns.items()}
+                bag,
+                choose_topic(bag, JOINT_STATE, 'joint_states', topic, '--joints'),
+                cdr.joint_state,
+                positions,
+            )
+            joints = {
+                name: _track((stamp_ns - epoch_ns) / 1e9, values)
+                for name, values in columns.items()
+            }
         return Readings(str(path), joints, _base(bag, root, epoch_ns))
 
 
@@ -81,15 +91,20 @@ def _from_table(path: str) -> Readings:
     table = open_table(path)
     if 'time_s' not in table.names:
         raise UserError(f'{path}: no column time_s beside the joints of a robot')
-    joints = {name: name.rpartition('_')[0] for name in table.names
-              if name.endswith(('_rad', '_m')) and not name.startswith('base_')}
+    joints = {
+        name: name.rpartition('_')[0]
+        for name in table.names
+        if name.endswith(('_rad', '_m')) and not name.startswith('base_')
+    }
     base = [f'base_{name}' for name in _BASE]
     base = base if set(base) <= set(table.names) else []
     columns = table.read(['time_s', *joints, *base])
     times = columns['time_s']
-    return Readings(path, {joint: _track(times, columns[name]) for name, joint in joints.items()},
-                    _track(times, np.column_stack([columns[name] for name in base]))
-                    if base else None)
+    return Readings(
+        path,
+        {joint: _track(times, columns[name]) for name, joint in joints.items()},
+        _track(times, np.column_stack([columns[name] for name in base])) if base else None,
+    )
 
 
 def _track(time_s: np.ndarray, values: np.ndarray) -> Track:
@@ -103,17 +118,29 @@ def _base(bag: Bag, root: str, epoch_ns: int) -> Track | None:
     """Return the pose of the base by odometry, or else by tf; None where neither moves it."""
     store, kinds = typestore(), dict(sorted(bag.types))
     odometry = [topic for topic, kind in kinds.items() if kind == _ODOMETRY]
-    topics = odometry or [topic for topic, kind in kinds.items()
-                          if kind == _TRANSFORMS and topic.endswith('tf')]
+    topics = odometry or [
+        topic for topic, kind in kinds.items() if kind == _TRANSFORMS and topic.endswith('tf')
+    ]
     # Stamps and poses by topic and the frame that moves
     moving: dict[tuple[str, str], tuple[list[int], list[list[float]]]] = {}
     for topic, raw in ((name, raw) for name in topics for raw in bag.messages(name)):
         message = store.deserialize_cdr(raw, kinds[topic])
-        for header, child, place, turn in [(
-                message.header, message.child_frame_id, message.pose.pose.position,
-                message.pose.pose.orientation)] if odometry else [
+        for header, child, place, turn in (
+            [
+                (
+                    message.header,
+                    message.child_frame_id,
+                    message.pose.pose.position,
+                    message.pose.pose.orientation,
+                )
+            ]
+            if odometry
+            else [
                 (t.header, t.child_frame_id, t.transform.translation, t.transform.rotation)
-                for t in message.transforms if t.child_frame_id.strip('/') == root]:
+                for t in message.transforms
+                if t.child_frame_id.strip('/') == root
+            ]
+        ):
             stamps, poses = moving.setdefault((topic, child.strip('/') or root), ([], []))
             stamps.append(header.stamp.sec * 1_000_000_000 + header.stamp.nanosec)
             poses.append([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
@@ -125,6 +152,7 @@ def _base(bag: Bag, root: str, epoch_ns: int) -> Track | None:
         raise UserError(
             f'{bag.path}: {len(of_root) or "no"} topics have the pose of {root}, the root of the '
             f'URDF; there are {", ".join(f"{t} of {child}" for t, child in moving)}; record one '
-            'for the root, or give a URDF whose root that frame is')
+            'for the root, or give a URDF whose root that frame is'
+        )
     stamps, poses = moving[of_root[0]]
     return _track((np.array(stamps) - epoch_ns) / 1e9, np.array(poses))

@@ -81,10 +81,11 @@ def period_s(time_s: np.ndarray) -> float:
     if len(ends) < 2:
         ends = np.array([0, len(time_s) - 1])
     lag = max(min(_LAG, (len(ends) - 1) // 4), 1)
-    period = float(np.median((time_s[ends[lag:]] - time_s[ends[:-lag]])
-                             / (ends[lag:] - ends[:-lag])))
+    period = float(
+        np.median((time_s[ends[lag:]] - time_s[ends[:-lag]]) / (ends[lag:] - ends[:-lag]))
+    )
     # From the end of a burst to the end of another one, so that all of them are whole.
-    time_s = time_s[ends[0]:ends[-1] + 1]
+    time_s = time_s[ends[0] : ends[-1] + 1]
     steps_s = np.diff(time_s)
     for _ in range(_ROUNDS):
         if not period > 0:
@@ -135,8 +136,11 @@ def halves(time_s: np.ndarray) -> Halves:
     middle = int(np.searchsorted(time_s, (time_s[0] + time_s[-1]) / 2))
     middle = min(max(middle, 1), len(time_s) - 2)
     span_s = max(float(time_s[-1] - time_s[0]), np.finfo(float).tiny)
-    return Halves(stamped_rate_hz(time_s[:middle + 1]), stamped_rate_hz(time_s[middle:]),
-                  (len(time_s) - 1) / span_s)
+    return Halves(
+        stamped_rate_hz(time_s[: middle + 1]),
+        stamped_rate_hz(time_s[middle:]),
+        (len(time_s) - 1) / span_s,
+    )
 
 
 def late_by(stamps: np.ndarray) -> np.ndarray:
@@ -149,5 +153,7 @@ def describe_bursts(time_s: np.ndarray) -> str:
     size = burst_samples(time_s)
     if size == 1:
         return ''
-    return f'; stamps come in bursts of about {size} samples (USB, or a buffer), at a mean of ' \
-           f'{stamped_rate_hz(time_s):.4g} Hz'
+    return (
+        f'; stamps come in bursts of about {size} samples (USB, or a buffer), at a mean of '
+        f'{stamped_rate_hz(time_s):.4g} Hz'
+    )

@@ -51,53 +51,82 @@ class Surroundings:
     the nominal one.
     """
 
-    _quantities: dict[str, _Quantity] = field(default_factory=lambda: {
-        name: _Quantity(getattr(NOMINAL_ENVIRONMENT, name))
-        for name in ('temperature_c', 'supply_v')})
+    _quantities: dict[str, _Quantity] = field(
+        default_factory=lambda: {
+            name: _Quantity(getattr(NOMINAL_ENVIRONMENT, name))
+            for name in ('temperature_c', 'supply_v')
+        }
+    )
 
     def __call__(self, block: Recording) -> dict[str, np.ndarray]:
         """Return the values at the samples of a block, (n,) each, by column; never NaN."""
         missing = np.full(len(block), np.nan)
-        return {name: quantity.filled(block.time_s, block.columns.get(name, missing))
-                for name, quantity in self._quantities.items()} if len(block) else {}
+        return (
+            {
+                name: quantity.filled(block.time_s, block.columns.get(name, missing))
+                for name, quantity in self._quantities.items()
+            }
+            if len(block)
+            else {}
+        )
 
     def assumed(self, effects: Iterable[str]) -> list[str]:
         """Return what is assumed of what the named effects follow, one line each, for people."""
         lines = []
         for name, quantity, names in self._followed(effects):
             if quantity.unknown:
-                lines.append(f'{name} is missing before its first value, in {quantity.unknown} of '
-                             f'{quantity.samples} samples: {names} at {quantity.nominal:g} '
-                             f'{column_unit(name)} there')
+                lines.append(
+                    f'{name} is missing before its first value, in {quantity.unknown} of '
+                    f'{quantity.samples} samples: {names} at {quantity.nominal:g} '
+                    f'{column_unit(name)} there'
+                )
             if quantity.missing:
-                lines.append(f'{name} is missing in {quantity.missing} of {quantity.samples} '
-                             f'samples, for {quantity.longest_s:.3g} s at most: the value before '
-                             'holds')
+                lines.append(
+                    f'{name} is missing in {quantity.missing} of {quantity.samples} '
+                    f'samples, for {quantity.longest_s:.3g} s at most: the value before '
+                    'holds'
+                )
         return [*self._unknown(effects), *lines]
 
     def interpolated(self, effects: Iterable[str]) -> list[str]:
         """Return the same where missing values are interpolated over the whole recording."""
-        return [*self._unknown(effects), *(
-            f'{name} is missing in {quantity.missing + quantity.unknown} of {quantity.samples} '
-            'samples: it is interpolated, and the nearest value holds at the ends'
-            for name, quantity, _ in self._followed(effects)
-            if quantity.missing + quantity.unknown)]
+        return [
+            *self._unknown(effects),
+            *(
+                f'{name} is missing in {quantity.missing + quantity.unknown} of '
+                f'{quantity.samples} '
+                'samples: it is interpolated, and the nearest value holds at the ends'
+                for name, quantity, _ in self._followed(effects)
+                if quantity.missing + quantity.unknown
+            ),
+        ]
 
     def _followed(self, effects: Iterable[str]) -> list[tuple[str, _Quantity, str]]:
         """Return what has values: its column, its state, and the effects that follow it."""
         names = _followers(effects)
-        return [(name, quantity, names[name]) for name, quantity in self._quantities.items()
-                if name in names and quantity.unknown < quantity.samples]
+        return [
+            (name, quantity, names[name])
+            for name, quantity in self._quantities.items()
+            if name in names and quantity.unknown < quantity.samples
+        ]
 
     def _unknown(self, effects: Iterable[str]) -> list[str]:
         """Return what is assumed for the whole recording, one line each."""
         names = _followers(effects)
-        power_on = [f'{names["time_s"]}: as if the sensor was switched on at the first sample'] \
-            if 'time_s' in names else []
-        return [*power_on, *(
-            f'{name} is not recorded: {names[name]} at {quantity.nominal:g} {column_unit(name)}'
-            for name, quantity in self._quantities.items()
-            if name in names and quantity.unknown == quantity.samples)]
+        power_on = (
+            [f'{names["time_s"]}: as if the sensor was switched on at the first sample']
+            if 'time_s' in names
+            else []
+        )
+        return [
+            *power_on,
+            *(
+                f'{name} is not recorded: {names[name]} at {quantity.nominal:g} '
+                f'{column_unit(name)}'
+                for name, quantity in self._quantities.items()
+                if name in names and quantity.unknown == quantity.samples
+            ),
+        ]
 
 
 def _followers(effects: Iterable[str]) -> dict[str, str]:

@@ -43,8 +43,11 @@ class PoseRecord:
 
     def to_json(self) -> dict[str, Any]:
         """Return the keys and values of the record's line; NaN and None have no key."""
-        return {key: value for key, value in asdict(self).items()
-                if value is not None and value == value}  # NaN differs from itself
+        return {
+            key: value
+            for key, value in asdict(self).items()
+            if value is not None and value == value
+        }  # NaN differs from itself
 
     @classmethod
     def from_json(cls, line: Mapping[str, Any]) -> PoseRecord:
@@ -139,20 +142,25 @@ class Unfinished(NamedTuple):
 class Journal:
     """An append-only file of JSON lines, locked while it is open: a head, then entries."""
 
-    def __init__(self, path: str | os.PathLike, head: Mapping[str, Any],
-                 start_over: bool = False) -> None:
+    def __init__(
+        self, path: str | os.PathLike, head: Mapping[str, Any], start_over: bool = False
+    ) -> None:
         self.path = Path(path)
         try:
             self._file = open(self.path, 'a+b', buffering=0)  # noqa: SIM115 (kept open)
         except OSError as error:
-            raise UserError(f'{path}: cannot write the journal: {error.strerror}; choose a '
-                            'directory that exists and can be written') from None
+            raise UserError(
+                f'{path}: cannot write the journal: {error.strerror}; choose a '
+                'directory that exists and can be written'
+            ) from None
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             self._file.close()
-            raise UserError(f'{path}: another calibration is writing this journal; finish or '
-                            'abort it, or choose another journal') from None
+            raise UserError(
+                f'{path}: another calibration is writing this journal; finish or '
+                'abort it, or choose another journal'
+            ) from None
         try:
             # Entries of an interrupted calibration with the same head, in order
             self.entries = self._resume(_as_read(head), start_over)
@@ -172,8 +180,9 @@ class Journal:
         try:
             append_line(self._file, json.dumps(line))
         except OSError as error:
-            raise UserError(f'{self.path}: cannot write the journal: {error.strerror}; make '
-                            'room and try again') from None
+            raise UserError(
+                f'{self.path}: cannot write the journal: {error.strerror}; make room and try again'
+            ) from None
 
     def _resume(self, head: dict[str, Any], start_over: bool) -> list[JournalEntry]:
         """Return the entries of an interrupted calibration, or begin a new file with the head."""
@@ -182,13 +191,17 @@ class Journal:
             raise UserError(
                 f'{self.path}: {found.damage}; {len(accepted_poses(found.entries))} poses before '
                 'it can be read; name another journal, or begin again with resume:=anew (this '
-                'file is kept)')
+                'file is kept)'
+            )
         is_new = not found.head and not found.damage
         if not is_new and (start_over or found.is_over(head)):
             # A finished journal is kept until the next one is finished, others for ever.
             last = found.entries[-1] if found.entries else None
-            name = 'previous' if isinstance(last, Fitted) and last.done and not found.damage else \
-                datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
+            name = (
+                'previous'
+                if isinstance(last, Fitted) and last.done and not found.damage
+                else datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
+            )
             with atomic_path(self.path.with_name(f'{self.path.name}.{name}')) as copy:
                 shutil.copyfile(self.path, copy)
             is_new = True
@@ -198,8 +211,10 @@ class Journal:
             sync(self.path.parent)
             return []
         if changed := differences(found.head, head):
-            raise UserError(f'{self.path}: holds an unfinished calibration of another kind: '
-                            f'{changed}; go back, or begin again with resume:=anew (it is kept)')
+            raise UserError(
+                f'{self.path}: holds an unfinished calibration of another kind: '
+                f'{changed}; go back, or begin again with resume:=anew (it is kept)'
+            )
         self._file.truncate(found.size)
         return found.entries
 
@@ -220,14 +235,20 @@ def unfinished(path: str | os.PathLike, head: Mapping[str, Any]) -> Unfinished |
     poses = len(accepted_poses(found.entries))
     if found.damage:
         return Unfinished(poses, found.damage)
-    return Unfinished(poses, differences(found.head, new_head)) \
-        if poses and not found.is_over(new_head) else None
+    return (
+        Unfinished(poses, differences(found.head, new_head))
+        if poses and not found.is_over(new_head)
+        else None
+    )
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
     """Return in which keys two heads differ."""
-    return ', '.join(f'{key} was {json.dumps(old.get(key))}, is {json.dumps(new.get(key))}'
-                     for key in {**new, **old} if old.get(key) != new.get(key))
+    return ', '.join(
+        f'{key} was {json.dumps(old.get(key))}, is {json.dumps(new.get(key))}'
+        for key in {**new, **old}
+        if old.get(key) != new.get(key)
+    )
 
 
 def skipped_poses(entries: Sequence[JournalEntry]) -> set[int]:
@@ -272,8 +293,9 @@ def _parse(path: Path) -> JournalContents:
     entries: list[JournalEntry] = []
     # A crash may have left the beginning of the head, or its length without its bytes.
     if b'\n' not in data and data.strip(b'\0') and not data.startswith(b'{'):
-        return JournalContents(head, entries, 0,
-                               'line 1 is not of a journal (it does not begin with {)')
+        return JournalContents(
+            head, entries, 0, 'line 1 is not of a journal (it does not begin with {)'
+        )
     size = 0
     # The text after the last newline is a line that a crash has cut.
     for number, raw in enumerate(data.split(b'\n')[:-1], 1):
@@ -286,11 +308,13 @@ def _parse(path: Path) -> JournalContents:
             elif line.get('format') == FORMAT:
                 head = line
             else:
-                raise ValueError(f'format {line.get("format")!r}, but this package reads version '
-                                 f'{FORMAT}')
+                raise ValueError(
+                    f'format {line.get("format")!r}, but this package reads version {FORMAT}'
+                )
         except (ValueError, TypeError, KeyError) as error:
-            return JournalContents(head, entries, size, f'line {number} is not of a journal '
-                                   f'({error})')
+            return JournalContents(
+                head, entries, size, f'line {number} is not of a journal ({error})'
+            )
         size += len(raw) + 1
     return JournalContents(head, entries, size, '')
 

@@ -24,7 +24,7 @@ _BLOCK_ROWS = 65536  # Rows that are read at a time (chosen: some MB)
 _MAPPINGS = {
     'sensor_accel': 'time={time}:us,x=x:mps2,y=y:mps2,z=z:mps2,temperature=temperature:c',
     'sensor_combined': 'time=timestamp:us,x=accelerometer_m_s2[0]:mps2,'
-                       'y=accelerometer_m_s2[1]:mps2,z=accelerometer_m_s2[2]:mps2',
+    'y=accelerometer_m_s2[1]:mps2,z=accelerometer_m_s2[2]:mps2',
     'vehicle_acceleration': 'time={time}:us,x=xyz[0]:mps2,y=xyz[1]:mps2,z=xyz[2]:mps2',
 }
 """Columns and units of messages by the definitions of PX4 (msg/*.msg), the raw readings first."""
@@ -41,24 +41,39 @@ def open_table(path: str | os.PathLike, topic: str = '') -> Table:
     if ending in _FORMATS:
         return _FORMATS[ending](path)
     form = find_form(path)
-    return Table(path, form.names, partial(read_blocks, path, form),
-                 header_line=form.header_line, repeated=form.repeated)
+    return Table(
+        path,
+        form.names,
+        partial(read_blocks, path, form),
+        header_line=form.header_line,
+        repeated=form.repeated,
+    )
 
 
-def in_memory(path: str, columns: Mapping[str, np.ndarray], cut: str = '',
-              info: Mapping[str, str] = MappingProxyType({}), **about: Any) -> Table:
+def in_memory(
+    path: str,
+    columns: Mapping[str, np.ndarray],
+    cut: str = '',
+    info: Mapping[str, str] = MappingProxyType({}),
+    **about: Any,
+) -> Table:
     """
     Return a table of arrays (n,) by name.
 
     cut: where a damaged file ends; info: keys and values that it states.
     """
+
     def blocks(names: Collection[str], _: Collection[str]) -> Iterator[TableBlock]:
         rows = len(next(iter(columns.values())))
         for start in range(0, rows, _BLOCK_ROWS):
             stop = min(start + _BLOCK_ROWS, rows)
-            yield TableBlock({name: np.asarray(columns[name][start:stop], float)
-                              for name in names},
-                             _row_places(path, start), info, stop / rows, cut)
+            yield TableBlock(
+                {name: np.asarray(columns[name][start:stop], float) for name in names},
+                _row_places(path, start),
+                info,
+                stop / rows,
+                cut,
+            )
 
     return Table(path, tuple(columns), blocks, **about)
 
@@ -76,28 +91,35 @@ def _library(path: str, kind: str, package: str) -> Iterator[None]:
     except UserError:
         raise
     except ImportError:
-        raise UserError(f'{path}: {kind} needs the Python package {package}: '
-                        f'{install_hint(package)}') from None
+        raise UserError(
+            f'{path}: {kind} needs the Python package {package}: {install_hint(package)}'
+        ) from None
     except Exception as error:
         # In a damaged file, a library can raise errors of any kind.
-        raise UserError(f'{path}: cannot read it as {kind}: '
-                        f'{one_line(error) or type(error).__name__}') from None
+        raise UserError(
+            f'{path}: cannot read it as {kind}: {one_line(error) or type(error).__name__}'
+        ) from None
 
 
 def _open_npz(path: str) -> Table:
-    with _library(path, '.npz of plain arrays', 'numpy'), \
-            np.load(path, allow_pickle=False) as arrays:
+    with (
+        _library(path, '.npz of plain arrays', 'numpy'),
+        np.load(path, allow_pickle=False) as arrays,
+    ):
         return _of_arrays(path, arrays, 'save each column as an array')
 
 
-_MATLAB = "save plain vectors with save('run.mat', 't', 'x', 'y', 'z', '-v7'), or a " \
-          "table with writetable(T, 'run.csv')"
+_MATLAB = (
+    "save plain vectors with save('run.mat', 't', 'x', 'y', 'z', '-v7'), or a "
+    "table with writetable(T, 'run.csv')"
+)
 """How MATLAB writes what can be read, for messages: no struct, timetable or HDF5 (-v7.3)."""
 
 
 def _open_mat(path: str) -> Table:
     with _library(path, f'a MATLAB file; {_MATLAB}; its format', 'scipy'):
         from scipy.io import loadmat
+
         return _of_arrays(path, loadmat(path), f'in MATLAB, {_MATLAB}')
 
 
@@ -110,40 +132,54 @@ def _of_arrays(path: str, arrays: Mapping[str, Any], advice: str) -> Table:
             series = np.atleast_2d(values)
             if series.shape[0] > series.shape[1]:
                 series = series.T  # MATLAB and others keep a vector as a row
-            columns |= {f'{name}[{i}]' if len(series) > 1 else name: each
-                        for i, each in enumerate(series)}
+            columns |= {
+                f'{name}[{i}]' if len(series) > 1 else name: each for i, each in enumerate(series)
+            }
     if not columns:
         raise UserError(f'{path}: holds no array of numbers with several rows; {advice}')
     rows = Counter(map(len, columns.values())).most_common(1)[0][0]
-    return in_memory(path, {name: values for name, values in columns.items()
-                            if len(values) == rows})
+    return in_memory(
+        path, {name: values for name, values in columns.items() if len(values) == rows}
+    )
 
 
 def _open_parquet(path: str) -> Table:
     """Open a Parquet file with the library pyarrow: its columns of numbers and of times."""
+
     def blocks(names: Collection[str], _: Collection[str]) -> Iterator[TableBlock]:
         first = 0
         with _library(path, 'Parquet', 'pyarrow'), pyarrow.parquet.ParquetFile(path) as file:
             for batch in file.iter_batches(_BLOCK_ROWS, columns=list(names)):
                 last = first + batch.num_rows
-                yield TableBlock({name: numbers(batch.column(name)) for name in names},
-                                 _row_places(path, first), done=last / file.metadata.num_rows)
+                yield TableBlock(
+                    {name: numbers(batch.column(name)) for name in names},
+                    _row_places(path, first),
+                    done=last / file.metadata.num_rows,
+                )
                 first = last
 
     def numbers(column: Any) -> np.ndarray:
         """Return a column as floats; an empty cell is NaN."""
         if kinds.is_temporal(column.type):
             column = column.cast(pyarrow.int64())
-        return np.asarray(column.cast(pyarrow.float64(), safe=False).to_numpy(
-            zero_copy_only=False), float)
+        return np.asarray(
+            column.cast(pyarrow.float64(), safe=False).to_numpy(zero_copy_only=False), float
+        )
 
     with _library(path, 'Parquet', 'pyarrow'):
         import pyarrow.parquet
+
         schema, kinds = pyarrow.parquet.read_schema(path), pyarrow.types
-    units = {each.name: each.type.unit for each in schema
-             if kinds.is_timestamp(each.type) or kinds.is_duration(each.type)}
-    names = tuple(each.name for each in schema if each.name in units
-                  or kinds.is_integer(each.type) or kinds.is_floating(each.type))
+    units = {
+        each.name: each.type.unit
+        for each in schema
+        if kinds.is_timestamp(each.type) or kinds.is_duration(each.type)
+    }
+    names = tuple(
+        each.name
+        for each in schema
+        if each.name in units or kinds.is_integer(each.type) or kinds.is_floating(each.type)
+    )
     if not names:
         raise UserError(f'{path}: has no column of numbers')
     return Table(path, names, blocks, units)
@@ -154,33 +190,52 @@ def _open_ulog(path: str, topic: str) -> Table:
     # The library prints its warnings.
     with _library(path, 'a log of PX4', 'pyulog'), redirect_stdout(StringIO()):
         from pyulog import ULog
+
         log = ULog(path)
     # The first instance of a message has no number.
-    messages = {f'{data.name}_{data.multi_id}' if data.multi_id else str(data.name): data
-                for data in log.data_list}
-    accelerations = [name for kind in _MAPPINGS for name in messages
-                     if messages[name].name == kind]
-    raw = [each for each in accelerations
-           if messages[each].name == messages[accelerations[0]].name]
+    messages = {
+        f'{data.name}_{data.multi_id}' if data.multi_id else str(data.name): data
+        for data in log.data_list
+    }
+    accelerations = [
+        name for kind in _MAPPINGS for name in messages if messages[name].name == kind
+    ]
+    raw = [
+        each for each in accelerations if messages[each].name == messages[accelerations[0]].name
+    ]
     name = topic.removesuffix('_0') or ', '.join(raw)
     if name not in messages:
-        raise UserError(f'{path}: no message {topic}' * bool(topic) or
-                        f'{path}: {len(raw) or "no"} accelerometers'
-                        f'; choose one with --topic: {", ".join(accelerations or messages)}')
+        raise UserError(
+            f'{path}: no message {topic}' * bool(topic)
+            or f'{path}: {len(raw) or "no"} accelerometers'
+            f'; choose one with --topic: {", ".join(accelerations or messages)}'
+        )
     data = messages[name]
-    columns = {name: values for name, values in data.data.items()
-               if getattr(values, 'dtype', None) is not None and values.dtype.kind in 'iuf'}
+    columns = {
+        name: values
+        for name, values in data.data.items()
+        if getattr(values, 'dtype', None) is not None and values.dtype.kind in 'iuf'
+    }
     time = 'timestamp_sample' if columns.get('timestamp_sample', [0])[0] else 'timestamp'
     mapping = _MAPPINGS.get(data.name, '').format(time=time)
     if 'temperature' not in columns:
         mapping = mapping.partition(',temperature=')[0]
     cut = f'{path}: is damaged; what can be read of it is used' * bool(log.file_corruption)
-    return in_memory(path, columns, cut, default_mapping=mapping,
-                     units={'timestamp': 'us', 'timestamp_sample': 'us'})
+    return in_memory(
+        path,
+        columns,
+        cut,
+        default_mapping=mapping,
+        units={'timestamp': 'us', 'timestamp_sample': 'us'},
+    )
 
 
 _FORMATS: Mapping[str, Callable[[str], Table]] = {
-    '.npz': _open_npz, '.mat': _open_mat, '.parquet': _open_parquet, '.pq': _open_parquet}
+    '.npz': _open_npz,
+    '.mat': _open_mat,
+    '.parquet': _open_parquet,
+    '.pq': _open_parquet,
+}
 """Formats besides text and logs by the ends of their files' names."""
 
 TABLE_ENDINGS = (*_FORMATS, '.ulg')  # Ends of the names of tables that are no text
@@ -195,8 +250,10 @@ def read_pose_table(path: str | os.PathLike) -> np.ndarray:
     """Read a table of `alpha_deg` and `beta_deg` as rad, (k, 2); NaN where a pose has none."""
     table = open_table(path)
     if not set(_POSE_COLUMNS) <= set(table.names):
-        raise UserError(f'{path}: has no angles of the poses; expected the columns '
-                        f'{" and ".join(_POSE_COLUMNS)}; the columns are {", ".join(table.names)}')
+        raise UserError(
+            f'{path}: has no angles of the poses; expected the columns '
+            f'{" and ".join(_POSE_COLUMNS)}; the columns are {", ".join(table.names)}'
+        )
     values = table.read(_POSE_COLUMNS)
     alpha_rad, beta_rad = (np.radians(values[name]) for name in _POSE_COLUMNS)
     # At alpha 0 and 180 degrees beta does not matter, and people leave its cell empty.

@@ -34,8 +34,18 @@ _ENDINGS = ('.csv', '.mcap', '.db3')
 _BAG = 'metadata.yaml'  # File that makes a folder a bag
 _TIMES = ('mtime', 'LastModified', 'last_modified', 'updated', 'modified')
 """Properties of an object that are the time of the last change, by the names of file systems."""
-_STAMPS = ('ETag', 'etag', 'e_tag', 'md5Hash', 'Content-MD5', 'Digest', 'created', 'ino',
-           'Last-Modified', *_TIMES)
+_STAMPS = (
+    'ETag',
+    'etag',
+    'e_tag',
+    'md5Hash',
+    'Content-MD5',
+    'Digest',
+    'created',
+    'ino',
+    'Last-Modified',
+    *_TIMES,
+)
 """Properties of an object that change with its content."""
 _THREADS = 32
 """Objects of a manifest that are looked up at once. Chosen: a server answers in 0.1 s."""
@@ -69,6 +79,7 @@ def file_system(address: str) -> tuple[Any, str]:
     """Return the file system of an address, and the path in it."""
     from fsspec.core import url_to_fs
     from fsspec.implementations.local import LocalFileSystem
+
     # A path of this machine may have two colons, which join addresses.
     if '://' not in address or address.startswith('file://'):
         return LocalFileSystem(), os.path.normpath(LocalFileSystem._strip_protocol(address))
@@ -76,8 +87,10 @@ def file_system(address: str) -> tuple[Any, str]:
     try:
         if address.lower().startswith(('http://', 'https://')):
             from aiohttp import ClientTimeout
-            options['client_kwargs'] = {'timeout': ClientTimeout(
-                total=None, sock_connect=_SILENCE_S, sock_read=_SILENCE_S)}
+
+            options['client_kwargs'] = {
+                'timeout': ClientTimeout(total=None, sock_connect=_SILENCE_S, sock_read=_SILENCE_S)
+            }
         return url_to_fs(address, **options)
     except (ImportError, ValueError) as error:
         # fsspec itself says what to install.
@@ -97,8 +110,9 @@ def find_sources(inputs: Iterable[str]) -> list[Source]:
         except UserError as error:
             raise UserError(without_secrets(str(error))) from None
         except Exception as error:
-            raise UserError(without_secrets(
-                f'{text}: cannot be listed: {one_line(error)}')) from None
+            raise UserError(
+                without_secrets(f'{text}: cannot be listed: {one_line(error)}')
+            ) from None
     return [sources[url] for url in sorted(sources)]
 
 
@@ -116,8 +130,9 @@ def _of_input(text: str) -> Iterable[Source]:
     return [look_up(fs, path)] if rows is None else _of_manifest(text, rows)
 
 
-def _of_listing(text: str, fs: Any, path: str, named: Mapping[str, Mapping[str, Any]]
-                ) -> list[Source]:
+def _of_listing(
+    text: str, fs: Any, path: str, named: Mapping[str, Mapping[str, Any]]
+) -> list[Source]:
     """
     Return the recordings of a folder or a glob, those in folders too; a bag is one recording.
 
@@ -130,15 +145,22 @@ def _of_listing(text: str, fs: Any, path: str, named: Mapping[str, Mapping[str, 
     bags = {name.rpartition('/')[0] for name in files if file_name(name) == _BAG}
     found: dict[str, dict[str, Mapping[str, Any]]] = {}
     for name, info in files.items():
-        bag = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in bags),
-                   '')
+        bag = next(
+            (str(folder) for folder in PurePosixPath(name).parents if str(folder) in bags), ''
+        )
         if bag or (file_name(name) != TABLE and (name in named or _is_recording_name(name))):
             found.setdefault(bag or name, {})[name] = info
-    sources = [_of_files(fs, name, content) for name, content in found.items()
-               if name.count('/.') <= path.count('/.')]
+    sources = [
+        _of_files(fs, name, content)
+        for name, content in found.items()
+        if name.count('/.') <= path.count('/.')
+    ]
     if not sources:
-        raise UserError(f'{text}: matches nothing' if path not in named else f'{text}: has no '
-                        f'recording (*{", *".join(_ENDINGS)}, a bag or a table)')
+        raise UserError(
+            f'{text}: matches nothing'
+            if path not in named
+            else f'{text}: has no recording (*{", *".join(_ENDINGS)}, a bag or a table)'
+        )
     return sources
 
 
@@ -159,8 +181,11 @@ def look_up(fs: Any, path: str) -> Source:
         if info['type'] != 'directory':
             return _of_files(fs, path, {path: info})
         files = fs.find(path, detail=True)
-        return _of_files(fs, path, files) if _BAG in map(file_name, files) else \
-            _source(fs, path, fault=f'is a folder without {_BAG}, not a recording')
+        return (
+            _of_files(fs, path, files)
+            if _BAG in map(file_name, files)
+            else _source(fs, path, fault=f'is a folder without {_BAG}, not a recording')
+        )
     except Exception as error:
         if not isinstance(error, FileNotFoundError):
             # A connection that broke is not used again.
@@ -173,7 +198,8 @@ def fault_of(error: BaseException) -> str:
     cause = error.__cause__
     # fsspec reports every failure of a web server as a file that is not found.
     if isinstance(error, FileNotFoundError) and (
-            cause is None or getattr(cause, 'status', None) == 404):
+        cause is None or getattr(cause, 'status', None) == 404
+    ):
         return NO_FILE
     reason = getattr(error, 'strerror', None) or one_line(cause or error) or type(error).__name__
     return f'cannot be read: {without_secrets(reason)}'
@@ -184,7 +210,8 @@ def _source(fs: Any, path: str, **known: Any) -> Source:
     # A name that is not UTF-8 has no place in a table.
     address = as_utf_8(str(fs.unstrip_protocol(path)))
     user, password, host, port = (
-        fs.storage_options.get(name) for name in ('username', 'password', 'host', 'port'))
+        fs.storage_options.get(name) for name in ('username', 'password', 'host', 'port')
+    )
     if host:
         # The path in a server does not name the server.
         server = f'{host}:{port}' if port else host
@@ -202,12 +229,19 @@ def _of_files(fs: Any, path: str, files: Mapping[str, Mapping[str, Any]]) -> Sou
     if as_utf_8(path) != path:
         return _source(fs, path, fault='its name is not UTF-8; rename it')
     sizes = [info.get('size') for info in files.values()]
-    stated = [[name, *(str(info.get(key)) for key in ('size', *_STAMPS))]
-              for name, info in sorted(files.items()) if any(map(info.get, _STAMPS))]
+    stated = [
+        [name, *(str(info.get(key)) for key in ('size', *_STAMPS))]
+        for name, info in sorted(files.items())
+        if any(map(info.get, _STAMPS))
+    ]
     stamp = hashlib.sha256(repr(stated).encode()).hexdigest()
-    return _source(fs, path, size_bytes=None if None in sizes else sum(filter(None, sizes)),
-                   stamp=stamp if len(stated) == len(files) else '',
-                   modified=max(map(_modified, files.values())))
+    return _source(
+        fs,
+        path,
+        size_bytes=None if None in sizes else sum(filter(None, sizes)),
+        stamp=stamp if len(stated) == len(files) else '',
+        modified=max(map(_modified, files.values())),
+    )
 
 
 def _modified(info: Mapping[str, Any]) -> str:
@@ -226,17 +260,25 @@ def _manifest_rows(text: str, fs: Any, path: str) -> list[dict[str, str]] | None
     """
     suffix = PurePosixPath(file_name(path)).suffix.lower()
     if suffix not in ('.csv', '.parquet', '.pq') or (
-            os.path.exists(path) and not os.path.isfile(path)):  # a pipe may never end
+        os.path.exists(path) and not os.path.isfile(path)
+    ):  # a pipe may never end
         return None
     try:
         with fs.open(path, 'rb') as file:
             if suffix == '.csv':
                 return _csv_rows(text, TextIOWrapper(file, 'utf-8-sig', newline=''))
             from pyarrow import parquet
+
             content = parquet.ParquetFile(file)
             names = [name for name in _MANIFEST_COLUMNS if name in content.schema_arrow.names]
-            return [{name: '' if value is None else str(value) for name, value in row.items()}
-                    for row in content.read(names).to_pylist()] if 'url' in names else None
+            return (
+                [
+                    {name: '' if value is None else str(value) for name, value in row.items()}
+                    for row in content.read(names).to_pylist()
+                ]
+                if 'url' in names
+                else None
+            )
     except UserError:
         raise
     except Exception:
@@ -252,8 +294,10 @@ def _csv_rows(text: str, file: Iterable[str]) -> list[dict[str, str]] | None:
     rows = list(table)
     for number, row in enumerate(rows, 1):
         if None in row or None in row.values():
-            raise UserError(f'{text}: row {number}: has not the {len(table.fieldnames or ())} '
-                            'columns of the header')
+            raise UserError(
+                f'{text}: row {number}: has not the {len(table.fieldnames or ())} '
+                'columns of the header'
+            )
     return rows
 
 
@@ -266,8 +310,10 @@ def _of_manifest(text: str, rows: list[dict[str, str]]) -> Iterable[Source]:
         if not row['url']:
             raise UserError(f'{text}: row {number}: url is empty')
         if row.get('date') and not as_date(row['date']):
-            raise UserError(f'{text}: row {number}: date is {row["date"]!r}, expected ISO 8601, '
-                            'for example 2026-11-01T10:00:00Z')
+            raise UserError(
+                f'{text}: row {number}: date is {row["date"]!r}, expected ISO 8601, '
+                'for example 2026-11-01T10:00:00Z'
+            )
 
     def source(row: dict[str, str]) -> Source:
         url, params, serial = (row.get(name, '') for name in ('url', 'params', 'serial'))
@@ -276,9 +322,12 @@ def _of_manifest(text: str, rows: list[dict[str, str]]) -> Iterable[Source]:
         except UserError as error:
             plain = without_secrets(url)
             recorded = Source(plain, fault=one_line(error).removeprefix(f'{plain}: '))
-        return replace(recorded, serial='' if serial == NO_UNIT else serial,
-                       params=_beside(folder, params) if set(params) & set('/.') else params,
-                       date=as_date(row.get('date', '')))
+        return replace(
+            recorded,
+            serial='' if serial == NO_UNIT else serial,
+            params=_beside(folder, params) if set(params) & set('/.') else params,
+            date=as_date(row.get('date', '')),
+        )
 
     with ThreadPoolExecutor(_THREADS) as pool:
         return list(pool.map(source, rows))

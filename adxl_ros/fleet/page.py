@@ -36,8 +36,10 @@ _NAMED = 3  # Number of drifting units that a screen names. Chosen: some lines
 _MOST_ROWS = 50  # Largest count of outliers and of reasons on the page; the table holds them all
 _MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))
 """Columns that tell whether a unit is within the tolerance."""
-_SENTENCES = {fleet.State.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
-              fleet.State.IN_ORDER: 'All units are within the tolerance.'}
+_SENTENCES = {
+    fleet.State.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
+    fleet.State.IN_ORDER: 'All units are within the tolerance.',
+}
 """What the most urgent state means for the user; the others mean the same."""
 
 
@@ -47,12 +49,15 @@ def date_text(year: float) -> str:
 
 
 def _stamps(years: Iterable[float]) -> list[str]:
-    return [f'{_EPOCH + timedelta(days=float(year) * fleet.DAYS_PER_YEAR):%Y-%m-%d %H:%M}'
-            for year in years]
+    return [
+        f'{_EPOCH + timedelta(days=float(year) * fleet.DAYS_PER_YEAR):%Y-%m-%d %H:%M}'
+        for year in years
+    ]
 
 
-def _trend_figure(table: fleet.FleetTable, result: fleet.QuantityResult, unit: int
-                  ) -> plotly.Figure:
+def _trend_figure(
+    table: fleet.FleetTable, result: fleet.QuantityResult, unit: int
+) -> plotly.Figure:
     """Plot a quantity of a unit over time, about its mean where units differ by far more."""
     quantity, place = result.quantity, result.place_of(unit)
     origin = result.trends.level[place] if quantity.is_coefficient and place is not None else 0.0
@@ -69,42 +74,69 @@ def _trend_figure(table: fleet.FleetTable, result: fleet.QuantityResult, unit: i
         for period in set(periods.tolist()) - {-1}:
             within, level = years[periods == period], value[periods == period].mean()
             ends = np.array([within.min(), within.max()])
-            traces.append(plotly.line([], level + slope * (ends - within.mean()), 'line', colour)
-                          | {'x': _stamps(ends)})
-    for name, shown, colour in (('recording', ~is_outlier, plotly.AXIS_COLOURS['x']),
-                                ('outlier', is_outlier, plotly.BEFORE_COLOUR)):
+            traces.append(
+                plotly.line([], level + slope * (ends - within.mean()), 'line', colour)
+                | {'x': _stamps(ends)}
+            )
+    for name, shown, colour in (
+        ('recording', ~is_outlier, plotly.AXIS_COLOURS['x']),
+        ('outlier', is_outlier, plotly.BEFORE_COLOUR),
+    ):
         if shown.any():
-            traces.append(plotly.points([], value[shown], half[shown], name, colour)
-                          | {'x': _stamps(years[shown])})
+            traces.append(
+                plotly.points([], value[shown], half[shown], name, colour)
+                | {'x': _stamps(years[shown])}
+            )
     # Calibrations between recordings, where a period ends
     rows = table.rows_of(unit)
     made = table.years[rows] - table['calibration_age_days'][rows] / fleet.DAYS_PER_YEAR
     begins = made[1:][np.diff(table.period[rows]) > 0]
-    marks = [{'type': 'line', 'x0': stamp, 'x1': stamp, 'yref': 'paper', 'y0': 0, 'y1': 1,
-              'line': {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'}}
-             for stamp in _stamps(begins[np.isfinite(begins)])]
+    marks = [
+        {
+            'type': 'line',
+            'x0': stamp,
+            'x1': stamp,
+            'yref': 'paper',
+            'y0': 0,
+            'y1': 1,
+            'line': {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'},
+        }
+        for stamp in _stamps(begins[np.isfinite(begins)])
+    ]
     title = quantity.shown_unit + ' from the mean' * quantity.is_coefficient
     return plotly.figure(
-        traces, _TREND_HEIGHT, showlegend=False, shapes=marks,
+        traces,
+        _TREND_HEIGHT,
+        showlegend=False,
+        shapes=marks,
         xaxis={'type': 'date', 'nticks': 3, 'tickangle': 0, 'tickformat': '%b %Y'},
-        yaxis={'title': {'text': title}, 'nticks': 5})
+        yaxis={'title': {'text': title}, 'nticks': 5},
+    )
 
 
 def _matrix_figure(table: fleet.FleetTable, share: pd.DataFrame) -> plotly.Figure:
     """Plot how often each effect is named in each unit."""
     share = share.iloc[:, :_MOST_EFFECTS]
     columns = list(share)
-    trace = {'type': 'heatmap', 'x': columns, 'y': [table.serials[unit] for unit in share.index],
-             'z': (100 * share.to_numpy()).round(1).tolist(), 'zmin': 0, 'zmax': 100,
-             'colorscale': [[0, '#f0f3f6'], [1, '#b03224']], 'xgap': 2,
-             'hovertemplate': '%{y}: %{x} in %{z} % of the recordings<extra></extra>',
-             'colorbar': {'title': {'text': '%'}, 'thickness': 10, 'len': 0.6}}
+    trace = {
+        'type': 'heatmap',
+        'x': columns,
+        'y': [table.serials[unit] for unit in share.index],
+        'z': (100 * share.to_numpy()).round(1).tolist(),
+        'zmin': 0,
+        'zmax': 100,
+        'colorscale': [[0, '#f0f3f6'], [1, '#b03224']],
+        'xgap': 2,
+        'hovertemplate': '%{y}: %{x} in %{z} % of the recordings<extra></extra>',
+        'colorbar': {'title': {'text': '%'}, 'thickness': 10, 'len': 0.6},
+    }
     height = _MATRIX_HEAD_PIXELS + min(_ROW_PIXELS * len(share), _MOST_PIXELS)
-    return plotly.figure([trace], height,
-                         xaxis={'side': 'top', 'tickangle': -90, 'type': 'category',
-                                'tickvals': columns},
-                         yaxis={'autorange': 'reversed', 'type': 'category',
-                                'title': {'text': 'unit'}})
+    return plotly.figure(
+        [trace],
+        height,
+        xaxis={'side': 'top', 'tickangle': -90, 'type': 'category', 'tickvals': columns},
+        yaxis={'autorange': 'reversed', 'type': 'category', 'title': {'text': 'unit'}},
+    )
 
 
 class Written(NamedTuple):
@@ -119,21 +151,34 @@ def write(folder: Path) -> Written:
     html_page.check_libraries()
     table = fleet.read(folder / TABLE)
     results = fleet.analyse(table)
-    calibration_store.write_population(folder / POPULATION, Population(POPULATION, {
-        result.quantity.column: result.population for result in results
-        if result.population is not None and result.population.prediction_std > 0}))
+    calibration_store.write_population(
+        folder / POPULATION,
+        Population(
+            POPULATION,
+            {
+                result.quantity.column: result.population
+                for result in results
+                if result.population is not None and result.population.prediction_std > 0
+            },
+        ),
+    )
     write_text(folder / PAGE, page(table, results, folder))
-    return Written([folder / name for name in (PAGE, POPULATION)],
-                   [*_batches(results), *_drifting(fleet.rank(table, results))])
+    return Written(
+        [folder / name for name in (PAGE, POPULATION)],
+        [*_batches(results), *_drifting(fleet.rank(table, results))],
+    )
 
 
 def _batches(results: Sequence[fleet.QuantityResult]) -> list[str]:
     """Return a sentence for each bad batch."""
-    return [f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
-            f'{result.quantity.label} that differs by '
-            + result.quantity.text(batch.difference, batch.low, batch.high) +
-            f' from that of the {(~batch.members).sum()} others: a bad batch.'
-            for result in results if (batch := result.batch) is not None]
+    return [
+        f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
+        f'{result.quantity.label} that differs by '
+        + result.quantity.text(batch.difference, batch.low, batch.high)
+        + f' from that of the {(~batch.members).sum()} others: a bad batch.'
+        for result in results
+        if (batch := result.batch) is not None
+    ]
 
 
 def _drifting(units: Sequence[fleet.UnitState]) -> list[str]:
@@ -150,75 +195,147 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
     units = fleet.rank(table, results)
     share = fleet.effect_matrix(table)
     # Units that drift come first, although others may be more urgent.
-    plotted = [(unit, shown[0]) for unit in sorted(units, key=lambda unit: not unit.drifts)
-               if (shown := [*(drift.result for drift in unit.drifts), *(
-                   result for result in results if result.place_of(unit.unit) is not None)])
-               ][:_SHOWN]
-    figures = {f'trend-{i}': _trend_figure(table, result, unit.unit)
-               for i, (unit, result) in enumerate(plotted)}
+    plotted = [
+        (unit, shown[0])
+        for unit in sorted(units, key=lambda unit: not unit.drifts)
+        if (
+            shown := [
+                *(drift.result for drift in unit.drifts),
+                *(result for result in results if result.place_of(unit.unit) is not None),
+            ]
+        )
+    ][:_SHOWN]
+    figures = {
+        f'trend-{i}': _trend_figure(table, result, unit.unit)
+        for i, (unit, result) in enumerate(plotted)
+    }
     if len(share.columns):
         figures['matrix'] = _matrix_figure(table, share)
     counts = Counter(unit.state for unit in units)
     years = table.years[np.isfinite(table.years)]
-    about = [f'{len(table)} recordings', f'{len(table.serials)} units',
-             *([f'{date_text(years.min())} to {date_text(years.max())}'] if len(years) else [])]
-    return html_page.render('adxl_ros.fleet', 'fleet.html', {
-        'title': 'Fleet', 'about': about, 'badge': _badge(table, units, counts),
-        'tiles': _tiles(table, counts), 'shown': _SHOWN, 'figures': figures,
-        'units': units, 'date': date_text, 'link': partial(_link, folder),
-        'without_unit': int((table.unit < 0).sum()),
-        'trends': [{'figure': f'trend-{i}', 'title': f'{unit.serial}: {result.quantity.label}',
-                    'text': f'{unit.drifts[0].text}.' if unit.drifts else 'No slope is claimed.'}
-                   for i, (unit, result) in enumerate(plotted)],
-        'batches': _batches(results), 'has_effects': 'matrix' in figures, 'judged': len(share),
-        'outliers': _outlier_rows(table, results),
-        'outlier_count': sum(int(result.is_outlier.sum()) for result in results),
-        'refusals': _refusal_rows(table), 'most_rows': _MOST_ROWS,
-        'tolerance': number(fleet.TOLERANCE_MG), 'false_discovery': f'{FALSE_DISCOVERY_RATE:.0%}',
-        'drifts': sum(int(result.is_claimed.sum()) for result in results)})
+    about = [
+        f'{len(table)} recordings',
+        f'{len(table.serials)} units',
+        *([f'{date_text(years.min())} to {date_text(years.max())}'] if len(years) else []),
+    ]
+    return html_page.render(
+        'adxl_ros.fleet',
+        'fleet.html',
+        {
+            'title': 'Fleet',
+            'about': about,
+            'badge': _badge(table, units, counts),
+            'tiles': _tiles(table, counts),
+            'shown': _SHOWN,
+            'figures': figures,
+            'units': units,
+            'date': date_text,
+            'link': partial(_link, folder),
+            'without_unit': int((table.unit < 0).sum()),
+            'trends': [
+                {
+                    'figure': f'trend-{i}',
+                    'title': f'{unit.serial}: {result.quantity.label}',
+                    'text': f'{unit.drifts[0].text}.' if unit.drifts else 'No slope is claimed.',
+                }
+                for i, (unit, result) in enumerate(plotted)
+            ],
+            'batches': _batches(results),
+            'has_effects': 'matrix' in figures,
+            'judged': len(share),
+            'outliers': _outlier_rows(table, results),
+            'outlier_count': sum(int(result.is_outlier.sum()) for result in results),
+            'refusals': _refusal_rows(table),
+            'most_rows': _MOST_ROWS,
+            'tolerance': number(fleet.TOLERANCE_MG),
+            'false_discovery': f'{FALSE_DISCOVERY_RATE:.0%}',
+            'drifts': sum(int(result.is_claimed.sum()) for result in results),
+        },
+    )
 
 
-def _badge(table: fleet.FleetTable, units: Sequence[fleet.UnitState], counts: Counter[fleet.State]
-           ) -> dict[str, str]:
+def _badge(
+    table: fleet.FleetTable, units: Sequence[fleet.UnitState], counts: Counter[fleet.State]
+) -> dict[str, str]:
     if not units:
-        return {'colour': 'grey', 'word': 'NO UNITS',
-                'sentence': 'No recording states a serial number.'}
+        return {
+            'colour': 'grey',
+            'word': 'NO UNITS',
+            'sentence': 'No recording states a serial number.',
+        }
     worst = units[0].state
     if worst is fleet.State.IN_ORDER and table.frame[[*_MEASURES]].isna().all(axis=None):
         # What was not measured is not within the tolerance.
-        return {'colour': 'grey', 'word': 'NOT MEASURED',
-                'sentence': 'No gap and no zero-g were measured; they need diagnose and fit.'}
-    return {'colour': worst.colour, 'word': 'IN ORDER' if worst is fleet.State.IN_ORDER else
-            f'{counts[worst]} of {len(units)} {worst.words}'.upper(), 'sentence': _SENTENCES.get(
-                worst, 'No unit is out of tolerance. Look at the head of the list.')}
+        return {
+            'colour': 'grey',
+            'word': 'NOT MEASURED',
+            'sentence': 'No gap and no zero-g were measured; they need diagnose and fit.',
+        }
+    return {
+        'colour': worst.colour,
+        'word': 'IN ORDER'
+        if worst is fleet.State.IN_ORDER
+        else f'{counts[worst]} of {len(units)} {worst.words}'.upper(),
+        'sentence': _SENTENCES.get(
+            worst, 'No unit is out of tolerance. Look at the head of the list.'
+        ),
+    }
 
 
 def _tiles(table: fleet.FleetTable, counts: Counter[fleet.State]) -> list[dict[str, str]]:
     outcomes = Counter(table['outcome'].tolist())
-    return [{'label': 'recordings', 'text': str(len(table)),
-             'note': f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed'},
-            *({'label': f'units: {state.words}', 'text': str(counts[state]), 'note': ''}
-              for state in fleet.State)]
+    return [
+        {
+            'label': 'recordings',
+            'text': str(len(table)),
+            'note': f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed',
+        },
+        *(
+            {'label': f'units: {state.words}', 'text': str(counts[state]), 'note': ''}
+            for state in fleet.State
+        ),
+    ]
 
 
 def _link(folder: Path, report: str) -> str:
     """Return the address of a single report: its page where there is one; empty for none."""
-    return next((name for name in (f'{report}/report.html', report)
-                 if report and (folder / name).exists()), '')
+    return next(
+        (
+            name
+            for name in (f'{report}/report.html', report)
+            if report and (folder / name).exists()
+        ),
+        '',
+    )
 
 
-def _outlier_rows(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult]
-                  ) -> list[dict[str, str]]:
+def _outlier_rows(
+    table: fleet.FleetTable, results: Sequence[fleet.QuantityResult]
+) -> list[dict[str, str]]:
     """Return the recordings that are far from others of their unit, the farthest first."""
-    outliers = [(float(result.distance[i]), result.rows[i], result.quantity,
-                 result.quantity.factor * result.recordings.value[i])
-                for result in results for i in np.flatnonzero(result.is_outlier)]
+    outliers = [
+        (
+            float(result.distance[i]),
+            result.rows[i],
+            result.quantity,
+            result.quantity.factor * result.recordings.value[i],
+        )
+        for result in results
+        for i in np.flatnonzero(result.is_outlier)
+    ]
     outliers.sort(key=lambda item: -item[0])
-    return [{'serial': table.serials[table.unit[row]], 'date': date_text(table.years[row]),
-             'quantity': quantity.label, 'distance': number(distance),
-             'value': f'{number(value)} {quantity.shown_unit}',
-             'url': table['url'][row], 'report': table['report'][row]}
-            for distance, row, quantity, value in outliers[:_MOST_ROWS]]
+    return [
+        {
+            'serial': table.serials[table.unit[row]],
+            'date': date_text(table.years[row]),
+            'quantity': quantity.label,
+            'distance': number(distance),
+            'value': f'{number(value)} {quantity.shown_unit}',
+            'url': table['url'][row],
+            'report': table['report'][row],
+        }
+        for distance, row, quantity, value in outliers[:_MOST_ROWS]
+    ]
 
 
 def _refusal_rows(table: fleet.FleetTable) -> list[list[str]]:
@@ -226,7 +343,14 @@ def _refusal_rows(table: fleet.FleetTable) -> list[list[str]]:
     failed = table.frame.assign(unit=table.unit)[table['outcome'] != 'done']
     kinds = np.array([reason_kind(row) for row in failed.to_dict('records')], object)
     # A recording without a serial number is of no unit.
-    rows = [[str(len(group)), str(len({*group['unit']} - {-1})), kind,
-             group['refused_by'].iloc[0] or '-', group['url'].iloc[0]]
-            for kind, group in failed.groupby(kinds)]
+    rows = [
+        [
+            str(len(group)),
+            str(len({*group['unit']} - {-1})),
+            kind,
+            group['refused_by'].iloc[0] or '-',
+            group['url'].iloc[0],
+        ]
+        for kind, group in failed.groupby(kinds)
+    ]
     return sorted(rows, key=lambda row: (-int(row[0]), row[2]))[:_MOST_ROWS]

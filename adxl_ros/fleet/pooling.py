@@ -68,8 +68,13 @@ class Recordings:
     std: np.ndarray  # Stated standard deviations of the values, (n,)
 
     def __getitem__(self, part: np.ndarray) -> Recordings:
-        return Recordings(_numbered(self.unit[part]), _numbered(self.period[part]),
-                          self.time[part], self.value[part], self.std[part])
+        return Recordings(
+            _numbered(self.unit[part]),
+            _numbered(self.period[part]),
+            self.time[part],
+            self.value[part],
+            self.std[part],
+        )
 
 
 def _numbered(labels: np.ndarray) -> np.ndarray:
@@ -123,8 +128,12 @@ def fit_trends(recordings: Recordings) -> Trends:
     variance, freedom = moderated(ratio, own_freedom)
     factor = np.sqrt(variance * widening)
     return replace(
-        fit, scatter=replace(scatter, widening=widening), level_std=factor * fit.level_std,
-        slope_std=factor * fit.slope_std, freedom=np.where(sums.has_slope, freedom, np.nan))
+        fit,
+        scatter=replace(scatter, widening=widening),
+        level_std=factor * fit.level_std,
+        slope_std=factor * fit.slope_std,
+        freedom=np.where(sums.has_slope, freedom, np.nan),
+    )
 
 
 class _Sums:
@@ -139,30 +148,41 @@ class _Sums:
         self.centre_value = np.bincount(unit, recordings.value) / self.counts
         self.time = recordings.time - (np.bincount(unit, recordings.time) / self.counts)[unit]
         self.value = recordings.value - self.centre_value[unit]
-        self.has_slope = (self.counts >= _MIN_RECORDINGS) & (
-            np.bincount(unit, self.time ** 2) > 0)
+        self.has_slope = (self.counts >= _MIN_RECORDINGS) & (np.bincount(unit, self.time**2) > 0)
 
     def fit(self, scatter: Scatter) -> Trends:
         """Fit the lines of all units for given variances, by generalised least squares."""
-        step2, unit = scatter.calibration ** 2, self.recordings.unit
-        weight = 1 / (self.recordings.std ** 2 + scatter.recording ** 2)
+        step2, unit = scatter.calibration**2, self.recordings.unit
+        weight = 1 / (self.recordings.std**2 + scatter.recording**2)
         t, y = self.time, self.value
-        w, wt, wy, wtt, wty, wyy = (np.add.reduceat(weight * part, self.period_starts)
-                                    for part in (np.ones_like(t), t, y, t * t, t * y, y * y))
+        w, wt, wy, wtt, wty, wyy = (
+            np.add.reduceat(weight * part, self.period_starts)
+            for part in (np.ones_like(t), t, y, t * t, t * y, y * y)
+        )
         # The step of a period has one common part in all of its recordings (Woodbury).
         shared = step2 / (1 + step2 * w)
-        a, b, c, p, q, r = (np.add.reduceat(part, self.unit_starts) for part in (
-            w - shared * w * w, wt - shared * w * wt, wtt - shared * wt * wt,
-            wy - shared * w * wy, wty - shared * wt * wy, wyy - shared * wy * wy))
+        a, b, c, p, q, r = (
+            np.add.reduceat(part, self.unit_starts)
+            for part in (
+                w - shared * w * w,
+                wt - shared * w * wt,
+                wtt - shared * wt * wt,
+                wy - shared * w * wy,
+                wty - shared * wt * wy,
+                wyy - shared * wy * wy,
+            )
+        )
         det = np.where(self.has_slope, a * c - b * b, 1.0)
         det = np.maximum(det, np.finfo(float).tiny)
         slope = np.where(self.has_slope, (a * q - b * p) / det, 0.0)
         intercept = (p - b * slope) / a
         squares = np.maximum(r - intercept * p - slope * q, 0.0)
-        log_det = np.add.reduceat(np.log1p(step2 * w), self.unit_starts).sum() \
-            - np.log(weight).sum()
-        log_likelihood = -0.5 * (log_det + np.log(np.where(self.has_slope, det, a)).sum()
-                                 + squares.sum())
+        log_det = (
+            np.add.reduceat(np.log1p(step2 * w), self.unit_starts).sum() - np.log(weight).sum()
+        )
+        log_likelihood = -0.5 * (
+            log_det + np.log(np.where(self.has_slope, det, a)).sum() + squares.sum()
+        )
         residual = y - intercept[unit] - slope[unit] * t
         step = shared * np.add.reduceat(weight * residual, self.period_starts)
         residual = (residual - step[self.recordings.period]) * np.sqrt(weight)
@@ -170,14 +190,22 @@ class _Sums:
         with np.errstate(invalid='ignore'):
             slope_std = nan * np.sqrt(a / det)
         return Trends(
-            scatter, self.centre_value + p / a, a ** -0.5, nan * slope, slope_std,
-            np.full(len(a), np.inf), squares, residual, float(log_likelihood))
+            scatter,
+            self.centre_value + p / a,
+            a**-0.5,
+            nan * slope,
+            slope_std,
+            np.full(len(a), np.inf),
+            squares,
+            residual,
+            float(log_likelihood),
+        )
 
 
 def _shared_scatter(sums: _Sums) -> Scatter:
     """Estimate the variances that all units share."""
     recordings = sums.recordings
-    spread2 = float(np.mean(sums.value ** 2)) + float(np.min(recordings.std)) ** 2
+    spread2 = float(np.mean(sums.value**2)) + float(np.min(recordings.std)) ** 2
     several = len(sums.period_starts) > len(sums.counts)
     if spread2 == 0 or not (sums.counts >= _MIN_RECORDINGS).any():
         return Scatter(0.0, 0.0) if recordings.std.min() > 0 else Scatter(1.0, 0.0)
@@ -185,13 +213,15 @@ def _shared_scatter(sums: _Sums) -> Scatter:
 
     def scatter(logs: np.ndarray) -> Scatter:
         variances = np.exp(np.maximum(logs, floor))
-        return Scatter(float(variances[0] ** 0.5),
-                       float(variances[1] ** 0.5) if several else 0.0)
+        return Scatter(float(variances[0] ** 0.5), float(variances[1] ** 0.5) if several else 0.0)
 
-    start = np.log(spread2) - np.array([1.0, 2.0])[:1 + several]
+    start = np.log(spread2) - np.array([1.0, 2.0])[: 1 + several]
     best = scipy.optimize.minimize(
-        lambda logs: -sums.fit(scatter(logs)).log_likelihood, start, method='Nelder-Mead',
-        options={'xatol': _FIT_TOLERANCE, 'fatol': _FIT_TOLERANCE})
+        lambda logs: -sums.fit(scatter(logs)).log_likelihood,
+        start,
+        method='Nelder-Mead',
+        options={'xatol': _FIT_TOLERANCE, 'fatol': _FIT_TOLERANCE},
+    )
     return scatter(best.x)
 
 
@@ -202,10 +232,10 @@ def _widening(sums: _Sums, fit: Trends) -> float:
     same = (unit[1:] == unit[:-1]) & used[unit[1:]]
     if not same.any() or fit.scatter.recording == 0:
         return 1.0
-    variance = fit.scatter.recording ** 2
-    share = float(np.mean((variance / (variance + sums.recordings.std ** 2))[used[unit]]))
+    variance = fit.scatter.recording**2
+    share = float(np.mean((variance / (variance + sums.recordings.std**2))[used[unit]]))
     products = float((residual[1:] * residual[:-1])[same].sum())
-    squares, count = float((residual ** 2)[used[unit]].sum()), int(sums.counts[used].sum())
+    squares, count = float((residual**2)[used[unit]].sum()), int(sums.counts[used].sum())
     lines, widening = 2 * int(used.sum()), 1.0
     for _ in range(_ROUNDS):
         # A line removes as much from squares and products of its residuals.
@@ -247,15 +277,16 @@ def outliers(recordings: Recordings, tests: int) -> tuple[np.ndarray, np.ndarray
     enough = counts >= _MIN_OF_OUTLIERS
     # Both the median of few values and that of their deviations are uncertain.
     mad = MAD_TO_STD * counts / (counts - _MAD_BIAS) * _medians(period, deviation)
-    variance, freedom = moderated(mad ** 2, np.where(
-        enough, _MAD_EFFICIENCY * (counts - 1), 0.0))
-    stated2 = recordings.std ** 2
+    variance, freedom = moderated(mad**2, np.where(enough, _MAD_EFFICIENCY * (counts - 1), 0.0))
+    stated2 = recordings.std**2
     worse2 = np.maximum(stated2 - _medians(period, stated2)[period], 0.0)
     scale = np.sqrt((variance * (1 + np.pi / 2 / counts))[period] + worse2)
-    distance = np.divide(deviation, scale, out=np.zeros(len(value)),
-                         where=(scale > 0) & enough[period])
-    limits = -scipy.special.stdtrit(np.minimum(freedom[period], 1e6),
-                                    FALSE_OUTLIERS / (2 * max(tests, 1)))
+    distance = np.divide(
+        deviation, scale, out=np.zeros(len(value)), where=(scale > 0) & enough[period]
+    )
+    limits = -scipy.special.stdtrit(
+        np.minimum(freedom[period], 1e6), FALSE_OUTLIERS / (2 * max(tests, 1))
+    )
     return distance, distance > limits
 
 
@@ -312,13 +343,19 @@ def _common_variance(variance: np.ndarray, freedom: np.ndarray) -> tuple[float, 
     if excess <= 2 / _EQUAL_VARIANCES:
         return float(np.exp(mean)), _EQUAL_VARIANCES
     # trigamma(x) is above 1/x², and near 1/x where x is large.
-    half = scipy.optimize.brentq(lambda x: float(scipy.special.polygamma(1, x)) - excess,
-                                 excess ** -0.5, _EQUAL_VARIANCES, xtol=1e-300, rtol=1e-14)
+    half = scipy.optimize.brentq(
+        lambda x: float(scipy.special.polygamma(1, x)) - excess,
+        excess**-0.5,
+        _EQUAL_VARIANCES,
+        xtol=1e-300,
+        rtol=1e-14,
+    )
     return float(np.exp(mean + scipy.special.digamma(half) - np.log(half))), 2 * half
 
 
-def random_effects(estimates: np.ndarray, std: np.ndarray, tests: int | None = None
-                   ) -> PooledCoefficient:
+def random_effects(
+    estimates: np.ndarray, std: np.ndarray, tests: int | None = None
+) -> PooledCoefficient:
     """
     Estimate mean and spread of a population, without the units that are not of it.
 
@@ -331,7 +368,8 @@ def random_effects(estimates: np.ndarray, std: np.ndarray, tests: int | None = N
     for _ in range(_MAX_ROUNDS):
         pooled = _of_units(estimates[kept], std[kept])
         distance = np.abs(estimates - pooled.mean) / np.sqrt(
-            pooled.spread ** 2 + pooled.mean_std ** 2 + std ** 2)
+            pooled.spread**2 + pooled.mean_std**2 + std**2
+        )
         limit = -float(scipy.special.stdtrit(kept.sum() - 2, chance))
         now = _largest_dropped(distance, limit)
         if np.array_equal(now, kept):
@@ -358,10 +396,14 @@ def _of_units(estimates: np.ndarray, std: np.ndarray) -> PooledCoefficient:
     mean, _ = weighted_mean(y, variance, spread2)
     mean_variance, prediction_variance = _variances(y, variance, mean)
     return PooledCoefficient(
-        mean=float(estimates.mean() + unit * mean), mean_std=unit * mean_variance ** 0.5,
-        spread=unit * spread2 ** 0.5, spread_low=unit * low ** 0.5,
-        spread_high=unit * high ** 0.5, prediction_std=unit * prediction_variance ** 0.5,
-        units=len(estimates))
+        mean=float(estimates.mean() + unit * mean),
+        mean_std=unit * mean_variance**0.5,
+        spread=unit * spread2**0.5,
+        spread_low=unit * low**0.5,
+        spread_high=unit * high**0.5,
+        prediction_std=unit * prediction_variance**0.5,
+        units=len(estimates),
+    )
 
 
 def _variances(y: np.ndarray, variance: np.ndarray, mean: float) -> tuple[float, float]:
@@ -374,8 +416,9 @@ def _variances(y: np.ndarray, variance: np.ndarray, mean: float) -> tuple[float,
     total = weight.sum(axis=1)
     means = weight @ y / total
     squares = (weight * (y - means[:, None]) ** 2).sum(axis=1)
-    log_density = 0.5 * (np.log(weight).sum(axis=1) - np.log(total) - squares) \
-        - 2 * np.log1p(-_GRID)
+    log_density = 0.5 * (np.log(weight).sum(axis=1) - np.log(total) - squares) - 2 * np.log1p(
+        -_GRID
+    )
     density = np.exp(log_density - log_density.max())
     density /= density.sum()
     mean_variance = float(density @ (1 / total + (means - mean) ** 2))
@@ -391,6 +434,7 @@ def weighted_mean(y: np.ndarray, variance: np.ndarray, spread2: float) -> tuple[
 
 def _spreads2(y: np.ndarray, variance: np.ndarray) -> list[float]:
     """Return the variance between units, and the ends of its 90 % interval; see the module."""
+
     def squares(spread2: float) -> float:
         mean, _ = weighted_mean(y, variance, spread2)
         return float(np.sum((y - mean) ** 2 / (variance + spread2)))
@@ -400,9 +444,19 @@ def _spreads2(y: np.ndarray, variance: np.ndarray) -> list[float]:
         # No weight is above 1/spread2, so that the squares are below the target at the high end.
         high = floor + len(y) * float(np.var(y)) / target
         is_below = floor == 0 or squares(floor) <= target
-        spreads2.append(0.0 if is_below else float(scipy.optimize.brentq(
-            lambda spread2, target=target: squares(spread2) - target, floor, high,
-            rtol=1e-12, xtol=1e-300)))
+        spreads2.append(
+            0.0
+            if is_below
+            else float(
+                scipy.optimize.brentq(
+                    lambda spread2, target=target: squares(spread2) - target,
+                    floor,
+                    high,
+                    rtol=1e-12,
+                    xtol=1e-300,
+                )
+            )
+        )
     return spreads2
 
 
@@ -416,8 +470,9 @@ class BadBatch(NamedTuple):
     high: float
 
 
-def bad_batch(serials: Sequence[str], level: np.ndarray, tolerance: float, tests: int
-              ) -> BadBatch | None:
+def bad_batch(
+    serials: Sequence[str], level: np.ndarray, tolerance: float, tests: int
+) -> BadBatch | None:
     """Return the most certain batch whose level differs by more than a tolerance."""
     counts = Counter(name[:length] for name in serials for length in range(1, len(name) + 1))
     batches: dict[bytes, tuple[str, np.ndarray]] = {}  # By their members, with the shortest prefix
@@ -432,6 +487,7 @@ def bad_batch(serials: Sequence[str], level: np.ndarray, tolerance: float, tests
         difference = float(level[members].mean() - level[~members].mean())
         if test.pvalue < lowest and abs(difference) > tolerance:
             lowest = float(test.pvalue)
-            best = BadBatch(prefix, members, difference,
-                            *map(float, test.confidence_interval(0.9)))
+            best = BadBatch(
+                prefix, members, difference, *map(float, test.confidence_interval(0.9))
+            )
     return best

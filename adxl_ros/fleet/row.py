@@ -53,12 +53,17 @@ class Column:
     is_timing: bool = False
 
 
-NOISE = (('n', 'white noise N', 'mps2_per_rthz', 'm/s²/√Hz'),
-         ('b', 'bias instability B', 'mps2', 'm/s²'),
-         ('k', 'random walk K', 'mps2_per_rts', 'm/s²/√s'))
+NOISE = (
+    ('n', 'white noise N', 'mps2_per_rthz', 'm/s²/√Hz'),
+    ('b', 'bias instability B', 'mps2', 'm/s²'),
+    ('k', 'random walk K', 'mps2_per_rts', 'm/s²/√s'),
+)
 """Terms of the noise: letter, name, unit in the names of columns, and unit."""
-_ENDS = (('', ''), ('_low', ': lower end of the 90 % interval'),
-         ('_high', ': upper end of the 90 % interval'))
+_ENDS = (
+    ('', ''),
+    ('_low', ': lower end of the 90 % interval'),
+    ('_high', ': upper end of the 90 % interval'),
+)
 
 
 COLUMNS: tuple[Column, ...] = (
@@ -89,28 +94,45 @@ COLUMNS: tuple[Column, ...] = (
     Column('calibration_id', 'text', 'calibration that was valid at the date'),
     Column('calibration_age_days', 'float', 'its age at the date', 'day'),
     Column('validity', 'text', 'valid, or why the calibration is not known to be valid'),
-    *(Column(f'noise_{letter}{end}_{axis}_{unit_name}', 'float', f'{meaning}{note}, axis {axis}',
-             unit)
-      for letter, meaning, unit_name, unit in NOISE for end, note in _ENDS for axis in AXES),
-    *(Column(f'{name}_{axis}_{unit_name}', 'float', f'{meaning}, axis {axis}', unit)
-      for name, unit_name, meaning, unit in (
-          ('zero_g', 'v', 'fitted zero-g', 'V'),
-          ('zero_g_std', 'v', 'standard deviation of the zero-g', 'V'),
-          ('scale', 'v_per_g', 'fitted scale factor', 'V/g'),
-          ('scale_std', 'v_per_g', 'standard deviation of the scale factor', 'V/g'))
-      for axis in AXES),
+    *(
+        Column(
+            f'noise_{letter}{end}_{axis}_{unit_name}',
+            'float',
+            f'{meaning}{note}, axis {axis}',
+            unit,
+        )
+        for letter, meaning, unit_name, unit in NOISE
+        for end, note in _ENDS
+        for axis in AXES
+    ),
+    *(
+        Column(f'{name}_{axis}_{unit_name}', 'float', f'{meaning}, axis {axis}', unit)
+        for name, unit_name, meaning, unit in (
+            ('zero_g', 'v', 'fitted zero-g', 'V'),
+            ('zero_g_std', 'v', 'standard deviation of the zero-g', 'V'),
+            ('scale', 'v_per_g', 'fitted scale factor', 'V/g'),
+            ('scale_std', 'v_per_g', 'standard deviation of the scale factor', 'V/g'),
+        )
+        for axis in AXES
+    ),
     Column('fit_model', 'text', 'model that was fitted'),
     Column('fit_poses', 'integer', 'poses that were fitted'),
-    *(Column(f'gap_{name}{end}{"_mps2" * bool(unit)}', 'float', f'{meaning}{note}', unit)
-      for name, meaning, unit in (
-          ('before', 'rms of recording minus simulation', 'm/s²'),
-          ('after', 'rms with the named effects, on held-out blocks', 'm/s²'),
-          ('floor', 'noise floor; without an interval if assumed', 'm/s²'),
-          ('closed', 'closed share of the squared gap above the floor', ''))
-      for end, note in _ENDS),
+    *(
+        Column(f'gap_{name}{end}{"_mps2" * bool(unit)}', 'float', f'{meaning}{note}', unit)
+        for name, meaning, unit in (
+            ('before', 'rms of recording minus simulation', 'm/s²'),
+            ('after', 'rms with the named effects, on held-out blocks', 'm/s²'),
+            ('floor', 'noise floor; without an interval if assumed', 'm/s²'),
+            ('closed', 'closed share of the squared gap above the floor', ''),
+        )
+        for end, note in _ENDS
+    ),
     Column('gap_floor_source', 'text', 'where the floor is from: still, repeats or assumed'),
-    Column('status', 'text',
-           'no_gap, explained, partly, inseparable, unknown, insufficient or bad_data'),
+    Column(
+        'status',
+        'text',
+        'no_gap, explained, partly, inseparable, unknown, insufficient or bad_data',
+    ),
     Column('effects', 'texts', 'effects that are named for certain'),
     Column('groups', 'groups', 'sets of inseparable effects, one of each acts'),
     Column('probability', 'float', 'probability of the verdict'),
@@ -129,8 +151,7 @@ COLUMNS: tuple[Column, ...] = (
 
 def empty_row() -> Row:
     """Return a row without any value."""
-    return {column.name: [] if column.kind in ('texts', 'groups') else None
-            for column in COLUMNS}
+    return {column.name: [] if column.kind in ('texts', 'groups') else None for column in COLUMNS}
 
 
 def finite(value: Any) -> float | None:
@@ -150,23 +171,41 @@ def reason_kind(row: Row) -> str:
 def arrow_schema() -> Any:
     """Return the columns as a schema of pyarrow, with unit and meaning as metadata."""
     import pyarrow as pa
+
     text = pa.string()
-    types = {'text': text, 'float': pa.float64(), 'integer': pa.int64(), 'flag': pa.bool_(),
-             'time': pa.timestamp('us', 'UTC'), 'texts': pa.list_(text),
-             'groups': pa.list_(pa.list_(text))}
-    return pa.schema([
-        pa.field(column.name, types[column.kind],
-                 metadata={'unit': column.unit, 'meaning': column.meaning})
-        for column in COLUMNS])
+    types = {
+        'text': text,
+        'float': pa.float64(),
+        'integer': pa.int64(),
+        'flag': pa.bool_(),
+        'time': pa.timestamp('us', 'UTC'),
+        'texts': pa.list_(text),
+        'groups': pa.list_(pa.list_(text)),
+    }
+    return pa.schema(
+        [
+            pa.field(
+                column.name,
+                types[column.kind],
+                metadata={'unit': column.unit, 'meaning': column.meaning},
+            )
+            for column in COLUMNS
+        ]
+    )
 
 
 def as_table(rows: Iterable[Row]) -> Any:
     """Return rows, whose times are texts of ISO 8601 with an offset, as a table of pyarrow."""
     import pyarrow as pa
+
     times = [column.name for column in COLUMNS if column.kind == 'time']
-    return pa.Table.from_pylist([
-        {**row, **{name: datetime.fromisoformat(row[name]) for name in times if row[name]}}
-        for row in rows], arrow_schema())
+    return pa.Table.from_pylist(
+        [
+            {**row, **{name: datetime.fromisoformat(row[name]) for name in times if row[name]}}
+            for row in rows
+        ],
+        arrow_schema(),
+    )
 
 
 TASKS = ('check', 'noise', 'fit', 'diagnose')  # All tasks, in the order in which they run
@@ -208,8 +247,11 @@ class Recipe:
             return self.stated[stated]
         if self.params is not None:
             return self.params
-        return max((stored for stored in self.store.get(serial, ()) if '' < stored.date <= date),
-                   key=lambda stored: stored.date, default=_NOMINAL)
+        return max(
+            (stored for stored in self.store.get(serial, ()) if '' < stored.date <= date),
+            key=lambda stored: stored.date,
+            default=_NOMINAL,
+        )
 
     def digest(self, chosen: ParameterText, serial: str) -> str:
         """Return the SHA-256 of all that a row follows from, beside the content."""
@@ -236,13 +278,22 @@ def task_names(text: str) -> tuple[str, ...]:
     return tuple(name for name in TASKS if name in chosen)
 
 
-def make_recipe(tasks: Iterable[str], params: str | None, stated: Iterable[str],
-                store: str | None, reading: ReadingOptions) -> Recipe:
+def make_recipe(
+    tasks: Iterable[str],
+    params: str | None,
+    stated: Iterable[str],
+    store: str | None,
+    reading: ReadingOptions,
+) -> Recipe:
     """Read all parameter files of a run."""
-    return Recipe(tuple(tasks), code_version(),
-                  _read(params) if params else None,
-                  {name: _read(name) for name in set(stated) if name},
-                  _stored(store) if store else {}, reading)
+    return Recipe(
+        tuple(tasks),
+        code_version(),
+        _read(params) if params else None,
+        {name: _read(name) for name in set(stated) if name},
+        _stored(store) if store else {},
+        reading,
+    )
 
 
 def _read(name: str) -> ParameterText:
@@ -250,9 +301,12 @@ def _read(name: str) -> ParameterText:
     path = parameter_file.installed_path(name)
     sensor = parameter_file.load(path, may_measure=True)
     date = calibration_store.date_of(sensor)
-    return ParameterText(Path(name).name, Path(path).read_text(encoding='utf-8'),
-                         calibration_store.calibration_id(sensor) if sensor.effects else '',
-                         date.isoformat() if date else '')
+    return ParameterText(
+        Path(name).name,
+        Path(path).read_text(encoding='utf-8'),
+        calibration_store.calibration_id(sensor) if sensor.effects else '',
+        date.isoformat() if date else '',
+    )
 
 
 def _stored(folder: str) -> dict[str, list[ParameterText]]:
@@ -262,11 +316,13 @@ def _stored(folder: str) -> dict[str, list[ParameterText]]:
         for path in sorted(Path(folder).glob('*/*.yaml')):
             text = path.read_text(encoding='utf-8')
             with suppress(yaml.YAMLError, KeyError, TypeError, AttributeError):
-                keys = yaml.load(text, getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-                                 )['/**']['ros__parameters']
+                keys = yaml.load(text, getattr(yaml, 'CSafeLoader', yaml.SafeLoader))['/**'][
+                    'ros__parameters'
+                ]
                 made = keys['provenance']
                 stored.setdefault(keys['sensor']['serial'], []).append(
-                    ParameterText(path.name, text, made['id'], as_date(made['date'])))
+                    ParameterText(path.name, text, made['id'], as_date(made['date']))
+                )
     except (OSError, ValueError) as error:
         raise UserError(f'{folder}: cannot be read: {one_line(error)}') from None
     return stored

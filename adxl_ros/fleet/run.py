@@ -34,8 +34,12 @@ _BATCH_ROWS = 1000  # Rows that are in memory at once while the table is written
 _LOCK = 'client.lock'  # File that the client of a folder locks; it names the client
 _NAME_DIGITS = 16
 """Digits of a SHA-256 in names of files and folders. Chosen: 10⁵ rows have no pair."""
-_SECONDS = {'check': (0.02, 30.0), 'noise': (0.05, 60.0), 'fit': (1.0, 100.0),
-            'diagnose': (10.0, 500.0)}
+_SECONDS = {
+    'check': (0.02, 30.0),
+    'noise': (0.05, 60.0),
+    'fit': (1.0, 100.0),
+    'diagnose': (10.0, 500.0),
+}
 """Usual run time of each task: of any recording, s, and for each GB, s. Measured on one core with
 CSV files of 416 s at 250 Hz."""
 _IDENTITY = ('url', 'serial', 'date', 'date_source', 'calibration_id', 'calibration_age_days')
@@ -50,8 +54,10 @@ def only_client(folder: Path) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.seek(0)
-            raise UserError(f'{folder}: {file.read() or "another client"} works on it; wait for '
-                            'its end, or name another folder') from None
+            raise UserError(
+                f'{folder}: {file.read() or "another client"} works on it; wait for '
+                'its end, or name another folder'
+            ) from None
         file.truncate(0)
         file.write(f'process {os.getpid()} on {os.uname().nodename}')
         file.flush()
@@ -96,8 +102,11 @@ class Results:
 
     def put(self, result: Result, attempts: int) -> Row:
         """Write what a task left: its files, then its row."""
-        row = {**result.row, 'attempts': attempts,
-               'written': datetime.now(timezone.utc).isoformat()}
+        row = {
+            **result.row,
+            'attempts': attempts,
+            'written': datetime.now(timezone.utc).isoformat(),
+        }
         if result.files:
             row['report'] = f'{_REPORTS}/{row["key"][:_NAME_DIGITS]}'
             for file, data in result.files.items():
@@ -105,21 +114,27 @@ class Results:
         of_url = hashlib.sha256(row['url'].encode()).hexdigest()[:_NAME_DIGITS]
         name = f'{row["key"]}-{of_url}.json'
         content = {'stamp': result.stamp, 'digest': result.digest, 'row': row}
-        write(self.folder / _ROWS / name,
-              json.dumps(content, allow_nan=False, ensure_ascii=False).encode())
+        write(
+            self.folder / _ROWS / name,
+            json.dumps(content, allow_nan=False, ensure_ascii=False).encode(),
+        )
         self._add(name, content)
         return row
 
     def write_table(self) -> Path:
         """Write the table: the newest row of each recording, by URL."""
         from pyarrow import ArrowException, parquet
+
         path = self.folder / TABLE
-        contents = (_read(self.folder / _ROWS / self.newest[url].name)
-                    for url in sorted(self.newest))
+        contents = (
+            _read(self.folder / _ROWS / self.newest[url].name) for url in sorted(self.newest)
+        )
         rows = (content['row'] for content in contents if content is not None)
         try:
-            with atomic_path(path) as fresh, \
-                    parquet.ParquetWriter(fresh, arrow_schema(), compression='zstd') as writer:
+            with (
+                atomic_path(path) as fresh,
+                parquet.ParquetWriter(fresh, arrow_schema(), compression='zstd') as writer,
+            ):
                 while batch := list(islice(rows, _BATCH_ROWS)):
                     writer.write_table(as_table(batch))
         except ArrowException as error:
@@ -146,8 +161,14 @@ class Plan(NamedTuple):
     core_hours: float  # Expected run time on one core, h
 
 
-def plan(sources: Sequence[Source], recipe: Recipe, results: Results, only_failed: bool = False,
-         since: str = '', limit: int | None = None) -> Plan:
+def plan(
+    sources: Sequence[Source],
+    recipe: Recipe,
+    results: Results,
+    only_failed: bool = False,
+    since: str = '',
+    limit: int | None = None,
+) -> Plan:
     """
     Decide which recordings are to be worked on.
 
@@ -157,16 +178,23 @@ def plan(sources: Sequence[Source], recipe: Recipe, results: Results, only_faile
     chosen = _since(sources, since, results) if since else sources
     newest = results.newest
     if only_failed:
-        todo, done = [source for source in chosen if source.url in newest
-                      and newest[source.url].row['outcome'] != 'done'], 0
+        todo, done = (
+            [
+                source
+                for source in chosen
+                if source.url in newest and newest[source.url].row['outcome'] != 'done'
+            ],
+            0,
+        )
     else:
-        todo = [source for source in chosen
-                if not is_done(source, newest.get(source.url), recipe)]
+        todo = [source for source in chosen if not is_done(source, newest.get(source.url), recipe)]
         done = len(chosen) - len(todo)
     todo = todo[:limit]
     size_bytes = sum(source.size_bytes or 0 for source in todo)
-    expected_s = sum(_SECONDS[name][0] * len(todo) + _SECONDS[name][1] * size_bytes / 1e9
-                     for name in recipe.tasks)
+    expected_s = sum(
+        _SECONDS[name][0] * len(todo) + _SECONDS[name][1] * size_bytes / 1e9
+        for name in recipe.tasks
+    )
     return Plan(todo, done, len(sources) - done - len(todo), size_bytes, expected_s / 3600)
 
 
@@ -175,8 +203,11 @@ def _since(sources: Sequence[Source], since: str, results: Results) -> list[Sour
     dates = {url: entry.row['date'] for url, entry in results.newest.items()}
     unread = [source for source in sources if not (source.date or dates.get(source.url))]
     dates |= {source.url: date for source, (_, date) in zip(unread, stated_by(unread))}
-    return [source for source in sources
-            if (source.date or dates.get(source.url) or source.modified or since) >= since]
+    return [
+        source
+        for source in sources
+        if (source.date or dates.get(source.url) or source.modified or since) >= since
+    ]
 
 
 def is_done(source: Source, entry: Entry | None, recipe: Recipe) -> bool:
@@ -186,13 +217,20 @@ def is_done(source: Source, entry: Entry | None, recipe: Recipe) -> bool:
     row = entry.row
     if source.date != (row['date'] if row['date_source'] == 'manifest' else ''):
         return False
-    parameters = recipe.parameters_of(source.serial or row['serial'] or '',
-                                      source.date or row['date'] or '', source.params)
+    parameters = recipe.parameters_of(
+        source.serial or row['serial'] or '', source.date or row['date'] or '', source.params
+    )
     return recipe.digest(parameters, source.serial) == entry.digest
 
 
-def work(pool: Pool, sources: Sequence[Source], recipe: Recipe, results: Results,
-         retries: int, show: Callable[[float], None]) -> Iterator[Row]:
+def work(
+    pool: Pool,
+    sources: Sequence[Source],
+    recipe: Recipe,
+    results: Results,
+    retries: int,
+    show: Callable[[float], None],
+) -> Iterator[Row]:
     """Work on recordings, and write each row as soon as it is there."""
     failed = {url for url, entry in results.newest.items() if entry.row['outcome'] != 'done'}
     tasks = ((source, source.url in failed) for source in sources)
@@ -212,8 +250,12 @@ def _written(end: Finished, recipe: Recipe, results: Results) -> Row:
     elif isinstance(error, StagingError):
         result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
     else:
-        result = refused(recipe, source, f'{type(error).__name__}: {one_line(error)} '
-                         f'({end.attempts} attempts)', 'crashed')
+        result = refused(
+            recipe,
+            source,
+            f'{type(error).__name__}: {one_line(error)} ({end.attempts} attempts)',
+            'crashed',
+        )
     if result.is_known:
         content = _read(results.folder / _ROWS / results.known[result.row['key']])
         assert content is not None, 'rows are never removed'

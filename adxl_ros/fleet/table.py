@@ -33,8 +33,17 @@ from adxl_ros.report.quantities import counted, mg, number
 import numpy as np
 import pandas as pd
 
-_TEXTS = ['url', 'hash', 'serial', 'outcome', 'refusal', 'refused_by', 'calibration_id', 'status',
-          'report']
+_TEXTS = [
+    'url',
+    'hash',
+    'serial',
+    'outcome',
+    'refusal',
+    'refused_by',
+    'calibration_id',
+    'status',
+    'report',
+]
 """Columns of texts that the page uses."""
 _OTHERS = ['date', 'effects', 'calibration_age_days', 'gap_floor_mps2']
 """Columns that the page uses, beside those of the quantities."""
@@ -98,8 +107,12 @@ def read(path: str | os.PathLike) -> FleetTable:
     """Read the columns of a table that the page uses."""
     import pyarrow as pa
     import pyarrow.parquet as pq
-    numbers = [name for quantity in quantities(None)
-               for name in (quantity.column, *quantity.error_columns)]
+
+    numbers = [
+        name
+        for quantity in quantities(None)
+        for name in (quantity.column, *quantity.error_columns)
+    ]
     try:
         frame = pq.read_table(path, columns=[*_TEXTS, *_OTHERS, *numbers]).to_pandas()
     except (OSError, KeyError, pa.ArrowException) as error:
@@ -116,27 +129,48 @@ def read(path: str | os.PathLike) -> FleetTable:
     named = frame['calibration_id'].mask(frame['calibration_id'] == '').groupby(unit).ffill()
     last = named.shift()
     begins = (np.diff(unit, prepend=-2) != 0) | (
-        named.notna() & last.notna() & (named != last)).to_numpy(bool)
+        named.notna() & last.notna() & (named != last)
+    ).to_numpy(bool)
     # A copy says nothing twice.
     first = ~frame.assign(unit=unit).duplicated(['unit', 'hash']) | (frame['hash'] == '')
-    return FleetTable(frame, tuple(map(str, serials)), unit,
-                      (date - np.datetime64(0, 'us')) / _YEAR, np.cumsum(begins) - 1,
-                      first.to_numpy(bool))
+    return FleetTable(
+        frame,
+        tuple(map(str, serials)),
+        unit,
+        (date - np.datetime64(0, 'us')) / _YEAR,
+        np.cumsum(begins) - 1,
+        first.to_numpy(bool),
+    )
 
 
 def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
     """Return all quantities of a table."""
-    listed = [Quantity('gap_before_mps2', 'gap', 'mg', MG,
-                       ('gap_before_low_mps2', 'gap_before_high_mps2'), is_coefficient=False)]
+    listed = [
+        Quantity(
+            'gap_before_mps2',
+            'gap',
+            'mg',
+            MG,
+            ('gap_before_low_mps2', 'gap_before_high_mps2'),
+            is_coefficient=False,
+        )
+    ]
     for axis in AXES:
         scales = np.zeros(0) if table is None else table[f'scale_{axis}_v_per_g']
         scales = scales[scales > 0]
         mg_per_v = 1e3 / float(np.median(scales)) if len(scales) else 1e3
         listed += [
-            Quantity(f'zero_g_{axis}_v', f'zero-g {axis}', 'mg', mg_per_v,
-                     (f'zero_g_std_{axis}_v',)),
-            Quantity(f'scale_{axis}_v_per_g', f'scale factor {axis}', 'mg/g', mg_per_v,
-                     (f'scale_std_{axis}_v_per_g',))]
+            Quantity(
+                f'zero_g_{axis}_v', f'zero-g {axis}', 'mg', mg_per_v, (f'zero_g_std_{axis}_v',)
+            ),
+            Quantity(
+                f'scale_{axis}_v_per_g',
+                f'scale factor {axis}',
+                'mg/g',
+                mg_per_v,
+                (f'scale_std_{axis}_v_per_g',),
+            ),
+        ]
     return tuple(listed)
 
 
@@ -182,24 +216,46 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
         units = np.unique(table.unit[rows[~is_outlier]])
         population, batch = None, None
         if quantity.is_coefficient and len(units) >= pooling.MIN_UNITS:
-            batch = pooling.bad_batch([table.serials[unit] for unit in units], trends.level,
-                                      TOLERANCE_MG / quantity.factor, len(measured))
+            batch = pooling.bad_batch(
+                [table.serials[unit] for unit in units],
+                trends.level,
+                TOLERANCE_MG / quantity.factor,
+                len(measured),
+            )
             usual = slice(None) if batch is None else ~batch.members
-            population = pooling.random_effects(trends.level[usual], trends.level_std[usual],
-                                                coefficients)
+            population = pooling.random_effects(
+                trends.level[usual], trends.level_std[usual], coefficients
+            )
         none = np.zeros(len(units), bool)
-        results.append(QuantityResult(quantity, rows, recordings, distance, is_outlier, units,
-                                      trends, none, np.zeros(len(units)), population, batch))
+        results.append(
+            QuantityResult(
+                quantity,
+                rows,
+                recordings,
+                distance,
+                is_outlier,
+                units,
+                trends,
+                none,
+                np.zeros(len(units)),
+                population,
+                batch,
+            )
+        )
     if not results:
         return []
     # The false discovery rate is controlled over all slopes together.
     is_claimed = pooling.claims(np.concatenate([r.trends.p_values for r in results]))
-    factor = pooling.interval_factor(np.concatenate([r.trends.freedom for r in results]),
-                                     is_claimed)
+    factor = pooling.interval_factor(
+        np.concatenate([r.trends.freedom for r in results]), is_claimed
+    )
     splits = np.cumsum([len(result.units) for result in results])[:-1]
-    return [replace(result, is_claimed=claimed, half_width=factors * result.trends.slope_std)
-            for result, claimed, factors in zip(
-                results, np.split(is_claimed, splits), np.split(factor, splits))]
+    return [
+        replace(result, is_claimed=claimed, half_width=factors * result.trends.slope_std)
+        for result, claimed, factors in zip(
+            results, np.split(is_claimed, splits), np.split(factor, splits)
+        )
+    ]
 
 
 _VERDICTS = ('no_gap', 'explained', 'partly', 'inseparable', 'unknown')
@@ -222,8 +278,11 @@ def effect_matrix(table: FleetTable) -> pd.DataFrame:
     frame, unit = table.frame[used], table.unit[used]
     counts = Counter(name for names in frame['effects'] for name in names)
     effects = sorted(counts, key=lambda name: (-counts[name], name))
-    has = pd.DataFrame([[name in names for name in effects] for names in frame['effects']],
-                       columns=effects, dtype=float)
+    has = pd.DataFrame(
+        [[name in names for name in effects] for names in frame['effects']],
+        columns=effects,
+        dtype=float,
+    )
     return has.groupby(unit).mean()
 
 
@@ -292,23 +351,35 @@ def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult]) -
     state, urgency, reason = State.IN_ORDER, 0.0, ''
     if over_mg > TOLERANCE_MG:
         state, urgency = State.OUT_OF_TOLERANCE, -over_mg
-        reason = f'Gap {number(gap_mg)} mg, noise {number(floor_mg)} mg; the tolerance is ' \
+        reason = (
+            f'Gap {number(gap_mg)} mg, noise {number(floor_mg)} mg; the tolerance is '
             f'{number(TOLERANCE_MG)} mg.'
+        )
     elif drift is not None:
         state = State.DRIFTS if drift.days else State.OUT_OF_TOLERANCE
         urgency = drift.days or -drift.reached_mg
         reason = f'{drift.text}: out of tolerance ' + (
-            f'in {number(drift.days, digits=2)} days.' if drift.days else 'now.')
+            f'in {number(drift.days, digits=2)} days.' if drift.days else 'now.'
+        )
     elif series:
         state, urgency = State.NOT_JUDGED, -series
-        reason = f'Refused, {counted(series, "recording")} in a row: ' \
+        reason = (
+            f'Refused, {counted(series, "recording")} in a row: '
             f'{table["refusal"][rows[-1]] or table["outcome"][rows[-1]]}'
+        )
     return UnitState(
-        urgency, unit, table.serials[unit], state, reason[:1].upper() + reason[1:], drifts,
+        urgency,
+        unit,
+        table.serials[unit],
+        state,
+        reason[:1].upper() + reason[1:],
+        drifts,
         f'{number(gap_mg)} / {number(floor_mg)}' if np.isfinite(gap_mg) else '-',
-        f'{len(rows)} ({refused.sum()})', f'{age_days:.0f}' if np.isfinite(age_days) else '-',
+        f'{len(rows)} ({refused.sum()})',
+        f'{age_days:.0f}' if np.isfinite(age_days) else '-',
         float(table.years[rows[-1]]),
-        next((text for text in table['report'][rows[::-1]] if text), ''))
+        next((text for text in table['report'][rows[::-1]] if text), ''),
+    )
 
 
 def _gap_now(table: FleetTable, rows: np.ndarray) -> tuple[float, float, float]:
@@ -320,11 +391,12 @@ def _gap_now(table: FleetTable, rows: np.ndarray) -> tuple[float, float, float]:
     gap = float(np.median(table['gap_before_mps2'][rows])) * MG
     floors = table['gap_floor_mps2'][rows]
     floor = float(np.nanmedian(floors)) * MG if np.isfinite(floors).any() else 0.0
-    return gap, floor, float(np.sqrt(max(gap ** 2 - floor ** 2, 0.0)))
+    return gap, floor, float(np.sqrt(max(gap**2 - floor**2, 0.0)))
 
 
-def _drifts(unit: int, results: Sequence[QuantityResult], over_mg: float, age_days: float
-            ) -> tuple[Drift, ...]:
+def _drifts(
+    unit: int, results: Sequence[QuantityResult], over_mg: float, age_days: float
+) -> tuple[Drift, ...]:
     """Return the claimed slopes of a unit, the most urgent first."""
     drifts = []
     for result in results:

@@ -88,9 +88,11 @@ def stage(source: Source, folder: Path) -> Staged:
         raise error(f'{url}: {before.fault}')
     size_mb, free_mb = (before.size_bytes or 0) / 1e6, shutil.disk_usage(folder).free / 1e6
     if size_mb + _SPARE_MB > free_mb:
-        raise StagingError(f'{url}: needs {size_mb:.3g} MB beside {_SPARE_MB} MB that stay free, '
-                           f'but {tempfile.gettempdir()} has {free_mb:.3g} MB free; set TMPDIR '
-                           'to a larger disk')
+        raise StagingError(
+            f'{url}: needs {size_mb:.3g} MB beside {_SPARE_MB} MB that stay free, '
+            f'but {tempfile.gettempdir()} has {free_mb:.3g} MB free; set TMPDIR '
+            'to a larger disk'
+        )
     target = folder / inputs.file_name(path)
     try:
         # A web server answers `isdir` with the whole file.
@@ -109,10 +111,13 @@ def stage(source: Source, folder: Path) -> Staged:
         raise StagingError(f'{url}: {inputs.fault_of(problem)}') from None
     fs.invalidate_cache()
     after = inputs.look_up(fs, path)
-    size_bytes = sum(copy.stat().st_size for copy in [target, *target.rglob('*')]
-                     if copy.is_file())
-    if (after.stamp, after.size_bytes) != (before.stamp, before.size_bytes) or \
-            before.size_bytes not in (None, size_bytes):
+    size_bytes = sum(
+        copy.stat().st_size for copy in [target, *target.rglob('*')] if copy.is_file()
+    )
+    if (after.stamp, after.size_bytes) != (
+        before.stamp,
+        before.size_bytes,
+    ) or before.size_bytes not in (None, size_bytes):
         raise StagingError(f'{url}: changed while it was read; is it still being written?')
     return Staged(target, sha256([target]), size_bytes)
 
@@ -135,9 +140,11 @@ def make_row(recipe: Recipe, earlier: frozenset[str], source: Source, is_again: 
     """Make the row of a recording; one with an `earlier` key is only made where `is_again`."""
     worker = f'{os.uname().nodename}:{os.getpid()}'
     if recipe.code != code_version():
-        raise UserError(f'worker {worker}: has another version of adxl_ros '
-                        f'({code_version()[:12]}, the client has {recipe.code[:12]}); install the '
-                        'same on all')
+        raise UserError(
+            f'worker {worker}: has another version of adxl_ros '
+            f'({code_version()[:12]}, the client has {recipe.code[:12]}); install the '
+            'same on all'
+        )
     begin_s = monotonic()
     try:
         if source.fault:
@@ -150,8 +157,11 @@ def make_row(recipe: Recipe, earlier: frozenset[str], source: Source, is_again: 
         result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
     row = result.row
     row |= {name: finite(value) for name, value in row.items() if isinstance(value, float)}
-    row |= {'seconds': round(monotonic() - begin_s, 6), 'worker': worker,
-            'memory_mb': getrusage(RUSAGE_SELF).ru_maxrss / 1024}
+    row |= {
+        'seconds': round(monotonic() - begin_s, 6),
+        'worker': worker,
+        'memory_mb': getrusage(RUSAGE_SELF).ru_maxrss / 1024,
+    }
     return result
 
 
@@ -160,8 +170,12 @@ def refused(recipe: Recipe, source: Source, reason: str, outcome: str = 'refused
     parameters = recipe.parameters_of(source.serial, source.date, source.params)
     digest = recipe.digest(parameters, source.serial)
     row = _identity(recipe, source, None, source.serial, (source.date, 'manifest'), parameters)
-    row |= {'key': sha256_of(f'{source.url} {source.stamp}', digest), 'outcome': outcome,
-            'refusal': reason, 'refused_by': 'stage'}
+    row |= {
+        'key': sha256_of(f'{source.url} {source.stamp}', digest),
+        'outcome': outcome,
+        'refusal': reason,
+        'refused_by': 'stage',
+    }
     return Result(row, {}, source.stamp, digest)
 
 
@@ -169,8 +183,9 @@ def _of_staged(recipe: Recipe, source: Source, earlier: frozenset[str], staged: 
     """Run the tasks on a copy, unless there is a row of this content by this recipe."""
     first, fault = None, ''
     try:
-        first = next(recording.blocks(
-            staged.path, 1, replace(recipe.reading, drop_bad_stamps=True)), None)
+        first = next(
+            recording.blocks(staged.path, 1, replace(recipe.reading, drop_bad_stamps=True)), None
+        )
     except UserError as error:
         fault = one_line(error)
     recorded = first.stream_info.serial if first else NO_UNIT
@@ -195,26 +210,41 @@ def _of_staged(recipe: Recipe, source: Source, earlier: frozenset[str], staged: 
     return Result(job.row, job.files, source.stamp, digest)
 
 
-def _identity(recipe: Recipe, source: Source, staged: Staged | None, serial: str,
-              date: tuple[str, str], parameters: ParameterText) -> Row:
+def _identity(
+    recipe: Recipe,
+    source: Source,
+    staged: Staged | None,
+    serial: str,
+    date: tuple[str, str],
+    parameters: ParameterText,
+) -> Row:
     """Return the columns that do not depend on the tasks."""
-    begun, made = (datetime.fromisoformat(text) if text else None
-                   for text in (date[0], parameters.date))
-    return {**empty_row(), 'url': source.url, 'hash': staged and staged.content,
-            'size_bytes': staged.size_bytes if staged else source.size_bytes,
-            'serial': serial if serial not in ('', NO_UNIT) else None,
-            'date': date[0] or None, 'date_source': date[1] if date[0] else None,
-            'tasks': list(recipe.tasks), 'calibration_id': parameters.calibration_id or None,
-            'calibration_age_days': (begun - made) / timedelta(days=1) if begun and made else None,
-            'validity': None if parameters.calibration_id else 'not calibrated',
-            'version': package_version(), 'code': recipe.code}
+    begun, made = (
+        datetime.fromisoformat(text) if text else None for text in (date[0], parameters.date)
+    )
+    return {
+        **empty_row(),
+        'url': source.url,
+        'hash': staged and staged.content,
+        'size_bytes': staged.size_bytes if staged else source.size_bytes,
+        'serial': serial if serial not in ('', NO_UNIT) else None,
+        'date': date[0] or None,
+        'date_source': date[1] if date[0] else None,
+        'tasks': list(recipe.tasks),
+        'calibration_id': parameters.calibration_id or None,
+        'calibration_age_days': (begun - made) / timedelta(days=1) if begun and made else None,
+        'validity': None if parameters.calibration_id else 'not calibrated',
+        'version': package_version(),
+        'code': recipe.code,
+    }
 
 
 class _Job:
     """The tasks on one staged recording."""
 
-    def __init__(self, recipe: Recipe, source: Source, staged: Staged, parameters: ParameterText,
-                 row: Row) -> None:
+    def __init__(
+        self, recipe: Recipe, source: Source, staged: Staged, parameters: ParameterText, row: Row
+    ) -> None:
         self._recipe, self._source, self._staged = recipe, source, staged
         self._parameters = parameters
         self._params: str | None = None  # Path of the parameter file; None: the nominal sensor
@@ -227,8 +257,11 @@ class _Job:
 
     def run(self) -> None:
         """Run the tasks. One that does not fit the recording is skipped, unless all are."""
-        findings = check_recording(str(self._staged.path), self._params, replace(
-            self._recipe.reading, drop_bad_stamps=True))
+        findings = check_recording(
+            str(self._staged.path),
+            self._params,
+            replace(self._recipe.reading, drop_bad_stamps=True),
+        )
         self._put_check(findings)
         if findings.contents is None:
             self.refuse('check', self.plain(findings.faults[0]))
@@ -240,11 +273,17 @@ class _Job:
             self.refuse('check', fault.text)
             return
         tasks = self._recipe.tasks
-        skipped = {ability.tool: self.plain(ability.reason) for ability in findings.abilities
-                   if not ability.is_able and ability.tool in tasks}
+        skipped = {
+            ability.tool: self.plain(ability.reason)
+            for ability in findings.abilities
+            if not ability.is_able and ability.tool in tasks
+        }
         has_result = tasks == ('check',)
-        for name, step in (('noise', self._noise), ('fit', self._fit),
-                           ('diagnose', self._diagnose)):
+        for name, step in (
+            ('noise', self._noise),
+            ('fit', self._fit),
+            ('diagnose', self._diagnose),
+        ):
             if name not in tasks or name in skipped:
                 continue
             try:
@@ -258,8 +297,9 @@ class _Job:
                 else:
                     self.refuse(name, reason)
             except Exception as error:
-                self.refuse(name, self.plain(f'{type(error).__name__}: {one_line(error)}'),
-                            'crashed')
+                self.refuse(
+                    name, self.plain(f'{type(error).__name__}: {one_line(error)}'), 'crashed'
+                )
         # Many recordings have no noise; what the others need says more.
         order = [name for name in tasks if name in skipped]
         if order and not has_result:
@@ -286,12 +326,18 @@ class _Job:
         if contents is None:
             return
         low, high = contents.reference_ranges.get('temperature_c', (None, None))
-        row |= {'axes': ''.join(axis.name.lstrip('a')[0] for axis in contents.axes),
-                'duration_s': contents.span_s, 'samples': contents.samples,
-                'rate_hz': contents.rate_hz, 'jitter_s': contents.jitter_s,
-                'missing': contents.missing, 'longest_gap_s': contents.longest_gap_s,
-                'temperature_c': contents.reference_means.get('temperature_c'),
-                'temperature_low_c': low, 'temperature_high_c': high}
+        row |= {
+            'axes': ''.join(axis.name.lstrip('a')[0] for axis in contents.axes),
+            'duration_s': contents.span_s,
+            'samples': contents.samples,
+            'rate_hz': contents.rate_hz,
+            'jitter_s': contents.jitter_s,
+            'missing': contents.missing,
+            'longest_gap_s': contents.longest_gap_s,
+            'temperature_c': contents.reference_means.get('temperature_c'),
+            'temperature_low_c': low,
+            'temperature_high_c': high,
+        }
         if self._params is None or not row['calibration_id']:
             return
         envelope = parameter_file.load(self._params, may_measure=True).envelope
@@ -306,59 +352,82 @@ class _Job:
     @cached_property
     def _recording(self) -> Recording:
         """Return the whole recording; reports name it, and not its copy."""
-        return replace(recording.read(self._staged.path, self._recipe.reading),
-                       path=self._source.url)
+        return replace(
+            recording.read(self._staged.path, self._recipe.reading), path=self._source.url
+        )
 
     def _noise(self) -> None:
         """Find the noise of the longest rest."""
         from adxl_ros.api.noise import noise  # the client needs none
+
         found = noise(
             lambda: recording.blocks(self._staged.path, BLOCK_ROWS, self._recipe.reading),
-            self._params)
+            self._params,
+        )
         for of_axis in found.axes:
             for (letter, _, unit, _), estimate in zip(NOISE, of_axis.estimates):
-                values = (estimate.value if estimate.is_seen else None, estimate.low,
-                          estimate.high)
-                self.row |= {f'noise_{letter}{end}_{of_axis.axis}_{unit}': value
-                             for end, value in zip(('', '_low', '_high'), values)}
+                values = (
+                    estimate.value if estimate.is_seen else None,
+                    estimate.low,
+                    estimate.high,
+                )
+                self.row |= {
+                    f'noise_{letter}{end}_{of_axis.axis}_{unit}': value
+                    for end, value in zip(('', '_low', '_high'), values)
+                }
 
     def _fit(self) -> None:
         """Fit a calibration to the recording alone."""
         from adxl_ros.api.calibration import fit  # the client needs none
+
         found = fit(self._recording, self._params, data_sha256=self._staged.content)
         fitted = found.sensor
         stds = dict(zip(fitted.covariance_names, np.sqrt(np.diag(fitted.covariance)).tolist()))
         for name, unit_name, coefficient, values in (
-                ('zero_g', 'v', ('bias', 'offset_v'), fitted.zero_g_v),
-                ('scale', 'v_per_g', ('scale_factor', 'offset_v_per_g'), fitted.scale_v_per_g)):
+            ('zero_g', 'v', ('bias', 'offset_v'), fitted.zero_g_v),
+            ('scale', 'v_per_g', ('scale_factor', 'offset_v_per_g'), fitted.scale_v_per_g),
+        ):
             for axis, value in zip(fitted.axes, values):
-                self.row |= {f'{name}_{axis}_{unit_name}': float(value),
-                             f'{name}_std_{axis}_{unit_name}':
-                             stds.get(Coefficient(*coefficient, axis))}
+                self.row |= {
+                    f'{name}_{axis}_{unit_name}': float(value),
+                    f'{name}_std_{axis}_{unit_name}': stds.get(Coefficient(*coefficient, axis)),
+                }
         self.row |= {'fit_model': fitted.model, 'fit_poses': found.poses}
-        self.files['unit.yaml'] = parameter_file.as_text(
-            fitted, found.result.report_lines).encode('utf-8')
+        self.files['unit.yaml'] = parameter_file.as_text(fitted, found.result.report_lines).encode(
+            'utf-8'
+        )
 
     def _diagnose(self) -> None:
         """Compare the recording with its simulation."""
         from adxl_ros.api.gap import diagnose  # the client needs none
+
         found = diagnose(self._recording, self._params)
         # The report names the file, and not the copy of the task.
         found = found.with_params(self._parameters.name if self._params else '')
         self._put_verdict(found.to_dict())
-        self.files |= {name: text.encode() for name, text in found.documents(
-            'gap', has_page=found.verdict in _PAGES).items()}
+        self.files |= {
+            name: text.encode()
+            for name, text in found.documents('gap', has_page=found.verdict in _PAGES).items()
+        }
 
     def _put_verdict(self, report: dict[str, Any]) -> None:
         """Put a diagnosis into the row."""
         gap = report['gap']
-        self.row |= {name: report['verdict'][name]
-                     for name in ('status', 'effects', 'groups', 'data_fault', 'probability')}
+        self.row |= {
+            name: report['verdict'][name]
+            for name in ('status', 'effects', 'groups', 'data_fault', 'probability')
+        }
         if gap is None:
             return
         self.row['gap_floor_source'] = gap['floor_source']
-        for name, unit in (('before', '_mps2'), ('after', '_mps2'), ('floor', '_mps2'),
-                           ('closed', '')):
+        for name, unit in (
+            ('before', '_mps2'),
+            ('after', '_mps2'),
+            ('floor', '_mps2'),
+            ('closed', ''),
+        ):
             interval = (gap[name] is not None and gap[f'{name}_ci']) or (None, None)
-            self.row |= {f'gap_{name}{end}{unit}': value for end, value in zip(
-                ('', '_low', '_high'), (gap[name], *interval))}
+            self.row |= {
+                f'gap_{name}{end}{unit}': value
+                for end, value in zip(('', '_low', '_high'), (gap[name], *interval))
+            }

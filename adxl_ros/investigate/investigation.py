@@ -106,15 +106,24 @@ class Answer:
     verdict: str = ''  # Status and effects of the diagnosis; '' without a verdict
 
 
-def run_round(question: Question, recordings: Sequence[Recording], sensor: Sensor,
-              limits: StageLimits, seed: int = 0) -> tuple[Answer, Gap | None]:
+def run_round(
+    question: Question,
+    recordings: Sequence[Recording],
+    sensor: Sensor,
+    limits: StageLimits,
+    seed: int = 0,
+) -> tuple[Answer, Gap | None]:
     """Diagnose the samples so far, and choose the next manoeuvre."""
     from adxl_ros.api.gap import diagnose  # the node itself needs none
+
     gap = diagnose(recordings, sensor, seed=seed) if recordings else None
     report = gap.diagnosis.report if gap else None
     # The prior probabilities, where the samples are too few.
-    hypotheses = report.verdict.hypotheses if report else normalised(
-        {(): _NOTHING, (UNKNOWN,): 1 - _NOTHING})
+    hypotheses = (
+        report.verdict.hypotheses
+        if report
+        else normalised({(): _NOTHING, (UNKNOWN,): 1 - _NOTHING})
+    )
     fault = gap.diagnosis.fault if gap else None
     if fault is not None and fault.status != 'insufficient':
         return Answer(hypotheses, Outcome.INSEPARABLE, fault=fault.message), gap
@@ -126,14 +135,18 @@ def run_round(question: Question, recordings: Sequence[Recording], sensor: Senso
         return decide(hypotheses, (), question, True, verdict), gap
     manoeuvres = plan_all(limits, question.pose, 60 * question.minutes)
     in_time = [m for m in manoeuvres if m.minutes <= question.remaining_minutes]
-    ranked = rank(hypotheses, report.linear_model if report else None, sensor,
-                  in_time or manoeuvres)
+    ranked = rank(
+        hypotheses, report.linear_model if report else None, sensor, in_time or manoeuvres
+    )
     return decide(*ranked, question, bool(in_time), verdict), gap
 
 
-def rank(hypotheses: Hypotheses, model: LinearModel | None, sensor: Sensor,
-         manoeuvres: Sequence[PlannedManoeuvre]
-         ) -> tuple[Hypotheses, tuple[next_experiment.ManoeuvreWorth, ...]]:
+def rank(
+    hypotheses: Hypotheses,
+    model: LinearModel | None,
+    sensor: Sensor,
+    manoeuvres: Sequence[PlannedManoeuvre],
+) -> tuple[Hypotheses, tuple[next_experiment.ManoeuvreWorth, ...]]:
     """
     Rank manoeuvres by their expected information per minute, the best first.
 
@@ -143,8 +156,9 @@ def rank(hypotheses: Hypotheses, model: LinearModel | None, sensor: Sensor,
     seen = {v.effect for v in model.variants} if model else set()
     considered = {e for h in next_experiment.leading(hypotheses) for e in h.effects}
     needed = sorted(considered | (set(library()) - seen))
-    responses = [next_experiment.predict(m.name, m.motion, m.begin_s, sensor, needed)
-                 for m in manoeuvres]
+    responses = [
+        next_experiment.predict(m.name, m.motion, m.begin_s, sensor, needed) for m in manoeuvres
+    ]
     excited = {v.effect for response in responses for v in response.linear_model.variants}
     # Effects that the samples could not show keep their prior odds over no gap.
     weights = {h.effects: h.probability for h in hypotheses}
@@ -155,8 +169,13 @@ def rank(hypotheses: Hypotheses, model: LinearModel | None, sensor: Sensor,
     return hypotheses, next_experiment.rank_responses(responses, hypotheses, model)
 
 
-def decide(hypotheses: Hypotheses, worth: Sequence[next_experiment.ManoeuvreWorth],
-           question: Question, has_time: bool, verdict: str = '') -> Answer:
+def decide(
+    hypotheses: Hypotheses,
+    worth: Sequence[next_experiment.ManoeuvreWorth],
+    question: Question,
+    has_time: bool,
+    verdict: str = '',
+) -> Answer:
     """
     Choose the next manoeuvre, or end.
 
@@ -164,13 +183,19 @@ def decide(hypotheses: Hypotheses, worth: Sequence[next_experiment.ManoeuvreWort
     only manoeuvres of a kind that is not recorded yet follow it.
     """
     best = hypotheses[0]
-    kinds = {CATALOGUE[name].kind for name in question.recorded} \
-        if verdict and verdict == question.verdict else set()
-    following = [w for w in worth if w.per_minute > _SMALLEST_PER_MINUTE
-                 and CATALOGUE[w.name].kind not in kinds]
+    kinds = (
+        {CATALOGUE[name].kind for name in question.recorded}
+        if verdict and verdict == question.verdict
+        else set()
+    )
+    following = [
+        w
+        for w in worth
+        if w.per_minute > _SMALLEST_PER_MINUTE and CATALOGUE[w.name].kind not in kinds
+    ]
     totals = accumulate(hypothesis.probability for hypothesis in hypotheses)
     # The fewest that together have 90 %
-    named = hypotheses[:next((i for i, total in enumerate(totals, 1) if total >= CERTAIN), None)]
+    named = hypotheses[: next((i for i, total in enumerate(totals, 1) if total >= CERTAIN), None)]
     if best.effects and best.probability >= CERTAIN:
         outcome = Outcome.CERTAIN
     elif not following and not best.effects:
@@ -184,12 +209,18 @@ def decide(hypotheses: Hypotheses, worth: Sequence[next_experiment.ManoeuvreWort
     else:
         return Answer(hypotheses, Outcome.GO_ON, manoeuvre=following[0].name, verdict=verdict)
     names = listed([hypothesis_text(h.effects) for h in named])
-    sentence = {Outcome.CERTAIN: f'The recording shows {names}: ',
-                Outcome.NO_VISIBLE_GAP: 'There is no gap that this stage can show: ',
-                Outcome.INSEPARABLE: f'This stage cannot separate {names}: together ',
-                Outcome.TIME_OVER: f'The time is over; the recording shows {names}: together '}
-    return Answer(hypotheses, outcome, f'{sentence[outcome]}'
-                  f'{100 * sum(h.probability for h in named):.0f} %.', verdict=verdict)
+    sentence = {
+        Outcome.CERTAIN: f'The recording shows {names}: ',
+        Outcome.NO_VISIBLE_GAP: 'There is no gap that this stage can show: ',
+        Outcome.INSEPARABLE: f'This stage cannot separate {names}: together ',
+        Outcome.TIME_OVER: f'The time is over; the recording shows {names}: together ',
+    }
+    return Answer(
+        hypotheses,
+        outcome,
+        f'{sentence[outcome]}{100 * sum(h.probability for h in named):.0f} %.',
+        verdict=verdict,
+    )
 
 
 def hypothesis_text(effects: Sequence[str]) -> str:
@@ -225,8 +256,12 @@ class OutputFolder:
     def free(path: Path) -> OutputFolder:
         """Return the first of `path`, `path_2`, ... that has nothing, or no diagnosis yet."""
         candidates = chain([path], (path.with_name(f'{path.name}_{n}') for n in count(2)))
-        return next(OutputFolder(p) for p in candidates if not p.exists() or (
-            p.is_dir() and {child.name for child in p.iterdir()} <= _WITHOUT_DIAGNOSIS))
+        return next(
+            OutputFolder(p)
+            for p in candidates
+            if not p.exists()
+            or (p.is_dir() and {child.name for child in p.iterdir()} <= _WITHOUT_DIAGNOSIS)
+        )
 
     def make(self, sensor: Sensor) -> None:
         """Make the folder, and write the baseline; an investigation without diagnosis goes."""
@@ -235,8 +270,9 @@ class OutputFolder:
             if self.bag.exists():
                 shutil.rmtree(self.bag)
         except OSError as error:
-            raise UserError(f'{self.path}: cannot make the folder: {error.strerror}; set output '
-                            'to another one') from None
+            raise UserError(
+                f'{self.path}: cannot make the folder: {error.strerror}; set output to another one'
+            ) from None
         parameter_file.save(self.baseline, sensor)
 
 
@@ -250,8 +286,9 @@ class BackgroundDiagnoser:
 
     def ask(self, question: Question) -> None:
         """Start the process."""
-        self._answer, self.cancel = in_background(_diagnose, self._folder, question, self._limits,
-                                                  self._seed)
+        self._answer, self.cancel = in_background(
+            _diagnose, self._folder, question, self._limits, self._seed
+        )
 
     def answer(self) -> Answer | None:
         """Return the answer, or None while the process runs."""
@@ -273,7 +310,8 @@ def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, see
     if gap is not None:
         # The page is that of the end.
         texts = gap.with_params(str(folder.baseline)).documents(
-            folder.path, has_page=answer.outcome is not Outcome.GO_ON)
+            folder.path, has_page=answer.outcome is not Outcome.GO_ON
+        )
         for name, text in texts.items():
             write_text(folder.path / name, text)
     return answer
@@ -304,10 +342,14 @@ class State(Enum):
 class Investigation:
     """The state machine."""
 
-    def __init__(self, limits: StageLimits, longest_minutes: float,
-                 diagnoser: BackgroundDiagnoser,
-                 show: Callable[[float, Answer], None] = lambda minutes, answer: None,
-                 flush: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        limits: StageLimits,
+        longest_minutes: float,
+        diagnoser: BackgroundDiagnoser,
+        show: Callable[[float, Answer], None] = lambda minutes, answer: None,
+        flush: Callable[[], None] = lambda: None,
+    ) -> None:
         """Wait for sensor and stage."""
         self.state = State.RECORDING  # The state
         # Answers so far, each with the minutes at which its question was asked
@@ -331,8 +373,11 @@ class Investigation:
     @property
     def has_verdict(self) -> bool:
         """Return whether it has come to a verdict."""
-        return self.state is State.FINISHED and bool(self.answers) \
+        return (
+            self.state is State.FINISHED
+            and bool(self.answers)
             and self.answers[-1][1].outcome not in (Outcome.GO_ON, Outcome.TIME_OVER)
+        )
 
     @property
     def speed(self) -> Pose | None:
@@ -342,10 +387,13 @@ class Investigation:
     @property
     def text(self) -> str:
         """Return what it does, for people."""
-        return {State.RECORDING: 'waiting for samples and stage',
-                State.DIAGNOSING: 'diagnosing the samples so far; the stage rests',
-                State.MOVING: CATALOGUE[self._manoeuvre].text if self._manoeuvre else '',
-                State.FINISHED: 'finished', State.STOPPED: f'stopped: {self.reason}'}[self.state]
+        return {
+            State.RECORDING: 'waiting for samples and stage',
+            State.DIAGNOSING: 'diagnosing the samples so far; the stage rests',
+            State.MOVING: CATALOGUE[self._manoeuvre].text if self._manoeuvre else '',
+            State.FINISHED: 'finished',
+            State.STOPPED: f'stopped: {self.reason}',
+        }[self.state]
 
     @property
     def minutes(self) -> float:
@@ -390,8 +438,10 @@ class Investigation:
         if now_s - self._since_s < _FIRST_REST_S:
             return
         if np.abs(np.subtract(pose, self._limits.nearest(*pose))).max() > _OUTSIDE_RAD:
-            self.stop(f'the stage is at {_text(pose)}, outside of its limits; move it, or set '
-                      'limits.alpha_deg and limits.beta_deg')
+            self.stop(
+                f'the stage is at {_text(pose)}, outside of its limits; move it, or set '
+                'limits.alpha_deg and limits.beta_deg'
+            )
             return
         self._begin_s = now_s
         self._ask(pose)
@@ -402,11 +452,16 @@ class Investigation:
         self.state, self._stream = State.DIAGNOSING, None
         self._asked_minutes = self.minutes
         self._flush()
-        self._diagnoser.ask(Question(
-            self._command or self._limits.nearest(*pose), self._asked_minutes,
-            max(self._longest_s - self.moved_s, 0.0) / 60, bool(self.answers),
-            tuple(answer.manoeuvre for _, answer in self.answers),
-            self.answers[-1][1].verdict if self.answers else ''))
+        self._diagnoser.ask(
+            Question(
+                self._command or self._limits.nearest(*pose),
+                self._asked_minutes,
+                max(self._longest_s - self.moved_s, 0.0) / 60,
+                bool(self.answers),
+                tuple(answer.manoeuvre for _, answer in self.answers),
+                self.answers[-1][1].verdict if self.answers else '',
+            )
+        )
 
     def _take_answer(self) -> None:
         """Take the answer if there is one, and follow it."""
@@ -429,7 +484,8 @@ class Investigation:
         begin = self._command or self._limits.nearest(*self._pose)
         self._manoeuvre = answer.manoeuvre
         self._stream = CommandStream(
-            self._limits, plan(answer.manoeuvre, self._limits, begin), begin)
+            self._limits, plan(answer.manoeuvre, self._limits, begin), begin
+        )
         self.state = State.MOVING
 
     def _move(self, elapsed_s: float, pose: Pose) -> None:
@@ -445,9 +501,11 @@ class Investigation:
             self._since_s = self._now_s
             self._command = stream.advance(elapsed_s, pose)
             if stream.waited_s > _LONGEST_WAIT_S:
-                self.stop(f'the stage has not followed its command for {_LONGEST_WAIT_S:.0f} s: '
-                          f'it is at {_text(pose)}, commanded {_text(self._command)}; check the '
-                          'stage, or lower limits.rate_deg_s')
+                self.stop(
+                    f'the stage has not followed its command for {_LONGEST_WAIT_S:.0f} s: '
+                    f'it is at {_text(pose)}, commanded {_text(self._command)}; check the '
+                    'stage, or lower limits.rate_deg_s'
+                )
         elif self._now_s - self._since_s > _SETTLING_S:
             self._ask(pose)
 

@@ -61,8 +61,9 @@ class StageLimits:
 
     def nearest(self, alpha_rad: float, beta_rad: float) -> Pose:
         """Return the pose within the limits that is nearest to a pose."""
-        return Pose(float(np.clip(alpha_rad, *self.alpha_rad)),
-                    float(np.clip(beta_rad, *self.beta_rad)))
+        return Pose(
+            float(np.clip(alpha_rad, *self.alpha_rad)), float(np.clip(beta_rad, *self.beta_rad))
+        )
 
 
 class Path:
@@ -98,8 +99,10 @@ class Path:
         middle_rad = getattr(self._script, joint)
         low_rad, high_rad = self.limits.of(joint)
         # A joint at its limit swings to the inner side.
-        middle_rad = min(max(middle_rad, min(low_rad + _SWING_RAD, high_rad)),
-                         max(high_rad - _SWING_RAD, low_rad))
+        middle_rad = min(
+            max(middle_rad, min(low_rad + _SWING_RAD, high_rad)),
+            max(high_rad - _SWING_RAD, low_rad),
+        )
         for _ in range(_SWINGS):
             for side in (1.0, -1.0):
                 self.turn(joint, middle_rad + side * _SWING_RAD, share)
@@ -135,45 +138,93 @@ _APPROACH_DEG = 20.0
 """Distance from which a pose is approached, degrees. Chosen: beyond every backlash."""
 CATALOGUE = {
     'rests_upright': Manoeuvre(
-        'rests', 'rest in steps of 60° of beta, with x and y upright',
-        [('rest', 90, beta_deg) for beta_deg in range(0, 360, 60)]),
+        'rests',
+        'rest in steps of 60° of beta, with x and y upright',
+        [('rest', 90, beta_deg) for beta_deg in range(0, 360, 60)],
+    ),
     'rests_on_sphere': Manoeuvre(
-        'rests', 'rest in poses that spread gravity over the sphere',
-        [('rest', *pose) for pose in ((0, 0), (45, 0), (45, 120), (45, 240), (135, 240),
-                                      (135, 120), (135, 0), (180, 0))]),
+        'rests',
+        'rest in poses that spread gravity over the sphere',
+        [
+            ('rest', *pose)
+            for pose in (
+                (0, 0),
+                (45, 0),
+                (45, 120),
+                (45, 240),
+                (135, 240),
+                (135, 120),
+                (135, 0),
+                (180, 0),
+            )
+        ],
+    ),
     'rests_on_axes': Manoeuvre(
-        'rests', 'rest with each axis up and down',
-        [('rest', 90, beta_deg, 2.0) for beta_deg in (0, 90, 180, 270)]),
+        'rests',
+        'rest with each axis up and down',
+        [('rest', 90, beta_deg, 2.0) for beta_deg in (0, 90, 180, 270)],
+    ),
     'slow_turn_of_beta': Manoeuvre(
-        'turns of beta', 'turn beta once, forth and back, slowly',
-        [('full_turn', 'beta', 90.0, _SLOW_SHARE)]),
+        'turns of beta',
+        'turn beta once, forth and back, slowly',
+        [('full_turn', 'beta', 90.0, _SLOW_SHARE)],
+    ),
     'fast_turn_of_beta': Manoeuvre(
-        'turns of beta', 'turn beta once, forth and back, at the limit of rate',
-        [('full_turn', 'beta', 90.0)]),
+        'turns of beta',
+        'turn beta once, forth and back, at the limit of rate',
+        [('full_turn', 'beta', 90.0)],
+    ),
     'slow_turn_of_alpha': Manoeuvre(
-        'turns of alpha', 'turn alpha over its range, forth and back, slowly',
-        [('full_turn', 'alpha', 45.0, _SLOW_SHARE)]),
+        'turns of alpha',
+        'turn alpha over its range, forth and back, slowly',
+        [('full_turn', 'alpha', 45.0, _SLOW_SHARE)],
+    ),
     'fast_turns_of_alpha': Manoeuvre(
-        'turns of alpha', 'turn alpha over its range at two angles beta, at the limit of rate',
-        [('full_turn', 'alpha', 0.0), ('full_turn', 'alpha', 90.0)]),
+        'turns of alpha',
+        'turn alpha over its range at two angles beta, at the limit of rate',
+        [('full_turn', 'alpha', 0.0), ('full_turn', 'alpha', 90.0)],
+    ),
     'two_rates_of_beta': Manoeuvre(
-        'rates', 'turn beta over half a turn at three rates, forth and back',
-        [('rest', 90, 0, 1.0), *(('turn', 'beta', to_rad, share) for share in (1.0, 0.5, 0.25)
-                                 for to_rad in (np.pi, 0.0))]),
+        'rates',
+        'turn beta over half a turn at three rates, forth and back',
+        [
+            ('rest', 90, 0, 1.0),
+            *(
+                ('turn', 'beta', to_rad, share)
+                for share in (1.0, 0.5, 0.25)
+                for to_rad in (np.pi, 0.0)
+            ),
+        ],
+    ),
     'swings_of_beta': Manoeuvre(
-        'reversals', 'swing beta about a pose, with reversals',
-        [('rest', 90, 45, 1.0), ('swing', 'beta'), ('swing', 'beta', 0.5)]),
+        'reversals',
+        'swing beta about a pose, with reversals',
+        [('rest', 90, 45, 1.0), ('swing', 'beta'), ('swing', 'beta', 0.5)],
+    ),
     'swings_of_alpha': Manoeuvre(
-        'reversals', 'swing alpha about a pose, with reversals',
-        [('rest', 45, 45, 1.0), ('swing', 'alpha'), ('swing', 'alpha', 0.5)]),
+        'reversals',
+        'swing alpha about a pose, with reversals',
+        [('rest', 45, 45, 1.0), ('swing', 'alpha'), ('swing', 'alpha', 0.5)],
+    ),
     'poses_from_both_sides': Manoeuvre(
-        'reversals', 'approach the same poses from both sides of each joint',
-        [move for beta_deg in (45, 225) for d_alpha, d_beta in ((0, -1), (0, 1), (-1, 0), (1, 0))
-         for move in (('rest', 60 + d_alpha * _APPROACH_DEG, beta_deg + d_beta * _APPROACH_DEG,
-                       0.5), ('rest', 60, beta_deg, 3.0))]),
+        'reversals',
+        'approach the same poses from both sides of each joint',
+        [
+            move
+            for beta_deg in (45, 225)
+            for d_alpha, d_beta in ((0, -1), (0, 1), (-1, 0), (1, 0))
+            for move in (
+                ('rest', 60 + d_alpha * _APPROACH_DEG, beta_deg + d_beta * _APPROACH_DEG, 0.5),
+                ('rest', 60, beta_deg, 3.0),
+            )
+        ],
+    ),
     'long_rests': Manoeuvre(
-        'long rests', 'rest for a minute in two opposite poses',
-        [('rest', 90, 45, _LONG_REST_S), ('rest', 90, 225, _LONG_REST_S)])}
+        'long rests',
+        'rest for a minute in two opposite poses',
+        [('rest', 90, 45, _LONG_REST_S), ('rest', 90, 225, _LONG_REST_S)],
+    ),
+}
 """Manoeuvres by name."""
 
 
@@ -229,33 +280,45 @@ class CommandStream:
     def advance(self, elapsed_s: float, pose: Pose) -> Pose:
         """Return the next command; a call later than `LONGEST_STEP_S` makes a manoeuvre longer."""
         # Where a stage is that has moved on with its last command.
-        self._expected = _moved(self._expected, self.command, *(
-            speed * max(elapsed_s, 0.0) for speed in self.speed))
+        self._expected = _moved(
+            self._expected, self.command, *(speed * max(elapsed_s, 0.0) for speed in self.speed)
+        )
         elapsed_s = min(max(elapsed_s, 0.0), LONGEST_STEP_S)
-        lag_rad = max(max(min(e, c) - p, p - max(e, c))
-                      for e, c, p in zip(self._expected, self.command, pose))
+        lag_rad = max(
+            max(min(e, c) - p, p - max(e, c))
+            for e, c, p in zip(self._expected, self.command, pose)
+        )
         if lag_rad > LARGEST_LAG_RAD:
             self.waited_s += elapsed_s
             return self.command
         self.waited_s = 0.0
         self._elapsed_s += elapsed_s
         motion = self._manoeuvre.motion
-        ahead_s = np.array([self._manoeuvre.begin_s
-                            + min(self._elapsed_s + LONGEST_STEP_S, motion.duration_s)])
-        goal = self._limits.nearest(float(motion.alpha(ahead_s)[0]),
-                                    float(motion.beta(ahead_s)[0]))
+        ahead_s = np.array(
+            [self._manoeuvre.begin_s + min(self._elapsed_s + LONGEST_STEP_S, motion.duration_s)]
+        )
+        goal = self._limits.nearest(
+            float(motion.alpha(ahead_s)[0]), float(motion.beta(ahead_s)[0])
+        )
         rate_rad_s = self._limits.rate_rad_s
         largest_rad = rate_rad_s * elapsed_s
         self.command = _moved(self.command, goal, largest_rad, largest_rad)
         # A stage that came to rest for want of commands starts as softly as a manoeuvre.
         faster = rate_rad_s * elapsed_s / RUN_UP_S
-        self.speed = Pose(*(
-            min(abs(c - e) / LONGEST_STEP_S, speed + faster, rate_rad_s)
-            for c, e, speed in zip(self.command, self._expected, self.speed)))
+        self.speed = Pose(
+            *(
+                min(abs(c - e) / LONGEST_STEP_S, speed + faster, rate_rad_s)
+                for c, e, speed in zip(self.command, self._expected, self.speed)
+            )
+        )
         return self.command
 
 
 def _moved(pose: Pose, goal: Pose, alpha_rad: float, beta_rad: float) -> Pose:
     """Return a pose after a move towards a goal, by a distance of each joint at most."""
-    return Pose(*(p + min(max(g - p, -largest), largest)
-                  for p, g, largest in zip(pose, goal, (alpha_rad, beta_rad))))
+    return Pose(
+        *(
+            p + min(max(g - p, -largest), largest)
+            for p, g, largest in zip(pose, goal, (alpha_rad, beta_rad))
+        )
+    )

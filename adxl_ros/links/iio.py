@@ -48,9 +48,11 @@ _TIMEOUT_S = 1.0
 """Lateness after which a buffer will not come, s: the server was killed or stopped."""
 _CLOCK_ATTRIBUTE = 'current_timestamp_clock'
 """Attribute of the kernel that selects the clock of the time stamps."""
-_MAX_STAMP_NS = 2 ** 62  # Largest plausible time stamp, ns
-_INSTALL = ('link.type iio needs the Python package pylibiio and the library libiio 0.x: '
-            f'{install_hint("pylibiio<1")} and sudo apt install libiio0')
+_MAX_STAMP_NS = 2**62  # Largest plausible time stamp, ns
+_INSTALL = (
+    'link.type iio needs the Python package pylibiio and the library libiio 0.x: '
+    f'{install_hint("pylibiio<1")} and sudo apt install libiio0'
+)
 """What a user is told where libiio is not installed."""
 
 
@@ -59,12 +61,15 @@ class Settings(base.DeviceSettings):
     """Settings of the link."""
 
     uri: str = base.option('local:', 'URI of libiio: local:, ip:HOST or ip:HOST:PORT, usb:...')
-    device: str = base.option('', 'name, id or label of the ADC; empty: the only one that has '
-                              'buffered channels')
+    device: str = base.option(
+        '', 'name, id or label of the ADC; empty: the only one that has buffered channels'
+    )
     # A list of strings, or one string with commas
     channels: str | Sequence[str] = base.option(
-        (), 'ids or labels of x, y, z as the sensor has them, supply, temperature, or ROLE=ID; '
-        'empty: the channels with these labels, else the first voltages or accelerations')
+        (),
+        'ids or labels of x, y, z as the sensor has them, supply, temperature, or ROLE=ID; '
+        'empty: the channels with these labels, else the first voltages or accelerations',
+    )
 
 
 def open_link(sensor: Sensor, settings: Settings) -> IioLink:
@@ -118,10 +123,17 @@ class IioLink(base.Link):
         """Return how the device and the clock work."""
         level, text = self._condition()
         buffer_s = self._stream.buffer_s if self._stream else 0.0
-        return base.LinkStatus(level, text, {
-            'connections': self._connections, 'repeated': self._repeated,
-            'buffer_ms': round(buffer_s * 1e3, 3), **self._stamper.statistics()},
-            self._stamper.events())
+        return base.LinkStatus(
+            level,
+            text,
+            {
+                'connections': self._connections,
+                'repeated': self._repeated,
+                'buffer_ms': round(buffer_s * 1e3, 3),
+                **self._stamper.statistics(),
+            },
+            self._stamper.events(),
+        )
 
     def close(self) -> None:
         """Close the device."""
@@ -177,8 +189,11 @@ class IioLink(base.Link):
         self._repeated += len(new) - int(new.sum())
         if new.any():
             volts = np.array([values[axis][new] for axis in self._declared.axes]).T
-            references = {column: values[role][new] for role, column in base.COLUMNS.items()
-                          if role in values}
+            references = {
+                column: values[role][new]
+                for role, column in base.COLUMNS.items()
+                if role in values
+            }
             self._stamper.add(stamping.Block(device_ns[new], volts, references), arrived_ns)
 
 
@@ -192,8 +207,10 @@ class _Column:
     def __init__(self, role: str, channel: Any, sensor: Sensor, supply_scale: float) -> None:
         form, kind = channel.data_format, channel.type.name
         if form.repeat > 1 or form.length not in (8, 16, 32, 64):
-            raise UserError(f'{channel.id}: a format of {form.length} bits, {form.repeat} times, '
-                            'cannot be read')
+            raise UserError(
+                f'{channel.id}: a format of {form.length} bits, {form.repeat} times, '
+                'cannot be read'
+            )
         self.role, self.channel = role, channel
         self._dtype = f'{"i" if form.is_signed else "u"}{form.length // 8}'
         # The kernel omits an offset of 0, but never a scale. IIO scales to mV and m°C.
@@ -210,8 +227,11 @@ class _Column:
             self._scale *= supply_scale
         # The ADC as fields of a sensor; 0 bits where the codes do not begin at 0 V
         bits = int(form.bits - form.is_signed)
-        self.adc: dict[str, float] = {'adc_bits': 0} if self._zero or self._offset else {
-            'adc_bits': bits, 'adc_vref_v': self._scale * 2.0 ** bits}
+        self.adc: dict[str, float] = (
+            {'adc_bits': 0}
+            if self._zero or self._offset
+            else {'adc_bits': bits, 'adc_vref_v': self._scale * 2.0**bits}
+        )
 
     def read(self, buffer: Any) -> np.ndarray:
         """Return V or degC for the codes of a buffer, (n,)."""
@@ -227,20 +247,32 @@ class _Stream:
     those of this machine's monotonic clock; buffer_s: duration of a buffer, s.
     """
 
-    def __init__(self, context: Any, device: Any, columns: Sequence[_Column], settings: Settings,
-                 sensor: Sensor) -> None:
+    def __init__(
+        self,
+        context: Any,
+        device: Any,
+        columns: Sequence[_Column],
+        settings: Settings,
+        sensor: Sensor,
+    ) -> None:
         self.name = _name(device)
         self._context, self._device = context, device
         self._timestamp = device.find_channel('timestamp')
         if self._timestamp is None or not self._timestamp.scan_element:
-            raise UserError(f'{self.name} has no channel timestamp: without it lost samples '
-                            'cannot be counted')
+            raise UserError(
+                f'{self.name} has no channel timestamp: without it lost samples cannot be counted'
+            )
         self.by_host_clock = _select_monotonic_clock(device) and settings.uri.startswith('local:')
         axis = next(column for column in columns if column.role in sensor.axes)
         self.rate_hz = rate_hz = _set_rate(context, device, columns, sensor.rate_hz)
         self.adc = {'rate_hz': rate_hz, **axis.adc}
-        count = min(max(settings.samples_together(rate_hz),
-                        ceil(_ROUND_TRIPS * _answer_s(axis.channel) * rate_hz)), _MAX_BUFFER)
+        count = min(
+            max(
+                settings.samples_together(rate_hz),
+                ceil(_ROUND_TRIPS * _answer_s(axis.channel) * rate_hz),
+            ),
+            _MAX_BUFFER,
+        )
         self.buffer_s = count / rate_hz
         self._columns = [*columns]
         for channel in [self._timestamp, *(column.channel for column in self._columns)]:
@@ -248,7 +280,8 @@ class _Stream:
         # Some kernels cannot set this number; a network server cannot once its buffer runs.
         with suppress(OSError):
             device.set_kernel_buffers_count(
-                min(max(ceil(_KEPT_S / self.buffer_s), _MIN_KERNEL_BUFFERS), _MAX_KERNEL_BUFFERS))
+                min(max(ceil(_KEPT_S / self.buffer_s), _MIN_KERNEL_BUFFERS), _MAX_KERNEL_BUFFERS)
+            )
         context.set_timeout(round((_TIMEOUT_S + 2 * self.buffer_s) * 1000))
         self._buffer = import_libiio().Buffer(device, count)
 
@@ -261,8 +294,11 @@ class _Stream:
         except OSError as error:
             raise _ReadError(f'{self.name}: lost: {base.reason(error)}') from None
         lengths = {len(device_ns), *map(len, values.values())}
-        if len(lengths) != 1 or not len(device_ns) or not all(
-                0 <= stamp_ns < _MAX_STAMP_NS for stamp_ns in device_ns.tolist()):
+        if (
+            len(lengths) != 1
+            or not len(device_ns)
+            or not all(0 <= stamp_ns < _MAX_STAMP_NS for stamp_ns in device_ns.tolist())
+        ):
             raise _ReadError(f'{self.name}: a buffer that makes no sense')
         return device_ns, values
 
@@ -284,8 +320,10 @@ def _open_stream(settings: Settings, entries: Sequence[str], sensor: Sensor) -> 
         raise _ReadError(base.reason(error)) from None
     try:
         device = _find_device(context, settings.device)
-        columns = [_Column(role, channel, sensor, settings.supply_scale)
-                   for role, channel in _assign_roles(device, entries, sensor.axes).items()]
+        columns = [
+            _Column(role, channel, sensor, settings.supply_scale)
+            for role, channel in _assign_roles(device, entries, sensor.axes).items()
+        ]
         return _Stream(context, device, columns, settings, sensor)
     except (OSError, ValueError) as error:
         raise _ReadError(f'{settings.device}: cannot be read: {base.reason(error)}') from None
@@ -316,33 +354,47 @@ def _find_device(context: Any, name: str) -> Any:
     buffered = [device for device in context.devices if _inputs(device)]
     if not name and len(buffered) == 1:
         return buffered[0]
-    raise UserError(f'link.device: {name!r} is not there; with buffered channels there are: '
-                    f'{", ".join(map(_name, buffered)) or "none"}')
+    raise UserError(
+        f'link.device: {name!r} is not there; with buffered channels there are: '
+        f'{", ".join(map(_name, buffered)) or "none"}'
+    )
 
 
 def _inputs(device: Any) -> list[Any]:
-    return [channel for channel in device.channels if channel.scan_element
-            and not channel.output and channel.id != 'timestamp']
+    return [
+        channel
+        for channel in device.channels
+        if channel.scan_element and not channel.output and channel.id != 'timestamp'
+    ]
 
 
 def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, Any]:
     """Return the channels of a device by role."""
     inputs, order = _inputs(device), [*axes, base.SUPPLY, base.TEMPERATURE]
-    named = {name: channel for channel in reversed(inputs)
-             for name in (channel.name, _label(channel), channel.id) if name}
+    named = {
+        name: channel
+        for channel in reversed(inputs)
+        for name in (channel.name, _label(channel), channel.id)
+        if name
+    }
     if not entries and set(axes) <= set(named):
         entries = [role for role in order if role in named]
     elif not entries:
-        measured = [channel for channel in inputs
-                    if channel.type.name in ('IIO_VOLTAGE', 'IIO_ACCEL')]
-        entries = [channel.id for channel
-                   in sorted(measured, key=lambda channel: channel.index)[:len(axes)]]
+        measured = [
+            channel for channel in inputs if channel.type.name in ('IIO_VOLTAGE', 'IIO_ACCEL')
+        ]
+        entries = [
+            channel.id
+            for channel in sorted(measured, key=lambda channel: channel.index)[: len(axes)]
+        ]
     assigned: list[tuple[str, Any]] = []
     for entry in entries:
         role, _, name = entry.rpartition('=')
         if name not in named:
-            raise UserError(f'link.channels: {_name(device)} has no channel {name!r}; it has '
-                            f'{", ".join(channel.id for channel in inputs)} in its buffer')
+            raise UserError(
+                f'link.channels: {_name(device)} has no channel {name!r}; it has '
+                f'{", ".join(channel.id for channel in inputs)} in its buffer'
+            )
         free = [candidate for candidate in order if candidate not in dict(assigned)]
         role = role or (name if name in free or not free else free[0])
         assigned.append((role, named[name]))
@@ -389,8 +441,11 @@ def _set_rate(context: Any, device: Any, columns: Sequence[_Column], rate_hz: fl
     triggers = [d for d in context.devices if isinstance(d, import_libiio().Trigger)]
     places = [device, *(column.channel for column in columns)]
     places += triggers if len(triggers) == 1 else []
-    attributes = [place.attrs['sampling_frequency'] for place in places
-                  if 'sampling_frequency' in place.attrs]
+    attributes = [
+        place.attrs['sampling_frequency']
+        for place in places
+        if 'sampling_frequency' in place.attrs
+    ]
     if not attributes:
         return rate_hz
     with suppress(OSError):

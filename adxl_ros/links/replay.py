@@ -16,7 +16,7 @@ import numpy as np
 
 _ROWS = 2000
 """Rows of a block. Chosen: reading a block takes some milliseconds, so samples leave in time."""
-_MAX_CLOCK_NS = 2 ** 31 * 10 ** 9  # Largest time of a ROS clock, ns: its seconds are an int32
+_MAX_CLOCK_NS = 2**31 * 10**9  # Largest time of a ROS clock, ns: its seconds are an int32
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,10 @@ class Settings(base.PacedSettings):
 def open_link(sensor: Sensor, settings: Settings) -> Replay:
     """Open the recording."""
     if not settings.recording:
-        raise UserError('link.recording: names no recording; set it to a rosbag2 directory, an '
-                        '.mcap or a CSV file')
+        raise UserError(
+            'link.recording: names no recording; set it to a rosbag2 directory, an '
+            '.mcap or a CSV file'
+        )
     return Replay(sensor, settings)
 
 
@@ -83,8 +85,13 @@ class Replay(base.Link):
         rows = slice(self._row, max(end, self._row))
         stamps = self._stamps[rows] + self._offset_ns
         periods = np.rint(np.diff(stamps, prepend=self._last_ns) / self._period_ns)
-        samples = base.Samples(stamps, self._volts[rows], now_ns, int((periods - 1).clip(0).sum()),
-                               {name: block.columns[name][rows] for name in self.references})
+        samples = base.Samples(
+            stamps,
+            self._volts[rows],
+            now_ns,
+            int((periods - 1).clip(0).sum()),
+            {name: block.columns[name][rows] for name in self.references},
+        )
         self._row = rows.stop
         if len(stamps):
             self._last_ns = int(stamps[-1])

@@ -69,16 +69,21 @@ class Settings(base.DeviceSettings):
     """Settings of the link."""
 
     port: str = base.option('', 'device path, such as /dev/ttyACM0, or a pyserial URL')
-    baud: int = base.option(115200, 'baud rate of a UART; USB and network ports ignore it', 'Bd',
-                            50, 100_000_000)
+    baud: int = base.option(
+        115200, 'baud rate of a UART; USB and network ports ignore it', 'Bd', 50, 100_000_000
+    )
     # A list of strings, or one string with commas
     channels: str | Sequence[str] = base.option(
-        (), 'roles of the channels of a frame: x, y, z, supply, temperature, or - for unused; '
-        'empty: the first channels are x, y, z, supply')
-    temperature_zero_v: float = base.option(0.5, 'output of the temperature sensor at 0 degC', 'V',
-                                            -10.0, 10.0)
-    temperature_v_per_c: float = base.option(0.01, 'slope of the temperature sensor', 'V/degC',
-                                             -10.0, 10.0)
+        (),
+        'roles of the channels of a frame: x, y, z, supply, temperature, or - for unused; '
+        'empty: the first channels are x, y, z, supply',
+    )
+    temperature_zero_v: float = base.option(
+        0.5, 'output of the temperature sensor at 0 degC', 'V', -10.0, 10.0
+    )
+    temperature_v_per_c: float = base.option(
+        0.01, 'slope of the temperature sensor', 'V/degC', -10.0, 10.0
+    )
 
 
 def open_link(sensor: Sensor, settings: Settings) -> SerialLink:
@@ -94,15 +99,17 @@ def open_link(sensor: Sensor, settings: Settings) -> SerialLink:
 class _Conversion:
     """How the codes of a board become samples; raises `UserError` where they cannot."""
 
-    def __init__(self, info: BoardInfo, roles: Sequence[str], axes: str, settings: Settings
-                 ) -> None:
+    def __init__(
+        self, info: BoardInfo, roles: Sequence[str], axes: str, settings: Settings
+    ) -> None:
         if len(roles) > info.channels:
-            raise UserError(f'link.channels: {len(roles)} are named, the board has '
-                            f'{info.channels}')
+            raise UserError(
+                f'link.channels: {len(roles)} are named, the board has {info.channels}'
+            )
         base.check_roles(roles, axes)
-        self.max_code = 2 ** info.bits - 1
+        self.max_code = 2**info.bits - 1
         # Value of a channel is gain · code + offset, V or degC, (m,)
-        self._gain = np.full(info.channels, info.vref_v / 2 ** info.bits)
+        self._gain = np.full(info.channels, info.vref_v / 2**info.bits)
         self._offset = np.zeros(info.channels)
         for i, role in enumerate(roles):
             if role == base.SUPPLY:
@@ -111,19 +118,23 @@ class _Conversion:
                 self._gain[i] /= settings.temperature_v_per_c
                 self._offset[i] = -settings.temperature_zero_v / settings.temperature_v_per_c
         self._axes = [roles.index(axis) for axis in axes]
-        self._references = {column: roles.index(role) for role, column in base.COLUMNS.items()
-                            if role in roles}
+        self._references = {
+            column: roles.index(role) for role, column in base.COLUMNS.items() if role in roles
+        }
         # Times of the samples of a frame after its first one, ns
-        self._steps_ns = np.rint(np.arange(wire_format.MAX_COUNT + 1) * (1e9 / info.rate_hz)
-                                 ).astype(np.int64)
+        self._steps_ns = np.rint(
+            np.arange(wire_format.MAX_COUNT + 1) * (1e9 / info.rate_hz)
+        ).astype(np.int64)
 
     def block(self, frame: SampleFrame, lost: int) -> stamping.Block:
         """Return the samples of a frame."""
         values = frame.codes * self._gain + self._offset
-        return stamping.Block(frame.time_us * 1000 + self._steps_ns[:len(values)],
-                              values[:, self._axes],
-                              {column: values[:, i] for column, i in self._references.items()},
-                              lost)
+        return stamping.Block(
+            frame.time_us * 1000 + self._steps_ns[: len(values)],
+            values[:, self._axes],
+            {column: values[:, i] for column, i in self._references.items()},
+            lost,
+        )
 
 
 _RATE_SAMPLES = 25
@@ -147,15 +158,20 @@ class _ClockRate:
     @property
     def fault(self) -> str:
         """Return that clock and stated rate contradict each other, or ''."""
-        return '' if self.used_hz == self._stated_hz else (
-            f'states {self._stated_hz:g} Hz, but its clock shows {self.used_hz:.4g} samples a '
-            'second, which is used; correct the rate in its info frame')
+        return (
+            ''
+            if self.used_hz == self._stated_hz
+            else (
+                f'states {self._stated_hz:g} Hz, but its clock shows {self.used_hz:.4g} samples a '
+                'second, which is used; correct the rate in its info frame'
+            )
+        )
 
     def compare(self, frame: SampleFrame) -> bool:
         """Take a frame; return whether it changes the rate to use."""
         first = self._first or frame
         # The numbers of samples wrap at 2^32.
-        count = (frame.index - first.index) % 2 ** 32
+        count = (frame.index - first.index) % 2**32
         if first is not frame and count < _RATE_SAMPLES:
             return False
         self._first = frame
@@ -163,14 +179,17 @@ class _ClockRate:
             return False
         self._newest_hz.append(count / max(frame.time_us - first.time_us, 1) * 1e6)
         clock_hz, low_hz, high_hz = (
-            float(f(self._newest_hz)) for f in (np.median, np.min, np.max))
+            float(f(self._newest_hz)) for f in (np.median, np.min, np.max)
+        )
         if len(self._newest_hz) < _RATES or high_hz > (1 + _RATE_SCATTER) * low_hz:
             return False
         if abs(clock_hz / self._stated_hz - 1) <= _MAX_RATE_ERROR:
             clock_hz = self._stated_hz
         lowest_hz, highest_hz = wire_format.RATES_HZ
-        if abs(clock_hz / self.used_hz - 1) <= _MAX_RATE_ERROR \
-                or not lowest_hz <= clock_hz <= highest_hz:
+        if (
+            abs(clock_hz / self.used_hz - 1) <= _MAX_RATE_ERROR
+            or not lowest_hz <= clock_hz <= highest_hz
+        ):
             return False
         self.used_hz = clock_hz
         return True
@@ -189,8 +208,11 @@ class SerialLink(base.Link):
         self._stated_roles = base.parse_channels(settings.channels)
         if self._stated_roles:
             base.check_roles(self._stated_roles, sensor.axes)
-        self.references = tuple(column for role, column in base.COLUMNS.items()
-                                if role in (self._stated_roles or _DEFAULT_ROLES))
+        self.references = tuple(
+            column
+            for role, column in base.COLUMNS.items()
+            if role in (self._stated_roles or _DEFAULT_ROLES)
+        )
         self._port = _Port(settings.port, settings.baud)
         self._splitter = wire_format.Splitter()
         # Decoded frames with the monotonic times of their arrivals, ns
@@ -231,15 +253,22 @@ class SerialLink(base.Link):
         level, text = self._condition()
         counts = self._counts
         statistics = {
-            'frames': counts['frames'], 'bad_frames': counts['bad_frames'],
-            'bytes': self._port.received_bytes, 'skipped_bytes': self._splitter.skipped,
-            'held_back': counts['held_back'], 'repeated': self._counter.repeated,
+            'frames': counts['frames'],
+            'bad_frames': counts['bad_frames'],
+            'bytes': self._port.received_bytes,
+            'skipped_bytes': self._splitter.skipped,
+            'held_back': counts['held_back'],
+            'repeated': self._counter.repeated,
             'device_overruns': self._counter.overruns,
             'frame_ms': round(self._frame_s * 1e3, 3),
-            'rail_frames': counts['rail_frames'], 'resets': counts['resets'],
-            'connections': self._port.connections, **self._stamper.statistics()}
-        reset = base.Event('the device was reset or is another one: a new count begins',
-                           counts['resets'])
+            'rail_frames': counts['rail_frames'],
+            'resets': counts['resets'],
+            'connections': self._port.connections,
+            **self._stamper.statistics(),
+        }
+        reset = base.Event(
+            'the device was reset or is another one: a new count begins', counts['resets']
+        )
         return base.LinkStatus(level, text, statistics, (reset, *self._stamper.events()))
 
     def close(self) -> None:
@@ -256,8 +285,10 @@ class SerialLink(base.Link):
             return base.Level.OK, 'connecting'
         if obstacle := self._obstacle(now_s):
             if now_s - self._last_sample_s > _DEAD_S:
-                return base.Level.ERROR, f'{port}: {obstacle}; no sample for more than ' \
-                                         f'{_DEAD_S:g} s'
+                return (
+                    base.Level.ERROR,
+                    f'{port}: {obstacle}; no sample for more than {_DEAD_S:g} s',
+                )
             return base.Level.WARN, f'{port}: {obstacle}'
         if self._misfit:
             return base.Level.ERROR, self._misfit
@@ -271,8 +302,10 @@ class SerialLink(base.Link):
         if now_s - max(self._port.last_byte_s, self._created_s) > max(_SILENT_S, long_s):
             return _SILENT
         if now_s - self._last_frame_s > max(_NO_FRAME_S, long_s):
-            return (f'bytes, but no frame of wire format 1: is link.baud ({self._settings.baud}) '
-                    'that of the board, and its firmware of this version?')
+            return (
+                f'bytes, but no frame of wire format 1: is link.baud ({self._settings.baud}) '
+                'that of the board, and its firmware of this version?'
+            )
         return 'waiting for the info frame of the board' if self._info is None else ''
 
     def _ask_for_short_frames(self) -> None:
@@ -289,7 +322,8 @@ class SerialLink(base.Link):
         latency_us = round(self._settings.latency_ms * 1e3)
         if info is not None:
             wanted = wire_format.samples_that_fit(
-                self._settings.samples_together(info.rate_hz), info, self._port.uart_bytes_per_s)
+                self._settings.samples_together(info.rate_hz), info, self._port.uart_bytes_per_s
+            )
             if count == wanted:
                 return
             latency_us = max(latency_us, round(wanted / info.rate_hz * 1e6))
@@ -344,16 +378,21 @@ class SerialLink(base.Link):
         axes = self._declared.axes
         roles = self._stated_roles or [
             base.UNUSED if role in AXES and role not in axes else role
-            for role in _DEFAULT_ROLES[:info.channels]]
+            for role in _DEFAULT_ROLES[: info.channels]
+        ]
         try:
             self._conversion = _Conversion(info, roles, axes, self._settings)
         except UserError as error:
             self._misfit = str(error)
             return
         if changed:
-            self.sensor = replace(self._declared, rate_hz=info.rate_hz, adc_bits=info.bits,
-                                  adc_vref_v=info.vref_v,
-                                  serial=info.serial or self._declared.serial)
+            self.sensor = replace(
+                self._declared,
+                rate_hz=info.rate_hz,
+                adc_bits=info.bits,
+                adc_vref_v=info.vref_v,
+                serial=info.serial or self._declared.serial,
+            )
 
     def _on_samples(self, frame: SampleFrame, arrived_ns: int) -> None:
         """Check, count and stamp the samples of a frame."""
@@ -364,8 +403,10 @@ class SerialLink(base.Link):
             self._counts['held_back'] += count
             return
         # The largest of few numbers takes Python half the time of numpy's first call.
-        if frame.codes.shape[1] != info.channels \
-                or max(map(max, frame.codes.tolist())) > conversion.max_code:
+        if (
+            frame.codes.shape[1] != info.channels
+            or max(map(max, frame.codes.tolist())) > conversion.max_code
+        ):
             self._counts['bad_frames'] += 1  # whole, but it contradicts the info frame
             return
         self._last_sample_s = time.monotonic()
@@ -440,11 +481,15 @@ class _Port:
 
     def _open(self) -> None:
         try:
-            self._port = self._pyserial.serial_for_url(self._name, self._baud, timeout=0,
-                                                       exclusive=True)
+            self._port = self._pyserial.serial_for_url(
+                self._name, self._baud, timeout=0, exclusive=True
+            )
         except (OSError, ValueError, termios.error) as error:
-            self._lose('in use: another process has locked it'
-                       if getattr(error, 'errno', None) in _LOCKED else base.reason(error))
+            self._lose(
+                'in use: another process has locked it'
+                if getattr(error, 'errno', None) in _LOCKED
+                else base.reason(error)
+            )
             return
         self.connections += 1
         self.opened_s = time.monotonic()
@@ -504,6 +549,7 @@ def import_pyserial() -> Any:
     try:
         import serial
     except ImportError:
-        raise UserError('link.type serial needs the Python package pyserial: '
-                        + install_hint('pyserial')) from None
+        raise UserError(
+            'link.type serial needs the Python package pyserial: ' + install_hint('pyserial')
+        ) from None
     return serial

@@ -34,14 +34,14 @@ Chosen: five of the stage's steps."""
 _BEAT_NS = 10_000_000
 """The first sample lies on a multiple of this, ns, as the stage's stamps do. So every reference
 has a sample of its own."""
-_FOREVER_NS = 2 ** 63 - 1  # Largest stamp, ns: no motion bounds the time
+_FOREVER_NS = 2**63 - 1  # Largest stamp, ns: no motion bounds the time
 
 
 @dataclass(frozen=True)
 class Settings(base.PacedSettings):
     """Settings of the link."""
 
-    seed: int = base.option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)
+    seed: int = base.option(0, 'seed of the noise', '', 0, 2**31 - 1)
     # alpha_rad, beta_rad: Pose without a stage, rad
     alpha_rad: float = base.option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
     beta_rad: float = base.option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
@@ -85,27 +85,34 @@ class SimulatedSensor(base.Link):
         self._stamps = np.zeros(0, np.int64)
         self._volts = np.zeros((0, len(sensor.axes)))
 
-    def sense_stage(self, stamp_ns: int, position: Mapping[str, float],
-                    velocity: Mapping[str, float]) -> None:
+    def sense_stage(
+        self, stamp_ns: int, position: Mapping[str, float], velocity: Mapping[str, float]
+    ) -> None:
         """Take the true motion of the stage at a stamp, which may lie ahead."""
         if not np.isfinite([*position.values(), *velocity.values()]).all():
             self._status = base.LinkStatus(
-                base.Level.WARN, f'{self.joint_state_topic}: not finite: {position}')
+                base.Level.WARN, f'{self.joint_state_topic}: not finite: {position}'
+            )
             return
         if abs(stamp_ns - self._until_ns) > _FOREIGN_NS:
             self._status = base.LinkStatus(
-                base.Level.WARN, 'the stage lives by another clock, '
+                base.Level.WARN,
+                'the stage lives by another clock, '
                 f'{(stamp_ns - self._until_ns) * 1e-9:+.1f} s from the sensor; set use_sim_time '
-                'for both or for none')
+                'for both or for none',
+            )
             return
         # A stage that has started again publishes these stamps a second time, from its new pose.
         while len(self._knots) > 1 and self._knots[-1].stamp_ns >= stamp_ns:
             self._knots.pop()
         previous = self._knots[-1].position
-        self._knots.append(_Knot(
-            stamp_ns,
-            tuple(position.get(joint, previous[i]) for i, joint in enumerate(JOINTS)),
-            tuple(velocity.get(joint, 0.0) for joint in JOINTS)))
+        self._knots.append(
+            _Knot(
+                stamp_ns,
+                tuple(position.get(joint, previous[i]) for i, joint in enumerate(JOINTS)),
+                tuple(velocity.get(joint, 0.0) for joint in JOINTS),
+            )
+        )
         self._watchdog = self._watchdog or base.Watchdog(_LONGEST_TURN_S)
         self._watchdog.feed()
         self._status = base.LinkStatus(base.Level.OK, 'on the stage')
@@ -147,15 +154,17 @@ class SimulatedSensor(base.Link):
             return self._knots[-1].stamp_ns
         self._watchdog = None
         self._status = base.LinkStatus(
-            base.Level.WARN, f'stage lost: nothing on {self.joint_state_topic} for {_LOST_S:g} '
-            's, its last pose is held')
+            base.Level.WARN,
+            f'stage lost: nothing on {self.joint_state_topic} for {_LOST_S:g} '
+            's, its last pose is held',
+        )
         return _FOREVER_NS
 
     def _make(self, until_ns: int) -> None:
         """Make a block of samples, beyond a time as far as the motion is known."""
         ahead_ns = min(until_ns + _AHEAD_NS, self._motion_until_ns())
         stamps = self._stamp(self._made + np.arange(_MAX_BLOCK, dtype=float))
-        stamps = stamps[:np.searchsorted(stamps, ahead_ns, 'right')]
+        stamps = stamps[: np.searchsorted(stamps, ahead_ns, 'right')]
         self._made += len(stamps)
         self._next_ns = int(self._stamp(self._made))
         volts = self._respond((stamps - self._origin_ns) * 1e-9)

@@ -53,12 +53,15 @@ _ABSENT = {'orientation': np.array([0.0, 0.0, 0.0, 1.0]), 'angular_velocity': np
 class Settings(base.SimulatorSettings):
     """Settings of the link."""
 
-    topic: str = base.option('imu/ideal', 'topic of the ideal sensor_msgs/Imu of a simulator: '
-                             'specific force')
+    topic: str = base.option(
+        'imu/ideal', 'topic of the ideal sensor_msgs/Imu of a simulator: specific force'
+    )
     unit: str = base.option('mps2', 'unit of its accelerations: mps2, g, mg or mmps2')
-    temperature_topic: str = base.option('temperature', 'topic of the temperature of the sensor, '
-                                         'sensor_msgs/Temperature; 25 °C until it comes')
-    seed: int = base.option(0, 'seed of the noise', '', 0, 2 ** 31 - 1)
+    temperature_topic: str = base.option(
+        'temperature',
+        'topic of the temperature of the sensor, sensor_msgs/Temperature; 25 °C until it comes',
+    )
+    seed: int = base.option(0, 'seed of the noise', '', 0, 2**31 - 1)
 
 
 class _Chain:
@@ -71,9 +74,16 @@ class _Chain:
         self._force = np.zeros((0, 3))
         self._first = self._count = 0
         self._temperature_c = NOMINAL_TEMPERATURE_C
-        self._respond = Response(sensor, Motion(
-            inf, force=self._force_at, temperature_c=self._temperature_at,
-            internal_rate_hz=sensor.rate_hz), seed)
+        self._respond = Response(
+            sensor,
+            Motion(
+                inf,
+                force=self._force_at,
+                temperature_c=self._temperature_at,
+                internal_rate_hz=sensor.rate_hz,
+            ),
+            seed,
+        )
 
     def __call__(self, force: np.ndarray, temperature_c: float) -> np.ndarray:
         """Return the output, V, (n, m), over the next samples of the specific force, (n, 3)."""
@@ -97,8 +107,9 @@ class _Chain:
             return list(self._force[nearest].T)
         first = np.clip(place.astype(int) - POINTS // 2 + 1, 0, len(self._force) - POINTS)
         weights = lagrange_weights(place - first)
-        return list(np.einsum('ij,ijk->ki', weights,
-                              self._force[first[:, None] + np.arange(POINTS)]))
+        return list(
+            np.einsum('ij,ijk->ki', weights, self._force[first[:, None] + np.arange(POINTS)])
+        )
 
     def _temperature_at(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         return np.full(len(time_s), 0.0 if order else self._temperature_c)
@@ -122,15 +133,17 @@ class EmulatedSensor(base.Link):
         self.imu_topic, self.temperature_topic = settings.topic, settings.temperature_topic
         self.imu_unit = unit_name(settings.unit, Quantity.OUTPUT) or ''
         if self.imu_unit not in GRAVITY:
-            raise UserError(f'link.unit is {settings.unit!r}, expected one of '
-                            f'{", ".join(GRAVITY)}')
+            raise UserError(
+                f'link.unit is {settings.unit!r}, expected one of {", ".join(GRAVITY)}'
+            )
         self._seed = settings.seed
         self._temperature_c = NOMINAL_TEMPERATURE_C
         left_out = SensorModel(sensor).left_out
         self._left_out = '; '.join(f'{name} {reason}' for name, reason in left_out.items())
         effects = tuple(name for name in sensor.effects if name not in left_out)
-        self._unit = replace(sensor, effects=effects,
-                             values={name: sensor.values[name] for name in effects})
+        self._unit = replace(
+            sensor, effects=effects, values={name: sensor.values[name] for name in effects}
+        )
         self._counts = dict.fromkeys(('resets', 'gaps', 'late', 'not_finite'), 0)
         self._publishers: int | None = None
         self._mixture = ''
@@ -173,19 +186,33 @@ class EmulatedSensor(base.Link):
             empty = base.no_samples(self._unit, self._newest_ns or 0)
             return replace(empty, missing=missing, estimated=missing)
         stamps_ns, fields, volts = zip(*made)
-        passed = {name: np.array([values[name] for values in fields])
-                  for name in fields[0] if name != 'linear_acceleration'}
-        return base.Samples(np.array(stamps_ns, np.int64), np.array(volts), stamps_ns[-1], missing,
-                            estimated=missing, imu_fields=passed)
+        passed = {
+            name: np.array([values[name] for values in fields])
+            for name in fields[0]
+            if name != 'linear_acceleration'
+        }
+        return base.Samples(
+            np.array(stamps_ns, np.int64),
+            np.array(volts),
+            stamps_ns[-1],
+            missing,
+            estimated=missing,
+            imu_fields=passed,
+        )
 
     def status(self) -> base.LinkStatus:
         """Return whether the simulator sends samples."""
         counts = dict(self._counts)
-        events = (base.Event(f'not emulated: {self._left_out}', int(bool(self._left_out))),
-                  base.Event('the simulation was reset; the sensor is at its power-on',
-                             counts['resets']),
-                  base.Event(f'{self.imu_topic}: a sample is not a number; check the simulation',
-                             counts['not_finite']))
+        events = (
+            base.Event(f'not emulated: {self._left_out}', int(bool(self._left_out))),
+            base.Event(
+                'the simulation was reset; the sensor is at its power-on', counts['resets']
+            ),
+            base.Event(
+                f'{self.imu_topic}: a sample is not a number; check the simulation',
+                counts['not_finite'],
+            ),
+        )
         return base.LinkStatus(*self._condition(), counts, events)
 
     def _condition(self) -> tuple[base.Level, str]:
@@ -194,9 +221,12 @@ class EmulatedSensor(base.Link):
             return base.Level.ERROR, self._mixture
         if self._newest_ns is None or time.monotonic() - self._heard_s > _SILENT_S:
             return base.Level.WARN, f'{topic}: ' + (
-                'waiting for a sample' if self._publishers is None
-                else 'no samples; is the simulation paused?' if self._publishers
-                else 'nobody publishes it; start the simulator, or set link.topic')
+                'waiting for a sample'
+                if self._publishers is None
+                else 'no samples; is the simulation paused?'
+                if self._publishers
+                else 'nobody publishes it; start the simulator, or set link.topic'
+            )
         if self._chain is None or sensor is None:
             return base.Level.WARN, f'{topic}: measuring the rate'
         return base.Level.OK, f'emulates {self._unit.serial} on {topic} at {sensor.rate_hz:.6g} Hz'
@@ -237,8 +267,9 @@ class EmulatedSensor(base.Link):
                 rate_hz = stamped_rate_hz(time_s)
                 # Where steps of the stamps are whole periods, longer ones show losses.
                 steps = np.diff(time_s) * rate_hz
-                self._shows_losses = bool(np.quantile(
-                    np.abs(steps - np.rint(steps).clip(1)), 0.99) < _STEP_SCATTER)
+                self._shows_losses = bool(
+                    np.quantile(np.abs(steps - np.rint(steps).clip(1)), 0.99) < _STEP_SCATTER
+                )
                 self.sensor = replace(self._unit, rate_hz=rate_hz)
                 self._period_ns = 1e9 / rate_hz
                 self._longest_ns = max(_MAX_FILLED_NS, _LATE_PERIODS * self._period_ns)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """Constants that the whole package shares."""
+
 G0_MPS2 = 9.80665
 """Standard gravity, m/s², exact (ISO 80000-3); the g of every coefficient in V/g or 1/g."""
 AXES = 'xyz'  # Axis letters in the order of every array

@@ -33,9 +33,12 @@ _ROOT_MEAN = 1.25
 Derived: there z² = 2·σ·g·n for normal noise n > 0, and the variance of z is 0.8·σ·g = σ·g/1.25."""
 
 
-def force_covariance(sensor: Sensor, force: Components,
-                     sample_variance_v2: np.ndarray | None = None,
-                     environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
+def force_covariance(
+    sensor: Sensor,
+    force: Components,
+    sample_variance_v2: np.ndarray | None = None,
+    environment: Environment = NOMINAL_ENVIRONMENT,
+) -> np.ndarray:
     """
     Return the covariance of the specific force that `signal_chain.inverse` estimates.
 
@@ -44,12 +47,14 @@ def force_covariance(sensor: Sensor, force: Components,
     that of one sample unless given, V², (m,). Returned in (m/s²)², (3, 3, n).
     """
     force = [np.atleast_1d(np.asarray(f, float)) for f in force]
-    return of_three_axes(sensor, force, *measured_covariance(
-        sensor, sample_variance_v2)(force, environment))
+    return of_three_axes(
+        sensor, force, *measured_covariance(sensor, sample_variance_v2)(force, environment)
+    )
 
 
-def of_three_axes(sensor: Sensor, force: Components, measured: np.ndarray,
-                  tangent: signal_chain.Tangent) -> np.ndarray:
+def of_three_axes(
+    sensor: Sensor, force: Components, measured: np.ndarray, tangent: signal_chain.Tangent
+) -> np.ndarray:
     """Complete the result of `measured_covariance` to `force_covariance`."""
     if sensor.axes == 'xy':
         in_plane = measured[0, 0], measured[0, 1], measured[1, 1]
@@ -62,9 +67,9 @@ def of_three_axes(sensor: Sensor, force: Components, measured: np.ndarray,
     return covariance
 
 
-def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = None,
-                        is_upright_certain: bool = True
-                        ) -> Callable[..., tuple[np.ndarray, signal_chain.Tangent]]:
+def measured_covariance(
+    sensor: Sensor, sample_variance_v2: np.ndarray | None = None, is_upright_certain: bool = True
+) -> Callable[..., tuple[np.ndarray, signal_chain.Tangent]]:
     """
     Prepare the covariance of the measured axes, given the others; see `force_covariance`.
 
@@ -79,22 +84,26 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
     by_coefficient = coefficient_tangent(sensor)
     envelope = sensor.envelope
 
-    def covariance(force: Components, environment: Environment = NOMINAL_ENVIRONMENT
-                   ) -> tuple[np.ndarray, signal_chain.Tangent]:
+    def covariance(
+        force: Components, environment: Environment = NOMINAL_ENVIRONMENT
+    ) -> tuple[np.ndarray, signal_chain.Tangent]:
         tangent = signal_chain.tangent(respond, sensor.axes, force, environment)
         variance_v2 = np.diag(sample_variance_v2)[:, :, None]
         if len(sensor.covariance):
             variance_v2 = variance_v2 + _propagated(
-                by_coefficient(force, environment), sensor.covariance)
+                by_coefficient(force, environment), sensor.covariance
+            )
         measured = _propagated(tangent.back, variance_v2)
         extrapolation = envelope.extrapolation(force)
         for d, axis in enumerate(sensor.axes):
             measured[d, d] += envelope.added_variance(
-                force[AXES.index(axis)], environment.temperature_c, extrapolation)
+                force[AXES.index(axis)], environment.temperature_c, extrapolation
+            )
         if tangent.slope and not is_upright_certain:
             other_v = respond([*force[:2], -force[2]], environment)
-            change_v = np.array([np.subtract(v, o) for v, o in zip(
-                respond(force, environment), other_v)]).reshape(2, -1)
+            change_v = np.array(
+                [np.subtract(v, o) for v, o in zip(respond(force, environment), other_v)]
+            ).reshape(2, -1)
             apart = np.einsum('ijn,jn->in', np.asarray(tangent.back).reshape(2, 2, -1), change_v)
             measured += np.einsum('in,jn->ijn', apart, apart) / 2
         for d, std_g in enumerate(envelope.zero_g_std_g(environment.temperature_c)):
@@ -107,13 +116,17 @@ def measured_covariance(sensor: Sensor, sample_variance_v2: np.ndarray | None = 
 def _propagated(slope: Any, covariance: np.ndarray) -> np.ndarray:
     """Propagate a covariance, (k, k) or (k, k, n), by slopes, (m, k, n): (m, m, n)."""
     slope = np.asarray(slope).reshape(len(slope), len(covariance), -1)
-    spread = np.tensordot(covariance, slope, (1, 1)) if covariance.ndim == 2 else \
-        np.einsum('abn,jbn->ajn', covariance, slope)
+    spread = (
+        np.tensordot(covariance, slope, (1, 1))
+        if covariance.ndim == 2
+        else np.einsum('abn,jbn->ajn', covariance, slope)
+    )
     return np.einsum('ian,ajn->ijn', slope, spread)
 
 
-def derived_z_covariance(force: Components, measured: tuple[Value, Value, Value],
-                         slope: Components, maths: Maths) -> tuple[Value, ...]:
+def derived_z_covariance(
+    force: Components, measured: tuple[Value, Value, Value], slope: Components, maths: Maths
+) -> tuple[Value, ...]:
     """
     Propagate the in-plane covariance to z = √(g² − x² − y²), equation 5.
 
@@ -134,14 +147,21 @@ def derived_z_covariance(force: Components, measured: tuple[Value, Value, Value]
     by_x, by_y = -x * divisor / blunted2, -y * divisor / blunted2
     distance = 2 * divisor / (1 + slope[0] ** 2 + slope[1] ** 2)
     upright = maths.where(divisor < 0, -1.0, 1.0) * (z - distance) > _OVERHANG_MPS2
-    independent = (_ROOT_MEAN * along * along * along / (blunted2 * blunted2)
-                   + maths.where(upright, distance * distance / 2, 0.0))
+    independent = _ROOT_MEAN * along * along * along / (blunted2 * blunted2) + maths.where(
+        upright, distance * distance / 2, 0.0
+    )
     xz, yz = by_x * xx + by_y * xy, by_x * xy + by_y * yy
     zz = by_x * xz + by_y * yz + independent
     # The error of z goes on to x and y.
     by_zz = [by_z * zz for by_z in slope]
-    return (xx + slope[0] * (2 * xz + by_zz[0]), xy + slope[0] * yz + slope[1] * (xz + by_zz[0]),
-            xz + by_zz[0], yy + slope[1] * (2 * yz + by_zz[1]), yz + by_zz[1], zz)
+    return (
+        xx + slope[0] * (2 * xz + by_zz[0]),
+        xy + slope[0] * yz + slope[1] * (xz + by_zz[0]),
+        xz + by_zz[0],
+        yy + slope[1] * (2 * yz + by_zz[1]),
+        yz + by_zz[1],
+        zz,
+    )
 
 
 _RELATIVE_STEP = 1e-3  # Step by coefficients, typical sizes; chosen: nearly linear
@@ -156,11 +176,17 @@ def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
     """
     names = sensor.covariance_names
     steps = [_RELATIVE_STEP * parameter_of(name).scale for name in names]
-    pairs = [[static_response(put(sensor, [name], get(sensor, [name]) + change))
-              for change in (step, -step)] for name, step in zip(names, steps)]
+    pairs = [
+        [
+            static_response(put(sensor, [name], get(sensor, [name]) + change))
+            for change in (step, -step)
+        ]
+        for name, step in zip(names, steps)
+    ]
 
-    def by_coefficient(force: Components,
-                       environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
+    def by_coefficient(
+        force: Components, environment: Environment = NOMINAL_ENVIRONMENT
+    ) -> np.ndarray:
         slopes = np.zeros((len(sensor.axes), len(names), np.size(force[0])))
         for row, (step, pair) in enumerate(zip(steps, pairs)):
             above, below = (respond(force, environment) for respond in pair)

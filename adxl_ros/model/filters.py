@@ -18,8 +18,9 @@ _FEW_INPUTS = 512  # Most inputs that are filtered one by one; chosen: 50 µs
 _STIFF = 8.0  # |z| from which weights are integrated by parts; chosen: stable there only
 
 
-def low_pass(x: np.ndarray, tau_s: float, dt_s: float, memory: dict[str, Any],
-             may_step: bool = False) -> np.ndarray:
+def low_pass(
+    x: np.ndarray, tau_s: float, dt_s: float, memory: dict[str, Any], may_step: bool = False
+) -> np.ndarray:
     """
     Filter inputs, (n,), by 1/(1 + τ·s); τ = 0 passes them on.
 
@@ -31,21 +32,23 @@ def low_pass(x: np.ndarray, tau_s: float, dt_s: float, memory: dict[str, Any],
     return pole(x, -1 / tau_s, dt_s, memory, may_step) / tau_s
 
 
-def resonator(x: np.ndarray, frequency_hz: float, damping_ratio: float, dt_s: float,
-              memory: dict[str, Any]) -> np.ndarray:
+def resonator(
+    x: np.ndarray, frequency_hz: float, damping_ratio: float, dt_s: float, memory: dict[str, Any]
+) -> np.ndarray:
     """
     Filter inputs, (n,), by ω²/(s² + 2·ζ·ω·s + ω²), ζ < 1, by partial fractions.
 
     Before the first block, with an empty memory, the filter is at rest at its first input.
     """
     omega = 2 * np.pi * frequency_hz
-    damped = omega * np.sqrt(1 - damping_ratio ** 2)
+    damped = omega * np.sqrt(1 - damping_ratio**2)
     mode = pole(x, complex(-damping_ratio * omega, damped), dt_s, memory)
-    return omega ** 2 / damped * mode.imag
+    return omega**2 / damped * mode.imag
 
 
-def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any],
-         may_step: bool = False) -> np.ndarray:
+def pole(
+    x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any], may_step: bool = False
+) -> np.ndarray:
     """
     Solve w' = rate·w + x, exactly for x a polynomial through the newest `ORDER` samples.
 
@@ -69,13 +72,14 @@ def pole(x: np.ndarray, rate: complex, dt_s: float, memory: dict[str, Any],
     elif x.ndim == 1:
         drive = np.convolve(inputs, weights, 'valid')
     else:
-        drive = sum(weight * inputs[ORDER - 1 - j:len(inputs) - j]
-                    for j, weight in enumerate(weights))
+        drive = sum(
+            weight * inputs[ORDER - 1 - j : len(inputs) - j] for j, weight in enumerate(weights)
+        )
     decay = np.exp(rate * dt_s)
     if first:
         drive[0] = -x[0] / rate * (1 - decay)
     w = first_order_recursion(1.0, decay, drive, last_w)
-    memory['inputs'], memory['w'] = inputs[-(ORDER - 1):], w[-1]
+    memory['inputs'], memory['w'] = inputs[-(ORDER - 1) :], w[-1]
     return w
 
 
@@ -86,9 +90,9 @@ def _stepping(inputs: np.ndarray, rows: np.ndarray) -> np.ndarray:
     It is the line where the newest input is far from the polynomial through those before it. That
     of a sine of 10 samples a period is near; the first input after a step misses it by the step.
     """
-    drive = np.empty(inputs[ORDER - 1:].shape)
+    drive = np.empty(inputs[ORDER - 1 :].shape)
     for newest in range(len(drive)):
-        smooth, straight, missed, slope, bend = rows @ inputs[newest:newest + ORDER]
+        smooth, straight, missed, slope, bend = rows @ inputs[newest : newest + ORDER]
         change = np.abs(slope) + np.abs(bend)
         drive[newest] = np.where(np.abs(missed) <= _MOST_MISSED * change, smooth, straight)
     return drive
@@ -105,12 +109,20 @@ def _step_rows(z: float, dt_s: float) -> np.ndarray:
     line = np.zeros(ORDER)
     line[-_LINE:] = _weights(z, _LINE)[::-1]
     missed = np.poly(np.ones(ORDER - 1))[::-1]
-    return np.array([_weights(z, ORDER)[::-1] * dt_s, line * dt_s, missed,
-                     [-1, 0, 0, 0, 0, 1], [1, 0, -1, -1, 0, 1]])
+    return np.array(
+        [
+            _weights(z, ORDER)[::-1] * dt_s,
+            line * dt_s,
+            missed,
+            [-1, 0, 0, 0, 0, 1],
+            [1, 0, -1, -1, 0, 1],
+        ]
+    )
 
 
-def first_order_recursion(gain: float, decay: complex, inputs: np.ndarray,
-                          previous: complex | np.ndarray) -> np.ndarray:
+def first_order_recursion(
+    gain: float, decay: complex, inputs: np.ndarray, previous: complex | np.ndarray
+) -> np.ndarray:
     """Filter inputs, (n,) or (n, k), by y[i] = decay · y[i − 1] + gain · inputs[i]."""
     if len(inputs) <= _FEW_INPUTS:
         # scipy.signal takes 0.5 s to import, and a live sensor has short blocks only.
@@ -120,6 +132,7 @@ def first_order_recursion(gain: float, decay: complex, inputs: np.ndarray,
             outputs.append(previous)
         return np.array(outputs)
     from scipy.signal import lfilter
+
     state = np.broadcast_to(decay * previous, (1, *inputs.shape[1:]))
     outputs, _ = lfilter([gain], [1.0, -decay], inputs, axis=0, zi=state)
     return outputs
@@ -129,8 +142,10 @@ def first_order_recursion(gain: float, decay: complex, inputs: np.ndarray,
 def _weights(z: complex, order: int) -> np.ndarray:
     """Return weights of the newest inputs, newest first: ∫ exp(z·(1 − s))·Lⱼ(s) ds, 0 to 1."""
     nodes = 1.0 - np.arange(order)
-    lagrange = [np.poly(np.delete(nodes, j)) / np.prod(nodes[j] - np.delete(nodes, j))
-                for j in range(order)]
+    lagrange = [
+        np.poly(np.delete(nodes, j)) / np.prod(nodes[j] - np.delete(nodes, j))
+        for j in range(order)
+    ]
     if abs(z) < _STIFF:
         s, weight = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
         s, weight = (s + 1) / 2, weight / 2
@@ -201,4 +216,4 @@ def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray
         output = np.maximum(bottom, np.minimum(top, output))
     memory['output'] = output
     outputs = np.maximum(low, np.minimum(high, starts)).swapaxes(0, 1)
-    return outputs.reshape(-1, rows.shape[1])[:len(x)].reshape(x.shape)
+    return outputs.reshape(-1, rows.shape[1])[: len(x)].reshape(x.shape)

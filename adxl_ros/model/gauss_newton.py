@@ -23,10 +23,14 @@ class Iterate:
 State = TypeVar('State', bound=Iterate)
 
 
-def gauss_newton(linearise: Callable[[np.ndarray], State], start: np.ndarray,
-                 has_converged: Callable[[State, State | None, State], bool],
-                 max_evaluations: int, max_halvings: int = 0,
-                 cost_tolerance: float = 0.0) -> State:
+def gauss_newton(
+    linearise: Callable[[np.ndarray], State],
+    start: np.ndarray,
+    has_converged: Callable[[State, State | None, State], bool],
+    max_evaluations: int,
+    max_halvings: int = 0,
+    cost_tolerance: float = 0.0,
+) -> State:
     """
     Iterate Gauss-Newton steps until they converge; return the last iterate that was accepted.
 
@@ -44,7 +48,7 @@ def gauss_newton(linearise: Callable[[np.ndarray], State], start: np.ndarray,
         for halvings in range(max_halvings + 1):
             if evaluations >= max_evaluations:
                 return present
-            trial = linearise(present.values + 0.5 ** halvings * present.step)
+            trial = linearise(present.values + 0.5**halvings * present.step)
             evaluations += 1
             # A cost of NaN passes, so that a caller sees it.
             if not trial.cost > present.cost + cost_tolerance:

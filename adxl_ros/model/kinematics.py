@@ -21,9 +21,13 @@ import scipy
 UPRIGHT = (0.0, 0.0, 1.0)  # The vertical in the frame of a level base, a unit vector
 
 
-def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
-                   shift_acceleration_mps2: Value = 0.0,
-                   up: Components | tuple[float, float, float] = UPRIGHT) -> Components:
+def specific_force(
+    alpha_rad: Value,
+    beta_rad: Value,
+    gravity_mps2: float,
+    shift_acceleration_mps2: Value = 0.0,
+    up: Components | tuple[float, float, float] = UPRIGHT,
+) -> Components:
     """
     Specific force in the case frame of a sensor on the stage, m/s².
 
@@ -35,9 +39,11 @@ def specific_force(alpha_rad: Value, beta_rad: Value, gravity_mps2: float,
     sin_alpha, cos_alpha = np.sin(alpha_rad), np.cos(alpha_rad)
     sin_beta, cos_beta = np.sin(beta_rad), np.cos(beta_rad)
     along = x * cos_alpha + z * sin_alpha
-    return [along * cos_beta + y * sin_beta + shift_acceleration_mps2,
-            y * cos_beta - along * sin_beta,
-            z * cos_alpha - x * sin_alpha]
+    return [
+        along * cos_beta + y * sin_beta + shift_acceleration_mps2,
+        y * cos_beta - along * sin_beta,
+        z * cos_alpha - x * sin_alpha,
+    ]
 
 
 def stage_angles(roll_rad: np.ndarray, pitch_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -48,9 +54,13 @@ def stage_angles(roll_rad: np.ndarray, pitch_rad: np.ndarray) -> tuple[np.ndarra
     return np.arctan2(np.hypot(x, y), z), np.arctan2(-y, x + 0.0)
 
 
-def specific_force_in_motion(alpha: Joint, beta: Joint, shift: Joint, gravity_mps2: float,
-                             up: Components | tuple[float, float, float] = UPRIGHT
-                             ) -> Components:
+def specific_force_in_motion(
+    alpha: Joint,
+    beta: Joint,
+    shift: Joint,
+    gravity_mps2: float,
+    up: Components | tuple[float, float, float] = UPRIGHT,
+) -> Components:
     """
     Specific force in the case frame of a sensor while all joints move, m/s².
 
@@ -76,10 +86,14 @@ def angular_motion(alpha: Joint, beta: Joint) -> tuple[Components, Components]:
     """
     sin_beta, cos_beta = np.sin(beta.position), np.cos(beta.position)
     along, across = sin_beta * alpha.velocity, cos_beta * alpha.velocity
-    return ([-along, -across, beta.velocity],
-            [-sin_beta * alpha.acceleration - across * beta.velocity,
-             -cos_beta * alpha.acceleration + along * beta.velocity,
-             beta.acceleration])
+    return (
+        [-along, -across, beta.velocity],
+        [
+            -sin_beta * alpha.acceleration - across * beta.velocity,
+            -cos_beta * alpha.acceleration + along * beta.velocity,
+            beta.acceleration,
+        ],
+    )
 
 
 def carried_acceleration(omega: Components, omega_dot: Components, r: Components) -> Components:
@@ -131,21 +145,35 @@ def tilt(force: Components, covariance: np.ndarray, measures_z: bool = True) -> 
     components = tuple(covariance[i, j] for i in range(3) for j in range(i, 3))
     with np.errstate(over='ignore', invalid='ignore'):
         roll, pitch, inclination, beta = (
-            _shown(angle, variance) for angle, variance in angles(force, components, ARRAYS))
+            _shown(angle, variance) for angle, variance in angles(force, components, ARRAYS)
+        )
     alpha = inclination[0] if measures_z else np.minimum(inclination[0], np.pi - inclination[0])
-    return Tilt(roll[0], pitch[0], inclination[0], alpha, beta[0],
-                roll[1], pitch[1], inclination[1], inclination[1], beta[1])
+    return Tilt(
+        roll[0],
+        pitch[0],
+        inclination[0],
+        alpha,
+        beta[0],
+        roll[1],
+        pitch[1],
+        inclination[1],
+        inclination[1],
+        beta[1],
+    )
 
 
 def _shown(angle: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the angle and its standard deviation; NaN and inf where it is not shown."""
     shows = variance < UNOBSERVABLE_RAD2
-    return (np.where(shows, angle, np.nan),
-            np.where(shows, np.sqrt(np.maximum(variance, 0)), np.inf))
+    return (
+        np.where(shows, angle, np.nan),
+        np.where(shows, np.sqrt(np.maximum(variance, 0)), np.inf),
+    )
 
 
-def angles(force: Components, covariance: tuple[Value, ...],
-           maths: Maths) -> tuple[tuple[Value, Value], ...]:
+def angles(
+    force: Components, covariance: tuple[Value, ...], maths: Maths
+) -> tuple[tuple[Value, Value], ...]:
     """
     Return roll, pitch, inclination and beta with first-order variances.
 
@@ -160,21 +188,33 @@ def angles(force: Components, covariance: tuple[Value, ...],
     total4 = total2 * total2
     in_plane, in_side = xx + yy, yy + zz
     along = y * y * yy + 2 * y * z * yz + z * z * zz
-    roll = maths.where(side2 > in_side + _FORCE2_FLOOR,
-                       (z * z * yy - 2 * y * z * yz + y * y * zz) / (side2 * side2), INFINITE)
+    roll = maths.where(
+        side2 > in_side + _FORCE2_FLOOR,
+        (z * z * yy - 2 * y * z * yz + y * y * zz) / (side2 * side2),
+        INFINITE,
+    )
     pitch = maths.where(
         side2 > in_side,
         (side2 * xx - 2 * x * (y * xy + z * xz) + x * x * along / side2) / total4,
-        in_side / total2)
+        in_side / total2,
+    )
     along = x * x * xx + 2 * x * y * xy + y * y * yy
     inclination = maths.where(
         plane2 > in_plane,
         (z * z * along / plane2 - 2 * z * (x * xz + y * yz) + plane2 * zz) / total4,
-        in_plane / total2)
-    beta = maths.where(plane2 > in_plane + _FORCE2_FLOOR,
-                       (y * y * xx - 2 * x * y * xy + x * x * yy) / (plane2 * plane2), INFINITE)
-    return ((maths.atan2(y, z), roll), (maths.atan2(-x, maths.sqrt(side2)), pitch),
-            (maths.atan2(maths.sqrt(plane2), z), inclination), (maths.atan2(0.0 - y, x), beta))
+        in_plane / total2,
+    )
+    beta = maths.where(
+        plane2 > in_plane + _FORCE2_FLOOR,
+        (y * y * xx - 2 * x * y * xy + x * x * yy) / (plane2 * plane2),
+        INFINITE,
+    )
+    return (
+        (maths.atan2(y, z), roll),
+        (maths.atan2(-x, maths.sqrt(side2)), pitch),
+        (maths.atan2(maths.sqrt(plane2), z), inclination),
+        (maths.atan2(0.0 - y, x), beta),
+    )
 
 
 def quaternion(roll_rad: Value, pitch_rad: Value, maths: Maths) -> tuple[Value, ...]:

@@ -34,14 +34,26 @@ def electronics(sensor: Sensor) -> Electronics:
     chain, count = Chain(sensor, names), len(sensor.axes)
     # Arrays of one sample: effects with a memory take no floats.
     around = Environment(*(np.full(1, value) for value in NOMINAL_ENVIRONMENT))
-    signals = chain.signals(around, time_s=around.time_s, dt_s=1 / sensor.rate_hz,
-                            force=[np.zeros(1)] * 3, sensed=[np.zeros(1)] * 3,
-                            output=[np.zeros(1)] * 3)
+    signals = chain.signals(
+        around,
+        time_s=around.time_s,
+        dt_s=1 / sensor.rate_hz,
+        force=[np.zeros(1)] * 3,
+        sensed=[np.zeros(1)] * 3,
+        output=[np.zeros(1)] * 3,
+    )
     with np.errstate(all='ignore'):
         chain(Place.ELECTRONICS, signals)
-    return Electronics(*(np.array([float(np.ravel(value)[0]) for value in values]) for values in (
-        signals.rc_s[:count], signals.noise_ratio[:count],
-        signals.lsb_v * np.array(signals.lsb_ratio))))
+    return Electronics(
+        *(
+            np.array([float(np.ravel(value)[0]) for value in values])
+            for values in (
+                signals.rc_s[:count],
+                signals.noise_ratio[:count],
+                signals.lsb_v * np.array(signals.lsb_ratio),
+            )
+        )
+    )
 
 
 def filtered_bandwidth_hz(rc_s: np.ndarray, rate_hz: float) -> np.ndarray:
@@ -79,8 +91,10 @@ def held_rounding(sensor: Sensor) -> np.ndarray:
         return np.zeros(len(sensor.axes))
     harmonics = np.arange(1, _HARMONICS + 1)[:, None]
     sigma_steps = analog_std_v(sensor) / electronics(sensor).lsb_v
-    return np.sum(6 / (np.pi * harmonics) ** 2
-                  * np.exp(-(2 * np.pi * harmonics * sigma_steps) ** 2), axis=0)
+    return np.sum(
+        6 / (np.pi * harmonics) ** 2 * np.exp(-((2 * np.pi * harmonics * sigma_steps) ** 2)),
+        axis=0,
+    )
 
 
 def density_for_variance(variance: np.ndarray, rc_s: np.ndarray, rate_hz: float) -> np.ndarray:
@@ -112,8 +126,8 @@ def density_v2_per_hz(sensor: Sensor, frequency_hz: np.ndarray) -> np.ndarray:
     rc_s, _, lsb_v = electronics(sensor)
     decay = np.where(rc_s > 0, np.exp(-1 / (sensor.rate_hz * np.where(rc_s > 0, rc_s, 1.0))), 0.0)
     turn = np.exp(-2j * np.pi * frequency_hz / sensor.rate_hz)[:, None]
-    shape = (1 - decay ** 2) / np.abs(1 - decay * turn) ** 2
-    return 2 / sensor.rate_hz * (analog_std_v(sensor) ** 2 * shape + lsb_v ** 2 / 12)
+    shape = (1 - decay**2) / np.abs(1 - decay * turn) ** 2
+    return 2 / sensor.rate_hz * (analog_std_v(sensor) ** 2 * shape + lsb_v**2 / 12)
 
 
 def effective_samples(count: int | np.ndarray, dt_s: float, rc_s: float) -> np.ndarray:
@@ -128,5 +142,5 @@ def effective_samples(count: int | np.ndarray, dt_s: float, rc_s: float) -> np.n
     if rc_s <= 0:
         return n
     a = np.exp(-dt_s / rc_s)
-    correlated = 2 * a / (1 - a) * (1 - (1 - a ** n) / (n * (1 - a)))
+    correlated = 2 * a / (1 - a) * (1 - (1 - a**n) / (n * (1 - a)))
     return n / (1 + correlated)

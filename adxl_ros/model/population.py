@@ -48,13 +48,20 @@ class Population:
 
     def prior(self, sensor: Sensor) -> Prior:
         """Return the prior of a unit's departures from its nominal values."""
-        rows = [(Coefficient(effect, parameter, axis), pooled.mean - value, pooled.prediction_std)
-                for effect, parameter, column, nominal in (
-                    ('bias', 'offset_v', 'zero_g_{}_v', sensor.nominal_zero_g_v),
-                    ('scale_factor', 'offset_v_per_g', 'scale_{}_v_per_g',
-                     sensor.nominal_scale_v_per_g))
-                for axis, value in zip(sensor.axes, nominal.tolist())
-                if (pooled := self.coefficients.get(column.format(axis)))]
+        rows = [
+            (Coefficient(effect, parameter, axis), pooled.mean - value, pooled.prediction_std)
+            for effect, parameter, column, nominal in (
+                ('bias', 'offset_v', 'zero_g_{}_v', sensor.nominal_zero_g_v),
+                (
+                    'scale_factor',
+                    'offset_v_per_g',
+                    'scale_{}_v_per_g',
+                    sensor.nominal_scale_v_per_g,
+                ),
+            )
+            for axis, value in zip(sensor.axes, nominal.tolist())
+            if (pooled := self.coefficients.get(column.format(axis)))
+        ]
         mean, std = np.array([row[1:] for row in rows]).reshape(-1, 2).T
         return Prior(tuple(name for name, *_ in rows), mean, std)
 
@@ -84,31 +91,53 @@ def posterior(sensor: Sensor, population: Population) -> Posterior:
     """
     names, mean, std = population.prior(sensor)
     if not names:
-        return Posterior(sensor, f'{population.name} has no zero-g or scale factor of the axes '
-                         f'{sensor.axes}; it is not used')
+        return Posterior(
+            sensor,
+            f'{population.name} has no zero-g or scale factor of the axes '
+            f'{sensor.axes}; it is not used',
+        )
     if not set(_EFFECTS) & set(sensor.effects):
-        unit = replace(put(with_neutral(sensor, _EFFECTS), names, mean),
-                       covariance=np.diag(std ** 2), covariance_names=names)
-        return Posterior(unit, f'zero-g and scale factor are those of '
-                         f'{population.name}: the unit has none of its own')
+        unit = replace(
+            put(with_neutral(sensor, _EFFECTS), names, mean),
+            covariance=np.diag(std**2),
+            covariance_names=names,
+        )
+        return Posterior(
+            unit,
+            f'zero-g and scale factor are those of '
+            f'{population.name}: the unit has none of its own',
+        )
     used = [i for i, name in enumerate(names) if name in sensor.covariance_names]
     if not used:
-        return Posterior(sensor, f'{population.name} is not used: zero-g and scale factor of '
-                         'the unit have no uncertainty')
+        return Posterior(
+            sensor,
+            f'{population.name} is not used: zero-g and scale factor of '
+            'the unit have no uncertainty',
+        )
     places = [sensor.covariance_names.index(names[i]) for i in used]
     departure = mean[used] - get(sensor, [names[i] for i in used])
     total = sensor.covariance[np.ix_(places, places)] + np.diag(std[used] ** 2)
     square = float(departure @ np.linalg.solve(total, departure))
     chance = float(scipy.special.chdtrc(len(places), square))
     if chance < STRANGER_CHANCE:
-        return Posterior(sensor, (
-            f'{sensor.serial} is not of {population.name}: χ² {square:.3g} for {len(places)} '
-            f'coefficients, probability {chance:.2g}. The prior is not used'), True)
+        return Posterior(
+            sensor,
+            (
+                f'{sensor.serial} is not of {population.name}: χ² {square:.3g} for {len(places)} '
+                f'coefficients, probability {chance:.2g}. The prior is not used'
+            ),
+            True,
+        )
     gain = np.linalg.solve(total, sensor.covariance[places]).T
     covariance = sensor.covariance - gain @ sensor.covariance[places]
     values = get(sensor, sensor.covariance_names) + gain @ departure
-    unit = replace(put(sensor, sensor.covariance_names, values),
-                   covariance=(covariance + covariance.T) / 2)
-    return Posterior(unit, (
-        f'{population.name} is the prior of {len(places)} coefficients: χ² {square:.3g}, '
-        f'probability {chance:.2g}'))
+    unit = replace(
+        put(sensor, sensor.covariance_names, values), covariance=(covariance + covariance.T) / 2
+    )
+    return Posterior(
+        unit,
+        (
+            f'{population.name} is the prior of {len(places)} coefficients: χ² {square:.3g}, '
+            f'probability {chance:.2g}'
+        ),
+    )

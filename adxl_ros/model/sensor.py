@@ -76,15 +76,16 @@ class Envelope:
         if self.temperature_c is None:
             return np.zeros(np.shape(temperature_c))
         low, high = self.temperature_c
-        return np.maximum(0.0, np.maximum(low - MARGIN_K - temperature_c,
-                                          temperature_c - high - MARGIN_K))
+        return np.maximum(
+            0.0, np.maximum(low - MARGIN_K - temperature_c, temperature_c - high - MARGIN_K)
+        )
 
     def extrapolation(self, force: Sequence[Any]) -> Any:
         """Return the extrapolation ρ of forces, m/s²; 1 inside."""
         rho: Any = 1.0
         for value, low, high in zip(force, self.force_low_mps2, self.force_high_mps2):
             distance = np.abs(value - (low + high) / 2) / ((high - low) / 2 + MARGIN_MPS2)
-            rho = np.maximum(rho, distance ** 2)
+            rho = np.maximum(rho, distance**2)
         return rho
 
     def zero_g_std_g(self, temperature_c: Any) -> list[Any]:
@@ -92,15 +93,18 @@ class Envelope:
         if self.temperature_c is None:
             return []
         departure = departure_k(temperature_c, self.zero_g_nodes_c) - departure_k(
-            self.zero_g_at_c, self.zero_g_nodes_c)
+            self.zero_g_at_c, self.zero_g_nodes_c
+        )
         return [size * departure for size in self.zero_g_next]
 
     def added_variance(self, axis_mps2: Any, temperature_c: Any, extrapolation: Any) -> Any:
         """Return the variance, (m/s²)², that each axis gets outside; see above."""
         beyond_k = self.beyond_k(temperature_c)
-        return ((G0_MPS2 * self.zero_g_per_k * beyond_k) ** 2
-                + (axis_mps2 * self.scale_per_k * beyond_k) ** 2
-                + self.misfit_mps2 ** 2 * (extrapolation ** 2 - 1))
+        return (
+            (G0_MPS2 * self.zero_g_per_k * beyond_k) ** 2
+            + (axis_mps2 * self.scale_per_k * beyond_k) ** 2
+            + self.misfit_mps2**2 * (extrapolation**2 - 1)
+        )
 
     def is_outside(self, temperature_c: Any, force: Sequence[Any]) -> np.ndarray:
         """Return which samples lie outside of the validity range, (n,)."""
@@ -111,27 +115,46 @@ class Envelope:
         texts = []
         if self.temperature_c is not None and self.beyond_k(temperature_c) > 0:
             low, high = self.temperature_c
-            texts.append(f'temperature {temperature_c:.1f} degC, calibrated at {low:.1f} to '
-                         f'{high:.1f}')
+            texts.append(
+                f'temperature {temperature_c:.1f} degC, calibrated at {low:.1f} to {high:.1f}'
+            )
         rho = float(self.extrapolation(force))
         if rho > 1:
-            texts.append(f'force near {", ".join(f"{f:.1f}" for f in force)} m/s^2, '
-                         f'{rho ** 0.5:.2g} times as far out as the calibrated poses')
+            texts.append(
+                f'force near {", ".join(f"{f:.1f}" for f in force)} m/s^2, '
+                f'{rho**0.5:.2g} times as far out as the calibrated poses'
+            )
         return tuple(texts)
 
 
-def _nominal(key: str, doc: str, unit: str = '', lower: float | None = None,
-             upper: float | None = None, choices: tuple[str, ...] = (),
-             placeholder: float | None = None, default: Any = MISSING) -> Any:
+def _nominal(
+    key: str,
+    doc: str,
+    unit: str = '',
+    lower: float | None = None,
+    upper: float | None = None,
+    choices: tuple[str, ...] = (),
+    placeholder: float | None = None,
+    default: Any = MISSING,
+) -> Any:
     """
     Declare a nominal value: its key in the parameter file, meaning, unit and bounds.
 
     A file may leave a value with a `placeholder` out; the value is then in `Sensor.unstated`. One
     with a `default` has that value where a file leaves it out.
     """
-    return field(default=default, metadata={
-        'key': key, 'doc': doc, 'unit': unit, 'lower': lower, 'upper': upper, 'choices': choices,
-        'placeholder': placeholder})
+    return field(
+        default=default,
+        metadata={
+            'key': key,
+            'doc': doc,
+            'unit': unit,
+            'lower': lower,
+            'upper': upper,
+            'choices': choices,
+            'placeholder': placeholder,
+        },
+    )
 
 
 @dataclass(frozen=True)
@@ -147,39 +170,77 @@ class Sensor:
     serial: str = _nominal('sensor.serial', 'serial number; nominal is no unit in particular')
     axes: str = _nominal('sensor.axes', 'measured axes', choices=MEASURED_AXES)
     nominal_zero_g_v: np.ndarray = _nominal(
-        'sensor.nominal_zero_g_v', 'zero-g output by the datasheet, by axis', 'V', -10.0, 10.0)
+        'sensor.nominal_zero_g_v', 'zero-g output by the datasheet, by axis', 'V', -10.0, 10.0
+    )
     nominal_scale_v_per_g: np.ndarray = _nominal(
-        'sensor.nominal_scale_v_per_g', 'scale factor by the datasheet, by axis', 'V/g',
-        1e-3, 10.0)
+        'sensor.nominal_scale_v_per_g', 'scale factor by the datasheet, by axis', 'V/g', 1e-3, 10.0
+    )
     noise_density_g_per_rthz: np.ndarray = _nominal(
-        'sensor.noise_density_g_per_rthz', 'white noise density, by axis', 'g/sqrt(Hz)',
-        0.0, 0.1, placeholder=0.0)
+        'sensor.noise_density_g_per_rthz',
+        'white noise density, by axis',
+        'g/sqrt(Hz)',
+        0.0,
+        0.1,
+        placeholder=0.0,
+    )
     rc_resistance_ohm: float = _nominal(
-        'sensor.rc_resistance_ohm', 'output resistance that the filter capacitor sees', 'Ohm',
-        0.0, 1e9, placeholder=0.0)
+        'sensor.rc_resistance_ohm',
+        'output resistance that the filter capacitor sees',
+        'Ohm',
+        0.0,
+        1e9,
+        placeholder=0.0,
+    )
     rc_capacitance_f: float = _nominal(
-        'sensor.rc_capacitance_f', 'filter capacitor; 0 is no filter', 'F', 0.0, 1.0,
-        placeholder=0.0)
-    adc_bits: int = _nominal('sensor.adc_bits', 'resolution of the ADC; 0 does not quantise',
-                             'bit', 0, 32, placeholder=0)
-    adc_vref_v: float = _nominal('sensor.adc_vref_v', 'full scale of the ADC', 'V', 0.1, 100.0,
-                                 placeholder=100.0)
+        'sensor.rc_capacitance_f',
+        'filter capacitor; 0 is no filter',
+        'F',
+        0.0,
+        1.0,
+        placeholder=0.0,
+    )
+    adc_bits: int = _nominal(
+        'sensor.adc_bits',
+        'resolution of the ADC; 0 does not quantise',
+        'bit',
+        0,
+        32,
+        placeholder=0,
+    )
+    adc_vref_v: float = _nominal(
+        'sensor.adc_vref_v', 'full scale of the ADC', 'V', 0.1, 100.0, placeholder=100.0
+    )
     rate_hz: float = _nominal('sensor.rate_hz', 'sample rate', 'Hz', 0.01, 100000.0)
-    range_g: float = _nominal('sensor.range_g', 'measuring range by the datasheet', 'g',
-                              0.1, 1000.0, placeholder=1000.0)
+    range_g: float = _nominal(
+        'sensor.range_g', 'measuring range by the datasheet', 'g', 0.1, 1000.0, placeholder=1000.0
+    )
     local_gravity_mps2: float = _nominal(
-        'sensor.local_gravity_mps2', 'gravity where the sensor is', 'm/s^2', 9.7, 9.9)
+        'sensor.local_gravity_mps2', 'gravity where the sensor is', 'm/s^2', 9.7, 9.9
+    )
     z_sign: int = _nominal(
-        'sensor.z_sign', 'which way up, for the z of equation 5: 1, -1, or 0 where not known', '',
-        -1, 1)
+        'sensor.z_sign',
+        'which way up, for the z of equation 5: 1, -1, or 0 where not known',
+        '',
+        -1,
+        1,
+    )
     stage_resolution_rad: float = _nominal(
-        'stage.resolution_rad', "step of the stage's encoder, or of the scale read by hand",
-        'rad', 0.0, 1.0)
+        'stage.resolution_rad',
+        "step of the stage's encoder, or of the scale read by hand",
+        'rad',
+        0.0,
+        1.0,
+    )
     model: str = _nominal('model', 'what was fitted', choices=MODELS)
     filter_rate_hz: float = _nominal(
-        'sensor.filter_rate_hz', 'sample rate at which the filter is the stated one, because it '
-        'is digital and its bandwidth is a fixed share of the rate; 0 is an analog filter', 'Hz',
-        0.0, 100000.0, default=0.0)
+        'sensor.filter_rate_hz',
+        'sample rate at which the filter is the stated one, because it '
+        'is digital and its bandwidth is a fixed share of the rate; 0 is an analog filter',
+        'Hz',
+        0.0,
+        100000.0,
+        default=0.0,
+    )
     effects: tuple[str, ...] = ()  # Names of the effects
     # Values by effect and parameter, (m,) or (), each in the unit of its parameter
     values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
@@ -238,13 +299,15 @@ class Sensor:
     @property
     def lsb_v(self) -> float:
         """Step of the ADC, V; 0 where it does not quantise."""
-        return self.adc_vref_v / 2 ** self.adc_bits if self.adc_bits else 0.0
+        return self.adc_vref_v / 2**self.adc_bits if self.adc_bits else 0.0
 
     def parameters(self, effect: str) -> Parameters:
         """Return the values of one of its effects in the form that its `apply` takes."""
         arrays = {name: np.asarray(value, float) for name, value in self.values[effect].items()}
-        return {name: tuple(value.tolist()) if value.ndim else float(value)
-                for name, value in arrays.items()}
+        return {
+            name: tuple(value.tolist()) if value.ndim else float(value)
+            for name, value in arrays.items()
+        }
 
     def saturated(self, volts: np.ndarray) -> np.ndarray:
         """Return where volts, (n, m), are at a rail of the ADC or beyond the range, (n, m)."""
@@ -255,8 +318,9 @@ class Sensor:
 
     def computed_at(self, rate_hz: float) -> Sensor:
         """Return the sensor for a computation at another rate, Hz; its filter stays as it is."""
-        return replace(self, rate_hz=rate_hz,
-                       filter_rate_hz=self.filter_rate_hz * rate_hz / self.rate_hz)
+        return replace(
+            self, rate_hz=rate_hz, filter_rate_hz=self.filter_rate_hz * rate_hz / self.rate_hz
+        )
 
     def without_covariance(self) -> Sensor:
         """Return the sensor with coefficients that count as exact."""
@@ -280,16 +344,20 @@ def with_axes(sensor: Sensor, axes: str) -> Sensor:
     if axes == sensor.axes:
         return sensor
     if sensor.effects:
-        raise UserError(f'the parameters of {sensor.serial} are calibrated for the axes '
-                        f'{sensor.axes}, not {axes}; name the parameter file of this sensor')
+        raise UserError(
+            f'the parameters of {sensor.serial} are calibrated for the axes '
+            f'{sensor.axes}, not {axes}; name the parameter file of this sensor'
+        )
     changed: dict[str, Any] = {}
     for name in ('nominal_zero_g_v', 'nominal_scale_v_per_g', 'noise_density_g_per_rthz'):
         values = getattr(sensor, name)
         if len(axes) > len(values) and np.ptp(values) > 0:
-            raise UserError(f'sensor.{name}: {values.tolist()} for {sensor.axes} does not '
-                            f'determine the value of the other axes of {axes}; name a parameter '
-                            f'file for {axes}')
-        changed[name] = np.array([*values, *[values[0]] * 3])[:len(axes)]
+            raise UserError(
+                f'sensor.{name}: {values.tolist()} for {sensor.axes} does not '
+                f'determine the value of the other axes of {axes}; name a parameter '
+                f'file for {axes}'
+            )
+        changed[name] = np.array([*values, *[values[0]] * 3])[: len(axes)]
     if len(axes) > len(sensor.axes):
         # A part with more axes has another datasheet.
         changed |= {'datasheet_name': '', 'datasheet': {}}
@@ -308,8 +376,12 @@ def to_nominal_mps2(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
 
 def names_of(effect: Effect, axes: str) -> tuple[Coefficient, ...]:
     """Name the coefficients of an effect: by parameter, for those measured axes that it has."""
-    return tuple(Coefficient(effect.name, p.name, axis) for p in effect.parameters
-                 for axis in (axes if p.axes else ('',)) if axis in p.axes)
+    return tuple(
+        Coefficient(effect.name, p.name, axis)
+        for p in effect.parameters
+        for axis in (axes if p.axes else ('',))
+        if axis in p.axes
+    )
 
 
 def fitted_of(effect: Effect, axes: str) -> tuple[Coefficient, ...]:
@@ -325,8 +397,10 @@ def parameter_of(name: Coefficient) -> Parameter:
 
 def neutral(effect: Effect, axes: str) -> dict[str, np.ndarray]:
     """Return the neutral values of an effect by parameter, (m,) or (), each in its unit."""
-    return {p.name: np.full(len(axes), p.neutral) if p.axes else np.array(p.neutral)
-            for p in effect.parameters}
+    return {
+        p.name: np.full(len(axes), p.neutral) if p.axes else np.array(p.neutral)
+        for p in effect.parameters
+    }
 
 
 def typical(effect: Effect, axes: str) -> dict[str, np.ndarray]:
@@ -349,20 +423,24 @@ def without_effect(sensor: Sensor, effect: str) -> Sensor:
     """Return the sensor without an effect and its covariance; it may not have it."""
     kept = [i for i, name in enumerate(sensor.covariance_names) if name.effect != effect]
     return replace(
-        sensor, effects=tuple(name for name in sensor.effects if name != effect),
+        sensor,
+        effects=tuple(name for name in sensor.effects if name != effect),
         values={name: value for name, value in sensor.values.items() if name != effect},
         covariance=sensor.covariance[np.ix_(kept, kept)],
-        covariance_names=tuple(sensor.covariance_names[i] for i in kept))
+        covariance_names=tuple(sensor.covariance_names[i] for i in kept),
+    )
 
 
 def get(sensor: Sensor, names: Sequence[Coefficient]) -> np.ndarray:
     """Return the values of coefficients, (k,), each in the unit of its parameter."""
-    return np.array([sensor.values[name.effect][name.parameter][_index(sensor, name)]
-                     for name in names], float)
+    return np.array(
+        [sensor.values[name.effect][name.parameter][_index(sensor, name)] for name in names], float
+    )
 
 
-def put(sensor: Sensor, names: Sequence[Coefficient],
-        coefficients: Sequence[float] | np.ndarray) -> Sensor:
+def put(
+    sensor: Sensor, names: Sequence[Coefficient], coefficients: Sequence[float] | np.ndarray
+) -> Sensor:
     """Return a copy of the sensor with other values of some coefficients, (k,)."""
     values = dict(sensor.values)
     for effect in {name.effect for name in names}:

@@ -57,7 +57,8 @@ class RunningEffect:
         # At the neutral values of its sizes and limits an effect does nothing.
         self.is_neutral = bool(sizes) and all(
             self.parameters.get(p.name) in (None, p.neutral, (p.neutral,) * len(sensor.axes))
-            for p in sizes)
+            for p in sizes
+        )
         self.name, self.place, self.apply = name, effect.place, effect.apply
         self.key = (name, *sorted(self.parameters.items()))
         self.memory: dict[str, Any] = {}
@@ -89,19 +90,28 @@ class Chain:
     def __init__(self, sensor: Sensor, names: Iterable[str] | None = None, seed: int = 0) -> None:
         """Prepare effects of the sensor, all unless some are named, before the first sample."""
         self.sensor = sensor
-        running = [RunningEffect(sensor, name, seed)
-                   for name in (sensor.effects if names is None else names)]
-        self.effects = {place: [effect for effect in running
-                                if effect.place is place and not effect.is_neutral]
-                        for place in Place}
+        running = [
+            RunningEffect(sensor, name, seed)
+            for name in (sensor.effects if names is None else names)
+        ]
+        self.effects = {
+            place: [
+                effect for effect in running if effect.place is place and not effect.is_neutral
+            ]
+            for place in Place
+        }
         self._zero_g_v = sensor.nominal_zero_g_v.tolist()
         self._scale_v_per_g = sensor.nominal_scale_v_per_g.tolist()
 
     def signals(self, environment: Environment, **given: Any) -> Signals:
         """Return signals before the chain: those that are given, and what the sensor states."""
-        return Signals(environment, gravity_mps2=self.sensor.local_gravity_mps2,
-                       nominal_scale_v_per_g=self._scale_v_per_g, vref_v=self.sensor.adc_vref_v,
-                       **given)
+        return Signals(
+            environment,
+            gravity_mps2=self.sensor.local_gravity_mps2,
+            nominal_scale_v_per_g=self._scale_v_per_g,
+            vref_v=self.sensor.adc_vref_v,
+            **given,
+        )
 
     def __call__(self, place: Place, signals: Signals) -> None:
         """Set the signals that begin at a place, and apply its effects."""
@@ -127,25 +137,35 @@ class Chain:
         for place in ANALOG:
             if place >= first:
                 self(place, signals)
-        return [zero + scale * out for zero, scale, out in
-                zip(signals.zero_g_v, signals.scale_v_per_g, signals.output)]
+        return [
+            zero + scale * out
+            for zero, scale, out in zip(signals.zero_g_v, signals.scale_v_per_g, signals.output)
+        ]
 
     def put_units(self, names: Sequence[Coefficient], values: np.ndarray) -> None:
         """Give each of n sensors coefficients of its own, (n, k); the others are shared."""
         for effect in self._running():
             for parameter in {name.parameter for name in names if name.effect == effect.name}:
-                by_axis = {name.axis: values[:, k].copy() for k, name in enumerate(names)
-                           if (name.effect, name.parameter) == (effect.name, parameter)}
+                by_axis = {
+                    name.axis: values[:, k].copy()
+                    for k, name in enumerate(names)
+                    if (name.effect, name.parameter) == (effect.name, parameter)
+                }
                 shared = effect.parameters[parameter]
-                effect.parameters[parameter] = by_axis.get('', shared) if not isinstance(
-                    shared, tuple) else tuple(by_axis.get(axis, value) for axis, value in
-                                              zip(self.sensor.axes, shared))
+                effect.parameters[parameter] = (
+                    by_axis.get('', shared)
+                    if not isinstance(shared, tuple)
+                    else tuple(
+                        by_axis.get(axis, value) for axis, value in zip(self.sensor.axes, shared)
+                    )
+                )
 
     def anew(self) -> Chain:
         """Return the chain as after power-on; random generators are shared."""
         new = copy(self)
-        new.effects = {place: [copy(effect) for effect in effects]
-                       for place, effects in self.effects.items()}
+        new.effects = {
+            place: [copy(effect) for effect in effects] for place, effects in self.effects.items()
+        }
         for effect in new._running():
             effect.memory, effect.parameters = {}, dict(effect.parameters)
         return new
@@ -173,8 +193,11 @@ class Chain:
     def convert(self, signals: Signals) -> np.ndarray:
         """Run the ADC on `input_v`; return volts, (..., m)."""
         self(Place.ADC, signals)
-        coded = quantise(np.stack(signals.volts, axis=-1), self.sensor,
-                         signals.lsb_v * np.array(signals.lsb_ratio))
+        coded = quantise(
+            np.stack(signals.volts, axis=-1),
+            self.sensor,
+            signals.lsb_v * np.array(signals.lsb_ratio),
+        )
         if not self.effects[Place.CODE]:
             return coded
         signals.volts = [coded[..., d] for d in range(coded.shape[-1])]
@@ -191,7 +214,8 @@ def analog_response(sensor: Sensor) -> Callable[..., Components]:
     """Prepare `static_response` up to the input of the ADC."""
     chain = static_chain(sensor)
     return lambda force, environment=NOMINAL_ENVIRONMENT: chain.volts(
-        chain.signals(environment, force=force))
+        chain.signals(environment, force=force)
+    )
 
 
 def static_response(sensor: Sensor) -> Callable[..., Components]:
@@ -202,8 +226,9 @@ def static_response(sensor: Sensor) -> Callable[..., Components]:
     specific force and an `Environment` (nominal unless given) to volts by measured axis.
     """
     chain = static_chain(sensor)
-    return lambda force, environment=NOMINAL_ENVIRONMENT: chain.through_adc(chain.volts(
-        chain.signals(environment, force=force)))
+    return lambda force, environment=NOMINAL_ENVIRONMENT: chain.through_adc(
+        chain.volts(chain.signals(environment, force=force))
+    )
 
 
 def adc_inverse(sensor: Sensor) -> Callable[[Components], Components]:
@@ -241,15 +266,22 @@ def gravity_mps2(sensor: Sensor) -> float:
     return signals.gravity_mps2
 
 
-def jacobian(respond: Callable[..., Components], force: Components,
-             environment: Environment = NOMINAL_ENVIRONMENT) -> np.ndarray:
+def jacobian(
+    respond: Callable[..., Components],
+    force: Components,
+    environment: Environment = NOMINAL_ENVIRONMENT,
+) -> np.ndarray:
     """Differentiate the volts of `analog_response` by force: (m, 3), or (m, 3, n) for arrays."""
     columns = []
     for c in range(3):
         above, below = list(force), list(force)
         above[c], below[c] = above[c] + _DIFFERENCE_MPS2, below[c] - _DIFFERENCE_MPS2
-        columns.append([(a - b) / (2 * _DIFFERENCE_MPS2) for a, b in zip(
-            respond(above, environment), respond(below, environment))])
+        columns.append(
+            [
+                (a - b) / (2 * _DIFFERENCE_MPS2)
+                for a, b in zip(respond(above, environment), respond(below, environment))
+            ]
+        )
     return np.swapaxes(np.array(columns), 0, 1)
 
 
@@ -264,16 +296,23 @@ class Tangent:
     slope: Components
 
 
-def tangent(respond: Callable[..., Components], axes: str, force: Components,
-            environment: Environment = NOMINAL_ENVIRONMENT) -> Tangent:
+def tangent(
+    respond: Callable[..., Components],
+    axes: str,
+    force: Components,
+    environment: Environment = NOMINAL_ENVIRONMENT,
+) -> Tangent:
     """Linearise the inverse of `respond` around forces; see `jacobian` for the parameters."""
     by_force: Any = jacobian(respond, force, environment)
     if isinstance(force[0], float):
         by_force = by_force.tolist()
     measured = [AXES.index(a) for a in axes]
     back = _inverse_matrix([[row[c] for c in measured] for row in by_force])
-    slope = [] if axes != 'xy' else [-sum(b * row[2] for b, row in zip(line, by_force))
-                                     for line in back]
+    slope = (
+        []
+        if axes != 'xy'
+        else [-sum(b * row[2] for b, row in zip(line, by_force)) for line in back]
+    )
     return Tangent(back, slope)
 
 
@@ -283,8 +322,10 @@ def _inverse_matrix(a: list[Components]) -> list[Components]:
         return [[1 / a[0][0]]]
     if len(a) == 2:
         determinant = a[0][0] * a[1][1] - a[0][1] * a[1][0]
-        return [[a[1][1] / determinant, -a[0][1] / determinant],
-                [-a[1][0] / determinant, a[0][0] / determinant]]
+        return [
+            [a[1][1] / determinant, -a[0][1] / determinant],
+            [-a[1][0] / determinant, a[0][0] / determinant],
+        ]
     next_two = ((1, 2), (2, 0), (0, 1))
     minors = [[a[i][p] * a[j][q] - a[i][q] * a[j][p] for p, q in next_two] for i, j in next_two]
     determinant = sum(v * m for v, m in zip(a[0], minors[0]))
@@ -300,8 +341,9 @@ def newton_step(axes: str, gravity_mps2: float, maths: Maths) -> Callable[..., C
     """
     measured = [AXES.index(a) for a in axes]
 
-    def next_force(residual_v: Components, force: Components, tangent: Tangent, up: Value
-                   ) -> Components:
+    def next_force(
+        residual_v: Components, force: Components, tangent: Tangent, up: Value
+    ) -> Components:
         force = list(force)
         for d, row in zip(measured, tangent.back):
             for by_volt, r in zip(row, residual_v):
@@ -344,8 +386,9 @@ def inverse(sensor: Sensor, z_sign: np.ndarray | None = None) -> Callable[..., C
         force = np.full((3, count), np.nan)
         around = Environment(*(np.broadcast_to(np.asarray(e, float), count) for e in environment))
         with np.errstate(all='ignore'):
-            force[:, finite] = search(input_v[:, finite], _select(around, finite),
-                                      np.broadcast_to(up, count)[finite])
+            force[:, finite] = search(
+                input_v[:, finite], _select(around, finite), np.broadcast_to(up, count)[finite]
+            )
         return list(force) if np.ndim(volts[0]) else force[:, 0].tolist()
 
     return invert
@@ -359,8 +402,9 @@ class _Search:
         self._respond = analog_response(sensor)
         self._step = newton_step(sensor.axes, self._gravity, ARRAYS)
 
-    def __call__(self, input_v: np.ndarray, environment: Environment, signs: np.ndarray
-                 ) -> np.ndarray:
+    def __call__(
+        self, input_v: np.ndarray, environment: Environment, signs: np.ndarray
+    ) -> np.ndarray:
         """Return the forces, (3, n), of volts, (m, n); NaN where there is none."""
         # Steps with the tangent at rest cost one response each, and mostly suffice.
         at_rest = tangent(self._respond, self._axes, [np.zeros(1)] * 3)
@@ -371,17 +415,24 @@ class _Search:
             x, y, z = force
             excess = x * x + y * y + z * z - self._gravity * self._gravity
             is_solved &= (np.abs(z) > _CLEAR_Z_MPS2) & (
-                np.abs(excess) < _TOLERANCE_MPS2 * self._gravity)
+                np.abs(excess) < _TOLERANCE_MPS2 * self._gravity
+            )
         further = np.flatnonzero(~is_solved)
         if len(further):
             force[:, further], change = self._steps(
-                input_v[:, further], _select(environment, further), signs[further],
-                _MAX_ITERATIONS)
+                input_v[:, further], _select(environment, further), signs[further], _MAX_ITERATIONS
+            )
             force[:, further[~(change < _UNSOLVED_MPS2)]] = np.nan
         return force
 
-    def _steps(self, input_v: np.ndarray, environment: Environment, signs: np.ndarray, limit: int,
-               common: Tangent | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def _steps(
+        self,
+        input_v: np.ndarray,
+        environment: Environment,
+        signs: np.ndarray,
+        limit: int,
+        common: Tangent | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Take steps from no force; return the last forces, (3, n), and steps, (n,)."""
         count = input_v.shape[1]
         force, last_change = np.zeros((3, count)), np.full(count, np.inf)
@@ -390,11 +441,17 @@ class _Search:
             # Most samples need equally many steps, and a slice costs less than their numbers.
             samples = slice(None) if len(active) == count else active
             current, around = list(force[:, samples]), _select(environment, samples)
-            residual_v = [v - r for v, r in zip(input_v[:, samples],
-                                                self._respond(current, around))]
-            following = np.array(self._step(
-                residual_v, current, common or tangent(self._respond, self._axes, current, around),
-                signs[samples]))
+            residual_v = [
+                v - r for v, r in zip(input_v[:, samples], self._respond(current, around))
+            ]
+            following = np.array(
+                self._step(
+                    residual_v,
+                    current,
+                    common or tangent(self._respond, self._axes, current, around),
+                    signs[samples],
+                )
+            )
             change = np.abs(following - current).max(axis=0)
             force[:, samples], last_change[samples] = following, change
             # A converged sample stays, so that it does not depend on its neighbours; NaN and
@@ -428,5 +485,6 @@ def at_a_rail(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
     saturation.
     """
     rails_v = 0.0, sensor.adc_vref_v - sensor.lsb_v
-    return np.logical_or.reduce([np.abs(axis_v - rail_v) < sensor.lsb_v / 2
-                                 for axis_v in volts.T for rail_v in rails_v])
+    return np.logical_or.reduce(
+        [np.abs(axis_v - rail_v) < sensor.lsb_v / 2 for axis_v in volts.T for rail_v in rails_v]
+    )

@@ -91,12 +91,17 @@ class ChangeTest:
     are infinite where every drift is usual.
     """
 
-    def __init__(self, channels: int, false_alarms_per_day: float, block_s: float = 1.0,
-                 walks: Sequence[float] = (np.inf,), drifts: Sequence[float] = (np.inf,)
-                 ) -> None:
+    def __init__(
+        self,
+        channels: int,
+        false_alarms_per_day: float,
+        block_s: float = 1.0,
+        walks: Sequence[float] = (np.inf,),
+        drifts: Sequence[float] = (np.inf,),
+    ) -> None:
         self._channels, self._block_s = channels, block_s
         self._walks, self._drifts = np.array(walks), np.array(drifts)
-        comparisons = sum(_DAY_S / block_s / _stride(2 ** j) for j in range(_LENGTHS))
+        comparisons = sum(_DAY_S / block_s / _stride(2**j) for j in range(_LENGTHS))
         # Permitted probability of a false alarm in one comparison
         self._p = min(_RESERVE * false_alarms_per_day / (comparisons * channels), 0.5)
         self._size = LONGEST_BLOCKS + 1
@@ -108,7 +113,8 @@ class ChangeTest:
         self._squares, self._weights = np.zeros((2, _KINDS, _LENGTHS, channels))
         # Differences that are not learnt yet, in the order of their blocks.
         self._waiting: list[list[tuple[int, int, np.ndarray, np.ndarray]]] = [
-            [] for _ in range(_LENGTHS)]
+            [] for _ in range(_LENGTHS)
+        ]
 
     def add(self, values: np.ndarray, moves: bool) -> list[Change]:
         """Test the next block by its means, (channels,)."""
@@ -119,7 +125,7 @@ class ChangeTest:
         self._moves[place] = self._moves[last] + moves
         alarms: dict[int, int] = {}
         for j in range(_LENGTHS):
-            length = 2 ** j
+            length = 2**j
             if self._count % _stride(length) == 0 and self._count >= (1 + _BEFORE) * length:
                 for channel in self._compare(j, length):
                     alarms.setdefault(channel, length)
@@ -133,8 +139,9 @@ class ChangeTest:
         """Compare one length, and learn; return the channels that have changed."""
         begin = self._count - (1 + _BEFORE) * length
         now, middle, first = (k % self._size for k in (self._count, self._count - length, begin))
-        difference = (self._sums[now] - self._sums[middle]) / length \
-            - (self._sums[middle] - self._sums[first]) / (_BEFORE * length)
+        difference = (self._sums[now] - self._sums[middle]) / length - (
+            self._sums[middle] - self._sums[first]
+        ) / (_BEFORE * length)
         kind = int(self._moves[now] > self._moves[first])
         valid = self._since <= begin
         self._learn(j, length)
@@ -153,7 +160,7 @@ class ChangeTest:
     def _usual(self, kind: int, j: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the usual size of a difference by series, and the limit of Student's t."""
         weights = self._weights[kind, j]
-        freedom = (weights * _stride(2 ** j) / (_INDEPENDENT * 2 ** j)).astype(int)
+        freedom = (weights * _stride(2**j) / (_INDEPENDENT * 2**j)).astype(int)
         std = np.sqrt(self._squares[kind, j] / np.maximum(weights, 1.0))
         limit = -scipy.special.stdtrit(freedom.clip(_FEWEST, _MOST), self._p / 2)
         return np.maximum(std, _SMALLEST), np.where(freedom < _FEWEST, _NEVER, limit)
@@ -165,7 +172,7 @@ class ChangeTest:
         while waiting and waiting[0][0] <= self._count - (1 + _BEFORE) * length:
             _, kind, difference, usable = waiting.pop(0)
             kept = np.where(usable, 1 - 1 / memory, 1.0)
-            self._squares[kind, j] = self._squares[kind, j] * kept + usable * difference ** 2
+            self._squares[kind, j] = self._squares[kind, j] * kept + usable * difference**2
             self._weights[kind, j] = self._weights[kind, j] * kept + usable
 
     def _located(self, channel: int, length: int) -> Change:
@@ -176,7 +183,7 @@ class ChangeTest:
         total = len(sums) - 1
         before = np.arange(1, total)
         change = (sums[-1] - sums[1:-1]) / (total - before) - sums[1:-1] / before
-        best = int(np.argmax(change ** 2 * before * (total - before)))
+        best = int(np.argmax(change**2 * before * (total - before)))
         self._begin_again(np.array([channel]), begin + int(before[best]))
         # After a change of the gain, the residual of motion has another usual size.
         self._squares[:, :, channel] = self._weights[:, :, channel] = 0.0
@@ -191,7 +198,7 @@ class ChangeTest:
 
 
 NAME = 'changes.jsonl'  # Name of the file
-_FIRST_UTC_NS = 10 ** 18
+_FIRST_UTC_NS = 10**18
 """Earliest stamp that is UTC, ns: September 2001. Chosen: a simulator begins at 0."""
 _NICENESS = 15  # Niceness of the process; chosen: every node of the robot has priority
 _BUDGET_S = 300.0  # Longest time of a diagnosis, s; chosen: ten times that of ten minutes at 1 kHz
@@ -229,24 +236,33 @@ def iso_time(stamp_ns: int) -> str:
     """Return a stamp, ns, as UTC to the second, such as 2026-11-23T05:00:00Z; else in seconds."""
     if stamp_ns < _FIRST_UTC_NS:
         return f'{stamp_ns * 1e-9:.0f} s'
-    return datetime.fromtimestamp(stamp_ns // 10 ** 9, timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
+    return datetime.fromtimestamp(stamp_ns // 10**9, timezone.utc).strftime('%Y-%m-%dT%H:%M:%SZ')
 
 
 def append(folder: Path, change: GapChange, serial: str) -> None:
     """Append a change to the record of a folder."""
     unit = 'mg' if change.quantity == 'mean' else 'ratio'
-    line = json.dumps({
-        'serial': serial, 'axis': change.axis, 'quantity': change.quantity,
-        'size': round(change.size, 6), 'unit': unit, 'since': iso_time(change.since_ns),
-        'since_ns': change.since_ns, 'detected_ns': change.detected_ns})
+    line = json.dumps(
+        {
+            'serial': serial,
+            'axis': change.axis,
+            'quantity': change.quantity,
+            'size': round(change.size, 6),
+            'unit': unit,
+            'since': iso_time(change.since_ns),
+            'since_ns': change.since_ns,
+            'detected_ns': change.detected_ns,
+        }
+    )
     path = folder / NAME
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with open(path, 'a+b', buffering=0) as file:
             append_line(file, line)
     except OSError as error:
-        raise UserError(f'{path}: cannot write: {error.strerror}; set output to a folder that '
-                        'can be written') from None
+        raise UserError(
+            f'{path}: cannot write: {error.strerror}; set output to a folder that can be written'
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -286,6 +302,7 @@ class DiagnosisRun:
 def _diagnose(folder: Path, given: DiagnosisInput) -> DiagnosisResult:
     """Diagnose; write the samples, the baseline, and the files of the diagnosis."""
     from adxl_ros.api.gap import diagnose  # the node itself needs none
+
     os.nice(_NICENESS)
     folder.mkdir(parents=True, exist_ok=True)
     samples = replace(given.recording, path=str(folder / 'recording.csv'))
@@ -295,8 +312,12 @@ def _diagnose(folder: Path, given: DiagnosisInput) -> DiagnosisResult:
     ideal = None
     if given.force is not None:
         time_s, force_mps2 = given.force
-        ideal = Recording(str(folder / 'reference.csv'), time_s, dict(zip(ACCEL, force_mps2.T)),
-                          epoch_ns=samples.epoch_ns)
+        ideal = Recording(
+            str(folder / 'reference.csv'),
+            time_s,
+            dict(zip(ACCEL, force_mps2.T)),
+            epoch_ns=samples.epoch_ns,
+        )
         recording.write(ideal.path, ideal, given.sensor)
     gap = diagnose(samples, given.sensor, sim=ideal).with_params(str(baseline))
     page, *_ = gap.save(folder, gap.command(folder / 'again'))

@@ -106,18 +106,26 @@ class LiveGap:
         self.obstacle = 'no samples yet'  # Why the newest second was not compared; empty if it was
         self.changes: list[GapChange] = []  # Changes so far, the newest last
         self._blocks: deque[Block] = deque(
-            maxlen=max(round(settings.window_s * 1e9 / BLOCK_NS), _FEWEST_BLOCKS))
+            maxlen=max(round(settings.window_s * 1e9 / BLOCK_NS), _FEWEST_BLOCKS)
+        )
         self._ends_ns: deque[int] = deque(maxlen=LONGEST_BLOCKS + 1)
         # Random walk of a healthy unit, or of its file if that is larger: that of a file goes on.
         healthy_g = effect_named('bias_walk').diagnosis.healthy_density
-        walk_g = float(np.max(sensor.values.get('bias_walk', {}).get('density_g_per_rts', ()),
-                              initial=healthy_g))
-        drift_g = healthy_g * _HEALTHY_S ** 0.5 if walk_g == healthy_g else np.inf
+        walk_g = float(
+            np.max(
+                sensor.values.get('bias_walk', {}).get('density_g_per_rts', ()), initial=healthy_g
+            )
+        )
+        drift_g = healthy_g * _HEALTHY_S**0.5 if walk_g == healthy_g else np.inf
         count = len(sensor.axes)
         any_noise = (np.inf,) * count
-        self._test = ChangeTest(2 * count, settings.false_alarms_per_day, BLOCK_NS * 1e-9,
-                                (G0_MPS2 * walk_g,) * count + any_noise,
-                                (G0_MPS2 * drift_g,) * count + any_noise)
+        self._test = ChangeTest(
+            2 * count,
+            settings.false_alarms_per_day,
+            BLOCK_NS * 1e-9,
+            (G0_MPS2 * walk_g,) * count + any_noise,
+            (G0_MPS2 * drift_g,) * count + any_noise,
+        )
         self._changed_ns: dict[str, int] = {}
         self._prediction = reference_stream.Prediction(sensor, self.reference)
         self.left_out = self._prediction.left_out  # Effects that the reference cannot drive
@@ -131,7 +139,7 @@ class LiveGap:
 
     def add_samples(self, stamp_ns: np.ndarray, accel_mps2: np.ndarray) -> None:
         """Add stamps, ns, (n,), and specific force by nominal conversion, m/s², (n, m or more)."""
-        accel_mps2 = accel_mps2[:, :len(self.sensor.axes)]
+        accel_mps2 = accel_mps2[:, : len(self.sensor.axes)]
         finite = np.isfinite(accel_mps2).all(axis=1)
         self.counts['samples'] += len(stamp_ns)
         self.counts['dropped'] += int((~finite).sum())
@@ -164,8 +172,11 @@ class LiveGap:
     def report(self) -> tuple[AxisGap, ...]:
         """Return the gap of each axis over the window; nothing before the first seconds."""
         blocks = list(self._blocks)
-        return tuple(self._axis_gap(d, axis, blocks) for d, axis in enumerate(self.sensor.axes)
-                     if len(blocks) >= _FEWEST_BLOCKS)
+        return tuple(
+            self._axis_gap(d, axis, blocks)
+            for d, axis in enumerate(self.sensor.axes)
+            if len(blocks) >= _FEWEST_BLOCKS
+        )
 
     def diagnosis_input(self, begin_ns: int = 0) -> DiagnosisInput:
         """Return what there is since a stamp, ns, of at most the history, for a diagnosis."""
@@ -176,8 +187,10 @@ class LiveGap:
         columns = dict(zip(ACCEL, accel_mps2.T))
         around, force = (begin_ns - BLOCK_NS, newest_ns + BLOCK_NS), None
         at_ns, readings = self.reference.readings.between(*around)
-        tracks = {name: (at_ns, values, LONGEST_MOVE_NS)
-                  for name, values in zip(JOINTS.values(), readings.T)}
+        tracks = {
+            name: (at_ns, values, LONGEST_MOVE_NS)
+            for name, values in zip(JOINTS.values(), readings.T)
+        }
         if self.reference.kind is not ReferenceKind.STAGE:
             tracks, force = {}, ((at_ns - origin_ns) * 1e-9, readings)
         for name, buffer in self.reference.surroundings.items():
@@ -187,9 +200,16 @@ class LiveGap:
         for name, track in tracks.items():
             # Unknown where no reading is near.
             columns[name] = Track('the reference', *track).interpolate(stamps_ns)
-        return DiagnosisInput(Recording(
-            'the running stream', (stamps_ns - origin_ns) * 1e-9, columns,
-            sensor_info(self.sensor)), self.sensor, force)
+        return DiagnosisInput(
+            Recording(
+                'the running stream',
+                (stamps_ns - origin_ns) * 1e-9,
+                columns,
+                sensor_info(self.sensor),
+            ),
+            self.sensor,
+            force,
+        )
 
     def span_s(self, begin_ns: int = 0) -> float:
         """Return the time of the samples since a stamp, ns, that are kept, s."""
@@ -227,8 +247,12 @@ class LiveGap:
         waits = newest_ns - end_ns < _LATE_NS
         if not waits or reference_ns is None:
             away_s = ((reference_ns or 0) - newest_ns) * 1e-9
-            self.obstacle = 'no reference has come' if reference_ns is None else \
-                f'the reference is {-away_s:.1f} s behind the samples: it is late, or has stopped'
+            self.obstacle = (
+                'no reference has come'
+                if reference_ns is None
+                else f'the reference is {-away_s:.1f} s behind the samples: it is '
+                f'late, or has stopped'
+            )
         return waits
 
     def _compared(self, begin_ns: int, end_ns: int) -> Block | None:
@@ -263,14 +287,21 @@ class LiveGap:
                 continue
             self._changed_ns[axis] = block.end_ns + round(self._settings.wait_s * 1e9)
             begun = max(len(self._ends_ns) - 1 - change.blocks, 0)
-            changes.append(GapChange(
-                axis, 'noise' if quantity else 'mean', self._ends_ns[begun], block.end_ns,
-                float(np.exp(change.size)) if quantity else change.size / _MG))
+            changes.append(
+                GapChange(
+                    axis,
+                    'noise' if quantity else 'mean',
+                    self._ends_ns[begun],
+                    block.end_ns,
+                    float(np.exp(change.size)) if quantity else change.size / _MG,
+                )
+            )
         self.changes = (self.changes + changes)[-_MOST_CHANGES:]
         return changes
 
     def _axis_gap(self, d: int, axis: str, blocks: list[Block]) -> AxisGap:
         """Return the gap of one axis."""
+
         def of_blocks(name: str) -> np.ndarray:
             return np.array([getattr(block, name)[d] for block in blocks])
 
@@ -286,10 +317,12 @@ class LiveGap:
         datasheet = _rms_interval(of_blocks('datasheet_square')).value
         explained = None
         if datasheet > _EXPLAINED_LEAST * floor.value:
-            explained = float(np.clip((datasheet ** 2 - gap.value ** 2) / (
-                datasheet ** 2 - floor.value ** 2), 0.0, 1.0))
-        return AxisGap(axis, gap, floor, source, float(of_blocks('mean_mps2').mean()) / _MG,
-                       explained)
+            explained = float(
+                np.clip((datasheet**2 - gap.value**2) / (datasheet**2 - floor.value**2), 0.0, 1.0)
+            )
+        return AxisGap(
+            axis, gap, floor, source, float(of_blocks('mean_mps2').mean()) / _MG, explained
+        )
 
 
 def _steps_ns(newest_ns: int | None, stamp_ns: np.ndarray) -> np.ndarray:
@@ -301,7 +334,10 @@ def _rms_interval(squares: np.ndarray) -> Interval:
     """Return the rms, mg, of the mean squares of blocks, (m/s²)², (n,), with its interval."""
     batches = [part.mean() for part in np.array_split(squares, min(_BATCHES, len(squares)))]
     mean = float(squares.mean())
-    half = float(scipy.special.stdtrit(len(batches) - 1, 0.5 + _CONFIDENCE / 2)
-                 * np.std(batches, ddof=1) / np.sqrt(len(batches)))
+    half = float(
+        scipy.special.stdtrit(len(batches) - 1, 0.5 + _CONFIDENCE / 2)
+        * np.std(batches, ddof=1)
+        / np.sqrt(len(batches))
+    )
     value, low, high = np.sqrt(np.maximum([mean, mean - half, mean + half], 0.0)) / _MG
     return Interval(float(value), float(low), float(high))

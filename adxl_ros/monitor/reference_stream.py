@@ -87,8 +87,9 @@ class StreamBuffer:
         if len(stamp_ns):
             self._pieces.append((stamp_ns, rows))
             self._rows += len(stamp_ns)
-            while self._pieces[0][0][-1] < stamp_ns[-1] - self._span_ns \
-                    or self._rows > max(_MOST_ROWS, len(stamp_ns)):
+            while self._pieces[0][0][-1] < stamp_ns[-1] - self._span_ns or self._rows > max(
+                _MOST_ROWS, len(stamp_ns)
+            ):
                 self._rows -= len(self._pieces.popleft()[0])
         return stamp_ns
 
@@ -131,8 +132,9 @@ class ReferenceStream:
         self._paths: list[Path] = [Held(), Held(), Held()]
         self._force: ForcePath
 
-    def add_joints(self, stamps_ns: Sequence[int], positions: Sequence[Mapping[str, float]]
-                   ) -> None:
+    def add_joints(
+        self, stamps_ns: Sequence[int], positions: Sequence[Mapping[str, float]]
+    ) -> None:
         """Add messages of the stage; a joint that one does not name is where it was before."""
         rows = []
         for position in positions:
@@ -153,12 +155,21 @@ class ReferenceStream:
         """Return the motion whose time begins at a stamp, ns; it follows the prepared blocks."""
         self._origin_ns = origin_ns
         alpha, beta, shift = (partial(self._joint, number) for number in range(len(JOINTS)))
-        motion = Motion(np.inf, alpha, beta, shift, partial(self._surrounding, 'temperature_c'),
-                        partial(self._surrounding, 'supply_v'))
+        motion = Motion(
+            np.inf,
+            alpha,
+            beta,
+            shift,
+            partial(self._surrounding, 'temperature_c'),
+            partial(self._surrounding, 'supply_v'),
+        )
         if self.kind is ReferenceKind.STAGE:
             return motion
-        return replace(motion, force=lambda time_s: self._force(time_s),
-                       internal_rate_hz=max(INTERNAL_RATE_HZ, self._sensor.rate_hz))
+        return replace(
+            motion,
+            force=lambda time_s: self._force(time_s),
+            internal_rate_hz=max(INTERNAL_RATE_HZ, self._sensor.rate_hz),
+        )
 
     def prepare(self, begin_ns: int, end_ns: int) -> BlockMotion | None:
         """Make the paths of a block."""
@@ -173,17 +184,25 @@ class ReferenceStream:
             self._force = ForcePath(time_s, readings)
             return bool((changes > _STILL_MPS2).any()), self.error_mps2
         step_rad = self._sensor.stage_resolution_rad
-        self._paths = [SmoothedPath(time_s, values, step)
-                       for values, step in zip(readings.T, (step_rad, step_rad, 0.0))]
+        self._paths = [
+            SmoothedPath(time_s, values, step)
+            for values, step in zip(readings.T, (step_rad, step_rad, 0.0))
+        ]
         largest = max(_STILL_STEPS * step_rad, _STILL_RAD)
         time_s = (np.linspace(begin_ns, end_ns, 3) - self._origin_ns) * 1e-9
         alpha, beta = (path(time_s) for path in self._paths[:2])
-        stds = [errors.std if isinstance(path, SmoothedPath) and (errors := path.errors(time_s))
-                else 0.0 for path in self._paths[:2]]
-        squares = np.sum([(slope * std) ** 2 for slope, std in zip(
-            gravity_slopes(alpha, beta), stds)], axis=0)
-        return bool((changes > largest).any()), \
-            self._sensor.local_gravity_mps2 * np.sqrt(squares.mean(axis=1))
+        stds = [
+            errors.std
+            if isinstance(path, SmoothedPath) and (errors := path.errors(time_s))
+            else 0.0
+            for path in self._paths[:2]
+        ]
+        squares = np.sum(
+            [(slope * std) ** 2 for slope, std in zip(gravity_slopes(alpha, beta), stds)], axis=0
+        )
+        return bool((changes > largest).any()), self._sensor.local_gravity_mps2 * np.sqrt(
+            squares.mean(axis=1)
+        )
 
     def _joint(self, number: int, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         return self._paths[number](time_s, order)
@@ -196,7 +215,8 @@ class ReferenceStream:
         at_ns = self._origin_ns + time_s * 1e9
         stamps_ns, values = buffer.between(
             min(int(at_ns[0]) - _SURROUNDINGS_NS, buffer.newest_ns),
-            max(int(at_ns[-1]) + _SURROUNDINGS_NS, buffer.newest_ns + 1))
+            max(int(at_ns[-1]) + _SURROUNDINGS_NS, buffer.newest_ns + 1),
+        )
         return np.interp(at_ns, stamps_ns, values[:, 0])
 
 
@@ -210,9 +230,11 @@ class RobotForce:
 
     def add(self, stamps_ns: Sequence[int], positions: Sequence[Mapping[str, float]]) -> None:
         """Add messages; those that do not name all joints of the robot are another device's."""
-        named = [(stamp_ns, [position[joint] for joint in self._robot.joints])
-                 for stamp_ns, position in zip(stamps_ns, positions)
-                 if set(self._robot.joints) <= set(position)]
+        named = [
+            (stamp_ns, [position[joint] for joint in self._robot.joints])
+            for stamp_ns, position in zip(stamps_ns, positions)
+            if set(self._robot.joints) <= set(position)
+        ]
         if named:
             stamp_ns, rows = zip(*named)
             _add_finite(self._joints, np.array(stamp_ns), np.array(rows), _LONGEST_GAP_NS)
@@ -223,24 +245,33 @@ class RobotForce:
         if newest_ns is None:
             return
         stamp_ns, rows = self._joints.between(newest_ns - _HISTORY_NS, newest_ns + 1)
-        begin_ns = max(self._given_ns if self._given_ns < newest_ns else 0,
-                       int(stamp_ns[0]) + _MARGIN_NS)
+        begin_ns = max(
+            self._given_ns if self._given_ns < newest_ns else 0, int(stamp_ns[0]) + _MARGIN_NS
+        )
         at_ns = _GRID_NS * np.arange(
-            -(-begin_ns // _GRID_NS), (newest_ns - _MARGIN_NS) // _GRID_NS)
+            -(-begin_ns // _GRID_NS), (newest_ns - _MARGIN_NS) // _GRID_NS
+        )
         if len(at_ns) * _GRID_NS < _ROBOT_NS:
             return
         time_s = (stamp_ns - begin_ns) * 1e-9
-        path = RobotPath(self._robot, Readings('the robot', {
-            name: (time_s, values) for name, values in zip(self._robot.joints, rows.T)}),
-            self._gravity_mps2, since_s=-0.1)
+        path = RobotPath(
+            self._robot,
+            Readings(
+                'the robot',
+                {name: (time_s, values) for name, values in zip(self._robot.joints, rows.T)},
+            ),
+            self._gravity_mps2,
+            since_s=-0.1,
+        )
         inside = (path.time_s > 0) & (path.time_s < time_s[-1] - 1e-9 * _MARGIN_NS)
         self._given_ns = int(at_ns[-1]) + _GRID_NS
         reference.error_mps2 = np.sqrt(np.mean(path.error_mps2[inside] ** 2, axis=0))
         reference.add_readings(at_ns, np.column_stack(path((at_ns - begin_ns) * 1e-9)))
 
 
-def _add_finite(buffer: StreamBuffer, stamp_ns: np.ndarray, rows: np.ndarray, longest_ns: int
-                ) -> None:
+def _add_finite(
+    buffer: StreamBuffer, stamp_ns: np.ndarray, rows: np.ndarray, longest_ns: int
+) -> None:
     """Add the finite rows; stamps that jump back by more than a time begin a new stream."""
     finite = np.isfinite(rows).all(axis=1)
     stamp_ns, newest_ns = stamp_ns[finite], buffer.newest_ns
@@ -273,12 +304,19 @@ class Prediction:
 
     def __init__(self, sensor: Sensor, reference: ReferenceStream) -> None:
         # Effects that need the angles of a stage, which the reference has not
-        self.left_out = () if reference.kind is ReferenceKind.STAGE else tuple(
-            name for name in sensor.effects if effect_named(name).concern is Concern.STAGE)
+        self.left_out = (
+            ()
+            if reference.kind is ReferenceKind.STAGE
+            else tuple(
+                name for name in sensor.effects if effect_named(name).concern is Concern.STAGE
+            )
+        )
         effects = tuple(name for name in sensor.effects if name not in self.left_out)
         self._sensor, self._reference, self._origin_ns = sensor, reference, 0
-        self._sensors = [noiseless(replace(sensor, effects=effects)),
-                         noiseless(replace(sensor, effects=(), values={}))]
+        self._sensors = [
+            noiseless(replace(sensor, effects=effects)),
+            noiseless(replace(sensor, effects=(), values={})),
+        ]
         self._responses: list[Response] = []
 
     def restart(self) -> None:
@@ -291,8 +329,9 @@ class Prediction:
             self._origin_ns, self._motion = begin_ns, self._reference.motion(begin_ns)
         return self._reference.prepare(begin_ns, end_ns)
 
-    def block(self, stamp_ns: np.ndarray, accel_mps2: np.ndarray, motion: BlockMotion,
-              end_ns: int) -> Block | None:
+    def block(
+        self, stamp_ns: np.ndarray, accel_mps2: np.ndarray, motion: BlockMotion, end_ns: int
+    ) -> Block | None:
         """
         Compare the samples of one prepared block; None for the first, in which filters settle.
 
@@ -302,22 +341,31 @@ class Prediction:
         if is_first:
             self._responses = [Response(sensor, self._motion, 0) for sensor in self._sensors]
         time_s = (stamp_ns - self._origin_ns) * 1e-9
-        modelled, datasheet = (accel_mps2 - to_nominal_mps2(respond(time_s), self._sensor)
-                               for respond in self._responses)
+        modelled, datasheet = (
+            accel_mps2 - to_nominal_mps2(respond(time_s), self._sensor)
+            for respond in self._responses
+        )
         if is_first:
             return None
         mean_mps2, (moves, error_mps2) = scipy.stats.trim_mean(modelled, _TRIMMED, axis=0), motion
-        independent = float(noise.effective_samples(
-            len(stamp_ns), 1 / self._sensor.rate_hz, self._sensor.rc_s))
+        independent = float(
+            noise.effective_samples(len(stamp_ns), 1 / self._sensor.rate_hz, self._sensor.rc_s)
+        )
         freedom = max(1 - 1 / max(independent, 1.0), 0.5)
         return Block(
-            end_ns, mean_mps2, (modelled ** 2).mean(axis=0),
-            modelled.var(axis=0) / freedom + _SMALLEST_MPS2 ** 2, _log_noise(modelled),
-            (datasheet ** 2).mean(axis=0), error_mps2[:len(mean_mps2)] ** 2, moves)
+            end_ns,
+            mean_mps2,
+            (modelled**2).mean(axis=0),
+            modelled.var(axis=0) / freedom + _SMALLEST_MPS2**2,
+            _log_noise(modelled),
+            (datasheet**2).mean(axis=0),
+            error_mps2[: len(mean_mps2)] ** 2,
+            moves,
+        )
 
 
 def _log_noise(residual: np.ndarray) -> np.ndarray:
     """Return the log of the median standard deviation of parts of columns, (n, m), (m,)."""
     parts = np.array_split(residual, max(min(_PARTS, len(residual) // _FEWEST_OF_PART), 1))
     variances = np.median([part.var(axis=0) for part in parts], axis=0)
-    return np.asarray(0.5 * np.log(variances + _SMALLEST_MPS2 ** 2))
+    return np.asarray(0.5 * np.log(variances + _SMALLEST_MPS2**2))

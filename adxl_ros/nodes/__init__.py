@@ -13,5 +13,7 @@ try:
     import rclpy  # noqa: F401
     import sensor_msgs.msg  # noqa: F401
 except ImportError as error:
-    raise SystemExit(f'{Path(sys.argv[0]).name}: the nodes need ROS 2, but {error}; source its '
-                     'setup.bash, or start the node by ./run') from None
+    raise SystemExit(
+        f'{Path(sys.argv[0]).name}: the nodes need ROS 2, but {error}; source its '
+        'setup.bash, or start the node by ./run'
+    ) from None

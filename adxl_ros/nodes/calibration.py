@@ -44,47 +44,103 @@ from std_srvs.srv import Trigger
 class CalibrationSettings:
     """The guided calibration."""
 
-    mode: str = parameter('stage', 'what the reference is',
-                          choices=('stage', 'gravity', 'thermal'))
+    mode: str = parameter(
+        'stage', 'what the reference is', choices=('stage', 'gravity', 'thermal')
+    )
     autostart: bool = parameter(False, 'start without a call of ~/start')
-    resume: str = parameter('ask', 'go on with an interrupted calibration; without a screen, ask '
-                            'is continue', choices=('ask', 'continue', 'anew'))
-    exit_when_done: bool = parameter(False, 'end the node after a calibration: status 0 where it '
-                                     'wrote its file, else 1')
+    resume: str = parameter(
+        'ask',
+        'go on with an interrupted calibration; without a screen, ask is continue',
+        choices=('ask', 'continue', 'anew'),
+    )
+    exit_when_done: bool = parameter(
+        False, 'end the node after a calibration: status 0 where it wrote its file, else 1'
+    )
     screen: bool = parameter(True, 'show a screen, where the node runs in a terminal')
     output: str = parameter('calibration.yaml', 'parameter file to write')
     journal: str = parameter('', 'file of accepted poses; empty: beside the output')
     report: str = parameter('', 'directory for the report; empty: none')
-    store: str = parameter(str(calibration_store.default_folder()), 'folder of calibrations that '
-                           'gets a copy; empty: none')
+    store: str = parameter(
+        str(calibration_store.default_folder()),
+        'folder of calibrations that gets a copy; empty: none',
+    )
     dwell_s: float = parameter(5.0, 'time at rest a pose', 's', 0.5, 3600.0, name='sweep.dwell_s')
     # A stage of 5 arcmin arrives within this default.
-    tolerance_rad: float = parameter(float(np.radians(0.2)), 'arrived within this', 'rad', 1e-6,
-                                     0.2, name='stage.tolerance_rad')
-    timeout_s: float = parameter(60.0, 'time after which a pose is late', 's', 1.0, 86400.0,
-                                 name='stage.timeout_s')
-    stage_mode: str = parameter('commanded', 'commanded turns itself, the others by hand',
-                                name='stage.mode', choices=('commanded', 'encoder', 'manual'))
+    tolerance_rad: float = parameter(
+        float(np.radians(0.2)), 'arrived within this', 'rad', 1e-6, 0.2, name='stage.tolerance_rad'
+    )
+    timeout_s: float = parameter(
+        60.0, 'time after which a pose is late', 's', 1.0, 86400.0, name='stage.timeout_s'
+    )
+    stage_mode: str = parameter(
+        'commanded',
+        'commanded turns itself, the others by hand',
+        name='stage.mode',
+        choices=('commanded', 'encoder', 'manual'),
+    )
     samples_unit: str = sample_unit()
-    near_deg: float = parameter(2.0, 'a stage turned by hand is captured within this of the pose',
-                                'deg', 0.01, 30.0, name='stage.near_deg')
-    temperature_span_c: float = parameter(3.0, 'largest temperature change since the first pose',
-                                          'degC', 0.1, 1000.0, name='sweep.temperature_span_c')
-    plan: str = parameter('auto', 'full (planes, 25 minutes), quick (about 38 poses), or auto: '
-                          'quick where a stage is turned by hand without planes',
-                          name='sweep.plan', choices=('auto', 'full', 'quick'))
-    planes_deg: Any = parameter((), 'planes alpha of the plan full; empty: 30 to 150, or 0 to 180 '
-                                'for a sensor with a z axis', 'deg', name='sweep.planes_deg')
-    step_deg: float = parameter(30.0, 'step of beta of the plan full', 'deg', 0.5, 90.0,
-                                name='sweep.step_deg')
-    check_poses: int = parameter(-1, 'poses kept out of the fit for the verdict; -1: 16, or 8 in '
-                                 'the plan quick', '', -1, 1000, name='sweep.check_poses')
-    tilt_error_deg: float = parameter(0.1, 'rms tilt error that the plan quick is to reach', 'deg',
-                                      1e-3, 10.0, name='sweep.tilt_error_deg')
-    range_c: Any = parameter((), 'lowest and highest temperature that mode thermal is to cover; '
-                             'empty: 0 to 50', 'degC', name='thermal.range_c')
-    block_s: float = parameter(10.0, 'length of a block of samples in mode thermal', 's', 0.5,
-                               600.0, name='thermal.block_s')
+    near_deg: float = parameter(
+        2.0,
+        'a stage turned by hand is captured within this of the pose',
+        'deg',
+        0.01,
+        30.0,
+        name='stage.near_deg',
+    )
+    temperature_span_c: float = parameter(
+        3.0,
+        'largest temperature change since the first pose',
+        'degC',
+        0.1,
+        1000.0,
+        name='sweep.temperature_span_c',
+    )
+    plan: str = parameter(
+        'auto',
+        'full (planes, 25 minutes), quick (about 38 poses), or auto: '
+        'quick where a stage is turned by hand without planes',
+        name='sweep.plan',
+        choices=('auto', 'full', 'quick'),
+    )
+    planes_deg: Any = parameter(
+        (),
+        'planes alpha of the plan full; empty: 30 to 150, or 0 to 180 for a sensor with a z axis',
+        'deg',
+        name='sweep.planes_deg',
+    )
+    step_deg: float = parameter(
+        30.0, 'step of beta of the plan full', 'deg', 0.5, 90.0, name='sweep.step_deg'
+    )
+    check_poses: int = parameter(
+        -1,
+        'poses kept out of the fit for the verdict; -1: 16, or 8 in the plan quick',
+        '',
+        -1,
+        1000,
+        name='sweep.check_poses',
+    )
+    tilt_error_deg: float = parameter(
+        0.1,
+        'rms tilt error that the plan quick is to reach',
+        'deg',
+        1e-3,
+        10.0,
+        name='sweep.tilt_error_deg',
+    )
+    range_c: Any = parameter(
+        (),
+        'lowest and highest temperature that mode thermal is to cover; empty: 0 to 50',
+        'degC',
+        name='thermal.range_c',
+    )
+    block_s: float = parameter(
+        10.0,
+        'length of a block of samples in mode thermal',
+        's',
+        0.5,
+        600.0,
+        name='thermal.block_s',
+    )
 
 
 _SCREEN_END_S = 5.0  # Longest wait for the end of the screen, s; chosen: far above its usual end
@@ -116,9 +172,17 @@ class OwnScreen:
         self._saved = termios.tcgetattr(sys.stdin.fileno())
         # Ctrl-C during the start is for the node. The screen inherits the mask.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        self.process = subprocess.Popen([
-            sys.executable, executable('screen'), '--ros-args', '-p', f'node:={node_name}', '-p',
-            f'node_pid:={os.getpid()}'])
+        self.process = subprocess.Popen(
+            [
+                sys.executable,
+                executable('screen'),
+                '--ros-args',
+                '-p',
+                f'node:={node_name}',
+                '-p',
+                f'node_pid:={os.getpid()}',
+            ]
+        )
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         self._output = ExitStack()
         self._output.enter_context(held_output())
@@ -155,8 +219,11 @@ class Announcer:
 
     def __init__(self, node: Node, has_stage: bool) -> None:
         self._node = node
-        self._command = create_publisher(node, JointState, 'stage/command', _COMMAND_QUEUE) \
-            if has_stage else None
+        self._command = (
+            create_publisher(node, JointState, 'stage/command', _COMMAND_QUEUE)
+            if has_stage
+            else None
+        )
         self._next = create_publisher(node, DiagnosticStatus, '~/next_pose', 1, latched=True)
         self._announced, self._commanded_ns = '', 0
 
@@ -167,13 +234,17 @@ class Announcer:
             self._publish(pose.text, pose.values)
             self._announced, self._commanded_ns = pose.text, 0
         now_ns = STEADY.now().nanoseconds
-        if self._command and pose.command_rad is not None \
-                and now_ns - self._commanded_ns >= _REPEAT_NS:
+        if (
+            self._command
+            and pose.command_rad is not None
+            and now_ns - self._commanded_ns >= _REPEAT_NS
+        ):
             self._commanded_ns = now_ns
             command = JointState(name=['alpha', 'beta'], position=list(pose.command_rad))
             # The clock of a simulation may lag behind samples that have come.
             command.header.stamp = topics.stamp(
-                max(self._node.get_clock().now().nanoseconds, pose.newest_ns))
+                max(self._node.get_clock().now().nanoseconds, pose.newest_ns)
+            )
             self._command.publish(command)
 
     def withdraw(self, reason: str) -> None:
@@ -190,15 +261,24 @@ _PERIOD_S = 0.2
 """Time between two messages, s; chosen: the eye follows it, and it costs no samples."""
 
 _ABORT = KeyAction('a', 'abort', 'abort')
-_RUNNING = (KeyAction('r', 'redo', 'redo'), KeyAction('s', 'skip', 'skip'),
-            KeyAction('f', 'finish', 'finish'), _ABORT)
+_RUNNING = (
+    KeyAction('r', 'redo', 'redo'),
+    KeyAction('s', 'skip', 'skip'),
+    KeyAction('f', 'finish', 'finish'),
+    _ABORT,
+)
 """Keys while a session runs."""
 _BY_HAND = (KeyAction('c', 'capture', 'capture'), *_RUNNING)
 """Keys while a session runs whose poses an operator captures."""
-_KEYS = {ControllerState.IDLE: (KeyAction('b', 'begin', 'start'),),
-         ControllerState.WAITING_FOR_SENSOR: (_ABORT,),
-         ControllerState.ASKING: (KeyAction('y', 'go on', 'resume'),
-                                  KeyAction('n', 'begin again', 'start_over'), _ABORT)}
+_KEYS = {
+    ControllerState.IDLE: (KeyAction('b', 'begin', 'start'),),
+    ControllerState.WAITING_FOR_SENSOR: (_ABORT,),
+    ControllerState.ASKING: (
+        KeyAction('y', 'go on', 'resume'),
+        KeyAction('n', 'begin again', 'start_over'),
+        _ABORT,
+    ),
+}
 """Keys while no session runs, by the state."""
 
 
@@ -212,8 +292,11 @@ class DisplayPublisher:
 
     def __init__(self, node: Node, controller: Controller, starts_screen: bool) -> None:
         self._node, self._controller = node, controller
-        self._own_screen = open_screen(node.get_fully_qualified_name(), node.get_logger().info) \
-            if starts_screen else None
+        self._own_screen = (
+            open_screen(node.get_fully_qualified_name(), node.get_logger().info)
+            if starts_screen
+            else None
+        )
         controller.may_ask = self._own_screen is not None
         self._publisher = create_publisher(node, String, '~/display', 1, latched=True)
         node.create_timer(_PERIOD_S, self.update, clock=STEADY)
@@ -225,7 +308,8 @@ class DisplayPublisher:
             self.close()
             self._node.get_logger().warning('the screen has ended; plain lines from here on')
         controller.may_ask = self._own_screen is not None or bool(
-            self._node.count_clients('~/resume'))
+            self._node.count_clients('~/resume')
+        )
         if controller.state is ControllerState.ASKING and not controller.may_ask:
             controller.start(start_over=False)
         controller.shows_idle_stream = bool(self._publisher.get_subscription_count())
@@ -246,18 +330,32 @@ class DisplayPublisher:
     def _publish(self, phase: Phase, text: str) -> None:
         controller, stream = self._controller, self._controller.stream
         unit, session, newest = stream.unit, controller.session, stream.newest
-        keys = () if phase is Phase.FIT else _KEYS.get(
-            controller.state, _BY_HAND if controller.settings.operator_captures else _RUNNING)
+        keys = (
+            ()
+            if phase is Phase.FIT
+            else _KEYS.get(
+                controller.state, _BY_HAND if controller.settings.operator_captures else _RUNNING
+            )
+        )
         coefficients: list[screen_contents.Row] = []
         if session is not None:
             rows, coefficients = session.rows()
         else:
             rows = [] if newest is None else newest.rows(newest.stillness())
-        self._publisher.publish(String(data=screen_contents.ScreenContents(
-            phase=phase.value, text=text, unit=f'{unit.serial} ({unit.axes})' if unit else '',
-            output=str(controller.settings.output), keys=keys, rows=tuple(rows),
-            coefficients=tuple(coefficients),
-            outcome=controller.outcome).to_json()))
+        self._publisher.publish(
+            String(
+                data=screen_contents.ScreenContents(
+                    phase=phase.value,
+                    text=text,
+                    unit=f'{unit.serial} ({unit.axes})' if unit else '',
+                    output=str(controller.settings.output),
+                    keys=keys,
+                    rows=tuple(rows),
+                    coefficients=tuple(coefficients),
+                    outcome=controller.outcome,
+                ).to_json()
+            )
+        )
 
 
 _POLL_S = 0.02
@@ -273,7 +371,8 @@ _CHECK_POSES = {'full': 16, 'quick': 8}
 """Check poses by kind of the pose plan; chosen: about a tenth, or a fifth, of the poses."""
 _EXAMPLES = {
     'a stage that is turned by hand': '--ros-args -p stage.mode:=manual -p output:=unit.yaml',
-    'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml'}
+    'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml',
+}
 """Examples of arguments, by their purpose."""
 _SAMPLES = 'imu/data_raw'  # Topic of the samples, relative to the namespace of the node
 _YAW_VARIANCE = 8
@@ -303,7 +402,7 @@ class Samples:
     def keep_newest(self, count: int = _SAMPLES_QUEUE) -> None:
         """Forget all samples but the newest, as many as the queue holds."""
         self._receive()
-        del self._raw[:max(len(self._raw) - count, 0)]
+        del self._raw[: max(len(self._raw) - count, 0)]
 
     def waiting(self) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -319,12 +418,13 @@ class Samples:
         """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m), finite."""
         self._receive()
         batch, self._raw = self._raw, []
-        stamps, fields = topics.decoded(batch, cdr.imu, linear_acceleration=3,
-                                        orientation_covariance=9)
+        stamps, fields = topics.decoded(
+            batch, cdr.imu, linear_acceleration=3, orientation_covariance=9
+        )
         accel, covariance = fields['linear_acceleration'], fields['orientation_covariance']
         # -1 in the first place means that a message has no orientation.
         yaw_rad2 = np.where(covariance[:, 0] >= 0, covariance[:, _YAW_VARIANCE], 0.0)
-        accel = accel[:, :len(unit.axes)]
+        accel = accel[:, : len(unit.axes)]
         finite = np.isfinite(accel)
         if batch:
             self.fault = self._fault(bool((yaw_rad2 != UNKNOWN_ANGLE_RAD2).all()), finite, unit)
@@ -340,15 +440,20 @@ class Samples:
     def _fault(self, is_raw: bool, finite: np.ndarray, unit: Sensor) -> str:
         """Return why samples with these finite values, (n, m), cannot be used, or ''."""
         if not is_raw:
-            return (f'{self._node.resolve_topic_name(_SAMPLES)}: this stream is already '
-                    'compensated (it carries an orientation, as imu/data does); remap it to '
-                    'imu/data_raw of the driver')
+            return (
+                f'{self._node.resolve_topic_name(_SAMPLES)}: this stream is already '
+                'compensated (it carries an orientation, as imu/data does); remap it to '
+                'imu/data_raw of the driver'
+            )
         if finite.all(axis=1).any():
             return ''
-        dead = ' and '.join(axis for axis, lives in zip(unit.axes, np.asarray(finite.any(axis=0)))
-                            if not lives)
-        return f'{dead or "one axis or another"} is not a number in all samples; check its ' \
-               'wiring and the driver'
+        dead = ' and '.join(
+            axis for axis, lives in zip(unit.axes, np.asarray(finite.any(axis=0))) if not lives
+        )
+        return (
+            f'{dead or "one axis or another"} is not a number in all samples; check its '
+            'wiring and the driver'
+        )
 
 
 class Calibration(Node):
@@ -363,7 +468,8 @@ class Calibration(Node):
         parameters.check_given(self)
         flat = parameters.declare_sensor(self)
         carried: dict[str, Any] = {
-            name: parameters.given_below(self, f'{name}.') for name in ('link', 'mounting')}
+            name: parameters.given_below(self, f'{name}.') for name in ('link', 'mounting')
+        }
         sensor = replace(parameters.make_sensor(flat, may_measure=True), **carried)
         anonymous = replace(parameters.anonymous_sensor(self, flat), **carried)
         self._own = own = parameters.declare_all(self, CalibrationSettings)
@@ -374,7 +480,8 @@ class Calibration(Node):
         self.announce, self.withdraw_pose = announcer.announce, announcer.withdraw
         self._samples = Samples(self, own.samples_unit)
         self._controller = controller.Controller(
-            settings, sensor, own.resume, self._samples, self, anonymous)
+            settings, sensor, own.resume, self._samples, self, anonymous
+        )
         if own.autostart:
             self._controller.start()
         self._connect()
@@ -384,9 +491,12 @@ class Calibration(Node):
         self.show_fit = self._display.show_fit
         if not own.autostart and not self._controller.may_ask:
             # Nobody sees a screen, so that the log says what the node waits for.
-            self.log('INFO', f'waits for a call of {self.resolve_service_name("~/start")}, or '
-                     f'start it with autostart:=true; it takes samples of '
-                     f'{self.resolve_topic_name(_SAMPLES)}')
+            self.log(
+                'INFO',
+                f'waits for a call of {self.resolve_service_name("~/start")}, or '
+                f'start it with autostart:=true; it takes samples of '
+                f'{self.resolve_topic_name(_SAMPLES)}',
+            )
 
     def log(self, severity: controller.Severity, text: str) -> None:
         """Log a line."""
@@ -407,19 +517,30 @@ class Calibration(Node):
         """Make diagnostics, subscriptions, services and the timer."""
         topics.DiagnosticsReporter(self, 'calibration', self._status)
         topics.create_subscription(
-            self, DiagnosticStatus, 'sensor_info', lambda message:
-            self._controller.read_sensor_info(topics.stream_info(message, 'sensor_info')), 1,
-            latched=True)
-        self._stage = {topic: topics.Inbox(self, JointState, topic, _STAGE_QUEUE)
-                       for topic in (_STAGE_TOPICS if self._own.mode == 'stage' else ())}
+            self,
+            DiagnosticStatus,
+            'sensor_info',
+            lambda message: self._controller.read_sensor_info(
+                topics.stream_info(message, 'sensor_info')
+            ),
+            1,
+            latched=True,
+        )
+        self._stage = {
+            topic: topics.Inbox(self, JointState, topic, _STAGE_QUEUE)
+            for topic in (_STAGE_TOPICS if self._own.mode == 'stage' else ())
+        }
         self._surroundings = topics.Surroundings(self, _QUEUE)
         start = self._controller.start
         requests: dict[str, Callable[[], Answer]] = {
-            'start': start, 'resume': partial(start, start_over=False),
+            'start': start,
+            'resume': partial(start, start_over=False),
             'start_over': partial(start, start_over=True),
             'redo': partial(self._controller.change_pose, 'redo'),
             'skip': partial(self._controller.change_pose, 'skip'),
-            'finish': self._controller.finish, 'abort': self._controller.abort}
+            'finish': self._controller.finish,
+            'abort': self._controller.abort,
+        }
         for name, request in requests.items():
             self.create_service(Trigger, f'~/{name}', self._service(request))
         # The answer comes when the pose is on disk.
@@ -468,18 +589,23 @@ class Calibration(Node):
                     stage.read_encoder(reading.stamp_ns, *reading.angles)
                 elif not reading.position.keys() & JOINTS.keys() and not self._names_joints:
                     self._names_joints = True
-                    self.log('WARNING', f'{self.resolve_topic_name(topic)} has the joints '
-                             f'{", ".join(reading.position)}, but calibration needs alpha and '
-                             'beta; the node stage gives them, by bridge.alpha.joint and '
-                             'bridge.beta.joint')
+                    self.log(
+                        'WARNING',
+                        f'{self.resolve_topic_name(topic)} has the joints '
+                        f'{", ".join(reading.position)}, but calibration needs alpha and '
+                        'beta; the node stage gives them, by bridge.alpha.joint and '
+                        'bridge.beta.joint',
+                    )
 
     def _service(self, request: Callable[[], Answer]) -> Callable[..., Trigger.Response]:
         """Make the callback of a service that calls a request of the controller."""
+
         def respond(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             self._read_stage()
             response.success, response.message = request()
             self._display.update()
             return response
+
         return respond
 
 
@@ -492,12 +618,20 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
     for name, path in (('output', output), ('journal', journal)):
         if path.is_dir():
             raise parameters.parameter_error(name, f'{path} is a directory; name a file')
-    planes_rad = tuple(np.radians(parameters.numbers('sweep.planes_deg', own.planes_deg or [],
-                                                     '[30.0, 60.0, 90.0]')).tolist())
+    planes_rad = tuple(
+        np.radians(
+            parameters.numbers('sweep.planes_deg', own.planes_deg or [], '[30.0, 60.0, 90.0]')
+        ).tolist()
+    )
     step_rad = float(np.radians(own.step_deg))
     capture = screen_contents.CaptureSettings(
-        own.dwell_s, own.tolerance_rad, own.timeout_s, StageMode(own.stage_mode),
-        float(np.radians(own.near_deg)), own.temperature_span_c)
+        own.dwell_s,
+        own.tolerance_rad,
+        own.timeout_s,
+        StageMode(own.stage_mode),
+        float(np.radians(own.near_deg)),
+        own.temperature_span_c,
+    )
     kind = own.plan
     if kind == 'auto':
         by_hand = capture.stage_mode is not StageMode.COMMANDED
@@ -506,12 +640,22 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
     # A bad plan is refused before there is a sensor.
     pose_plan.guided(planes_rad or pose_plan.default_planes_rad('xy'), step_rad, 0)
     return SessionSettings(
-        mode=own.mode, plan_kind=kind, planes_rad=planes_rad, step_rad=step_rad,
+        mode=own.mode,
+        plan_kind=kind,
+        planes_rad=planes_rad,
+        step_rad=step_rad,
         tilt_error_rad=float(np.radians(own.tilt_error_deg)),
         check_poses=_CHECK_POSES[kind] if own.check_poses < 0 else own.check_poses,
-        capture=capture, output=output, journal=journal, report=own.report, store=own.store,
-        thermal=ThermalSettings(parameters.low_and_high(
-            'thermal.range_c', own.range_c, ThermalSettings.range_c), own.block_s))
+        capture=capture,
+        output=output,
+        journal=journal,
+        report=own.report,
+        store=own.store,
+        thermal=ThermalSettings(
+            parameters.low_and_high('thermal.range_c', own.range_c, ThermalSettings.range_c),
+            own.block_s,
+        ),
+    )
 
 
 def main() -> int:

@@ -47,25 +47,51 @@ from std_srvs.srv import Trigger
 class CompensationSettings:
     """The compensation."""
 
-    calibration: str = parameter('', 'parameter file to use; setting it loads the whole file or '
-                                 'nothing of it', live=True)
-    inverse: str = parameter('exact', "inverse of the model: exact, or the paper's approximation",
-                             choices=('exact', 'paper'))
-    undo_filter: bool = parameter(False, f'take the RC filter out; a sample is published {HALF} '
-                                  'samples late, with its own stamp')
-    orientation: str = parameter('keep', 'of a sample that states one: keep it, or that of the '
-                                 'tilt', choices=('keep', 'tilt'))
-    store: str = parameter(str(calibration_store.default_folder()), 'folder of calibrations, '
-                           'whose newest of the unit is used where none is named; empty: none')
-    output_rate_hz: float = parameter(0.0, 'single samples are published at this rate, so that '
-                                      'faster vibration folds; 0: all', 'Hz', 0.0, 1e5)
-    free_acceleration: bool = parameter(False, 'publish imu/linear_acceleration_free of samples '
-                                        'that state an orientation')
+    calibration: str = parameter(
+        '', 'parameter file to use; setting it loads the whole file or nothing of it', live=True
+    )
+    inverse: str = parameter(
+        'exact',
+        "inverse of the model: exact, or the paper's approximation",
+        choices=('exact', 'paper'),
+    )
+    undo_filter: bool = parameter(
+        False,
+        f'take the RC filter out; a sample is published {HALF} samples late, with its own stamp',
+    )
+    orientation: str = parameter(
+        'keep',
+        'of a sample that states one: keep it, or that of the tilt',
+        choices=('keep', 'tilt'),
+    )
+    store: str = parameter(
+        str(calibration_store.default_folder()),
+        'folder of calibrations, '
+        'whose newest of the unit is used where none is named; empty: none',
+    )
+    output_rate_hz: float = parameter(
+        0.0,
+        'single samples are published at this rate, so that faster vibration folds; 0: all',
+        'Hz',
+        0.0,
+        1e5,
+    )
+    free_acceleration: bool = parameter(
+        False, 'publish imu/linear_acceleration_free of samples that state an orientation'
+    )
     samples_unit: str = sample_unit()
-    rpy_rad: Any = parameter([0.0, 0.0, 0.0], 'roll, pitch and yaw of the case on the robot, as '
-                             'in a URDF joint', 'rad', name='mounting.rpy_rad', live=True)
-    mounting_frame_id: str = parameter('base_link', 'frame of the robot, in the header where the '
-                                       'case is turned', name='mounting.frame_id')
+    rpy_rad: Any = parameter(
+        [0.0, 0.0, 0.0],
+        'roll, pitch and yaw of the case on the robot, as in a URDF joint',
+        'rad',
+        name='mounting.rpy_rad',
+        live=True,
+    )
+    mounting_frame_id: str = parameter(
+        'base_link',
+        'frame of the robot, in the header where the case is turned',
+        name='mounting.frame_id',
+    )
 
 
 _MOUNTING = 'mounting.'  # Begin of the names of the parameters of the mounting
@@ -90,8 +116,9 @@ class MountingParameters:
         self._mount(mounting)
         parameters.on_change(node, _RPY, _mounting, self._mount)
         # The answer comes after a second of samples, which the node takes meanwhile.
-        node.create_service(Trigger, '~/level', self._on_level,
-                            callback_group=ReentrantCallbackGroup())
+        node.create_service(
+            Trigger, '~/level', self._on_level, callback_group=ReentrantCallbackGroup()
+        )
 
     def take(self, path: str, sensor: Sensor) -> None:
         """Use the mounting that the file of a calibration has, unless one was given."""
@@ -103,7 +130,8 @@ class MountingParameters:
             self._node.set_parameters([Parameter(_RPY, value=list(mounting.rpy_rad))])
         elif mounting != self._mounting:
             self._node.get_logger().warning(
-                f'{_RPY} is given, and counts before that of {path}: {list(mounting.rpy_rad)}')
+                f'{_RPY} is given, and counts before that of {path}: {list(mounting.rpy_rad)}'
+            )
 
     def _mount(self, mounting: Mounting) -> None:
         self._mounting = mounting
@@ -130,17 +158,25 @@ class MountingParameters:
 
     def _kept(self, rpy_rad: list[float], before_rad: list[float]) -> str:
         """Write a new mounting where the next start finds it; return where that is."""
-        path = parameters.file_of(_RPY) if self._is_given else \
-            self._path or parameters.file_of('format')
+        path = (
+            parameters.file_of(_RPY)
+            if self._is_given
+            else self._path or parameters.file_of('format')
+        )
         begin = f'level: {_RPY} is {rpy_rad}'
         option = f"to keep it, start the node with -p '{_RPY}:={rpy_rad}'"
         if not path:
             return f'{begin} until this node ends; {option}'
         date = datetime.now(timezone.utc).isoformat(timespec='seconds')
         try:
-            parameters.write_into(path, self._node.get_fully_qualified_name(), {
-                _RPY: f'[{", ".join(map(parameter_file.float_text, rpy_rad))}]',
-                'provenance.levelled': f"'{date}, {_RPY} before: {before_rad}'"})
+            parameters.write_into(
+                path,
+                self._node.get_fully_qualified_name(),
+                {
+                    _RPY: f'[{", ".join(map(parameter_file.float_text, rpy_rad))}]',
+                    'provenance.levelled': f"'{date}, {_RPY} before: {before_rad}'",
+                },
+            )
         except UserError as error:
             return f'{begin} until this node ends: {error}; {option}'
         return f'{begin}, written into {Path(path).resolve()}, which the next start reads'
@@ -153,25 +189,31 @@ def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounti
     forces_mps2: corrected samples in the frame of the case, m/s², (n, 3).
     """
     if len(forces_mps2) < _FEWEST_SAMPLES:
-        raise UserError(f'{len(forces_mps2)} samples in {_LEVEL_S:g} s; at least '
-                        f'{_FEWEST_SAMPLES} are needed')
+        raise UserError(
+            f'{len(forces_mps2)} samples in {_LEVEL_S:g} s; at least {_FEWEST_SAMPLES} are needed'
+        )
     mean_mps2 = forces_mps2.mean(axis=0)
-    scatter_mps2 = forces_mps2.std(axis=0)[:len(sensor.axes)]
+    scatter_mps2 = forces_mps2.std(axis=0)[: len(sensor.axes)]
     noise_mps2 = noise.sample_std_v(sensor) / sensor.scale_v_per_g * G0_MPS2
     worst = int(np.argmax(scatter_mps2 / noise_mps2))
     if scatter_mps2[worst] > _MAX_NOISE * noise_mps2[worst]:
-        raise UserError(f'the sensor moves: {sensor.axes[worst]} scatters by '
-                        f'{scatter_mps2[worst]:.2g} m/s², and its noise is '
-                        f'{noise_mps2[worst]:.2g} m/s²; let the robot rest on level ground')
+        raise UserError(
+            f'the sensor moves: {sensor.axes[worst]} scatters by '
+            f'{scatter_mps2[worst]:.2g} m/s², and its noise is '
+            f'{noise_mps2[worst]:.2g} m/s²; let the robot rest on level ground'
+        )
     magnitude_mps2 = float(np.linalg.norm(mean_mps2))
     if abs(magnitude_mps2 / sensor.local_gravity_mps2 - 1) > _MAX_GRAVITY_ERROR:
-        raise UserError(f'the sensor reads {magnitude_mps2:.2f} m/s², and gravity is '
-                        f'{sensor.local_gravity_mps2:.2f} m/s²; calibrate it first')
+        raise UserError(
+            f'the sensor reads {magnitude_mps2:.2f} m/s², and gravity is '
+            f'{sensor.local_gravity_mps2:.2f} m/s²; calibrate it first'
+        )
     return mounting.levelled(mean_mps2.tolist())
 
 
-def _mounting(rpy_rad: Any, make_error: parameter_file.MakeError = parameters.parameter_error
-              ) -> Mounting:
+def _mounting(
+    rpy_rad: Any, make_error: parameter_file.MakeError = parameters.parameter_error
+) -> Mounting:
     """Return the mounting of three angles, rad; refuse what is none."""
     try:
         roll, pitch, yaw = map(float, rpy_rad)
@@ -186,15 +228,20 @@ def _mounting(rpy_rad: Any, make_error: parameter_file.MakeError = parameters.pa
 def _mounting_of(path: str, sensor: Sensor) -> Mounting | None:
     """Return the mounting that the file of a calibration has, None where it has none."""
     rpy_rad = sensor.mounting.get(_RPY.removeprefix(_MOUNTING))
-    return None if rpy_rad is None else _mounting(
-        rpy_rad, lambda key, reason: UserError(f'{path}: {key}: {reason}'))
+    return (
+        None
+        if rpy_rad is None
+        else _mounting(rpy_rad, lambda key, reason: UserError(f'{path}: {key}: {reason}'))
+    )
 
 
 _DEPTH = 100  # Samples that are kept while the node is busy: 0.1 s at 1 kHz
 _LOOK_S = 0.5
 """Time between two looks at who publishes and, where it is unknown, at the sensor, s; chosen."""
-_EXAMPLES = {'the newest calibration of the unit in the store': '',
-             'a calibration by its file': '--ros-args -p calibration:=unit.yaml'}
+_EXAMPLES = {
+    'the newest calibration of the unit in the store': '',
+    'a calibration by its file': '--ros-args -p calibration:=unit.yaml',
+}
 """Examples of arguments, by their purpose."""
 
 
@@ -220,31 +267,44 @@ class Compensation(Node):
         self._ages_s: deque[float] = deque(maxlen=MOST_AGES)
         self._data = topics.create_publisher(self, Imu, 'imu/data', _DEPTH)
         tilt = topics.create_publisher(self, Vector3Stamped, 'tilt', _DEPTH)
-        free = topics.create_publisher(
-            self, Vector3Stamped, 'imu/linear_acceleration_free', _DEPTH) \
-            if settings.free_acceleration else None
+        free = (
+            topics.create_publisher(self, Vector3Stamped, 'imu/linear_acceleration_free', _DEPTH)
+            if settings.free_acceleration
+            else None
+        )
         self._stream = LiveStream(
-            paper, settings.undo_filter, self._publish, tilt.publish,
-            settings.orientation == 'keep', free.publish if free else None,
-            settings.output_rate_hz)
+            paper,
+            settings.undo_filter,
+            self._publish,
+            tilt.publish,
+            settings.orientation == 'keep',
+            free.publish if free else None,
+            settings.output_rate_hz,
+        )
         self._policy = CompensationPolicy(paper, settings.store, self.resolve_topic_name)
         self._look_at_gravity = LiveLook()
-        self._samples = topics.Inbox(self, Imu, 'imu/data_raw', _DEPTH,
-                                     settings.samples_unit)
+        self._samples = topics.Inbox(self, Imu, 'imu/data_raw', _DEPTH, settings.samples_unit)
         self._flat = parameters.given_sensor(self)
-        own = parameters.make_sensor(self._flat, may_measure=True), (
-            'the parameters given' if parameters.is_from_file(self) else
-            f'the nominal {parameter_file.nominal_path()}')
+        own = (
+            parameters.make_sensor(self._flat, may_measure=True),
+            (
+                'the parameters given'
+                if parameters.is_from_file(self)
+                else f'the nominal {parameter_file.nominal_path()}'
+            ),
+        )
         loaded = self._load(settings.calibration)
         self._use(*(loaded or own))
-        self._mounting = MountingParameters(self, self._stream, mounting,
-                                            settings.mounting_frame_id)
+        self._mounting = MountingParameters(
+            self, self._stream, mounting, settings.mounting_frame_id
+        )
         if loaded:
             self._mounting.take(settings.calibration, loaded[0])
         parameters.on_change(self, 'calibration', self._load, self._exchange)
         self.create_timer(_LOOK_S, self._look, clock=STEADY)
-        topics.create_subscription(self, DiagnosticStatus, 'sensor_info', self._on_info, 1,
-                                   latched=True)
+        topics.create_subscription(
+            self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True
+        )
         self._surroundings = topics.Surroundings(self, 1)
         self._thread = topics.RepeatingThread(self, self._receive, 'imu/data_raw')
 
@@ -287,8 +347,9 @@ class Compensation(Node):
     def _correct_by(self, sensor: Sensor, source: str) -> None:
         text = self._policy.use(sensor, source)
         self._stream.use(sensor, self._policy.rate_hz)
-        self._newest: deque[bytes] = deque(maxlen=round(
-            max(LIVE_WINDOW_S * self._policy.rate_hz, _FEWEST_SAMPLES)))
+        self._newest: deque[bytes] = deque(
+            maxlen=round(max(LIVE_WINDOW_S * self._policy.rate_hz, _FEWEST_SAMPLES))
+        )
         parameters.show_sensor(self, sensor)
         if self._stream.unknown is None and text != self._told:
             self.get_logger().info(text)
@@ -319,10 +380,14 @@ class Compensation(Node):
         newest = [*self._newest]
         if self._stream.unknown is not None or not newest:
             return
-        fault = self._look_at_gravity(self._policy.sensor, self._policy.rate_hz,
-                                      *topics.finite_samples(newest)).fault
-        text = '' if fault is None else \
-            f'{self.resolve_topic_name("imu/data_raw")}: {fault.live_text}'
+        fault = self._look_at_gravity(
+            self._policy.sensor, self._policy.rate_hz, *topics.finite_samples(newest)
+        ).fault
+        text = (
+            ''
+            if fault is None
+            else f'{self.resolve_topic_name("imu/data_raw")}: {fault.live_text}'
+        )
         self._policy.no_gravity = text if fault is not None and fault.is_clear else ''
         self._policy.wrong_gravity = '' if self._policy.no_gravity else text
 
@@ -356,8 +421,11 @@ class Compensation(Node):
         self._stream.refused = bool(refusal)
         if not changed:
             return
-        topics.log(self, 'ERROR' if refusal else 'INFO',
-                   f'publishing nothing: {refusal}' if refusal else 'publishing again')
+        topics.log(
+            self,
+            'ERROR' if refusal else 'INFO',
+            f'publishing nothing: {refusal}' if refusal else 'publishing again',
+        )
 
     def _receive(self) -> None:
         """Correct the samples that come, by the newest finite temperature and supply."""
@@ -377,16 +445,24 @@ class Compensation(Node):
         counts = {name: total - self._reported[name] for name, total in totals.items()}
         self._reported, self._reported_ns = Counter(totals), steady_ns
         interval = Interval(
-            duration_s, counts, self._stream.outside, self._stream.surroundings.copy(),
+            duration_s,
+            counts,
+            self._stream.outside,
+            self._stream.surroundings.copy(),
             {name: (ros_ns - ns) * 1e-9 for name, ns in self._heard_ns.items()},
-            self._obstacle if self._stream.unknown is not None else '')
+            self._obstacle if self._stream.unknown is not None else '',
+        )
         newer = self._policy.newer()
         level, text = self._policy.status(interval, newer, self._calibration())
         late = HALF if self._settings.undo_filter else 0
-        values = {'rate_in_hz': round(counts['received'] / duration_s, 1),
-                  'rate_out_hz': round(counts['published'] / duration_s, 1), **totals,
-                  'delay_s': late / self._policy.rate_hz, **age_report(self._ages_s),
-                  **self._policy.values(interval, newer)}
+        values = {
+            'rate_in_hz': round(counts['received'] / duration_s, 1),
+            'rate_out_hz': round(counts['published'] / duration_s, 1),
+            **totals,
+            'delay_s': late / self._policy.rate_hz,
+            **age_report(self._ages_s),
+            **self._policy.values(interval, newer),
+        }
         return Status(Level[level], text, self._policy.sensor.serial, values)
 
 

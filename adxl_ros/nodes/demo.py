@@ -43,8 +43,14 @@ _CHECK_POSES = 16  # Number of poses that are kept out of the fit
 _SEED = 203  # Default seed of the demonstrated unit and its stage; chosen
 _STARTED = ('driver', 'stage', 'calibration')
 """Nodes of the demonstration in the order of their start."""
-_UNIT_EFFECTS = {'bias': 0.5, 'scale_factor': 0.5, 'misalignment': 0.7, 'cross_axis': 0.7,
-                 'cross_axis_z': 1.0, 'scale_factor_z': 0.7}
+_UNIT_EFFECTS = {
+    'bias': 0.5,
+    'scale_factor': 0.5,
+    'misalignment': 0.7,
+    'cross_axis': 0.7,
+    'cross_axis_z': 1.0,
+    'scale_factor_z': 0.7,
+}
 """Effects of the demonstrated unit, in multiples of their typical values; chosen."""
 _SPREAD = (0.5, 1.5)
 """Range of the random factor of each coefficient of the demonstrated unit; chosen."""
@@ -56,9 +62,12 @@ _QUEUE = 100_000
 lets a process wait."""
 _KEEPING: dict[str, object] = {'qos_overrides./imu/data_raw.publisher.depth': _QUEUE}
 """Parameters of a driver that keeps its samples until the calibration has them."""
-_UNATTENDED = {'autostart': True, 'screen': False,
-               'qos_overrides./imu/data_raw.subscription.reliability': 'reliable',
-               'qos_overrides./imu/data_raw.subscription.depth': _QUEUE}
+_UNATTENDED = {
+    'autostart': True,
+    'screen': False,
+    'qos_overrides./imu/data_raw.subscription.reliability': 'reliable',
+    'qos_overrides./imu/data_raw.subscription.depth': _QUEUE,
+}
 """Parameters of a calibration that nobody controls and that loses no sample: at many times real
 time, a best-effort subscriber loses samples on a busy machine."""
 _EXAMPLES = {'the simulated sensor': '-o demo_output'}  # Examples of arguments, by their purpose
@@ -67,8 +76,14 @@ NEXT_PAGE = 'docs/start/tilt.md'  # Page that a user reads next
 
 def _command(name: str, params_file: Path, parameters: Mapping[str, object]) -> list[str]:
     """Return the command of a node that follows the clock of the driver."""
-    command = [jobs.executable(name), '--ros-args', '--log-level', 'warn', '--params-file',
-               str(params_file)]
+    command = [
+        jobs.executable(name),
+        '--ros-args',
+        '--log-level',
+        'warn',
+        '--params-file',
+        str(params_file),
+    ]
     for key, value in {'use_sim_time': True, **parameters}.items():
         command += ['-p', f'{key}:={json.dumps(value, ensure_ascii=False, default=str)}']
     return command
@@ -90,8 +105,11 @@ def _poses(journal: Path) -> tuple[int, list[sweep_journal.PoseRecord]]:
     with suppress(UserError):
         entries = sweep_journal.read(journal).entries
         return len(sweep_journal.accepted_poses(entries)), [
-            pose for entry in entries if isinstance(entry, sweep_journal.Fitted)
-            for pose in entry.rests or ()]
+            pose
+            for entry in entries
+            if isinstance(entry, sweep_journal.Fitted)
+            for pose in entry.rests or ()
+        ]
     return 0, []
 
 
@@ -99,13 +117,24 @@ def _poses(journal: Path) -> tuple[int, list[sweep_journal.PoseRecord]]:
 def main() -> int:
     """Run the demonstration; return the exit status."""
     parser = program_parser(argparse.ArgumentParser, 'demo', __doc__, _EXAMPLES)
-    parser.add_argument('-o', dest='output', metavar='DIR', default='demo_output', type=Path,
-                        help='folder of pages and calibrations (default demo_output)')
-    parser.add_argument('--seed', type=int, metavar='N', default=_SEED,
-                        help=f'seed of the simulated unit and its stage (default {_SEED})')
+    parser.add_argument(
+        '-o',
+        dest='output',
+        metavar='DIR',
+        default='demo_output',
+        type=Path,
+        help='folder of pages and calibrations (default demo_output)',
+    )
+    parser.add_argument(
+        '--seed',
+        type=int,
+        metavar='N',
+        default=_SEED,
+        help=f'seed of the simulated unit and its stage (default {_SEED})',
+    )
     options = parser.parse_args()
-    if not 0 <= options.seed < 2 ** 31:
-        parser.error(f'--seed: {options.seed} is not between 0 and {2 ** 31 - 1}')
+    if not 0 <= options.seed < 2**31:
+        parser.error(f'--seed: {options.seed} is not between 0 and {2**31 - 1}')
     jobs.use_own_graph()
     try:
         try:
@@ -125,15 +154,19 @@ def main() -> int:
 def _run_sweep(folder: Path, seed: int) -> None:
     """Sweep a simulated sensor whose coefficients are drawn at datasheet spread."""
     unit, nominal = folder / 'simulated_unit.yaml', folder / 'nominal.yaml'
-    sensor = replace(parameter_file.load(parameter_file.nominal_path()), serial='demo',
-                     rate_hz=_RATE_HZ)
+    sensor = replace(
+        parameter_file.load(parameter_file.nominal_path()), serial='demo', rate_hz=_RATE_HZ
+    )
     truth = _draw_unit(sensor, seed)
     parameter_file.save(nominal, sensor)
     parameter_file.save(unit, truth, ['The truth of the simulated unit.'])
     name = parameter_file.nominal_path().stem
     output, report = folder / f'{name}_demo.yaml', folder / 'sweep'
-    _print(f'Demo: calibrate a simulated {name.upper()} whose true coefficients are known   '
-           f'({_DURATION_S} s)', '')
+    _print(
+        f'Demo: calibrate a simulated {name.upper()} whose true coefficients are known   '
+        f'({_DURATION_S} s)',
+        '',
+    )
     log, journal = output.with_suffix('.log'), output.with_name(f'{output.name}.journal')
     # Results of an earlier demonstration would pass for those of this one.
     for path in (output, journal):
@@ -141,18 +174,33 @@ def _run_sweep(folder: Path, seed: int) -> None:
     commands = [
         _command('driver', unit, _KEEPING | {'link.type': 'sim', 'link.speed': _SPEED}),
         _command('stage', nominal, {'delay_s': _DELAY_S, 'seed': seed}),
-        _command('calibration', nominal, {
-            **_UNATTENDED, 'output': output, 'store': folder / 'calibrations', 'report': report,
-            'sweep.planes_deg': _PLANES_DEG, 'sweep.step_deg': _STEP_DEG,
-            'sweep.check_poses': _CHECK_POSES})]
-    total = len(pose_plan.guided(np.radians(_PLANES_DEG).tolist(), float(np.radians(_STEP_DEG)),
-                                 _CHECK_POSES))
+        _command(
+            'calibration',
+            nominal,
+            {
+                **_UNATTENDED,
+                'output': output,
+                'store': folder / 'calibrations',
+                'report': report,
+                'sweep.planes_deg': _PLANES_DEG,
+                'sweep.step_deg': _STEP_DEG,
+                'sweep.check_poses': _CHECK_POSES,
+            },
+        ),
+    ]
+    total = len(
+        pose_plan.guided(
+            np.radians(_PLANES_DEG).tolist(), float(np.radians(_STEP_DEG)), _CHECK_POSES
+        )
+    )
     with log.open('wb') as file, jobs.running(commands, file) as nodes:
         with jobs.Step('1/3 sweep', 'starting', total) as step:
+
             def swept() -> bool:
                 count, _ = _poses(journal)
                 step.show(f'{count} of {total} poses', count)
                 return count == total
+
             _wait(swept, nodes, log)
         fitting = f'{total - _CHECK_POSES} poses'
         with jobs.Step('2/3 fit', fitting) as step:
@@ -162,9 +210,16 @@ def _run_sweep(folder: Path, seed: int) -> None:
             _wait(lambda: bool(_poses(journal)[1]), nodes, log)
     poses = Poses.from_records(_poses(journal)[1])
     fitted = parameter_file.load(output)
-    _print('', *screen_table(_held_out_errors(sensor, fitted, poses)), '',
-           *truth_table(compare(fitted, truth)), '', *acceptance_lines(fitted), '',
-           *file_lines({'Page': report / 'report.html', 'Calibration': output}))
+    _print(
+        '',
+        *screen_table(_held_out_errors(sensor, fitted, poses)),
+        '',
+        *truth_table(compare(fitted, truth)),
+        '',
+        *acceptance_lines(fitted),
+        '',
+        *file_lines({'Page': report / 'report.html', 'Calibration': output}),
+    )
 
 
 def _draw_unit(sensor: Sensor, seed: int) -> Sensor:
@@ -174,22 +229,39 @@ def _draw_unit(sensor: Sensor, seed: int) -> Sensor:
     The linear cross-axis terms are part of the misalignment, as in the fits.
     """
     rng = np.random.default_rng(seed)
-    values = {name: {p.name: np.array([
-        multiple * p.scale * rng.choice((-1, 1)) * rng.uniform(*_SPREAD)
-        * (p.name != 'linear') if axis in p.axes else 0.0
-        for axis in sensor.axes]) for p in effect_named(name).parameters}
-        for name, multiple in _UNIT_EFFECTS.items()}
+    values = {
+        name: {
+            p.name: np.array(
+                [
+                    multiple
+                    * p.scale
+                    * rng.choice((-1, 1))
+                    * rng.uniform(*_SPREAD)
+                    * (p.name != 'linear')
+                    if axis in p.axes
+                    else 0.0
+                    for axis in sensor.axes
+                ]
+            )
+            for p in effect_named(name).parameters
+        }
+        for name, multiple in _UNIT_EFFECTS.items()
+    }
     return replace(sensor, effects=tuple(_UNIT_EFFECTS), values=values)
 
 
-def _held_out_errors(nominal: Sensor, fitted: Sensor, poses: Poses
-                     ) -> list[unseen.HeldOutErrors]:
+def _held_out_errors(nominal: Sensor, fitted: Sensor, poses: Poses) -> list[unseen.HeldOutErrors]:
     """Return the errors of datasheet, linear and fitted coefficients on the check poses."""
     held_out = poses.subset(poses.check)
-    models = {'nominal': nominal, 'linear': linear.fit(nominal, poses.subset(~poses.check)),
-              fitted.model: fitted}
-    return [unseen.summarise(model, unseen.pose_errors(sensor, held_out))
-            for model, sensor in models.items()]
+    models = {
+        'nominal': nominal,
+        'linear': linear.fit(nominal, poses.subset(~poses.check)),
+        fitted.model: fitted,
+    }
+    return [
+        unseen.summarise(model, unseen.pose_errors(sensor, held_out))
+        for model, sensor in models.items()
+    ]
 
 
 def file_lines(values: dict[str, object]) -> list[str]:

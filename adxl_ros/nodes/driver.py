@@ -29,13 +29,23 @@ DEFAULT_FRAME = 'imu_link'  # Frame of the case, unless a parameter or a simulat
 class DriverSettings:
     """The driver."""
 
-    link: str = parameter(base.DEFAULT_LINK, 'where the samples come from', name=f'{LINK}type',
-                          choices=base.link_names())
-    stamp_offset_s: float = parameter(0.0, 'delay of the sensor, such as that of its RC filter, '
-                                      'by which the stamps are earlier', 's', -10.0, 10.0,
-                                      name='stamp_offset')
-    frame_id: str = parameter('', 'frame of the case; empty: imu_link, or as a simulator states '
-                              'it')
+    link: str = parameter(
+        base.DEFAULT_LINK,
+        'where the samples come from',
+        name=f'{LINK}type',
+        choices=base.link_names(),
+    )
+    stamp_offset_s: float = parameter(
+        0.0,
+        'delay of the sensor, such as that of its RC filter, by which the stamps are earlier',
+        's',
+        -10.0,
+        10.0,
+        name='stamp_offset',
+    )
+    frame_id: str = parameter(
+        '', 'frame of the case; empty: imu_link, or as a simulator states it'
+    )
     autostart: bool = parameter(True, 'configure and activate at the start')
 
 
@@ -44,14 +54,17 @@ _SIMULATED = f'SIMULATED sensor (link.type: {base.DEFAULT_LINK})'
 _EXAMPLES = {
     'a board on a serial port': '--ros-args -p link.type:=serial -p link.port:=/dev/ttyACM0',
     "a realistic sensor on a simulator's ideal one": '--ros-args -p link.type:=topic -p '
-    'link.topic:=/imu -p use_sim_time:=true --params-file gap/params.yaml'}
+    'link.topic:=/imu -p use_sim_time:=true --params-file gap/params.yaml',
+}
 """Examples of arguments, by their purpose."""
 
 
 def _transition(goal: str, *acts: str) -> Callable[..., TransitionCallbackReturn]:
     """Return the callback of a transition to a state, which calls methods of the driver."""
+
     def callback(node: Driver, _: LifecycleState) -> TransitionCallbackReturn:
         return node.change(goal, acts)
+
     return callback
 
 
@@ -59,8 +72,10 @@ def other_unit(given: Sensor, found: Sensor) -> str:
     """Return that a link has found another unit than the parameters name, or ''."""
     if NO_UNIT in (given.serial, found.serial) or given.serial == found.serial:
         return ''
-    return (f'the samples are of the unit {found.serial}, but the parameters are those of '
-            f'{given.serial}; give the file of {found.serial}')
+    return (
+        f'the samples are of the unit {found.serial}, but the parameters are those of '
+        f'{given.serial}; give the file of {found.serial}'
+    )
 
 
 class Driver(LifecycleNode):
@@ -93,11 +108,15 @@ class Driver(LifecycleNode):
         paced = isinstance(settings, base.PacedSettings)
         # All nodes must share a sensor time that is not real time: this node then publishes it,
         # unless another node does.
-        self._is_clock = paced and (settings.speed != 1
-                                    or self.get_parameter('use_sim_time').value)
+        self._is_clock = paced and (
+            settings.speed != 1 or self.get_parameter('use_sim_time').value
+        )
         # A real device lives in real time, whatever the clock of the graph is.
-        self._stamp_clock = self.get_clock() if paced or isinstance(
-            settings, base.SimulatorSettings) else Clock(clock_type=ClockType.SYSTEM_TIME)
+        self._stamp_clock = (
+            self.get_clock()
+            if paced or isinstance(settings, base.SimulatorSettings)
+            else Clock(clock_type=ClockType.SYSTEM_TIME)
+        )
         self._simulates = self._link == base.DEFAULT_LINK
         self._tally = Tally(STEADY.now().nanoseconds)
         self._fault = self._told = ''  # Why there are no samples; the unit that was named last
@@ -116,38 +135,58 @@ class Driver(LifecycleNode):
     def _refuse_silent_simulation(self) -> None:
         """Refuse a driver of a real unit without a link: no real unit gets simulated data."""
         given, serial = [*parameters.given_below(self, LINK)], self._sensor.serial
-        reason = f'{LINK}{given[0]} is given' if given else \
-            f'the sensor is the unit {serial}' if serial != NO_UNIT else ''
+        reason = (
+            f'{LINK}{given[0]} is given'
+            if given
+            else f'the sensor is the unit {serial}'
+            if serial != NO_UNIT
+            else ''
+        )
         if reason and 'type' not in given:
             devices = [name for name in base.link_names() if name != base.DEFAULT_LINK]
-            raise parameter_error('link.type', f'is not set, but {reason}; set it to '
-                                  f'{", ".join(devices)}, or to {base.DEFAULT_LINK} for a '
-                                  'simulated sensor')
+            raise parameter_error(
+                'link.type',
+                f'is not set, but {reason}; set it to '
+                f'{", ".join(devices)}, or to {base.DEFAULT_LINK} for a '
+                'simulated sensor',
+            )
 
     def _declare_link(self) -> Any:
         """Declare the parameters of the link; refuse those of another one."""
         specs = {spec.name.removeprefix(LINK): spec for spec in parameters.link_specs(self._link)}
         for name in parameters.given_below(self, LINK):
             if name not in ('type', *specs):
-                raise parameter_error(f'{LINK}{name}', f'the link {self._link} has no such '
-                                      'parameter; it has link.type, '
-                                      f'{", ".join(spec.name for spec in specs.values())}')
-        return self._module.Settings(**{name: parameters.declare(self, spec)
-                                        for name, spec in specs.items()})
+                raise parameter_error(
+                    f'{LINK}{name}',
+                    f'the link {self._link} has no such '
+                    'parameter; it has link.type, '
+                    f'{", ".join(spec.name for spec in specs.values())}',
+                )
+        return self._module.Settings(
+            **{name: parameters.declare(self, spec) for name, spec in specs.items()}
+        )
 
     def configure(self) -> None:
         """Create the topics."""
         self._fault = ''
-        self._output = SampleOutput(self, self._sensor, self._frame_id, self._delay_ns,
-                                    self._is_clock, self._stamp_clock, self._tally)
+        self._output = SampleOutput(
+            self,
+            self._sensor,
+            self._frame_id,
+            self._delay_ns,
+            self._is_clock,
+            self._stamp_clock,
+            self._tally,
+        )
 
     def activate(self) -> None:
         """Open the link and read it from now on; a failure leaves no link open."""
         assert self._output is not None, 'the life cycle configures a node before it activates it'
         self._fault = ''
         link = self._module.open_link(self._sensor, self._settings)
-        self._reader = LinkReader(self, link, self._output, self._settings, self._fail,
-                                  self._diagnostics.notice)
+        self._reader = LinkReader(
+            self, link, self._output, self._settings, self._fail, self._diagnostics.notice
+        )
 
     def close(self) -> None:
         """End the thread and close the link."""
@@ -189,8 +228,10 @@ class Driver(LifecycleNode):
             return
         sensor = self._output.sensor if self._output else self._sensor
         topic = self.resolve_topic_name('imu/data_raw')
-        self.get_logger().info(f'{state}: link {self._link}, unit {sensor.serial}, '
-                               f'{sensor.rate_hz:g} Hz, topic {topic}')
+        self.get_logger().info(
+            f'{state}: link {self._link}, unit {sensor.serial}, '
+            f'{sensor.rate_hz:g} Hz, topic {topic}'
+        )
         if state == 'active' and self._simulates:
             self.get_logger().warning(f'{_SIMULATED}: no sensor is read')
 
@@ -209,10 +250,15 @@ class Driver(LifecycleNode):
             # A simulator may publish no /clock, although the node waits for one.
             sensor_ns = self._stamp_clock.now().nanoseconds or sensor_ns
         values, warning = self._tally.report(STEADY.now().nanoseconds, sensor_ns)
-        counts = {topic: self.count_publishers(topic) for topic in (
-            self.resolve_topic_name('imu/data_raw'), '/clock')}
-        several = [f'{count} nodes publish {topic}; end all but one'
-                   for topic, count in counts.items() if count > 1]
+        counts = {
+            topic: self.count_publishers(topic)
+            for topic in (self.resolve_topic_name('imu/data_raw'), '/clock')
+        }
+        several = [
+            f'{count} nodes publish {topic}; end all but one'
+            for topic, count in counts.items()
+            if count > 1
+        ]
         warning = ', '.join(filter(None, (*several, warning)))
         level = self._level()
         if warning and level is Level.OK:
@@ -220,8 +266,12 @@ class Driver(LifecycleNode):
         kind = _SIMULATED if self._simulates else self._link
         text = ', '.join(filter(None, (f'{kind}: {link.text}', warning)))
         serial = (self._output.sensor if self._output else self._sensor).serial
-        return Status(level, text, serial, {
-            **values, 'link_type': self._link, 'link_state': link.text, **link.statistics})
+        return Status(
+            level,
+            text,
+            serial,
+            {**values, 'link_type': self._link, 'link_state': link.text, **link.statistics},
+        )
 
     def _level(self) -> Level:
         """Return the level of the link; a simulated sensor is a warning at least."""

@@ -38,16 +38,21 @@ from std_srvs.srv import Trigger
 class InvestigateSettings:
     """The investigation."""
 
-    output: str = parameter('investigation', 'folder of bag, report and parameters; a number is '
-                            'added where it has a diagnosis')
-    alpha_deg: Any = parameter((), 'range of alpha; empty: 0 to 180', 'deg',
-                               name='limits.alpha_deg')
+    output: str = parameter(
+        'investigation',
+        'folder of bag, report and parameters; a number is added where it has a diagnosis',
+    )
+    alpha_deg: Any = parameter(
+        (), 'range of alpha; empty: 0 to 180', 'deg', name='limits.alpha_deg'
+    )
     beta_deg: Any = parameter((), 'range of beta; empty: 0 to 360', 'deg', name='limits.beta_deg')
     # The default is that of the bridge, 0.3 rad/s.
-    rate_deg_s: float = parameter(17.0, 'largest rate of each joint', 'deg/s', 0.1, 180.0,
-                                  name='limits.rate_deg_s')
-    minutes: float = parameter(15.0, 'largest time of all manoeuvres together', 'min', 0.5, 240.0,
-                               name='limits.minutes')
+    rate_deg_s: float = parameter(
+        17.0, 'largest rate of each joint', 'deg/s', 0.1, 180.0, name='limits.rate_deg_s'
+    )
+    minutes: float = parameter(
+        15.0, 'largest time of all manoeuvres together', 'min', 0.5, 240.0, name='limits.minutes'
+    )
     seed: int = parameter(0, 'seed of the diagnosis', '', *SEEDS)
 
 
@@ -57,12 +62,18 @@ _MOST_NAMED = 3  # Largest number of hypotheses in a line; chosen: a reader keep
 
 def answer_lines(minutes: float, answer: Answer) -> list[str]:
     """Return the probabilities after a diagnosis, and what follows."""
-    named = '  '.join(f'{investigation.hypothesis_text(h.effects)} {percent(h.probability)}'
-                      for h in answer.hypotheses[:_MOST_NAMED])
+    named = '  '.join(
+        f'{investigation.hypothesis_text(h.effects)} {percent(h.probability)}'
+        for h in answer.hypotheses[:_MOST_NAMED]
+    )
     lines = wrap(f'{minutes:5.1f} min  {named}', COLUMNS, subsequent_indent=_INDENT)
     if answer.outcome is investigation.Outcome.GO_ON:
-        lines += wrap(f'next: {CATALOGUE[answer.manoeuvre].text}', COLUMNS,
-                      initial_indent=_INDENT, subsequent_indent=_INDENT)
+        lines += wrap(
+            f'next: {CATALOGUE[answer.manoeuvre].text}',
+            COLUMNS,
+            initial_indent=_INDENT,
+            subsequent_indent=_INDENT,
+        )
     return lines
 
 
@@ -72,13 +83,21 @@ def closing_lines(ended: Investigation, folder: OutputFolder) -> list[str]:
     if ended.state is State.STOPPED:
         return ['', *end_lines([f'Stopped without a verdict: {ended.reason}'], files)]
     words = 'rich', '--params', str(folder.parameters), '-o', str(free_name('sim.csv'))
-    return ['', *end_lines([ended.answers[-1][1].sentence], files,
-                           command('simulate', shlex.join(words)))]
+    return [
+        '',
+        *end_lines([ended.answers[-1][1].sentence], files, command('simulate', shlex.join(words))),
+    ]
 
 
 _SAMPLES, _STAGE = 'imu/data_raw', 'stage/joint_states'
-_KINDS = {_SAMPLES: Imu, _STAGE: JointState, 'stage/command': JointState,
-          'temperature': Temperature, 'supply': BatteryState, 'sensor_info': DiagnosticStatus}
+_KINDS = {
+    _SAMPLES: Imu,
+    _STAGE: JointState,
+    'stage/command': JointState,
+    'temperature': Temperature,
+    'supply': BatteryState,
+    'sensor_info': DiagnosticStatus,
+}
 """Type of each recorded topic."""
 _QUEUE = 20000  # Messages of a topic that are kept while the node is busy: 20 s at 1 kHz
 
@@ -86,9 +105,12 @@ _POLL_S = 0.02  # Time between two commands, s; chosen: a tenth of the largest s
 _FAREWELL_S = 0.5
 """Time for which the last command is repeated at the end, s; chosen: the stage has it then."""
 _COMMAND_QUEUE = 10  # Commands that are kept for a slow subscriber; chosen
-_EXAMPLES = {'a unit by its parameter file, within limits':
-             '--ros-args --params-file unit.yaml -p limits.rate_deg_s:=10.0 '
-             "-p 'limits.beta_deg:=[-90.0,90.0]'"}
+_EXAMPLES = {
+    'a unit by its parameter file, within limits': (
+        '--ros-args --params-file unit.yaml -p limits.rate_deg_s:=10.0 '
+        "-p 'limits.beta_deg:=[-90.0,90.0]'"
+    )
+}
 """Examples of arguments, by their purpose."""
 
 
@@ -110,9 +132,10 @@ class Investigate(Node):
         limits = StageLimits(alpha_rad, beta_rad, float(np.radians(own.rate_deg_s)))
         self._commands = topics.create_publisher(self, JointState, 'stage/command', _COMMAND_QUEUE)
         self.create_service(Trigger, '~/abort', self._on_abort)
-        self._inboxes = {topic: topics.Inbox(self, kind, topic, _QUEUE,
-                                             latched=topic == 'sensor_info')
-                         for topic, kind in _KINDS.items()}
+        self._inboxes = {
+            topic: topics.Inbox(self, kind, topic, _QUEUE, latched=topic == 'sensor_info')
+            for topic, kind in _KINDS.items()
+        }
         self._bag: LiveBag | None = None  # None before sensor and stage are there
         self._has_samples = False
         self._pose: Pose | None = None
@@ -120,19 +143,27 @@ class Investigate(Node):
         self._folder = OutputFolder.free(Path(own.output))
         self._screen = LiveLine()
         self._investigation = Investigation(
-            limits, own.minutes,
+            limits,
+            own.minutes,
             investigation.BackgroundDiagnoser(self._folder, limits, own.seed),
-            lambda minutes, answer: self._screen.add(*answer_lines(minutes, answer)), self._flush)
+            lambda minutes, answer: self._screen.add(*answer_lines(minutes, answer)),
+            self._flush,
+        )
         self._busy_s = time.monotonic()
         self._request = ''
         # A handler of rclpy would end the graph before the stage has its last command.
         for number, name in ((signal.SIGINT, 'Ctrl-C'), (signal.SIGTERM, 'SIGTERM')):
             signal.signal(number, partial(self.request_stop, name))
-        ranges = ', '.join(f'{joint} {low:.0f} to {high:.0f}°' for joint, (low, high) in (
-            ('alpha', alpha_deg), ('beta', beta_deg)))
-        self._screen.add(f'Investigation into {self._folder.path}, manoeuvres of '
-                         f'{own.minutes:g} minutes at most',
-                         f'Stage within {ranges}, {own.rate_deg_s:.3g}°/s', '')
+        ranges = ', '.join(
+            f'{joint} {low:.0f} to {high:.0f}°'
+            for joint, (low, high) in (('alpha', alpha_deg), ('beta', beta_deg))
+        )
+        self._screen.add(
+            f'Investigation into {self._folder.path}, manoeuvres of '
+            f'{own.minutes:g} minutes at most',
+            f'Stage within {ranges}, {own.rate_deg_s:.3g}°/s',
+            '',
+        )
         self.create_timer(_POLL_S, self._poll, clock=topics.STEADY)
 
     def request_stop(self, name: str, *_: object) -> None:
@@ -158,8 +189,10 @@ class Investigate(Node):
                 continue
             messages = self._inboxes[topic].take()
             if self._bag is not None:
-                recorded = self.resolve_topic_name(topic), \
-                    f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
+                recorded = (
+                    self.resolve_topic_name(topic),
+                    f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}',
+                )
                 for message in messages:
                     self._bag.write(*recorded, message, time.time_ns())
             if topic == _STAGE:
@@ -178,9 +211,14 @@ class Investigate(Node):
         now = self.get_clock().now()
         command = run.step(now.nanoseconds * 1e-9, self._pose) if now.nanoseconds else None
         if command is not None:
-            self._commands.publish(JointState(
-                header=Header(stamp=now.to_msg()), name=['alpha', 'beta'], position=list(command),
-                velocity=list(run.speed or ())))
+            self._commands.publish(
+                JointState(
+                    header=Header(stamp=now.to_msg()),
+                    name=['alpha', 'beta'],
+                    position=list(command),
+                    velocity=list(run.speed or ()),
+                )
+            )
         left = f', {run.remaining_s:.0f} s left' if run.state is State.MOVING else ''
         self._screen.show(f'{run.minutes:5.1f} min{left}  {run.text}'[:COLUMNS])
         now_s = time.monotonic()
@@ -215,8 +253,10 @@ class Investigate(Node):
         values = {'state': run.state.value, 'minutes': run.minutes}
         if run.answers:
             best = run.answers[-1][1].hypotheses[0]
-            values |= {'hypothesis': ' '.join(best.effects) or 'no gap',
-                       'probability': best.probability}
+            values |= {
+                'hypothesis': ' '.join(best.effects) or 'no gap',
+                'probability': best.probability,
+            }
         return Status(level, run.text, self._sensor.serial, values)
 
 

@@ -36,8 +36,9 @@ def executable(name: str) -> str:
 
 
 @contextmanager
-def running(commands: Sequence[Sequence[str]], errors: int | IO[bytes] = subprocess.DEVNULL
-            ) -> Iterator[list[subprocess.Popen]]:
+def running(
+    commands: Sequence[Sequence[str]], errors: int | IO[bytes] = subprocess.DEVNULL
+) -> Iterator[list[subprocess.Popen]]:
     """Yield the processes of commands, and end them: interrupt, and kill what stays for 10 s."""
     processes = [subprocess.Popen(command, stderr=errors) for command in commands]
     try:

@@ -45,20 +45,32 @@ class Argument(NamedTuple):
 
     def declared(self) -> DeclareLaunchArgument:
         """Return the action that declares it; an empty value leaves the parameter as it is."""
-        return declared(self.name, '', f'{self.spec.meaning}; not given: as in params_file, or '
-                        'the default', *('',) * bool(self.spec.choices), *self.spec.choices)
+        return declared(
+            self.name,
+            '',
+            f'{self.spec.meaning}; not given: as in params_file, or the default',
+            *('',) * bool(self.spec.choices),
+            *self.spec.choices,
+        )
 
     def value(self, text: str) -> Any:
         """Return the value of the parameter."""
         default = self.spec.default
         # A list of numbers has a unit; names with commas stay one text.
-        convert = _numbers if default == () and self.spec.unit else \
-            type(default) if isinstance(default, int | float) else str
+        convert = (
+            _numbers
+            if default == () and self.spec.unit
+            else type(default)
+            if isinstance(default, int | float)
+            else str
+        )
         try:
             return convert(text)
         except ValueError:
-            raise UserError(f'{self.name}:={text}: expected a number, or numbers with commas '
-                            'where it is a list') from None
+            raise UserError(
+                f'{self.name}:={text}: expected a number, or numbers with commas '
+                'where it is a list'
+            ) from None
 
 
 def _numbers(text: str) -> list[float]:
@@ -79,47 +91,78 @@ def arguments(own: type, *parameters: str, **renamed: str) -> tuple[Argument, ..
     return tuple(Argument(name, specs[parameter]) for name, parameter in names.items())
 
 
-LINK = arguments(driver.DriverSettings, 'frame_id', 'link.type', 'link.port', 'link.baud',
-                 'link.uri', 'link.device', 'link.channels', 'link.recording')
+LINK = arguments(
+    driver.DriverSettings,
+    'frame_id',
+    'link.type',
+    'link.port',
+    'link.baud',
+    'link.uri',
+    'link.device',
+    'link.channels',
+    'link.recording',
+)
 """Arguments of the link, and of the frame of its samples."""
-STAGE = (*arguments(stage.StageSettings, 'stage.type'), *arguments(
-    stage.BridgeSettings, *(spec.name for spec in specs_of(stage.BridgeSettings))))
+STAGE = (
+    *arguments(stage.StageSettings, 'stage.type'),
+    *arguments(stage.BridgeSettings, *(spec.name for spec in specs_of(stage.BridgeSettings))),
+)
 """Arguments of the stage."""
 SPEED = arguments(driver.DriverSettings, speed='link.speed')  # Speed of a simulated sensor
 
 
 def declared(name: str, default: str, description: str, *choices: str) -> DeclareLaunchArgument:
     """Declare an argument of a launch."""
-    return DeclareLaunchArgument(name, default_value=default, description=description,
-                                 choices=choices or None)
+    return DeclareLaunchArgument(
+        name, default_value=default, description=description, choices=choices or None
+    )
 
 
 TRANSFORM = (
-    declared('base_frame', '', 'frame of the robot, such as base_link, of which the static '
-             'transform to frame_id is published; empty: none'),
+    declared(
+        'base_frame',
+        '',
+        'frame of the robot, such as base_link, of which the static '
+        'transform to frame_id is published; empty: none',
+    ),
     declared('mounting_xyz_m', '0,0,0', 'place of the case in base_frame, m'),
-    declared('mounting_rpy_rad', '0,0,0', 'roll, pitch and yaw of the case in base_frame, rad'))
+    declared('mounting_rpy_rad', '0,0,0', 'roll, pitch and yaw of the case in base_frame, rad'),
+)
 """Arguments of the static transform."""
 
 
 def common_arguments(*own: Argument) -> list[DeclareLaunchArgument]:
     """Return the arguments that all launch files have."""
     return [
-        declared('params_file', str(parameter_file.nominal_path()),
-                 'parameter file of the sensor, its link and the nodes'),
+        declared(
+            'params_file',
+            str(parameter_file.nominal_path()),
+            'parameter file of the sensor, its link and the nodes',
+        ),
         declared('namespace', '', 'namespace of the nodes and their topics'),
         declared('log_level', 'info', 'log level', 'debug', 'info', 'warn', 'error', 'fatal'),
-        declared('enclave', '', 'folder of the enclaves of SROS 2, such as /adxl_ros; each node '
-                 'has one of its name there; empty: none'),
-        *(argument.declared() for argument in own)]
+        declared(
+            'enclave',
+            '',
+            'folder of the enclaves of SROS 2, such as /adxl_ros; each node '
+            'has one of its name there; empty: none',
+        ),
+        *(argument.declared() for argument in own),
+    ]
 
 
-def describe(arguments: Sequence[DeclareLaunchArgument],
-             make_nodes: Callable[[LaunchContext], list[Action]]) -> LaunchDescription:
+def describe(
+    arguments: Sequence[DeclareLaunchArgument], make_nodes: Callable[[LaunchContext], list[Action]]
+) -> LaunchDescription:
     """Describe a launch by its arguments and what makes its nodes."""
     names = [argument.name for argument in arguments]
-    return LaunchDescription([*arguments, OpaqueFunction(function=check_names, args=[names]),
-                              OpaqueFunction(function=make_nodes)])
+    return LaunchDescription(
+        [
+            *arguments,
+            OpaqueFunction(function=check_names, args=[names]),
+            OpaqueFunction(function=make_nodes),
+        ]
+    )
 
 
 def check_names(context: LaunchContext, names: Sequence[str]) -> None:
@@ -142,12 +185,19 @@ def check_names(context: LaunchContext, names: Sequence[str]) -> None:
 
 def _is_on_command_line(path: str) -> bool:
     """Return whether the command of this process names a launch file, by package or path."""
-    return (_PACKAGE, Path(path).name) in pairwise(sys.argv) or \
-        Path(path).resolve() in [Path(word).resolve() for word in sys.argv]
+    return (_PACKAGE, Path(path).name) in pairwise(sys.argv) or Path(path).resolve() in [
+        Path(word).resolve() for word in sys.argv
+    ]
 
 
-def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, Any],
-              params_file: str = '', respawn: bool = True, **options: Any) -> Node:
+def make_node(
+    context: LaunchContext,
+    executable: str,
+    overrides: Mapping[str, Any],
+    params_file: str = '',
+    respawn: bool = True,
+    **options: Any,
+) -> Node:
     """
     Make a node of this package with the parameter file of the launch.
 
@@ -157,23 +207,30 @@ def make_node(context: LaunchContext, executable: str, overrides: Mapping[str, A
     name = full_name(context, executable)
     is_named = has_section(path, name)
     if executable == 'driver' and not is_named:
-        raise UserError(f'{path}: has no parameters of the node {name}; begin the file with /**: '
-                        f'or {name}:')
+        raise UserError(
+            f'{path}: has no parameters of the node {name}; begin the file with /**: or {name}:'
+        )
     link = [argument for argument in LINK if argument.name in context.launch_configurations]
     # launch_ros would read a text as YAML.
-    given = {key: ParameterValue(value, value_type=str) if isinstance(value, str) else value
-             for key, value in {**given_parameters(context, link), **overrides}.items()}
+    given = {
+        key: ParameterValue(value, value_type=str) if isinstance(value, str) else value
+        for key, value in {**given_parameters(context, link), **overrides}.items()
+    }
     options.setdefault('output', 'screen')
     if 'on_exit' not in options:
         options |= {'respawn': respawn, 'respawn_delay': 2.0, 'on_exit': end_with_refusal}
     # The nominal sensor is what a node without a file has; a file would name it for any stream.
     is_named &= path != str(parameter_file.nominal_path())
     # With its name a node gets the parameters in a section of its own, which counts before others.
-    return Node(package=_PACKAGE, executable=executable, name=executable,
-                namespace=text(context, 'namespace'),
-                parameters=[path] * is_named + [given] * bool(given),
-                ros_arguments=[*_enclave(context, executable),
-                               '--log-level', text(context, 'log_level')], **options)
+    return Node(
+        package=_PACKAGE,
+        executable=executable,
+        name=executable,
+        namespace=text(context, 'namespace'),
+        parameters=[path] * is_named + [given] * bool(given),
+        ros_arguments=[*_enclave(context, executable), '--log-level', text(context, 'log_level')],
+        **options,
+    )
 
 
 def _enclave(context: LaunchContext, executable: str) -> list[str]:
@@ -188,13 +245,24 @@ def static_transform(context: LaunchContext) -> list[Action]:
     if not base_frame:
         return []
     frame_id = given_anywhere(context, 'frame_id', 'driver') or driver.DEFAULT_FRAME
-    values = (*three_numbers(context, 'mounting_xyz_m'),
-              *three_numbers(context, 'mounting_rpy_rad'), base_frame, frame_id)
-    options = zip(('--x', '--y', '--z', '--roll', '--pitch', '--yaw', '--frame-id',
-                   '--child-frame-id'), map(str, values))
-    return [Node(package='tf2_ros', executable=executable,
-                 ros_arguments=_enclave(context, executable),
-                 arguments=[part for option in options for part in option])]
+    values = (
+        *three_numbers(context, 'mounting_xyz_m'),
+        *three_numbers(context, 'mounting_rpy_rad'),
+        base_frame,
+        frame_id,
+    )
+    options = zip(
+        ('--x', '--y', '--z', '--roll', '--pitch', '--yaw', '--frame-id', '--child-frame-id'),
+        map(str, values),
+    )
+    return [
+        Node(
+            package='tf2_ros',
+            executable=executable,
+            ros_arguments=_enclave(context, executable),
+            arguments=[part for option in options for part in option],
+        )
+    ]
 
 
 def three_numbers(context: LaunchContext, name: str) -> list[float]:
@@ -215,21 +283,25 @@ def text(context: LaunchContext, name: str) -> str:
 def given_parameters(context: LaunchContext, arguments: Sequence[Argument]) -> dict[str, Any]:
     """Return the parameters that the arguments of a launch give."""
     texts = {argument: text(context, argument.name) for argument in arguments}
-    return {argument.spec.name: argument.value(given) for argument, given in texts.items()
-            if given}
+    return {
+        argument.spec.name: argument.value(given) for argument, given in texts.items() if given
+    }
 
 
 def full_name(context: LaunchContext, name: str) -> str:
     """Return the fully qualified name of a node or topic."""
-    namespace = prefix_namespace(context.launch_configurations.get(_PUSHED),
-                                 text(context, 'namespace')) or ''
+    namespace = (
+        prefix_namespace(context.launch_configurations.get(_PUSHED), text(context, 'namespace'))
+        or ''
+    )
     return '/'.join(('', *filter(None, namespace.split('/')), name))
 
 
 def given_anywhere(context: LaunchContext, parameter: str, executable: str) -> str:
     """Return a parameter that an argument or the parameter file gives."""
     return text(context, parameter.replace('.', '_')) or given_text(
-        text(context, 'params_file'), full_name(context, executable), parameter)
+        text(context, 'params_file'), full_name(context, executable), parameter
+    )
 
 
 def simulated_link(context: LaunchContext, speed: Mapping[str, Any]) -> dict[str, Any]:
@@ -246,13 +318,16 @@ def end_with_refusal(event: ProcessExited, context: LaunchContext) -> None:
 
 def end_with(success: str, failure: str) -> Callable[[ProcessExited, LaunchContext], list[Action]]:
     """Return a function that ends a launch when its main node ends, with the same success."""
+
     def end(event: ProcessExited, context: LaunchContext) -> list[Action]:
         if context.is_shutdown:
             return []
         if event.returncode:
-            raise UserError(f'{event.process_name} has ended with the status {event.returncode}; '
-                            f'{failure}')
+            raise UserError(
+                f'{event.process_name} has ended with the status {event.returncode}; {failure}'
+            )
         return [LogInfo(msg=success), Shutdown(reason=f'{event.process_name} is done')]
+
     return end
 
 
@@ -263,4 +338,5 @@ def refuse_simulated_stage(context: LaunchContext, others: str = '') -> None:
         raise UserError(
             f'link_type is {link}, but the stage would be simulated; set stage_type:=trajectory '
             'or joint_state with bridge_alpha_joint and bridge_beta_joint for a stage that turns '
-            f'itself, {others}or stage_type:=simulated')
+            f'itself, {others}or stage_type:=simulated'
+        )

@@ -18,8 +18,13 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState, Temperature
 
 _SIMULATOR_QUEUE = 1000  # Samples that are kept while the node is busy: 1 s at 1 kHz
-_FIELDS = {'orientation': 4, 'orientation_covariance': 9, 'angular_velocity': 3,
-           'angular_velocity_covariance': 9, 'linear_acceleration': 3}
+_FIELDS = {
+    'orientation': 4,
+    'orientation_covariance': 9,
+    'angular_velocity': 3,
+    'angular_velocity_covariance': 9,
+    'linear_acceleration': 3,
+}
 """Number fields of sensor_msgs/Imu with their counts."""
 _PAUSE_S = 0.004
 """Time between two looks at the samples, s. At 1 kHz four of them then share a run of the chain,
@@ -34,11 +39,14 @@ class SimulatorInput:
         self._node, self._link = node, link
         self.frame_id = ''  # Frame of the newest samples
         self._due_s = self._looked_s = time.monotonic()
-        self._inbox = topics.Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE,
-                                   link.imu_unit)
+        self._inbox = topics.Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE, link.imu_unit)
         self._temperature = topics.create_subscription(
-            node, Temperature, link.temperature_topic,
-            lambda message: link.sense_temperature(message.temperature), 1)
+            node,
+            Temperature,
+            link.temperature_topic,
+            lambda message: link.sense_temperature(message.temperature),
+            1,
+        )
 
     def destroy(self) -> None:
         """Remove the subscriptions; the thread that waits must have ended."""
@@ -86,8 +94,15 @@ _LOG_INTERVAL_S = 1.0  # Shortest time between two logs of the state of a link, 
 class LinkReader:
     """Reads a link in a thread and publishes its samples, until closed."""
 
-    def __init__(self, node: Node, link: Link, output: SampleOutput, settings: Any,
-                 on_error: Callable[[UserError], None], on_level: Callable[[Level], None]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        link: Link,
+        output: SampleOutput,
+        settings: Any,
+        on_error: Callable[[UserError], None],
+        on_level: Callable[[Level], None],
+    ) -> None:
         self._node, self._link, self._output, self._settings = node, link, output, settings
         self._on_level = on_level
         self._ros: Any = node.get_clock()
@@ -114,11 +129,15 @@ class LinkReader:
             if link.sensor is not None:
                 output.use(link.sensor)
             if isinstance(link, StageLink):
-                self._stage = topics.Inbox(node, JointState, link.joint_state_topic, _QUEUE,
-                                           reliable=True)
+                self._stage = topics.Inbox(
+                    node, JointState, link.joint_state_topic, _QUEUE, reliable=True
+                )
                 on_close.callback(self._stage.destroy)
-            on_close.callback(topics.RepeatingThread(
-                node, self._live_turn if link.live else self._paced_turn, 'link', on_error).close)
+            on_close.callback(
+                topics.RepeatingThread(
+                    node, self._live_turn if link.live else self._paced_turn, 'link', on_error
+                ).close
+            )
             self._on_close = on_close.pop_all()
 
     def close(self) -> None:
@@ -233,8 +252,9 @@ class LinkReader:
         if not -_PERIOD_S * 1e9 < jump_ns < _JUMP_NS:
             self._output.tally.counts['missing'] += self._link.begin(ros_ns)
             self._output.tally.begin(ros_ns)
-            self._node.get_logger().warning(f'the clock jumped by {jump_ns * 1e-9:+.3f} s; '
-                                            'the samples go on from there')
+            self._node.get_logger().warning(
+                f'the clock jumped by {jump_ns * 1e-9:+.3f} s; the samples go on from there'
+            )
         return ros_ns
 
     def _take_motion(self) -> None:

@@ -32,24 +32,38 @@ from sensor_msgs.msg import Imu, JointState
 class MonitorSettings:
     """The monitor."""
 
-    reference: str = parameter('stage', 'what the sensor is compared with: the joints of a stage, '
-                               'the ideal Imu of a simulator, or the joints of a robot',
-                               choices=('stage', 'imu', 'robot'))
-    reference_topic: str = parameter('', 'topic of the reference; empty: stage/joint_states, '
-                                     'imu/ideal, or joint_states')
+    reference: str = parameter(
+        'stage',
+        'what the sensor is compared with: the joints of a stage, '
+        'the ideal Imu of a simulator, or the joints of a robot',
+        choices=('stage', 'imu', 'robot'),
+    )
+    reference_topic: str = parameter(
+        '', 'topic of the reference; empty: stage/joint_states, imu/ideal, or joint_states'
+    )
     urdf: str = parameter('', 'file of the robot; its base rests')
     frame: str = parameter('imu_link', 'frame of the robot that carries the sensor')
     samples_unit: str = sample_unit()
     window_s: float = parameter(60.0, 'time over which gap and floor are taken', 's', 5.0, 3600.0)
-    false_alarms_per_day: float = parameter(0.0333, 'largest rate of reported changes that are '
-                                            'none', '1/day', 1e-5, 10.0)
+    false_alarms_per_day: float = parameter(
+        0.0333, 'largest rate of reported changes that are none', '1/day', 1e-5, 10.0
+    )
     history_s: float = parameter(600.0, 'time that is kept for a diagnosis', 's', 60.0, 3600.0)
-    wait_s: float = parameter(120.0, 'time of samples that an automatic diagnosis needs', 's',
-                              20.0, 3600.0, name='diagnose.wait_s')
-    output: str = parameter(str(calibration_store.default_folder().with_name('monitor')),
-                            'folder of the record of changes and of the diagnoses')
-    automatic: bool = parameter(True, 'diagnose a change, or an open gap',
-                                name='diagnose.automatic')
+    wait_s: float = parameter(
+        120.0,
+        'time of samples that an automatic diagnosis needs',
+        's',
+        20.0,
+        3600.0,
+        name='diagnose.wait_s',
+    )
+    output: str = parameter(
+        str(calibration_store.default_folder().with_name('monitor')),
+        'folder of the record of changes and of the diagnoses',
+    )
+    automatic: bool = parameter(
+        True, 'diagnose a change, or an open gap', name='diagnose.automatic'
+    )
 
 
 def gap_status(live: LiveGap, likely: DiagnosisResult | None, window_s: float) -> Status:
@@ -58,19 +72,29 @@ def gap_status(live: LiveGap, likely: DiagnosisResult | None, window_s: float) -
     text = 'comparing; the first result takes some seconds'
     values: dict[str, object] = {'window_s': window_s, 'changes': len(live.changes)}
     if gaps:
-        text = ', '.join(f'{name} {", ".join(parts)} mg' for name, parts in {
-            'gap': [f'{gap.axis} {gap.gap.value:.3g}' for gap in gaps],
-            'floor': [f'{gap.axis} {gap.floor.value:.3g}' for gap in gaps]}.items())
+        text = ', '.join(
+            f'{name} {", ".join(parts)} mg'
+            for name, parts in {
+                'gap': [f'{gap.axis} {gap.gap.value:.3g}' for gap in gaps],
+                'floor': [f'{gap.axis} {gap.floor.value:.3g}' for gap in gaps],
+            }.items()
+        )
     for change in changed:
         since = iso_time(change.since_ns)
         text += f'; changed since {since}: {change.text()}'
-        values |= {'changed_since': since, 'changed_since_s': change.since_ns * 1e-9,
-                   'detected_s': change.detected_ns * 1e-9}
+        values |= {
+            'changed_since': since,
+            'changed_since_s': change.since_ns * 1e-9,
+            'detected_s': change.detected_ns * 1e-9,
+        }
     if likely is not None:
         named = f'likely {" or ".join(likely.effects)} ({percent(likely.probability)})'
         text += f'; {named if likely.effects else likely.text}'
-        values |= {'likely_effect': ', '.join(likely.effects),
-                   'probability': likely.probability, 'report': likely.report}
+        values |= {
+            'likely_effect': ', '.join(likely.effects),
+            'probability': likely.probability,
+            'report': likely.report,
+        }
     is_fine = gaps and not changed and not any(gap.is_open for gap in gaps)
     return Status(Level.OK if is_fine else Level.WARN, text, live.sensor.serial, values)
 
@@ -79,17 +103,27 @@ def axis_status(gap: AxisGap, serial: str) -> Status:
     """Return the gap of an axis; `explained` is absent where nothing is to explain."""
     values: dict[str, object] = {'offset_mg': gap.offset_mg, 'floor_source': gap.floor_source}
     for name, interval in (('gap', gap.gap), ('floor', gap.floor)):
-        values |= {f'{name}_mg': interval.value, f'{name}_low_mg': interval.low,
-                   f'{name}_high_mg': interval.high}
+        values |= {
+            f'{name}_mg': interval.value,
+            f'{name}_low_mg': interval.low,
+            f'{name}_high_mg': interval.high,
+        }
     if gap.explained is not None:
         values['explained'] = gap.explained
-    return Status(Level.WARN if gap.is_open else Level.OK, f'gap {gap.gap.value:.3g} mg, floor '
-                  f'{gap.floor.value:.3g} mg', serial, values)
+    return Status(
+        Level.WARN if gap.is_open else Level.OK,
+        f'gap {gap.gap.value:.3g} mg, floor {gap.floor.value:.3g} mg',
+        serial,
+        values,
+    )
 
 
 _INPUT_QUEUE = 10000  # Messages that are kept while the node is busy: 10 s at 1 kHz
-_TOPICS = {ReferenceKind.STAGE: 'stage/joint_states', ReferenceKind.IMU: 'imu/ideal',
-           ReferenceKind.ROBOT: 'joint_states'}
+_TOPICS = {
+    ReferenceKind.STAGE: 'stage/joint_states',
+    ReferenceKind.IMU: 'imu/ideal',
+    ReferenceKind.ROBOT: 'joint_states',
+}
 """Usual topic of each reference."""
 _TURN_S = 0.05
 """Time between two looks at the topics, s; chosen: a turn costs as much as ten messages."""
@@ -104,7 +138,8 @@ _PAUSE_S = 600.0
 _EXAMPLES = {
     'a sensor on a stage': '--ros-args --params-file unit.yaml',
     'a sensor on a robot': '--ros-args --params-file unit.yaml -p reference:=robot '
-    '-p urdf:=robot.urdf'}
+    '-p urdf:=robot.urdf',
+}
 """Examples of arguments, by their purpose."""
 
 
@@ -122,11 +157,14 @@ class Monitor(Node):
         self._own = own = parameters.declare_all(self, MonitorSettings)
         self._kind = ReferenceKind(own.reference)
         self._reference_topic = own.reference_topic or _TOPICS[self._kind]
-        self._robot = RobotForce(
-            Robot(own.urdf, own.frame), self._file_sensor.local_gravity_mps2) \
-            if self._kind is ReferenceKind.ROBOT else None
-        self._settings = GapSettings(own.window_s, own.false_alarms_per_day, own.history_s,
-                                     own.wait_s)
+        self._robot = (
+            RobotForce(Robot(own.urdf, own.frame), self._file_sensor.local_gravity_mps2)
+            if self._kind is ReferenceKind.ROBOT
+            else None
+        )
+        self._settings = GapSettings(
+            own.window_s, own.false_alarms_per_day, own.history_s, own.wait_s
+        )
         self._output = Path(own.output).expanduser()
         self._live = LiveGap(self._file_sensor, self._kind, self._settings)
         self._info: StreamInfo | None = None  # None until samples are compared
@@ -137,18 +175,26 @@ class Monitor(Node):
         self._changed_ns = 0  # Begin of a change that is not diagnosed yet, ns; 0 without one
         self._diagnosed_s = -_PAUSE_S
         self._begun_s = 0.0
-        self._samples = Inbox(self, Imu, 'imu/data_raw', _INPUT_QUEUE,
-                              own.samples_unit)
-        self._reference = Inbox(self, Imu if self._kind is ReferenceKind.IMU else JointState,
-                                self._reference_topic, _INPUT_QUEUE)
+        self._samples = Inbox(self, Imu, 'imu/data_raw', _INPUT_QUEUE, own.samples_unit)
+        self._reference = Inbox(
+            self,
+            Imu if self._kind is ReferenceKind.IMU else JointState,
+            self._reference_topic,
+            _INPUT_QUEUE,
+        )
         self._surroundings = topics.Surroundings(self, _INPUT_QUEUE)
         self._publisher = topics.create_publisher(self, DiagnosticArray, 'gap', _QUEUE)
         self._service = topics.LateService(self, '~/diagnose')
         topics.DiagnosticsReporter(self, 'gap', self._status)
         self._info_topic = self.resolve_topic_name('sensor_info')
         topics.create_subscription(
-            self, DiagnosticStatus, 'sensor_info', lambda message: self._compare_by(
-                topics.stream_info(message, self._info_topic)), 1, latched=True)
+            self,
+            DiagnosticStatus,
+            'sensor_info',
+            lambda message: self._compare_by(topics.stream_info(message, self._info_topic)),
+            1,
+            latched=True,
+        )
         self.create_timer(_TURN_S, self._turn, clock=topics.STEADY)
         self.create_timer(_PERIOD_S, self._publish, clock=topics.STEADY)
 
@@ -176,10 +222,12 @@ class Monitor(Node):
         self._changed_ns, self._result = 0, None
         self.get_logger().info(
             f'comparing {self.resolve_topic_name("imu/data_raw")} of {sensor.serial} with '
-            f'{self.resolve_topic_name(self._reference_topic)}')
+            f'{self.resolve_topic_name(self._reference_topic)}'
+        )
         if self._live.left_out:
-            self.get_logger().warning(f'not predicted, for want of stage angles: '
-                                      f'{", ".join(self._live.left_out)}')
+            self.get_logger().warning(
+                f'not predicted, for want of stage angles: {", ".join(self._live.left_out)}'
+            )
 
     def _turn(self) -> None:
         """Take what has come, compare, and serve."""
@@ -206,7 +254,8 @@ class Monitor(Node):
             readings = [reading for reading in topics.joint_readings(messages) if reading.position]
             (self._robot.add if self._robot else reference.add_joints)(
                 [reading.stamp_ns for reading in readings],
-                [reading.position for reading in readings])
+                [reading.position for reading in readings],
+            )
         if self._robot:
             self._robot.send(reference)
 
@@ -215,7 +264,8 @@ class Monitor(Node):
         found = self._live.advance()
         for change in found:
             self.get_logger().warning(
-                f'changed since {iso_time(change.since_ns)}: {change.text()}')
+                f'changed since {iso_time(change.since_ns)}: {change.text()}'
+            )
             try:
                 changes.append(self._output, change, self._live.sensor.serial)
             except UserError as error:
@@ -226,11 +276,16 @@ class Monitor(Node):
 
     def _diagnose_if_due(self) -> None:
         """Diagnose a change, or the first open gap, once there are enough samples."""
-        is_due = self._own.automatic and self._run is None \
-            and time.monotonic() - self._diagnosed_s >= _PAUSE_S \
+        is_due = (
+            self._own.automatic
+            and self._run is None
+            and time.monotonic() - self._diagnosed_s >= _PAUSE_S
             and self._live.span_s(self._changed_ns) >= self._settings.wait_s
-        if is_due and (self._changed_ns or (self._result is None and any(
-                gap.is_open for gap in self._live.report()))):
+        )
+        if is_due and (
+            self._changed_ns
+            or (self._result is None and any(gap.is_open for gap in self._live.report()))
+        ):
             self._begin_diagnosis(self._changed_ns)
             self._changed_ns, self._diagnosed_s = 0, time.monotonic()
 
@@ -272,8 +327,9 @@ class Monitor(Node):
         summary = gap_status(self._live, self._result, self._settings.window_s)
         if obstacle := self._obstacle():
             return replace(summary, level=Level.WARN, summary=obstacle), {}
-        return summary, {gap.axis: axis_status(gap, self._live.sensor.serial)
-                         for gap in self._live.report()}
+        return summary, {
+            gap.axis: axis_status(gap, self._live.sensor.serial) for gap in self._live.report()
+        }
 
     def _publish(self) -> None:
         summary, axes = self._state()
@@ -287,10 +343,19 @@ class Monitor(Node):
     def _status(self) -> Status:
         """Return the state for /diagnostics, with counts."""
         summary, axes = self._state()
-        values = {**summary.values, **{f'{axis}_{key}': value for axis, status in axes.items()
-                                       for key, value in status.values.items()}}
-        values |= {**self._live.counts, 'diagnosis_runs': self._run is not None,
-                   'false_alarms_per_day': self._settings.false_alarms_per_day}
+        values = {
+            **summary.values,
+            **{
+                f'{axis}_{key}': value
+                for axis, status in axes.items()
+                for key, value in status.values.items()
+            },
+        }
+        values |= {
+            **self._live.counts,
+            'diagnosis_runs': self._run is not None,
+            'false_alarms_per_day': self._settings.false_alarms_per_day,
+        }
         faults = self._refusal, self._samples.fault(), self._reference.fault()
         level = Level.ERROR if any(faults) else summary.level
         return replace(summary, level=level, values=values)

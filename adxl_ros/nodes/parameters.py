@@ -40,7 +40,7 @@ import yaml
 T = TypeVar('T')
 Kind = Parameter.Type  # Types of ROS parameters
 LINK = 'link.'  # Begin of the names of all parameters of a link; the driver alone has them
-SEEDS = (0, 2 ** 31 - 1)  # Range of seeds
+SEEDS = (0, 2**31 - 1)  # Range of seeds
 _ANY_NODE = ('use_sim_time', 'start_type_description_service')  # Parameters of every node of rclpy
 _QOS = 'qos_overrides.'  # Begin of the names of parameters that override the QoS of a topic
 _FREE_PREFIXES = ('provenance.', LINK)
@@ -103,26 +103,36 @@ SI = 'mps2'  # Unit of the accelerations of a sensor_msgs/Imu by its definition
 
 def sample_unit() -> Any:
     """Declare the unit of the samples of a foreign IMU by a field of a dataclass."""
-    return parameter(SI, 'unit of the samples on imu/data_raw, as some drivers publish g',
-                     choices=tuple(GRAVITY), name='samples.unit')
+    return parameter(
+        SI,
+        'unit of the samples on imu/data_raw, as some drivers publish g',
+        choices=tuple(GRAVITY),
+        name='samples.unit',
+    )
 
 
 def specs_of(settings: Any) -> list[Spec]:
     """Return the parameters of a dataclass."""
-    return [spec._replace(name=spec.name or f.name) for f in fields(settings)
-            if (spec := f.metadata.get('spec'))]
+    return [
+        spec._replace(name=spec.name or f.name)
+        for f in fields(settings)
+        if (spec := f.metadata.get('spec'))
+    ]
 
 
 def node_specs(module: ModuleType) -> list[Spec]:
     """Return the parameters that the dataclasses of a node's file declare."""
-    return [spec for value in vars(module).values() if is_dataclass(value)
-            for spec in specs_of(value)]
+    return [
+        spec for value in vars(module).values() if is_dataclass(value) for spec in specs_of(value)
+    ]
 
 
 def link_specs(link: str) -> list[Spec]:
     """Return the parameters of a link, `link.type` aside."""
-    return [Spec(f'{LINK}{option.name}', option.default, **option.metadata)
-            for option in fields(base.link_module(link).Settings)]
+    return [
+        Spec(f'{LINK}{option.name}', option.default, **option.metadata)
+        for option in fields(base.link_module(link).Settings)
+    ]
 
 
 def given_parameters(node: Node) -> dict[str, Any]:
@@ -137,8 +147,11 @@ def given_parameters(node: Node) -> dict[str, Any]:
 
 def given_below(node: Node, begin: str) -> dict[str, Any]:
     """Return the given parameters whose names have a begin, by the rest of the name."""
-    return {name.removeprefix(begin): value for name, value in given_parameters(node).items()
-            if name.startswith(begin)}
+    return {
+        name.removeprefix(begin): value
+        for name, value in given_parameters(node).items()
+        if name.startswith(begin)
+    }
 
 
 def check_given(node: Node) -> None:
@@ -147,18 +160,28 @@ def check_given(node: Node) -> None:
     for path in _paths():
         sections = dict.fromkeys(section for section, _, _ in _entries(path))
         if sections and not any(_matches(section, name) for section in sections):
-            raise UserError(f'{path}: has parameters of {", ".join(sections)}, but none of the '
-                            f'node {name}; begin the file with /**: or {name}:')
-    known = {*_ANY_NODE, *(spec.name for spec in (
-        *sensor_specs(), *node_specs(sys.modules[type(node).__module__])))}
+            raise UserError(
+                f'{path}: has parameters of {", ".join(sections)}, but none of the '
+                f'node {name}; begin the file with /**: or {name}:'
+            )
+    known = {
+        *_ANY_NODE,
+        *(
+            spec.name
+            for spec in (*sensor_specs(), *node_specs(sys.modules[type(node).__module__]))
+        ),
+    }
     # One file may serve all nodes: a node ignores what another one has. The others are loaded one
     # after the other, and only until one has the name.
     broken: list[str] = []
     others = _names_of_nodes(broken)
     for name in given_parameters(node):
         if name.startswith(_QOS) and not _QOS_NAME.fullmatch(name):
-            raise parameter_error(name, f'expected {_QOS}/TOPIC.ENTITY.POLICY, ENTITY publisher '
-                                  f'or subscription, POLICY {", ".join(QOS_POLICIES)}')
+            raise parameter_error(
+                name,
+                f'expected {_QOS}/TOPIC.ENTITY.POLICY, ENTITY publisher '
+                f'or subscription, POLICY {", ".join(QOS_POLICIES)}',
+            )
         if name in known or name.startswith((*_FREE_PREFIXES, _QOS)):
             continue
         for other in others:
@@ -168,8 +191,9 @@ def check_given(node: Node) -> None:
         else:
             like = get_close_matches(name, sorted(known), 1, 0.0)[0]
             unread = f' ({"; ".join(broken)})' if broken else ''
-            raise parameter_error(name, f'no node has a parameter of this name{unread}; did you '
-                                  f'mean {like}?')
+            raise parameter_error(
+                name, f'no node has a parameter of this name{unread}; did you mean {like}?'
+            )
 
 
 def _names_of_nodes(broken: list[str]) -> Iterator[str]:
@@ -186,19 +210,25 @@ def _names_of_nodes(broken: list[str]) -> Iterator[str]:
 
 def warn_of_unused_qos(node: Node) -> None:
     """Warn of the given QoS of topics that a node does not have; other nodes may have them."""
-    given, own = ({match[1] for name in names if (match := _QOS_NAME.fullmatch(name))}
-                  for names in (given_parameters(node), node._parameters))
+    given, own = (
+        {match[1] for name in names if (match := _QOS_NAME.fullmatch(name))}
+        for names in (given_parameters(node), node._parameters)
+    )
     if own != {_DIAGNOSTICS} and given - own:
         node.get_logger().warning(
             f'qos_overrides of {", ".join(sorted(given - own))}: not used; the topics of this '
-            f'node are {", ".join(sorted(own))}')
+            f'node are {", ".join(sorted(own))}'
+        )
 
 
 def explain_read_only(node: Node) -> None:
     """Let the refusal of a read-only parameter say how it can be given; rclpy's does not."""
     refuse_or_set = node.set_parameters_atomically
-    calibration = '; set calibration to FILE for a whole calibration' \
-        if node.has_parameter('calibration') else ''
+    calibration = (
+        '; set calibration to FILE for a whole calibration'
+        if node.has_parameter('calibration')
+        else ''
+    )
 
     def set_parameters_atomically(given: list[Parameter]) -> msg.SetParametersResult:
         result = refuse_or_set(given)
@@ -219,24 +249,35 @@ def declare(node: Node, spec: Spec) -> Any:
     """Declare one parameter with its descriptor and return its value."""
     name, kind = spec.name, spec.kind
     descriptor = msg.ParameterDescriptor(
-        description=spec.meaning, read_only=not spec.live, dynamic_typing=spec.default == (),
-        additional_constraints=spec.limits)
+        description=spec.meaning,
+        read_only=not spec.live,
+        dynamic_typing=spec.default == (),
+        additional_constraints=spec.limits,
+    )
     if spec.lower is not None and spec.upper is not None:
         # ROS has no range for lists.
         if kind == Kind.DOUBLE:
-            descriptor.floating_point_range = [msg.FloatingPointRange(
-                from_value=float(spec.lower), to_value=float(spec.upper))]
+            descriptor.floating_point_range = [
+                msg.FloatingPointRange(from_value=float(spec.lower), to_value=float(spec.upper))
+            ]
         elif kind == Kind.INTEGER:
-            descriptor.integer_range = [msg.IntegerRange(
-                from_value=int(spec.lower), to_value=int(spec.upper))]
+            descriptor.integer_range = [
+                msg.IntegerRange(from_value=int(spec.lower), to_value=int(spec.upper))
+            ]
     try:
         value = node.declare_parameter(
-            name, '' if spec.default == () else spec.default, descriptor).value
+            name, '' if spec.default == () else spec.default, descriptor
+        ).value
     except ParameterException:
         given = given_parameters(node).get(name)
         expected = ', '.join(filter(None, (kind.name, spec.limits, spec.unit)))
-        hint = f'; write {given}.0' if kind == Kind.DOUBLE and isinstance(given, int) else \
-            f"""; write '{name}:="{given}"'""" if kind == Kind.STRING else ''
+        hint = (
+            f'; write {given}.0'
+            if kind == Kind.DOUBLE and isinstance(given, int)
+            else f"""; write '{name}:="{given}"'"""
+            if kind == Kind.STRING
+            else ''
+        )
         raise parameter_error(name, f'{given!r} is refused; expected {expected}{hint}') from None
     if value is None:
         _show(node, spec, None)
@@ -249,10 +290,14 @@ def _show(node: Node, spec: Spec, value: Any) -> None:
     """Show a value as that of a declared parameter; None is shown as what stands for no value."""
     # rclpy answers a request for several parameters with nothing when one of them has no value,
     # and takes an empty list as a list of bytes when it declares a parameter.
-    empty: dict[Kind, Any] = {Kind.STRING: '', Kind.INTEGER: round(spec.empty),
-                              Kind.DOUBLE: float(spec.empty)}
+    empty: dict[Kind, Any] = {
+        Kind.STRING: '',
+        Kind.INTEGER: round(spec.empty),
+        Kind.DOUBLE: float(spec.empty),
+    }
     node._parameters[spec.name] = Parameter(
-        spec.name, spec.kind, empty.get(spec.kind, []) if value is None else value)
+        spec.name, spec.kind, empty.get(spec.kind, []) if value is None else value
+    )
 
 
 def numbers(name: str, given: Any, example: str) -> list[float]:
@@ -268,8 +313,9 @@ def low_and_high(name: str, given: Any, default: tuple[float, float]) -> tuple[f
     example = '[{:.1f}, {:.1f}]'.format(*default)
     values = numbers(name, given or default, example)
     if len(values) != 2 or not -_LARGEST <= values[0] < values[1] <= _LARGEST:
-        raise parameter_error(name, f'{values} is no lowest and highest value within '
-                              f'{_LARGEST:g}; write {example}')
+        raise parameter_error(
+            name, f'{values} is no lowest and highest value within {_LARGEST:g}; write {example}'
+        )
     return values[0], values[1]
 
 
@@ -308,18 +354,23 @@ def file_of(key: str) -> str | None:
 
 def _paths() -> list[str]:
     """Return the files of `--params-file` in the order of the command line, without a launch's."""
-    return [path for flag, path in pairwise(sys.argv)
-            if flag == _FILE_FLAG and not Path(path).name.startswith(_OF_LAUNCH)]
+    return [
+        path
+        for flag, path in pairwise(sys.argv)
+        if flag == _FILE_FLAG and not Path(path).name.startswith(_OF_LAUNCH)
+    ]
 
 
 def _entries(path: str) -> Iterator[tuple[str, str, yaml.Node]]:
     """Yield the pattern of the node's name, the parameter's name and its value in a file."""
+
     def inside(tree: yaml.Node, keys: list[str]) -> Iterator[tuple[str, yaml.Node]]:
         if isinstance(tree, yaml.MappingNode):
             for key, value in tree.value:
                 yield from inside(value, [*keys, key.value])
         else:
             yield '.'.join(keys), tree
+
     for section, parameters in _sections(path):
         for name, value in inside(parameters, []):
             yield section, name, value
@@ -327,12 +378,14 @@ def _entries(path: str) -> Iterator[tuple[str, str, yaml.Node]]:
 
 def _sections(path: str) -> Iterator[tuple[str, yaml.MappingNode]]:
     """Yield the pattern of the node's name and the parameters of each section of a file."""
+
     def inside(tree: yaml.Node | None, keys: list[str]) -> Iterator[tuple[str, yaml.MappingNode]]:
         for key, value in tree.value if isinstance(tree, yaml.MappingNode) else ():
             if key.value != 'ros__parameters':
                 yield from inside(value, [*keys, key.value.strip('/')])
             elif isinstance(value, yaml.MappingNode):
                 yield ''.join(f'/{part}' for part in keys), value
+
     return inside(parameter_file.compose(path), [])
 
 
@@ -342,18 +395,24 @@ def write_into(path: str, node_name: str, values: Mapping[str, str]) -> None:
 
     values: YAML of the values by name. Raises `UserError` where the file cannot be written.
     """
-    section = next((parameters for pattern, parameters in _sections(path)
-                    if _matches(pattern, node_name)), None)
+    section = next(
+        (parameters for pattern, parameters in _sections(path) if _matches(pattern, node_name)),
+        None,
+    )
     if section is None:
         raise UserError(f'{path}: has no parameters of the node {node_name}')
     text = Path(path).read_text(encoding='utf-8')
-    present = {name: value for pattern, name, value in _entries(path)
-               if _matches(pattern, node_name)}
+    present = {
+        name: value for pattern, name, value in _entries(path) if _matches(pattern, node_name)
+    }
     begin = section.value[0][0].start_mark
     after = ', ' if section.flow_style else f'\n{" " * begin.column}'
-    edits = [(present[name].start_mark.index, present[name].end_mark.index, value)
-             if name in present else (begin.index, begin.index, f'{name}: {value}{after}')
-             for name, value in values.items()]
+    edits = [
+        (present[name].start_mark.index, present[name].end_mark.index, value)
+        if name in present
+        else (begin.index, begin.index, f'{name}: {value}{after}')
+        for name, value in values.items()
+    ]
     for start, stop, new in sorted(edits, reverse=True):
         text = text[:start] + new + text[stop:]
     write_text(Path(path).resolve(), text)
@@ -372,8 +431,14 @@ def has_section(path: str, node_name: str) -> bool:
 
 def given_text(path: str, node_name: str, key: str) -> str:
     """Return the text of a parameter in the sections of a file for a node."""
-    return next((str(value.value) for section, name, value in _entries(path)
-                 if name == key and _matches(section, node_name)), '')
+    return next(
+        (
+            str(value.value)
+            for section, name, value in _entries(path)
+            if name == key and _matches(section, node_name)
+        ),
+        '',
+    )
 
 
 def _matches(pattern: str, node_name: str) -> bool:
@@ -383,8 +448,12 @@ def _matches(pattern: str, node_name: str) -> bool:
     return bool(re.fullmatch(''.join(parts), node_name))
 
 
-_FIELD_KINDS = {'np.ndarray': Kind.DOUBLE_ARRAY, 'float': Kind.DOUBLE, 'int': Kind.INTEGER,
-                'str': Kind.STRING}
+_FIELD_KINDS = {
+    'np.ndarray': Kind.DOUBLE_ARRAY,
+    'float': Kind.DOUBLE,
+    'int': Kind.INTEGER,
+    'str': Kind.STRING,
+}
 """Parameter types by the annotations of `Sensor`'s fields."""
 _DATASHEET_KINDS = {'name': Kind.STRING, 'figures': Kind.STRING_ARRAY}
 """Parameter types of `datasheet.*`; the others are arrays of numbers."""
@@ -419,15 +488,27 @@ def sensor_specs() -> Iterator[Spec]:
     yield Spec('units', parameter_file.UNITS, 'units of the coefficients')
     for name, described in parameter_file.SENSOR_FIELDS.items():
         about = described.metadata
-        yield Spec(name, _FIELD_KINDS[str(described.type)], about['doc'], about['unit'],
-                   about['lower'], about['upper'], about['choices'])
+        yield Spec(
+            name,
+            _FIELD_KINDS[str(described.type)],
+            about['doc'],
+            about['unit'],
+            about['lower'],
+            about['upper'],
+            about['choices'],
+        )
     yield Spec('effects', Kind.STRING_ARRAY, 'effects that this unit has')
     for effect in library().values():
         for p in effect.parameters:
-            yield Spec(str(Coefficient(effect.name, p.name)),
-                       Kind.DOUBLE_ARRAY if p.axes else Kind.DOUBLE,
-                       f'{p.doc}, by axis' if p.axes else p.doc, p.unit, p.lower, p.upper,
-                       empty=p.neutral)
+            yield Spec(
+                str(Coefficient(effect.name, p.name)),
+                Kind.DOUBLE_ARRAY if p.axes else Kind.DOUBLE,
+                f'{p.doc}, by axis' if p.axes else p.doc,
+                p.unit,
+                p.lower,
+                p.upper,
+                empty=p.neutral,
+            )
     yield Spec('covariance_names', Kind.STRING_ARRAY, 'coefficients in the covariance')
     yield Spec('covariance', Kind.DOUBLE_ARRAY, 'covariance of the coefficients, rows flattened')
     for name, description in parameter_file.ENVELOPE.items():
@@ -466,13 +547,16 @@ def anonymous_sensor(node: Node, flat: Mapping[str, Any]) -> Sensor:
 def given_sensor(node: Node) -> dict[str, Any]:
     """Declare what a parameter file holds; return what is given, its provenance among it."""
     # The keys of a provenance are free, so that they cannot be declared.
-    return declare_sensor(node) | {name: str(value)
-                                   for name, value in given_parameters(node).items()
-                                   if name.startswith('provenance.')}
+    return declare_sensor(node) | {
+        name: str(value)
+        for name, value in given_parameters(node).items()
+        if name.startswith('provenance.')
+    }
 
 
-def on_change(node: Node, name: str, prepare: Callable[[Any], T], use: Callable[[T], None]
-              ) -> None:
+def on_change(
+    node: Node, name: str, prepare: Callable[[Any], T], use: Callable[[T], None]
+) -> None:
     """Prepare and use what is set while the node runs; an error of `prepare` refuses it."""
     prepared: list[T] = []
 

@@ -29,8 +29,14 @@ from rclpy.utilities import remove_ros_args
 _WITHOUT_SENSOR = ('stage', 'screen')  # Nodes without the parameters of a sensor
 _LISTED_OF_SENSOR = ('sensor.', 'stage.')
 """Begins of the names of those parameters of a file that are listed one by one."""
-_TYPES = {Kind.DOUBLE: 'float', Kind.INTEGER: 'int', Kind.STRING: 'text', Kind.BOOL: 'bool',
-          Kind.DOUBLE_ARRAY: 'floats', Kind.STRING_ARRAY: 'texts'}
+_TYPES = {
+    Kind.DOUBLE: 'float',
+    Kind.INTEGER: 'int',
+    Kind.STRING: 'text',
+    Kind.BOOL: 'bool',
+    Kind.DOUBLE_ARRAY: 'floats',
+    Kind.STRING_ARRAY: 'texts',
+}
 """Words for the types of parameters."""
 _USAGE = '%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE\n    -r FROM:=TO ...]'
 """Usage of a node."""
@@ -42,9 +48,14 @@ def _parameter_groups(name: str, own: Iterable[Spec]) -> Iterator[tuple[str, lis
     for link in base.link_names() if name == 'driver' else ():
         yield f'with link.type:={link}', sorted(parameters.link_specs(link))
     if name not in _WITHOUT_SENSOR:
-        yield 'parameters of the sensor, usually from --params-file', sorted(
-            spec for spec in parameters.nominal_specs()
-            if spec.name.startswith(_LISTED_OF_SENSOR))
+        yield (
+            'parameters of the sensor, usually from --params-file',
+            sorted(
+                spec
+                for spec in parameters.nominal_specs()
+                if spec.name.startswith(_LISTED_OF_SENSOR)
+            ),
+        )
 
 
 def _help(spec: Spec) -> str:
@@ -59,8 +70,11 @@ def _value_text(value: Any) -> str:
     """Return a default as it is written on the command line; empty without one."""
     if isinstance(value, list | tuple):
         return f'[{", ".join(map(_value_text, value))}]' if value else ''
-    return f'{value:.6g}' if isinstance(value, float) else \
-        str(value).replace(os.path.expanduser('~'), '~')
+    return (
+        f'{value:.6g}'
+        if isinstance(value, float)
+        else str(value).replace(os.path.expanduser('~'), '~')
+    )
 
 
 _SWITCH_S = 0.0005
@@ -77,8 +91,12 @@ _QUOTES = """; a text with a colon needs quotes of its own: -p '{}:="{}"'"""
 
 
 @ended_by_closed_output()
-def run(make_node: Callable[[], Node], description: str | None, examples: Mapping[str, str],
-        work: Callable[[Any, Executor], None] = lambda _, executor: executor.spin()) -> int:
+def run(
+    make_node: Callable[[], Node],
+    description: str | None,
+    examples: Mapping[str, str],
+    work: Callable[[Any, Executor], None] = lambda _, executor: executor.spin(),
+) -> int:
     """
     Run one node until SIGINT or SIGTERM, or show version or help.
 

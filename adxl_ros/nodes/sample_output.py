@@ -63,25 +63,34 @@ class Tally:
     def report(self, steady_ns: int, sensor_ns: int) -> tuple[dict[str, Any], str]:
         """Report what has been counted since the last report."""
         totals = Counter({**self.counts, 'steady_ns': steady_ns, 'sensor_ns': sensor_ns})
-        new = {name: totals[name] - self._reported[name] for name in (
-            'samples', 'missing', 'saturated', 'steady_ns', 'sensor_ns')}
+        new = {
+            name: totals[name] - self._reported[name]
+            for name in ('samples', 'missing', 'saturated', 'steady_ns', 'sensor_ns')
+        }
         self._reported = totals
         elapsed_ns = max(new['sensor_ns'], 0)
         values: dict[str, Any] = {
-            'missing': totals['missing'], 'missing_estimated': totals['estimated'],
-            'saturated': totals['saturated'], 'samples': totals['samples'],
+            'missing': totals['missing'],
+            'missing_estimated': totals['estimated'],
+            'saturated': totals['saturated'],
+            'samples': totals['samples'],
             'rate_hz': round(new['samples'] / elapsed_ns * 1e9, 3) if elapsed_ns else 0.0,
-            'speed': round(elapsed_ns / new['steady_ns'], 3)}
+            'speed': round(elapsed_ns / new['steady_ns'], 3),
+        }
         if self.newest_ns is not None:
             values['age_s'] = round((sensor_ns - self.newest_ns) * 1e-9, 6)
         return values | age_report(self.ages_s), ', '.join(
-            f'{new[name]} samples {name}' for name in ('missing', 'saturated') if new[name])
+            f'{new[name]} samples {name}' for name in ('missing', 'saturated') if new[name]
+        )
 
 
 _REFERENCE_QUEUE = 1000  # References that are kept for a slow subscriber: 10 s of stage angles
 _STAGE = 'stage/joint_states'  # Topic of the stage angles, which have several columns
-_COLUMNS = {_STAGE: tuple(JOINTS.values()), 'temperature': ('temperature_c',),
-            'supply': ('supply_v',)}
+_COLUMNS = {
+    _STAGE: tuple(JOINTS.values()),
+    'temperature': ('temperature_c',),
+    'supply': ('supply_v',),
+}
 """Columns of a recording by topic."""
 _KINDS = {_STAGE: JointState, 'temperature': Temperature, 'supply': BatteryState}
 """Type of each topic."""
@@ -95,14 +104,18 @@ class References:
 
     def __init__(self, node: Node, frame_id: str, columns: tuple[str, ...]) -> None:
         self._node, self._frame_id = node, frame_id
-        of_topics = {topic: [name for name in names if name in columns]
-                     for topic, names in _COLUMNS.items()}
+        of_topics = {
+            topic: [name for name in names if name in columns] for topic, names in _COLUMNS.items()
+        }
         self._columns = {topic: names for topic, names in of_topics.items() if names}
         # Period and values of the last message by topic
-        self._published = {topic: (-1, np.full(len(names), np.inf))
-                           for topic, names in self._columns.items()}
-        self._publishers = {topic: topics.create_publisher(
-            node, _KINDS[topic], topic, _REFERENCE_QUEUE) for topic in self._columns}
+        self._published = {
+            topic: (-1, np.full(len(names), np.inf)) for topic, names in self._columns.items()
+        }
+        self._publishers = {
+            topic: topics.create_publisher(node, _KINDS[topic], topic, _REFERENCE_QUEUE)
+            for topic in self._columns
+        }
 
     def destroy(self) -> None:
         """Remove the topics."""
@@ -122,8 +135,9 @@ class References:
                 continue
             values, periods = values[rows], stamps_ns[rows] // _PERIODS_NS[topic]
             last_period, last = self._published[topic]
-            is_new = (np.diff(values, axis=0, prepend=last[None]) != 0).any(axis=1) \
-                | (np.diff(periods, prepend=last_period) != 0)
+            is_new = (np.diff(values, axis=0, prepend=last[None]) != 0).any(axis=1) | (
+                np.diff(periods, prepend=last_period) != 0
+            )
             self._published[topic] = int(periods[-1]), values[-1]
             for row, of_row in zip(rows[is_new], values[is_new].tolist()):
                 message = self._message(topic, dict(zip(names, of_row)))
@@ -133,11 +147,17 @@ class References:
     def _message(self, topic: str, values: Mapping[str, float]) -> Any:
         """Make the message of the joints that have a value, or of a temperature or supply."""
         if topic == _STAGE:
-            angles = {joint: values[column] for joint, column in JOINTS.items()
-                      if math.isfinite(values.get(column, math.nan))}
+            angles = {
+                joint: values[column]
+                for joint, column in JOINTS.items()
+                if math.isfinite(values.get(column, math.nan))
+            }
             return JointState(name=list(angles), position=list(angles.values()))
-        message = Temperature(temperature=values['temperature_c']) if topic == 'temperature' \
+        message = (
+            Temperature(temperature=values['temperature_c'])
+            if topic == 'temperature'
             else BatteryState(voltage=values['supply_v'], present=True)
+        )
         message.header.frame_id = self._frame_id
         return message
 
@@ -149,8 +169,9 @@ _QUEUE = 5000  # Samples that are kept for a slow subscriber: 5 s at 1 kHz
 
 def imu_writer(sensor: Sensor, frame_id: str) -> topics.MessageWriter:
     """Return what writes the measured axes of samples, and further fields."""
-    return topics.MessageWriter(imu_message(sensor, frame_id), cdr.imu,
-                                linear_acceleration=len(sensor.axes))
+    return topics.MessageWriter(
+        imu_message(sensor, frame_id), cdr.imu, linear_acceleration=len(sensor.axes)
+    )
 
 
 def imu_message(sensor: Sensor, frame_id: str) -> Imu:
@@ -160,7 +181,7 @@ def imu_message(sensor: Sensor, frame_id: str) -> Imu:
     message.orientation_covariance[0] = message.angular_velocity_covariance[0] = -1.0
     variance = np.full(3, UNMEASURED_VARIANCE)
     noise_std_g = noise.sample_std_v(sensor) / sensor.nominal_scale_v_per_g
-    variance[:len(sensor.axes)] = (noise_std_g * G0_MPS2) ** 2
+    variance[: len(sensor.axes)] = (noise_std_g * G0_MPS2) ** 2
     message.linear_acceleration_covariance = np.diag(variance).ravel()
     return message
 
@@ -173,15 +194,24 @@ class SampleOutput:
     that of a simulator, and `is_clock` ends where another node publishes /clock.
     """
 
-    def __init__(self, node: Node, sensor: Sensor, frame_id: str, delay_ns: int, is_clock: bool,
-                 clock: StampClock, tally: Tally) -> None:
+    def __init__(
+        self,
+        node: Node,
+        sensor: Sensor,
+        frame_id: str,
+        delay_ns: int,
+        is_clock: bool,
+        clock: StampClock,
+        tally: Tally,
+    ) -> None:
         self._node, self._delay_ns, self._stamp_clock = node, delay_ns, clock
         self.sensor, self.frame_id, self.is_clock, self.tally = sensor, frame_id, is_clock, tally
         self._follows_frame = not frame_id
         self._writer = imu_writer(sensor, frame_id)
         self._data = topics.create_publisher(node, Imu, 'imu/data_raw', _QUEUE)
-        self._info = topics.create_publisher(node, DiagnosticStatus, 'sensor_info', 1,
-                                             latched=True)
+        self._info = topics.create_publisher(
+            node, DiagnosticStatus, 'sensor_info', 1, latched=True
+        )
         self._clock = topics.create_publisher(node, Clock, '/clock', 1) if is_clock else None
         self._left: Publisher | None = None  # Publisher of a clock that another node has become
         self._leave = node.create_guard_condition(self._destroy_left)
@@ -202,25 +232,34 @@ class SampleOutput:
     def follow_other_clock(self) -> None:
         """Stop being the clock if another node is; of drivers, the one that sorts first stays."""
         own = self._node.get_namespace(), self._node.get_name()
-        clocks = [(info.node_namespace, info.node_name) for info in
-                  self._node.get_publishers_info_by_topic('/clock')
-                  if info.node_name != _UNKNOWN_NODE]
+        clocks = [
+            (info.node_namespace, info.node_name)
+            for info in self._node.get_publishers_info_by_topic('/clock')
+            if info.node_name != _UNKNOWN_NODE
+        ]
         if self._clock is None or not any(
-                name != own and (name[1] != own[1] or name < own) for name in clocks):
+            name != own and (name[1] != own[1] or name < own) for name in clocks
+        ):
             return
         # The thread of the link calls this: the executor destroys the publisher in its own.
         self._left, self._clock, self.is_clock = self._clock, None, False
         self._leave.trigger()
         self._node.set_parameters([Parameter('use_sim_time', value=True)])
-        self._node.get_logger().warning('another node publishes /clock: this driver follows it, '
-                                        'and link.speed is that of this clock')
+        self._node.get_logger().warning(
+            'another node publishes /clock: this driver follows it, '
+            'and link.speed is that of this clock'
+        )
 
     def use(self, sensor: Sensor) -> None:
         """Convert samples by the nominal values of a sensor, and publish these."""
         self.sensor = sensor
         self._writer = imu_writer(sensor, self.frame_id)
-        self._info.publish(topics.status_message('sensor_info', topics.Status(
-            topics.Level.OK, '', sensor.serial, sensor_info(sensor))))
+        self._info.publish(
+            topics.status_message(
+                'sensor_info',
+                topics.Status(topics.Level.OK, '', sensor.serial, sensor_info(sensor)),
+            )
+        )
 
     def follow_frame(self, frame_id: str) -> None:
         """Publish in the frame of a simulator's samples, unless a frame was given."""
@@ -236,8 +275,10 @@ class SampleOutput:
         """Publish samples and what was recorded beside them."""
         finite = samples.finite()
         published_ns = finite.stamp_ns - self._delay_ns
-        fields = {**finite.imu_fields,
-                  'linear_acceleration': to_nominal_mps2(finite.volts, self.sensor)}
+        fields = {
+            **finite.imu_fields,
+            'linear_acceleration': to_nominal_mps2(finite.volts, self.sensor),
+        }
         for message in self._writer.messages(published_ns, **fields):
             self._data.publish(message)
         # The age of a sample is the time until here: all that can wait comes after it.
@@ -245,8 +286,11 @@ class SampleOutput:
         references.publish(samples.stamp_ns, samples.references)
         self.tally.ages_s.extend(((now_ns - published_ns) * 1e-9).tolist())
         self.tally.counts.update(
-            samples=len(published_ns), missing=finite.missing, estimated=finite.estimated,
-            saturated=int(self.sensor.saturated(finite.volts).any(axis=1).sum()))
+            samples=len(published_ns),
+            missing=finite.missing,
+            estimated=finite.estimated,
+            saturated=int(self.sensor.saturated(finite.volts).any(axis=1).sum()),
+        )
         if len(published_ns):
             self.tally.newest_ns = int(finite.stamp_ns[-1])
         self.tally.now_ns = samples.until_ns

@@ -41,9 +41,16 @@ class ScreenSettings:
 Styled = tuple[str, str]  # A style of prompt_toolkit and its text
 Line = list[Styled]  # A line of the screen
 
-_COLOURS = {'dwell': 'ansigreen', 'refused': 'ansired', 'silent': 'ansired',
-            'question': 'ansiyellow', 'rest': 'ansiyellow', 'stage': 'ansiyellow',
-            'operator': 'bold ansicyan', 'fit': 'ansigreen'}
+_COLOURS = {
+    'dwell': 'ansigreen',
+    'refused': 'ansired',
+    'silent': 'ansired',
+    'question': 'ansiyellow',
+    'rest': 'ansiyellow',
+    'stage': 'ansiyellow',
+    'operator': 'bold ansicyan',
+    'fit': 'ansigreen',
+}
 """Styles by phase."""
 _LEAST_WIDTH = 20  # A narrower terminal is drawn as if it had this width, columns
 _LEAST_LINES = 4
@@ -62,13 +69,21 @@ def draw(contents: ScreenContents, log: Iterable[Styled], columns: int, rows: in
     width = max(columns - 1, _LEAST_WIDTH)
     task = f' of {contents.unit or "no sensor yet"} into {contents.output}'
     title = f' calibration{task if contents.output else ""}'
-    body = [('reverse', f'{title:{width}}'), *_styled(
-        _COLOURS.get(contents.phase, 'bold'), wrap(contents.text, width)[:_TEXT_LINES])]
+    body = [
+        ('reverse', f'{title:{width}}'),
+        *_styled(_COLOURS.get(contents.phase, 'bold'), wrap(contents.text, width)[:_TEXT_LINES]),
+    ]
     for row in contents.rows:
         bar = '' if row.share is None else f'{_bar(row.share)} '
-        body += _styled(row.style, wrap(
-            f'{bar}{row.text}', width, initial_indent=f'{row.label:{_LABEL_WIDTH}}',
-            subsequent_indent=_LABEL_WIDTH * ' ')[:_FEW_LINES])
+        body += _styled(
+            row.style,
+            wrap(
+                f'{bar}{row.text}',
+                width,
+                initial_indent=f'{row.label:{_LABEL_WIDTH}}',
+                subsequent_indent=_LABEL_WIDTH * ' ',
+            )[:_FEW_LINES],
+        )
     for text in contents.outcome:
         # A line that fits keeps its spaces.
         body += _styled('', [text] if len(text) <= width else wrap(text, width))
@@ -80,9 +95,10 @@ def draw(contents: ScreenContents, log: Iterable[Styled], columns: int, rows: in
     room = max(rows - len(messages) - 1, _LEAST_LINES)
     body = [*body, *[('', '')] * room][:room]
     keys = [(key.key, key.action) for key in contents.keys] + [('q', 'quit')]
-    return [*([(style, line[:width])] for style, line in (*body, *messages)),
-            [part for key, action in keys
-             for part in (('reverse', f' {key} '), ('', f' {action}  '))]]
+    return [
+        *([(style, line[:width])] for style, line in (*body, *messages)),
+        [part for key, action in keys for part in (('reverse', f' {key} '), ('', f' {action}  '))],
+    ]
 
 
 def _styled(style: str, lines: Iterable[str]) -> list[Styled]:
@@ -91,8 +107,9 @@ def _styled(style: str, lines: Iterable[str]) -> list[Styled]:
 
 def _coefficients(rows: Sequence[Row], width: int) -> list[str]:
     """Return a line for each coefficient: name, bar and intervals."""
-    texts = {row.label: f'{_bar(row.share or 0.0, _COEFFICIENT_BAR_WIDTH)} {row.text}'
-             for row in rows}
+    texts = {
+        row.label: f'{_bar(row.share or 0.0, _COEFFICIENT_BAR_WIDTH)} {row.text}' for row in rows
+    }
     longest = max(map(len, texts.values()), default=0)
     room = max(min(max(map(len, texts), default=0), width - 1 - longest), _SHORTEST_NAME)
     return [f'{name[:room]:{room}} {text}' for name, text in texts.items()]
@@ -107,8 +124,11 @@ def _bar(share: float, width: int = _BAR_WIDTH) -> str:
 _REFRESH_S = 0.2  # Time between two drawings, s: the node publishes contents five times a second
 
 
-def full_screen(lines: Callable[[int, int], list[Line]], press: Callable[[str], None],
-                leave: Callable[[], None]) -> Any:
+def full_screen(
+    lines: Callable[[int, int], list[Line]],
+    press: Callable[[str], None],
+    leave: Callable[[], None],
+) -> Any:
     """Make the application of prompt_toolkit with a full screen."""
     try:
         from prompt_toolkit.application import Application
@@ -137,9 +157,14 @@ def full_screen(lines: Callable[[int, int], list[Line]], press: Callable[[str], 
     keys.add('escape', '<any>')(lambda _: None)
     for key in ('q', 'Q', 'c-c'):
         keys.add(key)(end)
-    return Application(Layout(Window(FormattedTextControl(fragments, show_cursor=False))),
-                       key_bindings=keys, full_screen=True, refresh_interval=_REFRESH_S,
-                       input=create_input(stdin), output=output)
+    return Application(
+        Layout(Window(FormattedTextControl(fragments, show_cursor=False))),
+        key_bindings=keys,
+        full_screen=True,
+        refresh_interval=_REFRESH_S,
+        input=create_input(stdin),
+        output=output,
+    )
 
 
 def _terminal() -> tuple[TextIO, TextIO]:
@@ -178,15 +203,19 @@ class Screen(Node):
         self._contents, self._received_s = ScreenContents('info', ''), 0.0
         self._log: deque[tuple[str, str]] = deque(maxlen=_FEW_LINES)  # Styles and messages
         self._application = full_screen(
-            lambda columns, rows: draw(self._shown(), self._log, columns, rows), self._press,
-            self._leave)
+            lambda columns, rows: draw(self._shown(), self._log, columns, rows),
+            self._press,
+            self._leave,
+        )
         create_subscription(self, String, f'{name}/display', self._on_display, 1, latched=True)
         create_subscription(self, Log, '/rosout', self._on_log, _QUEUE, latched=True)
-        self._keyed = {service: self.create_client(Trigger, f'{name}/{service}')
-                       for service in _SERVICES}
+        self._keyed = {
+            service: self.create_client(Trigger, f'{name}/{service}') for service in _SERVICES
+        }
 
     def show(self, executor: Executor) -> None:
         """Draw and read keys until the operator quits, a signal comes or the terminal ends."""
+
         def begin() -> None:
             application.create_background_task(self._spin(executor))
 
@@ -216,11 +245,19 @@ class Screen(Node):
     def _shown(self) -> ScreenContents:
         """Return the newest contents, or what the screen waits for; a node that fits is silent."""
         is_new = time.monotonic() - self._received_s < _SILENT_S or self._contents.phase == 'fit'
-        if self._received_s and is_new and rclpy.ok() \
-                and self.count_publishers(f'{self._target}/display'):
+        if (
+            self._received_s
+            and is_new
+            and rclpy.ok()
+            and self.count_publishers(f'{self._target}/display')
+        ):
             return self._contents
-        return replace(self._contents, phase='silent', keys=(), text=f'waiting for '
-                       f'{self._target}; is it running in this ROS domain?')
+        return replace(
+            self._contents,
+            phase='silent',
+            keys=(),
+            text=f'waiting for {self._target}; is it running in this ROS domain?',
+        )
 
     def _press(self, key: str) -> None:
         """Call the service of a key; the space captures."""
@@ -241,7 +278,8 @@ class Screen(Node):
             self._contents = ScreenContents.from_json(message.data)
         except (LookupError, TypeError, ValueError):
             self._contents = ScreenContents(
-                'refused', f'{self._target} is of another version of adxl_ros; update both')
+                'refused', f'{self._target} is of another version of adxl_ros; update both'
+            )
         if self._contents.phase != before:
             # A launch prints lines of its own into this terminal: draw all, not what is new.
             self._application.renderer.clear()

@@ -31,18 +31,27 @@ _RESOLUTION = SENSOR_FIELDS['stage.resolution_rad'].metadata
 class StageSettings:
     """The choice of the stage."""
 
-    kind: str = parameter('simulated', 'the simulated stage, or the bridge to a controller that '
-                          'takes joint states or trajectories', name='stage.type',
-                          choices=('simulated', 'joint_state', 'trajectory'))
+    kind: str = parameter(
+        'simulated',
+        'the simulated stage, or the bridge to a controller that '
+        'takes joint states or trajectories',
+        name='stage.type',
+        choices=('simulated', 'joint_state', 'trajectory'),
+    )
 
 
 @dataclass(frozen=True)
 class SimulatedStageSettings:
     """The simulated stage."""
 
-    resolution_rad: float = parameter(float(np.radians(5 / 60)), _RESOLUTION['doc'],
-                                      _RESOLUTION['unit'], _RESOLUTION['lower'],
-                                      _RESOLUTION['upper'], name='stage.resolution_rad')
+    resolution_rad: float = parameter(
+        float(np.radians(5 / 60)),
+        _RESOLUTION['doc'],
+        _RESOLUTION['unit'],
+        _RESOLUTION['lower'],
+        _RESOLUTION['upper'],
+        name='stage.resolution_rad',
+    )
     delay_s: float = parameter(0.1, 'time from a command to its effect', 's', 0.02, 1.0)
     slew_rate_rad_s: float = parameter(0.5, 'largest speed of a turn', 'rad/s', 1e-6, 100.0)
     slew_rate_m_s: float = parameter(0.01, 'largest speed of a shift', 'm/s', 1e-9, 10.0)
@@ -50,23 +59,32 @@ class SimulatedStageSettings:
     alpha_rad: float = parameter(0.0, 'position at the start', 'rad', -100.0, 100.0)
     beta_rad: float = parameter(0.0, 'position at the start', 'rad', -100.0, 100.0)
     shift_m: float = parameter(0.0, 'position at the start', 'm', -10.0, 10.0)
-    seed: int = parameter(0, "seed of the positions within an encoder's step", '',
-                          *parameters.SEEDS)
+    seed: int = parameter(
+        0, "seed of the positions within an encoder's step", '', *parameters.SEEDS
+    )
 
 
 def _joint(name: str) -> Any:
-    return parameter(parameters.Kind.STRING, f"the controller's name of {name}",
-                     name=f'bridge.{name}.joint')
+    return parameter(
+        parameters.Kind.STRING, f"the controller's name of {name}", name=f'bridge.{name}.joint'
+    )
 
 
 def _sign(name: str) -> Any:
-    return parameter(1, 'direction in which it turns: 1 or -1', '', -1, 1,
-                     name=f'bridge.{name}.sign')
+    return parameter(
+        1, 'direction in which it turns: 1 or -1', '', -1, 1, name=f'bridge.{name}.sign'
+    )
 
 
 def _offset(name: str) -> Any:
-    return parameter(0.0, f"{name} where the controller's joint is at 0", 'rad', -100.0, 100.0,
-                     name=f'bridge.{name}.offset_rad')
+    return parameter(
+        0.0,
+        f"{name} where the controller's joint is at 0",
+        'rad',
+        -100.0,
+        100.0,
+        name=f'bridge.{name}.offset_rad',
+    )
 
 
 @dataclass(frozen=True)
@@ -79,13 +97,18 @@ class BridgeSettings:
     beta_joint: str = _joint('beta')
     beta_sign: int = _sign('beta')
     beta_offset_rad: float = _offset('beta')
-    joint_states: str = parameter('/joint_states', "topic of the controller's joint states",
-                                  name='bridge.joint_states')
-    command: str = parameter('', 'topic on which the controller listens; empty: /joint_commands, '
-                             'or /joint_trajectory_controller/joint_trajectory',
-                             name='bridge.command')
-    speed_rad_s: float = parameter(0.3, 'speed of a trajectory', 'rad/s', 1e-4, 10.0,
-                                   name='bridge.speed_rad_s')
+    joint_states: str = parameter(
+        '/joint_states', "topic of the controller's joint states", name='bridge.joint_states'
+    )
+    command: str = parameter(
+        '',
+        'topic on which the controller listens; empty: /joint_commands, '
+        'or /joint_trajectory_controller/joint_trajectory',
+        name='bridge.command',
+    )
+    speed_rad_s: float = parameter(
+        0.3, 'speed of a trajectory', 'rad/s', 1e-4, 10.0, name='bridge.speed_rad_s'
+    )
 
 
 _STEP_NS = 10_000_000
@@ -110,22 +133,28 @@ class SimulatedStageNode:
         self._stage = SimulatedStage(
             np.array([own.alpha_rad, own.beta_rad, own.shift_m]),
             np.array([own.slew_rate_rad_s, own.slew_rate_rad_s, own.slew_rate_m_s]),
-            own.settling_time_s, np.array([own.resolution_rad, own.resolution_rad, 0.0]), own.seed)
+            own.settling_time_s,
+            np.array([own.resolution_rad, own.resolution_rad, 0.0]),
+            own.seed,
+        )
         self._delay_ns = round(1e9 * own.delay_s)
         self._unshown: deque[tuple[int, bytes]] = deque()
         zeros = [0.0] * len(JOINTS)
         self._writer = topics.MessageWriter(
-            JointState(name=list(JOINTS), position=zeros, velocity=zeros), cdr.joint_state)
+            JointState(name=list(JOINTS), position=zeros, velocity=zeros), cdr.joint_state
+        )
         self._simulated_ns = 0
         self._refusal_count = 0
         self._refusal = ''
         self._encoders = topics.create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
         self._true = topics.create_publisher(node, JointState, 'stage/true_joint_states', _QUEUE)
         topics.DiagnosticsReporter(node, 'stage', self._status)
-        topics.create_subscription(node, JointState, 'stage/command', self._on_command,
-                                   _COMMAND_QUEUE)
-        node.get_logger().info('simulated stage: waiting for '
-                               f'{node.resolve_topic_name("stage/command")}')
+        topics.create_subscription(
+            node, JointState, 'stage/command', self._on_command, _COMMAND_QUEUE
+        )
+        node.get_logger().info(
+            f'simulated stage: waiting for {node.resolve_topic_name("stage/command")}'
+        )
         # The timer runs on ROS time: each message of a faster clock wakes the node.
         node.create_timer(_STEP_NS * 1e-9, self._tick)
 
@@ -133,14 +162,16 @@ class SimulatedStageNode:
         positions = dict(zip(message.name, message.position))
         try:
             if len(message.name) != len(message.position):
-                raise UserError(f'{len(message.name)} names, but {len(message.position)} '
-                                'positions')
+                raise UserError(
+                    f'{len(message.name)} names, but {len(message.position)} positions'
+                )
             self._stage.command(positions, dict(zip(message.name, message.velocity)))
         except UserError as error:
             self._refusal_count += 1
             self._refusal = f'{self._node.resolve_topic_name("stage/command")}: {error}'
             self._node.get_logger().warning(
-                f'{self._refusal}; the stage stays with the command before')
+                f'{self._refusal}; the stage stays with the command before'
+            )
 
     def _tick(self) -> None:
         """Simulate up to the time at which a new command may take effect; show what is due."""
@@ -167,8 +198,12 @@ class SimulatedStageNode:
             encoder[i] = self._stage.encoder()
         for message in self._writer.messages(stamps_ns, position=position, velocity=velocity):
             self._true.publish(message)
-        self._unshown.extend(zip(stamps_ns.tolist(), self._writer.messages(
-            stamps_ns, position=encoder, velocity=velocity)))
+        self._unshown.extend(
+            zip(
+                stamps_ns.tolist(),
+                self._writer.messages(stamps_ns, position=encoder, velocity=velocity),
+            )
+        )
 
     def _status(self) -> Status:
         level, text = Level.OK, 'moving' if self._stage.moving() else 'at rest'
@@ -188,8 +223,10 @@ _BRIDGE_QUEUE = 100
 _COMMAND_QUEUE = 10  # Commands that are kept, of the calibration and for the controller; chosen
 _STATES_QUEUE = 1000
 """Joint states of the controller that are kept: 1 s of the fastest controllers."""
-_DEFAULT_COMMANDS = {'trajectory': '/joint_trajectory_controller/joint_trajectory',
-                     'joint_state': '/joint_commands'}
+_DEFAULT_COMMANDS = {
+    'trajectory': '/joint_trajectory_controller/joint_trajectory',
+    'joint_state': '/joint_commands',
+}
 """Usual topics of the controllers' commands, by kind."""
 
 
@@ -209,8 +246,9 @@ class StageBridge:
         self._offsets_rad = np.array([own.alpha_offset_rad, own.beta_offset_rad])
         for joint, name, sign in zip(_ANGLES, self._names, self._signs.tolist()):
             if not name:
-                raise parameter_error(f'bridge.{joint}.joint',
-                                      "is not set; name the controller's joint")
+                raise parameter_error(
+                    f'bridge.{joint}.joint', "is not set; name the controller's joint"
+                )
             if sign == 0:
                 raise parameter_error(f'bridge.{joint}.sign', '0 is not 1 or -1')
         self._states_topic = node.resolve_topic_name(own.joint_states)
@@ -220,29 +258,42 @@ class StageBridge:
         self._begun_ns = STEADY.now().nanoseconds
         self._refusal = self._fault = ''
         self._seen: set[str] = set()  # Names of the controller's joints
-        self._positions = topics.create_publisher(node, JointState, 'stage/joint_states',
-                                                  _BRIDGE_QUEUE)
+        self._positions = topics.create_publisher(
+            node, JointState, 'stage/joint_states', _BRIDGE_QUEUE
+        )
         self._commands = topics.create_publisher(
-            node, JointTrajectory if kind == 'trajectory' else JointState,
-            own.command or _DEFAULT_COMMANDS[kind], _COMMAND_QUEUE)
+            node,
+            JointTrajectory if kind == 'trajectory' else JointState,
+            own.command or _DEFAULT_COMMANDS[kind],
+            _COMMAND_QUEUE,
+        )
         topics.DiagnosticsReporter(node, 'stage', self._status)
-        topics.create_subscription(node, JointState, 'stage/command', self._on_command,
-                                   _COMMAND_QUEUE)
-        topics.create_subscription(node, JointState, own.joint_states, self._on_states,
-                                   _STATES_QUEUE)
+        topics.create_subscription(
+            node, JointState, 'stage/command', self._on_command, _COMMAND_QUEUE
+        )
+        topics.create_subscription(
+            node, JointState, own.joint_states, self._on_states, _STATES_QUEUE
+        )
         node.get_logger().info(
             f'bridge ({kind}): commands go to {self._commands.topic_name}, positions come from '
-            f'{self._states_topic}; waiting for {node.resolve_topic_name("stage/command")}')
+            f'{self._states_topic}; waiting for {node.resolve_topic_name("stage/command")}'
+        )
 
     def _on_command(self, message: JointState) -> None:
         positions = dict(zip(message.name, message.position))
         before_rad = np.where(np.isfinite(self._goal_rad), self._goal_rad, self._angles_rad)
-        goal_rad = np.array([positions.get(name, angle) for name, angle
-                             in zip(_ANGLES, before_rad.tolist())])
-        if set(positions) - set(_ANGLES) or len(message.name) != len(message.position) \
-                or not np.isfinite([*goal_rad, *self._angles_rad]).all():
-            reason = f'stage/command: {positions}: expected finite positions of alpha and beta, ' \
-                     f'and first a position on {self._states_topic}'
+        goal_rad = np.array(
+            [positions.get(name, angle) for name, angle in zip(_ANGLES, before_rad.tolist())]
+        )
+        if (
+            set(positions) - set(_ANGLES)
+            or len(message.name) != len(message.position)
+            or not np.isfinite([*goal_rad, *self._angles_rad]).all()
+        ):
+            reason = (
+                f'stage/command: {positions}: expected finite positions of alpha and beta, '
+                f'and first a position on {self._states_topic}'
+            )
             if reason != self._refusal:
                 self._node.get_logger().warning(reason)
             self._refusal = reason
@@ -250,11 +301,13 @@ class StageBridge:
         now_ns = STEADY.now().nanoseconds
         # The calibration repeats its command: a controller would begin its trajectory each time.
         if np.array_equal(goal_rad, self._goal_rad) and (
-                self._arrived() or now_ns < self._resend_ns):
+            self._arrived() or now_ns < self._resend_ns
+        ):
             return
         # The longer way to the goal counts.
-        duration_s = max(np.abs(goal_rad - self._angles_rad).max() / self._speed_rad_s,
-                         _SHORTEST_S)
+        duration_s = max(
+            np.abs(goal_rad - self._angles_rad).max() / self._speed_rad_s, _SHORTEST_S
+        )
         self._resend_ns = now_ns + round(duration_s * 1e9) + _GRACE_NS
         self._goal_rad, self._refusal = goal_rad, ''
         self._send(duration_s)
@@ -266,10 +319,16 @@ class StageBridge:
             message = JointState(name=self._names, position=positions)
             message.header.stamp = self._node.get_clock().now().to_msg()
         else:
-            sec, nanosec = divmod(round(duration_s * 1e9), 10 ** 9)
+            sec, nanosec = divmod(round(duration_s * 1e9), 10**9)
             # A trajectory with the stamp 0 begins at once.
-            message = JointTrajectory(joint_names=self._names, points=[JointTrajectoryPoint(
-                positions=positions, time_from_start=Duration(sec=sec, nanosec=nanosec))])
+            message = JointTrajectory(
+                joint_names=self._names,
+                points=[
+                    JointTrajectoryPoint(
+                        positions=positions, time_from_start=Duration(sec=sec, nanosec=nanosec)
+                    )
+                ],
+            )
         self._commands.publish(message)
 
     def _arrived(self) -> bool:
@@ -279,7 +338,8 @@ class StageBridge:
         positions = dict(zip(message.name, message.position))
         self._seen.update(message.name)
         angles_rad = self._offsets_rad + self._signs * [
-            positions.get(name, np.nan) for name in self._names]
+            positions.get(name, np.nan) for name in self._names
+        ]
         # A controller that counts from −π to π jumps where the stage turns on.
         turns = np.round((self._angles_rad - angles_rad) / (2 * np.pi))
         angles_rad += 2 * np.pi * np.where(np.isfinite(turns), turns, 0.0)
@@ -293,8 +353,11 @@ class StageBridge:
         self._positions.publish(stage)
 
     def _status(self) -> Status:
-        values = {name: angle for name, angle in zip(_ANGLES, self._angles_rad.tolist())
-                  if np.isfinite(angle)}
+        values = {
+            name: angle
+            for name, angle in zip(_ANGLES, self._angles_rad.tolist())
+            if np.isfinite(angle)
+        }
         level, text = self._state()
         if level is Level.ERROR and text != self._fault:
             self._node.get_logger().error(text)
@@ -307,21 +370,27 @@ class StageBridge:
         unknown = [name for name in self._names if name not in self._seen]
         # The joints of a robot may come in several messages.
         if self._seen and unknown and now_ns - self._begun_ns > _SILENT_NS:
-            return Level.ERROR, (f'{self._states_topic} has the joints '
-                                 f'{", ".join(sorted(self._seen))}, but no '
-                                 f'{" and no ".join(unknown)}; correct bridge.alpha.joint and '
-                                 'bridge.beta.joint')
+            return Level.ERROR, (
+                f'{self._states_topic} has the joints '
+                f'{", ".join(sorted(self._seen))}, but no '
+                f'{" and no ".join(unknown)}; correct bridge.alpha.joint and '
+                'bridge.beta.joint'
+            )
         if self._refusal:
             return Level.WARN, f'refused {self._refusal}'
         if now_ns - self._heard_ns > _SILENT_NS:
-            return Level.WARN, (f'nothing on {self._states_topic} of {" and ".join(self._names)}; '
-                                'is the controller running?')
+            return Level.WARN, (
+                f'nothing on {self._states_topic} of {" and ".join(self._names)}; '
+                'is the controller running?'
+            )
         is_there = self._arrived() or np.isnan(self._goal_rad).any()
         return Level.OK, 'at rest' if is_there else 'on the way'
 
 
-_EXAMPLES = {'the bridge to a controller of ros2_control': '--ros-args -p stage.type:=trajectory '
-             '-p bridge.alpha.joint:=tilt -p bridge.beta.joint:=turn'}
+_EXAMPLES = {
+    'the bridge to a controller of ros2_control': '--ros-args -p stage.type:=trajectory '
+    '-p bridge.alpha.joint:=tilt -p bridge.beta.joint:=turn'
+}
 """Examples of arguments, by their purpose."""
 
 

@@ -55,8 +55,9 @@ _MIXED_S = 3.0
 than the period of slow samples, shorter than two starts of a driver."""
 
 
-def create_publisher(node: Node, kind: Any, topic: str, depth: int, latched: bool = False
-                     ) -> Publisher:
+def create_publisher(
+    node: Node, kind: Any, topic: str, depth: int, latched: bool = False
+) -> Publisher:
     """Create a reliable keep-last publisher whose QoS can be overridden by parameters."""
     qos = QoSProfile(depth=depth)
     if latched:
@@ -65,15 +66,23 @@ def create_publisher(node: Node, kind: Any, topic: str, depth: int, latched: boo
         return node.create_publisher(kind, topic, qos, qos_overriding_options=_OVERRIDING)
 
 
-def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[Any], object],
-                        depth: int, latched: bool = False, raw: bool = False,
-                        group: CallbackGroup | None = None, reliable: bool = False
-                        ) -> Subscription:
+def create_subscription(
+    node: Node,
+    kind: Any,
+    topic: str,
+    callback: Callable[[Any], object],
+    depth: int,
+    latched: bool = False,
+    raw: bool = False,
+    group: CallbackGroup | None = None,
+    reliable: bool = False,
+) -> Subscription:
     """
     Subscribe best effort, so that both kinds of publisher connect; QoS can be overridden.
 
     One turn of the executor gives all waiting messages to the callback, one after the other.
     """
+
     def take_all(first: Any) -> None:
         callback(first)
         for message in take_messages(subscription, kind, raw, depth):
@@ -86,8 +95,14 @@ def create_subscription(node: Node, kind: Any, topic: str, callback: Callable[[A
         qos.reliability = ReliabilityPolicy.BEST_EFFORT
     with _qos_errors(node.resolve_topic_name(topic), 'subscription'):
         subscription = node.create_subscription(
-            kind, topic, take_all, qos, raw=raw, callback_group=group,
-            qos_overriding_options=_OVERRIDING)
+            kind,
+            topic,
+            take_all,
+            qos,
+            raw=raw,
+            callback_group=group,
+            qos_overriding_options=_OVERRIDING,
+        )
     return subscription
 
 
@@ -118,7 +133,7 @@ def log(node: Node, severity: str, text: str) -> None:
 
 def stamp(time_ns: int) -> Time:
     """Make the stamp of a ROS time, ns."""
-    sec, nanosec = divmod(int(time_ns), 10 ** 9)
+    sec, nanosec = divmod(int(time_ns), 10**9)
     return Time(sec=sec, nanosec=nanosec)
 
 
@@ -129,8 +144,13 @@ class RepeatingThread:
     A `UserError` ends the thread only, where a function takes it.
     """
 
-    def __init__(self, node: Node, turn: Callable[[], None], name: str,
-                 on_error: Callable[[UserError], None] | None = None) -> None:
+    def __init__(
+        self,
+        node: Node,
+        turn: Callable[[], None],
+        name: str,
+        on_error: Callable[[UserError], None] | None = None,
+    ) -> None:
         self._turn, self._context, self._on_error = turn, node.context, on_error
         self._open = True
         self._failure: Exception | None = None
@@ -171,8 +191,13 @@ class NotForExecutors(ReentrantCallbackGroup):
         return False
 
 
-def take_messages(subscription: Subscription, kind: Any, raw: bool, limit: int,
-                  accept: Callable[[int | None], bool] = lambda _: True) -> Iterator[Any]:
+def take_messages(
+    subscription: Subscription,
+    kind: Any,
+    raw: bool,
+    limit: int,
+    accept: Callable[[int | None], bool] = lambda _: True,
+) -> Iterator[Any]:
     """
     Take the messages that wait in a subscription, without a turn of an executor.
 
@@ -196,8 +221,9 @@ class LateService:
     """
 
     def __init__(self, node: Node, name: str) -> None:
-        self._service = node.create_service(Trigger, name, lambda _, answer: answer,
-                                            callback_group=NotForExecutors())
+        self._service = node.create_service(
+            Trigger, name, lambda _, answer: answer, callback_group=NotForExecutors()
+        )
 
     def take(self) -> list[Any]:
         """Return the requests that have come since the last call, to be answered."""
@@ -221,8 +247,9 @@ class Inbox:
     was started again, and over and over where two send by turns.
     """
 
-    def __init__(self, node: Node, kind: Any, topic: str, depth: int, unit: str = SI,
-                 **options: bool) -> None:
+    def __init__(
+        self, node: Node, kind: Any, topic: str, depth: int, unit: str = SI, **options: bool
+    ) -> None:
         """
         Subscribe; `reliable` and `latched` are those of `create_subscription`.
 
@@ -234,8 +261,8 @@ class Inbox:
         self._topic = node.resolve_topic_name(topic)
         self._number, self._back_s, self._mixed_until_s = 0, -_MIXED_S, 0.0
         self._subscription = create_subscription(
-            node, kind, topic, lambda _: None, depth, raw=True, group=NotForExecutors(),
-            **options)
+            node, kind, topic, lambda _: None, depth, raw=True, group=NotForExecutors(), **options
+        )
         self._wait_set: Any = None
 
     def wait(self) -> None:
@@ -300,8 +327,10 @@ class Inbox:
         self._node.destroy_subscription(self._subscription)
 
 
-_SURROUNDINGS = {'temperature': (Temperature, cdr.temperature, 'temperature'),
-                 'supply': (BatteryState, cdr.battery_state, 'voltage')}
+_SURROUNDINGS = {
+    'temperature': (Temperature, cdr.temperature, 'temperature'),
+    'supply': (BatteryState, cdr.battery_state, 'voltage'),
+}
 """Type, layout and field of each topic."""
 
 
@@ -309,8 +338,9 @@ class Surroundings:
     """Keeps temperature, °C, and supply, V, until they are taken, before samples of that time."""
 
     def __init__(self, node: Node, depth: int) -> None:
-        self._inboxes = {topic: Inbox(node, kind, topic, depth)
-                         for topic, (kind, _, _) in _SURROUNDINGS.items()}
+        self._inboxes = {
+            topic: Inbox(node, kind, topic, depth) for topic, (kind, _, _) in _SURROUNDINGS.items()
+        }
 
     def take(self) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
         """Yield each topic with stamps, ns, (n,), and values, (n, 1), since the last call."""
@@ -363,11 +393,17 @@ class DiagnosticsReporter:
 
 def status_message(name: str, status: Status) -> DiagnosticStatus:
     """Make the message of a status."""
-    values = [KeyValue(key=key, value=value if isinstance(value, str) else repr(value))
-              for key, value in status.values.items()]
+    values = [
+        KeyValue(key=key, value=value if isinstance(value, str) else repr(value))
+        for key, value in status.values.items()
+    ]
     return DiagnosticStatus(
-        level=getattr(DiagnosticStatus, status.level.name), name=name, message=status.summary,
-        hardware_id=status.hardware_id, values=values)
+        level=getattr(DiagnosticStatus, status.level.name),
+        name=name,
+        message=status.summary,
+        hardware_id=status.hardware_id,
+        values=values,
+    )
 
 
 def imu_samples(batch: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:
@@ -383,8 +419,9 @@ def finite_samples(batch: Sequence[bytes]) -> tuple[np.ndarray, np.ndarray]:
     return stamps[finite], accel[finite]
 
 
-def decoded(messages: Sequence[bytes], layout: Callable[[bytes], cdr.Layout], **counts: int
-            ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def decoded(
+    messages: Sequence[bytes], layout: Callable[[bytes], cdr.Layout], **counts: int
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return stamps, ns, (n,), and fields of a count of numbers, (n, k), of n messages."""
     stamps_ns = np.empty(len(messages), np.int64)
     fields = {name: np.empty((len(messages), count)) for name, count in counts.items()}
@@ -414,12 +451,17 @@ def joint_readings(messages: Sequence[bytes]) -> list[JointReading]:
     for table in cdr.tables(messages, cdr.joint_state):
         names = [text for key, text in table.layout.texts.items() if key != 'frame_id']
         positions, velocities = (
-            table.numbers(field).tolist() if field in table.layout.fields
-            else [[]] * len(table.rows) for field in ('position', 'velocity'))
+            table.numbers(field).tolist()
+            if field in table.layout.fields
+            else [[]] * len(table.rows)
+            for field in ('position', 'velocity')
+        )
         for row, stamp_ns, position, velocity in zip(
-                table.rows.tolist(), table.stamp_ns().tolist(), positions, velocities):
-            readings[row] = JointReading(stamp_ns, dict(zip(names, position)),
-                                         dict(zip(names, velocity)))
+            table.rows.tolist(), table.stamp_ns().tolist(), positions, velocities
+        ):
+            readings[row] = JointReading(
+                stamp_ns, dict(zip(names, position)), dict(zip(names, velocity))
+            )
     return [readings[row] for row in sorted(readings)]
 
 
@@ -431,16 +473,19 @@ class MessageWriter:
     these messages would take twice the time.
     """
 
-    def __init__(self, template: Any, layout_of: Callable[[bytes], cdr.Layout], **counts: int
-                 ) -> None:
+    def __init__(
+        self, template: Any, layout_of: Callable[[bytes], cdr.Layout], **counts: int
+    ) -> None:
         """Find the fields; of those that `counts` names, only so many numbers are written."""
         self._template = serialize_message(template)
         layout = layout_of(self._template)
         self._stamp = struct.Struct(f'{layout.order}iI')
         self._stamp_offset = layout.fields['sec'].offset
-        self._fields = {name: (struct.Struct(f'{layout.order}{counts.get(name, field.count)}d'),
-                               field.offset)
-                        for name, field in layout.fields.items() if field.code == 'f8'}
+        self._fields = {
+            name: (struct.Struct(f'{layout.order}{counts.get(name, field.count)}d'), field.offset)
+            for name, field in layout.fields.items()
+            if field.code == 'f8'
+        }
 
     def messages(self, stamp_ns: np.ndarray, **fields: np.ndarray) -> list[bytes]:
         """Serialize messages with stamps, ns, (n,), and number fields, (n, k)."""
@@ -448,7 +493,7 @@ class MessageWriter:
         messages = []
         for i, time_ns in enumerate(stamp_ns.tolist()):
             message = bytearray(self._template)
-            self._stamp.pack_into(message, self._stamp_offset, *divmod(time_ns, 10 ** 9))
+            self._stamp.pack_into(message, self._stamp_offset, *divmod(time_ns, 10**9))
             for packer, offset, rows in columns:
                 packer.pack_into(message, offset, *rows[i])
             messages.append(bytes(message))

@@ -24,8 +24,14 @@ AFTER_COLOUR = '#2a8a43'  # Colour of the state after a correction
 QUIET_COLOUR = '#7b8794'  # Colour of what is only there for comparison
 _DIGITS = 5  # Significant digits of plotted values (chosen: below a pixel of a zoomed plot)
 _FONT = {'family': 'system-ui, "DejaVu Sans", sans-serif', 'size': 12, 'color': '#1f2933'}
-_GRID = {'gridcolor': '#e4e7eb', 'zerolinecolor': '#9aa5b1', 'linecolor': '#9aa5b1',
-         'automargin': True, 'exponentformat': 'none', 'hoverformat': '.4~g'}
+_GRID = {
+    'gridcolor': '#e4e7eb',
+    'zerolinecolor': '#9aa5b1',
+    'linecolor': '#9aa5b1',
+    'automargin': True,
+    'exponentformat': 'none',
+    'hoverformat': '.4~g',
+}
 """Properties of all axes of a plot."""
 _FILE_DPI = 80
 """Resolution of PNG files, dots per inch (chosen: a plot of 12 inches fits a screen)."""
@@ -33,28 +39,57 @@ _FILE_DPI = 80
 
 def figure(traces: Iterable[Figure], height: int, **layout: Any) -> Figure:
     """Make a figure."""
-    axes = {name: _GRID | value for name, value in layout.items()
-            if name.startswith(('xaxis', 'yaxis'))}
-    return {'data': list(traces), 'layout': {
-        'height': height, 'autosize': True, 'font': _FONT, 'paper_bgcolor': '#fff',
-        'plot_bgcolor': '#fff', 'margin': {'l': 8, 'r': 12, 't': 10, 'b': 8}, 'bargap': 0.3,
-        'legend': {'orientation': 'h', 'x': 0, 'y': 1, 'yanchor': 'bottom'},
-        'hovermode': 'closest', 'dragmode': 'zoom', **layout, **axes}}
+    axes = {
+        name: _GRID | value
+        for name, value in layout.items()
+        if name.startswith(('xaxis', 'yaxis'))
+    }
+    return {
+        'data': list(traces),
+        'layout': {
+            'height': height,
+            'autosize': True,
+            'font': _FONT,
+            'paper_bgcolor': '#fff',
+            'plot_bgcolor': '#fff',
+            'margin': {'l': 8, 'r': 12, 't': 10, 'b': 8},
+            'bargap': 0.3,
+            'legend': {'orientation': 'h', 'x': 0, 'y': 1, 'yanchor': 'bottom'},
+            'hovermode': 'closest',
+            'dragmode': 'zoom',
+            **layout,
+            **axes,
+        },
+    }
 
 
-def line(x: Iterable[float], y: Iterable[float], name: str, colour: str, **properties: Any
-         ) -> Figure:
+def line(
+    x: Iterable[float], y: Iterable[float], name: str, colour: str, **properties: Any
+) -> Figure:
     """Make a line."""
-    return {'type': 'scatter', 'mode': 'lines', 'x': rounded(x), 'y': rounded(y), 'name': name,
-            'line': {'color': colour, 'width': 1.2}} | properties
+    return {
+        'type': 'scatter',
+        'mode': 'lines',
+        'x': rounded(x),
+        'y': rounded(y),
+        'name': name,
+        'line': {'color': colour, 'width': 1.2},
+    } | properties
 
 
-def points(x: Iterable[float], y: Iterable[float], half_width: Iterable[float], name: str,
-           colour: str) -> Figure:
+def points(
+    x: Iterable[float], y: Iterable[float], half_width: Iterable[float], name: str, colour: str
+) -> Figure:
     """Make points with error bars."""
-    return {'type': 'scatter', 'mode': 'markers', 'x': rounded(x), 'y': rounded(y), 'name': name,
-            'error_y': {'type': 'data', 'array': rounded(half_width), 'thickness': 1.2,
-                        'width': 3}, 'marker': {'color': colour, 'size': 6}}
+    return {
+        'type': 'scatter',
+        'mode': 'markers',
+        'x': rounded(x),
+        'y': rounded(y),
+        'name': name,
+        'error_y': {'type': 'data', 'array': rounded(half_width), 'thickness': 1.2, 'width': 3},
+        'marker': {'color': colour, 'size': 6},
+    }
 
 
 def axis_number(name: str, number: int) -> str:
@@ -64,8 +99,9 @@ def axis_number(name: str, number: int) -> str:
 
 def rounded(values: Iterable[float]) -> list[float | None]:
     """Return values with the digits of a plot; None where they are not finite."""
-    return [float(f'{v:.{_DIGITS}g}') if np.isfinite(v) else None
-            for v in np.asarray(values, float)]
+    return [
+        float(f'{v:.{_DIGITS}g}') if np.isfinite(v) else None for v in np.asarray(values, float)
+    ]
 
 
 def extremes(values: np.ndarray, count: int) -> np.ndarray:
@@ -79,13 +115,20 @@ def extremes(values: np.ndarray, count: int) -> np.ndarray:
     size = -(-len(values) // (count // 2))
     chosen = []
     for begin in range(0, len(values), size):
-        block = np.nan_to_num(values[begin:begin + size])
+        block = np.nan_to_num(values[begin : begin + size])
         chosen += sorted({begin + int(np.argmin(block)), begin + int(np.argmax(block))})
     return np.array(chosen)
 
 
-def whisker(value: float, low: float, high: float, bounds: tuple[float, float], text: str,
-            typical: float = 0.0, beyond: bool = False) -> Mapping[str, Any]:
+def whisker(
+    value: float,
+    low: float,
+    high: float,
+    bounds: tuple[float, float],
+    text: str,
+    typical: float = 0.0,
+    beyond: bool = False,
+) -> Mapping[str, Any]:
     """Place a value with its interval between bounds, in percent of their distance."""
     begin, end = bounds
 
@@ -94,8 +137,14 @@ def whisker(value: float, low: float, high: float, bounds: tuple[float, float], 
         return round(100 * float(np.clip(share, 0.0, 1.0)), 2)
 
     shaded = (place(-typical), place(typical) - place(-typical)) if typical else None
-    return {'text': text, 'zero': place(0.0), 'dot': place(value), 'typical': shaded,
-            'line': (place(low), place(high) - place(low)), 'beyond': beyond}
+    return {
+        'text': text,
+        'zero': place(0.0),
+        'dot': place(value),
+        'typical': shaded,
+        'line': (place(low), place(high) - place(low)),
+        'beyond': beyond,
+    }
 
 
 def new_figure(**options: Any) -> Any:

@@ -42,12 +42,14 @@ def render(package: str, template: str, values: Mapping[str, Any]) -> str:
     """Return a whole page."""
     check_libraries()
     from plotly.offline import get_plotlyjs
+
     layouts = templates.environment('a page', (package, ''), ('adxl_ros.report', 'page_templates'))
     plotly_js = gzip.compress(get_plotlyjs().encode(), _GZIP_LEVEL, mtime=0)
     made = f'made {datetime.now().astimezone():%Y-%m-%d %H:%M} by adxl_ros {package_version()}'
     return layouts.get_template(template).render(
         {'made': made, 'command': command_of_this_process(), **values},
-        plotly_js=b64encode(plotly_js).decode())
+        plotly_js=b64encode(plotly_js).decode(),
+    )
 
 
 def command_of_this_process() -> str:
@@ -72,7 +74,8 @@ _SECRET = re.compile(
     r'x-(amz|goog)-|token|[-_]key|key-pair|(api|access)key|secret|signature|passw|pwd|credential'
     r'|jwt|auth(?!ors?$)|googleaccessid'
     r'|^(sig|expires|policy|s([evsprt]|pr|rt|ip|k[tesv]|dd|es)|s[ak]oid|suoid|sktid|scid)$',
-    re.IGNORECASE)
+    re.IGNORECASE,
+)
 """Part of a parameter's name that is secret, or belongs to a signature of S3, Google or Azure."""
 
 
@@ -94,6 +97,9 @@ def as_utf_8(name: str) -> str:
 def _plain_query(match: re.Match[str]) -> str:
     """Return the place of an address with the parameters that are not secret."""
     place, query = match.groups()
-    kept = '&'.join(part for part in query.split('&')
-                    if not _SECRET.search(unquote_plus(part.partition('=')[0])))
+    kept = '&'.join(
+        part
+        for part in query.split('&')
+        if not _SECRET.search(unquote_plus(part.partition('=')[0]))
+    )
     return f'{place}?{kept}' if kept else place

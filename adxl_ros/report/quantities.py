@@ -62,8 +62,11 @@ def number(value: float, signed: bool = False, digits: int = 3) -> str:
     if not np.isfinite(value):
         return '-'
     rounded = float(f'{value:.{digits}g}')
-    text = f'{abs(rounded):.0f}' if abs(rounded) >= 100 else \
-        np.format_float_positional(abs(rounded), trim='-')
+    text = (
+        f'{abs(rounded):.0f}'
+        if abs(rounded) >= 100
+        else np.format_float_positional(abs(rounded), trim='-')
+    )
     sign = '\N{MINUS SIGN}' if rounded < 0 else '+' if signed and rounded > 0 else ''
     return sign + text
 
@@ -130,8 +133,9 @@ def parameter_label(key: str, is_single: bool) -> str:
     return axis if axis and is_single else f'{short} {axis}'.rstrip()
 
 
-def parameter_text(parameter: Mapping[str, Any], scale_v_per_g: float = 1.0, digits: int = 3
-                   ) -> str:
+def parameter_text(
+    parameter: Mapping[str, Any], scale_v_per_g: float = 1.0, digits: int = 3
+) -> str:
     """Return a parameter of a report with its interval, in a unit that people use."""
     if not parameter.get('determined', True):
         return 'not determined'
@@ -143,8 +147,12 @@ def parameter_text(parameter: Mapping[str, Any], scale_v_per_g: float = 1.0, dig
         places = int(np.clip(np.ceil(-np.log10(width)), 0, 6))
         value, low, high = (f'{round(v, places) + 0.0:.{places}f}' for v in values)
         return f'{value} ({low} to {high}) {unit}'.rstrip()
-    texts = dict.fromkeys(np.format_float_positional(v, digits, fractional=False, trim='-')
-                          if abs(v) < 100 else f'{v:.0f}' for v in values)
+    texts = dict.fromkeys(
+        np.format_float_positional(v, digits, fractional=False, trim='-')
+        if abs(v) < 100
+        else f'{v:.0f}'
+        for v in values
+    )
     return f'{", ".join(texts)} {unit}'.rstrip()
 
 
@@ -162,6 +170,7 @@ def _for_people(values: np.ndarray, unit: str, scale_v_per_g: float) -> tuple[np
     if base in ('g', 'm', 's', 'V', '1') and 0 < largest < 0.1:
         factor = 1e6 if largest < 1e-4 else 1e2 if base == '1' else 1e3
         values = factor * values
-        base = {1e6: 'ppm', 1e2: '%'}[factor] if base == '1' else {1e6: 'µ', 1e3: 'm'}[
-            factor] + base
+        base = (
+            {1e6: 'ppm', 1e2: '%'}[factor] if base == '1' else {1e6: 'µ', 1e3: 'm'}[factor] + base
+        )
     return values, (base + slash + per).removeprefix('1' if not per else '')

@@ -21,11 +21,21 @@ _LABEL_COLUMNS = 8  # Columns of the words before files and commands
 _STEP_COLUMNS = _LABEL_COLUMNS + 3  # Columns before the purpose of one of several steps
 _GREEN, _RED, _YELLOW = '\x1b[32m', '\x1b[31m', '\x1b[33m'
 """Codes of xterm: good, bad, and not decided."""
-_COLOURS = {'GAP EXPLAINED': _GREEN, 'PARTLY EXPLAINED': _YELLOW, 'NO GAP': _GREEN,
-            'CAUSES NOT SEPARATED': _YELLOW, 'UNKNOWN CAUSE': _RED,
-            'TOO LITTLE DATA': _YELLOW, 'BAD DATA': _RED, 'NOT SHOWN': _YELLOW,
-            'PASS': _GREEN, 'FAIL': _RED, 'NO': _RED,
-            'not refuted': _YELLOW, 'too few': _YELLOW}
+_COLOURS = {
+    'GAP EXPLAINED': _GREEN,
+    'PARTLY EXPLAINED': _YELLOW,
+    'NO GAP': _GREEN,
+    'CAUSES NOT SEPARATED': _YELLOW,
+    'UNKNOWN CAUSE': _RED,
+    'TOO LITTLE DATA': _YELLOW,
+    'BAD DATA': _RED,
+    'NOT SHOWN': _YELLOW,
+    'PASS': _GREEN,
+    'FAIL': _RED,
+    'NO': _RED,
+    'not refuted': _YELLOW,
+    'too few': _YELLOW,
+}
 """Colours of outcomes in a terminal, those of several words first."""
 _NO_COLOUR = '\x1b[0m'
 _OUTCOME = re.compile(rf'\b({"|".join(_COLOURS)})\b')
@@ -38,18 +48,25 @@ class NextStep(NamedTuple):
     command: str  # The command line that does it
 
 
-def program_parser(kind: type[P], name: str, description: str | None,
-                   examples: Mapping[str, str]) -> P:
+def program_parser(
+    kind: type[P], name: str, description: str | None, examples: Mapping[str, str]
+) -> P:
     """Make the parser of an executable, which has `--help` with examples, and `--version`."""
     lines = ['examples:']
     for purpose, arguments in examples.items():
         lines += [f'  {purpose}:', *command_lines(command(name, arguments), 4 * ' ')]
     parser = kind(
-        prog=program(name), description='\n'.join(wrapped(' '.join((description or '').split()))),
+        prog=program(name),
+        description='\n'.join(wrapped(' '.join((description or '').split()))),
         formatter_class=partial(argparse.RawDescriptionHelpFormatter, width=COLUMNS),
-        epilog='\n'.join(lines))
-    parser.add_argument('--version', action='version', version=f'adxl_ros {package_version()}',
-                        help='show the version and exit')
+        epilog='\n'.join(lines),
+    )
+    parser.add_argument(
+        '--version',
+        action='version',
+        version=f'adxl_ros {package_version()}',
+        help='show the version and exit',
+    )
     return parser
 
 
@@ -60,34 +77,58 @@ def row(cells: Iterable[str], formats: Iterable[str | int]) -> str:
 
 def wrapped(text: str, indent: int = 0) -> list[str]:
     """Wrap a text between words."""
-    return textwrap.wrap(text, COLUMNS, subsequent_indent=indent * ' ', break_long_words=False,
-                         break_on_hyphens=False)
+    return textwrap.wrap(
+        text,
+        COLUMNS,
+        subsequent_indent=indent * ' ',
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
 def entry_list(title: str, entries: Mapping[str, str]) -> str:
     """Return a list of names with their meanings."""
     width = max(map(len, entries)) + 2
-    return '\n'.join([f'{title}:', *(
-        textwrap.fill(f'  {name:{width}}{meaning}', COLUMNS, subsequent_indent=(width + 2) * ' ')
-        for name, meaning in entries.items())])
+    return '\n'.join(
+        [
+            f'{title}:',
+            *(
+                textwrap.fill(
+                    f'  {name:{width}}{meaning}', COLUMNS, subsequent_indent=(width + 2) * ' '
+                )
+                for name, meaning in entries.items()
+            ),
+        ]
+    )
 
 
-def end_lines(result: Sequence[str], files: Sequence[str],
-              following: str | Sequence[NextStep] = '', took_s: float | None = None) -> list[str]:
+def end_lines(
+    result: Sequence[str],
+    files: Sequence[str],
+    following: str | Sequence[NextStep] = '',
+    took_s: float | None = None,
+) -> list[str]:
     """Return the end of what a tool prints: result, files and what to do next."""
     lines = [part for line in result for part in wrapped(line, 2) or ['']]
     if files:
-        took = '' if took_s is None else f'  ({took_s:.0f}{_NO_BREAK}s)' if took_s >= 1 else \
-            f'  (< 1{_NO_BREAK}s)'
-        lines += wrapped(f' {"wrote":{_LABEL_COLUMNS - 1}}{"  ".join(files)}{took}',
-                         _LABEL_COLUMNS)
+        took = (
+            ''
+            if took_s is None
+            else f'  ({took_s:.0f}{_NO_BREAK}s)'
+            if took_s >= 1
+            else f'  (< 1{_NO_BREAK}s)'
+        )
+        lines += wrapped(
+            f' {"wrote":{_LABEL_COLUMNS - 1}}{"  ".join(files)}{took}', _LABEL_COLUMNS
+        )
     if isinstance(following, str):
         lines += command_lines(following, f' {"next":{_LABEL_COLUMNS - 1}}')
     else:
         for number, step in enumerate(following, 1):
             label = '' if number > 1 else 'next'
-            lines += wrapped(f' {label:{_LABEL_COLUMNS - 1}}{number}  {step.purpose}',
-                             _STEP_COLUMNS)
+            lines += wrapped(
+                f' {label:{_LABEL_COLUMNS - 1}}{number}  {step.purpose}', _STEP_COLUMNS
+            )
             lines += command_lines(step.command, _STEP_COLUMNS * ' ')
     return [coloured(line) for line in lines]
 
@@ -100,9 +141,14 @@ def command_lines(text: str, start: str) -> list[str]:
         return [start + text]
     # A line must not end within quotes.
     text = re.sub(r"'[^']*'", lambda quotes: quotes[0].replace(' ', _NO_BREAK), text)
-    lines = textwrap.wrap(text, COLUMNS - 2, initial_indent=start,
-                          subsequent_indent=(len(start) + 2) * ' ',
-                          break_long_words=False, break_on_hyphens=False)
+    lines = textwrap.wrap(
+        text,
+        COLUMNS - 2,
+        initial_indent=start,
+        subsequent_indent=(len(start) + 2) * ' ',
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
     *first, last = [line.replace(_NO_BREAK, ' ') for line in lines]
     return [*(f'{line} \\' for line in first), last]
 
@@ -115,10 +161,14 @@ def bar(stream: TextIO, *columns: str | int, transient: bool = True) -> Any:
         from rich import console, progress
     except ImportError:
         return None
-    drawn = [progress.BarColumn(column) if isinstance(column, int)
-             else getattr(progress, column)() if column.isidentifier()
-             else progress.TextColumn(column, markup=False)
-             for column in ('{task.description}', *columns)]
+    drawn = [
+        progress.BarColumn(column)
+        if isinstance(column, int)
+        else getattr(progress, column)()
+        if column.isidentifier()
+        else progress.TextColumn(column, markup=False)
+        for column in ('{task.description}', *columns)
+    ]
     screen = console.Console(file=stream, highlight=False, markup=False, emoji=False)
     return progress.Progress(*drawn, console=screen, transient=transient)
 

@@ -23,5 +23,11 @@ def environment(purpose: str, *folders: tuple[str, str], escapes: bool = True) -
     except ImportError:
         raise UserError(f'{purpose} needs jinja2: {install_hint("jinja2")}') from None
     loader = ChoiceLoader([PackageLoader(package, folder) for package, folder in folders])
-    return Environment(loader=loader, autoescape=escapes, undefined=StrictUndefined,
-                       trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True)
+    return Environment(
+        loader=loader,
+        autoescape=escapes,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )

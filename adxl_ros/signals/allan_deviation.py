@@ -64,8 +64,10 @@ class Phase:
             self._file.seek(0, os.SEEK_END)
             self._file.write(sums.tobytes())
         except OSError as error:
-            raise UserError(f'{tempfile.gettempdir()}: cannot be written: {error.strerror}; set '
-                            'TMPDIR to a larger disk') from None
+            raise UserError(
+                f'{tempfile.gettempdir()}: cannot be written: {error.strerror}; set '
+                'TMPDIR to a larger disk'
+            ) from None
 
     def _sums(self, begin: int, stop: int) -> np.ndarray:
         """Return the sums of the first `begin` to `stop` − 1 samples, (stop − begin, m)."""
@@ -81,12 +83,14 @@ class Phase:
             number = self.count + 1 - 2 * size
             for begin in range(0, number, _AT_ONCE):
                 stop = min(begin + _AT_ONCE, number)
-                early, middle, late = (self._sums(begin + lag, stop + lag)
-                                       for lag in (0, size, 2 * size))
+                early, middle, late = (
+                    self._sums(begin + lag, stop + lag) for lag in (0, size, 2 * size)
+                )
                 difference = late - middle - (middle - early)
                 squares[octave] += np.einsum('ij,ij->j', difference, difference) / number
-        return AllanDeviation(sizes / rate_hz, np.sqrt(squares / 2) / sizes[:, None],
-                              self.count / sizes)
+        return AllanDeviation(
+            sizes / rate_hz, np.sqrt(squares / 2) / sizes[:, None], self.count / sizes
+        )
 
     def cells(self) -> tuple[int, np.ndarray]:
         """Return the samples of a cell, a power of two, and the means of all cells, (k, m)."""
@@ -94,9 +98,12 @@ class Phase:
         while self.count // size >= _MOST_CELLS:
             size *= 2
         step = max(_AT_ONCE // size, 1) * size
-        edges = np.concatenate([
-            self._sums(i, min(i + step - size + 1, self.count + 1))[::size].copy()
-            for i in range(0, self.count + 1, step)])
+        edges = np.concatenate(
+            [
+                self._sums(i, min(i + step - size + 1, self.count + 1))[::size].copy()
+                for i in range(0, self.count + 1, step)
+            ]
+        )
         return size, self._offset + np.diff(edges, axis=0) / size
 
 
@@ -144,8 +151,9 @@ def shortest_rest_s(rate_hz: float) -> float:
     return max(SHORTEST_S, _FEWEST_SAMPLES / rate_hz) - 1 / rate_hz
 
 
-def longest_rest(read: Callable[[], Iterable[Recording]], unit: Sensor, first: Recording,
-                 look: RecordingLook) -> StillStretch:
+def longest_rest(
+    read: Callable[[], Iterable[Recording]], unit: Sensor, first: Recording, look: RecordingLook
+) -> StillStretch:
     """Find the longest rest of a recording, which is read twice; `look` is fed meanwhile."""
     if len(first) < 2:
         raise UserError(f'{first.path}: {len(first)} samples; record longer')
@@ -159,12 +167,22 @@ def longest_rest(read: Callable[[], Iterable[Recording]], unit: Sensor, first: R
     rest = max(rests, key=lambda rest: rest.span_s, default=Rest(0, 0, 0.0, 0.0))
     shortest_s = shortest_rest_s(first.rate_hz)
     if rest.span_s < shortest_s:
-        raise UserError(f'{first.path}: rests for {rest.span_s:.4g} s at most, expected '
-                        f'{shortest_s:.3g} s at least; record longer, and do not touch the sensor')
-    edges_s = np.array([first_s, *(time_s for each in rests for time_s in
-                                   (each.time_start_s, each.time_stop_s)), last_s])
-    motion_s = [(start_s, stop_s) for start_s, stop_s in edges_s.reshape(-1, 2).tolist()
-                if stop_s - start_s > _LARGEST_END_S]
+        raise UserError(
+            f'{first.path}: rests for {rest.span_s:.4g} s at most, expected '
+            f'{shortest_s:.3g} s at least; record longer, and do not touch the sensor'
+        )
+    edges_s = np.array(
+        [
+            first_s,
+            *(time_s for each in rests for time_s in (each.time_start_s, each.time_stop_s)),
+            last_s,
+        ]
+    )
+    motion_s = [
+        (start_s, stop_s)
+        for start_s, stop_s in edges_s.reshape(-1, 2).tolist()
+        if stop_s - start_s > _LARGEST_END_S
+    ]
     if not motion_s:
         rest = replace(rest, time_start_s=first_s, time_stop_s=last_s)
     with tempfile.TemporaryFile() as file:
@@ -201,26 +219,40 @@ class _Samples:
         self._gaps_s += float(gaps_s.sum())
         self._stop_s = float(time_s[-1])
         changes = np.abs(np.diff(rows, axis=0))
-        self._resolution = np.minimum(self._resolution, np.where(
-            changes > 0, changes, np.inf).min(axis=0, initial=np.inf))
+        self._resolution = np.minimum(
+            self._resolution, np.where(changes > 0, changes, np.inf).min(axis=0, initial=np.inf)
+        )
         self._phase.feed(rows)
 
-    def stretch(self, recorded_s: float, motion_s: list[tuple[float, float]], beyond_range: str
-                ) -> StillStretch:
+    def stretch(
+        self, recorded_s: float, motion_s: list[tuple[float, float]], beyond_range: str
+    ) -> StillStretch:
         """Return the samples as a rest; refuse an axis that never changes."""
         for name, resolution in zip(self._first.sensor_columns, self._resolution):
             if not np.isfinite(resolution):
-                raise UserError(f'{self._first.path}: {name} never changes from '
-                                f'{self._start_s:.4g} s to {self._stop_s:.4g} s; the axis is '
-                                'stuck, or not connected')
+                raise UserError(
+                    f'{self._first.path}: {name} never changes from '
+                    f'{self._start_s:.4g} s to {self._stop_s:.4g} s; the axis is '
+                    'stuck, or not connected'
+                )
         count = self._phase.count
         steps_s = self._stop_s - self._start_s - self._gaps_s
         rate_hz = (count - 1 - self._gaps) / steps_s
         allan, (size, means) = self._phase.allan_deviation(rate_hz), self._phase.cells()
         # The variance within 2^k samples is that of the octaves of Haar's wavelets in it.
         octaves = _window_octaves(rate_hz)
-        variance = (allan.deviation[:octaves] ** 2).sum(axis=0) / 2 / (1 - 0.5 ** octaves)
+        variance = (allan.deviation[:octaves] ** 2).sum(axis=0) / 2 / (1 - 0.5**octaves)
         return StillStretch(
-            self._start_s, self._stop_s, rate_hz, count, allan,
-            size / rate_hz, means, np.sqrt(variance), self._resolution, recorded_s,
-            motion_s, beyond_range)
+            self._start_s,
+            self._stop_s,
+            rate_hz,
+            count,
+            allan,
+            size / rate_hz,
+            means,
+            np.sqrt(variance),
+            self._resolution,
+            recorded_s,
+            motion_s,
+            beyond_range,
+        )

@@ -51,8 +51,9 @@ class Blocks:
     @staticmethod
     def join(parts: list[Blocks]) -> Blocks:
         """Concatenate the blocks of several parts of one stream."""
-        return Blocks(*(np.concatenate([getattr(p, f.name) for p in parts])
-                        for f in fields(Blocks)))
+        return Blocks(
+            *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Blocks))
+        )
 
 
 class BlockCutter:
@@ -72,13 +73,18 @@ class BlockCutter:
         self._run = -1
         self._last_time_s = -np.inf
 
-    def feed(self, time_s: np.ndarray, samples: np.ndarray,
-             angles_rad: np.ndarray | None = None) -> Blocks:
+    def feed(
+        self, time_s: np.ndarray, samples: np.ndarray, angles_rad: np.ndarray | None = None
+    ) -> Blocks:
         """Add finite samples, (n, m), and encoder angles, (n, a), NaN where not sampled."""
         columns = [time_s[:, None], samples] + ([] if angles_rad is None else [angles_rad])
-        return Blocks.join([self.none()] + [
-            self._cut(np.concatenate([part[i:i + _CHUNK].T for part in columns]))
-            for i in range(0, len(time_s), _CHUNK)])
+        return Blocks.join(
+            [self.none()]
+            + [
+                self._cut(np.concatenate([part[i : i + _CHUNK].T for part in columns]))
+                for i in range(0, len(time_s), _CHUNK)
+            ]
+        )
 
     def none(self) -> Blocks:
         """Return an empty sequence of blocks, of the right shape."""
@@ -94,8 +100,9 @@ class BlockCutter:
         complete = np.diff(edges) // self.size
         start = np.repeat(edges[:-1] + self.size * (complete - np.cumsum(complete)), complete)
         start += self.size * np.arange(len(start))
-        blocks = self._summed(columns, start,
-                              self._run + np.searchsorted(begins, start, side='right'))
+        blocks = self._summed(
+            columns, start, self._run + np.searchsorted(begins, start, side='right')
+        )
         # The next call counts a gap within the leftover rows.
         used = int(edges[-2] + self.size * complete[-1])
         self._run += int(np.searchsorted(begins, used))
@@ -107,14 +114,21 @@ class BlockCutter:
 
     def _summed(self, columns: np.ndarray, start: np.ndarray, run: np.ndarray) -> Blocks:
         block = columns[:, start[:, None] + np.arange(self.size)]
-        samples, angles = block[1:1 + self._axes], block[1 + self._axes:]
+        samples, angles = block[1 : 1 + self._axes], block[1 + self._axes :]
         change = np.abs(np.diff(samples, axis=2))
         step = np.where(change > 0, change, np.inf).min(axis=2, initial=np.inf)
         mean = samples.mean(axis=2)
         squares = ((samples - mean[..., None]) ** 2).sum(axis=2)
         bounds = np.stack([np.fmin.reduce(angles, axis=2), np.fmax.reduce(angles, axis=2)])
-        return Blocks(self._row + start, block[0][:, [0, -1]], run, mean.T, squares.T, step.T,
-                      bounds.transpose(2, 0, 1))
+        return Blocks(
+            self._row + start,
+            block[0][:, [0, -1]],
+            run,
+            mean.T,
+            squares.T,
+            step.T,
+            bounds.transpose(2, 0, 1),
+        )
 
 
 def angle_bounds(blocks: Blocks) -> np.ndarray:
@@ -130,8 +144,12 @@ def angle_bounds(blocks: Blocks) -> np.ndarray:
     place, last = np.arange(len(has_angle)), len(has_angle) - 1
     before = np.maximum.accumulate(np.where(has_angle, place, 0))
     after = np.minimum.accumulate(np.where(has_angle, place, last)[::-1])[::-1]
-    return np.fmax(bounds, np.fmax(bounds[before[np.maximum(place - 1, 0)]],
-                                   bounds[after[np.minimum(place + 1, last)]]))
+    return np.fmax(
+        bounds,
+        np.fmax(
+            bounds[before[np.maximum(place - 1, 0)]], bounds[after[np.minimum(place + 1, last)]]
+        ),
+    )
 
 
 def true_runs(mask: np.ndarray, group: np.ndarray | None = None) -> list[tuple[int, int]]:
@@ -169,15 +187,17 @@ class Spans:
         self.size = max(1, round(BLOCK_S * rate_hz))  # Samples of a block
         self.block_s = self.size / rate_hz  # Length of a block, s
         # Blocks of the window of a variance; odd, so that one is in the middle
-        self.window = max(round(_WINDOW_S / self.block_s),
-                          -(-_WINDOW_SAMPLES // self.size)) // 2 * 2 + 1
+        self.window = (
+            max(round(_WINDOW_S / self.block_s), -(-_WINDOW_SAMPLES // self.size)) // 2 * 2 + 1
+        )
         # Blocks of the shortest halves whose means are compared, and of both longest halves
         self.half = max(round(_HALF_S / self.block_s), 4)
         self.longest = self.half << DRIFT_OCTAVES
 
 
-def quiet_variance(blocks: Blocks, windows: np.ndarray,
-                   step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def quiet_variance(
+    blocks: Blocks, windows: np.ndarray, step: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Learn the variance that the quietest windows have in common, and its limit, (m,) each.
 
@@ -185,9 +205,10 @@ def quiet_variance(blocks: Blocks, windows: np.ndarray,
     step²/4. Samples without any noise still have a rounding error.
     """
     middle = np.median(np.abs(blocks.mean), axis=0)
-    smallest = step ** 2 / 4 + (_ROUNDING * middle) ** 2 + _TINY_VARIANCE
-    variance, ratio = np.array([_quietest(variances, limit)
-                                for variances, limit in zip(windows.T, smallest)]).T
+    smallest = step**2 / 4 + (_ROUNDING * middle) ** 2 + _TINY_VARIANCE
+    variance, ratio = np.array(
+        [_quietest(variances, limit) for variances, limit in zip(windows.T, smallest)]
+    ).T
     return variance, ratio * variance
 
 
@@ -203,14 +224,15 @@ def _quietest(variances: np.ndarray, smallest: float) -> tuple[float, float]:
         return smallest, MIN_VARIANCE_RATIO
     centre = values[int(_QUIETEST_SHARE * len(values))]
     for _ in range(_QUIET_STEPS):
-        near = values[:np.searchsorted(values, _QUIET_RATIO * centre)]
+        near = values[: np.searchsorted(values, _QUIET_RATIO * centre)]
         centre, before = np.median(near), centre
         if centre == before:
             break
-    logs = np.log(values[:np.searchsorted(values, _QUIET_RATIO * centre)])
+    logs = np.log(values[: np.searchsorted(values, _QUIET_RATIO * centre)])
     scatter = MAD_TO_STD * np.median(np.abs(logs - np.log(centre)))
-    return float(centre), float(np.clip(np.exp(_QUIET_DEVIATIONS * scatter),
-                                        MIN_VARIANCE_RATIO, _MAX_VARIANCE_RATIO))
+    return float(centre), float(
+        np.clip(np.exp(_QUIET_DEVIATIONS * scatter), MIN_VARIANCE_RATIO, _MAX_VARIANCE_RATIO)
+    )
 
 
 def adc_step(blocks: Blocks) -> np.ndarray:
@@ -230,8 +252,8 @@ def undithered(step: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     exp(−2π²σ²/step²) (Widrow's quantisation theorem). A scatter of up to half a step is no
     evidence of noise: without noise the codes may alternate between two values.
     """
-    noise = np.maximum(sigma ** 2 - step ** 2 / 4, 0)
-    return step * np.exp(-2 * np.pi ** 2 * noise / np.where(step > 0, step, np.inf) ** 2)
+    noise = np.maximum(sigma**2 - step**2 / 4, 0)
+    return step * np.exp(-2 * np.pi**2 * noise / np.where(step > 0, step, np.inf) ** 2)
 
 
 def window_variance(blocks: Blocks, spans: Spans) -> np.ndarray:
@@ -241,12 +263,13 @@ def window_variance(blocks: Blocks, spans: Spans) -> np.ndarray:
         return np.empty((0, blocks.mean.shape[1]))
     between = window * spans.size * sliding_window_view(blocks.mean, window, axis=0).var(axis=2)
     within = sliding_window_view(blocks.squares, window, axis=0).sum(axis=2)
-    gapless = blocks.run[window - 1:] == blocks.run[:len(blocks) - window + 1]
+    gapless = blocks.run[window - 1 :] == blocks.run[: len(blocks) - window + 1]
     return np.where(gapless[:, None], (within + between) / (window * spans.size - 1), np.inf)
 
 
-def quiet_blocks(blocks: Blocks, windows: np.ndarray, limit: np.ndarray,
-                 window: int) -> np.ndarray:
+def quiet_blocks(
+    blocks: Blocks, windows: np.ndarray, limit: np.ndarray, window: int
+) -> np.ndarray:
     """Mark the blocks, (k,), in whose window no variance is above the limit, (m,)."""
     quiet: np.ndarray = np.all(windows <= limit, axis=1)
     if not len(quiet):
@@ -258,8 +281,9 @@ def quiet_blocks(blocks: Blocks, windows: np.ndarray, limit: np.ndarray,
     return (end - begin >= window) & quiet[np.minimum(first, len(quiet) - 1)]
 
 
-def half_differences(blocks: Blocks, usable: np.ndarray,
-                     half: int) -> tuple[np.ndarray, np.ndarray]:
+def half_differences(
+    blocks: Blocks, usable: np.ndarray, half: int
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Compare the means of `half` blocks before and after each place.
 
@@ -269,7 +293,7 @@ def half_differences(blocks: Blocks, usable: np.ndarray,
     middle = np.median(blocks.mean[usable], axis=0) if usable.any() else 0.0
     total = np.zeros((len(blocks) + 1, blocks.mean.shape[1]))
     np.cumsum(np.where(usable[:, None], blocks.mean - middle, 0), axis=0, out=total[1:])
-    differences = (total[2 * half:] - 2 * total[half:-half] + total[:-2 * half]) / half
+    differences = (total[2 * half :] - 2 * total[half:-half] + total[: -2 * half]) / half
     unusable = np.concatenate([[0], np.cumsum(~usable)])
-    gapless = blocks.run[2 * half - 1:] == blocks.run[:len(differences)]
-    return differences, gapless & (unusable[2 * half:] == unusable[:-2 * half])
+    gapless = blocks.run[2 * half - 1 :] == blocks.run[: len(differences)]
+    return differences, gapless & (unusable[2 * half :] == unusable[: -2 * half])

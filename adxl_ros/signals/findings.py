@@ -91,8 +91,11 @@ class RecordingContents:
     cut: str  # Where a damaged file ends; empty if it is whole
 
 
-def examine(blocks: Iterable[Recording], sensor_of: Callable[[Recording], Sensor],
-            log_delay_s: float | None) -> RecordingContents:
+def examine(
+    blocks: Iterable[Recording],
+    sensor_of: Callable[[Recording], Sensor],
+    log_delay_s: float | None,
+) -> RecordingContents:
     """Find what a recording holds; `sensor_of` returns its sensor, calibrated or not."""
     blocks = iter(blocks)
     first = next((block for block in blocks if len(block)), None)
@@ -115,7 +118,8 @@ def examine(blocks: Iterable[Recording], sensor_of: Callable[[Recording], Sensor
             read = values[np.isfinite(values)]
             if name in REFERENCES and len(read):
                 references.setdefault(name, []).append(
-                    (float(read.min()), float(read.max()), float(read.sum()), len(read)))
+                    (float(read.min()), float(read.max()), float(read.sum()), len(read))
+                )
     gravity = look.gravity()
     # By reference: lowest and highest values, sums, counts
     parts = {name: list(zip(*rows)) for name, rows in references.items()}
@@ -124,23 +128,37 @@ def examine(blocks: Iterable[Recording], sensor_of: Callable[[Recording], Sensor
     means_mps2 = [to_nominal_mps2(found.mean_v, unit) for found in rests]
     span_s = stamps.last_s - stamps.first_s
     return RecordingContents(
-        path=block.path, samples=stamps.count, span_s=span_s,
-        rate_hz=stamps.rate_hz, jitter_s=stamps.jitter_s, burst=stamps.burst,
-        missing=stamps.missing, gaps=stamps.gaps, longest_gap_s=stamps.longest_gap_s,
-        bad_stamps=block.bad_stamps, axes=tuple(axis.result() for axis in axes),
-        rest_share=min(sum(spans_s) / span_s, 1.0), longest_rest_s=max(spans_s, default=0.0),
-        rests=len(spans_s), poses=_count_poses(means_mps2),
-        gravity=gravity, neighbour_faults=tuple(look.neighbour_faults()),
+        path=block.path,
+        samples=stamps.count,
+        span_s=span_s,
+        rate_hz=stamps.rate_hz,
+        jitter_s=stamps.jitter_s,
+        burst=stamps.burst,
+        missing=stamps.missing,
+        gaps=stamps.gaps,
+        longest_gap_s=stamps.longest_gap_s,
+        bad_stamps=block.bad_stamps,
+        axes=tuple(axis.result() for axis in axes),
+        rest_share=min(sum(spans_s) / span_s, 1.0),
+        longest_rest_s=max(spans_s, default=0.0),
+        rests=len(spans_s),
+        poses=_count_poses(means_mps2),
+        gravity=gravity,
+        neighbour_faults=tuple(look.neighbour_faults()),
         reference_ranges={name: (min(low), max(high)) for name, (low, high, *_) in parts.items()},
-        reference_means={name: sum(total) / sum(count)
-                         for name, (_, _, total, count) in parts.items()},
-        log_delay_s=log_delay_s, remarks=block.remarks, cut=block.cut)
+        reference_means={
+            name: sum(total) / sum(count) for name, (_, _, total, count) in parts.items()
+        },
+        log_delay_s=log_delay_s,
+        remarks=block.remarks,
+        cut=block.cut,
+    )
 
 
 def log_delay_s(times_ns: Iterable[np.ndarray]) -> float | None:
     """Return the median of log time minus header stamp, ns, (k, 2) by block; None without any."""
     # A few messages of each block are enough, whatever the length of the recording.
-    parts = [block[::max(len(block) // 128, 1)] for block in times_ns]
+    parts = [block[:: max(len(block) // 128, 1)] for block in times_ns]
     return 1e-9 * float(np.median(np.diff(np.concatenate(parts)))) if parts else None
 
 
@@ -149,8 +167,10 @@ class _Stamps:
 
     def __init__(self, first: Recording) -> None:
         if len(first) < 2:
-            raise UserError(f'{first.path}: {len(first)} sample with a usable stamp; at least 2 '
-                            'are needed; --rate HZ stamps by index')
+            raise UserError(
+                f'{first.path}: {len(first)} sample with a usable stamp; at least 2 '
+                'are needed; --rate HZ stamps by index'
+            )
         self.burst = burst_samples(first.time_s)
         self.period_s = period_s(first.time_s)
         self.first_s = float(first.time_s[0])
@@ -214,22 +234,32 @@ class _Axis:
                 self._clipped[side] += sum(
                     self._moves(signed, largest - drop, first, stop)
                     for first, stop in true_runs(signed == largest)
-                    if stop - first >= _CLIPPED_SAMPLES)
+                    if stop - first >= _CLIPPED_SAMPLES
+                )
 
     def _moves(self, values: np.ndarray, low: float, first: int, stop: int) -> bool:
         """Return whether the axis is below a value soon before or after some samples."""
         window = max(min(stop - first, round(_CLIPPED_WINDOW_S / self._period_s)), 1)
-        beside = np.append(values[max(first - window, 0):first], values[stop:stop + window])
+        beside = np.append(values[max(first - window, 0) : first], values[stop : stop + window])
         return bool((beside < low).any())
 
     def result(self) -> AxisRange:
         """Return the range of the axis."""
         low, high = -self._largest[0], self._largest[1]
         stuck_s = self._most_equal * self._period_s
-        is_reported = (stuck_s >= _STUCK_S and self._most_equal >= _STUCK_SAMPLES
-                       and self._changes > _CHANGING * (self._count - self._most_equal))
-        return AxisRange(self._name, low, high, sum(self._clipped), low == high,
-                         stuck_s * (is_reported or low == high))
+        is_reported = (
+            stuck_s >= _STUCK_S
+            and self._most_equal >= _STUCK_SAMPLES
+            and self._changes > _CHANGING * (self._count - self._most_equal)
+        )
+        return AxisRange(
+            self._name,
+            low,
+            high,
+            sum(self._clipped),
+            low == high,
+            stuck_s * (is_reported or low == high),
+        )
 
 
 def _count_poses(means_mps2: Sequence[np.ndarray]) -> int:
@@ -287,14 +317,21 @@ class Findings:
 def assess(contents: RecordingContents) -> Findings:
     """Return the findings of a recording that can be read."""
     faults = [*_stamp_faults(contents), *_sample_faults(contents)]
-    return Findings(contents.path, contents, tuple(faults), tuple(_remarks(contents)),
-                    (_fit(contents), _diagnose(contents), _noise(contents)))
+    return Findings(
+        contents.path,
+        contents,
+        tuple(faults),
+        tuple(_remarks(contents)),
+        (_fit(contents), _diagnose(contents), _noise(contents)),
+    )
 
 
 def _missing(contents: RecordingContents) -> str:
     expected = contents.samples + contents.missing
-    return (f'{contents.missing} samples are missing ({100 * contents.missing / expected:.2g} %) '
-            f'in {counted(contents.gaps, "gap")}, the longest of {contents.longest_gap_s:.3g} s')
+    return (
+        f'{contents.missing} samples are missing ({100 * contents.missing / expected:.2g} %) '
+        f'in {counted(contents.gaps, "gap")}, the longest of {contents.longest_gap_s:.3g} s'
+    )
 
 
 def _has_wide_gaps(contents: RecordingContents) -> bool:
@@ -304,27 +341,40 @@ def _has_wide_gaps(contents: RecordingContents) -> bool:
 
 def _stamp_faults(contents: RecordingContents) -> list[str]:
     which = 'with the stamp of the one before', 'whose stamp steps back'
-    faults = [f'samples {text}: {count}; --drop-bad-stamps leaves them out'
-              for text, count in zip(which, contents.bad_stamps) if count]
+    faults = [
+        f'samples {text}: {count}; --drop-bad-stamps leaves them out'
+        for text, count in zip(which, contents.bad_stamps)
+        if count
+    ]
     if _has_wide_gaps(contents):
         faults.append(f'{_missing(contents)}; record again, or use the parts')
     period_s = 1 / contents.rate_hz
     if contents.jitter_s > _LARGEST_JITTER * period_s and contents.burst == 1:
-        faults.append(f'stamps scatter by {1e3 * contents.jitter_s:.3g} ms rms, expected '
-                      f'{1e3 * _LARGEST_JITTER * period_s:.3g} ms at most; --rate HZ stamps by '
-                      'index')
+        faults.append(
+            f'stamps scatter by {1e3 * contents.jitter_s:.3g} ms rms, expected '
+            f'{1e3 * _LARGEST_JITTER * period_s:.3g} ms at most; --rate HZ stamps by '
+            'index'
+        )
     if contents.cut:
         faults.append(contents.cut)
     return faults
 
 
 def _sample_faults(contents: RecordingContents) -> list[str]:
-    faults = [f'{axis.name} never changes; the axis is stuck, or not connected' if axis.is_stuck
-              else f'{axis.name} does not change for {axis.stuck_s:.3g} s; the axis is stuck, or '
-              'the driver repeats a sample' for axis in contents.axes if axis.stuck_s]
-    faults += [f'{axis.name} stays at its extreme value {axis.clipped} times in motion; its range '
-               f'ends at {axis.lowest_mps2 / G0_MPS2:.3g} or {axis.highest_mps2 / G0_MPS2:.3g} g'
-               for axis in contents.axes if axis.clipped >= _FEWEST_CLIPPED]
+    faults = [
+        f'{axis.name} never changes; the axis is stuck, or not connected'
+        if axis.is_stuck
+        else f'{axis.name} does not change for {axis.stuck_s:.3g} s; the axis is stuck, or '
+        'the driver repeats a sample'
+        for axis in contents.axes
+        if axis.stuck_s
+    ]
+    faults += [
+        f'{axis.name} stays at its extreme value {axis.clipped} times in motion; its range '
+        f'ends at {axis.lowest_mps2 / G0_MPS2:.3g} or {axis.highest_mps2 / G0_MPS2:.3g} g'
+        for axis in contents.axes
+        if axis.clipped >= _FEWEST_CLIPPED
+    ]
     faults += contents.neighbour_faults
     if contents.gravity.fault:
         faults.append(contents.gravity.fault.text)
@@ -336,13 +386,17 @@ def _remarks(contents: RecordingContents) -> list[str]:
     if contents.missing and not _has_wide_gaps(contents):
         remarks.append(_missing(contents))
     if contents.burst > 1:
-        remarks.append(f'stamps come in bursts of {contents.burst} samples; --rate '
-                       f'{contents.rate_hz:.4g} stamps by index')
+        remarks.append(
+            f'stamps come in bursts of {contents.burst} samples; --rate '
+            f'{contents.rate_hz:.4g} stamps by index'
+        )
     delay_s = contents.log_delay_s or 0.0
     if abs(delay_s) > _LARGEST_DELAY_S:
         order = 'after' if delay_s > 0 else 'before'
-        remarks.append(f'log time is {duration(abs(delay_s))} {order} header time; the clocks of '
-                       'sensor and recorder differ, or the headers have simulated time')
+        remarks.append(
+            f'log time is {duration(abs(delay_s))} {order} header time; the clocks of '
+            'sensor and recorder differ, or the headers have simulated time'
+        )
     return remarks
 
 
@@ -358,46 +412,70 @@ def _fit(contents: RecordingContents) -> Ability:
     held = f'{counted(contents.poses, "orientation")} in {counted(contents.rests, "rest")}'
     if _range_rad(contents) is not None:
         is_able = contents.poses >= _FEWEST_STAGE_POSES
-        return Ability('fit', is_able, f'against stage angles, {held}' if is_able else
-                       f'has {held}, needs {_FEWEST_STAGE_POSES} orientations at least')
+        return Ability(
+            'fit',
+            is_able,
+            f'against stage angles, {held}'
+            if is_able
+            else f'has {held}, needs {_FEWEST_STAGE_POSES} orientations at least',
+        )
     if len(contents.axes) < len(AXES):
         return Ability('fit', False, 'has no stage angles, and gravity alone needs x, y and z')
     is_able = contents.poses >= FEWEST_GRAVITY_POSES
-    return Ability('fit', is_able, f'against gravity, {held}' if is_able else
-                   f'has {held} and no stage angles, needs {FEWEST_GRAVITY_POSES} orientations')
+    return Ability(
+        'fit',
+        is_able,
+        f'against gravity, {held}'
+        if is_able
+        else f'has {held} and no stage angles, needs {FEWEST_GRAVITY_POSES} orientations',
+    )
 
 
 def _diagnose(contents: RecordingContents) -> Ability:
     range_rad = _range_rad(contents)
     if contents.poses <= 1 and not (range_rad and range_rad > _MOVED_RAD):
-        follows = [text for name, (text, smallest) in _FOLLOWED.items()
-                   if np.ptp(contents.reference_ranges.get(name, (0.0, 0.0))) > smallest]
+        follows = [
+            text
+            for name, (text, smallest) in _FOLLOWED.items()
+            if np.ptp(contents.reference_ranges.get(name, (0.0, 0.0))) > smallest
+        ]
         if follows:
             return Ability('diagnose', True, f'at rest, for effects of {" and ".join(follows)}')
     if range_rad is None:
-        return Ability('diagnose', False, 'has no stage angles; give --sim with the specific '
-                       'force of the same motion')
+        return Ability(
+            'diagnose',
+            False,
+            'has no stage angles; give --sim with the specific force of the same motion',
+        )
     if range_rad < _MOVED_RAD:
         return Ability('diagnose', False, 'has stage angles that do not change; move the stage')
     if contents.span_s < SHORTEST_MOTION_S:
-        return Ability('diagnose', False, f'lasts {contents.span_s:.3g} s, needs '
-                       f'{SHORTEST_MOTION_S:g} s')
+        return Ability(
+            'diagnose', False, f'lasts {contents.span_s:.3g} s, needs {SHORTEST_MOTION_S:g} s'
+        )
     return Ability('diagnose', True, f'stage angles over {np.degrees(range_rad):.0f}°')
 
 
 def _noise(contents: RecordingContents) -> Ability:
     longest_s, shortest_s = contents.longest_rest_s, shortest_rest_s(contents.rate_hz)
-    return Ability('noise', longest_s >= shortest_s,
-                   f'longest rest {duration(longest_s)}' if longest_s >= shortest_s else
-                   f'rests for {longest_s:.4g} s, needs {shortest_s:.3g} s')
+    return Ability(
+        'noise',
+        longest_s >= shortest_s,
+        f'longest rest {duration(longest_s)}'
+        if longest_s >= shortest_s
+        else f'rests for {longest_s:.4g} s, needs {shortest_s:.3g} s',
+    )
 
 
 BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 
 
-def check_recording(given: str | os.PathLike | Recording, params: Sensor | str | None,
-                    reading: ReadingOptions, show: Callable[[float], None] = lambda done: None
-                    ) -> Findings:
+def check_recording(
+    given: str | os.PathLike | Recording,
+    params: Sensor | str | None,
+    reading: ReadingOptions,
+    show: Callable[[float], None] = lambda done: None,
+) -> Findings:
     """Return the findings of a recording, or of its path; what cannot be read is not sound."""
     if isinstance(given, Recording):
         contents = examine([given], lambda block: load_sensor(params, block), None)

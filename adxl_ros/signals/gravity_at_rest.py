@@ -72,7 +72,7 @@ class ReadingUnit:
     symbol: str = ''  # Its name in options and parameters; empty where they do not have it
 
 
-_COUNTS_PER_G = [2 ** k for k in range(6, 19)]
+_COUNTS_PER_G = [2**k for k in range(6, 19)]
 """Counts of 1 g of digital sensors: from 6 bits of ±2 g to 20 bits of ±2 g, by powers of two."""
 
 UNITS = (
@@ -82,14 +82,17 @@ UNITS = (
     ReadingUnit('cm/s²', 1e2 * G0_MPS2, 'divide the readings by 100'),
     ReadingUnit('ft/s²', G0_MPS2 / 0.3048, 'multiply the readings by 0.3048'),
     ReadingUnit('m/s² divided by 1000', 1e-3 * G0_MPS2, 'multiply the readings by 1000'),
-    ReadingUnit('m/s² that were stated as g', G0_MPS2 ** 2, 'state it by --unit mps2'),
-    *(ReadingUnit(f'counts of {count} per g', float(count),
-                  f'state it by --unit lsb --lsb-per-g {count}') for count in _COUNTS_PER_G),
+    ReadingUnit('m/s² that were stated as g', G0_MPS2**2, 'state it by --unit mps2'),
+    *(
+        ReadingUnit(
+            f'counts of {count} per g', float(count), f'state it by --unit lsb --lsb-per-g {count}'
+        )
+        for count in _COUNTS_PER_G
+    ),
 )
 """Units in which readings may be, those of physics before counts."""
 
-_AXIS_UNITS = [unit for unit in UNITS if unit.name in ('g', 'mg', 'mm/s²',
-                                                       'm/s² divided by 1000')]
+_AXIS_UNITS = [unit for unit in UNITS if unit.name in ('g', 'mg', 'mm/s²', 'm/s² divided by 1000')]
 """Units that single axes are tried in. Counts are left out: one of them fits almost any length."""
 
 
@@ -107,9 +110,11 @@ def nominal_tolerance(sensor: Sensor) -> Tolerance:
     zero_g = _departure(sensor, 'bias', 'offset_v') / sensor.nominal_scale_v_per_g
     scale = _departure(sensor, 'scale_factor', 'offset_v_per_g') / sensor.nominal_scale_v_per_g
     across = _departure(sensor, 'cross_axis', 'linear')
-    return Tolerance(G0_MPS2 * np.where(zero_g > 0, zero_g, _UNSTATED_ZERO_G),
-                     np.where(scale > 0, scale, _UNSTATED_SCALE),
-                     across or _UNSTATED_ACROSS)
+    return Tolerance(
+        G0_MPS2 * np.where(zero_g > 0, zero_g, _UNSTATED_ZERO_G),
+        np.where(scale > 0, scale, _UNSTATED_SCALE),
+        across or _UNSTATED_ACROSS,
+    )
 
 
 def _departure(sensor: Sensor, effect: str, parameter: str) -> float:
@@ -124,7 +129,8 @@ def calibrated_tolerance(sensor: Sensor) -> Tolerance:
 
     def fitted(effect: str, parameter: str) -> np.ndarray:
         return _CALIBRATED_STDS * np.array(
-            [std.get(Coefficient(effect, parameter, axis), 0.0) for axis in sensor.axes])
+            [std.get(Coefficient(effect, parameter, axis), 0.0) for axis in sensor.axes]
+        )
 
     zero_g = fitted('bias', 'offset_v') / sensor.nominal_scale_v_per_g + _SHIFT_IN_USE_G
     if 'temperature_bias' in sensor.effects:
@@ -133,8 +139,9 @@ def calibrated_tolerance(sensor: Sensor) -> Tolerance:
         zero_g = zero_g + _TEMPERATURES_K * np.abs(get(sensor, slopes))
     scale = fitted('scale_factor', 'offset_v_per_g') / sensor.nominal_scale_v_per_g
     across = np.concatenate([fitted('misalignment', name) for name in ('alpha_rad', 'beta_rad')])
-    return Tolerance(G0_MPS2 * zero_g, scale + _CHANGE_IN_USE,
-                     max(float(across.max()), _CHANGE_IN_USE))
+    return Tolerance(
+        G0_MPS2 * zero_g, scale + _CHANGE_IN_USE, max(float(across.max()), _CHANGE_IN_USE)
+    )
 
 
 IDEAL = Tolerance(np.zeros(3), np.zeros(3), _CHANGE_IN_USE)
@@ -198,8 +205,9 @@ class GravityFault:
         """Return what to do with a file whose unit no option states."""
         if self.kind is GravityFaultKind.MIXED_UNITS:
             return 'convert each axis to m/s²'
-        return self.remedy if np.isnan(self.factor) else \
-            f'multiply its readings by {self.factor:.6g}'
+        return (
+            self.remedy if np.isnan(self.factor) else f'multiply its readings by {self.factor:.6g}'
+        )
 
     @property
     def live_text(self) -> str:
@@ -233,8 +241,11 @@ class GravityAtRest:
         figures['allowed_mps2'] = list(self.allowed_mps2)
         if self.fault is not None:
             figures |= {'fault': self.fault.kind.value, 'unit': self.fault.unit}
-        return {name: value for name, value in figures.items()
-                if not isinstance(value, float) or np.isfinite(value)}
+        return {
+            name: value
+            for name, value in figures.items()
+            if not isinstance(value, float) or np.isfinite(value)
+        }
 
     @property
     def text(self) -> str:
@@ -242,16 +253,23 @@ class GravityAtRest:
         if not self.rests:
             return 'length of gravity: not checked, nothing rests'
         low, high = self.allowed_mps2
-        limits = f'{number(low)} to {number(high)}' if self.axes == len(AXES) else \
-            f'at most {number(high)}, a lower limit is not checked'
-        spread = f', half of them within {number(self.spread_mps2, digits=2)}' \
-            if self.rests > 1 else ''
-        return (f'length of gravity: {number(self.length_mps2)} m/s² over '
-                f'{counted(self.rests, "rest")}{spread} (the sensor allows {limits})')
+        limits = (
+            f'{number(low)} to {number(high)}'
+            if self.axes == len(AXES)
+            else f'at most {number(high)}, a lower limit is not checked'
+        )
+        spread = (
+            f', half of them within {number(self.spread_mps2, digits=2)}' if self.rests > 1 else ''
+        )
+        return (
+            f'length of gravity: {number(self.length_mps2)} m/s² over '
+            f'{counted(self.rests, "rest")}{spread} (the sensor allows {limits})'
+        )
 
 
-def look(readings: RestReadings, tolerance: Tolerance, gravity_mps2: float = G0_MPS2
-         ) -> GravityAtRest:
+def look(
+    readings: RestReadings, tolerance: Tolerance, gravity_mps2: float = G0_MPS2
+) -> GravityAtRest:
     """
     Compare the readings of rests with gravity.
 
@@ -278,14 +296,17 @@ def look(readings: RestReadings, tolerance: Tolerance, gravity_mps2: float = G0_
     length, case = readings.length_mps2, _Case(readings, tolerance, gravity_mps2)
     # A reading of the length g in these poses is that of a force between these lengths.
     upright = readings.divided(np.maximum(length, _LEAST_MPS2)[:, None] / gravity_mps2)
-    low, high = (np.median(limits) for limits in
-                 replace(case, readings=upright).force_limits())
+    low, high = (np.median(limits) for limits in replace(case, readings=upright).force_limits())
     return GravityAtRest(
-        count * every, axes, gravity_mps2, float(np.median(length)),
+        count * every,
+        axes,
+        gravity_mps2,
+        float(np.median(length)),
         float(np.subtract(*np.quantile(length, [0.75, 0.25]))),
         float(np.median(np.linalg.norm(readings.std_mps2, axis=1))),
-        (float(gravity_mps2 ** 2 / high),
-         float(gravity_mps2 ** 2 / low) if low > 0 else np.inf), case.fault())
+        (float(gravity_mps2**2 / high), float(gravity_mps2**2 / low) if low > 0 else np.inf),
+        case.fault(),
+    )
 
 
 @dataclass(frozen=True)
@@ -300,8 +321,9 @@ class _Case:
     def error_mps2(self) -> np.ndarray:
         """Error of a length that neither zero-g nor scale explain, m/s², (k,)."""
         noise_mps2 = np.linalg.norm(self.readings.std_mps2, axis=1)
-        return np.asarray(self.tolerance.across * self.gravity_mps2 + _LOCAL_MPS2
-                          + _NOISE_STDS * noise_mps2)
+        return np.asarray(
+            self.tolerance.across * self.gravity_mps2 + _LOCAL_MPS2 + _NOISE_STDS * noise_mps2
+        )
 
     def force_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the smallest and largest length of the force of each rest, m/s², (k,) each."""
@@ -339,11 +361,19 @@ class _Case:
         """Return the middle of the sphere nearest to the readings, within the tolerance, (m,)."""
         mean, axes = self.readings.mean_mps2, self.readings.mean_mps2.shape[1]
         # |r|² = 2·r·b + (|f|² − |b|²) is linear in b and in the bracket.
-        prior = np.diag(2 * self.gravity_mps2 * self.error_mps2.mean()
-                        / self.tolerance.zero_g_mps2.clip(min=_LEAST_MPS2))
-        rows = np.vstack([np.column_stack([2 * mean, np.ones(len(mean))]),
-                          np.column_stack([prior, np.zeros(axes)])])
-        squares = np.append((mean ** 2).sum(axis=1), np.zeros(axes))
+        prior = np.diag(
+            2
+            * self.gravity_mps2
+            * self.error_mps2.mean()
+            / self.tolerance.zero_g_mps2.clip(min=_LEAST_MPS2)
+        )
+        rows = np.vstack(
+            [
+                np.column_stack([2 * mean, np.ones(len(mean))]),
+                np.column_stack([prior, np.zeros(axes)]),
+            ]
+        )
+        squares = np.append((mean**2).sum(axis=1), np.zeros(axes))
         return np.asarray(np.linalg.lstsq(rows, squares)[0][:axes])
 
     def _unexplained(self, zero_g_mps2: np.ndarray) -> np.ndarray:
@@ -364,9 +394,10 @@ class _Case:
             # A step of Gauss and Newton, by weights in which false rests count less
             by_zero_g = -force / length[:, None] / (1 + scale)
             rows = np.hstack([by_zero_g, by_zero_g * force]) * allowed / error_mps2[:, None]
-            weighted = rows.T / np.sqrt(1 + beyond ** 2)
-            step = np.linalg.solve(weighted @ rows + _PRIOR * np.eye(2 * axes),
-                                   weighted @ beyond + _PRIOR * shares)
+            weighted = rows.T / np.sqrt(1 + beyond**2)
+            step = np.linalg.solve(
+                weighted @ rows + _PRIOR * np.eye(2 * axes), weighted @ beyond + _PRIOR * shares
+            )
             shares = np.clip(shares - step, -1.0, 1.0)
         return np.asarray(np.abs(beyond) > 1)
 
@@ -384,45 +415,63 @@ class _Case:
             return unit_fault
         if is_off and self._is_removed():
             return GravityFault(
-                GravityFaultKind.REMOVED, f'at rest {self._read()}: gravity is missing, as in '
-                'linear acceleration', 'record the specific force, which includes gravity')
+                GravityFaultKind.REMOVED,
+                f'at rest {self._read()}: gravity is missing, as in linear acceleration',
+                'record the specific force, which includes gravity',
+            )
         if (is_off or wrong.sum() > 1) and (mixed := self._mixed_units()):
             return mixed
         if is_off:
-            return GravityFault(GravityFaultKind.SCALE, f'at rest {self._read()}{self._range()}',
-                                'check unit and scale factor')
+            return GravityFault(
+                GravityFaultKind.SCALE,
+                f'at rest {self._read()}{self._range()}',
+                'check unit and scale factor',
+            )
         if is_spread:
             return self._spread(wrong)
         return None
 
     def _read(self) -> str:
         length = float(np.median(self.readings.length_mps2))
-        return (f'the readings are {number(length)} m/s² long '
-                f'({counted(len(self.readings.mean_mps2), "rest")}), expected '
-                f'{number(self.gravity_mps2)}')
+        return (
+            f'the readings are {number(length)} m/s² long '
+            f'({counted(len(self.readings.mean_mps2), "rest")}), expected '
+            f'{number(self.gravity_mps2)}'
+        )
 
     def _read_over_poses(self) -> str:
         lengths = self.readings.length_mps2
-        return (f'at rest the readings are {number(lengths.min())} to {number(lengths.max())} '
-                f'm/s² long ({counted(len(lengths), "rest")}), expected '
-                f'{number(self.gravity_mps2)} in each pose')
+        return (
+            f'at rest the readings are {number(lengths.min())} to {number(lengths.max())} '
+            f'm/s² long ({counted(len(lengths), "rest")}), expected '
+            f'{number(self.gravity_mps2)} in each pose'
+        )
 
     def _unit(self) -> GravityFault | None:
         """Return the unit of all axes in which the readings are gravity."""
         length = float(np.median(self.readings.length_mps2))
-        distances = {unit: abs(float(np.log(length / unit.gravity)))
-                     for unit in UNITS if self._fits(unit)}
+        distances = {
+            unit: abs(float(np.log(length / unit.gravity))) for unit in UNITS if self._fits(unit)
+        }
         if not distances:
             return None
         # A sensor within the usual tolerance may be nearer to another unit than to its own.
         farthest = min(distances.values()) + _ALIKE
-        likely = [unit for unit in sorted(distances, key=lambda unit: distances[unit])
-                  if distances[unit] < farthest][:2]
+        likely = [
+            unit
+            for unit in sorted(distances, key=lambda unit: distances[unit])
+            if distances[unit] < farthest
+        ][:2]
         names = ' or '.join(unit.name for unit in likely)
         remedies = ', or '.join(unit.remedy for unit in likely)
-        return GravityFault(GravityFaultKind.UNIT,
-                            f'at rest {self._read()}, as values in {names} are', remedies, names,
-                            likely[0].symbol, self.gravity_mps2 / likely[0].gravity)
+        return GravityFault(
+            GravityFaultKind.UNIT,
+            f'at rest {self._read()}, as values in {names} are',
+            remedies,
+            names,
+            likely[0].symbol,
+            self.gravity_mps2 / likely[0].gravity,
+        )
 
     def _fits(self, unit: ReadingUnit) -> bool:
         case = self.divided(unit.gravity / self.gravity_mps2)
@@ -434,8 +483,9 @@ class _Case:
 
     def _is_removed(self) -> bool:
         """Return whether most rests may read a sound sensor without any force."""
-        beyond = np.abs(self.readings.mean_mps2) > self.tolerance.zero_g_mps2 \
-            + self.error_mps2[:, None]
+        beyond = (
+            np.abs(self.readings.mean_mps2) > self.tolerance.zero_g_mps2 + self.error_mps2[:, None]
+        )
         return bool(beyond.any(axis=1).mean() <= _LARGEST_FALSE_SHARE)
 
     def _mixed_units(self) -> GravityFault | None:
@@ -448,7 +498,8 @@ class _Case:
         if not self.divided(length / self.gravity_mps2).contradicting().any():
             return None  # One factor of all axes explains them.
         factors = {'m/s²': 1.0} | {
-            unit.name: unit.gravity / self.gravity_mps2 for unit in _AXIS_UNITS}
+            unit.name: unit.gravity / self.gravity_mps2 for unit in _AXIS_UNITS
+        }
         best, least = None, np.inf
         for names in product(factors, repeat=axes):
             if len(set(names)) == 1:
@@ -465,21 +516,25 @@ class _Case:
         return GravityFault(
             GravityFaultKind.MIXED_UNITS,
             f'{self._read_over_poses()}: the axes are in different units ({stated})',
-            'state the unit of each axis by --columns', stated)
+            'state the unit of each axis by --columns',
+            stated,
+        )
 
     def _range(self) -> str:
         """Return the range of a digital sensor that explains a scale factor, or ''."""
         for power in (1, -1, 2, -2, 3, -3):
-            if self.divided(2.0 ** power).is_allowed():
-                return f', {2.0 ** power:g} times, as with the scale factor of another range'
+            if self.divided(2.0**power).is_allowed():
+                return f', {2.0**power:g} times, as with the scale factor of another range'
         return ''
 
     def _spread(self, wrong: np.ndarray) -> GravityFault:
         return GravityFault(
-            GravityFaultKind.SPREAD, f'{self._read_over_poses()}: no zero-g and scale factor '
+            GravityFaultKind.SPREAD,
+            f'{self._read_over_poses()}: no zero-g and scale factor '
             f'within the tolerance of the sensor explain {wrong.sum()} of them',
             'look for axes in different units, several sensors in one file, or a sensor that was '
-            'exchanged')
+            'exchanged',
+        )
 
 
 def of_volts(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> GravityAtRest:
@@ -489,14 +544,18 @@ def of_volts(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> GravityAt
     A calibrated sensor undoes its effects first. Where its readings then are no gravity, those by
     the nominal values tell the unit.
     """
-    nominal = RestReadings(to_nominal_mps2(mean_v, sensor),
-                           std_v / sensor.nominal_scale_v_per_g * G0_MPS2)
+    nominal = RestReadings(
+        to_nominal_mps2(mean_v, sensor), std_v / sensor.nominal_scale_v_per_g * G0_MPS2
+    )
     gravity_mps2 = sensor.local_gravity_mps2
     by_nominal = look(nominal, nominal_tolerance(sensor), gravity_mps2)
     if 'scale_factor' not in sensor.effects and 'bias' not in sensor.effects:
         return by_nominal
-    corrected = look(RestReadings(_corrected_mps2(mean_v, sensor), nominal.std_mps2),
-                     calibrated_tolerance(sensor), gravity_mps2)
+    corrected = look(
+        RestReadings(_corrected_mps2(mean_v, sensor), nominal.std_mps2),
+        calibrated_tolerance(sensor),
+        gravity_mps2,
+    )
     is_of_unit = corrected.fault and by_nominal.fault and by_nominal.fault.is_clear
     return by_nominal if is_of_unit else corrected
 
@@ -507,8 +566,7 @@ def _corrected_mps2(mean_v: np.ndarray, sensor: Sensor) -> np.ndarray:
     if sensor.axes != AXES or not len(mean_v):
         return straight  # The third component would be derived from gravity itself.
     with np.errstate(all='ignore'):
-        force = np.column_stack(signal_chain.inverse(sensor)(
-            list(mean_v.T), NOMINAL_ENVIRONMENT))
+        force = np.column_stack(signal_chain.inverse(sensor)(list(mean_v.T), NOMINAL_ENVIRONMENT))
     # No force explains what is far beyond the range.
     return np.where(np.isfinite(force), force, straight)
 

@@ -72,14 +72,14 @@ class NeighbouringSamples:
             return
         joined = np.concatenate([self._left, samples])
         joined_s = np.concatenate([self._left_s, time_s])
-        with_last = joined[max(len(self._left) - 1, 0):]
+        with_last = joined[max(len(self._left) - 1, 0) :]
         for ends, values in zip(self._ends, with_last.T):
             ends.feed(values)
         self._count_runs(with_last)
         self._compare_rows(samples)
         # The sides of the last jumps come with the next block.
         self._find_jumps(joined_s, joined)
-        self._left, self._left_s = joined[-2 * _SIDE:], joined_s[-2 * _SIDE:]
+        self._left, self._left_s = joined[-2 * _SIDE :], joined_s[-2 * _SIDE :]
 
     def faults(self) -> list[str]:
         """Return what is wrong, one line each."""
@@ -97,8 +97,7 @@ class NeighbouringSamples:
             return
         lengths = np.append(self._run + begins[0] - 1, np.diff(begins))
         self._run = len(samples) - int(begins[-1])
-        self._runs += np.bincount(lengths.clip(max=len(self._runs) - 1),
-                                  minlength=len(self._runs))
+        self._runs += np.bincount(lengths.clip(max=len(self._runs) - 1), minlength=len(self._runs))
 
     def _repeats(self) -> str:
         """Return how often each reading stands, where that is no chance."""
@@ -107,20 +106,25 @@ class NeighbouringSamples:
             return ''
         mean = float((lengths * self._runs).sum() / count)
         scatter = float(np.sqrt((self._runs * (lengths - mean) ** 2).sum() / count))
-        regular = [n for n in range(2, _MOST_REPEATS + 1)
-                   if self._runs[n::n].sum() >= _REGULAR_SHARE * count]
+        regular = [
+            n
+            for n in range(2, _MOST_REPEATS + 1)
+            if self._runs[n::n].sum() >= _REGULAR_SHARE * count
+        ]
         if regular:
             mean = float(regular[-1])
         elif mean < _FEWEST_EVEN or scatter > _EVEN_RUNS * mean or 2 * self._wide < count:
             return ''
-        return (f'each reading stands for {mean:.3g} samples: the sensor has '
-                f'{self._rate_hz / mean:.4g} readings a second, and the file {self._rate_hz:.4g}; '
-                'record each reading once')
+        return (
+            f'each reading stands for {mean:.3g} samples: the sensor has '
+            f'{self._rate_hz / mean:.4g} readings a second, and the file {self._rate_hz:.4g}; '
+            'record each reading once'
+        )
 
     def _compare_rows(self, samples: np.ndarray) -> None:
         """Compare every second, third and fourth row within windows of some rows."""
         count = len(samples) // _WINDOW
-        windows = samples[:count * _WINDOW].reshape(count, _WINDOW, samples.shape[1])
+        windows = samples[: count * _WINDOW].reshape(count, _WINDOW, samples.shape[1])
         self._windows += count
         for phases in _PHASES if count else ():
             parts = windows.reshape(count, _WINDOW // phases, phases, samples.shape[1])
@@ -130,35 +134,44 @@ class NeighbouringSamples:
             smallest = np.maximum(_TWO_VALUES, _MEAN_STDS * np.sqrt(2 * phases / _WINDOW)) * within
             apart = ((distance > smallest) & (distance > 0)).any(axis=1)
             self._alternating[phases] += int(apart.sum())
-            self._distance_mps2[phases] = max(self._distance_mps2[phases],
-                                              float(distance[apart].max(initial=0.0)))
+            self._distance_mps2[phases] = max(
+                self._distance_mps2[phases], float(distance[apart].max(initial=0.0))
+            )
 
     def _alternates(self) -> str:
         """Return after how many rows the readings come back, where they alternate."""
         for phases in _PHASES:
             if 2 * self._alternating[phases] > self._windows > 0:
-                return (f'rows alternate between {phases} values up to '
-                        f'{self._distance_mps2[phases]:.3g} m/s² apart: {phases} sensors in one '
-                        f'file, or a disturbance at 1/{phases} of the sample rate; separate them')
+                return (
+                    f'rows alternate between {phases} values up to '
+                    f'{self._distance_mps2[phases]:.3g} m/s² apart: {phases} sensors in one '
+                    f'file, or a disturbance at 1/{phases} of the sample rate; separate them'
+                )
         return ''
 
     def _wraps(self) -> str:
         """Return on which axis counts wrap at the end of their range."""
-        return next((f'{name} {text}' for name, ends in zip(self._axes, self._ends)
-                     if (text := ends.wraps())), '')
+        return next(
+            (
+                f'{name} {text}'
+                for name, ends in zip(self._axes, self._ends)
+                if (text := ends.wraps())
+            ),
+            '',
+        )
 
     def _find_jumps(self, time_s: np.ndarray, samples: np.ndarray) -> None:
         """Find steps from one steady part to another that no turn explains."""
         size = np.linalg.norm(np.diff(samples, axis=0), axis=1)
         # Steps whose both sides are known; those before were found in the block before.
-        both = size[_SIDE - 1:len(size) - _SIDE + 1]
+        both = size[_SIDE - 1 : len(size) - _SIDE + 1]
         places = _SIDE - 1 + np.flatnonzero(both > _SMALLEST_JUMP_G * G0_MPS2)
         for i in places.tolist():
-            beside = np.concatenate([size[i - _SIDE + 1:i], size[i + 1:i + _SIDE]])
+            beside = np.concatenate([size[i - _SIDE + 1 : i], size[i + 1 : i + _SIDE]])
             if beside.max() > _STEADY * size[i]:
                 continue
-            before = samples[i - _NEAREST + 1:i + 1].mean(axis=0)
-            after = samples[i + 1:i + 1 + _NEAREST].mean(axis=0)
+            before = samples[i - _NEAREST + 1 : i + 1].mean(axis=0)
+            after = samples[i + 1 : i + 1 + _NEAREST].mean(axis=0)
             step_s = max(float(time_s[i + 1] - time_s[i]), 1 / self._rate_hz)
             if _turn_rad(before, after) > _TURN_RAD_PER_S * step_s:
                 self._jumps.append((float(time_s[i]), float(size[i])))
@@ -168,9 +181,11 @@ class NeighbouringSamples:
         if not 0 < len(self._jumps) <= _MOST_TURNS:
             return ''
         at_s, jump_mps2 = self._jumps[0]
-        return (f'the readings jump by {jump_mps2 / G0_MPS2:.3g} g at {at_s:.6g} s from one '
-                'steady value to another, faster than a sensor turns: it was turned over, '
-                'exchanged or read in another way; use the parts')
+        return (
+            f'the readings jump by {jump_mps2 / G0_MPS2:.3g} g at {at_s:.6g} s from one '
+            'steady value to another, faster than a sensor turns: it was turned over, '
+            'exchanged or read in another way; use the parts'
+        )
 
 
 def neighbour_faults(read: Recording, unit: Sensor) -> list[str]:
@@ -229,7 +244,9 @@ class _Ends:
             fills = max(abs(low_g + range_g / 2), abs(high_g - range_g / 2)) < _FILLED * range_g
             is_range = high_g - low_g < (1 + _ROUNDING) * range_g
             if is_range and full >= _FEWEST_WRAPS and (full > half or fills):
-                return (f'jumps by nearly {range_g:.3g} g between neighbouring samples {full} '
-                        f'times: its counts wrap at the end of the range, {low_g:.3g} to '
-                        f'{high_g:.3g} g; record with a larger range')
+                return (
+                    f'jumps by nearly {range_g:.3g} g between neighbouring samples {full} '
+                    f'times: its counts wrap at the end of the range, {low_g:.3g} to '
+                    f'{high_g:.3g} g; record with a larger range'
+                )
         return ''

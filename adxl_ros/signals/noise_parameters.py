@@ -48,11 +48,11 @@ _OCTAVE_PROBABILITY = 0.05
 """Chance from which a filter shows in an octave. Chosen: an octave less costs little, but one that
 is kept because the others are low by chance makes N too small."""
 _BOUND_PROBABILITY = 1e-2  # Chance from which a walk has bounds. Chosen: 1 of 100 healthy logs
-_BOUND_STEP = 2 ** 0.5  # Ratio of tried correlation times. Chosen: the likelihood changes little
+_BOUND_STEP = 2**0.5  # Ratio of tried correlation times. Chosen: the likelihood changes little
 _SHORTEST_BOUND = 10.0  # Shortest T, by the highest frequency. Chosen: below, it is a filter
 _SHORTEST_BOUND_S = 1.0  # Shortest T, s: filters have 0.3 s at most (ADXL203 Rev. E, table 4)
 _MARGIN_OCTAVES = 1  # Octaves left out below a filter or line. Chosen: a line leaks less far
-_FILTER_LOSSES = (0.0, *(4.0 ** n for n in range(-2, 2)))
+_FILTER_LOSSES = (0.0, *(4.0**n for n in range(-2, 2)))
 """Power that tried filters take at the end of the fit, by what they leave. Chosen: less than the
 first does not show in a thousand coefficients, more than the last ends the fit earlier."""
 _FEWEST = 32  # Fewest coefficients of a fit. Chosen: white noise is then known within 20 %
@@ -112,11 +112,11 @@ class NoiseFit:
         for time_s in self.highest / (2 * self.highest_hz) * 2.0 ** np.arange(0, 10.25, 0.25):
             k = np.unique(np.geomspace(1, 2 * time_s * self.highest_hz, 400).astype(int))
             omega = np.pi * k / time_s
-            parts = np.column_stack([np.ones(len(k)), 1 / omega, omega ** -2.0]) * squares
+            parts = np.column_stack([np.ones(len(k)), 1 / omega, omega**-2.0]) * squares
             design = (parts / parts.sum(axis=1, keepdims=True))[:, present]
             information = design.T @ (design * np.gradient(k)[:, None] / 2)
             variance = np.linalg.inv(information)[present == term, present == term]
-            if variance < _SEEN ** -2:
+            if variance < _SEEN**-2:
                 return float(time_s)
         return np.inf
 
@@ -127,9 +127,13 @@ class NoiseFit:
         x = tau_s / time_s
         terms = np.abs(1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x))
         walk = np.where(x > 1e-3, time_s * np.sqrt(terms / tau_s), np.sqrt(tau_s / 3))
-        return np.stack([self.white.value / np.sqrt(tau_s),
-                         np.full(len(tau_s), FLOOR * self.instability.value),
-                         self.walk.value * walk])
+        return np.stack(
+            [
+                self.white.value / np.sqrt(tau_s),
+                np.full(len(tau_s), FLOOR * self.instability.value),
+                self.walk.value * walk,
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -152,8 +156,11 @@ class _Groups:
     def bounded(self, time_s: float, span_s: float) -> _Groups:
         """Return the groups with a walk of this correlation time, in recordings of `span_s`."""
         cycle = np.pi * time_s / span_s * (self.first + (self.count - 1) / 2)
-        return replace(self, shapes=self.shapes * np.column_stack(
-            [np.ones((len(cycle), 2)), 1 / (1 + cycle ** -2.0)]))
+        return replace(
+            self,
+            shapes=self.shapes
+            * np.column_stack([np.ones((len(cycle), 2)), 1 / (1 + cycle**-2.0)]),
+        )
 
     def filtered(self, strength: float, step_rad: float) -> _Groups:
         """Return the groups behind an AR(1) filter, which divides by 1 + strength·sin²."""
@@ -194,8 +201,9 @@ def coefficient_variances(count: int, step_s: float) -> np.ndarray:
     return np.column_stack([np.full(count - 1, 1 / step_s), flicker, walk])
 
 
-def fit_noise(means: np.ndarray, step_s: float, variances: np.ndarray | None = None,
-              rounding: float = 0.0) -> NoiseFit:
+def fit_noise(
+    means: np.ndarray, step_s: float, variances: np.ndarray | None = None, rounding: float = 0.0
+) -> NoiseFit:
     """
     Fit the terms to means of neighbouring cells, (n,), by their `coefficient_variances`.
 
@@ -229,14 +237,18 @@ def _walks(groups: _Groups, span_s: float, highest: int) -> tuple[list[_Groups],
 
 def _filters(models: list[_Groups], end_rad: float, step_rad: float) -> list[_Groups]:
     """Return the models behind each filter that is likely; angles are half a turn a sample."""
-    filtered = [model.filtered(loss / np.sin(end_rad) ** 2, step_rad)
-                for loss in _FILTER_LOSSES for model in models]
+    filtered = [
+        model.filtered(loss / np.sin(end_rad) ** 2, step_rad)
+        for loss in _FILTER_LOSSES
+        for model in models
+    ]
     likelihoods = np.array([_fit(model)[1] for model in filtered])
     return [filtered[i] for i in np.flatnonzero(2 * (likelihoods.max() - likelihoods) < _DROP)]
 
 
-def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0
-          ) -> tuple[np.ndarray, float]:
+def _best(
+    models: list[_Groups], fixed: int | None = None, value: float = 0.0
+) -> tuple[np.ndarray, float]:
     """Return the most likely fit of several models; see `_fit`."""
     return max((_fit(model, fixed, value) for model in models), key=lambda fit: fit[1])
 
@@ -249,8 +261,12 @@ def _grouped(power: np.ndarray, variances: np.ndarray) -> _Groups:
         position = max(position * _WIDTH, position + 1)
     first = np.array(edges)
     count = np.diff(np.append(first, len(power)))
-    return _Groups(np.add.reduceat(power, first) / count, count,
-                   np.add.reduceat(variances, first) / count[:, None], first + 1)
+    return _Groups(
+        np.add.reduceat(power, first) / count,
+        count,
+        np.add.reduceat(variances, first) / count[:, None],
+        first + 1,
+    )
 
 
 def _log_likelihood(groups: _Groups, theta: np.ndarray) -> float:
@@ -261,8 +277,9 @@ def _log_likelihood(groups: _Groups, theta: np.ndarray) -> float:
     return -0.5 * float(groups.count @ (np.log(variance) + groups.power / variance))
 
 
-def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0
-         ) -> tuple[np.ndarray, float]:
+def _fit(
+    groups: _Groups, fixed: int | None = None, value: float = 0.0
+) -> tuple[np.ndarray, float]:
     """Return the likeliest N², B² and K² of 0 or more, (3,), by Fisher scoring; and how likely."""
     free = [term for term in range(3) if term != fixed]
     theta = np.zeros(3)
@@ -280,7 +297,7 @@ def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0
         step = np.zeros(3)
         step[free] = solution / norm - theta[free]
         for halving in range(_HALVINGS):
-            trial = theta + step * 0.5 ** halving
+            trial = theta + step * 0.5**halving
             gained = _log_likelihood(groups, trial) - likelihood
             if gained > 0:
                 break
@@ -294,6 +311,7 @@ def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0
 
 def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term: int) -> Estimate:
     """Return a term with the ends of its interval by the profile likelihood."""
+
     def excess(logarithm: float) -> float:
         """Return twice the drop of the profile likelihood, minus its limit."""
         return 2 * (likelihood - _best(models, term, np.exp(logarithm))[1]) - _DROP
@@ -331,8 +349,11 @@ def _highest(groups: _Groups, count: int, span_s: float, rounding: float) -> int
         chances = scipy.stats.chi2.sf(used.count * used.power / (used.shapes @ theta), used.count)
         octave = used.where(used.first >= stop // 2)
         is_without_line = chances.min() * len(chances) > _LINE_PROBABILITY
-        if (_white_share(octave, theta, rounding) > _MOST and is_without_line
-                and _is_expected(octave, lower, theta)):
+        if (
+            _white_share(octave, theta, rounding) > _MOST
+            and is_without_line
+            and _is_expected(octave, lower, theta)
+        ):
             break
         stop //= 2
     return max(stop >> _MARGIN_OCTAVES, min(count, _FEWEST))
@@ -342,7 +363,7 @@ def _white_share(groups: _Groups, theta: np.ndarray, rounding: float) -> float:
     """Return the share of white noise, without the rounding, in the power of a fit, 0 to 1."""
     if not len(groups.count):
         return 0.0
-    white = max(float(theta[0]) - rounding ** 2, 0.0)
+    white = max(float(theta[0]) - rounding**2, 0.0)
     share = groups.shapes[:, 0] * white / (groups.shapes @ theta)
     return float(np.average(share, weights=groups.count))
 
@@ -351,13 +372,14 @@ def _is_expected(octave: _Groups, lower: _Groups, theta: np.ndarray) -> bool:
     """Whether an octave has the power that a fit of the lower groups predicts."""
     if not len(octave.count):
         return False
-    parts, design = ((g.shapes * theta)[:, theta > 0] / (g.shapes @ theta)[:, None]
-                     for g in (octave, lower))
+    parts, design = (
+        (g.shapes * theta)[:, theta > 0] / (g.shapes @ theta)[:, None] for g in (octave, lower)
+    )
     share = octave.count / octave.count.sum()
     predicted = share @ parts @ np.linalg.pinv(design * np.sqrt(lower.count / 2)[:, None])
     excess = float(share @ (octave.power / (octave.shapes @ theta))) - 1
     variance = 2 / octave.count.sum() + float(predicted @ predicted)
-    return bool(scipy.stats.chi2.sf(excess ** 2 / variance, 1) > _OCTAVE_PROBABILITY)
+    return bool(scipy.stats.chi2.sf(excess**2 / variance, 1) > _OCTAVE_PROBABILITY)
 
 
 _CERTAIN_STDS = 2.576  # Standard deviations that refute a filter: 1 of 100 healthy logs is beyond
@@ -404,16 +426,19 @@ class AxisNoise:
     def filter_evidence(self, rest: StillStretch) -> FilterEvidence | None:
         """Return what the noise shows of a filter; None where slow noise or rounding hides it."""
         white = self.fit.white
-        is_clear = self.white_variance > _MOST * (self.sample_std ** 2)
+        is_clear = self.white_variance > _MOST * (self.sample_std**2)
         if not white.is_seen or not is_clear:
             return None
-        share = self.white_variance / (white.value ** 2 * rest.rate_hz)
+        share = self.white_variance / (white.value**2 * rest.rate_hz)
         repeat = np.clip(1 - self.change_variance / self.white_variance, 0.0, 1.0)
-        independent = rest.count * (1 - repeat ** 2) / (1 + repeat ** 2)
+        independent = rest.count * (1 - repeat**2) / (1 + repeat**2)
         # 90 % of a normal distribution are within 1.645 standard deviations.
         white_std = 2 * np.log(white.high / white.low) / (2 * np.sqrt(_DROP))
-        return FilterEvidence(np.log(share), float(np.hypot(white_std, np.sqrt(2 / independent))),
-                              self.change_variance / self.white_variance)
+        return FilterEvidence(
+            np.log(share),
+            float(np.hypot(white_std, np.sqrt(2 / independent))),
+            self.change_variance / self.white_variance,
+        )
 
     @property
     def sample_white(self) -> float:
@@ -435,8 +460,11 @@ class RecordingNoise:
     doubts: tuple[str, ...] = ()
 
 
-def recording_noise(read: Callable[[], Iterable[Recording]], params: Sensor | str | None,
-                    show: Callable[[float], None] = lambda done: None) -> RecordingNoise:
+def recording_noise(
+    read: Callable[[], Iterable[Recording]],
+    params: Sensor | str | None,
+    show: Callable[[float], None] = lambda done: None,
+) -> RecordingNoise:
     """Fit the noise of all axes in the longest rest; `read` yields the blocks of a recording."""
     first = next(iter(read()), None)
     if first is None:
@@ -452,18 +480,29 @@ def recording_noise(read: Callable[[], Iterable[Recording]], params: Sensor | st
         std, resolution = float(rest.sample_std[i]), float(rest.resolution[i])
         rounding = resolution / float(np.sqrt(12 * rest.rate_hz))
         fit = fit_noise(rest.means[:, i], rest.step_s, variances, rounding)
-        rounding_variance = rounding ** 2 * rest.rate_hz
-        tau_s = rest.allan.tau_s[:rest.window_octaves]
-        slow_lines = [line for line, term in zip(fit.lines(tau_s)[1:], (fit.instability, fit.walk))
-                      if term.is_seen]
+        rounding_variance = rounding**2 * rest.rate_hz
+        tau_s = rest.allan.tau_s[: rest.window_octaves]
+        slow_lines = [
+            line
+            for line, term in zip(fit.lines(tau_s)[1:], (fit.instability, fit.walk))
+            if term.is_seen
+        ]
         slow = float(np.sum(np.square(slow_lines)) / 2 / (1 - 0.5 ** len(tau_s)))
-        noises.append(AxisNoise(
-            axis, without_rounding(fit, std, resolution, rounding), std, resolution, rounding,
-            max(std ** 2 - slow - rounding_variance, 0.0),
-            max(float(rest.allan.deviation[0, i]) ** 2 - rounding_variance, 0.0)))
+        noises.append(
+            AxisNoise(
+                axis,
+                without_rounding(fit, std, resolution, rounding),
+                std,
+                resolution,
+                rounding,
+                max(std**2 - slow - rounding_variance, 0.0),
+                max(float(rest.allan.deviation[0, i]) ** 2 - rounding_variance, 0.0),
+            )
+        )
         show((i + 1) / len(unit.axes))
-    return RecordingNoise(first.path, sensor, unit, rest, noises,
-                          (*doubts, *look.neighbour_faults()))
+    return RecordingNoise(
+        first.path, sensor, unit, rest, noises, (*doubts, *look.neighbour_faults())
+    )
 
 
 def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: float) -> NoiseFit:
@@ -474,17 +513,23 @@ def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: flo
     is hidden: it may be anything up to that, and codes that do not change show less.
     """
     if not _is_coarse(std, resolution):
-        return replace(fit, white=Estimate(*(float(np.sqrt(max(value ** 2 - rounding ** 2, 0.0)))
-                                             for value in fit.white)))
+        return replace(
+            fit,
+            white=Estimate(
+                *(float(np.sqrt(max(value**2 - rounding**2, 0.0))) for value in fit.white)
+            ),
+        )
     widest = max(_DITHERED_STEPS * resolution / std, 1.0)
-    white, instability, walk = (Estimate(term.value, 0.0, term.high * widest)
-                                for term in (fit.white, fit.instability, fit.walk))
+    white, instability, walk = (
+        Estimate(term.value, 0.0, term.high * widest)
+        for term in (fit.white, fit.instability, fit.walk)
+    )
     return replace(fit, white=white, instability=instability, walk=walk)
 
 
 def _is_coarse(std: float, resolution: float) -> bool:
     """Whether samples with rounding have less noise than makes rounding independent of them."""
-    return std ** 2 < resolution ** 2 * (_DITHERED_STEPS ** 2 + 1 / 12)
+    return std**2 < resolution**2 * (_DITHERED_STEPS**2 + 1 / 12)
 
 
 def with_noise(sensor: Sensor, noises: list[AxisNoise], rest: StillStretch) -> Sensor:
@@ -505,19 +550,20 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise], rest: StillStretch) -> S
     to_g = np.array([ONE_SIDED, 1 / np.sqrt(np.pi), 1.0])[:, None] / G0_MPS2
     # By field of an estimate, term and axis.
     value, low, high = (np.array([noise.estimates for noise in noises]) * to_g).T
-    for term, (effect, name) in enumerate((('flicker', 'density_g_per_rthz'),
-                                           ('bias_walk', 'density_g_per_rts')), 1):
+    for term, (effect, name) in enumerate(
+        (('flicker', 'density_g_per_rthz'), ('bias_walk', 'density_g_per_rts')), 1
+    ):
         before = sensor.values.get(effect, {}).get(name, 0.0)
         sizes = np.where(low[term] > 0, value[term], np.minimum(before, high[term]))
         values.pop(effect, None)
         if sizes.any():
             values[effect] = {name: sizes}
     if 'bias_walk' in values:
-        values['bias_walk']['return_per_s'] = np.array(
-            [1 / noise.fit.bound_s for noise in noises])
+        values['bias_walk']['return_per_s'] = np.array([1 / noise.fit.bound_s for noise in noises])
     kept = [name for name in sensor.effects if name in values]
-    sensor = replace(sensor, values=values,
-                     effects=(*kept, *(name for name in values if name not in kept)))
+    sensor = replace(
+        sensor, values=values, effects=(*kept, *(name for name in values if name not in kept))
+    )
     filtered, is_repeated = _with_filter(sensor, noises, rest)
     is_seen = low[0] > 0
     changed: dict[str, Any] = {'unstated': (_DENSITY,)}
@@ -538,11 +584,14 @@ def _density(sensor: Sensor, noises: list[AxisNoise], is_repeated: bool) -> np.n
     for noise, axis_share in zip(noises, share):
         white = noise.fit.white
         largest = white.value if white.is_seen else white.high
-        variance = noise.white_variance if is_repeated and white.is_seen else \
-            largest ** 2 * rate_hz * axis_share
+        variance = (
+            noise.white_variance
+            if is_repeated and white.is_seen
+            else largest**2 * rate_hz * axis_share
+        )
         if not sensor.adc_bits and white.is_seen:
-            variance += noise.rounding ** 2 * rate_hz
-        variances.append(variance / G0_MPS2 ** 2)
+            variance += noise.rounding**2 * rate_hz
+        variances.append(variance / G0_MPS2**2)
     measured = np.sqrt(density_for_variance(np.array(variances), unit.rc_s, rate_hz))
     measured /= unit.noise_ratio
     before = sensor.noise_density_g_per_rthz
@@ -551,8 +600,9 @@ def _density(sensor: Sensor, noises: list[AxisNoise], is_repeated: bool) -> np.n
     return np.where(is_seen, measured, np.minimum(stated, measured))
 
 
-def _with_filter(sensor: Sensor, noises: list[AxisNoise], rest: StillStretch
-                 ) -> tuple[Sensor, bool]:
+def _with_filter(
+    sensor: Sensor, noises: list[AxisNoise], rest: StillStretch
+) -> tuple[Sensor, bool]:
     """
     Return the sensor with a filter that agrees with the noise, and whether one does.
 
@@ -563,7 +613,7 @@ def _with_filter(sensor: Sensor, noises: list[AxisNoise], rest: StillStretch
     seen = [each for noise in noises if (each := noise.filter_evidence(rest))]
     if not seen:
         return sensor, False
-    weights = np.array([each.std ** -2 for each in seen])
+    weights = np.array([each.std**-2 for each in seen])
     log_share = float(np.average([each.log_share for each in seen], weights=weights))
     limit = _CERTAIN_STDS / float(np.sqrt(weights.sum()))
     is_stated = 'rc_capacitance_f' not in sensor.unstated
@@ -577,9 +627,11 @@ def _with_filter(sensor: Sensor, noises: list[AxisNoise], rest: StillStretch
     if is_stated and excess > 0 and not has_form:
         return sensor, False
     return replace(
-        without_effect(sensor, 'bandwidth'), rc_resistance_ohm=RESISTANCE_OHM,
+        without_effect(sensor, 'bandwidth'),
+        rc_resistance_ohm=RESISTANCE_OHM,
         rc_capacitance_f=rc_of_white_share(share, sensor.rate_hz) / RESISTANCE_OHM,
-        filter_rate_hz=sensor.rate_hz), True
+        filter_rate_hz=sensor.rate_hz,
+    ), True
 
 
 _PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000
@@ -603,22 +655,31 @@ def settings(noises: list[AxisNoise], rate_hz: float) -> dict[str, list[Setting]
     white, k = loudest.sample_white, walk.value
     if not walk.is_seen:
         k = max(noise.fit.walk.high for noise in noises)
-    white_note, note = ('' if term.is_seen else ', an upper limit'
-                        for term in (loudest.fit.white, walk))
-    variances = [noise.sample_std ** 2 for noise in noises]
+    white_note, note = (
+        '' if term.is_seen else ', an upper limit' for term in (loudest.fit.white, walk)
+    )
+    variances = [noise.sample_std**2 for noise in noises]
     matrix = np.diag((variances + [1e6] * 3)[:3]).ravel()
 
     def both(names: tuple[str, str], filter_hz: float, remark: str = '') -> list[Setting]:
         root = float(np.sqrt(filter_hz))
-        return [(names[0], [white * root], f'm/s^2{remark}{white_note}'),
-                (names[1], [k * root], f'm/s^3{note}')]
+        return [
+            (names[0], [white * root], f'm/s^2{remark}{white_note}'),
+            (names[1], [k * root], f'm/s^3{note}'),
+        ]
 
     return {
         'kalibr, imu.yaml': [
-            (name, [value], unit + remark) for (name, value, unit), remark
-            in zip(kalibr_settings(white, k, rate_hz), (white_note, note, ''))],
+            (name, [value], unit + remark)
+            for (name, value, unit), remark in zip(
+                kalibr_settings(white, k, rate_hz), (white_note, note, '')
+            )
+        ],
         f'VINS-Fusion, at {rate_hz:.4g} Hz': both(('acc_n', 'acc_w'), rate_hz),
         'robot_localization, in sensor_msgs/Imu of the driver': [
-            ('linear_acceleration_covariance', matrix.tolist(), '(m/s^2)^2')],
+            ('linear_acceleration_covariance', matrix.tolist(), '(m/s^2)^2')
+        ],
         'PX4, its filter at 100 Hz; vibration in flight needs more': both(
-            ('EKF2_ACC_NOISE', 'EKF2_ACC_B_NOISE'), _PX4_HZ, ', at least 0.01')}
+            ('EKF2_ACC_NOISE', 'EKF2_ACC_B_NOISE'), _PX4_HZ, ', at least 0.01'
+        ),
+    }

@@ -62,8 +62,9 @@ class LiveLook:
         # Rests of different poses, by whether their noise was learned from the stream
         self._rests: dict[bool, list[RestMean]] = {}
 
-    def __call__(self, sensor: Sensor, rate_hz: float, stamps_ns: np.ndarray,
-                 accel_mps2: np.ndarray) -> GravityAtRest:
+    def __call__(
+        self, sensor: Sensor, rate_hz: float, stamps_ns: np.ndarray, accel_mps2: np.ndarray
+    ) -> GravityAtRest:
         """
         Return the look at the rests so far.
 
@@ -73,16 +74,25 @@ class LiveLook:
         if sensor is not self._sensor:
             self._sensor, self._rests = sensor, {True: [], False: []}
         time_s = (stamps_ns - stamps_ns[:1].sum()) * 1e-9
-        volts = to_volts(accel_mps2[:, :len(sensor.axes)], sensor)
-        by_stream = self._look(sensor, RestFinder(
-            rate_hz, len(sensor.axes), datasheet_noise(sensor), learn=True), time_s, volts)
+        volts = to_volts(accel_mps2[:, : len(sensor.axes)], sensor)
+        by_stream = self._look(
+            sensor,
+            RestFinder(rate_hz, len(sensor.axes), datasheet_noise(sensor), learn=True),
+            time_s,
+            volts,
+        )
         if by_stream.fault is not None and by_stream.fault.is_clear:
             return by_stream
-        return self._look(sensor, RestFinder(
-            rate_hz, len(sensor.axes), datasheet_noise(sensor), learn=False), time_s, volts)
+        return self._look(
+            sensor,
+            RestFinder(rate_hz, len(sensor.axes), datasheet_noise(sensor), learn=False),
+            time_s,
+            volts,
+        )
 
-    def _look(self, sensor: Sensor, finder: RestFinder, time_s: np.ndarray, volts: np.ndarray
-              ) -> GravityAtRest:
+    def _look(
+        self, sensor: Sensor, finder: RestFinder, time_s: np.ndarray, volts: np.ndarray
+    ) -> GravityAtRest:
         """Add the rests of a window to those before, and look at all of them."""
         finder.feed(time_s, volts)
         rests = finder.rests()
@@ -90,12 +100,16 @@ class LiveLook:
             self._rests[finder.learn] = _with_rest(self._rests[finder.learn], found, sensor)
         kept = self._rests[finder.learn]
         shape = len(kept), len(sensor.axes)
-        return of_volts(np.reshape([rest.mean_v for rest in kept], shape),
-                        np.reshape([rest.std_v for rest in kept], shape), sensor)
+        return of_volts(
+            np.reshape([rest.mean_v for rest in kept], shape),
+            np.reshape([rest.std_v for rest in kept], shape),
+            sensor,
+        )
 
 
 def _with_rest(rests: list[RestMean], found: RestMean, sensor: Sensor) -> list[RestMean]:
     """Add a rest: one in the pose of an earlier one replaces it; a new length replaces all."""
+
     def force_v(rest: RestMean) -> np.ndarray:
         return rest.mean_v - sensor.nominal_zero_g_v
 
@@ -107,4 +121,4 @@ def _with_rest(rests: list[RestMean], found: RestMean, sensor: Sensor) -> list[R
             others.append(rest)
         elif not 1 / _OTHER_STREAM < length_v / other_v < _OTHER_STREAM:
             return [found]
-    return [*others[1 - _MOST_POSES:], found]
+    return [*others[1 - _MOST_POSES :], found]

@@ -36,8 +36,11 @@ def measure_unstated(sensor: Sensor, read: Recording) -> tuple[Sensor, list[str]
     """Measure from a recording its rate and what the parameter file leaves out."""
     name = Path(read.path).name
     if len(read) > 1:
-        sensor = replace(sensor, rate_hz=round(read.rate_hz, 6),
-                         provenance={**sensor.provenance, 'rate_from': name})
+        sensor = replace(
+            sensor,
+            rate_hz=round(read.rate_hz, 6),
+            provenance={**sensor.provenance, 'rate_from': name},
+        )
     if not sensor.unstated:
         return sensor, []
     unit = sensor if sensor.effects else with_axes(sensor, read.axes)
@@ -48,8 +51,11 @@ def measure_unstated(sensor: Sensor, read: Recording) -> tuple[Sensor, list[str]
 
 def listed(measured: list[str]) -> list[str]:
     """Return the lines of `measure_unstated` below a heading; none where nothing is measured."""
-    return ['', 'Measured, as no parameter file states it:',
-            *(f'  {line}' for line in measured)] if measured else []
+    return (
+        ['', 'Measured, as no parameter file states it:', *(f'  {line}' for line in measured)]
+        if measured
+        else []
+    )
 
 
 class BeyondRange:
@@ -70,8 +76,10 @@ class BeyondRange:
         """Return the count for people; '' where no reading is beyond the range."""
         if not self._samples:
             return ''
-        return (f'{self._samples} samples are beyond the stated range of ±{sensor.range_g:g} g '
-                f'(largest reading {self._largest_g:.3g} g); check sensor.range_g')
+        return (
+            f'{self._samples} samples are beyond the stated range of ±{sensor.range_g:g} g '
+            f'(largest reading {self._largest_g:.3g} g); check sensor.range_g'
+        )
 
 
 SHORTEST_S = 2.0  # Shortest time that shows noise, s. Chosen: some windows of 0.25 s
@@ -84,8 +92,9 @@ _MAX_NOISE_G_PER_RTHZ = 0.1  # Largest density of a parameter file, g/√Hz
 RESISTANCE_OHM = 1.0e4  # Resistor of a measured filter, Ω: only R·C has a meaning
 
 
-def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = ''
-              ) -> tuple[Sensor, list[str]]:
+def _measured(
+    unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = ''
+) -> tuple[Sensor, list[str]]:
     """
     Fill in what a parameter file leaves out; return the unit, and what is measured, for people.
 
@@ -97,37 +106,54 @@ def _measured(unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = 
     if len(time_s) < FEWEST_SAMPLES or not np.isfinite(windows).any():
         needed_s = max(SHORTEST_S, FEWEST_SAMPLES / unit.rate_hz)
         gaps = stats.gap_s(unit.rate_hz)
-        why = f'; they come with gaps of up to {np.diff(time_s).max():.2g} s' \
-            if np.diff(time_s).max() > gaps else ''
-        keys = [key for key, field in parameter_file.SENSOR_FIELDS.items()
-                if field.name in unit.unstated]
-        raise UserError(f'{where}{len(time_s)} samples at {unit.rate_hz:g} Hz do not show the '
-                        f'noise of the sensor{why}; record at least {needed_s:.3g} s without '
-                        f'gaps, or state {", ".join(keys)} in the parameter file; fit '
-                        '--means takes a table of which each row is the mean of a rest')
+        why = (
+            f'; they come with gaps of up to {np.diff(time_s).max():.2g} s'
+            if np.diff(time_s).max() > gaps
+            else ''
+        )
+        keys = [
+            key
+            for key, field in parameter_file.SENSOR_FIELDS.items()
+            if field.name in unit.unstated
+        ]
+        raise UserError(
+            f'{where}{len(time_s)} samples at {unit.rate_hz:g} Hz do not show the '
+            f'noise of the sensor{why}; record at least {needed_s:.3g} s without '
+            f'gaps, or state {", ".join(keys)} in the parameter file; fit '
+            '--means takes a table of which each row is the mean of a rest'
+        )
     step_v = stats.adc_step(blocks)
     variance_v2, limit_v2 = stats.quiet_variance(blocks, windows, step_v)
     rc_s = unit.rc_s
     if 'rc_capacitance_f' in unit.unstated:
         quiet = stats.quiet_blocks(blocks, windows, limit_v2, spans.window)
-        rests = [volts[blocks.start[begin]:blocks.start[end - 1] + spans.size]
-                 for begin, end in stats.true_runs(quiet, blocks.run)]
+        rests = [
+            volts[blocks.start[begin] : blocks.start[end - 1] + spans.size]
+            for begin, end in stats.true_runs(quiet, blocks.run)
+        ]
         rc_s = _filter_s(rests, unit.rate_hz, float(np.max(step_v)))
     noise_g = np.sqrt(variance_v2) / scale_v_per_g
     largest_g = float(np.max(np.abs(volts - unit.nominal_zero_g_v) / scale_v_per_g))
     # A common range: a power of two
     range_g = 2.0 ** ceil(log2(max(largest_g, _SMALLEST_RANGE_G)))
     bandwidth_hz = 0.25 / rc_s if rc_s else unit.rate_hz / 2
-    values = {'noise_density_g_per_rthz': np.minimum(noise_g / np.sqrt(bandwidth_hz),
-                                                     _MAX_NOISE_G_PER_RTHZ),
-              'range_g': range_g, 'rc_resistance_ohm': RESISTANCE_OHM,
-              'rc_capacitance_f': rc_s / RESISTANCE_OHM, 'filter_rate_hz': unit.rate_hz}
+    values = {
+        'noise_density_g_per_rthz': np.minimum(
+            noise_g / np.sqrt(bandwidth_hz), _MAX_NOISE_G_PER_RTHZ
+        ),
+        'range_g': range_g,
+        'rc_resistance_ohm': RESISTANCE_OHM,
+        'rc_capacitance_f': rc_s / RESISTANCE_OHM,
+        'filter_rate_hz': unit.rate_hz,
+    }
     texts = {
         'noise_density_g_per_rthz': 'noise of a sample: ' + _by_axis(unit, noise_g),
         'adc_bits': 'resolution: ' + _by_axis(unit, step_v / scale_v_per_g),
-        'rc_capacitance_f': f'filter: {rc_s * 1e3:.3g} ms' if rc_s else
-                            'filter: the noise at rest shows none',
-        'range_g': f'range: ±{range_g:g} g (largest reading {largest_g:.3g} g)'}
+        'rc_capacitance_f': f'filter: {rc_s * 1e3:.3g} ms'
+        if rc_s
+        else 'filter: the noise at rest shows none',
+        'range_g': f'range: ±{range_g:g} g (largest reading {largest_g:.3g} g)',
+    }
     lines = [text for name, text in texts.items() if name in unit.unstated]
     unknown = {*unit.unstated}
     if 'rc_capacitance_f' in unknown:
@@ -140,49 +166,64 @@ def _filter_s(rests: list[np.ndarray], rate_hz: float, step_v: float) -> float:
     """Return the mean time constant of the axes, s; 0 where the noise of one shows no filter."""
     time_constants = []
     for axis in range(rests[0].shape[1] if rests else 0):
-        estimate = estimate_filter([rest[:, axis] for rest in rests], rate_hz,
-                                   _FILTER_START_SAMPLES / rate_hz, step_v)
+        estimate = estimate_filter(
+            [rest[:, axis] for rest in rests], rate_hz, _FILTER_START_SAMPLES / rate_hz, step_v
+        )
         if estimate is None or not estimate.credible:
             return 0.0
         time_constants.append(estimate.rc_s)
     return float(np.mean(time_constants)) if time_constants else 0.0
 
 
-def unit_of_stream(sensor: Sensor, stamps_ns: np.ndarray, accel_mps2: np.ndarray
-                   ) -> tuple[Sensor, list[str]]:
+def unit_of_stream(
+    sensor: Sensor, stamps_ns: np.ndarray, accel_mps2: np.ndarray
+) -> tuple[Sensor, list[str]]:
     """
     Return the unit of a live stream that states nothing of itself, and what was measured.
 
     An axis of the specific force, (n, 3), that is always 0 is not measured.
     """
     late_ns = late_by(stamps_ns)
-    backward = f'{np.count_nonzero(late_ns)} of {len(stamps_ns)} samples, whose stamp steps ' \
+    backward = (
+        f'{np.count_nonzero(late_ns)} of {len(stamps_ns)} samples, whose stamp steps '
         f'back by up to {late_ns.max(initial=0) * 1e-6:.3g} ms'
+    )
     if np.count_nonzero(late_ns) > _MOST_BACKWARD * len(stamps_ns):
         raise UserError(f'{backward}; one driver must stamp them, in their order')
     stamps_ns, accel_mps2 = stamps_ns[late_ns == 0], accel_mps2[late_ns == 0]
     time_s = (stamps_ns - stamps_ns[:1]) * 1e-9
     if len(time_s) < 3 or time_s[-1] < SHORTEST_S:
-        raise UserError(f'{len(time_s)} samples in {np.ptp(time_s) if len(time_s) else 0:.1f} s; '
-                        f'{SHORTEST_S:g} s show rate and noise')
+        raise UserError(
+            f'{len(time_s)} samples in {np.ptp(time_s) if len(time_s) else 0:.1f} s; '
+            f'{SHORTEST_S:g} s show rate and noise'
+        )
     rate_hz = stamped_rate_hz(time_s)
     if not rate_hz > 0:
-        raise UserError(f'the stamps of {len(stamps_ns)} samples do not advance; the driver must '
-                        'stamp each sample')
+        raise UserError(
+            f'the stamps of {len(stamps_ns)} samples do not advance; the driver must '
+            'stamp each sample'
+        )
     rates = halves(time_s)
     if not rates.agree(_STEADY):
-        raise UserError(f'stamps are uneven: {rates.first_hz:.4g} and then {rates.second_hz:.4g} '
-                        f'a second within {time_s[-1]:.1f} s; the host stalls, or the driver '
-                        'stamps samples when they arrive')
+        raise UserError(
+            f'stamps are uneven: {rates.first_hz:.4g} and then {rates.second_hz:.4g} '
+            f'a second within {time_s[-1]:.1f} s; the host stalls, or the driver '
+            'stamps samples when they arrive'
+        )
     present = ''.join(axis for axis, values in zip(AXES, accel_mps2.T) if values.any())
     axes = present if present in MEASURED_AXES else AXES
     unit = sensor if sensor.effects else with_axes(sensor, axes)
     unit = replace(unit, rate_hz=round(rate_hz, 3))
-    volts = to_volts(accel_mps2[:, :len(unit.axes)], unit)
+    volts = to_volts(accel_mps2[:, : len(unit.axes)], unit)
     unit, lines = _measured(unit, time_s, volts)
-    return (replace(unit, measured=(*unit.measured, 'rate_hz')),
-            [f'rate: {unit.rate_hz:.4g} Hz, axes: {unit.axes}', *lines,
-             *([f'left out: {backward}'] if late_ns.any() else [])])
+    return (
+        replace(unit, measured=(*unit.measured, 'rate_hz')),
+        [
+            f'rate: {unit.rate_hz:.4g} Hz, axes: {unit.axes}',
+            *lines,
+            *([f'left out: {backward}'] if late_ns.any() else []),
+        ],
+    )
 
 
 def _by_axis(sensor: Sensor, values_g: np.ndarray) -> str:
@@ -220,21 +261,28 @@ class FilterNoise:
         return self.scatter < _MAX_SCATTER and self.ratio_std < _MAX_RATIO_STD
 
 
-def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, lsb_v: float
-                    ) -> FilterNoise | None:
+def estimate_filter(
+    rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, lsb_v: float
+) -> FilterNoise | None:
     """Estimate the RC of one axis by the likelihood of the periodogram of its rests (Whittle)."""
     # scipy.signal takes 0.3 s to import, which a calibration needs only at its end.
     from scipy.signal.windows import hann
+
     size = max(_MIN_SEGMENT_SAMPLES, round(_SEGMENT_S * rate_hz))
     window = hann(size, sym=False)
-    window /= np.sqrt(np.sum(window ** 2))
+    window /= np.sqrt(np.sum(window**2))
     power, count = _mean_periodogram(rests, window)
     if count < 2 or not rc_s or not np.any(power):
         return None
     weight = _INDEPENDENT_SEGMENTS * count
-    lags = np.correlate(window, window, 'full')[size - 1:]
-    start = np.log([max(float(np.mean(power)) / size, lsb_v ** 2, _MIN_VARIANCE_V2),
-                    rc_s * rate_hz, max(lsb_v, _MIN_LSB_V) ** 2 / 12])
+    lags = np.correlate(window, window, 'full')[size - 1 :]
+    start = np.log(
+        [
+            max(float(np.mean(power)) / size, lsb_v**2, _MIN_VARIANCE_V2),
+            rc_s * rate_hz,
+            max(lsb_v, _MIN_LSB_V) ** 2 / 12,
+        ]
+    )
 
     def cost(x: np.ndarray) -> float:
         """Return the negative log posterior for the parameters of `_expected`."""
@@ -242,13 +290,18 @@ def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, ls
         prior = ((x[2] - start[2]) / _ADC_NOISE_PRIOR_STD) ** 2
         return float(np.sum(power / expected + np.log(expected)) + prior / (2 * weight))
 
-    best = scipy.optimize.minimize(cost, start, method='Nelder-Mead', options={
-        'xatol': 1e-5, 'fatol': 1e-6, 'maxiter': 2000}).x
+    best = scipy.optimize.minimize(
+        cost, start, method='Nelder-Mead', options={'xatol': 1e-5, 'fatol': 1e-6, 'maxiter': 2000}
+    ).x
     scatter = float(np.mean((power / _expected(best, lags) - 1) ** 2) * weight)
-    slopes = np.array([np.log(_expected(best + step, lags) / _expected(best - step, lags))
-                       for step in _LOG_STEP * np.eye(3)]) / (2 * _LOG_STEP)
+    slopes = np.array(
+        [
+            np.log(_expected(best + step, lags) / _expected(best - step, lags))
+            for step in _LOG_STEP * np.eye(3)
+        ]
+    ) / (2 * _LOG_STEP)
     information = slopes @ slopes.T * weight / _CORRELATED_ORDINATES
-    information += np.diag([0.0, 0.0, _ADC_NOISE_PRIOR_STD ** -2])
+    information += np.diag([0.0, 0.0, _ADC_NOISE_PRIOR_STD**-2])
     # White noise does not show a filter.
     if np.linalg.cond(information) > _MAX_CONDITION:
         return None
@@ -259,11 +312,19 @@ def estimate_filter(rests: Iterable[np.ndarray], rate_hz: float, rc_s: float, ls
 def _mean_periodogram(rests: Iterable[np.ndarray], window: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the mean periodogram of all segments above the lowest bins, V², and their number."""
     size = len(window)
-    parts = np.concatenate([np.empty((0, size)), *(
-        sliding_window_view(volts, size)[::size // 2] for volts in rests if len(volts) >= size)])
+    parts = np.concatenate(
+        [
+            np.empty((0, size)),
+            *(
+                sliding_window_view(volts, size)[:: size // 2]
+                for volts in rests
+                if len(volts) >= size
+            ),
+        ]
+    )
     spectra = np.fft.rfft(window * (parts - parts.mean(axis=1, keepdims=True)))
     power = (np.abs(spectra) ** 2).sum(axis=0) / max(len(parts), 1)
-    return power[_LOWEST_BINS + 1:], len(parts)
+    return power[_LOWEST_BINS + 1 :], len(parts)
 
 
 def _expected(x: np.ndarray, lags: np.ndarray) -> np.ndarray:
@@ -273,29 +334,36 @@ def _expected(x: np.ndarray, lags: np.ndarray) -> np.ndarray:
     covariance[0] += adc_variance_v2
     terms = covariance * lags
     expected = 2 * np.fft.rfft(terms).real - terms[0]
-    return np.maximum(expected[_LOWEST_BINS + 1:], _MIN_EXPECTED_V2)
+    return np.maximum(expected[_LOWEST_BINS + 1 :], _MIN_EXPECTED_V2)
 
 
-def with_filter(fitted: Sensor, estimates: Sequence[Sequence[FilterNoise | None]]
-                ) -> tuple[Sensor, list[str]]:
+def with_filter(
+    fitted: Sensor, estimates: Sequence[Sequence[FilterNoise | None]]
+) -> tuple[Sensor, list[str]]:
     """Add the effect `bandwidth` with its variance to a fitted unit."""
     if not fitted.rc_s or not estimates:
         return fitted, []
     ratios, variances = [], []
     for axis, axis_estimates in zip(fitted.axes, zip(*estimates)):
-        credible = [estimate for estimate in axis_estimates
-                    if estimate is not None and estimate.credible]
+        credible = [
+            estimate for estimate in axis_estimates if estimate is not None and estimate.credible
+        ]
         if not credible:
-            return fitted, [f'{axis}: the noise at rest does not fit white noise behind the '
-                            'stated filter; the fit keeps the stated resistor']
-        weights = np.array([estimate.ratio_std ** -2 for estimate in credible])
+            return fitted, [
+                f'{axis}: the noise at rest does not fit white noise behind the '
+                'stated filter; the fit keeps the stated resistor'
+            ]
+        weights = np.array([estimate.ratio_std**-2 for estimate in credible])
         rc_s = np.average([estimate.rc_s for estimate in credible], weights=weights)
         ratios.append(rc_s / fitted.rc_s - 1)
         variances.append((rc_s / fitted.rc_s) ** 2 / weights.sum())
     names = names_of(effect_named('bandwidth'), fitted.axes)
     unit = put(with_neutral(fitted, ['bandwidth']), names, ratios)
-    return replace(unit, covariance=scipy.linalg.block_diag(fitted.covariance, np.diag(variances)),
-                   covariance_names=(*fitted.covariance_names, *names)), []
+    return replace(
+        unit,
+        covariance=scipy.linalg.block_diag(fitted.covariance, np.diag(variances)),
+        covariance_names=(*fitted.covariance_names, *names),
+    ), []
 
 
 CERTAIN_CORRELATION = 0.9  # Correlation that identifies an axis. Chosen: errors cost few percent
@@ -312,15 +380,20 @@ class PolarityFault:
     def describe(self, axis: str, reference: str) -> str:
         """Return the fault and its remedy as one line."""
         if axis == reference:
-            return (f'{axis} reads against its reference (correlation {self.correlation:.2f}): '
-                    'the axis is inverted; correct its sign or the mounting')
+            return (
+                f'{axis} reads against its reference (correlation {self.correlation:.2f}): '
+                'the axis is inverted; correct its sign or the mounting'
+            )
         sign = 'against' if self.correlation < 0 else 'with'
-        return (f'{axis} moves {sign} the reference of {reference} (correlation '
-                f'{self.correlation:.2f}): axes are swapped; correct the wiring or the mounting')
+        return (
+            f'{axis} moves {sign} the reference of {reference} (correlation '
+            f'{self.correlation:.2f}): axes are swapped; correct the wiring or the mounting'
+        )
 
 
-def find_polarity_fault(correlation: np.ndarray, references: list[int],
-                        swap_limit: float) -> PolarityFault | None:
+def find_polarity_fault(
+    correlation: np.ndarray, references: list[int], swap_limit: float
+) -> PolarityFault | None:
     """
     Find the first axis that is inverted or follows the reference of another axis.
 
@@ -333,7 +406,10 @@ def find_polarity_fault(correlation: np.ndarray, references: list[int],
         if row[reference] < -CERTAIN_CORRELATION:
             return PolarityFault(axis, reference, float(row[reference]))
         other = int(np.nanargmax(np.abs(row)))
-        if other != reference and abs(row[other]) > CERTAIN_CORRELATION \
-                and abs(row[reference]) < swap_limit:
+        if (
+            other != reference
+            and abs(row[other]) > CERTAIN_CORRELATION
+            and abs(row[reference]) < swap_limit
+        ):
             return PolarityFault(axis, other, float(row[other]))
     return None

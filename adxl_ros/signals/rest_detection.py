@@ -84,13 +84,21 @@ class NoiseLimits:
     def differ(self, before: np.ndarray, after: np.ndarray, spans: Spans) -> bool:
         """Return whether two sequences of means of blocks, (k, m), differ by more than noise."""
         white = self.block_noise(spans) ** 2 * (1 / len(before) + 1 / len(after))
-        allowed = _END_SIGMAS * np.sqrt(white + self.flicker ** 2) + self.step
+        allowed = _END_SIGMAS * np.sqrt(white + self.flicker**2) + self.step
         return bool((np.abs(before.mean(axis=0) - after.mean(axis=0)) > allowed).any())
 
 
 def _largest(limits: list[NoiseLimits]) -> NoiseLimits | None:
-    return NoiseLimits(*(np.maximum.reduce([getattr(each, f.name) for each in limits])
-                         for f in fields(NoiseLimits))) if limits else None
+    return (
+        NoiseLimits(
+            *(
+                np.maximum.reduce([getattr(each, f.name) for each in limits])
+                for f in fields(NoiseLimits)
+            )
+        )
+        if limits
+        else None
+    )
 
 
 def stated_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
@@ -106,11 +114,12 @@ def stated_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
     sigma = np.hypot(noise.sigma, step / np.sqrt(12))
     halves = spans.half * spans.size << np.arange(stats.DRIFT_OCTAVES)
     drift = np.sqrt(2 / effective_samples(halves, 1 / spans.rate_hz, noise.tau_s))[:, None] * sigma
-    return NoiseLimits(ratio * sigma ** 2, drift, stats.undithered(step, sigma))
+    return NoiseLimits(ratio * sigma**2, drift, stats.undithered(step, sigma))
 
 
-def learned_limits(blocks: Blocks, windows: np.ndarray, step: np.ndarray,
-                   spans: Spans) -> NoiseLimits | None:
+def learned_limits(
+    blocks: Blocks, windows: np.ndarray, step: np.ndarray, spans: Spans
+) -> NoiseLimits | None:
     """Learn the limits from the quietest windows; None while the stream is too short."""
     if len(blocks) < max(spans.window, 2 * spans.half):
         return None
@@ -136,9 +145,9 @@ def _drift_noise(differences: np.ndarray, valid: np.ndarray, half: int) -> np.nd
     A steady turn adds the same to all differences. Differences of two differences remove it. The
     first quartile of the magnitude is right even if most quiet blocks are no rest.
     """
-    both = valid[:-2 * half] & valid[2 * half:]
+    both = valid[: -2 * half] & valid[2 * half :]
     if both.any():
-        noise = (differences[2 * half:] - differences[:-2 * half])[both] / np.sqrt(2)
+        noise = (differences[2 * half :] - differences[: -2 * half])[both] / np.sqrt(2)
     elif valid.any():
         noise = differences[valid]
     else:
@@ -146,8 +155,9 @@ def _drift_noise(differences: np.ndarray, valid: np.ndarray, half: int) -> np.nd
     return np.quantile(np.abs(noise), 0.25, axis=0) / _QUARTILE_TO_STD
 
 
-def differing_start(means: np.ndarray, longest: int, white: np.ndarray, flicker: np.ndarray,
-                    step: np.ndarray) -> int:
+def differing_start(
+    means: np.ndarray, longest: int, white: np.ndarray, flicker: np.ndarray, step: np.ndarray
+) -> int:
     """
     Count the blocks at the start of a rest whose mean differs from the mean of the others.
 
@@ -163,7 +173,7 @@ def differing_start(means: np.ndarray, longest: int, white: np.ndarray, flicker:
         start_total = total[cut + lengths - 1]
         start_mean = (start_total - (total[cut - 1] if cut else 0.0)) / lengths[:, None]
         remaining_mean = (total[-1] - start_total) / remaining[:, None]
-        noise = np.sqrt(white ** 2 * (1 / lengths + 1 / remaining)[:, None] + flicker ** 2)
+        noise = np.sqrt(white**2 * (1 / lengths + 1 / remaining)[:, None] + flicker**2)
         differs = (np.abs(start_mean - remaining_mean) > _END_SIGMAS * noise + step).any(axis=1)
         if not differs.any():
             break
@@ -203,17 +213,26 @@ class Stillness:
     def describe_mps2(self, sensor: Sensor) -> str:
         """Return one line in m/s², for samples that are volts of a sensor."""
         scale = G0_MPS2 / float(sensor.nominal_scale_v_per_g[self.axis])
-        state = 'at rest' if self.at_rest else \
-            {'rms': 'moving', 'drift': 'drifting'}[self.statistic]
-        return (f'{state}: {self.value * scale:.2g} m/s² on {sensor.axes[self.axis]}, '
-                f'must be below {self.limit * scale:.2g}')
+        state = (
+            'at rest' if self.at_rest else {'rms': 'moving', 'drift': 'drifting'}[self.statistic]
+        )
+        return (
+            f'{state}: {self.value * scale:.2g} m/s² on {sensor.axes[self.axis]}, '
+            f'must be below {self.limit * scale:.2g}'
+        )
 
 
 class RestFinder:
     """Finds the rests in a stream while it runs."""
 
-    def __init__(self, rate_hz: float, axes: int, noise: Noise | None = None,
-                 learn: bool | None = None, angle_tolerance_rad: float | None = None):
+    def __init__(
+        self,
+        rate_hz: float,
+        axes: int,
+        noise: Noise | None = None,
+        learn: bool | None = None,
+        angle_tolerance_rad: float | None = None,
+    ):
         self.noise = noise
         self.learn = noise is None if learn is None else learn
         self.angle_tolerance_rad = angle_tolerance_rad
@@ -228,8 +247,9 @@ class RestFinder:
         self._parts = [self._cutter.none()]
         self._result: tuple[int, NoiseLimits | None, list[Rest]] | None = None
 
-    def feed(self, time_s: np.ndarray, samples: np.ndarray,
-             angles_rad: np.ndarray | None = None) -> None:
+    def feed(
+        self, time_s: np.ndarray, samples: np.ndarray, angles_rad: np.ndarray | None = None
+    ) -> None:
         """Add samples, (n, m), and encoder angles, rad, (n, 2), if the stream has them."""
         self._parts.append(self._cutter.feed(time_s, samples, angles_rad))
 
@@ -245,7 +265,7 @@ class RestFinder:
 
     def forget(self) -> None:
         """Keep the newest blocks only, in which a drift may begin."""
-        self._parts, self._result = [self.blocks()[-self._spans.longest:]], None
+        self._parts, self._result = [self.blocks()[-self._spans.longest :]], None
 
     def means(self, rests: list[Rest]) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean of each rest and its standard deviation, (k, m) each."""
@@ -262,22 +282,30 @@ class RestFinder:
         if limits is None or len(newest) < count or newest.run[0] != newest.run[-1]:
             return None
         rms = np.sqrt(stats.window_variance(newest, self._spans)[-1])
-        halves = newest.mean[-2 * half:].reshape(2, half, -1).mean(axis=1)
+        halves = newest.mean[-2 * half :].reshape(2, half, -1).mean(axis=1)
         values = np.concatenate([rms, np.abs(halves[1] - halves[0])])
-        allowed = np.concatenate([np.sqrt(limits.variance),
-                                  _DRIFT_SIGMAS * limits.drift[0] + limits.step])
+        allowed = np.concatenate(
+            [np.sqrt(limits.variance), _DRIFT_SIGMAS * limits.drift[0] + limits.step]
+        )
         worst = int(np.argmax(values / allowed))
         statistic, axis = divmod(worst, len(rms))
-        return Stillness(bool(values[worst] <= allowed[worst]), axis, ('rms', 'drift')[statistic],
-                         float(values[worst]), float(allowed[worst]))
+        return Stillness(
+            bool(values[worst] <= allowed[worst]),
+            axis,
+            ('rms', 'drift')[statistic],
+            float(values[worst]),
+            float(allowed[worst]),
+        )
 
     def _detect(self) -> tuple[NoiseLimits | None, list[Rest]]:
         """Find limits and rests of the stream so far; search again only after a new block."""
         blocks = self.blocks()
         if self._result is None or self._result[0] != len(blocks):
             windows, step = stats.window_variance(blocks, self._spans), stats.adc_step(blocks)
-            found = [stated_limits(self.noise, step, self._spans) if self.noise else None,
-                     learned_limits(blocks, windows, step, self._spans) if self.learn else None]
+            found = [
+                stated_limits(self.noise, step, self._spans) if self.noise else None,
+                learned_limits(blocks, windows, step, self._spans) if self.learn else None,
+            ]
             limits = _largest([each for each in found if each is not None])
             rests = [] if limits is None else self._rests(blocks, windows, limits)
             self._result = len(blocks), limits, rests
@@ -298,12 +326,19 @@ class RestFinder:
         if self.learn:
             groups = self._join_across_knocks(blocks, bounds, parts, limits, quiet)
         first_s, last_s = blocks.time_s.T.tolist()
-        return [Rest(int(blocks.start[group[0][0]]),
-                     int(blocks.start[group[-1][1] - 1]) + self._spans.size,
-                     first_s[group[0][0]], last_s[group[-1][1] - 1],
-                     tuple((last_s[end - 1], first_s[first])
-                           for (_, end), (first, _) in pairwise(group)))
-                for group in groups if group[-1][1] - group[0][0] >= self._min_blocks]
+        return [
+            Rest(
+                int(blocks.start[group[0][0]]),
+                int(blocks.start[group[-1][1] - 1]) + self._spans.size,
+                first_s[group[0][0]],
+                last_s[group[-1][1] - 1],
+                tuple(
+                    (last_s[end - 1], first_s[first]) for (_, end), (first, _) in pairwise(group)
+                ),
+            )
+            for group in groups
+            if group[-1][1] - group[0][0] >= self._min_blocks
+        ]
 
     def _drifting(self, blocks: Blocks, quiet: np.ndarray, limits: NoiseLimits) -> np.ndarray:
         """
@@ -329,8 +364,9 @@ class RestFinder:
                 drifting[first:stop] = True
         return drifting
 
-    def _without_ends(self, means: np.ndarray, first: int, stop: int,
-                      limits: NoiseLimits) -> tuple[int, int]:
+    def _without_ends(
+        self, means: np.ndarray, first: int, stop: int, limits: NoiseLimits
+    ) -> tuple[int, int]:
         """Cut the ends that differ from the middle: settling, or an approaching hand."""
         longest = min((stop - first) // 4, self._spans.longest // 2)
         if longest > 0:
@@ -339,13 +375,14 @@ class RestFinder:
             stop -= differing_start(means[first:stop][::-1], longest, *noise)
         return first, stop
 
-    def _split_by_angle(self, bounds: np.ndarray | None, first: int, stop: int
-                        ) -> list[tuple[int, int]]:
+    def _split_by_angle(
+        self, bounds: np.ndarray | None, first: int, stop: int
+    ) -> list[tuple[int, int]]:
         """Split blocks `first` to `stop` where an encoder angle leaves its tolerance."""
         if bounds is None:
             return [(first, stop)]
         parts, begin, widest = [], first, bounds[first]
-        changed = (bounds[first + 1:stop] != bounds[first:stop - 1]).any(axis=(1, 2))
+        changed = (bounds[first + 1 : stop] != bounds[first : stop - 1]).any(axis=(1, 2))
         for i in (first + 1 + np.flatnonzero(changed)).tolist():
             widest = np.fmax(widest, bounds[i])
             if not self._is_one_pose(widest):
@@ -353,9 +390,14 @@ class RestFinder:
                 begin, widest = i, bounds[i]
         return [*parts, (begin, stop)]
 
-    def _join_across_knocks(self, blocks: Blocks, bounds: np.ndarray | None,
-                            parts: list[tuple[int, int]], limits: NoiseLimits, quiet: np.ndarray
-                            ) -> list[list[tuple[int, int]]]:
+    def _join_across_knocks(
+        self,
+        blocks: Blocks,
+        bounds: np.ndarray | None,
+        parts: list[tuple[int, int]],
+        limits: NoiseLimits,
+        quiet: np.ndarray,
+    ) -> list[list[tuple[int, int]]]:
         """
         Group parts if the disturbance or gap between them has not changed mean and angles.
 
@@ -368,14 +410,21 @@ class RestFinder:
         for first, stop in parts:
             if groups:
                 begin, end = groups[-1][0][0], groups[-1][-1][1]
-                has_drifted = (first - end <= spans.longest and quiet[end:first].all()
-                               and blocks.run[end - 1] == blocks.run[first])
+                has_drifted = (
+                    first - end <= spans.longest
+                    and quiet[end:first].all()
+                    and blocks.run[end - 1] == blocks.run[first]
+                )
                 between_s = float(blocks.time_s[first, 0] - blocks.time_s[end - 1, 1])
-                if ((has_drifted or 0 <= between_s <= longest_s)
-                        and (bounds is None
-                             or self._is_one_pose(np.fmax.reduce(bounds[begin:stop])))
-                        and not limits.differ(means[max(begin, end - reach):end],
-                                              means[first:min(stop, first + reach)], spans)):
+                if (
+                    (has_drifted or 0 <= between_s <= longest_s)
+                    and (bounds is None or self._is_one_pose(np.fmax.reduce(bounds[begin:stop])))
+                    and not limits.differ(
+                        means[max(begin, end - reach) : end],
+                        means[first : min(stop, first + reach)],
+                        spans,
+                    )
+                ):
                     start = groups[-1].pop()[0] if has_drifted else first
                     groups[-1].append((start, stop))
                     continue
@@ -416,8 +465,11 @@ class RecordedRests:
 
     def feed(self, block: Recording) -> None:
         """Add a block of the recording."""
-        angles_rad = np.column_stack([block.columns[name] for name in _ANGLES]) \
-            if self._has_angles else None
+        angles_rad = (
+            np.column_stack([block.columns[name] for name in _ANGLES])
+            if self._has_angles
+            else None
+        )
         self._finder.feed(block.time_s, block.volts(self._unit), angles_rad)
         if block.time_s[-1] - self._taken_s > _PART_S:
             self.take()
@@ -434,34 +486,54 @@ class RecordedRests:
                 continue
             last = newest.rest
             later = [span for span in rest.disturbed_s if span[0] >= last.time_stop_s]
-            joined = replace(last, stop=rest.stop, time_stop_s=rest.time_stop_s,
-                             disturbed_s=(*last.disturbed_s, *later))
+            joined = replace(
+                last,
+                stop=rest.stop,
+                time_stop_s=rest.time_stop_s,
+                disturbed_s=(*last.disturbed_s, *later),
+            )
             self.detected[-1] = newest._replace(rest=joined)
 
 
-def find_rests(time_s: np.ndarray, samples: np.ndarray, rate_hz: float,
-               angles_rad: np.ndarray | None = None, noise: Noise | None = None,
-               learn: bool | None = None, angle_tolerance_rad: float | None = None) -> list[Rest]:
+def find_rests(
+    time_s: np.ndarray,
+    samples: np.ndarray,
+    rate_hz: float,
+    angles_rad: np.ndarray | None = None,
+    noise: Noise | None = None,
+    learn: bool | None = None,
+    angle_tolerance_rad: float | None = None,
+) -> list[Rest]:
     """Find the rests of a recording by samples, (n, m), in any unit, and encoder angles."""
     finder = RestFinder(rate_hz, samples.shape[1], noise, learn, angle_tolerance_rad)
     finder.feed(time_s, samples, angles_rad)
     return finder.rests()
 
 
-def rest_means(time_s: np.ndarray, samples: np.ndarray, rests: list[Rest], rate_hz: float,
-               noise: Noise | None = None) -> tuple[np.ndarray, np.ndarray]:
+def rest_means(
+    time_s: np.ndarray,
+    samples: np.ndarray,
+    rests: list[Rest],
+    rate_hz: float,
+    noise: Noise | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Average the rests of a recording, as `RestFinder.means` does: mean and std, (k, m) each.
 
     The std is that by the scatter between parts of the rest, and at least that of the noise.
     """
-    parts = [stats.BlockCutter(rate_hz, samples.shape[1]).feed(
-        time_s[rest.start:rest.stop], samples[rest.start:rest.stop]) for rest in rests]
+    parts = [
+        stats.BlockCutter(rate_hz, samples.shape[1]).feed(
+            time_s[rest.start : rest.stop], samples[rest.start : rest.stop]
+        )
+        for rest in rests
+    ]
     return _means(parts, Spans(rate_hz), noise)
 
 
-def _means(parts: list[Blocks], spans: Spans,
-           noise: Noise | None) -> tuple[np.ndarray, np.ndarray]:
+def _means(
+    parts: list[Blocks], spans: Spans, noise: Noise | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Average the blocks of each rest; mean and standard deviation, (k, m) each."""
     # The step is that of all rests: a rest with constant codes does not show it.
     step = stats.adc_step(Blocks.join(parts)) if parts else np.empty(0)
@@ -470,8 +542,9 @@ def _means(parts: list[Blocks], spans: Spans,
     return np.array(mean), np.array(error)
 
 
-def _mean(part: Blocks, step: np.ndarray, spans: Spans,
-          noise: Noise | None) -> tuple[np.ndarray, np.ndarray]:
+def _mean(
+    part: Blocks, step: np.ndarray, spans: Spans, noise: Noise | None
+) -> tuple[np.ndarray, np.ndarray]:
     """
     Average the blocks of a rest; mean and standard deviation, (m,) each.
 
@@ -484,13 +557,13 @@ def _mean(part: Blocks, step: np.ndarray, spans: Spans,
     count = len(part) // length
     long_run = np.zeros(len(mean))
     if count > 1:
-        batches = part.mean[:count * length].reshape(count, length, -1).mean(axis=1)
+        batches = part.mean[: count * length].reshape(count, length, -1).mean(axis=1)
         squares = ((batches - batches.mean(axis=0)) ** 2).sum(axis=0)
         long_run = length * squares / (count - 1)
     variance = np.maximum(long_run, white / spans.size) / len(part)
     if noise is not None:
         independent = effective_samples(len(part) * spans.size, 1 / spans.rate_hz, noise.tau_s)
-        variance = np.maximum(variance, noise.sigma ** 2 / independent)
+        variance = np.maximum(variance, noise.sigma**2 / independent)
     rounding = stats.undithered(step, np.sqrt(white)) ** 2 / 12
     return mean, np.sqrt(variance + rounding)
 

@@ -67,14 +67,20 @@ class Knots(Pieces):
     Between two knots at rest it is the motion of minimum jerk, 10·u³ − 15·u⁴ + 6·u⁵.
     """
 
-    def __init__(self, time_s: Sequence[float] | np.ndarray,
-                 position: Sequence[float] | np.ndarray,
-                 velocity: Sequence[float] | np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        time_s: Sequence[float] | np.ndarray,
+        position: Sequence[float] | np.ndarray,
+        velocity: Sequence[float] | np.ndarray | None = None,
+    ) -> None:
         """Interpolate ascending knots, (k,); second derivatives there are 0."""
         rates = np.zeros(len(time_s)) if velocity is None else np.asarray(velocity, float)
         derivatives = np.column_stack([position, rates, np.zeros(len(time_s))])
-        super().__init__(scipy.interpolate.PPoly.from_bernstein_basis(
-            scipy.interpolate.BPoly.from_derivatives(time_s, derivatives)))
+        super().__init__(
+            scipy.interpolate.PPoly.from_bernstein_basis(
+                scipy.interpolate.BPoly.from_derivatives(time_s, derivatives)
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -114,8 +120,9 @@ POINTS = 6  # Points of the polynomial between the steps of a grid; chosen: as e
 def lagrange_weights(position: np.ndarray) -> np.ndarray:
     """Return the weights of `POINTS` steps for interpolation at positions, (n, points)."""
     nodes = np.arange(POINTS)
-    return np.column_stack([
-        np.prod([(position - k) / (j - k) for k in nodes if k != j], axis=0) for j in nodes])
+    return np.column_stack(
+        [np.prod([(position - k) / (j - k) for k in nodes if k != j], axis=0) for j in nodes]
+    )
 
 
 def check_needs(sensor: Sensor, motion: Motion) -> None:
@@ -126,14 +133,18 @@ def check_needs(sensor: Sensor, motion: Motion) -> None:
         Need.ROTATION: (has_stage or is_robot, 'it is not known beside a specific force'),
         Need.ROBOT: (is_robot, 'the motion is not that of a robot; give --urdf'),
         Need.ADC: (sensor.adc_bits > 0, 'the sensor has none: sensor.adc_bits is 0'),
-        Need.NOISE: (np.any(sensor.noise_density_g_per_rthz),
-                     'the sensor has none: sensor.noise_density_g_per_rthz is 0')}
+        Need.NOISE: (
+            np.any(sensor.noise_density_g_per_rthz),
+            'the sensor has none: sensor.noise_density_g_per_rthz is 0',
+        ),
+    }
     for name in sensor.effects:
         for need in effect_named(name).needs:
             is_there, reason = missing.get(need, (True, ''))
             if not is_there:
-                raise UserError(f'{name} acts on the {need.value}, but {reason}; leave the effect '
-                                'out')
+                raise UserError(
+                    f'{name} acts on the {need.value}, but {reason}; leave the effect out'
+                )
 
 
 _DEGREE = 5  # Degree of the splines of joints; chosen: quintic, so that the acceleration is smooth
@@ -195,8 +206,15 @@ class SmoothedPath:
     Windows of the recording are fitted when they are needed.
     """
 
-    def __init__(self, time_s: np.ndarray, reading: np.ndarray, step: float,
-                 degree: int = _DEGREE, is_seen: bool = False, knot_s: float = KNOT_S) -> None:
+    def __init__(
+        self,
+        time_s: np.ndarray,
+        reading: np.ndarray,
+        step: float,
+        degree: int = _DEGREE,
+        is_seen: bool = False,
+        knot_s: float = KNOT_S,
+    ) -> None:
         """
         Prepare for the readings of an encoder at ascending times, NaN where there is none.
 
@@ -241,13 +259,17 @@ class SmoothedPath:
         corner_hz = min(self._strength ** (-1 / 6) / (2 * np.pi * knot_s), 1 / (2 * knot_s))
         place = np.clip(np.searchsorted(self._time_s, inside_s), 0, len(self._time_s) - 1)
         # The reading changes at most once in a sample.
-        changes_hz = np.where(_moving(self._reading)[place], np.minimum(
-            np.abs(self(inside_s, 1)) / self._step, rate_hz), 0.0)
+        changes_hz = np.where(
+            _moving(self._reading)[place],
+            np.minimum(np.abs(self(inside_s, 1)) / self._step, rate_hz),
+            0.0,
+        )
         ratio = _ERROR_FACTOR * corner_hz / np.maximum(changes_hz, 1e-9)
         # Noise behind a first-order filter with as much power as below the corner forgets at
         # four times the corner.
-        return PathErrors(self._step * np.minimum(ratio, 1 / np.sqrt(12)),
-                          np.minimum(4 * corner_hz, changes_hz))
+        return PathErrors(
+            self._step * np.minimum(ratio, 1 / np.sqrt(12)), np.minimum(4 * corner_hz, changes_hz)
+        )
 
     def _spline(self, number: int) -> scipy.interpolate.BSpline:
         if number not in self._windows:
@@ -258,19 +280,26 @@ class SmoothedPath:
         """Fit the smoothing spline of a window."""
         time_s, reading = self._part(number)
         if len(time_s) <= 2 * _DEGREE or np.ptp(reading) == 0:
-            return scipy.interpolate.make_interp_spline(time_s, reading, k=1) \
-                if len(time_s) > 1 else \
-                scipy.interpolate.BSpline(np.array([0.0, 1.0]), reading, 0, extrapolate=True)
+            return (
+                scipy.interpolate.make_interp_spline(time_s, reading, k=1)
+                if len(time_s) > 1
+                else scipy.interpolate.BSpline(np.array([0.0, 1.0]), reading, 0, extrapolate=True)
+            )
         if not self._step:
             interval_s = np.diff(time_s)
             even = interval_s.max() < _MAX_UNEVENNESS * np.median(interval_s)
             return scipy.interpolate.make_interp_spline(
-                time_s, reading, k=self._degree if even else _DEGREE)
+                time_s, reading, k=self._degree if even else _DEGREE
+            )
         window = _Window(time_s, reading, self._knot_s)
         # The noise of readings with a step of their own has no bounds.
-        coefficients = window.coefficients(self._strength) if self._is_seen else \
-            window.bounded_coefficients(self._strength, np.where(
-                _moving(reading), 0.0, _REST_WEIGHT), self._step / 2)
+        coefficients = (
+            window.coefficients(self._strength)
+            if self._is_seen
+            else window.bounded_coefficients(
+                self._strength, np.where(_moving(reading), 0.0, _REST_WEIGHT), self._step / 2
+            )
+        )
         return scipy.interpolate.BSpline(window.knots, window.mean + coefficients, _DEGREE)
 
     def _part(self, window: int) -> tuple[np.ndarray, np.ndarray]:
@@ -282,8 +311,10 @@ class SmoothedPath:
     def _matched_strength(self) -> float:
         """Return the median strength that windows all over the recording need."""
         last = int((self._time_s[-1] - self._time_s[0]) // _WINDOW_S)
-        strengths = [self._strength_of(int(number))
-                     for number in np.unique(np.linspace(0, last, _PROBES).round())]
+        strengths = [
+            self._strength_of(int(number))
+            for number in np.unique(np.linspace(0, last, _PROBES).round())
+        ]
         return float(np.median(list(filter(None, strengths)) or _USUAL_STRENGTH))
 
     def _strength_of(self, number: int) -> float:
@@ -315,8 +346,9 @@ def visible_step(reading: np.ndarray, step: float) -> float:
         return step
     # The usual distance of the samples at which lines through readings bend.
     bends = np.flatnonzero(np.abs(np.diff(reading, 2)) > _SMALLEST_CHANGE * step)
-    thinned = reading[::int(np.quantile(np.diff(bends), _READING_QUANTILE))
-                      if len(bends) > 1 else 1]
+    thinned = reading[
+        :: int(np.quantile(np.diff(bends), _READING_QUANTILE)) if len(bends) > 1 else 1
+    ]
     if noise_step(thinned, _SMALLEST_CHANGE * step) > _FINER * step:
         return step
     finer = noise_step(reading, _SMALLEST_CHANGE * step)
@@ -339,9 +371,14 @@ def _places_of_readings(reading: np.ndarray, smallest: float) -> np.ndarray:
         return np.arange(len(reading))
     distance = max(int(np.quantile(np.diff(bends), 1 - _READING_QUANTILE)), 1)
     corners = np.unique([0, *bends, len(reading) - 1])
-    return np.unique(np.concatenate([
-        np.linspace(a, b, max(round((b - a) / distance), 1) + 1).round().astype(int)
-        for a, b in pairwise(corners.tolist())]))
+    return np.unique(
+        np.concatenate(
+            [
+                np.linspace(a, b, max(round((b - a) / distance), 1) + 1).round().astype(int)
+                for a, b in pairwise(corners.tolist())
+            ]
+        )
+    )
 
 
 def noise_step(reading: np.ndarray, smallest: float, time_s: np.ndarray | None = None) -> float:
@@ -353,12 +390,14 @@ def noise_step(reading: np.ndarray, smallest: float, time_s: np.ndarray | None =
     if len(reading) <= 5:
         return 0.0
     times = sliding_window_view(np.arange(len(reading)) if time_s is None else time_s, 6).T
-    weights = np.array([1 / np.prod(np.delete(own - times, i, 0), axis=0)
-                        for i, own in enumerate(times)])
-    differences = np.sum(weights * sliding_window_view(reading, 6).T, axis=0) \
-        / np.linalg.norm(weights, axis=0)
+    weights = np.array(
+        [1 / np.prod(np.delete(own - times, i, 0), axis=0) for i, own in enumerate(times)]
+    )
+    differences = np.sum(weights * sliding_window_view(reading, 6).T, axis=0) / np.linalg.norm(
+        weights, axis=0
+    )
     moving = differences[np.abs(np.diff(reading))[4:] > smallest]
-    return float(np.sqrt(12 * np.mean(moving ** 2))) if len(moving) else 0.0
+    return float(np.sqrt(12 * np.mean(moving**2))) if len(moving) else 0.0
 
 
 class _Window:
@@ -366,8 +405,9 @@ class _Window:
 
     def __init__(self, time_s: np.ndarray, reading: np.ndarray, knot_s: float) -> None:
         duration_s = time_s[-1] - time_s[0]
-        inner = np.linspace(time_s[0], time_s[-1],
-                            max(int(min(duration_s / knot_s, len(time_s) / 2)), 1) + 1)
+        inner = np.linspace(
+            time_s[0], time_s[-1], max(int(min(duration_s / knot_s, len(time_s) / 2)), 1) + 1
+        )
         outer = (inner[1] - inner[0]) * np.arange(1, _DEGREE + 1)
         # Knots of the spline, s
         self.knots = np.concatenate([inner[0] - outer[::-1], inner, inner[-1] + outer])
@@ -387,8 +427,9 @@ class _Window:
         """Return the coefficients of least squares with a penalty, (k,)."""
         return scipy.linalg.solveh_banded(self._normal + strength * self._penalty, self.right)
 
-    def bounded_coefficients(self, strength: float, weights: np.ndarray, bound: float
-                             ) -> np.ndarray:
+    def bounded_coefficients(
+        self, strength: float, weights: np.ndarray, bound: float
+    ) -> np.ndarray:
         """
         Return the coefficients whose spline deviates from no reading by more than a bound.
 
@@ -404,8 +445,9 @@ class _Window:
         low, high, pulled = self._values - bound, self._values + bound, weights * self._values
         within, excess = self._values, np.zeros(len(self._values))
         for _ in range(_BOUND_ROUNDS):
-            coefficients = scipy.linalg.cho_solve_banded((factor, False),
-                                                         transposed @ (pulled + within - excess))
+            coefficients = scipy.linalg.cho_solve_banded(
+                (factor, False), transposed @ (pulled + within - excess)
+            )
             excess = excess + self.design @ coefficients
             within = np.clip(excess, low, high)
             excess = excess - within

@@ -101,17 +101,30 @@ class Response:
             return self(stamps_s)
         self._kept, self._block_steps = memo, steps
         sensor = self.sensor
-        key = (*self._key(*Place), self._seed, sensor.rate_hz, sensor.rc_s, sensor.lsb_v,
-               *sensor.nominal_zero_g_v.tolist(), *sensor.noise_density_g_per_rthz.tolist(),
-               stamps_s.tobytes())
+        key = (
+            *self._key(*Place),
+            self._seed,
+            sensor.rate_hz,
+            sensor.rc_s,
+            sensor.lsb_v,
+            *sensor.nominal_zero_g_v.tolist(),
+            *sensor.noise_density_g_per_rthz.tolist(),
+            stamps_s.tobytes(),
+        )
         return self._kept('volts', key, lambda: self(stamps_s)).copy()
 
     def _key(self, *places: Place) -> tuple:
         """Return what the chain up to the element depends on, with effects of some places."""
         sensor = self.sensor
-        return (self._motion, self._begin_s, self._step_s, sensor.local_gravity_mps2,
-                sensor.adc_vref_v, *sensor.nominal_scale_v_per_g.tolist(),
-                *(effect.key for place in places for effect in self._chain.effects[place]))
+        return (
+            self._motion,
+            self._begin_s,
+            self._step_s,
+            sensor.local_gravity_mps2,
+            sensor.adc_vref_v,
+            *sensor.nominal_scale_v_per_g.tolist(),
+            *(effect.key for place in places for effect in self._chain.effects[place]),
+        )
 
     def _instants(self, stamps_s: np.ndarray) -> np.ndarray:
         """Return the instants of samples by their stamps, s, (n,)."""
@@ -120,8 +133,10 @@ class Response:
         return signals.time_s
 
     def _environment(self, instants_s: np.ndarray) -> Environment:
-        return NOMINAL_ENVIRONMENT._replace(time_s=instants_s, **{
-            name: path(instants_s) for name, path in self._motion.environment.items()})
+        return NOMINAL_ENVIRONMENT._replace(
+            time_s=instants_s,
+            **{name: path(instants_s) for name, path in self._motion.environment.items()},
+        )
 
     def _sampled(self, steps: np.ndarray) -> tuple[np.ndarray, Signals]:
         """Return filtered volts, (n, m), at samples in steps of the grid, and its signals."""
@@ -138,7 +153,7 @@ class Response:
                 first += sum(map(len, kept[:-1]))
                 kept = kept[-1:]
         grid = np.concatenate(kept) if len(kept[0]) else kept[-1]
-        self._tail = grid[-(2 * POINTS):]
+        self._tail = grid[-(2 * POINTS) :]
         if aligned:
             index = nearest.astype(np.intp) - first
             return grid[index], signals
@@ -147,8 +162,10 @@ class Response:
         def between() -> tuple[np.ndarray, np.ndarray]:
             """Return the steps that samples lie between, (n, points), and their weights."""
             start = np.floor(steps).astype(np.intp) - (POINTS // 2 - 1)
-            return (np.clip(start[:, None] + np.arange(POINTS) - first, 0, None),
-                    lagrange_weights(steps - start))
+            return (
+                np.clip(start[:, None] + np.arange(POINTS) - first, 0, None),
+                lagrange_weights(steps - start),
+            )
 
         index, weights = self._kept('weights', key, between)
         return np.column_stack([np.einsum('ij,ij->i', weights, v[index]) for v in grid.T]), signals
@@ -160,8 +177,9 @@ class Response:
         self._done_steps += count
         volts = np.empty((count, len(self.sensor.axes)))
         for d, v in enumerate(self._chain.volts(signals, Place.ELECTRONICS)):
-            volts[:, d] = low_pass(np.broadcast_to(v, count), signals.rc_s[d],
-                                   self._dt_s, self._filters[d])
+            volts[:, d] = low_pass(
+                np.broadcast_to(v, count), signals.rc_s[d], self._dt_s, self._filters[d]
+            )
         return volts, signals
 
     def _output_of_element(self, count: int) -> Signals:
@@ -171,8 +189,11 @@ class Response:
         places = [Place.REFERENCE]
         for place in (Place.CLOCK, Place.STAGE, Place.FORCE, Place.MOUNTING, Place.ELEMENT):
             places.append(place)
-            signals = self._kept(place.name, (*self._key(*places), self._done_steps, count),
-                                 partial(self._through, place, signals))
+            signals = self._kept(
+                place.name,
+                (*self._key(*places), self._done_steps, count),
+                partial(self._through, place, signals),
+            )
         return replace(signals)
 
     def _through(self, place: Place, before: Signals) -> Signals:
@@ -181,8 +202,9 @@ class Response:
         motion, instants_s = self._motion, before.time_s
         if place is Place.STAGE and motion.force:
             if self._force_path is None:
-                self._force_path = self._kept('reference', self._key(Place.REFERENCE),
-                                              self._acting_force)
+                self._force_path = self._kept(
+                    'reference', self._key(Place.REFERENCE), self._acting_force
+                )
             signals.force = list(self._force_path(instants_s))
             if self._chain.effects[Place.FORCE] and isinstance(motion.force, ForcePath):
                 signals.rotation = motion.force.rotation(instants_s)
@@ -190,13 +212,15 @@ class Response:
         if place is Place.STAGE:
             signals.alpha, signals.beta, signals.shift = (
                 Joint(*(joint(instants_s, order) for order in range(3)))
-                for joint in (motion.alpha, motion.beta, motion.shift))
+                for joint in (motion.alpha, motion.beta, motion.shift)
+            )
         self._chain(place, signals)
         if place is Place.CLOCK:
             signals.environment = self._environment(signals.time_s)
         elif place is Place.STAGE:
             signals.force = specific_force_in_motion(
-                signals.alpha, signals.beta, signals.shift, signals.gravity_mps2, signals.up)
+                signals.alpha, signals.beta, signals.shift, signals.gravity_mps2, signals.up
+            )
         return signals
 
     def _acting_force(self) -> Callable[[np.ndarray], Components]:
@@ -209,8 +233,12 @@ class Response:
         assert force is not None
         if not isinstance(force, ForcePath) or not self._chain.effects[Place.REFERENCE]:
             return force
-        signals = Signals(NOMINAL_ENVIRONMENT, time_s=force.time_s, force=force(force.time_s),
-                          dt_s=float(np.median(np.diff(force.time_s))))
+        signals = Signals(
+            NOMINAL_ENVIRONMENT,
+            time_s=force.time_s,
+            force=force(force.time_s),
+            dt_s=float(np.median(np.diff(force.time_s))),
+        )
         signals.modes = {name: list(mode.T) for name, mode in force.modes.items()}
         self._chain(Place.REFERENCE, signals)
         return ForcePath(signals.time_s, np.column_stack(signals.force))
@@ -232,12 +260,13 @@ class Response:
         drawn = self._white.standard_normal((int(passed.sum()), len(std_v)))
         if not len(self._noise):
             # The first sample is stationary.
-            drawn[0] /= np.sqrt(1 - decay ** 2)
+            drawn[0] /= np.sqrt(1 - decay**2)
             self._noise = np.zeros(len(std_v))
         for d, a in enumerate(decay):
             if a:
-                drawn[:, d] = first_order_recursion(np.sqrt(1 - a * a), a, drawn[:, d],
-                                                    self._noise[d])
+                drawn[:, d] = first_order_recursion(
+                    np.sqrt(1 - a * a), a, drawn[:, d], self._noise[d]
+                )
         self._noise = drawn[-1].copy()
         return drawn[np.cumsum(passed) - 1] * std_v
 
@@ -260,8 +289,9 @@ class ChainMemo:
         return result
 
 
-def simulate(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0,
-             like: Recording | None = None) -> Columns:
+def simulate(
+    sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0, like: Recording | None = None
+) -> Columns:
     """
     Simulate a whole recording: columns by canonical name, (n,) each.
 
@@ -272,8 +302,9 @@ def simulate(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0,
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def simulate_blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0,
-                    like: Recording | None = None) -> Iterator[Columns]:
+def simulate_blocks(
+    sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0, like: Recording | None = None
+) -> Iterator[Columns]:
     """Simulate a recording block by block; another one that it is like has its stamps."""
     count = max(int(round(motion.duration_s * sensor.rate_hz, 6)), 1)
     stamps_s = begin_s + np.arange(count) / sensor.rate_hz if like is None else like.time_s
@@ -281,10 +312,15 @@ def simulate_blocks(sensor: Sensor, motion: Motion, seed: int, begin_s: float = 
     for begin in range(0, len(stamps_s), _BLOCK_ROWS):
         part = slice(begin, begin + _BLOCK_ROWS)
         time_s = stamps_s[part]
-        columns = {'time_s': time_s, **{
-            f'{axis}_v': volts for axis, volts in zip(sensor.axes, respond(time_s).T)}}
-        yield columns | (_references(sensor, motion, time_s) if like is None else {
-            name: like.columns[name][part] for name in REFERENCES if name in like.columns})
+        columns = {
+            'time_s': time_s,
+            **{f'{axis}_v': volts for axis, volts in zip(sensor.axes, respond(time_s).T)},
+        }
+        yield columns | (
+            _references(sensor, motion, time_s)
+            if like is None
+            else {name: like.columns[name][part] for name in REFERENCES if name in like.columns}
+        )
 
 
 def _references(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:
@@ -306,21 +342,35 @@ _RATE_HZ = 250.0  # Largest rate there, Hz; chosen: twice the bandwidth of the m
 _SHORT_RC_S = 1e-9  # RC of a filter that does nothing, s; chosen: not 0
 
 
-def change_mg(sensor: Sensor, motion: Motion, memo: ChainMemo, effects: Collection[str],
-              is_filtered: bool = True) -> float:
+def change_mg(
+    sensor: Sensor,
+    motion: Motion,
+    memo: ChainMemo,
+    effects: Collection[str],
+    is_filtered: bool = True,
+) -> float:
     """Return the rms of what some effects change, and the filter, too, if it is left out."""
     sensor = sensor.computed_at(min(sensor.rate_hz, _RATE_HZ))
     motion = replace(motion, internal_rate_hz=sensor.rate_hz)
     stamps_s = np.arange(int(motion.duration_s * sensor.rate_hz)) / sensor.rate_hz
     needs = [set(effect_named(name).needs) for name in effects]
     if not needs or not all({Need.ADC, Need.NOISE} & each for each in needs):
-        sensor = replace(sensor, adc_bits=_FINE_BITS if sensor.adc_bits else 0,
-                         noise_density_g_per_rthz=_QUIET * sensor.noise_density_g_per_rthz)
-    other = replace(sensor, values={**sensor.values, **{
-        name: neutral(effect_named(name), sensor.axes) for name in effects}})
+        sensor = replace(
+            sensor,
+            adc_bits=_FINE_BITS if sensor.adc_bits else 0,
+            noise_density_g_per_rthz=_QUIET * sensor.noise_density_g_per_rthz,
+        )
+    other = replace(
+        sensor,
+        values={
+            **sensor.values,
+            **{name: neutral(effect_named(name), sensor.axes) for name in effects},
+        },
+    )
     if other.rc_s and not is_filtered:
-        other = replace(other, rc_resistance_ohm=_SHORT_RC_S / other.rc_capacitance_f,
-                        filter_rate_hz=0.0)
+        other = replace(
+            other, rc_resistance_ohm=_SHORT_RC_S / other.rc_capacitance_f, filter_rate_hz=0.0
+        )
     volts = [Response(unit, motion, _SEED).whole(stamps_s, memo) for unit in (sensor, other)]
     change_g = (volts[0] - volts[1]) / sensor.nominal_scale_v_per_g
-    return float(1e3 * np.sqrt(np.mean(change_g ** 2)))
+    return float(1e3 * np.sqrt(np.mean(change_g**2)))

@@ -61,12 +61,15 @@ class Robot:
         try:
             import pinocchio
         except ImportError:
-            raise UserError('--urdf needs pinocchio: apt install ros-jazzy-pinocchio, or '
-                            f'{install_hint("pin")}') from None
+            raise UserError(
+                '--urdf needs pinocchio: apt install ros-jazzy-pinocchio, or '
+                f'{install_hint("pin")}'
+            ) from None
         self._pin: Any = pinocchio
         if not os.path.isfile(urdf):
-            raise UserError(f'{urdf or "urdf"}: no such file; give the URDF '
-                            '(xacro FILE > robot.urdf)')
+            raise UserError(
+                f'{urdf or "urdf"}: no such file; give the URDF (xacro FILE > robot.urdf)'
+            )
         with open(urdf, encoding='utf-8', errors='replace') as file:
             if '<xacro:' in file.read():
                 raise UserError(f'{urdf}: is a xacro; expand it by xacro FILE > robot.urdf')
@@ -76,10 +79,14 @@ class Robot:
         except Exception as error:
             raise UserError(f'{urdf}: no URDF that pinocchio reads: {one_line(error)}') from None
         if not model.existFrame(frame):
-            raise UserError(f'{urdf}: no frame {frame}; it has '
-                            f'{", ".join(f.name for f in model.frames)}')
-        chain = [model.names[i] for i in model.supports[model.frames[model.getFrameId(frame)]
-                                                        .parentJoint] if i]
+            raise UserError(
+                f'{urdf}: no frame {frame}; it has {", ".join(f.name for f in model.frames)}'
+            )
+        chain = [
+            model.names[i]
+            for i in model.supports[model.frames[model.getFrameId(frame)].parentJoint]
+            if i
+        ]
         self.joints = tuple(chain[moves:])  # Names of the joints between base and frame
         fixed = [i for i in range(1, model.njoints) if model.names[i] not in chain]
         self._model = pinocchio.buildReducedModel(model, fixed, pinocchio.neutral(model))
@@ -89,8 +96,9 @@ class Robot:
         # Name of the link that the base is
         self.root = model.frames[1 + moves].name if model.nframes > 1 else ''
 
-    def motion(self, joints: np.ndarray, base: np.ndarray | None, gravity_mps2: float
-               ) -> np.ndarray:
+    def motion(
+        self, joints: np.ndarray, base: np.ndarray | None, gravity_mps2: float
+    ) -> np.ndarray:
         """
         Return the motion of the frame.
 
@@ -106,8 +114,9 @@ class Robot:
             joint = model.joints[model.getJointId(name)]
             angle, v[:, joint.idx_v], a[:, joint.idx_v] = joints[:, :, number]
             # Pinocchio has cosine and sine of a joint without limits.
-            q[:, joint.idx_q:joint.idx_q + joint.nq] = np.column_stack(
-                [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)])
+            q[:, joint.idx_q : joint.idx_q + joint.nq] = np.column_stack(
+                [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)]
+            )
         result = np.empty((4, len(q), 3))
         up = np.array([0.0, 0.0, 1.0])
         for i in range(len(q)):
@@ -131,8 +140,11 @@ def _free_flyer(base: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     # Twice the vector part of the products of the inverse quaternion and the derivatives
     omega, alpha = (2 * (w * d[:, :3] - v * d[:, 3:] - np.cross(v, d[:, :3])) for d in (dq, ddq))
     velocity, acceleration = (Rotation.from_quat(q).apply(d, inverse=True) for d in (dx, ddx))
-    return (np.hstack([x, q]), np.hstack([velocity, omega]),
-            np.hstack([acceleration - np.cross(omega, velocity), alpha]))
+    return (
+        np.hstack([x, q]),
+        np.hstack([velocity, omega]),
+        np.hstack([acceleration - np.cross(omega, velocity), alpha]),
+    )
 
 
 class RobotPath(ForcePath):
@@ -140,13 +152,17 @@ class RobotPath(ForcePath):
 
     name, is_robot = 'the robot', True
 
-    def __init__(self, robot: Robot, readings: Readings, gravity_mps2: float = G0_MPS2,
-                 since_s: float = -np.inf) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        readings: Readings,
+        gravity_mps2: float = G0_MPS2,
+        since_s: float = -np.inf,
+    ) -> None:
         """Smooth the readings, and run the kinematics from a time on, s."""
         self._robot, self._gravity_mps2 = robot, gravity_mps2
         self._tracks = _tracks(robot, readings)
-        self._steps = [noise_step(values, _SMALLEST_STEP, times)
-                       for times, values in self._tracks]
+        self._steps = [noise_step(values, _SMALLEST_STEP, times) for times, values in self._tracks]
         begin_s = max(times[0] for times, _ in self._tracks)
         end_s = min(times[-1] for times, _ in self._tracks)
         readings_hz = max(stamped_rate_hz(times) for times, _ in self._tracks)
@@ -166,9 +182,18 @@ class RobotPath(ForcePath):
 
     def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Path]:
         """Smooth the tracks."""
-        return [SmoothedPath(times, values, step, is_seen=True, knot_s=min(
-            KNOT_S, _KNOT_READINGS * period_s(times))) if np.ptp(values)
-            else Held(float(values[0])) for (times, values), step in zip(tracks, self._steps)]
+        return [
+            SmoothedPath(
+                times,
+                values,
+                step,
+                is_seen=True,
+                knot_s=min(KNOT_S, _KNOT_READINGS * period_s(times)),
+            )
+            if np.ptp(values)
+            else Held(float(values[0]))
+            for (times, values), step in zip(tracks, self._steps)
+        ]
 
     def _moved(self, tracks: np.ndarray) -> np.ndarray:
         count = len(self._robot.joints)
@@ -183,27 +208,31 @@ class RobotPath(ForcePath):
     def as_motion(self) -> Motion:
         """Return the motion that a sensor in the frame follows."""
         rate_hz = stamped_rate_hz(self.time_s)
-        return Motion(float(np.ptp(self.time_s)), force=self,
-                      internal_rate_hz=max(rate_hz, INTERNAL_RATE_HZ))
+        return Motion(
+            float(np.ptp(self.time_s)), force=self, internal_rate_hz=max(rate_hz, INTERNAL_RATE_HZ)
+        )
 
     def text(self) -> str:
         """Return what is known of the robot, for people."""
-        error_mg = mg(np.sqrt(np.mean(self.error_mps2 ** 2)))
-        return (f'{self._robot.frame} moves by {", ".join(self.joints) or "its base"}, from '
-                f'{self.time_s[0]:.3g} to {self.time_s[-1]:.3g} s; the encoders leave an error of '
-                f'{error_mg:.2g} mg rms')
+        error_mg = mg(np.sqrt(np.mean(self.error_mps2**2)))
+        return (
+            f'{self._robot.frame} moves by {", ".join(self.joints) or "its base"}, from '
+            f'{self.time_s[0]:.3g} to {self.time_s[-1]:.3g} s; the encoders leave an error of '
+            f'{error_mg:.2g} mg rms'
+        )
 
     @property
     def step_rad(self) -> float:
         """Step of one encoder whose error is that of all joints together, rad."""
-        return float(np.sqrt(np.sum(np.square(self._steps[:len(self.joints)]))))
+        return float(np.sqrt(np.sum(np.square(self._steps[: len(self.joints)]))))
 
     def with_angles(self, read: Recording) -> Recording:
         """Add the angles of a stage that turns the sensor as the robot does; see `angles`."""
         known = (read.time_s >= self.time_s[0]) & (read.time_s <= self.time_s[-1])
         alpha_rad, beta_rad = np.where(known, self.angles(read.time_s), np.nan)
-        return replace(read, columns={**read.columns, 'alpha_rad': alpha_rad,
-                                      'beta_rad': beta_rad})
+        return replace(
+            read, columns={**read.columns, 'alpha_rad': alpha_rad, 'beta_rad': beta_rad}
+        )
 
     def angles(self, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """
@@ -231,7 +260,8 @@ class RobotPath(ForcePath):
         yielded = smoothed.copy()
         count = len(self._robot.joints)
         yielded[:, :, :count] -= _COMPLIANCE_S2 * np.array(
-            [lag(self.time_s, order)[:, :count] for order in range(3)])
+            [lag(self.time_s, order)[:, :count] for order in range(3)]
+        )
         modes['flexible'] = (self._moved(yielded)[0] - self.motion[0]) / _COMPLIANCE_S2
         return modes
 
@@ -245,10 +275,14 @@ class RobotPath(ForcePath):
         """
         error = self.error_mps2[:, component]
         around = max(round(_AROUND_S / (self.time_s[1] - self.time_s[0])), 3)
-        size, rate = (np.sqrt(np.maximum(uniform_filter1d(v ** 2, around), 0.0)) for v in (
-            error, np.gradient(error, self.time_s)))
-        return PathErrors(np.interp(time_s, self.time_s, size), np.interp(
-            time_s, self.time_s, rate / np.maximum(size, _SMALLEST_STEP)))
+        size, rate = (
+            np.sqrt(np.maximum(uniform_filter1d(v**2, around), 0.0))
+            for v in (error, np.gradient(error, self.time_s))
+        )
+        return PathErrors(
+            np.interp(time_s, self.time_s, size),
+            np.interp(time_s, self.time_s, rate / np.maximum(size, _SMALLEST_STEP)),
+        )
 
     @cached_property
     def smoothing_mps2(self) -> np.ndarray:
@@ -283,8 +317,9 @@ class RobotPath(ForcePath):
 
 def _derivatives(paths: Sequence[Path], time_s: np.ndarray) -> np.ndarray:
     """Return derivatives 0 to 2 of paths at times, s, (3, n, k)."""
-    return np.array([[path(time_s, order) for path in paths]
-                     for order in range(3)]).transpose(0, 2, 1)
+    return np.array([[path(time_s, order) for path in paths] for order in range(3)]).transpose(
+        0, 2, 1
+    )
 
 
 def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -294,28 +329,44 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
         raise UserError(
             f'{readings.path}: no position of {", ".join(missing)}, which '
             f'{"move" if len(missing) > 1 else "moves"} {robot.frame} in {robot.urdf}; recorded '
-            f'are {", ".join(readings.joints) or "no joints"}')
-    tracks = [(name, readings.joints[name][0], np.unwrap(readings.joints[name][1]))
-              for name in robot.joints]
+            f'are {", ".join(readings.joints) or "no joints"}'
+        )
+    tracks = [
+        (name, readings.joints[name][0], np.unwrap(readings.joints[name][1]))
+        for name in robot.joints
+    ]
     if readings.base is not None:
         times, pose = readings.base
-        signs = np.cumprod(np.append(1.0, np.where(np.sum(
-            pose[1:, 3:] * pose[:-1, 3:], axis=1) < 0, -1.0, 1.0)))
+        signs = np.cumprod(
+            np.append(1.0, np.where(np.sum(pose[1:, 3:] * pose[:-1, 3:], axis=1) < 0, -1.0, 1.0))
+        )
         pose = np.hstack([pose[:, :3], pose[:, 3:] * signs[:, None]])
-        tracks += [(f'base {axis}', times, values) for axis, values in zip(
-            ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), pose.T)]
+        tracks += [
+            (f'base {axis}', times, values)
+            for axis, values in zip(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), pose.T)
+        ]
     if not tracks:
-        raise UserError(f'{robot.urdf}: no joint moves {robot.frame}, and {readings.path} has no '
-                        'pose of a moving base; record odom, or tf')
+        raise UserError(
+            f'{robot.urdf}: no joint moves {robot.frame}, and {readings.path} has no '
+            'pose of a moving base; record odom, or tf'
+        )
     for name, times, _ in tracks:
         if len(times) < 8:
-            raise UserError(f'{readings.path}: {name} has {len(times)} finite readings whose '
-                            'stamps differ; at least 8 are needed')
+            raise UserError(
+                f'{readings.path}: {name} has {len(times)} finite readings whose '
+                'stamps differ; at least 8 are needed'
+            )
     return [(times, values) for _, times, values in tracks]
 
 
-def robot_path(urdf: str | os.PathLike, frame: str, path: str, epoch_ns: int,
-               gravity_mps2: float = G0_MPS2, topic: str = '') -> RobotPath:
+def robot_path(
+    urdf: str | os.PathLike,
+    frame: str,
+    path: str,
+    epoch_ns: int,
+    gravity_mps2: float = G0_MPS2,
+    topic: str = '',
+) -> RobotPath:
     """Return the specific force in a frame of a robot, by `robot_readings.read` of a recording."""
     robot = Robot(urdf, frame)
     readings = robot_readings.read(path, epoch_ns, topic, robot.root, bool(robot.joints))

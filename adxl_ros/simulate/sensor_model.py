@@ -66,10 +66,12 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
     """
     limit: float | np.ndarray = np.inf
     if units == 'datasheet':
-        rows = [(name, typical or maximum / _STDS_OF_MAXIMUM, maximum or np.inf)
-                for parameter, (typical, maximum) in sensor.datasheet.items()
-                for name in names_of(effect_named(parameter.effect), sensor.axes)
-                if name.without_axis == parameter]
+        rows = [
+            (name, typical or maximum / _STDS_OF_MAXIMUM, maximum or np.inf)
+            for parameter, (typical, maximum) in sensor.datasheet.items()
+            for name in names_of(effect_named(parameter.effect), sensor.axes)
+            if name.without_axis == parameter
+        ]
         names = [name for name, *_ in rows]
         std, largest = np.array([row[1:] for row in rows], float).reshape(-1, 2).T
         mean = np.array([parameter_of(name).neutral for name in names])
@@ -79,17 +81,24 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
         size, vectors = np.linalg.eigh(sensor.covariance)
         mean, root = get(sensor, names), vectors * np.sqrt(np.maximum(size, 0.0))
     else:
-        population = units if isinstance(units, Population) else \
-            calibration_store.read_population(units)
+        population = (
+            units if isinstance(units, Population) else calibration_store.read_population(units)
+        )
         prior = population.prior(sensor)
         names, mean, root = list(prior.names), prior.mean, np.diag(prior.std)
     if not names:
-        raise UserError(f'units {str(units)!r}: {sensor.serial} has no coefficients to draw from '
-                        'it; give datasheet tolerances, a calibration with a covariance, or the '
-                        'population.yaml of a fleet')
+        raise UserError(
+            f'units {str(units)!r}: {sensor.serial} has no coefficients to draw from '
+            'it; give datasheet tolerances, a calibration with a covariance, or the '
+            'population.yaml of a fleet'
+        )
     drawn = [effect_named(name.effect).invertible for name in names]
-    return UnitDraws(tuple(name for name, is_drawn in zip(names, drawn) if is_drawn),
-                     mean[drawn], root[drawn], np.broadcast_to(limit, len(names)))
+    return UnitDraws(
+        tuple(name for name, is_drawn in zip(names, drawn) if is_drawn),
+        mean[drawn],
+        root[drawn],
+        np.broadcast_to(limit, len(names)),
+    )
 
 
 _SAME_STEP = 1e-6  # Relative change of equal time steps; chosen: above rounding
@@ -105,8 +114,12 @@ class SensorModel:
     device are copied.
     """
 
-    def __init__(self, params: Sensor | str | PathLike, seed: int = 0,
-                 units: str | PathLike | Population | None = None) -> None:
+    def __init__(
+        self,
+        params: Sensor | str | PathLike,
+        seed: int = 0,
+        units: str | PathLike | Population | None = None,
+    ) -> None:
         """
         Put the sensors at the time of power-on.
 
@@ -134,8 +147,10 @@ class SensorModel:
         self._delay_s = float(self.sensor.values.get('time_offset', {}).get('offset_s', 0.0))
         # Reason by name of an effect of the unit that is not simulated
         self.left_out = {
-            name: reason for name in self.sensor.effects
-            if (reason := _reason_to_leave_out(effect_named(name), self._delay_s))}
+            name: reason
+            for name in self.sensor.effects
+            if (reason := _reason_to_leave_out(effect_named(name), self._delay_s))
+        }
         kept = tuple(name for name in self.sensor.effects if name not in self.left_out)
         check_needs(replace(self.sensor, effects=kept), Motion(0.0))
         # Drawn coefficients of the sensors, (n, k); None before the first step, or without draws
@@ -147,7 +162,8 @@ class SensorModel:
             simulated = with_neutral(simulated, [name.effect for name in self.draws.names])
             simulated = put(simulated, self.draws.names, [1e-9] * len(self.draws.names))
         self._chain = Chain(
-            simulated, [name for name in simulated.effects if name not in self.left_out], seed)
+            simulated, [name for name in simulated.effects if name not in self.left_out], seed
+        )
         self._past_weights = np.zeros(0)
         self._shape: tuple[int, ...] = ()
         self._dt_s, self._std_v = 0.0, np.zeros(0)
@@ -156,7 +172,9 @@ class SensorModel:
     def _switch_on(self, count: int) -> None:
         """Forget all that sensors remember: steps since power-on, filters, noise, past forces."""
         self._memory: dict[str, Any] = {
-            'steps': np.zeros(count), 'filters': [{} for _ in self.sensor.axes]}
+            'steps': np.zeros(count),
+            'filters': [{} for _ in self.sensor.axes],
+        }
         self._reset = np.zeros(0, int)  # Sensors that begin anew in the next step
 
     def reset(self, env_ids: Any = None, seed: int | None = None) -> None:
@@ -177,8 +195,13 @@ class SensorModel:
             self._units_rng, self._white = _generators(seed)
             self._chain.seed(seed)
         if count := len(self._memory['steps']):
-            rows = np.arange(count)[slice(None) if env_ids is None else env_ids if isinstance(
-                env_ids, slice | list) else _on_host(env_ids)]
+            rows = np.arange(count)[
+                slice(None)
+                if env_ids is None
+                else env_ids
+                if isinstance(env_ids, slice | list)
+                else _on_host(env_ids)
+            ]
             self._reset = np.union1d(self._reset, rows)
             self._draw(rows)
 
@@ -191,9 +214,13 @@ class SensorModel:
         self.coefficients[rows] = self.draws.draw(len(rows), self._units_rng)
         self._chain.put_units(self.draws.names, self.coefficients)
 
-    def __call__(self, specific_force: Any, dt: float,
-                 temperature: Any = NOMINAL_TEMPERATURE_C,
-                 supply: Any = NOMINAL_SUPPLY_V) -> Any:
+    def __call__(
+        self,
+        specific_force: Any,
+        dt: float,
+        temperature: Any = NOMINAL_TEMPERATURE_C,
+        supply: Any = NOMINAL_SUPPLY_V,
+    ) -> Any:
         """
         Advance by one time step.
 
@@ -225,8 +252,10 @@ class SensorModel:
         force = np.asarray(_on_host(specific_force), float)
         count = force.size // 3
         self._check(force, dt)
-        environment = [_of_each(name, values, count) for name, values in (
-            ('temperature', temperature), ('supply', supply))]
+        environment = [
+            _of_each(name, values, count)
+            for name, values in (('temperature', temperature), ('supply', supply))
+        ]
         rows = force.reshape(-1, 3)
         begun = self._reset
         if len(begun) == count:
@@ -241,8 +270,11 @@ class SensorModel:
             if self.draws is not None and self.coefficients is not None:
                 new._chain.put_units(self.draws.names, self.coefficients[begun])
             readings[begun] = new._advance(rows[begun], [v[:, begun] for v in environment])
-            _put_rows([*self._chain.memories(), self._memory],
-                      [*new._chain.memories(), new._memory], begun)
+            _put_rows(
+                [*self._chain.memories(), self._memory],
+                [*new._chain.memories(), new._memory],
+                begun,
+            )
             self._reset = np.zeros(0, int)
         return _like(readings.reshape(force.shape), specific_force)
 
@@ -255,7 +287,8 @@ class SensorModel:
         self._memory['steps'] = self._memory['steps'] + 1
         readings = np.zeros((len(rows), 3))
         readings[:, [AXES.index(axis) for axis in self.sensor.axes]] = to_nominal_mps2(
-            volts, self.sensor)
+            volts, self.sensor
+        )
         return readings
 
     def _check(self, force: np.ndarray, dt_s: float) -> None:
@@ -274,11 +307,15 @@ class SensorModel:
             self._switch_on(force.size // 3)
             self._draw(np.arange(force.size // 3))
         if force.shape != self._shape:
-            raise UserError(f'specific force has the shape {force.shape}, but {self._shape} '
-                            'before; make a new SensorModel')
+            raise UserError(
+                f'specific force has the shape {force.shape}, but {self._shape} '
+                'before; make a new SensorModel'
+            )
         if abs(dt_s - self._dt_s) > _SAME_STEP * self._dt_s:
-            raise UserError(f'dt is {dt_s} s, but {self._dt_s} s before; call it at equal time '
-                            'steps, or make a new SensorModel')
+            raise UserError(
+                f'dt is {dt_s} s, but {self._dt_s} s before; call it at equal time '
+                'steps, or make a new SensorModel'
+            )
 
     def _delayed(self, rows: np.ndarray) -> np.ndarray:
         """Return the force of the instant that `time_offset` sets, from the past samples."""
@@ -291,22 +328,25 @@ class SensorModel:
             self._memory['past'] = [rows.copy()] * (newest + POINTS)
         self._memory['past'] = [*self._memory['past'][1:], rows.copy()]
         # The oldest samples, whose newest one has the first weight.
-        return sum(weight * past for weight, past in zip(
-            self._past_weights, reversed(self._memory['past'][:POINTS])))
+        return sum(
+            weight * past
+            for weight, past in zip(self._past_weights, reversed(self._memory['past'][:POINTS]))
+        )
 
     def _volts(self, now: Environment, force: list[np.ndarray]) -> np.ndarray:
         """Run the chain, and add the noise behind the filter as `Response` does: V, (n, m)."""
         signals = self._chain.signals(now, time_s=now.time_s, dt_s=self._dt_s, force=force)
         self._chain(Place.FORCE, signals)
         analog_v = self._chain.volts(signals)
-        signals.input_v = [low_pass(np.asarray(volts), rc_s, self._dt_s, memory, may_step=True)
-                           for volts, rc_s, memory in zip(analog_v, signals.rc_s,
-                                                          self._memory['filters'])]
+        signals.input_v = [
+            low_pass(np.asarray(volts), rc_s, self._dt_s, memory, may_step=True)
+            for volts, rc_s, memory in zip(analog_v, signals.rc_s, self._memory['filters'])
+        ]
         if self._std_v.any():
             decay = np.array([np.exp(-self._dt_s / rc) if rc else 0.0 for rc in signals.rc_s])
             drawn = self._white.standard_normal((force[0].shape[-1], len(decay)))
             if 'noise' in self._memory:  # else it is the first sample, which is stationary
-                drawn = decay * self._memory['noise'] + np.sqrt(1 - decay ** 2) * drawn
+                drawn = decay * self._memory['noise'] + np.sqrt(1 - decay**2) * drawn
             self._memory['noise'] = drawn
             signals.input_v = [v + n for v, n in zip(signals.input_v, (drawn * self._std_v).T)]
         return self._chain.convert(signals)[0]
@@ -322,8 +362,11 @@ class SensorNoise:
 
     def __init__(self, noise_model_cfg: Any, num_envs: int, device: str) -> None:
         """Take the configuration; the device is that of the data."""
-        self._model = SensorModel(noise_model_cfg.params, getattr(noise_model_cfg, 'seed', 0),
-                                  getattr(noise_model_cfg, 'units', None))
+        self._model = SensorModel(
+            noise_model_cfg.params,
+            getattr(noise_model_cfg, 'seed', 0),
+            getattr(noise_model_cfg, 'units', None),
+        )
         self._dt_s = noise_model_cfg.dt
 
     def reset(self, env_ids: Any = None) -> None:
@@ -359,12 +402,15 @@ def _like(values: np.ndarray, like: Any) -> Any:
     try:
         from array_api_compat import array_namespace, device
     except ImportError:
-        raise UserError('arrays of other libraries than numpy need array-api-compat; '
-                        f'{install_hint("array-api-compat")}') from None
+        raise UserError(
+            'arrays of other libraries than numpy need array-api-compat; '
+            f'{install_hint("array-api-compat")}'
+        ) from None
     space = array_namespace(like)
     is_floating = space.isdtype(like.dtype, 'real floating')
-    return space.asarray(values, dtype=like.dtype if is_floating else space.float32,
-                         device=device(like))
+    return space.asarray(
+        values, dtype=like.dtype if is_floating else space.float32, device=device(like)
+    )
 
 
 def _generators(seed: int) -> list[np.random.Generator]:

@@ -48,11 +48,17 @@ def swept_sine(begin_s: float) -> Pieces:
     time_s = np.linspace(0.0, _SHAKE_S, round(_SHAKE_S * _SHAKE_KNOTS_HZ) + 1)
     growth_per_s = np.log(_SHAKE_HIGH_HZ / _SHAKE_LOW_HZ) / _SHAKE_S
     omega = 2 * np.pi * _SHAKE_LOW_HZ * np.exp(growth_per_s * time_s)
-    amplitude_m = _SHAKE_MPS2 / omega ** 2 * Knots(
-        [0, _FADE_S, _SHAKE_S - _FADE_S, _SHAKE_S], [0, 1, 1, 0])(time_s)
+    amplitude_m = (
+        _SHAKE_MPS2
+        / omega**2
+        * Knots([0, _FADE_S, _SHAKE_S - _FADE_S, _SHAKE_S], [0, 1, 1, 0])(time_s)
+    )
     position_m = -amplitude_m * np.sin((omega - omega[0]) / growth_per_s)
-    return Pieces(scipy.interpolate.PPoly.from_spline(
-        scipy.interpolate.make_interp_spline(begin_s + time_s, position_m, k=5)))
+    return Pieces(
+        scipy.interpolate.PPoly.from_spline(
+            scipy.interpolate.make_interp_spline(begin_s + time_s, position_m, k=5)
+        )
+    )
 
 
 @dataclass(frozen=True)
@@ -106,9 +112,11 @@ class Script:
         run_up = rate * RUN_UP_S / 2
         constant = distance - 2 * run_up
         self._knot(0.0, 0.0)
-        for angle, seconds, end_rate in ((run_up, RUN_UP_S, rate),
-                                         (constant, abs(constant) / speed, rate),
-                                         (run_up, RUN_UP_S, 0.0)):
+        for angle, seconds, end_rate in (
+            (run_up, RUN_UP_S, rate),
+            (constant, abs(constant) / speed, rate),
+            (run_up, RUN_UP_S, 0.0),
+        ):
             setattr(self, joint, getattr(self, joint) + angle)
             self.now += seconds
             self._knot(**{'alpha_rate': 0.0, 'beta_rate': 0.0, f'{joint}_rate': end_rate})
@@ -137,8 +145,9 @@ def _visit(poses_deg: Sequence[tuple[float, float]]) -> Motion:
 def sweep(_: np.random.Generator) -> Motion:
     """Visit planes alpha 90, 60, 30, 120, 150° forth and back (experiments 1 and 2)."""
     forth = list(range(0, 361, 30))
-    return _visit([(alpha, beta) for alpha in (90, 60, 30, 120, 150)
-                   for beta in forth + forth[::-1]])
+    return _visit(
+        [(alpha, beta) for alpha in (90, 60, 30, 120, 150) for beta in forth + forth[::-1]]
+    )
 
 
 def tilt_alpha(_: np.random.Generator) -> Motion:
@@ -159,8 +168,14 @@ def tilt_both(_: np.random.Generator) -> Motion:
 def motion(_: np.random.Generator) -> Motion:
     """Shake 60 µm p-p at 10 Hz along x at alpha 45°, beta 90° for 20 s (figures 11 and 12)."""
     amplitude_m, omega = 30e-6, 2 * np.pi * 10.0
-    return Motion(20.0, Held(np.pi / 4), Held(np.pi / 2), lambda time_s, order=0: (
-        amplitude_m * omega ** order * np.sin(omega * time_s + order * np.pi / 2)))
+    return Motion(
+        20.0,
+        Held(np.pi / 4),
+        Held(np.pi / 2),
+        lambda time_s, order=0: (
+            amplitude_m * omega**order * np.sin(omega * time_s + order * np.pi / 2)
+        ),
+    )
 
 
 def shaker(_: np.random.Generator) -> Motion:
@@ -169,18 +184,31 @@ def shaker(_: np.random.Generator) -> Motion:
     for beta in (np.pi / 2, 0.0, np.pi):
         script.go(np.pi / 2, beta)
         shakes.append(_shake(script))
-    return Motion(script.now, *script.joints(), lambda time_s, order=0: np.sum(
-        [shake(time_s, order) for shake in shakes], axis=0))
+    return Motion(
+        script.now,
+        *script.joints(),
+        lambda time_s, order=0: np.sum([shake(time_s, order) for shake in shakes], axis=0),
+    )
 
 
 def soak(_: np.random.Generator) -> Motion:
     """Rest for 30 min while temperature (25, 40, 10, 25 °C) and supply step."""
-    temperature_c = Steps(NOMINAL_TEMPERATURE_C,
-                          ((300, 40), (750, 10), (1200, NOMINAL_TEMPERATURE_C)), 60.0)
-    supply_v = Steps(NOMINAL_SUPPLY_V, ((150, 4.8), (225, NOMINAL_SUPPLY_V), (1575, 5.2),
-                                        (1690, NOMINAL_SUPPLY_V)), 0.5)
-    return Motion(1800.0, Held(np.radians(60)), Held(np.radians(30)),
-                  temperature_c=temperature_c, supply_v=supply_v, internal_rate_hz=10.0)
+    temperature_c = Steps(
+        NOMINAL_TEMPERATURE_C, ((300, 40), (750, 10), (1200, NOMINAL_TEMPERATURE_C)), 60.0
+    )
+    supply_v = Steps(
+        NOMINAL_SUPPLY_V,
+        ((150, 4.8), (225, NOMINAL_SUPPLY_V), (1575, 5.2), (1690, NOMINAL_SUPPLY_V)),
+        0.5,
+    )
+    return Motion(
+        1800.0,
+        Held(np.radians(60)),
+        Held(np.radians(30)),
+        temperature_c=temperature_c,
+        supply_v=supply_v,
+        internal_rate_hz=10.0,
+    )
 
 
 def tumble(rng: np.random.Generator) -> Motion:
@@ -216,8 +244,9 @@ def rich(_: np.random.Generator) -> Motion:
         script.go(alpha, beta)
         script.rest(DWELL_S)
     end = script.now
-    temperature_c = Steps(NOMINAL_TEMPERATURE_C,
-                          ((0.25 * end, 35.0), (0.6 * end, NOMINAL_TEMPERATURE_C)), 30.0)
+    temperature_c = Steps(
+        NOMINAL_TEMPERATURE_C, ((0.25 * end, 35.0), (0.6 * end, NOMINAL_TEMPERATURE_C)), 30.0
+    )
     supply_v = Steps(NOMINAL_SUPPLY_V, ((0.4 * end, 4.85), (0.8 * end, NOMINAL_SUPPLY_V)), 0.5)
     return Motion(end, *script.joints(), shift, temperature_c, supply_v)
 
@@ -231,8 +260,9 @@ def _shake(script: Script) -> Pieces:
 
 
 TRAJECTORIES: dict[str, Callable[[np.random.Generator], Motion]] = {
-    f.__name__: f for f in (sweep, tilt_alpha, tilt_beta, tilt_both, motion, shaker, soak,
-                            tumble, rich)}
+    f.__name__: f
+    for f in (sweep, tilt_alpha, tilt_beta, tilt_both, motion, shaker, soak, tumble, rich)
+}
 """Manoeuvres by name; each takes a random generator."""
 
 
@@ -245,38 +275,47 @@ def motion_from_force(ideal: Recording, resampled: bool) -> tuple[Motion, float]
     time_s = ideal.time_s
     force_mps2 = np.column_stack([ideal.columns[name] for name in ACCEL])
     if len(time_s) < _MIN_FORCE_SAMPLES:
-        raise UserError(f'{ideal.path}: {len(time_s)} samples of specific force; at least '
-                        f'{_MIN_FORCE_SAMPLES} are needed')
+        raise UserError(
+            f'{ideal.path}: {len(time_s)} samples of specific force; at least '
+            f'{_MIN_FORCE_SAMPLES} are needed'
+        )
     begin_s = float(time_s[0])
     rate_hz = stamped_rate_hz(time_s)
     return Motion(
-        float(time_s[-1] - begin_s) + 1 / rate_hz, force=ForcePath(time_s, force_mps2),
+        float(time_s[-1] - begin_s) + 1 / rate_hz,
+        force=ForcePath(time_s, force_mps2),
         internal_rate_hz=rate_hz if resampled else max(rate_hz, INTERNAL_RATE_HZ),
-        **environment_paths(ideal)), begin_s
+        **environment_paths(ideal),
+    ), begin_s
 
 
 def motion_from_references(read: Recording, sensor: Sensor) -> Motion:
     """Make a motion from the stage angles, temperature and supply of a recording."""
     for name in ('alpha_rad', 'beta_rad'):
         if name not in read.columns or np.isnan(read.columns[name]).all():
-            raise UserError(f'{read.path}: no stage angle {name} to follow; for specific force '
-                            f'say simulate imu --force {read.path}')
+            raise UserError(
+                f'{read.path}: no stage angle {name} to follow; for specific force '
+                f'say simulate imu --force {read.path}'
+            )
     paths: dict[str, Any] = environment_paths(read)
     for joint, name in JOINTS.items():
         resolution = 0.0 if joint == 'shift' else sensor.stage_resolution_rad
         if joint != 'shift':
             _check_speed(read, name, resolution)
         if np.isfinite(read.columns.get(name, np.nan)).any():
-            paths[joint] = SmoothedPath(read.time_s, read.columns[name], resolution,
-                                        BAND_LIMITED_DEGREE)
+            paths[joint] = SmoothedPath(
+                read.time_s, read.columns[name], resolution, BAND_LIMITED_DEGREE
+            )
     return Motion(float(read.time_s[-1] - read.time_s[0]), **paths)
 
 
 def environment_paths(read: Recording) -> dict[str, Path]:
     """Return the recorded temperature, °C, and supply, V, as paths by column."""
-    return {name: SmoothedPath(read.time_s, read.columns[name], 0.0)
-            for name in ('temperature_c', 'supply_v')
-            if name in read.columns and np.isfinite(read.columns[name]).any()}
+    return {
+        name: SmoothedPath(read.time_s, read.columns[name], 0.0)
+        for name in ('temperature_c', 'supply_v')
+        if name in read.columns and np.isfinite(read.columns[name]).any()
+    }
 
 
 def _check_speed(read: Recording, name: str, resolution_rad: float) -> None:
@@ -287,9 +326,11 @@ def _check_speed(read: Recording, name: str, resolution_rad: float) -> None:
     jumps = np.flatnonzero(change_rad - 2 * resolution_rad > _MAX_SPEED_RAD_S * interval_s)
     if len(jumps):
         i = jumps[0]
-        raise UserError(f'{read.path}: {name} jumps by {change_rad[i]:.3g} rad within '
-                        f'{interval_s[i]:.3g} s at {read.time_s[sampled[i]]:.6g} s, which no '
-                        'stage does; unwrap the angle, or cut the recording there')
+        raise UserError(
+            f'{read.path}: {name} jumps by {change_rad[i]:.3g} rad within '
+            f'{interval_s[i]:.3g} s at {read.time_s[sampled[i]]:.6g} s, which no '
+            'stage does; unwrap the angle, or cut the recording there'
+        )
 
 
 _NAMES = tuple(JOINTS)  # Names of the joints, in the order of all arrays
@@ -308,8 +349,14 @@ class SimulatedStage:
     of the command; its place in that step is random for each command.
     """
 
-    def __init__(self, pose: np.ndarray, slew: np.ndarray, settling_s: float,
-                 resolution: np.ndarray, seed: int) -> None:
+    def __init__(
+        self,
+        pose: np.ndarray,
+        slew: np.ndarray,
+        settling_s: float,
+        resolution: np.ndarray,
+        seed: int,
+    ) -> None:
         """Rest at a pose; `slew` is the largest velocity, and a resolution of 0 is exact."""
         self._slew, self._speed = slew, np.array(slew, float)
         self._omega, self._resolution = _SETTLED / settling_s, resolution
@@ -320,16 +367,18 @@ class SimulatedStage:
         self.position = self._goal.copy()  # True position, (3,)
         self.velocity = np.zeros(3)  # True velocity, (3,)
 
-    def command(self, positions: Mapping[str, float],
-                speeds: Mapping[str, float] = MappingProxyType({})) -> None:
+    def command(
+        self, positions: Mapping[str, float], speeds: Mapping[str, float] = MappingProxyType({})
+    ) -> None:
         """Command joints to positions; a joint whose command does not change goes on."""
         target = self._commanded.copy()
         for name, position in positions.items():
             if name not in _NAMES:
                 raise UserError(f'no joint {name!r}; the joints are {", ".join(_NAMES)}')
             if not abs(position) <= _REACH[name]:
-                raise UserError(f'{name} = {position:g} is out of reach; the stage goes to '
-                                f'+-{_REACH[name]:g}')
+                raise UserError(
+                    f'{name} = {position:g} is out of reach; the stage goes to +-{_REACH[name]:g}'
+                )
             target[_NAMES.index(name)] = position
         is_new = target != self._commanded
         if is_new.any():
@@ -364,5 +413,6 @@ class SimulatedStage:
 
     def _reachable(self, target: np.ndarray) -> np.ndarray:
         """Return where the joints come to rest for a target, (3,)."""
-        return encoder_reading(target, self._resolution) \
-            + self._resolution * self._rng.uniform(-0.5, 0.5, 3)
+        return encoder_reading(target, self._resolution) + self._resolution * self._rng.uniform(
+            -0.5, 0.5, 3
+        )

@@ -16,8 +16,9 @@ from adxl_ros.tools import command_line as cli
 _EXAMPLES = {
     'acceleration and tilt by a calibration': 'recording.csv --params unit.yaml -o tilt.csv',
     'a bag with imu/data and tilt': 'recording.mcap --params unit.yaml -o tilt.mcap',
-    'a moving sensor, without the lag of its filter':
-        'fast.csv --params unit.yaml --undo-filter -o a.csv',
+    'a moving sensor, without the lag of its filter': (
+        'fast.csv --params unit.yaml --undo-filter -o a.csv'
+    ),
 }
 """Examples of arguments, by their purpose."""
 
@@ -26,16 +27,32 @@ def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
     parse = cli.argument_parser('apply', __doc__, _EXAMPLES)
     parse.add_argument('recording', metavar='RECORDING', help=cli.RECORDING_HELP)
-    parse.add_argument('--params', metavar='FILE', default=None,
-                       help='the calibrated sensor (default: the nominal sensor)')
-    parse.add_argument('--inverse', choices=INVERSES, default=INVERSES[0],
-                       help="inverse of the model: exact (default), or the paper's approximation, "
-                            'equations 14 to 21')
-    parse.add_argument('--undo-filter', action='store_true',
-                       help='undo the RC filter, amplitude and phase, for a sensor that moves')
-    parse.add_argument('-o', dest='output', metavar='OUT', required=True,
-                       help='acceleration and tilt, with standard deviations: OUT.csv is a table; '
-                            'OUT.mcap, or a folder OUT, is a bag with imu/data and tilt')
+    parse.add_argument(
+        '--params',
+        metavar='FILE',
+        default=None,
+        help='the calibrated sensor (default: the nominal sensor)',
+    )
+    parse.add_argument(
+        '--inverse',
+        choices=INVERSES,
+        default=INVERSES[0],
+        help="inverse of the model: exact (default), or the paper's approximation, "
+        'equations 14 to 21',
+    )
+    parse.add_argument(
+        '--undo-filter',
+        action='store_true',
+        help='undo the RC filter, amplitude and phase, for a sensor that moves',
+    )
+    parse.add_argument(
+        '-o',
+        dest='output',
+        metavar='OUT',
+        required=True,
+        help='acceleration and tilt, with standard deviations: OUT.csv is a table; '
+        'OUT.mcap, or a folder OUT, is a bag with imu/data and tilt',
+    )
     cli.add_overwrite_option(parse)
     cli.add_recording_options(parse)
     return parse
@@ -58,8 +75,11 @@ def apply(options: argparse.Namespace) -> int:
     cli.report_notes('apply', correction.notes)
     cli.report_notes('apply', block.notes)
     following = ('compensation', f'--ros-args -p calibration:={cli.quoted(options.params or "")}')
-    cli.print_end(correction.screen, [options.output], command(
-        *following if correction.sensor.effects else ('fit', 'SWEEP -o unit.yaml')))
+    cli.print_end(
+        correction.screen,
+        [options.output],
+        command(*following if correction.sensor.effects else ('fit', 'SWEEP -o unit.yaml')),
+    )
     return 0
 
 

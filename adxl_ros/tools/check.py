@@ -17,8 +17,7 @@ from adxl_ros.tools import command_line as cli
 
 _EXAMPLES = {
     'all recordings of a day, with a page': '*.mcap --report check',
-    'a log of other software':
-        'log.csv --columns time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg',
+    'a log of other software': 'log.csv --columns time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg',
 }
 """Examples of arguments, by their purpose."""
 
@@ -27,8 +26,12 @@ def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
     parse = cli.argument_parser('check', __doc__, _EXAMPLES)
     parse.add_argument('recording', nargs='+', metavar='RECORDING', help=cli.RECORDING_HELP)
-    parse.add_argument('--params', metavar='FILE', default=None,
-                       help='the sensor, for recordings in volts (default: the nominal sensor)')
+    parse.add_argument(
+        '--params',
+        metavar='FILE',
+        default=None,
+        help='the sensor, for recordings in volts (default: the nominal sensor)',
+    )
     parse.add_argument('--report', metavar='DIR', help='write the page check.html there')
     cli.add_overwrite_option(parse)
     parse.add_argument('--json', action='store_true', help='print the result as JSON')
@@ -44,8 +47,14 @@ def check(options: argparse.Namespace) -> int:
         html_page.check_libraries()
     with cli.progress('check') as show:
         checked = check_recordings(
-            options.recording, options.params, urdf=options.urdf, frame=options.frame,
-            joints=options.joints, reading=cli.reading_options(options), progress=show)
+            options.recording,
+            options.params,
+            urdf=options.urdf,
+            frame=options.frame,
+            joints=options.joints,
+            reading=cli.reading_options(options),
+            progress=show,
+        )
     page = [checked.save(options.report)] if options.report else []
     if options.json:
         print(json.dumps(checked.to_dict()['recordings'], indent=1))
@@ -57,10 +66,18 @@ def check(options: argparse.Namespace) -> int:
 
 
 def _next_command(results: Sequence[Findings], options: argparse.Namespace) -> str:
-    able = [(result.path, ability.tool) for result in results if result.is_sound
-            for ability in result.abilities if ability.is_able and ability.tool != 'diagnose']
-    return command(able[0][1], f'{cli.quoted(able[0][0])}{cli.reading_text(options)} '
-                   '-o unit.yaml') if able else ''
+    able = [
+        (result.path, ability.tool)
+        for result in results
+        if result.is_sound
+        for ability in result.abilities
+        if ability.is_able and ability.tool != 'diagnose'
+    ]
+    return (
+        command(able[0][1], f'{cli.quoted(able[0][0])}{cli.reading_text(options)} -o unit.yaml')
+        if able
+        else ''
+    )
 
 
 def main() -> int:

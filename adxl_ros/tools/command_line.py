@@ -44,8 +44,12 @@ class _Parser(argparse.ArgumentParser):
         return super().format_help()
 
 
-def argument_parser(tool: str, description: str | None, examples: Mapping[str, str],
-                    details: Callable[[], str] | None = None) -> argparse.ArgumentParser:
+def argument_parser(
+    tool: str,
+    description: str | None,
+    examples: Mapping[str, str],
+    details: Callable[[], str] | None = None,
+) -> argparse.ArgumentParser:
     """Make the parser of a tool; `details` makes the end of its help text."""
     parse = program_parser(_Parser, tool, description, examples)
     parse.details = details
@@ -65,50 +69,99 @@ RECORDING_HELP = 'rosbag2 directory, .mcap, CSV or another table'
 def add_recording_options(parse: argparse.ArgumentParser) -> None:
     """Add the options that state topic, columns, units, stamps and mounting of a recording."""
     group = parse.add_argument_group(
-        'recordings of other software', 'docs/howto/logs.md has units and examples.')
-    group.add_argument('--topic', metavar='NAME', default='',
-                       help='topic of type sensor_msgs/Imu (default: imu/data_raw, or the only '
-                            'one)')
-    group.add_argument('--columns', metavar='MAPPING',
-                       help='columns and units of a table, for example '
-                            'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg; or a file that holds '
-                            'them')
-    group.add_argument('--unit', metavar='UNIT', default='',
-                       help='unit of the samples of a topic or of all axes of a table: g, mg, '
-                            'mps2, mmps2, lsb ... (default: what the file states; topics are in '
-                            'm/s²)')
-    group.add_argument('--lsb-per-g', metavar='COUNTS', default='',
-                       help='counts of 1 g of columns in LSB: one number, or one for each axis')
-    group.add_argument('--lsb-at-0g', metavar='COUNTS', default='',
-                       help='counts at 0 g of columns in LSB (default: 0), as 512 of a 10 bit ADC')
-    group.add_argument('--rate', metavar='HZ', type=float, default=None,
-                       help='stamp the samples by their index at this rate')
-    group.add_argument('--drop-bad-stamps', action='store_true',
-                       help='leave out samples whose stamp does not increase, and count them')
-    group.add_argument('--drop-bad-samples', action='store_true',
-                       help='leave out samples that have no number as their stamp or on an axis, '
-                            'and count them')
-    group.add_argument('--axes', metavar='x=-y,y=x,z=z',
-                       help='axes of the sensor by those of the file, for a documented mounting')
+        'recordings of other software', 'docs/howto/logs.md has units and examples.'
+    )
+    group.add_argument(
+        '--topic',
+        metavar='NAME',
+        default='',
+        help='topic of type sensor_msgs/Imu (default: imu/data_raw, or the only one)',
+    )
+    group.add_argument(
+        '--columns',
+        metavar='MAPPING',
+        help='columns and units of a table, for example '
+        'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg; or a file that holds '
+        'them',
+    )
+    group.add_argument(
+        '--unit',
+        metavar='UNIT',
+        default='',
+        help='unit of the samples of a topic or of all axes of a table: g, mg, '
+        'mps2, mmps2, lsb ... (default: what the file states; topics are in '
+        'm/s²)',
+    )
+    group.add_argument(
+        '--lsb-per-g',
+        metavar='COUNTS',
+        default='',
+        help='counts of 1 g of columns in LSB: one number, or one for each axis',
+    )
+    group.add_argument(
+        '--lsb-at-0g',
+        metavar='COUNTS',
+        default='',
+        help='counts at 0 g of columns in LSB (default: 0), as 512 of a 10 bit ADC',
+    )
+    group.add_argument(
+        '--rate',
+        metavar='HZ',
+        type=float,
+        default=None,
+        help='stamp the samples by their index at this rate',
+    )
+    group.add_argument(
+        '--drop-bad-stamps',
+        action='store_true',
+        help='leave out samples whose stamp does not increase, and count them',
+    )
+    group.add_argument(
+        '--drop-bad-samples',
+        action='store_true',
+        help='leave out samples that have no number as their stamp or on an axis, and count them',
+    )
+    group.add_argument(
+        '--axes',
+        metavar='x=-y,y=x,z=z',
+        help='axes of the sensor by those of the file, for a documented mounting',
+    )
 
 
 def add_robot_options(parse: argparse.ArgumentParser) -> None:
     """Add the options of a robot that carries the sensor, in place of a stage."""
     group = parse.add_argument_group(
         'a robot as the stage',
-        'joints from the recording (sensor_msgs/JointState), a moving base from odom')
+        'joints from the recording (sensor_msgs/JointState), a moving base from odom',
+    )
     group.add_argument('--urdf', metavar='FILE', help='the robot; needs pinocchio')
-    group.add_argument('--frame', metavar='NAME', default='imu_link',
-                       help='its frame that carries the sensor (default: imu_link)')
-    group.add_argument('--joints', metavar='TOPIC', default='',
-                       help='topic of its joints (default: joint_states, or the only one)')
+    group.add_argument(
+        '--frame',
+        metavar='NAME',
+        default='imu_link',
+        help='its frame that carries the sensor (default: imu_link)',
+    )
+    group.add_argument(
+        '--joints',
+        metavar='TOPIC',
+        default='',
+        help='topic of its joints (default: joint_states, or the only one)',
+    )
 
 
 def reading_options(options: argparse.Namespace) -> ReadingOptions:
     """Return how recordings are to be read."""
     return recordings.reading_options(
-        options.topic, options.columns, options.unit, options.rate, options.axes,
-        options.lsb_per_g, options.lsb_at_0g, options.drop_bad_stamps, options.drop_bad_samples)
+        options.topic,
+        options.columns,
+        options.unit,
+        options.rate,
+        options.axes,
+        options.lsb_per_g,
+        options.lsb_at_0g,
+        options.drop_bad_stamps,
+        options.drop_bad_samples,
+    )
 
 
 def reading_text(options: argparse.Namespace) -> str:
@@ -122,8 +175,10 @@ def reading_text(options: argparse.Namespace) -> str:
     return f' {shlex.join(words)}' if words else ''
 
 
-SYNTAX = ('NAME alone has typical values, KEY=VALUE sets a parameter for all its axes, '
-          'KEY.AXIS=VALUE for one; parameters without a value are neutral')
+SYNTAX = (
+    'NAME alone has typical values, KEY=VALUE sets a parameter for all its axes, '
+    'KEY.AXIS=VALUE for one; parameters without a value are neutral'
+)
 """What an option may be, for help texts."""
 
 
@@ -140,11 +195,20 @@ def effect_inputs(texts: Iterable[str]) -> list[EffectInput]:
     return inputs
 
 
-def print_end(result: Sequence[str], files: Iterable[str | os.PathLike],
-              following: str | Sequence[NextStep] = '', took_s: float | None = None) -> None:
+def print_end(
+    result: Sequence[str],
+    files: Iterable[str | os.PathLike],
+    following: str | Sequence[NextStep] = '',
+    took_s: float | None = None,
+) -> None:
     """Print the end of a tool within 79 columns; outcomes are coloured in a terminal."""
-    print('\n'.join(end_lines(result, [str(path) for path in files if Path(path).exists()],
-                              following, took_s)))
+    print(
+        '\n'.join(
+            end_lines(
+                result, [str(path) for path in files if Path(path).exists()], following, took_s
+            )
+        )
+    )
 
 
 def quoted(*words: str | os.PathLike) -> str:
@@ -170,8 +234,13 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
 def note(text: str, paste: str = '') -> None:
     """Print a message on stderr: one line, which a terminal gets wrapped between words."""
     if sys.stderr.isatty():
-        text = textwrap.fill(text.removesuffix(paste), COLUMNS, subsequent_indent='  ',
-                             break_long_words=False, break_on_hyphens=False)
+        text = textwrap.fill(
+            text.removesuffix(paste),
+            COLUMNS,
+            subsequent_indent='  ',
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
         text += f'\n{paste}' * bool(paste)
     print(text, file=sys.stderr)
 
@@ -184,19 +253,23 @@ def check_least(options: argparse.Namespace, **least: float) -> None:
 
 def add_overwrite_option(parse: argparse.ArgumentParser, name: str = '--force') -> None:
     """Add the option that replaces files of others; `name` is its other name."""
-    parse.add_argument(*dict.fromkeys(('--overwrite', name)), dest='overwrite',
-                       action='store_true',
-                       help='replace files that this package did not write, or that were changed '
-                            'since')
+    parse.add_argument(
+        *dict.fromkeys(('--overwrite', name)),
+        dest='overwrite',
+        action='store_true',
+        help='replace files that this package did not write, or that were changed since',
+    )
 
 
 def check_outputs(options: argparse.Namespace, *paths: str | os.PathLike | None) -> None:
     """Refuse to replace a file or folder of others; a path that is not given is None or ''."""
     for path in paths:
         if path and Path(path).exists() and not options.overwrite and not is_own(path):
-            raise UserError(f'{path}: is there already, and was not written by this package, or '
-                            'was changed since; choose another name, or replace it with '
-                            '--overwrite')
+            raise UserError(
+                f'{path}: is there already, and was not written by this package, or '
+                'was changed since; choose another name, or replace it with '
+                '--overwrite'
+            )
 
 
 def refuse_same_file(output: str, source: str) -> None:
@@ -221,8 +294,13 @@ def read(tool: str, path: str, reading: ReadingOptions = AS_IT_IS) -> Recording:
 @contextmanager
 def progress(title: str) -> Iterator[Callable[..., None]]:
     """Show a bar on a terminal with rich; yield what takes the share done, and a stage's name."""
-    drawn = bar(sys.stderr, _BAR_COLUMNS, '{task.percentage:3.0f} %', 'TimeElapsedColumn',
-                'TimeRemainingColumn')
+    drawn = bar(
+        sys.stderr,
+        _BAR_COLUMNS,
+        '{task.percentage:3.0f} %',
+        'TimeElapsedColumn',
+        'TimeRemainingColumn',
+    )
     if drawn is None:
         yield lambda done, stage='': None
         return
@@ -231,7 +309,8 @@ def progress(title: str) -> Iterator[Callable[..., None]]:
 
         def show(done: float, stage: str = '') -> None:
             # A plan that grows does not take the bar back.
-            drawn.update(task, completed=max(done, drawn.tasks[task].completed),
-                         description=stage or title)
+            drawn.update(
+                task, completed=max(done, drawn.tasks[task].completed), description=stage or title
+            )
 
         yield show

@@ -32,11 +32,21 @@ FORMATS = dict(sorted(exports.FORMATS.items()))  # All formats by name
 
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
-    parse = cli.argument_parser('export', __doc__, _EXAMPLES, lambda: entry_list(
-        'formats', {name: each.meaning for name, each in FORMATS.items()}))
+    parse = cli.argument_parser(
+        'export',
+        __doc__,
+        _EXAMPLES,
+        lambda: entry_list('formats', {name: each.meaning for name, each in FORMATS.items()}),
+    )
     parse.add_argument('params', metavar='PARAMS', help='parameter file of the sensor')
-    parse.add_argument('--to', dest='format', required=True, choices=list(FORMATS),
-                       metavar='FORMAT', help=f'{", ".join(FORMATS)}')
+    parse.add_argument(
+        '--to',
+        dest='format',
+        required=True,
+        choices=list(FORMATS),
+        metavar='FORMAT',
+        help=f'{", ".join(FORMATS)}',
+    )
     parse.add_argument('-o', dest='output', required=True, metavar='FILE', help='the new file')
     cli.add_overwrite_option(parse)
     return parse
@@ -55,13 +65,20 @@ def export(options: argparse.Namespace) -> int:
     lost = [name for name in exported.sizes_mg if name not in exported.holds]
     lines = [f'Sensor {sensor.serial} for {options.format}. The file holds: {", ".join(held)}.']
     lines += [f'It lacks: {", ".join(lost)}; its head has their sizes.'] * bool(lost)
-    cli.print_end(lines, [options.output], command(
-        'simulate', f'rich --params {cli.quoted(options.params)} -o rich.csv'))
+    cli.print_end(
+        lines,
+        [options.output],
+        command('simulate', f'rich --params {cli.quoted(options.params)} -o rich.csv'),
+    )
     return 0
 
 
-def _sized(sensor: Sensor, options: argparse.Namespace, holds: Mapping[str, str],
-           show: Callable[[float], None]) -> exports.Export:
+def _sized(
+    sensor: Sensor,
+    options: argparse.Namespace,
+    holds: Mapping[str, str],
+    show: Callable[[float], None],
+) -> exports.Export:
     """Simulate the sizes of all parts of a sensor."""
     motion = TRAJECTORIES['rich'](np.random.default_rng(0))
     change = partial(change_mg, sensor, motion, ChainMemo())
@@ -76,9 +93,13 @@ def _sized(sensor: Sensor, options: argparse.Namespace, holds: Mapping[str, str]
         sizes_mg[exports.STEPS] = _rms_mg([axis.step_mps2 / np.sqrt(12) for axis in axes])
     if sensor.rc_s:
         sizes_mg[exports.FILTER] = change([], False)
-    return exports.Export(sensor, Path(options.params).name, holds, sizes_mg,
-                          change([name for name in own if name not in holds],
-                                 exports.FILTER in holds))
+    return exports.Export(
+        sensor,
+        Path(options.params).name,
+        holds,
+        sizes_mg,
+        change([name for name in own if name not in holds], exports.FILTER in holds),
+    )
 
 
 def _rms_mg(values_mps2: list[float]) -> float:

@@ -20,8 +20,9 @@ from adxl_ros.report import page as html_page
 from adxl_ros.tools import command_line as cli
 
 _EXAMPLES = {
-    'the richest model that a sweep determines, with a page':
-        'sweep.csv -o unit.yaml --report report',
+    'the richest model that a sweep determines, with a page': (
+        'sweep.csv -o unit.yaml --report report'
+    ),
     'two sweeps of one unit, the linear model': 'one.mcap two.mcap --model linear -o unit.yaml',
     'a further effect': 'sweep.csv --effect temperature_bias -o unit.yaml',
 }
@@ -31,37 +32,67 @@ _EXAMPLES = {
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
     parse = cli.argument_parser('fit', __doc__, _EXAMPLES, _details)
-    parse.add_argument('recording', nargs='+',
-                       help=f'{cli.RECORDING_HELP}; all of one unit')
-    parse.add_argument('--params', metavar='FILE', default=None,
-                       help='values that are not fitted (default: the nominal sensor; what '
-                            'a file leaves out is measured)')
-    parse.add_argument('--model', choices=list(STAGE_FITS),
-                       help='model to fit to stage angles (default: the richest that the poses '
-                            'determine); a three-axis recording without angles is '
-                            'calibrated against gravity')
-    parse.add_argument('--effect', metavar='NAME', action='append', default=[],
-                       help='a further effect that the full model fits; see the list below')
-    parse.add_argument('--prior', metavar='FILE',
-                       help='the population.yaml of a fleet: few poses then give a smaller '
-                            'uncertainty; a unit that is not of the fleet is named')
-    parse.add_argument('--journal', metavar='FILE',
-                       help='use the rests that the journal of this sweep names')
-    parse.add_argument('--poses', metavar='FILE',
-                       help='table with alpha_deg and beta_deg of each rest, in their order')
-    parse.add_argument('--means', action='store_true',
-                       help='each row of the table is the mean of a rest, in any order; its '
-                            'stamps are not used')
-    parse.add_argument('-o', dest='output', metavar='FILE.yaml', required=True,
-                       help='the parameter file of the calibrated sensor')
-    parse.add_argument('--report', metavar='DIR',
-                       help='write the page report.html there')
-    parse.add_argument('--dcc', metavar='FILE.xml',
-                       help='write a Digital Calibration Certificate of a calibration on a stage, '
-                            f'by the schema DCC {SCHEMA_VERSION} of PTB')
-    parse.add_argument('--store', metavar='DIR', default=str(default_folder()),
-                       help='the calibration store, which gets a copy (default: %(default)s); '
-                            'empty for none')
+    parse.add_argument('recording', nargs='+', help=f'{cli.RECORDING_HELP}; all of one unit')
+    parse.add_argument(
+        '--params',
+        metavar='FILE',
+        default=None,
+        help='values that are not fitted (default: the nominal sensor; what '
+        'a file leaves out is measured)',
+    )
+    parse.add_argument(
+        '--model',
+        choices=list(STAGE_FITS),
+        help='model to fit to stage angles (default: the richest that the poses '
+        'determine); a three-axis recording without angles is '
+        'calibrated against gravity',
+    )
+    parse.add_argument(
+        '--effect',
+        metavar='NAME',
+        action='append',
+        default=[],
+        help='a further effect that the full model fits; see the list below',
+    )
+    parse.add_argument(
+        '--prior',
+        metavar='FILE',
+        help='the population.yaml of a fleet: few poses then give a smaller '
+        'uncertainty; a unit that is not of the fleet is named',
+    )
+    parse.add_argument(
+        '--journal', metavar='FILE', help='use the rests that the journal of this sweep names'
+    )
+    parse.add_argument(
+        '--poses',
+        metavar='FILE',
+        help='table with alpha_deg and beta_deg of each rest, in their order',
+    )
+    parse.add_argument(
+        '--means',
+        action='store_true',
+        help='each row of the table is the mean of a rest, in any order; its stamps are not used',
+    )
+    parse.add_argument(
+        '-o',
+        dest='output',
+        metavar='FILE.yaml',
+        required=True,
+        help='the parameter file of the calibrated sensor',
+    )
+    parse.add_argument('--report', metavar='DIR', help='write the page report.html there')
+    parse.add_argument(
+        '--dcc',
+        metavar='FILE.xml',
+        help='write a Digital Calibration Certificate of a calibration on a stage, '
+        f'by the schema DCC {SCHEMA_VERSION} of PTB',
+    )
+    parse.add_argument(
+        '--store',
+        metavar='DIR',
+        default=str(default_folder()),
+        help='the calibration store, which gets a copy (default: %(default)s); empty for none',
+    )
     cli.add_overwrite_option(parse)
     cli.add_robot_options(parse)
     cli.add_recording_options(parse)
@@ -70,8 +101,9 @@ def parser() -> argparse.ArgumentParser:
 
 def _details() -> str:
     """Return the effects that a fit can have for the help text."""
-    return cli.effect_list(effect for effect in library().values()
-                           if effect.invertible or effect.place is Place.STAGE)
+    return cli.effect_list(
+        effect for effect in library().values() if effect.invertible or effect.place is Place.STAGE
+    )
 
 
 _MEANS_RATE_HZ = 1.0  # Stamps of a table of means, which have no meaning
@@ -79,8 +111,9 @@ _MEANS_RATE_HZ = 1.0  # Stamps of a table of means, which have no meaning
 
 def fit(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    cli.check_outputs(options, options.output, options.dcc,
-                      options.report and Path(options.report, PAGE))
+    cli.check_outputs(
+        options, options.output, options.dcc, options.report and Path(options.report, PAGE)
+    )
     if options.report or options.dcc:
         html_page.check_libraries()
     reading = cli.reading_options(options)
@@ -89,10 +122,19 @@ def fit(options: argparse.Namespace) -> int:
     report: list[str | Path] = []
     with cli.progress('fit') as show:
         fitted = fit_unit(
-            (cli.read('fit', path, reading) for path in options.recording), options.params,
-            model=options.model, effects=options.effect, prior=options.prior,
-            journal=options.journal, poses=options.poses, means=options.means,
-            urdf=options.urdf, frame=options.frame, joints=options.joints, progress=show)
+            (cli.read('fit', path, reading) for path in options.recording),
+            options.params,
+            model=options.model,
+            effects=options.effect,
+            prior=options.prior,
+            journal=options.journal,
+            poses=options.poses,
+            means=options.means,
+            urdf=options.urdf,
+            frame=options.frame,
+            joints=options.joints,
+            progress=show,
+        )
         cli.report_notes('fit', fitted.notes)
         if options.report:
             show(0.6, 'report')
@@ -103,10 +145,16 @@ def fit(options: argparse.Namespace) -> int:
     fitted.save(options.output)
     cli.note(f'fit: {fitted.keep(options.store)}')
     # No samples of a table of means can be corrected.
-    applied = 'RECORDING' if options.means else \
-        f'{cli.quoted(options.recording[0])}{cli.reading_text(options)}'
-    cli.print_end([*fitted.screen, ''], [options.output, *report], command(
-        'apply', f'{applied} --params {cli.quoted(options.output)} -o tilt.csv'))
+    applied = (
+        'RECORDING'
+        if options.means
+        else f'{cli.quoted(options.recording[0])}{cli.reading_text(options)}'
+    )
+    cli.print_end(
+        [*fitted.screen, ''],
+        [options.output, *report],
+        command('apply', f'{applied} --params {cli.quoted(options.output)} -o tilt.csv'),
+    )
     return 0
 
 

@@ -35,8 +35,9 @@ from adxl_ros.workers import open_pool, RETRIES
 PROG = 'fleet'  # Name of the command, for messages
 _EXAMPLES = {
     'all recordings of a folder': 'recordings -o results',
-    'a bucket, on a Dask cluster':
-        "'s3://robots/**/*.mcap' --scheduler tcp://head:8786 -o results",
+    'a bucket, on a Dask cluster': (
+        "'s3://robots/**/*.mcap' --scheduler tcp://head:8786 -o results"
+    ),
     'what it would cost': 'manifest.csv -o results --dry-run',
 }
 """Examples of arguments, by their purpose."""
@@ -48,33 +49,68 @@ _SHOWN = ('outcome', 'refused_by', 'serial', 'status')
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
     parse = cli.argument_parser(PROG, __doc__, _EXAMPLES)
-    parse.add_argument('input', nargs='+', metavar='INPUT',
-                       help='file, folder, glob, URL of fsspec (s3://, gs://, https://, sftp://), '
-                            'or a manifest: CSV or Parquet with url, serial, params, date')
-    parse.add_argument('--do', metavar='TASKS', default=','.join(TASKS),
-                       help='tasks, with commas (default: %(default)s)')
-    parse.add_argument('-o', dest='output', metavar='DIR', required=True,
-                       help='rows, table, page and single reports; an interrupted run continues')
+    parse.add_argument(
+        'input',
+        nargs='+',
+        metavar='INPUT',
+        help='file, folder, glob, URL of fsspec (s3://, gs://, https://, sftp://), '
+        'or a manifest: CSV or Parquet with url, serial, params, date',
+    )
+    parse.add_argument(
+        '--do',
+        metavar='TASKS',
+        default=','.join(TASKS),
+        help='tasks, with commas (default: %(default)s)',
+    )
+    parse.add_argument(
+        '-o',
+        dest='output',
+        metavar='DIR',
+        required=True,
+        help='rows, table, page and single reports; an interrupted run continues',
+    )
     cli.add_overwrite_option(parse)
-    parse.add_argument('--params', metavar='FILE', default=None,
-                       help='parameter file of all recordings (default: the calibration of each '
-                            'unit at the date of the recording, else the nominal sensor)')
-    parse.add_argument('--store', metavar='DIR', default=str(calibration_store.default_folder()),
-                       help='the calibration store (default: %(default)s); empty for none')
+    parse.add_argument(
+        '--params',
+        metavar='FILE',
+        default=None,
+        help='parameter file of all recordings (default: the calibration of each '
+        'unit at the date of the recording, else the nominal sensor)',
+    )
+    parse.add_argument(
+        '--store',
+        metavar='DIR',
+        default=str(calibration_store.default_folder()),
+        help='the calibration store (default: %(default)s); empty for none',
+    )
     pool = parse.add_mutually_exclusive_group()
     pool.add_argument('--scheduler', metavar='ADDRESS', help='of a Dask cluster to run on')
-    pool.add_argument('--jobs', metavar='N', type=int,
-                      help='processes of this machine (default: one for each core)')
-    parse.add_argument('--retries', metavar='N', type=int, default=RETRIES,
-                       help='further attempts where a copy fails or a worker ends '
-                            '(default: %(default)s)')
-    parse.add_argument('--only-failed', action='store_true',
-                       help='repeat the recordings that were refused or crashed, no others')
-    parse.add_argument('--since', metavar='DATE', default='',
-                       help='leave out earlier recordings, by the date that they or a manifest '
-                            'state, else by the last change of the file')
-    parse.add_argument('--limit', metavar='N', type=int,
-                       help='work on N recordings at most')
+    pool.add_argument(
+        '--jobs',
+        metavar='N',
+        type=int,
+        help='processes of this machine (default: one for each core)',
+    )
+    parse.add_argument(
+        '--retries',
+        metavar='N',
+        type=int,
+        default=RETRIES,
+        help='further attempts where a copy fails or a worker ends (default: %(default)s)',
+    )
+    parse.add_argument(
+        '--only-failed',
+        action='store_true',
+        help='repeat the recordings that were refused or crashed, no others',
+    )
+    parse.add_argument(
+        '--since',
+        metavar='DATE',
+        default='',
+        help='leave out earlier recordings, by the date that they or a manifest '
+        'state, else by the last change of the file',
+    )
+    parse.add_argument('--limit', metavar='N', type=int, help='work on N recordings at most')
     parse.add_argument('--dry-run', action='store_true', help='only show what there is to do')
     cli.add_recording_options(parse)
     return parse
@@ -92,15 +128,23 @@ def fleet(options: argparse.Namespace) -> int:
         raise UserError(f'--since {options.since}: expected a date, for example 2026-11-01')
     tasks = task_names(options.do)
     sources = find_sources(options.input)
-    recipe = make_recipe(tasks, options.params, (source.params for source in sources),
-                         options.store, cli.reading_options(options))
+    recipe = make_recipe(
+        tasks,
+        options.params,
+        (source.params for source in sources),
+        options.store,
+        cli.reading_options(options),
+    )
     folder = Path(options.output)
     cli.check_outputs(options, folder / TABLE, folder / PAGE)
     selection = (options.only_failed, since, options.limit)
     if options.dry_run:
         results = Results(folder)
-        cli.print_end(_plan_lines(plan(sources, recipe, results, *selection), results), [],
-                      command_of_this_process().replace(' --dry-run', ''))
+        cli.print_end(
+            _plan_lines(plan(sources, recipe, results, *selection), results),
+            [],
+            command_of_this_process().replace(' --dry-run', ''),
+        )
         return 0
     make_folder(folder)
     with only_client(folder):
@@ -109,23 +153,29 @@ def fleet(options: argparse.Namespace) -> int:
         try:
             if to_do.todo:
                 shared = (recipe, frozenset(results.known))
-                with open_pool(options.scheduler, options.jobs, shared) as pool, \
-                        cli.progress(PROG) as show:
+                with (
+                    open_pool(options.scheduler, options.jobs, shared) as pool,
+                    cli.progress(PROG) as show,
+                ):
                     for row in work(pool, to_do.todo, recipe, results, options.retries, show):
                         rows.append({name: row[name] for name in _SHOWN})
         finally:
             # Ctrl-C leaves table and page of what is done.
             files, findings = _written(folder, results)
     is_repeated = any(row['outcome'] == 'crashed' or row['refused_by'] == 'stage' for row in rows)
-    cli.print_end([*_result_lines(rows, to_do), '', *findings, *[''] * bool(findings)], files,
-                  f'{command_of_this_process()} --only-failed' if is_repeated else '',
-                  monotonic() - begin_s)
+    cli.print_end(
+        [*_result_lines(rows, to_do), '', *findings, *[''] * bool(findings)],
+        files,
+        f'{command_of_this_process()} --only-failed' if is_repeated else '',
+        monotonic() - begin_s,
+    )
     return 1 if rows and not any(row['outcome'] == 'done' for row in rows) else 0
 
 
 def _written(folder: Path, results: Results) -> tuple[list[Path], list[str]]:
     """Write table and page; return files and findings, or report that a page is not possible."""
     from adxl_ros.fleet import page  # only the end of a run needs it
+
     files, findings = [results.write_table()], list[str]()
     try:
         written = page.write(folder)
@@ -137,18 +187,27 @@ def _written(folder: Path, results: Results) -> tuple[list[Path], list[str]]:
 
 def _plan_lines(to_do: Plan, results: Results) -> list[str]:
     known = {url: entry.row['serial'] for url, entry in results.newest.items()}
-    units = Counter(source.serial or stated or known.get(source.url) or NO_UNIT
-                    for source, (stated, _) in zip(to_do.todo, stated_by(to_do.todo)))
+    units = Counter(
+        source.serial or stated or known.get(source.url) or NO_UNIT
+        for source, (stated, _) in zip(to_do.todo, stated_by(to_do.todo))
+    )
     unknown = units.pop(NO_UNIT, 0)
     largest = ', '.join(f'{serial} ({count})' for serial, count in units.most_common(_UNITS))
-    rows = {'done already': str(to_do.done), 'left out': _left_out(to_do),
-            'core hours': f'{to_do.core_hours:.3g}',
-            'units': largest and f'{len(units)}: {largest}{", ..." * (len(units) > _UNITS)}',
-            'unknown unit': counted(unknown, 'recording')}
+    rows = {
+        'done already': str(to_do.done),
+        'left out': _left_out(to_do),
+        'core hours': f'{to_do.core_hours:.3g}',
+        'units': largest and f'{len(units)}: {largest}{", ..." * (len(units) > _UNITS)}',
+        'unknown unit': counted(unknown, 'recording'),
+    }
     size_gb = number(to_do.size_bytes / 1e9, digits=2)
-    return [f'{counted(len(to_do.todo), "recording")} to do, {size_gb} GB, about '
-            f'{duration(3600 * to_do.core_hours)} of one core', '',
-            *(f' {name:13}{text}' for name, text in rows.items() if text), '']
+    return [
+        f'{counted(len(to_do.todo), "recording")} to do, {size_gb} GB, about '
+        f'{duration(3600 * to_do.core_hours)} of one core',
+        '',
+        *(f' {name:13}{text}' for name, text in rows.items() if text),
+        '',
+    ]
 
 
 def _left_out(to_do: Plan) -> str:
@@ -157,8 +216,10 @@ def _left_out(to_do: Plan) -> str:
 
 def _result_lines(rows: Sequence[Row], to_do: Plan) -> list[str]:
     if not rows:
-        return [f'Nothing to do: {counted(to_do.done, "recording")} had a row before',
-                f' left out  {_left_out(to_do)}' * bool(to_do.outside)]
+        return [
+            f'Nothing to do: {counted(to_do.done, "recording")} had a row before',
+            f' left out  {_left_out(to_do)}' * bool(to_do.outside),
+        ]
     outcomes = Counter(row['outcome'] for row in rows)
     parts = [f'{outcomes[name]} {name}' for name in OUTCOMES if outcomes[name] or name == 'done']
 
@@ -168,11 +229,16 @@ def _result_lines(rows: Sequence[Row], to_do: Plan) -> list[str]:
 
     figures = {
         'units': str(len({row['serial'] for row in rows if row['serial']})),
-        'left out': _left_out(to_do), 'verdicts': counts('status'),
-        'refused by': counts('refused_by')}
-    return [f'{counted(len(rows), "recording")}: {", ".join(parts)}'
-            + (f'; {to_do.done} had their row before' if to_do.done else ''), '',
-            *(f' {name:11}{value}' for name, value in figures.items() if value)]
+        'left out': _left_out(to_do),
+        'verdicts': counts('status'),
+        'refused by': counts('refused_by'),
+    }
+    return [
+        f'{counted(len(rows), "recording")}: {", ".join(parts)}'
+        + (f'; {to_do.done} had their row before' if to_do.done else ''),
+        '',
+        *(f' {name:11}{value}' for name, value in figures.items() if value),
+    ]
 
 
 def main() -> int:

@@ -16,8 +16,9 @@ from adxl_ros.tools import command_line as cli
 
 _EXAMPLES = {
     'noise of each axis, with its Allan deviation': 'still.mcap --report noise',
-    'a parameter file for compensation and diagnose':
-        'still.csv --params my_sensor.yaml -o my_noise.yaml',
+    'a parameter file for compensation and diagnose': (
+        'still.csv --params my_sensor.yaml -o my_noise.yaml'
+    ),
     "a camera's IMU in a bag": 'bag --topic /camera/imu',
 }
 """Examples of arguments, by their purpose."""
@@ -26,13 +27,21 @@ _EXAMPLES = {
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
     parse = cli.argument_parser('noise', __doc__, _EXAMPLES)
-    parse.add_argument('recording', metavar='RECORDING',
-                       help=f'{cli.RECORDING_HELP}; of a sensor that nobody touches')
-    parse.add_argument('--params', metavar='FILE', default=None,
-                       help='the other values of the sensor (default: the nominal sensor; for a '
-                            'recording in m/s² that names no sensor, any IMU)')
-    parse.add_argument('-o', dest='output', metavar='FILE.yaml',
-                       help='a parameter file with the measured noise')
+    parse.add_argument(
+        'recording',
+        metavar='RECORDING',
+        help=f'{cli.RECORDING_HELP}; of a sensor that nobody touches',
+    )
+    parse.add_argument(
+        '--params',
+        metavar='FILE',
+        default=None,
+        help='the other values of the sensor (default: the nominal sensor; for a '
+        'recording in m/s² that names no sensor, any IMU)',
+    )
+    parse.add_argument(
+        '-o', dest='output', metavar='FILE.yaml', help='a parameter file with the measured noise'
+    )
     parse.add_argument('--report', metavar='DIR', help='write the curve allan.png there')
     cli.add_overwrite_option(parse)
     cli.add_recording_options(parse)
@@ -45,6 +54,7 @@ def noise(options: argparse.Namespace) -> int:
     reading = cli.reading_options(options)
     newest: list[Recording] = []
     with cli.progress('noise') as show:
+
         def blocks() -> Iterator[Recording]:
             for block in recording.blocks(options.recording, BLOCK_ROWS, reading):
                 newest[:] = [block]
@@ -59,9 +69,13 @@ def noise(options: argparse.Namespace) -> int:
         found.save(options.output)
         files.insert(0, Path(options.output))
         lines += [f'WARNING {text}' for text in found.refuted_filter]
-    following = command('diagnose', f'RECORDING --params {cli.quoted(options.output)} -o gap') \
-        if options.output else command(
-            'noise', f'{cli.quoted(options.recording)}{cli.reading_text(options)} -o noise.yaml')
+    following = (
+        command('diagnose', f'RECORDING --params {cli.quoted(options.output)} -o gap')
+        if options.output
+        else command(
+            'noise', f'{cli.quoted(options.recording)}{cli.reading_text(options)} -o noise.yaml'
+        )
+    )
     cli.print_end(lines, files, following)
     return 0
 

@@ -26,10 +26,12 @@ _NAMES = (*TRAJECTORIES, IMU)
 """What is no recording."""
 _EXAMPLES = {
     'a calibration sweep of the nominal sensor': 'sweep -o sweep.csv',
-    'two effects, one of typical size and one with a value':
-        'rich --effect lever_arm --effect temperature_bias:per_k.x=4e-4 -o rich.mcap',
-    'the motion of a recording, by a calibrated sensor':
-        'real.csv --params unit.yaml -o simulated.csv',
+    'two effects, one of typical size and one with a value': (
+        'rich --effect lever_arm --effect temperature_bias:per_k.x=4e-4 -o rich.mcap'
+    ),
+    'the motion of a recording, by a calibrated sensor': (
+        'real.csv --params unit.yaml -o simulated.csv'
+    ),
 }
 """Examples of arguments, by their purpose."""
 
@@ -37,22 +39,38 @@ _EXAMPLES = {
 def parser() -> argparse.ArgumentParser:
     """Describe the command line."""
     parse = cli.argument_parser('simulate', __doc__, _EXAMPLES, _details)
-    parse.add_argument('trajectory', metavar='TRAJECTORY',
-                       help=f'{", ".join(TRAJECTORIES)}, imu, or a recording')
-    parse.add_argument('--params', metavar='FILE', default=None,
-                       help='the sensor (default: the nominal sensor)')
-    parse.add_argument('--effect', action='append', default=[], metavar='NAME[:key=value,...]',
-                       help=f'add an effect: {cli.SYNTAX}')
-    parse.add_argument('--force', metavar='RECORDING',
-                       help='specific force for the trajectory imu')
+    parse.add_argument(
+        'trajectory', metavar='TRAJECTORY', help=f'{", ".join(TRAJECTORIES)}, imu, or a recording'
+    )
+    parse.add_argument(
+        '--params', metavar='FILE', default=None, help='the sensor (default: the nominal sensor)'
+    )
+    parse.add_argument(
+        '--effect',
+        action='append',
+        default=[],
+        metavar='NAME[:key=value,...]',
+        help=f'add an effect: {cli.SYNTAX}',
+    )
+    parse.add_argument(
+        '--force', metavar='RECORDING', help='specific force for the trajectory imu'
+    )
     parse.add_argument('--rate', type=float, metavar='HZ', help='sample rate')
-    parse.add_argument('--seed', type=int, default=0,
-                       help='seed of noise and manoeuvre (default 0)')
-    parse.add_argument('--port', metavar='PATH',
-                       help='act as a board: send the samples in real time to a terminal device, '
-                       'or to a new pseudo-terminal of this name')
-    parse.add_argument('-o', dest='output', metavar='RECORDING',
-                       help='.csv, .mcap or a rosbag2 directory (optional with --port)')
+    parse.add_argument(
+        '--seed', type=int, default=0, help='seed of noise and manoeuvre (default 0)'
+    )
+    parse.add_argument(
+        '--port',
+        metavar='PATH',
+        help='act as a board: send the samples in real time to a terminal device, '
+        'or to a new pseudo-terminal of this name',
+    )
+    parse.add_argument(
+        '-o',
+        dest='output',
+        metavar='RECORDING',
+        help='.csv, .mcap or a rosbag2 directory (optional with --port)',
+    )
     cli.add_overwrite_option(parse, '--overwrite')  # --force is the specific force
     return parse
 
@@ -60,25 +78,40 @@ def parser() -> argparse.ArgumentParser:
 def _details() -> str:
     """Return the trajectories and the effects for the help text."""
     about = {name: f.__doc__.splitlines()[0] for name, f in TRAJECTORIES.items() if f.__doc__}
-    about[IMU] = ('Apply the specific force of --force, from any simulator: ax_mps2, ay_mps2, '
-                  'az_mps2 or sensor_msgs/Imu.')
+    about[IMU] = (
+        'Apply the specific force of --force, from any simulator: ax_mps2, ay_mps2, '
+        'az_mps2 or sensor_msgs/Imu.'
+    )
     about['RECORDING'] = 'Follow the stage angles of a recording, at its stamps.'
-    return '\n\n'.join([entry_list('trajectories', about), cli.effect_list(library().values()),
-                        'docs/reference/effects.md has the parameters of each effect.'])
+    return '\n\n'.join(
+        [
+            entry_list('trajectories', about),
+            cli.effect_list(library().values()),
+            'docs/reference/effects.md has the parameters of each effect.',
+        ]
+    )
 
 
 def simulate(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     _check(options)
     is_named = options.trajectory in _NAMES
-    made = prepare(options.trajectory if is_named else cli.read('simulate', options.trajectory),
-                   options.params, cli.effect_inputs(options.effect), options.force, options.rate,
-                   options.seed)
+    made = prepare(
+        options.trajectory if is_named else cli.read('simulate', options.trajectory),
+        options.params,
+        cli.effect_inputs(options.effect),
+        options.force,
+        options.rate,
+        options.seed,
+    )
     cli.report_notes('simulate', made.left_out)
     with ExitStack() as stack:
         send = _board_output(stack, made.sensor, options.port) if options.port else None
-        write = stack.enter_context(recording.writer(options.output, made.sensor)) \
-            if options.output else None
+        write = (
+            stack.enter_context(recording.writer(options.output, made.sensor))
+            if options.output
+            else None
+        )
         show = stack.enter_context(cli.progress('simulate'))
         for block in made.blocks(options.seed):
             if send:
@@ -86,8 +119,9 @@ def simulate(options: argparse.Namespace) -> int:
             if write:
                 write(block)
             show(block.done)
-    cli.print_end(made.screen, filter(None, [options.output]),
-                  _next_step(options) if options.output else '')
+    cli.print_end(
+        made.screen, filter(None, [options.output]), _next_step(options) if options.output else ''
+    )
     return 0
 
 
@@ -104,8 +138,10 @@ def _next_step(options: argparse.Namespace) -> str:
 def _check(options: argparse.Namespace) -> None:
     """Refuse wrong usage, and an output that must not be replaced."""
     if options.trajectory not in _NAMES and not Path(options.trajectory).exists():
-        parser().error(f'{options.trajectory}: neither a recording nor one of the trajectories '
-                       f'{", ".join(_NAMES)}')
+        parser().error(
+            f'{options.trajectory}: neither a recording nor one of the trajectories '
+            f'{", ".join(_NAMES)}'
+        )
     if not options.output and not options.port:
         parser().error('the following arguments are required: -o, or --port')
     # The name of a trajectory is no file, though a file of that name may be written.
@@ -124,8 +160,9 @@ def _board_output(stack: ExitStack, sensor: Sensor, port: str) -> Callable[[Colu
         if not boards:
             roles = emulated_board.roles_of(sensor, columns)
             boards.append(emulated_board.Board(sensor, roles, descriptor))
-            print(f'simulate: sending: {emulated_board.driver_command(port, roles)}',
-                  file=sys.stderr)
+            print(
+                f'simulate: sending: {emulated_board.driver_command(port, roles)}', file=sys.stderr
+            )
         boards[0].send(columns)
 
     return send

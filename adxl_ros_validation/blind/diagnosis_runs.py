@@ -27,8 +27,17 @@ import numpy as np
 import pandas as pd
 import yaml
 
-_ENVIRONMENT = ('PATH', 'LD_LIBRARY_PATH', 'PYTHONPATH', 'AMENT_PREFIX_PATH', 'VIRTUAL_ENV',
-                '_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'ROS_DISTRO', 'LANG', 'SYSTEMROOT')
+_ENVIRONMENT = (
+    'PATH',
+    'LD_LIBRARY_PATH',
+    'PYTHONPATH',
+    'AMENT_PREFIX_PATH',
+    'VIRTUAL_ENV',
+    '_ROS_WHEELS_BOOTSTRAP_COMPLETE',
+    'ROS_DISTRO',
+    'LANG',
+    'SYSTEMROOT',
+)
 """Variables that ROS 2 and Python need. None contains the folder of the check."""
 _TIMEOUT_S = 1200.0
 """Longest time of one diagnosis, s; chosen."""
@@ -38,28 +47,43 @@ Result = dict[str, Any]
 
 def executable(name: str) -> list[str]:
     """Return the command line of an executable of the package."""
-    return [sys.executable, '-c',
-            f'import sys; from adxl_ros.tools.{name} import main; sys.exit(main())']
+    return [
+        sys.executable,
+        '-c',
+        f'import sys; from adxl_ros.tools.{name} import main; sys.exit(main())',
+    ]
 
 
 def call(folder: Path, name: str, *arguments: str) -> tuple[int, str]:
     """Run an executable in a folder, in an environment that names no other folder of the user."""
     environment = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
     # Each process uses one core: linear algebra must not use the others.
-    environment |= {'HOME': str(folder), 'OPENBLAS_NUM_THREADS': '1', 'OMP_NUM_THREADS': '1',
-                    'MPLCONFIGDIR': str(folder)}
+    environment |= {
+        'HOME': str(folder),
+        'OPENBLAS_NUM_THREADS': '1',
+        'OMP_NUM_THREADS': '1',
+        'MPLCONFIGDIR': str(folder),
+    }
     try:
-        done = subprocess.run([*executable(name), *arguments], cwd=folder, env=environment,
-                              stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                              stderr=subprocess.PIPE, text=True, timeout=_TIMEOUT_S)
+        done = subprocess.run(
+            [*executable(name), *arguments],
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=_TIMEOUT_S,
+        )
     except subprocess.TimeoutExpired:
         return 1, f'not finished after {_TIMEOUT_S:.0f} s'
     crashed = 'traceback: ' if 'Traceback (most recent' in done.stderr else ''
     return done.returncode, crashed + (done.stderr.strip().splitlines() or [''])[-1]
 
 
-def diagnose(name: str, recording: bytes, parameters: bytes, sim: bytes | None = None
-             ) -> tuple[str, Result]:
+def diagnose(
+    name: str, recording: bytes, parameters: bytes, sim: bytes | None = None
+) -> tuple[str, Result]:
     """Diagnose a recording in a folder that has nothing but it, its parameters and its `sim`."""
     with tempfile.TemporaryDirectory(prefix='diagnose_') as temporary:
         folder = Path(temporary)
@@ -69,41 +93,59 @@ def diagnose(name: str, recording: bytes, parameters: bytes, sim: bytes | None =
                 os.utime(folder / f'{name}{suffix}', (0, 0))
         start, used = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
         status, error = call(
-            folder, 'diagnose', f'{name}.csv', '--params', f'{name}.yaml', '-o', 'out', '--json',
-            '--seed', '0', *(['--sim', f'{name}_sim.csv'] if sim else []))
+            folder,
+            'diagnose',
+            f'{name}.csv',
+            '--params',
+            f'{name}.yaml',
+            '-o',
+            'out',
+            '--json',
+            '--seed',
+            '0',
+            *(['--sim', f'{name}_sim.csv'] if sim else []),
+        )
         seconds, now = time.monotonic() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
         params = folder / 'out' / 'params.yaml'
         try:
             content = json.loads(params.with_name('report.json').read_bytes())
         except (OSError, ValueError) as problem:
             content, error = None, error or f'no report: {problem}'
-        return name, {'report': content, 'seconds': seconds,
-                      'cpu_s': now.ru_utime - used.ru_utime + now.ru_stime - used.ru_stime,
-                      'status': status, 'error': error,
-                      'parameters': params.read_text() if params.exists() else None}
+        return name, {
+            'report': content,
+            'seconds': seconds,
+            'cpu_s': now.ru_utime - used.ru_utime + now.ru_stime - used.ru_stime,
+            'status': status,
+            'error': error,
+            'parameters': params.read_text() if params.exists() else None,
+        }
 
 
-def diagnose_all(folder: Path, pool: Pool, show: Callable[[float], None]
-                 ) -> dict[str, Result]:
+def diagnose_all(folder: Path, pool: Pool, show: Callable[[float], None]) -> dict[str, Result]:
     """Diagnose all recordings of a folder that have no report yet."""
     reports, recordings = folder / 'reports', folder / 'recordings'
     code = code_version()
     stamp = reports / 'version.txt'
     if stamp.exists() and stamp.read_text() != code:
-        raise UserError(f'{stamp}: earlier reports are of another version of the diagnosis '
-                        f'({stamp.read_text()[:12]}, now {code[:12]}); draw a new check '
-                        'into another folder')
+        raise UserError(
+            f'{stamp}: earlier reports are of another version of the diagnosis '
+            f'({stamp.read_text()[:12]}, now {code[:12]}); draw a new check '
+            'into another folder'
+        )
     write(stamp, code.encode())
 
     def job(name: str) -> tuple:
         paths = [recordings / f'{name}.{suffix}' for suffix in ('csv', 'yaml', 'sim')]
         return name, *(path.read_bytes() for path in paths if path.exists())
 
-    results = kept(reports, sorted(path.stem for path in recordings.glob('*.csv')), diagnose, job,
-                   pool, show)
+    results = kept(
+        reports, sorted(path.stem for path in recordings.glob('*.csv')), diagnose, job, pool, show
+    )
     if code_version() != code:
-        raise UserError('the code of the diagnosis changed while it ran; draw a new check into '
-                        'another folder, and do not change the package meanwhile')
+        raise UserError(
+            'the code of the diagnosis changed while it ran; draw a new check into '
+            'another folder, and do not change the package meanwhile'
+        )
     return results
 
 
@@ -133,21 +175,22 @@ class Comparison:
         """Return the squared gap beyond the stated calibration of each sample, (m/s²)², (n,)."""
         unit = self._scene.unit
         rest = ideal_observer.beyond_calibration(
-            unit, (self._measured - volts) * unit.volts_to_mps2, self._force)
-        return np.mean(rest ** 2, axis=0)
+            unit, (self._measured - volts) * unit.volts_to_mps2, self._force
+        )
+        return np.mean(rest**2, axis=0)
 
     def interval(self, values: np.ndarray) -> list[float]:
         """Return the 90 % interval of a mean by resampling blocks."""
         block = int(_BLOCK_S * self._scene.unit.rate_hz)
-        means = np.array([part.mean() for part in np.array_split(
-            values, max(len(values) // block, 2))])
+        means = np.array(
+            [part.mean() for part in np.array_split(values, max(len(values) // block, 2))]
+        )
         rng = np.random.default_rng(0)
         drawn = means[rng.integers(len(means), size=(_RESAMPLES, len(means)))].mean(axis=1)
         return [float(q) for q in np.quantile(drawn, (0.05, 0.95))]
 
 
-def evaluate(label: Label, stated: str, fitted: str | None
-             ) -> tuple[str, dict[str, Any] | None]:
+def evaluate(label: Label, stated: str, fitted: str | None) -> tuple[str, dict[str, Any] | None]:
     """Simulate a held-out recording of a trial, with and without what the diagnosis found."""
     faults = [fault for fault in label.acting() if not fault.kind.random]
     if not changed(stated, fitted) and not faults:
@@ -156,13 +199,20 @@ def evaluate(label: Label, stated: str, fitted: str | None
     compared = Comparison(scene, label.acting(), stated, fitted)
     without_faults = scene.volts([], noise=False)
     # The package's simulator follows the rounded encoder; the world's own effect is added to it.
-    floor, oracle = (compared.squares(
-        compared.baseline + scene.volts(acting, noise=False) - without_faults)
-        for acting in (faults, _fitted(label, faults)))
+    floor, oracle = (
+        compared.squares(compared.baseline + scene.volts(acting, noise=False) - without_faults)
+        for acting in (faults, _fitted(label, faults))
+    )
     before, after = compared.before, compared.after
-    return label.name, {'before': before.mean(), 'after': after.mean(), 'oracle': oracle.mean(),
-                        'floor': floor.mean(), 'gap_ci': compared.interval(before - floor),
-                        'harm_ci': compared.interval(after - before), 'error': compared.error}
+    return label.name, {
+        'before': before.mean(),
+        'after': after.mean(),
+        'oracle': oracle.mean(),
+        'floor': floor.mean(),
+        'gap_ci': compared.interval(before - floor),
+        'harm_ci': compared.interval(after - before),
+        'error': compared.error,
+    }
 
 
 def changed(stated: str, fitted: str | None) -> bool:
@@ -176,8 +226,11 @@ def _without_noise(text: str) -> dict[str, Any]:
     keys['effects'] = [name for name in keys.get('effects', []) if name not in NOISE_LIKE]
     keys['sensor']['noise_density_g_per_rthz'] = [0.0] * len(keys['sensor']['axes'])
     # The simulator does not use these keys, and they name removed effects.
-    return {name: value for name, value in keys.items()
-            if name not in (*NOISE_LIKE, 'covariance', 'covariance_names', 'provenance')}
+    return {
+        name: value
+        for name, value in keys.items()
+        if name not in (*NOISE_LIKE, 'covariance', 'covariance_names', 'provenance')
+    }
 
 
 def simulated(csv: str, parameters: str) -> np.ndarray:
@@ -185,10 +238,12 @@ def simulated(csv: str, parameters: str) -> np.ndarray:
     with tempfile.TemporaryDirectory(prefix='simulate_') as temporary:
         folder = Path(temporary)
         (folder / 'held.csv').write_text(csv)
-        (folder / 'held.yaml').write_text(yaml.safe_dump(
-            {'/**': {'ros__parameters': _without_noise(parameters)}}))
-        status, error = call(folder, 'simulate', 'held.csv', '--params', 'held.yaml', '-o',
-                             'again.csv')
+        (folder / 'held.yaml').write_text(
+            yaml.safe_dump({'/**': {'ros__parameters': _without_noise(parameters)}})
+        )
+        status, error = call(
+            folder, 'simulate', 'held.csv', '--params', 'held.yaml', '-o', 'again.csv'
+        )
         if status:
             raise UserError(f'simulate: {error}')
         table = pd.read_csv(folder / 'again.csv', comment='#')
@@ -204,12 +259,15 @@ def _fitted(label: Label, faults: list[Fault]) -> list[Fault]:
     columns = np.stack([observer.project(drawn.response([fault])) for fault in faults], axis=1)
     gap = observer.project(drawn.gap(label.acting()))
     sizes = np.linalg.lstsq(columns, gap, rcond=None)[0]
-    return [replace(fault, size=fault.size * float(np.clip(size, 0, 2)))
-            for fault, size in zip(faults, sizes)]
+    return [
+        replace(fault, size=fault.size * float(np.clip(size, 0, 2)))
+        for fault, size in zip(faults, sizes)
+    ]
 
 
-def diagnosed(folder: Path, pool: Pool, show: Show
-              ) -> tuple[dict[str, Any], list[Label], dict[str, Result]]:
+def diagnosed(
+    folder: Path, pool: Pool, show: Show
+) -> tuple[dict[str, Any], list[Label], dict[str, Result]]:
     """Diagnose all recordings that have no report yet; return check, labels and results."""
     digest = trials.published_hash(folder)
     # Labels may be on another machine: the diagnosis does not need them.
@@ -218,10 +276,19 @@ def diagnosed(folder: Path, pool: Pool, show: Show
     setup, labels = trials.committed_labels(folder)
     missing = [label.name for label in labels if label.name not in results]
     if missing:
-        raise UserError(f'{folder / "recordings"}: {missing[0]}.csv is missing, {len(missing)} '
-                        'of the committed recordings in all; a check needs all of them')
-    return {'hash': digest, **setup._asdict(), 'diagnose_code':
-            (folder / 'reports' / 'version.txt').read_text()}, labels, results
+        raise UserError(
+            f'{folder / "recordings"}: {missing[0]}.csv is missing, {len(missing)} '
+            'of the committed recordings in all; a check needs all of them'
+        )
+    return (
+        {
+            'hash': digest,
+            **setup._asdict(),
+            'diagnose_code': (folder / 'reports' / 'version.txt').read_text(),
+        },
+        labels,
+        results,
+    )
 
 
 def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
@@ -235,17 +302,30 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
 
     with show('held out') as advance:
         held_out = kept(folder / 'labels' / 'held', list(by_name), evaluate, job, pool, advance)
-    graded = [scores.Trial(label, grading.answer(results[label.name]), held_out[label.name])
-              for label in labels]
+    graded = [
+        scores.Trial(label, grading.answer(results[label.name]), held_out[label.name])
+        for label in labels
+    ]
     made = scores.scores(graded)
-    negative = {'labels_permuted': scores.permuted(graded),
-                'metadata_only': scores.metadata(folder / 'recordings', labels),
-                'strength_zero': scores.strength_zero(graded)}
+    negative = {
+        'labels_permuted': scores.permuted(graded),
+        'metadata_only': scores.metadata(folder / 'recordings', labels),
+        'strength_zero': scores.strength_zero(graded),
+    }
     return {
-        'schema': 1, **check, 'cases': len(labels), 'date': str(date.today()),
+        'schema': 1,
+        **check,
+        'cases': len(labels),
+        'date': str(date.today()),
         'version': package_version(),
-        'failed': {trial.label.name: results[trial.label.name]['error'] for trial in graded
-                   if trial.answer.status == 'failed'},
-        'bars': scores.bars(made), 'controls': negative,
+        'failed': {
+            trial.label.name: results[trial.label.name]['error']
+            for trial in graded
+            if trial.answer.status == 'failed'
+        },
+        'bars': scores.bars(made),
+        'controls': negative,
         'leaks': any(control['leaks'] for control in negative.values()),
-        'scores': made, 'rows': [trial.row() for trial in graded]}
+        'scores': made,
+        'rows': [trial.row() for trial in graded],
+    }

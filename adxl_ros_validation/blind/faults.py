@@ -73,8 +73,9 @@ def clock_skew(run: Run, size: float, shape: Shape) -> None:
 def mount_resonance(run: Run, size: float, shape: Shape) -> None:
     """Add one mode of the bracket; `size` is its share of the motion."""
     w0, zeta, fs = 2 * np.pi * shape['hertz'], shape['zeta'], 1 / run.dt
-    b, a = scipy.signal.bilinear([-1.0, -2 * zeta * w0 * 0.2, 0.0],
-                                 [1.0, 2 * zeta * w0, w0 * w0], fs)
+    b, a = scipy.signal.bilinear(
+        [-1.0, -2 * zeta * w0 * 0.2, 0.0], [1.0, 2 * zeta * w0, w0 * w0], fs
+    )
     moved = run.force - run.force[:, :1]
     run.force += size * scipy.signal.lfilter(b, a, moved)
 
@@ -119,9 +120,10 @@ def hysteresis(run: Run, size: float, shape: Shape) -> None:
 
 def vibration_rectification(run: Run, shape: Shape) -> np.ndarray:
     """Shift zero-g by the power of the vibration, with a limit, 1/g."""
-    fast = scipy.signal.sosfilt(scipy.signal.butter(2, 2.0, 'high', fs=1 / run.dt, output='sos'),
-                                run.u - run.u[:, :1])
-    power = low_pass(fast ** 2, 0.4, run.dt)
+    fast = scipy.signal.sosfilt(
+        scipy.signal.butter(2, 2.0, 'high', fs=1 / run.dt, output='sos'), run.u - run.u[:, :1]
+    )
+    power = low_pass(fast**2, 0.4, run.dt)
     return power / (1 + 4 * power)
 
 
@@ -187,7 +189,7 @@ def stuck(run: Run, size: float, shape: Shape) -> None:
     starts = np.flatnonzero(rng.random(len(run.t)) < shape['rate'] * run.dt)
     lengths = rng.exponential(1.0, len(run.t))[starts] * size / run.dt
     for start, length in zip(starts, lengths):
-        run.volts[:, start:start + 1 + int(length)] = run.volts[:, start:start + 1]
+        run.volts[:, start : start + 1 + int(length)] = run.volts[:, start : start + 1]
 
 
 def quantisation(run: Run, size: float, shape: Shape) -> None:
@@ -199,9 +201,9 @@ def quantisation(run: Run, size: float, shape: Shape) -> None:
 
 def adc_inl(run: Run, size: float, shape: Shape) -> None:
     """Weigh the high bits wrongly, V, as a charge converter with unmatched capacitors does."""
-    integer = np.clip(run.volts / sim.LSB_V, 0, 2 ** sim.ADC_BITS - 1).astype(np.int64)
+    integer = np.clip(run.volts / sim.LSB_V, 0, 2**sim.ADC_BITS - 1).astype(np.int64)
     for i, w in enumerate(shape['w']):
-        run.volts += size * w * 0.7 ** i * ((integer >> (sim.ADC_BITS - 1 - i) & 1) - 0.5)
+        run.volts += size * w * 0.7**i * ((integer >> (sim.ADC_BITS - 1 - i) & 1) - 0.5)
 
 
 def loose_gain(run: Run, size: float, shape: Shape) -> None:
@@ -251,14 +253,17 @@ _LAWS: dict[str, sim.Law] = {
     # Bend by a hyperbolic sine that is exact at 0 and at full scale.
     'nonlinearity': lambda run, shape: np.sinh(1.4 * run.u) / math.sinh(1.4) - run.u,
     # Bend by a hyperbola through zero.
-    'quadratic': lambda run, shape: np.sqrt(1 + 0.8 * run.u ** 2) - 1,
+    'quadratic': lambda run, shape: np.sqrt(1 + 0.8 * run.u**2) - 1,
     # Follow the temperature by an exponential.
     'temperature_bias': lambda run, shape: np.expm1((run.temperature - 25.0) / 25.0),
     # Follow the law of Arrhenius from 25 °C.
-    'temperature_scale': lambda run, shape: (
-        np.expm1(2500.0 * (1 / (_ZERO_C + 25.0) - 1 / (_ZERO_C + run.temperature)))),
+    'temperature_scale': lambda run, shape: np.expm1(
+        2500.0 * (1 / (_ZERO_C + 25.0) - 1 / (_ZERO_C + run.temperature))
+    ),
     # Settle by a stretched exponential after power-on.
-    'warm_up': lambda run, shape: np.exp(-(np.clip(run.t + 3.0, 0, None) / shape['lag']) ** 0.75),
+    'warm_up': lambda run, shape: np.exp(
+        -((np.clip(run.t + 3.0, 0, None) / shape['lag']) ** 0.75)
+    ),
     # Shift zero-g by the direction of the last temperature change.
     'thermal_loop': lambda run, shape: sim.travel_memory(run.temperature, 2.0),
     # Yield slowly to a load and recover as slowly, as a soft glue does.
@@ -268,7 +273,7 @@ _LAWS: dict[str, sim.Law] = {
     # Shift by the sign of the rate of beta with a smooth limit, as a dragging cable does.
     'rate_pull': lambda run, shape: np.tanh(np.gradient(run.beta, run.dt) / 0.5),
     # Lose what is near zero, as a class B output does.
-    'dead_zone': lambda run, shape: -run.u / 0.12 * np.exp(-(run.u / 0.12) ** 2 / 2),
+    'dead_zone': lambda run, shape: -run.u / 0.12 * np.exp(-((run.u / 0.12) ** 2) / 2),
 }
 """Laws of one line."""
 _LISTED, _UNLISTED = sim.load_kinds('blind/faults.yaml', globals() | _LAWS)

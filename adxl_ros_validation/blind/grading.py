@@ -61,22 +61,33 @@ def answer(result: dict[str, Any]) -> Answer:
     try:
         report = result['report']
         verdict = report['verdict']
-        hypotheses = tuple((frozenset(row['effects']), float(row['probability']))
-                           for row in report['hypotheses'])
+        hypotheses = tuple(
+            (frozenset(row['effects']), float(row['probability'])) for row in report['hypotheses']
+        )
         parameters = {
             f'{candidate["effect"]}.{name}': (
-                float(row['value']), float(row['ci'][0]), float(row['ci'][1]))
-            for candidate in report['candidates'] for name, row in candidate['parameters'].items()
-            if isinstance(row, dict) and row.get('ci')}
+                float(row['value']),
+                float(row['ci'][0]),
+                float(row['ci'][1]),
+            )
+            for candidate in report['candidates']
+            for name, row in candidate['parameters'].items()
+            if isinstance(row, dict) and row.get('ci')
+        }
         certain = frozenset(verdict['effects'])
         if verdict['status'] == 'unknown':
             certain |= {UNKNOWN}
-        return Answer(verdict['status'], certain,
-                      tuple(frozenset(group) for group in verdict['groups']),
-                      float(verdict['probability']), hypotheses or ((frozenset(), 0.0),),
-                      parameters, float(result['seconds']),
-                      float(report.get('material') or MATERIAL_MPS2),
-                      report['gap'].get('upper_limit'))
+        return Answer(
+            verdict['status'],
+            certain,
+            tuple(frozenset(group) for group in verdict['groups']),
+            float(verdict['probability']),
+            hypotheses or ((frozenset(), 0.0),),
+            parameters,
+            float(result['seconds']),
+            float(report.get('material') or MATERIAL_MPS2),
+            report['gap'].get('upper_limit'),
+        )
     except (KeyError, TypeError, ValueError, AttributeError):
         return Answer('failed', seconds=float(result['seconds']))
 
@@ -93,10 +104,15 @@ def right(label: Label, material_mps2: float = MATERIAL_MPS2) -> list[frozenset[
     Effects that the ideal observer does not see, or that are not material, may be missing.
     """
     true = truth(label)
-    rows = {UNKNOWN if label.group == 'outside' else fault['effect']: fault
-            for fault in label.faults}
-    hidden = [name for name in true if name in rows and (
-        rows[name]['power'] < VISIBLE_POWER or rows[name]['strength_mps2'] < material_mps2)]
+    rows = {
+        UNKNOWN if label.group == 'outside' else fault['effect']: fault for fault in label.faults
+    }
+    hidden = [
+        name
+        for name in true
+        if name in rows
+        and (rows[name]['power'] < VISIBLE_POWER or rows[name]['strength_mps2'] < material_mps2)
+    ]
     subsets = [combinations(hidden, k) for k in range(len(hidden) + 1)]
     return [true - set(missing) for subset in subsets for missing in subset]
 
@@ -108,17 +124,21 @@ def verdict_right(answer: Answer, label: Label) -> bool:
     The upper limit of "no gap" must hold the effects that are there. The effects that a verdict
     `partly` names must be the true ones.
     """
-    if answer.status in ('failed', 'insufficient', 'bad_data') or limit_holds(
-            answer, label) is False:
+    if (
+        answer.status in ('failed', 'insufficient', 'bad_data')
+        or limit_holds(answer, label) is False
+    ):
         return False
     accepted = right(label, answer.material_mps2)
     if answer.status == 'partly':
         accepted = [effects - {UNKNOWN} for effects in accepted if effects - {UNKNOWN}]
     # One effect of each group is left, in some order.
-    return any(all(name in group for name, group in zip(order, answer.groups))
-               for effects in accepted if answer.certain <= effects
-               and len(effects - answer.certain) == len(answer.groups)
-               for order in permutations(effects - answer.certain))
+    return any(
+        all(name in group for name, group in zip(order, answer.groups))
+        for effects in accepted
+        if answer.certain <= effects and len(effects - answer.certain) == len(answer.groups)
+        for order in permutations(effects - answer.certain)
+    )
 
 
 def limit_holds(answer: Answer, label: Label) -> bool | None:
@@ -129,8 +149,12 @@ def limit_holds(answer: Answer, label: Label) -> bool | None:
     """
     if answer.status != 'no_gap' or answer.limit_mps2 is None or label.group == 'zero':
         return None
-    return math.hypot(*(fault['strength_mps2'] for fault in label.faults
-                        if not fault.get('noise_like'))) <= answer.limit_mps2
+    return (
+        math.hypot(
+            *(fault['strength_mps2'] for fault in label.faults if not fault.get('noise_like'))
+        )
+        <= answer.limit_mps2
+    )
 
 
 def material(answer: Answer, label: Label) -> bool:
@@ -140,8 +164,7 @@ def material(answer: Answer, label: Label) -> bool:
 
 def visible(label: Label) -> bool:
     """Return whether the ideal observer detects every effect."""
-    return bool(label.faults) and all(
-        fault['power'] >= CERTAIN_POWER for fault in label.faults)
+    return bool(label.faults) and all(fault['power'] >= CERTAIN_POWER for fault in label.faults)
 
 
 def brier(answer: Answer, label: Label) -> float:
@@ -163,9 +186,12 @@ def true_parameters(label: Label) -> dict[str, float]:
     for fault in label.faults:
         name = fault['effect']
         w = fault['size'] * np.asarray(fault['shape'].get('w', []), float)
-        true |= {f'{name}.{part}': float(factor * w[i] + unit.stage_rad[own].sum())
-                 for part, (i, factor, *own) in KINDS[name].same.items() if i < len(w)}
-        m = w[:len(unit.axes)]
+        true |= {
+            f'{name}.{part}': float(factor * w[i] + unit.stage_rad[own].sum())
+            for part, (i, factor, *own) in KINDS[name].same.items()
+            if i < len(w)
+        }
+        m = w[: len(unit.axes)]
         if name == 'mount_resonance':
             true['mount_resonance.frequency_hz'] = fault['shape']['hertz']
         elif name in ('bias', 'scale_factor', 'noise_excess'):
@@ -173,11 +199,16 @@ def true_parameters(label: Label) -> dict[str, float]:
             part, values = {
                 'bias': ('offset_v', unit.zero_v + m * unit.scale_v_per_g - 2.5),
                 'scale_factor': ('offset_v_per_g', unit.scale_v_per_g * (1 + m) - 1.0),
-                'noise_excess': ('ratio', np.hypot(
-                    unit.noise_g_per_rthz, m / unit.scale_v_per_g / 78.5 ** 0.5)
-                    / unit.stated_noise_g_per_rthz - 1)}[name]
-            true |= {f'{name}.{part}.{axis}': float(value)
-                     for axis, value in zip(unit.axes, values)}
+                'noise_excess': (
+                    'ratio',
+                    np.hypot(unit.noise_g_per_rthz, m / unit.scale_v_per_g / 78.5**0.5)
+                    / unit.stated_noise_g_per_rthz
+                    - 1,
+                ),
+            }[name]
+            true |= {
+                f'{name}.{part}.{axis}': float(value) for axis, value in zip(unit.axes, values)
+            }
     return true
 
 
@@ -198,8 +229,9 @@ def pair_utility(diagnosis: Diagnosis, true: Diagnosis) -> float:
     """
     f, size = len(COMPONENTS), len(diagnosis)
     blamed, missed = len(diagnosis - true), len(true - diagnosis)
-    return 1 - blamed * (size + 1) / (f * (blamed + 1)) \
-        - missed * (f - size + 1) / (f * (missed + 1))
+    return (
+        1 - blamed * (size + 1) / (f * (blamed + 1)) - missed * (f - size + 1) / (f * (missed + 1))
+    )
 
 
 def utility(group: Collection[Diagnosis], true: Collection[Diagnosis]) -> float:
@@ -232,8 +264,10 @@ def true_group(label: Label) -> set[Diagnosis]:
     Each effect can be replaced by one that the recording cannot separate from it. Effects that the
     ideal observer does not see are missing, as the competition uses diagnoses of the least size.
     """
-    choices = [[UNKNOWN if label.group == 'outside' else fault['effect'], *fault['inseparable']]
-               for fault in label.faults
-               if fault['power'] >= VISIBLE_POWER and label.group != 'zero']
+    choices = [
+        [UNKNOWN if label.group == 'outside' else fault['effect'], *fault['inseparable']]
+        for fault in label.faults
+        if fault['power'] >= VISIBLE_POWER and label.group != 'zero'
+    ]
     diagnoses = map(frozenset, product(*choices))
     return {diagnosis for diagnosis in diagnoses if len(diagnosis) == len(choices)}

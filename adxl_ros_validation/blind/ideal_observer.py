@@ -37,7 +37,7 @@ def beyond_calibration(unit: Unit, change: np.ndarray, force: np.ndarray) -> np.
 
 def rms(values: np.ndarray) -> float:
     """Return the rms over samples and axes."""
-    return float(np.sqrt(np.mean(values ** 2)))
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def line(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -53,15 +53,16 @@ def _spectrum(unit: Unit, count: int) -> np.ndarray:
     power = np.zeros((len(unit.axes), len(f)))
     for fold in range(-8, 9):
         power += unit.noise_g_per_rthz[:, None] ** 2 / (
-            1 + ((f + fold * rate) / unit.corner_hz) ** 2)
+            1 + ((f + fold * rate) / unit.corner_hz) ** 2
+        )
     w = 2 * np.pi * f
     power += 2 * (unit.walk_g_per_rts[:, None] / w) ** 2
     lags = 0.1 * 10 ** np.arange(0.5, math.log10(20 * count / rate), 0.5)
     power += unit.flicker_g[:, None] ** 2 * sum(4 * lag / (1 + (w * lag) ** 2) for lag in lags)
     # The rounding of the encoder stays for the length of a pose; that of the ADC is white.
-    power += unit.resolution_rad ** 2 / 24 * 4 * 2.0 / (1 + (w * 2.0) ** 2)
+    power += unit.resolution_rad**2 / 24 * 4 * 2.0 / (1 + (w * 2.0) ** 2)
     power += ((sim.LSB_V / unit.scale_v_per_g) ** 2 / 12 * 2 / rate)[:, None]
-    return G0 ** 2 * power
+    return G0**2 * power
 
 
 class IdealObserver:
@@ -79,17 +80,30 @@ class IdealObserver:
         self.weight = 1 / np.sqrt(_spectrum(scene.unit, self.count) * scene.unit.rate_hz / 2)
         stage_error = sim.STAGE_STD * scene.unit.resolution_rad
         # What is stated only to its standard deviation: the stage, zero-g and scale factor.
-        stated = [(scene.response([Fault(KINDS[name], stage_error, {'w': row})], coarse=True), 1.0)
-                  for name, count in (('stage_offset', 2), ('stage_eccentricity', 4))
-                  for row in np.eye(count)]
-        stated += [(self.of_axis(d, response), std) for d in range(self.axes)
-                   for response, std in ((np.ones(self.count), sim.ZERO_G_STD_G * G0),
-                                         (self.force[d], sim.SCALE_STD))]
+        stated = [
+            (scene.response([Fault(KINDS[name], stage_error, {'w': row})], coarse=True), 1.0)
+            for name, count in (('stage_offset', 2), ('stage_eccentricity', 4))
+            for row in np.eye(count)
+        ]
+        stated += [
+            (self.of_axis(d, response), std)
+            for d in range(self.axes)
+            for response, std in (
+                (np.ones(self.count), sim.ZERO_G_STD_G * G0),
+                (self.force[d], sim.SCALE_STD),
+            )
+        ]
         self._no_prior = np.zeros(len(stated))
         priors = np.diag([1 / std for _, std in stated])
-        self.stated = np.linalg.qr(np.stack([
-            np.concatenate([self.whiten(change), prior])
-            for (change, _), prior in zip(stated, priors)], axis=1))[0]
+        self.stated = np.linalg.qr(
+            np.stack(
+                [
+                    np.concatenate([self.whiten(change), prior])
+                    for (change, _), prior in zip(stated, priors)
+                ],
+                axis=1,
+            )
+        )[0]
 
     def of_axis(self, d: int, row: np.ndarray) -> np.ndarray:
         """Return a change of one axis only, m/s², (m, n)."""
@@ -110,13 +124,21 @@ class IdealObserver:
         """Return columns that span the responses of each effect that is not like noise, (v, k)."""
         rivals = {}
         for name, kind in ((name, KINDS[name]) for name in KNOWN if not KINDS[name].random):
-            changes = [self.scene.response([Fault(kind, multiple * kind.start, shape)], True)
-                       for shape in kind.spread(self.scene.unit) for multiple in kind.sizes]
+            changes = [
+                self.scene.response([Fault(kind, multiple * kind.start, shape)], True)
+                for shape in kind.spread(self.scene.unit)
+                for multiple in kind.sizes
+            ]
             if kind.per_axis:
-                changes = [self.of_axis(d, change[d]) for change in changes
-                           for d in range(self.axes) if change[d].any()]
-            rivals[name] = _orthonormal([self.project(change) for change in changes],
-                                        self.stated.shape[0])
+                changes = [
+                    self.of_axis(d, change[d])
+                    for change in changes
+                    for d in range(self.axes)
+                    if change[d].any()
+                ]
+            rivals[name] = _orthonormal(
+                [self.project(change) for change in changes], self.stated.shape[0]
+            )
         return rivals
 
     def flexible_power(self, reserved: np.ndarray, vector: np.ndarray) -> float:
@@ -130,8 +152,9 @@ class IdealObserver:
         hats = _hats(scene, self.force)
         for d in range(self.axes):
             columns = [self.project(self.of_axis(d, hat)) for hat in hats]
-            basis = _orthonormal([column - reserved @ (reserved.T @ column)
-                                  for column in columns], len(rest))
+            basis = _orthonormal(
+                [column - reserved @ (reserved.T @ column) for column in columns], len(rest)
+            )
             explained += float(np.sum((basis.T @ rest) ** 2))
             used += basis.shape[1]
         threshold = scipy.stats.chi2.isf(0.001, used)
@@ -155,8 +178,12 @@ def _hats(scene: Scene, force: np.ndarray) -> list[np.ndarray]:
     t, measured = scene.stamps(), scene.references()
     rates = [np.gradient(scene.manoeuvre.joints(t)[name], t) for name in ('alpha', 'beta')]
     over = [(along, 7) for along in force] + [(np.tanh(2 * rate), 5) for rate in rates]
-    over += [(np.sin(measured['beta_rad']), 5), (np.cos(measured['beta_rad']), 5),
-             (measured['temperature_c'], 4), (t, 8)]
+    over += [
+        (np.sin(measured['beta_rad']), 5),
+        (np.cos(measured['beta_rad']), 5),
+        (measured['temperature_c'], 4),
+        (t, 8),
+    ]
     hats = []
     for values, count in over:
         centres = np.linspace(values.min(), values.max(), count)
@@ -184,7 +211,7 @@ def noise_visibility(observer: IdealObserver, kind: Kind, change: np.ndarray) ->
     """
     if kind.name == 'mains_hum':
         return float(np.sum(observer.project(change) ** 2))
-    white = observer.weight ** 2 * np.abs(np.fft.rfft(change)) ** 2 / observer.count
+    white = observer.weight**2 * np.abs(np.fft.rfft(change)) ** 2 / observer.count
     excess = np.stack([_smooth(row) for row in white])[:, 1:]
     visibility = sum(_whittle(row) for row in excess)
     if kind.name == 'spikes':
@@ -202,13 +229,15 @@ def noise_visibility(observer: IdealObserver, kind: Kind, change: np.ndarray) ->
 def _smooth(power: np.ndarray) -> np.ndarray:
     """Average over bands that widen with frequency."""
     edges = np.unique(np.geomspace(1, len(power), 60).astype(int))
-    means = np.add.reduceat(power, edges[:-1])[:len(edges) - 1] / np.diff(edges)
+    means = np.add.reduceat(power, edges[:-1])[: len(edges) - 1] / np.diff(edges)
     return np.concatenate([power[:1], np.repeat(means, np.diff(edges))])
 
 
 def _whittle(excess: np.ndarray) -> float:
     """Return the squared visibility of an excess of the spectrum by the Whittle likelihood."""
+
     def misfit(level: float) -> float:
         ratio = (1 + excess) / (1 + level)
         return float(2 * np.sum(ratio - 1 - np.log(ratio)) + (level / (2 * _NOISE_STD)) ** 2)
+
     return scipy.optimize.minimize_scalar(misfit, bounds=(-0.2, 0.2), method='bounded').fun

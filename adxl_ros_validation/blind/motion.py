@@ -26,7 +26,7 @@ def low_pass(values: np.ndarray, lag: float, dt: float) -> np.ndarray:
 
 def smooth(x: np.ndarray) -> np.ndarray:
     """Return the share of a move without a jump of velocity or acceleration at either end."""
-    return x ** 3 * (10 - 15 * x + 6 * x * x)
+    return x**3 * (10 - 15 * x + 6 * x * x)
 
 
 def still_air(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -37,7 +37,7 @@ def still_air(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _fade(u: np.ndarray) -> np.ndarray:
     """Fade in and out over a fifth of the duration, with three derivatives."""
     edge = np.clip(np.minimum(u, 1 - u) / 0.2, 0, 1)
-    return edge ** 4 * (35 - 84 * edge + 70 * edge ** 2 - 20 * edge ** 3)
+    return edge**4 * (35 - 84 * edge + 70 * edge**2 - 20 * edge**3)
 
 
 @dataclass
@@ -65,18 +65,21 @@ class Manoeuvre:
         """Stay for some seconds."""
         self.go(seconds=seconds)
 
-    def go(self, alpha: float | None = None, beta: float | None = None, seconds: float = 0.0
-           ) -> None:
+    def go(
+        self, alpha: float | None = None, beta: float | None = None, seconds: float = 0.0
+    ) -> None:
         """Move joints to where they should be, rad, at once."""
         self.time.append(self.seconds + seconds)
         self.alpha.append(self.alpha[-1] if alpha is None else alpha)
         self.beta.append(self.beta[-1] if beta is None else beta)
 
-    def swing(self, joint: str, size: float, hertz: float, seconds: float,
-              to_hertz: float | None = None) -> None:
+    def swing(
+        self, joint: str, size: float, hertz: float, seconds: float, to_hertz: float | None = None
+    ) -> None:
         """Swing a joint about its position; a frequency that changes keeps the acceleration."""
-        self.swings.append((joint, size, hertz, to_hertz or hertz, self.seconds,
-                            self.seconds + seconds))
+        self.swings.append(
+            (joint, size, hertz, to_hertz or hertz, self.seconds, self.seconds + seconds)
+        )
         self.rest(seconds)
 
     def joints(self, t: np.ndarray) -> dict[str, np.ndarray]:
@@ -93,13 +96,18 @@ class Manoeuvre:
             since = t[a:b] - start
             u = since / (stop - start)
             cycles = since * (first + (last - first) * u / 2)
-            joints[joint][a:b] += size * (first / (first + (last - first) * u)) ** 2 * self.fade(
-                u) * np.sin(2 * np.pi * cycles)
+            joints[joint][a:b] += (
+                size
+                * (first / (first + (last - first) * u)) ** 2
+                * self.fade(u)
+                * np.sin(2 * np.pi * cycles)
+            )
         return joints
 
 
-def draw(rng: np.random.Generator, seconds: tuple[float, float], rate_hz: float,
-         kind: str | None = None) -> Manoeuvre:
+def draw(
+    rng: np.random.Generator, seconds: tuple[float, float], rate_hz: float, kind: str | None = None
+) -> Manoeuvre:
     """Draw a manoeuvre; a quarter of them are poor."""
     length = rng.uniform(*seconds)
     if kind is None:
@@ -109,9 +117,13 @@ def draw(rng: np.random.Generator, seconds: tuple[float, float], rate_hz: float,
     script.rest(rng.uniform(1.5, 3.0))
     # The shaker stays below the 50 Hz of the filter.
     moves: dict[str, Callable[[Manoeuvre, float, np.random.Generator], None]] = {
-        'rich': partial(_rich, min(22.0, rate_hz / 10)), 'one_way': _one_way,
-        'crawl': _crawl, 'few_poses': _few_poses, 'together': _few_poses,
-        'one_plane': _one_plane}
+        'rich': partial(_rich, min(22.0, rate_hz / 10)),
+        'one_way': _one_way,
+        'crawl': _crawl,
+        'few_poses': _few_poses,
+        'together': _few_poses,
+        'one_plane': _one_plane,
+    }
     moves[kind](script, length, rng)
     script.rest(rng.uniform(1.0, 2.0))
     temperature, supply = (law(kind, script.seconds, rng) for law in (_temperature, _supply))
@@ -166,8 +178,11 @@ def _shake(fastest_hz: float, script: Manoeuvre, rng: np.random.Generator) -> No
 def _dash(script: Manoeuvre, rng: np.random.Generator) -> None:
     for _ in range(5):
         turn = rng.uniform(0.8, 2.2) * rng.choice([-1, 1])
-        script.go(float(np.clip(script.alpha[-1] + rng.normal(0, 0.4), 0.1, 3.0)),
-                  script.beta[-1] + turn, abs(turn) / rng.uniform(2.0, 3.5))
+        script.go(
+            float(np.clip(script.alpha[-1] + rng.normal(0, 0.4), 0.1, 3.0)),
+            script.beta[-1] + turn,
+            abs(turn) / rng.uniform(2.0, 3.5),
+        )
         script.rest(rng.uniform(0.3, 0.9))
 
 
@@ -183,8 +198,11 @@ def _one_way(script: Manoeuvre, length: float, rng: np.random.Generator) -> None
 def _crawl(script: Manoeuvre, length: float, rng: np.random.Generator) -> None:
     """Turn slowly between random poses."""
     while script.seconds < 0.8 * length:
-        script.go(np.deg2rad(rng.uniform(30, 150)), script.beta[-1] + rng.uniform(-2, 2),
-                  rng.uniform(12, 20))
+        script.go(
+            np.deg2rad(rng.uniform(30, 150)),
+            script.beta[-1] + rng.uniform(-2, 2),
+            rng.uniform(12, 20),
+        )
         script.rest(2.0)
 
 
@@ -206,8 +224,7 @@ def _one_plane(script: Manoeuvre, length: float, rng: np.random.Generator) -> No
             script.rest(1.0)
 
 
-def _temperature(kind: str, end: float,
-                 rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _temperature(kind: str, end: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     t = np.arange(0.0, end + 1.0, 0.5)
     start = rng.uniform(22, 28)
     if kind == 'together':
@@ -234,6 +251,7 @@ def _supply(kind: str, end: float, rng: np.random.Generator) -> tuple[np.ndarray
         for _ in range(int(rng.integers(3, 6))):
             on = rng.uniform(0, 0.9) * end
             steps[(t > on) & (t < on + rng.uniform(6, 30))] += rng.choice([-1, 1]) * rng.uniform(
-                0.02, 0.07)
+                0.02, 0.07
+            )
         volts += low_pass(steps, 0.7, 0.25)
     return t, volts

@@ -65,8 +65,12 @@ class Half:
     @property
     def samples(self) -> dict[str, tuple[float, float]]:
         """Return the columns of samples, each with the value at 0 g and the step of 1 g."""
-        return {name: scale for d in 'xyz' for name, scale in (
-            (f'a{d}_mps2', (0.0, G0)), (f'{d}_v', (_ZERO_V, 1.0))) if name in self.columns}
+        return {
+            name: scale
+            for d in 'xyz'
+            for name, scale in ((f'a{d}_mps2', (0.0, G0)), (f'{d}_v', (_ZERO_V, 1.0)))
+            if name in self.columns
+        }
 
     @property
     def axes(self) -> str:
@@ -75,29 +79,57 @@ class Half:
 
     def g(self) -> np.ndarray:
         """Return the samples, g, (m, n); volts by 2.5 V and 1 V/g."""
-        return np.stack([(self.columns[name].to_numpy() - zero) / step
-                         for name, (zero, step) in self.samples.items()])
+        return np.stack(
+            [
+                (self.columns[name].to_numpy() - zero) / step
+                for name, (zero, step) in self.samples.items()
+            ]
+        )
 
     def texts(self) -> tuple[str, str, str | None]:
         """Return recording, parameters and another simulator's force as texts of files."""
-        return (sim.csv_text(dict(self.columns), self.digits), self.parameters,
-                None if self.sim is None else sim.csv_text(dict(self.sim), self.digits))
+        return (
+            sim.csv_text(dict(self.columns), self.digits),
+            self.parameters,
+            None if self.sim is None else sim.csv_text(dict(self.sim), self.digits),
+        )
 
     def unit(self) -> Unit:
         """Return a unit of 2.5 V and 1 V/g with the axes of the recording."""
         one = np.ones(len(self.axes))
         rate_hz = 1 / float(self.columns['time_s'].diff().median())
-        return Unit(self.axes, _ZERO_V * one, one, _ZERO_V * one, one, one, one, math.inf, one,
-                    one, 0.0, np.zeros(6), rate_hz)
+        return Unit(
+            self.axes,
+            _ZERO_V * one,
+            one,
+            _ZERO_V * one,
+            one,
+            one,
+            one,
+            math.inf,
+            one,
+            one,
+            0.0,
+            np.zeros(6),
+            rate_hz,
+        )
 
     def kinds(self) -> list[str]:
         """Return the defects that can be put into its samples and shown by its reference."""
         is_still = np.std(self.g(), axis=1).max() < 0.05
-        has = {'': True, 'chain': False, 'force': not is_still,
-               'heat': np.ptp(self.columns.get('temperature_c', np.zeros(1))) > 3,
-               'motion': not is_still and self.reference != 'rests'}
-        return [name for name, kind in KINDS.items() if has[kind.needs] and (
-            kind.needs == 'motion' or kind.place not in (sim.Place.STAGE, sim.Place.MOUNT))]
+        has = {
+            '': True,
+            'chain': False,
+            'force': not is_still,
+            'heat': np.ptp(self.columns.get('temperature_c', np.zeros(1))) > 3,
+            'motion': not is_still and self.reference != 'rests',
+        }
+        return [
+            name
+            for name, kind in KINDS.items()
+            if has[kind.needs]
+            and (kind.needs == 'motion' or kind.place not in (sim.Place.STAGE, sim.Place.MOUNT))
+        ]
 
 
 def prepare(source: Path) -> tuple[list[Half], list[str]]:
@@ -139,8 +171,9 @@ def _read(path: Path) -> tuple[pd.DataFrame, dict[str, int]]:
         raise UserError(f'is no recording of this project: {error}') from None
     if 'time_s' not in columns:
         raise UserError('is no recording of this project: its first line names no time_s')
-    return columns, {name: int(cells[name][:200].str.partition('.')[2].str.len().max())
-                     for name in cells}
+    return columns, {
+        name: int(cells[name][:200].str.partition('.')[2].str.len().max()) for name in cells
+    }
 
 
 def _part(columns: pd.DataFrame | None, start: float, stop: float) -> pd.DataFrame | None:
@@ -165,8 +198,10 @@ def _half(path: Path) -> Half:
         raise UserError(f'has {end - begin:.0f} s; at least {_SHORTEST_S:.0f} s are needed')
     cut = begin + _FIRST * (end - begin)
     kind = 'simulator' if force is not None else 'stage' if 'alpha_rad' in columns else 'rests'
-    first, second = (Half(path.stem, kind, _part(columns, *span), _part(force, *span), digits)
-                     for span in ((begin, cut), (cut, math.inf)))
+    first, second = (
+        Half(path.stem, kind, _part(columns, *span), _part(force, *span), digits)
+        for span in ((begin, cut), (cut, math.inf))
+    )
     second = replace(second, noise_mps2=_noise(second))
     if force is not None:
         return replace(second, parameters=_against_force(first))
@@ -176,13 +211,17 @@ def _half(path: Path) -> Half:
             (folder / f'{name}.csv').write_text(half.texts()[0])
         second = replace(second, parameters=_fitted(folder, 'temperature_c' in columns))
         if kind == 'rests':
-            status, error = diagnosis_runs.call(folder, 'apply', 'second.csv', '--params',
-                                                'unit.yaml', '-o', 'force.csv')
+            status, error = diagnosis_runs.call(
+                folder, 'apply', 'second.csv', '--params', 'unit.yaml', '-o', 'force.csv'
+            )
             if status:
                 raise UserError(error)
             angles = _angles_at_rest(_read(folder / 'force.csv')[0], second.unit().rate_hz)
-            second = replace(second, columns=second.columns.assign(**angles),
-                             digits=digits | dict.fromkeys(angles, 7))
+            second = replace(
+                second,
+                columns=second.columns.assign(**angles),
+                digits=digits | dict.fromkeys(angles, 7),
+            )
     return second
 
 
@@ -190,8 +229,9 @@ def _fitted(folder: Path, warm: bool) -> str:
     """Return the parameters that `fit` makes of the first part."""
     error = ''
     for words in ([], ['--effect', 'temperature_bias']) if warm else ([],):
-        status, error = diagnosis_runs.call(folder, 'fit', 'first.csv', *words, '--store', '',
-                                            '-o', 'unit.yaml')
+        status, error = diagnosis_runs.call(
+            folder, 'fit', 'first.csv', *words, '--store', '', '-o', 'unit.yaml'
+        )
         if not status:
             return (folder / 'unit.yaml').read_text()
     raise UserError(f'its first part makes no parameters: {error}')
@@ -200,15 +240,33 @@ def _fitted(folder: Path, warm: bool) -> str:
 def _against_force(first: Half) -> str:
     """Return zero-g and scale factor by least squares over another simulator's force."""
     assert first.sim is not None
-    zero, scale = np.transpose([line(np.interp(
-        first.columns['time_s'], first.sim['time_s'], first.sim[f'a{d}_mps2']) / G0, row)
-        for d, row in zip(first.axes, first.g())])
+    zero, scale = np.transpose(
+        [
+            line(
+                np.interp(first.columns['time_s'], first.sim['time_s'], first.sim[f'a{d}_mps2'])
+                / G0,
+                row,
+            )
+            for d, row in zip(first.axes, first.g())
+        ]
+    )
     unit = first.unit()
     density = np.full(len(first.axes), _noise(first) / G0 / math.sqrt(unit.rate_hz / 2))
     return sim.parameter_file(
-        replace(unit, stated_zero_v=zero, stated_scale_v_per_g=scale,
-                stated_noise_g_per_rthz=density, resolution_rad=1e-3),
-        'unit', nominal_zero_v=0.0, is_certain=True, adc_bits=0, adc_vref_v=100.0, range_g=16.0)
+        replace(
+            unit,
+            stated_zero_v=zero,
+            stated_scale_v_per_g=scale,
+            stated_noise_g_per_rthz=density,
+            resolution_rad=1e-3,
+        ),
+        'unit',
+        nominal_zero_v=0.0,
+        is_certain=True,
+        adc_bits=0,
+        adc_vref_v=100.0,
+        range_g=16.0,
+    )
 
 
 def _angles_at_rest(applied: pd.DataFrame, rate: float) -> pd.DataFrame:
@@ -221,8 +279,13 @@ def _angles_at_rest(applied: pd.DataFrame, rate: float) -> pd.DataFrame:
     """
     force = applied[['ax_mps2', 'ay_mps2', 'az_mps2']].to_numpy().T
     width = max(int(0.5 * rate), 3)
-    spread = np.sqrt(np.maximum(scipy.ndimage.uniform_filter1d(force ** 2, width)
-                                - scipy.ndimage.uniform_filter1d(force, width) ** 2, 0)).max(0)
+    spread = np.sqrt(
+        np.maximum(
+            scipy.ndimage.uniform_filter1d(force**2, width)
+            - scipy.ndimage.uniform_filter1d(force, width) ** 2,
+            0,
+        )
+    ).max(0)
     still = spread < 2 * np.quantile(spread, 0.2)
     angles = pd.DataFrame(np.nan, applied.index, ['alpha_rad', 'beta_rad'])
     span = np.cumsum(np.diff(still, prepend=False))
@@ -239,7 +302,7 @@ def _noise(half: Half) -> float:
     """Return the rms of the noise of one sample, of all axes, in the quietest tenth, m/s²."""
     rows = np.diff(half.g(), axis=1) / math.sqrt(2)
     blocks = np.array_split(rows, max(rows.shape[1] // 50, 4), axis=1)
-    quiet = np.quantile([np.mean(block ** 2, axis=1) for block in blocks], 0.1, axis=0)
+    quiet = np.quantile([np.mean(block**2, axis=1) for block in blocks], 0.1, axis=0)
     return float(np.sqrt(np.mean(quiet)) * G0)
 
 
@@ -251,8 +314,11 @@ def plans(halves: Sequence[Half], seed: int, count: int) -> list[Plan]:
     for k in range(count):
         half = k % len(halves)
         group = str(rng.choice(['none', 'outside', 'single'], p=(*_SHARES, 1 - sum(_SHARES))))
-        names = [name for name in halves[half].kinds() if group == (
-            'single' if name in KNOWN else 'outside')]
+        names = [
+            name
+            for name in halves[half].kinds()
+            if group == ('single' if name in KNOWN else 'outside')
+        ]
         rarest = [name for name in names if used[name] == min(used[other] for other in names)]
         effects = (str(rng.choice(rarest)),) if rarest else ()
         used.update(effects)
@@ -265,20 +331,37 @@ def draw(halves: Sequence[Half], plan: Plan) -> Drawn:
     half, rng = halves[plan.seed[-1]], np.random.default_rng([*plan.seed, 0])
     end = float(half.columns['time_s'].iloc[-1])
     start = float(rng.uniform(0, (1 - _PART) * end))
-    columns, force = (_part(whole, start, start + _PART * end)
-                      for whole in (half.columns, half.sim))
+    columns, force = (
+        _part(whole, start, start + _PART * end) for whole in (half.columns, half.sim)
+    )
     half = replace(half, columns=columns, sim=force)
     faults, changed = [], half.g()
     for name in plan.effects:
         fault, _, strength, changed = trials.sized(
-            rng, KINDS[name], half.unit(), _NOISES,
-            partial(_with_fault, half, plan.seed), half.noise_mps2)
+            rng,
+            KINDS[name],
+            half.unit(),
+            _NOISES,
+            partial(_with_fault, half, plan.seed),
+            half.noise_mps2,
+        )
         faults.append(trials.described(fault, strength))
-    columns = half.columns.assign(**{name: step * row + zero for (name, (zero, step)), row in zip(
-        half.samples.items(), changed)})
-    return Drawn(Label(**asdict(plan), manoeuvre=f'{half.name} by {half.reference}',
-                       axes=half.axes, floor_mps2=half.noise_mps2, faults=faults),
-                 *replace(half, columns=columns).texts())
+    columns = half.columns.assign(
+        **{
+            name: step * row + zero
+            for (name, (zero, step)), row in zip(half.samples.items(), changed)
+        }
+    )
+    return Drawn(
+        Label(
+            **asdict(plan),
+            manoeuvre=f'{half.name} by {half.reference}',
+            axes=half.axes,
+            floor_mps2=half.noise_mps2,
+            faults=faults,
+        ),
+        *replace(half, columns=columns).texts(),
+    )
 
 
 def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float, np.ndarray]:
@@ -286,14 +369,28 @@ def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float,
     unit, before = half.unit(), half.g()
     # The force without its noise; an axis that is not measured has 0.
     force = np.zeros((3, len(half.columns)))
-    force[unit.axis_indices] = before * G0 if unit.rate_hz <= 3 * _MOTION_HZ else \
-        scipy.signal.sosfiltfilt(scipy.signal.butter(
-            2, _MOTION_HZ, fs=unit.rate_hz, output='sos'), before * G0, axis=1)
+    force[unit.axis_indices] = (
+        before * G0
+        if unit.rate_hz <= 3 * _MOTION_HZ
+        else scipy.signal.sosfiltfilt(
+            scipy.signal.butter(2, _MOTION_HZ, fs=unit.rate_hz, output='sos'), before * G0, axis=1
+        )
+    )
     t = np.arange(before.shape[1]) / unit.rate_hz
     still = np.zeros_like(t)
     warm = np.asarray(half.columns.get('temperature_c', still + 25.0))
-    run = sim.Run(unit, t, trials.integer_seed(*seed), still, still, still, warm, still + 5.0,
-                  corner_hz=math.inf, force=force)
+    run = sim.Run(
+        unit,
+        t,
+        trials.integer_seed(*seed),
+        still,
+        still,
+        still,
+        warm,
+        still + 5.0,
+        corner_hz=math.inf,
+        force=force,
+    )
     run.u = run.force[unit.axis_indices] / G0
     run.volts = before + _ZERO_V
     sensed = run.u.copy()
@@ -303,8 +400,9 @@ def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float,
         run.volts = np.stack([np.interp(t - run.late_s(t), t, row) for row in run.volts])
     after = run.volts - _ZERO_V
     # The rms counts where the reference is known; zero-g and scale factor are free.
-    known = half.columns['alpha_rad'].notna().to_numpy() if half.reference == 'rests' \
-        else slice(None)
+    known = (
+        half.columns['alpha_rad'].notna().to_numpy() if half.reference == 'rests' else slice(None)
+    )
     rest = G0 * (after - before)[:, known]
     if fault.kind.name not in ('bias', 'scale_factor'):
         for row, along in zip(rest, before[:, known]):
@@ -313,16 +411,16 @@ def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float,
     return rms(rest), after
 
 
-def seal(folder: Path, source: Path, seed: int | None, count: int, pool: Pool, show: Show
-         ) -> str:
+def seal(folder: Path, source: Path, seed: int | None, count: int, pool: Pool, show: Show) -> str:
     """Draw the trials of a folder or manifest into a folder; return the published hash."""
     base = folder / 'baseline' / 'recordings'
     if base.exists():
         return trials.published_hash(folder)
     with show('first parts'):
         halves, left_out = prepare(source)
-    digest = trials.seal(folder, partial(plans, halves), partial(draw, halves), seed, count, pool,
-                         show)
+    digest = trials.seal(
+        folder, partial(plans, halves), partial(draw, halves), seed, count, pool, show
+    )
     write(folder / 'left_out.json', json.dumps(left_out).encode())
     for half in halves:
         trials.save(base, half.name, half.texts())
@@ -361,52 +459,96 @@ def score(folder: Path, pool: Pool, show: Show) -> dict[str, Any]:
         source = label.manoeuvre.split(' by ')[0]
         exact, found = right(answer, base[source], label)
         # How often the verdict is right by the labels of other trials of its recording
-        by_chance = [right(answer, base[source], other)[0] for other in labels
-                     if other.manoeuvre == label.manoeuvre and other is not label]
-        rows.append({'name': label.name, 'recording': label.manoeuvre, 'group': label.group,
-                     'effects': list(label.effects), 'exact': exact, 'in_set': found,
-                     'noises': max([row['strength_mps2'] / label.floor_mps2
-                                    for row in label.faults], default=0.0),
-                     'status': answer.status, 'named': sorted(answer.named),
-                     'already': sorted(base[source].named),
-                     'probability': answer.probability, 'seconds': answer.seconds,
-                     'error': results[label.name]['error'],
-                     'by_chance': float(np.mean(by_chance or [False]))})
-    return {**check,
-            'left_out': json.loads((folder / 'left_out.json').read_text()), 'rows': rows,
-            'baseline': {name: [answer.status, sorted(answer.named)]
-                         for name, answer in base.items()}}
+        by_chance = [
+            right(answer, base[source], other)[0]
+            for other in labels
+            if other.manoeuvre == label.manoeuvre and other is not label
+        ]
+        rows.append(
+            {
+                'name': label.name,
+                'recording': label.manoeuvre,
+                'group': label.group,
+                'effects': list(label.effects),
+                'exact': exact,
+                'in_set': found,
+                'noises': max(
+                    [row['strength_mps2'] / label.floor_mps2 for row in label.faults], default=0.0
+                ),
+                'status': answer.status,
+                'named': sorted(answer.named),
+                'already': sorted(base[source].named),
+                'probability': answer.probability,
+                'seconds': answer.seconds,
+                'error': results[label.name]['error'],
+                'by_chance': float(np.mean(by_chance or [False])),
+            }
+        )
+    return {
+        **check,
+        'left_out': json.loads((folder / 'left_out.json').read_text()),
+        'rows': rows,
+        'baseline': {name: [answer.status, sorted(answer.named)] for name, answer in base.items()},
+    }
 
 
 def report(made: dict[str, Any]) -> Report:
     """Return the report of a check on real sensors."""
     rows = made['rows']
-    groups = {'none': 'no defect: nothing new is named', 'single': 'a defect of the library',
-              'outside': 'a defect outside it: unknown or partly'}
+    groups = {
+        'none': 'no defect: nothing new is named',
+        'single': 'a defect of the library',
+        'outside': 'a defect outside it: unknown or partly',
+    }
 
     def parts(names: Sequence[str]) -> Table:
         """Return the shares of rows by a name of each row; rows without a name do not count."""
-        return (['trials', 'exactly right (90 % interval)', 'in the named set',
-                 'labels permuted'], [
-            [name, *(scores.in_words(scores.share(part[key])) for key in ('exact', 'in_set')),
-             f'{part["by_chance"].mean():.2f}']
-            for name, part in pd.DataFrame(rows).groupby(np.array(names)) if name])
+        return (
+            ['trials', 'exactly right (90 % interval)', 'in the named set', 'labels permuted'],
+            [
+                [
+                    name,
+                    *(scores.in_words(scores.share(part[key])) for key in ('exact', 'in_set')),
+                    f'{part["by_chance"].mean():.2f}',
+                ]
+                for name, part in pd.DataFrame(rows).groupby(np.array(names))
+                if name
+            ],
+        )
 
-    strengths = pd.cut([row['noises'] for row in rows], [-1, 3, 8, math.inf], right=False,
-                       labels=[f'{words} times the noise' for words in (
-                           '0 to 3', '3 to 8', 'more than 8')])
-    return Report('Blind check on real sensors', [
-        f'{made["trials"]} trials on recordings of real sensors, seed {made["seed"]}; SHA-256 '
-        f'of salt and labels {made["hash"]}; code of the diagnosis '
-        f'{made["diagnose_code"][:16]}.'], {
-        'Result': parts([groups[row['group']] for row in rows]),
-        'By strength': parts([strength if row['group'] == 'single' else ''
-                              for strength, row in zip(strengths, rows)]),
-        'By recording': parts([row['recording'] for row in rows]),
-        'By defect': parts([''.join(row['effects']) for row in rows]),
-        'How often verdicts of a probability are right': reliability(scores.reliability(
-            [(row['probability'], row['exact']) for row in rows])),
-        'Untouched parts': (['recording', 'verdict', 'named'], [
-            [name, status, ', '.join(named) or '-']
-            for name, (status, named) in made['baseline'].items()]),
-        'Left out': (['recording'], [[text] for text in made['left_out']])})
+    strengths = pd.cut(
+        [row['noises'] for row in rows],
+        [-1, 3, 8, math.inf],
+        right=False,
+        labels=[f'{words} times the noise' for words in ('0 to 3', '3 to 8', 'more than 8')],
+    )
+    return Report(
+        'Blind check on real sensors',
+        [
+            f'{made["trials"]} trials on recordings of real sensors, seed {made["seed"]}; SHA-256 '
+            f'of salt and labels {made["hash"]}; code of the diagnosis '
+            f'{made["diagnose_code"][:16]}.'
+        ],
+        {
+            'Result': parts([groups[row['group']] for row in rows]),
+            'By strength': parts(
+                [
+                    strength if row['group'] == 'single' else ''
+                    for strength, row in zip(strengths, rows)
+                ]
+            ),
+            'By recording': parts([row['recording'] for row in rows]),
+            'By defect': parts([''.join(row['effects']) for row in rows]),
+            'How often verdicts of a probability are right': reliability(
+                scores.reliability([(row['probability'], row['exact']) for row in rows])
+            ),
+            'Untouched parts': (
+                ['recording', 'verdict', 'named'],
+                [
+                    [name, status, ', '.join(named) or '-']
+                    for name, (status, named) in made['baseline'].items()
+                ],
+            ),
+            'Left out': (['recording'], [[text] for text in made['left_out']]),
+        },
+    )

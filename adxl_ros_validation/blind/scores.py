@@ -48,46 +48,82 @@ class Trial(NamedTuple):
         right = grading.verdict_right(answer, label)
         rivals = label.faults[0]['inseparable'] if label.faults else ()
         return {
-            **{key: [fault[key] for fault in label.faults]
-               for key in ('strength_mps2', 'power', 'told', 'inseparable')},
-            'name': label.name, 'group': label.group, 'effects': list(label.effects),
-            'flexible': label.flexible, 'manoeuvre': label.manoeuvre, 'axes': label.axes,
-            'status': answer.status, 'top': top, 'named': sorted(named),
-            'probability': answer.probability, 'right': right, 'stated':
-            (answer.probability, right), 'seconds': answer.seconds, 'held': gaps,
-            'gap': answer.gap, 'flexible_sees': label.flexible >= grading.CERTAIN_POWER,
+            **{
+                key: [fault[key] for fault in label.faults]
+                for key in ('strength_mps2', 'power', 'told', 'inseparable')
+            },
+            'name': label.name,
+            'group': label.group,
+            'effects': list(label.effects),
+            'flexible': label.flexible,
+            'manoeuvre': label.manoeuvre,
+            'axes': label.axes,
+            'status': answer.status,
+            'top': top,
+            'named': sorted(named),
+            'probability': answer.probability,
+            'right': right,
+            'stated': (answer.probability, right),
+            'seconds': answer.seconds,
+            'held': gaps,
+            'gap': answer.gap,
+            'flexible_sees': label.flexible >= grading.CERTAIN_POWER,
             'effect': label.effects[0] if label.effects else 'none',
-            'said': answer.status if answer.status in ('failed', 'bad_data') else
-            'none' if not top else 'several' if len(top) > 1 else top[0],
-            'is_top': answer.top == truth, 'leads': truth <= answer.top,
-            'names': len(named & truth), 'names_all': truth <= named, 'set_size': len(named),
+            'said': answer.status
+            if answer.status in ('failed', 'bad_data')
+            else 'none'
+            if not top
+            else 'several'
+            if len(top) > 1
+            else top[0],
+            'is_top': answer.top == truth,
+            'leads': truth <= answer.top,
+            'names': len(named & truth),
+            'names_all': truth <= named,
+            'set_size': len(named),
             'inseparable_size': 1 + len(rivals),
-            'unknown': UNKNOWN in named | answer.top, 'seen': grading.visible(label),
-            'separable': bool(label.faults) and all(
-                fault['power'] * fault['told'] >= grading.CERTAIN_POWER for fault in label.faults),
+            'unknown': UNKNOWN in named | answer.top,
+            'seen': grading.visible(label),
+            'separable': bool(label.faults)
+            and all(
+                fault['power'] * fault['told'] >= grading.CERTAIN_POWER for fault in label.faults
+            ),
             'material': grading.material(answer, label),
             'limit_holds': grading.limit_holds(answer, label),
-            'brier': grading.brier(answer, label), 'utility': grading.utility(*groups),
+            'brier': grading.brier(answer, label),
+            'utility': grading.utility(*groups),
             'has_effect': any(groups[1]),
             'harm': gaps is not None and gaps['harm_ci'][0] > _HARM * gaps['floor'],
-            'inside': self._inside(), **self._closed()}
+            'inside': self._inside(),
+            **self._closed(),
+        }
 
     def _inside(self) -> tuple[int, int] | None:
         """Count intervals with the truth, and all, of effects that are rightly named for sure."""
         label, answer, _ = self
-        if label.group not in ('single', 'pair') or answer.groups \
-                or answer.certain != grading.truth(label):
+        if (
+            label.group not in ('single', 'pair')
+            or answer.groups
+            or answer.certain != grading.truth(label)
+        ):
             return None
         true = grading.true_parameters(label)
-        inside = [low <= true[name] <= high
-                  for name, (_, low, high) in answer.parameters.items() if name in true]
+        inside = [
+            low <= true[name] <= high
+            for name, (_, low, high) in answer.parameters.items()
+            if name in true
+        ]
         return (sum(inside), len(inside)) if inside else None
 
     def _closed(self) -> dict[str, float | None]:
         """Return the share closed of a visible gap on a held-out recording, by the oracle's."""
         label, _, gaps = self
-        if gaps is None or label.group not in ('single', 'pair') or gaps['gap_ci'][0] <= 0 \
-                or not grading.visible(label):
+        if (
+            gaps is None
+            or label.group not in ('single', 'pair')
+            or gaps['gap_ci'][0] <= 0
+            or not grading.visible(label)
+        ):
             return {'closed': None, 'by_oracle': None}
         gap = gaps['before'] - gaps['floor']
         part, oracle = (1 - (gaps[name] - gaps['floor']) / gap for name in ('after', 'oracle'))
@@ -111,27 +147,35 @@ def in_words(made: Score) -> str:
     return f'{value:.0f} % ({low:.0f} to {high:.0f}), n = {made["count"]}'
 
 
-def resampled(rows: Sequence[Any] | pd.Series, statistic: Callable[[list[Any]], float] = np.mean
-              ) -> Score:
+def resampled(
+    rows: Sequence[Any] | pd.Series, statistic: Callable[[list[Any]], float] = np.mean
+) -> Score:
     """Return a statistic of rows with its interval over resampled rows."""
     if not len(rows):
         return _NO_SCORE
     rows = list(rows)
     rng = np.random.default_rng(0)
-    drawn = [statistic([rows[i] for i in rng.integers(len(rows), size=len(rows))])
-             for _ in range(_RESAMPLES)]
+    drawn = [
+        statistic([rows[i] for i in rng.integers(len(rows), size=len(rows))])
+        for _ in range(_RESAMPLES)
+    ]
     low, high = np.nanquantile(drawn, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
-    return {'value': float(statistic(rows)), 'ci': [float(low), float(high)],
-            'count': len(rows)}
+    return {'value': float(statistic(rows)), 'ci': [float(low), float(high)], 'count': len(rows)}
 
 
 def by_strength(rows: pd.DataFrame, count: int = 8) -> list[dict[str, Any]]:
     """Return the share detected, and that which the oracle sees, in bins of equal numbers."""
     rows = rows.assign(strength=rows.strength_mps2.str[0]).sort_values('strength', kind='stable')
     parts = np.array_split(np.arange(len(rows)), min(count, max(len(rows) // 3, 1)))
-    return [{'strength': float(part.strength.median()), **share(part.gap),
-             'oracle': float((part.power.str[0] > 0.5).mean())}
-            for part in (rows.iloc[index] for index in parts) if len(part)]
+    return [
+        {
+            'strength': float(part.strength.median()),
+            **share(part.gap),
+            'oracle': float((part.power.str[0] > 0.5).mean()),
+        }
+        for part in (rows.iloc[index] for index in parts)
+        if len(part)
+    ]
 
 
 def reliability(rows: Sequence[tuple[float, bool]]) -> list[dict[str, Any]]:
@@ -139,15 +183,23 @@ def reliability(rows: Sequence[tuple[float, bool]]) -> list[dict[str, Any]]:
     table = np.asarray(rows, float).reshape(-1, 2)
     index = np.searchsorted(_CONFIDENCES[1:-1], table[:, 0], 'right')
     parts = [(k, table[index == k]) for k in np.unique(index)]
-    return [{'confidence': float(part[:, 0].mean()), 'right': float(part[:, 1].mean()),
-             'count': len(part), 'ci': share(part[:, 1] > 0.5)['ci'],
-             'bin': _CONFIDENCES[[k, k + 1]].tolist()} for k, part in parts]
+    return [
+        {
+            'confidence': float(part[:, 0].mean()),
+            'right': float(part[:, 1].mean()),
+            'count': len(part),
+            'ci': share(part[:, 1] > 0.5)['ci'],
+            'bin': _CONFIDENCES[[k, k + 1]].tolist(),
+        }
+        for k, part in parts
+    ]
 
 
 def calibration_error(rows: Sequence[tuple[float, bool]]) -> float:
     """Return the mean distance of confidence and share right, over the bins of `reliability`."""
-    return sum(row['count'] * abs(row['right'] - row['confidence'])
-               for row in reliability(rows)) / max(len(rows), 1)
+    return sum(
+        row['count'] * abs(row['right'] - row['confidence']) for row in reliability(rows)
+    ) / max(len(rows), 1)
 
 
 @dataclass(frozen=True)
@@ -166,21 +218,31 @@ class Bar:
         """Return the bar in words."""
         if math.isinf(self.low):
             return f'at most {self.high:g}'
-        return f'at least {self.low:g}' if math.isinf(self.high) else \
-            f'{self.low:g} to {self.high:g}'
+        return (
+            f'at least {self.low:g}' if math.isinf(self.high) else f'{self.low:g} to {self.high:g}'
+        )
 
 
 def _table(text: str) -> dict[str, Bar]:
     """Read the table of scores."""
-    return {name: Bar(**{key: row.pop(key) for key in [*row] if key not in _STATISTICS},
-                      statistic=row.popitem()) for name, row in yaml.safe_load(text).items()}
+    return {
+        name: Bar(
+            **{key: row.pop(key) for key in [*row] if key not in _STATISTICS},
+            statistic=row.popitem(),
+        )
+        for name, row in yaml.safe_load(text).items()
+    }
 
 
 _STATISTICS: dict[str, Callable[[pd.Series], Score]] = {
-    'share': share, 'mean': resampled, 'median': partial(resampled, statistic=np.median),
-    'ratio': partial(resampled, statistic=lambda counts: float(
-        np.divide(*np.sum(counts, axis=0)))),
-    'calibration': partial(resampled, statistic=calibration_error)}
+    'share': share,
+    'mean': resampled,
+    'median': partial(resampled, statistic=np.median),
+    'ratio': partial(
+        resampled, statistic=lambda counts: float(np.divide(*np.sum(counts, axis=0)))
+    ),
+    'calibration': partial(resampled, statistic=calibration_error),
+}
 _SCORES = _table(Path(__file__).with_suffix('.yaml').read_text(encoding='utf-8'))
 BARS = {name: bar for name, bar in _SCORES.items() if (bar.low, bar.high) != (-math.inf, math.inf)}
 """What a diagnosis should reach, by score."""
@@ -207,8 +269,16 @@ def outcome(bar: Bar, score: Score) -> str:
 
 def bars(made: dict[str, Any]) -> list[dict[str, Any]]:
     """Compare the scores with the bars."""
-    return [{'name': name, 'words': bar.words, 'bar': bar.in_words(),
-             'met': outcome(bar, made[name]), **made[name]} for name, bar in BARS.items()]
+    return [
+        {
+            'name': name,
+            'words': bar.words,
+            'bar': bar.in_words(),
+            'met': outcome(bar, made[name]),
+            **made[name],
+        }
+        for name, bar in BARS.items()
+    ]
 
 
 def scores(trials: Sequence[Trial]) -> dict[str, Any]:
@@ -217,22 +287,38 @@ def scores(trials: Sequence[Trial]) -> dict[str, Any]:
     real = rows[rows.group != 'zero']
     single, pairs, outside = (real[real.group == group] for group in ('single', 'pair', 'outside'))
     pairs, is_noise = pairs[pairs.seen], single.effect.isin(NOISE_LIKE)
-    true = real.effect.where(real.group == 'single', real.group.map(
-        {'none': 'none', 'outside': UNKNOWN}))
+    true = real.effect.where(
+        real.group == 'single', real.group.map({'none': 'none', 'outside': UNKNOWN})
+    )
     return {
-        **{name: _STATISTICS[bar.statistic[0]](
-            (rows if bar.zero else real).query(bar.of)[bar.statistic[1]].dropna())
-            for name, bar in _SCORES.items()},
-        'detection': {'of the mean': by_strength(single[~is_noise]),
-                      'noise like': by_strength(single[is_noise]),
-                      'outside': by_strength(outside)},
+        **{
+            name: _STATISTICS[bar.statistic[0]](
+                (rows if bar.zero else real).query(bar.of)[bar.statistic[1]].dropna()
+            )
+            for name, bar in _SCORES.items()
+        },
+        'detection': {
+            'of the mean': by_strength(single[~is_noise]),
+            'noise like': by_strength(single[is_noise]),
+            'outside': by_strength(outside),
+        },
         'reliability': reliability(real.stated.tolist()),
-        'pairs': {'whole': share(pairs.names == 2), 'in_part': share(pairs.names == 1),
-                  'exactly': share(pairs.is_top)},
-        'by_effect': {name: {'trials': len(part), 'detected': int(part.gap.sum()),
-                             'named': int(part.names_all.sum()), 'top': int(part.is_top.sum())}
-                      for name, part in real[real.seen & real.group.isin(
-                          ['single', 'outside'])].groupby('effect')},
+        'pairs': {
+            'whole': share(pairs.names == 2),
+            'in_part': share(pairs.names == 1),
+            'exactly': share(pairs.is_top),
+        },
+        'by_effect': {
+            name: {
+                'trials': len(part),
+                'detected': int(part.gap.sum()),
+                'named': int(part.names_all.sum()),
+                'top': int(part.is_top.sum()),
+            }
+            for name, part in real[real.seen & real.group.isin(['single', 'outside'])].groupby(
+                'effect'
+            )
+        },
         'confusion': {name: dict(Counter(part)) for name, part in real.said.groupby(true)},
         'longest_s': float(rows.seconds.max()),
         'status': dict(Counter(real.status)),
@@ -254,16 +340,20 @@ def permuted(trials: Sequence[Trial]) -> dict[str, Any]:
     """
     real = [trial for trial in trials if trial.label.group != 'zero']
     accepted = [grading.right(trial.label) for trial in real]
-    right = np.array([[trial.answer.top in effects for effects in accepted]
-                      for trial in real], float)
+    right = np.array(
+        [[trial.answer.top in effects for effects in accepted] for trial in real], float
+    )
     rng, n = np.random.default_rng(0), len(real)
-    shuffled = np.array([right[np.arange(n), rng.permutation(n)].mean()
-                         for _ in range(_SHUFFLES)])
+    shuffled = np.array([right[np.arange(n), rng.permutation(n)].mean() for _ in range(_SHUFFLES)])
     chance = float(right.mean())
     low, high = (float(q) for q in np.quantile(shuffled, (_CHANCE / 2, 1 - _CHANCE / 2)))
-    return {'score': float(shuffled.mean()), 'chance': chance,
-            'labels_in_place': float(np.trace(right)) / n,
-            'by_chance_between': [low, high], 'leaks': not low <= chance <= high}
+    return {
+        'score': float(shuffled.mean()),
+        'chance': chance,
+        'labels_in_place': float(np.trace(right)) / n,
+        'by_chance_between': [low, high],
+        'leaks': not low <= chance <= high,
+    }
 
 
 def metadata(recordings: Path, labels: Sequence[Label]) -> dict[str, Any]:
@@ -274,24 +364,34 @@ def metadata(recordings: Path, labels: Sequence[Label]) -> dict[str, Any]:
     and Wallis), for the quantity that they explain best. At chance is the same with permuted
     labels. Labels count in three ways: by group, by effect, and as some effect or none.
     """
+
     def facts_of(name: str) -> tuple[float, ...]:
         csv, yaml = (recordings / f'{name}.{suffix}' for suffix in ('csv', 'yaml'))
         data, size, about = csv.read_bytes(), csv.stat().st_size, yaml.stat()
         rows, last = data.count(b'\n'), data.rstrip().rsplit(b'\n', 1)[-1]
-        return (size, rows, size - rows * len(last), csv.stat().st_mtime, about.st_size,
-                about.st_mtime, float(last.split(b',')[0]))
+        return (
+            size,
+            rows,
+            size - rows * len(last),
+            csv.stat().st_mtime,
+            about.st_size,
+            about.st_mtime,
+            float(last.split(b',')[0]),
+        )
 
     def explained_by(members: np.ndarray) -> float:
         sums = members.T @ ranks
-        between = np.sum(sums ** 2 / members.sum(axis=0)[:, None], axis=0)
-        return float(np.max(between / np.maximum(np.sum(ranks ** 2, axis=0), 1e-12)))
+        between = np.sum(sums**2 / members.sum(axis=0)[:, None], axis=0)
+        return float(np.max(between / np.maximum(np.sum(ranks**2, axis=0), 1e-12)))
 
     facts = np.array([facts_of(label.name) for label in labels], float)
     ranks = scipy.stats.rankdata(np.column_stack([facts, np.arange(len(labels))]), axis=0)
     ranks -= ranks.mean(axis=0)
-    groupings = [[label.group for label in labels],
-                 ['+'.join(label.effects) for label in labels],
-                 ['something' if label.effects else 'nothing' for label in labels]]
+    groupings = [
+        [label.group for label in labels],
+        ['+'.join(label.effects) for label in labels],
+        ['something' if label.effects else 'nothing' for label in labels],
+    ]
     rng, count = np.random.default_rng(0), len(labels)
     explained, chance = [], []
     for grouping in groupings:
@@ -300,19 +400,36 @@ def metadata(recordings: Path, labels: Sequence[Label]) -> dict[str, Any]:
         chance.append([explained_by(members[rng.permutation(count)]) for _ in range(_SHUFFLES)])
     above = np.sum(np.array(chance) >= np.array(explained)[:, None] - 1e-12, axis=1)
     p = float((1 + above.min()) / (1 + _SHUFFLES))
-    return {'score': explained[0], 'chance': float(np.mean(chance[0])), 'p': p,
-            'leaks': p < _CHANCE}
+    return {
+        'score': explained[0],
+        'chance': float(np.mean(chance[0])),
+        'p': p,
+        'leaks': p < _CHANCE,
+    }
 
 
 def strength_zero(trials: Sequence[Trial]) -> dict[str, Any]:
     """Compare trials whose effect has strength zero with trials without an effect."""
-    zero, none = ([trial.answer.gap for trial in trials if trial.label.group == group]
-                  for group in ('zero', 'none'))
-    named = sum(trial.label.effects[0] in trial.answer.named for trial in trials
-                if trial.label.group == 'zero')
+    zero, none = (
+        [trial.answer.gap for trial in trials if trial.label.group == group]
+        for group in ('zero', 'none')
+    )
+    named = sum(
+        trial.label.effects[0] in trial.answer.named
+        for trial in trials
+        if trial.label.group == 'zero'
+    )
     if not zero or not none:
         return {'score': None, 'chance': None, 'p': 1.0, 'leaks': False, 'named': named}
-    p = float(scipy.stats.fisher_exact([
-        [sum(gaps), len(gaps) - sum(gaps)] for gaps in (zero, none)]).pvalue)
-    return {'score': sum(zero) / len(zero), 'chance': sum(none) / len(none), 'p': p,
-            'named': named, 'leaks': p < _CHANCE}
+    p = float(
+        scipy.stats.fisher_exact(
+            [[sum(gaps), len(gaps) - sum(gaps)] for gaps in (zero, none)]
+        ).pvalue
+    )
+    return {
+        'score': sum(zero) / len(zero),
+        'chance': sum(none) / len(none),
+        'p': p,
+        'named': named,
+        'leaks': p < _CHANCE,
+    }

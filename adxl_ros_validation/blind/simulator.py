@@ -24,7 +24,7 @@ ADC_BITS = 16
 """Resolution of the ADC, bits; chosen: that of the paper."""
 ADC_VREF = 5.0
 """Range of the ADC, V; chosen: that of the paper."""
-LSB_V = ADC_VREF / 2 ** ADC_BITS
+LSB_V = ADC_VREF / 2**ADC_BITS
 """Step of the ADC, V."""
 ZERO_G_STD_G = 150e-6
 """Standard deviation of zero-g since its calibration some days ago, g; chosen."""
@@ -74,33 +74,58 @@ def draw_unit(rng: np.random.Generator) -> Unit:
     corner = 50.0 * np.exp(rng.normal(0, 0.08))
     resolution = float(np.deg2rad(rng.choice([0.002, 0.005, 0.01])))
     return Unit(
-        axes, zero, scale,
+        axes,
+        zero,
+        scale,
         zero + ZERO_G_STD_G * scale * rng.normal(size=n),
         scale * (1 + SCALE_STD * rng.normal(size=n)),
-        noise, noise * np.exp(rng.normal(0, 0.015, n)),
+        noise,
+        noise * np.exp(rng.normal(0, 0.015, n)),
         corner,
-        10 ** rng.uniform(-6.0, -5.1, n), 10 ** rng.uniform(-5.3, -4.7, n),
-        resolution, STAGE_STD * resolution * np.clip(rng.normal(size=6), -2, 2),
-        float(rng.choice([100.0, 125.0, 200.0, 250.0])))
+        10 ** rng.uniform(-6.0, -5.1, n),
+        10 ** rng.uniform(-5.3, -4.7, n),
+        resolution,
+        STAGE_STD * resolution * np.clip(rng.normal(size=6), -2, 2),
+        float(rng.choice([100.0, 125.0, 200.0, 250.0])),
+    )
 
 
-def parameter_file(unit: Unit, serial: str, *, nominal_zero_v: float = 2.5,
-                   is_certain: bool = False, **sensor: float) -> str:
+def parameter_file(
+    unit: Unit,
+    serial: str,
+    *,
+    nominal_zero_v: float = 2.5,
+    is_certain: bool = False,
+    **sensor: float,
+) -> str:
     """Return the parameter file that the user has, with other values of the sensor, if any."""
     file = yaml.safe_load(Path(__file__).with_name('unit.yaml').read_text(encoding='utf-8'))
     keys, ones = file['/**']['ros__parameters'], np.ones(len(unit.axes))
-    keys['sensor'].update({
-        'serial': serial, 'axes': unit.axes, 'nominal_zero_g_v': (nominal_zero_v * ones).tolist(),
-        'nominal_scale_v_per_g': ones.tolist(),
-        'noise_density_g_per_rthz': unit.stated_noise_g_per_rthz.tolist(), 'rc_capacitance_f':
-        float(1 / (2 * np.pi * keys['sensor']['rc_resistance_ohm'] * unit.corner_hz)),
-        'adc_bits': ADC_BITS, 'adc_vref_v': ADC_VREF, 'rate_hz': unit.rate_hz, **sensor})
-    keys.update({
-        'stage': {'resolution_rad': unit.resolution_rad},
-        'bias': {'offset_v': (unit.stated_zero_v - nominal_zero_v).tolist()},
-        'scale_factor': {'offset_v_per_g': (unit.stated_scale_v_per_g - 1.0).tolist()}})
+    keys['sensor'].update(
+        {
+            'serial': serial,
+            'axes': unit.axes,
+            'nominal_zero_g_v': (nominal_zero_v * ones).tolist(),
+            'nominal_scale_v_per_g': ones.tolist(),
+            'noise_density_g_per_rthz': unit.stated_noise_g_per_rthz.tolist(),
+            'rc_capacitance_f': float(
+                1 / (2 * np.pi * keys['sensor']['rc_resistance_ohm'] * unit.corner_hz)
+            ),
+            'adc_bits': ADC_BITS,
+            'adc_vref_v': ADC_VREF,
+            'rate_hz': unit.rate_hz,
+            **sensor,
+        }
+    )
+    keys.update(
+        {
+            'stage': {'resolution_rad': unit.resolution_rad},
+            'bias': {'offset_v': (unit.stated_zero_v - nominal_zero_v).tolist()},
+            'scale_factor': {'offset_v_per_g': (unit.stated_scale_v_per_g - 1.0).tolist()},
+        }
+    )
     names = ('bias.offset_v', 'scale_factor.offset_v_per_g')
-    variance = np.outer(np.square((ZERO_G_STD_G, SCALE_STD)), unit.stated_scale_v_per_g ** 2)
+    variance = np.outer(np.square((ZERO_G_STD_G, SCALE_STD)), unit.stated_scale_v_per_g**2)
     keys['covariance_names'] = [f'{name}.{axis}' for name in names for axis in unit.axes]
     keys['covariance'] = np.diag(variance.ravel()).ravel().tolist()
     if is_certain:
@@ -162,8 +187,12 @@ def pink_noise(t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     dt = t[1] - t[0]
     for lag in dt * 10 ** np.arange(0.5, math.log10(2 * (t[-1] - t[0]) / dt), 0.5):
         keep = math.exp(-dt / lag)
-        noise += scipy.signal.lfilter([math.sqrt(1 - keep * keep)], [1, -keep],
-                                      rng.normal(size=len(t)), zi=[keep * rng.normal()])[0]
+        noise += scipy.signal.lfilter(
+            [math.sqrt(1 - keep * keep)],
+            [1, -keep],
+            rng.normal(size=len(t)),
+            zi=[keep * rng.normal()],
+        )[0]
     return noise
 
 
@@ -202,19 +231,22 @@ def constant(run: Run, shape: Shape) -> float:
 
 def _acting(how: str, law: Law) -> Act:
     """Let a law act on each axis by its weight."""
+
     def act(run: Run, size: float, shape: Shape) -> None:
         change = size * column(shape) * law(run, shape)
         if how == 'scaled':
-            run.u[:len(change)] *= 1 + change
+            run.u[: len(change)] *= 1 + change
         elif how == 'added':
-            run.u[:len(change)] += change
+            run.u[: len(change)] += change
         else:
             run.volts += change * (run.unit.scale_v_per_g[:, None] if how == 'output' else 1.0)
+
     return act
 
 
 added, scaled, added_at_output, added_v = (
-    partial(_acting, how) for how in ('added', 'scaled', 'output', 'volts'))
+    partial(_acting, how) for how in ('added', 'scaled', 'output', 'volts')
+)
 """Make a fault of a law: added to the input, g, its scale factor, or to the output, g or V."""
 
 
@@ -273,22 +305,28 @@ class Kind:
         count = self._count(unit)
         rows = np.ones((1, count)) if self.per_axis else np.eye(count)
         shapes: list[Shape] = [{'w': row} for row in rows if count] or [{}]
-        return [{**shape, **dict(zip(self.spread_at, numbers))}
-                for shape in shapes for numbers in product(*self.spread_at.values())]
+        return [
+            {**shape, **dict(zip(self.spread_at, numbers))}
+            for shape in shapes
+            for numbers in product(*self.spread_at.values())
+        ]
 
 
 def load_kinds(table: str, functions: Mapping[str, Any]) -> tuple[dict[str, Kind], ...]:
     """Return the listed and the unlisted faults of a table, whose functions have their names."""
     named = {**globals(), **functions}
 
-    def kind(name: str, law: str = '', place: str = 'element', weigh: str = 'weights',
-             **numbers: Any) -> Kind:
+    def kind(
+        name: str, law: str = '', place: str = 'element', weigh: str = 'weights', **numbers: Any
+    ) -> Kind:
         act = named[law](named[name]) if law else named[name]
         return Kind(name, act, place=Place[place.upper()], weigh=named[weigh], **numbers)
 
     parts = yaml.safe_load((Path(__file__).parents[1] / table).read_text(encoding='utf-8'))
-    return tuple({name: kind(name, **row) for name, row in parts[part].items()}
-                 for part in ('listed', 'unlisted'))
+    return tuple(
+        {name: kind(name, **row) for name, row in parts[part].items()}
+        for part in ('listed', 'unlisted')
+    )
 
 
 @dataclass(frozen=True)
@@ -320,16 +358,25 @@ class Scene:
         """Return the stamps of the recording, s, (n,)."""
         return np.arange(int(self.manoeuvre.seconds * self.unit.rate_hz)) / self.unit.rate_hz
 
-    def volts(self, faults: Sequence[Fault], *, noise: bool = True, fine_hz: float = FINE_HZ
-              ) -> np.ndarray:
+    def volts(
+        self, faults: Sequence[Fault], *, noise: bool = True, fine_hz: float = FINE_HZ
+    ) -> np.ndarray:
         """Simulate the recording's volts, (m, n)."""
         unit, sampled = self.unit, self.stamps()
         step = 1 / (unit.rate_hz * math.ceil(fine_hz / unit.rate_hz))
         # Late and early samples must lie within the grid.
         t = np.arange(-0.5, sampled[-1] + 1.0, step)
         joints = self.manoeuvre.joints(t)
-        run = Run(unit, t, self.seed, joints['alpha'], joints['beta'], joints['shift'],
-                  *self.manoeuvre.climate(t), corner_hz=unit.corner_hz)
+        run = Run(
+            unit,
+            t,
+            self.seed,
+            joints['alpha'],
+            joints['beta'],
+            joints['shift'],
+            *self.manoeuvre.climate(t),
+            corner_hz=unit.corner_hz,
+        )
 
         def act(place: Place) -> None:
             for fault in faults:
@@ -350,18 +397,21 @@ class Scene:
         run.volts = _one_pole(_one_pole(run.volts, run.corner_hz, step), run.second_hz, step)
         act(Place.WIRE)
         run.volts = scipy.interpolate.CubicSpline(t, run.volts, axis=1)(
-            np.clip(sampled - run.late_s(sampled), t[0], t[-1]))
+            np.clip(sampled - run.late_s(sampled), t[0], t[-1])
+        )
         run.t = sampled
         act(Place.SAMPLES)
         if noise:
-            run.volts = np.clip(np.floor(run.volts / LSB_V), 0, 2 ** ADC_BITS - 1) * LSB_V
+            run.volts = np.clip(np.floor(run.volts / LSB_V), 0, 2**ADC_BITS - 1) * LSB_V
         return run.volts
 
     def response(self, faults: Sequence[Fault], coarse: bool = False) -> np.ndarray:
         """Return the change of the output by faults, m/s², (m, n)."""
         noise = any(fault.kind.random for fault in faults)
-        with_faults, without = (self.volts(acting, noise=noise, fine_hz=_COARSE_HZ if coarse
-                                           else FINE_HZ) for acting in (faults, []))
+        with_faults, without = (
+            self.volts(acting, noise=noise, fine_hz=_COARSE_HZ if coarse else FINE_HZ)
+            for acting in (faults, [])
+        )
         return (with_faults - without) * self.unit.volts_to_mps2
 
     def force(self) -> np.ndarray:
@@ -379,11 +429,13 @@ class Scene:
         t, rng = self.stamps(), np.random.default_rng([self.seed, 77])
         joints, (temperature, supply) = self.manoeuvre.joints(t), self.manoeuvre.climate(t)
         step = self.unit.resolution_rad
-        return {'alpha_rad': np.round(joints['alpha'] / step) * step,
-                'beta_rad': np.round(joints['beta'] / step) * step,
-                'shift_m': joints['shift'],
-                'temperature_c': temperature + 0.006 * rng.normal(size=len(t)),
-                'supply_v': supply + 1e-4 * rng.normal(size=len(t))}
+        return {
+            'alpha_rad': np.round(joints['alpha'] / step) * step,
+            'beta_rad': np.round(joints['beta'] / step) * step,
+            'shift_m': joints['shift'],
+            'temperature_c': temperature + 0.006 * rng.normal(size=len(t)),
+            'supply_v': supply + 1e-4 * rng.normal(size=len(t)),
+        }
 
     def recording(self, faults: Sequence[Fault], digits: Mapping[str, int] = DIGITS) -> str:
         """Return the recording as CSV."""
@@ -395,17 +447,23 @@ def csv_text(columns: dict[str, np.ndarray], digits: Mapping[str, int]) -> str:
     """Return columns as CSV, each with as many digits in each recording; NaN is empty."""
     formats = ','.join(f'%.{digits.get(name, 7)}f' for name in columns)
     rows = np.stack(list(columns.values()), axis=1)
-    return '\n'.join([','.join(columns), *(formats % tuple(row) for row in rows.tolist()), '']
-                     ).replace('nan', '')
+    return '\n'.join(
+        [','.join(columns), *(formats % tuple(row) for row in rows.tolist()), '']
+    ).replace('nan', '')
 
 
 def _stage_errors(run: Run) -> None:
     """Add errors of the stage within its resolution, and of the encoder between its lines."""
     step, rng = run.unit.resolution_rad, run.random('encoder')
-    for joint, (offset, sine, cosine) in zip((run.alpha, run.beta),
-                                             run.unit.stage_rad.reshape(2, 3)):
-        joint += offset + sine * np.sin(joint) + cosine * np.cos(joint) + 0.15 * step * np.sin(
-            2 * np.pi * joint / (37 * step) + rng.uniform(0, 2 * np.pi))
+    for joint, (offset, sine, cosine) in zip(
+        (run.alpha, run.beta), run.unit.stage_rad.reshape(2, 3)
+    ):
+        joint += (
+            offset
+            + sine * np.sin(joint)
+            + cosine * np.cos(joint)
+            + 0.15 * step * np.sin(2 * np.pi * joint / (37 * step) + rng.uniform(0, 2 * np.pi))
+        )
 
 
 def _rotate(run: Run, vector: np.ndarray) -> np.ndarray:
@@ -431,7 +489,8 @@ def _force(run: Run) -> np.ndarray:
 def _second_derivative(values: np.ndarray, dt: float) -> np.ndarray:
     """Differentiate twice to fourth order: second order lacks 0.3 % of a shaker's 20 Hz."""
     return scipy.ndimage.correlate1d(
-        values, np.array([-1, 16, -30, 16, -1]) / (12 * dt * dt), axis=-1, mode='nearest')
+        values, np.array([-1, 16, -30, 16, -1]) / (12 * dt * dt), axis=-1, mode='nearest'
+    )
 
 
 def _one_pole(values: np.ndarray, corner_hz: float, dt: float) -> np.ndarray:
@@ -447,8 +506,9 @@ def _one_pole(values: np.ndarray, corner_hz: float, dt: float) -> np.ndarray:
 
 def _sensor_noise(run: Run) -> np.ndarray:
     unit, rng = run.unit, run.random('noise')
-    white = rng.normal(size=run.u.shape) * (
-        unit.noise_g_per_rthz * math.sqrt(0.5 / run.dt))[:, None]
+    white = (
+        rng.normal(size=run.u.shape) * (unit.noise_g_per_rthz * math.sqrt(0.5 / run.dt))[:, None]
+    )
     slow = np.arange(run.t[0], run.t[-1] + 0.2, 0.1)
     rng = run.random('drift')
     for row, walk, size in zip(white, unit.walk_g_per_rts, unit.flicker_g):

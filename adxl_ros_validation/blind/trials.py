@@ -104,12 +104,16 @@ def plans(seed: int, count: int, seconds: tuple[float, float] = SECONDS) -> list
     rows: list[tuple[str, tuple[str, ...]]] = [('none', ())] * none
     rows += [('single', (name,)) for name in _turns(KNOWN, count - none - pairs - outside, rng)]
     rows += [('outside', (name,)) for name in _turns(UNLISTED, outside, rng)]
-    rows += [('pair', tuple(str(name) for name in rng.choice(KNOWN, 2, replace=False)))
-             for _ in range(pairs)]
+    rows += [
+        ('pair', tuple(str(name) for name in rng.choice(KNOWN, 2, replace=False)))
+        for _ in range(pairs)
+    ]
     rows += [('zero', (name,)) for name in _turns(KNOWN, math.ceil(count / 12), rng)]
     order = rng.permutation(len(rows)).tolist()
-    return [Plan(f'r{i:04d}', rows[k][0], rows[k][1], (seed, 2, k), seconds)
-            for i, k in enumerate(order)]
+    return [
+        Plan(f'r{i:04d}', rows[k][0], rows[k][1], (seed, 2, k), seconds)
+        for i, k in enumerate(order)
+    ]
 
 
 def _turns(names: tuple[str, ...], count: int, rng: np.random.Generator) -> list[str]:
@@ -138,12 +142,17 @@ def draw_trial(plan: Plan) -> Drawn:
     drawn = scene(plan)
     clean, noisy = (drawn.volts([], noise=noise, fine_hz=800.0) for noise in (False, True))
     noise = (noisy - clean) * drawn.unit.volts_to_mps2
-    label = Label(**asdict(plan), manoeuvre=drawn.manoeuvre.kind, axes=drawn.unit.axes,
-                  floor_mps2=ideal_observer.rms(noise - noise.mean(axis=1, keepdims=True)))
+    label = Label(
+        **asdict(plan),
+        manoeuvre=drawn.manoeuvre.kind,
+        axes=drawn.unit.axes,
+        floor_mps2=ideal_observer.rms(noise - noise.mean(axis=1, keepdims=True)),
+    )
     if label.true:
         label = _with_faults(label, IdealObserver(drawn))
-    return Drawn(label, drawn.recording(label.acting()),
-                 simulator.parameter_file(drawn.unit, plan.name))
+    return Drawn(
+        label, drawn.recording(label.acting()), simulator.parameter_file(drawn.unit, plan.name)
+    )
 
 
 def _with_faults(label: Label, observer: IdealObserver) -> Label:
@@ -152,19 +161,30 @@ def _with_faults(label: Label, observer: IdealObserver) -> Label:
     rivals = observer.rivals()
     rows, flexible = [], 0.0
     for name in label.effects:
-        fault, _, found, change = sized(rng, KINDS[name], observer.scene.unit, STRENGTHS_MPS2,
-                                        partial(measured, observer.scene, observer.force))
+        fault, _, found, change = sized(
+            rng,
+            KINDS[name],
+            observer.scene.unit,
+            STRENGTHS_MPS2,
+            partial(measured, observer.scene, observer.force),
+        )
         row = _visibility(observer, rivals, fault, change)
-        rows.append({**described(fault, found), **row,
-                     'strength_floors': found / label.floor_mps2})
+        rows.append(
+            {**described(fault, found), **row, 'strength_floors': found / label.floor_mps2}
+        )
         if name in UNLISTED and row['power'] > 0.5:
             flexible = observer.flexible_power(rivals[row['rival']], observer.project(change))
     return replace(label, faults=rows, flexible=flexible)
 
 
-def sized(rng: np.random.Generator, kind: Kind, unit: Unit, bounds: tuple[float, float],
-          measure: Callable[[Fault], tuple[float, np.ndarray]], per_mps2: float = 1.0
-          ) -> tuple[Fault, float, float, np.ndarray]:
+def sized(
+    rng: np.random.Generator,
+    kind: Kind,
+    unit: Unit,
+    bounds: tuple[float, float],
+    measure: Callable[[Fault], tuple[float, np.ndarray]],
+    per_mps2: float = 1.0,
+) -> tuple[Fault, float, float, np.ndarray]:
     """
     Draw a fault of a strength, log-uniform within bounds; it has this or its largest size.
 
@@ -178,8 +198,11 @@ def sized(rng: np.random.Generator, kind: Kind, unit: Unit, bounds: tuple[float,
         rms, change = measure(fault)
         here = math.log(fault.size), math.log(max(rms, 1e-12))
         missing = math.log(strength) - here[1]
-        if abs(missing) < _SIZE_TOLERANCE or steps == _MAX_SIZE_STEPS or (
-                fault.size == fault.kind.largest and rms < strength):
+        if (
+            abs(missing) < _SIZE_TOLERANCE
+            or steps == _MAX_SIZE_STEPS
+            or (fault.size == fault.kind.largest and rms < strength)
+        ):
             break
         slope = 1.0
         if steps > 1 and here[0] != previous[0]:
@@ -193,37 +216,53 @@ def sized(rng: np.random.Generator, kind: Kind, unit: Unit, bounds: tuple[float,
 def measured(scene: Scene, force: np.ndarray, fault: Fault) -> tuple[float, np.ndarray]:
     """Return strength and response of a fault; `force` is along the axes, m/s², (m, n)."""
     change = scene.response([fault], coarse=True)
-    return ideal_observer.rms(
-        ideal_observer.beyond_calibration(scene.unit, change, force)), change
+    return ideal_observer.rms(ideal_observer.beyond_calibration(scene.unit, change, force)), change
 
 
 def described(fault: Fault, strength_mps2: float) -> dict[str, Any]:
     """Return what a label says of a fault whose visibility is not known."""
-    return {'effect': fault.kind.name, 'noise_like': fault.kind.random, 'size': fault.size,
-            'shape': {name: np.asarray(value).tolist() for name, value in fault.shape.items()},
-            'strength_mps2': strength_mps2, 'power': 1.0, 'told': 1.0, 'inseparable': []}
+    return {
+        'effect': fault.kind.name,
+        'noise_like': fault.kind.random,
+        'size': fault.size,
+        'shape': {name: np.asarray(value).tolist() for name, value in fault.shape.items()},
+        'strength_mps2': strength_mps2,
+        'power': 1.0,
+        'told': 1.0,
+        'inseparable': [],
+    }
 
 
-def _visibility(observer: IdealObserver, rivals: dict[str, np.ndarray], fault: Fault,
-                change: np.ndarray) -> dict[str, Any]:
+def _visibility(
+    observer: IdealObserver, rivals: dict[str, np.ndarray], fault: Fault, change: np.ndarray
+) -> dict[str, Any]:
     """Return how well the ideal observer detects a fault and separates it from others."""
     kind, vector = fault.kind, observer.project(change)
     squared = float(vector @ vector)
-    visibility = ideal_observer.noise_visibility(observer, kind, change) if kind.random \
-        else squared
-    rest_of = {name: squared - float(np.sum((columns.T @ vector) ** 2))
-               for name, columns in rivals.items() if name != kind.name}
+    visibility = (
+        ideal_observer.noise_visibility(observer, kind, change) if kind.random else squared
+    )
+    rest_of = {
+        name: squared - float(np.sum((columns.T @ vector) ** 2))
+        for name, columns in rivals.items()
+        if name != kind.name
+    }
     rival = min(rest_of, key=rest_of.__getitem__)
     power = ideal_observer.power(visibility)
     # Only slow noise can be mistaken for an effect that does not look like noise.
     separable = kind.random and kind.name not in _SLOW_NOISE
-    inseparable = [name for name, squares in rest_of.items()
-                   if squares < ideal_observer.INSEPARABLE_BELOW] \
-        if power > 0.5 and not separable else []
-    return {'visibility': visibility, 'power': power, 'rival': rival,
-            'told': ideal_observer.separation_probability(
-                visibility if separable else rest_of[rival]),
-            'inseparable': sorted(inseparable)}
+    inseparable = (
+        [name for name, squares in rest_of.items() if squares < ideal_observer.INSEPARABLE_BELOW]
+        if power > 0.5 and not separable
+        else []
+    )
+    return {
+        'visibility': visibility,
+        'power': power,
+        'rival': rival,
+        'told': ideal_observer.separation_probability(visibility if separable else rest_of[rival]),
+        'inseparable': sorted(inseparable),
+    }
 
 
 _SEAL = 'seal.json'
@@ -241,36 +280,66 @@ Show = Callable[[str], AbstractContextManager[Callable[[float], None]]]
 """Receives the name of a stage; gives a context with what receives the finished fraction."""
 
 
-def seal(folder: Path, plan_all: Callable[[int, int], list[Plan]], make: Callable[[Plan], Drawn],
-         seed: int | None, count: int, pool: Pool, show: Show) -> str:
+def seal(
+    folder: Path,
+    plan_all: Callable[[int, int], list[Plan]],
+    make: Callable[[Plan], Drawn],
+    seed: int | None,
+    count: int,
+    pool: Pool,
+    show: Show,
+) -> str:
     """
     Draw trials into a folder and publish the hash of their labels.
 
     A call on a folder that has them returns the hash; an interrupted one continues.
     """
     drawn, is_sealed = folder / 'labels' / 'drawn', (folder / _SEAL).exists()
-    known = committed_labels(folder)[0] if is_sealed else Setup(*json.loads(
-        (drawn / 'setup').read_bytes())) if (drawn / 'setup').exists() else None
+    known = (
+        committed_labels(folder)[0]
+        if is_sealed
+        else Setup(*json.loads((drawn / 'setup').read_bytes()))
+        if (drawn / 'setup').exists()
+        else None
+    )
     if known is None and any(folder.glob('*')):
         raise UserError(f'{folder}: is not empty and has no check; choose another folder')
     if seed is None:
-        seed = known.seed if known else secrets.randbelow(2 ** 31)
+        seed = known.seed if known else secrets.randbelow(2**31)
     setup = Setup(seed, count)
     if known not in (None, setup):
-        raise UserError(f'{folder}: has a check of another seed or number of trials; repeat the '
-                        'same options to continue it, or choose another folder')
+        raise UserError(
+            f'{folder}: has a check of another seed or number of trials; repeat the '
+            'same options to continue it, or choose another folder'
+        )
     if not is_sealed:
         write(drawn / 'setup', json.dumps(setup).encode())
         plans = {plan.name: plan for plan in plan_all(*setup)}
         with show('draw') as advance:
-            labels = kept(drawn, sorted(plans), partial(_made, make),
-                          lambda name: (plans[name],), pool, advance)
-        text = json.dumps({'salt': secrets.token_hex(16), **setup._asdict(),
-                           'labels': list(labels.values())}, indent=1).encode()
+            labels = kept(
+                drawn,
+                sorted(plans),
+                partial(_made, make),
+                lambda name: (plans[name],),
+                pool,
+                advance,
+            )
+        text = json.dumps(
+            {'salt': secrets.token_hex(16), **setup._asdict(), 'labels': list(labels.values())},
+            indent=1,
+        ).encode()
         write(folder / 'labels' / 'labels.json', text)
-        write(folder / _SEAL, json.dumps({
-            'sha256_of_salt_and_labels': hashlib.sha256(text).hexdigest(), 'cases': len(labels),
-            'date': str(date.today())}, indent=1).encode())
+        write(
+            folder / _SEAL,
+            json.dumps(
+                {
+                    'sha256_of_salt_and_labels': hashlib.sha256(text).hexdigest(),
+                    'cases': len(labels),
+                    'date': str(date.today()),
+                },
+                indent=1,
+            ).encode(),
+        )
     shutil.rmtree(drawn, ignore_errors=True)
     return published_hash(folder)
 
@@ -281,21 +350,26 @@ def _made(make: Callable[[Plan], Drawn], plan: Plan) -> tuple[str, dict[str, Any
     return label.name, asdict(label), texts
 
 
-def kept(folder: Path, names: Sequence[str], work: Callable[..., tuple],
-         job: Callable[[str], tuple], pool: Pool, show: Callable[[float], None]
-         ) -> dict[str, Any]:
+def kept(
+    folder: Path,
+    names: Sequence[str],
+    work: Callable[..., tuple],
+    job: Callable[[str], tuple],
+    pool: Pool,
+    show: Callable[[float], None],
+) -> dict[str, Any]:
     """
     Do the work that has no result in a folder yet, and return all results by name.
 
     `work` returns a name, its result, and the texts of the files of a trial that was drawn.
     """
+
     def keep(name: str, result: Any, texts: Iterable[str | None] = ()) -> None:
         save(folder.parents[1] / 'recordings', name, texts)
         write(folder / f'{name}.json', json.dumps(result).encode())
 
     todo = [name for name in names if not (folder / f'{name}.json').exists()]
-    for_each(pool, work, [partial(job, name) for name in todo], keep, show,
-             len(names) - len(todo))
+    for_each(pool, work, [partial(job, name) for name in todo], keep, show, len(names) - len(todo))
     return {name: json.loads((folder / f'{name}.json').read_bytes()) for name in names}
 
 
@@ -316,8 +390,9 @@ def _explained(path: Path, missing: str) -> Iterator[None]:
     except FileNotFoundError:
         raise UserError(f'{path}: no such file; {missing}') from None
     except (ValueError, KeyError, TypeError):
-        raise UserError(f'{path}: is damaged or of another version; draw a new check into another '
-                        'folder') from None
+        raise UserError(
+            f'{path}: is damaged or of another version; draw a new check into another folder'
+        ) from None
 
 
 def published_hash(folder: Path) -> str:
@@ -332,9 +407,12 @@ def committed_labels(folder: Path) -> tuple[Setup, list[Label]]:
     with _explained(path, 'copy it from where the check was drawn'):
         text = path.read_bytes()
         if hashlib.sha256(text).hexdigest() != digest:
-            raise UserError(f'{path}: these are not the labels whose hash {digest} was published; '
-                            'they were changed since')
+            raise UserError(
+                f'{path}: these are not the labels whose hash {digest} was published; '
+                'they were changed since'
+            )
         content: dict[str, Any] = json.loads(text)
-        return Setup(content['seed'], content['trials']), [Label(**row | {
-            name: tuple(row[name]) for name in ('effects', 'seed', 'seconds')})
-            for row in content['labels']]
+        return Setup(content['seed'], content['trials']), [
+            Label(**row | {name: tuple(row[name]) for name in ('effects', 'seed', 'seconds')})
+            for row in content['labels']
+        ]

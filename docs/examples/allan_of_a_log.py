@@ -11,8 +11,12 @@ white_mps2 = rng.normal(0.0, 0.02, (60 * RATE_HZ, 3))
 walk_mps2 = np.cumsum(rng.normal(0.0, 1e-5, (60 * RATE_HZ, 3)), axis=0)
 samples_mps2 = white_mps2 + walk_mps2 + [0.0, 0.0, 9.80665]
 
-recording = adxl.from_arrays(rate=RATE_HZ, ax_mps2=samples_mps2[:, 0],
-                             ay_mps2=samples_mps2[:, 1], az_mps2=samples_mps2[:, 2])
+recording = adxl.from_arrays(
+    rate=RATE_HZ,
+    ax_mps2=samples_mps2[:, 0],
+    ay_mps2=samples_mps2[:, 1],
+    az_mps2=samples_mps2[:, 2],
+)
 noise = adxl.noise(recording)
 print(noise)
 noise.plot().figure.savefig('allan.png')

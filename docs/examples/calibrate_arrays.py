@@ -13,8 +13,12 @@ run = adxl.simulate('tilt_both', 'adxl203', rate=25, seed=2, effects=UNIT)
 
 # Any arrays do: stamps, s, volts, and the angles of the stage, rad.
 recording = adxl.from_arrays(
-    time_s=sweep.time_s, x_v=sweep.columns['x_v'], y_v=sweep.columns['y_v'],
-    alpha_rad=sweep.columns['alpha_rad'], beta_rad=sweep.columns['beta_rad'])
+    time_s=sweep.time_s,
+    x_v=sweep.columns['x_v'],
+    y_v=sweep.columns['y_v'],
+    alpha_rad=sweep.columns['alpha_rad'],
+    beta_rad=sweep.columns['beta_rad'],
+)
 
 fit = adxl.fit(recording, 'adxl203', model='physical')
 print(fit)

@@ -55,8 +55,9 @@ def main(ideal: str, joints: str) -> None:
     """Write both files."""
     rows = swing(10.0, 1000.0)
     for path, header, columns in (
-            (ideal, 'time_s,ax_mps2,ay_mps2,az_mps2', rows[:, [0, 3, 4, 5]]),
-            (joints, 'time_s,x_v,alpha_rad,beta_rad', rows[:, [0, 0, 1, 2]])):
+        (ideal, 'time_s,ax_mps2,ay_mps2,az_mps2', rows[:, [0, 3, 4, 5]]),
+        (joints, 'time_s,x_v,alpha_rad,beta_rad', rows[:, [0, 0, 1, 2]]),
+    ):
         with open(path, 'w', encoding='utf-8') as file:
             file.write(header + '\n')
             file.writelines(','.join(map(repr, row)) + '\n' for row in columns.tolist())

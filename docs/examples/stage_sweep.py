@@ -4,8 +4,13 @@
 
 import adxl_ros as adxl
 
-sweep = adxl.simulate('sweep', 'adxl203', rate=10, seed=3, effects={
-    'bias': {'offset_v': {'x': 0.02}}, 'scale_factor': {'offset_v_per_g': {'y': 0.01}}})
+sweep = adxl.simulate(
+    'sweep',
+    'adxl203',
+    rate=10,
+    seed=3,
+    effects={'bias': {'offset_v': {'x': 0.02}}, 'scale_factor': {'offset_v_per_g': {'y': 0.01}}},
+)
 fit = adxl.fit(sweep, 'adxl203', model='linear')
 
 for errors in fit.held_out:  # on poses that the fit has not seen

@@ -13,10 +13,12 @@ readings = np.empty((STEPS, SENSORS, 3))
 for step in range(STEPS):
     force_mps2 = np.tile(GRAVITY_MPS2, (SENSORS, 1))
     force_mps2[:, 0] += np.sin(2 * np.pi * step * DT_S)  # a push along x
-    readings[step] = sensors(force_mps2, DT_S)           # also torch and jax arrays
+    readings[step] = sensors(force_mps2, DT_S)  # also torch and jax arrays
     if step == STEPS // 2:
-        sensors.reset(np.arange(100))                    # a hundred robots begin anew
+        sensors.reset(np.arange(100))  # a hundred robots begin anew
 
 offset_mg = 1e3 * (readings[:, 200:, 1].mean(axis=0)) / 9.80665
-print(f'zero-g of y over the parts: {offset_mg.std():.1f} mg, '
-      f'noise of a sample: {readings[:, 200:, 1].std(axis=0).mean() / 9.80665 * 1e3:.2f} mg')
+print(
+    f'zero-g of y over the parts: {offset_mg.std():.1f} mg, '
+    f'noise of a sample: {readings[:, 200:, 1].std(axis=0).mean() / 9.80665 * 1e3:.2f} mg'
+)

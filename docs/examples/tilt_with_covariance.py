@@ -12,5 +12,7 @@ std_deg = np.degrees(corrected.columns['roll_std_rad'])
 covariance = corrected.force_covariance  # (m/s²)², (n, 3, 3), as sensor_msgs/Imu has it
 
 for row in range(0, len(roll_deg), 1000):
-    print(f'{corrected.time_s[row]:6.2f} s   roll {roll_deg[row]:8.3f}° ± {std_deg[row]:.3f}°   '
-          f'std of x {1e3 * np.sqrt(covariance[row, 0, 0]):.2f} mm/s²')
+    print(
+        f'{corrected.time_s[row]:6.2f} s   roll {roll_deg[row]:8.3f}° ± {std_deg[row]:.3f}°   '
+        f'std of x {1e3 * np.sqrt(covariance[row, 0, 0]):.2f} mm/s²'
+    )

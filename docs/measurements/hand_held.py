@@ -65,8 +65,12 @@ def unit_errors(seed: int, folder: Path) -> dict[int, float]:
     """Return the error of one drawn unit by number of rests; 0 without a calibration."""
     draw = np.random.default_rng(seed).normal
     words = []
-    for name, size in (('bias:offset_v', 0.03), ('scale_factor:offset_v_per_g', 0.02),
-                       ('misalignment:alpha_rad', 0.0175), ('cross_axis:linear', 0.01)):
+    for name, size in (
+        ('bias:offset_v', 0.03),
+        ('scale_factor:offset_v_per_g', 0.02),
+        ('misalignment:alpha_rad', 0.0175),
+        ('cross_axis:linear', 0.01),
+    ):
         effect, parameter = name.split(':')
         values = ','.join(f'{parameter}.{axis}={draw() * size:.6g}' for axis in 'xyz')
         words += ['--effect', f'{effect}:{values}']
@@ -74,17 +78,31 @@ def unit_errors(seed: int, folder: Path) -> dict[int, float]:
     nominal = (RUN.parent / 'params' / 'lsm6dso.yaml').read_text('utf-8')
     params.write_text(re.sub('resolution_rad: .*', 'resolution_rad: 1.0e-6', nominal), 'utf-8')
     for name, noise in (('fitted', seed), ('other', seed + 1000)):
-        tool('simulate', 'tumble', '--params', params, *words, '--rate', 104, '--seed', noise,
-             '-o', folder / f'{name}.csv')
+        tool(
+            'simulate',
+            'tumble',
+            '--params',
+            params,
+            *words,
+            '--rate',
+            104,
+            '--seed',
+            noise,
+            '-o',
+            folder / f'{name}.csv',
+        )
     truth, whole = (pd.read_csv(folder / f'{n}.csv', comment='#') for n in ('other', 'fitted'))
-    head = [line for line in (folder / 'fitted.csv').read_text('utf-8').splitlines()
-            if line.startswith('#')]
+    head = [
+        line
+        for line in (folder / 'fitted.csv').read_text('utf-8').splitlines()
+        if line.startswith('#')
+    ]
     ends = [last for _, last in rests_of(whole)]
     errors = {}
     for count in (0, *RESTS):
         used = params
         if count:
-            part = whole.iloc[:ends[min(count, len(ends)) - 1]]
+            part = whole.iloc[: ends[min(count, len(ends)) - 1]]
             kept = part[['time_s', 'x_v', 'y_v', 'z_v']]
             path, used = folder / 'part.csv', folder / 'fit.yaml'
             path.write_text('\n'.join(head) + '\n' + kept.to_csv(index=False), 'utf-8')
@@ -98,10 +116,12 @@ def main() -> None:
     """Print the table."""
     with tempfile.TemporaryDirectory() as folder:
         found = pd.DataFrame([unit_errors(seed, Path(folder)) for seed in range(UNITS)])
-    print(f'# ./run --exec python docs/measurements/hand_held.py, {date.today()}, '
-          f'adxl_ros {package_version()}\n'
-          f'# {UNITS} units of lsm6dso, seeds 0 to {UNITS - 1}; rms tilt error on 40 other rests, '
-          'degrees\nrests,median,worst')
+    print(
+        f'# ./run --exec python docs/measurements/hand_held.py, {date.today()}, '
+        f'adxl_ros {package_version()}\n'
+        f'# {UNITS} units of lsm6dso, seeds 0 to {UNITS - 1}; rms tilt error on 40 other rests, '
+        'degrees\nrests,median,worst'
+    )
     for count in found.columns:
         print(f'{count},{found[count].median():.3f},{found[count].max():.3f}')
 

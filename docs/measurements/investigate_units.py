@@ -46,10 +46,26 @@ RICH_STEP_S = 15.0
 """Time between two diagnoses of the rich manoeuvre, s; it does not wait for them."""
 RATE_HZ = 200.0
 """Sample rate, Hz."""
-EFFECTS = ('backlash', 'base_tilt', 'bias', 'clock_skew', 'cross_axis', 'gravity', 'hysteresis',
-           'lever_arm', 'misalignment', 'nonlinearity', 'quadratic', 'scale_factor',
-           'scale_factor_cross', 'stage_eccentricity', 'stage_offset', 'time_offset',
-           'vibration_rectification', 'warm_up')
+EFFECTS = (
+    'backlash',
+    'base_tilt',
+    'bias',
+    'clock_skew',
+    'cross_axis',
+    'gravity',
+    'hysteresis',
+    'lever_arm',
+    'misalignment',
+    'nonlinearity',
+    'quadratic',
+    'scale_factor',
+    'scale_factor_cross',
+    'stage_eccentricity',
+    'stage_offset',
+    'time_offset',
+    'vibration_rectification',
+    'warm_up',
+)
 """Effects that a stage at rest or in motion excites."""
 COUNTS = (0.15, 0.6, 0.25)
 """Probabilities of no, one and two effects."""
@@ -57,7 +73,8 @@ UNLISTED = (
     lambda signals, d: np.sin(2 * np.pi * signals.environment.time_s / 15.0),
     lambda signals, d: np.sin(2 * np.pi * signals.sensed[d] / 0.3),
     lambda signals, d: np.tanh(5 * np.hypot(signals.alpha.velocity, signals.beta.velocity)),
-    lambda signals, d: np.sin(3 * np.asarray(signals.beta.position) + 1.0))
+    lambda signals, d: np.sin(3 * np.asarray(signals.beta.position) + 1.0),
+)
 """Laws of each axis that the library does not have."""
 UNLISTED_G = (2e-3, 1e-2)
 """Range of their sizes, g; they are log-uniform."""
@@ -133,18 +150,25 @@ class Bench:
     def recording(self):
         """Return all samples so far."""
         begins_s = [m.begin_s for m in self._manoeuvres]
-        return sampled(self.unit, Motion(
-            self.now_s, Joined(begins_s, [m.motion.alpha for m in self._manoeuvres]),
-            Joined(begins_s, [m.motion.beta for m in self._manoeuvres])))
+        return sampled(
+            self.unit,
+            Motion(
+                self.now_s,
+                Joined(begins_s, [m.motion.alpha for m in self._manoeuvres]),
+                Joined(begins_s, [m.motion.beta for m in self._manoeuvres]),
+            ),
+        )
 
 
 @contextmanager
 def in_library(faults):
     """Add faults to the library of this process for a while, so that the simulator runs them."""
+
     def effect(name, law, sizes):
         def act(signals, parameters):
             for d, size in enumerate(sizes):
                 signals.output[d] = signals.output[d] + size * law(signals, d)
+
         return Effect(name, Place.ELEMENT, (), act, '')
 
     added = {f'fault_{i}': effect(f'fault_{i}', *fault) for i, fault in enumerate(faults)}
@@ -159,8 +183,11 @@ def in_library(faults):
 def sampled(unit, motion):
     """Return the recording of a unit."""
     with in_library(unit.faults) as names:
-        sensor = replace(unit.sensor, effects=(*unit.sensor.effects, *names),
-                         values={**unit.sensor.values, **{name: {} for name in names}})
+        sensor = replace(
+            unit.sensor,
+            effects=(*unit.sensor.effects, *names),
+            values={**unit.sensor.values, **{name: {} for name in names}},
+        )
         columns = simulate(sensor, motion, unit.seed)
     return Recording(f'unit {unit.seed}', columns.pop('time_s'), columns)
 
@@ -181,16 +208,28 @@ def investigated(unit, base, is_random):
     bench, rng = Bench(unit, base), np.random.default_rng([unit.seed, 2])
     moved_s, has_samples, recorded, verdict = 0.0, False, (), ''
     while True:
-        question = Question(bench.pose, bench.now_s / 60, LONGEST_MINUTES - moved_s / 60,
-                            has_samples, recorded, verdict)
-        answer = run_round(question, [bench.recording()], base, LIMITS)[0] if has_samples \
+        question = Question(
+            bench.pose,
+            bench.now_s / 60,
+            LONGEST_MINUTES - moved_s / 60,
+            has_samples,
+            recorded,
+            verdict,
+        )
+        answer = (
+            run_round(question, [bench.recording()], base, LIMITS)[0]
+            if has_samples
             else first_answer()
+        )
         if answer.outcome is not Outcome.GO_ON:
             return answer, bench.now_s / 60
         name = answer.manoeuvre
         if is_random:
-            fitting = [m.name for m in plan_all(LIMITS, bench.pose)
-                       if m.minutes <= question.remaining_minutes]
+            fitting = [
+                m.name
+                for m in plan_all(LIMITS, bench.pose)
+                if m.minutes <= question.remaining_minutes
+            ]
             name = str(rng.choice(fitting))
         manoeuvre = plan(name, LIMITS, bench.pose, bench.now_s)
         moved_s += manoeuvre.motion.duration_s
@@ -207,8 +246,12 @@ def recorded_richly(unit, base):
         motion = Motion(end_s, full.alpha, full.beta)
         pose = LIMITS.nearest(*(float(p(np.array([end_s]))[0]) for p in (full.alpha, full.beta)))
         remaining_minutes = LONGEST_MINUTES if end_s < full.duration_s else 0.0
-        answer, _ = run_round(Question(pose, end_s / 60, remaining_minutes, True),
-                              [sampled(unit, motion)], base, LIMITS)
+        answer, _ = run_round(
+            Question(pose, end_s / 60, remaining_minutes, True),
+            [sampled(unit, motion)],
+            base,
+            LIMITS,
+        )
         if answer.outcome is not Outcome.GO_ON:
             return answer, end_s / 60
         end_s += RICH_STEP_S
@@ -217,31 +260,44 @@ def recorded_richly(unit, base):
 def row_of(unit, base, strategy):
     """Return the result of a strategy on a unit, as values of JSON."""
     begin_s = time.process_time()
-    answer, minutes = recorded_richly(unit, base) if strategy == 'rich' else \
-        investigated(unit, base, strategy == 'random')
+    answer, minutes = (
+        recorded_richly(unit, base)
+        if strategy == 'rich'
+        else investigated(unit, base, strategy == 'random')
+    )
     best = answer.hypotheses[0]
-    return {'seed': unit.seed, 'strategy': strategy, 'effects': unit.effects,
-            'faults': [UNLISTED.index(law) for law, _ in unit.faults],
-            'minutes': round(minutes, 2), 'outcome': answer.outcome.value,
-            'best': best.effects, 'probability': round(best.probability, 4),
-            'is_right': set(best.effects) == set(unit.effects)
-            or (UNKNOWN in best.effects and bool(unit.faults)),
-            'cpu_s': round(time.process_time() - begin_s, 1)}
+    return {
+        'seed': unit.seed,
+        'strategy': strategy,
+        'effects': unit.effects,
+        'faults': [UNLISTED.index(law) for law, _ in unit.faults],
+        'minutes': round(minutes, 2),
+        'outcome': answer.outcome.value,
+        'best': best.effects,
+        'probability': round(best.probability, 4),
+        'is_right': set(best.effects) == set(unit.effects)
+        or (UNKNOWN in best.effects and bool(unit.faults)),
+        'cpu_s': round(time.process_time() - begin_s, 1),
+    }
 
 
 def table(rows):
     """Return the lines of the table of docs/measurements/investigate.md."""
-    lines = ['| strategy | units | with a verdict | wrong | median minutes | mean minutes |',
-             '|---|---|---|---|---|---|']
+    lines = [
+        '| strategy | units | with a verdict | wrong | median minutes | mean minutes |',
+        '|---|---|---|---|---|---|',
+    ]
     for strategy in STRATEGIES:
         results = [r for r in rows if r['strategy'] == strategy]
         ended = [r for r in results if r['outcome'] in ('certain', 'no_visible_gap')]
         wrong = sum(not r['is_right'] for r in ended)
         minutes = [r['minutes'] if r in ended else np.inf for r in results]
         if results:
-            lines.append(f'| {strategy} | {len(results)} | {len(ended)} | {wrong} | '
-                         f'{np.median(minutes):.1f} | '
-                         f'{np.mean([r["minutes"] for r in results]):.1f} |')
+            lines.append(
+                f'| {strategy} | {len(results)} | {len(ended)} | {wrong} | '
+                f'{np.median(minutes):.1f} | '
+                f'{np.mean([r["minutes"] for r in results]):.1f} |'
+            )
     return lines
 
 
@@ -250,15 +306,24 @@ def main():
     parse.add_argument('--units', type=int, default=60, help='number of units (default 60)')
     parse.add_argument('--seed', type=int, default=0, help='seed of the first unit (default 0)')
     parse.add_argument('--strategy', choices=STRATEGIES, action='append', help='default: all')
-    parse.add_argument('--beyond', action='store_true',
-                       help='units with a fault that the library does not have')
-    parse.add_argument('-o', dest='output', type=Path, default=Path('investigate_units.jsonl'),
-                       help='a line of JSON for each run; runs that it has are not repeated')
+    parse.add_argument(
+        '--beyond', action='store_true', help='units with a fault that the library does not have'
+    )
+    parse.add_argument(
+        '-o',
+        dest='output',
+        type=Path,
+        default=Path('investigate_units.jsonl'),
+        help='a line of JSON for each run; runs that it has are not repeated',
+    )
     options = parse.parse_args()
     base = nominal_sensor()
     units = [drawn_unit(options.seed + i, base, options.beyond) for i in range(options.units)]
-    rows = [json.loads(line) for line in options.output.read_text().splitlines()] \
-        if options.output.exists() else []
+    rows = (
+        [json.loads(line) for line in options.output.read_text().splitlines()]
+        if options.output.exists()
+        else []
+    )
     done = {(row['seed'], row['strategy']) for row in rows}
     with open(options.output, 'a', encoding='utf-8') as file:
         for unit in units:

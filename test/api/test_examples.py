@@ -15,14 +15,20 @@ FILES = {
     'calibrate_arrays': ['unit.yaml'],
     'stage_sweep': ['report', 'unit.yaml'],
     'thousand_sensors': [],
-    'tilt_with_covariance': []}
+    'tilt_with_covariance': [],
+}
 """What each example writes into the folder that it is started in."""
 
 
 @pytest.mark.parametrize('name', FILES)
 def test_an_example_runs_and_writes(name: str, tmp_path: Path) -> None:
-    done = subprocess.run([sys.executable, REPO / 'docs' / 'examples' / f'{name}.py'], text=True,
-                          capture_output=True, cwd=tmp_path, timeout=60 * PATIENCE)
+    done = subprocess.run(
+        [sys.executable, REPO / 'docs' / 'examples' / f'{name}.py'],
+        text=True,
+        capture_output=True,
+        cwd=tmp_path,
+        timeout=60 * PATIENCE,
+    )
     assert done.returncode == 0, done.stderr
     assert done.stderr == '' and done.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == FILES[name]

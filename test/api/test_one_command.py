@@ -12,8 +12,13 @@ import pytest
 
 def run(*words: str, **options: object) -> subprocess.CompletedProcess:
     environment = {key: value for key, value in os.environ.items() if key != STARTED_BY}
-    return subprocess.run([sys.executable, '-m', 'adxl_ros', *words], text=True,
-                          capture_output=True, env=environment, **options)
+    return subprocess.run(
+        [sys.executable, '-m', 'adxl_ros', *words],
+        text=True,
+        capture_output=True,
+        env=environment,
+        **options,
+    )
 
 
 def test_help_lists_the_tools_and_a_tool_has_its_own() -> None:
@@ -37,10 +42,12 @@ def test_the_next_command_names_the_tool_as_it_was_started(tmp_path) -> None:
     assert ' next   python3 -m adxl_ros diagnose tilt.csv -o gap' in done.stdout
 
 
-@pytest.mark.parametrize('started_by, expected', [
-    (None, 'ros2 run adxl_ros fit a.csv'), ('./run', './run fit a.csv')])
-def test_a_command_of_ros_or_of_a_clone(started_by: str | None, expected: str,
-                                        monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    'started_by, expected', [(None, 'ros2 run adxl_ros fit a.csv'), ('./run', './run fit a.csv')]
+)
+def test_a_command_of_ros_or_of_a_clone(
+    started_by: str | None, expected: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv('AMENT_PREFIX_PATH', '/opt/ros/jazzy')
     monkeypatch.delenv(STARTED_BY, raising=False)
     if started_by:

@@ -16,11 +16,14 @@ ACCEL = {'ax_mps2': np.sin(TIME_S), 'ay_mps2': np.cos(TIME_S), 'az_mps2': np.ful
 
 
 def test_the_import_is_light_and_loads_no_ros() -> None:
-    code = ('import sys, time; begin = time.process_time(); import adxl_ros; '
-            'print(time.process_time() - begin, "numpy" in sys.modules); '
-            'adxl_ros.diagnose, adxl_ros.read; print("rclpy" in sys.modules)')
-    printed = subprocess.run([sys.executable, '-c', code], text=True, capture_output=True,
-                             check=True).stdout.split()
+    code = (
+        'import sys, time; begin = time.process_time(); import adxl_ros; '
+        'print(time.process_time() - begin, "numpy" in sys.modules); '
+        'adxl_ros.diagnose, adxl_ros.read; print("rclpy" in sys.modules)'
+    )
+    printed = subprocess.run(
+        [sys.executable, '-c', code], text=True, capture_output=True, check=True
+    ).stdout.split()
     assert float(printed[0]) < 0.2
     assert printed[1:] == ['False', 'False']
 
@@ -42,12 +45,17 @@ def test_arrays_tables_and_files_hold_the_same(tmp_path) -> None:
     recording = adxl.from_arrays(time_s=TIME_S, **ACCEL)
     table = pd.DataFrame({'time_s': TIME_S, **ACCEL})
     table.to_csv(tmp_path / 'log.csv', index=False)
-    for other in (adxl.from_arrays(table), adxl.read(table), adxl.read(tmp_path / 'log.csv'),
-                  adxl.from_arrays(rate=100, **ACCEL)):
+    for other in (
+        adxl.from_arrays(table),
+        adxl.read(table),
+        adxl.read(tmp_path / 'log.csv'),
+        adxl.from_arrays(rate=100, **ACCEL),
+    ):
         np.testing.assert_allclose(other.time_s, recording.time_s, atol=1e-12)
         np.testing.assert_allclose(other.columns['ay_mps2'], ACCEL['ay_mps2'], rtol=1e-9)
-    pd.testing.assert_series_equal(recording.to_pandas()['ax_mps2'].reset_index(drop=True),
-                                   table['ax_mps2'])
+    pd.testing.assert_series_equal(
+        recording.to_pandas()['ax_mps2'].reset_index(drop=True), table['ax_mps2']
+    )
     assert str(recording) == 'arrays: 3.99 s, 100 Hz, axes x y z'
 
 
@@ -60,6 +68,7 @@ def test_a_table_of_other_software_is_read_by_its_mapping() -> None:
 
 def test_axes_are_drawn_into_those_that_are_given() -> None:
     from matplotlib.figure import Figure
+
     axes = Figure().subplots()
     assert adxl.from_arrays(rate=100, **ACCEL).plot(axes) is axes
     assert len(axes.lines) == 3 and axes.get_xlabel() == 'time, s'
@@ -72,16 +81,21 @@ def test_a_recording_saves_itself(name: str, tmp_path) -> None:
     again = adxl.read(tmp_path / name)
     np.testing.assert_allclose(again.time_s, TIME_S, atol=1e-9)
     for column in (*ACCEL, 'temperature_c'):
-        np.testing.assert_allclose(again.columns[column], recording.columns[column], rtol=1e-6,
-                                   atol=1e-9)
+        np.testing.assert_allclose(
+            again.columns[column], recording.columns[column], rtol=1e-6, atol=1e-9
+        )
 
 
-@pytest.mark.parametrize('arrays, named', [
-    ({'ax_mps2': [1.0, 2.0]}, 'time'),
-    ({'time_s': [0.0, 1.0, 2.0], 'ax_mps2': [1.0, 2.0]}, 'ax_mps2'),
-    ({'time_s': [0.0, 0.1], 'gx_mps2': [1.0, 2.0]}, 'gx_mps2'),
-    ({'time_s': [0.2, 0.1], 'ax_mps2': [1.0, 2.0]}, 'arrays: row 2'),
-    ({'time_s': [0.1, 0.2], 'ax_mps2': [1.0, 1e9]}, 'arrays: row 2 of ax_mps2')])
+@pytest.mark.parametrize(
+    'arrays, named',
+    [
+        ({'ax_mps2': [1.0, 2.0]}, 'time'),
+        ({'time_s': [0.0, 1.0, 2.0], 'ax_mps2': [1.0, 2.0]}, 'ax_mps2'),
+        ({'time_s': [0.0, 0.1], 'gx_mps2': [1.0, 2.0]}, 'gx_mps2'),
+        ({'time_s': [0.2, 0.1], 'ax_mps2': [1.0, 2.0]}, 'arrays: row 2'),
+        ({'time_s': [0.1, 0.2], 'ax_mps2': [1.0, 1e9]}, 'arrays: row 2 of ax_mps2'),
+    ],
+)
 def test_what_is_no_recording_is_refused_by_name(arrays: dict, named: str) -> None:
     with pytest.raises(adxl.UserError, match=named):
         adxl.from_arrays(**arrays)

@@ -17,8 +17,13 @@ BIAS_V = 0.01  # Largest departure of the zero-g that is simulated, 10 mg
 @pytest.fixture(scope='module')
 def recording() -> object:
     """Make a recording of arrays, as a stranger has them."""
-    made = adxl.simulate('tilt_both', 'adxl203', rate=25, seed=1, effects={
-        'bias': {'offset_v': {'x': BIAS_V, 'y': -BIAS_V / 2}}})
+    made = adxl.simulate(
+        'tilt_both',
+        'adxl203',
+        rate=25,
+        seed=1,
+        effects={'bias': {'offset_v': {'x': BIAS_V, 'y': -BIAS_V / 2}}},
+    )
     columns = {name: made.columns[name] for name in ('x_v', 'y_v', 'alpha_rad', 'beta_rad')}
     return adxl.from_arrays(time_s=made.time_s, **columns)
 
@@ -39,8 +44,9 @@ def test_a_fit_finds_the_zero_g_and_saves_itself(fit, tmp_path) -> None:
     assert abs(zero_g.value - nominal - BIAS_V) < 3 * zero_g.half_width
     assert fit.poses + len(fit.outliers) == len(fit.result.poses)
     fit.save(tmp_path / 'unit.yaml')
-    np.testing.assert_allclose(adxl.load(tmp_path / 'unit.yaml').zero_g_v, fit.sensor.zero_g_v,
-                               rtol=1e-6)
+    np.testing.assert_allclose(
+        adxl.load(tmp_path / 'unit.yaml').zero_g_v, fit.sensor.zero_g_v, rtol=1e-6
+    )
     table = fit.to_pandas()
     assert len(table) == len(fit.coefficients) and set(table.unit) == {'V', 'V/g'}
     assert fit.to_dict()['coefficients'][0]['unit'] == 'V'
@@ -100,9 +106,15 @@ def test_a_verb_prints_nothing_and_leaves_the_global_seed(recording, fit, capsys
 def test_noise_of_white_samples_is_within_its_interval() -> None:
     rng = np.random.default_rng(5)
     std_mps2, rate_hz = 0.02, 100
-    noise = adxl.noise(adxl.from_arrays(
-        rate=rate_hz, **{f'a{axis}_mps2': value + rng.normal(0, std_mps2, 20_000)
-                         for axis, value in zip('xyz', (0, 0, G_MPS2))}))
+    noise = adxl.noise(
+        adxl.from_arrays(
+            rate=rate_hz,
+            **{
+                f'a{axis}_mps2': value + rng.normal(0, std_mps2, 20_000)
+                for axis, value in zip('xyz', (0, 0, G_MPS2))
+            },
+        )
+    )
     for axis in noise.axes:
         white = axis.fit.white
         assert white.low * 0.95 < std_mps2 / np.sqrt(rate_hz) < white.high * 1.05
@@ -112,15 +124,20 @@ def test_noise_of_white_samples_is_within_its_interval() -> None:
 
 def test_an_axis_that_is_stuck_is_not_sound() -> None:
     time_s = np.arange(2000) / 100
-    checked = adxl.check(adxl.from_arrays(
-        time_s=time_s, ax_mps2=np.sin(time_s), ay_mps2=np.zeros(2000), az_mps2=np.cos(time_s)))
+    checked = adxl.check(
+        adxl.from_arrays(
+            time_s=time_s, ax_mps2=np.sin(time_s), ay_mps2=np.zeros(2000), az_mps2=np.cos(time_s)
+        )
+    )
     assert not checked.is_sound and any('ay_mps2' in fault for fault in checked.faults)
     assert 'NOT SOUND' in str(checked)
 
 
 def test_a_simulation_has_its_effects_and_its_seed() -> None:
-    first, same, other = (adxl.simulate('motion', rate=50, seed=seed, effects={
-        'bias': {'offset_v.y': 0.02}}) for seed in (1, 1, 2))
+    first, same, other = (
+        adxl.simulate('motion', rate=50, seed=seed, effects={'bias': {'offset_v.y': 0.02}})
+        for seed in (1, 1, 2)
+    )
     np.testing.assert_array_equal(first.columns['y_v'], same.columns['y_v'])
     assert (first.columns['y_v'] != other.columns['y_v']).any()
     plain = adxl.simulate('motion', rate=50, seed=1)
@@ -132,17 +149,22 @@ def test_a_fit_is_a_sensor_of_a_simulator(fit) -> None:
     model = adxl.SensorModel(fit, seed=1)
     readings = model(np.tile([0.0, 0.0, G_MPS2], (500, 1)), 0.01)
     assert readings[:, 0].mean() / G_MPS2 == pytest.approx(
-        BIAS_V / fit.sensor.nominal_scale_v_per_g[0], abs=2e-3)
+        BIAS_V / fit.sensor.nominal_scale_v_per_g[0], abs=2e-3
+    )
 
 
-@pytest.mark.parametrize('call, named', [
-    (lambda: adxl.simulate('no_such_motion'), 'no_such_motion'),
-    (lambda: adxl.simulate('motion', effects=['no_such_effect']), 'no_such_effect'),
-    (lambda: adxl.simulate('motion', effects={'bias': {'offset_v': 99}}), '99'),
-    (lambda: adxl.simulate('imu'), '--force'),
-    (lambda: adxl.load('no_such_sensor'), 'no_such_sensor'),
-    (lambda: adxl.fit([]), 'no recording'),
-    (lambda: adxl.read('no_such_file.csv'), 'no_such_file.csv')])
+@pytest.mark.parametrize(
+    'call, named',
+    [
+        (lambda: adxl.simulate('no_such_motion'), 'no_such_motion'),
+        (lambda: adxl.simulate('motion', effects=['no_such_effect']), 'no_such_effect'),
+        (lambda: adxl.simulate('motion', effects={'bias': {'offset_v': 99}}), '99'),
+        (lambda: adxl.simulate('imu'), '--force'),
+        (lambda: adxl.load('no_such_sensor'), 'no_such_sensor'),
+        (lambda: adxl.fit([]), 'no recording'),
+        (lambda: adxl.read('no_such_file.csv'), 'no_such_file.csv'),
+    ],
+)
 def test_errors_name_what_is_wrong(call, named) -> None:
     with pytest.raises(adxl.UserError, match=named):
         call()

@@ -78,8 +78,11 @@ def scored(folder, body, pool):
     path.write_text(SCRIPT.format(body=body))
     real = diagnosis_runs.executable
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(diagnosis_runs, 'executable', lambda name: [
-            sys.executable, str(path)] if name == 'diagnose' else real(name))
+        patch.setattr(
+            diagnosis_runs,
+            'executable',
+            lambda name: [sys.executable, str(path)] if name == 'diagnose' else real(name),
+        )
         return diagnosis_runs.score(folder, pool, show)
 
 
@@ -121,11 +124,15 @@ def copied(committed_check, null_check, folder):
 def test_only_the_label_file_contains_labels(committed_check):
     names = sorted(path.name for path in (committed_check / 'recordings').iterdir())
     count = TRIALS + 2
-    assert names == sorted(f'r{i:04d}.{suffix}' for i in range(count)
-                           for suffix in ('csv', 'yaml'))
+    assert names == sorted(
+        f'r{i:04d}.{suffix}' for i in range(count) for suffix in ('csv', 'yaml')
+    )
     assert {path.stat().st_mtime for path in (committed_check / 'recordings').iterdir()} == {0}
-    effects = [name.encode() for name in faults.KINDS if name not in (
-        'bias', 'gravity', 'scale_factor', 'supply')]
+    effects = [
+        name.encode()
+        for name in faults.KINDS
+        if name not in ('bias', 'gravity', 'scale_factor', 'supply')
+    ]
     assert [path.name for path in (committed_check / 'labels').iterdir()] == ['labels.json']
     for path in committed_check.rglob('*'):
         if path.name == 'labels.json':
@@ -144,7 +151,12 @@ def test_scores_of_a_diagnosis_without_effects(null_check):
     assert not made['leaks']
     groups = [row['group'] for row in made['rows']]
     assert [groups.count(name) for name in ('none', 'pair', 'outside', 'single', 'zero')] == [
-        5, 4, 4, 7, 2]
+        5,
+        4,
+        4,
+        7,
+        2,
+    ]
 
 
 def test_a_diagnosis_cannot_reach_the_labels(committed_check, null_check, tmp_path, pool):
@@ -154,13 +166,19 @@ def test_a_diagnosis_cannot_reach_the_labels(committed_check, null_check, tmp_pa
     # The same diagnosis names the labels if it has the folder.
     shutil.rmtree(folder / 'reports')
     opened = scored(folder, CHEAT.format(folder=str(folder)), pool)
-    assert all(sorted(row['named']) == sorted(row['effects']) for row in opened['rows']
-               if row['group'] != 'zero')
+    assert all(
+        sorted(row['named']) == sorted(row['effects'])
+        for row in opened['rows']
+        if row['group'] != 'zero'
+    )
 
 
 def test_a_failed_diagnosis_is_counted(monkeypatch):
-    monkeypatch.setattr(diagnosis_runs, 'executable', lambda name: [
-        sys.executable, '-c', 'import sys; sys.exit("no such thing")'])
+    monkeypatch.setattr(
+        diagnosis_runs,
+        'executable',
+        lambda name: [sys.executable, '-c', 'import sys; sys.exit("no such thing")'],
+    )
     result = diagnosis_runs.diagnose('r0', b'time_s,x_v\n', b'')[1]
     given = grading.answer(result)
     assert (given.status, given.gap, result['error']) == ('failed', False, 'no such thing')
@@ -187,8 +205,9 @@ def test_a_generator_that_leaks_labels_is_detected(null_check, tmp_path, pool):
 
     def leaking(plan):
         label = next(label for label in labels if label.name == plan.name)
-        text, parameters = ((recordings / f'{plan.name}.{suffix}').read_text()
-                            for suffix in ('csv', 'yaml'))
+        text, parameters = (
+            (recordings / f'{plan.name}.{suffix}').read_text() for suffix in ('csv', 'yaml')
+        )
         return trials.Drawn(label, padded(label, text), parameters)
 
     trials.seal(folder, short_plans, leaking, SEED, TRIALS, pool, show)
@@ -204,11 +223,30 @@ def drawn_labels():
     common = {'manoeuvre': 'rich', 'axes': 'xyz', 'floor_mps2': 0.01}
     rows = []
     for plan in plans(1, 60):
-        faults = [{'effect': name, 'size': 1.0, 'shape': {'w': [0.0] * 6, 'hertz': 9.0},
-                   'strength_mps2': 0.01 * (i + 1), 'power': 1.0, 'told': 1.0, 'inseparable': []}
-                  for i, name in enumerate(plan.effects)]
-        rows.append(Label(plan.name, plan.group, plan.effects, plan.seed, plan.seconds, **common,
-                          faults=faults, flexible=1.0))
+        faults = [
+            {
+                'effect': name,
+                'size': 1.0,
+                'shape': {'w': [0.0] * 6, 'hertz': 9.0},
+                'strength_mps2': 0.01 * (i + 1),
+                'power': 1.0,
+                'told': 1.0,
+                'inseparable': [],
+            }
+            for i, name in enumerate(plan.effects)
+        ]
+        rows.append(
+            Label(
+                plan.name,
+                plan.group,
+                plan.effects,
+                plan.seed,
+                plan.seconds,
+                **common,
+                faults=faults,
+                flexible=1.0,
+            )
+        )
     return rows
 
 
@@ -216,8 +254,9 @@ def answered(label, wrong=False):
     """Return the right answer, or an answer with effects that the trial does not have."""
     effects = frozenset({'bias', 'gravity'}) if wrong else grading.truth(label)
     status = 'no_gap' if not effects else 'unknown' if 'unknown' in effects else 'explained'
-    return grading.Answer(status, effects, (), 0.95, ((effects, 0.95),
-                          (frozenset({'x'}), 0.05)), {}, 1.0)
+    return grading.Answer(
+        status, effects, (), 0.95, ((effects, 0.95), (frozenset({'x'}), 0.05)), {}, 1.0
+    )
 
 
 def test_perfect_and_wrong_answers():
@@ -227,27 +266,34 @@ def test_perfect_and_wrong_answers():
         assert right[name]['value'] == 1
     assert right['false_alarms']['value'] == right['harm']['value'] == 0
     assert right['calibration_error']['value'] == pytest.approx(0.05)
-    assert right['brier']['value'] == pytest.approx(2 * 0.05 ** 2)
+    assert right['brier']['value'] == pytest.approx(2 * 0.05**2)
     assert right['pairs']['whole']['value'] == 1
     assert 'NO' not in [row['met'] for row in scores.bars(right)]
-    wrong = scores.scores([scores.Trial(label, answered(label, True), None)
-                           for label in labels])
+    wrong = scores.scores([scores.Trial(label, answered(label, True), None) for label in labels])
     assert wrong['false_alarms']['value'] == 1 and wrong['top_1']['value'] == 0
     assert {row['name'] for row in scores.bars(wrong) if row['met'] != 'NO'} == {
-        'harm', 'coverage', 'closed_by_oracle', 'limit_held'}
+        'harm',
+        'coverage',
+        'closed_by_oracle',
+        'limit_held',
+    }
 
 
 @pytest.mark.parametrize('name', faults.KINDS)
 def test_every_fault_changes_a_recording(name):
     """The change grows with the size."""
-    scene = simulator.Scene(simulator.draw_unit(np.random.default_rng(0)), motion.draw(
-        np.random.default_rng(2), (60.0, 62.0), 125.0, 'rich'), 1)
+    scene = simulator.Scene(
+        simulator.draw_unit(np.random.default_rng(0)),
+        motion.draw(np.random.default_rng(2), (60.0, 62.0), 125.0, 'rich'),
+        1,
+    )
     kind = faults.KINDS[name]
     shape = kind.draw(np.random.default_rng(1), scene.unit)
 
     def size(times):
-        return ideal_observer.rms(scene.response(
-            [simulator.Fault(kind, times * kind.start, shape)], True))
+        return ideal_observer.rms(
+            scene.response([simulator.Fault(kind, times * kind.start, shape)], True)
+        )
 
     assert 0 < size(1.0) < size(2.0) < np.inf
 
@@ -268,10 +314,16 @@ def test_the_command_commits_and_scores(run_tool, tmp_path, monkeypatch):
         assert digest in (tmp_path / 'dir' / name).read_text()
 
 
-@pytest.mark.parametrize('words, status, says', [
-    (['--trials', 3], 2, 'required'), (['-o', 'a', '--open', 'b'], 2, 'not allowed'),
-    (['--trials', 0, '-o', 'a'], 1, 'at least 1'), (['--open', 'none'], 1, '--seal none'),
-    (['-o', 'a', '--real', 'x'], 1, 'x: no such file or folder')])
+@pytest.mark.parametrize(
+    'words, status, says',
+    [
+        (['--trials', 3], 2, 'required'),
+        (['-o', 'a', '--open', 'b'], 2, 'not allowed'),
+        (['--trials', 0, '-o', 'a'], 1, 'at least 1'),
+        (['--open', 'none'], 1, '--seal none'),
+        (['-o', 'a', '--real', 'x'], 1, 'x: no such file or folder'),
+    ],
+)
 def test_wrong_usage(run_tool, tmp_path, words, status, says):
     failed = run_tool('blind', *words)
     assert failed.returncode == status and says in failed.stderr

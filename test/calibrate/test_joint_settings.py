@@ -13,8 +13,9 @@ RESTS = ((0, 10), (20, 30), (40, 50))
 
 
 def by_rows(readings, commands, rests):
-    return recorded_settings(np.array(rests), np.array(readings), np.array(commands),
-                             TOLERANCE).tolist()
+    return recorded_settings(
+        np.array(rests), np.array(readings), np.array(commands), TOLERANCE
+    ).tolist()
 
 
 def by_tracker(readings, commands, rests):
@@ -44,32 +45,41 @@ def changed(**parts):
 
 
 @pytest.mark.parametrize('number', [by_rows, by_tracker])
-@pytest.mark.parametrize(('readings', 'commands', 'settings'), [
-    (changed(), changed(), [0, 0, 0]),
-    # The encoder.
-    (changed(r12_14=0.3), changed(), [0, 1, 1]),
-    (changed(r12_13=1.6 * STEP), changed(), [0, 1, 1]),
-    (changed(r12_14=STEP, r16_18=-STEP), changed(), [0, 0, 0]),
-    (changed(r15_60=STEP), changed(), [0, 0, 0]), (changed(r15_60=2 * STEP), changed(), [0, 1, 1]),
-    (changed(r15_35=0.3), changed(), [0, 1, 2]),
-    # The end of a rest in a recording may contain the beginning of the next move.
-    (changed(r29_60=2 * STEP), changed(), [0, 0, 1]),
-    (changed(r14_22=-2 * STEP), changed(), [0, 1, 1]),
-    # Rows without a reading.
-    (changed(r11_19=NAN), changed(), [0, 0, 0]), (changed(r11_40=NAN), changed(), [0, 0, 0]),
-    (changed(r11_40=NAN, r40_60=0.3), changed(), [0, 0, 1]),
-    (changed(r18_40=NAN, r12_14=0.3), changed(), [0, 1, 1]),
-    (changed(r0_60=NAN), changed(), [0, 0, 0]),
-    # The command.
-    (changed(), changed(r15_60=0.3), [0, 1, 1]), (changed(), changed(r12_14=0.3), [0, 1, 1]),
-    (changed(), changed(r12_14=2e-9), [0, 1, 1]),
-    # A controller reacts late, so that a rest continues after the next command.
-    (changed(), changed(r22_60=0.3), [0, 0, 1]), (changed(), changed(r12_14=1e-10), [0, 0, 0]),
-    (changed(), changed(r0_12=0.1, r12_20=NAN, r20_60=0.1), [0, 0, 0]),
-    (changed(), changed(r0_12=0.1, r12_20=NAN, r20_60=0.2), [0, 1, 1]),
-    (changed(), changed(r1_32=NAN), [0, 0, 0]), (changed(), changed(r0_60=NAN), [0, 0, 0]),
-    (changed(), changed(r0_32=NAN), [0, 0, 1]),
-    (changed(r0_60=NAN), changed(r15_30=0.1), [0, 1, 2])])
+@pytest.mark.parametrize(
+    ('readings', 'commands', 'settings'),
+    [
+        (changed(), changed(), [0, 0, 0]),
+        # The encoder.
+        (changed(r12_14=0.3), changed(), [0, 1, 1]),
+        (changed(r12_13=1.6 * STEP), changed(), [0, 1, 1]),
+        (changed(r12_14=STEP, r16_18=-STEP), changed(), [0, 0, 0]),
+        (changed(r15_60=STEP), changed(), [0, 0, 0]),
+        (changed(r15_60=2 * STEP), changed(), [0, 1, 1]),
+        (changed(r15_35=0.3), changed(), [0, 1, 2]),
+        # The end of a rest in a recording may contain the beginning of the next move.
+        (changed(r29_60=2 * STEP), changed(), [0, 0, 1]),
+        (changed(r14_22=-2 * STEP), changed(), [0, 1, 1]),
+        # Rows without a reading.
+        (changed(r11_19=NAN), changed(), [0, 0, 0]),
+        (changed(r11_40=NAN), changed(), [0, 0, 0]),
+        (changed(r11_40=NAN, r40_60=0.3), changed(), [0, 0, 1]),
+        (changed(r18_40=NAN, r12_14=0.3), changed(), [0, 1, 1]),
+        (changed(r0_60=NAN), changed(), [0, 0, 0]),
+        # The command.
+        (changed(), changed(r15_60=0.3), [0, 1, 1]),
+        (changed(), changed(r12_14=0.3), [0, 1, 1]),
+        (changed(), changed(r12_14=2e-9), [0, 1, 1]),
+        # A controller reacts late, so that a rest continues after the next command.
+        (changed(), changed(r22_60=0.3), [0, 0, 1]),
+        (changed(), changed(r12_14=1e-10), [0, 0, 0]),
+        (changed(), changed(r0_12=0.1, r12_20=NAN, r20_60=0.1), [0, 0, 0]),
+        (changed(), changed(r0_12=0.1, r12_20=NAN, r20_60=0.2), [0, 1, 1]),
+        (changed(), changed(r1_32=NAN), [0, 0, 0]),
+        (changed(), changed(r0_60=NAN), [0, 0, 0]),
+        (changed(), changed(r0_32=NAN), [0, 0, 1]),
+        (changed(r0_60=NAN), changed(r15_30=0.1), [0, 1, 2]),
+    ],
+)
 def test_a_joint_moves_with_its_encoder_or_its_command(number, readings, commands, settings):
     assert number(readings, commands, RESTS) == settings
 

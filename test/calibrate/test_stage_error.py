@@ -25,11 +25,12 @@ def poses():
 def dense(slope, poses, error):
     """Compute the dense covariance: noise, and errors by pose and by setting of each joint."""
     count, axes = slope.shape[:2]
-    matrix = np.diag((poses.std_v ** 2).ravel())
+    matrix = np.diag((poses.std_v**2).ravel())
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
         angles = error.joints[joint] ** 2 * (
-            error.setting_rad ** 2 * (setting[:, None] == setting)
-            + error.pose_rad ** 2 * np.eye(count))
+            error.setting_rad**2 * (setting[:, None] == setting)
+            + error.pose_rad**2 * np.eye(count)
+        )
         part = np.einsum('km,kl,ln->kmln', slope[:, :, joint], angles, slope[:, :, joint])
         matrix += part.reshape(count * axes, count * axes)
     return matrix
@@ -41,8 +42,9 @@ def test_products_and_determinant_are_those_of_the_dense_covariance(poses):
     matrix = dense(slope, poses, ERROR)
     covariance = PoseCovariance(slope, poses, shared_settings(poses), ERROR)
     flat = columns.reshape(-1, 5)
-    np.testing.assert_allclose(covariance.products(columns),
-                               flat.T @ np.linalg.solve(matrix, flat), rtol=1e-8)
+    np.testing.assert_allclose(
+        covariance.products(columns), flat.T @ np.linalg.solve(matrix, flat), rtol=1e-8
+    )
     assert covariance.log_determinant() == pytest.approx(np.linalg.slogdet(matrix)[1], abs=1e-6)
 
 
@@ -52,15 +54,16 @@ def test_predicted_errors_are_the_best_linear_estimates(poses):
     residual = np.random.default_rng(2).normal(size=poses.volts.shape) * 1e-4
     covariance = PoseCovariance(slope, poses, shared_settings(poses), ERROR)
     weighted = np.linalg.solve(dense(slope, poses, ERROR), residual.ravel()).reshape(
-        residual.shape)
+        residual.shape
+    )
     felt = np.einsum('kmj,km->kj', slope, weighted)
-    expected = ERROR.pose_rad ** 2 * felt
+    expected = ERROR.pose_rad**2 * felt
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
-        expected[:, joint] += ERROR.setting_rad ** 2 * (
-            setting[:, None] == setting) @ felt[:, joint]
-    expected *= ERROR.joints ** 2
-    np.testing.assert_allclose(covariance.predicted_errors(residual).total_rad, expected,
-                               rtol=1e-7, atol=1e-15)
+        expected[:, joint] += ERROR.setting_rad**2 * (setting[:, None] == setting) @ felt[:, joint]
+    expected *= ERROR.joints**2
+    np.testing.assert_allclose(
+        covariance.predicted_errors(residual).total_rad, expected, rtol=1e-7, atol=1e-15
+    )
 
 
 def test_the_stated_error_counts_where_poses_do_not_determine_it(poses):

@@ -20,12 +20,17 @@ QUIET = Interval(1.0, {'received': 1000, 'published': 1000}, (), {}, {})
 
 def unit(serial: str = '17', axes: str = 'xy', seed: int = 1) -> Sensor:
     sensor = drawn(np.random.default_rng(seed), nominal(axes))
-    return replace(sensor, serial=serial, covariance_names=(Coefficient('bias', 'offset_v', 'x'),),
-                   covariance=np.array([[1e-6]]))
+    return replace(
+        sensor,
+        serial=serial,
+        covariance_names=(Coefficient('bias', 'offset_v', 'x'),),
+        covariance=np.array([[1e-6]]),
+    )
 
 
-def policy_for(sensor: Sensor, store: Path | str = '', paper: bool = False,
-               **info: str) -> CompensationPolicy:
+def policy_for(
+    sensor: Sensor, store: Path | str = '', paper: bool = False, **info: str
+) -> CompensationPolicy:
     """Return the policy of a stream of this sensor; `changes` replaces keys of its info."""
     policy = CompensationPolicy(paper, str(store), '/{}'.format)
     policy.use(sensor, 'a file')
@@ -36,29 +41,48 @@ def policy_for(sensor: Sensor, store: Path | str = '', paper: bool = False,
 
 def stored(folder: Path, sensor: Sensor, days_old: float) -> Path:
     made = datetime.now(timezone.utc) - timedelta(days=days_old)
-    path = calibration_store.put(folder, replace(sensor, provenance={
-        'date': made.isoformat(timespec='seconds'), 'data_sha256': f'{days_old:064.3f}'}))
+    path = calibration_store.put(
+        folder,
+        replace(
+            sensor,
+            provenance={
+                'date': made.isoformat(timespec='seconds'),
+                'data_sha256': f'{days_old:064.3f}',
+            },
+        ),
+    )
     assert path is not None
     return path
 
 
 def test_the_source_of_a_calibration_is_stated_in_one_line() -> None:
     policy = CompensationPolicy(False, '', '/{}'.format)
-    assert policy.use(nominal(), 'the file') == \
-        'compensating by the file: nominal, which is not calibrated'
+    assert (
+        policy.use(nominal(), 'the file')
+        == 'compensating by the file: nominal, which is not calibrated'
+    )
     assert policy.use(unit(), 'the file').startswith('compensating by the file: 17, model ')
 
 
-@pytest.mark.parametrize(('key', 'value', 'reason'), [
-    ('serial', '18', 'is of the sensor 18, but the parameters are of 17'),
-    ('axes', 'xyz', 'axes xyz, but the parameters of 17 are for xy'),
-    ('nominal_zero_g_v', '1.65, 1.65', 'nominal_zero_g_v is [1.65, 1.65], but [2.5, 2.5]'),
-    ('nominal_scale_v_per_g', '0.3, 0.3', 'nominal_scale_v_per_g is [0.3, 0.3], but [1.0, 1.0]'),
-    ('format', '99', 'format version 99, but this package reads version 1'),
-    ('rate_hz', 'nan', "rate_hz is 'nan', expected samples a second"),
-    ('rate_hz', '-1', "rate_hz is '-1', expected samples a second")])
-def test_a_stream_is_refused_until_it_belongs_to_the_unit(key: str, value: str,
-                                                          reason: str) -> None:
+@pytest.mark.parametrize(
+    ('key', 'value', 'reason'),
+    [
+        ('serial', '18', 'is of the sensor 18, but the parameters are of 17'),
+        ('axes', 'xyz', 'axes xyz, but the parameters of 17 are for xy'),
+        ('nominal_zero_g_v', '1.65, 1.65', 'nominal_zero_g_v is [1.65, 1.65], but [2.5, 2.5]'),
+        (
+            'nominal_scale_v_per_g',
+            '0.3, 0.3',
+            'nominal_scale_v_per_g is [0.3, 0.3], but [1.0, 1.0]',
+        ),
+        ('format', '99', 'format version 99, but this package reads version 1'),
+        ('rate_hz', 'nan', "rate_hz is 'nan', expected samples a second"),
+        ('rate_hz', '-1', "rate_hz is '-1', expected samples a second"),
+    ],
+)
+def test_a_stream_is_refused_until_it_belongs_to_the_unit(
+    key: str, value: str, reason: str
+) -> None:
     policy = policy_for(unit(), **{key: value})
     assert reason in policy.refusal
     assert policy.refusal.startswith('/sensor_info: ')
@@ -104,12 +128,16 @@ def test_a_newer_calibration_is_announced_unless_one_was_named(tmp_path: Path) -
     assert policy.values(QUIET, fresh)['age_days'] == pytest.approx(3.0, abs=0.01)
 
 
-@pytest.mark.parametrize(('counts', 'expected'), [
-    ({'received': 0}, 'no samples on /imu/data_raw'),
-    ({'received': 9, 'dropped': 5}, '5 samples dropped'),
-    ({'received': 9, 'saturated': 2}, '2 samples with the ADC at its rail'),
-    ({'received': 9, 'backward': 4}, '4 samples whose stamp steps back'),
-    ({'received': 9, 'outside': 3}, '3 samples outside of what was calibrated')])
+@pytest.mark.parametrize(
+    ('counts', 'expected'),
+    [
+        ({'received': 0}, 'no samples on /imu/data_raw'),
+        ({'received': 9, 'dropped': 5}, '5 samples dropped'),
+        ({'received': 9, 'saturated': 2}, '2 samples with the ADC at its rail'),
+        ({'received': 9, 'backward': 4}, '4 samples whose stamp steps back'),
+        ({'received': 9, 'outside': 3}, '3 samples outside of what was calibrated'),
+    ],
+)
 def test_states_of_the_samples(counts: dict[str, int], expected: str) -> None:
     interval = replace(QUIET, counts=counts, outside=('temperature 40.0 degC',))
     level, text = policy_for(unit()).status(interval, None, '')

@@ -73,13 +73,17 @@ def test_a_stream_gives_the_same_samples_with_a_delay_of_eight():
 
 
 def test_the_predicted_variance_of_restored_noise_is_right():
-    sensor = put(with_neutral(nominal(), ['bandwidth']),
-                 [Coefficient('bandwidth', 'resistance_ratio', 'x')], [-0.2])
+    sensor = put(
+        with_neutral(nominal(), ['bandwidth']),
+        [Coefficient('bandwidth', 'resistance_ratio', 'x')],
+        [-0.2],
+    )
     time_s = np.arange(200_000) / sensor.rate_hz
     volts = Response(sensor, Motion(200.0, Held(0.5), Held(0.7)), 3)(time_s)
     back = inversions.undo_filter(volts, time_s, noise.electronics(sensor).rc_s, sensor.rate_hz)
     assert back[100:-100].std(axis=0) ** 2 == pytest.approx(
-        inversions.noise_variance_v2(sensor), rel=0.02)
+        inversions.noise_variance_v2(sensor), rel=0.02
+    )
 
 
 def unit(rng, **options):

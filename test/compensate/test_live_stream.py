@@ -20,22 +20,29 @@ G = 9.80665
 
 
 class Stream(LiveStream):
-    def __init__(self, sensor: Sensor, undo_filter: bool = False, period_ns: int = 2 * 10 ** 9,
-                 output_rate_hz: float = 0.0) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        undo_filter: bool = False,
+        period_ns: int = 2 * 10**9,
+        output_rate_hz: float = 0.0,
+    ) -> None:
         self.data: list[bytes] = []
         self.tilt: list[bytes] = []
-        super().__init__(False, undo_filter, self.data.append, self.tilt.append,
-                         output_rate_hz=output_rate_hz)
+        super().__init__(
+            False, undo_filter, self.data.append, self.tilt.append, output_rate_hz=output_rate_hz
+        )
         self.use(sensor, 1000.0)
         self.period_ns, self.time_ns = period_ns, 0
 
-    def send(self, sensor: Sensor, alpha: float, beta: float,
-             around: Environment = NOMINAL_ENVIRONMENT) -> None:
+    def send(
+        self, sensor: Sensor, alpha: float, beta: float, around: Environment = NOMINAL_ENVIRONMENT
+    ) -> None:
         force = [float(f) for f in specific_force(alpha, beta, G)]
         volts = np.array([signal_chain.static_response(sensor)(force, around)])
         message = Imu()
         self.time_ns += self.period_ns
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.time_ns, 10 ** 9)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(self.time_ns, 10**9)
         a = message.linear_acceleration
         a.x, a.y, a.z = [*to_nominal_mps2(volts, sensor)[0].tolist(), 0.0][:3]
         self(serialize_message(message))
@@ -68,8 +75,11 @@ def test_stamps_that_step_back_are_counted() -> None:
 
 
 def test_temperature_and_supply_apply_from_the_next_sample_on() -> None:
-    sensor = put(with_neutral(unit(), ['temperature_bias']),
-                 [Coefficient('temperature_bias', 'per_k', 'x')], [1e-3])
+    sensor = put(
+        with_neutral(unit(), ['temperature_bias']),
+        [Coefficient('temperature_bias', 'per_k', 'x')],
+        [1e-3],
+    )
     warm = NOMINAL_ENVIRONMENT._replace(temperature_c=35.0)
     stream = Stream(sensor)
     stream.surround('temperature_c', 35.0)

@@ -33,7 +33,7 @@ def samples(sensor: Sensor, force: list[np.ndarray]) -> list[list[float]]:
     """Apply a force to the sensor at its rate; return nominal acceleration, (n, 3)."""
     volts = Fed(sensor, 2)(force)
     accel = np.zeros((len(volts), 3))
-    accel[:, :len(sensor.axes)] = to_nominal_mps2(volts, sensor)
+    accel[:, : len(sensor.axes)] = to_nominal_mps2(volts, sensor)
     return accel.tolist()
 
 
@@ -62,22 +62,27 @@ def test_agrees_with_blocks(axes: str) -> None:
     accel = samples(sensor, turning(2.0))
     follow = follower(sensor)
     outputs = [follow(a, i / 1000) for i, a in enumerate(accel)]
-    volts = sensor.nominal_zero_g_v + np.array(accel)[:, :len(axes)] / G * \
-        sensor.nominal_scale_v_per_g
+    volts = (
+        sensor.nominal_zero_g_v
+        + np.array(accel)[:, : len(axes)] / G * sensor.nominal_scale_v_per_g
+    )
     force = signal_chain.inverse(sensor)(list(volts.T))
     np.testing.assert_allclose([f.force for f in outputs], np.array(force).T, rtol=0, atol=2e-8)
     covariance = force_covariance(sensor, force)
-    measured = np.sqrt(covariance[[0, 0], [0, 0]] if axes == 'x' else
-                       covariance[[0, 1], [0, 1]]).T
+    measured = np.sqrt(covariance[[0, 0], [0, 0]] if axes == 'x' else covariance[[0, 1], [0, 1]]).T
     std = np.sqrt([[f.covariance[0], f.covariance[0 if axes == 'x' else 3]] for f in outputs])
     np.testing.assert_allclose(std, measured, rtol=0.05)
     angles = tilt(force, covariance, 'z' in axes)
     finite = np.isfinite(angles.roll)
-    np.testing.assert_allclose(np.array([f.roll[0] for f in outputs])[finite], angles.roll[finite],
-                               rtol=0, atol=1e-7)
-    np.testing.assert_allclose([f.inclination[0] for f in outputs if axes != 'x'],
-                               angles.inclination[np.full(len(outputs), axes != 'x')],
-                               rtol=0, atol=1e-7)
+    np.testing.assert_allclose(
+        np.array([f.roll[0] for f in outputs])[finite], angles.roll[finite], rtol=0, atol=1e-7
+    )
+    np.testing.assert_allclose(
+        [f.inclination[0] for f in outputs if axes != 'x'],
+        angles.inclination[np.full(len(outputs), axes != 'x')],
+        rtol=0,
+        atol=1e-7,
+    )
 
 
 def test_motion_raises_the_variance_of_z_and_angles_while_it_lasts() -> None:
@@ -85,7 +90,7 @@ def test_motion_raises_the_variance_of_z_and_angles_while_it_lasts() -> None:
     sensor = unit('xy')
     force = at_rest(0.6, 1.0, 9000)
     shaken = slice(2000, 5000)
-    force[0][shaken] += 2 * 2 ** 0.5 * np.sin(2 * np.pi * 3 * np.arange(3000) / 1000)
+    force[0][shaken] += 2 * 2**0.5 * np.sin(2 * np.pi * 3 * np.arange(3000) / 1000)
     follow = follower(sensor)
     outputs = [follow(a, i / 1000) for i, a in enumerate(samples(sensor, force))]
     std = np.sqrt([f.covariance[5] for f in outputs])
@@ -101,11 +106,18 @@ def test_motion_raises_the_variance_of_z_and_angles_while_it_lasts() -> None:
     assert np.sqrt(last.pitch[1]) > 0.15
 
 
-@pytest.mark.parametrize('change', [
-    lambda force: force / G, lambda force: force / 1000, lambda force: 0.02 * force,
-    lambda force: 0.68 * force])
+@pytest.mark.parametrize(
+    'change',
+    [
+        lambda force: force / G,
+        lambda force: force / 1000,
+        lambda force: 0.02 * force,
+        lambda force: 0.68 * force,
+    ],
+)
 def test_the_tilt_of_a_force_whose_length_is_not_gravity_states_a_deviation_that_covers(
-        change: Callable[[np.ndarray], np.ndarray]) -> None:
+    change: Callable[[np.ndarray], np.ndarray],
+) -> None:
     sensor, true_rad = unit('xyz'), 0.6
     force = change(np.array(specific_force(true_rad, 1.0, G)))
     accel = samples(sensor, [np.full(50, f) for f in force])
@@ -113,10 +125,14 @@ def test_the_tilt_of_a_force_whose_length_is_not_gravity_states_a_deviation_that
     live = [follow(a, i / 1000) for i, a in enumerate(accel)][-1]
     columns = dict(zip(('ax_mps2', 'ay_mps2', 'az_mps2'), np.array(accel).T))
     block = Recording('made.csv', np.arange(50) / 1000, columns)
-    (_, estimates), = RecordingEstimator(sensor, block).blocks([block])
+    ((_, estimates),) = RecordingEstimator(sensor, block).blocks([block])
     length_error = abs(float(np.linalg.norm(force)) - G) / G
-    for variance in (live.roll[1], live.pitch[1], float(estimates.tilt.roll_std[-1]) ** 2,
-                     float(estimates.tilt.pitch_std[-1]) ** 2):
+    for variance in (
+        live.roll[1],
+        live.pitch[1],
+        float(estimates.tilt.roll_std[-1]) ** 2,
+        float(estimates.tilt.pitch_std[-1]) ** 2,
+    ):
         assert np.sqrt(variance) > 0.8 * length_error
 
 
@@ -147,9 +163,14 @@ def big_endian(raw: bytes) -> bytes:
     """Swap the bytes of every number of a serialized Imu or Vector3Stamped."""
     length = int.from_bytes(raw[12:16], 'little')
     numbers = 4 + (12 + length + 7) // 8 * 8
-    head = b''.join(raw[i:i + 4][::-1] for i in (4, 8, 12))
-    return b'\0\0' + raw[2:4] + head + raw[16:numbers] + np.frombuffer(
-        raw[numbers:], '<f8').astype('>f8').tobytes()
+    head = b''.join(raw[i : i + 4][::-1] for i in (4, 8, 12))
+    return (
+        b'\0\0'
+        + raw[2:4]
+        + head
+        + raw[16:numbers]
+        + np.frombuffer(raw[numbers:], '<f8').astype('>f8').tobytes()
+    )
 
 
 @pytest.mark.parametrize('frame_id', ['', 'a', 'abc', 'imu_link', 'arm/imu_of_the_left_hand'])
@@ -186,8 +207,10 @@ def test_x_and_y_cover_both_signs_of_z_unless_it_is_given(alpha_deg: float) -> N
         known = drawn(np.random.default_rng(seed), nominal('xy'))
         force = specific_force(np.radians(alpha_deg), 0.7, G)
         volts = signal_chain.static_response(known)(force)
-        for sensor, results in ((replace(known, z_sign=0), inside),
-                                (replace(known, z_sign=-1), certain)):
+        for sensor, results in (
+            (replace(known, z_sign=0), inside),
+            (replace(known, z_sign=-1), certain),
+        ):
             estimate = LiveEstimator(sensor)([float(v) for v in volts], 0.0)
             assert estimate is not None
             error = np.abs(np.array(estimate.force[:2]) - np.ravel(force[:2]))
@@ -199,8 +222,9 @@ def test_x_and_y_cover_both_signs_of_z_unless_it_is_given(alpha_deg: float) -> N
 
 
 def test_a_mounting_says_which_way_up_the_case_is() -> None:
-    sensor = replace(drawn(np.random.default_rng(3), nominal('xy')), z_sign=0,
-                     provenance={'reference': 'stage'})
+    sensor = replace(
+        drawn(np.random.default_rng(3), nominal('xy')), z_sign=0, provenance={'reference': 'stage'}
+    )
     live = LiveEstimator(sensor, mounting=Mounting((np.pi, 0.0, 0.0)))
     volts = signal_chain.static_response(sensor)(specific_force(np.radians(150), 0.7, G))
     estimate = live([float(v) for v in volts], 0.0)
@@ -215,18 +239,30 @@ def test_the_yaw_that_a_level_leaves_is_in_the_covariance() -> None:
     inside = []
     for _ in range(60):
         yaw, roll, pitch = rng.normal(0, 0.0175), *rng.uniform(-0.8, 0.8, 2)
-        robot = G * np.array([-np.sin(pitch), np.cos(pitch) * np.sin(roll),
-                              np.cos(pitch) * np.cos(roll)])
-        turned = [np.cos(yaw) * robot[0] + np.sin(yaw) * robot[1],
-                  np.cos(yaw) * robot[1] - np.sin(yaw) * robot[0], robot[2]]
+        robot = G * np.array(
+            [-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)]
+        )
+        turned = [
+            np.cos(yaw) * robot[0] + np.sin(yaw) * robot[1],
+            np.cos(yaw) * robot[1] - np.sin(yaw) * robot[0],
+            robot[2],
+        ]
         volts = signal_chain.static_response(sensor)(list(live.mounting.rows.T @ turned))
         estimate = live([float(v) for v in volts], 10.0 * len(inside))
         for (angle, variance), true in ((estimate.roll, roll), (estimate.pitch, pitch)):
             inside.append(abs(angle - true) <= 1.645 * np.sqrt(variance))
     assert np.mean(inside) >= 0.87
-    level = live([float(v) for v in signal_chain.static_response(sensor)(
-        list(live.mounting.rows.T @ [0.0, 0.0, G]))], 1e4)
-    staged = LiveEstimator(replace(sensor, provenance={'reference': 'stage'}),
-                           mounting=live.mounting)
+    level = live(
+        [
+            float(v)
+            for v in signal_chain.static_response(sensor)(
+                list(live.mounting.rows.T @ [0.0, 0.0, G])
+            )
+        ],
+        1e4,
+    )
+    staged = LiveEstimator(
+        replace(sensor, provenance={'reference': 'stage'}), mounting=live.mounting
+    )
     assert max(np.sqrt([level.roll[1], level.pitch[1]])) < 1e-3
     assert staged([float(v) for v in volts], 0.0).roll[1] < estimate.roll[1]

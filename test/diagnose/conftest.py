@@ -18,8 +18,18 @@ def diagnose_two_effects(folder):
         assert done.returncode == status, done.stderr
         return done.stdout
 
-    call('simulate', 'rich', '--rate', '62.5', '--effect', 'lever_arm:x_m=0.03,y_m=0.02',
-         '--effect', 'temperature_bias:per_k=4e-4', '-o', 'run.csv')
+    call(
+        'simulate',
+        'rich',
+        '--rate',
+        '62.5',
+        '--effect',
+        'lever_arm:x_m=0.03,y_m=0.02',
+        '--effect',
+        'temperature_bias:per_k=4e-4',
+        '-o',
+        'run.csv',
+    )
     screen = call('diagnose', 'run.csv', '-o', 'gap', '--self-check', '1')
     (folder / 'screen.txt').write_text(screen)
     text = (folder / 'run.csv').read_text()

@@ -61,11 +61,15 @@ def test_no_gap_has_an_upper_limit():
     assert diagnosis.report.sensor.values == diagnosis.report.baseline.values
 
 
-@pytest.mark.parametrize('option, parameter, value', [
-    ('backlash:alpha_rad=0.004,beta_rad=0.004', 'beta_rad', 0.004),
-    ('misalignment:alpha_rad=0.003,beta_rad=-0.002', 'alpha_rad.y', 0.003),
-    # As in the parameter file: the estimate plus the value of the baseline.
-    ('bias:offset_v=0.04', 'offset_v.y', 0.04)])
+@pytest.mark.parametrize(
+    'option, parameter, value',
+    [
+        ('backlash:alpha_rad=0.004,beta_rad=0.004', 'beta_rad', 0.004),
+        ('misalignment:alpha_rad=0.003,beta_rad=-0.002', 'alpha_rad.y', 0.003),
+        # As in the parameter file: the estimate plus the value of the baseline.
+        ('bias:offset_v=0.04', 'offset_v.y', 0.04),
+    ],
+)
 def test_one_effect_is_named_and_the_gap_closed(option, parameter, value):
     name, report = option.split(':')[0], diagnosed(option)[1]
     assert (report['verdict']['status'], report['verdict']['effects']) == ('explained', [name])
@@ -74,10 +78,16 @@ def test_one_effect_is_named_and_the_gap_closed(option, parameter, value):
     assert report['gap']['closed'] > 0.95
 
 
-@pytest.mark.parametrize('option, effect', [
-    ('mains_hum:amplitude_v=0.003', 'mains_hum'),
-    ('noise_excess:ratio=1.0', 'noise_excess'), ('spikes:rate_hz=0.5,amplitude_v=0.05', 'spikes'),
-    ('stuck:rate_hz=0.2,duration_s=0.1', 'stuck'), ('quantisation:lost_bits=4', 'quantisation')])
+@pytest.mark.parametrize(
+    'option, effect',
+    [
+        ('mains_hum:amplitude_v=0.003', 'mains_hum'),
+        ('noise_excess:ratio=1.0', 'noise_excess'),
+        ('spikes:rate_hz=0.5,amplitude_v=0.05', 'spikes'),
+        ('stuck:rate_hz=0.2,duration_s=0.1', 'stuck'),
+        ('quantisation:lost_bits=4', 'quantisation'),
+    ],
+)
 def test_effects_of_the_noise_are_named(option, effect):
     report = diagnosed(option)[1]
     assert (report['verdict']['status'], report['verdict']['effects']) == ('explained', [effect])
@@ -98,25 +108,36 @@ def test_two_effects_and_the_parameters_that_close_their_gap(run_tool, two_effec
     assert set(report['verdict']['effects']) == {'lever_arm', 'temperature_bias'}
     found = {c['effect']: c['parameters'] for c in report['candidates']}
     # An interval of 90 % is 1.645 standard deviations wide on either side, and 4 always hold.
-    for effect, key, value in (('lever_arm', 'x_m', 0.03), ('lever_arm', 'y_m', 0.02),
-                               ('temperature_bias', 'per_k.x', 4e-4),
-                               ('temperature_bias', 'per_k.y', 4e-4)):
+    for effect, key, value in (
+        ('lever_arm', 'x_m', 0.03),
+        ('lever_arm', 'y_m', 0.02),
+        ('temperature_bias', 'per_k.x', 4e-4),
+        ('temperature_bias', 'per_k.y', 4e-4),
+    ):
         low, high = found[effect][key]['ci']
         assert abs(value - (low + high) / 2) < 4 / 1.645 * (high - low) / 2
     sensor = parameter_file.load(two_effects / 'gap' / 'params.yaml')
     assert set(sensor.effects) == {'lever_arm', 'temperature_bias'}
     page = (two_effects / 'gap' / 'report.html').read_text()
     assert 'temperature_bias' in page and 'http' not in page
-    again = run_tool('diagnose', two_effects / 'run.csv', '--params',
-                     two_effects / 'gap' / 'params.yaml', '-o', 'again', '--json')
+    again = run_tool(
+        'diagnose',
+        two_effects / 'run.csv',
+        '--params',
+        two_effects / 'gap' / 'params.yaml',
+        '-o',
+        'again',
+        '--json',
+    )
     assert json.loads(again.stdout)['verdict']['status'] == 'no_gap'
 
 
 def test_what_recordings_cannot_separate_is_one_group():
     """Where the supply follows the temperature, both give the same samples."""
     motion = warm(turning())
-    motion = replace(motion, supply_v=Knots(np.linspace(0.0, motion.duration_s, 4),
-                                            [5.0, 5.0, 5.06, 5.04]))
+    motion = replace(
+        motion, supply_v=Knots(np.linspace(0.0, motion.duration_s, 4), [5.0, 5.0, 5.06, 5.04])
+    )
     diagnosis = diagnose([simulated(unit(), 'temperature_bias:per_k=4e-4', motion=motion)], unit())
     report = report_of(diagnosis)
     assert 'temperature_bias' in named(report)
@@ -125,6 +146,7 @@ def test_what_recordings_cannot_separate_is_one_group():
 
 def test_an_effect_outside_the_library_is_unknown():
     """A zero-g that follows the fourth harmonic of beta is unknown over beta."""
+
     def change(columns):
         for axis, phase in (('x', 0.0), ('y', 1.0)):
             columns[f'{axis}_v'] += 4e-3 * np.sin(4 * columns['beta_rad'] + phase)
@@ -137,8 +159,11 @@ def test_an_effect_outside_the_library_is_unknown():
 
 def test_the_nominal_file_lacks_zero_g_and_scale_factor():
     """The first diagnosis of a unit, without its calibration, names what a calibration gives."""
-    report = report_of(diagnose([simulated(unit())], replace(
-        nominal('xy'), rate_hz=125.0, stage_resolution_rad=1e-4)))
+    report = report_of(
+        diagnose(
+            [simulated(unit())], replace(nominal('xy'), rate_hz=125.0, stage_resolution_rad=1e-4)
+        )
+    )
     assert report['verdict']['effects'] == ['bias', 'scale_factor']
     assert report['gap']['closed'] > 0.95
 
@@ -148,18 +173,25 @@ def values(change):
     return lambda c: c | {a: change(c[a] - 2.5) + 2.5 for a in ('x_v', 'y_v')}
 
 
-@pytest.mark.parametrize('change, fault', [
-    (lambda c: c | {'x_v': c['y_v'], 'y_v': c['x_v']}, 'axis_swapped'),
-    (lambda c: c | {'y_v': 5 - c['y_v']}, 'axis_inverted'),
-    (values(lambda v: v * 9.80665), 'unit: m/s² instead of g'),
-    (values(lambda v: v / 9.80665), 'unit: g instead of m/s²'),
-    (values(lambda v: v * 1e3), 'unit: mV instead of V'),
-    (lambda c: c | {'time_s': c['time_s'] + 40.0 * (c['time_s'] > 30)}, 'clock_jump'),
-    (values(lambda v: np.roll(v, 300)), 'time_misaligned'),
-    (lambda c: c | {'x_v': np.where(np.arange(len(c['x_v'])) % 2, np.nan, c['x_v'])}, 'missing'),
-    (lambda c: c | {'x_v': np.full(len(c['x_v']), 2.5)}, 'constant'),
-    (lambda c: c | {'x_v': np.clip(c['x_v'], 2.4, 2.6)}, 'saturated'),
-    (lambda c: {k: v[:1250] for k, v in c.items()}, 'too_short')])
+@pytest.mark.parametrize(
+    'change, fault',
+    [
+        (lambda c: c | {'x_v': c['y_v'], 'y_v': c['x_v']}, 'axis_swapped'),
+        (lambda c: c | {'y_v': 5 - c['y_v']}, 'axis_inverted'),
+        (values(lambda v: v * 9.80665), 'unit: m/s² instead of g'),
+        (values(lambda v: v / 9.80665), 'unit: g instead of m/s²'),
+        (values(lambda v: v * 1e3), 'unit: mV instead of V'),
+        (lambda c: c | {'time_s': c['time_s'] + 40.0 * (c['time_s'] > 30)}, 'clock_jump'),
+        (values(lambda v: np.roll(v, 300)), 'time_misaligned'),
+        (
+            lambda c: c | {'x_v': np.where(np.arange(len(c['x_v'])) % 2, np.nan, c['x_v'])},
+            'missing',
+        ),
+        (lambda c: c | {'x_v': np.full(len(c['x_v']), 2.5)}, 'constant'),
+        (lambda c: c | {'x_v': np.clip(c['x_v'], 2.4, 2.6)}, 'saturated'),
+        (lambda c: {k: v[:1250] for k, v in c.items()}, 'too_short'),
+    ],
+)
 def test_faults_of_the_recording_are_one_line(change, fault):
     name, _, text = fault.partition(': ')
     diagnosis = diagnose([simulated(unit(), change=change)], unit())
@@ -173,8 +205,9 @@ def test_faults_of_the_recording_are_one_line(change, fault):
 def drawn(seed):
     rng = np.random.default_rng(seed)
     axes = str(rng.choice(['x', 'xy', 'xyz']))
-    sensor = replace(nominal(axes), adc_bits=int(rng.choice([0, 16])),
-                     rate_hz=float(10 ** rng.uniform(1, 3.3)))
+    sensor = replace(
+        nominal(axes), adc_bits=int(rng.choice([0, 16])), rate_hz=float(10 ** rng.uniform(1, 3.3))
+    )
     name = str(rng.choice(['rich', 'tilt_both', 'tumble', 'soak']))
     motion = trajectories.TRAJECTORIES[name](rng)
     motion = replace(motion, duration_s=min(motion.duration_s, rng.uniform(25, 50)))
@@ -185,9 +218,14 @@ def drawn(seed):
     def change(columns):
         name = str(rng.choice([c for c in columns if c != 'time_s']))
         column = columns[name]
-        odd = (column, np.full(len(column), column[0]), np.full(len(column), np.nan),
-               column * 10.0 ** rng.uniform(3, 100), column * 10.0 ** -rng.uniform(3, 100),
-               np.where(rng.random(len(column)) < 0.2, np.nan, column))[seed % 6]
+        odd = (
+            column,
+            np.full(len(column), column[0]),
+            np.full(len(column), np.nan),
+            column * 10.0 ** rng.uniform(3, 100),
+            column * 10.0 ** -rng.uniform(3, 100),
+            np.where(rng.random(len(column)) < 0.2, np.nan, column),
+        )[seed % 6]
         return columns | {name: odd}
 
     return simulated(sensor, *effects, motion=motion, seed=seed, change=change), sensor
@@ -218,12 +256,17 @@ def test_blocks_that_leave_the_zero_g_open_make_no_gap():
 
 def test_next_experiment_separates_most():
     """Heating separates temperature from supply, and a shaker does not."""
-    rivals, sensor = ('temperature_bias', 'supply'), with_effects(
-        unit(), ['temperature_bias:per_k=3e-4'])
+    rivals, sensor = (
+        ('temperature_bias', 'supply'),
+        with_effects(unit(), ['temperature_bias:per_k=3e-4']),
+    )
     verdict = diagnosed()[0].report.verdict
     verdict = replace(
-        verdict, status='inseparable', groups=(rivals,),
-        hypotheses=tuple(WeightedHypothesis((effect,), 0.5) for effect in rivals))
+        verdict,
+        status='inseparable',
+        groups=(rivals,),
+        hypotheses=tuple(WeightedHypothesis((effect,), 0.5) for effect in rivals),
+    )
     proposal = propose_next_experiment(verdict, [], sensor, None, 0)
     worth = {m.name: m.per_minute for m in proposal.menu}
     assert max(worth.values()) == worth[proposal.manoeuvre] > 0
@@ -240,8 +283,16 @@ def test_a_sensor_that_moves_without_a_reference_gets_no_verdict(run_tool, tmp_p
 def test_samples_of_another_generator(run_tool, tmp_path, shared_dir, name):
     folder = shared_dir / 'samples' / name
     run_tool('fit', folder / 'cal.csv', '--model', 'linear', '-o', tmp_path / 'unit.yaml')
-    run = run_tool('diagnose', folder / 'run.csv', '--params', tmp_path / 'unit.yaml', '-o',
-                   tmp_path / 'out', '--json')
+    run = run_tool(
+        'diagnose',
+        folder / 'run.csv',
+        '--params',
+        tmp_path / 'unit.yaml',
+        '-o',
+        tmp_path / 'out',
+        '--json',
+    )
     verdict = json.loads(run.stdout)['verdict']
     assert (verdict['status'], verdict['effects']) == (
-        ('no_gap', []) if name == 'no_gap' else ('explained', [name]))
+        ('no_gap', []) if name == 'no_gap' else ('explained', [name])
+    )

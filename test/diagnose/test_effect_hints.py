@@ -17,8 +17,11 @@ MODULES = sorted(Path(import_module('adxl_ros.diagnose').__file__).parent.glob('
 def test_diagnosis_names_no_effect(module):
     """A new effect needs no change of the diagnosis, because no table names effects."""
     tree = ast.parse(module.read_text(encoding='utf-8'))
-    texts = {node.value for node in ast.walk(tree)
-             if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    texts = {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
     assert not texts & set(library())
 
 

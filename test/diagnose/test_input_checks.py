@@ -57,16 +57,18 @@ def ideal(tmp_path, late_s, name='sim.csv'):
     time_s = np.arange(0, path.now, 0.01)
     force = specific_force(alpha(time_s), beta(time_s), G0_MPS2)
     rows = np.column_stack([time_s + late_s, *force])
-    np.savetxt(tmp_path / name, rows, '%.6f', ',', comments='',
-               header='time_s,ax_mps2,ay_mps2,az_mps2')
+    np.savetxt(
+        tmp_path / name, rows, '%.6f', ',', comments='', header='time_s,ax_mps2,ay_mps2,az_mps2'
+    )
     return name
 
 
 @pytest.mark.parametrize('late_s', [0.7, -1.3, 12.0])
 def test_a_shifted_simulator_is_late(run_tool, tmp_path, late_s):
     """A shift that no latency explains is named with its size, and `--align` with it."""
-    report, run = report_of(run_tool, tmp_path, unit(), made(unit()),
-                            options=['--sim', ideal(tmp_path, late_s)])
+    report, run = report_of(
+        run_tool, tmp_path, unit(), made(unit()), options=['--sim', ideal(tmp_path, late_s)]
+    )
     assert run.returncode == 1
     assert report['verdict']['data_fault'] == 'time_misaligned'
     words = report['summary'].split()
@@ -76,8 +78,9 @@ def test_a_shifted_simulator_is_late(run_tool, tmp_path, late_s):
 
 
 def test_a_simulator_of_another_time_does_not_overlap(run_tool, tmp_path):
-    report, run = report_of(run_tool, tmp_path, unit(), made(unit()),
-                            options=['--sim', ideal(tmp_path, 1000.0)])
+    report, run = report_of(
+        run_tool, tmp_path, unit(), made(unit()), options=['--sim', ideal(tmp_path, 1000.0)]
+    )
     assert (run.returncode, report['verdict']['data_fault']) == (1, 'no_overlap')
     summary = report['summary']
     assert 'from 0 to ' in summary and 'from 1000 to ' in summary and '--align' in summary
@@ -89,7 +92,7 @@ def test_align_shifts_the_simulator(tmp_path, late_s):
     force = motion_from_force(recording.read_ideal(tmp_path / ideal(tmp_path, late_s)), False)[0]
     comparison = compare_checked(made(unit()), unit(), force, True)
     residual_g = comparison.residual_v(comparison.sensor)[comparison.used]
-    assert np.sqrt(np.mean(residual_g ** 2)) < (1e-3 if late_s > 0.1 else 1e-2)
+    assert np.sqrt(np.mean(residual_g**2)) < (1e-3 if late_s > 0.1 else 1e-2)
     assert comparison.notes[0].startswith('--align')
     assert ('nothing is shifted' in comparison.notes[0]) == (late_s < 0.1)
 
@@ -99,8 +102,14 @@ def test_a_simulator_of_another_motion_is_no_shift(run_tool, tmp_path):
     time_s = recorded.time_s
     rng = np.random.default_rng(1)
     wander = np.cumsum(rng.normal(size=(3, len(time_s))), axis=1) * 0.02
-    np.savetxt(tmp_path / 'sim.csv', np.column_stack([time_s + 500.0, *wander]), '%.6f', ',',
-               comments='', header='time_s,ax_mps2,ay_mps2,az_mps2')
+    np.savetxt(
+        tmp_path / 'sim.csv',
+        np.column_stack([time_s + 500.0, *wander]),
+        '%.6f',
+        ',',
+        comments='',
+        header='time_s,ax_mps2,ay_mps2,az_mps2',
+    )
     report, run = report_of(run_tool, tmp_path, unit(), recorded, options=['--sim', 'sim.csv'])
     assert (run.returncode, report['verdict']['data_fault']) == (1, 'no_overlap')
     assert 'no shift' in report['summary']
@@ -162,8 +171,11 @@ def test_rounded_stamps_get_their_instants_back(lost):
     kept = np.ones(len(true_s), bool)
     if lost:
         kept[4000:4037] = kept[9000] = False
-    recorded = replace(recorded, time_s=np.round(true_s, 3)[kept],
-                       columns={k: v[kept] for k, v in recorded.columns.items()})
+    recorded = replace(
+        recorded,
+        time_s=np.round(true_s, 3)[kept],
+        columns={k: v[kept] for k, v in recorded.columns.items()},
+    )
     comparison = compare_checked(recorded, sensor, None, False)
     assert np.abs(comparison.time_s - true_s[kept]).max() < 2e-5
     assert comparison.sensor.rate_hz == pytest.approx(300.0, abs=1e-3)

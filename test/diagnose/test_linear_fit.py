@@ -37,12 +37,13 @@ def test_the_posterior_is_that_of_bayesian_least_squares():
     residual_v, columns = problem()
     fit = fitted(residual_v, columns)
     variance_v2 = fit.innovation_variance_v2[0]
-    precision = columns.T @ columns / variance_v2 + np.diag(PRIOR_STD ** -2)
+    precision = columns.T @ columns / variance_v2 + np.diag(PRIOR_STD**-2)
     assert fit.values == pytest.approx(
-        np.linalg.solve(precision, columns.T @ residual_v / variance_v2), rel=1e-6)
+        np.linalg.solve(precision, columns.T @ residual_v / variance_v2), rel=1e-6
+    )
     assert fit.covariance == pytest.approx(np.linalg.inv(precision), rel=1e-5)
     left = residual_v - columns @ fit.values
-    assert variance_v2 == pytest.approx(np.mean(left ** 2), rel=1e-5)
+    assert variance_v2 == pytest.approx(np.mean(left**2), rel=1e-5)
 
 
 def test_the_evidence_integrates_the_coefficients_out():
@@ -52,8 +53,10 @@ def test_the_evidence_integrates_the_coefficients_out():
     for ids in ((0, 1, 2), (0, 1), (1,)):
         fit = fitted(residual_v, columns, ids)
         chosen = columns[:, ids]
-        covariance = fit.innovation_variance_v2[0] * np.eye(COUNT) \
+        covariance = (
+            fit.innovation_variance_v2[0] * np.eye(COUNT)
             + chosen * PRIOR_STD[list(ids)] ** 2 @ chosen.T
+        )
         evidence.append(fit.log_evidence)
         marginal.append(multivariate_normal.logpdf(residual_v, np.zeros(COUNT), covariance))
     assert np.diff(evidence) == pytest.approx(np.diff(marginal), abs=0.1)
@@ -63,9 +66,10 @@ def test_blocks_that_are_left_out_do_not_count():
     residual_v, columns = problem()
     blocks = np.arange(BLOCKS) < BLOCKS // 2
     spoilt_v = residual_v.copy()
-    spoilt_v[COUNT // 2:] += 100.0
+    spoilt_v[COUNT // 2 :] += 100.0
     assert fitted(spoilt_v, columns, blocks=blocks).values == pytest.approx(
-        fitted(residual_v, columns, blocks=blocks).values, rel=1e-9)
+        fitted(residual_v, columns, blocks=blocks).values, rel=1e-9
+    )
 
 
 def test_samples_that_are_not_used_do_not_count():
@@ -74,7 +78,8 @@ def test_samples_that_are_not_used_do_not_count():
     used[100:140] = False
     spoilt_v = np.where(used, residual_v, 50.0)
     assert fitted(spoilt_v, columns, used=used).values == pytest.approx(
-        fitted(residual_v, columns, used=used).values, abs=0.02)
+        fitted(residual_v, columns, used=used).values, abs=0.02
+    )
 
 
 @pytest.mark.parametrize('value', [0.0, 0.4])
@@ -85,7 +90,8 @@ def test_a_given_coefficient_moves_the_others_by_their_covariance(value):
     conditional = fit.given(np.array([0]), np.array([value]))
     slope = fit.covariance[1:, 0] / fit.covariance[0, 0]
     assert conditional == pytest.approx(
-        [value, *(fit.values[1:] + slope * (value - fit.values[0]))])
+        [value, *(fit.values[1:] + slope * (value - fit.values[0]))]
+    )
 
 
 def test_the_loss_is_half_the_squared_distance():

@@ -24,7 +24,7 @@ def test_the_interval_contains_the_noise(seconds):
     contained = 0
     for seed in range(_TRIALS):
         white = np.random.default_rng(seed).normal(size=(count + 100, 1))
-        volts = lfilter([np.sqrt(1 - pole ** 2)], [1, -pole], white, axis=0)[100:]
+        volts = lfilter([np.sqrt(1 - pole**2)], [1, -pole], white, axis=0)[100:]
         sums = squares_at_rest(volts, np.ones(count, bool), sensor)
         parts = np.array([(squares_v2[0], count) for squares_v2, count in sums]).T
         rms = np.sqrt(parts[0].sum() / parts[1].sum())
@@ -48,7 +48,8 @@ def test_rounding_is_split_by_the_noise_before_it(steps):
     rng = np.random.default_rng(1)
     places = np.linspace(-0.5, 0.5, 200, endpoint=False)
     rounded = np.rint(places[:, None] + steps * rng.normal(size=(200, 4000)))
-    held = np.mean((rounded.mean(axis=1) - places) ** 2) * sensor.lsb_v ** 2
+    held = np.mean((rounded.mean(axis=1) - places) ** 2) * sensor.lsb_v**2
     share = float(noise.held_rounding(sensor)[0])
-    assert share * sensor.lsb_v ** 2 / 12 == pytest.approx(
-        held, rel=0.05, abs=1e-3 * sensor.lsb_v ** 2)
+    assert share * sensor.lsb_v**2 / 12 == pytest.approx(
+        held, rel=0.05, abs=1e-3 * sensor.lsb_v**2
+    )

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a diagnosis in a real browser: what it shows first, its proofs, layout and files."""
 
-
 from pages import layout_faults, NEEDS_CHROMIUM, wait_until_drawn, WIDTHS
 import pytest
 
@@ -25,8 +24,10 @@ def test_the_first_screen(page):
     for place in ('.badge', '.tiles', '[data-figure=waterfall]', '.effect >> nth=1'):
         box = page.locator(place).first.bounding_box()
         assert box['y'] + box['height'] < 900, place
-    assert page.locator('.command code').first.inner_text() == \
-        'ros2 run adxl_ros diagnose run.csv -o gap --self-check 1'
+    assert (
+        page.locator('.command code').first.inner_text()
+        == 'ros2 run adxl_ros diagnose run.csv -o gap --self-check 1'
+    )
 
 
 @pytest.mark.parametrize('width', WIDTHS)
@@ -43,9 +44,11 @@ def test_layout(opened, two_effects, name, width):
 def test_faults_of_layout_are_found(opened, tmp_path):
     """The search for faults can fail."""
     path = tmp_path / 'bad.html'
-    path.write_text('<body data-drawn="yes"><p>1.3e-14</p><p style="width:3000px">wide</p>'
-                    '<p style="position:absolute;top:0">above</p>'
-                    '<div style="width:30px;overflow:hidden;white-space:nowrap">a long text</div>')
+    path.write_text(
+        '<body data-drawn="yes"><p>1.3e-14</p><p style="width:3000px">wide</p>'
+        '<p style="position:absolute;top:0">above</p>'
+        '<div style="width:30px;overflow:hidden;white-space:nowrap">a long text</div>'
+    )
     page, _ = opened(path)
     kinds = {fault.partition(':')[0] for fault in layout_faults(page)}
     assert kinds == {'exponent', 'overlap', 'cut', 'wider than the window'}
@@ -75,6 +78,7 @@ def test_zoom_is_linked(page):
     page.mouse.move(box['x'] + 300, box['y'] + 21, steps=5)
     page.mouse.up()
     page.wait_for_function(
-        'document.querySelector("[data-figure=signals]").layout.xaxis.autorange !== true')
+        'document.querySelector("[data-figure=signals]").layout.xaxis.autorange !== true'
+    )
     assert plot.evaluate('plot => plot.data.every(t => !t.xaxis || t.xaxis === "x")')
     assert plot.locator('.nsewdrag').count() == 4

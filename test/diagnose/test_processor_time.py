@@ -33,14 +33,20 @@ def used_by(folder, rate_hz, duration_s, *effects):
             """Return a derivative at times on the way there or back."""
             place_s = np.mod(time_s, 2 * motion.duration_s)
             back = place_s > motion.duration_s
-            return path(np.where(back, 2 * motion.duration_s - place_s, place_s), order) \
-                * np.where(back, (-1.0) ** order, 1.0)
+            return path(
+                np.where(back, 2 * motion.duration_s - place_s, place_s), order
+            ) * np.where(back, (-1.0) ** order, 1.0)
 
         return folded
 
-    longer = replace(motion, duration_s=duration_s, **{
-        name: back_and_forth(getattr(motion, name))
-        for name in ('alpha', 'beta', 'shift', 'temperature_c', 'supply_v')})
+    longer = replace(
+        motion,
+        duration_s=duration_s,
+        **{
+            name: back_and_forth(getattr(motion, name))
+            for name in ('alpha', 'beta', 'shift', 'temperature_c', 'supply_v')
+        },
+    )
     columns = simulate(with_effects(sensor, list(effects)), longer, 1)
     time_s = columns.pop('time_s')
     path, params = folder / 'recording.csv', folder / 'params.yaml'
@@ -49,18 +55,35 @@ def used_by(folder, rate_hz, duration_s, *effects):
         write(Recording(str(path), time_s, columns, sensor_info(sensor)))
     before = standard_work()
     process = subprocess.Popen(
-        [sys.executable, '-c', 'import sys; from adxl_ros.tools.diagnose import main; '
-         'sys.exit(main())', str(path), '--params', str(params), '-o', str(folder / 'report')],
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        [
+            sys.executable,
+            '-c',
+            'import sys; from adxl_ros.tools.diagnose import main; sys.exit(main())',
+            str(path),
+            '--params',
+            str(params),
+            '-o',
+            str(folder / 'report'),
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
     _, _, used = os.wait4(process.pid, 0)
     assert (folder / 'report' / 'report.json').exists()
     slower = max(before, standard_work()) / STANDARD_S
-    return (used.ru_utime + used.ru_stime) / slower, used.ru_maxrss / 2 ** 20
+    return (used.ru_utime + used.ru_stime) / slower, used.ru_maxrss / 2**20
 
 
 def test_five_minutes_at_250_hz_take_eight_seconds(tmp_path):
-    seconds = [used_by(tmp_path, 250.0, 300.0, *effects)[0] for effects in (
-        (), ('hysteresis',), ('lever_arm', 'temperature_bias'), ('bias_walk', 'nonlinearity'))]
+    seconds = [
+        used_by(tmp_path, 250.0, 300.0, *effects)[0]
+        for effects in (
+            (),
+            ('hysteresis',),
+            ('lever_arm', 'temperature_bias'),
+            ('bias_walk', 'nonlinearity'),
+        )
+    ]
     assert np.median(seconds) < 8.0
     assert max(seconds) < 20.0
 

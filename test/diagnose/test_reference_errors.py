@@ -35,10 +35,11 @@ def carried_by_hand(seed, tremor_g):
         return values * rms / values.std()
 
     begins = np.clip(time_s - 8.0, 0.0, 1.0)
-    begins = begins ** 2 * (3 - 2 * begins)
+    begins = begins**2 * (3 - 2 * begins)
     roll, pitch = band(0.05, 0.4, 0.5) * begins, band(0.05, 0.4, 0.4) * begins
-    gravity = G * np.column_stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch),
-                                   np.cos(roll) * np.cos(pitch)])
+    gravity = G * np.column_stack(
+        [-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)]
+    )
     motion = [band(0.3, 3.0, 0.08 * G) + band(3.0, 12.0, tremor_g * G) for _ in range(3)]
     return time_s, gravity + np.column_stack(motion) * begins[:, None]
 
@@ -57,19 +58,34 @@ def causal(force):
 @pytest.fixture
 def diagnosed(run_tool, tmp_path):
     """Give a function that diagnoses a simulated recording beside a reference; its report."""
-    def diagnose(effects=(), smooth=None, late_s=0.0, turn_rad=(0.0, 0.0, 0.0), rate_hz=RATE_HZ,
-                 tremor_g=0.02):
+
+    def diagnose(
+        effects=(),
+        smooth=None,
+        late_s=0.0,
+        turn_rad=(0.0, 0.0, 0.0),
+        rate_hz=RATE_HZ,
+        tremor_g=0.02,
+    ):
         sensor = replace(nominal('xyz'), rate_hz=RATE_HZ)
         time_s, force = carried_by_hand(3, tremor_g)
         stamps_s = np.arange((SECONDS - 1) * RATE_HZ) / RATE_HZ
-        respond = Response(with_effects(sensor, list(effects)),
-                           Motion(SECONDS, force=ForcePath(time_s, force)), 5)
+        respond = Response(
+            with_effects(sensor, list(effects)), Motion(SECONDS, force=ForcePath(time_s, force)), 5
+        )
         volts = respond(stamps_s)
-        stated = Rotation.from_euler('xyz', turn_rad).inv().apply(
-            smooth(force) if smooth else force)
+        stated = (
+            Rotation.from_euler('xyz', turn_rad).inv().apply(smooth(force) if smooth else force)
+        )
         every = round(FINE_HZ / rate_hz)
-        np.savetxt(tmp_path / 'sim.csv', np.column_stack([time_s + late_s, stated])[::every],
-                   '%.9g', ',', comments='', header='time_s,ax_mps2,ay_mps2,az_mps2')
+        np.savetxt(
+            tmp_path / 'sim.csv',
+            np.column_stack([time_s + late_s, stated])[::every],
+            '%.9g',
+            ',',
+            comments='',
+            header='time_s,ax_mps2,ay_mps2,az_mps2',
+        )
         columns = {f'{axis}_v': v for axis, v in zip('xyz', volts.T)}
         return report(sensor, stamps_s, columns, ['--sim', 'sim.csv'])
 
@@ -103,13 +119,15 @@ def test_a_smoothed_reference_is_named(run_tool, diagnosed, tmp_path, smooth):
     assert answer['gap']['not_in_reference'] > 0
     assert 'less smoothing' in answer['next_experiment']['manoeuvre']
     assert answer['next_experiment']['command'] in ' '.join(
-        diagnosed.screens[0].replace('\\\n', ' ').split())
+        diagnosed.screens[0].replace('\\\n', ' ').split()
+    )
     sentence = 'rror of the reference, not of the sensor'
     assert sentence in answer['summary']
     assert sentence in ' '.join(diagnosed.screens[0].split())
     assert sentence in (tmp_path / 'gap' / 'report.html').read_text()
-    run = run_tool('simulate', 'sweep', '--params', 'gap/params.yaml', '--rate', '20', '-o',
-                   'sweep.csv')
+    run = run_tool(
+        'simulate', 'sweep', '--params', 'gap/params.yaml', '--rate', '20', '-o', 'sweep.csv'
+    )
     assert run.returncode == 0
     assert 'reference_filter is an error of the reference' in run.stderr
 
@@ -118,10 +136,14 @@ def test_a_turned_frame_is_not_separated_from_turned_axes(diagnosed):
     """A turn of the frame gives the same samples as an equal turn of all sensing axes."""
     answer = diagnosed(turn_rad=(0.02, -0.01, 0.03))
     assert answer['verdict']['groups'] == [['misalignment', 'reference_frame']]
-    turn = answer['candidates'][0] if answer['candidates'][0]['effect'] == 'reference_frame' \
+    turn = (
+        answer['candidates'][0]
+        if answer['candidates'][0]['effect'] == 'reference_frame'
         else answer['candidates'][1]
+    )
     assert [turn['parameters'][f'{axis}_rad']['value'] for axis in 'xyz'] == pytest.approx(
-        [0.02, -0.01, 0.03], abs=1e-3)
+        [0.02, -0.01, 0.03], abs=1e-3
+    )
 
 
 def test_a_simulation_with_an_error_of_the_reference_alone_is_refused(run_tool, tmp_path):

@@ -55,4 +55,4 @@ def test_flexible_functions_have_an_rms_of_one_about_zero(healthy):
         for functions in basis.values():
             used = functions[healthy.used]
             assert used.mean(axis=0) == pytest.approx(0.0, abs=1e-9)
-            assert (used ** 2).mean(axis=0).sum() == pytest.approx(1.0)
+            assert (used**2).mean(axis=0).sum() == pytest.approx(1.0)

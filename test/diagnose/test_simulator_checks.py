@@ -27,11 +27,14 @@ class Carried:
         self.time_s = np.arange(int(SECONDS * RATE_HZ)) / RATE_HZ
         begin = np.clip((self.time_s - REST_S) / 3, 0, 1)
         end = np.clip((SECONDS - REST_S - self.time_s) / 3, 0, 1)
-        envelope = begin ** 2 * (3 - 2 * begin) * end ** 2 * (3 - 2 * end)
+        envelope = begin**2 * (3 - 2 * begin) * end**2 * (3 - 2 * end)
 
         def wander(highest_hz, rms):
-            hz, phase, size = (rng.uniform(0.05, highest_hz, 16), rng.uniform(0, 6.28, 16),
-                               rng.normal(0, 0.25, 16))
+            hz, phase, size = (
+                rng.uniform(0.05, highest_hz, 16),
+                rng.uniform(0, 6.28, 16),
+                rng.normal(0, 0.25, 16),
+            )
             waves = np.sin(2 * np.pi * hz * self.time_s[:, None] + phase)
             return rms * np.sqrt(2) * envelope * (waves @ size)
 
@@ -55,8 +58,14 @@ class Carried:
         """Put a recording beside a simulator."""
         time_s = self.time_s if time_s is None else time_s
         rows = [time_s, self.force() if force is None else force]
-        np.savetxt(folder / 'sim.csv', np.column_stack(rows), '%.6f', ',', comments='',
-                   header='time_s,ax_mps2,ay_mps2,az_mps2')
+        np.savetxt(
+            folder / 'sim.csv',
+            np.column_stack(rows),
+            '%.6f',
+            ',',
+            comments='',
+            header='time_s,ax_mps2,ay_mps2,az_mps2',
+        )
         sim = motion_from_force(recording.read_ideal(folder / 'sim.csv'), False)[0]
         return compare_checked(recorded, replace(nominal('xyz'), rate_hz=RATE_HZ), sim, False)
 
@@ -70,8 +79,10 @@ def test_a_wrong_dynamic_part_is_an_error_of_the_simulator(tmp_path, factor):
     assert f'{factor:g} times' in raised.value.message
 
 
-@pytest.mark.parametrize('change', [
-    lambda force: force, lambda force: 1.03 * force, lambda force: force + [0.2, -0.1, 0.3]])
+@pytest.mark.parametrize(
+    'change',
+    [lambda force: force, lambda force: 1.03 * force, lambda force: force + [0.2, -0.1, 0.3]],
+)
 def test_a_right_simulator_is_compared(tmp_path, change):
     """Errors of the sensor are none of the simulator, and no rest is left out."""
     carried = Carried()
@@ -104,7 +115,7 @@ def test_samples_that_stand_alone_are_counted_with_their_size(tmp_path, size_g, 
         return force
 
     comparison = carried.beside(tmp_path, carried.recorded(struck))
-    part, = [part for part in comparison.left_out if part.effect is not None]
+    (part,) = [part for part in comparison.left_out if part.effect is not None]
     assert part.samples == pytest.approx(count, abs=0.1 * count)
     assert part.rms_mps2 == pytest.approx(size_g * G0_MPS2, rel=0.1)
     # They make no motion that the simulator would lack.
@@ -118,7 +129,7 @@ def test_an_axis_that_sticks_is_not_fast_motion(tmp_path, stuck_s, fault):
 
     def sticks(force):
         begin = round(20 * RATE_HZ) if stuck_s < SECONDS else 0
-        force[begin:begin + round(stuck_s * RATE_HZ), 1] = force[begin, 1]
+        force[begin : begin + round(stuck_s * RATE_HZ), 1] = force[begin, 1]
         return force
 
     try:
@@ -127,7 +138,7 @@ def test_an_axis_that_sticks_is_not_fast_motion(tmp_path, stuck_s, fault):
         assert raised.name == fault
     else:
         assert fault is None
-        part, = comparison.left_out
+        (part,) = comparison.left_out
         assert 'y does not change' in part.reason
         assert part.duration_s == pytest.approx(stuck_s, abs=0.1)
 
@@ -138,7 +149,7 @@ def test_pulses_beyond_the_range_are_named(tmp_path):
 
     def pulses(force):
         for place in (2000, 3000, 4000):
-            force[place:place + 4, 0] = (sensor.range_g + 0.5) * G0_MPS2
+            force[place : place + 4, 0] = (sensor.range_g + 0.5) * G0_MPS2
         return force
 
     notes = ' '.join(carried.beside(tmp_path, carried.recorded(pulses)).notes)

@@ -37,9 +37,16 @@ def rest(power=0.0, dimension='force'):
 
 def decided(candidates, left_over=0.0, detected=(), material=0.1, dimension='force'):
     evidence = Evidence(
-        candidates=candidates, counts=np.full(BLOCKS, SAMPLES), weights=block_weights(0),
-        material_mps2=material ** 0.5, reference_mps2=0.0, errs_in_motion=False, fades=False,
-        wanders=False, floor_mps2=FLOOR ** 0.5)
+        candidates=candidates,
+        counts=np.full(BLOCKS, SAMPLES),
+        weights=block_weights(0),
+        material_mps2=material**0.5,
+        reference_mps2=0.0,
+        errs_in_motion=False,
+        fades=False,
+        wanders=False,
+        floor_mps2=FLOOR**0.5,
+    )
     return decide(evidence, lambda effects, drift: rest(left_over, dimension), detected)
 
 
@@ -85,8 +92,10 @@ def test_an_effect_of_the_noise_is_named_beside_no_gap_of_the_mean():
 
 def test_a_set_without_a_drift_may_be_the_best_of_a_draw():
     """Two equal sets take turns in the draws; noise with a drift was fitted beside one only."""
-    verdict = decided({NOTHING: fits(5.0), BIAS: fits(0.0, drift_mps2=1.0),
-                       LEVER_ARM: fits(0.0, seed=2)}, dimension='time')
+    verdict = decided(
+        {NOTHING: fits(5.0), BIAS: fits(0.0, drift_mps2=1.0), LEVER_ARM: fits(0.0, seed=2)},
+        dimension='time',
+    )
     assert verdict.status in ('explained', 'inseparable', 'partly')
 
 

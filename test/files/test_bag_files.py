@@ -15,11 +15,19 @@ from reading import growth_mb, refusal
 from units import nominal
 
 rosbag2 = pytest.importorskip(
-    'rosbags.rosbag2', reason='rosbags is not installed: pip install rosbags')
+    'rosbags.rosbag2', reason='rosbags is not installed: pip install rosbags'
+)
 bags = pytest.importorskip('bags')
 imu, info, joints, Sent, stamps = bags.imu, bags.info, bags.joints, bags.Sent, bags.stamps
 EPOCH_NS, IMU, INFO, JOINTS, STORE, STRING, TYPES = (
-    bags.EPOCH_NS, bags.IMU, bags.INFO, bags.JOINTS, bags.STORE, bags.STRING, bags.TYPES)
+    bags.EPOCH_NS,
+    bags.IMU,
+    bags.INFO,
+    bags.JOINTS,
+    bags.STORE,
+    bags.STRING,
+    bags.TYPES,
+)
 
 
 def recorded(count: int = 3000, axes: str = 'xyz') -> Recording:
@@ -28,8 +36,13 @@ def recorded(count: int = 3000, axes: str = 'xyz') -> Recording:
     columns.update({name: rng.normal(size=count) for name in REFERENCES})
     columns['supply_v'] = columns['supply_v'].astype(np.float32).astype(float)
     steps = rng.integers(10**5, 10**7, count)
-    return Recording('made', np.cumsum(steps) / 1e9, columns,
-                     {**sensor_info(nominal(axes)), 'place': 'bench 3'}, epoch_ns=EPOCH_NS)
+    return Recording(
+        'made',
+        np.cumsum(steps) / 1e9,
+        columns,
+        {**sensor_info(nominal(axes)), 'place': 'bench 3'},
+        epoch_ns=EPOCH_NS,
+    )
 
 
 @pytest.mark.parametrize('name', ['run', 'run.v2', 'run.mcap'])
@@ -41,7 +54,7 @@ def test_round_trip_to_the_bit(tmp_path: Path, name: str, axes: str) -> None:
         recording.write(tmp_path / name, sent, sensor)
     assert [path.name for path in tmp_path.iterdir()] == [name]
     got = recording.read(tmp_path / name)
-    assert list(got.columns) == [*ACCEL[:len(axes)], *REFERENCES]
+    assert list(got.columns) == [*ACCEL[: len(axes)], *REFERENCES]
     assert (got.accel_mps2(sensor) == sent.accel_mps2(sensor)).all()
     np.testing.assert_allclose(got.volts(sensor), sent.volts(sensor), rtol=0, atol=1e-15)
     for column in REFERENCES:
@@ -86,8 +99,13 @@ def test_a_written_bag_is_readable_by_other_software(tmp_path: Path) -> None:
                 assert message.position[1] == sent.columns['beta_rad'][i]
             elif connection.topic == '/supply':
                 assert message.voltage == sent.columns['supply_v'][i]
-    assert count == {'/sensor_info': 0, '/imu/data_raw': 49, '/stage/joint_states': 49,
-                     '/temperature': 49, '/supply': 49}
+    assert count == {
+        '/sensor_info': 0,
+        '/imu/data_raw': 49,
+        '/stage/joint_states': 49,
+        '/temperature': 49,
+        '/supply': 49,
+    }
 
 
 def converted(source: Path, target: Path, storage: str, mode: str) -> None:
@@ -95,8 +113,10 @@ def converted(source: Path, target: Path, storage: str, mode: str) -> None:
         writer = rosbag2.Writer(target, version=9, storage_plugin=rosbag2.StoragePlugin[storage])
         writer.set_compression(rosbag2.CompressionMode[mode], rosbag2.CompressionFormat.ZSTD)
         with writer:
-            new = {c.id: writer.add_connection(c.topic, c.msgtype, typestore=STORE)
-                   for c in reader.connections}
+            new = {
+                c.id: writer.add_connection(c.topic, c.msgtype, typestore=STORE)
+                for c in reader.connections
+            }
             other = writer.add_connection('/rosout', STRING, typestore=STORE)
             writer.add_connection('/robot2/imu/data_raw', IMU, typestore=STORE)  # no message
             for i, (connection, log_ns, raw) in enumerate(reader.messages()):
@@ -106,9 +126,18 @@ def converted(source: Path, target: Path, storage: str, mode: str) -> None:
                     writer.write(other, log_ns, bytes(text))
 
 
-@pytest.mark.parametrize(('storage', 'mode'), [
-    ('MCAP', 'NONE'), ('MCAP', 'STORAGE'), ('MCAP', 'FILE'), ('MCAP', 'MESSAGE'),
-    ('SQLITE3', 'NONE'), ('SQLITE3', 'FILE'), ('SQLITE3', 'MESSAGE')])
+@pytest.mark.parametrize(
+    ('storage', 'mode'),
+    [
+        ('MCAP', 'NONE'),
+        ('MCAP', 'STORAGE'),
+        ('MCAP', 'FILE'),
+        ('MCAP', 'MESSAGE'),
+        ('SQLITE3', 'NONE'),
+        ('SQLITE3', 'FILE'),
+        ('SQLITE3', 'MESSAGE'),
+    ],
+)
 def test_every_storage_and_compression(tmp_path: Path, storage: str, mode: str) -> None:
     recording.write(tmp_path / 'plain', recorded(), nominal('xyz'))
     plain = recording.read(tmp_path / 'plain')
@@ -148,8 +177,11 @@ def test_references_at_another_rate_are_interpolated(tmp_path: Path) -> None:
     assert got.alignments['alpha_rad'] < 1e-9
     for rows in (100, 1000):
         blocks = list(recording.blocks(path, rows))
-        assert np.array_equal(np.concatenate([b.columns['beta_rad'] for b in blocks]),
-                              got.columns['beta_rad'], equal_nan=True)
+        assert np.array_equal(
+            np.concatenate([b.columns['beta_rad'] for b in blocks]),
+            got.columns['beta_rad'],
+            equal_nan=True,
+        )
         assert blocks[-1].alignments['beta_rad'] == pytest.approx(got.alignments['beta_rad'])
         assert blocks[-1].done == 1.0
 
@@ -157,26 +189,45 @@ def test_references_at_another_rate_are_interpolated(tmp_path: Path) -> None:
 def test_a_command_is_in_force_until_the_next_one(tmp_path: Path) -> None:
     """Its stamp counts, or the time of its record without a stamp. No sample waits for it."""
     times = stamps(1000)
-    messages = [m for i, t in enumerate(times) for m in (
-        imu(t), *([joints(t, alpha=0.0, beta=0.0)] if i % 10 == 0 else []))]
+    messages = [
+        m
+        for i, t in enumerate(times)
+        for m in (imu(t), *([joints(t, alpha=0.0, beta=0.0)] if i % 10 == 0 else []))
+    ]
 
     def index_after(row: int) -> int:
-        return next(i for i, m in enumerate(messages) if m.message.header == imu(times[row])
-                    .message.header and m.kind == IMU) + 1
+        return (
+            next(
+                i
+                for i, m in enumerate(messages)
+                if m.message.header == imu(times[row]).message.header and m.kind == IMU
+            )
+            + 1
+        )
 
     for row, late_ns, positions in (
-            (100, 500_000, {'alpha': 1.0}), (200, 0, {'beta': 2.0, 'other': 5.0}),
-            (300, 0, {'alpha': 3.0, 'beta': np.nan}), (400, 0, {'alpha': np.inf}),
-            (500, 0, {}), (600, -3_000_000, {'alpha': 1e7, 'beta': 4.0})):
+        (100, 500_000, {'alpha': 1.0}),
+        (200, 0, {'beta': 2.0, 'other': 5.0}),
+        (300, 0, {'alpha': 3.0, 'beta': np.nan}),
+        (400, 0, {'alpha': np.inf}),
+        (500, 0, {}),
+        (600, -3_000_000, {'alpha': 1e7, 'beta': 4.0}),
+    ):
         command = joints(times[row] + late_ns, '/stage/command', **positions)
         messages.insert(index_after(row), command)
     path = bags.bag_of(tmp_path / 'run', messages)
     got = recording.read(path)
     nan = np.nan
-    assert np.array_equal(got.columns['alpha_command_rad'], np.repeat(
-        [nan, 1.0, 3.0], [101, 199, 700]), equal_nan=True)
-    assert np.array_equal(got.columns['beta_command_rad'], np.repeat(
-        [nan, 2.0, 4.0], [200, 397, 403]), equal_nan=True)
+    assert np.array_equal(
+        got.columns['alpha_command_rad'],
+        np.repeat([nan, 1.0, 3.0], [101, 199, 700]),
+        equal_nan=True,
+    )
+    assert np.array_equal(
+        got.columns['beta_command_rad'],
+        np.repeat([nan, 2.0, 4.0], [200, 397, 403]),
+        equal_nan=True,
+    )
     assert not any('command' in column for column in got.alignments)
     for rows in (7, 100, 1000):
         blocks = list(recording.blocks(path, rows))
@@ -200,8 +251,8 @@ def test_a_cut_file_is_read_up_to_the_cut(tmp_path: Path, name: str) -> None:
         file.write_bytes(data[:size])
         got = recording.read(file)
         counts.append(len(got))
-        assert (got.stamp_ns == complete.stamp_ns[:len(got)]).all()
-        assert (got.columns['ay_mps2'] == complete.columns['ay_mps2'][:len(got)]).all()
+        assert (got.stamp_ns == complete.stamp_ns[: len(got)]).all()
+        assert (got.columns['ay_mps2'] == complete.columns['ay_mps2'][: len(got)]).all()
         assert got.info == complete.info
         assert f'{file}: cut off at byte ' in got.cut and f' of {size}; the last sample' in got.cut
         assert list(recording.blocks(file, 100))[-1].cut
@@ -239,45 +290,87 @@ T = stamps(3)
 CUT_IMU = bytes(STORE.serialize_cdr(imu(T[1]).message, IMU))[:100]
 
 
-@pytest.mark.parametrize(('messages', 'message'), [
-    ([Sent('/imu/data_raw', STRING, 0, TYPES[STRING](data=''))],
-     f': no topic of type {IMU}; it holds /imu/data_raw ({STRING})'),
-    ([joints(T[0])], f': no topic of type {IMU}; it holds /stage/joint_states ({JOINTS})'),
-    ([imu(T[0], topic='/imu'), imu(T[0], topic='/camera/imu')],
-     f': 2 topics {IMU}; choose one with --topic: /camera/imu, /imu'),
-    ([imu(T[0], topic='/a/imu/data_raw'), imu(T[0], topic='/b/imu/data_raw')],
-     f': 2 topics {IMU}; choose one with --topic: /a/imu/data_raw, /b/imu/data_raw'),
-    ([imu(T[1]), imu(T[2]), imu(T[0])],
-     ': topic /imu/data_raw: message 3, stamped 1750000000.123456789 s: time runs backwards, '
-     '0.002 s before the newest sample'),
-    ([imu(T[1]), imu(T[1])],
-     ': topic /imu/data_raw: message 2, stamped 1750000000.124456789 s: time stands still'),
-    ([imu(T[0]), imu(T[1], (1, np.nan, 1))],
-     ': topic /imu/data_raw: message 2, stamped 1750000000.124456789 s: linear_acceleration.y is '
-     'nan m/s², expected a number within ±1e+06'),
-    ([imu(T[0]), imu(T[1], (1, 1, 1e38))],
-     ': topic /imu/data_raw: message 2, stamped 1750000000.124456789 s: linear_acceleration.z is '
-     '1e+38 m/s²'),
-    ([imu(T[0], variance=(-1, 0, 0))],
-     ': topic /imu/data_raw: linear_acceleration_covariance gives the axes none'),
-    ([imu(T[0], variance=(1, 1e6, 1))],
-     ': topic /imu/data_raw: linear_acceleration_covariance gives the axes xz'),
-    ([imu(T[0]), Sent('/imu/data_raw', IMU, T[1], raw=CUT_IMU)],
-     ': topic /imu/data_raw: a message is damaged: 100 bytes are too few for it'),
-    ([imu(T[0]), Sent('/imu/data_raw', IMU, T[1], raw=b'\0\7' + CUT_IMU)],
-     ': topic /imu/data_raw: a message is damaged: encapsulation 0x0007 is not plain CDR'),
-    ([imu(T[0]), joints(T[0], alpha=1e38)],
-     ': topic /stage/joint_states: alpha_rad is 1e+38 at 1750000000.123456789 s, beyond ±1e+06'),
-    ([imu(T[0]), joints(T[1], alpha=1.0), joints(T[0], alpha=1.0)],
-     ': topic /stage/joint_states: time runs backwards: 1750000000.123456789 s comes after '
-     '1750000000.124456789 s'),
-    ([info(serial='A'), imu(T[0]), info(serial='B')],
-     ': topic /sensor_info: serial changes from A to B; record each sensor by itself'),
-    ([info(axes='yx'), imu(T[0])], ": topic /sensor_info: axes is 'yx', expected x, xy or xyz"),
-    ([imu(T[0]), Sent('/sensor_info', INFO, 0, raw=b'\0\1\0\0\7')],
-     ': topic /sensor_info: cannot read it as a rosbag2 recording: ')])
+@pytest.mark.parametrize(
+    ('messages', 'message'),
+    [
+        (
+            [Sent('/imu/data_raw', STRING, 0, TYPES[STRING](data=''))],
+            f': no topic of type {IMU}; it holds /imu/data_raw ({STRING})',
+        ),
+        ([joints(T[0])], f': no topic of type {IMU}; it holds /stage/joint_states ({JOINTS})'),
+        (
+            [imu(T[0], topic='/imu'), imu(T[0], topic='/camera/imu')],
+            f': 2 topics {IMU}; choose one with --topic: /camera/imu, /imu',
+        ),
+        (
+            [imu(T[0], topic='/a/imu/data_raw'), imu(T[0], topic='/b/imu/data_raw')],
+            f': 2 topics {IMU}; choose one with --topic: /a/imu/data_raw, /b/imu/data_raw',
+        ),
+        (
+            [imu(T[1]), imu(T[2]), imu(T[0])],
+            ': topic /imu/data_raw: message 3, stamped 1750000000.123456789 s: '
+            'time runs backwards, '
+            '0.002 s before the newest sample',
+        ),
+        (
+            [imu(T[1]), imu(T[1])],
+            ': topic /imu/data_raw: message 2, stamped 1750000000.124456789 s: time stands still',
+        ),
+        (
+            [imu(T[0]), imu(T[1], (1, np.nan, 1))],
+            ': topic /imu/data_raw: message 2, stamped 1750000000.124456789 s: '
+            'linear_acceleration.y is '
+            'nan m/s², expected a number within ±1e+06',
+        ),
+        (
+            [imu(T[0]), imu(T[1], (1, 1, 1e38))],
+            ': topic /imu/data_raw: message 2, stamped 1750000000.124456789 s: '
+            'linear_acceleration.z is '
+            '1e+38 m/s²',
+        ),
+        (
+            [imu(T[0], variance=(-1, 0, 0))],
+            ': topic /imu/data_raw: linear_acceleration_covariance gives the axes none',
+        ),
+        (
+            [imu(T[0], variance=(1, 1e6, 1))],
+            ': topic /imu/data_raw: linear_acceleration_covariance gives the axes xz',
+        ),
+        (
+            [imu(T[0]), Sent('/imu/data_raw', IMU, T[1], raw=CUT_IMU)],
+            ': topic /imu/data_raw: a message is damaged: 100 bytes are too few for it',
+        ),
+        (
+            [imu(T[0]), Sent('/imu/data_raw', IMU, T[1], raw=b'\0\7' + CUT_IMU)],
+            ': topic /imu/data_raw: a message is damaged: encapsulation 0x0007 is not plain CDR',
+        ),
+        (
+            [imu(T[0]), joints(T[0], alpha=1e38)],
+            ': topic /stage/joint_states: alpha_rad is 1e+38 at '
+            '1750000000.123456789 s, beyond ±1e+06',
+        ),
+        (
+            [imu(T[0]), joints(T[1], alpha=1.0), joints(T[0], alpha=1.0)],
+            ': topic /stage/joint_states: time runs backwards: 1750000000.123456789 s comes after '
+            '1750000000.124456789 s',
+        ),
+        (
+            [info(serial='A'), imu(T[0]), info(serial='B')],
+            ': topic /sensor_info: serial changes from A to B; record each sensor by itself',
+        ),
+        (
+            [info(axes='yx'), imu(T[0])],
+            ": topic /sensor_info: axes is 'yx', expected x, xy or xyz",
+        ),
+        (
+            [imu(T[0]), Sent('/sensor_info', INFO, 0, raw=b'\0\1\0\0\7')],
+            ': topic /sensor_info: cannot read it as a rosbag2 recording: ',
+        ),
+    ],
+)
 def test_invalid_bags_are_refused_in_one_line(
-        tmp_path: Path, messages: list[Sent], message: str) -> None:
+    tmp_path: Path, messages: list[Sent], message: str
+) -> None:
     assert refusal(bags.bag_of(tmp_path / 'run', messages)).startswith(message)
 
 

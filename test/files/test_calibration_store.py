@@ -26,16 +26,30 @@ def swept_csv(made_once):
 
 def sweep(folder):
     (folder / 'u7.yaml').write_text(NOMINAL.read_text().replace('serial: nominal', 'serial: U/7'))
-    done = run_executable('simulate', 'sweep', '--params', 'u7.yaml', '--rate', '100', '--effect',
-                          'bias', '--effect', 'misalignment', '--seed', '5', '-o', 'sweep.csv',
-                          cwd=folder)
+    done = run_executable(
+        'simulate',
+        'sweep',
+        '--params',
+        'u7.yaml',
+        '--rate',
+        '100',
+        '--effect',
+        'bias',
+        '--effect',
+        'misalignment',
+        '--seed',
+        '5',
+        '-o',
+        'sweep.csv',
+        cwd=folder,
+    )
     assert done.returncode == 0, done.stderr
     lines = (folder / 'sweep.csv').read_text().splitlines()
     head = next(i for i, line in enumerate(lines) if line.startswith('time_s'))
     first = [name for name in lines[head].split(',') if name not in ('temperature_c', 'supply_v')]
     kept = [lines[head].split(',').index(name) for name in first]
     rows = [','.join([*first, 'temperature_c', 'supply_v'])]
-    for i, line in enumerate(lines[head + 1:]):
+    for i, line in enumerate(lines[head + 1 :]):
         cells = line.split(',')
         rows.append(','.join([*(cells[k] for k in kept), f'{22 + i / len(lines):.3f}', '4.95']))
     (folder / 'sweep.csv').write_text('\n'.join([*lines[:head], *rows]) + '\n')
@@ -44,8 +58,9 @@ def sweep(folder):
 def test_provenance_store_and_the_previous_file(run_tool, swept_csv, tmp_path):
     """The file states its provenance. A second fit keeps the first file, and both are stored."""
     shutil.copytree(swept_csv, tmp_path, dirs_exist_ok=True)
-    done = run_tool('fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'physical', '-o',
-                    'u.yaml')
+    done = run_tool(
+        'fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'physical', '-o', 'u.yaml'
+    )
     assert done.returncode == 0, done.stderr
     first = (tmp_path / 'u.yaml').read_text()
     sensor = parameter_file.load(tmp_path / 'u.yaml')
@@ -64,12 +79,22 @@ def test_provenance_store_and_the_previous_file(run_tool, swept_csv, tmp_path):
     assert sensor.envelope.force_high_mps2[0] > 9
     assert (sensor.serial, sensor.model) == ('U/7', 'physical')
     folder = tmp_path / 'ros_home' / 'adxl_ros' / 'calibrations' / 'U%2F7'
-    kept, = folder.iterdir()
+    (kept,) = folder.iterdir()
     assert kept.read_text() == first
     assert f'kept as {kept}' in done.stderr
 
-    done = run_tool('fit', 'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml',
-                    '--store', 'elsewhere')
+    done = run_tool(
+        'fit',
+        'sweep.csv',
+        '--params',
+        'u7.yaml',
+        '--model',
+        'linear',
+        '-o',
+        'u.yaml',
+        '--store',
+        'elsewhere',
+    )
     assert done.returncode == 0, done.stderr
     assert parameter_file.load(tmp_path / 'u.yaml').model == 'linear'
     assert (tmp_path / 'u.yaml.previous').read_text() == first
@@ -88,7 +113,7 @@ def test_each_serial_number_has_its_folder(tmp_path, serial):
     assert calibration_store.newer(tmp_path / 'store', sensor) is None
     old = replace(sensor, provenance={'date': '2025-01-02T03:04:05+00:00'})
     assert calibration_store.newer(tmp_path / 'store', old) == path
-    (stored, again), = calibration_store.history(tmp_path / 'store', serial).calibrations
+    ((stored, again),) = calibration_store.history(tmp_path / 'store', serial).calibrations
     assert stored == path and again.serial == serial
 
 
@@ -110,9 +135,26 @@ def test_a_full_disk_keeps_the_old_file(swept_csv, tmp_path):
     (tmp_path / 'u.yaml').write_text('old')
     there = {path.name for path in tmp_path.iterdir()}
     done = subprocess.run(
-        ['bash', '-c', 'ulimit -f 1; trap "" XFSZ; exec "$@"', 'bash', executable('fit'),
-         'sweep.csv', '--params', 'u7.yaml', '--model', 'linear', '-o', 'u.yaml', '--overwrite'],
-        cwd=tmp_path, capture_output=True, text=True, timeout=60 * PATIENCE)
+        [
+            'bash',
+            '-c',
+            'ulimit -f 1; trap "" XFSZ; exec "$@"',
+            'bash',
+            executable('fit'),
+            'sweep.csv',
+            '--params',
+            'u7.yaml',
+            '--model',
+            'linear',
+            '-o',
+            'u.yaml',
+            '--overwrite',
+        ],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60 * PATIENCE,
+    )
     assert done.returncode == 1
     assert 'u.yaml: cannot write: File too large' in done.stderr
     assert done.stderr.count('\n') == 1

@@ -22,7 +22,8 @@ def test_rotation_covariance_and_orientation_agree_with_scipy():
     np.testing.assert_allclose(MOUNTING.rotate(vector), TURN.apply(vector))
     expected = TURN.as_matrix() @ covariance @ TURN.as_matrix().T
     np.testing.assert_allclose(
-        MOUNTING.rotate_covariance(covariance[np.triu_indices(3)]), expected[np.triu_indices(3)])
+        MOUNTING.rotate_covariance(covariance[np.triu_indices(3)]), expected[np.triu_indices(3)]
+    )
     np.testing.assert_allclose(MOUNTING.rotate_matrix(covariance.ravel()), expected.ravel())
     case = Rotation.random(random_state=3)
     robot = Rotation.from_quat(MOUNTING.rotate_orientation(case.as_quat()))
@@ -59,7 +60,8 @@ def test_angular_velocity_is_turned_unless_it_is_absent():
     np.testing.assert_allclose([w.x, w.y, w.z], TURN.apply([1, 0, 0]))
     np.testing.assert_allclose(
         turned.angular_velocity_covariance,
-        (TURN.as_matrix() @ np.diag([1.0, 2.0, 3.0]) @ TURN.as_matrix().T).ravel())
+        (TURN.as_matrix() @ np.diag([1.0, 2.0, 3.0]) @ TURN.as_matrix().T).ravel(),
+    )
     message.angular_velocity_covariance[0] = -1.0
     raw = serialize_message(message)
     assert imu_message.turned(raw, MOUNTING) == raw

@@ -49,63 +49,136 @@ CALIBRATED = """/**:
 BAD = {
     'not YAML': ('    effects: [bias', '    effects: [bias, {', r':\d+:\d+: not YAML: '),
     'a tab': ('      axes: xy', '\taxes: xy', r':8:1: not YAML: found character'),
-    'an object': ("serial: '17'", 'serial: !!python/object:os.system x',
-                  r':7:15: not YAML: could not determine a constructor'),
-    'no such key': ('      rate_hz: 1000.0\n', '',
-                    r':6:5: sensor.rate_hz: missing; it is the sample rate'),
-    'no coefficients': ('    scale_factor:\n      offset_v_per_g: [0.01, 0.02]\n', '',
-                        r':3:5: scale_factor.offset_v_per_g: missing'),
-    'unknown coefficient': ('      offset_v: [', '      drift: [0.0, 0.0]\n      offset_v: [',
-                            r':24:14: bias.drift: unknown parameter; bias has offset_v'),
-    'an int for a float': ('rate_hz: 1000.0', 'rate_hz: 1000',
-                           r':16:16: sensor.rate_hz: 1000 is not a floating-point number; '
-                           r'write it with a point'),
-    'an int in an array': ('offset_v: [0.02, -0.03]', 'offset_v: [0.02, 0]',
-                           r':24:17: bias.offset_v: 0 is not a floating-point number'),
-    'a float that YAML reads as text': ('rc_capacitance_f: 0.33e-6', 'rc_capacitance_f: 1e-6',
-                                        r":13:25: sensor.rc_capacitance_f: '1e-6' is not a "
-                                        r'floating-point number; .* 1\.0e-6'),
-    'a float for an int': ('adc_bits: 16', 'adc_bits: 16.0',
-                           r':14:17: sensor.adc_bits: 16.0 is not a whole number'),
+    'an object': (
+        "serial: '17'",
+        'serial: !!python/object:os.system x',
+        r':7:15: not YAML: could not determine a constructor',
+    ),
+    'no such key': (
+        '      rate_hz: 1000.0\n',
+        '',
+        r':6:5: sensor.rate_hz: missing; it is the sample rate',
+    ),
+    'no coefficients': (
+        '    scale_factor:\n      offset_v_per_g: [0.01, 0.02]\n',
+        '',
+        r':3:5: scale_factor.offset_v_per_g: missing',
+    ),
+    'unknown coefficient': (
+        '      offset_v: [',
+        '      drift: [0.0, 0.0]\n      offset_v: [',
+        r':24:14: bias.drift: unknown parameter; bias has offset_v',
+    ),
+    'an int for a float': (
+        'rate_hz: 1000.0',
+        'rate_hz: 1000',
+        r':16:16: sensor.rate_hz: 1000 is not a floating-point number; '
+        r'write it with a point',
+    ),
+    'an int in an array': (
+        'offset_v: [0.02, -0.03]',
+        'offset_v: [0.02, 0]',
+        r':24:17: bias.offset_v: 0 is not a floating-point number',
+    ),
+    'a float that YAML reads as text': (
+        'rc_capacitance_f: 0.33e-6',
+        'rc_capacitance_f: 1e-6',
+        r":13:25: sensor.rc_capacitance_f: '1e-6' is not a "
+        r'floating-point number; .* 1\.0e-6',
+    ),
+    'a float for an int': (
+        'adc_bits: 16',
+        'adc_bits: 16.0',
+        r':14:17: sensor.adc_bits: 16.0 is not a whole number',
+    ),
     'an int for text': ("serial: '17'", 'serial: 17', r':7:15: sensor.serial: 17 is not text'),
     'NaN': ('offset_v: [0.02,', 'offset_v: [.nan,', r':24:17: bias.offset_v: nan is not a finite'),
-    'out of range': ('rate_hz: 1000.0', 'rate_hz: -1.0',
-                     r':16:16: sensor.rate_hz: -1 Hz is outside 0.01 to 100000'),
-    'a coefficient out of range': ('offset_v: [0.02,', 'offset_v: [20.0,',
-                                   r':24:17: bias.offset_v: 20 V is outside -2 to 2'),
+    'out of range': (
+        'rate_hz: 1000.0',
+        'rate_hz: -1.0',
+        r':16:16: sensor.rate_hz: -1 Hz is outside 0.01 to 100000',
+    ),
+    'a coefficient out of range': (
+        'offset_v: [0.02,',
+        'offset_v: [20.0,',
+        r':24:17: bias.offset_v: 20 V is outside -2 to 2',
+    ),
     'another axis': ('axes: xy', 'axes: xz', r":8:13: sensor.axes: 'xz' is not one of x, xy, xyz"),
-    'too few figures': ('nominal_zero_g_v: [2.5, 2.5]', 'nominal_zero_g_v: [2.5]',
-                        r':9:25: sensor.nominal_zero_g_v: 1 values for 2 axes'),
+    'too few figures': (
+        'nominal_zero_g_v: [2.5, 2.5]',
+        'nominal_zero_g_v: [2.5]',
+        r':9:25: sensor.nominal_zero_g_v: 1 values for 2 axes',
+    ),
     'z_sign': ('z_sign: 1', 'z_sign: 2', r':19:15: sensor.z_sign: 2'),
-    'unknown format': ('format: 1', 'format: 7',
-                       r':3:13: format: version 7, but this package reads version 1'),
+    'unknown format': (
+        'format: 1',
+        'format: 7',
+        r':3:13: format: version 7, but this package reads version 1',
+    ),
     'no format': ('    format: 1\n', '', r':3:5: format: version None'),
-    'other units': ("units: 'V, V/g, 1/g, rad'", "units: 'mV, mV/g'",
-                    r":4:12: units: 'mV, mV/g', but coefficients are in 'V, V/g, 1/g, rad'"),
-    'unknown effect': ('effects: [bias, scale_factor]', 'effects: [bais, scale_factor]',
-                       r":22:14: effects: unknown effect 'bais'; known: "),
-    'an effect twice': ('effects: [bias, scale_factor]', 'effects: [bias, bias]',
-                        r':22:14: effects: a name stands twice'),
-    'no list of effects': ('effects: [bias, scale_factor]', 'effects: bias',
-                           r":22:14: effects: 'bias' is not a list of names"),
-    'a key twice': ('    model: linear\n', '    model: linear\n    model: physical\n',
-                    r':6:5: model: stands twice; keep one'),
-    'a figure that is a tree': ('rate_hz: 1000.0', 'rate_hz: {value: 1000.0}',
-                                r':16:7: sensor.rate_hz: missing'),
-    'unknown name in the covariance': ('bias.offset_v.y]', 'bias.offset_v.z]',
-                                       r":27:23: covariance_names: 'bias.offset_v.z' is no"),
-    'no covariance': ('    covariance: [1.0e-6, 0.0, 0.0, 1.0e-6]\n', '',
-                      r':3:5: covariance: missing; 2 names'),
-    'covariance of another size': ('[1.0e-6, 0.0, 0.0, 1.0e-6]', '[1.0e-6, 0.0, 0.0]',
-                                   r':28:17: covariance: 3 values, but 2 names need 4'),
-    'covariance not symmetric': ('[1.0e-6, 0.0, 0.0, 1.0e-6]', '[1.0e-6, 5.0e-7, 0.0, 1.0e-6]',
-                                 r':28:17: covariance: not symmetric and positive'),
-    'covariance not positive': ('[1.0e-6, 0.0, 0.0, 1.0e-6]', '[1.0e-6, 2.0e-6, 2.0e-6, 1.0e-6]',
-                                r':28:17: covariance: not symmetric and positive'),
-    'negative variance': ('[1.0e-6, 0.0, 0.0, 1.0e-6]', '[-1.0e-6, 0.0, 0.0, 1.0e-6]',
-                          r':28:17: covariance: not symmetric and positive'),
+    'other units': (
+        "units: 'V, V/g, 1/g, rad'",
+        "units: 'mV, mV/g'",
+        r":4:12: units: 'mV, mV/g', but coefficients are in 'V, V/g, 1/g, rad'",
+    ),
+    'unknown effect': (
+        'effects: [bias, scale_factor]',
+        'effects: [bais, scale_factor]',
+        r":22:14: effects: unknown effect 'bais'; known: ",
+    ),
+    'an effect twice': (
+        'effects: [bias, scale_factor]',
+        'effects: [bias, bias]',
+        r':22:14: effects: a name stands twice',
+    ),
+    'no list of effects': (
+        'effects: [bias, scale_factor]',
+        'effects: bias',
+        r":22:14: effects: 'bias' is not a list of names",
+    ),
+    'a key twice': (
+        '    model: linear\n',
+        '    model: linear\n    model: physical\n',
+        r':6:5: model: stands twice; keep one',
+    ),
+    'a figure that is a tree': (
+        'rate_hz: 1000.0',
+        'rate_hz: {value: 1000.0}',
+        r':16:7: sensor.rate_hz: missing',
+    ),
+    'unknown name in the covariance': (
+        'bias.offset_v.y]',
+        'bias.offset_v.z]',
+        r":27:23: covariance_names: 'bias.offset_v.z' is no",
+    ),
+    'no covariance': (
+        '    covariance: [1.0e-6, 0.0, 0.0, 1.0e-6]\n',
+        '',
+        r':3:5: covariance: missing; 2 names',
+    ),
+    'covariance of another size': (
+        '[1.0e-6, 0.0, 0.0, 1.0e-6]',
+        '[1.0e-6, 0.0, 0.0]',
+        r':28:17: covariance: 3 values, but 2 names need 4',
+    ),
+    'covariance not symmetric': (
+        '[1.0e-6, 0.0, 0.0, 1.0e-6]',
+        '[1.0e-6, 5.0e-7, 0.0, 1.0e-6]',
+        r':28:17: covariance: not symmetric and positive',
+    ),
+    'covariance not positive': (
+        '[1.0e-6, 0.0, 0.0, 1.0e-6]',
+        '[1.0e-6, 2.0e-6, 2.0e-6, 1.0e-6]',
+        r':28:17: covariance: not symmetric and positive',
+    ),
+    'negative variance': (
+        '[1.0e-6, 0.0, 0.0, 1.0e-6]',
+        '[-1.0e-6, 0.0, 0.0, 1.0e-6]',
+        r':28:17: covariance: not symmetric and positive',
+    ),
     'no namespace': ('/**:', 'driver:', r":1:1: no '/\*\*' with parameters below it"),
-    'no ros__parameters': ('ros__parameters:', 'parameters:', r":2:3: no 'ros__parameters'")}
+    'no ros__parameters': ('ros__parameters:', 'parameters:', r":2:3: no 'ros__parameters'"),
+}
 
 
 def refusal(path: Path) -> str:
@@ -136,8 +209,11 @@ def test_round_trip(tmp_path: Path) -> None:
     sensor = parameter_file.load(tmp_path / 'text.yaml')
     assert sensor.zero_g_v.tolist() == [2.52, 2.47]
     assert sensor.provenance == {'date': '2026-01-01'}
-    units = [sensor, drawn(np.random.default_rng(1), nominal('xyz')),
-             replace(sensor, serial='007', provenance={'source': 'a: b # c', 'poses': '12'})]
+    units = [
+        sensor,
+        drawn(np.random.default_rng(1), nominal('xyz')),
+        replace(sensor, serial='007', provenance={'source': 'a: b # c', 'poses': '12'}),
+    ]
     for unit in units:
         parameter_file.save(tmp_path / 'saved.yaml', unit, ['words: for', '/** people'])
         assert_equal(parameter_file.load(tmp_path / 'saved.yaml'), unit)

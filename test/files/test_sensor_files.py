@@ -31,16 +31,21 @@ def test_a_still_recording_has_the_stated_noise_and_zero_g(run_tool, tmp_path, p
     sensor = parameter_file.load(path)
     times = np.arange(4096) / sensor.rate_hz
     measured = ''.join(f',{axis}_v' for axis in sensor.axes)
-    (tmp_path / 'still.csv').write_text(f'time_s{measured},alpha_rad,beta_rad\n' + ''.join(
-        f'{time!r}{",1.0" * len(sensor.axes)},0.0,0.0\n' for time in times.tolist()))
+    (tmp_path / 'still.csv').write_text(
+        f'time_s{measured},alpha_rad,beta_rad\n'
+        + ''.join(f'{time!r}{",1.0" * len(sensor.axes)},0.0,0.0\n' for time in times.tolist())
+    )
     done = run_tool('simulate', 'still.csv', '--params', path, '-o', 'out.csv')
     assert done.returncode == 0, done.stderr
     simulated = recording.read(tmp_path / 'out.csv')
     assert simulated.rate_hz == pytest.approx(sensor.rate_hz, rel=1e-6)
     filter_hz = 0.25 / (sensor.rc_resistance_ohm * sensor.rc_capacitance_f)
     for axis, zero_g_v, scale, density in zip(
-            sensor.axes, sensor.nominal_zero_g_v, sensor.nominal_scale_v_per_g,
-            sensor.noise_density_g_per_rthz):
+        sensor.axes,
+        sensor.nominal_zero_g_v,
+        sensor.nominal_scale_v_per_g,
+        sensor.noise_density_g_per_rthz,
+    ):
         volts = simulated.columns[f'{axis}_v']
         noise_v = np.hypot(density * scale * np.sqrt(filter_hz), sensor.lsb_v / np.sqrt(12))
         # Filtered noise has few independent samples: its mean and deviation scatter more.
@@ -54,13 +59,16 @@ def test_a_still_recording_has_the_stated_noise_and_zero_g(run_tool, tmp_path, p
 def test_a_sensor_is_taken_by_its_name(run_tool, tmp_path):
     installed = parameter_file.nominal_path().with_name('mpu6050.yaml')
     for number, params in enumerate(('MPU-6050', installed)):
-        done = run_tool('simulate', 'motion', '--params', params, '--rate', 25,
-                        '-o', f'{number}.csv')
+        done = run_tool(
+            'simulate', 'motion', '--params', params, '--rate', 25, '-o', f'{number}.csv'
+        )
         assert done.returncode == 0, done.stderr
     assert (tmp_path / '0.csv').read_bytes() == (tmp_path / '1.csv').read_bytes()
     (tmp_path / 'mpu6050').write_text('none')
-    assert 'mpu6050:1:1' in run_tool(
-        'simulate', 'motion', '--params', 'mpu6050', '-o', '2.csv').stderr
+    assert (
+        'mpu6050:1:1'
+        in run_tool('simulate', 'motion', '--params', 'mpu6050', '-o', '2.csv').stderr
+    )
 
 
 def test_an_unknown_sensor_is_refused(run_tool):

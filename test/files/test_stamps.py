@@ -21,13 +21,15 @@ def polled(time_s: np.ndarray, period_s: float) -> np.ndarray:
 def stalled(time_s: np.ndarray, stall_s: float) -> np.ndarray:
     """Stamp the samples of the first part of each second at once, at its end."""
     waits = time_s % 1 < stall_s
-    return np.where(waits, np.floor(time_s) + stall_s + 1e-4 * np.arange(len(time_s)) / RATE_HZ,
-                    time_s)
+    return np.where(
+        waits, np.floor(time_s) + stall_s + 1e-4 * np.arange(len(time_s)) / RATE_HZ, time_s
+    )
 
 
 @pytest.mark.parametrize('seconds', [1.2, 10.0])
-@pytest.mark.parametrize(('rate_hz', 'period_s'), [
-    (100.0, 4.25e-3), (75.0, 10e-3), (133.0, 10e-3), (400.0, 1e-3)])
+@pytest.mark.parametrize(
+    ('rate_hz', 'period_s'), [(100.0, 4.25e-3), (75.0, 10e-3), (133.0, 10e-3), (400.0, 1e-3)]
+)
 def test_a_host_that_polls(rate_hz: float, period_s: float, seconds: float) -> None:
     time_s = polled(even(seconds, rate_hz), period_s)
     assert stamped_rate_hz(time_s) == pytest.approx(rate_hz, rel=period_s / seconds)

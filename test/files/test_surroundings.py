@@ -18,8 +18,11 @@ def block(temperature_c: list[float] | None, begin_s: float = 0.0) -> Recording:
 
 def test_a_value_holds_over_blocks_until_the_next_one() -> None:
     surroundings = Surroundings()
-    parts = [surroundings(block([NAN, 30, NAN, 31])), surroundings(block(None, 1.0)),
-             surroundings(block([NAN, 40], 2.0))]
+    parts = [
+        surroundings(block([NAN, 30, NAN, 31])),
+        surroundings(block(None, 1.0)),
+        surroundings(block([NAN, 40], 2.0)),
+    ]
     filled = np.concatenate([part['temperature_c'] for part in parts])
     assert filled.tolist() == [25, 30, 30, 31, *[31] * 10, 31, 40]
     before, held = surroundings.assumed(['temperature_bias', 'temperature_scale'])

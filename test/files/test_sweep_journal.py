@@ -38,9 +38,15 @@ def test_two_calibrations_of_one_journal_are_refused(tmp_path):
     Journal(tmp_path / 'j', HEAD).close()
 
 
-@pytest.mark.parametrize('text, words', [
-    ('', 'empty journal'), ('hello\n', 'line 1 is not of a journal'),
-    ('{"format": 9}\n', 'format 9'), ('[1]\n', 'not an object')])
+@pytest.mark.parametrize(
+    'text, words',
+    [
+        ('', 'empty journal'),
+        ('hello\n', 'line 1 is not of a journal'),
+        ('{"format": 9}\n', 'format 9'),
+        ('[1]\n', 'not an object'),
+    ],
+)
 def test_other_files_are_refused(tmp_path, text, words):
     path = tmp_path / 'j'
     path.write_text(text)
@@ -48,22 +54,30 @@ def test_other_files_are_refused(tmp_path, text, words):
         read(path)
 
 
-@pytest.mark.parametrize('text, poses', [
-    (b'%s\n%r\n{"po#e": \xff}\n%r\n', 1), (b'%s\n%r\n{"pose": 1, "mean_v": [2.5]}\n', 1),
-    (b'a list of mine', 0)])
+@pytest.mark.parametrize(
+    'text, poses',
+    [
+        (b'%s\n%r\n{"po#e": \xff}\n%r\n', 1),
+        (b'%s\n%r\n{"pose": 1, "mean_v": [2.5]}\n', 1),
+        (b'a list of mine', 0),
+    ],
+)
 def test_a_damaged_journal_is_replaced_only_on_request(tmp_path, text, poses):
     path, head = tmp_path / 'j', json.dumps({'format': 1, **HEAD}).encode()
     text = text.replace(b'%s', head).replace(b'%r', json.dumps(POSE.to_json()).encode())
     path.write_bytes(text)
-    with pytest.raises(UserError, match=f'is not of a journal .*; {poses} poses before it can be '
-                       'read; name another journal, or begin again with resume:=anew'):
+    with pytest.raises(
+        UserError,
+        match=f'is not of a journal .*; {poses} poses before it can be '
+        'read; name another journal, or begin again with resume:=anew',
+    ):
         Journal(path, HEAD)
     assert path.read_bytes() == text
     accepted, reason = unfinished(path, HEAD)
     assert accepted == poses and 'is not of a journal' in reason
     Journal(path, HEAD, start_over=True).close()
     assert read(path)[:2] == ({'format': 1, **HEAD}, [])
-    kept, = tmp_path.glob('j.2*')
+    (kept,) = tmp_path.glob('j.2*')
     assert kept.read_bytes() == text
 
 
@@ -96,6 +110,6 @@ def test_a_new_start_keeps_the_interrupted_journal(tmp_path):
     journal = Journal(path, {**HEAD, 'serial': 'B2'}, start_over=True)
     assert journal.entries == []
     journal.close()
-    kept, = tmp_path.glob('j.2*')
+    (kept,) = tmp_path.glob('j.2*')
     assert read(kept)[:2] == ({'format': 1, **HEAD}, [POSE])
     assert unfinished(path, HEAD) is None

@@ -18,18 +18,29 @@ import scipy.io
 
 FORCE_MPS2 = np.tile([1.0, -2.0, 9.5], (50, 1)) + 0.1 * np.sin(np.arange(50.0))[:, None]
 TIME_S = 0.01 * np.arange(50)
-IN_UNIT = {'g': 1 / G0_MPS2, 'mg': 1e3 / G0_MPS2, 'mps2': 1.0, 'mmps2': 1e3,
-           'lsb': 16384 / G0_MPS2}
+IN_UNIT = {
+    'g': 1 / G0_MPS2,
+    'mg': 1e3 / G0_MPS2,
+    'mps2': 1.0,
+    'mmps2': 1e3,
+    'lsb': 16384 / G0_MPS2,
+}
 """Reading of 1 m/s² by the name of a unit."""
 
 
 def bag_and_table(folder: Path, readings: np.ndarray) -> tuple[Path, Path]:
     """Write readings, named as if in m/s², as a bag and as a table."""
-    bag_of(folder / 'bag', [imu(EPOCH_NS + round(1e9 * time_s), reading, variance=(0, 0, 0))
-                            for time_s, reading in zip(TIME_S, readings)])
+    bag_of(
+        folder / 'bag',
+        [
+            imu(EPOCH_NS + round(1e9 * time_s), reading, variance=(0, 0, 0))
+            for time_s, reading in zip(TIME_S, readings)
+        ],
+    )
     table = folder / 'table.csv'
-    table.write_text('time_s,ax_mps2,ay_mps2,az_mps2\n'
-                     + lines([TIME_S, *readings.T], ['%.3f'] + ['%.9f'] * 3))
+    table.write_text(
+        'time_s,ax_mps2,ay_mps2,az_mps2\n' + lines([TIME_S, *readings.T], ['%.3f'] + ['%.9f'] * 3)
+    )
     return folder / 'bag', table
 
 
@@ -65,18 +76,32 @@ def options_for(folder: Path, header: str, time: np.ndarray, readings: np.ndarra
     return propose(open_table(path))[1]
 
 
-@pytest.mark.parametrize(('length', 'expected'), [
-    (9700.4, 'z:mmps2'), (9806.0, 'z:mmps2'), (8192.0, 'z:lsb'), (9.7, 'z:mps2'), (1000.0, 'z:mg'),
-    (1024.0, 'z:lsb')])
+@pytest.mark.parametrize(
+    ('length', 'expected'),
+    [
+        (9700.4, 'z:mmps2'),
+        (9806.0, 'z:mmps2'),
+        (8192.0, 'z:lsb'),
+        (9.7, 'z:mps2'),
+        (1000.0, 'z:mg'),
+        (1024.0, 'z:lsb'),
+    ],
+)
 def test_the_unit_is_guessed_by_the_nearest_length_of_gravity(
-        tmp_path: Path, length: float, expected: str) -> None:
+    tmp_path: Path, length: float, expected: str
+) -> None:
     readings = np.tile([0.0, 0.0, length], (50, 1))
     assert expected in options_for(tmp_path, 't,x,y,z', TIME_S, readings)
 
 
-@pytest.mark.parametrize(('header', 'counter'), [
-    ('Packet number,x,y,z', 10 * np.arange(50)), ('sampleIndex,x,y,z', 2 * np.arange(50)),
-    ('n,x,y,z', np.arange(50) + (np.arange(50) > 20))])
+@pytest.mark.parametrize(
+    ('header', 'counter'),
+    [
+        ('Packet number,x,y,z', 10 * np.arange(50)),
+        ('sampleIndex,x,y,z', 2 * np.arange(50)),
+        ('n,x,y,z', np.arange(50) + (np.arange(50) > 20)),
+    ],
+)
 def test_a_counter_is_no_time(tmp_path: Path, header: str, counter: np.ndarray) -> None:
     assert options_for(tmp_path, header, counter, FORCE_MPS2).endswith('--rate HZ')
 
@@ -92,8 +117,9 @@ def test_a_mirror_is_no_mounting(text: str) -> None:
         parse_mounting(text)
 
 
-@pytest.mark.parametrize('text', ['x=-y,y=x,z=z', 'x=y,y=z,z=x', 'x=-x,y=-y,z=z', 'x=y,y=x,z=-z',
-                                  'x=y,y=x'])
+@pytest.mark.parametrize(
+    'text', ['x=-y,y=x,z=z', 'x=y,y=z,z=x', 'x=-x,y=-y,z=z', 'x=y,y=x,z=-z', 'x=y,y=x']
+)
 def test_rotations_are_mountings(text: str) -> None:
     assert len(parse_mounting(text)) == 1 + text.count(',')
 
@@ -104,10 +130,12 @@ def test_dates_before_1970_rise(tmp_path: Path, offset: str) -> None:
     path = tmp_path / 'old.csv'
     start = np.datetime64('1969-12-31T23:59:58.750', 'ms')
     stamps = start + 250 * np.arange(12)
-    path.write_text('date,x,y,z\n' + ''.join(f'{stamp}{offset},0.01,0.02,1.0\n'
-                                             for stamp in stamps))
-    read = recording.read(path, ReadingOptions(
-        mapping=parse_mapping('time=date:s,x=x:g,y=y:g,z=z:g')))
+    path.write_text(
+        'date,x,y,z\n' + ''.join(f'{stamp}{offset},0.01,0.02,1.0\n' for stamp in stamps)
+    )
+    read = recording.read(
+        path, ReadingOptions(mapping=parse_mapping('time=date:s,x=x:g,y=y:g,z=z:g'))
+    )
     np.testing.assert_allclose(np.diff(read.time_s), 0.25, atol=1e-9)
 
 
@@ -130,8 +158,9 @@ def test_vectors_of_matlab_are_a_table(tmp_path: Path) -> None:
     path = tmp_path / 'run.mat'
     x, y, z = FORCE_MPS2.T
     scipy.io.savemat(path, {'t': TIME_S[:, None], 'x': x, 'y': y, 'z': z[:, None], 'note': 'a'})
-    read = recording.read(path, ReadingOptions(
-        mapping=parse_mapping('time=t:s,x=x:mps2,y=y:mps2,z=z:mps2')))
+    read = recording.read(
+        path, ReadingOptions(mapping=parse_mapping('time=t:s,x=x:mps2,y=y:mps2,z=z:mps2'))
+    )
     np.testing.assert_array_equal(read.columns['az_mps2'], z)
     scipy.io.savemat(path, {'log': {'t': TIME_S, 'x': x}})
     with pytest.raises(UserError, match='writetable'):

@@ -42,7 +42,8 @@ def test_a_folder_is_there_at_every_moment_of_its_replacement(tmp_path: Path) ->
 
 
 def test_without_an_exchange_a_folder_is_replaced_all_the_same(
-        tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(atomic_write.ctypes, 'CDLL', lambda *_, **__: object())
     for text in ('old', 'new'):
         write_folder(tmp_path / 'bag', text)
@@ -53,12 +54,15 @@ def test_without_an_exchange_a_folder_is_replaced_all_the_same(
 def test_a_kill_while_a_folder_is_written_leaves_the_earlier_one(tmp_path: Path) -> None:
     path = tmp_path / 'bag'
     write_folder(path, 'old')
-    code = ('import sys, time\nfrom pathlib import Path\n'
-            'from adxl_ros.files.atomic_write import atomic_path\n'
-            'with atomic_path(sys.argv[1]) as fresh:\n    fresh.mkdir()\n'
-            '    print("begun", flush=True)\n    time.sleep(60)\n')
-    with subprocess.Popen([sys.executable, '-c', code, str(path)], stdout=subprocess.PIPE
-                          ) as writer:
+    code = (
+        'import sys, time\nfrom pathlib import Path\n'
+        'from adxl_ros.files.atomic_write import atomic_path\n'
+        'with atomic_path(sys.argv[1]) as fresh:\n    fresh.mkdir()\n'
+        '    print("begun", flush=True)\n    time.sleep(60)\n'
+    )
+    with subprocess.Popen(
+        [sys.executable, '-c', code, str(path)], stdout=subprocess.PIPE
+    ) as writer:
         assert writer.stdout is not None and writer.stdout.readline() == b'begun\n'
         writer.send_signal(signal.SIGKILL)
     assert (path / 'content').read_text() == 'old'

@@ -13,8 +13,9 @@ pq = pytest.importorskip('pyarrow.parquet')
 pytestmark = pytest.mark.long
 
 FLEETS = {
-    'bad': MadeUpFleet(units=60, per_unit=12, batch=12, drifting_mg=2.5, refused=0.05,
-                       stage_fault=True),
+    'bad': MadeUpFleet(
+        units=60, per_unit=12, batch=12, drifting_mg=2.5, refused=0.05, stage_fault=True
+    ),
     'sound': MadeUpFleet(units=8, per_unit=6),
     'single': MadeUpFleet(units=1, per_unit=1),
     'refused': MadeUpFleet(units=3, per_unit=2, refused=1.0),
@@ -36,15 +37,20 @@ def page_without(column, fleet, folder):
     """Return the text of the page of a fleet whose table lacks the values of a column."""
     path = fleet.write(folder)
     table = pq.read_table(path)
-    pq.write_table(pa.Table.from_pylist(
-        [row | {column: None} for row in table.to_pylist()], table.schema), path)
+    pq.write_table(
+        pa.Table.from_pylist([row | {column: None} for row in table.to_pylist()], table.schema),
+        path,
+    )
     fleet_page.write(folder)
     return (folder / 'fleet.html').read_text()
 
 
 def test_the_end_of_a_run_names_batch_and_drifts(tmp_path):
-    fleets = {'batch': MadeUpFleet(units=24, per_unit=3, batch=6, batch_scale=1.05),
-              'drift': FLEETS['bad'], 'sound': FLEETS['sound']}
+    fleets = {
+        'batch': MadeUpFleet(units=24, per_unit=3, batch=6, batch_scale=1.05),
+        'drift': FLEETS['bad'],
+        'sound': FLEETS['sound'],
+    }
     findings = {}
     for name, fleet in fleets.items():
         (tmp_path / name).mkdir()
@@ -72,8 +78,10 @@ def test_the_page_names_what_is_wrong(page):
     assert page.locator('.multiples figure').first.locator('h3').inner_text().startswith('A-0003')
     trace = page.locator('[data-figure=trend-0]').evaluate('plot => plot.data.map(t => t.name)')
     assert 'recording' in trace and 'line' in trace
-    assert page.locator('[data-figure=trend-0]').evaluate(
-        'plot => (plot.layout.shapes || []).length') == 1
+    assert (
+        page.locator('[data-figure=trend-0]').evaluate('plot => (plot.layout.shapes || []).length')
+        == 1
+    )
     # The unit was calibrated once meanwhile, where its line may have a step.
     assert trace.count('line') == 2
 
@@ -91,8 +99,10 @@ def test_search(page):
 
 
 @NEEDS_CHROMIUM
-@pytest.mark.parametrize('name, width', [
-    *(('bad', width) for width in WIDTHS), ('sound', 1280), ('single', 480), ('refused', 480)])
+@pytest.mark.parametrize(
+    'name, width',
+    [*(('bad', width) for width in WIDTHS), ('sound', 1280), ('single', 480), ('refused', 480)],
+)
 def test_layout(opened, folders, name, width):
     path = folders[name] / 'fleet.html'
     page, messages = opened(path, width)

@@ -31,13 +31,26 @@ def test_a_serial_number_that_contradicts_the_recording_is_refused(tmp_path):
     serials = {'other': 'S2', 'same': 'S3', 'silent': 'nominal', 'open': 'S4', 'unsaid': 'S5'}
     for name, serial in serials.items():
         write(tmp_path / f'{name}.csv', *recording_text(serial, '2026-10-01', 1).splitlines())
-    rows = rows_of(write(tmp_path / 'list.csv', 'url,serial', 'other.csv,WRONG', 'same.csv,S3',
-                         'silent.csv,S6', 'open.csv,', 'unsaid.csv,nominal'))
+    rows = rows_of(
+        write(
+            tmp_path / 'list.csv',
+            'url,serial',
+            'other.csv,WRONG',
+            'same.csv,S3',
+            'silent.csv,S6',
+            'open.csv,',
+            'unsaid.csv,nominal',
+        )
+    )
     other = rows.pop('other.csv')
     assert (other['outcome'], other['refused_by'], other['serial']) == ('refused', 'read', None)
     assert other['refusal'] == 'states the serial S2, but the manifest says WRONG'
     assert {name: row['serial'] for name, row in rows.items()} == {
-        'same.csv': 'S3', 'silent.csv': 'S6', 'open.csv': 'S4', 'unsaid.csv': 'S5'}
+        'same.csv': 'S3',
+        'silent.csv': 'S6',
+        'open.csv': 'S4',
+        'unsaid.csv': 'S5',
+    }
     assert {row['outcome'] for row in rows.values()} == {'done'}
 
 
@@ -55,9 +68,16 @@ def test_a_name_that_is_not_utf_8_is_refused_by_its_name(tmp_path):
 def test_hidden_folders_are_not_searched(tmp_path, monkeypatch):
     """One that is named, or lies above the searched folder, is searched."""
     monkeypatch.chdir(tmp_path)
-    names = ('day/a.csv', 'day/.ipynb_checkpoints/a-checkpoint.csv', 'day/.old/bag/metadata.yaml',
-             'day/.old/bag/0.mcap', 'bag/metadata.yaml', 'bag/.hidden',
-             'day/sub/.x/b.csv', '.top/c.csv')
+    names = (
+        'day/a.csv',
+        'day/.ipynb_checkpoints/a-checkpoint.csv',
+        'day/.old/bag/metadata.yaml',
+        'day/.old/bag/0.mcap',
+        'bag/metadata.yaml',
+        'bag/.hidden',
+        'day/sub/.x/b.csv',
+        '.top/c.csv',
+    )
     for name in names:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         write(tmp_path / name, 'time_s,x_v')

@@ -5,11 +5,24 @@ from adxl_ros.fleet.pooling import random_effects, weighted_mean
 import numpy as np
 import pytest
 
-BCG = np.array([
-    (4, 119, 11, 128), (6, 300, 29, 274), (3, 228, 11, 209), (62, 13536, 248, 12619),
-    (33, 5036, 47, 5761), (180, 1361, 372, 1079), (8, 2537, 10, 619), (505, 87886, 499, 87892),
-    (29, 7470, 45, 7232), (17, 1699, 65, 1600), (186, 50448, 141, 27197), (5, 2493, 3, 2338),
-    (27, 16886, 29, 17825)], float)
+BCG = np.array(
+    [
+        (4, 119, 11, 128),
+        (6, 300, 29, 274),
+        (3, 228, 11, 209),
+        (62, 13536, 248, 12619),
+        (33, 5036, 47, 5761),
+        (180, 1361, 372, 1079),
+        (8, 2537, 10, 619),
+        (505, 87886, 499, 87892),
+        (29, 7470, 45, 7232),
+        (17, 1699, 65, 1600),
+        (186, 50448, 141, 27197),
+        (5, 2493, 3, 2338),
+        (27, 16886, 29, 17825),
+    ],
+    float,
+)
 """Thirteen trials of the BCG vaccine (Colditz 1994): ill and healthy, with it or not."""
 
 
@@ -25,19 +38,19 @@ def test_a_published_example():
     std = np.sqrt(1 / a - 1 / (a + b) + 1 / c - 1 / (c + d))
     pooled = random_effects(y, std)
     assert pooled.units == 13
-    assert (pooled.mean, pooled.spread ** 2) == pytest.approx((-0.7150, 0.3181), abs=5e-5)
-    _, mean_variance = weighted_mean(y, std ** 2, pooled.spread ** 2)
-    assert mean_variance ** 0.5 == pytest.approx(0.1809, abs=5e-5)
+    assert (pooled.mean, pooled.spread**2) == pytest.approx((-0.7150, 0.3181), abs=5e-5)
+    _, mean_variance = weighted_mean(y, std**2, pooled.spread**2)
+    assert mean_variance**0.5 == pytest.approx(0.1809, abs=5e-5)
     # The spread is uncertain, too.
-    assert 1 < pooled.mean_std / mean_variance ** 0.5 < 1.3
+    assert 1 < pooled.mean_std / mean_variance**0.5 < 1.3
 
 
 def test_the_closed_form_of_equal_errors():
     y = np.array([1.0, 2.0, 4.0, 5.0, 8.0])
     pooled = random_effects(y, np.full(5, 0.5))
     assert pooled.mean == pytest.approx(4.0)
-    assert pooled.spread ** 2 == pytest.approx(np.var(y, ddof=1) - 0.25)
-    _, mean_variance = weighted_mean(y, np.full(5, 0.25), pooled.spread ** 2)
+    assert pooled.spread**2 == pytest.approx(np.var(y, ddof=1) - 0.25)
+    _, mean_variance = weighted_mean(y, np.full(5, 0.25), pooled.spread**2)
     assert mean_variance == pytest.approx(np.var(y, ddof=1) / 5)
 
 

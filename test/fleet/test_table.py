@@ -15,9 +15,16 @@ TEXT = (REPO / 'docs' / 'howto' / 'fleet.md').read_text(encoding='utf-8')
 
 def test_a_row_keeps_every_type():
     pytest.importorskip('pyarrow')
-    row = {**empty_row(), 'url': 's3://bucket/a.csv', 'date': '2026-11-01T10:00:00+01:00',
-           'is_sound': True, 'samples': 3, 'faults': ['one'], 'groups': [['a', 'b']],
-           'noise_n_x_mps2_per_rthz': 1e-3}
+    row = {
+        **empty_row(),
+        'url': 's3://bucket/a.csv',
+        'date': '2026-11-01T10:00:00+01:00',
+        'is_sound': True,
+        'samples': 3,
+        'faults': ['one'],
+        'groups': [['a', 'b']],
+        'noise_n_x_mps2_per_rthz': 1e-3,
+    }
     back = as_table([row, empty_row()]).to_pylist()
     assert back[0] == {**row, 'date': datetime(2026, 11, 1, 9, tzinfo=timezone.utc)}
     assert back[1] == empty_row()

@@ -11,8 +11,17 @@ pytestmark = pytest.mark.long
 FLEETS = 40
 
 
-def fleet(rng, counts=(5, 60), units=200, scatter=1.0, stated=0.3, correlation=0.0, step=0.0,
-          unequal=0.0, drift=None):
+def fleet(
+    rng,
+    counts=(5, 60),
+    units=200,
+    scatter=1.0,
+    stated=0.3,
+    correlation=0.0,
+    step=0.0,
+    unequal=0.0,
+    drift=None,
+):
     """Draw recordings of units over a year; `step` is that of two calibrations of each unit."""
     parts, periods = [], 0
     for unit in range(units):
@@ -20,11 +29,15 @@ def fleet(rng, counts=(5, 60), units=200, scatter=1.0, stated=0.3, correlation=0
         time = np.sort(rng.uniform(size=n))
         noise = rng.normal(size=n)
         for i in range(1, n):
-            noise[i] = correlation * noise[i - 1] + np.sqrt(1 - correlation ** 2) * noise[i]
+            noise[i] = correlation * noise[i - 1] + np.sqrt(1 - correlation**2) * noise[i]
         period = np.searchsorted(np.sort(rng.uniform(size=2)) if step else [], time)
         std = stated * rng.lognormal(0, 0.3, n)
-        value = rng.normal(0, 5) + scatter * rng.lognormal(0, unequal) * noise \
-            + step * rng.normal(size=3)[period] + std * rng.normal(size=n)
+        value = (
+            rng.normal(0, 5)
+            + scatter * rng.lognormal(0, unequal) * noise
+            + step * rng.normal(size=3)[period]
+            + std * rng.normal(size=n)
+        )
         value += 0.0 if drift is None else drift[unit] * time
         numbers = np.unique(period, return_inverse=True)[1]
         parts.append((np.full(n, unit), periods + numbers, time, value, std))
@@ -42,14 +55,24 @@ def test_one_unit_has_the_slope_of_least_squares():
     expected = linregress(time, value)
     widening = trends.scatter.widening
     assert trends.slope[0] == pytest.approx(expected.slope)
-    assert trends.slope_std[0] == pytest.approx(expected.stderr * np.sqrt(
-        widening * 28 / (30 - 2 * widening)), rel=1e-3)
+    assert trends.slope_std[0] == pytest.approx(
+        expected.stderr * np.sqrt(widening * 28 / (30 - 2 * widening)), rel=1e-3
+    )
     assert trends.level[0] == pytest.approx(value.mean())
 
 
-@pytest.mark.parametrize('changes', [
-    {}, {'counts': (3, 6)}, {'counts': (60, 150), 'correlation': 0.8}, {'step': 3.0},
-    {'unequal': 0.5}, {'units': 8}], ids=str)
+@pytest.mark.parametrize(
+    'changes',
+    [
+        {},
+        {'counts': (3, 6)},
+        {'counts': (60, 150), 'correlation': 0.8},
+        {'step': 3.0},
+        {'unequal': 0.5},
+        {'units': 8},
+    ],
+    ids=str,
+)
 def test_the_share_of_false_claims(changes):
     """Among the claimed slopes 5 % or less are false, whatever the scatter is like."""
     rng = np.random.default_rng(1)
@@ -77,8 +100,10 @@ def test_a_recalibration_is_no_drift():
     assert np.flatnonzero(claims(trends.p_values)).tolist() == [7]
     assert trends.scatter.calibration == pytest.approx(5.0, rel=0.3)
     # A line through all recordings of a unit would call most steps a drift.
-    lines = [linregress(recordings.time[part], recordings.value[part]).pvalue
-             for part in (recordings.unit == unit for unit in range(60))]
+    lines = [
+        linregress(recordings.time[part], recordings.value[part]).pvalue
+        for part in (recordings.unit == unit for unit in range(60))
+    ]
     assert (false_discovery_control(lines) < 0.05).sum() > 30
 
 

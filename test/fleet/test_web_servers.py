@@ -24,6 +24,7 @@ def web_server(parts, wait_s=0.0, needs=''):
     reads = []
 
     class Handler(BaseHTTPRequestHandler):
+        """Serves one file in pieces, and notes its reads."""
 
         def do_HEAD(self):
             self.send_response(200 if needs in self.path else 403)
@@ -67,7 +68,7 @@ def test_a_token_opens_a_recording_and_stays_out_of_its_row(tmp_path):
     """The server refuses a token that is no longer valid; another parameter is another file."""
     with web_server(1, needs='token=SECRET2') as (url, _):
         first, second = (find_sources([f'{url}?x={x}&token=SECRET2'])[0] for x in (1, 2))
-        old, = find_sources([f'{url}?token=SECRET1&x=1'])
+        (old,) = find_sources([f'{url}?token=SECRET1&x=1'])
         assert stage(first, tmp_path).path.read_bytes() == _PART
         with pytest.raises(StagingError, match='Forbidden') as error:
             stage(replace(first, address=f'{url}?token=SECRET1&x=1'), tmp_path)

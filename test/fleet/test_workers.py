@@ -38,8 +38,12 @@ def is_alive(pid):
 
 def test_only_the_task_that_ends_its_worker_fails():
     with open_pool(None, 2) as pool:
-        results = {end.arguments[0]: end for end in finished_tasks(
-            pool, deadly, ((number, 3, 5) for number in range(12)), retries=1)}
+        results = {
+            end.arguments[0]: end
+            for end in finished_tasks(
+                pool, deadly, ((number, 3, 5) for number in range(12)), retries=1
+            )
+        }
     assert set(results) == set(range(12))
     assert isinstance(results[3].error, WorkerDied) and isinstance(results[5].error, ValueError)
     assert results[3].attempts == results[5].attempts == 2
@@ -90,8 +94,9 @@ if __name__ == '__main__':
     script = tmp_path / 'program' / 'parent.py'
     script.write_text(program)
     environment = os.environ | {'PYTHONPATH': os.pathsep.join(sys.path)}
-    with subprocess.Popen([sys.executable, str(script)], env=environment,
-                          stderr=subprocess.DEVNULL) as parent:
+    with subprocess.Popen(
+        [sys.executable, str(script)], env=environment, stderr=subprocess.DEVNULL
+    ) as parent:
         wait_for(lambda: len(list(tmp_path.iterdir())) == 3)
         pids = [int(path.name) for path in tmp_path.iterdir() if path.name.isdigit()]
         parent.send_signal(sent)

@@ -42,8 +42,12 @@ class Stage:
     """A stage that follows its command within a time step, unless it is stuck."""
 
     def __init__(self, investigation):
-        self.investigation, self.pose, self.now_s, self.commands = \
-            investigation, Pose(0.0, 0.0), 1000.0, []
+        self.investigation, self.pose, self.now_s, self.commands = (
+            investigation,
+            Pose(0.0, 0.0),
+            1000.0,
+            [],
+        )
         self.is_stuck = False
 
     def run(self, until, longest_s=2000.0):
@@ -71,9 +75,17 @@ def test_it_diagnoses_and_moves_in_turn_until_a_hypothesis_is_certain():
         if not states or states[-1] is not investigation.state:
             states.append(investigation.state)
         return investigation.has_ended
+
     stage.run(has_ended)
-    assert states == [State.RECORDING, State.DIAGNOSING, State.MOVING, State.DIAGNOSING,
-                      State.MOVING, State.DIAGNOSING, State.FINISHED]
+    assert states == [
+        State.RECORDING,
+        State.DIAGNOSING,
+        State.MOVING,
+        State.DIAGNOSING,
+        State.MOVING,
+        State.DIAGNOSING,
+        State.FINISHED,
+    ]
     assert investigation.has_verdict
     assert [q.has_samples for q in diagnoser.questions] == [False, True, True]
     assert diagnoser.questions[1].minutes > diagnoser.questions[0].minutes
@@ -111,8 +123,10 @@ def test_the_time_is_a_limit():
     assert sum(d > 0 for d in np.abs(np.diff(stage.commands, axis=0)).max(axis=1)) < 60 / 0.02
 
 
-@pytest.mark.parametrize('answer', [UserError('the bag is gone'), Answer(
-    (), Outcome.INSEPARABLE, fault='axis x is inverted')])
+@pytest.mark.parametrize(
+    'answer',
+    [UserError('the bag is gone'), Answer((), Outcome.INSEPARABLE, fault='axis x is inverted')],
+)
 def test_a_failed_diagnosis_stops_it(answer):
     investigation, stage, _ = started(GO_ON, answer)
     stage.run(lambda: investigation.has_ended)

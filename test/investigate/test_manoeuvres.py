@@ -30,8 +30,11 @@ def test_a_manoeuvre_keeps_angle_and_rate_and_begins_and_ends_at_rest(name, limi
     manoeuvre = plan(name, limits, pose, 100.0)
     time_s = times_of(manoeuvre)
     for path, (low, high), start, end in zip(
-            (manoeuvre.motion.alpha, manoeuvre.motion.beta), (limits.alpha_rad, limits.beta_rad),
-            pose, manoeuvre.end):
+        (manoeuvre.motion.alpha, manoeuvre.motion.beta),
+        (limits.alpha_rad, limits.beta_rad),
+        pose,
+        manoeuvre.end,
+    ):
         angle = path(time_s)
         assert low - 1e-9 <= angle.min() <= angle.max() <= high + 1e-9
         assert np.abs(path(time_s, 1)).max() <= limits.rate_rad_s * (1 + 1e-9)
@@ -66,8 +69,9 @@ def test_a_stage_moves_evenly_although_commands_come_late():
     while not stream.is_done:
         steps = int(rng.integers(1, 15))
         command = stream.advance(0.01 * steps, pose)
-        stage.command(dict(zip(('alpha', 'beta'), command)),
-                      dict(zip(('alpha', 'beta'), stream.speed)))
+        stage.command(
+            dict(zip(('alpha', 'beta'), command)), dict(zip(('alpha', 'beta'), stream.speed))
+        )
         for _ in range(steps):
             stage.step(0.01)
             rates.append(stage.velocity[1])

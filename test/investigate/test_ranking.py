@@ -62,18 +62,23 @@ def test_a_manoeuvre_that_does_not_fit_in_the_time_is_not_chosen():
     minutes = {m.name: m.minutes for m in plan_all(LIMITS, pose)}
     shortest = min(minutes, key=minutes.get)
     fits, _ = run_round(Question(pose, 0.0, minutes[shortest] + 1e-6, False), [], SENSOR, LIMITS)
-    none_fits, _ = run_round(Question(pose, 0.0, minutes[shortest] - 1e-6, False), [], SENSOR,
-                             LIMITS)
+    none_fits, _ = run_round(
+        Question(pose, 0.0, minutes[shortest] - 1e-6, False), [], SENSOR, LIMITS
+    )
     assert fits.manoeuvre == shortest
     assert (none_fits.manoeuvre, none_fits.outcome) == ('', Outcome.TIME_OVER)
-    assert decide(between((), ('hysteresis',)), (told_nothing(1.0),), FIRST, False
-                  ).outcome is Outcome.TIME_OVER
+    assert (
+        decide(between((), ('hysteresis',)), (told_nothing(1.0),), FIRST, False).outcome
+        is Outcome.TIME_OVER
+    )
 
 
 @pytest.mark.parametrize('probability, outcome', [(0.96, Outcome.CERTAIN), (0.85, Outcome.GO_ON)])
 def test_90_percent_of_a_hypothesis_is_a_verdict(probability, outcome):
-    hypotheses = (WeightedHypothesis(('hysteresis',), probability),
-                  WeightedHypothesis((), 1 - probability))
+    hypotheses = (
+        WeightedHypothesis(('hysteresis',), probability),
+        WeightedHypothesis((), 1 - probability),
+    )
     decision = decide(hypotheses, (told_nothing(1.0),), FIRST, True)
     assert decision.outcome is outcome
     if outcome is Outcome.CERTAIN:
@@ -83,8 +88,7 @@ def test_90_percent_of_a_hypothesis_is_a_verdict(probability, outcome):
 def test_a_verdict_that_stays_after_every_kind_of_manoeuvre_ends_it():
     """The manoeuvres still promise much, as where the probability of no gap has a ceiling."""
     hypotheses = (WeightedHypothesis((), 0.8), WeightedHypothesis(('gravity',), 0.2))
-    worth = tuple(ManoeuvreWorth(m.name, m.minutes, 1.0)
-                  for m in plan_all(LIMITS, Pose(1.5, 0.0)))
+    worth = tuple(ManoeuvreWorth(m.name, m.minutes, 1.0) for m in plan_all(LIMITS, Pose(1.5, 0.0)))
     question, recorded = FIRST, []
     while (answer := decide(hypotheses, worth, question, True, 'no_gap')).manoeuvre:
         recorded.append(answer.manoeuvre)

@@ -49,9 +49,25 @@ def library(made_once):
     compiler = shutil.which('cc') or shutil.which('gcc') or shutil.which('clang')
     if compiler is None:
         pytest.skip(lack('a C compiler', 'gcc'))
-    folder = made_once('firmware', lambda folder: subprocess.run(
-        [compiler, '-std=c99', '-Wall', '-Wextra', '-Werror', '-pedantic', '-shared', '-fPIC',
-         '-o', folder / 'frame.so', SOURCE], check=True))
+    folder = made_once(
+        'firmware',
+        lambda folder: subprocess.run(
+            [
+                compiler,
+                '-std=c99',
+                '-Wall',
+                '-Wextra',
+                '-Werror',
+                '-pedantic',
+                '-shared',
+                '-fPIC',
+                '-o',
+                folder / 'frame.so',
+                SOURCE,
+            ],
+            check=True,
+        ),
+    )
     library = ctypes.CDLL(str(folder / 'frame.so'))
     library.frame_data.restype = library.frame_info.restype = ctypes.c_size_t
     library.frame_samples.restype = ctypes.c_uint8
@@ -64,19 +80,27 @@ def data(library, counts, time_us, index, overruns, codes, bits=16):
     out = (ctypes.c_uint8 * (room + 8))(*[0xAA] * (room + 8))
     flat = (ctypes.c_uint16 * codes.size)(*codes.ravel().tolist())
     length = library.frame_data(
-        ctypes.byref(counts), ctypes.c_uint64(time_us), ctypes.c_uint32(index),
-        ctypes.c_uint16(overruns), ctypes.c_uint8(count), ctypes.c_uint8(channels), flat,
-        ctypes.c_uint8(bits), out)
+        ctypes.byref(counts),
+        ctypes.c_uint64(time_us),
+        ctypes.c_uint32(index),
+        ctypes.c_uint16(overruns),
+        ctypes.c_uint8(count),
+        ctypes.c_uint8(channels),
+        flat,
+        ctypes.c_uint8(bits),
+        out,
+    )
     assert length <= room
     assert set(out[length:]) == {0xAA}, 'no byte beyond the frame'
     return bytes(out[:length])
 
 
 def test_the_vector_of_the_interfaces(library):
-    codes = np.array([[0x8000, 0], [0x1234, 0xffff]])
+    codes = np.array([[0x8000, 0], [0x1234, 0xFFFF]])
     frame = data(library, Counts(7, 0), 1_000_000, 70, 0, codes)
-    vector = bytes.fromhex('03010101020701010440420f01010101024601010101030202028001093412ffff'
-                           'e9e413f100')
+    vector = bytes.fromhex(
+        '03010101020701010440420f01010101024601010101030202028001093412ffffe9e413f100'
+    )
     assert decode(vector[:-1]).flags == 0
     decoded = decode(frame[:-1])
     assert decoded.flags == RAIL
@@ -89,14 +113,21 @@ def test_every_frame_equals_that_of_the_reference(library):
     info = BoardInfo(1000.0, 16, 3, 5.0, 'adxl-0001')
     reference, counts = Encoder(info), Counts(0, AFTER_RESET)
     out = (ctypes.c_uint8 * 64)()
-    length = library.frame_info(ctypes.byref(counts), ctypes.c_float(1000.0), ctypes.c_uint8(16),
-                                ctypes.c_uint8(3), ctypes.c_float(5.0), b'adxl-0001', out)
+    length = library.frame_info(
+        ctypes.byref(counts),
+        ctypes.c_float(1000.0),
+        ctypes.c_uint8(16),
+        ctypes.c_uint8(3),
+        ctypes.c_float(5.0),
+        b'adxl-0001',
+        out,
+    )
     assert bytes(out[:length]) == reference.info_frame()
     for _ in range(500):
         count, channels = int(rng.integers(1, 60)), int(rng.integers(1, 5))
         # Few zeros make long runs without one, which COBS cuts at 254 bytes.
-        codes = rng.integers(1, 2 ** 16, (count, channels)) | (0x0101 * int(rng.integers(2)))
-        time_us, index = int(rng.integers(2 ** 53)), int(rng.integers(2 ** 32))
+        codes = rng.integers(1, 2**16, (count, channels)) | (0x0101 * int(rng.integers(2)))
+        time_us, index = int(rng.integers(2**53)), int(rng.integers(2**32))
         actual = data(library, counts, time_us, index, count, codes)
         expected = reference.sample_frame(time_us, index, codes, count)
         assert actual.count(b'\0') == 1
@@ -108,9 +139,13 @@ def test_every_frame_equals_that_of_the_reference(library):
 def received(library, raw, receiver=None):
     """Return the latencies of the commands in some bytes, µs, as the firmware takes them."""
     receiver, latency_us = receiver or Receiver(), ctypes.c_uint32()
-    return [latency_us.value for byte in raw
-            if library.frame_command(ctypes.byref(receiver), ctypes.c_uint8(byte),
-                                     ctypes.byref(latency_us))]
+    return [
+        latency_us.value
+        for byte in raw
+        if library.frame_command(
+            ctypes.byref(receiver), ctypes.c_uint8(byte), ctypes.byref(latency_us)
+        )
+    ]
 
 
 @settings(deadline=None)
@@ -128,10 +163,34 @@ def sketch(made_once):
     compiler = shutil.which('g++') or shutil.which('clang++')
     if compiler is None:
         pytest.skip(lack('a C++ compiler', 'g++'))
-    return made_once('sketch', lambda folder: subprocess.run(
-        [compiler, '-std=c++17', '-O1', '-Wall', '-Wextra', '-Werror', '-pthread', '-x', 'c++',
-         '-I', REPO / 'test' / 'support' / 'arduino', '-I', FOLDER, FOLDER / 'adxl_board.ino',
-         SOURCE, '-o', folder / 'sketch'], check=True)) / 'sketch'
+    return (
+        made_once(
+            'sketch',
+            lambda folder: subprocess.run(
+                [
+                    compiler,
+                    '-std=c++17',
+                    '-O1',
+                    '-Wall',
+                    '-Wextra',
+                    '-Werror',
+                    '-pthread',
+                    '-x',
+                    'c++',
+                    '-I',
+                    REPO / 'test' / 'support' / 'arduino',
+                    '-I',
+                    FOLDER,
+                    FOLDER / 'adxl_board.ino',
+                    SOURCE,
+                    '-o',
+                    folder / 'sketch',
+                ],
+                check=True,
+            ),
+        )
+        / 'sketch'
+    )
 
 
 @contextmanager
@@ -140,8 +199,10 @@ def running_sketch(sketch, tmp_path, baud, **parameters):
     tty.setraw(driver_fd)
     (tmp_path / 'port').symlink_to(os.ttyname(driver_fd))
     board = subprocess.Popen([sketch, str(board_fd), str(baud)], pass_fds=[board_fd])
-    link = serial.open_link(nominal(), serial.Settings(
-        port=str(tmp_path / 'port'), channels='x,y,supply', **parameters))
+    link = serial.open_link(
+        nominal(),
+        serial.Settings(port=str(tmp_path / 'port'), channels='x,y,supply', **parameters),
+    )
     try:
         yield link
     finally:
@@ -174,6 +235,7 @@ def test_the_sketch_obeys(sketch, tmp_path, latency_ms):
         read_until(link, lambda: value(link, 'frame_ms') == frame_ms and link.sensor)
         frames = value(link, 'frames')
         # A test that is held up finds the port silent until it reads again.
-        read_until(link, lambda: value(link, 'frames') > frames + 30
-                   and link.status().text == 'streaming')
+        read_until(
+            link, lambda: value(link, 'frames') > frames + 30 and link.status().text == 'streaming'
+        )
         assert link.sensor.serial == 'adxl-0001'

@@ -33,11 +33,13 @@ def served():
 
     def serve(sensor=None, adc=None, **settings):
         server = ScriptProcess('iiod.py', json.dumps(adc or {}))
-        link = iio.open_link(sensor or nominal(), iio.Settings(
-            uri=f'ip:127.0.0.1:{server.first_line}', **settings))
+        link = iio.open_link(
+            sensor or nominal(), iio.Settings(uri=f'ip:127.0.0.1:{server.first_line}', **settings)
+        )
         link.begin(0)
         opened.append((server, link))
         return server, link
+
     yield serve
     for server, link in opened:
         link.close()
@@ -55,15 +57,28 @@ def column(name, parts):
     return np.concatenate([part.references[name] for part in parts if len(part.stamp_ns)])
 
 
-FORMATS = ['le:u16/16>>0', 'be:u16/16>>0', 'le:u12/16>>4', 'be:s12/16>>4', 'le:s24/32>>8',
-           'be:u24/32>>8', 'le:s16/16>>0', 'le:s8/8>>0', 'be:s18/32>>0']
+FORMATS = [
+    'le:u16/16>>0',
+    'be:u16/16>>0',
+    'le:u12/16>>4',
+    'be:s12/16>>4',
+    'le:s24/32>>8',
+    'be:u24/32>>8',
+    'le:s16/16>>0',
+    'le:s8/8>>0',
+    'be:s18/32>>0',
+]
 
 
 @pytest.mark.parametrize('form', FORMATS)
 def test_every_format_gives_the_volts_of_its_codes(served, form):
     scale, offset = 0.05, -3
-    adc = {'channels': [{'id': 'voltage0', 'format': form, 'scale': scale, 'offset': offset},
-                        {'id': 'voltage1', 'format': form, 'scale': scale}]}
+    adc = {
+        'channels': [
+            {'id': 'voltage0', 'format': form, 'scale': scale, 'offset': offset},
+            {'id': 'voltage1', 'format': form, 'scale': scale},
+        ]
+    }
     _, link = served(adc=adc)
     volts = np.concatenate([part.volts for part in read_samples(link, 200)])
     assert len(volts) >= 200
@@ -75,19 +90,30 @@ def test_every_format_gives_the_volts_of_its_codes(served, form):
     assert np.array_equal(codes, iiod.code(k, 0, bits))
     other_codes = np.rint(volts[:, 1] / (scale * 1e-3)) + shift
     # A code of few bits determines the number of a sample only up to its period.
-    period = 2 ** bits - 2
+    period = 2**bits - 2
     turns = np.arange(3 if period % 3 == 0 else 1) * period
     assert any(np.array_equal(other_codes, iiod.code(k + turn, 1, bits)) for turn in turns)
 
 
-@pytest.mark.parametrize('entries', ['voltage1,voltage0,voltage2', ['y=voltage0', 'x=voltage1',
-                                                                    'supply=voltage2'],
-                                     'right,left,voltage2'])
+@pytest.mark.parametrize(
+    'entries',
+    [
+        'voltage1,voltage0,voltage2',
+        ['y=voltage0', 'x=voltage1', 'supply=voltage2'],
+        'right,left,voltage2',
+    ],
+)
 def test_channels_are_named_by_id_label_or_role(served, entries):
-    _, link = served(adc={'channels': [
-        {'id': 'voltage0', 'label': 'left', 'scale': 1.0},
-        {'id': 'voltage1', 'label': 'right', 'scale': 2.0},
-        {'id': 'voltage2', 'scale': 3.0}]}, channels=entries)
+    _, link = served(
+        adc={
+            'channels': [
+                {'id': 'voltage0', 'label': 'left', 'scale': 1.0},
+                {'id': 'voltage1', 'label': 'right', 'scale': 2.0},
+                {'id': 'voltage2', 'scale': 3.0},
+            ]
+        },
+        channels=entries,
+    )
     parts = read_samples(link, 300)
     first = next(part for part in parts if len(part.volts)).volts[0]
     k = round(first[1] / 1e-3) - 1
@@ -108,26 +134,49 @@ def test_the_rate_is_set_and_read_back(served):
 
 def test_a_digital_sensor_gives_pseudo_volts(served):
     sensor = nominal('xyz')
-    _, link = served(sensor, {'channels': [
-        {'id': f'accel_{a}', 'format': 'le:s16/16>>0', 'scale': 0.01} for a in 'xyz']})
+    _, link = served(
+        sensor,
+        {
+            'channels': [
+                {'id': f'accel_{a}', 'format': 'le:s16/16>>0', 'scale': 0.01} for a in 'xyz'
+            ]
+        },
+    )
     volts = np.concatenate([part.volts for part in read_samples(link, 50)])
     mps2 = (volts[:, 0] - 2.5) * 9.80665
     assert np.rint(mps2 / 0.01) == pytest.approx(mps2 / 0.01, abs=1e-6)
     assert link.sensor.adc_bits == 0
 
 
-@pytest.mark.parametrize('adc, settings, reason', [
-    ({'channels': [{'id': 'voltage0', 'scale': None}, {'id': 'voltage1'}]}, {},
-     "voltage0: its attribute scale is 'missing', not a number"),
-    ({'channels': [{'id': 'voltage0', 'scale': 'nan'}, {'id': 'voltage1'}]}, {}, "is 'nan'"),
-    ({'channels': [{'id': 'voltage0', 'offset': None}, {'id': 'voltage1'}]}, {},
-     "offset is 'missing'"),
-    ({}, {'channels': 'voltage0,voltage9'}, "no channel 'voltage9'; it has voltage0, "),
-    ({}, {'channels': 'voltage0'}, 'the channels are x; expected'),
-    ({'unstamped': True}, {}, 'timestamp'),
-    ({}, {'device': 'ads9999'}, "'ads9999' is not there; with buffered channels there are: adc"),
-    ({'channels': [{'id': 'temp'}, {'id': 'voltage1'}]}, {'channels': 'temp,voltage1'},
-     'temp cannot be x')])
+@pytest.mark.parametrize(
+    'adc, settings, reason',
+    [
+        (
+            {'channels': [{'id': 'voltage0', 'scale': None}, {'id': 'voltage1'}]},
+            {},
+            "voltage0: its attribute scale is 'missing', not a number",
+        ),
+        ({'channels': [{'id': 'voltage0', 'scale': 'nan'}, {'id': 'voltage1'}]}, {}, "is 'nan'"),
+        (
+            {'channels': [{'id': 'voltage0', 'offset': None}, {'id': 'voltage1'}]},
+            {},
+            "offset is 'missing'",
+        ),
+        ({}, {'channels': 'voltage0,voltage9'}, "no channel 'voltage9'; it has voltage0, "),
+        ({}, {'channels': 'voltage0'}, 'the channels are x; expected'),
+        ({'unstamped': True}, {}, 'timestamp'),
+        (
+            {},
+            {'device': 'ads9999'},
+            "'ads9999' is not there; with buffered channels there are: adc",
+        ),
+        (
+            {'channels': [{'id': 'temp'}, {'id': 'voltage1'}]},
+            {'channels': 'temp,voltage1'},
+            'temp cannot be x',
+        ),
+    ],
+)
 def test_a_misfit_is_reported_and_no_value_invented(served, adc, settings, reason):
     _, link = served(adc=adc, **settings)
     assert not sum(len(part.stamp_ns) for part in read_samples(link, 1, 0.4))
@@ -146,9 +195,13 @@ def test_a_buffer_is_as_long_as_the_latency(served):
     assert 2.0 <= durations_ms[0] < 100.0 <= durations_ms[1]
 
 
-@pytest.mark.parametrize('scatter_ns', [
-    60_000,  # beside other tests
-    pytest.param(20_000, marks=pytest.mark.perf)])
+@pytest.mark.parametrize(
+    'scatter_ns',
+    [
+        60_000,  # beside other tests
+        pytest.param(20_000, marks=pytest.mark.perf),
+    ],
+)
 def test_stamps_are_those_of_the_devices_clock(served, scatter_ns):
     _, link = served(adc={'ppm': 80, 'offset_ns': -3_000_000_000})
     parts, scatter, end_s = [], np.inf, time.monotonic() + PATIENCE * 60

@@ -73,8 +73,10 @@ def test_stamps_go_forward_although_readings_of_the_system_clock_scatter(monkeyp
     assert len(stamps) == 2000 and (np.diff(stamps) > 0).all()
 
 
-@pytest.mark.parametrize('ppm, min_ms, max_ms, delay_s', [
-    (100, 0.0, 5.0, 0), (-100, 0.2, 5.2, 0), (100, 3.0, 8.0, 0.003), (0, 0.1, 5.1, 0)])
+@pytest.mark.parametrize(
+    'ppm, min_ms, max_ms, delay_s',
+    [(100, 0.0, 5.0, 0), (-100, 0.2, 5.2, 0), (100, 3.0, 8.0, 0.003), (0, 0.1, 5.1, 0)],
+)
 def test_stamps_of_a_jittery_link_are_true_to_a_millisecond(ppm, min_ms, max_ms, delay_s):
     frames = DelayedFrames(ppm, min_ms, max_ms, delay_s, seed=ppm % 7)
     frames.run(4000)
@@ -103,7 +105,7 @@ def test_a_step_of_the_device_clock_is_recognised(step_ms):
     errors = frames.errors()
     assert frames.map.steps == 1
     assert np.abs(errors[:15000]).max() < 1
-    assert np.abs(errors[15000 + 3000:]).max() < 1.0, 'from three seconds after the step on'
+    assert np.abs(errors[15000 + 3000 :]).max() < 1.0, 'from three seconds after the step on'
 
 
 def test_stamps_keep_their_distances_after_the_load_of_a_busy_host():
@@ -126,6 +128,7 @@ def test_samples_that_come_in_a_burst_before_a_new_connection_were_delayed():
             device_ns = (number + np.arange(2)) * MS
             arrived_ns = (last + late_ms) * MS if late_ms else int(device_ns[-1])
             stamper.add(stamping.Block(device_ns, np.zeros((2, 2)), {}), START + arrived_ns)
+
     send(0, 3000, 0)
     send(3000, 3004, 2000)
     stamper.restart(1e6)
@@ -136,7 +139,7 @@ def test_samples_that_come_in_a_burst_before_a_new_connection_were_delayed():
 def data(index, time_us=None, flags=0):
     """Return a frame of ten samples, by default at its time at 1 kHz."""
     time_us = index * 1000 if time_us is None else time_us
-    return SampleFrame(flags, 0, time_us, index % 2 ** 32, 0, np.zeros((10, 2)))
+    return SampleFrame(flags, 0, time_us, index % 2**32, 0, np.zeros((10, 2)))
 
 
 def counted(*frames, arrived_us=None):
@@ -151,14 +154,15 @@ def counted(*frames, arrived_us=None):
 
 
 def test_missing_samples_are_counted_across_the_wrap():
-    base = 2 ** 32 - 15
+    base = 2**32 - 15
     _, accepted = counted(*(data(base + k, time_us=k * 1000) for k in (0, 10, 20, 50)))
     assert accepted == [(base, None, False), (base + 10, 0, False), (5, 0, False), (35, 20, False)]
 
 
 def test_repeated_and_late_frames_are_not_accepted():
-    counter, accepted = counted(data(0), data(10), data(10), data(0), data(20), data(50), data(30),
-                                data(60))
+    counter, accepted = counted(
+        data(0), data(10), data(10), data(0), data(20), data(50), data(30), data(60)
+    )
     assert [i for i, *_ in accepted] == [0, 10, 20, 50, 60]
     assert [lost for _, lost, _ in accepted] == [None, 0, 0, 20, 0]
     assert counter.repeated == 30
@@ -168,12 +172,19 @@ def test_a_reset_begins_a_new_count_with_and_without_its_flag():
     _, accepted = counted(data(500), data(510), data(0, 100, AFTER_RESET), data(10, 10100))
     assert accepted == [(500, None, False), (510, 0, False), (0, None, False), (10, 0, False)]
     _, accepted = counted(data(500), data(510), data(30, 30100), data(50, 50100), data(60, 60100))
-    assert accepted == [(500, None, False), (510, 0, False), (30, None, False), (50, 10, False),
-                        (60, 0, False)]
+    assert accepted == [
+        (500, None, False),
+        (510, 0, False),
+        (30, None, False),
+        (50, 10, False),
+        (60, 0, False),
+    ]
 
 
-@pytest.mark.parametrize('index, away_s, lost', [
-    (1010, 1.0, 1000), (10, 0.05, 0), (10, 9.0, 0), (1010, 3.0, None), (0, 1.0, None)])
+@pytest.mark.parametrize(
+    'index, away_s, lost',
+    [(1010, 1.0, 1000), (10, 0.05, 0), (10, 9.0, 0), (1010, 3.0, None), (0, 1.0, None)],
+)
 def test_a_count_continues_across_a_closed_port_if_the_clocks_agree(index, away_s, lost):
     counter = FrameCounter()
     counter.restart(1000.0)
@@ -195,8 +206,10 @@ def test_no_frame_is_accepted_twice_or_out_of_order(order):
     assert len(accepted) <= len(order)
 
 
-@pytest.mark.parametrize('change, reason', [
-    ({'adc_bits': 0}, 'adc_bits'), ({'adc_bits': 24}, '24'), ({'serial': 'x' * 17}, 'serial')])
+@pytest.mark.parametrize(
+    'change, reason',
+    [({'adc_bits': 0}, 'adc_bits'), ({'adc_bits': 24}, '24'), ({'serial': 'x' * 17}, 'serial')],
+)
 def test_a_sensor_beyond_the_wire_format_is_refused(change, reason):
     with pytest.raises(UserError, match=reason):
         emulated_board.check_sensor(replace(nominal(), **change))

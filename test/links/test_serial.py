@@ -35,8 +35,9 @@ class ConnectedBoard:
         self.info, self.codes = info, np.arange(info.channels * 10).reshape(10, -1) + 30000
         self.index = 0
         self.plug()
-        self.link = serial.open_link(sensor or nominal(),
-                                     serial.Settings(port=str(self.path), **settings))
+        self.link = serial.open_link(
+            sensor or nominal(), serial.Settings(port=str(self.path), **settings)
+        )
         self.link.begin(0)
         self.encoder = Encoder(info)
         self.link.read(0)
@@ -132,6 +133,7 @@ def connect(tmp_path):
     def make(**settings):
         boards.append(ConnectedBoard(tmp_path, **settings))
         return boards[-1]
+
     yield make
     for board in boards:
         board.close()
@@ -146,7 +148,10 @@ def test_samples_are_volts_of_the_codes_at_the_rate_of_the_board(connect):
     volts = volts_of(parts)
     assert volts[:10] == pytest.approx(board.codes * np.float32(3.3) / 4096, rel=1e-7)
     assert (board.link.sensor.serial, board.link.sensor.rate_hz, board.link.sensor.adc_bits) == (
-        'B9', 500.0, 12)
+        'B9',
+        500.0,
+        12,
+    )
     assert board.link.sensor.adc_vref_v == pytest.approx(3.3)
     board.wait_for('streaming', board.send_frames)
     assert board.link.status().text == 'streaming'
@@ -193,8 +198,9 @@ def test_channels_are_what_the_parameter_states(connect, roles):
     board.send_info()
     board.send_frames(40, 0.005)
     parts = board.read_samples(400)
-    volts = dict(zip(roles.split(',') if isinstance(roles, str) else roles,
-                     board.codes[0] * 5 / 2 ** 16))
+    volts = dict(
+        zip(roles.split(',') if isinstance(roles, str) else roles, board.codes[0] * 5 / 2**16)
+    )
     assert volts_of(parts)[0] == pytest.approx([volts['x'], volts['y']])
     supply_v = reference('supply_v', parts)
     assert supply_v == pytest.approx(2 * volts['supply'])
@@ -205,9 +211,13 @@ def test_channels_are_what_the_parameter_states(connect, roles):
     assert board.link.sensor.serial == nominal().serial, 'the board states no serial number'
 
 
-@pytest.mark.parametrize('info, settings, reason', [
-    (BoardInfo(1000.0, 16, 1, 5.0, ''), {}, 'the channels are x; expected each of x, y'),
-    (INFO, {'channels': 'x,y,supply'}, '3 are named, the board has 2')])
+@pytest.mark.parametrize(
+    'info, settings, reason',
+    [
+        (BoardInfo(1000.0, 16, 1, 5.0, ''), {}, 'the channels are x; expected each of x, y'),
+        (INFO, {'channels': 'x,y,supply'}, '3 are named, the board has 2'),
+    ],
+)
 def test_a_board_that_does_not_fit_states_why(connect, info, settings, reason):
     board = connect(info=info, **settings)
     board.send_info()
@@ -245,8 +255,10 @@ def test_silence_and_bytes_without_a_frame_are_distinguished(connect, monkeypatc
     assert board.link.status().level == base.Level.WARN
     board.wait_for('silent, the board sends nothing; no sample for more than 0.7 s')
     assert board.link.status().level == base.Level.ERROR
-    board.wait_for('is link.baud (115200) that of the board',
-                   lambda: board.send(os.urandom(50).replace(b'\0', b'\1') + b'\0'))
+    board.wait_for(
+        'is link.baud (115200) that of the board',
+        lambda: board.send(os.urandom(50).replace(b'\0', b'\1') + b'\0'),
+    )
     board.wait_for('streaming', board.send_frames)
 
 
@@ -284,7 +296,7 @@ def test_a_board_is_asked_for_small_frames(connect, latency_ms, latency_us):
     board.send_frames(1)
     board.read_samples(10)
     assert board.commands() == [latency_us]
-    board.codes = board.codes[:max(int(latency_ms), 1)]
+    board.codes = board.codes[: max(int(latency_ms), 1)]
     for count in range(2, 22):
         board.send_frames(1, 0.04)
         # The clock of this board is far too slow, so that its samples would be waited for.
@@ -295,8 +307,9 @@ def test_a_board_is_asked_for_small_frames(connect, latency_ms, latency_us):
 
 def test_a_socket_is_a_port():
     with socket.create_server(('127.0.0.1', 0)) as server:
-        link = serial.open_link(nominal(), serial.Settings(
-            port=f'socket://127.0.0.1:{server.getsockname()[1]}'))
+        link = serial.open_link(
+            nominal(), serial.Settings(port=f'socket://127.0.0.1:{server.getsockname()[1]}')
+        )
         accepted = []
         thread = threading.Thread(target=lambda: accepted.append(server.accept()[0]))
         thread.start()
@@ -316,19 +329,29 @@ def test_a_socket_is_a_port():
         link.close()
 
 
-@pytest.mark.parametrize('settings, reason', [
-    ({'port': ''}, 'link.port: names no port'),
-    ({'channels': 'x,w'}, 'channels are x, w; expected'),
-    ({'channels': 'x'}, 'expected each of x, y'),
-    ({'temperature_v_per_c': 0.0}, 'temperature_v_per')])
+@pytest.mark.parametrize(
+    'settings, reason',
+    [
+        ({'port': ''}, 'link.port: names no port'),
+        ({'channels': 'x,w'}, 'channels are x, w; expected'),
+        ({'channels': 'x'}, 'expected each of x, y'),
+        ({'temperature_v_per_c': 0.0}, 'temperature_v_per'),
+    ],
+)
 def test_settings_that_cannot_work_are_refused(settings, reason):
     with pytest.raises(UserError, match=reason):
         serial.open_link(nominal(), serial.Settings(**{'port': '/dev/null', **settings}))
 
 
-@pytest.mark.parametrize('port, reason', [
-    ('/no/such/port', 'No such file'), ('gopher://x', 'gopher|URL|protocol'),
-    ('socket://127.0.0.1:1', 'refused'), ('/etc/hostname', 'configure|ioctl|Inappropriate')])
+@pytest.mark.parametrize(
+    'port, reason',
+    [
+        ('/no/such/port', 'No such file'),
+        ('gopher://x', 'gopher|URL|protocol'),
+        ('socket://127.0.0.1:1', 'refused'),
+        ('/etc/hostname', 'configure|ioctl|Inappropriate'),
+    ],
+)
 def test_a_port_that_does_not_open_states_why(port, reason):
     link = serial.open_link(nominal(), serial.Settings(port=port))
     link.read(0)
@@ -343,12 +366,16 @@ def test_a_port_that_does_not_open_states_why(port, reason):
 def test_a_board_on_a_terminal_is_read_to_the_last_sample(tmp_path):
     path, sensor = str(tmp_path / 'board'), nominal(serial='S5')
     rng = np.random.default_rng(0)
-    columns = {'x_v': rng.uniform(1, 4, 1000), 'y_v': rng.uniform(1, 4, 1000),
-               'supply_v': np.full(1000, 4.9)}
+    columns = {
+        'x_v': rng.uniform(1, 4, 1000),
+        'y_v': rng.uniform(1, 4, 1000),
+        'supply_v': np.full(1000, 4.9),
+    }
     with emulated_board.open_terminal(path) as fd:
         sender = emulated_board.Board(sensor, emulated_board.roles_of(sensor, columns), fd)
-        link = serial.open_link(sensor, serial.Settings(port=path, supply_scale=2.0,
-                                                        channels='x,y,supply'))
+        link = serial.open_link(
+            sensor, serial.Settings(port=path, supply_scale=2.0, channels='x,y,supply')
+        )
         link.read(0)
         thread = threading.Thread(target=sender.send, args=(columns,))
         thread.start()
@@ -358,8 +385,9 @@ def test_a_board_on_a_terminal_is_read_to_the_last_sample(tmp_path):
         thread.join()
         volts = np.concatenate(volts_parts)
         assert volts.shape == (1000, 2)
-        assert np.abs(volts - np.column_stack([columns['x_v'], columns['y_v']])).max() <= \
-            sensor.lsb_v
+        assert (
+            np.abs(volts - np.column_stack([columns['x_v'], columns['y_v']])).max() <= sensor.lsb_v
+        )
         assert link.sensor.serial == 'S5'
         assert link.status().statistics['frame_ms'] == 2.0
         link.close()
@@ -408,8 +436,9 @@ def test_another_board_on_the_port_is_another_sensor(connect):
 
 
 @pytest.mark.parametrize('stated_hz, samples', [(500.0, 10), (500.0, 2), (2000.0, 10)])
-def test_a_rate_that_contradicts_the_clock_is_named_and_no_stamp_is_ahead(connect, stated_hz,
-                                                                          samples):
+def test_a_rate_that_contradicts_the_clock_is_named_and_no_stamp_is_ahead(
+    connect, stated_hz, samples
+):
     board = connect(info=BoardInfo(stated_hz, 16, 2, 5.0, ''))
     board.codes = board.codes[:samples]
     board.send_info()
@@ -439,8 +468,9 @@ def test_another_version_of_the_format_is_reported(connect):
     board = connect()
     board.send(encode_payload(b'\1\2' + bytes(30)))
     assert not board.read()
-    board.wait_for('its firmware of this version?', lambda: board.send(
-        encode_payload(b'\1\2' + bytes(30))))
+    board.wait_for(
+        'its firmware of this version?', lambda: board.send(encode_payload(b'\1\2' + bytes(30)))
+    )
     board.send_info()
     board.send_frames(3)
     board.read_samples(30)

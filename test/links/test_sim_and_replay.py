@@ -21,12 +21,13 @@ import pytest
 from units import nominal
 
 MS = 1_000_000
-START = 1_700_000_000 * 10 ** 9
+START = 1_700_000_000 * 10**9
 
 
 def simulated(sensor=None, alpha=np.pi / 2, beta=0.0, seed=0):
-    link = sim.open_link(sensor or nominal(),
-                         sim.Settings(alpha_rad=alpha, beta_rad=beta, seed=seed))
+    link = sim.open_link(
+        sensor or nominal(), sim.Settings(alpha_rad=alpha, beta_rad=beta, seed=seed)
+    )
     link.begin(START)
     return link
 
@@ -70,15 +71,20 @@ def test_sim_samples_a_pose_with_the_stated_noise():
     expected = [2.5 + 9.80665 / 9.80665, 2.5]
     count = noise.effective_samples(len(volts), 1e-3, sensor.rc_s)
     std_v = noise.sample_std_v(sensor)
-    assert np.abs(volts.mean(0) - expected).max() < 5 * std_v[0] / count ** 0.5
+    assert np.abs(volts.mean(0) - expected).max() < 5 * std_v[0] / count**0.5
     assert volts.std(0) == pytest.approx(std_v, rel=0.15)
 
 
 def turning(t):
     """Return a smooth motion at a time, s: positions and velocities by joint."""
-    return ({'alpha': 0.5 + 0.4 * np.sin(3 * t), 'beta': -2 * np.cos(t),
-             'shift': 0.01 * np.sin(8 * t)},
-            {'alpha': 1.2 * np.cos(3 * t), 'beta': 2 * np.sin(t), 'shift': 0.08 * np.cos(8 * t)})
+    return (
+        {
+            'alpha': 0.5 + 0.4 * np.sin(3 * t),
+            'beta': -2 * np.cos(t),
+            'shift': 0.01 * np.sin(8 * t),
+        },
+        {'alpha': 1.2 * np.cos(3 * t), 'beta': 2 * np.sin(t), 'shift': 0.08 * np.cos(8 * t)},
+    )
 
 
 def test_sim_senses_the_true_motion_at_its_samples():
@@ -124,8 +130,13 @@ def test_sim_waits_for_a_stage_and_holds_the_pose_of_a_lost_one(monkeypatch):
 
 
 def a_stage(**changes):
-    settings = {'pose': np.zeros(3), 'slew': np.array([0.5, 0.5, 0.01]), 'settling_s': 0.3,
-                'resolution': np.array([1.5e-3, 1.5e-3, 0.0]), 'seed': 3} | changes
+    settings = {
+        'pose': np.zeros(3),
+        'slew': np.array([0.5, 0.5, 0.01]),
+        'settling_s': 0.3,
+        'resolution': np.array([1.5e-3, 1.5e-3, 0.0]),
+        'seed': 3,
+    } | changes
     return SimulatedStage(**settings)
 
 
@@ -144,8 +155,9 @@ def test_stage_moves_at_the_slew_rate_to_the_commanded_encoder_step():
     assert (difference > 1e-6).all(), 'the true pose differs from the reading of the encoder'
 
 
-@pytest.mark.parametrize('command', [
-    {'gamma': 0.1}, {'alpha': np.nan}, {'alpha': 0.1, 'beta': np.inf}, {'alpha': 1e38}])
+@pytest.mark.parametrize(
+    'command', [{'gamma': 0.1}, {'alpha': np.nan}, {'alpha': 0.1, 'beta': np.inf}, {'alpha': 1e38}]
+)
 def test_stage_refuses_a_command_with_one_invalid_joint_completely(command):
     stage = a_stage()
     before = stage.position.copy()
@@ -173,11 +185,12 @@ def test_replay_returns_every_row_at_its_time(tmp_path):
     link = opened(written(tmp_path / 'r.csv', ROWS))
     assert link.sensor.axes == 'xyz'
     assert link.sensor.rate_hz == pytest.approx(100)
-    assert link.start_ns == 5 * 10 ** 9
+    assert link.start_ns == 5 * 10**9
     first = link.read(START + 95 * MS)
     assert np.allclose(first.stamp_ns, START + 10 * MS * np.arange(10), atol=1, rtol=0)
     assert to_nominal_mps2(first.volts, link.sensor)[:, 0] == pytest.approx(
-        0.1 * np.arange(10), abs=1e-12)
+        0.1 * np.arange(10), abs=1e-12
+    )
     rest = link.read(START + 10_000 * MS)
     assert len(rest.stamp_ns) == 40
     assert first.missing == rest.missing == 0
@@ -199,22 +212,30 @@ def test_replay_loops_without_a_gap(tmp_path):
 
 def test_replay_uses_what_the_recording_states(tmp_path):
     path = tmp_path / 'r.csv'
-    path.write_text('# serial: 17\n# rate_hz: 200.0\n# nominal_zero_g_v: 1.5, 1.6\n'
-                    '# nominal_scale_v_per_g: 0.3, 0.4\ntime_s,x_v,y_v,temperature_c\n'
-                    '0.0,1.5,2.0,20.5\n0.005,1.8,1.6,\n')
+    path.write_text(
+        '# serial: 17\n# rate_hz: 200.0\n# nominal_zero_g_v: 1.5, 1.6\n'
+        '# nominal_scale_v_per_g: 0.3, 0.4\ntime_s,x_v,y_v,temperature_c\n'
+        '0.0,1.5,2.0,20.5\n0.005,1.8,1.6,\n'
+    )
     link = opened(path, sensor=replace(nominal(), serial='5'))
     assert (link.sensor.serial, link.sensor.rate_hz, link.sensor.axes) == ('17', 200.0, 'xy')
     assert link.references == ('temperature_c',)
     samples = link.read(START + 1000 * MS)
     assert to_nominal_mps2(samples.volts, link.sensor) == pytest.approx(
-        np.array([[0, 9.80665], [9.80665, 0]]))
+        np.array([[0, 9.80665], [9.80665, 0]])
+    )
     assert samples.references['temperature_c'][0] == 20.5
     assert np.isnan(samples.references['temperature_c'][1])
 
 
-@pytest.mark.parametrize('text, reason', [
-    ('', 'empty'), ('time_s,x_v\n0.0,1.0\n0.1,two\n', 'two'),
-    ('# rate_hz: fast\ntime_s,x_v\n0.0,1.0\n', 'rate_hz')])
+@pytest.mark.parametrize(
+    'text, reason',
+    [
+        ('', 'empty'),
+        ('time_s,x_v\n0.0,1.0\n0.1,two\n', 'two'),
+        ('# rate_hz: fast\ntime_s,x_v\n0.0,1.0\n', 'rate_hz'),
+    ],
+)
 def test_replay_reports_a_fault_in_one_line(tmp_path, text, reason):
     path = tmp_path / 'bad.csv'
     path.write_text(text)

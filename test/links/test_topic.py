@@ -16,7 +16,7 @@ import pytest
 from units import nominal, with_effects
 
 STEP_NS = 5_000_000
-START_NS = 40 * 10 ** 9
+START_NS = 40 * 10**9
 EFFECTS = ('quadratic', 'temperature_bias:per_k.x=4e-4,per_k.y=-3e-4,per_k.z=2e-4', 'hysteresis')
 
 
@@ -33,14 +33,18 @@ def force(time_s: np.ndarray) -> np.ndarray:
 def fields(accel: np.ndarray) -> dict[str, np.ndarray]:
     """Return the fields of messages with gyroscope and orientation, (n, k) each."""
     count = len(accel)
-    return {'linear_acceleration': accel, 'angular_velocity': np.tile([0.1, 0.2, 0.3], (count, 1)),
-            'angular_velocity_covariance': np.tile(np.diag([1., 2., 3.]).ravel(), (count, 1)),
-            'orientation': np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
-            'orientation_covariance': np.tile(np.eye(3).ravel(), (count, 1))}
+    return {
+        'linear_acceleration': accel,
+        'angular_velocity': np.tile([0.1, 0.2, 0.3], (count, 1)),
+        'angular_velocity_covariance': np.tile(np.diag([1.0, 2.0, 3.0]).ravel(), (count, 1)),
+        'orientation': np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+        'orientation_covariance': np.tile(np.eye(3).ravel(), (count, 1)),
+    }
 
 
-def feed(link: topic.EmulatedSensor, stamps: np.ndarray, accel: np.ndarray | None = None
-         ) -> Samples:
+def feed(
+    link: topic.EmulatedSensor, stamps: np.ndarray, accel: np.ndarray | None = None
+) -> Samples:
     link.sense_imu(stamps, fields(force(stamps * 1e-9) if accel is None else accel))
     return link.read(0)
 
@@ -57,13 +61,23 @@ def test_it_reads_what_simulate_records(run_tool, tmp_path: Path, seed: int) -> 
     table = np.column_stack([time_s, force(time_s)]).tolist()
     rows = ['time_s,ax_mps2,ay_mps2,az_mps2', *(','.join(map(repr, row)) for row in table)]
     (tmp_path / 'ideal.csv').write_text('\n'.join(rows))
-    done = run_tool('simulate', 'imu', '--force', 'ideal.csv', '--params', 'unit.yaml', '--seed',
-                    seed, '-o', 'out.csv')
+    done = run_tool(
+        'simulate',
+        'imu',
+        '--force',
+        'ideal.csv',
+        '--params',
+        'unit.yaml',
+        '--seed',
+        seed,
+        '-o',
+        'out.csv',
+    )
     assert done.returncode == 0, done.stderr
     recorded = recording.read(tmp_path / 'out.csv').volts(sensor)
     link = topic.open_link(sensor, topic.Settings(seed=seed))
     samples = feed(link, np.rint(time_s * 1e9).astype(np.int64))
-    assert np.abs(samples.volts - recorded)[:len(samples.volts)].max() < 1e-9
+    assert np.abs(samples.volts - recorded)[: len(samples.volts)].max() < 1e-9
 
 
 def test_jitter_and_lost_samples_leave_the_chain_running() -> None:

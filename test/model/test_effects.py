@@ -23,10 +23,14 @@ from units import nominal
 G = 9.80665
 NAMES = sorted(library())
 CLEAN = {'noise_density_g_per_rthz': np.zeros(3), 'adc_bits': 0}
-MOTION = Motion(12.0, Knots([0, 1, 3, 5, 7, 12], [0.5, 0.5, 1.2, 0.9, 2.0, 2.0]),
-                Knots([0, 2, 4, 5, 12], [0, 0, 2, 1.5, 3]), Knots([0, 6, 7, 12], [0, 0, 0.02, 0]),
-                temperature_c=Steps(25.0, ((2.0, 35.0), (7.0, 20.0)), 1.0),
-                supply_v=Steps(5.0, ((4.0, 4.8),), 0.5))
+MOTION = Motion(
+    12.0,
+    Knots([0, 1, 3, 5, 7, 12], [0.5, 0.5, 1.2, 0.9, 2.0, 2.0]),
+    Knots([0, 2, 4, 5, 12], [0, 0, 2, 1.5, 3]),
+    Knots([0, 6, 7, 12], [0, 0, 0.02, 0]),
+    temperature_c=Steps(25.0, ((2.0, 35.0), (7.0, 20.0)), 1.0),
+    supply_v=Steps(5.0, ((4.0, 4.8),), 0.5),
+)
 
 
 _TIME_S = np.arange(0.0, 12.0, 0.01)
@@ -37,19 +41,32 @@ class RobotForce(ForcePath):
 
     def __init__(self, time_s, force_mps2):
         super().__init__(time_s, force_mps2)
-        self.modes = {name: np.roll(force_mps2, k + 1, axis=1) for k, name in enumerate(
-            (*(f'joint{n}' for n in range(1, 9)), 'flexible'))}
+        self.modes = {
+            name: np.roll(force_mps2, k + 1, axis=1)
+            for k, name in enumerate((*(f'joint{n}' for n in range(1, 9)), 'flexible'))
+        }
 
 
-FOLLOWED = Motion(12.0, force=RobotForce(_TIME_S, G * np.column_stack([
-    0.3 * np.sin(9 * _TIME_S), 0.4 * np.cos(5 * _TIME_S), 1 + 0.2 * np.sin(23 * _TIME_S)])),
-    temperature_c=MOTION.temperature_c, supply_v=MOTION.supply_v)
+FOLLOWED = Motion(
+    12.0,
+    force=RobotForce(
+        _TIME_S,
+        G
+        * np.column_stack(
+            [0.3 * np.sin(9 * _TIME_S), 0.4 * np.cos(5 * _TIME_S), 1 + 0.2 * np.sin(23 * _TIME_S)]
+        ),
+    ),
+    temperature_c=MOTION.temperature_c,
+    supply_v=MOTION.supply_v,
+)
 
 
 def with_effect(name, sensor=None, **changes):
     sensor = sensor or nominal('xyz', **CLEAN)
-    values = {**typical(library()[name], sensor.axes), **{k: np.asarray(v, float)
-                                                          for k, v in changes.items()}}
+    values = {
+        **typical(library()[name], sensor.axes),
+        **{k: np.asarray(v, float) for k, v in changes.items()},
+    }
     return replace(sensor, effects=(name,), values={name: values})
 
 
@@ -71,12 +88,14 @@ def plain():
 
 
 def test_the_library_has_the_documented_effects():
-    names = ('bias scale_factor cross_axis scale_factor_z cross_axis_z misalignment '
-             'nonlinearity quadratic hysteresis bandwidth mount_resonance temperature_bias '
-             'temperature_scale warm_up bias_walk supply saturation quantisation adc_inl '
-             'noise_excess flicker mains_hum spikes stuck vibration_rectification time_offset '
-             'clock_skew gravity base_tilt stage_offset stage_eccentricity backlash lever_arm '
-             'thermal_lag thermal_hysteresis reference_filter reference_delay reference_frame')
+    names = (
+        'bias scale_factor cross_axis scale_factor_z cross_axis_z misalignment '
+        'nonlinearity quadratic hysteresis bandwidth mount_resonance temperature_bias '
+        'temperature_scale warm_up bias_walk supply saturation quantisation adc_inl '
+        'noise_excess flicker mains_hum spikes stuck vibration_rectification time_offset '
+        'clock_skew gravity base_tilt stage_offset stage_eccentricity backlash lever_arm '
+        'thermal_lag thermal_hysteresis reference_filter reference_delay reference_frame'
+    )
     listed = names.split()
     assert not set(listed) - set(NAMES)
 
@@ -103,15 +122,21 @@ def test_typical_values_change_a_recording_and_blocks_join(name, plain):
     np.testing.assert_array_equal(np.vstack(parts), all_at_once_v)
 
 
-@pytest.mark.parametrize('name', [n for n in NAMES if library()[n].smooth
-                                  and library()[n].acts_on is ActsOn.MEAN])
+@pytest.mark.parametrize(
+    'name', [n for n in NAMES if library()[n].smooth and library()[n].acts_on is ActsOn.MEAN]
+)
 def test_tangents_do_not_depend_on_the_step(name):
     sensor = with_effect(name)
     for coefficient in names_of(library()[name], 'xyz'):
         value, scale = get(sensor, [coefficient])[0], parameter_of(coefficient).scale
-        slopes = [(volts(put(sensor, [coefficient], [value + step]))
-                   - volts(put(sensor, [coefficient], [value - step]))) / (2 * step)
-                  for step in (1e-3 * scale, 2e-4 * scale)]
+        slopes = [
+            (
+                volts(put(sensor, [coefficient], [value + step]))
+                - volts(put(sensor, [coefficient], [value - step]))
+            )
+            / (2 * step)
+            for step in (1e-3 * scale, 2e-4 * scale)
+        ]
         size = np.abs(slopes[0]).max()
         assert np.abs(slopes[0] - slopes[1]).max() <= 2e-3 * size + 1e-9 / scale
 
@@ -152,30 +177,41 @@ def test_play_equals_its_recursion():
         output = max(position - 2, min(position + 2, output))
         expected.append(output)
     memory = {}
-    parts = [play(x[i:i + 61], 2, memory) for i in range(0, len(x), 61)]
+    parts = [play(x[i : i + 61], 2, memory) for i in range(0, len(x), 61)]
     np.testing.assert_array_equal(np.concatenate(parts), expected)
 
 
 def test_lever_arm_is_centripetal_and_tangential():
     """The force is ω²·r towards the axis, and ω̇·r across it while the speed grows."""
     spin = Motion(9.0, Held(0.0), Knots([0, 2, 8, 9], [0, 3, 21, 22.5], [0, 3, 3, 0]))
-    difference_mps2 = (volts(with_effect('lever_arm', x_m=0.1, y_m=0.0, z_m=0.0), spin)
-                       - volts(nominal('xyz', **CLEAN), spin)) * G
+    difference_mps2 = (
+        volts(with_effect('lever_arm', x_m=0.1, y_m=0.0, z_m=0.0), spin)
+        - volts(nominal('xyz', **CLEAN), spin)
+    ) * G
     assert difference_mps2[5000] == pytest.approx([-0.9, 0.0, 0.0], abs=1e-6)
     growth = spin.beta(np.array([1.0]), 2)[0]
     assert growth > 1.0
-    slow = with_effect('lever_arm', nominal('xyz', **{**CLEAN, 'rc_capacitance_f': 0.0}),
-                       x_m=0.1, y_m=0.0, z_m=0.0)
-    difference_mps2 = (volts(slow, spin)
-                       - volts(nominal('xyz', **CLEAN, rc_capacitance_f=0.0), spin)) * G
+    slow = with_effect(
+        'lever_arm',
+        nominal('xyz', **{**CLEAN, 'rc_capacitance_f': 0.0}),
+        x_m=0.1,
+        y_m=0.0,
+        z_m=0.0,
+    )
+    difference_mps2 = (
+        volts(slow, spin) - volts(nominal('xyz', **CLEAN, rc_capacitance_f=0.0), spin)
+    ) * G
     assert difference_mps2[1000, 1] == pytest.approx(0.1 * growth, rel=1e-6)
 
 
 def test_thermal_lag_makes_the_zero_g_follow_a_slower_temperature():
     """With the slope of the zero-g, a step of temperature arrives by 1 − exp(−t/τ)."""
     step = Motion(300.0, internal_rate_hz=10.0, temperature_c=Steps(25.0, ((100.0, 35.0),), 0.01))
-    plain = nominal('x', **{key: CLEAN[key][:1] if np.ndim(CLEAN[key]) else CLEAN[key]
-                            for key in CLEAN}, rate_hz=10.0)
+    plain = nominal(
+        'x',
+        **{key: CLEAN[key][:1] if np.ndim(CLEAN[key]) else CLEAN[key] for key in CLEAN},
+        rate_hz=10.0,
+    )
     bias, lag = with_effect('temperature_bias', plain), with_effect('thermal_lag', plain)
     both = replace(bias, effects=(*bias.effects, *lag.effects), values=bias.values | lag.values)
     moved_g = volts(both, step)[:, 0] - volts(plain, step)[:, 0]
@@ -189,11 +225,15 @@ def test_thermal_hysteresis_depends_on_the_direction_and_not_on_the_speed():
     """Warming at first adds nothing; far behind the reversal, cooling adds the width."""
     middles = []
     for seconds in (400.0, 40.0):
-        cycle = Motion(seconds, internal_rate_hz=10.0, temperature_c=Knots(
-            [0, seconds / 2, seconds], [10.0, 60.0, 10.0]))
+        cycle = Motion(
+            seconds,
+            internal_rate_hz=10.0,
+            temperature_c=Knots([0, seconds / 2, seconds], [10.0, 60.0, 10.0]),
+        )
         plain = nominal('xyz', **CLEAN, rate_hz=10.0)
-        moved_v = (volts(with_effect('thermal_hysteresis', plain), cycle)
-                   - volts(plain, cycle))[:, 2]
+        moved_v = (volts(with_effect('thermal_hysteresis', plain), cycle) - volts(plain, cycle))[
+            :, 2
+        ]
         middles += [moved_v[len(moved_v) // 4], moved_v[3 * len(moved_v) // 4]]
     assert middles == pytest.approx([0.0, 4e-3] * 2, abs=1e-9)
 
@@ -205,7 +245,7 @@ def test_flicker_is_one_over_f():
     for seed in range(3):
         sensor = with_effect('flicker', nominal('xyz', **CLEAN, rate_hz=100.0))
         data = volts(sensor, rest, seed)
-        f, density = welch(data, 100.0, nperseg=2 ** 16, axis=0, detrend=False)
+        f, density = welch(data, 100.0, nperseg=2**16, axis=0, detrend=False)
         densities.append(density.mean(axis=1))
     shape = np.mean(densities, axis=0) * f / 1e-8
     for low, tolerance in ((0.03, 0.15), (0.3, 0.05), (2.0, 0.03), (6.0, 0.03)):
@@ -217,8 +257,10 @@ def test_flicker_is_one_over_f():
 def test_bias_walks_with_the_root_of_time():
     """After the time t the variance over units is k²·t."""
     sensor = with_effect('bias_walk', nominal('xyz', **CLEAN, rate_hz=100.0))
-    final_v = [volts(sensor, Motion(50.0, internal_rate_hz=10.0), seed)[-1] - [2.5, 2.5, 3.5]
-               for seed in range(150)]
+    final_v = [
+        volts(sensor, Motion(50.0, internal_rate_hz=10.0), seed)[-1] - [2.5, 2.5, 3.5]
+        for seed in range(150)
+    ]
     assert np.std(final_v) == pytest.approx(2e-5 * np.sqrt(50), rel=0.1)
 
 
@@ -227,18 +269,24 @@ def test_inverse_uses_temperature_supply_and_time():
     sensor = with_neutral(nominal('xyz'), names)
     sensor = replace(sensor, values={n: typical(library()[n], 'xyz') for n in names})
     rng = np.random.default_rng(0)
-    around = signal_chain.Environment(rng.uniform(0, 900, 400), rng.uniform(-20, 60, 400),
-                                      rng.uniform(4.5, 5.5, 400))
+    around = signal_chain.Environment(
+        rng.uniform(0, 900, 400), rng.uniform(-20, 60, 400), rng.uniform(4.5, 5.5, 400)
+    )
     truth = rng.normal(size=(3, 400)) * 5
     force = signal_chain.inverse(sensor)(
-        signal_chain.static_response(sensor)(list(truth), around), around)
+        signal_chain.static_response(sensor)(list(truth), around), around
+    )
     np.testing.assert_allclose(np.array(force), truth, atol=1e-9 * G)
 
 
-@pytest.mark.parametrize('name, changes, motion', [
-    ('quantisation', {'adc_bits': 0}, MOTION),
-    ('noise_excess', {'noise_density_g_per_rthz': np.zeros(3)}, MOTION),
-    ('backlash', {}, Motion(1.0, force=lambda at_s: [0 * at_s] * 3))])
+@pytest.mark.parametrize(
+    'name, changes, motion',
+    [
+        ('quantisation', {'adc_bits': 0}, MOTION),
+        ('noise_excess', {'noise_density_g_per_rthz': np.zeros(3)}, MOTION),
+        ('backlash', {}, Motion(1.0, force=lambda at_s: [0 * at_s] * 3)),
+    ],
+)
 def test_an_effect_without_its_stage_of_the_chain_is_refused(name, changes, motion):
     with pytest.raises(UserError, match=f'^{name} acts on the '):
         Response(replace(with_effect(name, nominal('xyz')), **changes), motion, 0)

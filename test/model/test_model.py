@@ -26,11 +26,13 @@ def test_matrix_of_misalignment_equals_equations_18_and_19():
 def test_means_of_simulated_noise_have_the_predicted_deviation():
     sensor = nominal(adc_bits=0)
     fed = Fed(sensor, 5)
-    volts = np.vstack([fed([np.zeros(50000), np.zeros(50000), np.full(50000, 9.8)])
-                       for _ in range(40)])
+    volts = np.vstack(
+        [fed([np.zeros(50000), np.zeros(50000), np.full(50000, 9.8)]) for _ in range(40)]
+    )
     means = volts.reshape(400, 5000, 2).mean(axis=1)
-    promised = noise.sample_std_v(sensor)[0] / np.sqrt(noise.effective_samples(
-        5000, 1e-3, sensor.rc_s))
+    promised = noise.sample_std_v(sensor)[0] / np.sqrt(
+        noise.effective_samples(5000, 1e-3, sensor.rc_s)
+    )
     assert means.std() == pytest.approx(promised, rel=0.1)
     assert volts.std() == pytest.approx(noise.sample_std_v(sensor)[0], rel=0.02)
 
@@ -43,9 +45,13 @@ def test_stage_frames():
     np.testing.assert_allclose(specific_force(0.0, 1.0, 9.8), [0, 0, 9.8], atol=1e-12)
 
 
-@pytest.mark.parametrize(('text', 'coefficient'), [
-    ('bias.offset_v.x', Coefficient('bias', 'offset_v', 'x')),
-    ('time_offset.offset_s', Coefficient('time_offset', 'offset_s'))])
+@pytest.mark.parametrize(
+    ('text', 'coefficient'),
+    [
+        ('bias.offset_v.x', Coefficient('bias', 'offset_v', 'x')),
+        ('time_offset.offset_s', Coefficient('time_offset', 'offset_s')),
+    ],
+)
 def test_text_and_name_are_equivalent(text: str, coefficient: Coefficient) -> None:
     assert Coefficient.parse(text) == coefficient
     assert str(coefficient) == f'{coefficient}' == text
@@ -55,9 +61,14 @@ def test_text_and_name_are_equivalent(text: str, coefficient: Coefficient) -> No
 
 def test_names_of_an_effect() -> None:
     assert [str(name) for name in names_of(effect_named('lever_arm'), 'xy')] == [
-        'lever_arm.x_m', 'lever_arm.y_m', 'lever_arm.z_m']
+        'lever_arm.x_m',
+        'lever_arm.y_m',
+        'lever_arm.z_m',
+    ]
     assert names_of(effect_named('bias'), 'xy') == (
-        Coefficient('bias', 'offset_v', 'x'), Coefficient('bias', 'offset_v', 'y'))
+        Coefficient('bias', 'offset_v', 'x'),
+        Coefficient('bias', 'offset_v', 'y'),
+    )
     assert parameter_of(Coefficient('bias', 'offset_v', 'y')).unit == 'V'
 
 

@@ -28,16 +28,32 @@ def test_the_documented_package_works(tmp_path, monkeypatch, run_tool):
         (package / name).write_text(text)
         assert len(text.splitlines()) < 45
     site = tmp_path / 'site'
-    done = subprocess.run([sys.executable, '-m', 'pip', 'install', '--quiet', '--no-deps',
-                           '--no-index', '--no-build-isolation', '--target', str(site), '.'],
-                          cwd=package, text=True, capture_output=True)
+    done = subprocess.run(
+        [
+            sys.executable,
+            '-m',
+            'pip',
+            'install',
+            '--quiet',
+            '--no-deps',
+            '--no-index',
+            '--no-build-isolation',
+            '--target',
+            str(site),
+            '.',
+        ],
+        cwd=package,
+        text=True,
+        capture_output=True,
+    )
     assert done.returncode == 0, done.stderr
     monkeypatch.setenv('PYTHONPATH', f'{site}{os.pathsep}{os.environ.get("PYTHONPATH", "")}')
     line = re.search(r'simulate (sweep .*) -o', PAGE.read_text())
     assert line
     effect = line[1].split()[2]
-    made = run_executable('simulate', 'tilt_alpha', '--rate', '50', '--effect', effect,
-                          '-o', 'a.csv', cwd=tmp_path)
+    made = run_executable(
+        'simulate', 'tilt_alpha', '--rate', '50', '--effect', effect, '-o', 'a.csv', cwd=tmp_path
+    )
     assert made.returncode == 0, made.stderr
     run_tool('simulate', 'tilt_alpha', '--rate', '50', '-o', 'b.csv')
     read = [recording.read(tmp_path / name).columns['x_v'] for name in ('a.csv', 'b.csv')]
@@ -45,19 +61,24 @@ def test_the_documented_package_works(tmp_path, monkeypatch, run_tool):
     assert abs(np.mean(read[0] - read[1]) - 1.4e-3) < 2e-5
     path = tmp_path / 'unit.yaml'
     parameter_file.save(path, nominal('xy'))
-    text = path.read_text().rstrip() + ('\n    effects: [cable_sag]\n    cable_sag:\n'
-                                        '      resistance_ohm: 2.0\n      current_a: 7.0e-4\n'
-                                        '      growth_per_g: [0.05, 0.05]\n')
+    text = path.read_text().rstrip() + (
+        '\n    effects: [cable_sag]\n    cable_sag:\n'
+        '      resistance_ohm: 2.0\n      current_a: 7.0e-4\n'
+        '      growth_per_g: [0.05, 0.05]\n'
+    )
     path.write_text(text)
     applied = run_executable('apply', 'a.csv', '--params', path, '-o', 'out.csv', cwd=tmp_path)
     assert applied.returncode == 0, applied.stderr
     run_tool('apply', 'b.csv', '-o', 'bare.csv')
-    ax = [np.genfromtxt(tmp_path / name, delimiter=',', names=True)['ax_mps2']
-          for name in ('out.csv', 'bare.csv')]
+    ax = [
+        np.genfromtxt(tmp_path / name, delimiter=',', names=True)['ax_mps2']
+        for name in ('out.csv', 'bare.csv')
+    ]
     assert abs(np.mean(ax[0] - ax[1])) < 2e-4
     # The diagnosis knows it; what grows so little with the output is a zero-g as well.
-    run = run_executable(*line[0].split()[:2], *line[1].split()[1:], '--rate', '50',
-                         '-o', 'c.csv', cwd=tmp_path)
+    run = run_executable(
+        *line[0].split()[:2], *line[1].split()[1:], '--rate', '50', '-o', 'c.csv', cwd=tmp_path
+    )
     assert run.returncode == 0, run.stderr
     run = run_executable('diagnose', 'c.csv', '-o', 'gap', cwd=tmp_path)
     assert run.returncode == 0, run.stderr

@@ -12,28 +12,38 @@ import numpy as np
 import pytest
 from units import nominal
 
-ZERO_G, SCALE = Coefficient('bias', 'offset_v', 'x'), Coefficient('scale_factor',
-                                                                  'offset_v_per_g', 'x')
-POPULATION = Population('population.yaml', {
-    'zero_g_x_v': PooledCoefficient(2.52, 0.001, 0.02, 0.015, 0.03, 0.02, 50),
-    'scale_x_v_per_g': PooledCoefficient(1.01, 0.001, 0.01, 0.008, 0.02, 0.01, 50)})
+ZERO_G, SCALE = (
+    Coefficient('bias', 'offset_v', 'x'),
+    Coefficient('scale_factor', 'offset_v_per_g', 'x'),
+)
+POPULATION = Population(
+    'population.yaml',
+    {
+        'zero_g_x_v': PooledCoefficient(2.52, 0.001, 0.02, 0.015, 0.03, 0.02, 50),
+        'scale_x_v_per_g': PooledCoefficient(1.01, 0.001, 0.01, 0.008, 0.02, 0.01, 50),
+    },
+)
 
 
 def estimated(zero_g_v, scale_v_per_g, covariance):
-    unit = put(with_neutral(nominal('x'), ['bias', 'scale_factor']), [ZERO_G, SCALE],
-               [zero_g_v - 2.5, scale_v_per_g - 1.0])
+    unit = put(
+        with_neutral(nominal('x'), ['bias', 'scale_factor']),
+        [ZERO_G, SCALE],
+        [zero_g_v - 2.5, scale_v_per_g - 1.0],
+    )
     return replace(unit, covariance=np.asarray(covariance), covariance_names=(ZERO_G, SCALE))
 
 
 def test_the_posterior_is_that_of_two_normal_densities():
     covariance = np.array([[4e-4, 1e-4], [1e-4, 2e-4]])
     unit = posterior(estimated(2.54, 1.02, covariance), POPULATION).sensor
-    prior = np.diag([0.02 ** -2, 0.01 ** -2])
+    prior = np.diag([0.02**-2, 0.01**-2])
     precision = np.linalg.inv(covariance)
     expected = np.linalg.inv(precision + prior)
     np.testing.assert_allclose(unit.covariance, expected)
-    np.testing.assert_allclose(get(unit, [ZERO_G, SCALE]), expected @ (
-        precision @ [0.04, 0.02] + prior @ [0.02, 0.01]))
+    np.testing.assert_allclose(
+        get(unit, [ZERO_G, SCALE]), expected @ (precision @ [0.04, 0.02] + prior @ [0.02, 0.01])
+    )
 
 
 @pytest.mark.long
@@ -61,13 +71,19 @@ def test_a_stranger_is_named_and_keeps_its_estimates():
     assert 'not used' in combined.line
 
 
-@pytest.mark.parametrize('text, words', [
-    ('', 'no population of format 1'),
-    ('format: 2\ncoefficients: {}\n', 'no population of format 1'),
-    ('format: [1\n', ':2:1: not YAML'),
-    ('format: 1\ncoefficients: {zero_g_x_v: 3}\n', 'zero_g_x_v: 3 is no set of numbers'),
-    ('format: 1\ncoefficients: {zero_g_x_v: {mean: .nan}}\n',
-     "coefficients.zero_g_x_v: {'mean': nan} is no set of numbers")])
+@pytest.mark.parametrize(
+    'text, words',
+    [
+        ('', 'no population of format 1'),
+        ('format: 2\ncoefficients: {}\n', 'no population of format 1'),
+        ('format: [1\n', ':2:1: not YAML'),
+        ('format: 1\ncoefficients: {zero_g_x_v: 3}\n', 'zero_g_x_v: 3 is no set of numbers'),
+        (
+            'format: 1\ncoefficients: {zero_g_x_v: {mean: .nan}}\n',
+            "coefficients.zero_g_x_v: {'mean': nan} is no set of numbers",
+        ),
+    ],
+)
 def test_a_bad_file_is_refused(tmp_path, text, words):
     path = tmp_path / 'p.yaml'
     path.write_text(text)

@@ -19,18 +19,26 @@ G = 9.80665
 AXES = ('x', 'xy', 'xyz')
 
 
-INVERTIBLE = tuple(name for name, effect in library().items()
-                   if effect.invertible and Need.STAGE not in effect.needs)
+INVERTIBLE = tuple(
+    name
+    for name, effect in library().items()
+    if effect.invertible and Need.STAGE not in effect.needs
+)
 
 
 @st.composite
 def sensors(draw: st.DrawFn, axes: str) -> Sensor:
     sensor = with_neutral(nominal(axes), INVERTIBLE)
     names = coefficients(sensor)
-    return put(sensor, names, [
-        parameter_of(n).scale * (
-            1 if parameter_of(n).role is Role.SHAPE else draw(st.floats(-2, 2)))
-        for n in names])
+    return put(
+        sensor,
+        names,
+        [
+            parameter_of(n).scale
+            * (1 if parameter_of(n).role is Role.SHAPE else draw(st.floats(-2, 2)))
+            for n in names
+        ],
+    )
 
 
 def coefficients(sensor: Sensor) -> tuple[Coefficient, ...]:
@@ -43,8 +51,11 @@ def drawn_sensor(axes: str, seed: int) -> Sensor:
     names = tuple(n for n in coefficients(sensor) if parameter_of(n).role is not Role.SHAPE)
     scale = np.array([parameter_of(n).scale for n in names])
     mixed = rng.normal(size=(len(names), len(names))) * 0.05 * scale[:, None] / len(names) ** 0.5
-    return replace(put(sensor, names, rng.normal(size=len(names)) * scale),
-                   covariance=mixed @ mixed.T, covariance_names=names)
+    return replace(
+        put(sensor, names, rng.normal(size=len(names)) * scale),
+        covariance=mixed @ mixed.T,
+        covariance_names=names,
+    )
 
 
 def direction(draw: st.DrawFn) -> np.ndarray:
@@ -54,8 +65,13 @@ def direction(draw: st.DrawFn) -> np.ndarray:
 
 def bit_error_v(sensor: Sensor) -> float:
     """Return the largest effect of the wrong bit weights, V."""
-    return float(sum(abs(value) for name, value in sensor.values['adc_inl'].items()
-                     if name.endswith('bit_v')))
+    return float(
+        sum(
+            abs(value)
+            for name, value in sensor.values['adc_inl'].items()
+            if name.endswith('bit_v')
+        )
+    )
 
 
 def near_a_step(sensor: Sensor, force: np.ndarray) -> bool:
@@ -87,14 +103,18 @@ def test_inverse_undoes_the_chain(data: st.DataObject, axes: str) -> None:
 
 @pytest.mark.parametrize('invalid_v', [np.nan, np.inf, 1e38, -1e300])
 @pytest.mark.parametrize('axes', AXES)
-def test_volts_without_a_solution_are_nan_and_change_no_other_sample(axes: str, invalid_v: float
-                                                                     ) -> None:
+def test_volts_without_a_solution_are_nan_and_change_no_other_sample(
+    axes: str, invalid_v: float
+) -> None:
     sensor = drawn_sensor(axes, 1)
     valid_v = signal_chain.static_response(sensor)([1.0, 0.0, 0.0])
     volts = [np.array([v, invalid_v, v]) for v in valid_v]
     force = np.array(signal_chain.inverse(sensor)(volts))
-    assert (np.isnan(force[:, 1]).all() or not np.isfinite(invalid_v)
-            or np.abs(force[:, 1]).max() > 1e3)
+    assert (
+        np.isnan(force[:, 1]).all()
+        or not np.isfinite(invalid_v)
+        or np.abs(force[:, 1]).max() > 1e3
+    )
     single = np.array(signal_chain.inverse(sensor)(valid_v))
     np.testing.assert_array_equal(force[:, 0], single)
     np.testing.assert_array_equal(force[:, 2], single)
@@ -111,10 +131,12 @@ def test_intervals_have_their_stated_coverage(axes: str) -> None:
     volts = []
     for _ in range(draws):
         drawn = get(sensor, sensor.covariance_names) + root @ rng.normal(size=len(root))
-        volts.append(signal_chain.static_response(put(sensor, sensor.covariance_names, drawn))(
-            list(force)))
+        volts.append(
+            signal_chain.static_response(put(sensor, sensor.covariance_names, drawn))(list(force))
+        )
     volts = np.array(volts) + noise.sample_std_v(sensor)[:, None] * rng.normal(
-        size=(draws, len(axes), len(beta)))
+        size=(draws, len(axes), len(beta))
+    )
     volts = np.moveaxis(volts, 1, 0).reshape(len(axes), -1)
     recovered = signal_chain.inverse(sensor)(list(volts))
     covariance = force_covariance(sensor, recovered)
@@ -138,8 +160,14 @@ def test_derivatives_by_coefficients_are_those_of_the_whole_chain(axes: str) -> 
     slopes = coefficient_tangent(sensor)(force, around)
     for i, name in enumerate(sensor.covariance_names):
         step, value = 1e-3 * parameter_of(name).scale, get(sensor, [name])
-        above, below = (np.array(signal_chain.static_response(
-            put(sensor, [name], value + sign * step))(force, around)) for sign in (1, -1))
+        above, below = (
+            np.array(
+                signal_chain.static_response(put(sensor, [name], value + sign * step))(
+                    force, around
+                )
+            )
+            for sign in (1, -1)
+        )
         expected = (above - below) / (2 * step)
         np.testing.assert_allclose(slopes[:, i], expected, atol=1e-8 * np.abs(expected).max())
 
@@ -150,7 +178,7 @@ def assert_coverage(error: np.ndarray, std: np.ndarray) -> None:
 
 def test_angles_of_known_poses() -> None:
     """In frames of REP 103, x reads −g/2 at a pitch of 30°, and y reads g at a roll of 90°."""
-    half, root = G / 2, G * 3 ** 0.5 / 2
+    half, root = G / 2, G * 3**0.5 / 2
     force = np.array([[-half, 0, root], [0, G, 0], [0, half, root], [half, -root, 0]]).T
     angles = tilt(list(force), np.full((3, 3, 4), 1e-12) * np.eye(3)[:, :, None])
     np.testing.assert_allclose(np.degrees(angles.pitch), [30, 0, 0, -30], atol=1e-9)

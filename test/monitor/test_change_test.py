@@ -22,8 +22,9 @@ def series(kind: str, blocks: int, channels: int, seed: int) -> np.ndarray:
     if kind in ('walk', 'all'):
         values += np.cumsum(rng.standard_normal((blocks, channels)), axis=0)
     if kind == 'all':
-        values += 300 * np.sin(2 * np.pi * (np.arange(blocks)[:, None] / DAY_S
-                                            + rng.random(channels)))
+        values += 300 * np.sin(
+            2 * np.pi * (np.arange(blocks)[:, None] / DAY_S + rng.random(channels))
+        )
     return values
 
 
@@ -42,8 +43,10 @@ def test_false_alarms_are_no_more_than_stated(kind: str) -> None:
     assert len(alarms) <= poisson.isf(1e-3, rate * sensors * hours / 24)
 
 
-@pytest.mark.parametrize('kind, size, delay_s', [
-    ('white', 1000.0, 2), ('white', 300.0, 20), ('white', 100.0, 200), ('all', 3000.0, 5)])
+@pytest.mark.parametrize(
+    'kind, size, delay_s',
+    [('white', 1000.0, 2), ('white', 300.0, 20), ('white', 100.0, 200), ('all', 3000.0, 5)],
+)
 def test_a_step_is_found_in_time(kind: str, size: float, delay_s: int) -> None:
     test = ChangeTest(6, 1 / 30)
     values = series(kind, 5400, 6, 5)

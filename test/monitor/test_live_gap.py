@@ -21,7 +21,7 @@ from units import nominal, with_effects
 
 RATE_HZ = 200.0
 UNIT = nominal('xyz', rate_hz=RATE_HZ, stage_resolution_rad=0.0)
-ORIGIN_NS = 1_700_000_000 * 10 ** 9
+ORIGIN_NS = 1_700_000_000 * 10**9
 EFFECTS = ('misalignment', 'temperature_bias', 'hysteresis')
 
 
@@ -33,14 +33,20 @@ class Swing:
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         phase = self._rate * time_s + order * np.pi / 2
-        return (0.7 if not order else 0.0) + self._amplitude * self._rate ** order * np.sin(phase)
+        return (0.7 if not order else 0.0) + self._amplitude * self._rate**order * np.sin(phase)
 
 
 class World:
     """A sensor on a stage, or beside a simulator, whose samples a comparison gets."""
 
-    def __init__(self, truth: Sensor, params: Sensor, kind: ReferenceKind = ReferenceKind.STAGE,
-                 amplitude: float = 0.5, step_rad: float = 0.0) -> None:
+    def __init__(
+        self,
+        truth: Sensor,
+        params: Sensor,
+        kind: ReferenceKind = ReferenceKind.STAGE,
+        amplitude: float = 0.5,
+        step_rad: float = 0.0,
+    ) -> None:
         self._truth, self._kind, self._step_rad = truth, kind, step_rad
         self._joints = Swing(amplitude, 0.6), Swing(2 * amplitude, 0.37)
         self._respond = self._response(truth)
@@ -50,16 +56,20 @@ class World:
         self.reference_until = np.inf
 
     def _response(self, sensor: Sensor) -> Response:
-        motion = Motion(np.inf, *self._joints, Held(), force=self._force) \
-            if self._kind is ReferenceKind.IMU else Motion(np.inf, *self._joints, Held())
+        motion = (
+            Motion(np.inf, *self._joints, Held(), force=self._force)
+            if self._kind is ReferenceKind.IMU
+            else Motion(np.inf, *self._joints, Held())
+        )
         return Response(sensor, motion, 3)
 
     @staticmethod
     def _force(time_s: np.ndarray) -> list[np.ndarray]:
         return [3 * np.sin(time_s), 2 * np.cos(0.7 * time_s), 9 + np.sin(0.3 * time_s)]
 
-    def run(self, seconds: int, change: Callable[[np.ndarray], np.ndarray] = lambda a: a
-            ) -> list[GapChange]:
+    def run(
+        self, seconds: int, change: Callable[[np.ndarray], np.ndarray] = lambda a: a
+    ) -> list[GapChange]:
         changes = []
         for _ in range(seconds * 10):
             time_s = (self.step + np.arange(20)) / RATE_HZ
@@ -78,7 +88,7 @@ class World:
             reference.add_readings(stamps, np.column_stack(self._force(time_s)))
             return
         for i, stamp in enumerate(stamps.tolist()):
-            angles = [float(joint(time_s[i:i + 1])[0]) for joint in self._joints]
+            angles = [float(joint(time_s[i : i + 1])[0]) for joint in self._joints]
             if self._step_rad:
                 angles = [round(angle / self._step_rad) * self._step_rad for angle in angles]
             reference.add_joints([stamp], [dict(zip(('alpha', 'beta'), angles))])
@@ -91,8 +101,9 @@ def gaps(world: World) -> list[float]:
 
 @pytest.mark.parametrize('kind', [ReferenceKind.STAGE, ReferenceKind.IMU])
 @pytest.mark.parametrize('amplitude', [0.0, 0.5])
-def test_the_gap_of_the_right_parameters_is_the_floor(kind: ReferenceKind, amplitude: float
-                                                      ) -> None:
+def test_the_gap_of_the_right_parameters_is_the_floor(
+    kind: ReferenceKind, amplitude: float
+) -> None:
     sensor = with_effects(UNIT, EFFECTS)
     world = World(sensor, sensor, kind, amplitude)
     assert not world.run(40)
@@ -130,7 +141,7 @@ def test_a_change_of_the_mean_and_of_the_noise() -> None:
     world = World(UNIT, UNIT)
     rng = np.random.default_rng(1)
     assert not world.run(80)
-    step, = world.run(20, lambda a: a + [0.0, 0.05, 0.0])
+    (step,) = world.run(20, lambda a: a + [0.0, 0.05, 0.0])
     assert (step.axis, step.quantity) == ('y', 'mean')
     assert step.size == pytest.approx(0.05 / 9.80665e-3, rel=0.1)
     assert (step.since_ns - ORIGIN_NS) * 1e-9 == pytest.approx(80, abs=1)
@@ -142,10 +153,12 @@ def test_a_change_of_the_mean_and_of_the_noise() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize('mg_per_min', [0.02, 10.0])
 def test_a_ramp_from_the_first_second_is_a_change_if_no_healthy_unit_drifts_so(
-        mg_per_min: float) -> None:
+    mg_per_min: float,
+) -> None:
     world = World(UNIT, UNIT, amplitude=0.0)
-    changes = world.run(150, lambda a: a + [
-        0.0, mg_per_min * world.step / RATE_HZ / 60 * 9.80665e-3, 0.0])
+    changes = world.run(
+        150, lambda a: a + [0.0, mg_per_min * world.step / RATE_HZ / 60 * 9.80665e-3, 0.0]
+    )
     assert {change.axis for change in changes} == ({'y'} if mg_per_min > 1 else set())
 
 
@@ -162,11 +175,11 @@ def test_faults_of_the_samples_are_counted() -> None:
     world.step += 7
     world.run(2)
     assert world.live.counts['missing'] == 10 + 7
-    world.offset_ns -= 300 * 10 ** 9
+    world.offset_ns -= 300 * 10**9
     world.run(30)
     assert world.live.counts['jumps'] == 1
     assert np.isfinite(gaps(world)).all() and len(gaps(world)) == 3
-    world.offset_ns += 300 * 10 ** 9
+    world.offset_ns += 300 * 10**9
     world.run(30)
     assert world.live.counts['jumps'] == 2
     assert not any(axis.is_open for axis in world.live.report())

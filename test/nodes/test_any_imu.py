@@ -45,9 +45,10 @@ class Camera:
     def send(self, force_mps2: np.ndarray) -> None:
         message = Imu()
         time_ns = 1_700_000_000_000_000_000 + round(
-            (self._count + self._jitter.uniform(0, 0.9)) * 1e9 / RATE_HZ)
+            (self._count + self._jitter.uniform(0, 0.9)) * 1e9 / RATE_HZ
+        )
         self._count += 1
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time_ns, 10 ** 9)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time_ns, 10**9)
         message.header.frame_id = 'camera_imu'
         message.orientation.x, message.orientation.w = 0.6, 0.8
         message.orientation_covariance = [0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.02]
@@ -67,14 +68,16 @@ def test_compensation_takes_any_imu(camera: Camera, start: Start) -> None:
     """Axes, rate and noise are measured; the gyroscope passes through."""
     graph = camera.graph
     data = graph.listen(Imu, 'imu/data')
-    node = start('compensation', '--ros-args', '-r', f'imu/data_raw:={TOPIC}', '-p',
-                 'orientation:=tilt')
+    node = start(
+        'compensation', '--ros-args', '-r', f'imu/data_raw:={TOPIC}', '-p', 'orientation:=tilt'
+    )
     camera.connected()
 
     def published() -> bool:
         camera.rest([0.0, 0.0, G], 0.1)
         graph.spin(0.05)
         return bool(data)
+
     graph.spin_until(published, 40, 'corrected samples')
     node.wait_for('Hz, axes: xyz')
     message = data[-1]
@@ -87,20 +90,31 @@ def test_compensation_takes_any_imu(camera: Camera, start: Start) -> None:
 
 
 def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(
-        camera: Camera, start: Start, tmp_path: Path) -> None:
+    camera: Camera, start: Start, tmp_path: Path
+) -> None:
     """
     Acceleration, covariance, gyroscope and tilt are those of the robot, after ~/level, too.
 
     The level is written into the file of the mounting.
     """
     mounted = tmp_path / 'mounted.yaml'
-    mounted.write_text('compensation:\n  ros__parameters:\n    mounting: {rpy_rad: '
-                       '[3.141592653589793, 0.0, 0.0]}  # upside down\n')
+    mounted.write_text(
+        'compensation:\n  ros__parameters:\n    mounting: {rpy_rad: '
+        '[3.141592653589793, 0.0, 0.0]}  # upside down\n'
+    )
     graph = camera.graph
     data, tilt = graph.listen(Imu, 'imu/data'), graph.listen(Vector3Stamped, 'tilt')
     free = graph.listen(Vector3Stamped, 'imu/linear_acceleration_free')
-    start('compensation', '--ros-args', '-r', f'imu/data_raw:={TOPIC}', '--params-file', mounted,
-          '-p', 'free_acceleration:=true')
+    start(
+        'compensation',
+        '--ros-args',
+        '-r',
+        f'imu/data_raw:={TOPIC}',
+        '--params-file',
+        mounted,
+        '-p',
+        'free_acceleration:=true',
+    )
     camera.connected()
 
     def until(condition: Callable[[], bool], purpose: str) -> None:
@@ -108,7 +122,9 @@ def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(
             camera.rest([0.0, 1.0, -G], 0.1)
             graph.spin(0.05)
             return bool(data and tilt and free) and condition()
+
         graph.spin_until(met, 40, purpose)
+
     until(lambda: True, 'corrected samples')
     assert data[-1].header.frame_id == tilt[-1].header.frame_id == 'base_link'
     np.testing.assert_allclose(accel(data[-1]), [0, -1, G], atol=0.2)
@@ -128,5 +144,5 @@ def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(
     until(lambda: abs(tilt[-1].vector.x) < 0.01, 'a level robot')
     # The orientation that the camera states is 2·atan2(0.6, 0.8) about x, whatever it measures.
     quaternion = data[-1].orientation
-    assert quaternion.x ** 2 + quaternion.w ** 2 == pytest.approx(1)
+    assert quaternion.x**2 + quaternion.w**2 == pytest.approx(1)
     assert np.linalg.norm([free[-1].vector.y, free[-1].vector.z]) > 1

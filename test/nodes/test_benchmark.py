@@ -26,14 +26,19 @@ def test_rows_state_the_ratio_to_each_rival_and_what_is_not_installed() -> None:
         spent_s += seconds
 
     make = partial(Job, clock=lambda: spent_s)
-    job = make('count', lambda: work(0.3), 1.5,
-               {'rival': lambda: work(0.2), 'other': missing, 'slow': lambda: work(3.0)})
+    job = make(
+        'count',
+        lambda: work(0.3),
+        1.5,
+        {'rival': lambda: work(0.2), 'other': missing, 'slow': lambda: work(3.0)},
+    )
     first, second, third = rows_of(job, 2)
     assert first == '| count | 0.3 (0.3–0.3) | rival | 1.5 (1.5–1.5) | 1.5 |'
     assert second == '| count | 0.3 (0.3–0.3) | other | not installed | – |'
     assert third == '| count | 0.3 (0.3–0.3) | slow | 0.1 (0.1–0.1) | – |'
     assert rows_of(make('alone', lambda: work(2.0), 5.0), 1) == [
-        '| alone | 2 (2–2) | – | – | 5 s |']
+        '| alone | 2 (2–2) | – | – | 5 s |'
+    ]
 
 
 def refuse(*_: object) -> float:
@@ -42,13 +47,25 @@ def refuse(*_: object) -> float:
 
 def test_a_row_that_fails_is_named_and_the_others_stand(monkeypatch, capsys) -> None:
     def measure(subject: bench_command._Subject, seconds: float) -> dict:
-        return refuse() if 'iio' in subject.label else {
-            'first_s': 2.0, 'rate_hz': 1000.0, 'missing': 0, 'p50_ms': 0.5, 'p99_ms': 1.0,
-            'loads': (0.1,)}
+        return (
+            refuse()
+            if 'iio' in subject.label
+            else {
+                'first_s': 2.0,
+                'rate_hz': 1000.0,
+                'missing': 0,
+                'p50_ms': 0.5,
+                'p99_ms': 1.0,
+                'loads': (0.1,),
+            }
+        )
 
     labels = 'bare publisher and relay', 'driver, iio, compensation', 'driver, sim, compensation'
-    monkeypatch.setattr(bench_command, '_subjects', lambda *_: [
-        bench_command._Subject(label, 'imu/data', []) for label in labels])
+    monkeypatch.setattr(
+        bench_command,
+        '_subjects',
+        lambda *_: [bench_command._Subject(label, 'imu/data', []) for label in labels],
+    )
     monkeypatch.setattr(bench_command, '_measure', measure)
     bench_command.measure_live(1.0, 3, None)
     table = capsys.readouterr().out.splitlines()[3:]
@@ -65,16 +82,20 @@ def test_a_row_that_fails_is_named_and_the_others_stand(monkeypatch, capsys) -> 
 
 @pytest.mark.parametrize('kind', ['csv', 'mcap'])
 def test_a_long_recording_is_applied_with_its_memory_and_leaves_no_file(
-        monkeypatch, tmp_path, kind):
+    monkeypatch, tmp_path, kind
+):
     if kind == 'mcap':
         pytest.importorskip('rosbags')
     # The other executables stand beside the running one.
     monkeypatch.setattr(sys, 'argv', [executable('bench')])
     jobs = bench_jobs._long_applying(tmp_path, nominal(), kind, 0.01)
-    row, = rows_of(next(jobs), 1)
+    (row,) = rows_of(next(jobs), 1)
     format_ = kind.upper()
-    assert re.match(rf'\| apply, 0.01 h at 1 kHz, {format_} to {format_} '
-                    r'\(\d+ s elapsed, [1-9]\d+ MB\) \| .* \| 0.075 s \|', row)
+    assert re.match(
+        rf'\| apply, 0.01 h at 1 kHz, {format_} to {format_} '
+        r'\(\d+ s elapsed, [1-9]\d+ MB\) \| .* \| 0.075 s \|',
+        row,
+    )
     assert list(jobs) == []
     assert [path.name for path in tmp_path.iterdir()] == ['unit.yaml']
     # More than any disk holds.

@@ -21,11 +21,24 @@ from units import drawn, nominal, with_effects
 FAST = ('-p', 'use_sim_time:=true')
 # At many times real time a best-effort subscriber, or one with a short queue, loses samples on a
 # busy machine.
-LOSSLESS = (*RELIABLE, '-p', f'qos_overrides./imu/data_raw.subscription.depth:={QUEUE}',
-            '-p', 'qos_overrides./stage/command.publisher.depth:=1000')
+LOSSLESS = (
+    *RELIABLE,
+    '-p',
+    f'qos_overrides./imu/data_raw.subscription.depth:={QUEUE}',
+    '-p',
+    'qos_overrides./stage/command.publisher.depth:=1000',
+)
 KEPT = ('-p', f'qos_overrides./imu/data_raw.publisher.depth:={QUEUE}')
-QUICK = ('-p', 'sweep.planes_deg:=[45.0, 90.0, 135.0]', '-p',
-         'sweep.step_deg:=45.0', '-p', 'sweep.dwell_s:=1.0', '-p', 'sweep.check_poses:=6')
+QUICK = (
+    '-p',
+    'sweep.planes_deg:=[45.0, 90.0, 135.0]',
+    '-p',
+    'sweep.step_deg:=45.0',
+    '-p',
+    'sweep.dwell_s:=1.0',
+    '-p',
+    'sweep.check_poses:=6',
+)
 
 
 def _files(tmp_path, seed=3, axes='xy'):
@@ -38,19 +51,41 @@ def _files(tmp_path, seed=3, axes='xy'):
 
 
 def _sweep(start, truth, bare, *options, speed=4.0, slew_rad_s=0.5):
-    bench = [start('driver', '--ros-args', '--params-file', truth, '-p', 'link.type:=sim', '-p',
-                   f'link.speed:={speed}', *FAST, *KEPT),
-             start('stage', '--ros-args', '--params-file', bare, *FAST, '-p',
-                   f'slew_rate_rad_s:={slew_rad_s}', '-p',
-                   f'qos_overrides./stage/joint_states.publisher.depth:={QUEUE}')]
-    return bench, start('calibration', '--ros-args', '--params-file', bare, *FAST, *LOSSLESS,
-                        *QUICK, *options)
+    bench = [
+        start(
+            'driver',
+            '--ros-args',
+            '--params-file',
+            truth,
+            '-p',
+            'link.type:=sim',
+            '-p',
+            f'link.speed:={speed}',
+            *FAST,
+            *KEPT,
+        ),
+        start(
+            'stage',
+            '--ros-args',
+            '--params-file',
+            bare,
+            *FAST,
+            '-p',
+            f'slew_rate_rad_s:={slew_rad_s}',
+            '-p',
+            f'qos_overrides./stage/joint_states.publisher.depth:={QUEUE}',
+        ),
+    ]
+    return bench, start(
+        'calibration', '--ros-args', '--params-file', bare, *FAST, *LOSSLESS, *QUICK, *options
+    )
 
 
 def check_settings(read, unit, entries):
     """Assert that a recording numbers the settings of the joints as its journal does."""
-    alpha, beta = ([getattr(e, f'{joint}_setting') for e in entries]
-                   for joint in ('alpha', 'beta'))
+    alpha, beta = (
+        [getattr(e, f'{joint}_setting') for e in entries] for joint in ('alpha', 'beta')
+    )
     poses = extract_poses(read, unit, entries)
     assert (poses.alpha_setting == alpha).all() and (poses.beta_setting == beta).all()
     # Without the journal a rest may begin later, and end with the next move.
@@ -71,17 +106,38 @@ def check_partitions(alpha, beta, expected_alpha, expected_beta):
 def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp_path):
     rosbags = pytest.importorskip('bags', reason='rosbags is not installed: pip install rosbags')
     truth, bare = _files(tmp_path)
-    kinds = {'/imu/data_raw': Imu, '/stage/joint_states': JointState,
-             '/sensor_info': DiagnosticStatus, '/stage/command': JointState}
+    kinds = {
+        '/imu/data_raw': Imu,
+        '/stage/joint_states': JointState,
+        '/sensor_info': DiagnosticStatus,
+        '/stage/command': JointState,
+    }
     with Graph() as graph:
-        kept = {topic: graph.listen(kind, topic, latched=topic == '/sensor_info', raw=True)
-                for topic, kind in kinds.items()}
-        bench, node = _sweep(start, truth, bare, '-p', 'output:=unit.yaml', '-p',
-                             'report:=report', '-p', 'link.type:=serial', '-p',
-                             'link.port:=/dev/ttyACM0', speed=10.0, slew_rad_s=3.0)
+        kept = {
+            topic: graph.listen(kind, topic, latched=topic == '/sensor_info', raw=True)
+            for topic, kind in kinds.items()
+        }
+        bench, node = _sweep(
+            start,
+            truth,
+            bare,
+            '-p',
+            'output:=unit.yaml',
+            '-p',
+            'report:=report',
+            '-p',
+            'link.type:=serial',
+            '-p',
+            'link.port:=/dev/ttyACM0',
+            speed=10.0,
+            slew_rad_s=3.0,
+        )
         # The record begins before the sweep does.
-        graph.spin_until(lambda: all(kept[topic] for topic in kinds if topic != '/stage/command'),
-                         60, 'all topics')
+        graph.spin_until(
+            lambda: all(kept[topic] for topic in kinds if topic != '/stage/command'),
+            60,
+            'all topics',
+        )
         assert graph.call(Trigger, 'calibration/start', Trigger.Request()).success
         graph.spin_until((tmp_path / 'unit.yaml').exists, 120, 'the parameter file')
         # 2000 samples a second would need the processor time of the report.
@@ -94,7 +150,7 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     assert live.link == {'type': 'serial', 'port': '/dev/ttyACM0'}, 'the file carries the link'
     np.testing.assert_allclose(live.zero_g_v, truth_sensor.zero_g_v, atol=1e-3)
     np.testing.assert_allclose(live.scale_v_per_g, truth_sensor.scale_v_per_g, atol=1e-3)
-    copy, = (tmp_path / 'ros_home' / 'adxl_ros' / 'calibrations' / 'T1').iterdir()
+    (copy,) = (tmp_path / 'ros_home' / 'adxl_ros' / 'calibrations' / 'T1').iterdir()
     assert copy.read_text() == (tmp_path / 'unit.yaml').read_text()
     assert copy.stem == live.provenance['id']
     assert 'held out' in (tmp_path / 'report' / 'report.html').read_text()
@@ -102,13 +158,20 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     assert all(f'#  {model} calibration' in head for model in ('linear', 'physical', 'full'))
 
     sent = []
-    for topic, kind in (('/imu/data_raw', rosbags.IMU), ('/stage/joint_states', rosbags.JOINTS),
-                        ('/sensor_info', rosbags.INFO), ('/stage/command', rosbags.JOINTS)):
-        sent += [rosbags.Sent(topic, kind, arrival_ns, raw=raw)
-                 for arrival_ns, raw in zip(graph.arrived_ns[topic], kept[topic])]
+    for topic, kind in (
+        ('/imu/data_raw', rosbags.IMU),
+        ('/stage/joint_states', rosbags.JOINTS),
+        ('/sensor_info', rosbags.INFO),
+        ('/stage/command', rosbags.JOINTS),
+    ):
+        sent += [
+            rosbags.Sent(topic, kind, arrival_ns, raw=raw)
+            for arrival_ns, raw in zip(graph.arrived_ns[topic], kept[topic])
+        ]
     bag = rosbags.bag_of(tmp_path / 'bag', sorted(sent, key=lambda message: message.stamp_ns))
-    done = run_tool('fit', bag, '--params', bare, '--journal', 'unit.yaml.journal',
-                    '-o', 'offline.yaml')
+    done = run_tool(
+        'fit', bag, '--params', bare, '--journal', 'unit.yaml.journal', '-o', 'offline.yaml'
+    )
     assert done.returncode == 0, done.stderr
     offline = parameter_file.load(tmp_path / 'offline.yaml')
     for effect, values in live.values.items():
@@ -129,16 +192,20 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     recording.write(tmp_path / 'bag.csv', read, truth_sensor)
     for path in (bag, tmp_path / 'bag.csv'):
         read = recording.read(path)
-        check_settings(read, recorded_unit(nominal(serial='T1', rate_hz=200.0), read),
-                       entries[-1].rests)
-    counts = [len({getattr(entry, f'{joint}_setting') for entry in entries[-1].rests})
-              for joint in ('alpha', 'beta')]
+        check_settings(
+            read, recorded_unit(nominal(serial='T1', rate_hz=200.0), read), entries[-1].rests
+        )
+    counts = [
+        len({getattr(entry, f'{joint}_setting') for entry in entries[-1].rests})
+        for joint in ('alpha', 'beta')
+    ]
     assert 5 <= min(counts) < len(entries[-1].rests) / 2, 'neighbours share one joint'
 
 
 def test_services_and_refusals(start, tmp_path):
     truth, bare = _files(tmp_path)
     with Graph() as graph:
+
         def ask(name):
             answer = graph.call(Trigger, f'calibration/{name}', Trigger.Request())
             return answer.success, answer.message
@@ -152,8 +219,18 @@ def test_services_and_refusals(start, tmp_path):
         graph.spin_until(lambda: graph.number('calibration', 'accepted') >= 2, 60, 'two poses')
         assert ask('start') == (False, 'a calibration is running; finish or abort it first')
         assert ask('capture')[0] is False
-        second = start('calibration', '--ros-args', '--params-file', bare, *FAST, *QUICK,
-                       '-p', 'autostart:=true', '-r', '__node:=second')
+        second = start(
+            'calibration',
+            '--ros-args',
+            '--params-file',
+            bare,
+            *FAST,
+            *QUICK,
+            '-p',
+            'autostart:=true',
+            '-r',
+            '__node:=second',
+        )
         second.wait_for('another calibration is writing this journal')
         assert 'Traceback' not in second.output()
         done, words = ask('abort')
@@ -174,11 +251,19 @@ def test_services_and_refusals(start, tmp_path):
 def test_the_node_can_end_with_its_calibration(start, tmp_path, output, status):
     truth, bare = _files(tmp_path)
     with Graph() as graph:
-        _, node = _sweep(start, truth, bare, '-p', 'autostart:=true', '-p',
-                         'exit_when_done:=true', '-p', f'output:={output}')
+        _, node = _sweep(
+            start,
+            truth,
+            bare,
+            '-p',
+            'autostart:=true',
+            '-p',
+            'exit_when_done:=true',
+            '-p',
+            f'output:={output}',
+        )
         if status == 0:
-            graph.spin_until(lambda: graph.number('calibration', 'accepted') >= 6, 60,
-                             'six poses')
+            graph.spin_until(lambda: graph.number('calibration', 'accepted') >= 6, 60, 'six poses')
             assert graph.call(Trigger, 'calibration/finish', Trigger.Request()).success
         graph.spin_until(lambda: node.popen.poll() is not None, 60, 'the end')
         assert node.wait() == status
@@ -188,11 +273,15 @@ def test_the_node_can_end_with_its_calibration(start, tmp_path, output, status):
             assert graph.value('calibration', 'verdict') in node.output()
 
 
-@pytest.mark.parametrize('setting, words', [
-    ('sweep.planes_deg:=[thirty]', 'sweep.planes_deg: '),
-    ('sweep.step_deg:=0.0', 'sweep.step_deg'),
-    ('thermal.range_c:=[50.0, 0.0]', 'thermal.range_c: [50.0, 0.0] is no lowest'),
-    ('output:=.', 'output: . is a directory; name a')])
+@pytest.mark.parametrize(
+    'setting, words',
+    [
+        ('sweep.planes_deg:=[thirty]', 'sweep.planes_deg: '),
+        ('sweep.step_deg:=0.0', 'sweep.step_deg'),
+        ('thermal.range_c:=[50.0, 0.0]', 'thermal.range_c: [50.0, 0.0] is no lowest'),
+        ('output:=.', 'output: . is a directory; name a'),
+    ],
+)
 def test_settings_out_of_range_end_the_node(refusal, tmp_path, setting, words):
     _, bare = _files(tmp_path)
     assert words in refusal('calibration', '--ros-args', '--params-file', bare, '-p', setting)
@@ -201,8 +290,13 @@ def test_settings_out_of_range_end_the_node(refusal, tmp_path, setting, words):
 def test_a_resting_sensor_is_calibrated_over_temperature(start, tmp_path):
     unit = with_neutral(nominal('xyz', serial='T7', rate_hz=20.0), ['bias'])
     parameter_file.save(tmp_path / 'base.yaml', replace(unit, model='linear'))
-    motion = Motion(440.0, Held(0.7), Held(0.4), temperature_c=Knots(
-        [0, 200, 400, 440], [5, 45, 5, 5]), internal_rate_hz=20.0)
+    motion = Motion(
+        440.0,
+        Held(0.7),
+        Held(0.4),
+        temperature_c=Knots([0, 200, 400, 440], [5, 45, 5, 5]),
+        internal_rate_hz=20.0,
+    )
     columns = simulate(with_effects(unit, ['temperature_bias:per_k=4e-4']), motion, 3)
     columns['temperature_c'] = np.round(columns['temperature_c'], 1)
     columns = {name: values for name, values in columns.items() if not name.endswith('_rad')}
@@ -210,15 +304,45 @@ def test_a_resting_sensor_is_calibrated_over_temperature(start, tmp_path):
         print(','.join(columns), file=file)
         np.savetxt(file, np.column_stack(list(columns.values())), '%.9f', ',')
     with Graph() as graph:
-        start('calibration', '--ros-args', '--params-file', tmp_path / 'base.yaml', *FAST,
-              *LOSSLESS, '-p', 'qos_overrides./temperature.subscription.reliability:=reliable',
-              '-p', 'qos_overrides./temperature.subscription.depth:=1000', '-p', 'mode:=thermal',
-              '-p', 'thermal.range_c:=[10.0, 40.0]', '-p', 'thermal.block_s:=4.0', '-p',
-              'autostart:=true', '-p', 'output:=warm.yaml')
+        start(
+            'calibration',
+            '--ros-args',
+            '--params-file',
+            tmp_path / 'base.yaml',
+            *FAST,
+            *LOSSLESS,
+            '-p',
+            'qos_overrides./temperature.subscription.reliability:=reliable',
+            '-p',
+            'qos_overrides./temperature.subscription.depth:=1000',
+            '-p',
+            'mode:=thermal',
+            '-p',
+            'thermal.range_c:=[10.0, 40.0]',
+            '-p',
+            'thermal.block_s:=4.0',
+            '-p',
+            'autostart:=true',
+            '-p',
+            'output:=warm.yaml',
+        )
         graph.spin_until(lambda: graph.reports('calibration', 'waiting for sensor_info'), 30, 'up')
-        start('driver', '--ros-args', '--params-file', tmp_path / 'base.yaml', *FAST, '-p',
-              'link.type:=replay', '-p', f'link.recording:={tmp_path / "oven.csv"}', '-p',
-              'link.speed:=40.0', '-p', 'autostart:=false', *KEPT)
+        start(
+            'driver',
+            '--ros-args',
+            '--params-file',
+            tmp_path / 'base.yaml',
+            *FAST,
+            '-p',
+            'link.type:=replay',
+            '-p',
+            f'link.recording:={tmp_path / "oven.csv"}',
+            '-p',
+            'link.speed:=40.0',
+            '-p',
+            'autostart:=false',
+            *KEPT,
+        )
         assert graph.change('driver', Transition.TRANSITION_CONFIGURE)
         graph.spin_until(lambda: graph.node.count_publishers('imu/data_raw'), 30, 'a publisher')
         assert graph.change('driver', Transition.TRANSITION_ACTIVATE)
@@ -240,8 +364,16 @@ def test_a_compensated_stream_and_a_wrong_rate_are_refused(start, tmp_path):
         start('driver', '--ros-args', '--params-file', bare, '-p', 'link.type:=sim')
         start('compensation', '--ros-args', '--params-file', bare)
         start('calibration', *common, '-r', 'imu/data_raw:=imu/data')
-        start('calibration', *common, '-r', '__node:=other', '-r', 'imu/data_raw:=half', '-p',
-              'journal:=other.journal')
+        start(
+            'calibration',
+            *common,
+            '-r',
+            '__node:=other',
+            '-r',
+            'imu/data_raw:=half',
+            '-p',
+            'journal:=other.journal',
+        )
         raw = graph.listen(Imu, 'imu/data_raw')
         half = graph.node.create_publisher(Imu, 'half', 1000)
         dead, numbers = [], count()
@@ -255,10 +387,13 @@ def test_a_compensated_stream_and_a_wrong_rate_are_refused(start, tmp_path):
             raw.clear()
 
         graph.node.create_timer(0.1, feed_half)
-        graph.spin_until(lambda: graph.reports('calibration', 'this stream is already '
-                                               'compensated'), 60, 'why')
-        graph.spin_until(lambda: graph.reports('other', 'samples are 100 a second'), 60,
-                         'the reason')
+        graph.spin_until(
+            lambda: graph.reports('calibration', 'this stream is already compensated'), 60, 'why'
+        )
+        graph.spin_until(
+            lambda: graph.reports('other', 'samples are 100 a second'), 60, 'the reason'
+        )
         dead.append('x')
-        graph.spin_until(lambda: graph.reports('other', 'x is not a number in all samples'), 60,
-                         'which axis')
+        graph.spin_until(
+            lambda: graph.reports('other', 'x is not a number in all samples'), 60, 'which axis'
+        )

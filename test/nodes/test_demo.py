@@ -37,8 +37,11 @@ def test_steps_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def suspend_calibration(demo_pid: int) -> None:
     """Stop the calibration of a demonstration for half a second, as a busy machine does."""
-    pid, = (pid for pid in children(demo_pid)
-            if b'calibration' in Path(f'/proc/{pid}/cmdline').read_bytes())
+    (pid,) = (
+        pid
+        for pid in children(demo_pid)
+        if b'calibration' in Path(f'/proc/{pid}/cmdline').read_bytes()
+    )
     os.kill(pid, signal.SIGSTOP)
     time.sleep(0.5)
     os.kill(pid, signal.SIGCONT)
@@ -46,8 +49,7 @@ def suspend_calibration(demo_pid: int) -> None:
 
 def test_live(ros_env, tmp_path) -> None:
     """No line wraps; no sample is lost although the calibration stops for 20 s of sensor time."""
-    terminal = Terminal([executable('demo')], ros_env, tmp_path, lines=60,
-                        columns=80)
+    terminal = Terminal([executable('demo')], ros_env, tmp_path, lines=60, columns=80)
     try:
         terminal.wait_for('1/3 sweep', 'of 146 poses', '━', timeout_s=60.0)
         suspend_calibration(terminal.popen.pid)
@@ -72,6 +74,7 @@ def test_live(ros_env, tmp_path) -> None:
     assert '\x1b[32mPASS' in terminal.raw.decode()
     for name in ('sweep/report.html', 'adxl203_demo.yaml'):
         assert f' demo_output/{name}' in screen and (tmp_path / 'demo_output' / name).is_file()
-    poses = sweep_journal.accepted_poses(sweep_journal.read(
-        tmp_path / 'demo_output' / 'adxl203_demo.yaml.journal').entries)
+    poses = sweep_journal.accepted_poses(
+        sweep_journal.read(tmp_path / 'demo_output' / 'adxl203_demo.yaml.journal').entries
+    )
     assert {pose.stop_ns - pose.start_ns for pose in poses} == {4_996_000_000}

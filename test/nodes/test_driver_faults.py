@@ -88,8 +88,9 @@ def test_every_fault_of_an_iiod_is_survived(start, tmp_path):
             assert report.counted == report.estimated, name
             assert report.missing > 500, name
             assert report.counted == pytest.approx(report.missing, rel=TIMED), name
-        graph.spin_until(lambda: graph.value('driver', 'link_state') == 'streaming at 1000 Hz',
-                         10, 'streaming')
+        graph.spin_until(
+            lambda: graph.value('driver', 'link_state') == 'streaming at 1000 Hz', 10, 'streaming'
+        )
     assert driver.stop() == 0
     # One line at the start, and those of the link. A clock that is read late seems to stop.
     messages = [line for line in lines(driver) if '[driver]' in line and 'stepped' not in line]
@@ -114,12 +115,22 @@ def test_two_drivers_cannot_have_one_port(start, tmp_path):
 
 def test_a_hostile_stream_costs_no_memory_and_disturbs_no_other_link(start, tmp_path):
     """Send noise as fast as it is read, then frames with false lengths, on a socket."""
-    with board_rig(tmp_path, {'keeps': True}) as rig, \
-            socket.create_server(('127.0.0.1', 0)) as server:
+    with (
+        board_rig(tmp_path, {'keeps': True}) as rig,
+        socket.create_server(('127.0.0.1', 0)) as server,
+    ):
         start('driver', ROS, *rig.driver_parameters())
         port = server.getsockname()[1]
-        hurt = start('driver', ROS, '-p', 'link.type:=serial', '-p',
-                     f'link.port:=socket://127.0.0.1:{port}', '-r', '__ns:=/hurt')
+        hurt = start(
+            'driver',
+            ROS,
+            '-p',
+            'link.type:=serial',
+            '-p',
+            f'link.port:=socket://127.0.0.1:{port}',
+            '-r',
+            '__ns:=/hurt',
+        )
         peer, _ = server.accept()
         peer.sendall(b'hello')
         rig.wait_for_samples(500, 30)
@@ -127,7 +138,7 @@ def test_a_hostile_stream_costs_no_memory_and_disturbs_no_other_link(start, tmp_
         before = memory_mib(hurt.popen.pid)
         rng = np.random.default_rng(0)
         chunk = rng.bytes(1_000_000)
-        bombs = b''.join(bytes([0xff]) * 254 + rng.bytes(3) for _ in range(4000))
+        bombs = b''.join(bytes([0xFF]) * 254 + rng.bytes(3) for _ in range(4000))
         peer.settimeout(0.2)
         sent, end = 0, time.monotonic() + PATIENCE * 10
         while sent < 5_000_000 and time.monotonic() < end:
@@ -151,14 +162,16 @@ def test_a_system_manager_changes_the_state_of_the_driver(start, tmp_path):
     with board_rig(tmp_path) as rig:
         graph = rig.graph
         driver = start('driver', ROS, *rig.driver_parameters(), '-p', 'autostart:=false')
-        for transition, state in ((None, 'unconfigured'),
-                                  (Transition.TRANSITION_CONFIGURE, 'inactive'),
-                                  (Transition.TRANSITION_ACTIVATE, 'active'),
-                                  (Transition.TRANSITION_DEACTIVATE, 'inactive'),
-                                  (Transition.TRANSITION_ACTIVATE, 'active'),
-                                  (Transition.TRANSITION_DEACTIVATE, 'inactive'),
-                                  (Transition.TRANSITION_CLEANUP, 'unconfigured'),
-                                  (Transition.TRANSITION_UNCONFIGURED_SHUTDOWN, 'finalized')):
+        for transition, state in (
+            (None, 'unconfigured'),
+            (Transition.TRANSITION_CONFIGURE, 'inactive'),
+            (Transition.TRANSITION_ACTIVATE, 'active'),
+            (Transition.TRANSITION_DEACTIVATE, 'inactive'),
+            (Transition.TRANSITION_ACTIVATE, 'active'),
+            (Transition.TRANSITION_DEACTIVATE, 'inactive'),
+            (Transition.TRANSITION_CLEANUP, 'unconfigured'),
+            (Transition.TRANSITION_UNCONFIGURED_SHUTDOWN, 'finalized'),
+        ):
             assert transition is None or graph.change('driver', transition)
             answer = graph.call(GetState, 'driver/get_state', GetState.Request())
             assert answer.current_state.label == state
@@ -173,8 +186,11 @@ def test_a_system_manager_changes_the_state_of_the_driver(start, tmp_path):
             graph.spin_until(lambda: graph.reports('driver', 'inactive'), 5, 'inactive')
             rig.collect()
             assert len(rig.numbers) == before, 'an inactive driver reads nothing'
-            held = [os.readlink(f) for f in Path(f'/proc/{driver.popen.pid}/fd').iterdir()
-                    if f.is_symlink() and os.path.lexists(f)]
+            held = [
+                os.readlink(f)
+                for f in Path(f'/proc/{driver.popen.pid}/fd').iterdir()
+                if f.is_symlink() and os.path.lexists(f)
+            ]
             assert os.path.realpath(rig.path) not in held
         assert rig.wrong == 0
 
@@ -190,6 +206,7 @@ def repeat_on_board(tmp_path, sensor, columns):
             ready.set()
             while not stop.is_set():
                 sender.send(columns)
+
     thread = threading.Thread(target=feed)
     thread.start()
     ready.wait()
@@ -199,11 +216,22 @@ def repeat_on_board(tmp_path, sensor, columns):
 def test_a_measured_supply_corrects_the_supply_effect(start, tmp_path):
     """Without correction, a ratiometric sensor at 4.8 V shows -0.2 V / (1 V/g) at 0 g."""
     effect = effect_named('supply')
-    sensor = replace(nominal(), effects=('supply',), values={'supply': {
-        p.name: np.full(2, 1.0) if p.axes else np.array(5.0) for p in effect.parameters}})
+    sensor = replace(
+        nominal(),
+        effects=('supply',),
+        values={
+            'supply': {
+                p.name: np.full(2, 1.0) if p.axes else np.array(5.0) for p in effect.parameters
+            }
+        },
+    )
     parameter_file.save(tmp_path / 'unit.yaml', sensor)
-    columns = {'x_v': np.full(200, 2.4), 'y_v': np.full(200, 2.4 + 0.96 / 2),
-               'supply_v': np.full(200, 4.8), 'temperature_c': np.full(200, 31.0)}
+    columns = {
+        'x_v': np.full(200, 2.4),
+        'y_v': np.full(200, 2.4 + 0.96 / 2),
+        'supply_v': np.full(200, 4.8),
+        'temperature_c': np.full(200, 31.0),
+    }
     path, end = repeat_on_board(tmp_path, nominal(), columns)
     try:
         with Graph() as graph:
@@ -211,13 +239,26 @@ def test_a_measured_supply_corrects_the_supply_effect(start, tmp_path):
             corrected = graph.listen(Imu, 'imu/data')
             supply = graph.listen(BatteryState, 'supply')
             temperature = graph.listen(Temperature, 'temperature')
-            start('driver', ROS, '-p', 'link.type:=serial', '-p', f'link.port:={path}', '-p',
-                  'link.channels:=x,y,supply,temperature', '-p', 'link.supply_scale:=2.0')
+            start(
+                'driver',
+                ROS,
+                '-p',
+                'link.type:=serial',
+                '-p',
+                f'link.port:={path}',
+                '-p',
+                'link.channels:=x,y,supply,temperature',
+                '-p',
+                'link.supply_scale:=2.0',
+            )
             start('compensation', ROS, '--params-file', tmp_path / 'unit.yaml')
             graph.spin_until(lambda: supply and temperature and raw and corrected, 30, 'all of it')
             # A constant supply is published once a second: the compensation may not have it yet.
-            graph.spin_until(lambda: accel(corrected[-1])[:2] == pytest.approx(
-                [0, 0.5 * 9.80665], abs=0.01), 10, 'the correction')
+            graph.spin_until(
+                lambda: accel(corrected[-1])[:2] == pytest.approx([0, 0.5 * 9.80665], abs=0.01),
+                10,
+                'the correction',
+            )
     finally:
         end()
     assert supply[-1].voltage == pytest.approx(4.8, abs=1e-3)

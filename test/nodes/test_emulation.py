@@ -37,7 +37,7 @@ class Simulator:
 
     def step(self, factor: float = 2.0) -> None:
         self.now_ns += STEP_NS
-        stamp = Time(sec=self.now_ns // 10 ** 9, nanosec=self.now_ns % 10 ** 9)
+        stamp = Time(sec=self.now_ns // 10**9, nanosec=self.now_ns % 10**9)
         if self.has_clock:
             self._clock.publish(Clock(clock=stamp))
         message = Imu()
@@ -51,8 +51,9 @@ class Simulator:
         self.sent.append(self.now_ns)
         self._graph.spin(STEP_NS * 1e-9 / factor)
 
-    def run_until(self, condition: Callable[[], object], purpose: str, factor: float = 2.0
-                  ) -> None:
+    def run_until(
+        self, condition: Callable[[], object], purpose: str, factor: float = 2.0
+    ) -> None:
         end_s = time.monotonic() + PATIENCE * 60
         while not condition():
             self.step(factor)
@@ -61,14 +62,19 @@ class Simulator:
 
 
 def start_driver(start: Callable[..., Started], *arguments: str) -> Started:
-    return start('driver', '--ros-args', '-p', 'link.type:=topic', '-p', 'use_sim_time:=true',
-                 *arguments)
+    return start(
+        'driver', '--ros-args', '-p', 'link.type:=topic', '-p', 'use_sim_time:=true', *arguments
+    )
 
 
 def test_a_withheld_effect_shows_in_the_stream_of_the_robot(start, tmp_path: Path) -> None:
     offset_g = np.array([0.03, -0.02, 0.01])
-    sensor = nominal('xyz', serial='SIM7', effects=('bias',), values={
-        'bias': {'offset_v': offset_g * nominal('xyz').nominal_scale_v_per_g}})
+    sensor = nominal(
+        'xyz',
+        serial='SIM7',
+        effects=('bias',),
+        values={'bias': {'offset_v': offset_g * nominal('xyz').nominal_scale_v_per_g}},
+    )
     parameter_file.save(tmp_path / 'unit.yaml', sensor)
     with Graph() as graph:
         simulator = Simulator(graph)
@@ -90,7 +96,10 @@ def test_a_withheld_effect_shows_in_the_stream_of_the_robot(start, tmp_path: Pat
     newest = samples[-1]
     assert newest.header.frame_id == 'case'
     assert (newest.angular_velocity.z, newest.orientation.x, newest.orientation.w) == (
-        0.25, 0.6, 0.8)
+        0.25,
+        0.6,
+        0.8,
+    )
     assert newest.angular_velocity_covariance[8] == 1e-4
     assert driver.stop() == 0
     assert 'Traceback' not in driver.output()

@@ -20,10 +20,18 @@ from units import nominal
 
 pytestmark = pytest.mark.long
 SIM = ('-p', 'use_sim_time:=true')
-FAST = ('-p', 'limits.rate_deg_s:=60.0', '-p', 'limits.beta_deg:=[-90.0,90.0]', '-p',
-        'qos_overrides./imu/data_raw.subscription.reliability:=reliable', '-p',
-        'qos_overrides./imu/data_raw.subscription.depth:=100000', '-p',
-        'qos_overrides./stage/command.publisher.depth:=10000')
+FAST = (
+    '-p',
+    'limits.rate_deg_s:=60.0',
+    '-p',
+    'limits.beta_deg:=[-90.0,90.0]',
+    '-p',
+    'qos_overrides./imu/data_raw.subscription.reliability:=reliable',
+    '-p',
+    'qos_overrides./imu/data_raw.subscription.depth:=100000',
+    '-p',
+    'qos_overrides./stage/command.publisher.depth:=10000',
+)
 RATE_HZ = 100.0
 RATE_RAD_S = np.radians(60)
 LONG = '-p', 'limits.rate_deg_s:=10.0', '-p', 'limits.minutes:=0.9'
@@ -41,12 +49,23 @@ class Laboratory(Graph):
         parameter_file.save(folder / 'nominal.yaml', base)
         unit = with_neutral(base, ['hysteresis'])
         values = unit.values['hysteresis'] | {'half_width_g': np.array([0.004, 0.003])}
-        parameter_file.save(folder / 'unit.yaml', replace(
-            unit, values={**unit.values, 'hysteresis': values}))
+        parameter_file.save(
+            folder / 'unit.yaml', replace(unit, values={**unit.values, 'hysteresis': values})
+        )
         self.folder, self._start = folder, start
-        self.driver = start('driver', '--ros-args', '--params-file', 'unit.yaml', *SIM, '-p',
-                            'link.type:=sim', '-p', 'link.speed:=6.0', '-p',
-                            'qos_overrides./imu/data_raw.publisher.depth:=100000')
+        self.driver = start(
+            'driver',
+            '--ros-args',
+            '--params-file',
+            'unit.yaml',
+            *SIM,
+            '-p',
+            'link.type:=sim',
+            '-p',
+            'link.speed:=6.0',
+            '-p',
+            'qos_overrides./imu/data_raw.publisher.depth:=100000',
+        )
         self.stage = start('stage', '--ros-args', *SIM, '-p', 'slew_rate_rad_s:=3.0')
 
     def __enter__(self):
@@ -56,19 +75,27 @@ class Laboratory(Graph):
         return self
 
     def investigate(self, *options, start=None):
-        return (start or self._start)('investigate', '--ros-args', '--params-file',
-                                      'nominal.yaml', *SIM, *FAST, *options)
+        return (start or self._start)(
+            'investigate', '--ros-args', '--params-file', 'nominal.yaml', *SIM, *FAST, *options
+        )
 
     def wait_for_motion(self):
         del self.states[:]
-        self.spin_until(lambda: self.states and np.abs(np.subtract(
-            self.states[-1].position, self.states[0].position)).max() > 0.1, 90, 'motion')
+        self.spin_until(
+            lambda: (
+                self.states
+                and np.abs(np.subtract(self.states[-1].position, self.states[0].position)).max()
+                > 0.1
+            ),
+            90,
+            'motion',
+        )
 
     def wait_for_rest(self):
         def rests():
             newest = self.states[-100:]
-            return len(self.states) > 100 \
-                and max(np.abs(s.velocity).max() for s in newest) < 1e-6
+            return len(self.states) > 100 and max(np.abs(s.velocity).max() for s in newest) < 1e-6
+
         del self.states[:]
         self.spin_until(rests, 20, 'rest')
         return np.array(self.states[-1].position[:2])
@@ -123,8 +150,10 @@ def test_an_investigation_ends_with_the_effect_of_the_unit(laboratory, tmp_path)
 
 
 def test_whatever_ends_an_investigation_leaves_the_stage_at_rest_and_the_bag_whole(
-        laboratory, in_terminal, kill, tmp_path):
+    laboratory, in_terminal, kill, tmp_path
+):
     """The stage would move on for many seconds; it comes to rest near its pose at the end."""
+
     def killed(node):
         kill(node.popen.pid)
 
@@ -139,7 +168,8 @@ def test_whatever_ends_an_investigation_leaves_the_stage_at_rest_and_the_bag_who
     for number, end in enumerate((killed, aborted, interrupted)):
         if end is interrupted:
             terminal = node = laboratory.investigate(
-                '-p', f'output:=run{number}', *LONG, start=partial(in_terminal, columns=80))
+                '-p', f'output:=run{number}', *LONG, start=partial(in_terminal, columns=80)
+            )
             terminal.wait_for('0.0 min  no gap ', 'next: ', timeout_s=90)
         else:
             node = laboratory.investigate('-p', f'output:=run{number}', *LONG)
@@ -165,9 +195,19 @@ def test_whatever_ends_an_investigation_leaves_the_stage_at_rest_and_the_bag_who
     assert max(map(len, terminal.text().splitlines())) < 80
 
 
-@pytest.mark.parametrize('setting, reason', [
-    ('limits.alpha_deg:=[90.0,10.0]', 'limits.alpha_deg: [90.0, 10.0] is no lowest and highest'),
-    ('limits.beta_deg:=[0.0]', 'limits.beta_deg: [0.0] is no lowest and highest'),
-    ('limits.rate_deg_s:=0.0', 'limits.rate_deg_s: 0.0 is refused; expected DOUBLE, 0.1 to 180')])
+@pytest.mark.parametrize(
+    'setting, reason',
+    [
+        (
+            'limits.alpha_deg:=[90.0,10.0]',
+            'limits.alpha_deg: [90.0, 10.0] is no lowest and highest',
+        ),
+        ('limits.beta_deg:=[0.0]', 'limits.beta_deg: [0.0] is no lowest and highest'),
+        (
+            'limits.rate_deg_s:=0.0',
+            'limits.rate_deg_s: 0.0 is refused; expected DOUBLE, 0.1 to 180',
+        ),
+    ],
+)
 def test_limits_without_meaning_are_refused(refusal, setting, reason):
     assert reason in refusal('investigate', '--ros-args', '-p', setting)

@@ -42,18 +42,31 @@ class HalfOpen:
 
 
 @pytest.fixture
-def make_driver(ros_env: dict[str, str], port: str, monkeypatch: pytest.MonkeyPatch
-                ) -> Iterator[SimpleNamespace]:
+def make_driver(
+    ros_env: dict[str, str], port: str, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[SimpleNamespace]:
     """Give a driver on the port, and the failure of its next activation."""
     setting = SimpleNamespace(failure=None)
 
     def open_link(sensor: Sensor, settings: serial_link.Settings) -> HalfOpen:
         return HalfOpen(serial_link.open_link(sensor, settings), setting.failure)
 
-    monkeypatch.setattr(base, 'link_module', lambda _: SimpleNamespace(
-        Settings=serial_link.Settings, open_link=open_link))
-    rclpy.init(args=['--ros-args', '-p', 'link.type:=serial', '-p', f'link.port:={port}', '-p',
-                     'autostart:=false'])
+    monkeypatch.setattr(
+        base,
+        'link_module',
+        lambda _: SimpleNamespace(Settings=serial_link.Settings, open_link=open_link),
+    )
+    rclpy.init(
+        args=[
+            '--ros-args',
+            '-p',
+            'link.type:=serial',
+            '-p',
+            f'link.port:={port}',
+            '-p',
+            'autostart:=false',
+        ]
+    )
     setting.driver = Driver()
     yield setting
     setting.driver.close()
@@ -69,11 +82,16 @@ def is_free(port: str) -> bool:
     return True
 
 
-@pytest.mark.parametrize(('failure', 'result'), [
-    (UserError('no such channel'), TransitionCallbackReturn.FAILURE),
-    (RuntimeError('broken'), TransitionCallbackReturn.ERROR)])
-def test_a_failed_activation_leaves_no_link_open(make_driver: SimpleNamespace, port: str,
-                                                 failure: Exception, result: object) -> None:
+@pytest.mark.parametrize(
+    ('failure', 'result'),
+    [
+        (UserError('no such channel'), TransitionCallbackReturn.FAILURE),
+        (RuntimeError('broken'), TransitionCallbackReturn.ERROR),
+    ],
+)
+def test_a_failed_activation_leaves_no_link_open(
+    make_driver: SimpleNamespace, port: str, failure: Exception, result: object
+) -> None:
     driver = make_driver.driver
     assert driver.trigger_configure() == TransitionCallbackReturn.SUCCESS
     make_driver.failure = failure

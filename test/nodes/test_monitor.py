@@ -45,14 +45,23 @@ class Streams:
         self._graph = graph
         self._real = graph.node.create_publisher(Imu, 'imu/data_raw', 1000)
         self._ideal = graph.node.create_publisher(Imu, 'imu/ideal', 1000)
-        info = graph.node.create_publisher(DiagnosticStatus, 'sensor_info', QoSProfile(
-            depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
-        info.publish(DiagnosticStatus(values=[
-            KeyValue(key=key, value=value) for key, value in sensor_info(stated).items()]))
-        self._responses = [Response(sensor, Motion(np.inf, force=force), 1)
-                           for sensor in (UNIT, SHIFTED)]
+        info = graph.node.create_publisher(
+            DiagnosticStatus,
+            'sensor_info',
+            QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+        )
+        info.publish(
+            DiagnosticStatus(
+                values=[
+                    KeyValue(key=key, value=value) for key, value in sensor_info(stated).items()
+                ]
+            )
+        )
+        self._responses = [
+            Response(sensor, Motion(np.inf, force=force), 1) for sensor in (UNIT, SHIFTED)
+        ]
         self.is_shifted = False
-        self.origin_ns = 1_700_000_000 * 10 ** 9
+        self.origin_ns = 1_700_000_000 * 10**9
         self.step = 0
         self.published = 0
         self.has_reference = True
@@ -81,7 +90,7 @@ class Streams:
     @staticmethod
     def _publish(publisher, stamp_ns: int, accel: np.ndarray) -> None:
         message = Imu()
-        message.header.stamp = Time(sec=stamp_ns // 10 ** 9, nanosec=stamp_ns % 10 ** 9)
+        message.header.stamp = Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
         for axis, value in zip('xyz', accel.tolist()):
             setattr(message.linear_acceleration, axis, value)
         publisher.publish(message)
@@ -93,8 +102,20 @@ def monitor(start: Callable[..., Started], tmp_path: Path) -> Callable[..., Star
     parameter_file.save(tmp_path / 'unit.yaml', UNIT)
 
     def begin(*arguments: str) -> Started:
-        return start('monitor', '--ros-args', '--params-file', 'unit.yaml', '-p',
-                     'reference:=imu', '-p', 'output:=kept', '-p', 'window_s:=10.0', *arguments)
+        return start(
+            'monitor',
+            '--ros-args',
+            '--params-file',
+            'unit.yaml',
+            '-p',
+            'reference:=imu',
+            '-p',
+            'output:=kept',
+            '-p',
+            'window_s:=10.0',
+            *arguments,
+        )
+
     return begin
 
 
@@ -109,10 +130,14 @@ def values(status: DiagnosticStatus) -> dict[str, str]:
 
 
 def numbers(messages: list[DiagnosticArray]) -> list[float]:
-    texts = [pair.value for message in messages for status in message.status
-             for pair in status.values]
-    return [float(text) for text in texts if text.replace('.', '', 1).lstrip('-')[:1].isdigit()
-            and 'T' not in text]
+    texts = [
+        pair.value for message in messages for status in message.status for pair in status.values
+    ]
+    return [
+        float(text)
+        for text in texts
+        if text.replace('.', '', 1).lstrip('-')[:1].isdigit() and 'T' not in text
+    ]
 
 
 def test_gap_floor_and_a_change(monitor, graph, tmp_path) -> None:
@@ -141,8 +166,9 @@ def test_gap_floor_and_a_change(monitor, graph, tmp_path) -> None:
     assert re.search(r'changed since \S+: x by \+(19|20|21)', status.message)
     assert 'noise' not in status.message, 'a step is no noise'
     assert np.isfinite(numbers(gaps)).all()
-    record = [json.loads(line) for line in (tmp_path / 'kept' / 'changes.jsonl').read_text(
-        ).splitlines()]
+    record = [
+        json.loads(line) for line in (tmp_path / 'kept' / 'changes.jsonl').read_text().splitlines()
+    ]
     assert (record[0]['axis'], record[0]['quantity'], record[0]['serial']) == ('x', 'mean', 'M7')
     assert record[0]['size'] == pytest.approx(20, rel=0.2)
     assert node.stop() == 0
@@ -154,8 +180,9 @@ def test_a_change_is_diagnosed_and_a_report_is_on_disk(monitor, graph, tmp_path)
     node = monitor('-p', 'diagnose.wait_s:=60.0')
     streams.is_shifted = True
     streams.run_until(lambda: graph.reports('monitor', 'gap x'), 'the gap')
-    streams.run_until(lambda: graph.has_stated('monitor', 'diagnosis_runs', 'True'),
-                      'an automatic diagnosis')
+    streams.run_until(
+        lambda: graph.has_stated('monitor', 'diagnosis_runs', 'True'), 'an automatic diagnosis'
+    )
     # A request is answered by the diagnosis that runs.
     answer = graph.call(Trigger, 'monitor/diagnose', Trigger.Request(), 200)
     assert answer.success, answer.message
@@ -175,11 +202,17 @@ def test_a_killed_monitor_loses_no_change(monitor, graph, kill, tmp_path) -> Non
         # A name of its own: what the killed monitor said last may arrive after its end.
         name = f'monitor{count}'
         node = monitor('-r', f'__node:={name}', '-p', 'diagnose.automatic:=false')
-        streams.run_until(lambda: graph.reports(name, 'gap x')  # noqa: B023
-                          and graph.number(name, 'blocks') > 60, '60 s')  # noqa: B023
+        streams.run_until(
+            lambda name=name: graph.reports(name, 'gap x') and graph.number(name, 'blocks') > 60,
+            '60 s',
+        )
         streams.is_shifted = not streams.is_shifted
-        streams.run_until(lambda: record.exists() and record.read_text().count(
-            '"axis": "x"') >= count, 'the record')  # noqa: B023
+        streams.run_until(
+            lambda count=count: (
+                record.exists() and record.read_text().count('"axis": "x"') >= count
+            ),
+            'the record',
+        )
         kill(node.popen.pid)
         node.popen.wait()
     lines = [json.loads(line) for line in record.read_text().splitlines()]
@@ -191,10 +224,17 @@ def test_no_sample_at_1_khz_is_lost(start, graph) -> None:
     start('monitor', '--ros-args', '-p', 'diagnose.automatic:=false', *RELIABLE)
     graph.spin_until(lambda: 'monitor' in graph.diagnostics, 20, 'the monitor')
     start('stage')
-    start('driver', '--ros-args', '-p', 'link.type:=sim', '-p',
-          'qos_overrides./imu/data_raw.publisher.depth:=20000')
+    start(
+        'driver',
+        '--ros-args',
+        '-p',
+        'link.type:=sim',
+        '-p',
+        'qos_overrides./imu/data_raw.publisher.depth:=20000',
+    )
     graph.spin_until(lambda: graph.reports('monitor', 'gap x'), 40, 'the gap')
     graph.spin_until(lambda: graph.number('monitor', 'samples') > 8000, 40, '8000 samples')
     assert (graph.value('monitor', 'missing'), graph.value('monitor', 'dropped')) == ('0', '0')
-    assert 0.5 < graph.number('monitor', 'x_gap_mg') / graph.number(
-        'monitor', 'x_floor_mg') < 1.1, 'the floor includes steps of the encoder'
+    assert (
+        0.5 < graph.number('monitor', 'x_gap_mg') / graph.number('monitor', 'x_floor_mg') < 1.1
+    ), 'the floor includes steps of the encoder'

@@ -35,9 +35,13 @@ def test_help_has_examples_within_a_terminal(name: str, help_of: Callable[[str],
 
 @pytest.mark.parametrize('name', NODES)
 def test_help_lists_each_parameter_with_type_default_and_meaning(
-        name: str, help_of: Callable[[str], str]) -> None:
-    listed = re.findall(r'^  ([\w.]+)\s+(?:float|floats|int|bool|text|texts)(?:,[^:]+)?:',
-                        help_of(name), re.MULTILINE)
+    name: str, help_of: Callable[[str], str]
+) -> None:
+    listed = re.findall(
+        r'^  ([\w.]+)\s+(?:float|floats|int|bool|text|texts)(?:,[^:]+)?:',
+        help_of(name),
+        re.MULTILINE,
+    )
     module = import_module(f'adxl_ros.nodes.{name}')
     assert {spec.name for spec in node_specs(module)} <= set(listed)
 

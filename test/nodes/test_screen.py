@@ -11,20 +11,50 @@ from std_srvs.srv import Trigger
 from units import drawn, nominal
 
 FAST = ('-p', 'use_sim_time:=true')
-PLAN = ('-p', 'sweep.planes_deg:=[45.0, 90.0]', '-p', 'sweep.step_deg:=90.0', '-p',
-        'sweep.dwell_s:=0.6', '-p', 'sweep.check_poses:=0', '-p', 'output:=unit.yaml', *RELIABLE)
+PLAN = (
+    '-p',
+    'sweep.planes_deg:=[45.0, 90.0]',
+    '-p',
+    'sweep.step_deg:=90.0',
+    '-p',
+    'sweep.dwell_s:=0.6',
+    '-p',
+    'sweep.check_poses:=0',
+    '-p',
+    'output:=unit.yaml',
+    *RELIABLE,
+)
 
 
 def bench(start, tmp_path):
     base = nominal('xyz', serial='T1', rate_hz=200.0)
     parameter_file.save(tmp_path / 'truth.yaml', drawn(np.random.default_rng(3), base))
     parameter_file.save(tmp_path / 'bare.yaml', base)
-    start('driver', '--ros-args', '--params-file', tmp_path / 'truth.yaml', '-p',
-          'link.type:=sim', '-p', 'link.speed:=4.0', *FAST)
-    start('stage', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST, '-p',
-          'slew_rate_rad_s:=6.0', '-p', 'settling_time_s:=0.1')
-    return start('calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST,
-                 *PLAN)
+    start(
+        'driver',
+        '--ros-args',
+        '--params-file',
+        tmp_path / 'truth.yaml',
+        '-p',
+        'link.type:=sim',
+        '-p',
+        'link.speed:=4.0',
+        *FAST,
+    )
+    start(
+        'stage',
+        '--ros-args',
+        '--params-file',
+        tmp_path / 'bare.yaml',
+        *FAST,
+        '-p',
+        'slew_rate_rad_s:=6.0',
+        '-p',
+        'settling_time_s:=0.1',
+    )
+    return start(
+        'calibration', '--ros-args', '--params-file', tmp_path / 'bare.yaml', *FAST, *PLAN
+    )
 
 
 def test_a_screen_drives_the_sweep_of_a_node_without_a_terminal(start, in_terminal, tmp_path):
@@ -57,8 +87,9 @@ def test_a_screen_drives_the_sweep_of_a_node_without_a_terminal(start, in_termin
     assert node.popen.poll() is None
     with Graph() as graph:
         # Nobody is at a screen any more, so an interrupted calibration is resumed.
-        graph.spin_until(lambda: not graph.node.count_clients('calibration/resume'), 30,
-                         'no screen')
+        graph.spin_until(
+            lambda: not graph.node.count_clients('calibration/resume'), 30, 'no screen'
+        )
         assert graph.call(Trigger, 'calibration/start', Trigger.Request()).success
     node.wait_for('resumed after')
 

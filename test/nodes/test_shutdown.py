@@ -25,9 +25,14 @@ def test_interrupted_twice_a_node_ends_cleanly(start):
         assert 'Traceback' not in node.output()
 
 
-@pytest.mark.parametrize('name, library', [
-    ('driver', '_multiarray_umath'), ('driver', '_rclpy_pybind11'),
-    *((name, 'libfastrtps') for name in ('driver', 'compensation', 'monitor'))])
+@pytest.mark.parametrize(
+    'name, library',
+    [
+        ('driver', '_multiarray_umath'),
+        ('driver', '_rclpy_pybind11'),
+        *((name, 'libfastrtps') for name in ('driver', 'compensation', 'monitor')),
+    ],
+)
 def test_interrupted_while_it_starts_a_node_prints_no_traceback(start, name, library):
     """The signal comes while a node loads numpy, loads rclpy, or makes its first topics."""
     node = start(name)

@@ -2,7 +2,6 @@
 
 """The stage over DDS, alone and in lockstep with the driver's simulated sensor."""
 
-
 from adxl_ros.model.kinematics import specific_force
 from graph import Graph, imu_table, stamp_ns
 import numpy as np
@@ -11,13 +10,27 @@ from sensor_msgs.msg import Imu, JointState
 
 ROS = '--ros-args'
 SIM_TIME = (ROS, '-p', 'use_sim_time:=true')
-QUICK = ('-p', 'slew_rate_rad_s:=2.0', '-p',
-         'qos_overrides./stage/true_joint_states.publisher.depth:=10000')
+QUICK = (
+    '-p',
+    'slew_rate_rad_s:=2.0',
+    '-p',
+    'qos_overrides./stage/true_joint_states.publisher.depth:=10000',
+)
 STEP = np.radians(5 / 60)
-IDEAL = ('-p', 'sensor.noise_density_g_per_rthz:=[0.0,0.0,0.0]', '-p', 'sensor.axes:=xyz', '-p',
-         'sensor.nominal_zero_g_v:=[2.5,2.5,2.5]', '-p',
-         'sensor.nominal_scale_v_per_g:=[1.0,1.0,1.0]', '-p', 'sensor.rc_capacitance_f:=0.0', '-p',
-         'sensor.adc_bits:=0')
+IDEAL = (
+    '-p',
+    'sensor.noise_density_g_per_rthz:=[0.0,0.0,0.0]',
+    '-p',
+    'sensor.axes:=xyz',
+    '-p',
+    'sensor.nominal_zero_g_v:=[2.5,2.5,2.5]',
+    '-p',
+    'sensor.nominal_scale_v_per_g:=[1.0,1.0,1.0]',
+    '-p',
+    'sensor.rc_capacitance_f:=0.0',
+    '-p',
+    'sensor.adc_bits:=0',
+)
 
 
 class Commander(Graph):
@@ -32,12 +45,16 @@ class Commander(Graph):
 
     def go(self, **joints):
         """Command until the stage has arrived, because the first commands may be lost."""
+
         def arrived():
             self.command.publish(JointState(name=list(joints), position=list(joints.values())))
             self.spin(0.2)
             last = dict(zip(self.states[-1].name, self.states[-1].position)) if self.states else {}
-            return last and np.abs(self.states[-1].velocity).max() < 1e-4 and all(
-                abs(last[j] - angle) <= STEP / 2 + 1e-9 for j, angle in joints.items())
+            return (
+                last
+                and np.abs(self.states[-1].velocity).max() < 1e-4
+                and all(abs(last[j] - angle) <= STEP / 2 + 1e-9 for j, angle in joints.items())
+            )
 
         self.spin_until(arrived, 60, 'arrival')
 
@@ -71,16 +88,18 @@ def test_the_simulated_sensor_senses_the_true_angles(start, speed):
     start('driver', *clock, '-p', 'link.type:=sim', '-p', f'link.speed:={speed}', *IDEAL)
     with Commander() as graph:
         samples = graph.listen(Imu, 'imu/data_raw', raw=True)
-        graph.spin_until(lambda: graph.reports('driver', 'on the stage') and graph.true, 20,
-                         'driver and stage')
+        graph.spin_until(
+            lambda: graph.reports('driver', 'on the stage') and graph.true, 20, 'driver and stage'
+        )
         # The driver uses the stage from its first message on, not from its discovery.
         graph.spin_until(lambda: len(samples) > 500 and len(graph.true) > 50, 20, 'a while')
         del samples[:]
         graph.go(alpha=0.8, beta=-0.5)
         graph.go(alpha=1.5, beta=0.7)
         arrival_ns = stamp_ns(graph.states[-1])
-        graph.spin_until(lambda: imu_table(samples[-1:])[0][0] >= arrival_ns, 20,
-                         'the samples of the arrival')
+        graph.spin_until(
+            lambda: imu_table(samples[-1:])[0][0] >= arrival_ns, 20, 'the samples of the arrival'
+        )
         assert graph.value('driver', 'missing') == '0'
     stamps, measured = imu_table(samples)
     assert (np.diff(stamps) == 1_000_000).all()

@@ -28,33 +28,44 @@ class Controller(Graph):
         self.states = make(JointState, '/joint_states', 10)
         self.command = make(JointState, 'stage/command', 10)
         self.stage_states = self.listen(JointState, 'stage/joint_states')
-        self.commands = self.listen(*(
-            (JointTrajectory, '/joint_trajectory_controller/joint_trajectory')
-            if self.kind == 'trajectory' else (JointState, '/joint_commands')))
+        self.commands = self.listen(
+            *(
+                (JointTrajectory, '/joint_trajectory_controller/joint_trajectory')
+                if self.kind == 'trajectory'
+                else (JointState, '/joint_commands')
+            )
+        )
         self.node.create_timer(0.02, self.publish)
         return self
 
     def publish(self):
-        message = JointState(name=list(self.angles), position=[
-            math.remainder(angle, 2 * math.pi) for angle in self.angles.values()])
+        message = JointState(
+            name=list(self.angles),
+            position=[math.remainder(angle, 2 * math.pi) for angle in self.angles.values()],
+        )
         message.header.stamp = self.node.get_clock().now().to_msg()
         self.states.publish(message)
 
     def goal(self):
         newest = self.commands[-1]
-        return dict(zip(newest.joint_names, newest.points[0].positions)) \
-            if self.kind == 'trajectory' else dict(zip(newest.name, newest.position))
+        return (
+            dict(zip(newest.joint_names, newest.points[0].positions))
+            if self.kind == 'trajectory'
+            else dict(zip(newest.name, newest.position))
+        )
 
     def send_command(self, alpha, beta):
         self.command.publish(JointState(name=['alpha', 'beta'], position=[alpha, beta]))
 
     def command_until(self, alpha, beta, condition, purpose):
         """Repeat a command until a condition holds, because the first ones may be lost."""
+
         def holds():
             if condition():
                 return True
             self.send_command(alpha, beta)
             return False
+
         self.spin_until(holds, 20, purpose)
 
     def at(self):
@@ -92,30 +103,58 @@ def test_a_turn_beyond_half_a_turn_is_unwrapped(start):
         start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES)
         for beta in np.arange(0, 6.5, 0.5):
             graph.angles['turn'] = beta
-            graph.spin_until(lambda wanted=beta: abs(graph.at().get('beta', -1) - wanted) < 1e-9,
-                             20, f'beta {beta}')
+            graph.spin_until(
+                lambda wanted=beta: abs(graph.at().get('beta', -1) - wanted) < 1e-9,
+                20,
+                f'beta {beta}',
+            )
 
 
 def test_a_command_that_is_lost_is_sent_again(start):
     with Controller('trajectory') as graph:
-        start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES, '-p',
-              'bridge.speed_rad_s:=10.0')
-        start('stage', '--ros-args', '-p', 'stage.type:=trajectory', *NAMES, '-p',
-              'bridge.alpha.joint:=tlit', '-r', '__node:=misspelt')
+        start(
+            'stage',
+            '--ros-args',
+            '-p',
+            'stage.type:=trajectory',
+            *NAMES,
+            '-p',
+            'bridge.speed_rad_s:=10.0',
+        )
+        start(
+            'stage',
+            '--ros-args',
+            '-p',
+            'stage.type:=trajectory',
+            *NAMES,
+            '-p',
+            'bridge.alpha.joint:=tlit',
+            '-r',
+            '__node:=misspelt',
+        )
         graph.spin_until(graph.at, 30, 'the stage')
 
         def commanded_twice():
             graph.send_command(0.4, 0.0)
             return len(graph.commands) >= 2
+
         graph.spin_until(commanded_twice, 20, 'a second time')
         graph.spin_until(lambda: graph.reports('stage', 'on the way'), 20, 'the state')
-        graph.spin_until(lambda: graph.reports(
-            'misspelt', '/joint_states has the joints gripper, tilt, turn, but no tlit'), 20,
-            'the name of the joint')
+        graph.spin_until(
+            lambda: graph.reports(
+                'misspelt', '/joint_states has the joints gripper, tilt, turn, but no tlit'
+            ),
+            20,
+            'the name of the joint',
+        )
 
 
-@pytest.mark.parametrize('options, words', [
-    (('-p', 'bridge.alpha.joint:=tilt'), 'bridge.beta.joint: is not set'),
-    ((*NAMES, '-p', 'bridge.beta.sign:=0'), 'bridge.beta.sign: 0 is not 1 or -1')])
+@pytest.mark.parametrize(
+    'options, words',
+    [
+        (('-p', 'bridge.alpha.joint:=tilt'), 'bridge.beta.joint: is not set'),
+        ((*NAMES, '-p', 'bridge.beta.sign:=0'), 'bridge.beta.sign: 0 is not 1 or -1'),
+    ],
+)
 def test_missing_names_end_the_node(refusal, options, words):
     assert words in refusal('stage', '--ros-args', '-p', 'stage.type:=joint_state', *options)

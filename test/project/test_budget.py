@@ -19,8 +19,16 @@ tomllib = pytest.importorskip('tomllib', reason=lack('Python 3.11'))
 pytestmark = pytest.mark.xdist_group('budget')
 ROOT = Path(__file__).parents[2]
 BUDGET = tomllib.loads((ROOT / 'pyproject.toml').read_text())['tool']['adxl_ros']['budget']
-BRANCHES = (ast.If, ast.For, ast.While, ast.ExceptHandler, ast.IfExp, ast.comprehension,
-            ast.Assert, ast.match_case)
+BRANCHES = (
+    ast.If,
+    ast.For,
+    ast.While,
+    ast.ExceptHandler,
+    ast.IfExp,
+    ast.comprehension,
+    ast.Assert,
+    ast.match_case,
+)
 
 
 def parse_without_docstrings(text):
@@ -33,16 +41,23 @@ def parse_without_docstrings(text):
 
 
 def is_docstring(statement):
-    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant) \
+    return (
+        isinstance(statement, ast.Expr)
+        and isinstance(statement.value, ast.Constant)
         and isinstance(statement.value.value, str)
+    )
 
 
 @cache
 def modules():
     """Return the syntax trees of all modules by name."""
-    return {'.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix('.__init__'):
-            parse_without_docstrings(path.read_text())
-            for package in BUDGET['content'] for path in (ROOT / package).rglob('*.py')}
+    return {
+        '.'.join(path.relative_to(ROOT).with_suffix('').parts).removesuffix(
+            '.__init__'
+        ): parse_without_docstrings(path.read_text())
+        for package in BUDGET['content']
+        for path in (ROOT / package).rglob('*.py')
+    }
 
 
 def content(tree):
@@ -51,8 +66,9 @@ def content(tree):
 
 def branches(tree):
     """Count the branches of a function, with comprehensions and conditional expressions."""
-    operators = sum(len(node.values) - 1 for node in ast.walk(tree)
-                    if isinstance(node, ast.BoolOp))
+    operators = sum(
+        len(node.values) - 1 for node in ast.walk(tree) if isinstance(node, ast.BoolOp)
+    )
     return 1 + operators + sum(isinstance(node, BRANCHES) for node in ast.walk(tree))
 
 
@@ -69,19 +85,23 @@ def imported(tree):
 
 @pytest.mark.parametrize('package', BUDGET['content'])
 def test_content(package):
-    used = sum(content(tree) for name, tree in modules().items()
-               if name.split('.')[0] == package)
+    used = sum(content(tree) for name, tree in modules().items() if name.split('.')[0] == package)
     print(f'{package}: {used} of {BUDGET["content"][package]} nodes')
     assert used <= BUDGET['content'][package], 'a change must say what it removes'
 
 
 def test_large_functions():
     """A function has a size that one reading takes in; those that do not yet are counted."""
-    large = [f'{name}.{node.name}: {content(node)} nodes, {branches(node)} branches'
-             for name, tree in modules().items() for node in ast.walk(tree)
-             if isinstance(node, ast.FunctionDef)
-             and (content(node) > BUDGET['function']['nodes']
-                  or branches(node) > BUDGET['function']['branches'])]
+    large = [
+        f'{name}.{node.name}: {content(node)} nodes, {branches(node)} branches'
+        for name, tree in modules().items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
+        and (
+            content(node) > BUDGET['function']['nodes']
+            or branches(node) > BUDGET['function']['branches']
+        )
+    ]
     print('\n'.join(large))
     assert len(large) <= BUDGET['function']['above'], large
 
@@ -92,8 +112,11 @@ def test_import_depth():
 
     @cache
     def chain(name):
-        inner = [chain(other) for other in set(imported(known[name])) if other in known
-                 and other != name and not name.startswith(other + '.')]
+        inner = [
+            chain(other)
+            for other in set(imported(known[name]))
+            if other in known and other != name and not name.startswith(other + '.')
+        ]
         return (name, *max(inner, key=len, default=()))
 
     longest = max((chain(name) for name in known), key=len)

@@ -11,11 +11,16 @@ from ament_index_python.packages import get_package_prefix, get_package_share_di
 from processes import executable, NEEDS_ROS2, PATIENCE, REPO
 import pytest
 
-SCRIPTS = [entry for entry in distribution('adxl_ros').entry_points
-           if entry.group == 'console_scripts']
+SCRIPTS = [
+    entry for entry in distribution('adxl_ros').entry_points if entry.group == 'console_scripts'
+]
 EXECUTABLES = [entry.name for entry in SCRIPTS]
-LAUNCH_FILES = ('calibrate.launch.py', 'emulate.launch.py', 'investigate.launch.py',
-                'robot.launch.py')
+LAUNCH_FILES = (
+    'calibrate.launch.py',
+    'emulate.launch.py',
+    'investigate.launch.py',
+    'robot.launch.py',
+)
 
 
 def run(*args: str, **options: object) -> subprocess.CompletedProcess:
@@ -23,8 +28,9 @@ def run(*args: str, **options: object) -> subprocess.CompletedProcess:
     if Path(get_package_prefix('adxl_ros')) != REPO / 'install' / 'adxl_ros':
         pytest.skip('the package under test was not built by make build')
     command = [options.pop('path', REPO / 'run'), *args]
-    return subprocess.run(command, text=True, capture_output=True,
-                          timeout=60 * PATIENCE, **options)
+    return subprocess.run(
+        command, text=True, capture_output=True, timeout=60 * PATIENCE, **options
+    )
 
 
 @pytest.mark.parametrize('script', SCRIPTS, ids=EXECUTABLES)
@@ -33,9 +39,14 @@ def test_executable_is_where_ros2_run_looks(script: EntryPoint) -> None:
     assert callable(script.load())
 
 
-@pytest.mark.parametrize('path', [
-    'package.xml', 'params/adxl203.yaml', *(f'launch/{name}' for name in LAUNCH_FILES),
-])
+@pytest.mark.parametrize(
+    'path',
+    [
+        'package.xml',
+        'params/adxl203.yaml',
+        *(f'launch/{name}' for name in LAUNCH_FILES),
+    ],
+)
 def test_share(path: str) -> None:
     assert (Path(get_package_share_directory('adxl_ros')) / path).is_file()
 
@@ -54,6 +65,7 @@ def test_run_lists_its_commands() -> None:
 def test_launch_file_loads(name: str) -> None:
     from launch import LaunchContext
     from launch.launch_description_sources import PythonLaunchDescriptionSource
+
     path = Path(get_package_share_directory('adxl_ros')) / 'launch' / name
     description = PythonLaunchDescriptionSource(str(path)).get_launch_description(LaunchContext())
     arguments = {argument.name for argument in description.get_launch_arguments()}

@@ -66,12 +66,23 @@ open_screen('/calibration', print)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert len(lines) == 8
-    for line, name in zip(lines, ('pyulog', 'pyarrow', 'rosbags>=', 'matplotlib', 'plotly',
-                                  'pyserial', "'pylibiio<1' and sudo apt install libiio0")):
+    for line, name in zip(
+        lines,
+        (
+            'pyulog',
+            'pyarrow',
+            'rosbags>=',
+            'matplotlib',
+            'plotly',
+            'pyserial',
+            "'pylibiio<1' and sudo apt install libiio0",
+        ),
+    ):
         assert re.search(f'install .*{re.escape(name)}', line), line
     # A calibration goes on.
-    assert lines[-1] == \
-        'no screen, plain lines: it needs prompt_toolkit; pip install prompt_toolkit'
+    assert (
+        lines[-1] == 'no screen, plain lines: it needs prompt_toolkit; pip install prompt_toolkit'
+    )
 
 
 @pytest.mark.long

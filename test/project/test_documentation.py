@@ -17,12 +17,26 @@ from rclpy.context import Context
 
 DOCS = REPO / 'docs'
 PAGES = [REPO / 'README.md', REPO / 'CONTRIBUTING.md', *sorted(DOCS.glob('**/*.md'))]
-BY_HAND = [page for page in PAGES if 'measurements' not in page.parts
-           and 'Made by `make reference`' not in page.read_text('utf-8')]
+BY_HAND = [
+    page
+    for page in PAGES
+    if 'measurements' not in page.parts
+    and 'Made by `make reference`' not in page.read_text('utf-8')
+]
 MOST_WORDS = 24_000
 """Words of the pages by hand: what they have more, somebody has to read and to keep true."""
-EXECUTABLES = (*TOOLS, 'driver', 'compensation', 'calibration', 'stage', 'monitor', 'investigate',
-               'screen', 'demo', 'bench')
+EXECUTABLES = (
+    *TOOLS,
+    'driver',
+    'compensation',
+    'calibration',
+    'stage',
+    'monitor',
+    'investigate',
+    'screen',
+    'demo',
+    'bench',
+)
 OPTIONS_OF_ALL = {'--help', '--version', '--ros-args'}
 
 
@@ -33,8 +47,9 @@ def name_of(page: Path) -> str:
 
 def blocks(page: Path, language: str) -> list[str]:
     """Return the code blocks of a page in a language."""
-    return re.findall(rf'^```{language}\n(.*?)^```', page.read_text('utf-8'),
-                      re.DOTALL | re.MULTILINE)
+    return re.findall(
+        rf'^```{language}\n(.*?)^```', page.read_text('utf-8'), re.DOTALL | re.MULTILINE
+    )
 
 
 def commands(page: Path) -> list[list[str]]:
@@ -67,7 +82,7 @@ def test_ros_parses_the_arguments(page: Path) -> None:
     for words in commands(page):
         if '--ros-args' in words and '--params-file' not in words:
             context = Context()
-            rclpy.init(args=['node', *words[words.index('--ros-args'):]], context=context)
+            rclpy.init(args=['node', *words[words.index('--ros-args') :]], context=context)
             context.shutdown()
 
 
@@ -82,7 +97,7 @@ def test_options_and_parameters_exist(page: Path, help_of: Callable) -> None:
     for words in commands(page):
         if words[:3] != ['ros2', 'run', 'adxl_ros'] and words[0] != 'adxl_ros':
             continue
-        name, *rest = words[words.index('adxl_ros') + 1:]
+        name, *rest = words[words.index('adxl_ros') + 1 :]
         assert name in EXECUTABLES, f'{name_of(page)}: {name} is no executable'
         text = help_of(name)
         cut = rest.index('--ros-args') if '--ros-args' in rest else len(rest)
@@ -90,44 +105,58 @@ def test_options_and_parameters_exist(page: Path, help_of: Callable) -> None:
             if re.match('--[a-z]', word):
                 assert word in text, f'{name_of(page)}: {name} has no {word}'
         if name != 'screen':
-            for flag, rule in zip(rest[cut:], rest[cut + 1:]):
+            for flag, rule in zip(rest[cut:], rest[cut + 1 :]):
                 key = rule.split(':=')[0]
-                assert flag != '-p' or key in text + ' use_sim_time', \
+                assert flag != '-p' or key in text + ' use_sim_time', (
                     f'{name_of(page)}: {name} has no parameter {key}'
+                )
 
 
 @pytest.mark.parametrize('page', BY_HAND, ids=name_of)
 def test_launch_files_have_the_arguments(page: Path) -> None:
-    declared = ''.join(path.read_text('utf-8') for path in [
-        *(REPO / 'launch').glob('*.py'), *(REPO / 'adxl_ros' / 'nodes').glob('**/*launch*.py')])
+    declared = ''.join(
+        path.read_text('utf-8')
+        for path in [
+            *(REPO / 'launch').glob('*.py'),
+            *(REPO / 'adxl_ros' / 'nodes').glob('**/*launch*.py'),
+        ]
+    )
     for words in commands(page):
         if words[:3] == ['ros2', 'launch', 'adxl_ros']:
             assert (REPO / 'launch' / words[3]).exists()
             for word in words[4:]:
                 argument = word.split(':=')[0]
                 known = argument.replace('alpha', '{joint}').replace('beta', '{joint}')
-                assert argument == '-s' or argument in declared or known in declared, \
+                assert argument == '-s' or argument in declared or known in declared, (
                     f'{name_of(page)}: {words[3]} has no argument {argument}'
+                )
 
 
 @pytest.mark.parametrize('page', PAGES, ids=name_of)
 def test_links_lead_somewhere(page: Path) -> None:
     """Links to files and to headings of pages."""
-    for target, anchor in re.findall(r'\]\(\s*(?!https?:)([^)#\s]*)(#[^)\s]*)?\)',
-                                     page.read_text('utf-8')):
+    for target, anchor in re.findall(
+        r'\]\(\s*(?!https?:)([^)#\s]*)(#[^)\s]*)?\)', page.read_text('utf-8')
+    ):
         linked = page.parent / target if target else page
         assert linked.exists(), f'{name_of(page)} links to {target}'
         if anchor and linked.suffix == '.md':
             headings = re.findall(r'^#+ (.*)$', linked.read_text('utf-8'), re.MULTILINE)
-            assert anchor in {'#' + re.sub(r'[^\w\- ]', '', heading).lower().replace(' ', '-')
-                              for heading in headings}, f'{name_of(page)}: {target}{anchor}'
+            assert anchor in {
+                '#' + re.sub(r'[^\w\- ]', '', heading).lower().replace(' ', '-')
+                for heading in headings
+            }, f'{name_of(page)}: {target}{anchor}'
 
 
 def test_pages_that_messages_name_exist() -> None:
-    listed = subprocess.run(['git', 'ls-files', '-z'], cwd=REPO, text=True, capture_output=True,
-                            check=True).stdout.split('\0')
-    sources = [REPO / name for name in listed if name.endswith(
-        ('.py', '.html', '.xml', '.h', '.c', 'Makefile', '.ino'))]
+    listed = subprocess.run(
+        ['git', 'ls-files', '-z'], cwd=REPO, text=True, capture_output=True, check=True
+    ).stdout.split('\0')
+    sources = [
+        REPO / name
+        for name in listed
+        if name.endswith(('.py', '.html', '.xml', '.h', '.c', 'Makefile', '.ino'))
+    ]
     for path in filter(Path.exists, sources):
         for page in re.findall(r'\bdocs/[\w/]+\.(?:md|txt|yaml)', path.read_text('utf-8')):
             assert (REPO / page).exists(), f'{name_of(path)} names {page}'
@@ -142,8 +171,11 @@ def test_each_page_names_the_next() -> None:
 
 
 def test_the_pages_by_hand_stay_short() -> None:
-    texts = (re.sub(r'<!-- ([\w ]+) -->\n.*?<!-- /\1 -->', '', page.read_text('utf-8'),
-                    flags=re.DOTALL) for page in BY_HAND if 'reference' not in page.parts)
+    texts = (
+        re.sub(r'<!-- ([\w ]+) -->\n.*?<!-- /\1 -->', '', page.read_text('utf-8'), flags=re.DOTALL)
+        for page in BY_HAND
+        if 'reference' not in page.parts
+    )
     assert sum(len(text.split()) for text in texts) <= MOST_WORDS
 
 
@@ -151,10 +183,18 @@ def test_the_tilt_error_has_one_definition() -> None:
     """The glossary defines it, and each page that states one links there."""
     texts = {page: page.read_text('utf-8').lower() for page in BY_HAND}
     glossary = DOCS / 'explain' / 'glossary.md'
-    assert [page for page, text in texts.items()
-            if re.search(r'angle\s+between\s+(the\s+)?true\s+and', text)] == [glossary]
-    assert not [name_of(page) for page, text in texts.items() if re.search(r'tilt\s+error', text)
-                and page != glossary and 'glossary.md#tilt-error' not in text]
+    assert [
+        page
+        for page, text in texts.items()
+        if re.search(r'angle\s+between\s+(the\s+)?true\s+and', text)
+    ] == [glossary]
+    assert not [
+        name_of(page)
+        for page, text in texts.items()
+        if re.search(r'tilt\s+error', text)
+        and page != glossary
+        and 'glossary.md#tilt-error' not in text
+    ]
 
 
 @pytest.mark.parametrize('page', BY_HAND, ids=name_of)
@@ -173,12 +213,14 @@ def test_reference_is_that_of_the_package(tmp_path: Path) -> None:
     pytest.importorskip('plotly')
     reference().main(tmp_path)
     for page in tmp_path.glob('*.md'):
-        assert (DOCS / 'reference' / page.name).read_text('utf-8') == page.read_text('utf-8'), \
+        assert (DOCS / 'reference' / page.name).read_text('utf-8') == page.read_text('utf-8'), (
             f'{page.name}: run make reference'
+        )
 
 
 def test_every_effect_has_a_picture() -> None:
     text = (DOCS / 'reference' / 'effects.md').read_text('utf-8')
     pictures = re.findall(r'!\[\w+\]\((.*?)\)', text)
-    assert {DOCS / 'reference' / name for name in pictures} \
-        == set((DOCS / 'reference' / 'effects').glob('*.png'))
+    assert {DOCS / 'reference' / name for name in pictures} == set(
+        (DOCS / 'reference' / 'effects').glob('*.png')
+    )

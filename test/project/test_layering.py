@@ -11,14 +11,26 @@ import pytest
 
 PACKAGE = REPO / 'adxl_ros'
 CORE = {'adxl_ros', 'ament_index_python', 'numpy', 'scipy', 'yaml'}
-ROS = {'builtin_interfaces', 'diagnostic_msgs', 'geometry_msgs', 'launch', 'launch_ros',
-       'rcl_interfaces', 'rclpy', 'rosgraph_msgs', 'sensor_msgs', 'std_msgs', 'std_srvs',
-       'trajectory_msgs'}
+ROS = {
+    'builtin_interfaces',
+    'diagnostic_msgs',
+    'geometry_msgs',
+    'launch',
+    'launch_ros',
+    'rcl_interfaces',
+    'rclpy',
+    'rosgraph_msgs',
+    'sensor_msgs',
+    'std_msgs',
+    'std_srvs',
+    'trajectory_msgs',
+}
 
 
 def test_contracts(capsys: pytest.CaptureFixture) -> None:
     cli = pytest.importorskip(
-        'importlinter.cli', reason='import-linter is not installed: pip install import-linter')
+        'importlinter.cli', reason='import-linter is not installed: pip install import-linter'
+    )
     status = cli.lint_imports(config_filename=str(REPO / 'pyproject.toml'), no_cache=True)
     assert status == 0, capsys.readouterr().out
 
@@ -40,8 +52,9 @@ def imported_at_once(path: Path) -> set[str]:
     return packages
 
 
-@pytest.mark.parametrize('path', sorted(PACKAGE.rglob('*.py')),
-                         ids=lambda path: str(path.relative_to(PACKAGE)))
+@pytest.mark.parametrize(
+    'path', sorted(PACKAGE.rglob('*.py')), ids=lambda path: str(path.relative_to(PACKAGE))
+)
 def test_extras_are_imported_where_they_are_used(path: Path) -> None:
     allowed = CORE | set(sys.stdlib_module_names)
     if 'nodes' in path.parts:

@@ -16,17 +16,25 @@ import pytest
 import yaml
 
 SHARE = REPO / 'share'
-TYPES = dict(re.findall(r'^\| `([\w/]+)` \((\w+/\w+)\)', (
-    REPO / 'docs' / 'reference' / 'nodes.md').read_text('utf-8'), re.MULTILINE))
+TYPES = dict(
+    re.findall(
+        r'^\| `([\w/]+)` \((\w+/\w+)\)',
+        (REPO / 'docs' / 'reference' / 'nodes.md').read_text('utf-8'),
+        re.MULTILINE,
+    )
+)
 """Topics of the nodes and their types; a test compares the page with the nodes."""
 
 
 def check_path(path: str) -> None:
     """Assert that a topic has the field that a plot shows: /imu/data.linear_acceleration.x."""
-    topic = next(name for name in sorted(TYPES, key=len, reverse=True)
-                 if path.startswith((f'/{name}/', f'/{name}.')))
+    topic = next(
+        name
+        for name in sorted(TYPES, key=len, reverse=True)
+        if path.startswith((f'/{name}/', f'/{name}.'))
+    )
     package, name = TYPES[topic].split('/')
-    field = path[len(topic) + 2:].replace('/', '.').partition('.@')[0]
+    field = path[len(topic) + 2 :].replace('/', '.').partition('.@')[0]
     attrgetter(field)(getattr(import_module(f'{package}.msg'), name)())
 
 

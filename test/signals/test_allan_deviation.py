@@ -18,20 +18,22 @@ allantools = pytest.importorskip('allantools')
 def streamed(samples: np.ndarray, rate_hz: float, portion: int) -> AllanDeviation:
     stream = Phase(samples.shape[1], BytesIO())
     for start in range(0, len(samples), portion):
-        stream.feed(samples[start:start + portion])
+        stream.feed(samples[start : start + portion])
     size, means = stream.cells()
-    expected = samples[:len(means) * size].reshape(len(means), size, -1).mean(axis=1)
+    expected = samples[: len(means) * size].reshape(len(means), size, -1).mean(axis=1)
     assert len(samples) // size == len(means) < 1 << 17
     np.testing.assert_allclose(means, expected, rtol=1e-12)
     return stream.allan_deviation(rate_hz)
 
 
-@pytest.mark.parametrize('count, portions', [
-    (9, (1, 777)), (5000, (777, 65536)), (300_001, (777, 65536))])
+@pytest.mark.parametrize(
+    'count, portions', [(9, (1, 777)), (5000, (777, 65536)), (300_001, (777, 65536))]
+)
 def test_equal_to_allantools(count: int, portions: tuple[int, int]) -> None:
     rng = np.random.default_rng(1)
-    samples = 9.8 + np.column_stack([still_samples(rng, count, 100.0, 1e-3, 1e-4, 1e-5)
-                                     for _ in range(2)])
+    samples = 9.8 + np.column_stack(
+        [still_samples(rng, count, 100.0, 1e-3, 1e-4, 1e-5) for _ in range(2)]
+    )
     first, second = (streamed(samples, 100.0, portion) for portion in portions)
     assert first.deviation == pytest.approx(second.deviation, rel=1e-9)
     for axis in range(2):

@@ -28,8 +28,19 @@ import pytest
 
 PARAMS = Path(__file__).parents[2] / 'params'
 REAL = Path(__file__).parents[3] / 'shared' / 'real'
-FACES = np.array([[0, 0, 1.0], [0, 0, -1], [0, 1, 0], [0, -1, 0], [1, 0, 0], [-1, 0, 0],
-                  [0.6, 0.8, 0], [0, 0.6, -0.8], [-0.6, 0, 0.8]])
+FACES = np.array(
+    [
+        [0, 0, 1.0],
+        [0, 0, -1],
+        [0, 1, 0],
+        [0, -1, 0],
+        [1, 0, 0],
+        [-1, 0, 0],
+        [0.6, 0.8, 0],
+        [0, 0.6, -0.8],
+        [-0.6, 0, 0.8],
+    ]
+)
 """Directions of the force in nine rests."""
 G = G0_MPS2
 
@@ -38,11 +49,13 @@ def sensor(name: str = 'any_imu') -> Sensor:
     return parameter_file.load(str(PARAMS / f'{name}.yaml'), may_measure=True)
 
 
-def looked(readings: np.ndarray, unit: Sensor | None = None, noise_mps2: float = 0.001
-           ) -> GravityAtRest:
+def looked(
+    readings: np.ndarray, unit: Sensor | None = None, noise_mps2: float = 0.001
+) -> GravityAtRest:
     unit = unit or sensor()
-    return look(RestReadings(readings, np.full_like(readings, noise_mps2)),
-                nominal_tolerance(unit))
+    return look(
+        RestReadings(readings, np.full_like(readings, noise_mps2)), nominal_tolerance(unit)
+    )
 
 
 def kind(readings: np.ndarray, unit: Sensor | None = None) -> GravityFaultKind | None:
@@ -59,14 +72,24 @@ def test_length_spread_and_limits_of_a_sound_sensor() -> None:
     assert gravity.allowed_mps2[0] < G < gravity.allowed_mps2[1]
 
 
-@pytest.mark.parametrize(('number', 'unit', 'option'), [
-    (1.0, 'g', '--unit g'), (1000.0, 'mg', '--unit mg'), (1000 * G, 'mm/s²', '--unit mmps2'),
-    (G / 0.3048, 'ft/s²', '0.3048'), (100 * G, 'cm/s²', '100'), (G / 1000, 'divided by', '1000'),
-    (G * G, 'as g', '--unit mps2'), (256.0, '256', '--lsb-per-g 256'),
-    (16384.0, '16384', '--lsb-per-g 16384')])
+@pytest.mark.parametrize(
+    ('number', 'unit', 'option'),
+    [
+        (1.0, 'g', '--unit g'),
+        (1000.0, 'mg', '--unit mg'),
+        (1000 * G, 'mm/s²', '--unit mmps2'),
+        (G / 0.3048, 'ft/s²', '0.3048'),
+        (100 * G, 'cm/s²', '100'),
+        (G / 1000, 'divided by', '1000'),
+        (G * G, 'as g', '--unit mps2'),
+        (256.0, '256', '--lsb-per-g 256'),
+        (16384.0, '16384', '--lsb-per-g 16384'),
+    ],
+)
 @pytest.mark.parametrize('poses', [1, 9])
-def test_each_unit_is_named_with_the_option_that_states_it(number: float, unit: str, option: str,
-                                                           poses: int) -> None:
+def test_each_unit_is_named_with_the_option_that_states_it(
+    number: float, unit: str, option: str, poses: int
+) -> None:
     readings = number * (FACES[:poses] + [0.01, -0.02, 0.002])
     gravity = look(RestReadings(readings, 1e-3 * np.abs(readings)), nominal_tolerance(sensor()))
     assert gravity.fault is not None and gravity.fault.kind is GravityFaultKind.UNIT
@@ -80,7 +103,7 @@ def test_each_unit_is_named_with_the_option_that_states_it(number: float, unit: 
 def test_a_scale_that_no_unit_explains_is_a_warning(scale: float) -> None:
     gravity = looked(scale * G * FACES)
     assert gravity.fault is not None and gravity.fault.kind is GravityFaultKind.SCALE
-    line, = require_unit(gravity, 'log.csv', needs_gravity=True)
+    (line,) = require_unit(gravity, 'log.csv', needs_gravity=True)
     assert f'{scale * G:.3g} m/s²' in line
 
 
@@ -92,8 +115,14 @@ def test_gravity_that_was_taken_away() -> None:
         require_unit(looked(readings), 'log.csv', needs_gravity=True)
 
 
-@pytest.mark.parametrize(('factors', 'stated'), [
-    ((1 / G, 1, 1), 'x in g'), ((1, 1, 1000), 'z in mm/s²'), ((1000 / G, 1000 / G, 1), 'y in mg')])
+@pytest.mark.parametrize(
+    ('factors', 'stated'),
+    [
+        ((1 / G, 1, 1), 'x in g'),
+        ((1, 1, 1000), 'z in mm/s²'),
+        ((1000 / G, 1000 / G, 1), 'y in mg'),
+    ],
+)
 def test_axes_in_different_units(factors: tuple[float, float, float], stated: str) -> None:
     fault = looked((G * FACES + [0.1, -0.2, 0.15]) * factors).fault
     assert fault is not None and fault.kind is GravityFaultKind.MIXED_UNITS
@@ -134,24 +163,31 @@ def test_every_sensor_at_the_limits_of_its_tolerance_is_sound(name: str) -> None
         directions = rng.normal(size=(rng.integers(1, 30), 3))
         directions /= np.linalg.norm(directions, axis=1)[:, None]
         for forces in (G * FACES, G * directions):
-            readings = forces[:, :axes] * (1 + tolerance.scale * rng.choice([-1, 1], axes)) \
-                + tolerance.zero_g_mps2 * rng.choice([-1, 1], axes)
+            readings = forces[:, :axes] * (
+                1 + tolerance.scale * rng.choice([-1, 1], axes)
+            ) + tolerance.zero_g_mps2 * rng.choice([-1, 1], axes)
             assert kind(readings, unit) is None
 
 
 def test_the_datasheet_decides() -> None:
     stated, unstated = sensor('adxl355'), sensor()
     assert kind(G * FACES + [0, 0, 1.5], unstated) is None
-    tight = replace(stated, datasheet={
-        Coefficient('bias', 'offset_v'): (0.0, 0.01),
-        Coefficient('scale_factor', 'offset_v_per_g'): (0.0, 0.01)})
+    tight = replace(
+        stated,
+        datasheet={
+            Coefficient('bias', 'offset_v'): (0.0, 0.01),
+            Coefficient('scale_factor', 'offset_v_per_g'): (0.0, 0.01),
+        },
+    )
     assert kind(G * FACES[:1] + [0, 0, 1.5], tight) is GravityFaultKind.SCALE
 
 
 def test_a_calibrated_sensor_is_judged_by_its_calibration() -> None:
     nominal = sensor()
-    values = {'bias': {'offset_v': np.array([0.0, 0.0, 0.3])},
-              'scale_factor': {'offset_v_per_g': np.array([-0.3, -0.3, -0.3])}}
+    values = {
+        'bias': {'offset_v': np.array([0.0, 0.0, 0.3])},
+        'scale_factor': {'offset_v_per_g': np.array([-0.3, -0.3, -0.3])},
+    }
     fitted = replace(nominal, effects=('bias', 'scale_factor'), values=values)
     volts = FACES * fitted.scale_v_per_g + fitted.zero_g_v
     std = np.full_like(volts, 1e-4)
@@ -163,8 +199,11 @@ def test_a_calibrated_sensor_is_judged_by_its_calibration() -> None:
 
 def test_the_reference_of_another_simulator_has_the_tolerance_of_gravity() -> None:
     still = np.zeros((2, 3))
-    for length, expected in ((9.81, None), (1.0, GravityFaultKind.UNIT),
-                             (0.0, GravityFaultKind.REMOVED)):
+    for length, expected in (
+        (9.81, None),
+        (1.0, GravityFaultKind.UNIT),
+        (0.0, GravityFaultKind.REMOVED),
+    ):
         fault = look(RestReadings(length * FACES[:2], still), IDEAL).fault
         assert (fault and fault.kind) is expected
 
@@ -177,14 +216,20 @@ def tumble(rate_hz: float, rests: int = 6) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read(time_s: np.ndarray, force: np.ndarray) -> recording.Recording:
-    return recording.Recording('made.csv', time_s, dict(zip(
-        ('ax_mps2', 'ay_mps2', 'az_mps2'), force.T)))
+    return recording.Recording(
+        'made.csv', time_s, dict(zip(('ax_mps2', 'ay_mps2', 'az_mps2'), force.T))
+    )
 
 
 @pytest.mark.parametrize('rate_hz', [20.0, 100.0, 1000.0, 3200.0])
-@pytest.mark.parametrize(('change', 'expected'), [
-    (lambda force: force, None), (lambda force: force / G, GravityFaultKind.UNIT),
-    (lambda force: force * [1 / G, 1, 1], GravityFaultKind.MIXED_UNITS)])
+@pytest.mark.parametrize(
+    ('change', 'expected'),
+    [
+        (lambda force: force, None),
+        (lambda force: force / G, GravityFaultKind.UNIT),
+        (lambda force: force * [1 / G, 1, 1], GravityFaultKind.MIXED_UNITS),
+    ],
+)
 def test_a_recording_of_any_rate(rate_hz: float, change: Callable, expected: object) -> None:
     time_s, force = tumble(rate_hz)
     made = read(time_s, change(force))
@@ -195,8 +240,10 @@ def test_a_recording_of_any_rate(rate_hz: float, change: Callable, expected: obj
 
 
 def test_a_live_stream_is_judged_from_its_first_rest_on() -> None:
-    unit, live = replace(sensor(), noise_density_g_per_rthz=np.full(3, 4e-4), unstated=()), \
-        LiveLook()
+    unit, live = (
+        replace(sensor(), noise_density_g_per_rthz=np.full(3, 4e-4), unstated=()),
+        LiveLook(),
+    )
     time_s, force = tumble(100.0, 1)
     stamps_ns = (time_s * 1e9).astype(np.int64)
     gravity = live(unit, 100.0, stamps_ns, force / G)

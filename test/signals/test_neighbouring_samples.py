@@ -11,10 +11,10 @@ RATE_HZ = 100.0
 
 
 def faults(samples: np.ndarray, block: int = 10_000) -> list[str]:
-    looked = NeighbouringSamples('xyz'[:samples.shape[1]], RATE_HZ)
+    looked = NeighbouringSamples('xyz'[: samples.shape[1]], RATE_HZ)
     time_s = np.arange(len(samples)) / RATE_HZ
     for i in range(0, len(samples), block):
-        looked.feed(time_s[i:i + block], samples[i:i + block])
+        looked.feed(time_s[i : i + block], samples[i : i + block])
     return looked.faults()
 
 
@@ -38,13 +38,13 @@ def test_coarse_codes_repeat_by_chance(step_mps2: float, noise_mps2: float) -> N
 @pytest.mark.parametrize('block', [50, 333, 10_000])
 @pytest.mark.parametrize('times', [2, 7, 50])
 def test_readings_that_stand_for_several_samples(times: int, block: int) -> None:
-    found, = faults(np.repeat(turning(2000), times, axis=0), block)
+    (found,) = faults(np.repeat(turning(2000), times, axis=0), block)
     assert f'{times} samples' in found and f'{RATE_HZ / times:.4g} readings' in found
 
 
 def test_a_host_that_polls_faster_than_the_sensor() -> None:
     polled = turning()[(np.arange(8000) / 2.5).astype(int)]
-    found, = faults(polled)
+    (found,) = faults(polled)
     assert '2.5 samples' in found
 
 
@@ -54,7 +54,7 @@ def test_rows_of_several_sensors_in_turn(sensors: int, differ: list[float]) -> N
     samples = turning()
     for phase in range(sensors):
         samples[phase::sensors] += phase * np.array(differ)
-    found, = [text for text in faults(samples) if 'alternate' in text]
+    (found,) = [text for text in faults(samples) if 'alternate' in text]
     assert f'{sensors} sensors' in found
 
 
@@ -64,7 +64,7 @@ def test_counts_that_wrap(shake_g: float) -> None:
     true_g[:2000] = [0, 0, 1]
     true_g += np.random.default_rng(4).normal(0, 0.004, true_g.shape)
     counts = (np.round(true_g * 16384) + 32768) % 65536 - 32768
-    found, = [text for text in faults(counts / 16384 * G) if 'wrap' in text]
+    (found,) = [text for text in faults(counts / 16384 * G) if 'wrap' in text]
     assert '4 g' in found
 
 
@@ -82,7 +82,7 @@ def test_shocks_and_a_sensor_that_clips_do_not_wrap() -> None:
 def test_a_sensor_that_is_turned_over_between_two_samples(signs: list[int], block: int) -> None:
     samples = turning()
     samples[2000:] *= signs
-    found, = faults(samples, block)
+    (found,) = faults(samples, block)
     assert 'at 19.99 s' in found
 
 

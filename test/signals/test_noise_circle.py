@@ -19,8 +19,7 @@ import numpy as np
 from processes import REPO
 import pytest
 
-SENSORS = sorted(path.stem for path in (REPO / 'params').glob('*.yaml')
-                 if path.stem != 'any_imu')
+SENSORS = sorted(path.stem for path in (REPO / 'params').glob('*.yaml') if path.stem != 'any_imu')
 RATES_HZ = (50.0, 200.0, 1000.0)
 SECONDS = 11.0
 
@@ -39,8 +38,7 @@ def sample_std(recording: Recording, sensor: Sensor) -> float:
     return float(to_nominal_mps2(recording.columns['x_v'][:, None], sensor).std())
 
 
-def measured(recording: Recording, stated: Sensor, folder: Path
-             ) -> tuple[Sensor, RecordingNoise]:
+def measured(recording: Recording, stated: Sensor, folder: Path) -> tuple[Sensor, RecordingNoise]:
     """Return the sensor that `noise` writes, and its result."""
     parameter_file.save(folder / 'stated.yaml', stated)
     result = recording_noise(lambda: [recording], str(folder / 'stated.yaml'))
@@ -73,7 +71,8 @@ def test_noise_that_refutes_the_stated_filter(name: str, tmp_path: Path) -> None
     recorded = at_rest(aliased, 1)
     sensor, _ = measured(recorded, one_axis(name), tmp_path)
     assert sample_std(at_rest(sensor, 2), sensor) == pytest.approx(
-        sample_std(recorded, aliased), rel=0.1)
+        sample_std(recorded, aliased), rel=0.1
+    )
 
 
 @pytest.mark.parametrize('amplitude_mg', [0.3, 2.0])
@@ -101,7 +100,7 @@ def a_deviation(_: RecordingNoise, std_mps2: float) -> float:
 
 
 def a_variance(_: RecordingNoise, std_mps2: float) -> float:
-    return std_mps2 ** 2
+    return std_mps2**2
 
 
 def a_density(result: RecordingNoise, _: float) -> float:

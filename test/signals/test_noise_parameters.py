@@ -12,8 +12,9 @@ N, B, K = 1e-3, 2e-4, 1e-5
 STEP_S = 1.0
 
 
-def cells(seed: int, count: int = 7200, terms: tuple[float, float, float] = (N, B, K)
-          ) -> np.ndarray:
+def cells(
+    seed: int, count: int = 7200, terms: tuple[float, float, float] = (N, B, K)
+) -> np.ndarray:
     samples = still_samples(np.random.default_rng(seed), 10 * count, 10.0, *terms)
     return samples.reshape(count, 10).mean(axis=1)
 
@@ -29,18 +30,21 @@ def test_nine_of_ten_intervals_hold_the_truth() -> None:
         # 40 draws of 0.9: 30 to 40 in 998 of 1000 cases.
         assert inside >= 30, name
         assert np.median([estimate.value for estimate in estimates]) == pytest.approx(
-            truth, rel=0.25)
+            truth, rel=0.25
+        )
 
 
 def test_the_fitted_curve_is_the_allan_deviation_of_the_terms() -> None:
     fit = fit_noise(cells(1), STEP_S)
     white, floor, walk = fit.lines(np.array([1.0, 3.0]))
     assert white == pytest.approx(fit.white.value / np.sqrt([1.0, 3.0]))
-    assert floor == pytest.approx(np.full(2, np.sqrt(2 * np.log(2) / np.pi)
-                                          * fit.instability.value))
+    assert floor == pytest.approx(
+        np.full(2, np.sqrt(2 * np.log(2) / np.pi) * fit.instability.value)
+    )
     assert walk[1] == pytest.approx(fit.walk.value)
     assert fit.allan_deviation(np.array([1.0]))[0] ** 2 == pytest.approx(
-        white[0] ** 2 + floor[0] ** 2 + walk[0] ** 2)
+        white[0] ** 2 + floor[0] ** 2 + walk[0] ** 2
+    )
 
 
 def test_a_walk_with_bounds() -> None:
@@ -50,7 +54,7 @@ def test_a_walk_with_bounds() -> None:
     fits = []
     for _ in range(10):
         walk = lfilter([1.0], [1.0, -decay], rng.standard_normal(8000))[800:]
-        walk *= k * np.sqrt(bound_s / 2 * (1 - decay ** 2))
+        walk *= k * np.sqrt(bound_s / 2 * (1 - decay**2))
         fits.append(fit_noise(walk + rng.standard_normal(7200) * N, STEP_S))
     assert all(50.0 < fit.bound_s < 200.0 for fit in fits)
     assert sum(fit.walk.low <= k <= fit.walk.high for fit in fits) >= 7
@@ -64,7 +68,7 @@ def test_a_line_leaves_the_truth_in_the_interval(amplitude: float) -> None:
     for seed in range(6):
         rng, time_s = np.random.default_rng(seed), np.arange(6000) * 0.1
         line = amplitude * np.sin(2 * np.pi * 0.55 * time_s + seed)
-        white = fit_noise(N * (rng.standard_normal(6000) / 0.1 ** 0.5 + line), 0.1).white
+        white = fit_noise(N * (rng.standard_normal(6000) / 0.1**0.5 + line), 0.1).white
         assert 0.98 * white.low <= N <= 1.02 * white.high
 
 
@@ -76,7 +80,7 @@ def test_a_filter_is_no_walk(seconds: int) -> None:
     std = N / np.sqrt(2 * rc_s)
     for seed in range(3):
         drawn = np.random.default_rng(seed).standard_normal(seconds * 1000 + 200)
-        samples = std * lfilter([np.sqrt(1 - decay ** 2)], [1.0, -decay], drawn)[200:]
+        samples = std * lfilter([np.sqrt(1 - decay**2)], [1.0, -decay], drawn)[200:]
         rounded = np.round(samples / step) * step
         fit = fit_noise(rounded, 1 / rate_hz, rounding=step / np.sqrt(12 * rate_hz))
         assert fit.white.low > 0

@@ -86,9 +86,13 @@ def damaged(rng, time_s, samples):
 
 
 @settings(max_examples=40)
-@given(strategies.integers(0, 2**32 - 1), strategies.integers(1, 3),
-       strategies.sampled_from([1.0, 20.0, 100.0, 400.0]), strategies.booleans(),
-       strategies.booleans())
+@given(
+    strategies.integers(0, 2**32 - 1),
+    strategies.integers(1, 3),
+    strategies.sampled_from([1.0, 20.0, 100.0, 400.0]),
+    strategies.booleans(),
+    strategies.booleans(),
+)
 def test_live_equals_offline(seed, axes, rate_hz, known_noise, with_stage):
     rng = np.random.default_rng(seed)
     scale_s = 1.0 if rate_hz > 10 else 30.0
@@ -108,8 +112,9 @@ def test_live_equals_offline(seed, axes, rate_hz, known_noise, with_stage):
             live.stillness()
     assert live.rests() == offline
     if offline:
-        for got, wanted in zip(live.means(offline),
-                               rest_means(time_s, samples, offline, rate_hz, noise)):
+        for got, wanted in zip(
+            live.means(offline), rest_means(time_s, samples, offline, rate_hz, noise)
+        ):
             assert (got == wanted).all()
 
 
@@ -149,7 +154,7 @@ def test_known_noise_behind_its_filter():
         assert np.median(lengths) > 4.6
         mean, error = rest_means(time_s, volts, rests, 1000.0, ADXL)
         normalized = (mean - 2.5 - poses[:-1]) / error
-        assert 0.75 < np.sqrt((normalized ** 2).mean()) < 1.15
+        assert 0.75 < np.sqrt((normalized**2).mean()) < 1.15
         # 5 s at 1 kHz count for 237 samples.
         assert np.median(error) == pytest.approx(0.535e-3 / np.sqrt(237), rel=0.15)
 
@@ -166,7 +171,7 @@ def test_settling_is_excluded_from_a_rest(tau_s, amplitude):
         volts[:, 0] += tail
         rest = find_rests(time_s, volts, 1000.0, noise=ADXL)[0]
         assert rest.stop >= 9000
-        worst.append(tail[rest.start:rest.stop].mean())
+        worst.append(tail[rest.start : rest.stop].mean())
     assert np.median(worst) < 2.5 * 0.535e-3 / np.sqrt(237)
 
 
@@ -187,7 +192,7 @@ def test_the_encoder_ends_a_rest_where_the_sensor_does_not_respond():
     rests = find_rests(time_s, volts, 1000.0, encoder, ADXL, angle_tolerance_rad=1.45e-3)
     assert len(rests) == 4
     for k, rest in enumerate(rests):
-        assert np.ptp(angles[rest.start:rest.stop, 1]) < 2 * 1.45e-3
+        assert np.ptp(angles[rest.start : rest.stop, 1]) < 2 * 1.45e-3
         assert rest.stop - rest.start > 4600
         # The settling of the filter is excluded as well.
         assert k == 0 or rest.start >= 6000 * k - 500 + 8000 * TAU_S
@@ -217,9 +222,16 @@ def test_speed():
     assert len(rests) == 500
 
 
-@pytest.mark.parametrize('name, min_rests, max_rests', [
-    ('mpu9150_0', 22, 24), ('mpu9150_1', 22, 24), ('mpu9150_2', 22, 24),
-    ('xsens_multiposition', 37, 39), ('two_axis_stand', 23, 25)])
+@pytest.mark.parametrize(
+    'name, min_rests, max_rests',
+    [
+        ('mpu9150_0', 22, 24),
+        ('mpu9150_1', 22, 24),
+        ('mpu9150_2', 22, 24),
+        ('xsens_multiposition', 37, 39),
+        ('two_axis_stand', 23, 25),
+    ],
+)
 def test_rests_of_real_recordings(shared_dir, name, min_rests, max_rests):
     """Real recordings have the number of rests that is documented, except for stops of 1 s."""
     path = shared_dir / 'real' / f'{name}.csv'

@@ -23,18 +23,22 @@ def test_the_accelerometer_of_mujoco_agrees_to_a_tenth_of_a_mg(run_tool, tmp_pat
     pytest.importorskip('mujoco', reason='mujoco is not installed: pip install mujoco')
     ideal, joints = tmp_path / 'ideal.csv', tmp_path / 'joints.csv'
     subprocess.run([sys.executable, str(SCRIPT), str(ideal), str(joints)], check=True)
-    parameter_file.save(tmp_path / 'exact.yaml', nominal(
-        'xyz', noise_density_g_per_rthz=np.zeros(3), adc_bits=0, stage_resolution_rad=0.0))
+    parameter_file.save(
+        tmp_path / 'exact.yaml',
+        nominal('xyz', noise_density_g_per_rthz=np.zeros(3), adc_bits=0, stage_resolution_rad=0.0),
+    )
     volts = []
-    for args in (('imu', '--force', ideal),
-                 (joints, '--effect', 'lever_arm:x_m=0.05,y_m=-0.03,z_m=0.1')):
+    for args in (
+        ('imu', '--force', ideal),
+        (joints, '--effect', 'lever_arm:x_m=0.05,y_m=-0.03,z_m=0.1'),
+    ):
         out = tmp_path / 'out.csv'
         done = run_tool('simulate', *args, '--params', tmp_path / 'exact.yaml', '-o', out)
         assert done.returncode == 0, done.stderr
         volts.append(recording.read(out).volts(nominal('xyz')))
     by_mujoco, by_joints = volts
     assert np.ptp(by_mujoco, axis=0).min() > 0.5, 'the arm must move the sensor'
-    difference_mg = 1e3 * (by_mujoco[:len(by_joints)] - by_joints)[50:-50]
+    difference_mg = 1e3 * (by_mujoco[: len(by_joints)] - by_joints)[50:-50]
     assert np.abs(difference_mg).max() < 0.1
 
 
@@ -85,10 +89,23 @@ def test_an_effect_in_the_loop_of_mujoco_is_found_and_closed(run_tool, tmp_path)
     ideal, readings = mujoco_loop(mujoco, SensorModel(truth, seed=1))
     time_s = np.arange(len(ideal)) / 200.0
     save(tmp_path / 'ideal.csv', 'time_s,ax_mps2,ay_mps2,az_mps2', time_s, ideal)
-    save(tmp_path / 'real.csv', 'time_s,ax_mps2,ay_mps2,az_mps2,temperature_c', time_s, readings,
-         25 + np.arange(len(ideal)) / 600)
-    done = run_tool('diagnose', tmp_path / 'real.csv', '--sim', tmp_path / 'ideal.csv',
-                    '--params', tmp_path / 'nominal.yaml', '-o', tmp_path / 'gap')
+    save(
+        tmp_path / 'real.csv',
+        'time_s,ax_mps2,ay_mps2,az_mps2,temperature_c',
+        time_s,
+        readings,
+        25 + np.arange(len(ideal)) / 600,
+    )
+    done = run_tool(
+        'diagnose',
+        tmp_path / 'real.csv',
+        '--sim',
+        tmp_path / 'ideal.csv',
+        '--params',
+        tmp_path / 'nominal.yaml',
+        '-o',
+        tmp_path / 'gap',
+    )
     assert done.returncode == 0, done.stderr
     verdict = json.loads((tmp_path / 'gap' / 'report.json').read_text())['verdict']
     assert (verdict['status'], verdict['effects']) == ('explained', ['quadratic'])

@@ -17,15 +17,22 @@ ARM_M, PENDULUM = 0.5, [('0 1 0', '0 0 1')]
 def swing(time_s):
     """Return angle, rate and acceleration of a joint."""
     w, v = 2 * np.pi * 0.5, 2 * np.pi * 0.23
-    return (0.8 * np.sin(w * time_s) + 0.5 * np.sin(v * time_s),
-            0.8 * w * np.cos(w * time_s) + 0.5 * v * np.cos(v * time_s),
-            -0.8 * w * w * np.sin(w * time_s) - 0.5 * v * v * np.sin(v * time_s))
+    return (
+        0.8 * np.sin(w * time_s) + 0.5 * np.sin(v * time_s),
+        0.8 * w * np.cos(w * time_s) + 0.5 * v * np.cos(v * time_s),
+        -0.8 * w * w * np.sin(w * time_s) - 0.5 * v * v * np.sin(v * time_s),
+    )
 
 
 def pendulum_force(q, rate, acceleration):
     """Return the specific force at the end of an arm that turns about y, m/s², (n, 3)."""
-    return np.column_stack([-ARM_M * rate ** 2 - G0_MPS2 * np.sin(q), 0 * q,
-                            -ARM_M * acceleration + G0_MPS2 * np.cos(q)])
+    return np.column_stack(
+        [
+            -ARM_M * rate**2 - G0_MPS2 * np.sin(q),
+            0 * q,
+            -ARM_M * acceleration + G0_MPS2 * np.cos(q),
+        ]
+    )
 
 
 @pytest.fixture
@@ -37,19 +44,26 @@ def pendulum(tmp_path):
 def path_of(robot, rate_hz, step_rad, base=None, span_s=40.0):
     time_s = np.arange(0, span_s, 1 / rate_hz)
     time_s = time_s + np.random.default_rng(0).uniform(0, 2e-5, len(time_s))  # as read
-    return RobotPath(robot, Readings('run', {
-        'j1': (time_s, encoded(swing(time_s)[0], step_rad)), 'other': (time_s, time_s)}, base))
+    return RobotPath(
+        robot,
+        Readings(
+            'run',
+            {'j1': (time_s, encoded(swing(time_s)[0], step_rad)), 'other': (time_s, time_s)},
+            base,
+        ),
+    )
 
 
-@pytest.mark.parametrize(('rate_hz', 'step_rad'), [
-    (100, 0.0), (100, 1e-5), (250, 5e-5), (500, 1e-7), (500, 1e-3)])
+@pytest.mark.parametrize(
+    ('rate_hz', 'step_rad'), [(100, 0.0), (100, 1e-5), (250, 5e-5), (500, 1e-7), (500, 1e-3)]
+)
 def test_force_of_a_pendulum(pendulum, rate_hz, step_rad):
     """Its error is that which the steps of the encoder predict, which uneven stamps are not."""
     path, time_s = path_of(pendulum, rate_hz, step_rad), np.arange(2, 38, 0.003)
     assert path.step_rad == pytest.approx(step_rad, rel=0.3, abs=1e-7)
     error = np.array(path(time_s)).T - pendulum_force(*swing(time_s))
     predicted = np.column_stack([path.errors(time_s, c).std for c in range(3)])
-    assert np.sqrt(np.mean(error ** 2)) < 3 * np.sqrt(np.mean(predicted ** 2)) + 1e-3
+    assert np.sqrt(np.mean(error**2)) < 3 * np.sqrt(np.mean(predicted**2)) + 1e-3
 
 
 @pytest.mark.parametrize(('rate_hz', 'step_rad'), [(100, 1e-3), (250, 1e-4), (500, 1e-3)])
@@ -60,10 +74,12 @@ def test_memory_of_the_error(pendulum, rate_hz, step_rad):
     error = np.array(path(time_s)).T - pendulum_force(*swing(time_s))
     for component in (0, 2):
         errors = path.errors(time_s, component)
-        scaled, memory = error[:, component] / errors.std, np.exp(
-            -errors.forgetting_per_s * step_s)[1:]
-        fresh = (scaled[1:] - memory * scaled[:-1]) / np.sqrt(1 - memory ** 2)
-        assert np.sqrt(np.mean(fresh ** 2)) < 1.5
+        scaled, memory = (
+            error[:, component] / errors.std,
+            np.exp(-errors.forgetting_per_s * step_s)[1:],
+        )
+        fresh = (scaled[1:] - memory * scaled[:-1]) / np.sqrt(1 - memory**2)
+        assert np.sqrt(np.mean(fresh**2)) < 1.5
 
 
 def test_errors_of_the_robot_change_the_force_as_they_say(pendulum):
@@ -74,12 +90,18 @@ def test_errors_of_the_robot_change_the_force_as_they_say(pendulum):
     force = pendulum_force(q, rate, acceleration)
     moved = pendulum_force(q + offset_rad, rate, acceleration) - force
     assert path.modes['joint1'][inner] * offset_rad == pytest.approx(moved[inner], abs=1e-3)
-    derivatives = np.gradient(acceleration, time_s), np.gradient(np.gradient(
-        acceleration, time_s), time_s)
-    yielded = pendulum_force(q - compliance_s2 * acceleration, rate - compliance_s2
-                             * derivatives[0], acceleration - compliance_s2 * derivatives[1])
+    derivatives = (
+        np.gradient(acceleration, time_s),
+        np.gradient(np.gradient(acceleration, time_s), time_s),
+    )
+    yielded = pendulum_force(
+        q - compliance_s2 * acceleration,
+        rate - compliance_s2 * derivatives[0],
+        acceleration - compliance_s2 * derivatives[1],
+    )
     assert path.modes['flexible'][inner] * compliance_s2 == pytest.approx(
-        (yielded - force)[inner], abs=0.02)
+        (yielded - force)[inner], abs=0.02
+    )
 
 
 def test_rotation_and_angles_of_a_stage(pendulum):
@@ -89,8 +111,9 @@ def test_rotation_and_angles_of_a_stage(pendulum):
     assert wy == pytest.approx(rate, abs=1e-3)
     assert ay == pytest.approx(acceleration, abs=1e-2)
     alpha, beta = path.angles(time_s)
-    up = np.column_stack([np.sin(alpha) * np.cos(beta), -np.sin(alpha) * np.sin(beta),
-                          np.cos(alpha)])
+    up = np.column_stack(
+        [np.sin(alpha) * np.cos(beta), -np.sin(alpha) * np.sin(beta), np.cos(alpha)]
+    )
     assert up == pytest.approx(np.column_stack([-np.sin(q), 0 * q, np.cos(q)]), abs=1e-6)
 
 
@@ -102,25 +125,36 @@ def test_a_moving_base(tmp_path):
     zero = 0 * time_s
     pose = np.column_stack([shift, zero, zero, zero, zero, np.sin(yaw / 2), -np.cos(yaw / 2)])
     pose[:, 5] *= -1
-    path = RobotPath(Robot(tmp_path / 'robot.urdf', 'imu_link', moves=True),
-                     Readings('run', {}, (time_s, pose)))
+    path = RobotPath(
+        Robot(tmp_path / 'robot.urdf', 'imu_link', moves=True), Readings('run', {}, (time_s, pose))
+    )
     inner = time_s[300:-300]
     rate, acceleration = 0.9 * 1.3 * np.cos(1.3 * inner), -0.9 * 1.69 * np.sin(1.3 * inner)
     yaw, x = 0.9 * np.sin(1.3 * inner), -0.05 * 16 * np.sin(4 * inner)
-    expected = np.column_stack([-ARM_M * rate ** 2 + x * np.cos(yaw),
-                                ARM_M * acceleration - x * np.sin(yaw), G0_MPS2 + 0 * x])
+    expected = np.column_stack(
+        [
+            -ARM_M * rate**2 + x * np.cos(yaw),
+            ARM_M * acceleration - x * np.sin(yaw),
+            G0_MPS2 + 0 * x,
+        ]
+    )
     force = np.array(path(inner)).T
     assert force == pytest.approx(expected, abs=5e-3)
 
 
-@pytest.mark.parametrize(('frame', 'joints', 'words'), [
-    ('imu', 'time_s,j1_rad', 'no frame imu; it has'),
-    ('imu_link', 'time_s,j2_rad', 'no position of j1, which moves imu_link'),
-    ('base', 'time_s,j1_rad', 'no joint moves base')])
+@pytest.mark.parametrize(
+    ('frame', 'joints', 'words'),
+    [
+        ('imu', 'time_s,j1_rad', 'no frame imu; it has'),
+        ('imu_link', 'time_s,j2_rad', 'no position of j1, which moves imu_link'),
+        ('base', 'time_s,j1_rad', 'no joint moves base'),
+    ],
+)
 def test_wrong_names_are_told(tmp_path, frame, joints, words):
     (tmp_path / 'robot.urdf').write_text(urdf(PENDULUM))
-    (tmp_path / 'run.csv').write_text(joints + '\n' + ''.join(
-        f'{t},{100 * t}\n' for t in np.arange(0, 1, 0.01)))
+    (tmp_path / 'run.csv').write_text(
+        joints + '\n' + ''.join(f'{t},{100 * t}\n' for t in np.arange(0, 1, 0.01))
+    )
     with pytest.raises(UserError) as error:
         robot_path(tmp_path / 'robot.urdf', frame, str(tmp_path / 'run.csv'), 0)
     assert words in str(error.value)

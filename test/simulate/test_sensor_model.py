@@ -22,12 +22,29 @@ import pytest
 from units import nominal, with_effects
 
 RATE_HZ = 200.0
-STAGE = {'backlash', 'base_tilt', 'gravity', 'lever_arm', 'stage_eccentricity', 'stage_offset',
-         'joint_offset', 'flexible_link'}
+STAGE = {
+    'backlash',
+    'base_tilt',
+    'gravity',
+    'lever_arm',
+    'stage_eccentricity',
+    'stage_offset',
+    'joint_offset',
+    'flexible_link',
+}
 CLOCK = {'clock_skew', 'time_offset'}
 NOISE = {'bias_walk', 'flicker', 'noise_excess', 'spikes', 'stuck'}
-MEAN = ['bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z', 'nonlinearity',
-        'hysteresis', 'temperature_bias', 'saturation']
+MEAN = [
+    'bias',
+    'scale_factor',
+    'misalignment',
+    'cross_axis',
+    'cross_axis_z',
+    'nonlinearity',
+    'hysteresis',
+    'temperature_bias',
+    'saturation',
+]
 
 
 def unit(*effects, **changes):
@@ -42,8 +59,9 @@ def swing(count=300, late_s=0.0):
     """Return specific force of a body that begins to swing smoothly, m/s², (n, 3)."""
     time_s = np.maximum(np.arange(count) / RATE_HZ - late_s, 1e-9)
     time_s = time_s * np.exp(-1 / time_s)
-    return G0_MPS2 * np.column_stack([np.sin(7 * time_s), np.cos(5 * time_s),
-                                      np.sin(3 * time_s + 1)])
+    return G0_MPS2 * np.column_stack(
+        [np.sin(7 * time_s), np.cos(5 * time_s), np.sin(3 * time_s + 1)]
+    )
 
 
 def temperature_c(count=300):
@@ -54,17 +72,24 @@ def recorded(sensor, seed):
     """Return the readings of a simulated recording of the same motion, m/s², (n, 3)."""
     force = swing()
     index = lambda time_s: np.rint(time_s * RATE_HZ).astype(int)  # noqa: E731
-    motion = Motion(len(force) / RATE_HZ, internal_rate_hz=RATE_HZ,
-                    force=lambda time_s: list(force[index(time_s)].T),
-                    temperature_c=lambda time_s: temperature_c()[index(time_s)])
+    motion = Motion(
+        len(force) / RATE_HZ,
+        internal_rate_hz=RATE_HZ,
+        force=lambda time_s: list(force[index(time_s)].T),
+        temperature_c=lambda time_s: temperature_c()[index(time_s)],
+    )
     volts = Response(sensor, motion, seed)(np.arange(len(force)) / RATE_HZ)
     return to_nominal_mps2(volts, sensor)
 
 
 def called(sensor, seed, force, begin=0):
     model = SensorModel(sensor, seed)
-    return np.array([model(f, 1 / RATE_HZ, temperature=t)
-                     for f, t in zip(force[begin:], temperature_c()[begin:])])
+    return np.array(
+        [
+            model(f, 1 / RATE_HZ, temperature=t)
+            for f, t in zip(force[begin:], temperature_c()[begin:])
+        ]
+    )
 
 
 @pytest.mark.parametrize('effect', sorted(set(library()) - STAGE - CLOCK))
@@ -95,17 +120,25 @@ def test_time_offset_delays_the_force(delay_s):
     """It reads the force of an earlier time, between the steps of the simulator."""
     late, prompt, begin = unit(f'time_offset:offset_s={delay_s}'), unit(), 100
     lsb_mps2 = late.lsb_v / late.nominal_scale_v_per_g[0] * G0_MPS2
-    batch, expected = (np.stack([force, 0.5 * force], axis=1)
-                       for force in (swing(), swing(late_s=delay_s)))
+    batch, expected = (
+        np.stack([force, 0.5 * force], axis=1) for force in (swing(), swing(late_s=delay_s))
+    )
     assert called(late, 1, batch)[begin:] == pytest.approx(
-        called(prompt, 1, expected)[begin:], abs=2 * lsb_mps2)
+        called(prompt, 1, expected)[begin:], abs=2 * lsb_mps2
+    )
     assert np.abs(batch - expected)[begin:].max() > 5 * lsb_mps2
 
 
-@pytest.mark.parametrize(('force', 'dt_s', 'words'), [
-    ([1.0, 2.0], 0.005, 'expected (3,)'), ([1.0, 2.0, np.nan], 0.005, 'not finite'),
-    ([0.0, 0.0, 9.8], 0.0, 'positive'), ([0.0, 0.0, 9.8], 0.01, 'equal time steps'),
-    (np.zeros((4, 3)), 0.005, 'before')])
+@pytest.mark.parametrize(
+    ('force', 'dt_s', 'words'),
+    [
+        ([1.0, 2.0], 0.005, 'expected (3,)'),
+        ([1.0, 2.0, np.nan], 0.005, 'not finite'),
+        ([0.0, 0.0, 9.8], 0.0, 'positive'),
+        ([0.0, 0.0, 9.8], 0.01, 'equal time steps'),
+        (np.zeros((4, 3)), 0.005, 'before'),
+    ],
+)
 def test_wrong_calls_are_refused(force, dt_s, words):
     model = SensorModel(unit())
     model([0.0, 0.0, 9.8], 0.005)
@@ -123,10 +156,12 @@ def test_4096_sensors_run_in_real_time(capsys):
     def gaussian(force, dt_s):
         return force + rng.standard_normal(force.shape)
 
-    for name, call in (('chain', SensorModel(quiet(*MEAN))),
-                       ('chain with white noise', SensorModel(unit(*MEAN))),
-                       ('units that differ', SensorModel(nominal('xyz', rate_hz=RATE_HZ), 0,
-                                                         'datasheet')), ('Gaussian', gaussian)):
+    for name, call in (
+        ('chain', SensorModel(quiet(*MEAN))),
+        ('chain with white noise', SensorModel(unit(*MEAN))),
+        ('units that differ', SensorModel(nominal('xyz', rate_hz=RATE_HZ), 0, 'datasheet')),
+        ('Gaussian', gaussian),
+    ):
         call(force, 1 / RATE_HZ)
         begin_s = process_time()
         for _ in range(steps):
@@ -134,8 +169,11 @@ def test_4096_sensors_run_in_real_time(capsys):
         times_s[name] = process_time() - begin_s
     with capsys.disabled():
         for name, time_s in times_s.items():
-            print(f'\n4096 sensors, {name}: {1e3 * time_s / steps:.2f} ms a step, '
-                  f'{time_s / times_s["Gaussian"]:.1f} times a Gaussian', end='')
+            print(
+                f'\n4096 sensors, {name}: {1e3 * time_s / steps:.2f} ms a step, '
+                f'{time_s / times_s["Gaussian"]:.1f} times a Gaussian',
+                end='',
+            )
     assert times_s['chain'] < steps / RATE_HZ
     assert times_s['units that differ'] < 1e-3 * steps
 
@@ -170,7 +208,7 @@ def test_noise_and_drift_of_reset_sensors_are_those_of_others():
         since += 1
     white = SensorModel(unit(), 2)(np.zeros((2000, 3)), 1 / RATE_HZ)[:, 0] / G0_MPS2
     walk = 1e-6 * since / RATE_HZ
-    assert np.mean(readings ** 2) == pytest.approx(np.mean(white ** 2 + walk), rel=0.1)
+    assert np.mean(readings**2) == pytest.approx(np.mean(white**2 + walk), rel=0.1)
     late = since > 30
     assert np.mean(readings[late] ** 2) > 1.5 * np.mean(readings[~late] ** 2)
 
@@ -190,11 +228,17 @@ def test_units_of_a_datasheet_keep_its_tolerances():
 
 def test_units_around_a_calibration_have_its_covariance():
     """The readings spread as the covariance says, with its correlations."""
-    names = [Coefficient('bias', 'offset_v', 'x'), Coefficient('scale_factor',
-                                                               'offset_v_per_g', 'x')]
+    names = [
+        Coefficient('bias', 'offset_v', 'x'),
+        Coefficient('scale_factor', 'offset_v_per_g', 'x'),
+    ]
     covariance = np.array([[4e-6, 3e-6], [3e-6, 9e-6]])
-    sensor = replace(put(quiet('bias', 'scale_factor'), names, [0.02, 0.01]),
-                     covariance=covariance, covariance_names=tuple(names), adc_bits=0)
+    sensor = replace(
+        put(quiet('bias', 'scale_factor'), names, [0.02, 0.01]),
+        covariance=covariance,
+        covariance_names=tuple(names),
+        adc_bits=0,
+    )
     force = np.tile([G0_MPS2, 0.0, 0.0], (20000, 1))
     readings_g = SensorModel(sensor, units='calibration')(force, 1 / RATE_HZ)[:, 0] / G0_MPS2
     assert readings_g.mean() == pytest.approx(1.03, abs=1e-4)
@@ -203,8 +247,9 @@ def test_units_around_a_calibration_have_its_covariance():
 
 def test_units_of_a_fleet(tmp_path):
     pooled = PooledCoefficient(2.45, 1e-3, 0.02, 0.015, 0.03, 0.021, 12)
-    calibration_store.write_population(tmp_path / 'population.yaml',
-                                       Population('fleet', {'zero_g_x_v': pooled}))
+    calibration_store.write_population(
+        tmp_path / 'population.yaml', Population('fleet', {'zero_g_x_v': pooled})
+    )
     model = SensorModel(nominal('xyz'), units=tmp_path / 'population.yaml')
     model(np.zeros((5000, 3)), 1 / RATE_HZ)
     assert model.coefficients.mean() == pytest.approx(2.45 - 2.5, abs=2e-3)
@@ -225,7 +270,8 @@ def test_arrays_of_other_libraries_have_the_same_numbers(library_name):
         readings = other(given, 1 / RATE_HZ)
         assert type(readings) is type(given) and readings.dtype == given.dtype
         assert np.asarray(readings) == pytest.approx(
-            model(f.astype(np.float32), 1 / RATE_HZ), abs=1e-6)
+            model(f.astype(np.float32), 1 / RATE_HZ), abs=1e-6
+        )
 
 
 def test_the_filter_does_not_ring_after_a_step():
@@ -249,8 +295,9 @@ def test_the_filter_does_not_ring_after_a_step():
 
 def test_a_filter_that_is_digital_follows_the_time_steps():
     sensor = quiet()
-    at_file, at_slow = (SensorModel(replace(sensor, adc_bits=0, filter_rate_hz=RATE_HZ))
-                        for _ in range(2))
+    at_file, at_slow = (
+        SensorModel(replace(sensor, adc_bits=0, filter_rate_hz=RATE_HZ)) for _ in range(2)
+    )
     for value in (0.0, 0.0, 1.0, 1.0, 0.0):
         force = np.array([value, 0.0, 0.0])
         assert at_file(force, 1 / RATE_HZ) == pytest.approx(at_slow(force, 10 / RATE_HZ))

@@ -44,6 +44,7 @@ def test_predicted_error_is_that_of_the_path(rate_hz):
 @pytest.mark.parametrize('speed', [1.0, 0.1])
 def test_a_path_along_lines_is_as_good_as_one_through_the_readings(speed, offset):
     """Samples at 1 kHz, an encoder at 100 Hz; a part of a sample costs a part of a step."""
+
     def true(at_s):
         return 0.8 * np.sin(speed * at_s) + 0.3 * np.sin(2.3 * speed * at_s)
 
@@ -53,7 +54,8 @@ def test_a_path_along_lines_is_as_good_as_one_through_the_readings(speed, offset
     inside_s = time_s[1000:-1000]
     along, through = (
         np.std(SmoothedPath(at_s, values, STEP)(inside_s) - true(inside_s))
-        for at_s, values in ((time_s, np.interp(time_s, read_s, readings)), (read_s, readings)))
+        for at_s, values in ((time_s, np.interp(time_s, read_s, readings)), (read_s, readings))
+    )
     assert along < 1.2 * through + 0.025 * offset * STEP
 
 

@@ -39,29 +39,55 @@ def header(stamp_ns: int, frame: str = 'imu_link') -> Any:
     return TYPES['std_msgs/msg/Header'](stamp=time, frame_id=frame)
 
 
-def imu(stamp_ns: int, accel: Iterable[float] = (1.0, 2.0, 3.0), topic: str = '/imu/data_raw',
-        variance: Iterable[float] = (1e-4, 1e-4, 1e6), frame: str = 'imu_link') -> Sent:
+def imu(
+    stamp_ns: int,
+    accel: Iterable[float] = (1.0, 2.0, 3.0),
+    topic: str = '/imu/data_raw',
+    variance: Iterable[float] = (1e-4, 1e-4, 1e6),
+    frame: str = 'imu_link',
+) -> Sent:
     vector = TYPES['geometry_msgs/msg/Vector3']
     none = np.full(9, -1.0)
-    return Sent(topic, IMU, stamp_ns, TYPES[IMU](
-        header=header(stamp_ns, frame),
-        orientation=TYPES['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0),
-        orientation_covariance=none, angular_velocity=vector(x=0.0, y=0.0, z=0.0),
-        angular_velocity_covariance=none, linear_acceleration=vector(*map(float, accel)),
-        linear_acceleration_covariance=np.diag(np.array(list(variance), float)).ravel()))
+    return Sent(
+        topic,
+        IMU,
+        stamp_ns,
+        TYPES[IMU](
+            header=header(stamp_ns, frame),
+            orientation=TYPES['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation_covariance=none,
+            angular_velocity=vector(x=0.0, y=0.0, z=0.0),
+            angular_velocity_covariance=none,
+            linear_acceleration=vector(*map(float, accel)),
+            linear_acceleration_covariance=np.diag(np.array(list(variance), float)).ravel(),
+        ),
+    )
 
 
 def joints(stamp_ns: int, topic: str = '/stage/joint_states', **positions: float) -> Sent:
     none = np.zeros(0)
-    return Sent(topic, JOINTS, stamp_ns, TYPES[JOINTS](
-        header=header(stamp_ns, ''), name=list(positions),
-        position=np.array(list(positions.values())), velocity=none, effort=none))
+    return Sent(
+        topic,
+        JOINTS,
+        stamp_ns,
+        TYPES[JOINTS](
+            header=header(stamp_ns, ''),
+            name=list(positions),
+            position=np.array(list(positions.values())),
+            velocity=none,
+            effort=none,
+        ),
+    )
 
 
 def info(topic: str = '/sensor_info', **values: str) -> Sent:
     pairs = [TYPES['diagnostic_msgs/msg/KeyValue'](key=k, value=v) for k, v in values.items()]
-    return Sent(topic, INFO, EPOCH_NS, TYPES[INFO](
-        level=0, name='', message='', hardware_id='', values=pairs))
+    return Sent(
+        topic,
+        INFO,
+        EPOCH_NS,
+        TYPES[INFO](level=0, name='', message='', hardware_id='', values=pairs),
+    )
 
 
 def bag_of(path: Path, messages: Iterable[Sent], little_endian: bool = True) -> Path:
@@ -71,8 +97,9 @@ def bag_of(path: Path, messages: Iterable[Sent], little_endian: bool = True) -> 
             key = sent.topic, sent.kind
             if key not in connections:
                 connections[key] = writer.add_connection(*key, typestore=STORE)
-            raw = sent.raw or STORE.serialize_cdr(sent.message, sent.kind,
-                                                  little_endian=little_endian)
+            raw = sent.raw or STORE.serialize_cdr(
+                sent.message, sent.kind, little_endian=little_endian
+            )
             log_ns = EPOCH_NS + 1000 * i if sent.log_ns is None else sent.log_ns
             writer.write(connections[key], log_ns, raw)  # in the order of arrival
     return path

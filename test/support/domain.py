@@ -12,8 +12,10 @@ import tempfile
 
 DOMAINS = range(1, 102)
 """Domains of tests: 0 is the default, and above 101 lie the ephemeral ports of the system."""
-BY_UDP = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET', 'FASTRTPS_DEFAULT_PROFILES_FILE':
-          str(Path(__file__).with_name('udp_of_this_host.xml'))}
+BY_UDP = {
+    'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET',
+    'FASTRTPS_DEFAULT_PROFILES_FILE': str(Path(__file__).with_name('udp_of_this_host.xml')),
+}
 """
 Variables for tests with the fixture `kill`. The shared memory of Fast DDS stays locked after a
 kill, and rmw_fastrtps always uses it with LOCALHOST. The profile limits the processes to this

@@ -18,6 +18,7 @@ def byte_fault(kind, rate=1e-3):
         rig.graph.spin(0.7)
         rig.command('clear')
         return 0
+
     return inject
 
 
@@ -42,21 +43,26 @@ def kill_server(rig, pid):
 
 
 SERIAL_FAULTS = {
-    **{f'{kind} a thousandth of the bytes': byte_fault(kind)
-       for kind in ('flip', 'lose', 'insert', 'burst')},
+    **{
+        f'{kind} a thousandth of the bytes': byte_fault(kind)
+        for kind in ('flip', 'lose', 'insert', 'burst')
+    },
     'wrong baud rate': byte_fault('baud', 0),
     '100 kB without a delimiter': board_fault('flat 100000'),
     '200 kB of noise': board_fault('noise 200000'),
     '137 samples lost by the board': board_fault('drop 137'),
     'unplugged for 1 s, in a read': board_fault('unplug 1'),
     'board and clock halted for 1 s': board_fault('halt 1'),
-    'reader stopped for 3 s': stop_driver}
+    'reader stopped for 3 s': stop_driver,
+}
 """Faults of the serial link, after which the board's count shows what is missing."""
 RESET = board_fault('reset 0.5')
 """The board is away for half a second; after it the board has no count."""
-IIO_FAULTS = {'SIGSTOP of iiod for 2 s': stop_server,
-              'SIGKILL of iiod, back after 1 s': kill_server,
-              'reader stopped for 3 s': stop_driver}
+IIO_FAULTS = {
+    'SIGSTOP of iiod for 2 s': stop_server,
+    'SIGKILL of iiod, back after 1 s': kill_server,
+    'reader stopped for 3 s': stop_driver,
+}
 """Faults of the IIO link, which has no count."""
 
 

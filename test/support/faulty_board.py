@@ -133,8 +133,9 @@ class FaultyBoard:
         codes = np.full((self.block, self.channels), 32768)
         codes[:, 0], codes[:, 1] = k % CODES + 1, mark(k)
         index = self.next_sample - self.first_sample
-        raw = self.encoder.sample_frame(round(index * 1e6 / self.rate), index,
-                                        codes.astype(np.uint16), self.overruns)
+        raw = self.encoder.sample_frame(
+            round(index * 1e6 / self.rate), index, codes.astype(np.uint16), self.overruns
+        )
         if not self.write(raw):
             self.overruns += self.block
         self.next_sample += self.block
@@ -153,7 +154,7 @@ class FaultyBoard:
     def flush(self):
         with suppress(BlockingIOError):
             if self.unsent:
-                self.unsent = self.unsent[os.write(self.board_fd, self.unsent):]
+                self.unsent = self.unsent[os.write(self.board_fd, self.unsent) :]
 
     def damage(self, raw):
         draw = self.random
@@ -182,7 +183,7 @@ class FaultyBoard:
         while raw:
             select.select([], [self.board_fd], [], 0.1)
             try:
-                raw = raw[os.write(self.board_fd, raw[:4096]):]
+                raw = raw[os.write(self.board_fd, raw[:4096]) :]
             except BlockingIOError:
                 continue
 
@@ -233,8 +234,10 @@ def main():
             if not line:
                 return
             board.obey(line.split())
-            print(json.dumps({'done_ns': time.monotonic_ns(), 'next_sample': board.next_sample}),
-                  flush=True)
+            print(
+                json.dumps({'done_ns': time.monotonic_ns(), 'next_sample': board.next_sample}),
+                flush=True,
+            )
         wait_s = board.turn()
 
 

@@ -18,10 +18,13 @@ def recording_text(serial, date, seed, span_s=SPAN_S):
     rng = np.random.default_rng(seed)
     count = round(span_s * RATE_HZ)
     volts = 2.5 + rng.normal(0.0, 0.002, 2)[:, None] + 1e-3 * rng.normal(size=(2, count))
-    lines = [f'{i / RATE_HZ:.2f},{x:.6f},{y:.6f},{25 + seed % 7 + i / count:.3f}'
-             for i, (x, y) in enumerate(volts.T)]
-    return '\n'.join([f'# serial: {serial}', f'# date: {date}', 'time_s,x_v,y_v,temperature_c',
-                      *lines, ''])
+    lines = [
+        f'{i / RATE_HZ:.2f},{x:.6f},{y:.6f},{25 + seed % 7 + i / count:.3f}'
+        for i, (x, y) in enumerate(volts.T)
+    ]
+    return '\n'.join(
+        [f'# serial: {serial}', f'# date: {date}', 'time_s,x_v,y_v,temperature_c', *lines, '']
+    )
 
 
 def write_fleet(folder, units=3, days=2, first_seed=0, span_s=SPAN_S):
@@ -39,6 +42,7 @@ def write_fleet(folder, units=3, days=2, first_seed=0, span_s=SPAN_S):
 
 def table_of(folder):
     from pyarrow import parquet
+
     return parquet.read_table(Path(folder) / 'fleet.parquet').to_pylist()
 
 

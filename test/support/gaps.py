@@ -14,14 +14,24 @@ from units import nominal, with_effects
 
 
 def unit(axes='xy'):
-    names = tuple(Coefficient(effect, parameter, axis) for effect, parameter in (
-        ('bias', 'offset_v'), ('scale_factor', 'offset_v_per_g')) for axis in axes)
+    names = tuple(
+        Coefficient(effect, parameter, axis)
+        for effect, parameter in (('bias', 'offset_v'), ('scale_factor', 'offset_v_per_g'))
+        for axis in axes
+    )
     return replace(
-        nominal(axes), rate_hz=125.0, stage_resolution_rad=1e-4, model='linear',
-        effects=('bias', 'scale_factor'), covariance_names=names,
+        nominal(axes),
+        rate_hz=125.0,
+        stage_resolution_rad=1e-4,
+        model='linear',
+        effects=('bias', 'scale_factor'),
+        covariance_names=names,
         covariance=np.eye(len(names)) * 1e-9,
-        values={'bias': {'offset_v': np.array([0.01, -0.04, 0.02])[:len(axes)]},
-                'scale_factor': {'offset_v_per_g': np.array([0.02, -0.01, 0.0])[:len(axes)]}})
+        values={
+            'bias': {'offset_v': np.array([0.01, -0.04, 0.02])[: len(axes)]},
+            'scale_factor': {'offset_v_per_g': np.array([0.02, -0.01, 0.0])[: len(axes)]},
+        },
+    )
 
 
 def turning(speeds=(0.6, 1.5, 1.0, 2.5, 0.8), alphas=(np.pi / 2, np.pi / 4, 2.0)):

@@ -27,7 +27,7 @@ QUEUE = 100_000
 
 
 def stamp_ns(message):
-    return message.header.stamp.sec * 10 ** 9 + message.header.stamp.nanosec
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
 def accel(message):
@@ -37,7 +37,7 @@ def accel(message):
 
 def imu_table(raws):
     """Return stamps, ns, (n,), and accelerations, m/s², (n, 3), of serialized Imu messages."""
-    table, = cdr.tables(raws, cdr.imu)
+    (table,) = cdr.tables(raws, cdr.imu)
     return table.stamp_ns(), table.numbers('linear_acceleration')
 
 
@@ -118,8 +118,10 @@ class Graph:
         while not condition():
             self._executor.spin_once(timeout_sec=0.05)
             if time.monotonic() > end_s:
-                pytest.fail(f'{purpose}: not after {PATIENCE} times {timeout_s} s; '
-                            f'diagnostics: {self.diagnostics}')
+                pytest.fail(
+                    f'{purpose}: not after {PATIENCE} times {timeout_s} s; '
+                    f'diagnostics: {self.diagnostics}'
+                )
         self.drain()
 
     def spin(self, seconds):
@@ -130,9 +132,11 @@ class Graph:
 
     def wait_for_silence(self, topic, seconds=1.0, timeout_s=20.0):
         """Listen until a topic has sent nothing for a time, s: what was under way has come."""
+
         def is_silent():
             last_ns = max([began_ns, *self.arrived_ns[topic][-1:]])
             return time.monotonic_ns() - last_ns > seconds * 1e9
+
         began_ns = time.monotonic_ns()
         self.spin_until(is_silent, timeout_s, f'silence on {topic}')
 
@@ -155,6 +159,7 @@ class Graph:
                 futures.append(client.call_async(request))
                 ask_again_s = time.monotonic() + timeout_s
             return any(future.done() for future in futures)
+
         self.spin_until(answered, timeout_s, f'answer of {service}')
         return next(future.result() for future in futures if future.done())
 
@@ -171,8 +176,11 @@ class Graph:
 
     def has_stated(self, node, key, value):
         """Return whether a value in the diagnostics of a node was this at any time."""
-        return any((pair.key, pair.value) == (key, value)
-                   for status in self._statuses[node] for pair in status.values)
+        return any(
+            (pair.key, pair.value) == (key, value)
+            for status in self._statuses[node]
+            for pair in status.values
+        )
 
     def value(self, node, key):
         """Return a value in the newest diagnostics of a node; '' while there is none."""

@@ -17,9 +17,13 @@ import sys
 import time
 from typing import NamedTuple
 
-ATTRIBUTES = {'context': 'name version-major version-minor version-git description',
-              'device': 'id name', 'channel': 'id type', 'attribute': 'name filename',
-              'scan-element': 'index format'}
+ATTRIBUTES = {
+    'context': 'name version-major version-minor version-git description',
+    'device': 'id name',
+    'channel': 'id type',
+    'attribute': 'name filename',
+    'scan-element': 'index format',
+}
 """Attributes of the elements of a context, by element."""
 
 
@@ -31,8 +35,11 @@ def declaration(element, attributes):
 
 GRAMMAR = ''.join(declaration(*item) for item in ATTRIBUTES.items())
 """Document type of a context, which libiio demands."""
-CHANNELS = [{'id': 'voltage0', 'label': 'x'}, {'id': 'voltage1', 'label': 'y'},
-            {'id': 'voltage2', 'label': 'supply'}]
+CHANNELS = [
+    {'id': 'voltage0', 'label': 'x'},
+    {'id': 'voltage1', 'label': 'y'},
+    {'id': 'voltage2', 'label': 'supply'},
+]
 """Channels without other ones in the options."""
 FORMAT = 'le:u16/16>>0'
 """Format of a channel without another one."""
@@ -46,7 +53,7 @@ EIO, EINVAL = -5, -22
 
 def code(k, c, bits):
     """Return the right-aligned code, unsigned, of channel c at sample k."""
-    return (k * (2 * c + 1) + 1000 * c) % (2 ** bits - 2) + 1
+    return (k * (2 * c + 1) + 1000 * c) % (2**bits - 2) + 1
 
 
 class Format(NamedTuple):
@@ -75,8 +82,11 @@ class Adc:
         self.channels = [*options.get('channels', CHANNELS)]
         # libiio numbers the channels of the buffer first, with the time stamps as the last one.
         self.stamp_index = sum(not channel.get('unbuffered') for channel in self.channels)
-        self.attributes = {'sampling_frequency': str(self.rate),
-                           'current_timestamp_clock': 'realtime', **options.get('attributes', {})}
+        self.attributes = {
+            'sampling_frequency': str(self.rate),
+            'current_timestamp_clock': 'realtime',
+            **options.get('attributes', {}),
+        }
         self.offset_ns = options.get('offset_ns', 7_000_000_000)
         self.drift = 1 + options.get('ppm', 0) * 1e-6
         # A server that is started again has the same device.
@@ -135,29 +145,40 @@ class Adc:
         value = code(k, i, form.bits)
         if form.sign == 's':
             value -= 2 ** (form.bits - 1)
-        value = (value % 2 ** form.bits) << form.shift
+        value = (value % 2**form.bits) << form.shift
         return value.to_bytes(form.stored // 8, 'big' if form.order == 'be' else 'little')
 
     def channel_xml(self, i):
         channel = self.channels[i]
-        names = [name for name in ('label', 'offset', 'scale', 'raw')
-                 if name in channel or name in DEFAULTS]
+        names = [
+            name
+            for name in ('label', 'offset', 'scale', 'raw')
+            if name in channel or name in DEFAULTS
+        ]
         attributes = ''.join(
-            f'<attribute name="{name}" filename="in_{channel["id"]}_{name}" />' for name in names)
+            f'<attribute name="{name}" filename="in_{channel["id"]}_{name}" />' for name in names
+        )
         scan = '' if channel.get('unbuffered') else scan_xml(i, channel.get('format', FORMAT))
         return f'<channel id="{channel["id"]}" type="input">{scan}{attributes}</channel>'
 
     def xml(self):
         channels = ''.join(map(self.channel_xml, range(len(self.channels))))
-        stamp = '' if self.options.get('unstamped') else (
-            '<channel id="timestamp" type="input">'
-            f'{scan_xml(self.stamp_index, STAMP_FORMAT)}</channel>')
+        stamp = (
+            ''
+            if self.options.get('unstamped')
+            else (
+                '<channel id="timestamp" type="input">'
+                f'{scan_xml(self.stamp_index, STAMP_FORMAT)}</channel>'
+            )
+        )
         attributes = ''.join(f'<attribute name="{name}" />' for name in self.attributes)
-        return (f'<?xml version="1.0" encoding="utf-8"?><!DOCTYPE context [{GRAMMAR}]>'
-                '<context name="network" version-major="0" version-minor="24" '
-                'version-git="v0.24" description="fixture">'
-                f'<device id="iio:device0" name="adc">{channels}{stamp}{attributes}</device>'
-                '</context>').encode()
+        return (
+            f'<?xml version="1.0" encoding="utf-8"?><!DOCTYPE context [{GRAMMAR}]>'
+            '<context name="network" version-major="0" version-minor="24" '
+            'version-git="v0.24" description="fixture">'
+            f'<device id="iio:device0" name="adc">{channels}{stamp}{attributes}</device>'
+            '</context>'
+        ).encode()
 
     def read(self, words):
         """Return the text of an attribute, or an error number."""

@@ -51,8 +51,9 @@ def half_sent(number):
 
 
 def children(pid):
-    listed = subprocess.run(['pgrep', '-P', str(pid), '-f', 'spawn_main'], capture_output=True,
-                            text=True, check=False).stdout.split()
+    listed = subprocess.run(
+        ['pgrep', '-P', str(pid), '-f', 'spawn_main'], capture_output=True, text=True, check=False
+    ).stdout.split()
     return [int(word) for word in listed]
 
 
@@ -74,17 +75,28 @@ class DaskCluster:
 
     def _start(self, module, *words):
         environment = os.environ | {'PYTHONPATH': os.pathsep.join([str(SUPPORT), *sys.path])}
-        return subprocess.Popen([sys.executable, '-m', f'distributed.cli.{module}', *words,
-                                 '--no-dashboard'], env=environment, cwd=self._folder,
-                                stdout=self._log, stderr=self._log)
+        return subprocess.Popen(
+            [sys.executable, '-m', f'distributed.cli.{module}', *words, '--no-dashboard'],
+            env=environment,
+            cwd=self._folder,
+            stdout=self._log,
+            stderr=self._log,
+        )
 
     def _scheduler(self):
         port = self.address.rpartition(':')[2]
         return self._start('dask_scheduler', '--host', '127.0.0.1', '--port', port)
 
     def _worker(self):
-        return self._start('dask_worker', self.address, '--nthreads', '1', '--no-nanny',
-                           '--local-directory', str(self._folder))
+        return self._start(
+            'dask_worker',
+            self.address,
+            '--nthreads',
+            '1',
+            '--no-nanny',
+            '--local-directory',
+            str(self._folder),
+        )
 
     def kill_worker(self, number):
         self._end(self.workers[number])

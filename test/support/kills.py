@@ -22,10 +22,25 @@ from processes import executable
 from units import drawn, nominal
 
 SIM = ('-p', 'use_sim_time:=true')
-SWEEP = ('-p', 'autostart:=true', '-p', 'sweep.planes_deg:=[90.0]',
-         '-p', 'sweep.step_deg:=90.0', '-p', 'sweep.dwell_s:=0.5', '-p',
-         'sweep.check_poses:=2', '-p', 'output:=unit.yaml', '-p', 'store:=store', '-p',
-         'report:=report', *RELIABLE)
+SWEEP = (
+    '-p',
+    'autostart:=true',
+    '-p',
+    'sweep.planes_deg:=[90.0]',
+    '-p',
+    'sweep.step_deg:=90.0',
+    '-p',
+    'sweep.dwell_s:=0.5',
+    '-p',
+    'sweep.check_poses:=2',
+    '-p',
+    'output:=unit.yaml',
+    '-p',
+    'store:=store',
+    '-p',
+    'report:=report',
+    *RELIABLE,
+)
 _TIMEOUT_S = 90.0
 """Longest wait for the moment of a kill, s."""
 _DELAYS_S = {'poses': 2.0, 'fit': 1.0, 'write': 0.005, 'end': 0.0}
@@ -53,16 +68,28 @@ class Sweeps:
         parameter_file.save(self.folder / 'bare.yaml', base)
         self._kept_poses, self._written = {}, ''
         self._stored, self._unfinished_before = set(), set()
-        self._others = [self._start('driver', 'truth.yaml', '-p', 'link.type:=sim', '-p',
-                                    'link.speed:=10.0'),
-                        self._start('stage', 'bare.yaml', '-p', 'slew_rate_rad_s:=6.0')]
+        self._others = [
+            self._start('driver', 'truth.yaml', '-p', 'link.type:=sim', '-p', 'link.speed:=10.0'),
+            self._start('stage', 'bare.yaml', '-p', 'slew_rate_rad_s:=6.0'),
+        ]
 
     def _start(self, name, file, *arguments):
         with open(self.folder / f'{name}.log', 'wb') as log:
             return subprocess.Popen(
-                [executable(name), '--ros-args', '--params-file', self.folder / file, *SIM,
-                 *arguments], env=self.env, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=log,
-                stderr=subprocess.STDOUT)
+                [
+                    executable(name),
+                    '--ros-args',
+                    '--params-file',
+                    self.folder / file,
+                    *SIM,
+                    *arguments,
+                ],
+                env=self.env,
+                cwd=self.folder,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
 
     def end(self):
         for process in self._others:
@@ -77,8 +104,10 @@ class Sweeps:
         node = self._start('calibration', 'bare.yaml', *SWEEP)
         began_s, log = time.monotonic(), self.folder / 'calibration.log'
         try:
-            while not self._has_come(moment, log.read_text(errors='replace')) \
-                    and time.monotonic() - began_s < _TIMEOUT_S:
+            while (
+                not self._has_come(moment, log.read_text(errors='replace'))
+                and time.monotonic() - began_s < _TIMEOUT_S
+            ):
                 time.sleep(0.005 if moment != 'write' else 0.001)
             time.sleep(delay_s)
         finally:
@@ -101,8 +130,11 @@ class Sweeps:
         while True:
             # A folder may be finished while the search looks into it.
             with suppress(FileNotFoundError):
-                return {path for pattern in ('.unit*.part', '*/.*.part', 'store/K1/.*.part')
-                        for path in self.folder.glob(pattern)}
+                return {
+                    path
+                    for pattern in ('.unit*.part', '*/.*.part', 'store/K1/.*.part')
+                    for path in self.folder.glob(pattern)
+                }
 
     def _check(self, output):
         acknowledged = [int(n) - 1 for n in re.findall(r'pose (\d+) is on disk', output)]
@@ -115,7 +147,8 @@ class Sweeps:
             self.in_fit += 1
         if self._unfinished_before & unfinished:
             self.broken.append(
-                f'kill {self.kills}: not cleared: {self._unfinished_before & unfinished}')
+                f'kill {self.kills}: not cleared: {self._unfinished_before & unfinished}'
+            )
         self._unfinished_before = unfinished
         try:
             self._check_poses(acknowledged)
@@ -125,8 +158,10 @@ class Sweeps:
 
     def _check_poses(self, acknowledged):
         entries = sweep_journal.read(self.folder / 'unit.yaml.journal').entries
-        kept = {entry.pose: json.dumps(entry.to_json())
-                for entry in sweep_journal.accepted_poses(entries)}
+        kept = {
+            entry.pose: json.dumps(entry.to_json())
+            for entry in sweep_journal.accepted_poses(entries)
+        }
         missing = [n for n in {*self._kept_poses, *acknowledged} if n not in kept]
         changed = [n for n in self._kept_poses if n in kept and kept[n] != self._kept_poses[n]]
         if missing or changed:

@@ -42,18 +42,26 @@ class MadeUpFleet:
         refused = rng.uniform(size=n) < self.refused
         done = ~refused
         drift_v = np.where(unit == 3, self.drifting_mg * 1e-3 * year, 0.0)
-        columns = {'url': [f'/data/stage{s}/{name}/{i:06d}.mcap'
-                           for i, (s, name) in enumerate(zip(stage, serial))],
-                   'hash': [f'{i:064x}' for i in range(n)], 'serial': serial,
-                   'date': (year * 31_557_600e6 + 1_750_000_000e6).astype('datetime64[us]'),
-                   'outcome': np.where(refused, 'refused', 'done'),
-                   'refused_by': np.where(refused, 'diagnose', None),
-                   'refusal': [f'{i:06d}.mcap: line {3 * i}: no time stamp' if bad else None
-                               for i, bad in enumerate(refused)],
-                   'calibration_id': [f'{name}-{int(b)}' for name, b in zip(serial, second)],
-                   'calibration_age_days': 365.25 * age_year,
-                   'duration_s': np.full(n, 60.0), 'version': ['0.1.0'] * n,
-                   'seconds': rng.uniform(5, 20, n)}
+        columns = {
+            'url': [
+                f'/data/stage{s}/{name}/{i:06d}.mcap'
+                for i, (s, name) in enumerate(zip(stage, serial))
+            ],
+            'hash': [f'{i:064x}' for i in range(n)],
+            'serial': serial,
+            'date': (year * 31_557_600e6 + 1_750_000_000e6).astype('datetime64[us]'),
+            'outcome': np.where(refused, 'refused', 'done'),
+            'refused_by': np.where(refused, 'diagnose', None),
+            'refusal': [
+                f'{i:06d}.mcap: line {3 * i}: no time stamp' if bad else None
+                for i, bad in enumerate(refused)
+            ],
+            'calibration_id': [f'{name}-{int(b)}' for name, b in zip(serial, second)],
+            'calibration_age_days': 365.25 * age_year,
+            'duration_s': np.full(n, 60.0),
+            'version': ['0.1.0'] * n,
+            'seconds': rng.uniform(5, 20, n),
+        }
         for axis in 'xy':
             level = (2.5 + rng.normal(0, 0.02, m))[unit] + drift_v * (axis == 'x')
             zero_g = level + rng.normal(0, 4e-4, n)
@@ -68,22 +76,31 @@ class MadeUpFleet:
             columns[f'noise_n_{axis}_mps2_per_rthz'] = noise
             columns[f'noise_n_low_{axis}_mps2_per_rthz'] = 0.97 * noise
             columns[f'noise_n_high_{axis}_mps2_per_rthz'] = 1.03 * noise
-        gap_mg = np.hypot(0.6, np.abs(rng.normal(0.5, 0.1, m))[unit] + 2.0 * in_batch
-                          + 1e3 * drift_v / SCALE_V_PER_G) * (1 + rng.normal(0, 0.05, n))
-        columns |= {'gap_before_mps2': gap_mg * MPS2_PER_MG,
-                    'gap_before_low_mps2': 0.95 * gap_mg * MPS2_PER_MG,
-                    'gap_before_high_mps2': 1.05 * gap_mg * MPS2_PER_MG,
-                    'gap_floor_mps2': np.full(n, 0.6 * MPS2_PER_MG)}
+        gap_mg = np.hypot(
+            0.6,
+            np.abs(rng.normal(0.5, 0.1, m))[unit] + 2.0 * in_batch + 1e3 * drift_v / SCALE_V_PER_G,
+        ) * (1 + rng.normal(0, 0.05, n))
+        columns |= {
+            'gap_before_mps2': gap_mg * MPS2_PER_MG,
+            'gap_before_low_mps2': 0.95 * gap_mg * MPS2_PER_MG,
+            'gap_before_high_mps2': 1.05 * gap_mg * MPS2_PER_MG,
+            'gap_floor_mps2': np.full(n, 0.6 * MPS2_PER_MG),
+        }
         effects = []
         for i in range(n):
             named = ['temperature_bias'] if in_batch[i] and rng.uniform() < 0.9 else []
             named += ['stage_eccentricity'] if self.stage_fault and stage[i] == 2 else []
-            named += [str(rng.choice(['bias_walk', 'lever_arm', 'flicker', 'hysteresis']))] \
-                if rng.uniform() < 0.03 else []
+            named += (
+                [str(rng.choice(['bias_walk', 'lever_arm', 'flicker', 'hysteresis']))]
+                if rng.uniform() < 0.03
+                else []
+            )
             effects.append(named if done[i] else [])
         columns['effects'] = effects
-        columns['status'] = [('explained' if named else 'no_gap') if ok else None
-                             for named, ok in zip(effects, done)]
+        columns['status'] = [
+            ('explained' if named else 'no_gap') if ok else None
+            for named, ok in zip(effects, done)
+        ]
         return write_columns(folder, columns, done)
 
 
@@ -96,8 +113,11 @@ def write_columns(folder, columns, done):
         if values is None:
             arrays.append(pa.nulls(n, field.type))
             continue
-        missing = None if field.type != pa.float64() or field.name == 'calibration_age_days' \
+        missing = (
+            None
+            if field.type != pa.float64() or field.name == 'calibration_age_days'
             else ~np.asarray(done)
+        )
         arrays.append(pa.array(values, field.type, mask=missing, from_pandas=True))
     path = folder / 'fleet.parquet'
     pq.write_table(pa.Table.from_arrays(arrays, schema=schema), path)

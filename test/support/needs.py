@@ -29,8 +29,10 @@ def summary(reasons: Iterable[str]) -> list[str]:
         packages |= {*apt_package.split()}
     if not counts:
         return []
-    lines = [f'skipped {counts.total()} tests, which need: ' + ', '.join(
-        f'{what} ({count})' for what, count in counts.most_common())]
+    lines = [
+        f'skipped {counts.total()} tests, which need: '
+        + ', '.join(f'{what} ({count})' for what, count in counts.most_common())
+    ]
     if packages:
         lines.append(f'to run them: sudo apt install {" ".join(sorted(packages))}')
     return lines

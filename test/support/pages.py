@@ -9,8 +9,9 @@ from needs import lack
 from processes import PATIENCE
 import pytest
 
-CHROMIUM = next(filter(None, map(shutil.which, (
-    'chromium', 'chromium-browser', 'google-chrome'))), None)
+CHROMIUM = next(
+    filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))), None
+)
 NEEDS_CHROMIUM = pytest.mark.skipif(CHROMIUM is None, reason=lack('Chromium', 'chromium'))
 WIDTHS = (480, 900, 1280)
 """Widths of a phone, a tablet and a laptop, pixels."""
@@ -72,7 +73,8 @@ FAULTS = r"""
 @contextmanager
 def running_browser():
     driver = pytest.importorskip(
-        'playwright.sync_api', reason='playwright is not installed: pip install playwright')
+        'playwright.sync_api', reason='playwright is not installed: pip install playwright'
+    )
     with driver.sync_playwright() as playwright:
         launched = playwright.chromium.launch(executable_path=CHROMIUM, args=['--no-sandbox'])
         yield launched
@@ -91,8 +93,14 @@ def opener(browser):
         messages = []
         page.on('console', lambda message: messages.append(f'{message.type}: {message.text}'))
         page.on('pageerror', lambda error: messages.append(f'error: {error}'))
-        page.on('request', lambda request: messages.append(f'loads {request.url}')
-                if not request.url.startswith(('data:', 'blob:', f'file://{path}')) else None)
+        page.on(
+            'request',
+            lambda request: (
+                messages.append(f'loads {request.url}')
+                if not request.url.startswith(('data:', 'blob:', f'file://{path}'))
+                else None
+            ),
+        )
         page.goto(f'file://{path}')
         return page, messages
 

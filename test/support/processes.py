@@ -23,10 +23,17 @@ import pytest
 
 REPO = Path(__file__).resolve().parents[2]
 """The root of the repository."""
-NEEDS_ROS2 = pytest.mark.skipif(shutil.which('ros2') is None,
-                                reason=lack('ros2 and launch of a sourced ROS 2 Jazzy'))
-TOOLS = sorted({point.name for point in entry_points(group='console_scripts') if point.module
-                .startswith(('adxl_ros.tools.', 'adxl_ros_validation.'))} - {'bench'})
+NEEDS_ROS2 = pytest.mark.skipif(
+    shutil.which('ros2') is None, reason=lack('ros2 and launch of a sourced ROS 2 Jazzy')
+)
+TOOLS = sorted(
+    {
+        point.name
+        for point in entry_points(group='console_scripts')
+        if point.module.startswith(('adxl_ros.tools.', 'adxl_ros_validation.'))
+    }
+    - {'bench'}
+)
 """The command-line tools, as they are installed."""
 PATIENCE = 5
 """How many times longer than on a quiet machine any action may take on a busy one."""
@@ -42,8 +49,11 @@ def wait_until(condition: Callable[[], object], timeout_s: float, purpose: str) 
 
 
 def children(pid: int) -> list[int]:
-    return [int(n) for task in Path(f'/proc/{pid}/task').iterdir()
-            for n in (task / 'children').read_text().split()]
+    return [
+        int(n)
+        for task in Path(f'/proc/{pid}/task').iterdir()
+        for n in (task / 'children').read_text().split()
+    ]
 
 
 @dataclass(frozen=True)
@@ -59,13 +69,17 @@ class Started:
 
     def wait_for(self, text: str, timeout_s: float = 20.0) -> None:
         """Wait until the process has printed `text`; fail after its end or after the time."""
+
         def seen() -> bool:
             ended = self.popen.poll() is not None
             printed = text in self.output()
             if ended and not printed:
-                pytest.fail(f'{self.name} ended with {self.popen.returncode} and without '
-                            f'printing {text!r}:\n{self.output()}')
+                pytest.fail(
+                    f'{self.name} ended with {self.popen.returncode} and without '
+                    f'printing {text!r}:\n{self.output()}'
+                )
             return printed
+
         wait_until(seen, timeout_s, f'{self.name} printing {text!r}')
 
     def wait(self, timeout_s: float = 20.0) -> int:
@@ -100,8 +114,13 @@ def executable(name: str) -> Path:
 
 
 def run_executable(name: str, *args: object, **options: object) -> subprocess.CompletedProcess:
-    return subprocess.run([executable(name), *map(str, args)], text=True, capture_output=True,
-                          stdin=subprocess.DEVNULL, **{'timeout': PATIENCE * 120, **options})
+    return subprocess.run(
+        [executable(name), *map(str, args)],
+        text=True,
+        capture_output=True,
+        stdin=subprocess.DEVNULL,
+        **{'timeout': PATIENCE * 120, **options},
+    )
 
 
 def run_in_process(name: str, *args: object, cwd: Path) -> subprocess.CompletedProcess:
@@ -113,8 +132,11 @@ def run_in_process(name: str, *args: object, cwd: Path) -> subprocess.CompletedP
     (tool,) = entry_points(group='console_scripts', name=name)
     main = tool.load()
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    with (redirect_stdout(StringIO()) as out, redirect_stderr(StringIO()) as err,
-          pytest.MonkeyPatch.context() as patch):
+    with (
+        redirect_stdout(StringIO()) as out,
+        redirect_stderr(StringIO()) as err,
+        pytest.MonkeyPatch.context() as patch,
+    ):
         patch.chdir(cwd)
         patch.setattr(sys, 'argv', [name, *map(str, args)])
         try:

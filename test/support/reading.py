@@ -34,7 +34,11 @@ def refusal(path: Path) -> str:
 
 def growth_mb(path: Path) -> float:
     """Return the growth of memory after the first blocks of a recording, MB."""
-    done = subprocess.run([sys.executable, '-c', GROWTH, path], text=True, check=True,
-                          capture_output=True, env={**os.environ,
-                                                    'PYTHONPATH': os.pathsep.join(sys.path)})
+    done = subprocess.run(
+        [sys.executable, '-c', GROWTH, path],
+        text=True,
+        check=True,
+        capture_output=True,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)},
+    )
     return float(done.stdout) / 1024

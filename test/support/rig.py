@@ -30,8 +30,13 @@ class ScriptProcess:
     def __init__(self, script, *args):
         # The process
         self.popen = subprocess.Popen(
-            [sys.executable, HERE / script, *map(str, args)], text=True, bufsize=1,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+            [sys.executable, HERE / script, *map(str, args)],
+            text=True,
+            bufsize=1,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
         self.first_line = self.popen.stdout.readline().strip()  # Its first line on stdout
 
     def ask(self, line):
@@ -116,6 +121,7 @@ class DriverRig:
         def complete():
             self.collect()
             return len(self.numbers) >= target
+
         self.graph.spin_until(complete, timeout_s, purpose)
 
     def begin_report(self):
@@ -132,27 +138,32 @@ class DriverRig:
         self._settle()
         expected = int(self.numbers[-1] - self.numbers[0]) + 1
         return SampleReport(
-            self.wrong, expected - len(self.numbers),
+            self.wrong,
+            expected - len(self.numbers),
             round(self.diagnostic('missing') - self._counted_before),
-            round(self.diagnostic('missing_estimated') - self._estimated_before))
+            round(self.diagnostic('missing_estimated') - self._estimated_before),
+        )
 
     def _settle(self):
         """Wait for a sample of this moment, and for diagnostics that came after it."""
         self._wait_for_stamp(time.time_ns(), 30, 'a sample of now')
         sampled_ns = time.time_ns()
-        self.graph.spin_until(lambda: self.graph.reported_ns.get('driver', 0) > sampled_ns, 10,
-                              'diagnostics')
+        self.graph.spin_until(
+            lambda: self.graph.reported_ns.get('driver', 0) > sampled_ns, 10, 'diagnostics'
+        )
         self.collect()
 
     def wait_for_recovery(self, back_ns, purpose):
         """Wait for a sample taken after a monotonic time; a second later it is late."""
-        self._wait_for_stamp(back_ns + time.time_ns() - time.monotonic_ns(), 1,
-                             f'a new sample after: {purpose}')
+        self._wait_for_stamp(
+            back_ns + time.time_ns() - time.monotonic_ns(), 1, f'a new sample after: {purpose}'
+        )
 
     def _wait_for_stamp(self, ros_ns, timeout_s, purpose):
         def reached():
             self.collect()
             return len(self.stamps) and self.stamps[-1] >= ros_ns
+
         self.graph.spin_until(reached, timeout_s, purpose)
 
 
@@ -176,8 +187,15 @@ class SerialRig(DriverRig):
         self._raws.clear()
 
     def driver_parameters(self):
-        return [*KEPT, '-p', 'link.type:=serial', '-p', f'link.port:={self.path}', '-p',
-                'link.channels:=x,y,supply']
+        return [
+            *KEPT,
+            '-p',
+            'link.type:=serial',
+            '-p',
+            f'link.port:={self.path}',
+            '-p',
+            'link.channels:=x,y,supply',
+        ]
 
     def identify(self, codes, stamps):
         numbers = self.numbered(codes[:, 0], stamps)
@@ -187,8 +205,13 @@ class SerialRig(DriverRig):
 
     def taken_ns(self, numbers):
         halted_ns = sum(np.where(numbers >= first, ns, 0) for first, ns in self._halts)
-        return (self._origin_ns + time.time_ns() - time.monotonic_ns() + halted_ns
-                + np.rint(numbers * self._period_ns).astype(np.int64))
+        return (
+            self._origin_ns
+            + time.time_ns()
+            - time.monotonic_ns()
+            + halted_ns
+            + np.rint(numbers * self._period_ns).astype(np.int64)
+        )
 
     def command(self, line):
         """Send a command to the board; return the monotonic time at which it is done, ns."""
@@ -214,8 +237,15 @@ class IioRig(DriverRig):
         self.server.kill()
 
     def driver_parameters(self):
-        return [*KEPT, '-p', 'link.type:=iio', '-p', 'link.device:=adc', '-p',
-                f'link.uri:=ip:127.0.0.1:{self._options["port"]}']
+        return [
+            *KEPT,
+            '-p',
+            'link.type:=iio',
+            '-p',
+            'link.device:=adc',
+            '-p',
+            f'link.uri:=ip:127.0.0.1:{self._options["port"]}',
+        ]
 
     def identify(self, codes, stamps):
         numbers = self.numbered(codes[:, 0], stamps)
@@ -223,8 +253,12 @@ class IioRig(DriverRig):
         return numbers, int(wrong.sum())
 
     def taken_ns(self, numbers):
-        return (self._options['began_ns'] + time.time_ns() - time.monotonic_ns()
-                + np.rint(numbers * 1e6).astype(np.int64))
+        return (
+            self._options['began_ns']
+            + time.time_ns()
+            - time.monotonic_ns()
+            + np.rint(numbers * 1e6).astype(np.int64)
+        )
 
 
 def suspend(pid, duration_s, graph):

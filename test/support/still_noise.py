@@ -12,8 +12,14 @@ _TIMES_LONGER = 8
 """Length of the drawn 1/f noise, in lengths of the part that is used. Then it has slow motion."""
 
 
-def still_samples(rng: np.random.Generator, count: int, rate_hz: float, white: float,
-                  instability: float, walk: float) -> np.ndarray:
+def still_samples(
+    rng: np.random.Generator,
+    count: int,
+    rate_hz: float,
+    white: float,
+    instability: float,
+    walk: float,
+) -> np.ndarray:
     """Return samples (n,) with N in u/√Hz, B in u, and K in u/√s."""
     samples = rng.standard_normal(count) * white * np.sqrt(rate_hz)
     samples += np.cumsum(rng.standard_normal(count)) * walk / np.sqrt(rate_hz)
@@ -30,10 +36,17 @@ def flicker(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.fft.irfft(spectrum, longer)[:count]
 
 
-def write_csv(path: Path, time_s: np.ndarray, accel_mps2: np.ndarray, **columns: np.ndarray
-              ) -> Path:
+def write_csv(
+    path: Path, time_s: np.ndarray, accel_mps2: np.ndarray, **columns: np.ndarray
+) -> Path:
     """Write a recording in m/s², (n, m), with further columns."""
-    names = ['time_s', *('ax_mps2', 'ay_mps2', 'az_mps2')[:accel_mps2.shape[1]], *columns]
-    np.savetxt(path, np.column_stack([time_s, accel_mps2, *columns.values()]), fmt='%.12g',
-               delimiter=',', header=','.join(names), comments='')
+    names = ['time_s', *('ax_mps2', 'ay_mps2', 'az_mps2')[: accel_mps2.shape[1]], *columns]
+    np.savetxt(
+        path,
+        np.column_stack([time_s, accel_mps2, *columns.values()]),
+        fmt='%.12g',
+        delimiter=',',
+        header=','.join(names),
+        comments='',
+    )
     return path

@@ -32,9 +32,15 @@ class Terminal:
         self.slave = slave
         self.before = termios.tcgetattr(slave)
         self.popen = subprocess.Popen(
-            command, env={**env, 'TERM': 'xterm-256color'}, cwd=cwd, stdin=slave, stdout=slave,
-            stderr=slave, start_new_session=True,
-            preexec_fn=(lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0)) if controls else None)
+            command,
+            env={**env, 'TERM': 'xterm-256color'},
+            cwd=cwd,
+            stdin=slave,
+            stdout=slave,
+            stderr=slave,
+            start_new_session=True,
+            preexec_fn=(lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0)) if controls else None,
+        )
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
@@ -75,8 +81,9 @@ class Terminal:
             if all(text in unfolded for text in expected):
                 return screen
             if time.monotonic() > end_s:
-                pytest.fail(f'no {texts} on the screen after {PATIENCE} times {timeout_s} s:\n'
-                            f'{screen}')
+                pytest.fail(
+                    f'no {texts} on the screen after {PATIENCE} times {timeout_s} s:\n{screen}'
+                )
             time.sleep(0.05)
 
     def wait(self, timeout_s=20.0):

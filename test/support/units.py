@@ -26,8 +26,10 @@ PLANES_RAD = np.radians([30, 60, 90, 120, 150])
 def nominal(axes='xy', **changes):
     sensor = parameter_file.load(NOMINAL)
     count = len(axes)
-    arrays = {name: np.full(count, getattr(sensor, name)[0]) for name in (
-        'nominal_zero_g_v', 'nominal_scale_v_per_g', 'noise_density_g_per_rthz')}
+    arrays = {
+        name: np.full(count, getattr(sensor, name)[0])
+        for name in ('nominal_zero_g_v', 'nominal_scale_v_per_g', 'noise_density_g_per_rthz')
+    }
     return replace(sensor, axes=axes, **{'z_sign': 1, **arrays, **changes})
 
 
@@ -40,39 +42,55 @@ def drawn(rng, sensor, effects=EFFECTS):
     """Draw a unit at datasheet spread, in the gauge of the fits."""
     values = {}
     for name in effects:
-        values[name] = {p.name: np.array([
-            rng.normal() * 0.5 * p.scale
-            * (a in p.axes and (name, p.name) not in {('cross_axis', 'linear'),
-                                                      ('cross_axis_z', 'linear')})
-            for a in sensor.axes]) if p.axes else np.array(rng.normal() * p.scale)
-            for p in effect_named(name).parameters}
+        values[name] = {
+            p.name: np.array(
+                [
+                    rng.normal()
+                    * 0.5
+                    * p.scale
+                    * (
+                        a in p.axes
+                        and (name, p.name)
+                        not in {('cross_axis', 'linear'), ('cross_axis_z', 'linear')}
+                    )
+                    for a in sensor.axes
+                ]
+            )
+            if p.axes
+            else np.array(rng.normal() * p.scale)
+            for p in effect_named(name).parameters
+        }
     return replace(sensor, effects=tuple(effects), values=values)
 
 
-def swept(rng, truth, planes_rad=PLANES_RAD, check_poses=16, noisy=True, per_setting=False,
-          targets=None):
+def swept(
+    rng, truth, planes_rad=PLANES_RAD, check_poses=16, noisy=True, per_setting=False, targets=None
+):
     """
     Sweep a unit: poses with the noise of 5 s means, on a stage with an error within a step.
 
     A joint draws its error in each pose, or with `per_setting` only after each move.
     """
     targets = targets or sweep(planes_rad, np.radians(30), check_poses)
-    alpha, beta = (np.array([getattr(t, name) for t in targets])
-                   for name in ('alpha_rad', 'beta_rad'))
+    alpha, beta = (
+        np.array([getattr(t, name) for t in targets]) for name in ('alpha_rad', 'beta_rad')
+    )
     slack = truth.stage_resolution_rad * noisy
 
     def error(angle):
         drawn = slack * rng.uniform(-0.5, 0.5, len(angle))
         setting = np.cumsum(np.abs(np.diff(angle, prepend=angle[0])) > 1e-9)
         return drawn[setting] if per_setting else drawn
+
     joint_error = error(alpha), error(beta)
     force = stage_force(truth, alpha + joint_error[0], beta + joint_error[1])
     volts = np.column_stack(signal_chain.static_response(truth)(force))
     count = noise.effective_samples(5000, 1e-3, truth.rc_s)
     std = np.broadcast_to(noise.sample_std_v(truth) / np.sqrt(count), volts.shape)
     volts = volts + noisy * std * rng.normal(size=volts.shape)
-    return Poses(volts, std, alpha, beta, np.zeros((len(alpha), 2)),
-                 np.array([t.check for t in targets]))
+    return Poses(
+        volts, std, alpha, beta, np.zeros((len(alpha), 2)), np.array([t.check for t in targets])
+    )
 
 
 class Fed:
@@ -80,8 +98,11 @@ class Fed:
 
     def __init__(self, sensor, seed=0):
         self.rate_hz, self.count = sensor.rate_hz, 0
-        self.respond = Response(sensor, Motion(np.inf, force=lambda at_s: self.force,
-                                               internal_rate_hz=sensor.rate_hz), seed)
+        self.respond = Response(
+            sensor,
+            Motion(np.inf, force=lambda at_s: self.force, internal_rate_hz=sensor.rate_hz),
+            seed,
+        )
 
     def __call__(self, force):
         """Return the volts at a specific force of three components, m/s², each (n,)."""
@@ -94,9 +115,19 @@ class Fed:
 
 def pose_record(pose, **changes):
     """Return a pose record of a journal; by default the sensor is level."""
-    return PoseRecord(**{'pose': pose, 'alpha_rad': 0.0, 'beta_rad': 0.0, 'start_ns': pose,
-                         'stop_ns': pose, 'samples': 1000, 'mean_v': (2.5, 2.5),
-                         'std_v': (1e-4, 1e-4), **changes})
+    return PoseRecord(
+        **{
+            'pose': pose,
+            'alpha_rad': 0.0,
+            'beta_rad': 0.0,
+            'start_ns': pose,
+            'stop_ns': pose,
+            'samples': 1000,
+            'mean_v': (2.5, 2.5),
+            'std_v': (1e-4, 1e-4),
+            **changes,
+        }
+    )
 
 
 class Bench:
@@ -112,9 +143,12 @@ class Bench:
         """Hold the angles, rad, for some seconds; return the first accepted pose."""
         for _ in range(round(seconds / 0.05)):
             time = np.arange(50) / 1000
-            force = specific_force(np.full(50, alpha), np.full(50, beta), 9.80665,
-                                   shake_mps2 * np.sin(2 * np.pi * 7 * (
-                                       self.now_ns % 10 ** 9 * 1e-9 + time)))
+            force = specific_force(
+                np.full(50, alpha),
+                np.full(50, beta),
+                9.80665,
+                shake_mps2 * np.sin(2 * np.pi * 7 * (self.now_ns % 10**9 * 1e-9 + time)),
+            )
             volts = self.fed(force)
             stamps = self.now_ns + np.arange(50) * 1_000_000
             if encoder:

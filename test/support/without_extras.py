@@ -11,8 +11,19 @@ import sys
 from processes import PATIENCE
 
 # Packages with an import name that differs from the distribution, or without an entry in setup.py.
-OTHERS = ('PIL', 'arch', 'iio', 'jinja2', 'mcap', 'numba', 'rosbag2_py',
-          'ruamel', 'serial', 'sklearn', 'tqdm')
+OTHERS = (
+    'PIL',
+    'arch',
+    'iio',
+    'jinja2',
+    'mcap',
+    'numba',
+    'rosbag2_py',
+    'ruamel',
+    'serial',
+    'sklearn',
+    'tqdm',
+)
 
 BLOCK = """
 import json, sys
@@ -35,5 +46,9 @@ def extras() -> set[str]:
 
 def run_without_extras(code: str, *args: str) -> subprocess.CompletedProcess:
     blocked = json.dumps(sorted(extras().union(OTHERS)))
-    return subprocess.run([sys.executable, '-c', BLOCK + code, blocked, *args], text=True,
-                          capture_output=True, timeout=60 * PATIENCE)
+    return subprocess.run(
+        [sys.executable, '-c', BLOCK + code, blocked, *args],
+        text=True,
+        capture_output=True,
+        timeout=60 * PATIENCE,
+    )

@@ -27,9 +27,24 @@ pytestmark = pytest.mark.long
 
 G = 9.80665
 COLUMNS = [
-    'time_s', 'ax_mps2', 'ay_mps2', 'az_mps2', 'ax_std_mps2', 'ay_std_mps2', 'az_std_mps2',
-    'roll_rad', 'pitch_rad', 'inclination_rad', 'roll_std_rad', 'pitch_std_rad',
-    'inclination_std_rad', 'alpha_rad', 'beta_rad', 'alpha_std_rad', 'beta_std_rad']
+    'time_s',
+    'ax_mps2',
+    'ay_mps2',
+    'az_mps2',
+    'ax_std_mps2',
+    'ay_std_mps2',
+    'az_std_mps2',
+    'roll_rad',
+    'pitch_rad',
+    'inclination_rad',
+    'roll_std_rad',
+    'pitch_std_rad',
+    'inclination_std_rad',
+    'alpha_rad',
+    'beta_rad',
+    'alpha_std_rad',
+    'beta_std_rad',
+]
 ALPHA, BETA = np.radians([20, 70, 50, 35]), np.radians([10, -100, 150, 60])
 
 RunTool = Callable[..., subprocess.CompletedProcess]
@@ -37,16 +52,28 @@ RunTool = Callable[..., subprocess.CompletedProcess]
 
 def unit(axes: str = 'xy') -> Sensor:
     sensor = replace(drawn(np.random.default_rng(1), nominal(axes)), serial='17')
-    return replace(sensor, covariance=1e-6 * np.eye(len(axes)),
-                   covariance_names=tuple(Coefficient('bias', 'offset_v', a) for a in axes))
+    return replace(
+        sensor,
+        covariance=1e-6 * np.eye(len(axes)),
+        covariance_names=tuple(Coefficient('bias', 'offset_v', a) for a in axes),
+    )
 
 
-def record(folder: Path, sensor: Sensor, volts: np.ndarray, info: dict[str, str] | None = None,
-           units: str = 'v') -> Path:
+def record(
+    folder: Path,
+    sensor: Sensor,
+    volts: np.ndarray,
+    info: dict[str, str] | None = None,
+    units: str = 'v',
+) -> Path:
     data = volts if units == 'v' else to_nominal_mps2(volts, sensor)
     names = ('x_v', 'y_v', 'z_v') if units == 'v' else ('ax_mps2', 'ay_mps2', 'az_mps2')
-    part = Recording('made', 10 + np.arange(len(volts)) / 1000, dict(zip(names, data.T)),
-                     sensor_info(sensor) if info is None else info)
+    part = Recording(
+        'made',
+        10 + np.arange(len(volts)) / 1000,
+        dict(zip(names, data.T)),
+        sensor_info(sensor) if info is None else info,
+    )
     recording.write(folder / 'made.csv', part, sensor)
     parameter_file.save(folder / 'unit.yaml', sensor)
     return folder / 'made.csv'
@@ -57,8 +84,14 @@ def volts_of(sensor: Sensor, alpha: np.ndarray = ALPHA, beta: np.ndarray = BETA)
 
 
 def applied(run_tool: RunTool, path: Path, parameters: Path | None = None) -> tuple:
-    done = run_tool('apply', path, '--params', parameters or path.with_name('unit.yaml'),
-                    '-o', path.with_name('out.csv'))
+    done = run_tool(
+        'apply',
+        path,
+        '--params',
+        parameters or path.with_name('unit.yaml'),
+        '-o',
+        path.with_name('out.csv'),
+    )
     assert done.returncode == 0, done.stderr
     with open(path.with_name('out.csv'), encoding='utf-8', newline='') as file:
         rows = list(csv.reader(file))
@@ -73,8 +106,9 @@ def numbers(table: dict, *names: str) -> np.ndarray:
 
 @pytest.mark.parametrize('axes', ['xy', 'xyz'])
 @pytest.mark.parametrize('units', ['v', 'mps2'])
-def test_force_and_angles_are_recovered(run_tool: RunTool, tmp_path: Path, axes: str,
-                                        units: str) -> None:
+def test_force_and_angles_are_recovered(
+    run_tool: RunTool, tmp_path: Path, axes: str, units: str
+) -> None:
     sensor = unit(axes)
     table, messages = applied(run_tool, record(tmp_path, sensor, volts_of(sensor), units=units))
     assert messages == ''
@@ -82,8 +116,9 @@ def test_force_and_angles_are_recovered(run_tool: RunTool, tmp_path: Path, axes:
     np.testing.assert_allclose(numbers(table, 'ax_mps2', 'ay_mps2', 'az_mps2'), force, atol=1e-9)
     np.testing.assert_allclose(numbers(table, 'alpha_rad', 'beta_rad'), [ALPHA, BETA], atol=1e-9)
     expected = [np.arctan2(force[1], force[2]), np.arctan2(-force[0], np.hypot(*force[1:])), ALPHA]
-    np.testing.assert_allclose(numbers(table, 'roll_rad', 'pitch_rad', 'inclination_rad'),
-                               expected, atol=1e-9)
+    np.testing.assert_allclose(
+        numbers(table, 'roll_rad', 'pitch_rad', 'inclination_rad'), expected, atol=1e-9
+    )
     assert numbers(table, 'time_s').tolist() == [[10.0, 10.001, 10.002, 10.003]]
     std = numbers(table, *(name for name in COLUMNS if '_std_' in name))
     assert (std > 0).all()
@@ -93,8 +128,14 @@ def test_force_and_angles_are_recovered(run_tool: RunTool, tmp_path: Path, axes:
 
 def test_unobservable_angles_are_empty_cells(run_tool: RunTool, tmp_path: Path) -> None:
     sensor = replace(unit(), mounting={'rpy_rad': [0.1, 0.0, 0.0]})
-    table, messages = applied(run_tool, record(tmp_path, sensor, volts_of(
-        sensor, np.array([0.0, np.pi / 2, np.pi / 2]), np.array([1.0, 0.0, np.pi]))))
+    table, messages = applied(
+        run_tool,
+        record(
+            tmp_path,
+            sensor,
+            volts_of(sensor, np.array([0.0, np.pi / 2, np.pi / 2]), np.array([1.0, 0.0, np.pi])),
+        ),
+    )
     assert 'those of the case: only the compensation turns them' in messages
     assert [text == '' for text in table['beta_rad']] == [True, False, False]
     assert [text == 'inf' for text in table['beta_std_rad']] == [True, False, False]
@@ -104,8 +145,9 @@ def test_unobservable_angles_are_empty_cells(run_tool: RunTool, tmp_path: Path) 
     assert numbers(table, 'beta_rad')[0, 2] == pytest.approx(np.pi, abs=1e-3)
 
 
-def test_samples_without_a_solution_are_kept_and_counted(run_tool: RunTool,
-                                                         tmp_path: Path) -> None:
+def test_samples_without_a_solution_are_kept_and_counted(
+    run_tool: RunTool, tmp_path: Path
+) -> None:
     sensor = unit()
     volts = np.vstack([volts_of(sensor), [[20.0, 2.0]], [[0.0, 2.5]], volts_of(sensor)])
     table, messages = applied(run_tool, record(tmp_path, sensor, volts))
@@ -124,8 +166,11 @@ def test_samples_without_a_solution_are_kept_and_counted(run_tool: RunTool,
 def refused(run_tool: RunTool, path: Path, *options: object) -> str:
     """Assert that `apply` has status 1, one line on stderr and no output; return the line."""
     before = {p: p.read_bytes() for p in path.parent.iterdir() if p.is_file()}
-    done = run_tool('apply', path, *(options or (
-        '--params', path.with_name('unit.yaml'), '-o', path.with_name('out.csv'))))
+    done = run_tool(
+        'apply',
+        path,
+        *(options or ('--params', path.with_name('unit.yaml'), '-o', path.with_name('out.csv'))),
+    )
     assert done.returncode == 1
     assert done.stdout == ''
     assert done.stderr.count('\n') == 1
@@ -134,11 +179,16 @@ def refused(run_tool: RunTool, path: Path, *options: object) -> str:
     return done.stderr
 
 
-@pytest.mark.parametrize(('key', 'value', 'message'), [
-    ('serial', '18', 'is of the sensor 18, but the parameters are of 17'),
-    ('nominal_zero_g_v', 'two, 2.5', 'nominal_zero_g_v')])
-def test_another_unit_is_refused(run_tool: RunTool, tmp_path: Path, key: str, value: str,
-                                 message: str) -> None:
+@pytest.mark.parametrize(
+    ('key', 'value', 'message'),
+    [
+        ('serial', '18', 'is of the sensor 18, but the parameters are of 17'),
+        ('nominal_zero_g_v', 'two, 2.5', 'nominal_zero_g_v'),
+    ],
+)
+def test_another_unit_is_refused(
+    run_tool: RunTool, tmp_path: Path, key: str, value: str, message: str
+) -> None:
     sensor = unit()
     path = record(tmp_path, sensor, volts_of(sensor), {**sensor_info(sensor), key: value})
     reason = refused(run_tool, path)
@@ -171,17 +221,37 @@ runpy.run_path(sys.argv[0], run_name='__main__')
 """
 
 
-@pytest.mark.parametrize(('number', 'status', 'output'), [
-    (signal.SIGINT, 130, 'out.csv'), (signal.SIGTERM, 143, 'out.csv'),
-    (signal.SIGINT, 130, 'out.mcap'), (signal.SIGINT, 130, 'out')])
-def test_an_interruption_leaves_no_output(tmp_path: Path, number: int, status: int, output: str
-                                          ) -> None:
+@pytest.mark.parametrize(
+    ('number', 'status', 'output'),
+    [
+        (signal.SIGINT, 130, 'out.csv'),
+        (signal.SIGTERM, 143, 'out.csv'),
+        (signal.SIGINT, 130, 'out.mcap'),
+        (signal.SIGINT, 130, 'out'),
+    ],
+)
+def test_an_interruption_leaves_no_output(
+    tmp_path: Path, number: int, status: int, output: str
+) -> None:
     sensor = unit()
     path = record(tmp_path, sensor, volts_of(sensor))
     done = subprocess.run(
-        [sys.executable, '-c', INTERRUPTED, str(int(number)), executable('apply'), path,
-         '--params', tmp_path / 'unit.yaml', '-o', tmp_path / output],
-        stderr=subprocess.PIPE, text=True, timeout=60 * PATIENCE)
+        [
+            sys.executable,
+            '-c',
+            INTERRUPTED,
+            str(int(number)),
+            executable('apply'),
+            path,
+            '--params',
+            tmp_path / 'unit.yaml',
+            '-o',
+            tmp_path / output,
+        ],
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=60 * PATIENCE,
+    )
     assert done.returncode == status
     assert done.stderr.count('\n') <= 1
     assert 'Traceback' not in done.stderr
@@ -208,7 +278,7 @@ def messages_of(path: Path, kinds: dict[str, str]) -> dict[str, list]:
         for connection, stamp_ns, raw in bag.messages():
             message = store.deserialize_cdr(raw, connection.msgtype)
             stamp = message.header.stamp
-            assert stamp.sec * 10 ** 9 + stamp.nanosec == stamp_ns
+            assert stamp.sec * 10**9 + stamp.nanosec == stamp_ns
             assert message.header.frame_id == 'imu_link'
             messages[connection.topic].append(message)
     return messages
@@ -217,33 +287,49 @@ def messages_of(path: Path, kinds: dict[str, str]) -> dict[str, list]:
 def test_a_bag_holds_the_estimates_of_the_table(run_tool: RunTool, tmp_path: Path) -> None:
     """A sample without a solution is left out, and an angle that is not shown keeps its value."""
     sensor = unit()
-    volts = np.vstack([volts_of(sensor), [[20.0, 2.0]], [[0.0, 2.5]], volts_of(
-        sensor, np.array([np.pi / 2, 0.4]), np.array([0.2, 0.3]))])
+    volts = np.vstack(
+        [
+            volts_of(sensor),
+            [[20.0, 2.0]],
+            [[0.0, 2.5]],
+            volts_of(sensor, np.array([np.pi / 2, 0.4]), np.array([0.2, 0.3])),
+        ]
+    )
     path = record(tmp_path, sensor, volts)
     table, _ = applied(run_tool, path)
     recording.write(tmp_path / 'made.mcap', recording.read(path), sensor)
     kept = [i for i in range(len(volts)) if i != 4]
-    for source, output in (('made.csv', 'out.mcap'), ('made.csv', 'folder'),
-                           ('made.mcap', 'again.mcap')):
-        done = run_tool('apply', tmp_path / source, '--params', tmp_path / 'unit.yaml', '-o',
-                        tmp_path / output)
+    for source, output in (
+        ('made.csv', 'out.mcap'),
+        ('made.csv', 'folder'),
+        ('made.mcap', 'again.mcap'),
+    ):
+        done = run_tool(
+            'apply', tmp_path / source, '--params', tmp_path / 'unit.yaml', '-o', tmp_path / output
+        )
         assert done.returncode == 0, done.stderr
         assert '1 of 8 samples have no solution: their cells are empty' in done.stderr
         assert '1 of 8 samples have the ADC at its rail: ' in done.stderr
         assert str(tmp_path / output) in done.stdout
-        topics = messages_of(tmp_path / output, {
-            '/imu/data': 'sensor_msgs/msg/Imu', '/tilt': 'geometry_msgs/msg/Vector3Stamped'})
+        topics = messages_of(
+            tmp_path / output,
+            {'/imu/data': 'sensor_msgs/msg/Imu', '/tilt': 'geometry_msgs/msg/Vector3Stamped'},
+        )
         imu, tilt = topics['/imu/data'], topics['/tilt']
         stamps_s = [m.header.stamp.sec + m.header.stamp.nanosec * 1e-9 for m in imu]
         np.testing.assert_allclose(stamps_s, numbers(table, 'time_s')[0, kept], atol=1e-9)
-        force = [(m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z)
-                 for m in imu]
-        np.testing.assert_allclose(force, numbers(
-            table, 'ax_mps2', 'ay_mps2', 'az_mps2').T[kept], rtol=1e-9, atol=1e-9)
-        variance = np.array([m.linear_acceleration_covariance.reshape(3, 3).diagonal()
-                             for m in imu])
+        force = [
+            (m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z)
+            for m in imu
+        ]
+        np.testing.assert_allclose(
+            force, numbers(table, 'ax_mps2', 'ay_mps2', 'az_mps2').T[kept], rtol=1e-9, atol=1e-9
+        )
+        variance = np.array(
+            [m.linear_acceleration_covariance.reshape(3, 3).diagonal() for m in imu]
+        )
         std = numbers(table, 'ax_std_mps2', 'ay_std_mps2', 'az_std_mps2').T[kept]
-        expected = np.where(np.isfinite(std), std ** 2, 1e6)
+        expected = np.where(np.isfinite(std), std**2, 1e6)
         np.testing.assert_allclose(variance, expected, rtol=1e-9)
         angles = numbers(table, 'roll_rad', 'pitch_rad', 'inclination_rad').T[kept]
         for row in range(1, len(angles)):
@@ -264,8 +350,11 @@ def test_a_bag_holds_the_estimates_of_the_table(run_tool: RunTool, tmp_path: Pat
 
 def test_a_temperature_that_ends_is_held_and_said(run_tool: RunTool, tmp_path: Path) -> None:
     """A gap behind the first block is no step, and stands in the result."""
-    sensor = replace(unit().without_covariance(), effects=('temperature_bias',), values={
-        'temperature_bias': typical(effect_named('temperature_bias'), 'xy')})
+    sensor = replace(
+        unit().without_covariance(),
+        effects=('temperature_bias',),
+        values={'temperature_bias': typical(effect_named('temperature_bias'), 'xy')},
+    )
     count = 20000
     path = record(tmp_path, sensor, np.tile(volts_of(sensor)[:1], (count, 1)))
     read = recording.read(path)

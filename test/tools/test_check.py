@@ -47,15 +47,20 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
 
 def checked(folder: Path, *arguments: str) -> dict:
     done = run(folder, *arguments, '--json')
-    result, = json.loads(done.stdout)
+    (result,) = json.loads(done.stdout)
     assert done.returncode == (0 if result['sound'] else 1)
     return result
 
 
 def test_a_sound_recording(tmp_path: Path) -> None:
     time_s, accel = samples()
-    write_csv(tmp_path / 'turned.csv', time_s, accel, temperature_c=25 + time_s / 60,
-              supply_v=np.full(len(time_s), 5.0))
+    write_csv(
+        tmp_path / 'turned.csv',
+        time_s,
+        accel,
+        temperature_c=25 + time_s / 60,
+        supply_v=np.full(len(time_s), 5.0),
+    )
     result = checked(tmp_path, 'turned.csv')
     contents = result['contents']
     assert result['faults'] == []
@@ -89,23 +94,48 @@ def clipped_slowly(time_s: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, n
 ROW = np.arange(6000)
 
 
-@pytest.mark.parametrize(('change', 'count', 'fault'), [
-    (lambda t, a: (t[abs(t - 21.5) > 1.5], a[abs(t - 21.5) > 1.5]), 1, '301 samples are missing'),
-    (lambda t, a: (t[np.where((ROW >= 100) & (ROW < 103), 99, ROW)], a), 1,
-     'samples with the stamp of the one before: 3'),
-    (lambda t, a: (t - 2.0 * ((ROW >= 1000) & (ROW < 1005)), a), 1,
-     'samples whose stamp steps back: 5'),
-    (lambda t, a: (np.sort(t + np.random.default_rng(2).uniform(0, 0.02, len(t))), a), 1,
-     'stamps scatter by'), (lambda t, a: (t, a * [1, 0, 1]), None, 'ay_mps2 never changes'),
-    (clipped, 1, 'ax_mps2 stays at its extreme value'),
-    (clipped_slowly, 1, 'ax_mps2 stays at its extreme value'),
-    (lambda t, a: (t, np.c_[a[:, :2], a[np.minimum(ROW, 4499), 2]]), 1,
-     'az_mps2 does not change for 15 s'),
-    (lambda t, a: (t, a[np.where(ROW // 600 == 5, 2999, ROW)]), 3,
-     'ay_mps2 does not change for 6 s'),
-    (lambda t, a: (t, a / G), None, 'values in g')])
-def test_each_fault_is_named(tmp_path: Path, change: Callable, count: int | None, fault: str
-                             ) -> None:
+@pytest.mark.parametrize(
+    ('change', 'count', 'fault'),
+    [
+        (
+            lambda t, a: (t[abs(t - 21.5) > 1.5], a[abs(t - 21.5) > 1.5]),
+            1,
+            '301 samples are missing',
+        ),
+        (
+            lambda t, a: (t[np.where((ROW >= 100) & (ROW < 103), 99, ROW)], a),
+            1,
+            'samples with the stamp of the one before: 3',
+        ),
+        (
+            lambda t, a: (t - 2.0 * ((ROW >= 1000) & (ROW < 1005)), a),
+            1,
+            'samples whose stamp steps back: 5',
+        ),
+        (
+            lambda t, a: (np.sort(t + np.random.default_rng(2).uniform(0, 0.02, len(t))), a),
+            1,
+            'stamps scatter by',
+        ),
+        (lambda t, a: (t, a * [1, 0, 1]), None, 'ay_mps2 never changes'),
+        (clipped, 1, 'ax_mps2 stays at its extreme value'),
+        (clipped_slowly, 1, 'ax_mps2 stays at its extreme value'),
+        (
+            lambda t, a: (t, np.c_[a[:, :2], a[np.minimum(ROW, 4499), 2]]),
+            1,
+            'az_mps2 does not change for 15 s',
+        ),
+        (
+            lambda t, a: (t, a[np.where(ROW // 600 == 5, 2999, ROW)]),
+            3,
+            'ay_mps2 does not change for 6 s',
+        ),
+        (lambda t, a: (t, a / G), None, 'values in g'),
+    ],
+)
+def test_each_fault_is_named(
+    tmp_path: Path, change: Callable, count: int | None, fault: str
+) -> None:
     write_csv(tmp_path / 'faulty.csv', *change(*samples()))
     faults = checked(tmp_path, 'faulty.csv')['faults']
     assert any(fault in text for text in faults), faults
@@ -142,8 +172,10 @@ def test_wrong_usage_is_status_2(tmp_path: Path) -> None:
 
 def test_log_time_against_header_time(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
-    sent = [imu(stamp, (*rng.normal(0, 0.02, 2), G + rng.normal(0, 0.02)), variance=[1e-4] * 3)
-            for stamp in stamps(1000, 10_000_000)]
+    sent = [
+        imu(stamp, (*rng.normal(0, 0.02, 2), G + rng.normal(0, 0.02)), variance=[1e-4] * 3)
+        for stamp in stamps(1000, 10_000_000)
+    ]
     late = [replace(item, log_ns=item.stamp_ns + 250_000_000) for item in sent]
     bag_of(tmp_path / 'late', late)
     result = checked(tmp_path, 'late')
@@ -156,16 +188,26 @@ def test_the_mapping_of_a_foreign_log_is_one_line(tmp_path: Path) -> None:
     """A name with blanks is not broken, so that the options can be pasted."""
     time_s, accel = samples()
     names = ';'.join(f'Acceleration {axis} [m/s^2]' for axis in 'xyz')
-    np.savetxt(tmp_path / 'log.csv', np.column_stack([time_s, accel]), fmt='%.6g', delimiter=';',
-               header=f'Time [s];{names}', comments='')
+    np.savetxt(
+        tmp_path / 'log.csv',
+        np.column_stack([time_s, accel]),
+        fmt='%.6g',
+        delimiter=';',
+        header=f'Time [s];{names}',
+        comments='',
+    )
     done = run(tmp_path, 'log.csv')
     line = next(line for line in done.stdout.splitlines() if '--columns' in line)
     assert checked(tmp_path, 'log.csv', *shlex.split(line))['sound']
 
 
 def test_effects_that_a_recording_could_show_are_listed(tmp_path: Path) -> None:
-    assert run_in_process('simulate', 'tilt_both', '--rate', '100', '-o', 'moves.csv',
-                          cwd=tmp_path).returncode == 0
+    assert (
+        run_in_process(
+            'simulate', 'tilt_both', '--rate', '100', '-o', 'moves.csv', cwd=tmp_path
+        ).returncode
+        == 0
+    )
     rows = {row['effect']: row for row in checked(tmp_path, 'moves.csv')['could_show']}
     assert rows['bias']['missing'] == ''
     assert rows['bias']['from'].endswith('mg')

@@ -31,18 +31,30 @@ OFFSET_V = np.array([0.03, -0.05])
 WALK_MPS2 = np.array([2e-5, 3e-5]) * G0_MPS2
 MISALIGNED_RAD = 0.01
 # Elements of SDFormat 1.9, noise.sdf.
-NOISE_ELEMENTS = {'mean', 'stddev', 'bias_mean', 'bias_stddev', 'dynamic_bias_stddev',
-                  'dynamic_bias_correlation_time', 'precision'}
+NOISE_ELEMENTS = {
+    'mean',
+    'stddev',
+    'bias_mean',
+    'bias_stddev',
+    'dynamic_bias_stddev',
+    'dynamic_bias_correlation_time',
+    'precision',
+}
 
 
 def unit():
     """Return a sensor with effects that some formats hold and others do not."""
     return replace(
-        nominal('xy'), serial='SN--7', effects=('bias', 'misalignment', 'lever_arm', 'bias_walk'),
-        values={'bias': {'offset_v': OFFSET_V},
-                'misalignment': {'alpha_rad': np.zeros(2), 'beta_rad': np.full(2, MISALIGNED_RAD)},
-                'lever_arm': {f'{axis}_m': np.array(m) for axis, m in zip('xyz', ARM_M)},
-                'bias_walk': {'density_g_per_rts': WALK_MPS2 / G0_MPS2}})
+        nominal('xy'),
+        serial='SN--7',
+        effects=('bias', 'misalignment', 'lever_arm', 'bias_walk'),
+        values={
+            'bias': {'offset_v': OFFSET_V},
+            'misalignment': {'alpha_rad': np.zeros(2), 'beta_rad': np.full(2, MISALIGNED_RAD)},
+            'lever_arm': {f'{axis}_m': np.array(m) for axis, m in zip('xyz', ARM_M)},
+            'bias_walk': {'density_g_per_rts': WALK_MPS2 / G0_MPS2},
+        },
+    )
 
 
 @pytest.fixture(scope='module')
@@ -174,13 +186,23 @@ def check_noise(values):
 def test_isaaclab(exported, monkeypatch, version):
     """Data is a tensor in 2.x, and a ProxyArray since 3.0 (concepts/sensors/imu.rst)."""
     offset = make_dataclass('OffsetCfg', ['pos'])  # Its default of rot is no turn in both
-    values = run_module(exported, 'isaaclab', monkeypatch, {
-        'isaaclab': {}, 'isaaclab.utils': {}, 'torch': {'tensor': np.array},
-        'isaaclab.sensors': {'ImuCfg': SimpleNamespace(OffsetCfg=offset)},
-        'isaaclab.utils.noise': {}, 'isaaclab.utils.noise.noise_model': {'NoiseModel': NoiseModel},
-        'isaaclab.utils.noise.noise_cfg': {
-            'GaussianNoiseCfg': Gaussian,
-            'NoiseModelCfg': make_dataclass('NoiseModelCfg', ['class_type', 'noise_cfg'])}})
+    values = run_module(
+        exported,
+        'isaaclab',
+        monkeypatch,
+        {
+            'isaaclab': {},
+            'isaaclab.utils': {},
+            'torch': {'tensor': np.array},
+            'isaaclab.sensors': {'ImuCfg': SimpleNamespace(OffsetCfg=offset)},
+            'isaaclab.utils.noise': {},
+            'isaaclab.utils.noise.noise_model': {'NoiseModel': NoiseModel},
+            'isaaclab.utils.noise.noise_cfg': {
+                'GaussianNoiseCfg': Gaussian,
+                'NoiseModelCfg': make_dataclass('NoiseModelCfg', ['class_type', 'noise_cfg']),
+            },
+        },
+    )
     assert values['OFFSET'] == offset(ARM_M)
     assert values['UPDATE_PERIOD_S'] == pytest.approx(1 / unit().rate_hz)
     tensor = np.zeros((2, 3))
@@ -192,16 +214,32 @@ def test_isaaclab(exported, monkeypatch, version):
 
 def test_mjlab(exported, monkeypatch):
     """A name is that of the entity and its own (mjlab 1.6, builtin_sensor.py)."""
-    values = run_module(exported, 'mjlab', monkeypatch, {
-        'mjlab': {}, 'mjlab.utils': {},
-        'mjlab.sensor': {
-            'BuiltinSensorCfg': make_dataclass('BuiltinSensorCfg', ['name', 'sensor_type', 'obj']),
-            'ObjRef': make_dataclass('ObjRef', ['type', 'name', 'entity'])},
-        'mjlab.utils.noise': {'GaussianNoiseCfg': Gaussian, 'NoiseModel': NoiseModel,
-                              'NoiseModelCfg': MjlabNoiseModelCfg}})
+    values = run_module(
+        exported,
+        'mjlab',
+        monkeypatch,
+        {
+            'mjlab': {},
+            'mjlab.utils': {},
+            'mjlab.sensor': {
+                'BuiltinSensorCfg': make_dataclass(
+                    'BuiltinSensorCfg', ['name', 'sensor_type', 'obj']
+                ),
+                'ObjRef': make_dataclass('ObjRef', ['type', 'name', 'entity']),
+            },
+            'mjlab.utils.noise': {
+                'GaussianNoiseCfg': Gaussian,
+                'NoiseModel': NoiseModel,
+                'NoiseModelCfg': MjlabNoiseModelCfg,
+            },
+        },
+    )
     sensor = values['ACCELEROMETER']
     assert (sensor.sensor_type, sensor.obj.type, sensor.obj.name) == (
-        'accelerometer', 'site', values['NAME'])
+        'accelerometer',
+        'site',
+        values['NAME'],
+    )
     assert values['POS'] == ARM_M
     # Tensors are made of tuples of floats.
     assert isinstance(values['ACCELERATION_NOISE'].std, tuple)
@@ -214,9 +252,13 @@ def test_mjlab(exported, monkeypatch):
 NotNegative = Annotated[float, Field(ge=0)]
 Three = Annotated[tuple[float, float, float], Field(strict=False)]
 GenesisImu = create_model(
-    'GenesisImu', __config__=ConfigDict(strict=True, extra='forbid'),
-    **dict.fromkeys(('pos_offset', 'acc_bias', 'acc_noise', 'acc_random_walk', 'acc_resolution'),
-                    (Three, ...)), **dict.fromkeys(('delay', 'jitter'), (NotNegative, ...)))
+    'GenesisImu',
+    __config__=ConfigDict(strict=True, extra='forbid'),
+    **dict.fromkeys(
+        ('pos_offset', 'acc_bias', 'acc_noise', 'acc_random_walk', 'acc_resolution'), (Three, ...)
+    ),
+    **dict.fromkeys(('delay', 'jitter'), (NotNegative, ...)),
+)
 """Options of gs.sensors.IMU in Genesis 0.4.5 and 1.4.5, by the rules of options/sensors."""
 
 
@@ -235,15 +277,17 @@ def test_genesis(exported, monkeypatch, tmp_path):
     assert options.acc_noise == pytest.approx([*mps2(noise.analog_std_v(unit())), 0.0])
     # It adds one draw a step: after 1 s the walk has the density of the unit.
     assert np.array(options.acc_random_walk)[:2] * np.sqrt(unit().rate_hz) == pytest.approx(
-        WALK_MPS2)
+        WALK_MPS2
+    )
     rows = [line.split() for line in exported['genesis'].text.splitlines()]
     assert [row[1] for row in rows if row[-2:] == ['not', 'held']] == ['RC']
 
 
 @pytest.mark.parametrize('offset_s', [0.02, -0.02])
 def test_genesis_holds_a_delay_but_no_lead(tmp_path, offset_s):
-    sensor = nominal('x', effects=('time_offset',),
-                     values={'time_offset': {'offset_s': np.array(offset_s)}})
+    sensor = nominal(
+        'x', effects=('time_offset',), values={'time_offset': {'offset_s': np.array(offset_s)}}
+    )
     text, values = export(tmp_path, 'genesis', sensor).text, {}
     row = next(line for line in text.splitlines() if line.startswith('# time_offset'))
     exec(text, values)
@@ -271,8 +315,20 @@ def test_okvis2(exported):
     assert all(isinstance(value, float) for value in [*own.pop('a0'), *own.values()])
     named = exported['okvis2'].text.partition('are yours: ')[2].partition('imu_parameters')[0]
     assert {*own, 'a0', *named.replace('#', '').replace(',', ' ').split()} == {
-        'use', 'T_BS', 'a_max', 'g_max', 'sigma_g_c', 'sigma_bg', 'sigma_a_c', 'sigma_ba',
-        'sigma_gw_c', 'sigma_aw_c', 'a0', 'g0', 'g'}
+        'use',
+        'T_BS',
+        'a_max',
+        'g_max',
+        'sigma_g_c',
+        'sigma_bg',
+        'sigma_a_c',
+        'sigma_ba',
+        'sigma_gw_c',
+        'sigma_aw_c',
+        'a0',
+        'g0',
+        'g',
+    }
 
 
 def test_fusioncore(exported):
@@ -282,7 +338,8 @@ def test_fusioncore(exported):
     assert parameters == {
         'imu.accel_noise': pytest.approx(np.sqrt(sample_variance())),
         'ukf.q_accel_bias': pytest.approx((3e-5 * G0_MPS2) ** 2 / unit().rate_hz),
-        **{f'imu.lever_arm_{axis}': m for axis, m in zip('xyz', ARM_M)}}
+        **{f'imu.lever_arm_{axis}': m for axis, m in zip('xyz', ARM_M)},
+    }
 
 
 def test_point_lio(exported):
@@ -296,12 +353,13 @@ def test_point_lio(exported):
     assert own['satu_acc'] == pytest.approx(unit().range_g * G0_MPS2)
     assert own['imu_meas_acc_cov'] == own['acc_cov_input'] == pytest.approx(sample_variance())
     dt_s = own['imu_time_inte']
-    assert own['b_acc_cov'] * dt_s ** 2 == pytest.approx((3e-5 * G0_MPS2) ** 2 * dt_s)
+    assert own['b_acc_cov'] * dt_s**2 == pytest.approx((3e-5 * G0_MPS2) ** 2 * dt_s)
 
 
 def test_an_estimator_learns_the_first_limit(tmp_path):
-    sensor = nominal('xy', effects=('saturation',),
-                     values={'saturation': {'limit_g': np.array([1.2, 1.5])}})
+    sensor = nominal(
+        'xy', effects=('saturation',), values={'saturation': {'limit_g': np.array([1.2, 1.5])}}
+    )
     own = yaml.safe_load(export(tmp_path, 'okvis2', sensor).text)['imu_parameters']
     assert own['a_max'] == pytest.approx(1.2 * G0_MPS2)
 
@@ -316,20 +374,25 @@ def test_kalibr(exported):
     values = yaml.safe_load(exported['kalibr'].text)
     white_v2_per_hz = noise.density_v2_per_hz(unit(), np.zeros(1)).max() / 2
     assert np.sqrt(2 * white_v2_per_hz) == pytest.approx(
-        unit().noise_density_g_per_rthz.max() * unit().nominal_scale_v_per_g.max(), rel=1e-3)
+        unit().noise_density_g_per_rthz.max() * unit().nominal_scale_v_per_g.max(), rel=1e-3
+    )
     assert values == {
-        'rostopic': '/imu/data_raw', 'update_rate': unit().rate_hz,
+        'rostopic': '/imu/data_raw',
+        'update_rate': unit().rate_hz,
         'accelerometer_noise_density': pytest.approx(mps2(np.sqrt(white_v2_per_hz)).max()),
-        'accelerometer_random_walk': pytest.approx(3e-5 * G0_MPS2)}
+        'accelerometer_random_walk': pytest.approx(3e-5 * G0_MPS2),
+    }
 
 
 def test_broadcaster(exported):
-    parameters = yaml.safe_load(exported['broadcaster'].text)[
-        'imu_sensor_broadcaster']['ros__parameters']
+    parameters = yaml.safe_load(exported['broadcaster'].text)['imu_sensor_broadcaster'][
+        'ros__parameters'
+    ]
     covariance = parameters['static_covariance_linear_acceleration']
     assert all(isinstance(value, float) for value in covariance)
     assert np.reshape(covariance, (3, 3)) == pytest.approx(
-        np.diag([*mps2(noise.sample_std_v(unit())) ** 2, 1e6]))
+        np.diag([*mps2(noise.sample_std_v(unit())) ** 2, 1e6])
+    )
     for absent in ('orientation', 'angular_velocity'):
         assert parameters[f'static_covariance_{absent}'] == [-1.0] + 8 * [0.0]
 
@@ -337,7 +400,8 @@ def test_broadcaster(exported):
 def test_json(exported, tmp_path):
     content = json.loads(exported['json'].text)
     assert [axis['zero_g_mps2'] for axis in content['axes']] == pytest.approx(
-        mps2(OFFSET_V).tolist())
+        mps2(OFFSET_V).tolist()
+    )
     c, s = np.cos(MISALIGNED_RAD), np.sin(MISALIGNED_RAD)
     assert np.array(content['gain']) == pytest.approx(np.array([[c, s, 0], [-s, c, 0]]), abs=1e-6)
     assert content['position_m'] == list(ARM_M)
@@ -349,13 +413,15 @@ def test_json(exported, tmp_path):
 
 
 def test_errors_are_one_line(tmp_path):
-    parameter_file.save(tmp_path / 'unit.yaml', replace(
-        nominal('x'), noise_density_g_per_rthz=np.zeros(1)))
+    parameter_file.save(
+        tmp_path / 'unit.yaml', replace(nominal('x'), noise_density_g_per_rthz=np.zeros(1))
+    )
     for arguments, status, words in (
-            (('unit.yaml', '--to', 'kalibr', '-o', 'out.yaml'), 1, 'noise_density'),
-            (('unit.yaml', '--to', 'json', '-o', 'unit.yaml'), 1, 'is the input itself'),
-            (('none.yaml', '--to', 'json', '-o', 'out.json'), 1, 'cannot be read'),
-            (('unit.yaml', '--to', 'urdf', '-o', 'out.urdf'), 2, 'invalid choice')):
+        (('unit.yaml', '--to', 'kalibr', '-o', 'out.yaml'), 1, 'noise_density'),
+        (('unit.yaml', '--to', 'json', '-o', 'unit.yaml'), 1, 'is the input itself'),
+        (('none.yaml', '--to', 'json', '-o', 'out.json'), 1, 'cannot be read'),
+        (('unit.yaml', '--to', 'urdf', '-o', 'out.urdf'), 2, 'invalid choice'),
+    ):
         done = run_in_process('export', *arguments, cwd=tmp_path)
         assert done.returncode == status
         assert words in done.stderr.splitlines()[-1]

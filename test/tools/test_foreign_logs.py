@@ -34,14 +34,15 @@ def plain_text(columns: list[np.ndarray]) -> str:
 
 def proposed(error: str) -> list[str]:
     assert error.count('\n') == 1, error
-    return shlex.split(error[error.index('--columns'):].replace('--rate HZ', '--rate 100'))
+    return shlex.split(error[error.index('--columns') :].replace('--rate HZ', '--rate 100'))
 
 
 def check_errors(path: Path, atol_g: float = 2e-3) -> None:
     fitted = parameter_file.load(path, may_measure=True)
     scale = fitted.nominal_scale_v_per_g
-    np.testing.assert_allclose((fitted.zero_g_v - fitted.nominal_zero_g_v) / scale, BIAS_G,
-                               atol=atol_g)
+    np.testing.assert_allclose(
+        (fitted.zero_g_v - fitted.nominal_zero_g_v) / scale, BIAS_G, atol=atol_g
+    )
     np.testing.assert_allclose(fitted.scale_v_per_g / scale, SCALE, atol=2e-3)
 
 
@@ -54,7 +55,7 @@ def test_two_commands_from_a_log_to_a_calibration(run_tool, tmp_path, name) -> N
     done = run_tool('fit', name, '-o', 'unit.yaml', *proposed(done.stderr))
     assert done.returncode == 0, done.stderr
     check_errors(tmp_path / 'unit.yaml')
-    following = shlex.split(done.stdout[done.stdout.index('ros2 run'):].replace('\\\n', ' '))
+    following = shlex.split(done.stdout[done.stdout.index('ros2 run') :].replace('\\\n', ' '))
     done = run_tool(*following[3:])
     assert done.returncode == 0, done.stderr
 
@@ -69,8 +70,18 @@ def test_counts_about_an_offset(run_tool, tmp_path) -> None:
     assert options[:2] == ['--columns', 'time=ms:ms,x=A0:lsb,y=A1:lsb,z=A2:lsb']
     assert float(options[options.index('--lsb-at-0g') + 1]) == pytest.approx(512, abs=6)
     assert float(options[options.index('--lsb-per-g') + 1]) == pytest.approx(102, abs=4)
-    done = run_tool('fit', 'adc.txt', '-o', 'unit.yaml', '--columns', options[1],
-                    '--lsb-per-g', 102, '--lsb-at-0g', 512)
+    done = run_tool(
+        'fit',
+        'adc.txt',
+        '-o',
+        'unit.yaml',
+        '--columns',
+        options[1],
+        '--lsb-per-g',
+        102,
+        '--lsb-at-0g',
+        512,
+    )
     assert done.returncode == 0, done.stderr
     check_errors(tmp_path / 'unit.yaml')
 
@@ -82,11 +93,18 @@ def test_tables_of_libraries(run_tool, tmp_path, name) -> None:
     elif name == 'log.parquet':
         parquet = pytest.importorskip('pyarrow.parquet', reason='no pyarrow')
         import pyarrow
+
         stamps = (EPOCH_NS + np.rint(1e9 * LOG.time_s)).astype(np.int64)
-        parquet.write_table(pyarrow.table({
-            'stamp': pyarrow.array(stamps, pyarrow.timestamp('ns')), 'device': ['a'] * len(stamps),
-            **{f'acc_{axis}': LOG.output_g[:, i] for i, axis in enumerate('xyz')}}),
-            tmp_path / name)
+        parquet.write_table(
+            pyarrow.table(
+                {
+                    'stamp': pyarrow.array(stamps, pyarrow.timestamp('ns')),
+                    'device': ['a'] * len(stamps),
+                    **{f'acc_{axis}': LOG.output_g[:, i] for i, axis in enumerate('xyz')},
+                }
+            ),
+            tmp_path / name,
+        )
     else:
         pytest.importorskip('pyulog', reason='no pyulog')
         (tmp_path / name).write_bytes(ulog(LOG))
@@ -109,11 +127,13 @@ def test_a_file_of_another_format_is_refused_in_one_line(run_tool, tmp_path, nam
 @pytest.mark.parametrize(('name', 'package'), [('a.parquet', 'pyarrow'), ('a.ulg', 'pyulog')])
 def test_a_missing_library_is_named(tmp_path, name, package) -> None:
     (tmp_path / name).write_bytes(b'')
-    done = run_without_extras('import sys\nfrom adxl_ros.files import recording\n'
-                              'from adxl_ros.errors import UserError\n'
-                              'try:\n    recording.read(sys.argv[1])\n'
-                              'except UserError as error:\n    print(error)\n',
-                              str(tmp_path / name))
+    done = run_without_extras(
+        'import sys\nfrom adxl_ros.files import recording\n'
+        'from adxl_ros.errors import UserError\n'
+        'try:\n    recording.read(sys.argv[1])\n'
+        'except UserError as error:\n    print(error)\n',
+        str(tmp_path / name),
+    )
     assert done.returncode == 0, done.stderr
     assert ' pip install ' in done.stdout and done.stdout.endswith(f' {package}\n'), done.stdout
 
@@ -130,7 +150,8 @@ def test_angles_in_a_log_are_the_reference(run_tool, tmp_path, names) -> None:
     fitted = parameter_file.load(tmp_path / 'unit.yaml')
     assert fitted.provenance['reference'] == 'stage'
     assert 'rests without angles, left out: 1 (the first one from 10.' in ' '.join(
-        done.stdout.split())
+        done.stdout.split()
+    )
     check_errors(tmp_path / 'unit.yaml', 5e-3)
 
 
@@ -156,16 +177,17 @@ def test_a_table_of_poses_is_the_reference(run_tool, tmp_path) -> None:
     check_errors(tmp_path / 'u.yaml', 5e-3)
     written(tmp_path, 'poses.csv', 'alpha_deg,beta_deg\n' + '\n'.join(rows[:-1]) + '\n')
     done = run_tool('fit', 'log.csv', '--columns', XYZ_G, '--poses', 'poses.csv', '-o', 'v.yaml')
-    assert 'poses.csv: has 31 poses, but the recording has 32 rests, which begin at 0.' \
-        in done.stderr
+    assert (
+        'poses.csv: has 31 poses, but the recording has 32 rests, which begin at 0.' in done.stderr
+    )
 
 
 @pytest.mark.parametrize('angles', ['', 'alpha_deg,beta_deg'])
 def test_each_row_may_be_the_mean_of_a_rest(run_tool, tmp_path, angles) -> None:
     """Without the option the refusal names it; with it, the coefficients have an uncertainty."""
     starts = np.flatnonzero(np.diff(np.isfinite(LOG.angles_rad[:, 0]).astype(int), prepend=0) > 0)
-    means = [LOG.output_g[start:start + 150].mean(axis=0) for start in starts]
-    table = np.hstack([means, np.degrees(LOG.angles_rad[starts])])[:, :5 if angles else 3]
+    means = [LOG.output_g[start : start + 150].mean(axis=0) for start in starts]
+    table = np.hstack([means, np.degrees(LOG.angles_rad[starts])])[:, : 5 if angles else 3]
     header = ','.join(filter(None, ['x', 'y', 'z', angles]))
     np.savetxt(tmp_path / 'means.csv', table, delimiter=',', header=header, comments='')
     columns = 'x=x:g,y=y:g,z=z:g' + ',alpha=alpha_deg,beta=beta_deg' * bool(angles)
@@ -174,8 +196,13 @@ def test_each_row_may_be_the_mean_of_a_rest(run_tool, tmp_path, angles) -> None:
     done = run_tool(*command, '--means')
     if angles:
         assert done.returncode == 1 and 'sensor.noise_density_g_per_rthz' in done.stderr
-        text = parameter_file.any_imu_path().read_text().replace(
-            'rate_hz:', 'noise_density_g_per_rthz: [4.0e-4, 4.0e-4, 4.0e-4]\n      rate_hz:')
+        text = (
+            parameter_file.any_imu_path()
+            .read_text()
+            .replace(
+                'rate_hz:', 'noise_density_g_per_rthz: [4.0e-4, 4.0e-4, 4.0e-4]\n      rate_hz:'
+            )
+        )
         written(tmp_path, 'stated.yaml', text)
         done = run_tool(*command, '--means', '--params', 'stated.yaml')
     assert done.returncode == 0, done.stderr
@@ -214,8 +241,15 @@ def test_stamps_in_bursts(run_tool, tmp_path) -> None:
     done = run_tool(*command, '--rate', 100)
     assert done.returncode == 0, done.stderr
     check_errors(tmp_path / 'unit.yaml')
-    written(tmp_path, 'log.csv', 't,x,y,z\n' + lines(
-        [stamps + 1e-4 * (np.arange(len(stamps)) % 8), *LOG.output_g.T], ['%.4f'] + ['%.5f'] * 3))
+    written(
+        tmp_path,
+        'log.csv',
+        't,x,y,z\n'
+        + lines(
+            [stamps + 1e-4 * (np.arange(len(stamps)) % 8), *LOG.output_g.T],
+            ['%.4f'] + ['%.5f'] * 3,
+        ),
+    )
     done = run_tool(*command)
     assert done.returncode == 0 and 'bursts of about 8 samples' in done.stderr
     assert parameter_file.load(tmp_path / 'unit.yaml').rate_hz == pytest.approx(100, rel=0.01)
@@ -241,8 +275,12 @@ def test_bad_stamps_are_left_out_and_counted(run_tool, tmp_path) -> None:
 def test_volts_of_another_sensor(run_tool, tmp_path) -> None:
     """Volts about 1.65 V: the answer asks for the file of the sensor, which then calibrates."""
     volts = 1.65 + 0.33 * LOG.output_g
-    written(tmp_path, 'log.csv', 't,Vx,Vy,Vz,AngleX(deg)\n' + lines(
-        [LOG.time_s, *volts.T, 0 * LOG.time_s], ['%.3f'] + ['%.5f'] * 3 + ['%.1f']))
+    written(
+        tmp_path,
+        'log.csv',
+        't,Vx,Vy,Vz,AngleX(deg)\n'
+        + lines([LOG.time_s, *volts.T, 0 * LOG.time_s], ['%.3f'] + ['%.5f'] * 3 + ['%.1f']),
+    )
     done = run_tool('fit', 'log.csv', '-o', 'unit.yaml')
     assert 'add --params with the parameter file of the sensor' in done.stderr
     options = proposed(done.stderr)
@@ -268,8 +306,12 @@ def test_a_documented_mounting(run_tool, tmp_path) -> None:
 @pytest.mark.parametrize('tool', ['check', 'fit', 'noise', 'diagnose'])
 def test_every_tool_refuses_stamps_in_another_unit(run_tool, tmp_path, tool, counts) -> None:
     """A column that says s and counts ms or us: one line, and its options read the log."""
-    written(tmp_path, 'log.csv', 'time_s,ax_mps2,ay_mps2,az_mps2\n' + lines(
-        [counts * LOG.time_s, *G0_MPS2 * LOG.output_g.T], ['%.0f'] + ['%.4f'] * 3))
+    written(
+        tmp_path,
+        'log.csv',
+        'time_s,ax_mps2,ay_mps2,az_mps2\n'
+        + lines([counts * LOG.time_s, *G0_MPS2 * LOG.output_g.T], ['%.0f'] + ['%.4f'] * 3),
+    )
     output = [] if tool in ('check', 'noise') else ['-o', 'out.yaml']
     done = run_tool(tool, 'log.csv', *output)
     text = ' '.join((done.stdout + done.stderr).split())
@@ -277,7 +319,7 @@ def test_every_tool_refuses_stamps_in_another_unit(run_tool, tmp_path, tool, cou
     assert f'time_s has steps of {0.01 * counts:.4g}, which as s are' in text
     unit = 'ms' if counts == 1e3 else 'us'
     assert f"--columns 'time=time_s:{unit},x=ax_mps2:mps2" in text
-    options = shlex.split(text[text.index('--columns'):])[:2]
+    options = shlex.split(text[text.index('--columns') :])[:2]
     assert run_tool('check', 'log.csv', *options).returncode == 0
 
 
@@ -295,31 +337,59 @@ def test_numbered_columns_and_a_mapping_file(run_tool, tmp_path) -> None:
     np.testing.assert_allclose(read['time_s'], LOG.time_s, atol=1e-9)
 
 
-@pytest.mark.parametrize(('text', 'options', 'words'), [
-    (SHORT, ['--columns', 'time=t:s,x=x:g,y=y:g,z=w:g'],
-     "--columns: log.csv has no column 'w' for z; the columns are t, x, y, z"),
-    (SHORT, ['--columns', 'time=t:s,x=x:foot'], "x=x:foot: unknown unit 'foot'; write one of g, "),
-    (SHORT, ['--columns', 'tme=t:s,x=x:g'], "no role 'tme'; the roles are time, x, y"),
-    (SHORT, ['--columns', 'x=x:g,y=y:g,z=z:g'], 'has no time; add time=COLUMN:UNIT, or give'),
-    (SHORT, ['--columns', 'time=t:s,x=x:lsb,y=y:lsb,z=z:lsb'], 'x is in LSB; add --lsb-per-g'),
-    (SHORT, ['--columns', 'time=t:s,x=x:g,y=y:v'], 'some axes are in volts and others are not'),
-    (SHORT, ['--columns', 'time=t:s,x=x:g,roll=y:deg'], 'roll are no reference; name roll and'),
-    ('t,x,y,z,r,p\n' + 20 * '0,0,0,1,90,0\n',
-     ['--columns', f'{XYZ_G},roll=r:rad,pitch=p:deg', '--rate', '9'],
-     'log.csv:2:5: r is 90, no roll in rad; delete the line, or correct the unit'),
-    (SHORT, ['--columns', NO_UNIT], '--columns: nothing states the unit of x; write for example '
-                                    'x=x:mps2'),
-    (SHORT, ['--columns', 'gone.txt'], '--columns gone.txt: is neither a mapping nor a file'),
-    (SHORT, ['--columns', XYZ_G, '--axes', 'x=-y,y=y'], '--axes x=-y,y=y: each axis of the'),
-    (SHORT, ['--columns', XYZ_G, '--lsb-per-g', '4'], '--lsb-per-g: no column is in LSB'),
-    (SHORT, ['--columns', XYZ_G, '--rate', '0'], '--rate 0: expected samples a second'),
-    (SHORT, ['--topic', '/imu'], '--topic /imu: log.csv is no bag; leave --topic out'),
-    (SHORT.replace('-0.02,1.002', 'off,1.002', 1), ['--columns', XYZ_G],
-     "log.csv:4:3: y is 'off', not a number"),
-    ('name,state\na,b\nc,d\n', [], 'log.csv: the first 200 lines hold no row of numbers'),
-    ('height,width\n1,2\n3,4\n', [], 'none looks like an accelerometer: name the columns')])
-def test_wrong_input_has_one_line_that_says_what_to_write(run_tool, tmp_path, text, options, words
-                                                          ) -> None:
+@pytest.mark.parametrize(
+    ('text', 'options', 'words'),
+    [
+        (
+            SHORT,
+            ['--columns', 'time=t:s,x=x:g,y=y:g,z=w:g'],
+            "--columns: log.csv has no column 'w' for z; the columns are t, x, y, z",
+        ),
+        (
+            SHORT,
+            ['--columns', 'time=t:s,x=x:foot'],
+            "x=x:foot: unknown unit 'foot'; write one of g, ",
+        ),
+        (SHORT, ['--columns', 'tme=t:s,x=x:g'], "no role 'tme'; the roles are time, x, y"),
+        (SHORT, ['--columns', 'x=x:g,y=y:g,z=z:g'], 'has no time; add time=COLUMN:UNIT, or give'),
+        (SHORT, ['--columns', 'time=t:s,x=x:lsb,y=y:lsb,z=z:lsb'], 'x is in LSB; add --lsb-per-g'),
+        (
+            SHORT,
+            ['--columns', 'time=t:s,x=x:g,y=y:v'],
+            'some axes are in volts and others are not',
+        ),
+        (
+            SHORT,
+            ['--columns', 'time=t:s,x=x:g,roll=y:deg'],
+            'roll are no reference; name roll and',
+        ),
+        (
+            't,x,y,z,r,p\n' + 20 * '0,0,0,1,90,0\n',
+            ['--columns', f'{XYZ_G},roll=r:rad,pitch=p:deg', '--rate', '9'],
+            'log.csv:2:5: r is 90, no roll in rad; delete the line, or correct the unit',
+        ),
+        (
+            SHORT,
+            ['--columns', NO_UNIT],
+            '--columns: nothing states the unit of x; write for example x=x:mps2',
+        ),
+        (SHORT, ['--columns', 'gone.txt'], '--columns gone.txt: is neither a mapping nor a file'),
+        (SHORT, ['--columns', XYZ_G, '--axes', 'x=-y,y=y'], '--axes x=-y,y=y: each axis of the'),
+        (SHORT, ['--columns', XYZ_G, '--lsb-per-g', '4'], '--lsb-per-g: no column is in LSB'),
+        (SHORT, ['--columns', XYZ_G, '--rate', '0'], '--rate 0: expected samples a second'),
+        (SHORT, ['--topic', '/imu'], '--topic /imu: log.csv is no bag; leave --topic out'),
+        (
+            SHORT.replace('-0.02,1.002', 'off,1.002', 1),
+            ['--columns', XYZ_G],
+            "log.csv:4:3: y is 'off', not a number",
+        ),
+        ('name,state\na,b\nc,d\n', [], 'log.csv: the first 200 lines hold no row of numbers'),
+        ('height,width\n1,2\n3,4\n', [], 'none looks like an accelerometer: name the columns'),
+    ],
+)
+def test_wrong_input_has_one_line_that_says_what_to_write(
+    run_tool, tmp_path, text, options, words
+) -> None:
     written(tmp_path, 'log.csv', text)
     done = run_tool('fit', 'log.csv', '-o', 'unit.yaml', *options)
     assert done.returncode == 1 and not (tmp_path / 'unit.yaml').exists()
@@ -328,9 +398,14 @@ def test_wrong_input_has_one_line_that_says_what_to_write(run_tool, tmp_path, te
 
 def bag_with(folder: Path, topics: list[str], log: Turned = LOG) -> None:
     stamps = EPOCH_NS + np.rint(1e9 * log.time_s).astype(np.int64)
-    bag_of(folder / 'bag', [imu(stamp, force, topic, (0.0, 0.0, 0.0), topic)
-                            for stamp, force in zip(stamps.tolist(), G0_MPS2 * log.output_g)
-                            for topic in topics])
+    bag_of(
+        folder / 'bag',
+        [
+            imu(stamp, force, topic, (0.0, 0.0, 0.0), topic)
+            for stamp, force in zip(stamps.tolist(), G0_MPS2 * log.output_g)
+            for topic in topics
+        ],
+    )
 
 
 def test_several_imu_topics_of_a_bag_are_named(run_tool, tmp_path) -> None:

@@ -52,30 +52,47 @@ def end_of(text: str) -> tuple[str, str]:
 @pytest.mark.long
 def test_each_tool_names_its_files_and_the_next_command(tmp_path: Path) -> None:
     """The next command of one tool is what a user runs then."""
-    done = run_executable('simulate', 'sweep', '--rate', '50', '--effect', 'misalignment', '-o',
-                          'sweep.csv', cwd=tmp_path)
+    done = run_executable(
+        'simulate',
+        'sweep',
+        '--rate',
+        '50',
+        '--effect',
+        'misalignment',
+        '-o',
+        'sweep.csv',
+        cwd=tmp_path,
+    )
     assert 'misalignment' in done.stdout
     assert end_of(done.stdout) == ('sweep.csv\n', 'ros2 run adxl_ros fit sweep.csv -o unit.yaml')
-    done = run_executable('fit', 'sweep.csv', '-o', 'unit.yaml', '--store', '', '--report', '.',
-                          cwd=tmp_path)
+    done = run_executable(
+        'fit', 'sweep.csv', '-o', 'unit.yaml', '--store', '', '--report', '.', cwd=tmp_path
+    )
     files, following = end_of(done.stdout)
     assert files.split()[:2] == ['unit.yaml', 'report.html']
     assert all((tmp_path / name).exists() for name in files.split()[:2])
     assert re.search('^ (PASS|NOT SHOWN|FAIL) ', done.stdout, re.MULTILINE)
     assert following == 'ros2 run adxl_ros apply sweep.csv --params unit.yaml -o tilt.csv'
-    done = run_executable('apply', 'sweep.csv', '--params', 'unit.yaml', '-o', 'tilt.csv',
-                          cwd=tmp_path)
+    done = run_executable(
+        'apply', 'sweep.csv', '--params', 'unit.yaml', '-o', 'tilt.csv', cwd=tmp_path
+    )
     assert end_of(done.stdout) == (
         'tilt.csv\n',
-        'ros2 run adxl_ros compensation --ros-args -p calibration:=unit.yaml')
+        'ros2 run adxl_ros compensation --ros-args -p calibration:=unit.yaml',
+    )
 
 
 @pytest.mark.long
 def test_diagnose_in_a_terminal_of_80_columns(tmp_path: Path) -> None:
     """Stages while it runs; then a coloured verdict, files and steps, none wrapped in a word."""
     run_executable('simulate', 'tilt_both', '--rate', '100', '-o', 'tilt.csv', cwd=tmp_path)
-    terminal = Terminal([executable('diagnose'), 'tilt.csv', '-o', 'gap'], dict(os.environ),
-                        tmp_path, lines=60, columns=80)
+    terminal = Terminal(
+        [executable('diagnose'), 'tilt.csv', '-o', 'gap'],
+        dict(os.environ),
+        tmp_path,
+        lines=60,
+        columns=80,
+    )
     try:
         screen = terminal.wait_for('next', 'ros2 run adxl_ros simulate', timeout_s=120.0)
         assert terminal.wait(30.0) == 0
@@ -84,14 +101,17 @@ def test_diagnose_in_a_terminal_of_80_columns(tmp_path: Path) -> None:
         terminal.close()
     lines = screen.splitlines()
     assert max(map(len, lines)) <= COLUMNS
-    assert re.match(r'tilt\.csv \(\d+ s, 100 Hz, x y\) +minus +simulation of the nominal sensor$',
-                    lines[0])
-    assert re.search(r'^(NO GAP|GAP EXPLAINED|UNKNOWN CAUSE).* mg rms +noise floor ', screen,
-                     re.MULTILINE)
+    assert re.match(
+        r'tilt\.csv \(\d+ s, 100 Hz, x y\) +minus +simulation of the nominal sensor$', lines[0]
+    )
+    assert re.search(
+        r'^(NO GAP|GAP EXPLAINED|UNKNOWN CAUSE).* mg rms +noise floor ', screen, re.MULTILINE
+    )
     assert re.search(r'\x1b\[3\dm(NO GAP|GAP EXPLAINED|UNKNOWN CAUSE)\x1b\[0m', raw)
     assert '1/5 checks' in raw and '2/5 library of effects' in raw
-    assert re.search(r'^ wrote +gap/report\.html +gap/params\.yaml +gap/report\.json', screen,
-                     re.MULTILINE)
+    assert re.search(
+        r'^ wrote +gap/report\.html +gap/params\.yaml +gap/report\.json', screen, re.MULTILINE
+    )
 
 
 def test_an_error_wraps_between_words_in_a_terminal_only(tmp_path: Path) -> None:
@@ -124,17 +144,26 @@ def test_output_that_nobody_reads_ends_an_executable_without_a_message(name: str
     os.close(reader)
     try:
         # argparse ignores the pipe where nothing is buffered.
-        piped = subprocess.run([executable(name), '--help'], text=True, stdout=writer,
-                               stdin=subprocess.DEVNULL, stderr=subprocess.PIPE,
-                               timeout=60 * PATIENCE, env=os.environ | {'PYTHONUNBUFFERED': ''})
+        piped = subprocess.run(
+            [executable(name), '--help'],
+            text=True,
+            stdout=writer,
+            stdin=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            timeout=60 * PATIENCE,
+            env=os.environ | {'PYTHONUNBUFFERED': ''},
+        )
     finally:
         os.close(writer)
     assert (piped.returncode, piped.stderr) == (1, '')
 
 
 def test_a_pipe_between_processes_that_breaks_is_not_hidden() -> None:
-    code = ('from adxl_ros.process import ended_by_closed_output\n'
-            'with ended_by_closed_output():\n    raise BrokenPipeError')
-    done = subprocess.run([sys.executable, '-c', code], text=True, capture_output=True,
-                          timeout=60 * PATIENCE)
+    code = (
+        'from adxl_ros.process import ended_by_closed_output\n'
+        'with ended_by_closed_output():\n    raise BrokenPipeError'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code], text=True, capture_output=True, timeout=60 * PATIENCE
+    )
     assert done.returncode == 1 and 'BrokenPipeError' in done.stderr

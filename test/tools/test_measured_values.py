@@ -46,8 +46,9 @@ def tumble(path: Path, noise_mps2: float, tau_s: float = 0.0, step_mps2: float =
     samples = np.concatenate([parts, moves], axis=1).reshape(-1, 3)
     if step_mps2:
         samples = np.round(samples / step_mps2) * step_mps2
-    rows = [f'{i / RATE_HZ!r},{",".join(map(repr, row))}' for i, row in
-            enumerate(samples.tolist())]
+    rows = [
+        f'{i / RATE_HZ!r},{",".join(map(repr, row))}' for i, row in enumerate(samples.tolist())
+    ]
     path.write_text('\n'.join(['time_s,ax_mps2,ay_mps2,az_mps2', *rows]) + '\n')
     return path
 
@@ -61,7 +62,8 @@ def test_fit_measures_the_sensor(run_tool, tmp_path, tau_s) -> None:
     unit = parameter_file.load(tmp_path / 'unit.yaml')
     bandwidth_hz = 0.25 / tau_s if tau_s else RATE_HZ / 2
     np.testing.assert_allclose(
-        unit.noise_density_g_per_rthz * G * np.sqrt(bandwidth_hz), 0.05, rtol=0.15)
+        unit.noise_density_g_per_rthz * G * np.sqrt(bandwidth_hz), 0.05, rtol=0.15
+    )
     assert unit.rc_s == pytest.approx(tau_s, rel=0.15)
     assert unit.range_g == pytest.approx(4.0), 'the largest reading is between 2 and 4 g'
     for text in (done.stdout, (tmp_path / 'unit.yaml').read_text()):
@@ -100,9 +102,17 @@ def test_what_cannot_be_measured_is_refused(run_tool, tmp_path) -> None:
     assert '29 samples at 200 Hz do not show the noise of the sensor' in done.stderr
 
 
-FACES_DEG = {'+x': (90, 0), '-x': (90, 180), '+y': (90, -90), '-y': (90, 90), '+z': (0, 0),
-             '-z': (180, 0)}
-MATRIX = np.eye(3) + np.array([[.01, .004, -.003], [.002, -.02, .006], [-.005, .001, .015]])
+FACES_DEG = {
+    '+x': (90, 0),
+    '-x': (90, 180),
+    '+y': (90, -90),
+    '-y': (90, 90),
+    '+z': (0, 0),
+    '-z': (180, 0),
+}
+MATRIX = np.eye(3) + np.array(
+    [[0.01, 0.004, -0.003], [0.002, -0.02, 0.006], [-0.005, 0.001, 0.015]]
+)
 
 
 def faces(path: Path, names: list[str]) -> Path:
@@ -111,16 +121,18 @@ def faces(path: Path, names: list[str]) -> Path:
     rows: list[str] = []
     for name in names:
         alpha, beta = np.radians(FACES_DEG[name])
-        force = G * np.array([np.sin(alpha) * np.cos(beta), -np.sin(alpha) * np.sin(beta),
-                              np.cos(alpha)])
+        force = G * np.array(
+            [np.sin(alpha) * np.cos(beta), -np.sin(alpha) * np.sin(beta), np.cos(alpha)]
+        )
         rest = MATRIX @ force + ERROR + rng.normal(0, 0.05, (600, 3))
         move = rng.normal(0, 3.0, (200, 3))
         angles = f'{float(alpha)!r},{float(beta)!r}'
         rows += [f'{",".join(map(repr, row))},{angles}' for row in rest.tolist()]
         rows += [f'{",".join(map(repr, row))},,' for row in move.tolist()]
     lines = [f'{i / RATE_HZ!r},{row}' for i, row in enumerate(rows)]
-    path.write_text('\n'.join(['time_s,ax_mps2,ay_mps2,az_mps2,alpha_rad,beta_rad', *lines])
-                    + '\n')
+    path.write_text(
+        '\n'.join(['time_s,ax_mps2,ay_mps2,az_mps2,alpha_rad,beta_rad', *lines]) + '\n'
+    )
     return path
 
 
@@ -147,7 +159,8 @@ def test_an_open_coefficient_is_named_and_the_others_are_fitted(run_tool, tmp_pa
     done = run_tool('fit', path, '-o', tmp_path / 'unit.yaml')
     assert done.returncode == 0, done.stderr
     assert 'open, by its prior alone: scale_factor.offset_v_per_g.z' in done.stdout.replace(
-        '\n  ', ' ')
+        '\n  ', ' '
+    )
     unit = parameter_file.load(tmp_path / 'unit.yaml')
     np.testing.assert_allclose(unit.zero_g_v * G, ERROR, atol=0.03)
     np.testing.assert_allclose(unit.scale_v_per_g[:2], np.diag(MATRIX)[:2], atol=0.002)

@@ -22,8 +22,9 @@ N, B, K = 1e-3, 2e-4, 2e-5
 G = 9.80665
 
 
-def samples(seconds: float, seed: int = 1, terms: tuple[float, float, float] = (N, B, K)
-            ) -> tuple[np.ndarray, np.ndarray]:
+def samples(
+    seconds: float, seed: int = 1, terms: tuple[float, float, float] = (N, B, K)
+) -> tuple[np.ndarray, np.ndarray]:
     rng, count = np.random.default_rng(seed), int(seconds * RATE_HZ)
     axes = [still_samples(rng, count, RATE_HZ, *terms) for _ in range(3)]
     return np.arange(count) / RATE_HZ, np.column_stack(axes) + [0.0, 0.0, G]
@@ -42,7 +43,7 @@ def measured(path: Path) -> RecordingNoise:
 def settings_of(text: str) -> dict:
     """Return the settings to paste on a screen."""
     begin = text.index('# kalibr')
-    return yaml.safe_load(text[begin:text.index('\n\n', begin)])
+    return yaml.safe_load(text[begin : text.index('\n\n', begin)])
 
 
 def flat(text: str) -> str:
@@ -69,12 +70,13 @@ def test_terms_curve_files_and_settings(tmp_path: Path) -> None:
     assert settings['acc_n'] == pytest.approx(N * np.sqrt(RATE_HZ), rel=0.05)
     assert settings['EKF2_ACC_NOISE'] == pytest.approx(N * 10, rel=0.05)
     variances = settings['linear_acceleration_covariance']
-    assert variances[4] == pytest.approx(N ** 2 * RATE_HZ, rel=0.1)
+    assert variances[4] == pytest.approx(N**2 * RATE_HZ, rel=0.1)
     assert [path.name for path in (tmp_path / 'curve').iterdir()] == ['allan.png']
     sensor = parameter_file.load(tmp_path / 'noise.yaml')
     assert sensor.axes == 'xyz'
-    assert sensor.noise_density_g_per_rthz == pytest.approx(np.full(3, np.sqrt(2) * N / G),
-                                                            rel=0.03)
+    assert sensor.noise_density_g_per_rthz == pytest.approx(
+        np.full(3, np.sqrt(2) * N / G), rel=0.03
+    )
     assert 'flicker' in sensor.effects
     # Nothing of the nominal sensor is in the file: a rest shows neither range nor resolution.
     assert (sensor.rc_s, sensor.rate_hz) == (0.0, RATE_HZ)
@@ -93,8 +95,10 @@ def test_the_lines_to_paste_are_yaml(tmp_path: Path) -> None:
 
 def test_a_short_recording_is_named(tmp_path: Path) -> None:
     write_csv(tmp_path / 'still.csv', *samples(60.0, terms=(N, 0.0, 0.0)))
-    assert re.search('WARNING x: 60 s is too short to see the random walk K[.] .* record about',
-                     flat(run(tmp_path, 'still.csv').stdout))
+    assert re.search(
+        'WARNING x: 60 s is too short to see the random walk K[.] .* record about',
+        flat(run(tmp_path, 'still.csv').stdout),
+    )
     walk = measured(tmp_path / 'still.csv').axes[0].fit.walk
     assert walk.high > walk.low == 0
 
@@ -112,8 +116,11 @@ def test_noise_that_rounding_hides_is_not_written(tmp_path: Path) -> None:
     assert 'WARNING x: N is not determined' in flat(text)
     file = tmp_path / 'noise.yaml'
     assert parameter_file.load(file, may_measure=True).unstated == ('noise_density_g_per_rthz',)
-    file.write_text(file.read_text().replace(
-        '      rc_res', '      noise_density_g_per_rthz: [1.3e-4, 0.1, 0.1]\n      rc_res', 1))
+    file.write_text(
+        file.read_text().replace(
+            '      rc_res', '      noise_density_g_per_rthz: [1.3e-4, 0.1, 0.1]\n      rc_res', 1
+        )
+    )
     run(tmp_path, 'coarse.csv', '--params', 'noise.yaml', '-o', 'kept.yaml')
     kept = parameter_file.load(tmp_path / 'kept.yaml').noise_density_g_per_rthz
     assert kept[0] == 1.3e-4
@@ -135,15 +142,20 @@ def test_a_rest_goes_on_after_a_few_lost_samples_and_not_after_a_long_gap(tmp_pa
     assert 'interrupted' in run(tmp_path, 'gap.csv').stdout
 
 
-@pytest.mark.parametrize(('change', 'reason'), [
-    ('stuck', 'az_mps2 never changes'), ('stuck half way', 'az_mps2 never changes'),
-    ('short', 'record longer')])
+@pytest.mark.parametrize(
+    ('change', 'reason'),
+    [
+        ('stuck', 'az_mps2 never changes'),
+        ('stuck half way', 'az_mps2 never changes'),
+        ('short', 'record longer'),
+    ],
+)
 def test_refusals_are_one_line(tmp_path: Path, change: str, reason: str) -> None:
     time_s, accel = samples(5.0 if change == 'short' else 60.0)
     if change == 'stuck':
         accel[:, 2] = G
     if change == 'stuck half way':
-        accel[len(accel) // 2:, 2] = G
+        accel[len(accel) // 2 :, 2] = G
     write_csv(tmp_path / 'bad.csv', time_s, accel)
     done = run_in_process('noise', 'bad.csv', '-o', 'noise.yaml', cwd=tmp_path)
     assert done.returncode == 1

@@ -10,8 +10,11 @@ from adxl_ros.model.sensor import get, put, with_neutral
 import numpy as np
 from units import nominal
 
-NAMES = [Coefficient(*effect, axis) for effect in (('bias', 'offset_v'), (
-    'scale_factor', 'offset_v_per_g')) for axis in 'xy']
+NAMES = [
+    Coefficient(*effect, axis)
+    for effect in (('bias', 'offset_v'), ('scale_factor', 'offset_v_per_g'))
+    for axis in 'xy'
+]
 STD = np.array([2e-3, 2e-3, 1e-3, 1e-3])
 MEAN = np.array([0.02, -0.01, 0.01, 0.0])
 
@@ -22,16 +25,25 @@ def pooled(mean, std):
 
 def population(shift_v=0.0):
     """Return the population of the drawn units; `shift_v` makes its zero-g wrong."""
-    return Population('population.yaml', {
-        **{f'zero_g_{axis}_v': pooled(2.5 + mean + shift_v, 2e-3)
-           for axis, mean in zip('xy', MEAN)},
-        **{f'scale_{axis}_v_per_g': pooled(1 + mean, 1e-3)
-           for axis, mean in zip('xy', MEAN[2:])}})
+    return Population(
+        'population.yaml',
+        {
+            **{
+                f'zero_g_{axis}_v': pooled(2.5 + mean + shift_v, 2e-3)
+                for axis, mean in zip('xy', MEAN)
+            },
+            **{
+                f'scale_{axis}_v_per_g': pooled(1 + mean, 1e-3)
+                for axis, mean in zip('xy', MEAN[2:])
+            },
+        },
+    )
 
 
 def drawn(rng):
-    return put(with_neutral(nominal(), ['bias', 'scale_factor']), NAMES,
-               MEAN + STD * rng.normal(size=4))
+    return put(
+        with_neutral(nominal(), ['bias', 'scale_factor']), NAMES, MEAN + STD * rng.normal(size=4)
+    )
 
 
 def test_poses_take_the_population(run_tool, tmp_path):
@@ -39,8 +51,9 @@ def test_poses_take_the_population(run_tool, tmp_path):
     parameter_file.save(tmp_path / 'truth.yaml', truth)
     calibration_store.write_population(tmp_path / 'population.yaml', population())
     run_tool('simulate', 'sweep', '--params', 'truth.yaml', '--rate', 100, '-o', 'one.csv')
-    done = run_tool('fit', 'one.csv', '--model', 'linear', '--prior', 'population.yaml',
-                    '-o', 'unit.yaml')
+    done = run_tool(
+        'fit', 'one.csv', '--model', 'linear', '--prior', 'population.yaml', '-o', 'unit.yaml'
+    )
     assert done.returncode == 0, done.stderr
     assert 'prior: population.yaml is the prior of 4 coefficients' in done.stdout
     unit = parameter_file.load(tmp_path / 'unit.yaml')

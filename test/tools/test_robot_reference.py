@@ -31,9 +31,13 @@ def poses(time_s):
         for step in range(int(SPAN_S / 2)):
             u = np.clip(time_s - 2 * step, 0, 1)
             turn = rng.uniform(-1.2, 1.2) - (out[0, -1, joint] if step % 2 else 0)
-            for order, values in enumerate((
-                    u ** 4 * (35 - 84 * u + 70 * u ** 2 - 20 * u ** 3),
-                    140 * u ** 3 * (1 - u) ** 3, 420 * u ** 2 * (1 - u) ** 2 * (1 - 2 * u))):
+            for order, values in enumerate(
+                (
+                    u**4 * (35 - 84 * u + 70 * u**2 - 20 * u**3),
+                    140 * u**3 * (1 - u) ** 3,
+                    420 * u**2 * (1 - u) ** 2 * (1 - 2 * u),
+                )
+            ):
                 out[order, :, joint] += turn * values
     return out
 
@@ -52,26 +56,55 @@ def robot(tmp_path_factory):
         time_s = np.arange(1, SPAN_S - 1, 1 / RATE_HZ)
         volts = Response(sensor, Motion(SPAN_S, force=ForcePath(fine_s, force)), 1, 1.0)(time_s)
         readings = encoded(poses(fine_s[::4])[0] - [0, joint_offset_rad, 0], STEP_RAD)
-        bag_of(folder / name, [
-            *(imu(EPOCH_NS + round(t * 1e9), a, variance=(1e-4,) * 3)
-              for t, a in zip(time_s, to_nominal_mps2(volts, sensor))),
-            *(joints(EPOCH_NS + round(t * 1e9), '/joint_states', gripper=0.1, **{
-                f'j{k + 1}': q for k, q in enumerate(row)})
-              for t, row in zip(fine_s[::4], readings))])
+        bag_of(
+            folder / name,
+            [
+                *(
+                    imu(EPOCH_NS + round(t * 1e9), a, variance=(1e-4,) * 3)
+                    for t, a in zip(time_s, to_nominal_mps2(volts, sensor))
+                ),
+                *(
+                    joints(
+                        EPOCH_NS + round(t * 1e9),
+                        '/joint_states',
+                        gripper=0.1,
+                        **{f'j{k + 1}': q for k, q in enumerate(row)},
+                    )
+                    for t, row in zip(fine_s[::4], readings)
+                ),
+            ],
+        )
         return folder / name
+
     return record
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(('effects', 'offset_rad', 'status', 'named'), [
-    ((), 0.0, 'no_gap', []),
-    (('scale_factor:offset_v_per_g=0.01',), 0.0, 'explained', ['scale_factor']),
-    ((), 0.005, 'explained', ['joint_offset'])], ids=['none', 'scale_factor', 'joint_offset'])
+@pytest.mark.parametrize(
+    ('effects', 'offset_rad', 'status', 'named'),
+    [
+        ((), 0.0, 'no_gap', []),
+        (('scale_factor:offset_v_per_g=0.01',), 0.0, 'explained', ['scale_factor']),
+        ((), 0.005, 'explained', ['joint_offset']),
+    ],
+    ids=['none', 'scale_factor', 'joint_offset'],
+)
 def test_diagnose_names_what_is_wrong(robot, run_tool, effects, offset_rad, status, named):
     """Of sensor and robot, and nothing where nothing is."""
     bag = robot(f'run{len(effects)}{offset_rad}', *effects, joint_offset_rad=offset_rad)
-    done = run_tool('diagnose', bag, '--urdf', bag.parent / 'robot.urdf', '--params',
-                    bag.parent / 'unit.yaml', '--in', 'tilt', '-o', bag.parent / 'gap', '--json')
+    done = run_tool(
+        'diagnose',
+        bag,
+        '--urdf',
+        bag.parent / 'robot.urdf',
+        '--params',
+        bag.parent / 'unit.yaml',
+        '--in',
+        'tilt',
+        '-o',
+        bag.parent / 'gap',
+        '--json',
+    )
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     verdict = report['verdict']
@@ -84,8 +117,18 @@ def test_fit_takes_poses_of_the_robot(robot, run_tool):
     """Zero-g and scale factor are those of the unit."""
     bag = robot('poses', 'bias:offset_v=0.02', 'scale_factor:offset_v_per_g=0.01')
     output = bag.parent / 'fitted.yaml'
-    done = run_tool('fit', bag, '--urdf', bag.parent / 'robot.urdf', '--params',
-                    bag.parent / 'unit.yaml', '--model', 'linear', '-o', output)
+    done = run_tool(
+        'fit',
+        bag,
+        '--urdf',
+        bag.parent / 'robot.urdf',
+        '--params',
+        bag.parent / 'unit.yaml',
+        '--model',
+        'linear',
+        '-o',
+        output,
+    )
     assert done.returncode == 0, done.stderr
     fitted = parameter_file.load(output)
     names = [Coefficient('bias', 'offset_v', axis) for axis in 'xyz']

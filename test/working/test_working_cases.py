@@ -15,8 +15,9 @@ import pytest
 def scene():
     """Return a unit in a manoeuvre that has everything that faults need."""
     rng = np.random.default_rng(4)
-    unit = next(u for u in iter(lambda: world.draw_unit(rng), None)
-                if u.axes == 'xyz' and u.rate_hz == 100)
+    unit = next(
+        u for u in iter(lambda: world.draw_unit(rng), None) if u.axes == 'xyz' and u.rate_hz == 100
+    )
     return Scene(unit, world.draw_motion(rng, unit, {'heat', 'supply', 'shake', 'fast'}), 3)
 
 
@@ -25,8 +26,10 @@ def test_every_fault_changes_a_recording(name, scene):
     kind = world.KINDS[name]
     assert (name in library()) == (name in world.LISTED)
     shape = {**kind.draw(np.random.default_rng(1), scene.unit)}
-    sizes = [rms(scene.response([Fault(kind, size, shape)], True))
-             for size in (kind.start, min(3 * kind.start, kind.largest))]
+    sizes = [
+        rms(scene.response([Fault(kind, size, shape)], True))
+        for size in (kind.start, min(3 * kind.start, kind.largest))
+    ]
     assert np.all(np.isfinite(sizes)) and 1e-5 < sizes[0] < sizes[1]
 
 
@@ -46,25 +49,38 @@ def test_moves_reach_their_ends_without_a_jump(share):
 def row(group, effects, status, named=(), probability=0.65, groups=()):
     """Return a case with a report; its effects have 0.03 m/s²."""
     faults = [{'effect': name, 'strength_mps2': 0.03, 'power': 1.0} for name in effects]
-    report = {'verdict': {'status': status, 'effects': list(named), 'probability': probability,
-                          'groups': [list(names) for names in groups]},
-              'hypotheses': [{'effects': list(named), 'probability': probability}],
-              'gap': {}, 'candidates': []}
+    report = {
+        'verdict': {
+            'status': status,
+            'effects': list(named),
+            'probability': probability,
+            'groups': [list(names) for names in groups],
+        },
+        'hypotheses': [{'effects': list(named), 'probability': probability}],
+        'gap': {},
+        'candidates': [],
+    }
     return working_cases.Row(
         Label('w', group, tuple(effects), (1, 2), (9.0, 9.0), 'mixed', 'xy', 0.01, faults),
-        {'report': report, 'seconds': 2.0, 'cpu_s': 1.0, 'error': ''}, frozenset({'flicker'}),
-        False)
+        {'report': report, 'seconds': 2.0, 'cpu_s': 1.0, 'error': ''},
+        frozenset({'flicker'}),
+        False,
+    )
 
 
-@pytest.mark.parametrize('given, right, in_set', [
-    (row('single', ['supply'], 'explained', ['supply']), True, True),
-    (row('single', ['supply'], 'explained', ['supply', 'flicker']), True, True),
-    (row('single', ['supply'], 'inseparable', [], groups=[['supply', 'bias']]), False, True),
-    (row('single', ['supply'], 'explained', ['bias']), False, False),
-    (row('single', ['supply'], 'no_gap'), False, False),
-    (row('outside', ['beat'], 'unknown'), True, True),
-    (row('outside', ['beat'], 'partly', ['bias']), True, True),
-    (row('none', [], 'explained', ['supply']), False, False),
-    (row('none', [], 'explained', ['flicker']), True, True)])
+@pytest.mark.parametrize(
+    'given, right, in_set',
+    [
+        (row('single', ['supply'], 'explained', ['supply']), True, True),
+        (row('single', ['supply'], 'explained', ['supply', 'flicker']), True, True),
+        (row('single', ['supply'], 'inseparable', [], groups=[['supply', 'bias']]), False, True),
+        (row('single', ['supply'], 'explained', ['bias']), False, False),
+        (row('single', ['supply'], 'no_gap'), False, False),
+        (row('outside', ['beat'], 'unknown'), True, True),
+        (row('outside', ['beat'], 'partly', ['bias']), True, True),
+        (row('none', [], 'explained', ['supply']), False, False),
+        (row('none', [], 'explained', ['flicker']), True, True),
+    ],
+)
 def test_exact_and_in_the_set(given, right, in_set):
     assert (working_cases.right(given), working_cases.in_set(given)) == (right, in_set)

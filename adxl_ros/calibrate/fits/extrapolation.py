@@ -34,12 +34,14 @@ class NextDegree(NamedTuple):
     def error_g(self, temperature_c: np.ndarray, zero_g_at_c: float) -> np.ndarray:
         """Return the error of the zero-g that it causes, g rms, by axis, (m, k)."""
         departure = departure_k(temperature_c, self.nodes_c) - departure_k(
-            zero_g_at_c, self.nodes_c)
+            zero_g_at_c, self.nodes_c
+        )
         return np.abs(np.outer(self.size, departure))
 
 
-def next_degree(temperature_c: np.ndarray, residual_g: np.ndarray, curvature_k2: np.ndarray
-                ) -> NextDegree:
+def next_degree(
+    temperature_c: np.ndarray, residual_g: np.ndarray, curvature_k2: np.ndarray
+) -> NextDegree:
     """
     Estimate the next degree of the zero-g from the residuals of a fit of slope and curvature.
 
@@ -51,24 +53,27 @@ def next_degree(temperature_c: np.ndarray, residual_g: np.ndarray, curvature_k2:
     # The whole span counts as one more sample, so that few temperatures determine all degrees.
     even = np.linspace(warmer.min(), warmer.max(), _DEGREE + 2)
     weight = np.sqrt(np.concatenate([np.ones(len(warmer)), np.full(len(even), 1 / len(even))]))
-    last, following = (_orthogonal(np.concatenate([warmer, even]), weight, degree)
-                       for degree in (_DEGREE, _DEGREE + 1))
+    last, following = (
+        _orthogonal(np.concatenate([warmer, even]), weight, degree)
+        for degree in (_DEGREE, _DEGREE + 1)
+    )
     nodes_c = middle_c + span_k * np.sort(np.roots(following).real)
     shape = departure_k(temperature_c, nodes_c)
-    last_k2 = span_k ** _DEGREE * np.polyval(last, warmer)
+    last_k2 = span_k**_DEGREE * np.polyval(last, warmer)
     prior = np.maximum(np.abs(curvature_k2), _TYPICAL_K2)
     prior = prior * np.linalg.norm(last_k2) / np.linalg.norm(shape)
     squares = float(shape @ shape)
     estimate = shape @ residual_g / squares
     rest_g = residual_g - np.outer(shape, estimate)
-    variance_g2 = (rest_g ** 2).sum(axis=0) / max(len(rest_g) - _DEGREE - 2, 1)
+    variance_g2 = (rest_g**2).sum(axis=0) / max(len(rest_g) - _DEGREE - 2, 1)
     neighbours = np.sum(rest_g[1:] * rest_g[:-1], axis=0) / np.maximum(
-        (rest_g ** 2).sum(axis=0), np.finfo(float).tiny)
+        (rest_g**2).sum(axis=0), np.finfo(float).tiny
+    )
     correlation = np.clip(neighbours, 0.0, _LARGEST_CORRELATION)
     # Correlated residuals count as fewer independent ones.
     variance_g2 *= (1 + correlation) / (1 - correlation)
     information = squares / np.maximum(variance_g2, np.finfo(float).tiny)
-    variance = 1 / (information + prior ** -2)
+    variance = 1 / (information + prior**-2)
     return NextDegree(nodes_c, np.sqrt((variance * information * estimate) ** 2 + variance))
 
 

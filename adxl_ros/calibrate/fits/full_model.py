@@ -48,8 +48,15 @@ from adxl_ros.report.quantities import with_half_width
 import numpy as np
 import scipy
 
-TERMS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z', 'scale_factor_z',
-         'nonlinearity')
+TERMS = (
+    'bias',
+    'scale_factor',
+    'misalignment',
+    'cross_axis',
+    'cross_axis_z',
+    'scale_factor_z',
+    'nonlinearity',
+)
 """Terms of a two-axis unit: those of the paper, and a cube."""
 _THREE_AXES = ('scale_factor_cross',)  # Terms that only a three-axis unit has
 _PRIOR_SUFFICES = ('nonlinearity',)
@@ -124,8 +131,9 @@ def default_terms(axes: str) -> tuple[str, ...]:
     return TERMS + (_THREE_AXES if axes == AXES else ())
 
 
-def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None, max_open: int = 0
-             ) -> FullFit:
+def fit_full(
+    sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None, max_open: int = 0
+) -> FullFit:
     """
     Fit the terms to the poses by maximum likelihood.
 
@@ -168,28 +176,50 @@ def fit_full(sensor: Sensor, poses: Poses, terms: Sequence[str] | None = None, m
     return _Search(start, poses, names, stated).run()
 
 
-def _likeliest_shapes(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
-                      stated: StageError, effects: Sequence[str]) -> Sensor:
+def _likeliest_shapes(
+    unit: Sensor,
+    poses: Poses,
+    names: tuple[Coefficient, ...],
+    stated: StageError,
+    effects: Sequence[str],
+) -> Sensor:
     """
     Give the shape parameters (periods, time constants) of effects their likeliest values.
 
     The volts are nearly linear in all other coefficients. The likelihood by a shape parameter has
     several maxima, so that its whole range is searched, and then the interval of the best value.
     """
-    shapes = [(name, parameter) for name in effects for parameter in effect_named(name).parameters
-              if effect_named(name).invertible and parameter.role is Role.SHAPE
-              and not parameter.held]
+    shapes = [
+        (name, parameter)
+        for name in effects
+        for parameter in effect_named(name).parameters
+        if effect_named(name).invertible and parameter.role is Role.SHAPE and not parameter.held
+    ]
     for effect, parameter in shapes:
         of_effect = unit.values[effect]
         shape, value = np.shape(of_effect[parameter.name]), parameter.scale
-        for steps in (np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1),
-                      np.linspace(-1, 1, _FINE_SHAPES)):
-            values = value * _SHAPE_STEP ** steps
-            units = [replace(unit, values={
-                **unit.values, effect: {**of_effect, parameter.name: np.full(shape, trial)}})
-                for trial in values if parameter.lower <= trial <= parameter.upper]
-            unit = min(units, key=lambda trial: linearised(
-                trial, poses, names, prior_precision(names)).misfit(stated))
+        for steps in (
+            np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1),
+            np.linspace(-1, 1, _FINE_SHAPES),
+        ):
+            values = value * _SHAPE_STEP**steps
+            units = [
+                replace(
+                    unit,
+                    values={
+                        **unit.values,
+                        effect: {**of_effect, parameter.name: np.full(shape, trial)},
+                    },
+                )
+                for trial in values
+                if parameter.lower <= trial <= parameter.upper
+            ]
+            unit = min(
+                units,
+                key=lambda trial: linearised(trial, poses, names, prior_precision(names)).misfit(
+                    stated
+                ),
+            )
             value = float(np.ravel(unit.values[effect][parameter.name])[0])
     return unit
 
@@ -197,8 +227,9 @@ def _likeliest_shapes(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...]
 class _Search:
     """The fit from one start: stage error, coefficients and angles in turn until all converge."""
 
-    def __init__(self, unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
-                 stated: StageError) -> None:
+    def __init__(
+        self, unit: Sensor, poses: Poses, names: tuple[Coefficient, ...], stated: StageError
+    ) -> None:
         self._measured, self._names, self._stated = poses, names, stated
         self._precision = prior_precision(names)  # Inverse prior variances, (p,)
         self._unit, self._stage = unit, stated  # Unit with coefficients, and stage error
@@ -224,8 +255,11 @@ class _Search:
             kept_before, deviance_before = self._kept, deviance
             deviance = about.deviance(self._stage)
             self._kept = _inliers(about, self._stage)
-            converged = (np.array_equal(self._kept, kept_before) and step_std < _SETTLED_STD
-                         and abs(deviance - deviance_before) < _SETTLED_DEVIANCE)
+            converged = (
+                np.array_equal(self._kept, kept_before)
+                and step_std < _SETTLED_STD
+                and abs(deviance - deviance_before) < _SETTLED_DEVIANCE
+            )
             if converged:
                 break
         return self._result(converged)
@@ -243,8 +277,11 @@ class _Search:
             about = self._about(self._unit, self._weighted())
             self._stage = about.stage_error(self._stated.total_rad, self._stage)
             # Angle errors δ that are not predicted yet change the force by δ²/2 of g.
-            self._curvature_v = self._unit.nominal_scale_v_per_g * self._stage.total_rad ** 2 \
-                * _CURVATURE_SHRINK ** number
+            self._curvature_v = (
+                self._unit.nominal_scale_v_per_g
+                * self._stage.total_rad**2
+                * _CURVATURE_SHRINK**number
+            )
 
     def _solved(self, poses: Poses, steps: int) -> _Iterate:
         """Take Gauss-Newton steps without step control: the chain is nearly linear in them."""
@@ -258,9 +295,11 @@ class _Search:
             return _Iterate(values, step, 0.0, about, covariance, information)
 
         return gauss_newton(
-            linearise, get(self._unit, self._names),
+            linearise,
+            get(self._unit, self._names),
             lambda _, previous, __: previous is not None and previous.step_std < _LAST_STEP_STD,
-            steps + 1)
+            steps + 1,
+        )
 
     def _step(self) -> float:
         """Move coefficients and angles to likelier ones; return the longest step, in stds."""
@@ -271,10 +310,13 @@ class _Search:
 
         def cost(values: np.ndarray, angles: linearisation.AngleErrors) -> float:
             residual = self._measured.volts - predicted_volts(
-                put(self._unit, self._names, values), _turned(self._measured, angles.total_rad))
-            return float(np.sum((residual / weighted.std_v)[self._kept] ** 2)
-                         + np.sum(self._precision * values ** 2)
-                         + solved.covariance.penalty(angles))
+                put(self._unit, self._names, values), _turned(self._measured, angles.total_rad)
+            )
+            return float(
+                np.sum((residual / weighted.std_v)[self._kept] ** 2)
+                + np.sum(self._precision * values**2)
+                + solved.covariance.penalty(angles)
+            )
 
         highest, before = cost(start, self._errors), self._errors
         for share in 0.5 ** np.arange(_MAX_HALVINGS + 1):
@@ -291,20 +333,33 @@ class _Search:
         about = self._about(self._unit, self._poses)
         over_levels = about.covariance_over_levels(self._stage, self._stated.total_rad)
         of_sensor = [i for i, name in enumerate(self._names) if not belongs_to_stage(name)]
-        effects = tuple(effect for effect in self._unit.effects
-                        if effect_named(effect).place is not Place.STAGE)
+        effects = tuple(
+            effect
+            for effect in self._unit.effects
+            if effect_named(effect).place is not Place.STAGE
+        )
         fitted = replace(
-            self._unit, model='full', effects=effects,
+            self._unit,
+            model='full',
+            effects=effects,
             values={name: self._unit.values[name] for name in effects},
             covariance=over_levels[np.ix_(of_sensor, of_sensor)],
-            covariance_names=tuple(self._names[i] for i in of_sensor))
+            covariance_names=tuple(self._names[i] for i in of_sensor),
+        )
         errors = about.covariance(self._stage).predicted_errors(about.residual)
         return FullFit(
-            fitted=fitted, unit=self._unit, names=self._names, stage=self._stage,
+            fitted=fitted,
+            unit=self._unit,
+            names=self._names,
+            stage=self._stage,
             stated_std_rad=self._stated.total_rad,
             outliers=tuple(np.flatnonzero(~self._kept).tolist()),
-            information=np.linalg.inv(over_levels), squared_distances=errors.squared_distances,
-            linear_poses=self._poses, deviance=about.deviance(self._stage), converged=converged)
+            information=np.linalg.inv(over_levels),
+            squared_distances=errors.squared_distances,
+            linear_poses=self._poses,
+            deviance=about.deviance(self._stage),
+            converged=converged,
+        )
 
 
 @dataclass(frozen=True)
@@ -325,16 +380,20 @@ def _inliers(about: Linearised, stage: StageError) -> np.ndarray:
     """Mark the poses that are no outliers, (k,) bool; all poses if too many are outliers."""
     errors = about.covariance(stage).predicted_errors(about.residual)
     kept = errors.squared_distances < scipy.special.chdtri(
-        about.residual.shape[1], _OUTLIER_CHANCE)
+        about.residual.shape[1], _OUTLIER_CHANCE
+    )
     return kept if kept.mean() >= 1 - _MAX_OUTLIERS else np.ones(len(kept), bool)
 
 
 def fitted_coefficients(axes: str, terms: Sequence[str]) -> tuple[Coefficient, ...]:
     """Name the coefficients of terms: of the sensor, the base's tilt, then of the stage."""
     effects = dict.fromkeys(map(effect_of, terms))
-    names = [name for effect in effects for name in names_of(effect_named(effect), axes)
-             if parameter_of(name).role not in (Role.SHAPE, Role.OPTIONAL)
-             and term_of(name) in terms]
+    names = [
+        name
+        for effect in effects
+        for name in names_of(effect_named(effect), axes)
+        if parameter_of(name).role not in (Role.SHAPE, Role.OPTIONAL) and term_of(name) in terms
+    ]
     of_stage = [name for name in names if belongs_to_stage(name) and name not in _BASE_TILT]
     return (*(name for name in names if not belongs_to_stage(name)), *_BASE_TILT, *of_stage)
 
@@ -352,13 +411,26 @@ def effect_of(term: str) -> str:
 
 def prior_precision(names: Sequence[Coefficient]) -> np.ndarray:
     """Return the inverse prior variances of coefficients about 0, (p,)."""
-    return 1 / np.square([LEVEL_STD_RAD if name in _BASE_TILT else parameter_of(name).scale * (
-        _GAUGE_PRIOR_SIZES if term_of(name) in GAUGE else
-        _STAGE_PRIOR_SIZES if belongs_to_stage(name) else _SENSOR_PRIOR_SIZES) for name in names])
+    return 1 / np.square(
+        [
+            LEVEL_STD_RAD
+            if name in _BASE_TILT
+            else parameter_of(name).scale
+            * (
+                _GAUGE_PRIOR_SIZES
+                if term_of(name) in GAUGE
+                else _STAGE_PRIOR_SIZES
+                if belongs_to_stage(name)
+                else _SENSOR_PRIOR_SIZES
+            )
+            for name in names
+        ]
+    )
 
 
-def fisher_information(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
-                       stage: StageError) -> np.ndarray:
+def fisher_information(
+    unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
+) -> np.ndarray:
     """Return the Fisher information, priors included, (p, p); the Cramér-Rao bound inverted."""
     about = linearised(unit, poses, names, prior_precision(names))
     return about.information(about.covariance(stage))
@@ -371,8 +443,11 @@ def _sizes(names: Sequence[Coefficient]) -> np.ndarray:
 
 def _turned(poses: Poses, errors_rad: np.ndarray) -> Poses:
     """Add angle errors, (k, 2), to the angles of the encoder."""
-    return replace(poses, alpha_rad=poses.alpha_rad + errors_rad[:, 0],
-                   beta_rad=poses.beta_rad + errors_rad[:, 1])
+    return replace(
+        poses,
+        alpha_rad=poses.alpha_rad + errors_rad[:, 0],
+        beta_rad=poses.beta_rad + errors_rad[:, 1],
+    )
 
 
 def _turned_linearly(unit: Sensor, poses: Poses, errors_rad: np.ndarray) -> Poses:
@@ -387,34 +462,51 @@ def belongs_to_stage(name: Coefficient) -> bool:
     return effect_named(name.effect).place is Place.STAGE
 
 
-def open_coefficients(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
-                      stage: StageError) -> list[Coefficient]:
+def open_coefficients(
+    unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
+) -> list[Coefficient]:
     """Return the sensor's coefficients that poses leave as uncertain as their typical size."""
     scale = _sizes(names)
-    required = [not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_PRIOR_SUFFICES)
-                for name in names]
+    required = [
+        not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_PRIOR_SUFFICES)
+        for name in names
+    ]
     # The poses must determine a required coefficient without its prior.
     information = fisher_information(unit, poses, names, stage) - np.diag(
-        prior_precision(names) * required)
-    variances = np.diag(np.linalg.inv(
-        information * np.outer(scale, scale) + _REGULARISATION * np.eye(len(names))))
-    return [name for name, variance, is_required in zip(names, variances, required)
-            if is_required and variance > 1.0]
+        prior_precision(names) * required
+    )
+    variances = np.diag(
+        np.linalg.inv(information * np.outer(scale, scale) + _REGULARISATION * np.eye(len(names)))
+    )
+    return [
+        name
+        for name, variance, is_required in zip(names, variances, required)
+        if is_required and variance > 1.0
+    ]
 
 
-def require_determined(unit: Sensor, poses: Poses, names: Sequence[Coefficient],
-                       stage: StageError, max_open: int = 0) -> None:
+def require_determined(
+    unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError, max_open: int = 0
+) -> None:
     """Refuse poses that leave more coefficients open; the message names poses that help."""
     undetermined = open_coefficients(unit, poses, names, stage)
     if len(undetermined) <= max_open and poses.volts.size > len(names) - max_open:
         return
-    reason = f'they do not determine {", ".join(map(str, undetermined))}' if undetermined else \
-        f'they have {poses.volts.size} values for {len(names)} coefficients'
+    reason = (
+        f'they do not determine {", ".join(map(str, undetermined))}'
+        if undetermined
+        else f'they have {poses.volts.size} values for {len(names)} coefficients'
+    )
     follows = {quantity for name in undetermined for quantity in effect_named(name.effect).follows}
-    advice = f'poses with other values of {" and ".join(sorted(follows))}' if follows else \
-        f'poses (alpha, beta) = {next_poses(unit, poses, names, stage)} deg'
-    raise UserError(f'the full model is not determined by {len(poses)} poses: {reason}; add '
-                    f'{advice}, or fit --model physical or linear')
+    advice = (
+        f'poses with other values of {" and ".join(sorted(follows))}'
+        if follows
+        else f'poses (alpha, beta) = {next_poses(unit, poses, names, stage)} deg'
+    )
+    raise UserError(
+        f'the full model is not determined by {len(poses)} poses: {reason}; add '
+        f'{advice}, or fit --model physical or linear'
+    )
 
 
 def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError) -> str:
@@ -423,10 +515,13 @@ def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: 
     scale = _sizes(names)
     rows = linearisation.whitened_jacobian(unit, grid, tuple(names), stage) * scale
     information = fisher_information(unit, poses, names, stage) * np.outer(scale, scale)
-    chosen = linearisation.choose_poses(rows, information + _REGULARISATION * np.eye(len(names)),
-                                        _NAMED_POSES)
-    return ', '.join(f'({np.degrees(grid.alpha_rad[i]):.0f}, {np.degrees(grid.beta_rad[i]):.0f})'
-                     for i in chosen)
+    chosen = linearisation.choose_poses(
+        rows, information + _REGULARISATION * np.eye(len(names)), _NAMED_POSES
+    )
+    return ', '.join(
+        f'({np.degrees(grid.alpha_rad[i]):.0f}, {np.degrees(grid.beta_rad[i]):.0f})'
+        for i in chosen
+    )
 
 
 ALWAYS = ('bias', 'scale_factor')  # Terms that every fit has and that are not compared
@@ -457,10 +552,16 @@ class Term:
 
 def candidates(poses: Poses) -> tuple[str, ...]:
     """Name the terms that these poses may need beyond the default ones."""
-    changed = {name for name, change in _MIN_CHANGE.items()
-               if np.ptp(getattr(poses.environment, name)) > change}
-    following = [name for name, effect in library().items()
-                 if effect.invertible and changed & set(effect.follows)]
+    changed = {
+        name
+        for name, change in _MIN_CHANGE.items()
+        if np.ptp(getattr(poses.environment, name)) > change
+    }
+    following = [
+        name
+        for name, effect in library().items()
+        if effect.invertible and changed & set(effect.follows)
+    ]
     return ('stage_eccentricity', *following)
 
 
@@ -469,8 +570,9 @@ def fit(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> Sensor:
     return fit_selected(sensor, poses, effects)[0].fitted
 
 
-def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
-                 ) -> tuple[FullFit, list[Term]]:
+def fit_selected(
+    sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
+) -> tuple[FullFit, list[Term]]:
     """Fit the full model and effects as `fit_full` does, and add terms that the poses support."""
     terms = tuple(dict.fromkeys((*default_terms(sensor.axes), *effects)))
     full = fit_full(sensor, poses, terms)
@@ -527,17 +629,23 @@ def gauge_is_identifiable(full: FullFit) -> bool:
 def _linearised(full: FullFit, added: Sequence[str]) -> tuple[Linearised, np.ndarray]:
     """Linearise the fit with further terms; also return the term of each coefficient, (p,)."""
     unit = with_neutral(full.unit, map(effect_of, added))
-    further = [name for term in added
-               for name in fitted_coefficients(unit.axes, (term,))
-               if name not in full.names]
+    further = [
+        name
+        for term in added
+        for name in fitted_coefficients(unit.axes, (term,))
+        if name not in full.names
+    ]
     names = (*full.names, *further)
-    return (linearised(unit, full.linear_poses, names, prior_precision(names),
-                       full.kept),
-            np.array([term_of(name) for name in names]))
+    return (
+        linearised(unit, full.linear_poses, names, prior_precision(names), full.kept),
+        np.array([term_of(name) for name in names]),
+    )
 
 
-NOT_CONVERGED = ('the fit did not converge: coefficients and intervals are those of its last '
-                 'step; add poses, or leave out terms')
+NOT_CONVERGED = (
+    'the fit did not converge: coefficients and intervals are those of its last '
+    'step; add poses, or leave out terms'
+)
 """Line of a fit that did not converge."""
 _MAX_WARMING_K = 3.0
 """Range of temperature beyond which the report warns, K: 0.3 mg by the datasheet's 0.1 mg/°C."""
@@ -552,12 +660,16 @@ _MIN_PART = 0.2  # Smallest component of the weakest direction, a unit vector, i
 def report_lines(full: FullFit, poses: Poses, terms: Sequence[Term]) -> list[str]:
     """Report the stage, the weakest direction and the terms of a fit of poses."""
     helpful = next_poses(full.unit, poses, full.names, full.stage)
-    setting_deg, pose_deg = (np.degrees(rad * full.stage.joints) for rad in (
-        full.stage.setting_rad, full.stage.pose_rad))
+    setting_deg, pose_deg = (
+        np.degrees(rad * full.stage.joints)
+        for rad in (full.stage.setting_rad, full.stage.pose_rad)
+    )
     std = np.sqrt(np.diag(np.linalg.inv(full.information)))
-    values = [f'{name} {with_half_width(float(value), Z_90 * value_std)} {parameter_of(name).unit}'
-              for name, value, value_std in zip(full.names, get(full.unit, full.names), std)
-              if belongs_to_stage(name)]
+    values = [
+        f'{name} {with_half_width(float(value), Z_90 * value_std)} {parameter_of(name).unit}'
+        for name, value, value_std in zip(full.names, get(full.unit, full.names), std)
+        if belongs_to_stage(name)
+    ]
     return [
         f'stage error: alpha {setting_deg[0]:.2g}, beta {setting_deg[1]:.2g} deg rms by setting, '
         f'{pose_deg[0]:.2g} and {pose_deg[1]:.2g} deg by pose (stated '
@@ -566,8 +678,12 @@ def report_lines(full: FullFit, poses: Poses, terms: Sequence[Term]) -> list[str
         _weakest_direction(full.fitted),
         f'next poses that would help most, (alpha, beta) in deg: {helpful}',
         *(['log Bayes factor of each term, nats; above 0 the poses support it:'] if terms else []),
-        *(f'  {term.name:20} {term.log_bayes_factor:10.1f}'
-          f'{"" if term.is_supported else "   not supported by these poses"}' for term in terms)]
+        *(
+            f'  {term.name:20} {term.log_bayes_factor:10.1f}'
+            f'{"" if term.is_supported else "   not supported by these poses"}'
+            for term in terms
+        ),
+    ]
 
 
 def _weakest_direction(fitted: Sensor) -> str:
@@ -575,25 +691,37 @@ def _weakest_direction(fitted: Sensor) -> str:
     names, scale = fitted.covariance_names, _sizes(fitted.covariance_names)
     values, vectors = np.linalg.eigh(fitted.covariance / np.outer(scale, scale))
     weakest = vectors[:, -1]
-    parts = ' '.join(f'{weakest[i]:+.2f} {names[i]}' for i in np.argsort(-np.abs(weakest))[
-        :_MAX_PARTS] if abs(weakest[i]) > _MIN_PART)
-    return (f'least determined: {parts}, std {np.sqrt(values[-1]):.2g} typical sizes (condition '
-            f'number {np.sqrt(values[-1] / values[0]):.0f})')
+    parts = ' '.join(
+        f'{weakest[i]:+.2f} {names[i]}'
+        for i in np.argsort(-np.abs(weakest))[:_MAX_PARTS]
+        if abs(weakest[i]) > _MIN_PART
+    )
+    return (
+        f'least determined: {parts}, std {np.sqrt(values[-1]):.2g} typical sizes (condition '
+        f'number {np.sqrt(values[-1] / values[0]):.0f})'
+    )
 
 
 def warnings(full: FullFit, poses: Poses) -> list[str]:
     """Return what is wrong with the poses or the fit, one line each."""
     lines = [] if full.converged else [NOT_CONVERGED]
     if full.stage.total_rad > _BAD_STAGE_RATIO * full.stated_std_rad + _MIN_STAGE_EXCESS_RAD:
-        lines.append('the reference is worse than stated, or the model lacks an effect that looks '
-                     'like a stage error; poses are weighted accordingly')
+        lines.append(
+            'the reference is worse than stated, or the model lacks an effect that looks '
+            'like a stage error; poses are weighted accordingly'
+        )
     if full.outliers:
-        named = [f'{i + 1} (alpha {np.degrees(poses.alpha_rad[i]):.1f}, beta '
-                 f'{np.degrees(poses.beta_rad[i]):.1f} deg, from {poses.time_s[i, 0]:.1f} s, '
-                 f'{np.sqrt(full.squared_distances[i]):.0f} sigma)' for i in full.outliers]
+        named = [
+            f'{i + 1} (alpha {np.degrees(poses.alpha_rad[i]):.1f}, beta '
+            f'{np.degrees(poses.beta_rad[i]):.1f} deg, from {poses.time_s[i, 0]:.1f} s, '
+            f'{np.sqrt(full.squared_distances[i]):.0f} sigma)'
+            for i in full.outliers
+        ]
         lines.append(f'outliers, left out: pose {", ".join(named)}')
     change_k = np.ptp(poses.environment.temperature_c)
     if change_k > _MAX_WARMING_K and 'temperature_bias' not in full.fitted.effects:
-        lines.append(f'temperature moved by {change_k:.1f} degC, which the model ignores; keep it '
-                     'steady, or fit --effect temperature_bias')
+        lines.append(
+            f'temperature moved by {change_k:.1f} degC, which the model ignores; keep it '
+            'steady, or fit --effect temperature_bias'
+        )
     return lines

@@ -27,11 +27,13 @@ from adxl_ros.model.sensor import parameter_of, Sensor
 import numpy as np
 import scipy
 
-NAMES = (*(Coefficient('bias', 'offset_v', axis) for axis in AXES),
-         *(Coefficient('scale_factor', 'offset_v_per_g', axis) for axis in AXES),
-         Coefficient('misalignment', 'beta_rad', 'y'),
-         Coefficient('misalignment', 'alpha_rad', 'z'),
-         Coefficient('misalignment', 'beta_rad', 'z'))
+NAMES = (
+    *(Coefficient('bias', 'offset_v', axis) for axis in AXES),
+    *(Coefficient('scale_factor', 'offset_v_per_g', axis) for axis in AXES),
+    Coefficient('misalignment', 'beta_rad', 'y'),
+    Coefficient('misalignment', 'alpha_rad', 'z'),
+    Coefficient('misalignment', 'beta_rad', 'z'),
+)
 """The nine coefficients. In the fits of gravity they are zero-g shifts in g, relative changes of
 the scale factor and angles in rad: the "parameters" below, (9,)."""
 PRIOR_STD = 0.1
@@ -42,7 +44,7 @@ tolerances of datasheets."""
 TRIAL_STD_G = 1e-4  # Standard deviation of a rest's magnitude before the excess is estimated, g
 _ROUNDING_STD_G = 1e-9  # Std of a mean by rounding alone, so that no weight is infinite
 _MAX_VALUE = 0.5  # Largest magnitude of a parameter in an iteration; chosen: five prior stds
-_PRIOR_INFORMATION = np.eye(len(NAMES)) / PRIOR_STD ** 2
+_PRIOR_INFORMATION = np.eye(len(NAMES)) / PRIOR_STD**2
 """Inverse covariance of the prior about 0, (9, 9)."""
 
 
@@ -61,12 +63,15 @@ class Step(NamedTuple):
     @property
     def left_out(self) -> tuple[Coefficient, ...]:
         """Coefficients that are known by their prior alone."""
-        return NAMES[self.determined:]
+        return NAMES[self.determined :]
 
 
 NINE = Step('nine parameters', len(NAMES), np.zeros(len(NAMES)))
-SIX = Step('zero-g and scale factor', 6, np.array(
-    [0.0] * 6 + [parameter_of(name).scale ** -2.0 for name in NAMES[6:]]))
+SIX = Step(
+    'zero-g and scale factor',
+    6,
+    np.array([0.0] * 6 + [parameter_of(name).scale ** -2.0 for name in NAMES[6:]]),
+)
 LADDER = (NINE, SIX)
 """Fits from the one with the most parameters on."""
 
@@ -86,20 +91,28 @@ class NominalRests:
 def nominal_rests(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> NominalRests:
     """Convert means of rests and their standard deviations, V, (k, 3), by nominal values."""
     scale = sensor.nominal_scale_v_per_g
-    return NominalRests((mean_v - sensor.nominal_zero_g_v) / scale,
-                        (std_v / scale) ** 2 + _ROUNDING_STD_G ** 2,
-                        sensor.local_gravity_mps2 / G0_MPS2)
+    return NominalRests(
+        (mean_v - sensor.nominal_zero_g_v) / scale,
+        (std_v / scale) ** 2 + _ROUNDING_STD_G**2,
+        sensor.local_gravity_mps2 / G0_MPS2,
+    )
 
 
-def effect_values(parameters: np.ndarray, sensor: Sensor
-                  ) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
+def effect_values(
+    parameters: np.ndarray, sensor: Sensor
+) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray]:
     """Return the values of the effects, and the factor from each parameter to its coefficient."""
     scale = sensor.nominal_scale_v_per_g
     units = np.concatenate([scale, scale, np.ones(3)])
     values = parameters * units
-    return {'bias': {'offset_v': values[:3]}, 'scale_factor': {'offset_v_per_g': values[3:6]},
-            'misalignment': {'alpha_rad': np.array([0.0, 0.0, values[7]]),
-                             'beta_rad': np.array([0.0, values[6], values[8]])}}, units
+    return {
+        'bias': {'offset_v': values[:3]},
+        'scale_factor': {'offset_v_per_g': values[3:6]},
+        'misalignment': {
+            'alpha_rad': np.array([0.0, 0.0, values[7]]),
+            'beta_rad': np.array([0.0, values[6], values[8]]),
+        },
+    }, units
 
 
 def _sensing_axes(parameters: np.ndarray) -> np.ndarray:
@@ -153,22 +166,24 @@ def regularised_fit(rests: NominalRests, steps: int) -> np.ndarray:
     parameters = np.zeros(len(NAMES))
     for _ in range(steps):
         length, _, rows = linearised(rests.mean, parameters)
-        weighted = rows.T / (magnitude_variance(rests, parameters).mean() + TRIAL_STD_G ** 2)
-        gradient = weighted @ (rests.gravity_g - length) - parameters / PRIOR_STD ** 2
+        weighted = rows.T / (magnitude_variance(rests, parameters).mean() + TRIAL_STD_G**2)
+        gradient = weighted @ (rests.gravity_g - length) - parameters / PRIOR_STD**2
         step = np.linalg.solve(weighted @ rows + _PRIOR_INFORMATION, gradient)
         parameters = np.clip(parameters + step, -_MAX_VALUE, _MAX_VALUE)
     return parameters
 
 
-def fisher_information(rests: NominalRests, parameters: np.ndarray, excess_g2: float
-                       ) -> np.ndarray:
+def fisher_information(
+    rests: NominalRests, parameters: np.ndarray, excess_g2: float
+) -> np.ndarray:
     """Return the Fisher information of rests about the parameters, without the prior, (9, 9)."""
     rows = linearised(rests.mean, parameters).jacobian
     return rows.T @ (rows / (magnitude_variance(rests, parameters) + excess_g2)[:, None])
 
 
-def posterior_information(rests: NominalRests, parameters: np.ndarray, excess_g2: float
-                          ) -> np.ndarray:
+def posterior_information(
+    rests: NominalRests, parameters: np.ndarray, excess_g2: float
+) -> np.ndarray:
     """Return the information of prior and rests about the parameters, (9, 9)."""
     return _PRIOR_INFORMATION + fisher_information(rests, parameters, excess_g2)
 
@@ -197,8 +212,11 @@ def next_up(available: np.ndarray, now: np.ndarray | None) -> int | None:
 
 def points_up(candidate: int) -> str:
     """Return a sentence: '+x points up', '+x and −y point up equally'."""
-    axes = [('+' if sign > 0 else '−') + axis for axis, sign in zip(AXES, CANDIDATES[candidate])
-            if sign]
+    axes = [
+        ('+' if sign > 0 else '−') + axis
+        for axis, sign in zip(AXES, CANDIDATES[candidate])
+        if sign
+    ]
     return f'{axes[0]} points up' if len(axes) == 1 else f'{" and ".join(axes)} point up equally'
 
 
@@ -296,21 +314,25 @@ def _fitted(rests: NominalRests, sensor: Sensor, step: Step) -> GravityFit:
     variance = magnitude_variance(rests, parameters) + excess_g2
     information = fisher_information(rests[kept], parameters, excess_g2)
     # An excess that ν rests determine widens its share of the variance by ν/(ν − 2).
-    widened = 1 + excess_g2 / variance[kept].mean() * 2 / max(
-        kept.sum() - step.determined - 2, 1)
-    covariance = np.linalg.inv(information / widened + np.diag(step.precision)) \
-        + _second_order(step)
+    widened = 1 + excess_g2 / variance[kept].mean() * 2 / max(kept.sum() - step.determined - 2, 1)
+    covariance = np.linalg.inv(information / widened + np.diag(step.precision)) + _second_order(
+        step
+    )
     values, units = effect_values(parameters, sensor)
     residual = _residual(rests, parameters)
     return GravityFit(
-        values=values, covariance=covariance * np.outer(units, units),
+        values=values,
+        covariance=covariance * np.outer(units, units),
         before_mps2=G0_MPS2 * (np.linalg.norm(rests.mean, axis=1) - rests.gravity_g),
         residual_mps2=G0_MPS2 * residual,
         held_out_mps2=G0_MPS2 * _held_out(rests, kept, parameters, variance, residual, step),
         expected_mps2=G0_MPS2 * np.sqrt(variance),
         excess_mps2=G0_MPS2 * float(np.sqrt(excess_g2)),
         outliers=tuple(int(i) for i in np.flatnonzero(~kept)),
-        step=step, note=_note(rests[kept], parameters, step), converged=converged)
+        step=step,
+        note=_note(rests[kept], parameters, step),
+        converged=converged,
+    )
 
 
 def _second_order(step: Step) -> np.ndarray:
@@ -323,7 +345,7 @@ def _second_order(step: Step) -> np.ndarray:
     squares = np.zeros(len(NAMES))
     if step.left_out:
         variance = 1 / step.precision[-1]
-        squares[4:6] = 0.75 * variance ** 2, 2 * variance ** 2
+        squares[4:6] = 0.75 * variance**2, 2 * variance**2
     return np.diag(squares)
 
 
@@ -331,8 +353,10 @@ def _note(rests: NominalRests, parameters: np.ndarray, step: Step) -> str:
     if not step.left_out:
         return ''
     names, std_deg = ', '.join(map(str, step.left_out)), np.degrees(step.precision[-1] ** -0.5)
-    return (f'the rests determine {step.text} only; left out, by their prior of 0 ± '
-            f'{std_deg:.2g}° (standard deviation): {names}; {_advice(rests, parameters)}')
+    return (
+        f'the rests determine {step.text} only; left out, by their prior of 0 ± '
+        f'{std_deg:.2g}° (standard deviation): {names}; {_advice(rests, parameters)}'
+    )
 
 
 def _residual(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
@@ -340,15 +364,22 @@ def _residual(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
     return magnitude(rests.mean, parameters) - rests.gravity_g
 
 
-def _solve(rests: NominalRests, start: np.ndarray, variance: np.ndarray, step: Step
-           ) -> tuple[np.ndarray, bool]:
+def _solve(
+    rests: NominalRests, start: np.ndarray, variance: np.ndarray, step: Step
+) -> tuple[np.ndarray, bool]:
     """Fit with given variances of the magnitudes, g², (k,); also return whether it converged."""
     std, prior = np.sqrt(variance), np.diag(np.sqrt(step.precision))
     # `least_squares` calls the same routine of MINPACK, and takes twice the time around it.
     parameters, _, _, _, status = scipy.optimize.leastsq(
-        lambda p: np.concatenate([_residual(rests, p) / std, prior @ p]), start,
+        lambda p: np.concatenate([_residual(rests, p) / std, prior @ p]),
+        start,
         Dfun=lambda p: np.vstack([linearised(rests.mean, p).jacobian / std[:, None], prior]),
-        full_output=True, xtol=_TOLERANCE, ftol=_TOLERANCE, gtol=_TOLERANCE, diag=_UNSCALED)
+        full_output=True,
+        xtol=_TOLERANCE,
+        ftol=_TOLERANCE,
+        gtol=_TOLERANCE,
+        diag=_UNSCALED,
+    )
     return parameters, status in _CONVERGED
 
 
@@ -368,12 +399,15 @@ def _fit(rests: NominalRests, step: Step) -> _Estimate:
 
 def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
     """Solve Σ r²/(v + excess) = freedom."""
+
     def surplus(excess_g2: float) -> float:
         return float((squares / (variance + excess_g2)).sum()) - freedom
+
     if surplus(0.0) <= 0:
         return 0.0
-    return float(scipy.optimize.brentq(surplus, 0.0, squares.sum() / freedom, rtol=1e-9,
-                                       xtol=1e-30))
+    return float(
+        scipy.optimize.brentq(surplus, 0.0, squares.sum() / freedom, rtol=1e-9, xtol=1e-30)
+    )
 
 
 def _inliers(rests: NominalRests, step: Step) -> np.ndarray:
@@ -391,18 +425,21 @@ def _inliers(rests: NominalRests, step: Step) -> np.ndarray:
         return np.ones(count, bool)
     prior = TRIAL_STD_G * np.diag(np.sqrt(step.precision))
     robust = scipy.optimize.least_squares(
-        lambda p: np.concatenate([_residual(rests, p), prior @ p]), np.zeros(len(NAMES)),
-        lambda p: np.vstack([linearised(rests.mean, p).jacobian, prior]), loss='soft_l1',
-        f_scale=TRIAL_STD_G)
+        lambda p: np.concatenate([_residual(rests, p), prior @ p]),
+        np.zeros(len(NAMES)),
+        lambda p: np.vstack([linearised(rests.mean, p).jacobian, prior]),
+        loss='soft_l1',
+        f_scale=TRIAL_STD_G,
+    )
     size = np.abs(robust.fun[:count])
     freedom = max(count - max_outliers - step.determined, 1)
-    variance = np.sum(np.sort(size)[:count - max_outliers] ** 2) / freedom
-    kept = size <= _MAX_DEVIATIONS * np.sqrt(
-        variance + magnitude_variance(rests, robust.x).mean())
+    variance = np.sum(np.sort(size)[: count - max_outliers] ** 2) / freedom
+    kept = size <= _MAX_DEVIATIONS * np.sqrt(variance + magnitude_variance(rests, robust.x).mean())
     for _ in range(2 * max_outliers):
         distance = _studentised(rests, kept, _fit(rests[kept], step), step)
-        limit = -scipy.special.stdtrit(max(kept.sum() - step.min_rests, 1),
-                                       _OUTLIER_CHANCE / (2 * count))
+        limit = -scipy.special.stdtrit(
+            max(kept.sum() - step.min_rests, 1), _OUTLIER_CHANCE / (2 * count)
+        )
         excluded, included = np.where(kept, np.inf, distance), np.where(kept, distance, 0)
         if excluded.min() <= limit:
             kept[excluded.argmin()] = True
@@ -413,26 +450,34 @@ def _inliers(rests: NominalRests, step: Step) -> np.ndarray:
     return kept
 
 
-def _studentised(rests: NominalRests, kept: np.ndarray, estimate: _Estimate, step: Step
-                 ) -> np.ndarray:
+def _studentised(
+    rests: NominalRests, kept: np.ndarray, estimate: _Estimate, step: Step
+) -> np.ndarray:
     """Return the distance of each rest from the fit to the others by its std, (k,)."""
     parameters, excess_g2, _ = estimate
     variance = magnitude_variance(rests, parameters) + excess_g2
-    covariance = np.linalg.inv(posterior_information(
-        rests[kept], parameters, excess_g2) + np.diag(step.precision))
+    covariance = np.linalg.inv(
+        posterior_information(rests[kept], parameters, excess_g2) + np.diag(step.precision)
+    )
     jacobian = linearised(rests.mean, parameters).jacobian
     leverage = np.einsum('ki,ij,kj->k', jacobian, covariance, jacobian) / variance
     distance = np.abs(_residual(rests, parameters)) / np.sqrt(variance)
     inside = distance / np.sqrt(np.maximum(1 - leverage, _MIN_REMAINDER))
     # χ² per degree of freedom of the other rests, at least that of the noise of the means.
     freedom = kept.sum() - step.determined
-    others = (max((distance[kept] ** 2).sum(), freedom) - inside ** 2) / max(freedom - 1, 1)
+    others = (max((distance[kept] ** 2).sum(), freedom) - inside**2) / max(freedom - 1, 1)
     inside = inside / np.sqrt(np.maximum(others, np.median(1 - excess_g2 / variance)))
     return np.where(kept, inside, distance / np.sqrt(1 + leverage))
 
 
-def _held_out(rests: NominalRests, kept: np.ndarray, parameters: np.ndarray,
-              variance: np.ndarray, residual: np.ndarray, step: Step) -> np.ndarray:
+def _held_out(
+    rests: NominalRests,
+    kept: np.ndarray,
+    parameters: np.ndarray,
+    variance: np.ndarray,
+    residual: np.ndarray,
+    step: Step,
+) -> np.ndarray:
     """Return magnitude minus gravity by the fit to the other stretches of rests, g, (k,)."""
     errors, used = residual.copy(), rests[kept]
     count = len(used.mean)
@@ -441,43 +486,59 @@ def _held_out(rests: NominalRests, kept: np.ndarray, parameters: np.ndarray,
         others = stretch != number
         # A stretch may hold the only rests that determine a parameter.
         is_open = _undetermined(used[others], parameters, 0.0, step)
-        without = parameters if is_open or others.sum() < step.determined else _solve(
-            used[others], parameters, variance[kept][others], step)[0]
+        without = (
+            parameters
+            if is_open or others.sum() < step.determined
+            else _solve(used[others], parameters, variance[kept][others], step)[0]
+        )
         errors[np.flatnonzero(kept)[~others]] = _residual(used[~others], without)
     return errors
 
 
 def _require_gravity(rests: NominalRests, parameters: np.ndarray) -> None:
     """Refuse rests that do not read gravity; readings in another unit were refused before."""
-    measured_g = np.median(magnitude(rests.mean, parameters)) if len(rests.mean) else \
-        rests.gravity_g
+    measured_g = (
+        np.median(magnitude(rests.mean, parameters)) if len(rests.mean) else rests.gravity_g
+    )
     if not _MIN_GRAVITY_RATIO < measured_g / rests.gravity_g < _MAX_GRAVITY_RATIO:
-        raise UserError(f'gravity: the rests read {float(measured_g * G0_MPS2):.3g} m/s², not '
-                        f'{rests.gravity_g * G0_MPS2:.3g}: correct nominal_zero_g_v, '
-                        'nominal_scale_v_per_g or local_gravity_mps2')
+        raise UserError(
+            f'gravity: the rests read {float(measured_g * G0_MPS2):.3g} m/s², not '
+            f'{rests.gravity_g * G0_MPS2:.3g}: correct nominal_zero_g_v, '
+            'nominal_scale_v_per_g or local_gravity_mps2'
+        )
 
 
-def _undetermined(rests: NominalRests, parameters: np.ndarray, excess_g2: float, step: Step
-                  ) -> list[Coefficient]:
+def _undetermined(
+    rests: NominalRests, parameters: np.ndarray, excess_g2: float, step: Step
+) -> list[Coefficient]:
     """Return the coefficients of a step that rests do not determine."""
-    covariance = np.linalg.inv(posterior_information(rests, parameters, excess_g2)
-                               + np.diag(step.precision))
-    return [name for name, variance in zip(NAMES[:step.determined], np.diag(covariance))
-            if variance > DETERMINED_STD ** 2]
+    covariance = np.linalg.inv(
+        posterior_information(rests, parameters, excess_g2) + np.diag(step.precision)
+    )
+    return [
+        name
+        for name, variance in zip(NAMES[: step.determined], np.diag(covariance))
+        if variance > DETERMINED_STD**2
+    ]
 
 
-def _require_determined(rests: NominalRests, parameters: np.ndarray, excess_g2: float, step: Step
-                        ) -> None:
+def _require_determined(
+    rests: NominalRests, parameters: np.ndarray, excess_g2: float, step: Step
+) -> None:
     """Refuse rests that do not determine a coefficient of a step; say what is missing."""
     count, missing = len(rests.mean), _undetermined(rests, parameters, excess_g2, step)
     if count >= step.min_rests and not missing:
         return
-    reason = f'do not determine {", ".join(map(str, missing))}' if missing else \
-        f'are too few, at least {step.min_rests} in different directions are needed'
+    reason = (
+        f'do not determine {", ".join(map(str, missing))}'
+        if missing
+        else f'are too few, at least {step.min_rests} in different directions are needed'
+    )
     scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
     raise _UndeterminedError(
         f'gravity: without their angles (fit --poses), the {count} rests {reason}{scatter}; '
-        f'{_advice(rests, parameters)}; if they have them, --params needs the file of this sensor')
+        f'{_advice(rests, parameters)}; if they have them, --params needs the file of this sensor'
+    )
 
 
 def _advice(rests: NominalRests, parameters: np.ndarray) -> str:
@@ -488,6 +549,8 @@ def _advice(rests: NominalRests, parameters: np.ndarray) -> str:
     if len(faces):
         return f'add rests in which {", or ".join(map(points_up, faces.tolist()))}'
     if len(edges):
-        return f'add rests with two axes equally up, such as those in which ' \
+        return (
+            f'add rests with two axes equally up, such as those in which '
             f'{", or ".join(map(points_up, edges[:_NAMED].tolist()))}'
+        )
     return 'add rests with each axis up and down, and with two axes equally up'

@@ -45,27 +45,43 @@ def fit(sensor: Sensor, poses: Poses) -> Sensor:
             used = np.ones(len(poses), bool)
         span_g = np.ptp(reference_g[used])
         if used.sum() < 2 or span_g < _MIN_SPAN_G:
-            raise UserError(f'{axis}: its reference spans {span_g:.2f} g over {used.sum()} poses, '
-                            'which does not determine the scale factor; add poses with the axis '
-                            'up and down')
+            raise UserError(
+                f'{axis}: its reference spans {span_g:.2f} g over {used.sum()} poses, '
+                'which does not determine the scale factor; add poses with the axis '
+                'up and down'
+            )
         design = np.column_stack([np.ones(len(poses)), reference_g])
         departure = poses.volts[:, d] - design @ nominal[d]
         change = np.linalg.lstsq(design[used], departure[used], rcond=None)[0]
         lines[d] = nominal[d] + change
-        variance = max(np.sum((departure - design @ change) ** 2) / max(len(poses) - 2, 1),
-                       np.mean(poses.std_v[:, d] ** 2))
+        variance = max(
+            np.sum((departure - design @ change) ** 2) / max(len(poses) - 2, 1),
+            np.mean(poses.std_v[:, d] ** 2),
+        )
         covariance[np.ix_([d, count + d], [d, count + d])] = np.linalg.inv(
-            design[used].T @ design[used] / variance)
-    values = {'bias': {'offset_v': lines[:, 0] - sensor.nominal_zero_g_v},
-              'scale_factor': {'offset_v_per_g': lines[:, 1] - sensor.nominal_scale_v_per_g}}
-    names = [Coefficient(effect, parameter, axis) for effect, by_parameter in values.items()
-             for parameter in by_parameter for axis in sensor.axes]
-    return replace(sensor, model='linear', effects=('bias', 'scale_factor'), values=values,
-                   covariance=covariance, covariance_names=tuple(names))
+            design[used].T @ design[used] / variance
+        )
+    values = {
+        'bias': {'offset_v': lines[:, 0] - sensor.nominal_zero_g_v},
+        'scale_factor': {'offset_v_per_g': lines[:, 1] - sensor.nominal_scale_v_per_g},
+    }
+    names = [
+        Coefficient(effect, parameter, axis)
+        for effect, by_parameter in values.items()
+        for parameter in by_parameter
+        for axis in sensor.axes
+    ]
+    return replace(
+        sensor,
+        model='linear',
+        effects=('bias', 'scale_factor'),
+        values=values,
+        covariance=covariance,
+        covariance_names=tuple(names),
+    )
 
 
-EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z',
-           'scale_factor_z')
+EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z', 'scale_factor_z')
 """Effects of the paper's model."""
 _GAUGE = {('cross_axis', 'linear'), ('cross_axis_z', 'linear')}
 """Effect and parameter of the coefficients that stay 0."""
@@ -104,8 +120,9 @@ def fit_physical(sensor: Sensor, poses: Poses) -> Sensor:
 def regress_axes(sensor: Sensor, poses: Poses) -> list[AxisRegression]:
     """Fit the regressions of the x and y axes (equations 8 to 17)."""
     if not sensor.axes.startswith('xy'):
-        raise UserError(f'the physical model needs the axes x and y, not {sensor.axes}; '
-                        'fit --model linear')
+        raise UserError(
+            f'the physical model needs the axes x and y, not {sensor.axes}; fit --model linear'
+        )
     start = fit(sensor, poses)
     return [_regress_axis(d, start, poses) for d in range(2)]
 
@@ -117,36 +134,45 @@ def _regress_axis(d: int, start: Sensor, poses: Poses) -> AxisRegression:
     # The measured value of the other axis would add its misalignment to q1 and q2.
     across = force[:, 1 - d]
     vertical = np.abs(np.sin(poses.alpha_rad)) > _VERTICAL_SIN
-    residual = volts - zero - scale * along                                  # (10)
-    p = _quadratic(across[vertical], residual[vertical],
-                   'the plane alpha = 90 deg', 'poses at steps of 30 deg in beta there')  # (11)
+    residual = volts - zero - scale * along  # (10)
+    p = _quadratic(
+        across[vertical],
+        residual[vertical],
+        'the plane alpha = 90 deg',
+        'poses at steps of 30 deg in beta there',
+    )  # (11)
     corrected = volts - np.polynomial.polynomial.polyval(across, p)
     rows = []
     for plane in planes(poses.alpha_rad):
         inclined = np.abs(np.sin(poses.alpha_rad[plane]).mean()) >= _MIN_PLANE_SIN
-        line = np.polyfit(along[plane], corrected[plane], 1) \
-            if inclined and np.ptp(along[plane]) > _MIN_PLANE_SPAN_G else \
-            (np.nan, np.mean(corrected[plane] - scale * along[plane]))
+        line = (
+            np.polyfit(along[plane], corrected[plane], 1)
+            if inclined and np.ptp(along[plane]) > _MIN_PLANE_SPAN_G
+            else (np.nan, np.mean(corrected[plane] - scale * along[plane]))
+        )
         rows.append([az[plane].mean(), line[1], line[0]])
-    plane_az, plane_bias, plane_scale = np.array(rows).T                     # (12), (15)
+    plane_az, plane_bias, plane_scale = np.array(rows).T  # (12), (15)
     plane_bias -= zero
     missing = 'planes alpha = 30, 60, 120 and 150 deg beside 90'
     has_scale = np.isfinite(plane_scale)
     r = _quadratic(plane_az[has_scale], plane_scale[has_scale], 'the inclined planes', missing)
     # q1 is the misalignment's A_z, which the scale factor multiplies like any other force.
     growth = np.polynomial.polynomial.polyval(plane_az, r / r[0])
-    q = _quadratic(plane_az, plane_bias, 'the planes', missing, growth)      # (13)
+    q = _quadratic(plane_az, plane_bias, 'the planes', missing, growth)  # (13)
     return AxisRegression(zero, scale, p, q, r, plane_az, plane_bias, plane_scale)
 
 
-def _quadratic(a: np.ndarray, values: np.ndarray, where: str, missing: str,
-               growth: np.ndarray | float = 1.0) -> np.ndarray:
+def _quadratic(
+    a: np.ndarray, values: np.ndarray, where: str, missing: str, growth: np.ndarray | float = 1.0
+) -> np.ndarray:
     """Fit the coefficients of 1, a·growth, a², (3,), for inputs a, g; refuse too few inputs."""
     # Inputs within 0.017 g are one, as angles within 1° are.
     if len(planes(a)) < _MIN_INPUTS or np.ptp(a) < _MIN_INPUT_SPAN_G:
-        raise UserError(f'the physical model is not determined: {len(planes(a))} distinct '
-                        f'inputs in {where}, at least {_MIN_INPUTS} are needed; add {missing}, '
-                        'or fit the linear model')
+        raise UserError(
+            f'the physical model is not determined: {len(planes(a))} distinct '
+            f'inputs in {where}, at least {_MIN_INPUTS} are needed; add {missing}, '
+            'or fit the linear model'
+        )
     design = np.column_stack([np.ones_like(a), a * growth, a * a])
     return np.linalg.lstsq(design, values, rcond=None)[0]
 
@@ -159,10 +185,12 @@ def _assemble(sensor: Sensor, poses: Poses, regressions: list[AxisRegression]) -
     for d, axis in enumerate(regressions):
         slope = axis.r[0]
         if max(abs(axis.p[1]), abs(axis.q[1])) >= abs(slope):
-            raise UserError(f'the physical model does not hold: {sensor.axes[d]} follows another '
-                            'axis more than its own; check wiring, mounting and poses')
+            raise UserError(
+                f'the physical model does not hold: {sensor.axes[d]} follows another '
+                'axis more than its own; check wiring, mounting and poses'
+            )
         turn, tilt = np.arcsin(axis.p[1] / slope), np.arcsin(axis.q[1] / slope)
-        beta[d], alpha[d] = (turn, -tilt) if d == 0 else (-turn, tilt)       # (18), (19)
+        beta[d], alpha[d] = (turn, -tilt) if d == 0 else (-turn, tilt)  # (18), (19)
         zero[d] = axis.zero_g_v + axis.p[0] + axis.q[0]
         scale[d] = slope / (np.cos(turn) * np.cos(tilt))
         p2[d], q2[d] = axis.p[2] / scale[d], axis.q[2] / scale[d]
@@ -175,12 +203,19 @@ def _assemble(sensor: Sensor, poses: Poses, regressions: list[AxisRegression]) -
         'misalignment': {'alpha_rad': alpha, 'beta_rad': beta},
         'cross_axis': {'linear': np.zeros(count), 'quadratic_per_g': p2},
         'cross_axis_z': {'linear': np.zeros(count), 'quadratic_per_g': q2},
-        'scale_factor_z': {'linear_per_g': r1, 'quadratic_per_g2': r2}}
-    names = [Coefficient(effect, parameter, axis) for effect, by_parameter in values.items()
-             for parameter in by_parameter if (effect, parameter) not in _GAUGE
-             for axis in sensor.axes if axis != 'z' or effect in _OF_Z_AXIS]
-    return replace(sensor, model='physical', effects=EFFECTS, values=values,
-                   covariance_names=tuple(names))
+        'scale_factor_z': {'linear_per_g': r1, 'quadratic_per_g2': r2},
+    }
+    names = [
+        Coefficient(effect, parameter, axis)
+        for effect, by_parameter in values.items()
+        for parameter in by_parameter
+        if (effect, parameter) not in _GAUGE
+        for axis in sensor.axes
+        if axis != 'z' or effect in _OF_Z_AXIS
+    ]
+    return replace(
+        sensor, model='physical', effects=EFFECTS, values=values, covariance_names=tuple(names)
+    )
 
 
 def _fit_z_axis(sensor: Sensor, poses: Poses) -> tuple[float, float, float, float]:
@@ -205,21 +240,32 @@ def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:
     respond = signal_chain.static_response(fitted)
     predicted = np.column_stack(respond(reference_force(poses, fitted.local_gravity_mps2)))
     # An encoder of step r leaves the true angle uniform within it: its variance is r²/12.
-    variance = poses.std_v ** 2 + np.sum(
-        angle_jacobian(fitted, poses) ** 2 * fitted.stage_std_rad ** 2, axis=2)
+    variance = poses.std_v**2 + np.sum(
+        angle_jacobian(fitted, poses) ** 2 * fitted.stage_std_rad**2, axis=2
+    )
     chi2 = np.sum((poses.volts - predicted) ** 2 / variance)
     widening = np.sqrt(max(chi2 / max(poses.volts.size - len(fitted.covariance_names), 1), 1.0))
     rng = np.random.default_rng(0)
     drawn = []
     for _ in range(_REPLICAS):
-        errors_rad = [widening * fitted.stage_resolution_rad * rng.uniform(
-            -0.5, 0.5, int(setting.max()) + 1)[setting]
-            for setting in (poses.alpha_setting, poses.beta_setting)]
-        volts = np.column_stack(respond(specific_force(
-            poses.alpha_rad + errors_rad[0], poses.beta_rad + errors_rad[1],
-            fitted.local_gravity_mps2)))
+        errors_rad = [
+            widening
+            * fitted.stage_resolution_rad
+            * rng.uniform(-0.5, 0.5, int(setting.max()) + 1)[setting]
+            for setting in (poses.alpha_setting, poses.beta_setting)
+        ]
+        volts = np.column_stack(
+            respond(
+                specific_force(
+                    poses.alpha_rad + errors_rad[0],
+                    poses.beta_rad + errors_rad[1],
+                    fitted.local_gravity_mps2,
+                )
+            )
+        )
         volts += widening * poses.std_v * rng.standard_normal(volts.shape)
         replica = replace(poses, volts=volts)
-        drawn.append(get(_assemble(sensor, replica, regress_axes(sensor, replica)),
-                         fitted.covariance_names))
+        drawn.append(
+            get(_assemble(sensor, replica, regress_axes(sensor, replica)), fitted.covariance_names)
+        )
     return np.cov(np.array(drawn).T)

@@ -55,18 +55,24 @@ class PoseCovariance:
     `shared_settings`; kept: poses that count, (k,) bool; the others have no weight.
     """
 
-    def __init__(self, jacobian: np.ndarray, poses: Poses, shared: tuple[np.ndarray, int],
-                 error: StageError, kept: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        jacobian: np.ndarray,
+        poses: Poses,
+        shared: tuple[np.ndarray, int],
+        error: StageError,
+        kept: np.ndarray | None = None,
+    ) -> None:
         # Scaled by r and 1/r, so that both joints have the same standard deviations.
         self._jacobian, self._error = jacobian * error.joints, error
         self._kept = np.ones(len(poses), bool) if kept is None else kept
         self._number, self._shared = shared
         # The error of a setting with only one pose is an error of that pose.
-        self._pose_rad2 = error.pose_rad ** 2 + np.where(
-            self._number < 0, error.setting_rad ** 2, 0.0)
+        self._pose_rad2 = error.pose_rad**2 + np.where(self._number < 0, error.setting_rad**2, 0.0)
         noise = poses.std_v[:, :, None] ** 2 * np.eye(jacobian.shape[1])
         self.blocks = noise + (self._jacobian * self._pose_rad2[:, None, :]) @ np.swapaxes(
-            self._jacobian, 1, 2)
+            self._jacobian, 1, 2
+        )
         self._root = np.linalg.cholesky(self.blocks)
         self._whitening = np.linalg.inv(self._root)
 
@@ -88,7 +94,8 @@ class PoseCovariance:
     def _settings_root(self) -> np.ndarray:
         """Return the Cholesky factor of 1 + σ_s²·Zᵀ B⁻¹ Z, (q, q)."""
         return np.linalg.cholesky(
-            np.eye(self._shared) + self._white_settings.T @ self._white_settings)
+            np.eye(self._shared) + self._white_settings.T @ self._white_settings
+        )
 
     def _solve_settings(self, products: np.ndarray) -> np.ndarray:
         return scipy.linalg.solve_triangular(self._settings_root, products, lower=True)
@@ -105,8 +112,9 @@ class PoseCovariance:
         by_setting = self._solve_settings(self._white_settings.T @ white)
         return white.T @ white - by_setting.T @ by_setting
 
-    def normal_equations(self, design: np.ndarray, residual: np.ndarray
-                         ) -> tuple[np.ndarray, np.ndarray]:
+    def normal_equations(
+        self, design: np.ndarray, residual: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return XᵀS⁻¹X, (p, p), and XᵀS⁻¹r, (p,), of a design, (k, m, p), and residuals."""
         products = self.products(np.concatenate([design, residual[:, :, None]], axis=2))
         return products[:-1, :-1], products[:-1, -1]
@@ -118,30 +126,37 @@ class PoseCovariance:
 
     def penalty(self, errors: AngleErrors) -> float:
         """Return the sum of the squared angle errors over their variances."""
-        pose_rad, setting_rad = (part / self._error.joints for part in (
-            errors.pose_rad, errors.setting_rad))
-        total = np.sum((pose_rad ** 2 / np.maximum(self._pose_rad2, _MIN_VARIANCE_RAD2))[
-            self._kept])
+        pose_rad, setting_rad = (
+            part / self._error.joints for part in (errors.pose_rad, errors.setting_rad)
+        )
+        total = np.sum((pose_rad**2 / np.maximum(self._pose_rad2, _MIN_VARIANCE_RAD2))[self._kept])
         for joint in range(2):
             _, first = np.unique(self._number[:, joint], return_index=True)
             shared = first[self._number[first, joint] >= 0]
             total += np.sum(setting_rad[shared, joint] ** 2) / max(
-                self._error.setting_rad ** 2, _MIN_VARIANCE_RAD2)
+                self._error.setting_rad**2, _MIN_VARIANCE_RAD2
+            )
         return float(total)
 
     def predicted_errors(self, residual: np.ndarray) -> AngleErrors:
         """Predict the angle errors from residuals, (k, m): the best linear unbiased prediction."""
         by_setting = self._solve_settings(
-            self._white_settings.T @ self.whiten_by_pose(residual[:, :, None]))
-        factor = scipy.linalg.solve_triangular(self._settings_root, by_setting, lower=True,
-                                               trans=1)[:, 0]
+            self._white_settings.T @ self.whiten_by_pose(residual[:, :, None])
+        )
+        factor = scipy.linalg.solve_triangular(
+            self._settings_root, by_setting, lower=True, trans=1
+        )[:, 0]
         setting = np.append(self._error.setting_rad * factor, 0.0)[self._number]
         white = (self._whitening @ (residual - self._settings @ factor)[:, :, None])[:, :, 0]
         weighted = np.swapaxes(self._whitening, 1, 2) @ white[:, :, None]
         pose = self._pose_rad2 * (np.swapaxes(self._jacobian, 1, 2) @ weighted)[:, :, 0]
         joints = self._error.joints
-        return AngleErrors(np.where(self._number >= 0, setting, 0.0) * joints, pose * joints,
-                           np.sum(white ** 2, axis=1), float(factor @ factor))
+        return AngleErrors(
+            np.where(self._number >= 0, setting, 0.0) * joints,
+            pose * joints,
+            np.sum(white**2, axis=1),
+            float(factor @ factor),
+        )
 
 
 @dataclass(frozen=True)
@@ -164,7 +179,8 @@ class AngleErrors:
         return replace(
             other,
             setting_rad=self.setting_rad + share * (other.setting_rad - self.setting_rad),
-            pose_rad=self.pose_rad + share * (other.pose_rad - self.pose_rad))
+            pose_rad=self.pose_rad + share * (other.pose_rad - self.pose_rad),
+        )
 
 
 def shared_settings(poses: Poses) -> tuple[np.ndarray, int]:
@@ -247,15 +263,22 @@ class Linearised:
         """Return the poses with some coefficients at 0 and not fitted, (p,) bool."""
         fitted = ~excluded
         residual = self.residual + self.design[:, :, excluded] @ self.values[excluded]
-        return replace(self, design=self.design[:, :, fitted], residual=residual,
-                       values=self.values[fitted], precision=self.precision[fitted])
+        return replace(
+            self,
+            design=self.design[:, :, fitted],
+            residual=residual,
+            values=self.values[fitted],
+            precision=self.precision[fitted],
+        )
 
     def misfit(self, error: StageError) -> float:
         """Return the minimum of rᵀS⁻¹r plus the prior's sum of squares."""
         covariance = self.covariance(error)
         step, _ = self.solve(covariance)
-        return float(covariance.products((self.residual - self.design @ step)[:, :, None])[0, 0]
-                     + np.sum(self.precision * (self.values + step) ** 2))
+        return float(
+            covariance.products((self.residual - self.design @ step)[:, :, None])[0, 0]
+            + np.sum(self.precision * (self.values + step) ** 2)
+        )
 
     def deviance(self, error: StageError) -> float:
         """
@@ -270,31 +293,45 @@ class Linearised:
         errors = covariance.predicted_errors(self.residual - self.design @ step)
         bound = float(scipy.special.chdtri(self.residual.shape[1], _HUBER_CHANCE))
         distance = errors.squared_distances[self.kept]
-        robust = np.where(distance < bound, distance,
-                          2 * np.sqrt(bound * np.maximum(distance, bound)) - bound)
-        return float(np.sum(robust) + errors.setting_penalty
-                     + np.sum(self.precision * (self.values + step) ** 2)
-                     + covariance.log_determinant()
-                     + np.linalg.slogdet(information)[1] - np.sum(np.log(self.precision)))
+        robust = np.where(
+            distance < bound, distance, 2 * np.sqrt(bound * np.maximum(distance, bound)) - bound
+        )
+        return float(
+            np.sum(robust)
+            + errors.setting_penalty
+            + np.sum(self.precision * (self.values + step) ** 2)
+            + covariance.log_determinant()
+            + np.linalg.slogdet(information)[1]
+            - np.sum(np.log(self.precision))
+        )
 
     def stage_error(self, stated_rad: float, start: StageError | None = None) -> StageError:
         """Estimate the stage error by restricted maximum likelihood."""
         start = start or StageError(stated_rad)
         total = float(np.log(np.clip(start.total_rad, 10 * _MIN_TOTAL_RAD, _MAX_TOTAL_RAD)))
         share = (start.pose_rad / max(start.total_rad, _MIN_TOTAL_RAD)) ** 2
-        bounds = np.array([np.log((_MIN_TOTAL_RAD, _MAX_TOTAL_RAD)), (0.0, 1.0),
-                           (-_MAX_LOG_RATIO, _MAX_LOG_RATIO)])
+        bounds = np.array(
+            [
+                np.log((_MIN_TOTAL_RAD, _MAX_TOTAL_RAD)),
+                (0.0, 1.0),
+                (-_MAX_LOG_RATIO, _MAX_LOG_RATIO),
+            ]
+        )
         search = scipy.optimize.minimize(
             lambda x: self._level_deviance(_from_search(x * _SEARCH_UNIT), stated_rad),
             np.array([total, share, np.log(start.ratio)]) / _SEARCH_UNIT,
-            method='L-BFGS-B', options=_SEARCH_OPTIONS, bounds=bounds / _SEARCH_UNIT)
+            method='L-BFGS-B',
+            options=_SEARCH_OPTIONS,
+            bounds=bounds / _SEARCH_UNIT,
+        )
         return _from_search(search.x * _SEARCH_UNIT)
 
     def _level_deviance(self, error: StageError, stated_rad: float) -> float:
         """Return −2 times the log posterior of a stage error, up to a constant."""
         prior = np.log(error.total_rad / stated_rad) / _TOTAL_PRIOR_STD if stated_rad > 0 else 0.0
-        return float(self.deviance(error) + prior ** 2
-                     + (np.log(error.ratio) / _RATIO_PRIOR_STD) ** 2)
+        return float(
+            self.deviance(error) + prior**2 + (np.log(error.ratio) / _RATIO_PRIOR_STD) ** 2
+        )
 
     def covariance_over_levels(self, error: StageError, stated_rad: float) -> np.ndarray:
         """
@@ -309,32 +346,52 @@ class Linearised:
         total = at_estimate.copy()
         for sign in (1, -1):
             # The level of one joint changes, and that of the other one stays.
-            levels = [StageError(error.setting_rad * np.exp(d / 2), error.pose_rad * np.exp(d / 2),
-                                 error.ratio * np.exp(sign * d / 2)) for d in _LEVELS]
+            levels = [
+                StageError(
+                    error.setting_rad * np.exp(d / 2),
+                    error.pose_rad * np.exp(d / 2),
+                    error.ratio * np.exp(sign * d / 2),
+                )
+                for d in _LEVELS
+            ]
             deviance = np.array([self._level_deviance(e, stated_rad) for e in levels])
             weight = np.exp((deviance.min() - deviance) / 2)
             for level, share in zip(levels, weight / weight.sum()):
                 if share > _LEAST_WEIGHT:
                     step, information = self.solve(self.covariance(level))
-                    total += share * (np.linalg.inv(information) - at_estimate
-                                      + np.outer(step - best, step - best))
+                    total += share * (
+                        np.linalg.inv(information)
+                        - at_estimate
+                        + np.outer(step - best, step - best)
+                    )
         return total
 
 
 def _from_search(x: np.ndarray) -> StageError:
     """Return the stage error from ln(total), the poses' share of its square, and ln(ratio)."""
     total = np.exp(x[0])
-    return StageError(float(total * np.sqrt(1 - x[1])), float(total * np.sqrt(x[1])),
-                      float(np.exp(x[2])))
+    return StageError(
+        float(total * np.sqrt(1 - x[1])), float(total * np.sqrt(x[1])), float(np.exp(x[2]))
+    )
 
 
-def linearised(unit: Sensor, poses: Poses, names: Sequence[Coefficient], precision: np.ndarray,
-               kept: np.ndarray | None = None) -> Linearised:
+def linearised(
+    unit: Sensor,
+    poses: Poses,
+    names: Sequence[Coefficient],
+    precision: np.ndarray,
+    kept: np.ndarray | None = None,
+) -> Linearised:
     """Linearise the volts of poses about the coefficients of a unit; see `Linearised`."""
-    return Linearised(poses, angle_jacobian(unit, poses),
-                      coefficient_jacobian(unit, poses, names),
-                      poses.volts - predicted_volts(unit, poses), get(unit, names),
-                      precision, np.ones(len(poses), bool) if kept is None else kept)
+    return Linearised(
+        poses,
+        angle_jacobian(unit, poses),
+        coefficient_jacobian(unit, poses, names),
+        poses.volts - predicted_volts(unit, poses),
+        get(unit, names),
+        precision,
+        np.ones(len(poses), bool) if kept is None else kept,
+    )
 
 
 GRID_RAD = np.radians(15.0)
@@ -361,15 +418,21 @@ def choose_poses(rows: np.ndarray, information: np.ndarray, count: int) -> list[
 
 def candidate_poses(std_v: np.ndarray) -> Poses:
     """Return a grid over the sphere with a noise, (m,); each pose sets both joints anew."""
-    alpha, beta = np.meshgrid(np.arange(round(np.pi / GRID_RAD) + 1) * GRID_RAD,
-                              np.arange(round(2 * np.pi / GRID_RAD)) * GRID_RAD)
+    alpha, beta = np.meshgrid(
+        np.arange(round(np.pi / GRID_RAD) + 1) * GRID_RAD,
+        np.arange(round(2 * np.pi / GRID_RAD)) * GRID_RAD,
+    )
     settings = np.arange(alpha.size)
-    return replace(Poses.without_volts(alpha.ravel(), beta.ravel(), std_v),
-                   alpha_setting=settings, beta_setting=settings)
+    return replace(
+        Poses.without_volts(alpha.ravel(), beta.ravel(), std_v),
+        alpha_setting=settings,
+        beta_setting=settings,
+    )
 
 
-def whitened_jacobian(unit: Sensor, poses: Poses, names: tuple[Coefficient, ...],
-                      stage: StageError) -> np.ndarray:
+def whitened_jacobian(
+    unit: Sensor, poses: Poses, names: tuple[Coefficient, ...], stage: StageError
+) -> np.ndarray:
     """Return the Jacobian, (k, m, p), whitened by noise and stage error, without settings."""
     design = coefficient_jacobian(unit, poses, names)
     return volts_covariance(unit, poses, stage).whiten_by_pose(design).reshape(design.shape)

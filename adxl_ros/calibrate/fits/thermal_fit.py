@@ -69,15 +69,18 @@ class ThermalFit:
         """Return the standard deviation of the zero-g of the worst axis, g, (n,)."""
         warmer_k = temperatures_c - NOMINAL_TEMPERATURE_C
         base_k = calibrated_c - NOMINAL_TEMPERATURE_C
-        slopes = np.column_stack([warmer_k - base_k, warmer_k ** 2 - base_k ** 2])
+        slopes = np.column_stack([warmer_k - base_k, warmer_k**2 - base_k**2])
         variances, axes = [], dict.fromkeys(name.axis for name in self.names if name.axis)
         for axis, residual_g in zip(axes, self.rms_g):
-            places = [self.names.index(Coefficient('temperature_bias', parameter, axis))
-                      for parameter in ('per_k', 'per_k2')]
+            places = [
+                self.names.index(Coefficient('temperature_bias', parameter, axis))
+                for parameter in ('per_k', 'per_k2')
+            ]
             part = self.covariance[np.ix_(places, places)]
-            variances.append(np.einsum('ni,ij,nj->n', slopes, part, slopes) + residual_g ** 2)
-        variances_g2 = np.array(variances) + self.further.error_g(
-            temperatures_c, calibrated_c) ** 2
+            variances.append(np.einsum('ni,ij,nj->n', slopes, part, slopes) + residual_g**2)
+        variances_g2 = (
+            np.array(variances) + self.further.error_g(temperatures_c, calibrated_c) ** 2
+        )
         return np.asarray(np.sqrt(variances_g2.max(axis=0)))
 
 
@@ -91,11 +94,15 @@ def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
     """
     temperature_c = blocks.temperature_c
     if len(temperature_c) < _FEWEST_BLOCKS:
-        raise UserError(f'thermal: {len(temperature_c)} blocks at rest with a temperature, at '
-                        f'least {_FEWEST_BLOCKS} are needed; record for longer')
+        raise UserError(
+            f'thermal: {len(temperature_c)} blocks at rest with a temperature, at '
+            f'least {_FEWEST_BLOCKS} are needed; record for longer'
+        )
     if np.ptp(temperature_c) < _SMALLEST_SPAN_K:
-        raise UserError(f'thermal: the temperature changes by {np.ptp(temperature_c):.1f} K, at '
-                        f'least {_SMALLEST_SPAN_K:g} K are needed; warm or cool the sensor')
+        raise UserError(
+            f'thermal: the temperature changes by {np.ptp(temperature_c):.1f} K, at '
+            f'least {_SMALLEST_SPAN_K:g} K are needed; warm or cool the sensor'
+        )
     outputs_g = (blocks.volts - sensor.zero_g_v) / sensor.scale_v_per_g
     turned = np.abs(np.diff(outputs_g, axis=0)).max(axis=1) > _TURN_G
     orientation = np.concatenate([[0], np.cumsum(turned)])
@@ -107,14 +114,23 @@ def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
         best = solver.likeliest({'thermal_lag': _LAGS_S, 'thermal_hysteresis': _REACHES * span_k})
     solved = solver(*best)
     residual_g = np.column_stack([axis.residual_g for axis in solved])
-    curvature_k2 = np.array([value for axis in solved for name, value in zip(
-        axis.names, axis.values) if name.parameter == 'per_k2'])
+    curvature_k2 = np.array(
+        [
+            value
+            for axis in solved
+            for name, value in zip(axis.names, axis.values)
+            if name.parameter == 'per_k2'
+        ]
+    )
     return ThermalFit(
         tuple(name for axis in solved for name in axis.names),
         np.concatenate([axis.values for axis in solved]),
-        scipy.linalg.block_diag(*(axis.covariance for axis in solved)), *best,
-        residual_g, next_degree(temperature_c, residual_g, curvature_k2),
-        (float(temperature_c.min()), float(temperature_c.max())))
+        scipy.linalg.block_diag(*(axis.covariance for axis in solved)),
+        *best,
+        residual_g,
+        next_degree(temperature_c, residual_g, curvature_k2),
+        (float(temperature_c.min()), float(temperature_c.max())),
+    )
 
 
 @dataclass(frozen=True)
@@ -129,11 +145,27 @@ class _Solver:
     def __call__(self, history: str, shape: float) -> list[_Axis]:
         """Return the fit of each axis."""
         # The output of a history, and its derivative by the shape.
-        low, output, high = (_history_output(self.blocks, history, shape * (1 + step))
-                             for step in (-_STEP, 0.0, _STEP)) if history else np.zeros((3, 1))
+        low, output, high = (
+            (
+                _history_output(self.blocks, history, shape * (1 + step))
+                for step in (-_STEP, 0.0, _STEP)
+            )
+            if history
+            else np.zeros((3, 1))
+        )
         by_shape = (high - low) / (2 * _STEP * shape) if history else output
-        return [_fit_axis(axis, self.blocks.temperature_c, output_g, self.orientation, history,
-                          output, by_shape) for axis, output_g in zip(self.axes, self.outputs_g.T)]
+        return [
+            _fit_axis(
+                axis,
+                self.blocks.temperature_c,
+                output_g,
+                self.orientation,
+                history,
+                output,
+                by_shape,
+            )
+            for axis, output_g in zip(self.axes, self.outputs_g.T)
+        ]
 
     def score(self, history: str, shape: float) -> float:
         """Return half of the BIC, as a gain."""
@@ -149,7 +181,10 @@ class _Solver:
             bounds = np.log(shapes[[max(place - 1, 0), min(place + 1, len(shapes) - 1)]])
             search = scipy.optimize.minimize_scalar(
                 lambda logarithm, history=history: -self.score(history, float(np.exp(logarithm))),
-                bounds=bounds, method='bounded', options={'xatol': 0.01})
+                bounds=bounds,
+                method='bounded',
+                options={'xatol': 0.01},
+            )
             if -search.fun > highest:
                 best, highest = (history, float(np.exp(search.x))), -search.fun
         return best
@@ -180,12 +215,21 @@ class _Axis(NamedTuple):
     log_likelihood: float
 
 
-def _fit_axis(axis: str, temperature_c: np.ndarray, output_g: np.ndarray, orientation: np.ndarray,
-              history: str, history_g: np.ndarray, by_shape: np.ndarray) -> _Axis:
+def _fit_axis(
+    axis: str,
+    temperature_c: np.ndarray,
+    output_g: np.ndarray,
+    orientation: np.ndarray,
+    history: str,
+    history_g: np.ndarray,
+    by_shape: np.ndarray,
+) -> _Axis:
     """Fit one axis, the correlation of neighbouring blocks included."""
     warmer_k, correlation = temperature_c - NOMINAL_TEMPERATURE_C, 0.0
-    columns = {('temperature_bias', 'per_k'): warmer_k,
-               ('temperature_bias', 'per_k2'): warmer_k ** 2}
+    columns = {
+        ('temperature_bias', 'per_k'): warmer_k,
+        ('temperature_bias', 'per_k2'): warmer_k**2,
+    }
     # The zero-g of each orientation has the last columns.
     free = (orientation[:, None] == np.arange(orientation[-1] + 1)).astype(float)
     forces_g = output_g @ free / free.sum(axis=0)
@@ -201,17 +245,18 @@ def _fit_axis(axis: str, temperature_c: np.ndarray, output_g: np.ndarray, orient
     def whitened(values: np.ndarray) -> np.ndarray:
         """Return what neighbouring blocks do not predict; an orientation begins anew."""
         white = values - correlation * np.roll(values, 1, axis=0)
-        white[begins] = values[begins] * np.sqrt(1 - correlation ** 2)
+        white[begins] = values[begins] * np.sqrt(1 - correlation**2)
         return white
 
     for _ in range(_ITERATIONS):
         white, target = whitened(design), whitened(output_g)
-        size = np.sqrt((white ** 2).sum(axis=0))
+        size = np.sqrt((white**2).sum(axis=0))
         values = np.linalg.lstsq(white / size, target, rcond=None)[0] / size
         residual_g = output_g - design @ values
         rest = target - white @ values
-        neighbours = residual_g[1:] @ residual_g[:-1] / max(residual_g @ residual_g,
-                                                            np.finfo(float).tiny)
+        neighbours = (
+            residual_g[1:] @ residual_g[:-1] / max(residual_g @ residual_g, np.finfo(float).tiny)
+        )
         correlation = float(np.clip(neighbours, 0.0, _LARGEST_CORRELATION))
     degrees = max(len(output_g) - design.shape[1], 1)
     variance_g2 = max(float(rest @ rest) / degrees, np.finfo(float).tiny)
@@ -220,11 +265,13 @@ def _fit_axis(axis: str, temperature_c: np.ndarray, output_g: np.ndarray, orient
         design = np.column_stack([design, values[len(names) - 1] * by_shape])
     white, white_free = np.hsplit(whitened(design), [len(names)])
     white = white - white_free @ np.linalg.lstsq(white_free, white, rcond=None)[0]
-    precision = white.T @ white / variance_g2 + np.diag([
-        (PRIOR_WIDTH * parameter_of(name).scale) ** -2.0 for name in names])
-    likelihood = -0.5 * len(output_g) * np.log(variance_g2) + 0.5 * np.log(1 - correlation ** 2)
-    return _Axis(names, values[:len(names)], np.linalg.inv(precision), residual_g,
-                 float(likelihood))
+    precision = white.T @ white / variance_g2 + np.diag(
+        [(PRIOR_WIDTH * parameter_of(name).scale) ** -2.0 for name in names]
+    )
+    likelihood = -0.5 * len(output_g) * np.log(variance_g2) + 0.5 * np.log(1 - correlation**2)
+    return _Axis(
+        names, values[: len(names)], np.linalg.inv(precision), residual_g, float(likelihood)
+    )
 
 
 _SIZES = {'thermal_lag': 'per_k', 'thermal_hysteresis': 'half_width_g'}
@@ -238,23 +285,32 @@ def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
     kept = [i for i, name in enumerate(base.covariance_names) if name.effect not in EFFECTS]
     kept_names = tuple(base.covariance_names[i] for i in kept)
     dropped = set(EFFECTS) - set(effects)
-    before = replace(base, effects=tuple(e for e in base.effects if e not in dropped),
-                     values={e: v for e, v in base.values.items() if e not in dropped})
+    before = replace(
+        base,
+        effects=tuple(e for e in base.effects if e not in dropped),
+        values={e: v for e, v in base.values.items() if e not in dropped},
+    )
     sensor = put(with_neutral(before, [*effects, 'bias']), names, fitted.values)
     if fitted.history:
-        sensor = put(sensor, [Coefficient(fitted.history, _SHAPES[fitted.history])],
-                     np.array([fitted.shape]))
+        sensor = put(
+            sensor,
+            [Coefficient(fitted.history, _SHAPES[fitted.history])],
+            np.array([fitted.shape]),
+        )
     joint = np.eye(len(kept) + len(names))
     biases = [Coefficient('bias', 'offset_v', axis) for axis in base.axes]
-    shifts_v = [_zero_g_v(base, d, calibrated_c) - _zero_g_v(sensor, d, calibrated_c)
-                for d in range(len(base.axes))]
+    shifts_v = [
+        _zero_g_v(base, d, calibrated_c) - _zero_g_v(sensor, d, calibrated_c)
+        for d in range(len(base.axes))
+    ]
     for d, (axis, bias) in enumerate(zip(base.axes, biases)):
         if bias not in kept_names:
             continue
         for power, parameter in enumerate(('per_k', 'per_k2'), 1):
             column = len(kept) + names.index(Coefficient('temperature_bias', parameter, axis))
-            joint[kept_names.index(bias), column] = -base.scale_v_per_g[d] * (
-                calibrated_c - NOMINAL_TEMPERATURE_C) ** power
+            joint[kept_names.index(bias), column] = (
+                -base.scale_v_per_g[d] * (calibrated_c - NOMINAL_TEMPERATURE_C) ** power
+            )
     sensor = put(sensor, biases, get(sensor, biases) + shifts_v)
     blocks = scipy.linalg.block_diag(base.covariance[np.ix_(kept, kept)], fitted.covariance)
     covariance = joint @ blocks @ joint.T
@@ -267,8 +323,9 @@ def _zero_g_v(sensor: Sensor, d: int, temperature_c: float) -> float:
     if values is None:
         return 0.0
     warmer_k = temperature_c - NOMINAL_TEMPERATURE_C
-    return float(sensor.scale_v_per_g[d] * warmer_k * (
-        values['per_k'][d] + warmer_k * values['per_k2'][d]))
+    return float(
+        sensor.scale_v_per_g[d] * warmer_k * (values['per_k'][d] + warmer_k * values['per_k2'][d])
+    )
 
 
 PARTS = 10
@@ -301,8 +358,7 @@ class Passed:
         warms = not self.warming.all() and (self.rises or self.cooling.all())
         parts = self.middles_c[~(self.warming if warms else self.cooling)]
         low, high = f'{parts[0] - half_c:.0f}', f'{parts[-1] + half_c:.0f}'
-        return f'warm it from {low} to {high} °C' if warms else \
-            f'cool it from {high} to {low} °C'
+        return f'warm it from {low} to {high} °C' if warms else f'cool it from {high} to {low} °C'
 
 
 def passed(temperatures_c: np.ndarray, range_c: tuple[float, float]) -> Passed:
@@ -350,11 +406,16 @@ def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
     volts, time_s = recording.volts(unit), recording.time_s
     span_s = float(time_s[-1] - time_s[0])
     block_s = max(BLOCK_S, span_s / _MOST_BLOCKS, _FEWEST_SAMPLES * period_s(time_s))
-    edges = np.unique(np.searchsorted(time_s, time_s[0] + block_s * np.arange(
-        int(span_s / block_s) + 1)))
-    parts = [slice(a, b) for a, b in pairwise(edges)
-             if b - a >= _FEWEST_SAMPLES and np.isfinite(temperature_c[a:b]).any()
-             and np.isfinite(volts[a:b]).all()]
+    edges = np.unique(
+        np.searchsorted(time_s, time_s[0] + block_s * np.arange(int(span_s / block_s) + 1))
+    )
+    parts = [
+        slice(a, b)
+        for a, b in pairwise(edges)
+        if b - a >= _FEWEST_SAMPLES
+        and np.isfinite(temperature_c[a:b]).any()
+        and np.isfinite(volts[a:b]).all()
+    ]
     if not parts:
         return None
     mean_v = np.array([volts[p].mean(axis=0) for p in parts])
@@ -363,10 +424,14 @@ def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
     counts = np.array([p.stop - p.start for p in parts])[:, None]
     missing = np.full(len(parts), np.nan)
     poses = Poses(
-        volts=mean_v, std_v=scatter_v / np.sqrt(counts), alpha_rad=missing, beta_rad=missing,
+        volts=mean_v,
+        std_v=scatter_v / np.sqrt(counts),
+        alpha_rad=missing,
+        beta_rad=missing,
         time_s=np.array([[time_s[p.start], time_s[p.stop - 1]] for p in parts]),
         check=np.zeros(len(parts), bool),
-        temperature_c=np.array([np.nanmean(temperature_c[p]) for p in parts])).subset(at_rest)
+        temperature_c=np.array([np.nanmean(temperature_c[p]) for p in parts]),
+    ).subset(at_rest)
     range_g = np.ptp(poses.volts, axis=0) / unit.nominal_scale_v_per_g if len(poses) else 0.0
     return poses if len(poses) and np.max(range_g) < _SAME_ORIENTATION_G else None
 

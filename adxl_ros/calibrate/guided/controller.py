@@ -88,8 +88,9 @@ class SampleSource(Protocol):
 class StreamSensor:
     """The sensor of the stream, and its newest samples while no calibration runs."""
 
-    def __init__(self, settings: SessionSettings, sensor: Sensor, anonymous: Sensor,
-                 samples: SampleSource) -> None:
+    def __init__(
+        self, settings: SessionSettings, sensor: Sensor, anonymous: Sensor, samples: SampleSource
+    ) -> None:
         self._settings, self._sensor, self._anonymous = settings, sensor, anonymous
         self._samples = samples
         self.unit: Sensor | None = None  # The nominal sensor; None while it is unknown
@@ -129,8 +130,10 @@ class StreamSensor:
     def _measure(self) -> tuple[Severity, str] | None:
         """Measure the sensor of a stream that states nothing of itself."""
         stamps_ns, accel_mps2 = self._samples.waiting()
-        if len(stamps_ns) < recorded_sensor.FEWEST_SAMPLES or \
-                np.ptp(stamps_ns) < recorded_sensor.SHORTEST_S * 1e9:
+        if (
+            len(stamps_ns) < recorded_sensor.FEWEST_SAMPLES
+            or np.ptp(stamps_ns) < recorded_sensor.SHORTEST_S * 1e9
+        ):
             return None
         try:
             unit, lines = recorded_sensor.unit_of_stream(self._anonymous, stamps_ns, accel_mps2)
@@ -144,9 +147,15 @@ class StreamSensor:
 class Controller:
     """Runs guided calibrations, one after the other."""
 
-    def __init__(self, settings: SessionSettings, sensor: Sensor, resume: str,
-                 samples: SampleSource, outputs: Outputs, anonymous: Sensor | None = None
-                 ) -> None:
+    def __init__(
+        self,
+        settings: SessionSettings,
+        sensor: Sensor,
+        resume: str,
+        samples: SampleSource,
+        outputs: Outputs,
+        anonymous: Sensor | None = None,
+    ) -> None:
         self.settings = settings
         self.state = ControllerState.IDLE  # The present state
         self.stream = StreamSensor(settings, sensor, anonymous or sensor, samples)
@@ -183,8 +192,11 @@ class Controller:
             return _NOT_RUNNING
         guide = self.session.guide
         if guide.moves_itself:
-            return Answer(False, 'nothing to capture: the stage moves itself, and poses are taken '
-                                 'when it has arrived')
+            return Answer(
+                False,
+                'nothing to capture: the stage moves itself, and poses are taken '
+                'when it has arrived',
+            )
         if fault := self.session.fault or self.fit_fault:
             return Answer(False, fault)
         self._take_samples(self.session)
@@ -264,14 +276,18 @@ class Controller:
             return
         if session is not None:
             if changes := differences(self.settings.head(session.unit), self.settings.head(unit)):
-                self._stop('ERROR', f'sensor_info: {changes}: changed during the '
-                           'calibration; put it back and start again, the poses are kept')
+                self._stop(
+                    'ERROR',
+                    f'sensor_info: {changes}: changed during the '
+                    'calibration; put it back and start again, the poses are kept',
+                )
             else:
                 # The driver has started again, and may have been touched.
                 if session.stage is not None:
                     session.stage.verify()
                 self._outputs.answer_captures(
-                    Answer(False, 'the driver started again; capture again'))
+                    Answer(False, 'the driver started again; capture again')
+                )
         self.stream.take(unit)
 
     def read_quantity(self, quantity: str, stamp_ns: int, value: float) -> None:
@@ -287,8 +303,9 @@ class Controller:
             self._try_to_start()
         session = self.session
         if session is None:
-            if line := self.stream.watch(self.shows_idle_stream,
-                                         self.state is not ControllerState.IDLE):
+            if line := self.stream.watch(
+                self.shows_idle_stream, self.state is not ControllerState.IDLE
+            ):
                 self._say(*line)
             return
         self._take_samples(session)
@@ -323,8 +340,11 @@ class Controller:
             if stream.fault:
                 return Status(Phase.REFUSED, stream.fault, True)
             silence = self._samples.silence()
-            obstacle = f'{silence}; is the driver running?' if silence else \
-                'without it, 2 s of samples show the sensor'
+            obstacle = (
+                f'{silence}; is the driver running?'
+                if silence
+                else 'without it, 2 s of samples show the sensor'
+            )
             return Status(Phase.INFO, f'waiting for sensor_info; {obstacle}', True)
         if self.session is None:
             hints = IDLE_TEXT, stream.outlook, self._samples.silence()
@@ -339,12 +359,18 @@ class Controller:
         """Return status, serial number and values by key; log an obstacle once for each pose."""
         status, unit, session = self.status(), self.stream.unit, self.session
         values: dict[str, str | float] = {
-            'accepted': str(self._accepted), 'output': str(self.settings.output),
-            'verdict': self.outcome[0] if self.outcome else ''}
+            'accepted': str(self._accepted),
+            'output': str(self.settings.output),
+            'verdict': self.outcome[0] if self.outcome else '',
+        }
         if session is not None:
             guide = session.guide
-            values |= {'phase': status.phase.value, 'pose': str(guide.pose_number),
-                       'next': guide.destination(), 'accepted': str(session.accepted_count)}
+            values |= {
+                'phase': status.phase.value,
+                'pose': str(guide.pose_number),
+                'next': guide.destination(),
+                'accepted': str(session.accepted_count),
+            }
             tilt_rad = guide.tilt_error_rad()
             if np.isfinite(tilt_rad):
                 values['tilt_error_deg'] = float(np.degrees(tilt_rad))
@@ -367,19 +393,29 @@ class Controller:
             if self.question:
                 self.state = ControllerState.ASKING
                 return
-            self.session = session = Session(unit, self.settings, bool(self._starts_over),
-                                             self._sensor)
+            self.session = session = Session(
+                unit, self.settings, bool(self._starts_over), self._sensor
+            )
         except UserError as error:
             self._stop('ERROR', f'{error}')
             return
         self.state, self.outcome = ControllerState.RUNNING, ()
         self._samples.restart_silence()
-        task = self.stream.outlook or f'rest in {NINE.min_rests} or more directions (at best in ' \
+        task = (
+            self.stream.outlook
+            or f'rest in {NINE.min_rests} or more directions (at best in '
             f'{ENOUGH_RESTS}), then call ~/finish'
-        check = ' (the last one first, to see that the mounting is as it was)' \
-            if session.guide.to_verify else ''
-        resumed = f', resumed after {session.resumed} poses{check}; resume:=anew puts them aside' \
-            if session.resumed else ''
+        )
+        check = (
+            ' (the last one first, to see that the mounting is as it was)'
+            if session.guide.to_verify
+            else ''
+        )
+        resumed = (
+            f', resumed after {session.resumed} poses{check}; resume:=anew puts them aside'
+            if session.resumed
+            else ''
+        )
         self._say('INFO', f'calibrating {unit.serial}: {task}{resumed}')
 
     def _take_samples(self, session: Session) -> None:

@@ -53,12 +53,13 @@ class NewestSamples:
     def feed(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """Take samples."""
         self.stamps_ns = np.concatenate([self.stamps_ns, stamps_ns])[
-            -self._count(_RATE_WINDOW_S):]
-        self.volts = np.concatenate([self.volts, volts])[-self._count(_REST_WINDOW_S):]
+            -self._count(_RATE_WINDOW_S) :
+        ]
+        self.volts = np.concatenate([self.volts, volts])[-self._count(_REST_WINDOW_S) :]
 
     def stillness(self) -> Stillness | None:
         """Return whether the samples are at rest, by the datasheet's noise; None if too few."""
-        stamps_ns = self.stamps_ns[len(self.stamps_ns) - len(self.volts):]
+        stamps_ns = self.stamps_ns[len(self.stamps_ns) - len(self.volts) :]
         dwell = Dwell(self._sensor, int(stamps_ns[:1].sum()))
         dwell.feed(stamps_ns, self.volts)
         return dwell.stillness()
@@ -78,22 +79,32 @@ class NewestSamples:
         # Samples that wait while the host stalls come late in one half or the other.
         if not rates.contradict(stated_hz, _RATE_ERROR):
             return ''
-        return (f'samples are {self.rate_hz():.4g} a second by their stamps, but rate_hz is '
-                f'{stated_hz:.4g}; correct the rate of the driver')
+        return (
+            f'samples are {self.rate_hz():.4g} a second by their stamps, but rate_hz is '
+            f'{stated_hz:.4g}; correct the rate of the driver'
+        )
 
     def rows(self, stillness: Stillness | None) -> list[Row]:
         """Return what the sensor reads at present, for the screen."""
         if not len(self.volts):
             return []
-        shown = to_nominal_mps2(self.volts[-self._count(_SHOWN_S):], self._sensor)
-        axes = '  '.join(f'{axis} {mean:+.3f} ± {rms:.3f}' for axis, mean, rms in zip(
-            self._sensor.axes, shown.mean(axis=0), shown.std(axis=0)))
+        shown = to_nominal_mps2(self.volts[-self._count(_SHOWN_S) :], self._sensor)
+        axes = '  '.join(
+            f'{axis} {mean:+.3f} ± {rms:.3f}'
+            for axis, mean, rms in zip(self._sensor.axes, shown.mean(axis=0), shown.std(axis=0))
+        )
         rate = f'  {self.rate_hz():.0f} Hz' if math.isfinite(self.rate_hz()) else ''
         rows = [Row('reads', f'{axes} m/s²{rate}')]
         if stillness is not None:
             share = stillness.value / stillness.limit if stillness.limit else 1.0
-            rows.append(Row('rest', stillness.describe_mps2(self._sensor), share,
-                            'green' if stillness.at_rest else 'yellow'))
+            rows.append(
+                Row(
+                    'rest',
+                    stillness.describe_mps2(self._sensor),
+                    share,
+                    'green' if stillness.at_rest else 'yellow',
+                )
+            )
         return rows
 
     def _count(self, seconds: float) -> int:
@@ -117,8 +128,10 @@ class LateStamps:
         """Return what was left out, for people, while it is recent; else ''."""
         if not self._number or now_ns - self._newest_ns > _RATE_WINDOW_S * 1e9:
             return ''
-        return (f'imu/data_raw: left out, samples whose stamp steps back: {self._number} so far, '
-                f'by up to {self._largest_ns * 1e-6:.3g} ms; one driver must stamp them in order')
+        return (
+            f'imu/data_raw: left out, samples whose stamp steps back: {self._number} so far, '
+            f'by up to {self._largest_ns * 1e-6:.3g} ms; one driver must stamp them in order'
+        )
 
 
 class Readings:
@@ -148,8 +161,9 @@ class Dwell:
     def __init__(self, sensor: Sensor, arrived_ns: int) -> None:
         self.arrived_ns = arrived_ns
         self._sensor = sensor
-        self._finder = rest_detection.RestFinder(sensor.rate_hz, len(sensor.axes),
-                                                 datasheet_noise(sensor), learn=False)
+        self._finder = rest_detection.RestFinder(
+            sensor.rate_hz, len(sensor.axes), datasheet_noise(sensor), learn=False
+        )
         self._stamps: list[np.ndarray] = []
         self._volts: list[np.ndarray] = []
 
@@ -183,7 +197,7 @@ class Dwell:
 
     def volts(self, rest: Rest) -> np.ndarray:
         """Return the samples of a rest, V, (n, m)."""
-        return np.concatenate(self._volts)[rest.start:rest.stop]
+        return np.concatenate(self._volts)[rest.start : rest.stop]
 
     def after(self, stop_ns: int) -> Dwell:
         """Return a dwell with the samples after a stamp, ns."""
@@ -196,12 +210,20 @@ class Dwell:
         stamps, start, stop = np.concatenate(self._stamps), rest.start, rest.start + samples
         times = (stamps - self.arrived_ns) * 1e-9
         mean, std = rest_detection.rest_means(
-            times, np.concatenate(self._volts),
+            times,
+            np.concatenate(self._volts),
             [Rest(start, stop, times[start], times[stop - 1])],
-            self._sensor.rate_hz, datasheet_noise(self._sensor))
-        return PoseRecord(pose=pose, start_ns=int(stamps[start]), stop_ns=int(stamps[stop - 1]),
-                          samples=samples, mean_v=tuple(mean[0].tolist()),
-                          std_v=tuple(std[0].tolist()))
+            self._sensor.rate_hz,
+            datasheet_noise(self._sensor),
+        )
+        return PoseRecord(
+            pose=pose,
+            start_ns=int(stamps[start]),
+            stop_ns=int(stamps[stop - 1]),
+            samples=samples,
+            mean_v=tuple(mean[0].tolist()),
+            std_v=tuple(std[0].tolist()),
+        )
 
 
 _CLOCK_OFFSET_S = 2.0
@@ -223,8 +245,9 @@ class EncoderTrack:
         # Stamps of the readings minus those of the newest samples, s
         self.offsets_s: deque[float] = deque(maxlen=_KEPT_OFFSETS)
 
-    def read(self, stamp_ns: int, alpha_rad: float, beta_rad: float, sample_ns: int | None
-             ) -> bool:
+    def read(
+        self, stamp_ns: int, alpha_rad: float, beta_rad: float, sample_ns: int | None
+    ) -> bool:
         """Take a reading, and the newest stamp of the samples; return whether time went back."""
         if sample_ns is not None:
             self.offsets_s.append((stamp_ns - sample_ns) * 1e-9)
@@ -235,14 +258,15 @@ class EncoderTrack:
     def clock_fault(self) -> str:
         """Return what is wrong with the clock of the encoder, or ''."""
         # The smallest offset is that of the message with the least delay.
-        ahead_s = min(self.offsets_s, key=abs) \
-            if len(self.offsets_s) >= _FEWEST_OFFSETS else 0.0
+        ahead_s = min(self.offsets_s, key=abs) if len(self.offsets_s) >= _FEWEST_OFFSETS else 0.0
         if abs(ahead_s) <= _CLOCK_OFFSET_S:
             return ''
         order = 'ahead of' if ahead_s > 0 else 'behind'
-        return (f'stage/joint_states is stamped {duration(abs(ahead_s))} {order} imu/data_raw: '
-                'stage and sensor must share one clock (use_sim_time for both or for none, or '
-                'synchronise their computers)')
+        return (
+            f'stage/joint_states is stamped {duration(abs(ahead_s))} {order} imu/data_raw: '
+            'stage and sensor must share one clock (use_sim_time for both or for none, or '
+            'synchronise their computers)'
+        )
 
     def silence(self, sample_ns: int) -> str:
         """Return one line on the time without readings up to a stamp, ns; '' if it is short."""
@@ -360,17 +384,26 @@ class Guide:
 
 def with_ambient(record: PoseRecord, readings: Mapping[str, Readings]) -> PoseRecord:
     """Add temperature and supply to a record."""
-    temperature_c, supply_v = (quantity.mean(record.start_ns, record.stop_ns)
-                               for quantity in readings.values())
+    temperature_c, supply_v = (
+        quantity.mean(record.start_ns, record.stop_ns) for quantity in readings.values()
+    )
     return replace(record, temperature_c=temperature_c, supply_v=supply_v)
 
 
 def temperature_fault(accepted: Mapping[int, PoseRecord], now_c: float, span_c: float) -> str:
     """Refuse a pose whose temperature differs from that of the first pose."""
-    first_c = next((record.temperature_c for _, record in sorted(accepted.items())
-                    if math.isfinite(record.temperature_c)), math.nan)
+    first_c = next(
+        (
+            record.temperature_c
+            for _, record in sorted(accepted.items())
+            if math.isfinite(record.temperature_c)
+        ),
+        math.nan,
+    )
     if not abs(now_c - first_c) > span_c:
         return ''
-    return (f'temperature moved {abs(now_c - first_c):.1f} °C since the first pose '
-            f'({first_c:.1f} to {now_c:.1f} °C), must stay within {span_c:g} °C; wait until '
-            'it is back, or finish with the poses so far')
+    return (
+        f'temperature moved {abs(now_c - first_c):.1f} °C since the first pose '
+        f'({first_c:.1f} to {now_c:.1f} °C), must stay within {span_c:g} °C; wait until '
+        'it is back, or finish with the poses so far'
+    )

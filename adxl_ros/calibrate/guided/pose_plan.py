@@ -37,8 +37,11 @@ class Target:
 def sweep(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> list[Target]:
     """Plan the paper's two experiments: in each plane alpha, beta turns forth and back."""
     forth = _turn(planes_rad, step_rad)
-    grid = [Target(float(alpha), float(beta)) for alpha in planes_rad
-            for beta in (*forth, *forth[::-1])]
+    grid = [
+        Target(float(alpha), float(beta))
+        for alpha in planes_rad
+        for beta in (*forth, *forth[::-1])
+    ]
     return grid + spread(check_poses)
 
 
@@ -64,23 +67,26 @@ def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> li
     for i, beta in enumerate((*forth, *forth[::-1])):
         is_quarter_turn = abs(np.sin(2 * beta)) < _ROUNDING
         visited = planes if is_quarter_turn or not inclined.any() else planes[inclined]
-        grid += [Target(float(alpha), float(beta)) for alpha in visited[::-1 if i % 2 else 1]]
+        grid += [Target(float(alpha), float(beta)) for alpha in visited[:: -1 if i % 2 else 1]]
     return with_checks(grid, check_poses)
 
 
 def with_checks(targets: list[Target], check_poses: int) -> list[Target]:
     """Add check poses in whole degrees, each the nearest to the pose before."""
     angles_deg = np.degrees([(t.alpha_rad, t.beta_rad) for t in spread(check_poses)])
-    checks = [Target(alpha_rad, beta_rad, True)
-              for alpha_rad, beta_rad in np.radians(np.round(angles_deg)).tolist()]
+    checks = [
+        Target(alpha_rad, beta_rad, True)
+        for alpha_rad, beta_rad in np.radians(np.round(angles_deg)).tolist()
+    ]
     return targets + nearest(targets[-1], checks)
 
 
 class Course:
     """The poses of a plan: which are taken or left out, and which is to be taken next."""
 
-    def __init__(self, targets: Sequence[Target], accepted: Collection[int],
-                 skipped: Iterable[int]) -> None:
+    def __init__(
+        self, targets: Sequence[Target], accepted: Collection[int], skipped: Iterable[int]
+    ) -> None:
         self.targets, self.accepted = targets, accepted  # Poses, and numbers of the taken ones
         self.skipped = set(skipped) - set(accepted)  # Numbers of those that are left out
         self.index = self.next_open()  # Number of the pose to go to, from 0
@@ -113,8 +119,15 @@ def nearest(start: Target, targets: list[Target]) -> list[Target]:
     """Order poses so that each one is the nearest to the pose before."""
     remaining, path = list(targets), [start]
     while remaining:
-        path.append(min(remaining, key=lambda target: max(
-            abs(path[-1].alpha_rad - target.alpha_rad), abs(path[-1].beta_rad - target.beta_rad))))
+        path.append(
+            min(
+                remaining,
+                key=lambda target: max(
+                    abs(path[-1].alpha_rad - target.alpha_rad),
+                    abs(path[-1].beta_rad - target.beta_rad),
+                ),
+            )
+        )
         remaining.remove(path[-1])
     return path[1:]
 
@@ -124,8 +137,10 @@ def spread(count: int) -> list[Target]:
     index = np.arange(count)
     alpha = np.arccos(_HIGHEST_COSINE - 2 * _HIGHEST_COSINE * (index + 0.5) / max(count, 1))
     beta = (index * _GOLDEN_RAD) % (2 * np.pi)
-    return [Target(alpha_rad, beta_rad, True)
-            for alpha_rad, beta_rad in zip(alpha.tolist(), beta.tolist())]
+    return [
+        Target(alpha_rad, beta_rad, True)
+        for alpha_rad, beta_rad in zip(alpha.tolist(), beta.tolist())
+    ]
 
 
 def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> str:
@@ -134,11 +149,17 @@ def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> str:
     planes, grid, turn = np.round(np.degrees(alpha_rad)), check == 0, np.diff(beta_rad, prepend=0)
     turn[:1] = 0
     groups = {f'{plane:.0f}°': grid & (planes == plane) for plane in dict.fromkeys(planes[grid])}
-    groups |= {'beta forth': grid & (turn > 0), 'beta back': grid & (turn < 0),
-               'check poses': ~grid}
+    groups |= {
+        'beta forth': grid & (turn > 0),
+        'beta back': grid & (turn < 0),
+        'check poses': ~grid,
+    }
     taken = np.isin(np.arange(len(targets)), list(accepted))
-    return ', '.join(f'{name} {(taken & group).sum()}/{group.sum()}'
-                     for name, group in groups.items() if group.any())
+    return ', '.join(
+        f'{name} {(taken & group).sum()}/{group.sum()}'
+        for name, group in groups.items()
+        if group.any()
+    )
 
 
 _CHANGE_G = 0.003
@@ -150,18 +171,26 @@ def angle_fault(target: Target, alpha_rad: float, beta_rad: float, tolerance_rad
     """Refuse a stage that is not at the pose."""
     return ', '.join(
         f'{name} is {np.degrees(abs(now - wanted)):.1f}° from the target {np.degrees(wanted):.4g}°'
-        for name, now, wanted in (('alpha', alpha_rad, target.alpha_rad),
-                                  ('beta', beta_rad, target.beta_rad))
-        if abs(now - wanted) > tolerance_rad)
+        for name, now, wanted in (
+            ('alpha', alpha_rad, target.alpha_rad),
+            ('beta', beta_rad, target.beta_rad),
+        )
+        if abs(now - wanted) > tolerance_rad
+    )
 
 
 def turn_fault(sensor: Sensor, change_v: np.ndarray, near_rad: float) -> str:
     """Refuse a mean that differs from that of the capture by a change, V, (m,)."""
     change_g = np.abs(change_v) / sensor.nominal_scale_v_per_g
     axis = int(change_g.argmax())
-    return '' if change_g[axis] < np.sin(near_rad) else (
-        f'the pose changed after the capture: {sensor.axes[axis]} moved by '
-        f'{change_g[axis]:.2f} g; hold the stage still until the pose is taken')
+    return (
+        ''
+        if change_g[axis] < np.sin(near_rad)
+        else (
+            f'the pose changed after the capture: {sensor.axes[axis]} moved by '
+            f'{change_g[axis]:.2f} g; hold the stage still until the pose is taken'
+        )
+    )
 
 
 def saturation_fault(sensor: Sensor, volts: np.ndarray) -> str:
@@ -172,9 +201,11 @@ def saturation_fault(sensor: Sensor, volts: np.ndarray) -> str:
     axis = int(columns[0])
     reading_v = volts[rows[0], axis]
     reading_g = (reading_v - sensor.nominal_zero_g_v[axis]) / sensor.nominal_scale_v_per_g[axis]
-    return (f'saturated: {sensor.axes[axis]} reads {signed_text(reading_g)} g '
-            f'({reading_v:.3f} V), beyond its range of ±{sensor.range_g:g} g or at a rail of the '
-            'ADC; check supply and wiring')
+    return (
+        f'saturated: {sensor.axes[axis]} reads {signed_text(reading_g)} g '
+        f'({reading_v:.3f} V), beyond its range of ±{sensor.range_g:g} g or at a rail of the '
+        'ADC; check supply and wiring'
+    )
 
 
 def signed_text(value: float) -> str:
@@ -192,7 +223,9 @@ def changed(sensor: Sensor, before: PoseRecord, now: PoseRecord, tolerance_rad: 
     axis = int((change_g - limit_g).argmax())
     if change_g[axis] <= limit_g[axis]:
         return ''
-    return (f'mounting changed: in pose {before.pose + 1} {sensor.axes[axis]} reads '
-            f'{now_v[axis]:.4f} V, but read {before_v[axis]:.4f} V before the interruption '
-            f'({change_g[axis] * 1e3:.1f} mg apart, {limit_g[axis] * 1e3:.1f} mg are allowed); '
-            'put the sensor back as it was, or begin again with resume:=anew')
+    return (
+        f'mounting changed: in pose {before.pose + 1} {sensor.axes[axis]} reads '
+        f'{now_v[axis]:.4f} V, but read {before_v[axis]:.4f} V before the interruption '
+        f'({change_g[axis] * 1e3:.1f} mg apart, {limit_g[axis] * 1e3:.1f} mg are allowed); '
+        'put the sensor back as it was, or begin again with resume:=anew'
+    )

@@ -44,8 +44,9 @@ class HandRests(Guide):
 
     next_up: int | None  # Orientation to ask for
 
-    def __init__(self, sensor: Sensor, temperature_span_c: float,
-                 accepted: Sequence[PoseRecord] = ()) -> None:
+    def __init__(
+        self, sensor: Sensor, temperature_span_c: float, accepted: Sequence[PoseRecord] = ()
+    ) -> None:
         super().__init__(sensor, accepted)
         self._span_c = temperature_span_c
         self._skipped = np.zeros(len(gravity_fit.UP), bool)
@@ -59,7 +60,8 @@ class HandRests(Guide):
         self._announced_ns = self._next_search_ns = 0
         self._dropped: list[PoseRecord] = []
         self._finder = RestFinder(
-            self.sensor.rate_hz, len(self.sensor.axes), datasheet_noise(self.sensor), learn=True)
+            self.sensor.rate_hz, len(self.sensor.axes), datasheet_noise(self.sensor), learn=True
+        )
 
     def take_samples(self, stamps_ns: np.ndarray, volts: np.ndarray) -> None:
         """Give samples to the search for rests."""
@@ -114,11 +116,22 @@ class HandRests(Guide):
 
     def poses_to_fit(self) -> list[PoseRecord]:
         """Return the rests of the interrupted calibration, and all rests of this stream."""
-        kept = [record for record in self._records(0) if not self._fault(record) and not any(
-            record.start_ns <= other.stop_ns and other.start_ns <= record.stop_ns
-            for other in self._dropped)]
-        return [*self._resumed, *(replace(record, pose=number)
-                                  for number, record in enumerate(kept, len(self._resumed)))]
+        kept = [
+            record
+            for record in self._records(0)
+            if not self._fault(record)
+            and not any(
+                record.start_ns <= other.stop_ns and other.start_ns <= record.stop_ns
+                for other in self._dropped
+            )
+        ]
+        return [
+            *self._resumed,
+            *(
+                replace(record, pose=number)
+                for number, record in enumerate(kept, len(self._resumed))
+            ),
+        ]
 
     def stillness(self) -> Stillness | None:
         """Return whether the newest samples are at rest, by the noise that the stream shows."""
@@ -136,21 +149,32 @@ class HandRests(Guide):
     def _update_estimate(self) -> None:
         """Fit the gravity model to the rests so far, with the priors of the datasheet."""
         records = [self.accepted[number] for number in sorted(self.accepted)]
-        mean_v, std_v = (np.array([getattr(record, name) for record in records]).reshape(-1, 3)
-                         for name in ('mean_v', 'std_v'))
+        mean_v, std_v = (
+            np.array([getattr(record, name) for record in records]).reshape(-1, 3)
+            for name in ('mean_v', 'std_v')
+        )
         rests = nominal_rests(mean_v, std_v, self.sensor)
         self._parameters = np.zeros(len(NAMES))
         if records:
             self._parameters = gravity_fit.regularised_fit(rests, _STEPS)
         information = gravity_fit.posterior_information(
-            rests, self._parameters, gravity_fit.TRIAL_STD_G ** 2)
+            rests, self._parameters, gravity_fit.TRIAL_STD_G**2
+        )
         values, to_units = gravity_fit.effect_values(self._parameters, self.sensor)
         covariance = np.linalg.inv(information) * np.outer(to_units, to_units)
         self.rows = running_estimate.coefficient_rows(
-            NAMES, self._parameters * to_units, np.sqrt(np.diag(covariance)),
-            gravity_fit.PRIOR_STD * to_units)
-        self.fitted = replace(self.sensor, effects=tuple(values), values=values,
-                              covariance=covariance, covariance_names=NAMES)
+            NAMES,
+            self._parameters * to_units,
+            np.sqrt(np.diag(covariance)),
+            gravity_fit.PRIOR_STD * to_units,
+        )
+        self.fitted = replace(
+            self.sensor,
+            effects=tuple(values),
+            values=values,
+            covariance=covariance,
+            covariance_names=NAMES,
+        )
         force = force_g(rests.mean, self._parameters)
         self.covered = gravity_fit.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
         self.next_up = gravity_fit.next_up(~self.covered & ~self._skipped, self.up())
@@ -170,9 +194,17 @@ class HandRests(Guide):
         for rest in self._finder.rests():
             mean_v, std_v = self._finder.means([rest])
             span = int(stamps_ns[rest.start]), int(stamps_ns[rest.stop - 1])
-            yield guide.with_ambient(PoseRecord(
-                pose=number, start_ns=span[0], stop_ns=span[1], samples=rest.stop - rest.start,
-                mean_v=tuple(mean_v[0].tolist()), std_v=tuple(std_v[0].tolist())), self.readings)
+            yield guide.with_ambient(
+                PoseRecord(
+                    pose=number,
+                    start_ns=span[0],
+                    stop_ns=span[1],
+                    samples=rest.stop - rest.start,
+                    mean_v=tuple(mean_v[0].tolist()),
+                    std_v=tuple(std_v[0].tolist()),
+                ),
+                self.readings,
+            )
 
 
 class HandGuide(HandRests):
@@ -194,39 +226,71 @@ class HandGuide(HandRests):
     def status(self) -> Status:
         """Return what the guide waits for, with the values that matter."""
         count, stillness = len(self.accepted), self._finder.stillness()
-        advice = next((text for needed, text in (
-            (SIX.min_rests, f'{SIX.min_rests - count} more at least'),
-            (NINE.min_rests, f'{SIX.text} only; {NINE.min_rests - count} more for the angles'),
-            (ENOUGH_RESTS, 'more make it better')) if count < needed), 'call finish when done')
+        advice = next(
+            (
+                text
+                for needed, text in (
+                    (SIX.min_rests, f'{SIX.min_rests - count} more at least'),
+                    (
+                        NINE.min_rests,
+                        f'{SIX.text} only; {NINE.min_rests - count} more for the angles',
+                    ),
+                    (ENOUGH_RESTS, 'more make it better'),
+                )
+                if count < needed
+            ),
+            'call finish when done',
+        )
         rests = f'{count} rests ({advice})'
         if stillness is None:
             return Status(Phase.REST, f'{rests}; waiting for samples', False)
         phase = Phase.DWELL if stillness.at_rest else Phase.REST
-        return Status(phase, f'{rests}; {stillness.describe_mps2(self.sensor)}; '
-                      f'{self.destination()}', False)
+        return Status(
+            phase, f'{rests}; {stillness.describe_mps2(self.sensor)}; {self.destination()}', False
+        )
 
     def progress(self) -> list[Row]:
         """Return direction, readings and progress, for the screen."""
         up, count = self.up(), len(self.accepted)
-        now = [] if up is None else [Row('now', gravity_fit.points_up(
-            int(np.argmax(gravity_fit.UP @ up))) + ' now')]
-        return [Row('pose', f'{self.pose_number}: {self.destination()}'), *now,
-                *self.newest.rows(self.stillness()),
-                Row('poses', f'{count} done, {max(ENOUGH_RESTS - count, 0)} left for a good fit',
-                    count / ENOUGH_RESTS)]
+        now = (
+            []
+            if up is None
+            else [Row('now', gravity_fit.points_up(int(np.argmax(gravity_fit.UP @ up))) + ' now')]
+        )
+        return [
+            Row('pose', f'{self.pose_number}: {self.destination()}'),
+            *now,
+            *self.newest.rows(self.stillness()),
+            Row(
+                'poses',
+                f'{count} done, {max(ENOUGH_RESTS - count, 0)} left for a good fit',
+                count / ENOUGH_RESTS,
+            ),
+        ]
 
     def estimated(self) -> tuple[list[Row], list[Row]]:
         """Return coverage and error, and the coefficients by the rests so far, for the screen."""
-        groups = {name: self.covered[axes == gravity_fit.AXES_UP] for name, axes in (
-            ('faces', 1), ('edges', 2), ('corners', 3))}
-        return [Row('coverage', ', '.join(f'{name} up {group.sum()}/{len(group)}'
-                                          for name, group in groups.items())),
-                tilt_row(self.tilt_error_rad())], self.rows
+        groups = {
+            name: self.covered[axes == gravity_fit.AXES_UP]
+            for name, axes in (('faces', 1), ('edges', 2), ('corners', 3))
+        }
+        return [
+            Row(
+                'coverage',
+                ', '.join(
+                    f'{name} up {group.sum()}/{len(group)}' for name, group in groups.items()
+                ),
+            ),
+            tilt_row(self.tilt_error_rad()),
+        ], self.rows
 
     def tilt_error_rad(self) -> float:
         """Return the expected rms error of alpha and beta by the rests so far, rad."""
-        std_v = np.mean([record.std_v for record in self.accepted.values()] or
-                        [tuple(datasheet_noise(self.sensor).sigma)], axis=0)
+        std_v = np.mean(
+            [record.std_v for record in self.accepted.values()]
+            or [tuple(datasheet_noise(self.sensor).sigma)],
+            axis=0,
+        )
         return running_estimate.tilt_error_rad(self.fitted, std_v)
 
 
@@ -245,8 +309,13 @@ class ThermalSettings:
 class ThermalGuide(Guide):
     """Averages a resting sensor block by block while its temperature changes."""
 
-    def __init__(self, sensor: Sensor, base: Sensor, settings: ThermalSettings,
-                 accepted: Sequence[PoseRecord] = ()) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        base: Sensor,
+        settings: ThermalSettings,
+        accepted: Sequence[PoseRecord] = (),
+    ) -> None:
         super().__init__(sensor, accepted)
         self._base, self._settings = base, settings
         self._dwell: Dwell | None = None
@@ -273,10 +342,14 @@ class ThermalGuide(Guide):
                 self._dwell = None
             return None
         record = guide.with_ambient(
-            dwell.record(max(self.accepted, default=-1) + 1, rest, samples), self.readings)
-        self.refuse('no temperature: nothing on the topic temperature; publish the reading of a '
-                    'thermometer at the sensor' if not math.isfinite(record.temperature_c) else
-                    pose_plan.saturation_fault(self.sensor, dwell.volts(rest)[:samples]))
+            dwell.record(max(self.accepted, default=-1) + 1, rest, samples), self.readings
+        )
+        self.refuse(
+            'no temperature: nothing on the topic temperature; publish the reading of a '
+            'thermometer at the sensor'
+            if not math.isfinite(record.temperature_c)
+            else pose_plan.saturation_fault(self.sensor, dwell.volts(rest)[:samples])
+        )
         if self.refusal:
             self._dwell = dwell.after(record.stop_ns)
             return None
@@ -294,8 +367,11 @@ class ThermalGuide(Guide):
 
     def skip(self, append: Callable[[JournalEntry], None]) -> str:
         """Return that nothing can be left out."""
-        return '' if self._passed.complete else \
-            'nothing to skip: finish ends the calibration before the range is covered'
+        return (
+            ''
+            if self._passed.complete
+            else 'nothing to skip: finish ends the calibration before the range is covered'
+        )
 
     def forget(self, number: int) -> str:
         """Forget a block; return a line for people."""
@@ -309,8 +385,7 @@ class ThermalGuide(Guide):
 
     def next_pose(self) -> NextPose | None:
         """Return what to announce; None once the range is covered."""
-        return None if self._passed.complete else \
-            NextPose(self.destination(), {}, None)
+        return None if self._passed.complete else NextPose(self.destination(), {}, None)
 
     def status(self) -> Status:
         """Return what the guide waits for, with the values that matter."""
@@ -321,19 +396,35 @@ class ThermalGuide(Guide):
         at_rest = self._dwell is not None and self._dwell.at_rest()
         motion = '' if at_rest or self._dwell is None else 'the sensor moves; '
         (coverage, error), _ = self.estimated()
-        return Status(Phase.DWELL if at_rest else Phase.REST, f'{len(self.accepted)} blocks; '
-                      f'{coverage.text}; {error.text}; {motion}{self.destination()}', False)
+        return Status(
+            Phase.DWELL if at_rest else Phase.REST,
+            f'{len(self.accepted)} blocks; '
+            f'{coverage.text}; {error.text}; {motion}{self.destination()}',
+            False,
+        )
 
     def progress(self) -> list[Row]:
         """Return temperature, readings and progress, for the screen."""
         passed = self._passed
-        now = [Row('now', f'{self._blocks_c[-1]:.1f} °C, '
-                   f'{"warming" if passed.rises else "cooling"}')] if self.accepted else []
+        now = (
+            [
+                Row(
+                    'now',
+                    f'{self._blocks_c[-1]:.1f} °C, {"warming" if passed.rises else "cooling"}',
+                )
+            ]
+            if self.accepted
+            else []
+        )
         done = int(passed.warming.sum() + passed.cooling.sum())
-        return [Row('pose', f'{self.pose_number}: {self.destination()}'), *now,
-                *self.newest.rows(self.stillness()),
-                Row('parts', f'{done} done, {2 * PARTS - done} left for a good fit',
-                    done / (2 * PARTS))]
+        return [
+            Row('pose', f'{self.pose_number}: {self.destination()}'),
+            *now,
+            *self.newest.rows(self.stillness()),
+            Row(
+                'parts', f'{done} done, {2 * PARTS - done} left for a good fit', done / (2 * PARTS)
+            ),
+        ]
 
     def estimated(self) -> tuple[list[Row], list[Row]]:
         """Return coverage and error, and the coefficients by the blocks so far, for the screen."""
@@ -341,12 +432,24 @@ class ThermalGuide(Guide):
         if fit is not None:
             prior = [thermal_fit.PRIOR_WIDTH * parameter_of(name).scale for name in fit.names]
             rows = running_estimate.coefficient_rows(
-                fit.names, fit.values, np.sqrt(np.diag(fit.covariance)), np.array(prior))
-        error = f'not known yet over {low_c:g} to {high_c:g} °C' if self._error_mg is None else \
-            (f'zero-g {self._error_mg:.2g} mg expected over {low_c:g} to {high_c:g} °C, after '
-             f'{self._blocks_c.min():.1f} to {self._blocks_c.max():.1f} °C')
-        return [Row('coverage', f'warming {self._passed.warming.sum()}/{PARTS}, '
-                    f'cooling {self._passed.cooling.sum()}/{PARTS}'), Row('error', error)], rows
+                fit.names, fit.values, np.sqrt(np.diag(fit.covariance)), np.array(prior)
+            )
+        error = (
+            f'not known yet over {low_c:g} to {high_c:g} °C'
+            if self._error_mg is None
+            else (
+                f'zero-g {self._error_mg:.2g} mg expected over {low_c:g} to {high_c:g} °C, after '
+                f'{self._blocks_c.min():.1f} to {self._blocks_c.max():.1f} °C'
+            )
+        )
+        return [
+            Row(
+                'coverage',
+                f'warming {self._passed.warming.sum()}/{PARTS}, '
+                f'cooling {self._passed.cooling.sum()}/{PARTS}',
+            ),
+            Row('error', error),
+        ], rows
 
     def _update(self) -> None:
         """Bring coverage, fit and expected error up to date."""
@@ -359,6 +462,8 @@ class ThermalGuide(Guide):
             return
         with suppress(UserError):
             self._fit = thermal_fit.fit(
-                self._base, thermal_fit.blocks_of(Poses.from_records(records)), False)
+                self._base, thermal_fit.blocks_of(Poses.from_records(records)), False
+            )
             self._error_mg = thermal_fit.expected_error_mg(
-                self._fit, self._passed, thermal_fit.calibrated_temperature_c(self._base))
+                self._fit, self._passed, thermal_fit.calibrated_temperature_c(self._base)
+            )

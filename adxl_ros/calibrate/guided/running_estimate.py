@@ -49,22 +49,31 @@ class RunningEstimate:
 
     def reading_fault(self, target: Target, volts: np.ndarray, tolerance_rad: float) -> str:
         """Refuse a pose whose mean, V, (m,), is an outlier to the prediction by earlier poses."""
-        sensor, pose = self.unit, Poses.without_volts(
-            np.array([target.alpha_rad]), np.array([target.beta_rad]), self.pose_std_v)
+        sensor, pose = (
+            self.unit,
+            Poses.without_volts(
+                np.array([target.alpha_rad]), np.array([target.beta_rad]), self.pose_std_v
+            ),
+        )
         slope = coefficient_jacobian(sensor, pose, self.names)[0]
-        variance = np.diag(slope @ self.covariance @ slope.T + linearisation.volts_covariance(
-            sensor, pose, self.stage).blocks[0])
+        variance = np.diag(
+            slope @ self.covariance @ slope.T
+            + linearisation.volts_covariance(sensor, pose, self.stage).blocks[0]
+        )
         expected_v = predicted_volts(sensor, pose)[0]
         slack_v = sensor.nominal_scale_v_per_g * np.hypot(_MODEL_STD_G, tolerance_rad)
         residual_stds = np.abs(volts - expected_v) / np.hypot(np.sqrt(variance), slack_v)
         if residual_stds.max() <= _OUTLIER_STDS:
             return ''
         axis = int(residual_stds.argmax())
-        measured_g, expected_g = ((v - sensor.zero_g_v) / sensor.scale_v_per_g
-                                  for v in (volts, expected_v))
-        return (f'{sensor.axes[axis]} reads {signed_text(measured_g[axis])} g where '
-                f'{signed_text(expected_g[axis])} g was expected: axis inverted or '
-                'swapped, or another pose; check wiring, mounting and pose')
+        measured_g, expected_g = (
+            (v - sensor.zero_g_v) / sensor.scale_v_per_g for v in (volts, expected_v)
+        )
+        return (
+            f'{sensor.axes[axis]} reads {signed_text(measured_g[axis])} g where '
+            f'{signed_text(expected_g[axis])} g was expected: axis inverted or '
+            'swapped, or another pose; check wiring, mounting and pose'
+        )
 
     def with_poses(self, targets: Sequence[Target]) -> RunningEstimate:
         """Predict the covariance of the estimate after further poses."""
@@ -73,15 +82,21 @@ class RunningEstimate:
         angles_rad = np.array([(target.alpha_rad, target.beta_rad) for target in targets])
         poses = Poses.without_volts(angles_rad[:, 0], angles_rad[:, 1], self.pose_std_v)
         model = linearised(self.unit, poses, self.names, np.zeros(len(self.names)))
-        return replace(self, covariance=np.linalg.inv(
-            np.linalg.inv(self.covariance) + model.information(model.covariance(self.stage))))
+        return replace(
+            self,
+            covariance=np.linalg.inv(
+                np.linalg.inv(self.covariance) + model.information(model.covariance(self.stage))
+            ),
+        )
 
     def tilt_error_rad(self) -> float:
         """Return the expected rms error of alpha and beta over the sphere, rad."""
-        of_unit = [i for i, name in enumerate(self.names)
-                   if not full_model.belongs_to_stage(name)]
-        unit = replace(self.unit, covariance=self.covariance[np.ix_(of_unit, of_unit)],
-                       covariance_names=tuple(self.names[i] for i in of_unit))
+        of_unit = [i for i, name in enumerate(self.names) if not full_model.belongs_to_stage(name)]
+        unit = replace(
+            self.unit,
+            covariance=self.covariance[np.ix_(of_unit, of_unit)],
+            covariance_names=tuple(self.names[i] for i in of_unit),
+        )
         return tilt_error_rad(unit, self.pose_std_v)
 
     def rows(self) -> list[Row]:
@@ -90,44 +105,66 @@ class RunningEstimate:
         return coefficient_rows(self.names, get(self.unit, self.names), std, self.prior)
 
 
-def from_records(sensor: Sensor, records: Sequence[PoseRecord], dwell_s: float,
-                 previous: RunningEstimate | None = None) -> RunningEstimate:
+def from_records(
+    sensor: Sensor,
+    records: Sequence[PoseRecord],
+    dwell_s: float,
+    previous: RunningEstimate | None = None,
+) -> RunningEstimate:
     """Estimate a unit from the poses of a journal, check poses left out; see `from_poses`."""
     fitted = [record for record in records if not record.check]
-    poses = Poses.from_records(fitted) if fitted else \
-        Poses.without_volts(np.zeros(0), np.zeros(0), np.zeros(len(sensor.axes)))
+    poses = (
+        Poses.from_records(fitted)
+        if fitted
+        else Poses.without_volts(np.zeros(0), np.zeros(0), np.zeros(len(sensor.axes)))
+    )
     return from_poses(sensor, poses, dwell_s, sensor.stage_std_rad, previous)
 
 
-def from_poses(sensor: Sensor, poses: Poses, dwell_s: float, stage_rad: float,
-               previous: RunningEstimate | None = None) -> RunningEstimate:
+def from_poses(
+    sensor: Sensor,
+    poses: Poses,
+    dwell_s: float,
+    stage_rad: float,
+    previous: RunningEstimate | None = None,
+) -> RunningEstimate:
     """Estimate a unit by a linearised fit of the full model with the priors of the datasheet."""
     terms = full_model.default_terms(sensor.axes)
     names = full_model.fitted_coefficients(sensor.axes, terms)
     unit = previous.unit if previous else with_neutral(sensor, (*terms, 'base_tilt'))
     stage = previous.stage if previous else StageError(stage_rad)
-    prior = np.array([full_model.LEVEL_STD_RAD if full_model.belongs_to_stage(name)
-                      else parameter_of(name).scale for name in names])
-    information = np.diag(1 / prior ** 2)
+    prior = np.array(
+        [
+            full_model.LEVEL_STD_RAD
+            if full_model.belongs_to_stage(name)
+            else parameter_of(name).scale
+            for name in names
+        ]
+    )
+    information = np.diag(1 / prior**2)
     poses = replace(poses, std_v=np.maximum(poses.std_v, _LEAST_STD_V))
     for _ in range(_ROUNDS if len(poses) else 0):
-        model = linearised(unit, poses, names, 1 / prior ** 2)
+        model = linearised(unit, poses, names, 1 / prior**2)
         stage = model.stage_error(stage_rad, stage)
         step, information = model.solve(model.covariance(stage))
         unit = put(unit, names, get(unit, names) + step)
-    samples = noise.effective_samples(round(dwell_s * sensor.rate_hz), 1 / sensor.rate_hz,
-                                      sensor.rc_s)
+    samples = noise.effective_samples(
+        round(dwell_s * sensor.rate_hz), 1 / sensor.rate_hz, sensor.rc_s
+    )
     pose_std_v = np.maximum(noise.sample_std_v(sensor) / np.sqrt(samples), _LEAST_STD_V)
     return RunningEstimate(unit, names, np.linalg.inv(information), prior, stage, pose_std_v)
 
 
 def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
     """Predict the rms angle between true and measured vertical over the sphere, or NaN."""
-    alpha_rad, beta_rad = np.array([(target.alpha_rad, target.beta_rad)
-                                    for target in pose_plan.spread(_EVALUATION_POSES)]).T
+    alpha_rad, beta_rad = np.array(
+        [(target.alpha_rad, target.beta_rad) for target in pose_plan.spread(_EVALUATION_POSES)]
+    ).T
     force = specific_force(alpha_rad, beta_rad, sensor.local_gravity_mps2)
-    by_noise, by_all = (force_covariance(unit, force, pose_std_v ** 2)
-                        for unit in (sensor.without_covariance(), sensor))
+    by_noise, by_all = (
+        force_covariance(unit, force, pose_std_v**2)
+        for unit in (sensor.without_covariance(), sensor)
+    )
     used = tilt(force, by_noise, 'z' in sensor.axes).alpha_std < _VISIBLE_RAD
     if not used.any():
         return float('nan')
@@ -135,18 +172,26 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
     return min(math.sqrt(variance), np.pi / 2)
 
 
-def coefficient_rows(names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray,
-                     prior: np.ndarray) -> list[Row]:
+def coefficient_rows(
+    names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray, prior: np.ndarray
+) -> list[Row]:
     """Lay out the parameters of the unit: how far the prior has shrunk, and 90 % intervals."""
     places: dict[Coefficient, list[int]] = {}
     for i, name in enumerate(names):
         if not full_model.belongs_to_stage(name):
             places.setdefault(name.without_axis, []).append(i)
-    return [Row(str(name), ' '.join(
-        f'{names[i].axis or names[i].parameter} '
-        + with_half_width(values[i], Z_90 * std[i]).replace(' +- ', '±') for i in place),
-        float(np.min(1 - np.clip(std[place] / prior[place], 0, 1))))
-        for name, place in places.items()]
+    return [
+        Row(
+            str(name),
+            ' '.join(
+                f'{names[i].axis or names[i].parameter} '
+                + with_half_width(values[i], Z_90 * std[i]).replace(' +- ', '±')
+                for i in place
+            ),
+            float(np.min(1 - np.clip(std[place] / prior[place], 0, 1))),
+        )
+        for name, place in places.items()
+    ]
 
 
 _SPARE_READINGS = 40
@@ -154,16 +199,18 @@ _SPARE_READINGS = 40
 _MOST_POSES = 90  # Largest number of poses; chosen: by hand a longer plan is no longer quick
 
 
-def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: int
-          ) -> list[Target]:
+def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: int) -> list[Target]:
     """Choose the fewest poses that reach a tilt error, and never more than 90."""
     start = from_records(sensor, [], dwell_s)
     fewest = math.ceil((len(start.names) + _SPARE_READINGS) / len(sensor.axes))
     grid = linearisation.candidate_poses(start.pose_std_v)
     rows = linearisation.whitened_jacobian(start.unit, grid, start.names, start.stage)
-    chosen = [Target(float(grid.alpha_rad[i]), float(grid.beta_rad[i])) for i in
-              linearisation.choose_poses(rows, np.diag(1 / start.prior ** 2),
-                                         max(_MOST_POSES, fewest))]
+    chosen = [
+        Target(float(grid.alpha_rad[i]), float(grid.beta_rad[i]))
+        for i in linearisation.choose_poses(
+            rows, np.diag(1 / start.prior**2), max(_MOST_POSES, fewest)
+        )
+    ]
     for count in range(fewest, len(chosen) + 1):
         # Each pose is the nearest to the one before, from the lowest angles on.
         first = min(chosen[:count], key=lambda target: (target.alpha_rad, target.beta_rad))

@@ -27,9 +27,21 @@ from adxl_ros.signals.gravity_at_rest import of_volts
 import numpy as np
 
 _UNIT_FIELDS = (
-    'serial', 'axes', 'rate_hz', 'nominal_zero_g_v', 'nominal_scale_v_per_g',
-    'noise_density_g_per_rthz', 'rc_resistance_ohm', 'rc_capacitance_f', 'filter_rate_hz',
-    'adc_bits', 'adc_vref_v', 'range_g', 'local_gravity_mps2', 'stage_resolution_rad')
+    'serial',
+    'axes',
+    'rate_hz',
+    'nominal_zero_g_v',
+    'nominal_scale_v_per_g',
+    'noise_density_g_per_rthz',
+    'rc_resistance_ohm',
+    'rc_capacitance_f',
+    'filter_rate_hz',
+    'adc_bits',
+    'adc_vref_v',
+    'range_g',
+    'local_gravity_mps2',
+    'stage_resolution_rad',
+)
 """Fields of the sensor that must be the same for a calibration to be resumed."""
 
 
@@ -61,8 +73,9 @@ class SessionSettings:
         if self.mode != 'stage':
             return []
         if self.plan_kind == 'quick':
-            return running_estimate.quick(unit, self.capture.dwell_s, self.tilt_error_rad,
-                                          self.check_poses)
+            return running_estimate.quick(
+                unit, self.capture.dwell_s, self.tilt_error_rad, self.check_poses
+            )
         planes_rad = self.planes_rad or pose_plan.default_planes_rad(unit.axes)
         return pose_plan.guided(planes_rad, self.step_rad, self.check_poses)
 
@@ -70,14 +83,17 @@ class SessionSettings:
         """Return what is ahead, for people: the poses of a stage, or a range of temperature."""
         if self.mode == 'thermal':
             low_c, high_c = self.thermal.range_c
-            return (f'leave it at rest from {low_c:g} to {high_c:g} °C and back; call ~/finish to '
-                    'end early')
+            return (
+                f'leave it at rest from {low_c:g} to {high_c:g} °C and back; call ~/finish to '
+                'end early'
+            )
         targets = self.targets(unit)
         if not targets:
             return ''
         seconds = len(targets) * (self.capture.dwell_s + pose_plan.MOVE_S)
-        text = (f'plan {self.plan_kind}: {len(targets)} poses, about '
-                f'{max(round(seconds / 60), 1)} min')
+        text = (
+            f'plan {self.plan_kind}: {len(targets)} poses, about {max(round(seconds / 60), 1)} min'
+        )
         error_rad = running_estimate.expected_tilt_error_rad(unit, self.capture.dwell_s, targets)
         if not np.isfinite(error_rad):
             return text
@@ -85,33 +101,51 @@ class SessionSettings:
 
     def head(self, unit: Sensor) -> dict[str, Any]:
         """Return the settings and values, by key, that an interrupted calibration must share."""
-        unit_fields = {name: 'measured' if name in unit.measured else
-                       np.asarray(getattr(unit, name)).tolist() for name in _UNIT_FIELDS}
-        head = {'mode': self.mode, **unit_fields,
-                'sweep.temperature_span_c': self.capture.temperature_span_c}
+        unit_fields = {
+            name: 'measured' if name in unit.measured else np.asarray(getattr(unit, name)).tolist()
+            for name in _UNIT_FIELDS
+        }
+        head = {
+            'mode': self.mode,
+            **unit_fields,
+            'sweep.temperature_span_c': self.capture.temperature_span_c,
+        }
         if self.mode == 'gravity':
             return head
         if self.mode == 'thermal':
-            return {**head, 'thermal.range_c': list(self.thermal.range_c),
-                    'thermal.block_s': self.thermal.block_s}
-        return {**head, 'stage.mode': self.capture.stage_mode.value,
-                'stage.tolerance_rad': self.capture.tolerance_rad,
-                'stage.near_deg': _degrees(self.capture.near_rad),
-                'sweep.dwell_s': self.capture.dwell_s, 'sweep.plan': self.plan_kind,
-                'sweep.planes_deg': [_degrees(plane) for plane in self.planes_rad],
-                'sweep.step_deg': _degrees(self.step_rad),
-                'sweep.tilt_error_rad': self.tilt_error_rad,
-                'sweep.check_poses': self.check_poses, 'order': pose_plan.ORDER}
+            return {
+                **head,
+                'thermal.range_c': list(self.thermal.range_c),
+                'thermal.block_s': self.thermal.block_s,
+            }
+        return {
+            **head,
+            'stage.mode': self.capture.stage_mode.value,
+            'stage.tolerance_rad': self.capture.tolerance_rad,
+            'stage.near_deg': _degrees(self.capture.near_rad),
+            'sweep.dwell_s': self.capture.dwell_s,
+            'sweep.plan': self.plan_kind,
+            'sweep.planes_deg': [_degrees(plane) for plane in self.planes_rad],
+            'sweep.step_deg': _degrees(self.step_rad),
+            'sweep.tilt_error_rad': self.tilt_error_rad,
+            'sweep.check_poses': self.check_poses,
+            'order': pose_plan.ORDER,
+        }
 
     def question(self, unit: Sensor) -> str:
         """Return the question what to do with an interrupted calibration; '' without one."""
         interrupted = sweep_journal.unfinished(self.journal, self.head(unit))
         if interrupted is None:
             return ''
-        choices = f'which cannot go on: {interrupted.obstacle}. Restore the old setting (a)' \
-            if interrupted.obstacle else 'of this unit. Go on with them (y)'
-        return (f'{self.journal} holds {interrupted.poses} poses of an interrupted calibration '
-                f'{choices}, or begin again (n; they are kept)?')
+        choices = (
+            f'which cannot go on: {interrupted.obstacle}. Restore the old setting (a)'
+            if interrupted.obstacle
+            else 'of this unit. Go on with them (y)'
+        )
+        return (
+            f'{self.journal} holds {interrupted.poses} poses of an interrupted calibration '
+            f'{choices}, or begin again (n; they are kept)?'
+        )
 
 
 def _degrees(angle_rad: float) -> float:
@@ -125,28 +159,37 @@ class GravityError(UserError):
 class Session:
     """One calibration of one unit: a guide, its journal, and the fit."""
 
-    def __init__(self, unit: Sensor, settings: SessionSettings, start_over: bool,
-                 base: Sensor | None = None) -> None:
+    def __init__(
+        self, unit: Sensor, settings: SessionSettings, start_over: bool, base: Sensor | None = None
+    ) -> None:
         if not os.access(settings.output.parent, os.W_OK):
-            raise UserError(f'output: {settings.output}: {settings.output.parent} is not a '
-                            'directory that can be written; choose another')
+            raise UserError(
+                f'output: {settings.output}: {settings.output.parent} is not a '
+                'directory that can be written; choose another'
+            )
         if settings.mode == 'gravity' and unit.axes != AXES:
-            raise UserError(f'mode: gravity needs the axes x, y and z, but the sensor has '
-                            f'{unit.axes}; use mode:=stage')
+            raise UserError(
+                f'mode: gravity needs the axes x, y and z, but the sensor has '
+                f'{unit.axes}; use mode:=stage'
+            )
         targets = settings.targets(unit)
         self._base = unit
         if settings.mode == 'thermal' and base is not None and base.effects:
             # The calibrated unit, with the nominal values of its stream.
-            self._base = replace(with_axes(base, unit.axes), serial=unit.serial,
-                                 rate_hz=unit.rate_hz)
+            self._base = replace(
+                with_axes(base, unit.axes), serial=unit.serial, rate_hz=unit.rate_hz
+            )
         self.unit, self.settings = unit, settings
         self.fault = ''  # What is wrong with the samples, or ''
         self.doubt = ''  # What is wrong with the length of gravity, but by less than a unit
         # The accepted poses on disk
         self.journal = sweep_journal.Journal(settings.journal, settings.head(unit), start_over)
         # A process that was killed while it wrote has left unfinished files.
-        places = [*([Path(settings.report, page.PAGE)] if settings.report else []),
-                  settings.output, settings.journal]
+        places = [
+            *([Path(settings.report, page.PAGE)] if settings.report else []),
+            settings.output,
+            settings.journal,
+        ]
         for place in places:
             remove_unfinished(place.parent, place.name)
         if settings.store:
@@ -163,8 +206,9 @@ class Session:
         elif settings.mode == 'thermal':
             self.guide = ThermalGuide(unit, self._base, settings.thermal, accepted)
         else:
-            self.guide = self.stage = StageGuide(unit, targets, settings.capture, accepted,
-                                                 sweep_journal.skipped_poses(entries))
+            self.guide = self.stage = StageGuide(
+                unit, targets, settings.capture, accepted, sweep_journal.skipped_poses(entries)
+            )
 
     @property
     def accepted_count(self) -> int:
@@ -217,17 +261,23 @@ class Session:
         if not records:
             raise UserError('no pose is taken yet')
         if all(record.check for record in records):
-            raise UserError('only check poses are taken, which the fit does not use; take other '
-                            'poses, too')
+            raise UserError(
+                'only check poses are taken, which the fit does not use; take other poses, too'
+            )
         poses = Poses.from_records(records)
-        result = calibration.calibrate_thermal(
-            self._base, poses, source, range_c=self.settings.thermal.range_c) \
-            if self.settings.mode == 'thermal' else calibration.calibrate(
-                self.unit, [calibration.RecordedPoses(source, poses)])
+        result = (
+            calibration.calibrate_thermal(
+                self._base, poses, source, range_c=self.settings.thermal.range_c
+            )
+            if self.settings.mode == 'thermal'
+            else calibration.calibrate(self.unit, [calibration.RecordedPoses(source, poses)])
+        )
         entries = sweep_journal.read(self.journal.path).entries
         if any(isinstance(entry, MountingUnchecked) for entry in entries):
-            provenance = {**result.fitted.provenance,
-                          'mounting': 'not checked after an interruption'}
+            provenance = {
+                **result.fitted.provenance,
+                'mounting': 'not checked after an interruption',
+            }
             result = replace(result, fitted=replace(result.fitted, provenance=provenance))
         result.save(self.settings.output)
         self._fitted = records

@@ -31,9 +31,14 @@ class MountingError(UserError):
 class StageSweep(Guide):
     """Takes the poses of a plan: after arrival or capture a full dwell at rest is averaged."""
 
-    def __init__(self, sensor: Sensor, targets: Sequence[Target],
-                 settings: screen_contents.CaptureSettings, accepted: Sequence[PoseRecord] = (),
-                 skipped: Iterable[int] = ()) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        targets: Sequence[Target],
+        settings: screen_contents.CaptureSettings,
+        accepted: Sequence[PoseRecord] = (),
+        skipped: Iterable[int] = (),
+    ) -> None:
         super().__init__(sensor, accepted)
         self.settings = settings
         self.moves_itself = settings.stage_mode is StageMode.COMMANDED
@@ -41,8 +46,9 @@ class StageSweep(Guide):
         self.course = Course(targets, self.accepted, skipped)
         self.encoder = EncoderTrack()
         self.tracker = SettingTracker(angle_tolerance_rad(sensor), accepted)
-        self.estimate = running_estimate.from_records(sensor, self.poses_to_fit(),
-                                                      settings.dwell_s)
+        self.estimate = running_estimate.from_records(
+            sensor, self.poses_to_fit(), settings.dwell_s
+        )
         self.go(self.course.index)
         self.verify()
 
@@ -81,7 +87,8 @@ class StageSweep(Guide):
             if self.encoder.angles_rad is None or silence:
                 return f'{silence}: in stage.mode encoder its angle counts'
             fault = self.encoder.clock_fault() or pose_plan.angle_fault(
-                target, *self.encoder.angles_rad, self.settings.near_rad)
+                target, *self.encoder.angles_rad, self.settings.near_rad
+            )
             if fault:
                 return f'{fault}; turn the stage there and capture again'
         self.refusal = ''
@@ -111,7 +118,8 @@ class StageSweep(Guide):
         self.course.skipped.discard(number)
         # The rejected reading must not influence the prediction for the new one.
         self.estimate = running_estimate.from_records(
-            self.sensor, self.poses_to_fit(), self.settings.dwell_s)
+            self.sensor, self.poses_to_fit(), self.settings.dwell_s
+        )
         self.go(number)
         return f'pose {number + 1} will be taken again'
 
@@ -138,8 +146,9 @@ class StageSweep(Guide):
 
     def begin_stream(self, back_s: float) -> None:
         """Begin the pose again; the stage may have moved, and the sensor, too."""
-        self._new_refusal = f'imu/data_raw went back in time by {back_s:.0f} s: the pose begins ' \
-            'again'
+        self._new_refusal = (
+            f'imu/data_raw went back in time by {back_s:.0f} s: the pose begins again'
+        )
         self.verify()
         self.tracker.lose_track()
         self.encoder.offsets_s.clear()
@@ -156,8 +165,12 @@ class StageSweep(Guide):
         """Return the pose for the journal when a full dwell at rest is complete, else None."""
         target, settings, dwell = self.course.target, self.settings, self.dwell
         samples = round(settings.dwell_s * self.sensor.rate_hz)
-        if target is None or dwell is None or len(dwell) < samples or (
-                self.uses_encoder and self.encoder.clock_fault()):
+        if (
+            target is None
+            or dwell is None
+            or len(dwell) < samples
+            or (self.uses_encoder and self.encoder.clock_fault())
+        ):
             return None
         rest = dwell.full_rest(samples)
         if rest is None:
@@ -175,12 +188,20 @@ class StageSweep(Guide):
         alpha_rad, beta_rad = target.alpha_rad, target.beta_rad
         if self.uses_encoder:
             readings_rad = self.tracker.between(*span)
-            alpha_rad, beta_rad = readings_rad.mean(axis=0).tolist() if len(readings_rad) else \
-                self.encoder.angles_rad or (alpha_rad, beta_rad)
+            alpha_rad, beta_rad = (
+                readings_rad.mean(axis=0).tolist()
+                if len(readings_rad)
+                else self.encoder.angles_rad or (alpha_rad, beta_rad)
+            )
         alpha, beta = self.tracker.settings(*span, alpha_rad, beta_rad)
-        record = replace(guide.with_ambient(record, self.readings),
-                         alpha_rad=alpha_rad, beta_rad=beta_rad, check=target.check,
-                         alpha_setting=alpha, beta_setting=beta)
+        record = replace(
+            guide.with_ambient(record, self.readings),
+            alpha_rad=alpha_rad,
+            beta_rad=beta_rad,
+            check=target.check,
+            alpha_setting=alpha,
+            beta_setting=beta,
+        )
         if refusal := _fault(self, record, dwell, rest):
             self.refuse(refusal)
         elif self.to_verify:
@@ -195,7 +216,8 @@ class StageSweep(Guide):
         self.course.skipped.discard(record.pose)
         self.tracker.take(record.start_ns, record.stop_ns, record.alpha_rad, record.beta_rad)
         self.estimate = running_estimate.from_records(
-            self.sensor, self.poses_to_fit(), self.settings.dwell_s, self.estimate)
+            self.sensor, self.poses_to_fit(), self.settings.dwell_s, self.estimate
+        )
         self.go(self.course.next_open())
 
     def refuse(self, reason: str) -> None:
@@ -212,19 +234,24 @@ def _fault(sweep: StageSweep, record: PoseRecord, dwell: Dwell, rest: Rest) -> s
     if settings.stage_mode is StageMode.ENCODER:
         now_rad = sweep.encoder.angles_rad or (record.alpha_rad, record.beta_rad)
         fault = pose_plan.angle_fault(
-            sweep.course.targets[record.pose], *now_rad, settings.near_rad)
+            sweep.course.targets[record.pose], *now_rad, settings.near_rad
+        )
     elif settings.stage_mode is StageMode.MANUAL:
         # Without an encoder the first rest shows where the operator captured.
         first_v = dwell.volts(dwell.rests()[0]).mean(axis=0)
-        fault = pose_plan.turn_fault(sweep.sensor, np.array(record.mean_v) - first_v,
-                                     settings.near_rad)
-    fault = fault or pose_plan.saturation_fault(
-        sweep.sensor, dwell.volts(rest)) or temperature_fault(
-            sweep.accepted, record.temperature_c, settings.temperature_span_c)
+        fault = pose_plan.turn_fault(
+            sweep.sensor, np.array(record.mean_v) - first_v, settings.near_rad
+        )
+    fault = (
+        fault
+        or pose_plan.saturation_fault(sweep.sensor, dwell.volts(rest))
+        or temperature_fault(sweep.accepted, record.temperature_c, settings.temperature_span_c)
+    )
     if fault or sweep.to_verify:
         return fault
-    return sweep.estimate.reading_fault(Target(record.alpha_rad, record.beta_rad),
-                                        np.array(record.mean_v), settings.tolerance_rad)
+    return sweep.estimate.reading_fault(
+        Target(record.alpha_rad, record.beta_rad), np.array(record.mean_v), settings.tolerance_rad
+    )
 
 
 def _verify_mounting(sweep: StageSweep, record: PoseRecord) -> None:
@@ -232,8 +259,9 @@ def _verify_mounting(sweep: StageSweep, record: PoseRecord) -> None:
     before, tolerance_rad = sweep.to_verify[0], sweep.sensor.stage_resolution_rad
     if sweep.uses_encoder:
         # The encoder shows how far the stage is from the earlier angles.
-        tolerance_rad += max(abs(record.alpha_rad - before.alpha_rad),
-                             abs(record.beta_rad - before.beta_rad))
+        tolerance_rad += max(
+            abs(record.alpha_rad - before.alpha_rad), abs(record.beta_rad - before.beta_rad)
+        )
     else:
         tolerance_rad = max(tolerance_rad, sweep.settings.tolerance_rad)
     change = pose_plan.changed(sweep.sensor, before, record, tolerance_rad)
@@ -269,8 +297,10 @@ class StageGuide(StageSweep):
         if target is None:
             return ''
         purpose = ' once more, to see that the mounting is as it was' if self.to_verify else ''
-        return (f'alpha {np.degrees(target.alpha_rad):.1f}°, '
-                f'beta {np.degrees(target.beta_rad):.1f}°{purpose}')
+        return (
+            f'alpha {np.degrees(target.alpha_rad):.1f}°, '
+            f'beta {np.degrees(target.beta_rad):.1f}°{purpose}'
+        )
 
     def next_pose(self) -> NextPose | None:
         """Return the pose to announce; None where no pose is open."""
@@ -278,14 +308,19 @@ class StageGuide(StageSweep):
         if target is None:
             return None
         values: dict[str, str | float] = {
-            'pose': str(self.pose_number), 'poses': str(count),
-            'stage_mode': self.settings.stage_mode.value, 'alpha_rad': target.alpha_rad,
-            'beta_rad': target.beta_rad, 'check': 'true' if target.check else 'false'}
+            'pose': str(self.pose_number),
+            'poses': str(count),
+            'stage_mode': self.settings.stage_mode.value,
+            'alpha_rad': target.alpha_rad,
+            'beta_rad': target.beta_rad,
+            'check': 'true' if target.check else 'false',
+        }
         task, command_rad = f'turn the stage to {self.destination()}, then capture', None
         if self.moves_itself:
             task, command_rad = self.destination(), (target.alpha_rad, target.beta_rad)
-        return NextPose(f'pose {self.pose_number} of {count}: {task}', values, command_rad,
-                        self.newest_ns or 0)
+        return NextPose(
+            f'pose {self.pose_number} of {count}: {task}', values, command_rad, self.newest_ns or 0
+        )
 
     def status(self) -> Status:
         """Return what the guide waits for, with the values that matter."""
@@ -310,39 +345,71 @@ class StageGuide(StageSweep):
             return Status(Phase.REST, f'at {place}: {motion}{since}', late)
         if not self.moves_itself:
             return Status(Phase.OPERATOR, f'turn the stage to {place}, then capture', False)
-        distance = silence if silence or self.encoder.angles_rad is None else \
-            pose_plan.angle_fault(target, *self.encoder.angles_rad, self.settings.tolerance_rad) \
+        distance = (
+            silence
+            if silence or self.encoder.angles_rad is None
+            else pose_plan.angle_fault(
+                target, *self.encoder.angles_rad, self.settings.tolerance_rad
+            )
             or 'arrived'
-        return Status(Phase.STAGE, f'the stage has not arrived at {place}{since}: {distance}',
-                      late)
+        )
+        return Status(
+            Phase.STAGE, f'the stage has not arrived at {place}{since}: {distance}', late
+        )
 
     def progress(self) -> list[Row]:
         """Return pose, readings and progress of the sweep, for the screen."""
-        target, angles_rad, total = self.course.target, self.encoder.angles_rad, len(
-            self.course.targets)
+        target, angles_rad, total = (
+            self.course.target,
+            self.encoder.angles_rad,
+            len(self.course.targets),
+        )
         rows = [Row('pose', f'{self.pose_number} of {total}: {self.destination()}')]
         if target is not None and angles_rad is not None:
-            rows.append(Row('now', ', '.join(
-                f'{joint} {np.degrees(now):.2f}° ({np.degrees(now - wanted):+.2f}°)'
-                for joint, now, wanted in zip(('alpha', 'beta'), angles_rad,
-                                              (target.alpha_rad, target.beta_rad)))))
+            rows.append(
+                Row(
+                    'now',
+                    ', '.join(
+                        f'{joint} {np.degrees(now):.2f}° ({np.degrees(now - wanted):+.2f}°)'
+                        for joint, now, wanted in zip(
+                            ('alpha', 'beta'), angles_rad, (target.alpha_rad, target.beta_rad)
+                        )
+                    ),
+                )
+            )
         rests = [] if self.dwell is None else self.dwell.rests()
         samples, dwell_s = rests[-1].stop - rests[-1].start if rests else 0, self.settings.dwell_s
         at_rest_s = min(samples / self.sensor.rate_hz, dwell_s)
         intervals_ns = np.abs(np.diff([record.stop_ns for record in self.accepted.values()]))
-        pose_s = dwell_s + MOVE_S if len(intervals_ns) < _FEWEST_INTERVALS else \
-            float(np.median(intervals_ns)) * 1e-9
+        pose_s = (
+            dwell_s + MOVE_S
+            if len(intervals_ns) < _FEWEST_INTERVALS
+            else float(np.median(intervals_ns)) * 1e-9
+        )
         skipped = f'{len(self.course.skipped)} left out, ' if self.course.skipped else ''
-        return [*rows, *self.newest.rows(self.stillness()),
-                Row('dwell', f'{at_rest_s:.1f} of {dwell_s:g} s', at_rest_s / dwell_s),
-                Row('poses', f'{len(self.accepted)} done, {skipped}{self.open_poses} left, about '
-                    f'{self.open_poses * pose_s / 60:.0f} min', 1 - self.open_poses / total)]
+        return [
+            *rows,
+            *self.newest.rows(self.stillness()),
+            Row('dwell', f'{at_rest_s:.1f} of {dwell_s:g} s', at_rest_s / dwell_s),
+            Row(
+                'poses',
+                f'{len(self.accepted)} done, {skipped}{self.open_poses} left, about '
+                f'{self.open_poses * pose_s / 60:.0f} min',
+                1 - self.open_poses / total,
+            ),
+        ]
 
     def estimated(self) -> tuple[list[Row], list[Row]]:
         """Return coverage and error, and the coefficients by the poses so far, for the screen."""
         targets, closed = self.course.targets, self.course.closed
         final_rad = self.estimate.with_poses(
-            [target for number, target in enumerate(targets)
-             if number not in closed and not target.check]).tilt_error_rad()
-        return [Row('coverage', pose_plan.by_plane(targets, self.accepted)),
-                screen_contents.tilt_row(self.tilt_error_rad(), final_rad)], self.estimate.rows()
+            [
+                target
+                for number, target in enumerate(targets)
+                if number not in closed and not target.check
+            ]
+        ).tilt_error_rad()
+        return [
+            Row('coverage', pose_plan.by_plane(targets, self.accepted)),
+            screen_contents.tilt_row(self.tilt_error_rad(), final_rad),
+        ], self.estimate.rows()

@@ -61,8 +61,9 @@ class Assessment:
         return float(np.degrees(np.sqrt(self.tilt.calibration)))
 
 
-def assess(model: str, budgets: ErrorBudgets, sensor: Sensor, is_certain: bool = True
-           ) -> Assessment:
+def assess(
+    model: str, budgets: ErrorBudgets, sensor: Sensor, is_certain: bool = True
+) -> Assessment:
     """
     Compare the calibration error of one model, without noise and stage error, with its `limit`.
 
@@ -71,6 +72,7 @@ def assess(model: str, budgets: ErrorBudgets, sensor: Sensor, is_certain: bool =
     is_certain: whether the fit has converged and determines its coefficients. Else its errors at
     the held-out poses show nothing of others, so that it cannot pass.
     """
+
     def outcome(budget: ErrorBudget, limit_square: float) -> str:
         if not limit_square > 0:
             return ''
@@ -80,8 +82,9 @@ def assess(model: str, budgets: ErrorBudgets, sensor: Sensor, is_certain: bool =
         return FAIL if certain > limit_square else PASS if passes else NOT_SHOWN
 
     (accel, tilt), square = budgets, limit(sensor)[0] ** 2
-    return Assessment(model, accel, tilt, outcome(accel, square),
-                      outcome(tilt, square * tilt.tilt_per_axis))
+    return Assessment(
+        model, accel, tilt, outcome(accel, square), outcome(tilt, square * tilt.tilt_per_axis)
+    )
 
 
 def with_open(assessment: Assessment, determined: ErrorBudgets, sensor: Sensor) -> Assessment:
@@ -92,8 +95,9 @@ def with_open(assessment: Assessment, determined: ErrorBudgets, sensor: Sensor) 
     nothing passes.
     """
     outcomes = assess(assessment.model, determined, sensor, is_certain=False)
-    return replace(assessment, accel_outcome=outcomes.accel_outcome,
-                   tilt_outcome=outcomes.tilt_outcome)
+    return replace(
+        assessment, accel_outcome=outcomes.accel_outcome, tilt_outcome=outcomes.tilt_outcome
+    )
 
 
 def judged(assessment: Assessment, fitted: Sensor) -> Assessment:
@@ -101,8 +105,9 @@ def judged(assessment: Assessment, fitted: Sensor) -> Assessment:
     return replace(assessment, accel_outcome=FAIL) if implausible(fitted) else assessment
 
 
-def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, kept: np.ndarray
-                          ) -> ErrorBudgets:
+def gravity_error_budgets(
+    fit: GravityFit, fitted: Sensor, force: np.ndarray, kept: np.ndarray
+) -> ErrorBudgets:
     """
     Split the held-out errors of the magnitude of gravity; there is no stage part.
 
@@ -112,11 +117,11 @@ def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, ke
     force: specific force in all rests by the fit, m/s², (k, 3).
     """
     errors = fit.held_out_mps2[kept]
-    excess = fit.excess_mps2 ** 2
+    excess = fit.excess_mps2**2
     by_noise = float(np.mean(fit.expected_mps2[kept] ** 2)) - excess
     covariance = force_covariance(fitted, list(force[kept].T), np.zeros(len(fitted.axes)))
     gravity, used = fitted.local_gravity_mps2, np.ones(len(kept), bool)
-    measured, nu = float(np.mean(errors ** 2)), held_out.degrees_of_freedom(errors)
+    measured, nu = float(np.mean(errors**2)), held_out.degrees_of_freedom(errors)
     quantile = float(scipy.special.chdtri(nu, _UPPER_QUANTILE))
     upper = max(measured * nu / quantile - by_noise, excess)
     accel = held_out.axis_variance(covariance, [0, 1, 2], used)
@@ -125,9 +130,16 @@ def gravity_error_budgets(fit: GravityFit, fitted: Sensor, force: np.ndarray, ke
     # Each of three axes has the error of a magnitude; two of the three turn the vertical.
     return ErrorBudgets(
         ErrorBudget(measured, by_noise, 0.0, accel, excess, spread * accel + upper),
-        ErrorBudget(3 * measured / gravity ** 2, 2 * by_noise / gravity ** 2, 0.0, tilt,
-                    2 * excess / gravity ** 2, spread * tilt + 2 * upper / gravity ** 2,
-                    tilt_per_axis=2 / gravity ** 2))
+        ErrorBudget(
+            3 * measured / gravity**2,
+            2 * by_noise / gravity**2,
+            0.0,
+            tilt,
+            2 * excess / gravity**2,
+            spread * tilt + 2 * upper / gravity**2,
+            tilt_per_axis=2 / gravity**2,
+        ),
+    )
 
 
 def limit(sensor: Sensor) -> tuple[float, str]:
@@ -139,9 +151,9 @@ def limit(sensor: Sensor) -> tuple[float, str]:
     """
     typical, _ = sensor.datasheet.get(_NONLINEARITY, (0.0, 0.0))
     if typical:
-        return typical * sensor.range_g ** 3 * G0_MPS2, 'datasheet'
+        return typical * sensor.range_g**3 * G0_MPS2, 'datasheet'
     noise_g = sample_std_v(sensor) / sensor.scale_v_per_g
-    return G0_MPS2 * float(np.sqrt(np.mean(noise_g ** 2))), 'noise of one sample'
+    return G0_MPS2 * float(np.sqrt(np.mean(noise_g**2))), 'noise of one sample'
 
 
 def _two_digits(value: float) -> str:
@@ -155,19 +167,29 @@ LIMITS = {
     'stage': 'the angles of the stage; further poses reduce it',
     'model': 'the model, which does not have the form of this unit',
     'noise or model': 'noise or model; a table of means does not separate them',
-    'stage or model': 'the stage or the model; poses that are visited twice separate them'}
+    'stage or model': 'the stage or the model; poses that are visited twice separate them',
+}
 """What limits a calibration, and what helps, by cause."""
 
 
-def summary_lines(fitted: Sensor, assessment: Assessment | None, errors: Sequence[str]
-                  ) -> list[str]:
+def summary_lines(
+    fitted: Sensor, assessment: Assessment | None, errors: Sequence[str]
+) -> list[str]:
     """Return verdict, errors as given, and limits: what a terminal and the head of a file show."""
     lines = [*acceptance_lines(fitted), '', *errors]
     if assessment is not None:
-        cause = 'open' if open_coefficients(fitted) else \
-            assessment.accel.limited_by if limit(fitted)[0] else 'noise or model'
-        lines += ['', *limit_table(assessment, fitted),
-                  f' limited by               {LIMITS[cause]}']
+        cause = (
+            'open'
+            if open_coefficients(fitted)
+            else assessment.accel.limited_by
+            if limit(fitted)[0]
+            else 'noise or model'
+        )
+        lines += [
+            '',
+            *limit_table(assessment, fitted),
+            f' limited by               {LIMITS[cause]}',
+        ]
     return lines
 
 
@@ -184,15 +206,26 @@ def screen_table(models: Sequence[HeldOutErrors]) -> list[str]:
     """Lay out the errors of the models on held-out poses for people; the last one is saved."""
     # Padded so that the decimal points stand in one line.
     lines = [f' {"":24}tilt error     acceleration error     (rms)']
-    lines += [f' {_MODELS[errors.model]:22} {tilt:>9} ° {accel:>18} mg' for errors in models
-              for tilt, accel in [['-   ' if np.isnan(value) else digits(value).ljust(
-                  len(f'{value:.3f}')) for value in (errors.tilt_deg.rms, errors.accel_mg.rms)]]]
+    lines += [
+        f' {_MODELS[errors.model]:22} {tilt:>9} ° {accel:>18} mg'
+        for errors in models
+        for tilt, accel in [
+            [
+                '-   ' if np.isnan(value) else digits(value).ljust(len(f'{value:.3f}'))
+                for value in (errors.tilt_deg.rms, errors.accel_mg.rms)
+            ]
+        ]
+    ]
     lines[-1] += '           <- saved'
     return lines
 
 
-_MODELS = {'nominal': 'datasheet values', 'linear': 'linear calibration',
-           'physical': 'physical calibration', 'full': 'full calibration'}
+_MODELS = {
+    'nominal': 'datasheet values',
+    'linear': 'linear calibration',
+    'physical': 'physical calibration',
+    'full': 'full calibration',
+}
 """Models in words."""
 
 
@@ -205,45 +238,65 @@ def digits(value: float) -> str:
 def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
     """Lay out the error of the calibration above its limit, with one outcome for each figure."""
     limit_mps2, _ = limit(sensor)
-    rows = (('calibration error', assessment.error_mg, assessment.error_deg, '', ''),
-            ('limit', mg(limit_mps2),
-             np.degrees(limit_mps2 * np.sqrt(assessment.tilt.tilt_per_axis)),
-             assessment.accel_outcome, assessment.tilt_outcome))
-    return [f' {name:24} {"-" if np.isnan(value_deg) else _two_digits(value_deg):>7} ° {tilt:9} '
-            f'{_two_digits(value_mg):>8} mg {accel}'.rstrip()
-            for name, value_mg, value_deg, accel, tilt in rows[:2 if limit_mps2 else 1]]
+    rows = (
+        ('calibration error', assessment.error_mg, assessment.error_deg, '', ''),
+        (
+            'limit',
+            mg(limit_mps2),
+            np.degrees(limit_mps2 * np.sqrt(assessment.tilt.tilt_per_axis)),
+            assessment.accel_outcome,
+            assessment.tilt_outcome,
+        ),
+    )
+    return [
+        f' {name:24} {"-" if np.isnan(value_deg) else _two_digits(value_deg):>7} ° {tilt:9} '
+        f'{_two_digits(value_mg):>8} mg {accel}'.rstrip()
+        for name, value_mg, value_deg, accel, tilt in rows[: 2 if limit_mps2 else 1]
+    ]
 
 
 def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:
     """State the errors against gravity of rests that begin at times, (k,), and the outliers."""
     kept = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-    before, after, unseen = (held_out.statistic(mg(values[kept])) for values in (
-        fit.before_mps2, fit.residual_mps2, fit.held_out_mps2))
+    before, after, unseen = (
+        held_out.statistic(mg(values[kept]))
+        for values in (fit.before_mps2, fit.residual_mps2, fit.held_out_mps2)
+    )
     low, high = unseen.interval
-    lines = [f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before.rms:.2f}, '
-             f'{fit.step.text} {after.rms:.3f}, held-out stretches of time {unseen.rms:.3f} '
-             f'({low:.3f} to {high:.3f}), {unseen.largest:.3f} max']
+    lines = [
+        f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before.rms:.2f}, '
+        f'{fit.step.text} {after.rms:.3f}, held-out stretches of time {unseen.rms:.3f} '
+        f'({low:.3f} to {high:.3f}), {unseen.largest:.3f} max'
+    ]
     if fit.outliers:
         rests = ', '.join(f'{i + 1} (from {time_s[i]:.1f} s)' for i in fit.outliers)
         lines.append(f'outliers, left out: rest {rests}')
     return lines
 
 
-def provenance_entries(assessment: Assessment | None, models: Sequence[HeldOutErrors],
-                       doubts: Sequence[str] = ()) -> dict[str, str]:
+def provenance_entries(
+    assessment: Assessment | None, models: Sequence[HeldOutErrors], doubts: Sequence[str] = ()
+) -> dict[str, str]:
     """Return the entries about the saved model, and why it cannot pass, without NaN."""
     doubt = {'doubt': doubts[0]} if doubts else {}
     if assessment is None:
         return doubt
-    numbers: dict[str, float] = {'own_accel_mg': assessment.error_mg,
-                                 'own_tilt_deg': assessment.error_deg}
+    numbers: dict[str, float] = {
+        'own_accel_mg': assessment.error_mg,
+        'own_tilt_deg': assessment.error_deg,
+    }
     for errors in models[-1:]:
-        numbers |= {'held_out_poses': errors.pose_count,
-                    'held_out_tilt_rms_deg': errors.tilt_deg.rms,
-                    'held_out_accel_rms_mg': errors.accel_mg.rms}
-    entries = {**{key: f'{value:.4g}' for key, value in numbers.items() if np.isfinite(value)},
-               'verdict': assessment.accel_outcome, 'verdict_tilt': assessment.tilt_outcome,
-               'limited_by': assessment.accel.limited_by}
+        numbers |= {
+            'held_out_poses': errors.pose_count,
+            'held_out_tilt_rms_deg': errors.tilt_deg.rms,
+            'held_out_accel_rms_mg': errors.accel_mg.rms,
+        }
+    entries = {
+        **{key: f'{value:.4g}' for key, value in numbers.items() if np.isfinite(value)},
+        'verdict': assessment.accel_outcome,
+        'verdict_tilt': assessment.tilt_outcome,
+        'limited_by': assessment.accel.limited_by,
+    }
     return {key: entry for key, entry in entries.items() if entry} | doubt
 
 
@@ -251,14 +304,19 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
     """Compare the error with the datasheet, or with the noise where it states none."""
     provenance = fitted.provenance
     if fault := implausible(fitted):
-        return FAIL, [f'{fault}.', 'Check the unit of the readings, the range setting, and the '
-                      'parameter file; do not use this file.']
+        return FAIL, [
+            f'{fault}.',
+            'Check the unit of the readings, the range setting, and the '
+            'parameter file; do not use this file.',
+        ]
     if 'own_accel_mg' not in provenance:
         return NOT_SHOWN, ['no pose was kept out of the fit to assess it']
     limit_mps2, origin = limit(fitted)
     if not limit_mps2:
-        return NOT_SHOWN, [f'calibration error {_two_digits(float(provenance["own_accel_mg"]))} '
-                           'mg; neither a datasheet nor the noise of a sample states a limit']
+        return NOT_SHOWN, [
+            f'calibration error {_two_digits(float(provenance["own_accel_mg"]))} '
+            'mg; neither a datasheet nor the noise of a sample states a limit'
+        ]
     limit_text = f'{_two_digits(mg(limit_mps2))} mg'
     accel = provenance.get('verdict', '')
     outcomes = accel, provenance.get('verdict_tilt', '')
@@ -275,11 +333,16 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
         lines.append('The recording is not sound: see the warning.')
     elif outcome == NOT_SHOWN:
         open_names = ', '.join(map(str, open_coefficients(fitted)))
-        lines.append(f'Other poses may have a larger error: {open_names} not determined.'
-                     if open_names else 'The poses are too few to show that it is within.')
+        lines.append(
+            f'Other poses may have a larger error: {open_names} not determined.'
+            if open_names
+            else 'The poses are too few to show that it is within.'
+        )
     if 'span_s' in provenance:
-        lines.append(f'By rests within {duration(float(provenance["span_s"]))}; a longer drift is '
-                     'not in this figure.')
+        lines.append(
+            f'By rests within {duration(float(provenance["span_s"]))}; a longer drift is '
+            'not in this figure.'
+        )
     return outcome, lines
 
 
@@ -289,21 +352,29 @@ def implausible(fitted: Sensor) -> str:
         typical, largest = fitted.datasheet.get(name, (0.0, 0.0))
         shifts = fitted.values.get(name.effect, {}).get(name.parameter, np.zeros(0))
         nominal = fitted.nominal_zero_g_v if name == _ZERO_G else fitted.nominal_scale_v_per_g
-        tolerances = np.full(len(nominal), largest or 2 * typical) if largest or typical else \
-            _ANY_TOLERANCE[name] * fitted.nominal_scale_v_per_g
+        tolerances = (
+            np.full(len(nominal), largest or 2 * typical)
+            if largest or typical
+            else _ANY_TOLERANCE[name] * fitted.nominal_scale_v_per_g
+        )
         origin = 'its datasheet' if largest or typical else 'the width of any accelerometer'
         for axis, shift, middle, tolerance in zip(fitted.axes, shifts, nominal, tolerances):
             if abs(shift) > _FAR * tolerance:
                 what = 'zero-g' if name == _ZERO_G else 'scale factor'
-                return (f'the {what} of {axis} is {middle + shift:.3g} {unit}, far outside of '
-                        f'{middle - tolerance:.3g} to {middle + tolerance:.3g} {unit} by {origin}')
+                return (
+                    f'the {what} of {axis} is {middle + shift:.3g} {unit}, far outside of '
+                    f'{middle - tolerance:.3g} to {middle + tolerance:.3g} {unit} by {origin}'
+                )
     return ''
 
 
 def open_coefficients(fitted: Sensor) -> list[Coefficient]:
     """Return zero-g, scale factors and misalignments that are known by their prior alone."""
-    return [name for name, variance in zip(fitted.covariance_names, np.diag(fitted.covariance))
-            if name.effect in AFFINE and variance > _OPEN * parameter_of(name).scale ** 2]
+    return [
+        name
+        for name, variance in zip(fitted.covariance_names, np.diag(fitted.covariance))
+        if name.effect in AFFINE and variance > _OPEN * parameter_of(name).scale ** 2
+    ]
 
 
 def acceptance_lines(fitted: Sensor) -> list[str]:

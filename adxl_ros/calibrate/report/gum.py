@@ -34,26 +34,31 @@ _LOCAL_STD_MPS2 = 5e-4
 _NOT_LOCAL_MPS2 = (G0_MPS2, 9.8, 9.81)
 """Values of gravity that are those of no place in particular, m/s²."""
 _UNIFORM = np.sqrt(3)  # Half-width of a uniform distribution divided by its standard deviation
-_SURROUNDINGS = {'temperature': ('temperature_c', 'K', MARGIN_K, 0.1),
-                 'supply': ('supply_v', 'V', 0.0, 1e-3)}
+_SURROUNDINGS = {
+    'temperature': ('temperature_c', 'K', MARGIN_K, 0.1),
+    'supply': ('supply_v', 'V', 0.0, 1e-3),
+}
 """Field of a pose, unit, margin of the range, and step of central differences."""
 MODEL = (
     'a = F(V; θ, T, U)·(1 + δg/g) − g·(∂u/∂α·δα + ∂u/∂β·δβ) + δm. The measurand a is the '
     'acceleration along an axis of the case at the stated pose α, β. F inverts the calibrated '
     'sensor. V is the mean output of a rest, θ the coefficients, T the temperature, U the supply, '
-    'g the local gravity, u the component of the vertical. The corrections δ are 0 and uncertain.')
+    'g the local gravity, u the component of the vertical. The corrections δ are 0 and uncertain.'
+)
 """The measurement model."""
 MEANING = (
     f'The expanded uncertainty is the standard uncertainty times k = {K}: about 95 % for a normal '
     'distribution, more where a uniform one has the largest part. It holds for rests as long as '
-    'those of the calibration and a supply that is constant or in the model, without ageing.')
+    'those of the calibration and a supply that is constant or in the model, without ageing.'
+)
 """What an expanded uncertainty means."""
 RULE = (
     f'{PASS} if error + guard band is at most the limit; {FAIL} if the error exceeds it; '
     f'{NOT_SHOWN} in between, and where stage and model are inseparable. The guard band reaches '
     'to the upper end of the 90 % interval, so that the risk of a false '
     f'{PASS} is at most 5 %. The error is that of coefficients and model; the other inputs belong '
-    'to each use.')
+    'to each use.'
+)
 """The decision rule (ISO/IEC 17025, 7.8.6)."""
 
 
@@ -95,7 +100,7 @@ class Uncertainty:
     @property
     def combined_mps2(self) -> np.ndarray:
         """Return the combined standard uncertainty, m/s², (k, m)."""
-        return np.asarray(np.sqrt(sum(row.contribution_mps2 ** 2 for row in self.inputs)))
+        return np.asarray(np.sqrt(sum(row.contribution_mps2**2 for row in self.inputs)))
 
     @property
     def worst(self) -> tuple[int, int]:
@@ -115,43 +120,71 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
     force = np.column_stack(reference_force(held, gravity))
     by_noise, by_coefficients, by_stage, _ = (
         np.sqrt(np.maximum([covariance[d, d][used] for d in axes], 0.0)).T
-        for covariance in held_out.covariances(errors, held, force))
+        for covariance in held_out.covariances(errors, held, force)
+    )
     held, reference = held.subset(used), force[used][:, axes]
     error, budget = errors.errors.accel_mps2[used], assessment.accel
     model = np.full(error.shape, np.sqrt(budget.model))
     # The poses may scatter more than the step of the encoder permits.
     stage_mps2, stage_kind = by_stage, 'B, uniform within a step'
-    stage_rad, excess = fitted.stage_std_rad, budget.stage / max(np.mean(by_stage ** 2), 1e-30)
+    stage_rad, excess = fitted.stage_std_rad, budget.stage / max(np.mean(by_stage**2), 1e-30)
     if excess > 1:
-        stage_mps2 = by_stage * excess ** 0.5 if stage_rad else model * 0 + budget.stage ** 0.5
+        stage_mps2 = by_stage * excess**0.5 if stage_rad else model * 0 + budget.stage**0.5
         stage_kind = 'A, scatter of the poses'
-        stage_rad = stage_rad * excess ** 0.5 or budget.stage ** 0.5 / gravity
+        stage_rad = stage_rad * excess**0.5 or budget.stage**0.5 / gravity
     gravity_std, gravity_kind = _LOCAL_STD_MPS2, 'B, anomalies of gravity'
     if gravity in _NOT_LOCAL_MPS2:
         gravity_std, gravity_kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, not local: anywhere'
     inputs = (
         Input('noise of the mean', 'A, normal', 1e3 * np.mean(held.std_v, axis=0), 'mV', by_noise),
-        Input('coefficients', 'A, covariance of the fit', mg(by_coefficients), 'mg',
-              by_coefficients),
+        Input(
+            'coefficients', 'A, covariance of the fit', mg(by_coefficients), 'mg', by_coefficients
+        ),
         Input('stage angles', stage_kind, np.degrees(stage_rad), '°', stage_mps2),
         Input('model', 'A, held-out errors', mg(model), 'mg', model),
-        Input('local gravity', gravity_kind, gravity_std, 'm/s²',
-              np.abs(reference) / gravity * gravity_std),
-        *(_surroundings(name, fitted, held, reference) for name in _SURROUNDINGS))
+        Input(
+            'local gravity',
+            gravity_kind,
+            gravity_std,
+            'm/s²',
+            np.abs(reference) / gravity * gravity_std,
+        ),
+        *(_surroundings(name, fitted, held, reference) for name in _SURROUNDINGS),
+    )
     limit_mps2, limit_name = acceptance.limit(fitted)
-    tilt_limit_rad = limit_mps2 * assessment.tilt.tilt_per_axis ** 0.5
+    tilt_limit_rad = limit_mps2 * assessment.tilt.tilt_per_axis**0.5
     decisions = tuple(
-        Decision(quantity, unit, scale * part.calibration ** 0.5,
-                 scale * (part.calibration_high ** 0.5 - part.calibration ** 0.5), scale * limit,
-                 outcome)
+        Decision(
+            quantity,
+            unit,
+            scale * part.calibration**0.5,
+            scale * (part.calibration_high**0.5 - part.calibration**0.5),
+            scale * limit,
+            outcome,
+        )
         for quantity, unit, scale, part, limit, outcome in (
-            ('acceleration', 'mg', mg(1.0), assessment.accel, limit_mps2,
-             assessment.accel_outcome),
-            ('tilt', '°', float(np.degrees(1.0)), assessment.tilt, tilt_limit_rad,
-             assessment.tilt_outcome))
-        if outcome)
-    return Uncertainty(fitted.axes, held.alpha_rad, held.beta_rad, reference, error, inputs,
-                       limit_name, decisions)
+            (
+                'acceleration',
+                'mg',
+                mg(1.0),
+                assessment.accel,
+                limit_mps2,
+                assessment.accel_outcome,
+            ),
+            (
+                'tilt',
+                '°',
+                float(np.degrees(1.0)),
+                assessment.tilt,
+                tilt_limit_rad,
+                assessment.tilt_outcome,
+            ),
+        )
+        if outcome
+    )
+    return Uncertainty(
+        fitted.axes, held.alpha_rad, held.beta_rad, reference, error, inputs, limit_name, decisions
+    )
 
 
 def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray) -> Input:
@@ -160,17 +193,32 @@ def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray)
     values, environment = getattr(held, field), held.environment
     seen = values[np.isfinite(values)]
     half_range = margin + (np.ptp(seen) / 2 if seen.size else 0.0)
-    kind = 'B, range of the poses' if seen.size else \
-        f'B, ±{margin:g} {unit}, not measured' if margin else 'not measured, taken as constant'
+    kind = (
+        'B, range of the poses'
+        if seen.size
+        else f'B, ±{margin:g} {unit}, not measured'
+        if margin
+        else 'not measured, taken as constant'
+    )
     std = half_range / _UNIFORM
     inverse = signal_chain.inverse(fitted, np.where(np.cos(held.alpha_rad) < 0, -1, 1))
-    shifted = [np.column_stack(inverse(list(held.volts.T), environment._replace(
-        **{field: getattr(environment, field) + sign * step}))) for sign in (1, -1)]
+    shifted = [
+        np.column_stack(
+            inverse(
+                list(held.volts.T),
+                environment._replace(**{field: getattr(environment, field) + sign * step}),
+            )
+        )
+        for sign in (1, -1)
+    ]
     slope = (shifted[0] - shifted[1])[:, [AXES.index(axis) for axis in fitted.axes]] / (2 * step)
     if name == 'temperature':
         # What the model does not follow drifts as the datasheet states.
-        slope = np.sqrt(slope ** 2 + (G0_MPS2 * fitted.envelope.zero_g_per_k) ** 2
-                        + (reference * fitted.envelope.scale_per_k) ** 2)
+        slope = np.sqrt(
+            slope**2
+            + (G0_MPS2 * fitted.envelope.zero_g_per_k) ** 2
+            + (reference * fitted.envelope.scale_per_k) ** 2
+        )
     return Input(name, kind, std, unit, np.abs(np.nan_to_num(slope)) * std)
 
 
@@ -182,89 +230,171 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
     for row in found.inputs:
         std = float(np.broadcast_to(row.std, found.error_mps2.shape)[found.worst])
         part_mg = float(mg(row.contribution_mps2[found.worst]))
-        sensitivity = '1' if row.unit == 'mg' else \
-            f'{number(part_mg / std if std else 0.0, digits=2)} mg per {row.unit}'
-        rows.append([row.name, f'{number(std, digits=2)} {row.unit} ({row.kind})', sensitivity,
-                     f'{part_mg:.3f}'])
+        sensitivity = (
+            '1'
+            if row.unit == 'mg'
+            else f'{number(part_mg / std if std else 0.0, digits=2)} mg per {row.unit}'
+        )
+        rows.append(
+            [
+                row.name,
+                f'{number(std, digits=2)} {row.unit} ({row.kind})',
+                sensitivity,
+                f'{part_mg:.3f}',
+            ]
+        )
     expanded_mg = mg(K * found.combined_mps2)
     pose, axis = found.worst
     alpha, beta = np.degrees([found.alpha_rad[pose], found.beta_rad[pose]])
     inside = np.abs(found.error_mps2) <= K * found.combined_mps2
-    decisions = [[
-        row.quantity, f'{row.error:.3f} + {row.guard_band:.3f} = '
-        f'{row.error + row.guard_band:.3f} {row.unit}',
-        f'{number(row.limit, digits=2)} {row.unit}',
-        row.outcome] for row in found.decisions]
+    decisions = [
+        [
+            row.quantity,
+            f'{row.error:.3f} + {row.guard_band:.3f} = '
+            f'{row.error + row.guard_band:.3f} {row.unit}',
+            f'{number(row.limit, digits=2)} {row.unit}',
+            row.outcome,
+        ]
+        for row in found.decisions
+    ]
     return {
-        'model': MODEL, 'meaning': MEANING, 'rule': RULE, 'limit_name': found.limit_name,
+        'model': MODEL,
+        'meaning': MEANING,
+        'rule': RULE,
+        'limit_name': found.limit_name,
         'pose': f'alpha {alpha:.1f}°, beta {beta:.1f}°, axis {found.axes[axis]}',
-        'budget': rows, 'decisions': decisions,
+        'budget': rows,
+        'decisions': decisions,
         'combined': f'{expanded_mg[pose, axis] / K:.3f} mg',
         'expanded': f'{expanded_mg[pose, axis]:.2f} mg',
         'range': f'{expanded_mg.min():.2f} to {expanded_mg.max():.2f} mg',
-        'inside': f'{int(inside.sum())} of {inside.size}'}
+        'inside': f'{int(inside.sum())} of {inside.size}',
+    }
 
 
 SCHEMA_VERSION = '3.2.0'
-_UNITS = {'V': (r'\volt', 1.0), '°': (r'\degree', 1.0),
-          'V/g': (r'\volt\metre\tothe{-1}\second\tothe{2}', 1 / G0_MPS2)}
+_UNITS = {
+    'V': (r'\volt', 1.0),
+    '°': (r'\degree', 1.0),
+    'V/g': (r'\volt\metre\tothe{-1}\second\tothe{2}', 1 / G0_MPS2),
+}
 """Units in D-SI, where g is none, and factors of the coefficients that a certificate states."""
 _ACCELERATION = r'\metre\second\tothe{-2}'
 
 
-def _quantity(name: str, values: Any, unit: str, std: Any = None, about: str = '',
-              kind: str = '') -> dict[str, Any]:
+def _quantity(
+    name: str, values: Any, unit: str, std: Any = None, about: str = '', kind: str = ''
+) -> dict[str, Any]:
     """Describe a quantity of one value, or of a list, with the expanded uncertainty of each."""
     expanded: Any = [] if std is None else K * np.asarray(std)
-    numbers, expanded = (' '.join(f'{value:.7g}' for value in np.ravel(each))
-                         for each in (values, expanded))
-    return {'name': name, 'about': about, 'kind': kind, 'unit': unit, 'numbers': numbers,
-            'is_list': np.ndim(values) > 0, 'expanded': expanded}
+    numbers, expanded = (
+        ' '.join(f'{value:.7g}' for value in np.ravel(each)) for each in (values, expanded)
+    )
+    return {
+        'name': name,
+        'about': about,
+        'kind': kind,
+        'unit': unit,
+        'numbers': numbers,
+        'is_list': np.ndim(values) > 0,
+        'expanded': expanded,
+    }
 
 
 def write(path: str | os.PathLike, result: CalibrationResult) -> None:
     """Write the certificate of a calibration against a stage, by the template of its elements."""
     found = uncertainty(result)
     if found is None:
-        raise UserError(f'{path}: a certificate states errors at stage angles, and no pose with '
-                        'angles was kept out of the fit; leave --dcc out')
+        raise UserError(
+            f'{path}: a certificate states errors at stage angles, and no pose with '
+            'angles was kept out of the fit; leave --dcc out'
+        )
     elements = templates.environment('a certificate', ('adxl_ros.calibrate.report', ''))
     fitted = result.fitted
-    write_text(path, elements.get_template('certificate.xml').render(
-        schema_version=SCHEMA_VERSION, k=K, rule=RULE,
-        method=f'{MEANING} {MODEL}', fitted=fitted, provenance=fitted.provenance,
-        step_deg=np.degrees(fitted.stage_resolution_rad), **_results(fitted, found)))
+    write_text(
+        path,
+        elements.get_template('certificate.xml').render(
+            schema_version=SCHEMA_VERSION,
+            k=K,
+            rule=RULE,
+            method=f'{MEANING} {MODEL}',
+            fitted=fitted,
+            provenance=fitted.provenance,
+            step_deg=np.degrees(fitted.stage_resolution_rad),
+            **_results(fitted, found),
+        ),
+    )
 
 
 def _results(fitted: Sensor, found: Uncertainty) -> dict[str, list[Any]]:
     """Return decisions, errors, coefficients and conditions as quantities."""
     decisions = [
-        {'quantity': row.quantity, 'outcome': row.outcome,
-         'conformity': {PASS: 'pass', FAIL: 'fail'}.get(
-             row.outcome, 'conditionalPass' if row.error <= row.limit else 'conditionalFail'),
-         'figures': [_quantity(name, factor * value, unit, kind=kind) for name, value, kind in (
-             ('error of the calibration', row.error, 'basic_measuredValue'),
-             ('guard band', row.guard_band, ''),
-             (f'limit by the {found.limit_name}', row.limit, 'basic_acceptanceLimitUpper'))]}
-        for row in found.decisions for unit, factor in [
-            (_ACCELERATION, 1e-3 * G0_MPS2) if row.unit == 'mg' else (r'\degree', 1.0)]]
+        {
+            'quantity': row.quantity,
+            'outcome': row.outcome,
+            'conformity': {PASS: 'pass', FAIL: 'fail'}.get(
+                row.outcome, 'conditionalPass' if row.error <= row.limit else 'conditionalFail'
+            ),
+            'figures': [
+                _quantity(name, factor * value, unit, kind=kind)
+                for name, value, kind in (
+                    ('error of the calibration', row.error, 'basic_measuredValue'),
+                    ('guard band', row.guard_band, ''),
+                    (f'limit by the {found.limit_name}', row.limit, 'basic_acceptanceLimitUpper'),
+                )
+            ],
+        }
+        for row in found.decisions
+        for unit, factor in [
+            (_ACCELERATION, 1e-3 * G0_MPS2) if row.unit == 'mg' else (r'\degree', 1.0)
+        ]
+    ]
     errors = [
-        [_quantity('alpha', np.degrees(found.alpha_rad), r'\degree'),
-         _quantity('beta', np.degrees(found.beta_rad), r'\degree'),
-         _quantity(f'reference acceleration along {name}', found.reference_mps2[:, d],
-                   _ACCELERATION, kind='basic_referenceValue'),
-         _quantity(f'measured acceleration along {name}',
-                   (found.reference_mps2 + found.error_mps2)[:, d], _ACCELERATION,
-                   kind='basic_measuredValue'),
-         _quantity(f'error along {name}', found.error_mps2[:, d], _ACCELERATION,
-                   found.combined_mps2[:, d], kind='basic_measurementError')]
-        for d, name in enumerate(fitted.axes)]
-    coefficients = [_quantity(f'{row.label} {row.axis}', factor * row.fitted, unit,
-                              factor * row.half_width / Z_90, row.name)
-                    for row in compare(fitted, fitted) if row.unit in _UNITS
-                    for unit, factor in [_UNITS[row.unit]]]
+        [
+            _quantity('alpha', np.degrees(found.alpha_rad), r'\degree'),
+            _quantity('beta', np.degrees(found.beta_rad), r'\degree'),
+            _quantity(
+                f'reference acceleration along {name}',
+                found.reference_mps2[:, d],
+                _ACCELERATION,
+                kind='basic_referenceValue',
+            ),
+            _quantity(
+                f'measured acceleration along {name}',
+                (found.reference_mps2 + found.error_mps2)[:, d],
+                _ACCELERATION,
+                kind='basic_measuredValue',
+            ),
+            _quantity(
+                f'error along {name}',
+                found.error_mps2[:, d],
+                _ACCELERATION,
+                found.combined_mps2[:, d],
+                kind='basic_measurementError',
+            ),
+        ]
+        for d, name in enumerate(fitted.axes)
+    ]
+    coefficients = [
+        _quantity(
+            f'{row.label} {row.axis}',
+            factor * row.fitted,
+            unit,
+            factor * row.half_width / Z_90,
+            row.name,
+        )
+        for row in compare(fitted, fitted)
+        if row.unit in _UNITS
+        for unit, factor in [_UNITS[row.unit]]
+    ]
     conditions = [_quantity('local gravity', fitted.local_gravity_mps2, _ACCELERATION)]
-    conditions += [_quantity(f'{name} temperature', value + 273.15, r'\kelvin') for name, value in
-                   zip(('lowest', 'highest'), fitted.envelope.temperature_c or ())]
-    return {'decisions': decisions, 'errors': errors, 'coefficients': coefficients,
-            'conditions': conditions}
+    conditions += [
+        _quantity(f'{name} temperature', value + 273.15, r'\kelvin')
+        for name, value in zip(('lowest', 'highest'), fitted.envelope.temperature_c or ())
+    ]
+    return {
+        'decisions': decisions,
+        'errors': errors,
+        'coefficients': coefficients,
+        'conditions': conditions,
+    }

@@ -91,17 +91,24 @@ def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Po
 
     A sensor without z cannot distinguish α from π − α: the reference gives the sign of its z.
     """
-    reference = reference_force(poses, sensor.local_gravity_mps2) if stage is None else \
-        stage_force(stage, poses.alpha_rad, poses.beta_rad)
+    reference = (
+        reference_force(poses, sensor.local_gravity_mps2)
+        if stage is None
+        else stage_force(stage, poses.alpha_rad, poses.beta_rad)
+    )
     z_sign = np.where(reference[2] < 0, -1, 1)
     force = signal_chain.inverse(sensor, z_sign)(list(poses.volts.T), poses.environment)
-    covariance = force_covariance(sensor, force, np.mean(poses.std_v, axis=0) ** 2,
-                                  poses.environment)
+    covariance = force_covariance(
+        sensor, force, np.mean(poses.std_v, axis=0) ** 2, poses.environment
+    )
     shows_tilt = tilt(force, covariance, 'z' in sensor.axes).alpha_std < _MAX_ALPHA_STD_RAD
     measured = [AXES.index(axis) for axis in sensor.axes]
     tilt_error = angle_between(np.column_stack(force), np.column_stack(reference))
-    return PoseErrors(np.column_stack([force[d] - reference[d] for d in measured]),
-                      np.where(shows_tilt, tilt_error, np.nan), np.column_stack(force))
+    return PoseErrors(
+        np.column_stack([force[d] - reference[d] for d in measured]),
+        np.where(shows_tilt, tilt_error, np.nan),
+        np.column_stack(force),
+    )
 
 
 def angle_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -110,15 +117,25 @@ def angle_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.arctan2(across, np.sum(first * second, axis=1))
 
 
-def summarise(model: str, errors: PoseErrors, pose_index: np.ndarray | None = None,
-              fitted: Sequence[Sensor] = (), fold: np.ndarray | None = None) -> HeldOutErrors:
+def summarise(
+    model: str,
+    errors: PoseErrors,
+    pose_index: np.ndarray | None = None,
+    fitted: Sequence[Sensor] = (),
+    fold: np.ndarray | None = None,
+) -> HeldOutErrors:
     """Summarise the errors of one model; the arrays as in `HeldOutErrors`, None for one fold."""
     count = len(errors.accel_mps2)
     accel_mg = mg(errors.accel_mps2[determining_alpha(errors)])
     return HeldOutErrors(
-        model, statistic(np.degrees(errors.tilt_rad)), statistic(accel_mg), errors,
-        np.arange(count) if pose_index is None else pose_index, tuple(fitted),
-        np.zeros(count, int) if fold is None else fold)
+        model,
+        statistic(np.degrees(errors.tilt_rad)),
+        statistic(accel_mg),
+        errors,
+        np.arange(count) if pose_index is None else pose_index,
+        tuple(fitted),
+        np.zeros(count, int) if fold is None else fold,
+    )
 
 
 def determining_alpha(errors: PoseErrors) -> np.ndarray:
@@ -136,7 +153,7 @@ def statistic(values: np.ndarray) -> ErrorStatistic:
     sizes, nu = np.abs(values[np.isfinite(values)]), degrees_of_freedom(values)
     if not sizes.size:
         return ErrorStatistic(np.nan, np.nan, (np.nan, np.nan))
-    rms = float(np.sqrt(np.mean(sizes ** 2)))
+    rms = float(np.sqrt(np.mean(sizes**2)))
     low, high = (rms * float(np.sqrt(nu / scipy.special.chdtri(nu, p))) for p in (0.05, 0.95))
     return ErrorStatistic(rms, float(sizes.max()), (low, high))
 
@@ -154,12 +171,12 @@ def degrees_of_freedom(values: np.ndarray) -> float:
     """
     table = values.reshape(len(values), -1)
     table = table[np.isfinite(table).all(axis=1)]
-    squares = np.mean(table ** 2, axis=1)
+    squares = np.mean(table**2, axis=1)
     count, mean = len(squares), float(np.sum(squares)) / max(len(squares), 1)
     if count < 3 or mean <= 0:
         return float(max(count, 1))
     deviation = squares - mean
-    variance = float(np.mean(deviation ** 2))
+    variance = float(np.mean(deviation**2))
     if variance <= 0:
         return float(count)
     inflation = 1.0
@@ -168,12 +185,13 @@ def degrees_of_freedom(values: np.ndarray) -> float:
         if correlation <= 0:
             break
         inflation += 2 * (1 - k / count) * correlation
-    freedom = 2 * mean ** 2 / (variance / (count - 1) * inflation)
+    freedom = 2 * mean**2 / (variance / (count - 1) * inflation)
     return float(np.clip(freedom, 1.0, table.size))
 
 
-def cross_validate(fits: dict[str, Fit], sensor: Sensor, poses: Poses,
-                   stage: Sensor | None = None) -> list[HeldOutErrors]:
+def cross_validate(
+    fits: dict[str, Fit], sensor: Sensor, poses: Poses, stage: Sensor | None = None
+) -> list[HeldOutErrors]:
     """
     Return the errors of models on poses that are held out of their fit.
 
@@ -182,8 +200,11 @@ def cross_validate(fits: dict[str, Fit], sensor: Sensor, poses: Poses,
     skipped for a model whose fit fails.
     """
     number = np.arange(len(poses))
-    folds = [poses.check] if poses.check.any() else \
-        [number % _FOLDS == fold for fold in range(min(_FOLDS, len(poses)))]
+    folds = (
+        [poses.check]
+        if poses.check.any()
+        else [number % _FOLDS == fold for fold in range(min(_FOLDS, len(poses)))]
+    )
     models = []
     for model, fit in fits.items():
         parts, units, index = [], [], []
@@ -197,11 +218,16 @@ def cross_validate(fits: dict[str, Fit], sensor: Sensor, poses: Poses,
         if parts:
             # The poses in the order of the visit.
             order = np.argsort(np.concatenate(index))
-            joined = [np.concatenate([getattr(part, field.name) for part in parts])[order]
-                      for field in fields(PoseErrors)]
+            joined = [
+                np.concatenate([getattr(part, field.name) for part in parts])[order]
+                for field in fields(PoseErrors)
+            ]
             fold = np.repeat(np.arange(len(index)), [len(part) for part in index])
-            models.append(summarise(model, PoseErrors(*joined), np.concatenate(index)[order],
-                                    units, fold[order]))
+            models.append(
+                summarise(
+                    model, PoseErrors(*joined), np.concatenate(index)[order], units, fold[order]
+                )
+            )
     return models
 
 
@@ -244,8 +270,7 @@ class ErrorBudget:
     @property
     def limited_by(self) -> str:
         """Return the cause of the largest part: noise, stage, model, or 'stage or model'."""
-        if not self.separable and \
-                max(self.model, self.coefficients) > max(self.noise, self.stage):
+        if not self.separable and max(self.model, self.coefficients) > max(self.noise, self.stage):
             return 'stage or model'
         # Noise and stage cause the error of the coefficients, which is no limit of its own.
         parts = ('noise', 'stage', 'model')
@@ -262,14 +287,18 @@ class ErrorBudgets(NamedTuple):
     tilt: ErrorBudget  # rad²
 
 
-def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = None
-                  ) -> ErrorBudgets:
+def error_budgets(
+    errors: HeldOutErrors, poses: Poses, stage: Sensor | None = None
+) -> ErrorBudgets:
     """Split the held-out errors of one model by cause."""
     held, sensor, measured = poses.subset(errors.pose_index), errors.fitted[0], errors.errors
     gravity = sensor.local_gravity_mps2
     reference = np.column_stack(reference_force(held, gravity))
-    corrected = reference if stage is None else np.column_stack(
-        stage_force(stage, held.alpha_rad, held.beta_rad))
+    corrected = (
+        reference
+        if stage is None
+        else np.column_stack(stage_force(stage, held.alpha_rad, held.beta_rad))
+    )
     has_tilt, used = np.isfinite(measured.tilt_rad), determining_alpha(measured)
     axes = [AXES.index(axis) for axis in sensor.axes]
     *by_cause, probe = covariances(errors, held, reference)
@@ -278,22 +307,33 @@ def error_budgets(errors: HeldOutErrors, poses: Poses, stage: Sensor | None = No
     accel = tilt = _NO_BUDGET
     if used.any():
         parts = [axis_variance(covariance, axes, used) for covariance in by_cause]
-        accel = _budget((measured.force_mps2 - corrected)[used][:, axes],
-                        float(np.mean(measured.accel_mps2[used] ** 2)), parts,
-                        accel_scatter - parts[0] * has_noise, spread)
+        accel = _budget(
+            (measured.force_mps2 - corrected)[used][:, axes],
+            float(np.mean(measured.accel_mps2[used] ** 2)),
+            parts,
+            accel_scatter - parts[0] * has_noise,
+            spread,
+        )
     if has_tilt.any():
-        parts = [tilt_variance(covariance, reference, gravity, has_tilt)
-                 for covariance in by_cause]
-        tilt = _budget(angle_between(measured.force_mps2, corrected)[has_tilt],
-                       float(np.mean(measured.tilt_rad[has_tilt] ** 2)), parts,
-                       tilt_scatter - parts[0] * has_noise, spread)
-        tilt = replace(tilt, tilt_per_axis=tilt_variance(
-            probe, reference, gravity, has_tilt) / _PROBE_MPS2 ** 2)
+        parts = [
+            tilt_variance(covariance, reference, gravity, has_tilt) for covariance in by_cause
+        ]
+        tilt = _budget(
+            angle_between(measured.force_mps2, corrected)[has_tilt],
+            float(np.mean(measured.tilt_rad[has_tilt] ** 2)),
+            parts,
+            tilt_scatter - parts[0] * has_noise,
+            spread,
+        )
+        tilt = replace(
+            tilt, tilt_per_axis=tilt_variance(probe, reference, gravity, has_tilt) / _PROBE_MPS2**2
+        )
     return ErrorBudgets(accel, tilt)
 
 
-def coefficient_spread(sensor: Sensor, force: Components,
-                       environment: Environment = NOMINAL_ENVIRONMENT) -> float:
+def coefficient_spread(
+    sensor: Sensor, force: Components, environment: Environment = NOMINAL_ENVIRONMENT
+) -> float:
     """
     Return how far the mean square by the coefficients may exceed its mean: the 95 % quantile.
 
@@ -303,17 +343,24 @@ def coefficient_spread(sensor: Sensor, force: Components,
     """
     if not sensor.covariance_names:
         return 1.0
-    tangent = signal_chain.tangent(signal_chain.analog_response(sensor), sensor.axes, force,
-                                   environment)
-    slope = np.einsum('iak,apk->ipk', np.array(tangent.back),
-                      coefficient_tangent(sensor)(force, environment))
+    tangent = signal_chain.tangent(
+        signal_chain.analog_response(sensor), sensor.axes, force, environment
+    )
+    slope = np.einsum(
+        'iak,apk->ipk', np.array(tangent.back), coefficient_tangent(sensor)(force, environment)
+    )
     product = np.einsum('ipk,iqk->pq', slope, slope) @ sensor.covariance
     nu = float(np.trace(product) ** 2 / np.trace(product @ product))
     return float(scipy.special.chdtri(nu, 1 - _UPPER_QUANTILE)) / nu
 
 
-def _budget(errors: np.ndarray, measured: float, predicted: Sequence[float], unexplainable: float,
-            spread: float) -> ErrorBudget:
+def _budget(
+    errors: np.ndarray,
+    measured: float,
+    predicted: Sequence[float],
+    unexplainable: float,
+    spread: float,
+) -> ErrorBudget:
     """
     Split a mean square of errors against the corrected reference.
 
@@ -322,7 +369,7 @@ def _budget(errors: np.ndarray, measured: float, predicted: Sequence[float], une
     noise; NaN where it is unknown; spread: see `coefficient_spread`.
     """
     by_noise, by_coefficients, by_stated_stage = predicted
-    mean_square, nu = float(np.mean(errors ** 2)), degrees_of_freedom(errors)
+    mean_square, nu = float(np.mean(errors**2)), degrees_of_freedom(errors)
     lower = mean_square * nu / float(scipy.special.chdtri(nu, _CHANCE))
     upper = mean_square * nu / float(scipy.special.chdtri(nu, _UPPER_QUANTILE))
     largest_stage = float(np.fmax(by_stated_stage, unexplainable))
@@ -330,8 +377,14 @@ def _budget(errors: np.ndarray, measured: float, predicted: Sequence[float], une
     model = mean_square - explained if lower > explained else 0.0
     stage = min(max(mean_square - by_noise - by_coefficients, 0.0), largest_stage)
     return ErrorBudget(
-        measured, by_noise, max(measured - mean_square, 0.0) + stage, by_coefficients, model,
-        spread * by_coefficients + max(upper - explained, 0.0), bool(np.isfinite(unexplainable)))
+        measured,
+        by_noise,
+        max(measured - mean_square, 0.0) + stage,
+        by_coefficients,
+        model,
+        spread * by_coefficients + max(upper - explained, 0.0),
+        bool(np.isfinite(unexplainable)),
+    )
 
 
 def covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> list[np.ndarray]:
@@ -349,9 +402,14 @@ def covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> li
         exact, none_v2 = sensor.without_covariance(), np.zeros(len(sensor.axes))
         # Without both the doubt is left on which side of 90° alpha is, but the stage knows it.
         total, without_noise, by_side, probed = (
-            force_covariance(unit, force, variance_v2, environment) for unit, variance_v2 in (
-                (sensor, np.mean(held.std_v[fold], axis=0) ** 2), (sensor, none_v2),
-                (exact, none_v2), (exact, (sensor.scale_v_per_g / G0_MPS2 * _PROBE_MPS2) ** 2)))
+            force_covariance(unit, force, variance_v2, environment)
+            for unit, variance_v2 in (
+                (sensor, np.mean(held.std_v[fold], axis=0) ** 2),
+                (sensor, none_v2),
+                (exact, none_v2),
+                (exact, (sensor.scale_v_per_g / G0_MPS2 * _PROBE_MPS2) ** 2),
+            )
+        )
         by_noise[:, :, fold] = total - without_noise
         by_coefficients[:, :, fold] = without_noise - by_side
         by_probe[:, :, fold] = probed - by_side
@@ -364,8 +422,9 @@ def _stage_covariance(sensor: Sensor, held: Poses) -> np.ndarray:
     a, b, zero = held.alpha_rad, held.beta_rad, np.zeros(len(held))
     by_alpha = np.array([np.cos(a) * np.cos(b), -np.cos(a) * np.sin(b), -np.sin(a)])
     by_beta = np.array([-np.sin(a) * np.sin(b), -np.sin(a) * np.cos(b), zero])
-    return variance * (np.einsum('ik,jk->ijk', by_alpha, by_alpha)
-                       + np.einsum('ik,jk->ijk', by_beta, by_beta))
+    return variance * (
+        np.einsum('ik,jk->ijk', by_alpha, by_alpha) + np.einsum('ik,jk->ijk', by_beta, by_beta)
+    )
 
 
 def axis_variance(covariance: np.ndarray, axes: list[int], used: np.ndarray) -> float:
@@ -373,13 +432,14 @@ def axis_variance(covariance: np.ndarray, axes: list[int], used: np.ndarray) -> 
     return float(np.mean([covariance[d, d][used] for d in axes]))
 
 
-def tilt_variance(covariance: np.ndarray, force: np.ndarray, gravity: float, used: np.ndarray
-                  ) -> float:
+def tilt_variance(
+    covariance: np.ndarray, force: np.ndarray, gravity: float, used: np.ndarray
+) -> float:
     """Return the mean square of tilt over the poses used, rad², by the part across the force."""
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
     trace = np.einsum('iik->k', covariance)
     radial = np.einsum('ki,ijk,kj->k', up, covariance, up)
-    return float(np.mean((trace - radial)[used])) / gravity ** 2
+    return float(np.mean((trace - radial)[used])) / gravity**2
 
 
 def _scatter(sensor: Sensor, poses: Poses) -> tuple[float, float, bool]:
@@ -389,8 +449,14 @@ def _scatter(sensor: Sensor, poses: Poses) -> tuple[float, float, bool]:
     returns: both, in the units of `ErrorBudgets`, NaN where the poses do not show them; and
     whether they include the noise of the means.
     """
-    joints = np.column_stack([np.cos(poses.alpha_rad), np.sin(poses.alpha_rad),
-                              np.cos(poses.beta_rad), np.sin(poses.beta_rad)])
+    joints = np.column_stack(
+        [
+            np.cos(poses.alpha_rad),
+            np.sin(poses.alpha_rad),
+            np.cos(poses.beta_rad),
+            np.sin(poses.beta_rad),
+        ]
+    )
     near = scipy.spatial.cKDTree(joints).query_pairs(_SAME_POSE_RAD)
     pairs = np.array(sorted(near), int).reshape(-1, 2)
     gravity = sensor.local_gravity_mps2
@@ -401,15 +467,15 @@ def _scatter(sensor: Sensor, poses: Poses) -> tuple[float, float, bool]:
         accel = np.diff(errors.accel_mps2[pairs], axis=1)[:, 0]
         force = np.diff((errors.force_mps2 - reference)[pairs], axis=1)[:, 0]
         has_tilt = np.isfinite(errors.tilt_rad[pairs]).all(axis=1)
-        across = np.cross(force, reference[pairs[:, 0]])[has_tilt] / gravity ** 2
-        tilt = np.sum(across ** 2) / max(len(across), 1) / 2
-        return float(np.mean(accel ** 2) / 2), float(tilt), True
+        across = np.cross(force, reference[pairs[:, 0]])[has_tilt] / gravity**2
+        tilt = np.sum(across**2) / max(len(across), 1) / 2
+        return float(np.mean(accel**2) / 2), float(tilt), True
     if sensor.axes != AXES:
         return np.nan, np.nan, False
     # No stage error changes |f|. A model error is as large in |f| as in any other direction.
     magnitude = np.linalg.norm(errors.force_mps2, axis=1) - gravity
-    excess = max(float(np.mean(errors.accel_mps2 ** 2) - np.mean(magnitude ** 2)), 0.0)
-    return excess, 3 * excess / gravity ** 2, False
+    excess = max(float(np.mean(errors.accel_mps2**2) - np.mean(magnitude**2)), 0.0)
+    return excess, 3 * excess / gravity**2, False
 
 
 def rms_mg(mean_square: float) -> float:

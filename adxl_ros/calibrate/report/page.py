@@ -29,8 +29,12 @@ import numpy as np
 
 PAGE = 'report.html'  # The file of a report
 _COLOURS = {PASS: 'green', NOT_SHOWN: 'amber', FAIL: 'red'}  # Colour of the badge by outcome
-_PART_COLOURS = {'noise': '#7b8794', 'stage': '#d9930d', 'coefficients': '#1f5fbf',
-                 'model': '#c0392b'}
+_PART_COLOURS = {
+    'noise': '#7b8794',
+    'stage': '#d9930d',
+    'coefficients': '#1f5fbf',
+    'model': '#c0392b',
+}
 """Colours of the parts of the error budget."""
 _BEYOND = 'beyond the maximum'
 """Outcome of a coefficient whose whole interval exceeds the maximum of the datasheet."""
@@ -38,12 +42,14 @@ _BEYOND_WHISKER = 1.08
 """Half of a whisker's range divided by the largest value in it. Chosen: no dot is cut."""
 
 
-def write(folder: str | os.PathLike, result: CalibrationResult,
-          store: str | os.PathLike = '') -> None:
+def write(
+    folder: str | os.PathLike, result: CalibrationResult, store: str | os.PathLike = ''
+) -> None:
     """Write the page."""
     html_page.check_libraries()
-    past = calibration_store.history(store, result.fitted.serial).calibrations \
-        if str(store) else []
+    past = (
+        calibration_store.history(store, result.fitted.serial).calibrations if str(store) else []
+    )
     write_text(Path(folder) / PAGE, page(result, [sensor for _, sensor in past]))
 
 
@@ -51,8 +57,11 @@ def paper_figure(result: CalibrationResult) -> Any:
     """Draw figures 2 to 8 of the paper for a unit, by its model or at least the physical one."""
     if result.gravity_fit is not None:
         raise UserError('they need the angles of a stage')
-    unit = result.fitted if result.fitted.model in ('physical', 'full') else \
-        linear.fit_physical(result.nominal, result.poses.subset(~result.poses.check))
+    unit = (
+        result.fitted
+        if result.fitted.model in ('physical', 'full')
+        else linear.fit_physical(result.nominal, result.poses.subset(~result.poses.check))
+    )
     return draw_sweep(result.nominal, unit, result.poses)
 
 
@@ -67,53 +76,82 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     drawn: dict[str, Figure] = {}
     if (fit := result.gravity_fit) is not None:
         drawn['errors'] = _error_figure(
-            result.inliers, mg(fit.held_out_mps2[:, None]), Z_90 * mg(fit.expected_mps2),
-            'x', 'rest', 'magnitude minus gravity, mg')
+            result.inliers,
+            mg(fit.held_out_mps2[:, None]),
+            Z_90 * mg(fit.expected_mps2),
+            'x',
+            'rest',
+            'magnitude minus gravity, mg',
+        )
     elif errors is not None and assessment is not None:
-        half_mg = np.full(errors.pose_count, Z_90 * mg(assessment.accel.expected ** 0.5))
+        half_mg = np.full(errors.pose_count, Z_90 * mg(assessment.accel.expected**0.5))
         drawn['errors'] = _error_figure(
-            held_out.determining_alpha(errors.errors), mg(errors.errors.accel_mps2), half_mg,
-            fitted.axes, 'held-out pose', 'error of acceleration, mg')
+            held_out.determining_alpha(errors.errors),
+            mg(errors.errors.accel_mps2),
+            half_mg,
+            fitted.axes,
+            'held-out pose',
+            'error of acceleration, mg',
+        )
     file_name = re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml'
     picture, fault = '', ''
     try:
         picture = html_page.picture_url(paper_figure(result))
     except UserError as error:
         fault = str(error)
-    return html_page.render('adxl_ros.calibrate.report', 'calibration.html', {
-        'title': f'Calibration of {fitted.serial}, {fitted.provenance["date"][:10]}',
-        'about': [f'{fitted.model} model', f'{len(result.poses)} poses', f'axes {fitted.axes}'],
-        'badge': badge(fitted),
-        'tiles': tiles(result, assessment),
-        'advice': f'Limited by {acceptance.LIMITS[assessment.accel.limited_by]}.'
-        if assessment else 'Take more poses: too few were held out to assess this calibration.',
-        'file_name': file_name,
-        'apply_command': command('apply', f'RECORDING --params {file_name} -o tilt.csv'),
-        'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
-        'figures': drawn,
-        'sphere': _sphere(result),
-        'coefficients': rows,
-        'beyond': [row for row in rows if row['outcome'] == _BEYOND],
-        'datasheet': fitted.datasheet_name,
-        'models': list(errors_of or row_of), 'errors_of': errors_of, 'row_of': row_of,
-        'poses': len(result.poses), 'digits': digits, 'mg': held_out.rms_mg,
-        'limit': f'{origin} ({mg(limit_mps2):.2g} mg)',
-        'budget': assessment.accel if assessment and errors else None,
-        'part_colours': _PART_COLOURS,
-        'gum': gum.section(gum.uncertainty(result)),
-        'history': history(fitted, past),
-        'picture': picture, 'picture_fault': fault,
-        'report_lines': result.report_lines,
-        'provenance': [[key.replace('_', ' '), value]
-                       for key, value in fitted.provenance.items()]})
+    return html_page.render(
+        'adxl_ros.calibrate.report',
+        'calibration.html',
+        {
+            'title': f'Calibration of {fitted.serial}, {fitted.provenance["date"][:10]}',
+            'about': [
+                f'{fitted.model} model',
+                f'{len(result.poses)} poses',
+                f'axes {fitted.axes}',
+            ],
+            'badge': badge(fitted),
+            'tiles': tiles(result, assessment),
+            'advice': f'Limited by {acceptance.LIMITS[assessment.accel.limited_by]}.'
+            if assessment
+            else 'Take more poses: too few were held out to assess this calibration.',
+            'file_name': file_name,
+            'apply_command': command('apply', f'RECORDING --params {file_name} -o tilt.csv'),
+            'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
+            'figures': drawn,
+            'sphere': _sphere(result),
+            'coefficients': rows,
+            'beyond': [row for row in rows if row['outcome'] == _BEYOND],
+            'datasheet': fitted.datasheet_name,
+            'models': list(errors_of or row_of),
+            'errors_of': errors_of,
+            'row_of': row_of,
+            'poses': len(result.poses),
+            'digits': digits,
+            'mg': held_out.rms_mg,
+            'limit': f'{origin} ({mg(limit_mps2):.2g} mg)',
+            'budget': assessment.accel if assessment and errors else None,
+            'part_colours': _PART_COLOURS,
+            'gum': gum.section(gum.uncertainty(result)),
+            'history': history(fitted, past),
+            'picture': picture,
+            'picture_fault': fault,
+            'report_lines': result.report_lines,
+            'provenance': [
+                [key.replace('_', ' '), value] for key, value in fitted.provenance.items()
+            ],
+        },
+    )
 
 
 def badge(fitted: Sensor) -> dict[str, str]:
     """Return the acceptance and its colour."""
     outcome, lines = acceptance.acceptance(fitted)
     sentence = '. '.join(line.rstrip('.') for line in lines)
-    return {'colour': _COLOURS[outcome], 'word': outcome,
-            'sentence': f'{sentence[0].upper()}{sentence[1:]}.'}
+    return {
+        'colour': _COLOURS[outcome],
+        'word': outcome,
+        'sentence': f'{sentence[0].upper()}{sentence[1:]}.',
+    }
 
 
 def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict[str, str]]:
@@ -121,22 +159,41 @@ def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict
     tiles = []
     if (fit := result.gravity_fit) is not None:
         used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-        before, after = (digits(held_out.rms_mg(float(np.mean(v[used] ** 2))))
-                         for v in (fit.before_mps2, fit.held_out_mps2))
-        tiles = [{'label': 'error of the magnitude of gravity', 'text': f'{before} → {after} mg',
-                  'note': f'rms over {len(used)} rests, held out'}]
-    for label, unit, name in (('tilt error', '°', 'tilt_deg'),
-                              ('acceleration error', 'mg', 'accel_mg')):
+        before, after = (
+            digits(held_out.rms_mg(float(np.mean(v[used] ** 2))))
+            for v in (fit.before_mps2, fit.held_out_mps2)
+        )
+        tiles = [
+            {
+                'label': 'error of the magnitude of gravity',
+                'text': f'{before} → {after} mg',
+                'note': f'rms over {len(used)} rests, held out',
+            }
+        ]
+    for label, unit, name in (
+        ('tilt error', '°', 'tilt_deg'),
+        ('acceleration error', 'mg', 'accel_mg'),
+    ):
         statistics = [getattr(errors, name) for errors in result.held_out]
         if statistics and not np.isnan(statistics[-1].rms):
             before, after = (digits(statistics[i].rms) for i in (0, -1))
             low, high = map(digits, statistics[-1].interval)
-            tiles.append({'label': label, 'text': f'{before} → {after} {unit}',
-                          'note': f'rms on held-out poses, 90 %: {low} to {high} {unit}'})
+            tiles.append(
+                {
+                    'label': label,
+                    'text': f'{before} → {after} {unit}',
+                    'note': f'rms on held-out poses, 90 %: {low} to {high} {unit}',
+                }
+            )
     if assessment is not None:
-        tiles.append({'label': 'limited by', 'text': assessment.accel.limited_by,
-                      'note': f'calibration error {digits(assessment.error_mg)} mg, without '
-                              'noise and stage error of the check'})
+        tiles.append(
+            {
+                'label': 'limited by',
+                'text': assessment.accel.limited_by,
+                'note': f'calibration error {digits(assessment.error_mg)} mg, without '
+                'noise and stage error of the check',
+            }
+        )
     return tiles
 
 
@@ -144,10 +201,13 @@ def _sphere(result: CalibrationResult) -> dict[str, Any]:
     """Return the data of the sphere's script: errors of each model by pose and quantity."""
     fitted, poses, fit = result.fitted, result.poses, result.gravity_fit
     if fit is not None:
-        force = np.column_stack(signal_chain.inverse(fitted)(
-            list(poses.volts.T), poses.environment))
-        errors = {'nominal': mg(fit.before_mps2[:, None]),
-                  'gravity': mg(fit.residual_mps2[:, None])}
+        force = np.column_stack(
+            signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment)
+        )
+        errors = {
+            'nominal': mg(fit.before_mps2[:, None]),
+            'gravity': mg(fit.residual_mps2[:, None]),
+        }
         quantities = [['magnitude minus gravity', 'mg']]
         labels = [f'rest {i + 1}' for i in range(len(poses))]
     else:
@@ -156,18 +216,30 @@ def _sphere(result: CalibrationResult) -> dict[str, Any]:
         errors = {}
         for model, unit in units.items():
             of_unit = held_out.pose_errors(unit, poses)
-            errors[model] = np.column_stack([np.degrees(of_unit.tilt_rad),
-                                             mg(of_unit.accel_mps2)])
+            errors[model] = np.column_stack([np.degrees(of_unit.tilt_rad), mg(of_unit.accel_mps2)])
         quantities = [['tilt error', '°'], *([f'error of {a}', 'mg'] for a in fitted.axes)]
-        labels = [f'pose {i}, alpha {alpha:.1f}°, beta {beta:.1f}°' for i, (alpha, beta) in
-                  enumerate(np.degrees([poses.alpha_rad, poses.beta_rad]).T, 1)]
+        labels = [
+            f'pose {i}, alpha {alpha:.1f}°, beta {beta:.1f}°'
+            for i, (alpha, beta) in enumerate(np.degrees([poses.alpha_rad, poses.beta_rad]).T, 1)
+        ]
     up = force / np.linalg.norm(force, axis=1, keepdims=True)
     values = np.stack(list(errors.values()), axis=1)
-    return {'models': list(errors), 'quantities': quantities, 'poses': [
-        {'u': np.round(up[i], 5).tolist(), 'label': label, 'held_out': bool(poses.check[i]),
-         'values': [[float(f'{v:.4g}') if np.isfinite(v) else None for v in of_model]
-                    for of_model in values[i]]}
-        for i, label in enumerate(labels)]}
+    return {
+        'models': list(errors),
+        'quantities': quantities,
+        'poses': [
+            {
+                'u': np.round(up[i], 5).tolist(),
+                'label': label,
+                'held_out': bool(poses.check[i]),
+                'values': [
+                    [float(f'{v:.4g}') if np.isfinite(v) else None for v in of_model]
+                    for of_model in values[i]
+                ],
+            }
+            for i, label in enumerate(labels)
+        ],
+    }
 
 
 def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
@@ -176,34 +248,76 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
     departures = get(fitted, fitted.covariance_names)
     rows = []
     for row, name, value, half_width in zip(
-            compare(fitted, fitted), fitted.covariance_names, departures, half_widths):
+        compare(fitted, fitted), fitted.covariance_names, departures, half_widths
+    ):
         typical, maximum = fitted.datasheet.get(name.without_axis, (0.0, 0.0))
         largest = max(typical, maximum, abs(value) + half_width, 1e-12) * _BEYOND_WHISKER
         unit = '' if row.unit == '1' else f' {row.unit}'
         text = f'{rounded(row, row.fitted)} ± {rounded(row, row.half_width)}{unit}'
         # The lower end of the interval decides.
         lower = abs(value) - half_width
-        beyond = '' if not (typical or maximum) else _BEYOND if 0 < maximum < lower else \
-            'beyond typical' if 0 < typical < lower else 'within'
+        beyond = (
+            ''
+            if not (typical or maximum)
+            else _BEYOND
+            if 0 < maximum < lower
+            else 'beyond typical'
+            if 0 < typical < lower
+            else 'within'
+        )
         factor = float(np.degrees(1.0)) if row.unit == '°' else 1.0
-        ranges = [f'{word} ±{factor * figure:.2g}' for word, figure in (
-            ('typical', typical), ('maximum', maximum)) if figure]
-        rows.append({
-            'label': f'{row.label} {row.axis}', 'name': str(name), 'text': text,
-            'datasheet': ', '.join(ranges) or '-', 'outcome': beyond,
-            'mark': figures.whisker(
-                value, value - half_width, value + half_width, (-largest, largest), text,
-                typical or maximum, beyond.startswith('beyond'))})
+        ranges = [
+            f'{word} ±{factor * figure:.2g}'
+            for word, figure in (('typical', typical), ('maximum', maximum))
+            if figure
+        ]
+        rows.append(
+            {
+                'label': f'{row.label} {row.axis}',
+                'name': str(name),
+                'text': text,
+                'datasheet': ', '.join(ranges) or '-',
+                'outcome': beyond,
+                'mark': figures.whisker(
+                    value,
+                    value - half_width,
+                    value + half_width,
+                    (-largest, largest),
+                    text,
+                    typical or maximum,
+                    beyond.startswith('beyond'),
+                ),
+            }
+        )
     return rows
 
 
-def _error_figure(used: np.ndarray, errors_mg: np.ndarray, half_mg: np.ndarray, names: str,
-                  x_label: str, y_label: str) -> Figure:
+def _error_figure(
+    used: np.ndarray,
+    errors_mg: np.ndarray,
+    half_mg: np.ndarray,
+    names: str,
+    x_label: str,
+    y_label: str,
+) -> Figure:
     """Draw the held-out errors, (k, m), of the poses used with bars of the expected 90 %."""
-    traces = [figures.points(np.flatnonzero(used) + 1, errors_mg[used, d], half_mg[used], name,
-                             AXIS_COLOURS[name[0]]) for d, name in enumerate(names)]
-    return figures.figure(traces, 320, margin={'l': 8, 'r': 12, 't': 36, 'b': 8},
-                          xaxis={'title': {'text': x_label}}, yaxis={'title': {'text': y_label}})
+    traces = [
+        figures.points(
+            np.flatnonzero(used) + 1,
+            errors_mg[used, d],
+            half_mg[used],
+            name,
+            AXIS_COLOURS[name[0]],
+        )
+        for d, name in enumerate(names)
+    ]
+    return figures.figure(
+        traces,
+        320,
+        margin={'l': 8, 'r': 12, 't': 36, 'b': 8},
+        xaxis={'title': {'text': x_label}},
+        yaxis={'title': {'text': y_label}},
+    )
 
 
 _VERTICAL = np.sin(np.radians(89))
@@ -216,43 +330,79 @@ def draw_sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:
     line, regressions = linear.fit(sensor, swept), linear.regress_axes(sensor, swept)
     reference = reference_force(swept, sensor.local_gravity_mps2)
     force_g = np.column_stack(reference) / G0_MPS2
-    predicted = np.column_stack(signal_chain.static_response(fitted)(
-        reference, swept.environment))
+    predicted = np.column_stack(signal_chain.static_response(fitted)(reference, swept.environment))
     figure = figures.new_figure(figsize=(17.6, 9))
     grid = figure.subplots(2, 4)
     for d, (row, regression) in enumerate(zip(grid, regressions)):
         linear_v = line.zero_g_v[d] + line.scale_v_per_g[d] * force_g[:, d]
-        deviation_mv, model_mv = (1e3 * (volts[:, d] - linear_v)
-                                  for volts in (swept.volts, predicted))
+        deviation_mv, model_mv = (
+            1e3 * (volts[:, d] - linear_v) for volts in (swept.volts, predicted)
+        )
         name, other = ('x', 'y') if d == 0 else ('y', 'x')
-        row[0].set(title='figs. 2, 3, 5, 7: forth ●, back ◁, model ─',
-                   xlabel=f'{name} reference, g', ylabel=f'{name} output minus linear, mV')
+        row[0].set(
+            title='figs. 2, 3, 5, 7: forth ●, back ◁, model ─',
+            xlabel=f'{name} reference, g',
+            ylabel=f'{name} output minus linear, mV',
+        )
         backward = np.gradient(swept.beta_rad) < 0
         for plane in planes(swept.alpha_rad):
             index = np.sort(plane)
-            curve, = row[0].plot(force_g[index, d], model_mv[index], lw=1,
-                                 label=f'{np.degrees(swept.alpha_rad[index]).mean():.0f}°')
-            for part, marker, fill in ((index[~backward[index]], 'o', None),
-                                       (index[backward[index]], '<', 'none')):
-                row[0].plot(force_g[part, d], deviation_mv[part], marker, ms=3,
-                            color=curve.get_color(), mfc=fill)
+            (curve,) = row[0].plot(
+                force_g[index, d],
+                model_mv[index],
+                lw=1,
+                label=f'{np.degrees(swept.alpha_rad[index]).mean():.0f}°',
+            )
+            for part, marker, fill in (
+                (index[~backward[index]], 'o', None),
+                (index[backward[index]], '<', 'none'),
+            ):
+                row[0].plot(
+                    force_g[part, d],
+                    deviation_mv[part],
+                    marker,
+                    ms=3,
+                    color=curve.get_color(),
+                    mfc=fill,
+                )
         row[0].legend(title='alpha', fontsize=7)
         vertical = np.abs(np.sin(swept.alpha_rad)) > _VERTICAL
         az_g = regression.plane_az_g
         for axis, title, x_label, y_label, x, y, polynomial in (
-                (row[1], f'fig. 4: residual against {other} (10, 11)',
-                 f'{other} reference, g', f'{name} residual, mV', force_g[vertical, 1 - d],
-                 deviation_mv[vertical], 1e3 * regression.p),
-                (row[2], 'fig. 6: zero-g against z (12, 13)', 'z reference, g',
-                 f'{name} zero-g minus that at 90°, mV', az_g, 1e3 * regression.plane_bias_v,
-                 1e3 * regression.q),
-                (row[3], 'fig. 8: scale factor against z (15, 17)', 'z reference, g',
-                 f'{name} scale factor, V/g', az_g, regression.plane_scale_v_per_g,
-                 regression.r)):
+            (
+                row[1],
+                f'fig. 4: residual against {other} (10, 11)',
+                f'{other} reference, g',
+                f'{name} residual, mV',
+                force_g[vertical, 1 - d],
+                deviation_mv[vertical],
+                1e3 * regression.p,
+            ),
+            (
+                row[2],
+                'fig. 6: zero-g against z (12, 13)',
+                'z reference, g',
+                f'{name} zero-g minus that at 90°, mV',
+                az_g,
+                1e3 * regression.plane_bias_v,
+                1e3 * regression.q,
+            ),
+            (
+                row[3],
+                'fig. 8: scale factor against z (15, 17)',
+                'z reference, g',
+                f'{name} scale factor, V/g',
+                az_g,
+                regression.plane_scale_v_per_g,
+                regression.r,
+            ),
+        ):
             fine_g = np.linspace(x.min(), x.max(), 101)
             axis.plot(x, y, 'o', ms=4)
             axis.plot(fine_g, np.polynomial.polynomial.polyval(fine_g, polynomial))
             axis.set(title=title, xlabel=x_label, ylabel=y_label)
-    figure.suptitle(f'{fitted.serial}: deviation from the linear model, measured and by the '
-                    f'{fitted.model} model (Ang et al. 2007, figures 2 to 8)')
+    figure.suptitle(
+        f'{fitted.serial}: deviation from the linear model, measured and by the '
+        f'{fitted.model} model (Ang et al. 2007, figures 2 to 8)'
+    )
     return figure

@@ -31,24 +31,36 @@ _MAX_SHARE = 1e-3
 """Largest share of a sample that a latency may lack: a float32 of a firmware is not exact."""
 
 
-def option(default: bool | int | float | str | tuple[()], doc: str, unit: str = '',
-           lower: float | None = None, upper: float | None = None) -> Any:
+def option(
+    default: bool | int | float | str | tuple[()],
+    doc: str,
+    unit: str = '',
+    lower: float | None = None,
+    upper: float | None = None,
+) -> Any:
     """
     Declare a field of a link's `Settings`, which is the parameter `link.<name>` of the driver.
 
     Its type is that of the default; an empty tuple stands for a list of strings, or one string
     with commas. The permitted range is in `unit`.
     """
-    return field(default=default, metadata={'doc': doc, 'unit': unit, 'lower': lower,
-                                            'upper': upper})
+    return field(
+        default=default, metadata={'doc': doc, 'unit': unit, 'lower': lower, 'upper': upper}
+    )
 
 
 @dataclass(frozen=True)
 class LatencySettings:
     """Settings of every link of this package."""
 
-    latency_ms: float = option(2.0, 'longest time for which samples are collected before they '
-                               'are passed on together; 0: each sample alone', 'ms', 0.0, 1000.0)
+    latency_ms: float = option(
+        2.0,
+        'longest time for which samples are collected before they '
+        'are passed on together; 0: each sample alone',
+        'ms',
+        0.0,
+        1000.0,
+    )
 
     def samples_together(self, rate_hz: float) -> int:
         """Return how many samples at a rate, Hz, are passed on together."""
@@ -59,8 +71,9 @@ class LatencySettings:
 class PacedSettings(LatencySettings):
     """Settings of a link that makes its own time."""
 
-    speed: float = option(1.0, 'sensor time by real time; other than 1 the driver publishes '
-                          '/clock', '', 0.01, 1000.0)
+    speed: float = option(
+        1.0, 'sensor time by real time; other than 1 the driver publishes /clock', '', 0.01, 1000.0
+    )
 
 
 @dataclass(frozen=True)
@@ -68,8 +81,13 @@ class DeviceSettings(LatencySettings):
     """Settings of a link that reads a device."""
 
     delay: float = option(0.0, 'shortest time from a sample to its arrival', 's', 0.0, 1.0)
-    supply_scale: float = option(1.0, 'supply voltage by the voltage of its channel: the ratio '
-                                 'of its divider', 'V/V', 1e-3, 1e3)
+    supply_scale: float = option(
+        1.0,
+        'supply voltage by the voltage of its channel: the ratio of its divider',
+        'V/V',
+        1e-3,
+        1e3,
+    )
 
 
 @dataclass(frozen=True)
@@ -130,9 +148,13 @@ class Samples:
             return self
         rows = finite.all(axis=1)
         return Samples(
-            self.stamp_ns[rows], self.volts[rows], self.until_ns,
-            self.missing + int((~rows).sum()), estimated=self.estimated,
-            imu_fields={name: values[rows] for name, values in self.imu_fields.items()})
+            self.stamp_ns[rows],
+            self.volts[rows],
+            self.until_ns,
+            self.missing + int((~rows).sum()),
+            estimated=self.estimated,
+            imu_fields={name: values[rows] for name, values in self.imu_fields.items()},
+        )
 
 
 def no_samples(sensor: Sensor, until_ns: int) -> Samples:
@@ -179,8 +201,9 @@ class StageLink(Protocol):
 
     joint_state_topic: str  # Topic with the true motion of the stage
 
-    def sense_stage(self, stamp_ns: int, position: Mapping[str, float],
-                    velocity: Mapping[str, float]) -> None:
+    def sense_stage(
+        self, stamp_ns: int, position: Mapping[str, float], velocity: Mapping[str, float]
+    ) -> None:
         """Take the true motion of named joints, in rad, m and s, at a stamp that may lie ahead."""
 
 
@@ -305,4 +328,5 @@ def check_roles(roles: Sequence[str], axes: str) -> None:
         raise UserError(
             f'link.channels: the channels are {", ".join(roles) or "none"}; expected each of '
             f'{", ".join(axes)} (sensor.axes) once, supply and temperature at most once, and - '
-            'for a channel that is not used')
+            'for a channel that is not used'
+        )

@@ -37,8 +37,11 @@ class Board:
 
     def __init__(self, sensor: Sensor, roles: list[str], fd: int) -> None:
         self._sensor, self._roles, self._fd = sensor, roles, fd
-        self._encoder = wire_format.Encoder(wire_format.BoardInfo(
-            sensor.rate_hz, sensor.adc_bits, len(roles), sensor.adc_vref_v, sensor.serial))
+        self._encoder = wire_format.Encoder(
+            wire_format.BoardInfo(
+                sensor.rate_hz, sensor.adc_bits, len(roles), sensor.adc_vref_v, sensor.serial
+            )
+        )
         self._began_s: float | None = None
         self._index = self._overruns = 0
         self._informed_s = -_INFO_S
@@ -48,19 +51,23 @@ class Board:
     def send(self, columns: Mapping[str, np.ndarray]) -> None:
         """Send the samples of columns, (n,) each, every frame at the time of its last sample."""
         volts = np.column_stack([_volts(role, columns) for role in self._roles])
-        codes = np.rint(volts / self._sensor.lsb_v).clip(
-            0, 2 ** self._sensor.adc_bits - 1).astype(np.uint16)
+        codes = (
+            np.rint(volts / self._sensor.lsb_v)
+            .clip(0, 2**self._sensor.adc_bits - 1)
+            .astype(np.uint16)
+        )
         if self._began_s is None:
             self._began_s = time.monotonic()
         while len(codes):
-            block, codes = codes[:self._frame_samples], codes[self._frame_samples:]
+            block, codes = codes[: self._frame_samples], codes[self._frame_samples :]
             first_s = self._index / self._sensor.rate_hz
             if first_s - self._informed_s >= _INFO_S and self._write(self._encoder.info_frame()):
                 self._informed_s = first_s
             due_s = self._began_s + (self._index + len(block) - 1) / self._sensor.rate_hz
             time.sleep(max(due_s - time.monotonic(), 0))
-            frame = self._encoder.sample_frame(round(first_s * 1e6), self._index, block,
-                                               self._overruns)
+            frame = self._encoder.sample_frame(
+                round(first_s * 1e6), self._index, block, self._overruns
+            )
             if not self._write(frame):
                 self._overruns += len(block)
             self._index += len(block)
@@ -69,10 +76,10 @@ class Board:
         """Write a frame, after the rest of a previous one; return whether it was taken."""
         try:
             if self._unsent:
-                self._unsent = self._unsent[os.write(self._fd, self._unsent):]
+                self._unsent = self._unsent[os.write(self._fd, self._unsent) :]
             if self._unsent:
                 return False
-            self._unsent = frame[os.write(self._fd, frame):]
+            self._unsent = frame[os.write(self._fd, frame) :]
         except BlockingIOError:
             return False
         except OSError as error:
@@ -105,11 +112,15 @@ def driver_command(port: str, roles: list[str]) -> str:
 def check_sensor(sensor: Sensor) -> None:
     """Raise `UserError` for a sensor that wire format 1 cannot describe."""
     if not 1 <= sensor.adc_bits <= wire_format.MAX_BITS:
-        raise UserError(f'sensor.adc_bits: {sensor.adc_bits}: a board sends codes of 1 to '
-                        f'{wire_format.MAX_BITS} bits')
+        raise UserError(
+            f'sensor.adc_bits: {sensor.adc_bits}: a board sends codes of 1 to '
+            f'{wire_format.MAX_BITS} bits'
+        )
     if len(sensor.serial) > wire_format.MAX_SERIAL or not sensor.serial.isascii():
-        raise UserError(f'sensor.serial: {sensor.serial!r}: a board has room for '
-                        f'{wire_format.MAX_SERIAL} ASCII characters')
+        raise UserError(
+            f'sensor.serial: {sensor.serial!r}: a board has room for '
+            f'{wire_format.MAX_SERIAL} ASCII characters'
+        )
 
 
 @contextmanager

@@ -125,7 +125,8 @@ class ClockMap:
         """Return whether samples can be stamped at a host time, ns."""
         is_held = bool(self._late) and self._lateness_ns(self._late[0]) > _STOPPED_NS
         if len(self._late) > 1 and self._has_passed(
-                self._decision_s if is_held else _SHIFT_S, self._late[0], now_ns):
+            self._decision_s if is_held else _SHIFT_S, self._late[0], now_ns
+        ):
             is_held = False
             self._explain_lateness()
         first = self._first
@@ -182,8 +183,10 @@ class ClockMap:
         if (open_s >= _WINDOW_S and self._count >= _MIN_ARRIVALS) or open_s >= _MAX_WINDOW_S:
             self._windows.append(self._open)
             self._open = None
-            while len(self._windows) > _MIN_WINDOWS \
-                    and device_ns - self._windows[0].device_ns > _SPAN_S * 1e9:
+            while (
+                len(self._windows) > _MIN_WINDOWS
+                and device_ns - self._windows[0].device_ns > _SPAN_S * 1e9
+            ):
                 self._windows.popleft()
             self._steer(device_ns, _HORIZON_S)
 
@@ -223,10 +226,12 @@ class ClockMap:
         """Begin a new clock if the late samples were late by the same time: it stepped back."""
         late, self._late = self._late, []
         taken_ns, half = late[-1].device_ns - late[0].device_ns, len(late) // 2
-        first_ns, second_ns = (min(arrival.lag_ns for arrival in part)
-                               for part in (late[:half], late[half:]))
-        if abs(second_ns - first_ns) < _SAME_NS \
-                and taken_ns < _CATCH_UP_RATIO * (late[-1].host_ns - late[0].host_ns):
+        first_ns, second_ns = (
+            min(arrival.lag_ns for arrival in part) for part in (late[:half], late[half:])
+        )
+        if abs(second_ns - first_ns) < _SAME_NS and taken_ns < _CATCH_UP_RATIO * (
+            late[-1].host_ns - late[0].host_ns
+        ):
             former_ns = self._former_lag_ns
             if former_ns is None:
                 former_ns = late[0].lag_ns - self._lateness_ns(late[0])
@@ -288,7 +293,7 @@ class Block:
 _FOLLOW_NS = 10_000_000
 """Time between two readings of the system clock, ns; chosen: a reading takes several microseconds,
 and nobody sees a clock that was set 10 ms later."""
-_FOREVER_NS = 2 ** 63 - 1  # Largest time, ns: any waiting time is over by then
+_FOREVER_NS = 2**63 - 1  # Largest time, ns: any waiting time is over by then
 
 
 class Stamper:
@@ -327,8 +332,9 @@ class Stamper:
             self._new_clock |= stepped
             if not self._new_clock:
                 steps_ns = np.diff(block.device_ns, prepend=self._last_device_ns)
-                self._estimated += sum(max(round(step_ns / self.period_ns) - 1, 0)
-                                       for step_ns in steps_ns.tolist())
+                self._estimated += sum(
+                    max(round(step_ns / self.period_ns) - 1, 0) for step_ns in steps_ns.tolist()
+                )
             self._last_device_ns = newest_ns
         else:
             self._counted += block.lost
@@ -353,24 +359,32 @@ class Stamper:
         return Samples(
             np.concatenate([part.stamp_ns for part in parts]),
             np.concatenate([part.volts for part in parts]),
-            time.time_ns(), sum(part.missing for part in parts),
-            {name: np.concatenate([part.references[name] for part in parts])
-             for name in parts[0].references},
-            sum(part.estimated for part in parts))
+            time.time_ns(),
+            sum(part.missing for part in parts),
+            {
+                name: np.concatenate([part.references[name] for part in parts])
+                for name in parts[0].references
+            },
+            sum(part.estimated for part in parts),
+        )
 
     def statistics(self) -> dict[str, Any]:
         """Return how the clocks work, as diagnostics show it."""
         clock = self.clock
-        return {'clock': 'settled' if clock.settled else 'settling',
-                'clock_drift_ppm': round(clock.drift_ppm, 2),
-                'clock_jitter_us': round(clock.jitter_ns * 1e-3, 1),
-                'clock_steps': clock.steps, 'system_clock_steps': self._system_steps}
+        return {
+            'clock': 'settled' if clock.settled else 'settling',
+            'clock_drift_ppm': round(clock.drift_ppm, 2),
+            'clock_jitter_us': round(clock.jitter_ns * 1e-3, 1),
+            'clock_steps': clock.steps,
+            'system_clock_steps': self._system_steps,
+        }
 
     def events(self) -> tuple[Event, Event]:
         """Return the events of the clocks, for the status of a link."""
-        return (Event('the clock of the device has stepped: a new map of it begins',
-                      self.clock.steps),
-                Event('the system clock was set: the stamps follow it', self._system_steps))
+        return (
+            Event('the clock of the device has stepped: a new map of it begins', self.clock.steps),
+            Event('the system clock was set: the stamps follow it', self._system_steps),
+        )
 
     def _stamp(self) -> None:
         """Stamp the waiting samples, with the number of samples that are missing before them."""
@@ -388,15 +402,22 @@ class Stamper:
                 self._estimated += max(round(periods) - 1, 0)
             self._new_clock = False
             self._last_ns = int(host_ns[-1])
-            self._stamped.append(Samples(
-                host_ns + self._ros_offset_ns, block.volts, time.time_ns(),
-                self._counted + self._estimated, self._thin(host_ns, block.references),
-                self._estimated))
+            self._stamped.append(
+                Samples(
+                    host_ns + self._ros_offset_ns,
+                    block.volts,
+                    time.time_ns(),
+                    self._counted + self._estimated,
+                    self._thin(host_ns, block.references),
+                    self._estimated,
+                )
+            )
             self._counted = self._estimated = 0
         self._unstamped.clear()
 
-    def _thin(self, host_ns: np.ndarray, references: Mapping[str, np.ndarray]
-              ) -> dict[str, np.ndarray]:
+    def _thin(
+        self, host_ns: np.ndarray, references: Mapping[str, np.ndarray]
+    ) -> dict[str, np.ndarray]:
         """Return each reference by its mean in the first row after a period, and NaN elsewhere."""
         thinned = {column: np.full(len(host_ns), np.nan) for column in self._references}
         if (period := int(host_ns[-1]) // _PERIOD_NS) != self._period:

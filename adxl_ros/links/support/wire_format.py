@@ -42,7 +42,7 @@ MAX_FRAME_BYTES = _MAX_PAYLOAD + _CRC.size + 2 + _MAX_PAYLOAD // 254
 _MAX_LOAD = 0.85
 """Largest share of the time of a wire that frames take. Chosen: info frames and the tolerance of
 baud rates, 5 %, need the other part."""
-_MAX_TIME_US = 2 ** 53  # Largest time of a device clock, µs: 285 years
+_MAX_TIME_US = 2**53  # Largest time of a device clock, µs: 285 years
 RATES_HZ = (0.01, 1e5)  # Bounds of the sample rate, Hz, as `sensor.rate_hz` permits
 _VREFS_V = (0.1, 100.0)  # Bounds of the reference voltage, V, as `sensor.adc_vref_v` permits
 MAX_BITS = 16  # Largest resolution of the ADC, bit: codes are u16
@@ -89,18 +89,37 @@ class Encoder:
     def info_frame(self) -> bytes:
         """Encode the frame that comes first and then every second."""
         i = self.info
-        return encode_payload(_INFO.pack(
-            INFO_TYPE, VERSION, self._flags, next(self._sequence) % 2 ** 32, i.rate_hz, i.bits,
-            i.channels, i.vref_v, i.serial.encode('ascii')))
+        return encode_payload(
+            _INFO.pack(
+                INFO_TYPE,
+                VERSION,
+                self._flags,
+                next(self._sequence) % 2**32,
+                i.rate_hz,
+                i.bits,
+                i.channels,
+                i.vref_v,
+                i.serial.encode('ascii'),
+            )
+        )
 
-    def sample_frame(self, time_us: int, index: int, codes: np.ndarray, overruns: int = 0,
-                     flags: int = 0) -> bytes:
+    def sample_frame(
+        self, time_us: int, index: int, codes: np.ndarray, overruns: int = 0, flags: int = 0
+    ) -> bytes:
         """Encode ADC codes, (n, m), n and m at most 255, as a frame of samples."""
-        rail = RAIL if (codes == 0).any() or (codes >= 2 ** self.info.bits - 1).any() else 0
+        rail = RAIL if (codes == 0).any() or (codes >= 2**self.info.bits - 1).any() else 0
         flags |= self._flags | rail
         self._flags = 0
-        head = _SAMPLES.pack(SAMPLES_TYPE, VERSION, flags, next(self._sequence) % 2 ** 32, time_us,
-                             index % 2 ** 32, overruns % 2 ** 16, *codes.shape)
+        head = _SAMPLES.pack(
+            SAMPLES_TYPE,
+            VERSION,
+            flags,
+            next(self._sequence) % 2**32,
+            time_us,
+            index % 2**32,
+            overruns % 2**16,
+            *codes.shape,
+        )
         return encode_payload(head + codes.astype('<u2').tobytes())
 
 
@@ -121,8 +140,7 @@ def decode(raw: bytes) -> BoardInfo | SampleFrame:
 
 def encode_command(sequence: int, latency_us: int) -> bytes:
     """Encode the frame by which the host asks for small frames."""
-    payload = _COMMAND.pack(COMMAND_TYPE, VERSION, 0, sequence % 2 ** 32,
-                            min(latency_us, 2 ** 32 - 1))
+    payload = _COMMAND.pack(COMMAND_TYPE, VERSION, 0, sequence % 2**32, min(latency_us, 2**32 - 1))
     return b'\0' + encode_payload(payload)
 
 
@@ -144,7 +162,7 @@ def _stuff(raw: bytes) -> bytes:
     """
     stuffed = bytearray()
     for run in raw.split(b'\0'):
-        *full, rest = (run[i:i + _BLOCK] for i in range(0, len(run) + 1, _BLOCK))
+        *full, rest = (run[i : i + _BLOCK] for i in range(0, len(run) + 1, _BLOCK))
         for block in (*full, rest):
             stuffed.append(len(block) + 1)
             stuffed += block
@@ -159,7 +177,7 @@ def _unstuff(raw: bytes) -> bytes:
     parts, at = [], 0
     while at < len(raw):
         length = raw[at]
-        parts.append(raw[at + 1:at + length])
+        parts.append(raw[at + 1 : at + length])
         at += length
         if length <= _BLOCK and at < len(raw):
             parts.append(b'\0')
@@ -171,7 +189,7 @@ def _unstuff(raw: bytes) -> bytes:
 def _checked_payload(raw: bytes) -> bytes:
     """Return the payload of a frame; raise `WireError` unless whole and of this version."""
     decoded = _unstuff(raw)
-    payload, check = decoded[:-_CRC.size], decoded[-_CRC.size:]
+    payload, check = decoded[: -_CRC.size], decoded[-_CRC.size :]
     if len(payload) < _COMMAND.size or check != _CRC.pack(zlib.crc32(payload)):
         raise WireError('the CRC does not match')
     if payload[1] != VERSION:
@@ -184,9 +202,13 @@ def _decode_info(payload: bytes) -> BoardInfo:
         raise WireError('no info frame')
     _, _, flags, _, rate_hz, bits, channels, vref_v, serial = _INFO.unpack(payload)
     name = serial.rstrip(b'\0')
-    if not (RATES_HZ[0] <= rate_hz <= RATES_HZ[1] and _VREFS_V[0] <= vref_v <= _VREFS_V[1]
-            and 1 <= bits <= MAX_BITS and 1 <= channels <= MAX_CHANNELS
-            and all(32 <= byte < 127 for byte in name)):
+    if not (
+        RATES_HZ[0] <= rate_hz <= RATES_HZ[1]
+        and _VREFS_V[0] <= vref_v <= _VREFS_V[1]
+        and 1 <= bits <= MAX_BITS
+        and 1 <= channels <= MAX_CHANNELS
+        and all(32 <= byte < 127 for byte in name)
+    ):
         raise WireError('an info frame beyond the bounds of the format')
     return BoardInfo(rate_hz, bits, channels, vref_v, name.decode('ascii').strip(), flags)
 
@@ -194,10 +216,15 @@ def _decode_info(payload: bytes) -> BoardInfo:
 def _decode_samples(payload: bytes) -> SampleFrame:
     if len(payload) < _SAMPLES.size:
         raise WireError('no frame of samples')
-    (_, _, flags, sequence, time_us, index, overruns, count,
-     channels) = _SAMPLES.unpack_from(payload)
-    if (len(payload) != _SAMPLES.size + 2 * count * channels or not count
-            or not 0 < channels <= MAX_CHANNELS or time_us > _MAX_TIME_US):
+    (_, _, flags, sequence, time_us, index, overruns, count, channels) = _SAMPLES.unpack_from(
+        payload
+    )
+    if (
+        len(payload) != _SAMPLES.size + 2 * count * channels
+        or not count
+        or not 0 < channels <= MAX_CHANNELS
+        or time_us > _MAX_TIME_US
+    ):
         raise WireError('a frame of samples beyond the bounds of the format')
     codes = np.frombuffer(payload, '<u2', offset=_SAMPLES.size).reshape(count, channels)
     return SampleFrame(flags, sequence, time_us, index, overruns, codes)
@@ -299,7 +326,7 @@ class FrameCounter:
             if part.lost is None:
                 self._first = part.frame
             elif self._previous is not None:
-                self.overruns += (part.frame.overruns - self._previous.overruns) % 2 ** 16
+                self.overruns += (part.frame.overruns - self._previous.overruns) % 2**16
             self._previous, self._closed_us, self._arrived_us = part.frame, None, arrived_us
         return accepted
 
@@ -307,7 +334,10 @@ class FrameCounter:
         """Compare a frame with the previous one; None where the next one must decide."""
         # The first frames of a count have the flag of a reset, also where they come twice.
         is_first = self._first is not None and (frame.sequence, frame.time_us, frame.index) == (
-            self._first.sequence, self._first.time_us, self._first.index)
+            self._first.sequence,
+            self._first.time_us,
+            self._first.index,
+        )
         if self._previous is None or (frame.flags & AFTER_RESET and not is_first):
             return AcceptedFrame(frame, None)
         ahead, passed_us = self._step(self._previous, frame)
@@ -325,7 +355,7 @@ class FrameCounter:
         """Return the samples and the time, µs, from the end of a frame to another one."""
         count = len(first.codes)
         # The numbers of samples wrap at 2^32.
-        ahead = (second.index - first.index - count + 2 ** 31) % 2 ** 32 - 2 ** 31
+        ahead = (second.index - first.index - count + 2**31) % 2**32 - 2**31
         return ahead, second.time_us - first.time_us - count * self._period_us
 
     def _agree(self, samples: int, passed_us: float) -> bool:

@@ -21,10 +21,12 @@ def library() -> dict[str, Effect]:
     A package adds an effect by an entry point in the group `adxl_ros.effects` that names an
     `Effect`.
     """
-    modules = [import_module(f'{__name__}.{module.name}')
-               for module in pkgutil.iter_modules(__path__)]
-    own = [value for module in modules for value in vars(module).values()
-           if isinstance(value, Effect)]
+    modules = [
+        import_module(f'{__name__}.{module.name}') for module in pkgutil.iter_modules(__path__)
+    ]
+    own = [
+        value for module in modules for value in vars(module).values() if isinstance(value, Effect)
+    ]
     collected = sorted(own, key=lambda effect: effect.name)
     collected += [point.load() for point in entry_points(group='adxl_ros.effects')]
     effects: dict[str, Effect] = {}

@@ -31,8 +31,12 @@ from adxl_ros.model.filters import loop, low_pass, resonator, stop
 import numpy as np
 
 _IN_PLANE, _OUT_OF_PLANE = (1, 0, 0), (2, 2, 1)
-OTHER_AXIS = {'cross_axis': _IN_PLANE, 'scale_factor_cross': _IN_PLANE,
-              'cross_axis_z': _OUT_OF_PLANE, 'scale_factor_z': _OUT_OF_PLANE}
+OTHER_AXIS = {
+    'cross_axis': _IN_PLANE,
+    'scale_factor_cross': _IN_PLANE,
+    'cross_axis_z': _OUT_OF_PLANE,
+    'scale_factor_z': _OUT_OF_PLANE,
+}
 """By effect: index of the axis c that acts on x, y and z; what is in plane for z is x, and what
 is out of plane is y."""
 
@@ -40,47 +44,80 @@ is out of plane is y."""
 def _bias_by(others: tuple[int, int, int], signals: Signals, p: Parameters) -> None:
     """Add p1·A_c + p2·A_c² of another axis c to each measured axis."""
     other = [signals.sensed[other] for other in others]
-    add(signals.output, ((p1 + p2 * c) * c for p1, p2, c in zip(
-        p['linear'], p['quadratic_per_g'], other)))
+    add(
+        signals.output,
+        ((p1 + p2 * c) * c for p1, p2, c in zip(p['linear'], p['quadratic_per_g'], other)),
+    )
 
 
-@effect(Place.ELEMENT,
-        Parameter('linear', 'g/g', -0.3, 0.3, 0.015, 'ADXL203 datasheet: cross-axis 1.5 %',
-                  'p1 of equation 11; to first order the same as a misalignment'),
-        Parameter('quadratic_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 4',
-                  'p2 of equation 11'),
-        invertible=True,
-        cause='The other in-plane axis shifts the bias; calibrate with the plane alpha = 90 deg.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.CROSS_FORCE,),
-                                 proof=(ProofVariable.CROSS_FORCE,)))
+@effect(
+    Place.ELEMENT,
+    Parameter(
+        'linear',
+        'g/g',
+        -0.3,
+        0.3,
+        0.015,
+        'ADXL203 datasheet: cross-axis 1.5 %',
+        'p1 of equation 11; to first order the same as a misalignment',
+    ),
+    Parameter('quadratic_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 4', 'p2 of equation 11'),
+    invertible=True,
+    cause='The other in-plane axis shifts the bias; calibrate with the plane alpha = 90 deg.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.PLANES,
+        form=(FormDimension.CROSS_FORCE,),
+        proof=(ProofVariable.CROSS_FORCE,),
+    ),
+)
 def cross_axis(signals: Signals, p: Parameters) -> None:
     """Bias from the other in-plane axis: g(V_c) of equations 10 and 11, centred and in g."""
     _bias_by(_IN_PLANE, signals, p)
 
 
-@effect(Place.ELEMENT,
-        Parameter('linear', 'g/g', -0.3, 0.3, 0.015, 'ADXL203 datasheet: cross-axis 1.5 %',
-                  'q1 of equation 13; to first order the same as a misalignment'),
-        Parameter('quadratic_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 6',
-                  'q2 of equation 13'),
-        invertible=True,
-        cause='The out-of-plane axis shifts the bias; calibrate with several planes alpha.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.CROSS_FORCE,),
-                                 proof=(ProofVariable.FORCE_Z,)))
+@effect(
+    Place.ELEMENT,
+    Parameter(
+        'linear',
+        'g/g',
+        -0.3,
+        0.3,
+        0.015,
+        'ADXL203 datasheet: cross-axis 1.5 %',
+        'q1 of equation 13; to first order the same as a misalignment',
+    ),
+    Parameter('quadratic_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 6', 'q2 of equation 13'),
+    invertible=True,
+    cause='The out-of-plane axis shifts the bias; calibrate with several planes alpha.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.PLANES,
+        form=(FormDimension.CROSS_FORCE,),
+        proof=(ProofVariable.FORCE_Z,),
+    ),
+)
 def cross_axis_z(signals: Signals, p: Parameters) -> None:
     """Bias from the out-of-plane axis: h(V_z) of equations 12 and 13, centred and in g."""
     _bias_by(_OUT_OF_PLANE, signals, p)
 
 
-@effect(Place.ELEMENT,
-        Parameter('linear_per_g', '1/g', -0.3, 0.3, 0.01,
-                  'as scale_factor_z: paper, figure 8',
-                  'relative change of the scale factor for 1 g on the other axis'),
-        invertible=True,
-        cause='The other in-plane axis changes the scale factor; calibrate with several planes '
-              'alpha.',
-        diagnosis=DiagnosisHints(form=(FormDimension.FORCE, FormDimension.CROSS_FORCE),
-                                 proof=(ProofVariable.CROSS_FORCE, ProofVariable.OWN_FORCE)))
+@effect(
+    Place.ELEMENT,
+    Parameter(
+        'linear_per_g',
+        '1/g',
+        -0.3,
+        0.3,
+        0.01,
+        'as scale_factor_z: paper, figure 8',
+        'relative change of the scale factor for 1 g on the other axis',
+    ),
+    invertible=True,
+    cause='The other in-plane axis changes the scale factor; calibrate with several planes alpha.',
+    diagnosis=DiagnosisHints(
+        form=(FormDimension.FORCE, FormDimension.CROSS_FORCE),
+        proof=(ProofVariable.CROSS_FORCE, ProofVariable.OWN_FORCE),
+    ),
+)
 def scale_factor_cross(signals: Signals, p: Parameters) -> None:
     """
     Scale factor that depends on the other in-plane axis; that of the z axis depends on x.
@@ -89,36 +126,68 @@ def scale_factor_cross(signals: Signals, p: Parameters) -> None:
     squares of the other two. A quadratic term would equal a sum of `nonlinearity`,
     `scale_factor_z` and `scale_factor`, so that the effect has none.
     """
-    add(signals.output, (s * sensed * signals.sensed[other] for s, sensed, other in zip(
-        p['linear_per_g'], signals.sensed, _IN_PLANE)))
+    add(
+        signals.output,
+        (
+            s * sensed * signals.sensed[other]
+            for s, sensed, other in zip(p['linear_per_g'], signals.sensed, _IN_PLANE)
+        ),
+    )
 
 
-@effect(Place.ELEMENT,
-        Parameter('linear_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 8',
-                  'r1 over r0 of equation 15'),
-        Parameter('quadratic_per_g2', '1/g^2', -0.3, 0.3, 0.01, 'paper, figure 8',
-                  'r2 over r0 of equation 15'),
-        invertible=True,
-        cause='The out-of-plane axis changes the scale factor; calibrate with several planes '
-              'alpha.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
-                                 form=(FormDimension.FORCE, FormDimension.CROSS_FORCE),
-                                 proof=(ProofVariable.FORCE_Z, ProofVariable.OWN_FORCE)))
+@effect(
+    Place.ELEMENT,
+    Parameter(
+        'linear_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 8', 'r1 over r0 of equation 15'
+    ),
+    Parameter(
+        'quadratic_per_g2',
+        '1/g^2',
+        -0.3,
+        0.3,
+        0.01,
+        'paper, figure 8',
+        'r2 over r0 of equation 15',
+    ),
+    invertible=True,
+    cause='The out-of-plane axis changes the scale factor; calibrate with several planes alpha.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.PLANES,
+        form=(FormDimension.FORCE, FormDimension.CROSS_FORCE),
+        proof=(ProofVariable.FORCE_Z, ProofVariable.OWN_FORCE),
+    ),
+)
 def scale_factor_z(signals: Signals, p: Parameters) -> None:
     """Scale factor by the out-of-plane axis, y for z: equations 15 and 17, centred and in g."""
     other = [signals.sensed[other] for other in _OUT_OF_PLANE]
-    add(signals.output, (sensed * (r1 + r2 * c) * c for sensed, r1, r2, c in zip(
-        signals.sensed, p['linear_per_g'], p['quadratic_per_g2'], other)))
+    add(
+        signals.output,
+        (
+            sensed * (r1 + r2 * c) * c
+            for sensed, r1, r2, c in zip(
+                signals.sensed, p['linear_per_g'], p['quadratic_per_g2'], other
+            )
+        ),
+    )
 
 
-@effect(Place.ELEMENT,
-        Parameter('cubic_per_g2', '1/g^2', -0.1, 0.1, 7e-4,
-                  'ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
-                  'coefficient of the cube of the acceleration along the axis'),
-        invertible=True,
-        cause='The scale factor changes with the input; calibrate with poses between 0 and 1 g.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,),
-                                 proof=(ProofVariable.OWN_FORCE,)))
+@effect(
+    Place.ELEMENT,
+    Parameter(
+        'cubic_per_g2',
+        '1/g^2',
+        -0.1,
+        0.1,
+        7e-4,
+        'ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
+        'coefficient of the cube of the acceleration along the axis',
+    ),
+    invertible=True,
+    cause='The scale factor changes with the input; calibrate with poses between 0 and 1 g.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,), proof=(ProofVariable.OWN_FORCE,)
+    ),
+)
 def nonlinearity(signals: Signals, p: Parameters) -> None:
     """
     Odd nonlinearity of an axis: its scale factor changes with its own input.
@@ -128,14 +197,23 @@ def nonlinearity(signals: Signals, p: Parameters) -> None:
     add(signals.output, (k * a * a * a for k, a in zip(p['cubic_per_g2'], signals.sensed)))
 
 
-@effect(Place.ELEMENT,
-        Parameter('quadratic_per_g', '1/g', -0.1, 0.1, 1.2e-3,
-                  'ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
-                  'coefficient of the square of the acceleration along the axis'),
-        invertible=True,
-        cause='Scale factors up and down differ; calibrate, and let no supply clip one side.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,),
-                                 proof=(ProofVariable.OWN_FORCE,)))
+@effect(
+    Place.ELEMENT,
+    Parameter(
+        'quadratic_per_g',
+        '1/g',
+        -0.1,
+        0.1,
+        1.2e-3,
+        'ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
+        'coefficient of the square of the acceleration along the axis',
+    ),
+    invertible=True,
+    cause='Scale factors up and down differ; calibrate, and let no supply clip one side.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,), proof=(ProofVariable.OWN_FORCE,)
+    ),
+)
 def quadratic(signals: Signals, p: Parameters) -> None:
     """
     Even nonlinearity of an axis: its scale factors up and down differ.
@@ -145,19 +223,39 @@ def quadratic(signals: Signals, p: Parameters) -> None:
     add(signals.output, (k * a * a for k, a in zip(p['quadratic_per_g'], signals.sensed)))
 
 
-@effect(Place.ELEMENT,
-        Parameter('half_width_g', 'g', -0.1, 0.1, 2e-3, 'physics: friction in die and package',
-                  'largest lag behind the input: half of the width of the loop'),
-        Parameter('reach_g', 'g', 1e-3, 2.0, 0.2, 'physics: part of the range',
-                  'change of the input after a reversal that builds up half of the lag', '',
-                  neutral=0.2, role=Role.SHAPE, starts=(0.04, 0.2, 1.0)),
-        smooth=False,
-        cause='The reading depends on the direction of the last change; approach poses from both '
-              'sides and average, or relieve the package of mounting stress.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
-                                 form=(FormDimension.FORCE, FormDimension.DIRECTION,
-                                       FormDimension.LAG),
-                                 proof=(ProofVariable.FORCE_RATE, ProofVariable.OWN_FORCE)))
+@effect(
+    Place.ELEMENT,
+    Parameter(
+        'half_width_g',
+        'g',
+        -0.1,
+        0.1,
+        2e-3,
+        'physics: friction in die and package',
+        'largest lag behind the input: half of the width of the loop',
+    ),
+    Parameter(
+        'reach_g',
+        'g',
+        1e-3,
+        2.0,
+        0.2,
+        'physics: part of the range',
+        'change of the input after a reversal that builds up half of the lag',
+        '',
+        neutral=0.2,
+        role=Role.SHAPE,
+        starts=(0.04, 0.2, 1.0),
+    ),
+    smooth=False,
+    cause='The reading depends on the direction of the last change; approach poses from both '
+    'sides and average, or relieve the package of mounting stress.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.SPEEDS,
+        form=(FormDimension.FORCE, FormDimension.DIRECTION, FormDimension.LAG),
+        proof=(ProofVariable.FORCE_RATE, ProofVariable.OWN_FORCE),
+    ),
+)
 def hysteresis(signals: Signals, p: Parameters) -> None:
     """
     Hysteresis of the sensing element: a Prandtl-Ishlinskii operator of the acceleration.
@@ -173,16 +271,35 @@ def hysteresis(signals: Signals, p: Parameters) -> None:
             signals.output[d] = signals.output[d] - half_width * lag
 
 
-@effect(Place.ELEMENT,
-        Parameter('coefficient_per_g', 'g/g^2', -1.0, 1.0, 0.05,
-                  'physics: asymmetry of the element, clipping of fast peaks',
-                  'shift of the zero-g divided by the mean square of the vibration'),
-        Parameter('tau_s', 's', 0.01, 60.0, 0.5, 'physics: slower than any vibration',
-                  'time over which the mean square is taken', '', neutral=0.5, role=Role.SHAPE,
-                  starts=(0.1, 0.5, 2.5)),
-        cause='Vibration shifts the zero-g; damp the mount, or stay away from its resonance.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,),
-                                 proof=(ProofVariable.TIME,)))
+@effect(
+    Place.ELEMENT,
+    Parameter(
+        'coefficient_per_g',
+        'g/g^2',
+        -1.0,
+        1.0,
+        0.05,
+        'physics: asymmetry of the element, clipping of fast peaks',
+        'shift of the zero-g divided by the mean square of the vibration',
+    ),
+    Parameter(
+        'tau_s',
+        's',
+        0.01,
+        60.0,
+        0.5,
+        'physics: slower than any vibration',
+        'time over which the mean square is taken',
+        '',
+        neutral=0.5,
+        role=Role.SHAPE,
+        starts=(0.1, 0.5, 2.5),
+    ),
+    cause='Vibration shifts the zero-g; damp the mount, or stay away from its resonance.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,), proof=(ProofVariable.TIME,)
+    ),
+)
 def vibration_rectification(signals: Signals, p: Parameters) -> None:
     """
     Vibration rectification: vibration shifts the zero-g by its mean square.
@@ -196,8 +313,9 @@ def vibration_rectification(signals: Signals, p: Parameters) -> None:
         sensed = signals.sensed[d]
         mean, square = (signals.memory.setdefault((d, i), {}) for i in range(2))
         vibration = sensed - low_pass(sensed, tau_s, signals.dt_s, mean)
-        signals.output[d] = signals.output[d] + k * low_pass(vibration * vibration, tau_s,
-                                                             signals.dt_s, square)
+        signals.output[d] = signals.output[d] + k * low_pass(
+            vibration * vibration, tau_s, signals.dt_s, square
+        )
 
 
 def direction(axis: int, alpha_rad: Value, beta_rad: Value) -> Components:
@@ -208,45 +326,94 @@ def direction(axis: int, alpha_rad: Value, beta_rad: Value) -> Components:
     Θz = R_x(α)·R_y(β)·[0 0 1]ᵀ.
     """
     maths = ARRAYS if np.ndim(alpha_rad) or np.ndim(beta_rad) else FLOATS
-    sa, ca, sb, cb = (f(angle) for angle in (alpha_rad, beta_rad)
-                      for f in (maths.sin, maths.cos))
+    sa, ca, sb, cb = (f(angle) for angle in (alpha_rad, beta_rad) for f in (maths.sin, maths.cos))
     return [[ca * cb, sb, -sa * cb], [-sb, ca * cb, sa * cb], [sb, -sa * cb, ca * cb]][axis]
 
 
-@effect(Place.MOUNTING,
-        Parameter('alpha_rad', 'rad', -0.5, 0.5, 0.0175,
-                  'ADXL203 datasheet: package alignment 1 deg',
-                  'tilt of the sensing axis out of the plane (z: about x), equations 18 and 19'),
-        Parameter('beta_rad', 'rad', -0.5, 0.5, 0.0175,
-                  'ADXL203 datasheet: package alignment 1 deg, x to y 0.1 deg',
-                  'turn of the sensing axis in the plane (z: about y), equations 18 and 19'),
-        exact=True, invertible=True,
-        cause='The sensing axes are not those of the case; calibrate, or mount the package '
-              'better.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
-                                 proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)))
+@effect(
+    Place.MOUNTING,
+    Parameter(
+        'alpha_rad',
+        'rad',
+        -0.5,
+        0.5,
+        0.0175,
+        'ADXL203 datasheet: package alignment 1 deg',
+        'tilt of the sensing axis out of the plane (z: about x), equations 18 and 19',
+    ),
+    Parameter(
+        'beta_rad',
+        'rad',
+        -0.5,
+        0.5,
+        0.0175,
+        'ADXL203 datasheet: package alignment 1 deg, x to y 0.1 deg',
+        'turn of the sensing axis in the plane (z: about y), equations 18 and 19',
+    ),
+    exact=True,
+    invertible=True,
+    cause='The sensing axes are not those of the case; calibrate, or mount the package better.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.PLANES, proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)
+    ),
+)
 def misalignment(signals: Signals, p: Parameters) -> None:
     """Directions of the sensing axes in the case: equations 18 and 19, and the same for z."""
     alpha_rad, beta_rad, memory = p['alpha_rad'], p['beta_rad'], signals.memory
     if memory.get('alpha_rad') is not alpha_rad or memory.get('beta_rad') is not beta_rad:
-        memory.update(alpha_rad=alpha_rad, beta_rad=beta_rad, directions=[
-            direction(d, *angles) for d, angles in enumerate(zip(alpha_rad, beta_rad))])
+        memory.update(
+            alpha_rad=alpha_rad,
+            beta_rad=beta_rad,
+            directions=[
+                direction(d, *angles) for d, angles in enumerate(zip(alpha_rad, beta_rad))
+            ],
+        )
     force = list(signals.sensed)
     for d, (tx, ty, tz) in enumerate(memory['directions']):
         signals.sensed[d] = tx * force[0] + ty * force[1] + tz * force[2]
 
 
-@effect(Place.MOUNTING,
-        Parameter('gain', '1', -2.0, 2.0, 1.0, 'physics: 0 is rigid, 1 all through the mount',
-                  'part of the force that comes through the mount'),
-        Parameter('frequency_hz', 'Hz', 2.0, 450.0, 120.0, 'physics: a board on standoffs',
-                  'natural frequency, undamped', '', neutral=120.0, role=Role.SHAPE,
-                  starts=(8.0, 14.0, 24.0, 40.0, 70.0, 120.0, 250.0)),
-        Parameter('damping_ratio', '1', 0.001, 0.95, 0.05, 'physics: metal and FR4',
-                  'damping divided by the critical one', '', neutral=0.05, role=Role.SHAPE),
-        cause='The mount is a spring; stiffen it, or keep the motion away from its resonance.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,),
-                                 proof=(ProofVariable.FREQUENCY,)))
+@effect(
+    Place.MOUNTING,
+    Parameter(
+        'gain',
+        '1',
+        -2.0,
+        2.0,
+        1.0,
+        'physics: 0 is rigid, 1 all through the mount',
+        'part of the force that comes through the mount',
+    ),
+    Parameter(
+        'frequency_hz',
+        'Hz',
+        2.0,
+        450.0,
+        120.0,
+        'physics: a board on standoffs',
+        'natural frequency, undamped',
+        '',
+        neutral=120.0,
+        role=Role.SHAPE,
+        starts=(8.0, 14.0, 24.0, 40.0, 70.0, 120.0, 250.0),
+    ),
+    Parameter(
+        'damping_ratio',
+        '1',
+        0.001,
+        0.95,
+        0.05,
+        'physics: metal and FR4',
+        'damping divided by the critical one',
+        '',
+        neutral=0.05,
+        role=Role.SHAPE,
+    ),
+    cause='The mount is a spring; stiffen it, or keep the motion away from its resonance.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,), proof=(ProofVariable.FREQUENCY,)
+    ),
+)
 def mount_resonance(signals: Signals, p: Parameters) -> None:
     """
     Resonance of the mount: it transmits the motion like a spring and a damper.
@@ -256,34 +423,67 @@ def mount_resonance(signals: Signals, p: Parameters) -> None:
     for d, gain in enumerate(p['gain']):
         if gain:
             sensed = signals.sensed[d]
-            transmitted = resonator(sensed, p['frequency_hz'], p['damping_ratio'], signals.dt_s,
-                                    signals.memory.setdefault(d, {}))
+            transmitted = resonator(
+                sensed,
+                p['frequency_hz'],
+                p['damping_ratio'],
+                signals.dt_s,
+                signals.memory.setdefault(d, {}),
+            )
             signals.sensed[d] = sensed + gain * (transmitted - sensed)
 
 
-@effect(Place.ELECTRONICS,
-        Parameter('offset_v', 'V', -2.0, 2.0, 0.1, 'ADXL203 datasheet: zero-g 2.4 to 2.6 V',
-                  'zero-g output minus the nominal one'),
-        exact=True, invertible=True,
-        cause='The zero-g output of this unit is not the nominal one; calibrate the unit.',
-        # Zero-g of a healthy unit changes by 0.1 mg from day to day (tuned by hand on simulated
-        # recordings).
-        diagnosis=DiagnosisHints(straight_line=StraightLine.ZERO_G, healthy_std=1e-4,
-                                 revealed_by=Manoeuvre.REMOUNT, proof=(ProofVariable.TIME,)))
+@effect(
+    Place.ELECTRONICS,
+    Parameter(
+        'offset_v',
+        'V',
+        -2.0,
+        2.0,
+        0.1,
+        'ADXL203 datasheet: zero-g 2.4 to 2.6 V',
+        'zero-g output minus the nominal one',
+    ),
+    exact=True,
+    invertible=True,
+    cause='The zero-g output of this unit is not the nominal one; calibrate the unit.',
+    # Zero-g of a healthy unit changes by 0.1 mg from day to day (tuned by hand on simulated
+    # recordings).
+    diagnosis=DiagnosisHints(
+        straight_line=StraightLine.ZERO_G,
+        healthy_std=1e-4,
+        revealed_by=Manoeuvre.REMOUNT,
+        proof=(ProofVariable.TIME,),
+    ),
+)
 def bias(signals: Signals, p: Parameters) -> None:
     """Zero-g of a unit minus the nominal one (B of equation 2)."""
     add(signals.zero_g_v, p['offset_v'])
 
 
-@effect(Place.ELECTRONICS,
-        Parameter('offset_v_per_g', 'V/g', -0.9, 9.0, 0.04,
-                  'ADXL203 datasheet: 960 to 1040 mV/g', 'scale factor minus the nominal one'),
-        exact=True, invertible=True,
-        cause='The scale factor of this unit is not the nominal one; calibrate the unit.',
-        # The scale factor of a healthy unit changes by 0.01 % from day to day (tuned by hand on
-        # simulated recordings).
-        diagnosis=DiagnosisHints(straight_line=StraightLine.SCALE_FACTOR, healthy_std=1e-4,
-                                 revealed_by=Manoeuvre.REMOUNT, proof=(ProofVariable.OWN_FORCE,)))
+@effect(
+    Place.ELECTRONICS,
+    Parameter(
+        'offset_v_per_g',
+        'V/g',
+        -0.9,
+        9.0,
+        0.04,
+        'ADXL203 datasheet: 960 to 1040 mV/g',
+        'scale factor minus the nominal one',
+    ),
+    exact=True,
+    invertible=True,
+    cause='The scale factor of this unit is not the nominal one; calibrate the unit.',
+    # The scale factor of a healthy unit changes by 0.01 % from day to day (tuned by hand on
+    # simulated recordings).
+    diagnosis=DiagnosisHints(
+        straight_line=StraightLine.SCALE_FACTOR,
+        healthy_std=1e-4,
+        revealed_by=Manoeuvre.REMOUNT,
+        proof=(ProofVariable.OWN_FORCE,),
+    ),
+)
 def scale_factor(signals: Signals, p: Parameters) -> None:
     """Scale factor of a unit minus the nominal one (SF of equation 1)."""
     add(signals.scale_v_per_g, p['offset_v_per_g'])
@@ -294,42 +494,94 @@ _SCALE_EXPONENT = 1.135
 (ADXL203 datasheet, specifications)."""
 
 
-@effect(Place.ELECTRONICS,
-        Parameter('zero_g_exponent', '1', -3.0, 3.0, 1.0, 'ADXL203 datasheet: ratiometric',
-                  'exponent of the supply voltage in the zero-g; 0 is independent of it'),
-        Parameter('scale_exponent', '1', -3.0, 3.0, _SCALE_EXPONENT,
-                  'ADXL203 datasheet: 560 mV/g at 3 V, not 600',
-                  'exponent of the supply voltage in the scale factor; 0 is independent of it'),
-        Parameter('nominal_v', 'V of the supply', 1.0, 30.0, NOMINAL_SUPPLY_V,
-                  'ADXL203 datasheet: values at 5 V',
-                  'supply voltage of the datasheet values', '',
-                  neutral=NOMINAL_SUPPLY_V, held=True, role=Role.SHAPE),
-        invertible=True, follows=('supply_v',),
-        cause='The output follows the supply; measure the supply and correct, or regulate it.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SUPPLY, form=(FormDimension.SUPPLY,),
-                                 proof=(ProofVariable.SUPPLY,)))
+@effect(
+    Place.ELECTRONICS,
+    Parameter(
+        'zero_g_exponent',
+        '1',
+        -3.0,
+        3.0,
+        1.0,
+        'ADXL203 datasheet: ratiometric',
+        'exponent of the supply voltage in the zero-g; 0 is independent of it',
+    ),
+    Parameter(
+        'scale_exponent',
+        '1',
+        -3.0,
+        3.0,
+        _SCALE_EXPONENT,
+        'ADXL203 datasheet: 560 mV/g at 3 V, not 600',
+        'exponent of the supply voltage in the scale factor; 0 is independent of it',
+    ),
+    Parameter(
+        'nominal_v',
+        'V of the supply',
+        1.0,
+        30.0,
+        NOMINAL_SUPPLY_V,
+        'ADXL203 datasheet: values at 5 V',
+        'supply voltage of the datasheet values',
+        '',
+        neutral=NOMINAL_SUPPLY_V,
+        held=True,
+        role=Role.SHAPE,
+    ),
+    invertible=True,
+    follows=('supply_v',),
+    cause='The output follows the supply; measure the supply and correct, or regulate it.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.SUPPLY, form=(FormDimension.SUPPLY,), proof=(ProofVariable.SUPPLY,)
+    ),
+)
 def supply(signals: Signals, p: Parameters) -> None:
     """Supply voltage: zero-g and scale factor follow it, though not exactly in proportion."""
     ratio = signals.environment.supply_v / p['nominal_v']
     for d, (zero, scale) in enumerate(zip(p['zero_g_exponent'], p['scale_exponent'])):
-        signals.zero_g_v[d] = signals.zero_g_v[d] * ratio ** zero
-        signals.scale_v_per_g[d] = signals.scale_v_per_g[d] * ratio ** scale
+        signals.zero_g_v[d] = signals.zero_g_v[d] * ratio**zero
+        signals.scale_v_per_g[d] = signals.scale_v_per_g[d] * ratio**scale
 
 
-@effect(Place.ELECTRONICS,
-        Parameter('limit_g', 'g', 0.1, 1000.0, 1.0,
-                  'ADXL203 datasheet: range 1.7 g at least; lower with a low supply',
-                  'largest output of either sign; 1000 does not clip', neutral=1000.0,
-                  role=Role.LIMIT),
-        Parameter('knee_g', 'g', 0.0, 0.5, 0.02, 'physics: an amplifier near its rail',
-                  'width of a soft clip; 0 is hard', '', typical=0.0,
-                  role=Role.OPTIONAL),
-        Parameter('offset_g', 'g', -0.5, 0.5, 0.02,
-                  'ADXL203 datasheet: zero-g 2.4 to 2.6 V between rails of 0 and 5 V',
-                  'middle of the two limits', typical=0.0, role=Role.OPTIONAL),
-        smooth=False,
-        cause='The output clips; raise the supply, lower the gain, or choose a wider range.',
-        diagnosis=DiagnosisHints(form=(FormDimension.FORCE,), proof=(ProofVariable.OWN_FORCE,)))
+@effect(
+    Place.ELECTRONICS,
+    Parameter(
+        'limit_g',
+        'g',
+        0.1,
+        1000.0,
+        1.0,
+        'ADXL203 datasheet: range 1.7 g at least; lower with a low supply',
+        'largest output of either sign; 1000 does not clip',
+        neutral=1000.0,
+        role=Role.LIMIT,
+    ),
+    Parameter(
+        'knee_g',
+        'g',
+        0.0,
+        0.5,
+        0.02,
+        'physics: an amplifier near its rail',
+        'width of a soft clip; 0 is hard',
+        '',
+        typical=0.0,
+        role=Role.OPTIONAL,
+    ),
+    Parameter(
+        'offset_g',
+        'g',
+        -0.5,
+        0.5,
+        0.02,
+        'ADXL203 datasheet: zero-g 2.4 to 2.6 V between rails of 0 and 5 V',
+        'middle of the two limits',
+        typical=0.0,
+        role=Role.OPTIONAL,
+    ),
+    smooth=False,
+    cause='The output clips; raise the supply, lower the gain, or choose a wider range.',
+    diagnosis=DiagnosisHints(form=(FormDimension.FORCE,), proof=(ProofVariable.OWN_FORCE,)),
+)
 def saturation(signals: Signals, p: Parameters) -> None:
     """
     Saturation: the output stage clips at its limit.
@@ -346,44 +598,82 @@ def saturation(signals: Signals, p: Parameters) -> None:
         if not knee_g:
             signals.output[d] = np.clip(x, -lower, upper)
         else:
-            beyond = [np.logaddexp(0.0, (sign * x - rail) / knee_g)
-                      for sign, rail in ((1, upper), (-1, lower))]
+            beyond = [
+                np.logaddexp(0.0, (sign * x - rail) / knee_g)
+                for sign, rail in ((1, upper), (-1, lower))
+            ]
             signals.output[d] = x - knee_g * (beyond[0] - beyond[1])
 
 
 _WITHOUT_FILTER_S = 1e-3  # Time constant that r counts in where no filter is stated, s. Chosen
 
 
-@effect(Place.ELECTRONICS,
-        Parameter('resistance_ratio', '1', -0.95, 1000.0, 1.0,
-                  'ADXL203 datasheet: 32 kOhm +-25 %; ADXL355: settings from 1 to 1000 Hz',
-                  "filter's resistance divided by the stated one, minus 1; ms without a filter",
-                  typical=0.15, starts=(0.03, *(2.0 ** n for n in range(7)))),
-        needs=(Need.FILTER,),
-        cause='The output filter is not the stated one; measure its resistor and capacitor.',
-        # The RC product of a healthy unit is within some 2 % of the measured one (chosen:
-        # resistors and capacitors of 1 %, and their temperature).
-        diagnosis=DiagnosisHints(healthy_std=0.02,
-                                 stated_by=('rc_resistance_ohm', 'rc_capacitance_f'),
-                                 revealed_by=Manoeuvre.SHAKE, form=(FormDimension.LAG,),
-                                 proof=(ProofVariable.FREQUENCY,)))
+@effect(
+    Place.ELECTRONICS,
+    Parameter(
+        'resistance_ratio',
+        '1',
+        -0.95,
+        1000.0,
+        1.0,
+        'ADXL203 datasheet: 32 kOhm +-25 %; ADXL355: settings from 1 to 1000 Hz',
+        "filter's resistance divided by the stated one, minus 1; ms without a filter",
+        typical=0.15,
+        starts=(0.03, *(2.0**n for n in range(7))),
+    ),
+    needs=(Need.FILTER,),
+    cause='The output filter is not the stated one; measure its resistor and capacitor.',
+    # The RC product of a healthy unit is within some 2 % of the measured one (chosen:
+    # resistors and capacitors of 1 %, and their temperature).
+    diagnosis=DiagnosisHints(
+        healthy_std=0.02,
+        stated_by=('rc_resistance_ohm', 'rc_capacitance_f'),
+        revealed_by=Manoeuvre.SHAKE,
+        form=(FormDimension.LAG,),
+        proof=(ProofVariable.FREQUENCY,),
+    ),
+)
 def bandwidth(signals: Signals, p: Parameters) -> None:
     """Bandwidth of the output filter: on-chip resistors differ by 25 %, registers set the rest."""
     for d, ratio in enumerate(p['resistance_ratio']):
-        signals.rc_s[d] = signals.rc_s[d] * (1 + ratio) if signals.rc_s[d] \
+        signals.rc_s[d] = (
+            signals.rc_s[d] * (1 + ratio)
+            if signals.rc_s[d]
             else _WITHOUT_FILTER_S * max(ratio, 0.0)
+        )
 
 
-@effect(Place.ELECTRONICS,
-        Parameter('per_k', 'g/K', -0.1, 0.1, 1e-4, 'ADXL203 datasheet: 0.1 mg/degC',
-                  'slope of the zero-g over temperature at 25 degC'),
-        Parameter('per_k2', 'g/K^2', -0.01, 0.01, 1e-6,
-                  'physics: a slope that changes by 1 % a degree',
-                  'curvature of the zero-g over temperature', typical=0.0, role=Role.OPTIONAL),
-        invertible=True, follows=('temperature_c',),
-        cause='The zero-g follows the temperature; measure it and correct, or keep it steady.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, form=(FormDimension.TEMPERATURE,),
-                                 proof=(ProofVariable.TEMPERATURE,)))
+@effect(
+    Place.ELECTRONICS,
+    Parameter(
+        'per_k',
+        'g/K',
+        -0.1,
+        0.1,
+        1e-4,
+        'ADXL203 datasheet: 0.1 mg/degC',
+        'slope of the zero-g over temperature at 25 degC',
+    ),
+    Parameter(
+        'per_k2',
+        'g/K^2',
+        -0.01,
+        0.01,
+        1e-6,
+        'physics: a slope that changes by 1 % a degree',
+        'curvature of the zero-g over temperature',
+        typical=0.0,
+        role=Role.OPTIONAL,
+    ),
+    invertible=True,
+    follows=('temperature_c',),
+    cause='The zero-g follows the temperature; measure it and correct, or keep it steady.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.HEAT,
+        form=(FormDimension.TEMPERATURE,),
+        proof=(ProofVariable.TEMPERATURE,),
+    ),
+)
 def temperature_bias(signals: Signals, p: Parameters) -> None:
     """
     Zero-g that changes with temperature.
@@ -391,23 +681,43 @@ def temperature_bias(signals: Signals, p: Parameters) -> None:
     Add k·(T − 25 °C) + k2·(T − 25 °C)² to the output, g.
     """
     warmer_k = signals.environment.temperature_c - NOMINAL_TEMPERATURE_C
-    add(signals.output, (warmer_k * (per_k + warmer_k * per_k2)
-                         for per_k, per_k2 in zip(p['per_k'], p['per_k2'])))
+    add(
+        signals.output,
+        (warmer_k * (per_k + warmer_k * per_k2) for per_k, per_k2 in zip(p['per_k'], p['per_k2'])),
+    )
 
 
-@effect(Place.ELECTRONICS,
-        Parameter('per_k', '1/K', -0.01, 0.01, 1e-4,
-                  'ADXL203 datasheet: sensitivity +-0.3 % over temperature',
-                  'relative slope of the scale factor over temperature, from 25 degC on'),
-        Parameter('per_k2', '1/K^2', -0.001, 0.001, 1e-6,
-                  'physics: a slope that changes by 1 % a degree',
-                  'relative curvature of the scale factor over temperature', typical=0.0,
-                  role=Role.OPTIONAL),
-        invertible=True, follows=('temperature_c',),
-        cause='The scale factor follows the temperature; measure it and correct, or keep it '
-              'steady.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, form=(FormDimension.TEMPERATURE,),
-                                 proof=(ProofVariable.TEMPERATURE,)))
+@effect(
+    Place.ELECTRONICS,
+    Parameter(
+        'per_k',
+        '1/K',
+        -0.01,
+        0.01,
+        1e-4,
+        'ADXL203 datasheet: sensitivity +-0.3 % over temperature',
+        'relative slope of the scale factor over temperature, from 25 degC on',
+    ),
+    Parameter(
+        'per_k2',
+        '1/K^2',
+        -0.001,
+        0.001,
+        1e-6,
+        'physics: a slope that changes by 1 % a degree',
+        'relative curvature of the scale factor over temperature',
+        typical=0.0,
+        role=Role.OPTIONAL,
+    ),
+    invertible=True,
+    follows=('temperature_c',),
+    cause='The scale factor follows the temperature; measure it and correct, or keep it steady.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.HEAT,
+        form=(FormDimension.TEMPERATURE,),
+        proof=(ProofVariable.TEMPERATURE,),
+    ),
+)
 def temperature_scale(signals: Signals, p: Parameters) -> None:
     """
     Scale factor that changes with temperature.
@@ -417,21 +727,44 @@ def temperature_scale(signals: Signals, p: Parameters) -> None:
     warmer_k = signals.environment.temperature_c - NOMINAL_TEMPERATURE_C
     for d, (per_k, per_k2) in enumerate(zip(p['per_k'], p['per_k2'])):
         signals.scale_v_per_g[d] = signals.scale_v_per_g[d] * (
-            1 + warmer_k * (per_k + warmer_k * per_k2))
+            1 + warmer_k * (per_k + warmer_k * per_k2)
+        )
 
 
-@effect(Place.ELECTRONICS,
-        Parameter('per_k', 'g/K', -0.1, 0.1, 1e-4, 'ADXL203 datasheet: 0.1 mg/degC',
-                  'slope of the zero-g over the temperature that lags the thermometer'),
-        Parameter('tau_s', 's', 1.0, 1e4, 60.0, 'physics: a small board in moving air',
-                  'time constant between thermometer and sensor', '', neutral=60.0,
-                  role=Role.SHAPE, starts=(8.0, 25.0, 80.0, 250.0)),
-        follows=('temperature_c',),
-        cause='The thermometer is warm earlier or later than the sensor; mount it at the sensor, '
-              'or change the temperature slowly.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, time_constant='tau_s',
-                                 form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
-                                 proof=(ProofVariable.TEMPERATURE_RATE,)))
+@effect(
+    Place.ELECTRONICS,
+    Parameter(
+        'per_k',
+        'g/K',
+        -0.1,
+        0.1,
+        1e-4,
+        'ADXL203 datasheet: 0.1 mg/degC',
+        'slope of the zero-g over the temperature that lags the thermometer',
+    ),
+    Parameter(
+        'tau_s',
+        's',
+        1.0,
+        1e4,
+        60.0,
+        'physics: a small board in moving air',
+        'time constant between thermometer and sensor',
+        '',
+        neutral=60.0,
+        role=Role.SHAPE,
+        starts=(8.0, 25.0, 80.0, 250.0),
+    ),
+    follows=('temperature_c',),
+    cause='The thermometer is warm earlier or later than the sensor; mount it at the sensor, '
+    'or change the temperature slowly.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.HEAT,
+        time_constant='tau_s',
+        form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
+        proof=(ProofVariable.TEMPERATURE_RATE,),
+    ),
+)
 def thermal_lag(signals: Signals, p: Parameters) -> None:
     """
     Lag of the sensor behind its thermometer, or lead, so that the zero-g is late or early.
@@ -448,20 +781,40 @@ def thermal_lag(signals: Signals, p: Parameters) -> None:
     add(signals.output, (per_k * lag_k for per_k in p['per_k']))
 
 
-@effect(Place.ELECTRONICS,
-        Parameter('half_width_g', 'g', -0.1, 0.1, 2e-3,
-                  'physics: friction and creep in solder and die attach',
-                  'zero-g while cooling minus that while warming, divided by 2'),
-        Parameter('reach_k', 'K', 0.1, 200.0, 10.0, 'physics: part of the range',
-                  'half of the change after a reversal that opens the loop', '',
-                  neutral=10.0, role=Role.SHAPE, starts=(2.0, 10.0, 50.0)),
-        smooth=False, follows=('temperature_c',),
-        cause='The zero-g depends on whether the sensor warms or cools; relieve its package of '
-              'stress, or state the loop as an uncertainty.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT,
-                                 form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
-                                 proof=(ProofVariable.TEMPERATURE_RATE,
-                                        ProofVariable.TEMPERATURE)))
+@effect(
+    Place.ELECTRONICS,
+    Parameter(
+        'half_width_g',
+        'g',
+        -0.1,
+        0.1,
+        2e-3,
+        'physics: friction and creep in solder and die attach',
+        'zero-g while cooling minus that while warming, divided by 2',
+    ),
+    Parameter(
+        'reach_k',
+        'K',
+        0.1,
+        200.0,
+        10.0,
+        'physics: part of the range',
+        'half of the change after a reversal that opens the loop',
+        '',
+        neutral=10.0,
+        role=Role.SHAPE,
+        starts=(2.0, 10.0, 50.0),
+    ),
+    smooth=False,
+    follows=('temperature_c',),
+    cause='The zero-g depends on whether the sensor warms or cools; relieve its package of '
+    'stress, or state the loop as an uncertainty.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.HEAT,
+        form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
+        proof=(ProofVariable.TEMPERATURE_RATE, ProofVariable.TEMPERATURE),
+    ),
+)
 def thermal_hysteresis(signals: Signals, p: Parameters) -> None:
     """
     Thermal hysteresis: a zero-g that differs between warming and cooling.
@@ -478,16 +831,37 @@ def thermal_hysteresis(signals: Signals, p: Parameters) -> None:
     add(signals.output, (-half_width * branch for half_width in p['half_width_g']))
 
 
-@effect(Place.ELECTRONICS,
-        Parameter('amplitude_g', 'g', -0.5, 0.5, 2e-3, 'physics: self-heating by 20 K, 0.1 mg/K',
-                  'zero-g at power-on minus the settled one'),
-        Parameter('tau_s', 's', 1.0, 1e5, 300.0, 'physics: a board in still air',
-                  'time constant of settling', '', neutral=300.0, role=Role.SHAPE,
-                  starts=(15.0, 60.0, 300.0, 1500.0)),
-        invertible=True, follows=('time_s',),
-        cause='The sensor warms up after power-on; wait some time constants before measuring.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.HEAT, form=(FormDimension.TIME,),
-                                 proof=(ProofVariable.TIME,)))
+@effect(
+    Place.ELECTRONICS,
+    Parameter(
+        'amplitude_g',
+        'g',
+        -0.5,
+        0.5,
+        2e-3,
+        'physics: self-heating by 20 K, 0.1 mg/K',
+        'zero-g at power-on minus the settled one',
+    ),
+    Parameter(
+        'tau_s',
+        's',
+        1.0,
+        1e5,
+        300.0,
+        'physics: a board in still air',
+        'time constant of settling',
+        '',
+        neutral=300.0,
+        role=Role.SHAPE,
+        starts=(15.0, 60.0, 300.0, 1500.0),
+    ),
+    invertible=True,
+    follows=('time_s',),
+    cause='The sensor warms up after power-on; wait some time constants before measuring.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.HEAT, form=(FormDimension.TIME,), proof=(ProofVariable.TIME,)
+    ),
+)
 def warm_up(signals: Signals, p: Parameters) -> None:
     """
     Warm-up: a zero-g that settles after power-on.

@@ -26,35 +26,106 @@ from adxl_ros.model.effects.base import (
 from adxl_ros.model.filters import first_order_recursion
 import numpy as np
 
-_BITS = ('first_bit_v', 'second_bit_v', 'third_bit_v', 'fourth_bit_v', 'fifth_bit_v',
-         'sixth_bit_v')
+_BITS = (
+    'first_bit_v',
+    'second_bit_v',
+    'third_bit_v',
+    'fourth_bit_v',
+    'fifth_bit_v',
+    'sixth_bit_v',
+)
 """Parameters of the bits, the heaviest first."""
 
 
-_INL_STARTS = (1.0, 2.4, 4.0, 5.8, 7.6, 9.4, 11.2, 13.0, 14.8, 16.6, 18.4, 20.2, 22.0, 23.8, 25.6,
-               27.4, 29.2, 32.0, 36.0, 41.0, 47.0, 54.0, 62.0)
+_INL_STARTS = (
+    1.0,
+    2.4,
+    4.0,
+    5.8,
+    7.6,
+    9.4,
+    11.2,
+    13.0,
+    14.8,
+    16.6,
+    18.4,
+    20.2,
+    22.0,
+    23.8,
+    25.6,
+    27.4,
+    29.2,
+    32.0,
+    36.0,
+    41.0,
+    47.0,
+    54.0,
+    62.0,
+)
 """Periods from which a fit starts. Chosen: 1 g of either sign covers 0.4 of the full scale.
 A start that differs by a third of a period there, 0.9, explains half of the power of a sine. Above
 30 the steps are wider, because converters with so many segments are rare."""
 
 
-@effect(Place.ADC,
-        Parameter('amplitude_v', 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
-                  'amplitude of the sine by which it deviates from the straight line', ''),
-        Parameter('cosine_v', 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
-                  'amplitude of the cosine, which shifts the sine over the codes', '',
-                  typical=0.0, role=Role.OPTIONAL),
-        Parameter('cycles', '1', 0.5, 64.0, 8.0, 'physics: segments of a converter',
-                  'periods of the deviation over the full scale', '', neutral=8.0,
-                  role=Role.SHAPE, starts=_INL_STARTS),
-        *(Parameter(name, 'V', -0.05, 0.05, 3e-4, 'physics: 4 LSB of 16 bit at 5 V',
-                    f'error of the weight of bit {i}, the heaviest being 1', '', typical=0.0,
-                    role=Role.OPTIONAL, shaped=False)
-          for i, name in enumerate(_BITS, 1)),
-        invertible=True,
-        cause='The ADC is nonlinear; calibrate it with a voltage source, or choose another.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, form=(FormDimension.CODE,),
-                                 proof=(ProofVariable.OUTPUT,)))
+@effect(
+    Place.ADC,
+    Parameter(
+        'amplitude_v',
+        'V',
+        -0.05,
+        0.05,
+        3e-4,
+        'physics: 4 LSB of 16 bit at 5 V',
+        'amplitude of the sine by which it deviates from the straight line',
+        '',
+    ),
+    Parameter(
+        'cosine_v',
+        'V',
+        -0.05,
+        0.05,
+        3e-4,
+        'physics: 4 LSB of 16 bit at 5 V',
+        'amplitude of the cosine, which shifts the sine over the codes',
+        '',
+        typical=0.0,
+        role=Role.OPTIONAL,
+    ),
+    Parameter(
+        'cycles',
+        '1',
+        0.5,
+        64.0,
+        8.0,
+        'physics: segments of a converter',
+        'periods of the deviation over the full scale',
+        '',
+        neutral=8.0,
+        role=Role.SHAPE,
+        starts=_INL_STARTS,
+    ),
+    *(
+        Parameter(
+            name,
+            'V',
+            -0.05,
+            0.05,
+            3e-4,
+            'physics: 4 LSB of 16 bit at 5 V',
+            f'error of the weight of bit {i}, the heaviest being 1',
+            '',
+            typical=0.0,
+            role=Role.OPTIONAL,
+            shaped=False,
+        )
+        for i, name in enumerate(_BITS, 1)
+    ),
+    invertible=True,
+    cause='The ADC is nonlinear; calibrate it with a voltage source, or choose another.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.REMOUNT, form=(FormDimension.CODE,), proof=(ProofVariable.OUTPUT,)
+    ),
+)
 def adc_inl(signals: Signals, p: Parameters) -> None:
     """
     Integral nonlinearity of the ADC: one curve over its codes for all channels.
@@ -66,40 +137,83 @@ def adc_inl(signals: Signals, p: Parameters) -> None:
     """
     turn = 2 * np.pi * p['cycles'] / signals.vref_v
     for d, volts in enumerate(signals.input_v):
-        errors_v = [p[name] * function(turn * volts)
-                    for name, function in (('amplitude_v', np.sin), ('cosine_v', np.cos))
-                    if p[name]]
+        errors_v = [
+            p[name] * function(turn * volts)
+            for name, function in (('amplitude_v', np.sin), ('cosine_v', np.cos))
+            if p[name]
+        ]
         if any(p[name] for name in _BITS):
             code = np.floor(volts / signals.vref_v * 2 ** len(_BITS)).astype(int)
-            errors_v += [p[name] * ((code >> (len(_BITS) - bit) & 1) - 0.5)
-                         for bit, name in enumerate(_BITS, 1) if p[name]]
+            errors_v += [
+                p[name] * ((code >> (len(_BITS) - bit) & 1) - 0.5)
+                for bit, name in enumerate(_BITS, 1)
+                if p[name]
+            ]
         signals.volts[d] = sum(errors_v, signals.volts[d])
 
 
-@effect(Place.ELECTRONICS,
-        Parameter('lost_bits', 'bit', 0.0, 12.0, 3.0, 'physics: a driver that drops low bits',
-                  'number of bits that the ADC loses', ''),
-        Parameter('axis_lost_bits', 'bit', 0.0, 12.0, 3.0, 'physics: a converter for each axis',
-                  'number of further bits that the axis loses', typical=0.0,
-                  role=Role.OPTIONAL),
-        smooth=False, acts_on=ActsOn.NOISE, needs=(Need.ADC,),
-        cause='The ADC resolves less than stated; check its setting, reference and format.',
-        diagnosis=DiagnosisHints(detector=Detector.COARSE_CODES, proof=(ProofVariable.STEP,)))
+@effect(
+    Place.ELECTRONICS,
+    Parameter(
+        'lost_bits',
+        'bit',
+        0.0,
+        12.0,
+        3.0,
+        'physics: a driver that drops low bits',
+        'number of bits that the ADC loses',
+        '',
+    ),
+    Parameter(
+        'axis_lost_bits',
+        'bit',
+        0.0,
+        12.0,
+        3.0,
+        'physics: a converter for each axis',
+        'number of further bits that the axis loses',
+        typical=0.0,
+        role=Role.OPTIONAL,
+    ),
+    smooth=False,
+    acts_on=ActsOn.NOISE,
+    needs=(Need.ADC,),
+    cause='The ADC resolves less than stated; check its setting, reference and format.',
+    diagnosis=DiagnosisHints(detector=Detector.COARSE_CODES, proof=(ProofVariable.STEP,)),
+)
 def quantisation(signals: Signals, p: Parameters) -> None:
     """Quantisation that is coarser than the resolution of the ADC."""
     signals.lsb_v = signals.lsb_v * 2.0 ** p['lost_bits']
     for d, lost in enumerate(p['axis_lost_bits']):
-        signals.lsb_ratio[d] = signals.lsb_ratio[d] * 2.0 ** lost
+        signals.lsb_ratio[d] = signals.lsb_ratio[d] * 2.0**lost
 
 
-@effect(Place.ADC,
-        Parameter('rate_hz', 'Hz', 0.0, 1000.0, 0.2, 'physics: loose contacts, switching loads',
-                  'spikes per second and axis', ''),
-        Parameter('amplitude_v', 'V', 0.0, 10.0, 0.05, 'physics: loose contacts',
-                  'size of a spike, of either sign'),
-        smooth=False, acts_on=ActsOn.NOISE,
-        cause='Single samples have large errors; check for loose contacts and loads that switch.',
-        diagnosis=DiagnosisHints(detector=Detector.ISOLATED_SAMPLES, proof=(ProofVariable.STEP,)))
+@effect(
+    Place.ADC,
+    Parameter(
+        'rate_hz',
+        'Hz',
+        0.0,
+        1000.0,
+        0.2,
+        'physics: loose contacts, switching loads',
+        'spikes per second and axis',
+        '',
+    ),
+    Parameter(
+        'amplitude_v',
+        'V',
+        0.0,
+        10.0,
+        0.05,
+        'physics: loose contacts',
+        'size of a spike, of either sign',
+    ),
+    smooth=False,
+    acts_on=ActsOn.NOISE,
+    cause='Single samples have large errors; check for loose contacts and loads that switch.',
+    diagnosis=DiagnosisHints(detector=Detector.ISOLATED_SAMPLES, proof=(ProofVariable.STEP,)),
+)
 def spikes(signals: Signals, p: Parameters) -> None:
     """
     Spikes: single samples with a large error.
@@ -111,21 +225,40 @@ def spikes(signals: Signals, p: Parameters) -> None:
     drawn = signals.rng.random((*np.shape(signals.environment.time_s), axes, 2))
     hit = drawn[..., 0] < p['rate_hz'] * signals.dt_s
     sign = np.where(drawn[..., 1] < 0.5, -1.0, 1.0)
-    add(signals.volts, (np.where(hit[..., d], amplitude * sign[..., d], 0.0)
-                        for d, amplitude in enumerate(p['amplitude_v'])))
+    add(
+        signals.volts,
+        (
+            np.where(hit[..., d], amplitude * sign[..., d], 0.0)
+            for d, amplitude in enumerate(p['amplitude_v'])
+        ),
+    )
 
 
-_NEVER = -2 ** 40  # Index of a start that lies before any recording; chosen: far below 0
+_NEVER = -(2**40)  # Index of a start that lies before any recording; chosen: far below 0
 
 
-@effect(Place.CODE,
-        Parameter('rate_hz', 'Hz', 0.0, 1000.0, 0.1, 'physics: a bus that times out',
-                  'starts per second', ''),
-        Parameter('duration_s', 's', 1e-4, 100.0, 0.05, 'physics: a few frames',
-                  'time that the sample is held', '', neutral=0.05, role=Role.SHAPE),
-        smooth=False, acts_on=ActsOn.NOISE,
-        cause='The link repeats samples; check the bus, its load and its buffers.',
-        diagnosis=DiagnosisHints(detector=Detector.REPEATED_SAMPLES, proof=(ProofVariable.STEP,)))
+@effect(
+    Place.CODE,
+    Parameter(
+        'rate_hz', 'Hz', 0.0, 1000.0, 0.1, 'physics: a bus that times out', 'starts per second', ''
+    ),
+    Parameter(
+        'duration_s',
+        's',
+        1e-4,
+        100.0,
+        0.05,
+        'physics: a few frames',
+        'time that the sample is held',
+        '',
+        neutral=0.05,
+        role=Role.SHAPE,
+    ),
+    smooth=False,
+    acts_on=ActsOn.NOISE,
+    cause='The link repeats samples; check the bus, its load and its buffers.',
+    diagnosis=DiagnosisHints(detector=Detector.REPEATED_SAMPLES, proof=(ProofVariable.STEP,)),
+)
 def stuck(signals: Signals, p: Parameters) -> None:
     """
     Stuck samples: the link repeats its last sample for a while.
@@ -154,38 +287,69 @@ def stuck(signals: Signals, p: Parameters) -> None:
         signals.memory['newest'] = newest[-1] - count
 
 
-@effect(Place.CLOCK,
-        Parameter('offset_s', 's', -1.0, 1.0, 5e-3, 'physics: buffers between ADC and host',
-                  'delay of the stamps behind the samples', ''),
-        exact=True,
-        cause='The stamps of sensor and stage differ; synchronise the clocks, or state the delay.',
-        # Stamps have a latency of some 0.1 ms (chosen: buffers of a board that works).
-        diagnosis=DiagnosisHints(healthy_std=1e-4, revealed_by=Manoeuvre.SHAKE,
-                                 proof=(ProofVariable.FORCE_RATE,)))
+@effect(
+    Place.CLOCK,
+    Parameter(
+        'offset_s',
+        's',
+        -1.0,
+        1.0,
+        5e-3,
+        'physics: buffers between ADC and host',
+        'delay of the stamps behind the samples',
+        '',
+    ),
+    exact=True,
+    cause='The stamps of sensor and stage differ; synchronise the clocks, or state the delay.',
+    # Stamps have a latency of some 0.1 ms (chosen: buffers of a board that works).
+    diagnosis=DiagnosisHints(
+        healthy_std=1e-4, revealed_by=Manoeuvre.SHAKE, proof=(ProofVariable.FORCE_RATE,)
+    ),
+)
 def time_offset(signals: Signals, p: Parameters) -> None:
     """Time offset: the stamps are late."""
     signals.time_s = signals.time_s - p['offset_s']
 
 
-@effect(Place.CLOCK,
-        Parameter('ratio', 's/s', -0.01, 0.01, 1e-4, 'physics: crystals, 100 ppm',
-                  'relative excess of the rate of the clock that makes the stamps', ''),
-        exact=True,
-        cause='The clocks of sensor and stage drift apart; discipline them by one source.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
-                                 proof=(ProofVariable.FORCE_RATE, ProofVariable.TIME)))
+@effect(
+    Place.CLOCK,
+    Parameter(
+        'ratio',
+        's/s',
+        -0.01,
+        0.01,
+        1e-4,
+        'physics: crystals, 100 ppm',
+        'relative excess of the rate of the clock that makes the stamps',
+        '',
+    ),
+    exact=True,
+    cause='The clocks of sensor and stage drift apart; discipline them by one source.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.SPEEDS, proof=(ProofVariable.FORCE_RATE, ProofVariable.TIME)
+    ),
+)
 def clock_skew(signals: Signals, p: Parameters) -> None:
     """Clock skew: the clock that stamps the samples runs fast or slow."""
     signals.time_s = signals.time_s - p['ratio'] * signals.time_s
 
 
-@effect(Place.ELECTRONICS,
-        Parameter('ratio', '1', -0.99, 100.0, 0.3,
-                  'ADXL203 datasheet: 190 instead of 110 ug/sqrt(Hz) at 3 V',
-                  'noise density divided by the stated one, minus 1'),
-        acts_on=ActsOn.NOISE, needs=(Need.NOISE,),
-        cause='The noise is not the stated one; check the supply, its decoupling and the cable.',
-        diagnosis=DiagnosisHints(detector=Detector.NOISE_LEVEL, proof=(ProofVariable.FREQUENCY,)))
+@effect(
+    Place.ELECTRONICS,
+    Parameter(
+        'ratio',
+        '1',
+        -0.99,
+        100.0,
+        0.3,
+        'ADXL203 datasheet: 190 instead of 110 ug/sqrt(Hz) at 3 V',
+        'noise density divided by the stated one, minus 1',
+    ),
+    acts_on=ActsOn.NOISE,
+    needs=(Need.NOISE,),
+    cause='The noise is not the stated one; check the supply, its decoupling and the cable.',
+    diagnosis=DiagnosisHints(detector=Detector.NOISE_LEVEL, proof=(ProofVariable.FREQUENCY,)),
+)
 def noise_excess(signals: Signals, p: Parameters) -> None:
     """White noise beyond the stated density."""
     for d, ratio in enumerate(p['ratio']):
@@ -193,7 +357,7 @@ def noise_excess(signals: Signals, p: Parameters) -> None:
 
 
 _LOWEST_HZ = 1e-5  # Lowest corner, Hz; chosen: the density is 1/f from ten times this
-_HIGHEST_RATIO = 10 ** -0.5
+_HIGHEST_RATIO = 10**-0.5
 """Highest corner divided by the sample rate; chosen: aliasing replaces the missing corners."""
 _PER_DECADE = 2
 """Corners per decade; chosen: the density is 1/f within 3 % up to a fifth of the sample rate."""
@@ -221,16 +385,28 @@ def _flicker_filter(rate_hz: float) -> np.ndarray:
     return sections
 
 
-@effect(Place.ADC,
-        Parameter('density_g_per_rthz', 'g/sqrt(Hz)', 0.0, 0.1, 1e-4,
-                  'physics: corner near 1 Hz at 110 ug/sqrt(Hz)',
-                  'density at 1 Hz; it falls with the root of the frequency'),
-        acts_on=ActsOn.NOISE,
-        cause='The electronics have 1/f noise; average shorter and take the zero more often.',
-        # A healthy unit has 0.2 mg rms over five decades of frequency at most (tuned by hand on
-        # simulated recordings).
-        diagnosis=DiagnosisHints(drift=DriftSpectrum.FLICKER, healthy_density=6e-5,
-                                 revealed_by=Manoeuvre.HEAT, proof=(ProofVariable.FREQUENCY,)))
+@effect(
+    Place.ADC,
+    Parameter(
+        'density_g_per_rthz',
+        'g/sqrt(Hz)',
+        0.0,
+        0.1,
+        1e-4,
+        'physics: corner near 1 Hz at 110 ug/sqrt(Hz)',
+        'density at 1 Hz; it falls with the root of the frequency',
+    ),
+    acts_on=ActsOn.NOISE,
+    cause='The electronics have 1/f noise; average shorter and take the zero more often.',
+    # A healthy unit has 0.2 mg rms over five decades of frequency at most (tuned by hand on
+    # simulated recordings).
+    diagnosis=DiagnosisHints(
+        drift=DriftSpectrum.FLICKER,
+        healthy_density=6e-5,
+        revealed_by=Manoeuvre.HEAT,
+        proof=(ProofVariable.FREQUENCY,),
+    ),
+)
 def flicker(signals: Signals, p: Parameters) -> None:
     """
     Flicker noise: 1/f noise, which is 0 at power-on.
@@ -246,27 +422,56 @@ def flicker(signals: Signals, p: Parameters) -> None:
         return
     # scipy.signal takes 0.5 s to import.
     from scipy.signal import sosfilt
+
     sections = _flicker_filter(1 / signals.dt_s)
     noise, signals.memory['state'] = sosfilt(
-        sections, signals.rng.standard_normal(shape), axis=0,
-        zi=signals.memory.get('state', np.zeros((len(sections), 2, *shape[1:]))))
-    add(signals.volts, (density * noise[..., d] * signals.nominal_scale_v_per_g[d]
-                        for d, density in enumerate(p['density_g_per_rthz'])))
+        sections,
+        signals.rng.standard_normal(shape),
+        axis=0,
+        zi=signals.memory.get('state', np.zeros((len(sections), 2, *shape[1:]))),
+    )
+    add(
+        signals.volts,
+        (
+            density * noise[..., d] * signals.nominal_scale_v_per_g[d]
+            for d, density in enumerate(p['density_g_per_rthz'])
+        ),
+    )
 
 
-@effect(Place.ADC,
-        Parameter('density_g_per_rts', 'g/sqrt(s)', 0.0, 0.1, 2e-5,
-                  'physics: slow stress in package and solder',
-                  'rms of the wandering zero-g divided by the root of time'),
-        Parameter('return_per_s', '1/s', 0.0, 1.0, 1e-2, 'physics: bounds of the stress',
-                  'inverse correlation time of a walk that has bounds', typical=0.0,
-                  role=Role.OPTIONAL),
-        acts_on=ActsOn.NOISE,
-        cause='The zero-g wanders; take the zero again more often, or choose a quieter sensor.',
-        # A healthy unit drifts by 0.3 mg within 100 s at most (tuned by hand on simulated
-        # recordings).
-        diagnosis=DiagnosisHints(drift=DriftSpectrum.RANDOM_WALK, healthy_density=3e-5,
-                                 revealed_by=Manoeuvre.HEAT, proof=(ProofVariable.FREQUENCY,)))
+@effect(
+    Place.ADC,
+    Parameter(
+        'density_g_per_rts',
+        'g/sqrt(s)',
+        0.0,
+        0.1,
+        2e-5,
+        'physics: slow stress in package and solder',
+        'rms of the wandering zero-g divided by the root of time',
+    ),
+    Parameter(
+        'return_per_s',
+        '1/s',
+        0.0,
+        1.0,
+        1e-2,
+        'physics: bounds of the stress',
+        'inverse correlation time of a walk that has bounds',
+        typical=0.0,
+        role=Role.OPTIONAL,
+    ),
+    acts_on=ActsOn.NOISE,
+    cause='The zero-g wanders; take the zero again more often, or choose a quieter sensor.',
+    # A healthy unit drifts by 0.3 mg within 100 s at most (tuned by hand on simulated
+    # recordings).
+    diagnosis=DiagnosisHints(
+        drift=DriftSpectrum.RANDOM_WALK,
+        healthy_density=3e-5,
+        revealed_by=Manoeuvre.HEAT,
+        proof=(ProofVariable.FREQUENCY,),
+    ),
+)
 def bias_walk(signals: Signals, p: Parameters) -> None:
     """
     Random walk of the zero-g: acceleration random walk, rate noise of an Allan deviation.
@@ -284,23 +489,53 @@ def bias_walk(signals: Signals, p: Parameters) -> None:
     returns = np.broadcast_to(p.get('return_per_s', 0.0), density.shape) * signals.dt_s
     shrink = -np.expm1(-2 * returns) / np.where(returns, 2 * returns, 1.0)
     drawn *= density * np.sqrt(np.where(returns, shrink, 1.0) * signals.dt_s)
-    walk = np.stack([first_order_recursion(1.0, a, drawn[..., d], last[..., d])
-                     for d, a in enumerate(np.exp(-returns))], axis=-1)
+    walk = np.stack(
+        [
+            first_order_recursion(1.0, a, drawn[..., d], last[..., d])
+            for d, a in enumerate(np.exp(-returns))
+        ],
+        axis=-1,
+    )
     signals.memory['walked'] = walk[-1]
-    add(signals.volts, (walk[..., d] * scale
-                        for d, scale in enumerate(signals.nominal_scale_v_per_g)))
+    add(
+        signals.volts,
+        (walk[..., d] * scale for d, scale in enumerate(signals.nominal_scale_v_per_g)),
+    )
 
 
-@effect(Place.ADC,
-        Parameter('amplitude_v', 'V', -1.0, 1.0, 1e-3, 'physics: unshielded cable',
-                  'amplitude of the sine'),
-        Parameter('frequency_hz', 'Hz', 1.0, 1000.0, 50.0, 'mains: 50 or 60 Hz',
-                  'frequency of the sine', '', neutral=50.0, role=Role.SHAPE),
-        Parameter('phase_rad', 'rad', -7.0, 7.0, 1.0, 'chosen: any', 'phase at time 0', '',
-                  typical=0.0, role=Role.OPTIONAL),
-        acts_on=ActsOn.NOISE,
-        cause='The mains couple into the signal; shield and twist the cable, and ground one end.',
-        diagnosis=DiagnosisHints(detector=Detector.MAINS_LINE, proof=(ProofVariable.FREQUENCY,)))
+@effect(
+    Place.ADC,
+    Parameter(
+        'amplitude_v', 'V', -1.0, 1.0, 1e-3, 'physics: unshielded cable', 'amplitude of the sine'
+    ),
+    Parameter(
+        'frequency_hz',
+        'Hz',
+        1.0,
+        1000.0,
+        50.0,
+        'mains: 50 or 60 Hz',
+        'frequency of the sine',
+        '',
+        neutral=50.0,
+        role=Role.SHAPE,
+    ),
+    Parameter(
+        'phase_rad',
+        'rad',
+        -7.0,
+        7.0,
+        1.0,
+        'chosen: any',
+        'phase at time 0',
+        '',
+        typical=0.0,
+        role=Role.OPTIONAL,
+    ),
+    acts_on=ActsOn.NOISE,
+    cause='The mains couple into the signal; shield and twist the cable, and ground one end.',
+    diagnosis=DiagnosisHints(detector=Detector.MAINS_LINE, proof=(ProofVariable.FREQUENCY,)),
+)
 def mains_hum(signals: Signals, p: Parameters) -> None:
     """
     Mains hum: a sine at the input of the ADC.

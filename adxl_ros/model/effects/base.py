@@ -166,8 +166,14 @@ class Maths(NamedTuple):
 
 ARRAYS = Maths(np.sqrt, np.sin, np.cos, np.arctan2, np.maximum, np.where)
 """Functions for arrays, (n,)."""
-FLOATS = Maths(math.sqrt, math.sin, math.cos, math.atan2, max,
-               lambda condition, value, otherwise: value if condition else otherwise)
+FLOATS = Maths(
+    math.sqrt,
+    math.sin,
+    math.cos,
+    math.atan2,
+    max,
+    lambda condition, value, otherwise: value if condition else otherwise,
+)
 """Functions for single samples: ten times faster than those of numpy."""
 
 Parameters = dict[str, Any]
@@ -395,9 +401,11 @@ class Effect:
         """Return what it is an error of."""
         if self.place is Place.REFERENCE:
             return Concern.REFERENCE
-        return Concern.STAGE if self.place is Place.STAGE \
-            or {Need.STAGE, Need.ROTATION} & set(self.needs) \
+        return (
+            Concern.STAGE
+            if self.place is Place.STAGE or {Need.STAGE, Need.ROTATION} & set(self.needs)
             else Concern.SENSOR
+        )
 
 
 def add(components: Components, values: Iterable[Value]) -> None:
@@ -406,7 +414,8 @@ def add(components: Components, values: Iterable[Value]) -> None:
         components[d] = components[d] + value
 
 
-def effect(place: Place, *parameters: Parameter, cause: str, **properties: Any
-           ) -> Callable[[Apply], Effect]:
+def effect(
+    place: Place, *parameters: Parameter, cause: str, **properties: Any
+) -> Callable[[Apply], Effect]:
     """Turn a function into the effect of its name, with the properties of `Effect`."""
     return lambda apply: Effect(apply.__name__, place, parameters, apply, cause, **properties)

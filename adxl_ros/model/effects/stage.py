@@ -30,29 +30,60 @@ from adxl_ros.model.kinematics import angular_motion, carried_acceleration
 import numpy as np
 
 
-@effect(Place.STAGE,
-        Parameter('offset_mps2', 'm/s^2', -5.0, 5.0, 0.01,
-                  'geodesy: 9.780 at the equator, 9.832 at the poles',
-                  'local gravity minus the stated one', ''),
-        exact=True, invertible=True, needs=(Need.STAGE,),
-        cause='Local gravity is not the stated one; look it up for latitude and height.',
-        diagnosis=DiagnosisHints(imitated=True, revealed_by=Manoeuvre.REMOUNT,
-                                 proof=(ProofVariable.OWN_FORCE,)))
+@effect(
+    Place.STAGE,
+    Parameter(
+        'offset_mps2',
+        'm/s^2',
+        -5.0,
+        5.0,
+        0.01,
+        'geodesy: 9.780 at the equator, 9.832 at the poles',
+        'local gravity minus the stated one',
+        '',
+    ),
+    exact=True,
+    invertible=True,
+    needs=(Need.STAGE,),
+    cause='Local gravity is not the stated one; look it up for latitude and height.',
+    diagnosis=DiagnosisHints(
+        imitated=True, revealed_by=Manoeuvre.REMOUNT, proof=(ProofVariable.OWN_FORCE,)
+    ),
+)
 def gravity(signals: Signals, p: Parameters) -> None:
     """Local gravity that differs from the stated one."""
     signals.gravity_mps2 = signals.gravity_mps2 + p['offset_mps2']
 
 
-@effect(Place.STAGE,
-        Parameter('x_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
-                  "turn of the vertical about the base's x, across the axis of alpha", ''),
-        Parameter('y_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
-                  'turn of the vertical about the axis of alpha; it equals an offset of alpha',
-                  ''),
-        exact=True, needs=(Need.STAGE,),
-        cause='The base of the stage is not level; level it, or measure its tilt.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
-                                 proof=(ProofVariable.BETA, ProofVariable.ALPHA)))
+@effect(
+    Place.STAGE,
+    Parameter(
+        'x_rad',
+        'rad',
+        -0.5,
+        0.5,
+        1.75e-3,
+        'paper: level of 0.1 deg',
+        "turn of the vertical about the base's x, across the axis of alpha",
+        '',
+    ),
+    Parameter(
+        'y_rad',
+        'rad',
+        -0.5,
+        0.5,
+        1.75e-3,
+        'paper: level of 0.1 deg',
+        'turn of the vertical about the axis of alpha; it equals an offset of alpha',
+        '',
+    ),
+    exact=True,
+    needs=(Need.STAGE,),
+    cause='The base of the stage is not level; level it, or measure its tilt.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.PLANES, proof=(ProofVariable.BETA, ProofVariable.ALPHA)
+    ),
+)
 def base_tilt(signals: Signals, p: Parameters) -> None:
     """
     Tilt of the stage's base: it is not level.
@@ -73,16 +104,37 @@ def _turned(vector: Components, x_rad: float, y_rad: float, z_rad: float = 0.0) 
     return [x * c - y * s, x * s + y * c, z]
 
 
-@effect(Place.STAGE,
-        Parameter('alpha_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
-                  'true alpha minus the encoder', ''),
-        Parameter('beta_rad', 'rad', -0.5, 0.5, 1.75e-3, 'paper: level of 0.1 deg',
-                  'true beta minus the encoder', ''),
-        exact=True, needs=(Need.STAGE,),
-        cause='The zero of an encoder is wrong; set it by a level, or remount the sensor by '
-              '180 deg.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.REMOUNT, half_turn='beta_rad',
-                                 proof=(ProofVariable.BETA, ProofVariable.ALPHA)))
+@effect(
+    Place.STAGE,
+    Parameter(
+        'alpha_rad',
+        'rad',
+        -0.5,
+        0.5,
+        1.75e-3,
+        'paper: level of 0.1 deg',
+        'true alpha minus the encoder',
+        '',
+    ),
+    Parameter(
+        'beta_rad',
+        'rad',
+        -0.5,
+        0.5,
+        1.75e-3,
+        'paper: level of 0.1 deg',
+        'true beta minus the encoder',
+        '',
+    ),
+    exact=True,
+    needs=(Need.STAGE,),
+    cause='The zero of an encoder is wrong; set it by a level, or remount the sensor by 180 deg.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.REMOUNT,
+        half_turn='beta_rad',
+        proof=(ProofVariable.BETA, ProofVariable.ALPHA),
+    ),
+)
 def stage_offset(signals: Signals, p: Parameters) -> None:
     """Offset of the stage's encoders: true angle minus reading."""
     for joint in ('alpha', 'beta'):
@@ -90,17 +142,31 @@ def stage_offset(signals: Signals, p: Parameters) -> None:
         setattr(signals, joint, read._replace(position=read.position + p[f'{joint}_rad']))
 
 
-@effect(Place.STAGE,
-        *(Parameter(f'{joint}_{wave}_rad', 'rad', -0.2, 0.2, 1e-3,
-                    'physics: a disc of radius 20 mm, 20 um off its axis',
-                    f'true {joint} minus the encoder, amplitude of the {wave}', '')
-          for joint in ('alpha', 'beta') for wave in ('sine', 'cosine')),
-        needs=(Need.STAGE,),
-        cause='The disc of an encoder is not centred on its axis; '
-              'use two reading heads, or a table of errors.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
-                                 form=(FormDimension.ALPHA, FormDimension.BETA),
-                                 proof=(ProofVariable.BETA, ProofVariable.ALPHA)))
+@effect(
+    Place.STAGE,
+    *(
+        Parameter(
+            f'{joint}_{wave}_rad',
+            'rad',
+            -0.2,
+            0.2,
+            1e-3,
+            'physics: a disc of radius 20 mm, 20 um off its axis',
+            f'true {joint} minus the encoder, amplitude of the {wave}',
+            '',
+        )
+        for joint in ('alpha', 'beta')
+        for wave in ('sine', 'cosine')
+    ),
+    needs=(Need.STAGE,),
+    cause='The disc of an encoder is not centred on its axis; '
+    'use two reading heads, or a table of errors.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.PLANES,
+        form=(FormDimension.ALPHA, FormDimension.BETA),
+        proof=(ProofVariable.BETA, ProofVariable.ALPHA),
+    ),
+)
 def stage_eccentricity(signals: Signals, p: Parameters) -> None:
     """
     Eccentricity of the stage's encoder discs: an error with one period per turn.
@@ -113,23 +179,51 @@ def stage_eccentricity(signals: Signals, p: Parameters) -> None:
             q, velocity, acceleration = getattr(signals, joint)
             sine, cosine = np.sin(q), np.cos(q)
             slope, bend = s * cosine - c * sine, -s * sine - c * cosine
-            setattr(signals, joint, Joint(
-                q + s * sine + c * cosine, velocity + slope * velocity,
-                acceleration + slope * acceleration + bend * velocity * velocity))
+            setattr(
+                signals,
+                joint,
+                Joint(
+                    q + s * sine + c * cosine,
+                    velocity + slope * velocity,
+                    acceleration + slope * acceleration + bend * velocity * velocity,
+                ),
+            )
 
 
 _ROUNDING = 1e-9  # Relative rounding error of a dead band; chosen: far above that of float64
 
 
-@effect(Place.STAGE,
-        Parameter('alpha_rad', 'rad', 0.0, 0.2, 1e-3, 'physics: worm gears, 3 arcmin',
-                  'dead band of alpha, its full width', ''),
-        Parameter('beta_rad', 'rad', 0.0, 0.2, 1e-3, 'physics: worm gears, 3 arcmin',
-                  'dead band of beta, its full width', ''),
-        smooth=False, needs=(Need.STAGE,),
-        cause='The gears have play; approach each pose from the same side, or preload them.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.DIRECTION,),
-                                 proof=(ProofVariable.BETA, ProofVariable.ALPHA)))
+@effect(
+    Place.STAGE,
+    Parameter(
+        'alpha_rad',
+        'rad',
+        0.0,
+        0.2,
+        1e-3,
+        'physics: worm gears, 3 arcmin',
+        'dead band of alpha, its full width',
+        '',
+    ),
+    Parameter(
+        'beta_rad',
+        'rad',
+        0.0,
+        0.2,
+        1e-3,
+        'physics: worm gears, 3 arcmin',
+        'dead band of beta, its full width',
+        '',
+    ),
+    smooth=False,
+    needs=(Need.STAGE,),
+    cause='The gears have play; approach each pose from the same side, or preload them.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.SPEEDS,
+        form=(FormDimension.DIRECTION,),
+        proof=(ProofVariable.BETA, ProofVariable.ALPHA),
+    ),
+)
 def backlash(signals: Signals, p: Parameters) -> None:
     """
     Backlash of the stage: a joint follows its encoder with play.
@@ -146,16 +240,34 @@ def backlash(signals: Signals, p: Parameters) -> None:
             setattr(signals, joint, Joint(position, velocity * touches, acceleration * touches))
 
 
-@effect(Place.FORCE,
-        *(Parameter(f'{axis}_m', 'm', -2.0, 2.0, 0.02, 'physics: size of a board',
-                    f"from the axis to the sensor along the sensor's {axis}", '')
-          for axis in AXES),
-        exact=True, needs=(Need.ROTATION,),
-        cause='The sensor is not on the axis of rotation; mount it there, or state the arm.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
-                                 proof=(ProofVariable.ALPHA_RATE, ProofVariable.BETA_RATE,
-                                        ProofVariable.ALPHA_ACCELERATION,
-                                        ProofVariable.BETA_ACCELERATION)))
+@effect(
+    Place.FORCE,
+    *(
+        Parameter(
+            f'{axis}_m',
+            'm',
+            -2.0,
+            2.0,
+            0.02,
+            'physics: size of a board',
+            f"from the axis to the sensor along the sensor's {axis}",
+            '',
+        )
+        for axis in AXES
+    ),
+    exact=True,
+    needs=(Need.ROTATION,),
+    cause='The sensor is not on the axis of rotation; mount it there, or state the arm.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.SPEEDS,
+        proof=(
+            ProofVariable.ALPHA_RATE,
+            ProofVariable.BETA_RATE,
+            ProofVariable.ALPHA_ACCELERATION,
+            ProofVariable.BETA_ACCELERATION,
+        ),
+    ),
+)
 def lever_arm(signals: Signals, p: Parameters) -> None:
     """Lever arm: rotation accelerates a sensor beside the axes of the stage, or the frame."""
     r = [p['x_m'], p['y_m'], p['z_m']]
@@ -165,17 +277,28 @@ def lever_arm(signals: Signals, p: Parameters) -> None:
         signals.force = [f + a for f, a in zip(signals.force, added)]
 
 
-@effect(Place.REFERENCE,
-        *(Parameter(f'{axis}_rad', 'rad', -0.5, 0.5, 0.0175,
-                    'physics: markers are placed to some 1 deg',
-                    f'turn of the specific force about {axis}, from the reference to the '
-                    'sensor', '')
-          for axis in AXES),
-        exact=True,
-        cause='The frame of the reference is turned against that of the sensor; state the '
-              'rotation, or align the two.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
-                                 proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)))
+@effect(
+    Place.REFERENCE,
+    *(
+        Parameter(
+            f'{axis}_rad',
+            'rad',
+            -0.5,
+            0.5,
+            0.0175,
+            'physics: markers are placed to some 1 deg',
+            f'turn of the specific force about {axis}, from the reference to the sensor',
+            '',
+        )
+        for axis in AXES
+    ),
+    exact=True,
+    cause='The frame of the reference is turned against that of the sensor; state the '
+    'rotation, or align the two.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.PLANES, proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)
+    ),
+)
 def reference_frame(signals: Signals, p: Parameters) -> None:
     """
     Rotation between the frame of the reference and that of the sensor.
@@ -185,14 +308,23 @@ def reference_frame(signals: Signals, p: Parameters) -> None:
     signals.force = _turned(signals.force, p['x_rad'], p['y_rad'], p['z_rad'])
 
 
-@effect(Place.REFERENCE,
-        Parameter('delay_s', 's', 0.0, 1.0, 5e-3, 'physics: filters and transport of a tracker',
-                  'delay of the stamps of the reference behind its motion', ''),
-        exact=True,
-        cause='The reference is late, or the stamps of the sensor are early; synchronise the '
-              'clocks, or state the delay.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS,
-                                 proof=(ProofVariable.FORCE_RATE,)))
+@effect(
+    Place.REFERENCE,
+    Parameter(
+        'delay_s',
+        's',
+        0.0,
+        1.0,
+        5e-3,
+        'physics: filters and transport of a tracker',
+        'delay of the stamps of the reference behind its motion',
+        '',
+    ),
+    exact=True,
+    cause='The reference is late, or the stamps of the sensor are early; synchronise the '
+    'clocks, or state the delay.',
+    diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, proof=(ProofVariable.FORCE_RATE,)),
+)
 def reference_delay(signals: Signals, p: Parameters) -> None:
     """Delay of the reference: its stamps are late."""
     signals.time_s = signals.time_s - p['delay_s']
@@ -216,39 +348,77 @@ def _restoring_gain(frequency_hz: np.ndarray, p: Parameters) -> np.ndarray:
     relative = (2 * np.pi * frequency_hz * p['length_s']) ** p['steepness']
     log_passed = -_ORDER * np.log1p(relative / (2 * _ORDER))
     passed = np.exp(log_passed)
-    restoring = passed / (passed ** 2 + (p['lost_gain'] * (1 - passed)) ** 2)
+    restoring = passed / (passed**2 + (p['lost_gain'] * (1 - passed)) ** 2)
     if not p['phase']:
         return restoring
     # The phase of a causal filter follows from the logarithm of its gain.
     cepstrum = np.fft.irfft(log_passed)
     half = len(cepstrum) // 2
     cepstrum[1:half] *= 2
-    cepstrum[half + 1:] = 0.0
-    phase_rad = np.fft.rfft(cepstrum).imag[:len(log_passed)]
+    cepstrum[half + 1 :] = 0.0
+    phase_rad = np.fft.rfft(cepstrum).imag[: len(log_passed)]
     return restoring * np.exp(-1j * p['phase'] * phase_rad)
 
 
-@effect(Place.REFERENCE,
-        Parameter('length_s', 's', 0.0, 0.5, 5e-3,
-                  'practice: marker positions are smoothed at 3 to 12 Hz, lengths of 40 to 10 ms',
-                  'length σ of the kernel; half of the power is lost near 0.14/σ', '',
-                  typical=0.02, starts=(0.003, 0.006, 0.012, 0.025, 0.05)),
-        Parameter('steepness', '1', 1.5, 12.0, 2.0,
-                  'physics: 2.3 is a Gaussian, 3.2 a Butterworth filter of order 2',
-                  'exponent n of the attenuation', '', neutral=2.0, role=Role.SHAPE,
-                  starts=(2.3, 4.5)),
-        Parameter('lost_gain', '1', 0.1, 0.5, 0.2,
-                  'measured: optical tracking against an accelerometer, 0.1 to 0.4',
-                  'gain of the filter below which errors of the reference hide the motion', '',
-                  neutral=0.2, role=Role.SHAPE, starts=(0.12, 0.35)),
-        Parameter('phase', '1', 0.0, 1.0, 1.0,
-                  'physics: 0 is smoothed forth and back, 1 while it is recorded',
-                  'phase divided by that of a causal filter', '', neutral=1.0, role=Role.SHAPE,
-                  starts=(0.0, 1.0)),
-        cause='The reference is smoother than the motion; use it with less smoothing, or compare '
-              'slow motion only.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,),
-                                 proof=(ProofVariable.FREQUENCY,)))
+@effect(
+    Place.REFERENCE,
+    Parameter(
+        'length_s',
+        's',
+        0.0,
+        0.5,
+        5e-3,
+        'practice: marker positions are smoothed at 3 to 12 Hz, lengths of 40 to 10 ms',
+        'length σ of the kernel; half of the power is lost near 0.14/σ',
+        '',
+        typical=0.02,
+        starts=(0.003, 0.006, 0.012, 0.025, 0.05),
+    ),
+    Parameter(
+        'steepness',
+        '1',
+        1.5,
+        12.0,
+        2.0,
+        'physics: 2.3 is a Gaussian, 3.2 a Butterworth filter of order 2',
+        'exponent n of the attenuation',
+        '',
+        neutral=2.0,
+        role=Role.SHAPE,
+        starts=(2.3, 4.5),
+    ),
+    Parameter(
+        'lost_gain',
+        '1',
+        0.1,
+        0.5,
+        0.2,
+        'measured: optical tracking against an accelerometer, 0.1 to 0.4',
+        'gain of the filter below which errors of the reference hide the motion',
+        '',
+        neutral=0.2,
+        role=Role.SHAPE,
+        starts=(0.12, 0.35),
+    ),
+    Parameter(
+        'phase',
+        '1',
+        0.0,
+        1.0,
+        1.0,
+        'physics: 0 is smoothed forth and back, 1 while it is recorded',
+        'phase divided by that of a causal filter',
+        '',
+        neutral=1.0,
+        role=Role.SHAPE,
+        starts=(0.0, 1.0),
+    ),
+    cause='The reference is smoother than the motion; use it with less smoothing, or compare '
+    'slow motion only.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,), proof=(ProofVariable.FREQUENCY,)
+    ),
+)
 def reference_filter(signals: Signals, p: Parameters) -> None:
     """
     Filter of the reference: it is smoother than the motion, as optical tracking is.
@@ -268,39 +438,63 @@ def reference_filter(signals: Signals, p: Parameters) -> None:
         middle = (even[0] + even[-1]) / 2
         padded = np.pad(even - middle, margin, mode='reflect', reflect_type='odd')
         lacking = np.fft.irfft(np.fft.rfft(padded, size) * restoring, size)
-        signals.force[d] = stated + np.interp(signals.time_s, even_s,
-                                              lacking[margin:margin + count])
+        signals.force[d] = stated + np.interp(
+            signals.time_s, even_s, lacking[margin : margin + count]
+        )
 
 
 ROBOT_JOINTS = 8
 """Joints of a robot whose offsets are errors of their own; chosen: an arm has six or seven."""
 
 
-@effect(Place.REFERENCE,
-        *(Parameter(f'joint{number}_rad', 'rad', -0.5, 0.5, 5e-3,
-                    'practice: joints are mastered to some 0.1 deg',
-                    f'true angle of joint {number} of the chain minus its encoder; m for a '
-                    'linear one', '') for number in range(1, ROBOT_JOINTS + 1)),
-        exact=True, needs=(Need.ROBOT,),
-        cause='The zero of a joint is wrong, so that the robot stands otherwise than its encoders '
-              'say; master the joint again.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.PLANES,
-                                 proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)))
+@effect(
+    Place.REFERENCE,
+    *(
+        Parameter(
+            f'joint{number}_rad',
+            'rad',
+            -0.5,
+            0.5,
+            5e-3,
+            'practice: joints are mastered to some 0.1 deg',
+            f'true angle of joint {number} of the chain minus its encoder; m for a linear one',
+            '',
+        )
+        for number in range(1, ROBOT_JOINTS + 1)
+    ),
+    exact=True,
+    needs=(Need.ROBOT,),
+    cause='The zero of a joint is wrong, so that the robot stands otherwise than its encoders '
+    'say; master the joint again.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.PLANES, proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)
+    ),
+)
 def joint_offset(signals: Signals, p: Parameters) -> None:
     """Offsets of the joints of a robot: true angle minus reading."""
     for number in range(1, ROBOT_JOINTS + 1):
         _add_mode(signals, f'joint{number}', p[f'joint{number}_rad'])
 
 
-@effect(Place.REFERENCE,
-        Parameter('compliance_s2', 's^2', 0.0, 0.01, 1e-4,
-                  'physics: a first resonance of 16 Hz, 1/(2*pi*f)^2',
-                  'angle by which a joint lags, divided by its angular acceleration', ''),
-        needs=(Need.ROBOT,),
-        cause='The links or gears of the robot yield to their own inertia; move more slowly, or '
-              'model them.',
-        diagnosis=DiagnosisHints(revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,),
-                                 proof=(ProofVariable.FORCE_RATE,)))
+@effect(
+    Place.REFERENCE,
+    Parameter(
+        'compliance_s2',
+        's^2',
+        0.0,
+        0.01,
+        1e-4,
+        'physics: a first resonance of 16 Hz, 1/(2*pi*f)^2',
+        'angle by which a joint lags, divided by its angular acceleration',
+        '',
+    ),
+    needs=(Need.ROBOT,),
+    cause='The links or gears of the robot yield to their own inertia; move more slowly, or '
+    'model them.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,), proof=(ProofVariable.FORCE_RATE,)
+    ),
+)
 def flexible_link(signals: Signals, p: Parameters) -> None:
     """Flexible links of a robot: its joints follow their encoders by q − c·d²q/dt²."""
     _add_mode(signals, 'flexible', p['compliance_s2'])

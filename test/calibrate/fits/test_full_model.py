@@ -34,17 +34,20 @@ def errors(fit, truth):
     """Return errors of the coefficients and their standard deviations, (p,) each."""
     names = fit.fitted.covariance_names
     truth = with_neutral(truth, {name.effect for name in names})
-    return (get(fit.fitted, names) - get(truth, names),
-            np.sqrt(np.diag(fit.fitted.covariance)))
+    return (get(fit.fitted, names) - get(truth, names), np.sqrt(np.diag(fit.fitted.covariance)))
 
 
-@pytest.mark.parametrize('axes, units, per_setting', [
-    ('xy', 40, True), ('xyz', 24, False)])
+@pytest.mark.parametrize('axes, units, per_setting', [('xy', 40, True), ('xyz', 24, False)])
 def test_ninety_percent_intervals_cover_ninety_percent(axes, units, per_setting):
     """The coverage is right over hundreds of intervals, for all kinds of stage errors."""
-    z = np.concatenate([np.divide(*errors(full_model.fit_full(sensor, poses), truth))
-                        for sensor, truth, poses in (
-                            swept_unit(k, axes, per_setting=per_setting) for k in range(units))])
+    z = np.concatenate(
+        [
+            np.divide(*errors(full_model.fit_full(sensor, poses), truth))
+            for sensor, truth, poses in (
+                swept_unit(k, axes, per_setting=per_setting) for k in range(units)
+            )
+        ]
+    )
     assert len(z) > 550
     assert 0.875 < np.mean(np.abs(z) < Z_90) < 0.93
 
@@ -79,16 +82,19 @@ def test_the_gauge_is_fixed_where_only_the_sum_is_identifiable():
     rng = np.random.default_rng(3)
     truth = drawn(rng, nominal(), ('bias', 'scale_factor', 'misalignment'))
     truth = with_neutral(truth, ['cross_axis', 'cross_axis_z'])
-    truth = put(truth, [Coefficient('cross_axis', 'linear', 'x'),
-                        Coefficient('cross_axis_z', 'linear', 'y')], [0.012, -0.02])
+    truth = put(
+        truth,
+        [Coefficient('cross_axis', 'linear', 'x'), Coefficient('cross_axis_z', 'linear', 'y')],
+        [0.012, -0.02],
+    )
     poses = swept(rng, truth)
     fit, _ = full_model.fit_selected(nominal(), poses)
-    assert not set(full_model.GAUGE) & {full_model.term_of(name)
-                                        for name in fit.fitted.covariance_names}
+    assert not set(full_model.GAUGE) & {
+        full_model.term_of(name) for name in fit.fitted.covariance_names
+    }
     assert fit.fitted.values['cross_axis']['linear'].tolist() == [0, 0]
     turned = fit.fitted.values['misalignment']['beta_rad'][0]
-    assert turned == pytest.approx(
-        truth.values['misalignment']['beta_rad'][0] + 0.012, abs=4e-4)
+    assert turned == pytest.approx(truth.values['misalignment']['beta_rad'][0] + 0.012, abs=4e-4)
 
 
 def test_outliers_are_named_and_excluded():
@@ -100,28 +106,30 @@ def test_outliers_are_named_and_excluded():
     assert fit.outliers == tuple(bad)
     error, std = errors(fit, truth)
     assert np.sqrt(np.mean((error / std) ** 2)) < 1.6
-    assert any('outliers, left out: pose 8 (alpha' in line
-               for line in full_model.warnings(fit, poses))
+    assert any(
+        'outliers, left out: pose 8 (alpha' in line for line in full_model.warnings(fit, poses)
+    )
 
 
 def test_a_change_of_temperature_is_reported_and_fitted():
     sensor, truth, poses = swept_unit(10, check_poses=0)
     warm = replace(poses, temperature_c=np.linspace(20, 35, len(poses)))
     fit, _ = full_model.fit_selected(sensor, warm)
-    assert any('temperature moved by 15.0 degC' in line
-               for line in full_model.warnings(fit, warm))
+    assert any('temperature moved by 15.0 degC' in line for line in full_model.warnings(fit, warm))
     drift = 1e-3 * truth.scale_v_per_g * (warm.temperature_c[:, None] - 25)
     fit, _ = full_model.fit_selected(sensor, replace(warm, volts=warm.volts + drift))
     assert fit.fitted.values['temperature_bias']['per_k'] == pytest.approx([1e-3] * 2, rel=0.1)
     assert not any('temperature moved' in line for line in full_model.warnings(fit, warm))
 
 
-@pytest.mark.parametrize('planes_deg, lost', [
-    ([90], 'cross_axis_z.quadratic_per_g'), ([90, 60], 'scale_factor_z')])
+@pytest.mark.parametrize(
+    'planes_deg, lost', [([90], 'cross_axis_z.quadratic_per_g'), ([90, 60], 'scale_factor_z')]
+)
 def test_poses_of_too_few_planes_are_refused(planes_deg, lost):
     sensor, _, poses = swept_unit(1, planes_rad=np.radians(planes_deg), check_poses=0)
-    with pytest.raises(UserError,
-                       match=rf'do not determine .*{lost}.*add poses \(alpha, beta\) = '):
+    with pytest.raises(
+        UserError, match=rf'do not determine .*{lost}.*add poses \(alpha, beta\) = '
+    ):
         full_model.fit_full(sensor, poses)
 
 
@@ -133,19 +141,31 @@ def test_a_simpler_model_is_fitted_if_the_full_one_is_not_determined():
     assert fit.warnings[-1].startswith('not physical: ')
 
 
-@pytest.mark.parametrize('change', [
-    lambda truth: put(truth, [Coefficient('misalignment', 'alpha_rad', axis) for axis in 'xy'],
-                      truth.values['misalignment']['alpha_rad'] + [0.02, 0.02]),
-    lambda truth: put(truth, [Coefficient('bias', 'offset_v', 'x')],
-                      truth.values['bias']['offset_v'][:1] + 0.08)])
+@pytest.mark.parametrize(
+    'change',
+    [
+        lambda truth: put(
+            truth,
+            [Coefficient('misalignment', 'alpha_rad', axis) for axis in 'xy'],
+            truth.values['misalignment']['alpha_rad'] + [0.02, 0.02],
+        ),
+        lambda truth: put(
+            truth,
+            [Coefficient('bias', 'offset_v', 'x')],
+            truth.values['bias']['offset_v'][:1] + 0.08,
+        ),
+    ],
+)
 def test_recordings_that_contradict_each_other_are_refused(change):
     rng = np.random.default_rng(12)
     truth = drawn(rng, nominal(), TERMS)
     parts = [swept(rng, unit, check_poses=0) for unit in (truth, truth, change(truth))]
     with pytest.raises(UserError, match=r'(turned|shifted) by .* standard dev.*: another unit'):
         calibration.calibrate(
-            nominal(), [calibration.RecordedPoses(f'{name}.csv', part)
-                        for name, part in zip('abc', parts)], 'full')
+            nominal(),
+            [calibration.RecordedPoses(f'{name}.csv', part) for name, part in zip('abc', parts)],
+            'full',
+        )
 
 
 @pytest.mark.perf
@@ -159,9 +179,18 @@ def test_six_hundred_poses_of_three_axes_take_two_seconds():
 
 
 def test_the_noise_determines_the_filter_time_constant(run_tool, tmp_path):
-    run_tool('simulate', 'sweep', '--params', NOMINAL, '--effect',
-             'bandwidth:resistance_ratio.x=0.2,resistance_ratio.y=-0.15', '--effect',
-             'misalignment', '-o', tmp_path / 'sweep.csv')
+    run_tool(
+        'simulate',
+        'sweep',
+        '--params',
+        NOMINAL,
+        '--effect',
+        'bandwidth:resistance_ratio.x=0.2,resistance_ratio.y=-0.15',
+        '--effect',
+        'misalignment',
+        '-o',
+        tmp_path / 'sweep.csv',
+    )
     done = run_tool('fit', tmp_path / 'sweep.csv', '-o', tmp_path / 'unit.yaml')
     assert done.returncode == 0, done.stderr
     assert '#   bandwidth.resistance_ratio ' in (tmp_path / 'unit.yaml').read_text()

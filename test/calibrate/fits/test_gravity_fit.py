@@ -33,11 +33,24 @@ def unit(rng, spread=1.0, **changes):
     """Draw a three-axis unit in the gauge of the fit, and its nine parameters."""
     sensor = nominal('xyz', **changes)
     scale = sensor.nominal_scale_v_per_g
-    truth = np.concatenate([scale * rng.uniform(-0.1, 0.1, 3), scale * rng.uniform(-0.04, 0.04, 3),
-                            rng.normal(0, 0.0175, 3)]) * spread
-    values = {'bias': {'offset_v': truth[:3]}, 'scale_factor': {'offset_v_per_g': truth[3:6]},
-              'misalignment': {'alpha_rad': np.array([0, 0, truth[7]]),
-                               'beta_rad': np.array([0, truth[6], truth[8]])}}
+    truth = (
+        np.concatenate(
+            [
+                scale * rng.uniform(-0.1, 0.1, 3),
+                scale * rng.uniform(-0.04, 0.04, 3),
+                rng.normal(0, 0.0175, 3),
+            ]
+        )
+        * spread
+    )
+    values = {
+        'bias': {'offset_v': truth[:3]},
+        'scale_factor': {'offset_v_per_g': truth[3:6]},
+        'misalignment': {
+            'alpha_rad': np.array([0, 0, truth[7]]),
+            'beta_rad': np.array([0, truth[6], truth[8]]),
+        },
+    }
     return replace(sensor, effects=EFFECTS, values=values), truth
 
 
@@ -48,8 +61,9 @@ def directions(rng, count):
 
 def rested(rng, sensor, poses, error_v=5e-5, excess_g=0.0):
     """Simulate the rests of a unit in `poses`: means and standard errors, V."""
-    force = poses * (sensor.local_gravity_mps2
-                     + G0_MPS2 * excess_g * rng.normal(size=(len(poses), 1)))
+    force = poses * (
+        sensor.local_gravity_mps2 + G0_MPS2 * excess_g * rng.normal(size=(len(poses), 1))
+    )
     volts = np.column_stack(signal_chain.static_response(sensor)(list(force.T)))
     errors = error_v * rng.uniform(0.5, 2, (len(poses), 1)) * np.ones(3)
     return volts + errors * rng.normal(size=volts.shape), errors
@@ -60,17 +74,22 @@ def bare(sensor):
 
 
 def parameters(fit):
-    return np.array([fit.values[name.effect][name.parameter]['xyz'.index(name.axis)]
-                     for name in NAMES])
+    return np.array(
+        [fit.values[name.effect][name.parameter]['xyz'.index(name.axis)] for name in NAMES]
+    )
 
 
 @settings(max_examples=30)
 @given(strategies.integers(0, 2**32 - 1))
 def test_exact_without_noise(seed):
     rng = np.random.default_rng(seed)
-    sensor, truth = unit(rng, 2.0, nominal_scale_v_per_g=rng.uniform(0.3, 2, 3),
-                         nominal_zero_g_v=rng.uniform(1, 3, 3),
-                         local_gravity_mps2=rng.uniform(9.76, 9.83))
+    sensor, truth = unit(
+        rng,
+        2.0,
+        nominal_scale_v_per_g=rng.uniform(0.3, 2, 3),
+        nominal_zero_g_v=rng.uniform(1, 3, 3),
+        local_gravity_mps2=rng.uniform(9.76, 9.83),
+    )
     means, errors = rested(rng, sensor, directions(rng, 24), 0.0)
     fit = fit_gravity(means, errors, bare(sensor))
     assert np.abs(parameters(fit) - truth).max() < 1e-8
@@ -86,14 +105,22 @@ def test_jacobian_against_differences():
         up, down = estimate.copy(), estimate.copy()
         up[k] += step
         down[k] -= step
-        wanted = (gravity_fit.magnitude(mean, up)
-                  - gravity_fit.magnitude(mean, down)) / (2 * step)
+        wanted = (gravity_fit.magnitude(mean, up) - gravity_fit.magnitude(mean, down)) / (2 * step)
         assert column == pytest.approx(wanted, abs=1e-9)
 
 
-@pytest.mark.parametrize('count, error_v, excess_g', [
-    (12, 1e-4, 0.0), (18, 1e-4, 0.0), (30, 1e-4, 0.0), (24, 1e-6, 0.0), (24, 2e-5, 2e-4),
-    (16, 2e-5, 2e-4), (24, 1e-4, 1e-4)])
+@pytest.mark.parametrize(
+    'count, error_v, excess_g',
+    [
+        (12, 1e-4, 0.0),
+        (18, 1e-4, 0.0),
+        (30, 1e-4, 0.0),
+        (24, 1e-6, 0.0),
+        (24, 2e-5, 2e-4),
+        (16, 2e-5, 2e-4),
+        (24, 1e-4, 1e-4),
+    ],
+)
 def test_covariance_has_the_stated_coverage(count, error_v, excess_g):
     """90 % intervals contain the truth in 85 to 95 % of the units; without excess also in more."""
     rng = np.random.default_rng(2)
@@ -117,16 +144,19 @@ def test_held_out_errors_equal_fits_without_the_stretch():
     fit = fit_gravity(means, errors, bare(sensor))
     for i in (0, 7, 19):
         others = np.arange(20) * 5 // 20 != i * 5 // 20
-        without = replace(sensor, values=fit_gravity(means[others], errors[others],
-                                                     bare(sensor)).values)
-        force = np.array(signal_chain.inverse(without)(list(means[i:i + 1].T)))
+        without = replace(
+            sensor, values=fit_gravity(means[others], errors[others], bare(sensor)).values
+        )
+        force = np.array(signal_chain.inverse(without)(list(means[i : i + 1].T)))
         error = np.linalg.norm(force) - sensor.local_gravity_mps2
         # Without the rests the excess and thus the weights change a little.
         assert fit.held_out_mps2[i] == pytest.approx(error, abs=2e-4)
 
 
-@pytest.mark.parametrize('count, knocks, size_g', [
-    (14, 1, 0.02), (18, 2, 0.02), (24, 1, 0.002), (24, 3, 0.02), (24, 3, 0.2), (40, 5, 0.005)])
+@pytest.mark.parametrize(
+    'count, knocks, size_g',
+    [(14, 1, 0.02), (18, 2, 0.02), (24, 1, 0.002), (24, 3, 0.02), (24, 3, 0.2), (40, 5, 0.005)],
+)
 def test_outliers_are_named(count, knocks, size_g):
     rng = np.random.default_rng(7)
     right, worst = 0, []
@@ -135,8 +165,12 @@ def test_outliers_are_named(count, knocks, size_g):
         poses = np.concatenate([SIX, directions(rng, count - 6)])
         means, errors = rested(rng, sensor, poses, 5e-5, 5e-5)
         bad = rng.choice(count, knocks, replace=False)
-        means[bad] += poses[bad] * size_g * rng.choice([-1, 1], (knocks, 1)) \
+        means[bad] += (
+            poses[bad]
+            * size_g
+            * rng.choice([-1, 1], (knocks, 1))
             * rng.uniform(0.7, 1.5, (knocks, 1))
+        )
         fit = fit_gravity(means, errors, bare(sensor))
         right += set(fit.outliers) >= set(bad.tolist()) and len(fit.outliers) <= knocks + 1
         worst.append(np.abs(parameters(fit) - truth)[:3].max())
@@ -161,14 +195,19 @@ def test_faces_alone_determine_six_parameters(poses):
     assert 'point up equally' in fit.note
 
 
-@pytest.mark.parametrize('poses, reason, advice', [
-    (SIX, 'are too few', 'two axes equally up'),
-    (np.tile([[0.6, 0.0, 0.8]], (20, 1)), 'do not determine bias.offset_v.x', '−z points up'),
-    (np.zeros((0, 3)), 'do not determine', '+x points up'),
-    (np.column_stack([np.cos(np.arange(20)), np.sin(np.arange(20)), np.zeros(20)]),
-     'do not determine bias.offset_v.z, scale_factor.offset_v_per_g.z; ',
-     'add rests in which +z points up, or −z points up; '),
-])
+@pytest.mark.parametrize(
+    'poses, reason, advice',
+    [
+        (SIX, 'are too few', 'two axes equally up'),
+        (np.tile([[0.6, 0.0, 0.8]], (20, 1)), 'do not determine bias.offset_v.x', '−z points up'),
+        (np.zeros((0, 3)), 'do not determine', '+x points up'),
+        (
+            np.column_stack([np.cos(np.arange(20)), np.sin(np.arange(20)), np.zeros(20)]),
+            'do not determine bias.offset_v.z, scale_factor.offset_v_per_g.z; ',
+            'add rests in which +z points up, or −z points up; ',
+        ),
+    ],
+)
 def test_missing_directions_are_named(poses, reason, advice):
     rng = np.random.default_rng(8)
     sensor, _ = unit(rng)
@@ -215,13 +254,19 @@ def real(shared_dir, name, local_gravity_mps2=G0_MPS2):
 XSENS_MPS2 = 9.81744
 
 
-@pytest.mark.parametrize('name, local, before, within, without', [
-    ('mpu9150_0', G0_MPS2, (8, 24), 0.26, 0.33), ('mpu9150_1', G0_MPS2, (8, 24.5), 0.26, 0.33),
-    ('mpu9150_2', G0_MPS2, (8, 24), 0.26, 0.33),
-    ('xsens_multiposition', XSENS_MPS2, (100, 150), 0.104, 0.16),
-    ('two_axis_stand', G0_MPS2, (60, 64), 0.12, 0.145)])
-def test_residuals_of_real_recordings(shared_dir, monkeypatch, name, local, before, within,
-                                      without):
+@pytest.mark.parametrize(
+    'name, local, before, within, without',
+    [
+        ('mpu9150_0', G0_MPS2, (8, 24), 0.26, 0.33),
+        ('mpu9150_1', G0_MPS2, (8, 24.5), 0.26, 0.33),
+        ('mpu9150_2', G0_MPS2, (8, 24), 0.26, 0.33),
+        ('xsens_multiposition', XSENS_MPS2, (100, 150), 0.104, 0.16),
+        ('two_axis_stand', G0_MPS2, (60, 64), 0.12, 0.145),
+    ],
+)
+def test_residuals_of_real_recordings(
+    shared_dir, monkeypatch, name, local, before, within, without
+):
     """The rms residuals over the rests, mg, are those of published methods or better."""
     sensor, _, means, errors = real(shared_dir, name, local)
     # The published figures leave out one rest at a time.

@@ -29,9 +29,18 @@ class Rig:
         self.now_ns = 1_700_000_000_000_000_000
         self.fed, self._waiting = Fed(TRUTH, 1), []
         settings = SessionSettings(
-            'stage', 'full', (np.pi / 4, np.pi / 2), np.pi / 2, 1e-3, 2,
-            CaptureSettings(0.5, np.radians(0.2), 20.0, mode), folder / 'unit.yaml',
-            folder / 'journal', '', '')
+            'stage',
+            'full',
+            (np.pi / 4, np.pi / 2),
+            np.pi / 2,
+            1e-3,
+            2,
+            CaptureSettings(0.5, np.radians(0.2), 20.0, mode),
+            folder / 'unit.yaml',
+            folder / 'journal',
+            '',
+            '',
+        )
         self.controller = Controller(replace(settings, **changes), UNIT, resume, self, self)
 
     def log(self, severity, text):
@@ -92,8 +101,9 @@ class Rig:
                 self.read_encoder()
             alpha_rad, beta_rad = (np.full(10, angle) for angle in self.angles_rad)
             stamps_ns = self.now_ns + np.arange(10) * 5_000_000
-            self._waiting.append((stamps_ns, self.fed(specific_force(alpha_rad, beta_rad,
-                                                                     9.80665))))
+            self._waiting.append(
+                (stamps_ns, self.fed(specific_force(alpha_rad, beta_rad, 9.80665)))
+            )
             self.now_ns += 50_000_000
             self.controller.poll()
 
@@ -118,6 +128,7 @@ def rig(tmp_path):
             made[-1].close()
         made.append(Rig(tmp_path, *args, **changes))
         return made[-1]
+
     yield make
     made[-1].close()
 
@@ -126,10 +137,13 @@ def test_a_sweep_goes_from_the_wait_for_its_sensor_to_its_file(rig, tmp_path):
     bench = rig()
     controller = bench.controller
     assert controller.start() == (
-        True, 'starts when sensor_info comes, or samples show the sensor')
+        True,
+        'starts when sensor_info comes, or samples show the sensor',
+    )
     assert controller.state is ControllerState.WAITING_FOR_SENSOR
     assert controller.status().text == (
-        'waiting for sensor_info; without it, 2 s of samples show the sensor')
+        'waiting for sensor_info; without it, 2 s of samples show the sensor'
+    )
     bench.silence_text = 'nothing on imu/data_raw'
     assert controller.status().text.endswith('nothing on imu/data_raw; is the driver running?')
     bench.turn()
@@ -170,7 +184,8 @@ def test_an_operator_at_a_screen_has_a_choice_and_others_resume(rig, tmp_path):
     assert asking.controller.state is ControllerState.ASKING
     assert asking.controller.start() == answer
     assert asking.controller.status() == (
-        type(asking.controller.status())(Phase.QUESTION, answer.message, True))
+        type(asking.controller.status())(Phase.QUESTION, answer.message, True)
+    )
     assert asking.controller.start(start_over=False).success
     assert asking.controller.session.accepted_count == 3
     assert 'resumed after 3 poses (the last one first' in asking.lines()[-1]
@@ -185,7 +200,7 @@ def test_an_operator_at_a_screen_has_a_choice_and_others_resume(rig, tmp_path):
     anew.say_info()
     assert anew.controller.start().success
     assert anew.controller.session.resumed == 0
-    kept, = tmp_path.glob('journal.2*')
+    (kept,) = tmp_path.glob('journal.2*')
     assert len(sweep_journal.accepted_poses(sweep_journal.read(kept).entries)) == 3
 
 
@@ -197,6 +212,7 @@ def test_a_fit_that_fails_at_the_end_waits_for_a_decision(rig, tmp_path, monkeyp
 
     def full_disk():
         raise UserError('unit.yaml: the disk is full')
+
     monkeypatch.setattr(session, 'finish', full_disk)
     bench.turn_until(lambda: bench.controller.fit_fault, 120)
     status = bench.controller.status()
@@ -254,6 +270,7 @@ def test_another_sensor_ends_the_session_and_a_restarted_driver_checks_the_mount
     assert 'rate_hz was 200.0, is 100.0: changed during the calibration' in bench.lines()[-1]
     bench.say_info(serial='C2')
     assert bench.controller.stream.unit is None and bench.lines('ERROR')[-1].startswith(
-        'sensor_info: is of the sensor C2')
+        'sensor_info: is of the sensor C2'
+    )
     bench.controller.start()
     assert bench.controller.status().phase is Phase.REFUSED

@@ -37,8 +37,10 @@ def test_a_stage_turned_by_hand_is_captured_near_its_target():
     """An error of 3.2° is refused at once. With 1° the angle of the encoder counts."""
     by_hand = bench('encoder', [Target(np.pi / 2, np.radians(30))])
     by_hand.run(0.5, np.pi / 2, np.radians(33.2))
-    assert by_hand.sweep.capture() == \
-        'beta is 3.2° from the target 30°; turn the stage there and capture again'
+    assert (
+        by_hand.sweep.capture()
+        == 'beta is 3.2° from the target 30°; turn the stage there and capture again'
+    )
     by_hand.run(0.5, np.pi / 2, np.radians(31))
     assert by_hand.sweep.capture() == ''
     assert by_hand.run(4, np.pi / 2, np.radians(31)).beta_rad == pytest.approx(np.radians(31))
@@ -75,9 +77,13 @@ def test_a_silent_encoder_is_reported_and_gives_no_pose():
         assert dead.run(3, np.pi / 2, 0.0)
 
 
-@pytest.mark.parametrize('turned, words', [
-    (np.pi, 'x reads −1.00 g where +1.00 g was expected: axis inverted or swapped'),
-    (-np.pi / 2, 'y reads +1.00 g where +0.00 g was expected: axis inverted or swapped')])
+@pytest.mark.parametrize(
+    'turned, words',
+    [
+        (np.pi, 'x reads −1.00 g where +1.00 g was expected: axis inverted or swapped'),
+        (-np.pi / 2, 'y reads +1.00 g where +0.00 g was expected: axis inverted or swapped'),
+    ],
+)
 def test_the_first_pose_shows_inverted_or_swapped_axes(turned, words):
     wrong = bench('manual', [Target(np.pi / 2, 0.0)])
     wrong.run(0.2, np.pi / 2, turned, encoder=False)
@@ -91,9 +97,16 @@ def test_a_wrong_pose_is_refused_once_the_unit_is_estimated():
     sensor = drawn(np.random.default_rng(5), nominal())
     targets = guided([np.pi / 2], np.radians(30), 0)
     poses = swept(np.random.default_rng(1), sensor, [np.pi / 2], 0)
-    accepted = [pose_record(i, alpha_rad=np.pi / 2, beta_rad=poses.beta_rad[i],
-                            mean_v=tuple(poses.volts[i]), std_v=tuple(poses.std_v[i]))
-                for i in range(8)]
+    accepted = [
+        pose_record(
+            i,
+            alpha_rad=np.pi / 2,
+            beta_rad=poses.beta_rad[i],
+            mean_v=tuple(poses.volts[i]),
+            std_v=tuple(poses.std_v[i]),
+        )
+        for i in range(8)
+    ]
     hand = bench('manual', targets, sensor, accepted)
     hand.sweep.skip([].append)  # the check of the mounting
     target = hand.sweep.course.target
@@ -110,15 +123,20 @@ def test_units_at_the_edge_of_the_datasheet_are_never_refused():
     rng = np.random.default_rng(7)
     for _ in range(8):
         truth = drawn(rng, nominal('xyz'))
-        truth = replace(truth, values={e: {p: _edge(Coefficient(e, p), v)
-                                           for p, v in parameters.items()}
-                                       for e, parameters in truth.values.items()})
+        truth = replace(
+            truth,
+            values={
+                e: {p: _edge(Coefficient(e, p), v) for p, v in parameters.items()}
+                for e, parameters in truth.values.items()
+            },
+        )
         poses = swept(rng, truth, check_poses=0)
         order = rng.permutation(len(poses))[:12]
         estimate = None
         for count in range(len(order)):
             estimate = running_estimate.from_poses(
-                nominal('xyz'), poses.subset(order[:count]), 5.0, 4.2e-4, estimate)
+                nominal('xyz'), poses.subset(order[:count]), 5.0, 4.2e-4, estimate
+            )
             i = order[count]
             target = Target(poses.alpha_rad[i], poses.beta_rad[i])
             assert not estimate.reading_fault(target, poses.volts[i], np.radians(0.2))
@@ -142,8 +160,10 @@ def test_a_change_of_temperature_is_refused():
     assert warm.run(5, np.pi / 2, np.pi / 6).temperature_c == 24.0
 
 
-@pytest.mark.parametrize('ahead_s, words', [
-    (-40.0, 'stamped 40 s behind imu/data_raw'), (7200.0, 'stamped 2 h ahead of imu/data_raw')])
+@pytest.mark.parametrize(
+    'ahead_s, words',
+    [(-40.0, 'stamped 40 s behind imu/data_raw'), (7200.0, 'stamped 2 h ahead of imu/data_raw')],
+)
 def test_a_stage_on_another_clock_is_reported(ahead_s, words):
     apart = bench()
     for _ in range(80):
@@ -153,8 +173,9 @@ def test_a_stage_on_another_clock_is_reported(ahead_s, words):
     assert state.late and words in state.text and 'use_sim_time' in state.text
 
 
-@pytest.mark.parametrize('by_rad, words', [
-    (0.0, ''), (np.radians(3), 'mounting changed: in pose 1 y reads')])
+@pytest.mark.parametrize(
+    'by_rad, words', [(0.0, ''), (np.radians(3), 'mounting changed: in pose 1 y reads')]
+)
 def test_the_mounting_is_verified_after_an_interruption(by_rad, words):
     before = bench()
     entry = before.run(5, np.pi / 2, 0.0)
@@ -166,8 +187,13 @@ def test_the_mounting_is_verified_after_an_interruption(by_rad, words):
         assert after.run(4, np.pi / 2, 0.0) is None
         assert not after.sweep.to_verify and after.sweep.course.target == NEXT
         return
-    after.fed = Fed(replace(nominal(), effects=('misalignment',), values={'misalignment': {
-        'alpha_rad': np.zeros(2), 'beta_rad': np.full(2, by_rad)}}))
+    after.fed = Fed(
+        replace(
+            nominal(),
+            effects=('misalignment',),
+            values={'misalignment': {'alpha_rad': np.zeros(2), 'beta_rad': np.full(2, by_rad)}},
+        )
+    )
     with pytest.raises(MountingError, match=words):
         after.run(4, np.pi / 2, 0.0)
 
@@ -178,7 +204,7 @@ def test_by_hand_directions_are_requested_until_all_are_covered():
     truth = drawn(np.random.default_rng(2), sensor, ('bias', 'scale_factor', 'misalignment'))
     guide = HandGuide(sensor, 3.0)
     fed = Fed(truth, 4)
-    now_ns, requests, errors = 10 ** 18, [], []
+    now_ns, requests, errors = 10**18, [], []
     for _ in range(16):
         requests.append(guide.destination())
         up = _direction(guide)
@@ -203,6 +229,7 @@ def test_by_hand_directions_are_requested_until_all_are_covered():
 
 def _direction(guide):
     from adxl_ros.calibrate.fits.gravity_fit import UP as EACH
+
     return EACH[guide.next_up]
 
 

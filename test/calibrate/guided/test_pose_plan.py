@@ -31,8 +31,11 @@ def test_the_guided_order_has_smaller_errors_on_a_stage_with_errors_by_setting(a
 @pytest.mark.parametrize('kind', pose_plan.KINDS)
 def test_fits_have_the_standard_deviations_that_a_plan_predicts(axes, kind):
     sensor = nominal(axes)
-    targets = pose_plan.guided(pose_plan.default_planes_rad(axes), STEP, 0) \
-        if kind == 'full' else running_estimate.quick(sensor, 5.0, np.radians(0.1), 0)
+    targets = (
+        pose_plan.guided(pose_plan.default_planes_rad(axes), STEP, 0)
+        if kind == 'full'
+        else running_estimate.quick(sensor, 5.0, np.radians(0.1), 0)
+    )
     ratios = []
     for seed in range(6):
         rng = np.random.default_rng(seed)

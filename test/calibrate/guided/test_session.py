@@ -27,11 +27,25 @@ def begin(tmp_path):
         if begun:
             begun[-1].journal.close()
         capture = CaptureSettings(1.0, 0.0035, 20.0, StageMode.MANUAL)
-        settings = replace(SessionSettings(
-            'stage', 'full', (np.pi / 4, np.pi / 2), np.pi / 2, float(np.radians(0.1)), 2,
-            capture, tmp_path / 'unit.yaml', tmp_path / 'journal', '', ''), **changes)
+        settings = replace(
+            SessionSettings(
+                'stage',
+                'full',
+                (np.pi / 4, np.pi / 2),
+                np.pi / 2,
+                float(np.radians(0.1)),
+                2,
+                capture,
+                tmp_path / 'unit.yaml',
+                tmp_path / 'journal',
+                '',
+                '',
+            ),
+            **changes,
+        )
         begun.append(Session(UNIT, settings, start_over))
         return begun[-1]
+
     yield begin
     begun[-1].journal.close()
 
@@ -40,19 +54,34 @@ def take(session, count, off_v=0.0):
     for _ in range(count):
         guide = session.guide
         target, index = guide.course.target, guide.course.index
-        volts = np.column_stack(signal_chain.static_response(TRUTH)(specific_force(
-            np.array([target.alpha_rad]), np.array([target.beta_rad]), 9.80665)))[0] + off_v
+        volts = (
+            np.column_stack(
+                signal_chain.static_response(TRUTH)(
+                    specific_force(
+                        np.array([target.alpha_rad]), np.array([target.beta_rad]), 9.80665
+                    )
+                )
+            )[0]
+            + off_v
+        )
         entry = pose_record(
-            index, alpha_rad=target.alpha_rad, beta_rad=target.beta_rad, check=target.check,
-            start_ns=2 * index, stop_ns=2 * index + 1, mean_v=tuple(volts.tolist()),
-            std_v=(5e-5, 5e-5))
+            index,
+            alpha_rad=target.alpha_rad,
+            beta_rad=target.beta_rad,
+            check=target.check,
+            start_ns=2 * index,
+            stop_ns=2 * index + 1,
+            mean_v=tuple(volts.tolist()),
+            std_v=(5e-5, 5e-5),
+        )
         session.journal.append(entry)
         guide.take(entry)
 
 
 def poses_on_disk(session):
-    return [e.pose for e in sweep_journal.accepted_poses(
-        sweep_journal.read(session.journal.path)[1])]
+    return [
+        e.pose for e in sweep_journal.accepted_poses(sweep_journal.read(session.journal.path)[1])
+    ]
 
 
 def test_a_pose_to_be_repeated_is_neither_fitted_nor_resumed(begin):
@@ -121,12 +150,22 @@ def test_few_poses_are_fitted_or_refused(begin, count):
 @pytest.mark.parametrize('mode', ['stage', 'gravity'])
 def test_a_calibration_resumes_only_with_equal_values_and_settings(begin, mode):
     settings, unit = replace(begin().settings, mode=mode), nominal('xyz')
-    changed = [(settings, replace(unit, **{name: np.asarray(getattr(unit, name)) * 2}))
-               for name in ('noise_density_g_per_rthz', 'rc_capacitance_f', 'adc_vref_v',
-                            'range_g', 'local_gravity_mps2', 'stage_resolution_rad')]
+    changed = [
+        (settings, replace(unit, **{name: np.asarray(getattr(unit, name)) * 2}))
+        for name in (
+            'noise_density_g_per_rthz',
+            'rc_capacitance_f',
+            'adc_vref_v',
+            'range_g',
+            'local_gravity_mps2',
+            'stage_resolution_rad',
+        )
+    ]
     names = ['temperature_span_c'] + ['tolerance_rad', 'near_rad'] * (mode == 'stage')
-    changed += [(replace(settings, capture=replace(settings.capture, **{name: 0.1})), unit)
-                for name in names]
+    changed += [
+        (replace(settings, capture=replace(settings.capture, **{name: 0.1})), unit)
+        for name in names
+    ]
     before = settings.head(unit)
     for other, sensor in changed:
         assert len([key for key, value in other.head(sensor).items() if value != before[key]]) == 1
@@ -137,16 +176,26 @@ def gravity_session(begin, monkeypatch, factor):
     unit = nominal('xyz', serial='S1')
     monkeypatch.setattr('test_session.UNIT', unit)
     session = begin(mode='gravity')
-    rests = iter([pose_record(
-        i, start_ns=2 * i, stop_ns=2 * i + 1, std_v=(5e-5,) * 3,
-        mean_v=tuple((unit.nominal_zero_g_v + factor * np.array(up)).tolist()))
-        for i, up in enumerate(([0, 0, 1.0], [0, 1.0, 0]))])
+    rests = iter(
+        [
+            pose_record(
+                i,
+                start_ns=2 * i,
+                stop_ns=2 * i + 1,
+                std_v=(5e-5,) * 3,
+                mean_v=tuple((unit.nominal_zero_g_v + factor * np.array(up)).tolist()),
+            )
+            for i, up in enumerate(([0, 0, 1.0], [0, 1.0, 0]))
+        ]
+    )
     monkeypatch.setattr(session.guide, 'accept', lambda: next(rests, None))
     return session
 
 
-@pytest.mark.parametrize(('factor', 'reason'), [
-    (1 / 9.80665, 'as values in g'), (1000.0, 'mm/s²'), (0.0, 'gravity is missing')])
+@pytest.mark.parametrize(
+    ('factor', 'reason'),
+    [(1 / 9.80665, 'as values in g'), (1000.0, 'mm/s²'), (0.0, 'gravity is missing')],
+)
 def test_the_first_rest_in_another_unit_ends_the_calibration(begin, monkeypatch, factor, reason):
     session = gravity_session(begin, monkeypatch, factor)
     with pytest.raises(GravityError, match=reason):

@@ -15,8 +15,9 @@ TARGETS = [Target(np.pi / 2, 0.0), Target(np.pi / 2, np.pi / 6)]
 
 def _bench(mode='commanded', **changes):
     sensor = nominal(**changes)
-    settings = CaptureSettings(dwell_s=5.0, tolerance_rad=0.0035, timeout_s=20.0,
-                               stage_mode=StageMode(mode))
+    settings = CaptureSettings(
+        dwell_s=5.0, tolerance_rad=0.0035, timeout_s=20.0, stage_mode=StageMode(mode)
+    )
     return Bench(StageGuide(sensor, TARGETS, settings), sensor)
 
 
@@ -74,13 +75,16 @@ def test_the_guided_order_saves_travel_and_reaches_angles_from_both_sides():
 
     def poses(plan):
         return sorted((t.check, t.alpha_rad, t.beta_rad) for t in plan)
+
     # Check poses are in whole degrees, because an operator without an encoder sets them.
     difference_deg = np.abs(np.degrees(np.array(poses(targets)) - poses(paper)))
     assert difference_deg[:130].max() < 1e-9 and 0.1 < difference_deg[130:].max() <= 0.5
     checks = np.degrees([(t.alpha_rad, t.beta_rad) for t in targets if t.check])
     np.testing.assert_allclose(checks, np.round(checks), atol=1e-9)
-    travel, paper_travel = (np.abs(np.diff([(t.alpha_rad, t.beta_rad) for t in plan], axis=0))
-                            .max(axis=1).sum() for plan in (targets, paper))
+    travel, paper_travel = (
+        np.abs(np.diff([(t.alpha_rad, t.beta_rad) for t in plan], axis=0)).max(axis=1).sum()
+        for plan in (targets, paper)
+    )
     assert travel < 0.75 * paper_travel
     grid = [t for t in targets if not t.check]
     for joint, count in (('alpha_rad', 5), ('beta_rad', 13)):

@@ -31,18 +31,29 @@ def stalled(time_s: np.ndarray) -> np.ndarray:
     return np.where(phase_s < 0.1, time_s - phase_s + 0.1 + 1e-4 * phase_s, time_s)
 
 
-@pytest.mark.parametrize('stamped', [
-    lambda time_s: np.ceil(time_s / 4.25e-3) * 4.25e-3, stalled,
-    lambda time_s: time_s - 0.015 * (np.arange(len(time_s)) % 50 == 49)],
-    ids=['polled', 'stalled', 'steps back'])
+@pytest.mark.parametrize(
+    'stamped',
+    [
+        lambda time_s: np.ceil(time_s / 4.25e-3) * 4.25e-3,
+        stalled,
+        lambda time_s: time_s - 0.015 * (np.arange(len(time_s)) % 50 == 49),
+    ],
+    ids=['polled', 'stalled', 'steps back'],
+)
 def test_all_rests_are_taken(stamped) -> None:
     time_s, force = tumbled()
-    sensor = replace(nominal('xyz'), rate_hz=RATE_HZ, range_g=4.0, adc_bits=0,
-                     noise_density_g_per_rthz=np.full(3, 3e-4), rc_capacitance_f=0.0)
+    sensor = replace(
+        nominal('xyz'),
+        rate_hz=RATE_HZ,
+        range_g=4.0,
+        adc_bits=0,
+        noise_density_g_per_rthz=np.full(3, 3e-4),
+        rc_capacitance_f=0.0,
+    )
     guide, faults = HandGuide(sensor, 3.0), set()
     stamps_ns, volts = np.rint(stamped(time_s) * 1e9).astype(np.int64), to_volts(force, sensor)
     for begin in range(0, len(stamps_ns), 7):
-        faults.add(guide.feed(stamps_ns[begin:begin + 7], volts[begin:begin + 7]))
+        faults.add(guide.feed(stamps_ns[begin : begin + 7], volts[begin : begin + 7]))
         if (record := guide.accept()) is not None:
             guide.take(record)
     assert len(guide.accepted) == len(UP)

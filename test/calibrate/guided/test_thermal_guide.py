@@ -38,8 +38,14 @@ CYCLE = Ramp([0, 300, 360, 660, 720, 800, 860, 940], [5, 45, 45, 5, 5, 45, 45, 5
 def base():
     names = tuple(Coefficient('bias', 'offset_v', axis) for axis in 'xyz')
     unit = with_neutral(UNIT, ['bias'])
-    return replace(unit, model='linear', covariance_names=names, covariance=np.eye(3) * 1e-8,
-                   envelope=Envelope(temperature_c=(29.0, 31.0)), provenance={'id': 'abc'})
+    return replace(
+        unit,
+        model='linear',
+        covariance_names=names,
+        covariance=np.eye(3) * 1e-8,
+        envelope=Envelope(temperature_c=(29.0, 31.0)),
+        provenance={'id': 'abc'},
+    )
 
 
 @pytest.fixture
@@ -50,12 +56,22 @@ def begin(tmp_path):
         if begun:
             begun[-1].journal.close()
         settings = SessionSettings(
-            'thermal', 'full', (), 0.1, 0.01, 0, CaptureSettings(1.0, 0.0035, 20.0,
-                                                                 StageMode.MANUAL),
-            tmp_path / 'unit.yaml', tmp_path / 'journal', '', '',
-            ThermalSettings((10.0, high_c), 4.0))
+            'thermal',
+            'full',
+            (),
+            0.1,
+            0.01,
+            0,
+            CaptureSettings(1.0, 0.0035, 20.0, StageMode.MANUAL),
+            tmp_path / 'unit.yaml',
+            tmp_path / 'journal',
+            '',
+            '',
+            ThermalSettings((10.0, high_c), 4.0),
+        )
         begun.append(Session(UNIT, settings, False, base()))
         return begun[-1]
+
     yield begin
     begun[-1].journal.close()
 
@@ -64,8 +80,11 @@ def recorded(*effects, seconds=940.0):
     """Simulate the resting unit; return stamps, ns, volts and temperatures."""
     motion = Motion(seconds, Held(0.7), Held(0.4), temperature_c=CYCLE, internal_rate_hz=RATE_HZ)
     columns = simulate(with_effects(UNIT, list(effects)), motion, 4)
-    return (np.round(columns['time_s'] * 1e9).astype(np.int64) + 10 ** 18,
-            np.column_stack([columns[f'{axis}_v'] for axis in 'xyz']), columns['temperature_c'])
+    return (
+        np.round(columns['time_s'] * 1e9).astype(np.int64) + 10**18,
+        np.column_stack([columns[f'{axis}_v'] for axis in 'xyz']),
+        columns['temperature_c'],
+    )
 
 
 def play(session, stamps_ns, volts, temperatures_c):
@@ -97,15 +116,20 @@ def test_the_range_is_covered_in_both_directions_and_the_file_has_the_slopes(beg
     assert np.all(np.abs(slopes - 4e-4) < 4 * std) and np.all(std < 2e-5)
     # At 30 °C, 5 K above the datasheet's temperature, the file gives the zero-g as before.
     shift_v = fitted.values['bias']['offset_v'] + fitted.scale_v_per_g * (
-        5 * slopes + 25 * fitted.values['temperature_bias']['per_k2'])
+        5 * slopes + 25 * fitted.values['temperature_bias']['per_k2']
+    )
     np.testing.assert_allclose(shift_v, 0.0, atol=1e-12)
     assert fitted.provenance['base'] == 'abc'
     assert parameter_file.load(session.settings.output).effects == fitted.effects
 
 
-@pytest.mark.parametrize('option, parameter, value', [
-    ('thermal_lag:per_k=4e-4,tau_s=20', 'tau_s', 20.0),
-    ('thermal_hysteresis:half_width_g=3e-3,reach_k=4', 'reach_k', 4.0)])
+@pytest.mark.parametrize(
+    'option, parameter, value',
+    [
+        ('thermal_lag:per_k=4e-4,tau_s=20', 'tau_s', 20.0),
+        ('thermal_hysteresis:half_width_g=3e-3,reach_k=4', 'reach_k', 4.0),
+    ],
+)
 def test_a_loop_is_fitted_where_warming_and_cooling_differ(begin, option, parameter, value):
     session = begin(80.0)
     play(session, *recorded('temperature_bias:per_k=4e-4', option))

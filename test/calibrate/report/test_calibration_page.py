@@ -29,16 +29,46 @@ def fill_report(folder):
         done = run_executable(name, *arguments, '--params', 'u7.yaml', cwd=folder)
         assert done.returncode == 0, done.stderr
 
-    run('simulate', 'sweep', '--rate', '100', '--effect', 'bias', '--effect', 'cross_axis_z',
-        '--seed', '5', '-o', 'sweep.csv')
-    run('fit', 'sweep.csv', '--model', 'physical', '-o', 'unit.yaml', '--store', 'store',
-        '--report', 'first')
-    (path, sensor), = calibration_store.history(folder / 'store', '<U&7>').calibrations
+    run(
+        'simulate',
+        'sweep',
+        '--rate',
+        '100',
+        '--effect',
+        'bias',
+        '--effect',
+        'cross_axis_z',
+        '--seed',
+        '5',
+        '-o',
+        'sweep.csv',
+    )
+    run(
+        'fit',
+        'sweep.csv',
+        '--model',
+        'physical',
+        '-o',
+        'unit.yaml',
+        '--store',
+        'store',
+        '--report',
+        'first',
+    )
+    ((path, sensor),) = calibration_store.history(folder / 'store', '<U&7>').calibrations
     path.unlink()
     bias = sensor.values['bias']['offset_v'] - [0.004, 0.0]
-    old = replace(sensor, values={**sensor.values, 'bias': {'offset_v': bias}}, provenance={
-        **sensor.provenance, 'id': 'last-year', 'date': '2026-01-01T00:00:00+00:00',
-        'data_sha256': '0' * 64, 'temperature_c': '25.00'})
+    old = replace(
+        sensor,
+        values={**sensor.values, 'bias': {'offset_v': bias}},
+        provenance={
+            **sensor.provenance,
+            'id': 'last-year',
+            'date': '2026-01-01T00:00:00+00:00',
+            'data_sha256': '0' * 64,
+            'temperature_c': '25.00',
+        },
+    )
     calibration_store.put(folder / 'store', old)
     run('fit', 'sweep.csv', '-o', 'unit.yaml', '--store', 'store', '--report', 'report')
 
@@ -53,11 +83,17 @@ def test_the_report_has_its_contents(opened, report_folder):
     assert page.locator('.tile').count() == 3
     rows = page.locator('table.limits tbody tr')
     assert rows.locator('td:first-child').all_inner_texts() == [
-        'nominal', 'linear', 'physical', 'full']
+        'nominal',
+        'linear',
+        'physical',
+        'full',
+    ]
     assert 'PASS' in rows.nth(3).inner_text() and 'FAIL' in rows.nth(1).inner_text()
     # Each cell has one outcome.
-    assert not any(' ' in cell for cell in page.locator(
-        'table.limits .PASS, table.limits .FAIL').all_inner_texts())
+    assert not any(
+        ' ' in cell
+        for cell in page.locator('table.limits .PASS, table.limits .FAIL').all_inner_texts()
+    )
     coefficients = page.locator('table.coefficients')
     sensor = parameter_file.load(report_folder / 'unit.yaml')
     names = coefficients.inner_text()

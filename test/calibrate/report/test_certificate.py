@@ -23,15 +23,19 @@ GRAVITY_MPS2, GRAVITY_STD_MPS2 = 9.80131, 5e-4
 NAMESPACES = {'dcc': 'https://ptb.de/dcc', 'si': 'https://ptb.de/si'}
 SCHEMA = Path(os.environ.get('DCC_SCHEMA', ''))
 """Folder with dcc.xsd, and with the schemas of its imports as SI_Format.xsd and xmldsig.xsd."""
-IMPORTS = {'https://ptb.de/si/v2.1.0/SI_Format.xsd': 'SI_Format.xsd',
-           'https://www.w3.org/TR/xmldsig-core/xmldsig-core-schema.xsd': 'xmldsig.xsd'}
+IMPORTS = {
+    'https://ptb.de/si/v2.1.0/SI_Format.xsd': 'SI_Format.xsd',
+    'https://www.w3.org/TR/xmldsig-core/xmldsig-core-schema.xsd': 'xmldsig.xsd',
+}
 
 
 def calibrated(seed, axes='xy', model=None, gravity_mps2=GRAVITY_MPS2):
     rng = np.random.default_rng([seed, 17])
     sensor = nominal(axes, serial='<7 & 8>', local_gravity_mps2=gravity_mps2)
-    truth = replace(drawn(rng, sensor, TERMS),
-                    local_gravity_mps2=gravity_mps2 + GRAVITY_STD_MPS2 * rng.normal())
+    truth = replace(
+        drawn(rng, sensor, TERMS),
+        local_gravity_mps2=gravity_mps2 + GRAVITY_STD_MPS2 * rng.normal(),
+    )
     poses = swept(rng, truth)
     return truth, calibration.calibrate(sensor, [calibration.RecordedPoses('made', poses)], model)
 
@@ -56,7 +60,8 @@ def test_the_expanded_interval_holds_for_drawn_units(axes, units):
         table = gum.uncertainty(result)
         rng, alpha, beta = np.random.default_rng([seed, 18]), table.alpha_rad, table.beta_rad
         std_v = noise.sample_std_v(truth) / np.sqrt(
-            noise.effective_samples(5000, 1e-3, truth.rc_s))
+            noise.effective_samples(5000, 1e-3, truth.rc_s)
+        )
         z_sign = np.where(np.cos(alpha) < 0, -1, 1)
         stated = np.column_stack(specific_force(alpha, beta, truth.local_gravity_mps2))
         for _ in range(20):
@@ -68,7 +73,7 @@ def test_the_expanded_interval_holds_for_drawn_units(axes, units):
             got = np.column_stack(signal_chain.inverse(result.fitted, z_sign)(list(volts.T)))
             ratios.append(((got - stated)[:, columns] / table.combined_mps2).ravel())
     ratios = np.concatenate(ratios)
-    assert 0.9 < np.sqrt(np.mean(ratios ** 2)) < 1.1
+    assert 0.9 < np.sqrt(np.mean(ratios**2)) < 1.1
     assert 0.94 < np.mean(np.abs(ratios) < gum.K) < 0.99
 
 
@@ -78,24 +83,29 @@ def test_the_table_adds_up_and_has_the_numbers_of_the_error_budget(found):
     assessment, at = result.assessments[-1], table.worst
     for row, part in zip(table.inputs, ('noise', 'coefficients', None, 'model')):
         if part:
-            assert np.mean(row.contribution_mps2 ** 2) == pytest.approx(
-                getattr(assessment.accel, part), rel=1e-9)
+            assert np.mean(row.contribution_mps2**2) == pytest.approx(
+                getattr(assessment.accel, part), rel=1e-9
+            )
     parts_mg = [1e3 * row.contribution_mps2[at] / G0_MPS2 for row in table.inputs]
     section = gum.section(table)
     assert section['combined'] == f'{np.sqrt(np.sum(np.square(parts_mg))):.3f} mg'
     assert [row[3] for row in section['budget']] == [f'{part:.3f}' for part in parts_mg]
     accel, tilt = table.decisions
     assert accel.error == pytest.approx(assessment.error_mg)
-    assert (accel.outcome, tilt.outcome) == (
-        assessment.accel_outcome, assessment.tilt_outcome) == ('PASS', 'PASS')
+    assert (
+        (accel.outcome, tilt.outcome)
+        == (assessment.accel_outcome, assessment.tilt_outcome)
+        == ('PASS', 'PASS')
+    )
     assert accel.error + accel.guard_band <= accel.limit
 
 
 def test_the_stage_knows_on_which_side_of_90_degrees_a_pose_is(found):
     errors = next(row for row in found[0].held_out if row.model == 'full')
     held = found[0].poses.subset(errors.pose_index)
-    force = np.column_stack(specific_force(0 * held.beta_rad + np.radians(87), held.beta_rad,
-                                           GRAVITY_MPS2))
+    force = np.column_stack(
+        specific_force(0 * held.beta_rad + np.radians(87), held.beta_rad, GRAVITY_MPS2)
+    )
     by_coefficients = held_out.covariances(errors, held, force)[1]
     assert np.sqrt(by_coefficients[0, 0].max()) < 2e-3
 
@@ -121,31 +131,58 @@ def test_a_certificate_has_the_elements_of_the_schema(found, tmp_path):
     assert root.get('schemaVersion') == gum.SCHEMA_VERSION
     administrative, measured = root
     assert children(administrative) == [
-        'dccSoftware', 'coreData', 'items', 'calibrationLaboratory', 'respPersons', 'customer',
-        'statements']
+        'dccSoftware',
+        'coreData',
+        'items',
+        'calibrationLaboratory',
+        'respPersons',
+        'customer',
+        'statements',
+    ]
     assert children(administrative[1]) == [
-        'countryCodeISO3166_1', 'usedLangCodeISO639_1', 'mandatoryLangCodeISO639_1',
-        'uniqueIdentifier', 'identifications', 'beginPerformanceDate', 'endPerformanceDate',
-        'performanceLocation']
+        'countryCodeISO3166_1',
+        'usedLangCodeISO639_1',
+        'mandatoryLangCodeISO639_1',
+        'uniqueIdentifier',
+        'identifications',
+        'beginPerformanceDate',
+        'endPerformanceDate',
+        'performanceLocation',
+    ]
     assert children(measured[0]) == [
-        'name', 'usedMethods', 'measuringEquipments', 'influenceConditions', 'results']
+        'name',
+        'usedMethods',
+        'measuringEquipments',
+        'influenceConditions',
+        'results',
+    ]
     text = {element.text for element in root.iter()}
     assert {'<7 & 8>', 'pass', 'not stated'} <= text
     named, table = NAMESPACES, gum.uncertainty(result)
-    errors = [part for part in root.iterfind('.//dcc:quantity', named)
-              if part.get('refType') == 'basic_measurementError']
+    errors = [
+        part
+        for part in root.iterfind('.//dcc:quantity', named)
+        if part.get('refType') == 'basic_measurementError'
+    ]
     for d, part in enumerate(errors):
-        values, expanded = (np.array(part.find(f'.//si:{tag}', named).text.split(), float)
-                            for tag in ('valueXMLList', 'uncertaintyXMLList'))
+        values, expanded = (
+            np.array(part.find(f'.//si:{tag}', named).text.split(), float)
+            for tag in ('valueXMLList', 'uncertaintyXMLList')
+        )
         np.testing.assert_allclose(values, table.error_mps2[:, d], rtol=1e-6)
         np.testing.assert_allclose(expanded, 2 * table.combined_mps2[:, d], rtol=1e-6)
     assert len(errors) == 2
-    scale, = (part for part in root.iterfind('.//dcc:quantity', named)
-              if part.findtext('.//dcc:name/dcc:content', namespaces=named) == 'scale factor x')
-    assert scale.findtext('.//si:unit', namespaces=named) == \
-        r'\volt\metre\tothe{-1}\second\tothe{2}'
+    (scale,) = (
+        part
+        for part in root.iterfind('.//dcc:quantity', named)
+        if part.findtext('.//dcc:name/dcc:content', namespaces=named) == 'scale factor x'
+    )
+    assert (
+        scale.findtext('.//si:unit', namespaces=named) == r'\volt\metre\tothe{-1}\second\tothe{2}'
+    )
     assert float(scale.findtext('.//si:value', namespaces=named)) == pytest.approx(
-        result.fitted.scale_v_per_g[0] / G0_MPS2)
+        result.fitted.scale_v_per_g[0] / G0_MPS2
+    )
 
 
 def validate(path):

@@ -22,13 +22,21 @@ STD = 1e-3
 
 def fitted_of(truth, names, error=0.0):
     unit = with_neutral(truth, [name.effect for name in names])
-    return replace(put(unit, names, get(unit, names) + error), model='full',
-                   covariance_names=names, covariance=STD ** 2 * np.eye(len(names)))
+    return replace(
+        put(unit, names, get(unit, names) + error),
+        model='full',
+        covariance_names=names,
+        covariance=STD**2 * np.eye(len(names)),
+    )
 
 
 def names_for(axes, terms=TERMS, without=()):
-    return tuple(name for term in terms for name in names_of(effect_named(term), axes)
-                 if name.without_axis not in without)
+    return tuple(
+        name
+        for term in terms
+        for name in names_of(effect_named(term), axes)
+        if name.without_axis not in without
+    )
 
 
 def fitted_and_truth(error=0.0, axes='xy', without=LINEAR):
@@ -43,8 +51,9 @@ def coefficient_of(compared, name, axis):
 def test_each_fitted_coefficient_is_compared() -> None:
     fitted, truth = fitted_and_truth()
     compared = compare(fitted, truth)
-    assert [f'{row.name}.{row.axis}' for row in compared] == \
-        list(map(str, fitted.covariance_names))
+    assert [f'{row.name}.{row.axis}' for row in compared] == list(
+        map(str, fitted.covariance_names)
+    )
     assert all(row.fitted == pytest.approx(row.truth, abs=1e-9) and row.inside for row in compared)
     zero_g = coefficient_of(compared, 'bias.offset_v', 'y')
     assert (zero_g.label, zero_g.unit) == ('zero-g', 'V')
@@ -62,20 +71,31 @@ def test_each_fitted_coefficient_is_compared() -> None:
     assert coefficient_of(compared, 'nonlinearity.cubic_per_g2', 'x').truth == 0
 
 
-@pytest.mark.parametrize(('error', 'inside'), [(1.6 * STD, True), (-1.6 * STD, True),
-                                               (1.7 * STD, False), (-1.7 * STD, False)])
+@pytest.mark.parametrize(
+    ('error', 'inside'),
+    [(1.6 * STD, True), (-1.6 * STD, True), (1.7 * STD, False), (-1.7 * STD, False)],
+)
 def test_an_interval_is_90_percent(error: float, inside: bool) -> None:
     assert {row.inside for row in compare(*fitted_and_truth(error))} == {inside}
 
 
 def test_table_of_the_truth() -> None:
     fitted, truth = fitted_and_truth(without=())
-    fitted = put(fitted, [Coefficient('scale_factor_z', 'quadratic_per_g2', 'x')], [
-        truth.values['scale_factor_z']['quadratic_per_g2'][0] + 0.002])
+    fitted = put(
+        fitted,
+        [Coefficient('scale_factor_z', 'quadratic_per_g2', 'x')],
+        [truth.values['scale_factor_z']['quadratic_per_g2'][0] + 0.002],
+    )
     lines = truth_table(compare(fitted, truth))
     rows = {re.sub(' +', ' ', line[:24]).strip(): line for line in lines}
     assert rows['zero-g x'].split()[2:] == [
-        f'{truth.zero_g_v[0]:.4f}', '±', '0.0016', 'V', f'{truth.zero_g_v[0]:.4f}', 'ok']
+        f'{truth.zero_g_v[0]:.4f}',
+        '±',
+        '0.0016',
+        'V',
+        f'{truth.zero_g_v[0]:.4f}',
+        'ok',
+    ]
     assert rows['scale, z² x'].endswith('   MISSED')
     assert rows['cubic y'].split()[-2:] == ['0', 'ok']
     assert rows['misalignment alpha y'].split()[6] == '°'
@@ -85,8 +105,9 @@ def test_table_of_the_truth() -> None:
 
 
 def test_table_of_errors() -> None:
-    errors = held_out.PoseErrors(np.full((3, 2), 0.45),
-                                 np.radians(np.full(3, 7.2)), np.zeros((3, 3)))
+    errors = held_out.PoseErrors(
+        np.full((3, 2), 0.45), np.radians(np.full(3, 7.2)), np.zeros((3, 3))
+    )
     fitted = replace(errors, accel_mps2=errors.accel_mps2 / 100, tilt_rad=np.full(3, np.nan))
     models = [held_out.summarise('nominal', errors), held_out.summarise('full', fitted)]
     lines = screen_table(models)
@@ -95,16 +116,27 @@ def test_table_of_errors() -> None:
     assert max(map(len, lines)) <= 79
 
 
-@pytest.mark.parametrize(('accel', 'tilt', 'begin'), [
-    ('PASS', 'PASS', [' PASS  calibration error 0.20 mg; the datasheet allows 3.4 mg']),
-    ('PASS', '', [' PASS  calibration error 0.20 mg; the datasheet allows 3.4 mg']),
-    ('FAIL', 'PASS', [' FAIL  calibration error 0.20 mg; the datasheet allows 3.4 mg',
-                      'do not use']),
-    ('PASS', 'FAIL', [' FAIL  tilt error 0.33°, more than 3.4 mg causes', 'do not use']),
-    ('PASS', 'NOT SHOWN', [' NOT SHOWN  calibration error 0.20 mg', 'too few'])])
+@pytest.mark.parametrize(
+    ('accel', 'tilt', 'begin'),
+    [
+        ('PASS', 'PASS', [' PASS  calibration error 0.20 mg; the datasheet allows 3.4 mg']),
+        ('PASS', '', [' PASS  calibration error 0.20 mg; the datasheet allows 3.4 mg']),
+        (
+            'FAIL',
+            'PASS',
+            [' FAIL  calibration error 0.20 mg; the datasheet allows 3.4 mg', 'do not use'],
+        ),
+        ('PASS', 'FAIL', [' FAIL  tilt error 0.33°, more than 3.4 mg causes', 'do not use']),
+        ('PASS', 'NOT SHOWN', [' NOT SHOWN  calibration error 0.20 mg', 'too few']),
+    ],
+)
 def test_acceptance(accel: str, tilt: str, begin: list[str]) -> None:
-    provenance = {'own_accel_mg': '0.201', 'own_tilt_deg': '0.3251', 'verdict': accel,
-                  'verdict_tilt': tilt}
+    provenance = {
+        'own_accel_mg': '0.201',
+        'own_tilt_deg': '0.3251',
+        'verdict': accel,
+        'verdict_tilt': tilt,
+    }
     lines = acceptance_lines(replace(fitted_and_truth()[0], provenance=provenance))
     assert len(lines) == len(begin) and max(map(len, lines)) <= 79
     assert all(text in line for text, line in zip(begin, lines))

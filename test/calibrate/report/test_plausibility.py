@@ -25,20 +25,32 @@ def fitted(sensor: Sensor, scale: list[float], zero_g: list[float]) -> Sensor:
     up = rng.normal(size=(30, 3))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     volts = sensor.nominal_zero_g_v + sensor.nominal_scale_v_per_g * (
-        up * scale + zero_g + rng.normal(0, 2e-5, up.shape))
+        up * scale + zero_g + rng.normal(0, 2e-5, up.shape)
+    )
     missing, begins_s = np.full(30, np.nan), 5.0 * np.arange(30)
-    poses = Poses(volts, np.full((30, 3), 2e-5), missing, missing,
-                  np.column_stack([begins_s, begins_s + 4]), np.zeros(30, bool))
+    poses = Poses(
+        volts,
+        np.full((30, 3), 2e-5),
+        missing,
+        missing,
+        np.column_stack([begins_s, begins_s + 4]),
+        np.zeros(30, bool),
+    )
     return calibrate(sensor, [RecordedPoses('rests.csv', poses)]).fitted
 
 
 @pytest.mark.parametrize('sensor', [nominal('xyz'), any_imu()], ids=['adxl203', 'any'])
-@pytest.mark.parametrize(('scale', 'zero_g', 'words'), [
-    ([0.68] * 3, [0.0] * 3, 'scale factor of x'),
-    ([1.0, 1.0, 2.0], [0.0] * 3, 'scale factor of z'),
-    ([1.0] * 3, [0.0, 0.6, 0.0], 'zero-g of y')])
-def test_an_implausible_unit_fails(sensor: Sensor, scale: list[float], zero_g: list[float],
-                                   words: str) -> None:
+@pytest.mark.parametrize(
+    ('scale', 'zero_g', 'words'),
+    [
+        ([0.68] * 3, [0.0] * 3, 'scale factor of x'),
+        ([1.0, 1.0, 2.0], [0.0] * 3, 'scale factor of z'),
+        ([1.0] * 3, [0.0, 0.6, 0.0], 'zero-g of y'),
+    ],
+)
+def test_an_implausible_unit_fails(
+    sensor: Sensor, scale: list[float], zero_g: list[float], words: str
+) -> None:
     unit = fitted(sensor, scale, zero_g)
     outcome, lines = acceptance.acceptance(unit)
     assert outcome == acceptance.FAIL == unit.provenance['verdict']
