@@ -31,9 +31,9 @@ import numpy as np
 
 _LONGEST_S = 600.0  # Longest time of a step, s; chosen: far above what sweep and fit take
 _POLL_S = 0.2  # Time between two looks at the progress, s
-_SPEED = 40.0
+_SPEED = 80.0
 """Sensor time per real time; chosen: two cores can follow, and a slower machine takes longer."""
-_RATE_HZ = 250.0
+_RATE_HZ = 125.0
 """Rate of the simulated sensor, Hz. Chosen: its noise ends at 50 Hz, so that more samples would
 say no more, and many times real time leaves room to catch up."""
 _DURATION_S = 50  # Real time of the demonstration, s; measured

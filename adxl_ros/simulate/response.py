@@ -210,9 +210,10 @@ class Response:
                 signals.rotation = motion.force.rotation(instants_s)
             return signals
         if place is Place.STAGE:
-            signals.alpha, signals.beta, signals.shift = (
-                Joint(*(joint(instants_s, order) for order in range(3)))
-                for joint in (motion.alpha, motion.beta, motion.shift)
+            signals.alpha, signals.beta, signals.shift = self._kept(
+                'joints',
+                (*self._key(Place.REFERENCE, Place.CLOCK), self._done_steps, len(instants_s)),
+                lambda: self._joints(instants_s),
             )
         self._chain(place, signals)
         if place is Place.CLOCK:
@@ -222,6 +223,14 @@ class Response:
                 signals.alpha, signals.beta, signals.shift, signals.gravity_mps2, signals.up
             )
         return signals
+
+    def _joints(self, instants_s: np.ndarray) -> tuple[Joint, ...]:
+        """Return positions, rates and accelerations of the joints, before the stage's effects."""
+        motion = self._motion
+        return tuple(
+            Joint(*(joint(instants_s, order) for order in range(3)))
+            for joint in (motion.alpha, motion.beta, motion.shift)
+        )
 
     def _acting_force(self) -> Callable[[np.ndarray], Components]:
         """
