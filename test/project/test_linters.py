@@ -10,7 +10,8 @@ import sys
 from processes import REPO
 import pytest
 
-PYTHON_SOURCES = ('adxl_ros', 'adxl_ros_validation', 'launch', 'test', 'setup.py')
+RELEASED_SOURCES = ('adxl_ros', 'adxl_ros_validation', 'launch', 'setup.py')
+PYTHON_SOURCES = (*RELEASED_SOURCES, 'test')
 
 
 def run_module(name: str, *args: str) -> None:
@@ -35,8 +36,8 @@ def run_module(name: str, *args: str) -> None:
 @pytest.mark.parametrize(
     ('linter', 'arguments'),
     [
-        ('ament_flake8', ('--config', 'test/project/ament_flake8.ini', *PYTHON_SOURCES)),
-        ('ament_pep257', PYTHON_SOURCES),
+        ('ament_flake8', ('--config', 'test/project/ament_flake8.ini', *RELEASED_SOURCES)),
+        ('ament_pep257', RELEASED_SOURCES),
         ('ament_xmllint', ('package.xml',)),
     ],
 )
