@@ -679,6 +679,10 @@ class ChannelColumns(NamedTuple):
     # block, (m/s²)², (blocks, k + 1, k + 1)
     plain: np.ndarray
 
+    def combination(self, departures: np.ndarray) -> np.ndarray:
+        """Return the factors of the columns, (k + 1,), that leave the residual at departures."""
+        return np.concatenate([[1.0], -departures[self.places]])
+
 
 @dataclass(frozen=True)
 class LinearisedHypothesis:

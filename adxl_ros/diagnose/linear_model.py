@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, product
+from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
@@ -257,6 +258,19 @@ def hints_of(name: Coefficient) -> base.DiagnosisHints:
     return effect_named(name.effect).diagnosis
 
 
+class Channel(NamedTuple):
+    """One axis of one recording."""
+
+    comparison: BaselineComparison  # The recording
+    axis: int  # Number of the axis
+
+    @property
+    def v_per_mean_mps2(self) -> float:
+        """Voltage that adds 1 m/s² to the root of the mean square over axes, V/(m/s²)."""
+        scale = float(self.comparison.scale_v_per_mps2[self.axis])
+        return scale * len(self.comparison.sensor.axes) ** 0.5
+
+
 @dataclass(frozen=True)
 class LinearModel:
     """
@@ -303,10 +317,10 @@ class LinearModel:
         """Rms of the motion that smooth references lack, m/s²."""
         return float(np.sqrt(np.mean([c.lost_motion_mps2() ** 2 for c in self.comparisons])))
 
-    @property
-    def places(self) -> list[tuple[BaselineComparison, int]]:
-        """Return the recording and the number of the axis of each channel."""
-        return [(c, axis) for c in self.comparisons for axis in range(len(c.sensor.axes))]
+    @cached_property
+    def places(self) -> list[Channel]:
+        """Recording and axis of each channel."""
+        return channels_of(self.comparisons)
 
     @cached_property
     def null_fit(self) -> LinearFit:
@@ -385,6 +399,14 @@ class LinearModel:
             start,
             evidence.drifts_among(self.baseline.effects),
         )
+
+
+def channels_of(comparisons: Sequence[BaselineComparison]) -> list[Channel]:
+    """Return the channels of recordings."""
+    channels = []
+    for comparison in comparisons:
+        channels += [Channel(comparison, axis) for axis in range(len(comparison.sensor.axes))]
+    return channels
 
 
 def calibration_takes_up(effect: str) -> bool:

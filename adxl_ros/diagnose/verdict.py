@@ -13,7 +13,7 @@ user would act on. The same rule, applied to blocks drawn with replacement, says
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -21,7 +21,13 @@ from typing import NamedTuple
 import warnings
 
 from adxl_ros.diagnose import evidence as linear
-from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis, Whitener
+from adxl_ros.diagnose.evidence import (
+    BLOCKS,
+    ChannelColumns,
+    LinearFit,
+    LinearisedHypothesis,
+    Whitener,
+)
 from adxl_ros.diagnose.flexible_functions import Basis
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.model.constants import G0_MPS2
@@ -36,20 +42,28 @@ HEALTHY = ''  # The drift of a healthy unit's noise
 MATERIAL_MG = 0.1  # Amplitude that a user would act on, mg, unless `--material` states another one
 MATERIAL_SHARE_OF_NOISE = 0.1
 """Share of the noise that a user would act on: it adds half a per cent to the rms."""
-_SHARE_OF_SET, _SHARE_OF_FORM = 0.03, 0.1
-"""Share of the explained power that each effect of a set must hold, and the same beside an effect
-whose form is not exact over the same variables."""
-_FORM_AT_REST, _REST_ERRORS = _SHARE_OF_FORM**2, 2.0
-"""Share of the explained power by which a set may make rests worse, and the same in standard
-errors: a tenth of its amplitude may be an error of its form."""
-_NATS = 3.0  # Held-out log likelihood that a further effect must gain
+_SHARE_OF_SET = 0.03
+"""Share of the explained power that each effect of a set must hold. Chosen: a sixth of the
+amplitude."""
+_SHARE_OF_FORM = 0.1
+"""The same beside an effect whose form is not exact over the same variables. Chosen: a third of
+the amplitude, because what such a form leaves may look like an effect."""
+_FORM_AT_REST = _SHARE_OF_FORM**2
+"""Share of the explained power by which a set may make rests worse: a tenth of its amplitude may
+be an error of its form."""
+_REST_ERRORS = 2.0
+"""The same in standard errors: one set in 40 exceeds it by chance."""
+_NATS = 3.0  # Held-out log likelihood that a further effect must gain: a ratio of 20
 _SMALLEST_P = 0.001
 """Probability of the increments of a drift below which they are of something else. Chosen: one
 error in 1000."""
-_LOWEST, _HIGHEST = 0.05, 0.95  # Quantiles of the 90 % intervals
-_REPEATED, _RIGHT = (0.0, 0.5, 0.8, 0.95, 1.0), (0.2, 0.4, 0.6, 0.75, 0.9)
-"""Shares of the draws that repeat a verdict, and how often such verdicts were right. Rounded from
-40 working cases (seed 901): of those that all draws repeat, 21 of 25."""
+_LOWEST = 0.05  # Quantile at the lower end of a 90 % interval
+_HIGHEST = 0.95  # Quantile at its upper end
+_REPEATED = (0.0, 0.5, 0.8, 0.95, 1.0)
+"""Shares of the draws that repeat a verdict, at which `_RIGHT` is known."""
+_RIGHT = (0.2, 0.4, 0.6, 0.75, 0.9)
+"""How often verdicts that so many draws repeat were right. Rounded from 40 working cases (seed
+901): of those that all draws repeat, 21 of 25."""
 _POSE = {'force', 'cross_force', 'alpha_rad', 'beta_rad'}
 """Dimensions that only change with the pose."""
 _SHOWN_BY_POSE = {
@@ -61,15 +75,18 @@ _SHOWN_BY_POSE = {
 }
 """Variables over which an effect that only changes with the pose shows."""
 _DRAWS = 200  # Draws of blocks. Chosen: the 5 % quantile has 10 draws below it
-FOLDS, _RUN_BLOCKS = 4, 2
-"""Parts of a recording, each of which is held out once, and neighbouring blocks that are held out
-together. Chosen: run time, and slow effects change within two."""
-_FIRST_MEAN_S, _FEWEST_MEANS, _FEWEST_STEPS = 0.1, 16, 12
-"""Shortest mean in which a drift is looked for, s, and fewest means, and increments, that show a
-form. Chosen: noise of sensors is white below it."""
-_ROUNDS, _FIRST_LEVEL_G, _SMALLEST_LEVEL = 12, 1e-3, 1e-4
-"""Rounds of the fit of the levels of flexible functions, first level, g rms, and level, in first
-ones, below which a function is left out. Chosen: any other start ends at the same levels."""
+FOLDS = 4  # Parts of a recording, each of which is held out once. Chosen: run time
+_RUN_BLOCKS = 2
+"""Neighbouring blocks that are held out together. Chosen: slow effects change within two."""
+_FIRST_MEAN_S = 0.1
+"""Shortest mean in which a drift is looked for, s. Chosen: noise of sensors is white below it."""
+_FEWEST_MEANS = 16  # Fewest means of the longest length. Chosen: their increments show a form
+_FEWEST_STEPS = 12  # Fewest increments that show a form. Chosen: a kurtosis scatters by 1.4
+_ROUNDS = 12
+"""Rounds of the fit of the levels of flexible functions. Chosen: the levels hardly change then."""
+_FIRST_LEVEL_G = 1e-3  # First level, g rms. Chosen: any other start ends at the same levels
+_SMALLEST_LEVEL = 1e-4
+"""Level, in first ones, below which a function is left out. Chosen: 0.1 µg is below any noise."""
 
 
 class WeightedHypothesis(NamedTuple):
@@ -104,9 +121,8 @@ class Rest:
     """What flexible functions predict of held-out blocks beyond a set of effects."""
 
     squares: np.ndarray  # Decrease of the squares by all functions, by block, (m/s²)², (blocks,)
-    # The same by all functions but those of time, and their increase of the log likelihood
-    steady_squares: np.ndarray
-    steady_log_likelihood: np.ndarray
+    steady_squares: np.ndarray  # The same by all functions but those of time
+    steady_log_likelihood: np.ndarray  # Increase of the log likelihood by these, (blocks,)
     by_dimension: dict[str, np.ndarray]  # Decrease by the functions of one dimension alone
     # Probability that a drift has increments with such jumps or lines; 1 beside a healthy unit
     drift_p: float = 1.0
@@ -119,12 +135,13 @@ def block_weights(seed: int) -> np.ndarray:
     return np.concatenate([np.ones((1, BLOCKS)), counts])
 
 
-def folds() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield held-out and fitted blocks, (blocks,) bool each."""
-    number = np.arange(BLOCKS)
-    for fold in range(FOLDS):
-        held_out = (number // _RUN_BLOCKS) % FOLDS == fold
-        yield held_out, np.convolve(held_out, np.ones(3), 'same') == 0
+class Fold(NamedTuple):
+    """A fit to some blocks, and the blocks that it predicts."""
+
+    held_out: np.ndarray  # Blocks that are predicted, (blocks,) bool
+    fitted: np.ndarray  # Blocks that are fitted: none of them is next to a held-out one
+    fit: LinearFit
+    departures: np.ndarray  # Departures of the k coefficients from the prior mean, (k,)
 
 
 @dataclass(frozen=True)
@@ -142,12 +159,19 @@ class HeldOutFits:
         return self.linearised.fit(drifts=self.drifts)
 
     @cached_property
-    def by_fold(self) -> list[tuple[np.ndarray, np.ndarray, LinearFit, np.ndarray]]:
-        """Held-out blocks, fitted blocks, fit, and departures from the prior mean by fold."""
+    def full_departures(self) -> np.ndarray:
+        """Departures from the prior mean in the fit to all blocks, (k,)."""
+        return self.linearised.departures(self.full, self.full)
+
+    @cached_property
+    def folds(self) -> list[Fold]:
+        """The fits to all blocks but one part of them, which is held out."""
         out = []
-        for held_out, fitted in folds():
+        for part in range(FOLDS):
+            held_out = (np.arange(BLOCKS) // _RUN_BLOCKS) % FOLDS == part
+            fitted = np.convolve(held_out, np.ones(3), 'same') == 0
             fit = self.linearised.fit(fitted, self.drifts)
-            out.append((held_out, fitted, fit, self.linearised.departures(fit, self.full)))
+            out.append(Fold(held_out, fitted, fit, self.linearised.departures(fit, self.full)))
         return out
 
     @cached_property
@@ -155,14 +179,14 @@ class HeldOutFits:
         """Squares and log likelihood of the held-out blocks."""
         squares, log_likelihood = np.zeros(BLOCKS), np.zeros(BLOCKS)
         linearised = self.linearised
-        for held_out, _, fit, departures in self.by_fold:
+        for held_out, _, fit, departures in self.folds:
             for columns, channel, f, variance in zip(
                 linearised.columns,
                 linearised.channels,
                 fit.filter_indices,
                 fit.innovation_variance_v2,
             ):
-                v = np.concatenate([[1.0], -departures[columns.places]])
+                v = columns.combination(departures)
                 squares[held_out] += np.einsum('i,bij,j->b', v, columns.plain[held_out], v)
                 white = np.einsum('i,bij,j->b', v, channel.block_grams[f][held_out], v)
                 log_likelihood[held_out] += channel.log_scales[f][held_out] - 0.5 * (
@@ -193,6 +217,79 @@ class HeldOutFits:
         return float(G0_MPS2 * np.sqrt(np.mean(np.square(sizes_g))))
 
 
+class _Decrease(NamedTuple):
+    """What functions predict of each block, (blocks,) each."""
+
+    squares: np.ndarray  # Decrease of the squares, (m/s²)²
+    log_likelihood: np.ndarray  # Increase of the log likelihood
+
+
+@dataclass(frozen=True)
+class _FlexibleFunctions:
+    """The k flexible functions of one channel, beside the columns of a set of effects."""
+
+    dimensions: np.ndarray  # What each function follows, (k,)
+    columns: ChannelColumns  # The columns of the set
+    # Products of the columns, then the functions, in both directions, by block
+    white_v2: np.ndarray  # Whitened, V²
+    plain_mps2: np.ndarray  # Mean over axes, (m/s²)²
+    variance_v2: float  # Variance of the whitened noise, V²
+
+    @classmethod
+    def of(cls, fits: HeldOutFits, number: int, basis: Basis) -> _FlexibleFunctions:
+        """Multiply the columns and functions of the channel of some number."""
+        columns, channel = fits.linearised.columns[number], fits.model.places[number]
+        sensor, used = channel.comparison.sensor, channel.comparison.used
+        unit_v = _FIRST_LEVEL_G * float(sensor.scale_v_per_g[channel.axis])
+        design = np.concatenate([columns.values, *(unit_v * b for b in basis.values())], axis=1)
+        whitener = fits.linearised.filters[number][fits.full.filter_indices[number]]
+        ids = np.arange(design.shape[1] - 1)
+        white = linear.whiten_channel(design[:, 0], design[:, 1:], ids, used, [whitener])
+        return cls(
+            dimensions=np.repeat(
+                [d.value for d in basis], [functions.shape[1] for functions in basis.values()]
+            ),
+            columns=columns,
+            white_v2=white.block_grams[0],
+            plain_mps2=linear.plain_grams(design / channel.v_per_mean_mps2, used),
+            variance_v2=float(fits.full.innovation_variance_v2[number]),
+        )
+
+    def products(
+        self, grams: np.ndarray, departures: np.ndarray, chosen: np.ndarray
+    ) -> FunctionProducts:
+        """Return the products of chosen functions, where effects have some departures."""
+        effects = self.columns.values.shape[1]
+        functions = grams[..., effects:, effects:]
+        residual = grams[..., effects:, :effects] @ self.columns.combination(departures)
+        return FunctionProducts(functions[..., chosen, :][..., chosen], residual[..., chosen])
+
+    def predict(self, fits: HeldOutFits, chosen: np.ndarray) -> _Decrease:
+        """Fit functions, (k,) bool, to the other blocks, and predict those held out."""
+        number = np.flatnonzero(chosen)
+        together = self.white_v2.sum(axis=0)
+        level = largest_evidence_levels(
+            self.products(together, fits.full_departures, number),
+            self.dimensions[number],
+            self.variance_v2,
+        )
+        active, level = number[level > 0], level[level > 0]
+        squares, log_likelihood = np.zeros(BLOCKS), np.zeros(BLOCKS)
+        if not len(active):
+            return _Decrease(squares, log_likelihood)
+        for held_out, fitted, _, departures in fits.folds:
+            known = self.products(self.white_v2[fitted].sum(axis=0), departures, active)
+            values = np.linalg.solve(
+                known.functions / self.variance_v2 + np.diag(1 / level),
+                known.residual / self.variance_v2,
+            )
+            plain = self.products(self.plain_mps2[held_out], departures, active)
+            white = self.products(self.white_v2[held_out], departures, active)
+            squares[held_out] = plain.decrease(values)
+            log_likelihood[held_out] = 0.5 * white.decrease(values) / self.variance_v2
+        return _Decrease(squares, log_likelihood)
+
+
 def reproducible_rest(fits: HeldOutFits, bases: Sequence[Basis]) -> Rest:
     """
     Predict held-out blocks by flexible functions of everything that a residual may follow.
@@ -201,61 +298,32 @@ def reproducible_rest(fits: HeldOutFits, bases: Sequence[Basis]) -> Rest:
     1992), so that functions that follow noise vanish. The effects keep their values, so that the
     functions take up only what the effects leave. `bases` are the functions of each channel.
     """
-    linearised, model = fits.linearised, fits.model
-    by_choice = {name: np.zeros(BLOCKS) for name in ('all', 'steady', 'nats')}
-    whole = linearised.departures(fits.full, fits.full)
-    for number, (columns, filters, basis, (comparison, axis)) in enumerate(
-        zip(linearised.columns, linearised.filters, bases, model.places)
-    ):
+    squares, steady_squares, steady_log_likelihood = np.zeros((3, BLOCKS))
+    by_dimension: dict[str, np.ndarray] = {}
+    for number, basis in enumerate(bases):
         if not basis:
             continue
-        unit_v = _FIRST_LEVEL_G * float(comparison.sensor.scale_v_per_g[axis])
-        design = np.concatenate([columns.values, *(unit_v * b for b in basis.values())], axis=1)
-        white = linear.whiten_channel(
-            design[:, 0],
-            design[:, 1:],
-            np.arange(design.shape[1] - 1),
-            comparison.used,
-            [filters[fits.full.filter_indices[number]]],
-        ).block_grams[0]
-        scale = float(comparison.scale_v_per_mps2[axis]) * len(comparison.sensor.axes) ** 0.5
-        plain = linear.plain_grams(design / scale, comparison.used)
-        variance = float(fits.full.innovation_variance_v2[number])
-        names = np.repeat([d.value for d in basis], [b.shape[1] for b in basis.values()])
-        choices = {d.value: names == d.value for d in basis}
-        choices |= {'all': names != '', 'steady': names != FormDimension.TIME.value}
-        for name, chosen in choices.items():
-            level = _levels(_products(white, whole[columns.places]), names, chosen, variance)
-            active = np.flatnonzero(level)
-            for held_out, fitted, _, departures in fits.by_fold if len(active) else ():
-                gram, residual = _products(white[fitted], departures[columns.places], active)
-                values = np.linalg.solve(
-                    gram / variance + np.diag(1 / level[active]), residual / variance
-                )
-                flat, gained = (
-                    np.array(
-                        [
-                            _gain(
-                                _products(block[None], departures[columns.places], active), values
-                            )
-                            for block in grams[held_out]
-                        ]
-                    )
-                    for grams in (plain, white)
-                )
-                by_choice.setdefault(name, np.zeros(BLOCKS))[held_out] += flat
-                if name == 'steady':
-                    by_choice['nats'][held_out] += 0.5 * gained / variance
-    together, steady, nats = (by_choice.pop(name) for name in ('all', 'steady', 'nats'))
-    p = [
-        increments_p(
-            c.values @ np.concatenate([[1.0], -whole[c.places]]),
-            comparison.used,
-            comparison.sensor.rate_hz,
-        )
-        for c, (comparison, _) in zip(linearised.columns if fits.drifts else (), model.places)
-    ]
-    return Rest(together, steady, nats, by_choice, min([1.0, *(len(p) * v for v in p)]))
+        functions = _FlexibleFunctions.of(fits, number, basis)
+        squares += functions.predict(fits, functions.dimensions != '').squares
+        steady = functions.predict(fits, functions.dimensions != FormDimension.TIME.value)
+        steady_squares += steady.squares
+        steady_log_likelihood += steady.log_likelihood
+        for dimension in (d.value for d in basis):
+            alone = functions.predict(fits, functions.dimensions == dimension).squares
+            by_dimension[dimension] = by_dimension.get(dimension, 0.0) + alone
+    return Rest(squares, steady_squares, steady_log_likelihood, by_dimension, _drift_p(fits))
+
+
+def _drift_p(fits: HeldOutFits) -> float:
+    """Return how probable the residuals of all channels are if they drift; 1 without a drift."""
+    if not fits.drifts:
+        return 1.0
+    smallest = 1.0
+    for columns, (comparison, _) in zip(fits.linearised.columns, fits.model.places):
+        residual_v = columns.values @ columns.combination(fits.full_departures)
+        p = increments_p(residual_v, comparison.used, comparison.sensor.rate_hz)
+        smallest = min(smallest, len(fits.model.places) * p)
+    return smallest
 
 
 def increments_p(values: np.ndarray, used: np.ndarray, rate_hz: float) -> float:
@@ -291,36 +359,38 @@ def increments_p(values: np.ndarray, used: np.ndarray, rate_hz: float) -> float:
         return float(min(1.0, 2 * min(line, scipy.stats.kurtosistest(steps).pvalue)))
 
 
-def _products(
-    grams: np.ndarray, departures: np.ndarray, chosen: np.ndarray | slice = slice(None)
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return products of functions with each other and with what effects leave, over blocks."""
-    k, total = 1 + len(departures), grams.sum(axis=0)
-    functions, residual = total[k:, k:], total[k:, :k] @ np.concatenate([[1.0], -departures])
-    return functions[chosen][:, chosen], residual[chosen]
+class FunctionProducts(NamedTuple):
+    """Products of k functions, of one part of a recording or by part."""
+
+    functions: np.ndarray  # With each other, (..., k, k)
+    residual: np.ndarray  # With what the effects leave, (..., k)
+
+    def decrease(self, values: np.ndarray) -> np.ndarray:
+        """Return by how much the functions lower the squares with k coefficients."""
+        return 2 * self.residual @ values - (self.functions @ values) @ values
 
 
-def _gain(products: tuple[np.ndarray, np.ndarray], values: np.ndarray) -> float:
-    """Return by how much functions lower the squares."""
-    return float(2 * products[1] @ values - values @ products[0] @ values)
-
-
-def _levels(
-    products: tuple[np.ndarray, np.ndarray], names: np.ndarray, chosen: np.ndarray, variance: float
+def largest_evidence_levels(
+    products: FunctionProducts, dimensions: np.ndarray, variance: float
 ) -> np.ndarray:
-    """Return the variance of each function's coefficient of the largest evidence, (functions,)."""
-    level, (gram, residual) = np.where(chosen, 1.0, 0.0), products
+    """
+    Return the prior variances of the coefficients of k functions of the largest evidence, (k,).
+
+    All functions of a dimension have one. It is 0 where the functions follow noise. `variance` is
+    that of the noise.
+    """
+    level = np.ones(len(dimensions))
     for _ in range(_ROUNDS):
         active = np.flatnonzero(level)
         if not len(active):
             break
-        covariance = np.linalg.inv(
-            gram[np.ix_(active, active)] / variance + np.diag(1 / level[active])
-        )
-        squares = (covariance @ residual[active] / variance) ** 2 + np.diag(covariance)
-        for name in np.unique(names[active]):
-            of_name = names[active] == name
-            level[active[of_name]] = squares[of_name].mean()
+        precision = products.functions[np.ix_(active, active)] / variance
+        covariance = np.linalg.inv(precision + np.diag(1 / level[active]))
+        mean = covariance @ products.residual[active] / variance
+        squares = mean**2 + np.diag(covariance)
+        for dimension in np.unique(dimensions[active]):
+            alike = dimensions[active] == dimension
+            level[active[alike]] = squares[alike].mean()
         level[level <= _SMALLEST_LEVEL**2] = 0.0
     return level
 
@@ -384,14 +454,26 @@ class SimulatedAgain(NamedTuple):
     at_bound: bool  # Whether a size is at the end of what its parameter can have
 
 
+class Figure(NamedTuple):
+    """A figure that the rule weighs: a difference of power, (m/s²)², or log likelihood."""
+
+    value: float
+    low: float  # Lower end of its interval over draws; within one draw the value itself
+
+    @property
+    def predicts(self) -> bool:
+        """Whether samples are so much more probable, beyond the interval."""
+        return self.value > _NATS and self.low > 0
+
+
 @dataclass(frozen=True)
 class Evidence:
-    """What the rule weighs; its methods return one value for each draw of the blocks."""
+    """What the rule weighs: all blocks, with draws of them for the intervals, or one draw."""
 
     # Sets of effects, the empty one among them, by the drift that the noise may have
     candidates: Mapping[frozenset[str], Mapping[str, HeldOutFits]]
     counts: np.ndarray  # Samples by block, (blocks,)
-    # How often each block is drawn, (draws, blocks); once each in the first row
+    # How often each block is drawn, (draws, blocks); the first row is what the rule is applied to
     weights: np.ndarray
     material_mps2: float  # Material amplitude, m/s²
     # Rms error of the reference, m/s²: its steps return with each pose, as an effect would
@@ -404,9 +486,19 @@ class Evidence:
     sizeless: Mapping[frozenset[str], frozenset[str]] = field(default_factory=dict)
     # The sets that could be the answer, simulated again, not linearised
     again: Mapping[frozenset[str], SimulatedAgain] = field(default_factory=dict)
+    is_draw: bool = False  # Whether it is one draw, whose figures have no interval
+
+    def draw(self, number: int) -> Evidence:
+        """Return one draw of the blocks."""
+        return replace(self, weights=self.weights[number : number + 1], is_draw=True)
+
+    def figure(self, draws: np.ndarray) -> Figure:
+        """Return what the rule weighs of a figure with one value for each draw."""
+        value = float(draws[0])
+        return Figure(value, value if self.is_draw else float(np.quantile(draws, _LOWEST)))
 
     def left(self, effects: frozenset[str]) -> np.ndarray:
-        """Return the power above the noise floor that a set leaves."""
+        """Return the power above the noise floor that a set leaves, by draw."""
         return self.mean(self.candidates[effects][HEALTHY].figures.squares) - self.floor_mps2**2
 
     def material_power(self, pose_share: float) -> float:
@@ -415,7 +507,7 @@ class Evidence:
         return self.material_mps2**2 + share * self.reference_mps2**2
 
     def mean(self, by_block: np.ndarray) -> np.ndarray:
-        """Return the mean over samples of sums by block."""
+        """Return the mean over samples of sums by block, by draw."""
         return self.weights @ by_block / np.maximum(self.weights @ self.counts, 1.0)
 
     def is_refuted(self, effects: frozenset[str]) -> bool:
@@ -437,8 +529,9 @@ class Evidence:
         """Determine whether a set, as it is printed, leaves materially more than another."""
         if not {effects, other} <= {*self.again}:
             return False
-        more = self.mean(self.again[effects].printed - self.again[other].printed)
-        return float(more[0]) > self.material_power(1.0) and _low(more) > 0
+        printed, others = self.again[effects].printed, self.again[other].printed
+        more = self.figure(self.mean(printed - others))
+        return more.value > self.material_power(1.0) and more.low > 0
 
     def drift_power(self, effects: frozenset[str], drifts: Sequence[str]) -> float:
         """Return the power of the first drift beside a set, (m/s²)²; 0 without one."""
@@ -448,12 +541,12 @@ class Evidence:
         return fits[drifts[0]].drift_mps2 ** 2
 
     def gain(self, more: frozenset[str], less: frozenset[str]) -> np.ndarray:
-        """Return by how much one set explains more power than another."""
+        """Return by how much one set explains more power than another, by draw."""
         a, b = (self.candidates[e][HEALTHY].figures for e in (more, less))
         return self.mean(b.squares - a.squares)
 
     def nats(self, more: frozenset[str], less: frozenset[str], drift: str = HEALTHY) -> np.ndarray:
-        """Return by how much a set, with its noise, makes the held-out samples more probable."""
+        """Return by how much a set and its noise make held-out samples more probable, by draw."""
         a, b = self.candidates[more][drift].figures, self.candidates[less][HEALTHY].figures
         return self.weights @ (a.log_likelihood - b.log_likelihood)
 
@@ -463,23 +556,15 @@ class Evidence:
         return Interval(float(draws[0]), float(min(low, draws[0])), float(max(high, draws[0])))
 
 
-def _low(draws: np.ndarray) -> float:
-    """Return the lower end of the interval; of one draw, itself."""
-    return float(np.quantile(draws, _LOWEST)) if len(draws) > 1 else float(draws[0])
-
-
-def _predicts(nats: np.ndarray) -> bool:
-    """Determine whether held-out samples are more probable, beyond the interval."""
-    return bool(nats[0] > _NATS and _low(nats) > 0)
-
-
 def is_needed(evidence: Evidence, effects: frozenset[str], effect: str) -> bool:
     """Determine whether a set loses a material part of what it explains without an effect."""
     if effect in evidence.sizeless.get(effects, ()):
         return False
     rest = effects - {effect}
-    lost, nats = evidence.gain(effects, rest), evidence.nats(effects, rest)
-    if nats[0] <= _NATS or max(_low(nats), _low(lost)) <= 0:
+    lost = evidence.figure(evidence.gain(effects, rest))
+    nats = evidence.figure(evidence.nats(effects, rest))
+    is_certain = nats.value > _NATS and max(nats.low, lost.low) > 0
+    if not is_certain:
         return False
     hints = effect_named(effect).diagnosis
     # An error of form of another effect may look like an effect over the same variables.
@@ -487,7 +572,7 @@ def is_needed(evidence: Evidence, effects: frozenset[str], effect: str) -> bool:
     share = _SHARE_OF_FORM if shares_form else _SHARE_OF_SET
     explained = float(evidence.gain(effects, _NOTHING)[0])
     by_pose = bool(hints.proof) and {*hints.proof} <= _SHOWN_BY_POSE
-    return float(lost[0]) > max(evidence.material_power(float(by_pose)), share * explained)
+    return lost.value > max(evidence.material_power(float(by_pose)), share * explained)
 
 
 def minimal_sets(evidence: Evidence) -> list[frozenset[str]]:
@@ -508,14 +593,11 @@ def minimal_sets(evidence: Evidence) -> list[frozenset[str]]:
     ]
     kept.sort(key=lambda effects: -evidence.nats(effects, _NOTHING)[0])
     first = kept[0]
-    alternatives = [
-        first,
-        *(
-            other
-            for other in kept[1:]
-            if len(other) == len(first) and not _predicts(evidence.nats(first, other))
-        ),
-    ]
+    alternatives = [first]
+    for other in kept[1:]:
+        is_less_probable = evidence.figure(evidence.nats(first, other)).predicts
+        if len(other) == len(first) and not is_less_probable:
+            alternatives.append(other)
     dropped = [a for a in alternatives if any(evidence.leaves_more(a, b) for b in alternatives)]
     return [effects for effects in kept if effects not in dropped]
 
@@ -535,24 +617,98 @@ def drifts_beside(evidence: Evidence, effects: frozenset[str], rest: Rest) -> li
     best = nats[drifts[0]]
     explained = float(evidence.gain(effects, _NOTHING)[0])
     exact = all(effect_named(e).exact for e in effects)
-    smallest = max(
-        evidence.material_mps2**2, (_SHARE_OF_SET if exact else _SHARE_OF_FORM) * explained
-    )
-    if (
-        candidate[drifts[0]].drift_mps2 ** 2 <= smallest
-        or not _predicts(best)
-        or not _predicts(best - evidence.weights @ rest.steady_log_likelihood)
-    ):
+    share = _SHARE_OF_SET if exact else _SHARE_OF_FORM
+    smallest = max(evidence.material_mps2**2, share * explained)
+    of_functions = evidence.weights @ rest.steady_log_likelihood
+    is_material = candidate[drifts[0]].drift_mps2 ** 2 > smallest
+    is_likely = evidence.figure(best).predicts
+    beats_functions = evidence.figure(best - of_functions).predicts
+    if not (is_material and is_likely and beats_functions):
         return []
-    return [d for d in drifts if d == drifts[0] or not _predicts(best - nats[d])]
+    others = [d for d in drifts[1:] if not evidence.figure(best - nats[d]).predicts]
+    return [drifts[0], *others]
 
 
 class _Answer(NamedTuple):
     """Status, certain effects, and groups of inseparable ones."""
 
     status: str
-    effects: frozenset[str]
-    groups: frozenset[frozenset[str]]
+    effects: frozenset[str] = _NOTHING
+    groups: frozenset[frozenset[str]] = frozenset()
+
+
+class _Powers(NamedTuple):
+    """What the best set explains and leaves, (m/s²)²."""
+
+    explained: float  # Explained power
+    above: float  # What is left above the noise floor, repeating or not
+    repeats: float  # What repeats beside the set and the drifts; 0 where it is not material
+    drift: float  # Power of the first drift
+    drifts: Sequence[str]  # The drifts of the noise, the best first
+
+    @property
+    def is_unexplained(self) -> bool:
+        """Whether more repeats than effects and drift explain."""
+        return self.repeats > self.explained + self.drift
+
+    def remaining(self, material: float) -> float:
+        """Return what is left beside effects: what repeats, or all that no drift explains."""
+        is_more = self.above > self.drift + material
+        return max(self.repeats, self.above) if is_more else self.repeats
+
+
+def _powers(
+    evidence: Evidence,
+    best: frozenset[str],
+    rest: Rest,
+    rest_material: float,
+    drifts: Sequence[str],
+) -> _Powers:
+    """Weigh what the best set leaves, and drop the drifts where it is none."""
+    explained = evidence.figure(evidence.gain(best, _NOTHING)).value
+    above = evidence.figure(evidence.left(best)).value
+    repeats = evidence.figure(evidence.mean(rest.squares))
+    steady = evidence.figure(evidence.mean(rest.steady_squares))
+    drift = evidence.drift_power(best, drifts)
+    follows_more = steady.low > rest_material and steady.value > _SHARE_OF_FORM * drift
+    is_random = rest.drift_p >= _SMALLEST_P
+    if drifts and (follows_more or not is_random):
+        # A drift follows time alone, and at random; its fit takes up what does not, too.
+        return _Powers(explained, above, max(repeats.value, above), 0.0, ())
+    material = repeats.value if repeats.low > rest_material else 0.0
+    return _Powers(explained, above, material, drift, drifts)
+
+
+def _rivals(
+    evidence: Evidence, minimal: Sequence[frozenset[str]], repeats: float
+) -> list[frozenset[str]]:
+    """
+    Return the other sets that could be the answer in place of the first.
+
+    The order of two sets could be that of their errors of form, where these are as large as what
+    repeats beside the best set; or that of errors of the reference in motion.
+    """
+    best = minimal[0]
+    smallest = max(repeats, evidence.errs_in_motion * evidence.reference_mps2**2)
+    rivals = []
+    for other in minimal[1:]:
+        is_less_probable = evidence.figure(evidence.nats(best, other)).predicts
+        explains_less = evidence.figure(evidence.gain(best, other)).value > smallest
+        is_beaten = is_less_probable and explains_less
+        is_alike = len(other) == len(best) and not is_beaten
+        if is_alike and not evidence.leaves_more(other, best):
+            rivals.append(other)
+    return rivals
+
+
+def _groups(best: frozenset[str], rivals: Sequence[frozenset[str]]) -> frozenset[frozenset[str]]:
+    """Return each effect of the best set with those that rivals have in its place."""
+    groups = set()
+    for effect in best:
+        instead = [other - best for other in rivals if effect not in other]
+        if any(instead):
+            groups.add(frozenset({effect}).union(*instead))
+    return frozenset(groups)
 
 
 def _answer(
@@ -564,54 +720,29 @@ def _answer(
 ) -> _Answer:
     """Apply the rule to the figures of all blocks, or of one draw of them."""
     minimal = minimal_sets(evidence)
-    best = minimal[0]
-    explained, above = (float(v[0]) for v in (evidence.gain(best, _NOTHING), evidence.left(best)))
-    repeats, steady = map(evidence.mean, (rest.squares, rest.steady_squares))
-    left = float(repeats[0]) if _low(repeats) > rest_material else 0.0
-    drift = evidence.drift_power(best, drifts)
-    follows = _low(steady) > rest_material and float(steady[0]) > _SHARE_OF_FORM * drift
-    if drifts and (follows or rest.drift_p < _SMALLEST_P):
-        # A drift follows time alone, and at random; its fit takes up what does not, too.
-        drifts, drift, left = (), 0.0, max(float(repeats[0]), above)
-    if left > explained + drift:
-        return _Answer('unknown', _NOTHING, frozenset())
-    named = () if evidence.wanders else drifts
-    if not best and not detected and not named:
+    best, material = minimal[0], evidence.material_power(1.0)
+    powers = _powers(evidence, best, rest, rest_material, drifts)
+    if powers.is_unexplained:
+        return _Answer('unknown')
+    named = frozenset(() if evidence.wanders else powers.drifts)
+    if not best | detected | named:
         # What neither repeats nor is noise at rest is no gap only while the noise is larger.
-        is_much = above > max(evidence.floor_mps2**2, evidence.material_power(1.0))
-        return _Answer('unknown' if is_much else 'no_gap', _NOTHING, frozenset())
-    # The order of two sets could be that of their errors of form, where these are as large as
-    # the rest that the best set leaves; or that of errors of the reference in motion.
-    smallest = max(left, evidence.errs_in_motion * evidence.reference_mps2**2)
-    rivals = [
-        other
-        for other in minimal[1:]
-        if len(other) == len(best)
-        and not (
-            _predicts(evidence.nats(best, other))
-            and float(evidence.gain(best, other)[0]) > smallest
-        )
-        and not evidence.leaves_more(other, best)
-    ]
-    groups = {
-        group
-        for e in best
-        if len(
-            group := frozenset({e}).union(*(other - best for other in rivals if e not in other))
-        )
-        > 1
-    }
-    certain = best.difference(*groups) | detected | {*named[:1]}
+        is_much = powers.above > max(evidence.floor_mps2**2, material)
+        return _Answer('unknown' if is_much else 'no_gap')
+    groups = _groups(best, _rivals(evidence, minimal, powers.repeats))
+    certain = best.difference(*groups) | detected
     if len(named) > 1:
-        groups, certain = groups | {frozenset(named)}, certain - {*named}
-    if best and above > drift + evidence.material_power(1.0):
-        left = max(left, above)
-    partly = left > _SHARE_OF_FORM * (explained + left)
-    if groups and partly and not certain:
+        groups, certain = groups | {named}, certain - named
+    else:
+        certain |= named
+    remaining = powers.remaining(material) if best else powers.repeats
+    is_partly = remaining > _SHARE_OF_FORM * (powers.explained + remaining)
+    if groups and is_partly and not certain:
         # Nothing is named for certain, and none of the rivals explains what repeats.
-        return _Answer('unknown', _NOTHING, frozenset())
-    status = 'inseparable' if groups else 'partly' if partly else 'explained'
-    return _Answer(status, certain, frozenset(groups))
+        return _Answer('unknown')
+    if groups:
+        return _Answer('inseparable', certain, groups)
+    return _Answer('partly' if is_partly else 'explained', certain)
 
 
 def decide(
@@ -641,33 +772,34 @@ def decide(
     repeats = evidence.interval(evidence.mean(rest.squares))
     # What follows the pose may be of the reference.
     pose = max((power[d] for d in _POSE & {*power}), default=0.0)
-    rest_material = evidence.material_power(
-        float(np.clip(pose / repeats.value, 0.0, 1.0)) if repeats.value > 0 else 0.0
-    )
-    answer, *drawn = (
-        _answer(
-            replace(evidence, weights=weights), rest, rest_material, drifts, frozenset(detected)
-        )
-        for weights in (evidence.weights, *evidence.weights[1:, None])
-    )
-    highest = max(evidence.interval(evidence.gain(e, _NOTHING)).high for e in evidence.candidates)
+    pose_share = float(np.clip(pose / repeats.value, 0.0, 1.0)) if repeats.value > 0 else 0.0
+    rest_material = evidence.material_power(pose_share)
+
+    def answer_of(weighed: Evidence) -> _Answer:
+        return _answer(weighed, rest, rest_material, drifts, frozenset(detected))
+
+    answer = answer_of(evidence)
+    drawn = [answer_of(evidence.draw(number)) for number in range(1, len(evidence.weights))]
     probability, hypotheses = _probabilities(answer, drawn)
+    highest = max(evidence.interval(evidence.gain(e, _NOTHING)).high for e in evidence.candidates)
     strongest = sorted(power, key=lambda d: -power[d])
     return Verdict(
-        answer.status,
-        tuple(sorted(answer.effects)),
-        tuple(sorted(tuple(sorted(g)) for g in answer.groups)),
-        probability,
-        hypotheses,
-        best,
-        evidence.material_mps2,
-        evidence.reference_mps2,
-        evidence.interval(evidence.gain(best, _NOTHING)),
-        repeats,
-        evidence.interval(evidence.left(best)),
-        float(np.sqrt(max(highest, repeats.high, evidence.material_power(1.0)))),
-        {e: evidence.interval(evidence.gain(best, best - {e})) for e in sorted(best)},
-        tuple(d for d in strongest if power[d] > 0 and power[d] >= power[strongest[0]] / 2),
+        status=answer.status,
+        effects=tuple(sorted(answer.effects)),
+        groups=tuple(sorted(tuple(sorted(g)) for g in answer.groups)),
+        probability=probability,
+        hypotheses=hypotheses,
+        best=best,
+        material_mps2=evidence.material_mps2,
+        reference_mps2=evidence.reference_mps2,
+        explained=evidence.interval(evidence.gain(best, _NOTHING)),
+        rest=repeats,
+        left=evidence.interval(evidence.left(best)),
+        upper_limit_mps2=max(highest, repeats.high, evidence.material_power(1.0)) ** 0.5,
+        lost_without={e: evidence.interval(evidence.gain(best, best - {e})) for e in sorted(best)},
+        rest_follows=tuple(
+            d for d in strongest if power[d] > 0 and power[d] >= power[strongest[0]] / 2
+        ),
     )
 
 
