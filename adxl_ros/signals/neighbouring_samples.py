@@ -4,7 +4,8 @@
 Faults between neighbouring samples, which means over a rest do not show.
 
 They are readings that stand for several samples each, the rows of several sensors in turn, counts
-that wrap at the end of their range, and readings that jump from one rest to another at once.
+that wrap at the end of their range, readings that jump from one rest to another at once, and
+single wrong samples.
 """
 
 from __future__ import annotations
@@ -47,6 +48,14 @@ _NEAREST = 3  # Samples on either side whose mean is compared
 _STEADY = 0.2  # Largest step among them, by the jump. Chosen: noise and slow motion are smaller
 _SMALLEST_JUMP_G = 0.3  # Smallest jump, g. Chosen: 17° of tilt, above any offset of the sensor
 
+_FEWEST_SPIKES = 3  # Fewest single wrong samples. Chosen: as with counts that wrap
+_ALIKE_SIZE = 0.75
+"""Size from which another sample deviates as much as a spike, by the spike. The neighbours of a
+spike deviate by half of it, and it itself by all of it: the middle."""
+_BINS_PER_OCTAVE = 4  # Bins of the sizes of deviations. Chosen: a width of 19 %
+_SMALLEST_BIN_MPS2 = 1e-6  # Deviations below this are rounding, m/s²: that of six decimals
+_SIZE_BINS = 40 * _BINS_PER_OCTAVE  # Number of these bins: up to 1e6 m/s²
+
 
 class NeighbouringSamples:
     """Looks at neighbouring samples of a stream, in blocks of any length."""
@@ -63,6 +72,10 @@ class NeighbouringSamples:
         self._distance_mps2 = dict.fromkeys(_PHASES, 0.0)  # Largest distance of their means
         self._ends = [_Ends() for _ in axes]
         self._jumps: list[tuple[float, float]] = []  # Times, s, and sizes, m/s², of jumps
+        self._spike_s: list[float] = []  # Times of single samples away from steady ones, s
+        self._spike_mps2: list[float] = []  # Their largest deviation of an axis, m/s²
+        # Number of samples by how much they deviate from the mean of their neighbours
+        self._deviations = np.zeros(_SIZE_BINS, int)
 
     def feed(self, time_s: np.ndarray, samples: np.ndarray) -> None:
         """Add samples, m/s², (n, m), with their stamps, s, (n,)."""
@@ -77,13 +90,20 @@ class NeighbouringSamples:
             ends.feed(values)
         self._count_runs(with_last)
         self._compare_rows(samples)
-        # The sides of the last jumps come with the next block.
+        # The sides of the last samples come with the next block.
         self._find_jumps(joined_s, joined)
-        self._left, self._left_s = joined[-2 * _SIDE :], joined_s[-2 * _SIDE :]
+        self._find_spikes(joined_s, joined)
+        self._left, self._left_s = joined[1 - 2 * _SIDE :], joined_s[1 - 2 * _SIDE :]
 
     def faults(self) -> list[str]:
         """Return what is wrong, one line each."""
-        found = (self._repeats(), self._alternates(), self._wraps(), self._jumped())
+        # A value that wraps for one sample stands alone as well.
+        found = (
+            self._repeats(),
+            self._alternates(),
+            self._wraps() or self._spikes(),
+            self._jumped(),
+        )
         return [text for text in found if text]
 
     def _count_runs(self, samples: np.ndarray) -> None:
@@ -185,6 +205,54 @@ class NeighbouringSamples:
             f'the readings jump by {jump_mps2 / G0_MPS2:.3g} g at {at_s:.6g} s from one '
             'steady value to another, faster than a sensor turns: it was turned over, '
             'exchanged or read in another way; use the parts'
+        )
+
+    def _find_spikes(self, time_s: np.ndarray, samples: np.ndarray) -> None:
+        """
+        Find single samples that differ from steady ones on both sides by the same step.
+
+        No force does that: it would leave a change of velocity behind, which motion afterwards
+        takes back.
+        """
+        if len(samples) < 2 * _SIDE:
+            return
+        between = (samples[:-2] + samples[2:]) / 2
+        deviation = np.abs(samples[1:-1] - between).max(axis=1)
+        codes = np.array([ends.step_mps2 for ends in self._ends])
+        code = float(codes[np.isfinite(codes)].max(initial=0.0))
+        across = np.maximum(np.abs(samples[2:] - samples[:-2]).max(axis=1), code)
+        stands_out = across < _STEADY * deviation
+        # Spikes nearby are no unsteadiness of the samples around one.
+        others = samples.copy()
+        others[1:-1][stands_out] = between[stands_out]
+        steps = np.abs(np.diff(others, axis=0)).max(axis=1)
+        # Samples whose both sides are known; those before were judged in the block before.
+        known = slice(_SIDE - 1, len(deviation) - _SIDE + 2)
+        bins = _BINS_PER_OCTAVE * np.log2(
+            deviation[known].clip(_SMALLEST_BIN_MPS2) / _SMALLEST_BIN_MPS2
+        )
+        self._deviations += np.bincount(
+            bins.astype(int).clip(max=_SIZE_BINS - 1), minlength=_SIZE_BINS
+        )
+        for i in (_SIDE + np.flatnonzero(stands_out[known])).tolist():
+            size_mps2 = float(deviation[i - 1])
+            if steps[i - _SIDE : i + _SIDE - 1].max() < _STEADY * size_mps2:
+                self._spike_s.append(float(time_s[i]))
+                self._spike_mps2.append(size_mps2)
+
+    def _spikes(self) -> str:
+        """Return how many single samples are wrong; shocks deviate for more than one sample."""
+        count = len(self._spike_s)
+        if count < _FEWEST_SPIKES:
+            return ''
+        size_mps2 = float(np.median(self._spike_mps2))
+        first_bin = _BINS_PER_OCTAVE * np.log2(_ALIKE_SIZE * size_mps2 / _SMALLEST_BIN_MPS2)
+        if self._deviations[int(max(first_bin, 0.0)) :].sum() > 2 * count:
+            return ''
+        return (
+            f'{count} single samples stand {size_mps2 / G0_MPS2:.3g} g away from those around '
+            f'them, the first at {self._spike_s[0]:.6g} s: error values of the bus, a loose '
+            'contact, or shocks shorter than a sample'
         )
 
 

@@ -70,7 +70,8 @@ def test_counts_that_wrap(shake_g: float) -> None:
 
 def test_shocks_and_a_sensor_that_clips_do_not_wrap() -> None:
     true_g = turning(6000) / G
-    true_g[1000::500, 2] += 2.5
+    for later, share in enumerate([1.0, 0.6, -0.3]):
+        true_g[1000 + later :: 500, 2] += 2.5 * share
     assert faults(np.clip(true_g, -2, 2 - 1 / 16384) * G) == []
     shaken_g = true_g + np.random.default_rng(3).normal(0, 1.5, true_g.shape)
     assert faults(np.clip(shaken_g, -2, 2 - 1 / 16384) * G) == []
@@ -92,3 +93,33 @@ def test_rests_that_were_joined_are_no_turns() -> None:
     directions /= np.linalg.norm(directions, axis=1)[:, None]
     rests = np.repeat(G * directions, 300, axis=0)
     assert faults(rests + np.random.default_rng(4).normal(0, 0.02, rests.shape)) == []
+
+
+@pytest.mark.parametrize('block', [7, 50, 333, 10_000])
+@pytest.mark.parametrize(('spikes', 'size_g'), [(5, 24.0), (60, 0.5)])
+def test_single_wrong_samples(spikes: int, size_g: float, block: int) -> None:
+    samples, rng = turning(), np.random.default_rng(5)
+    rows = 20 + 60 * np.arange(spikes)
+    samples[rows] += size_g * G * rng.choice([-1, 1], (spikes, 3))
+    (found,) = faults(samples, block)
+    assert f'{spikes} single samples' in found
+    stated_g = float(found.split(' g ')[0].split()[-1])
+    assert stated_g == pytest.approx(size_g, rel=0.02)
+    assert f'{rows[0] / RATE_HZ:g} s' in found
+
+
+@pytest.mark.parametrize('length', [2, 4])
+def test_shocks_are_no_wrong_samples(length: int) -> None:
+    """A sensor that rings for some samples after a shock may meet one of them alone."""
+    samples, since = turning(), np.arange(40)
+    ringing = np.exp(-since / length) * np.cos(2.0 * since)
+    for row in range(100, 3900, 100):
+        samples[row : row + 40, 2] += 2 * G * ringing
+    assert faults(samples) == []
+
+
+def test_codes_that_change_for_one_sample_are_right() -> None:
+    steady = np.tile([0.0, 0.0, G], (4000, 1))
+    steady[100::50] += 0.04
+    steady[125::50, 0] -= 0.04
+    assert faults(np.round(steady / 0.04) * 0.04) == []
