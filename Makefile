@@ -139,8 +139,8 @@ gallery: build
 reference: build
 	./run --exec python docs/reference.py
 
-site: .venv/.documented
-	.venv/bin/python -m sphinx -W --keep-going -q -E -c docs . site
+site: build .venv/.documented
+	OPENBLAS_NUM_THREADS=1 ./run --exec python -m sphinx -W --keep-going -q -E -c docs . site
 	@echo '<meta http-equiv="refresh" content="0; url=docs/index.html">' > site/index.html
 	@echo 'wrote site/index.html'
 

@@ -16,15 +16,17 @@ from importlib import import_module
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from adxl_ros.api.calibration import fit
-    from adxl_ros.api.checking import check
-    from adxl_ros.api.correction import apply
-    from adxl_ros.api.gap import diagnose
-    from adxl_ros.api.noise import noise
+    from adxl_ros.api.calibration import Fit, fit
+    from adxl_ros.api.checking import Check, check
+    from adxl_ros.api.correction import apply, Corrected
+    from adxl_ros.api.gap import diagnose, Gap
+    from adxl_ros.api.noise import Noise, noise
     from adxl_ros.api.recordings import from_arrays, read
     from adxl_ros.api.sensors import load
     from adxl_ros.api.simulation import simulate
     from adxl_ros.errors import UserError
+    from adxl_ros.files.recording_columns import Recording
+    from adxl_ros.model.sensor import Sensor
     from adxl_ros.simulate.sensor_model import SensorModel
 
 _MODULES = {
@@ -37,12 +39,26 @@ _MODULES = {
     'noise': 'api.noise',
     'read': 'api.recordings',
     'simulate': 'api.simulation',
+    'Check': 'api.checking',
+    'Corrected': 'api.correction',
+    'Fit': 'api.calibration',
+    'Gap': 'api.gap',
+    'Noise': 'api.noise',
+    'Recording': 'files.recording_columns',
+    'Sensor': 'model.sensor',
     'SensorModel': 'simulate.sensor_model',
     'UserError': 'errors',
 }
-"""Module of each name that `import adxl_ros` gives."""
+"""Module of each name that `import adxl_ros` gives: verbs, types of their results, the error."""
 
 __all__ = [
+    'Check',
+    'Corrected',
+    'Fit',
+    'Gap',
+    'Noise',
+    'Recording',
+    'Sensor',
     'SensorModel',
     'UserError',
     'apply',

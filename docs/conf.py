@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 project = 'adxl_ros'
 author = 'the adxl_ros authors'
-extensions = ['myst_parser']
+extensions = ['myst_nb']  # with the parser of Markdown
 html_theme = 'furo'
 html_title = 'adxl_ros'
 html_show_copyright = False
@@ -22,11 +22,22 @@ include_patterns = [
     'firmware/README.md',
     'docs/*.md',
     'docs/**/*.md',
+    'docs/examples/*.py',
 ]
-source_suffix = {'.md': 'markdown'}
+# The examples are programs and notebooks at once; each site shows what they print today.
+nb_custom_formats = {'.py': ['jupytext.reads', {'fmt': 'py:percent'}]}
+nb_execution_mode = 'force'
+nb_execution_excludepatterns = ['mujoco_arm.py', 'swing.py']  # They write files that are named.
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
+nb_execution_in_temp = True
+source_suffix = {'.md': 'myst-nb', '.py': 'myst-nb'}
 myst_heading_anchors = 4
 highlight_language = 'text'
-suppress_warnings = ['myst.header']  # a log begins its tables one level too deep
+suppress_warnings = [
+    'myst.header',  # a log begins its tables one level too deep
+    'myst-nb.lexer',  # of a program that is not run
+]
 
 FIRST = {
     'docs/index': [
@@ -34,6 +45,7 @@ FIRST = {
         'start/tilt',
         'start/compare',
         'start/stage',
+        'examples/index',
         'howto/index',
         'explain/index',
         'reference/index',
@@ -51,9 +63,11 @@ def add_contents(app: Sphinx, name: str, source: list[str]) -> None:
     """Give the index pages a table of contents, which GitHub would show as code."""
     if not name.endswith('/index'):
         return
-    folder = ROOT / Path(name).parent
+    folder = Path(name).parent
     pages = FIRST.get(name) or sorted(
-        page.stem for page in folder.glob('*.md') if page.stem != 'index'
+        Path(found).name
+        for found in app.env.found_docs
+        if Path(found).parent == folder and found != name
     )
     entries = [f'/{page}' if (ROOT / f'{page}.md').exists() else page for page in pages]
     source[0] += '\n'.join(['', '```{toctree}', ':hidden:', '', *entries, '```', ''])

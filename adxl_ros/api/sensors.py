@@ -4,20 +4,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+import math
 import os
 from typing import Any, NamedTuple
 
+from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.recording_columns import NO_UNIT, Recording
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Effect
+from adxl_ros.model.sensor import neutral, Sensor, typical
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
+import numpy as np
 
 SensorInput = Any
 """A Sensor, a result that has one (`Fit`, `Gap`), a datasheet's name or the path of a file."""
+EffectInput = tuple[str, Mapping[str, Any]]
+"""Name of an effect, and values by parameter, such as 'gain' or 'gain.x'; none for typical."""
+AddedEffects = Mapping[str, Mapping[str, Any] | None] | Sequence[str]
+"""Names of effects of typical size, or a dict of values by parameter for each name."""
 
 
-def load(name: str | os.PathLike) -> Sensor:
+def load(name: str | os.PathLike, *, effects: AddedEffects = ()) -> Sensor:
     """
     Load a sensor.
 
@@ -25,6 +36,8 @@ def load(name: str | os.PathLike) -> Sensor:
     ----------
     name
         Name of a datasheet, such as 'adxl203' or 'mpu6050', or the path of a parameter file.
+    effects
+        Effects that are added, as in `simulate`: for a `SensorModel` in a simulator.
 
     Returns
     -------
@@ -38,7 +51,68 @@ def load(name: str | os.PathLike) -> Sensor:
         The file cannot be read, or a value is missing or out of bounds.
 
     """
-    return parameter_file.load(name, may_measure=True)
+    return with_effects(parameter_file.load(name, may_measure=True), effect_inputs(effects))
+
+
+def effect_inputs(effects: AddedEffects) -> list[EffectInput]:
+    """Return effects by their names, each with one number a key."""
+    given = effects if isinstance(effects, Mapping) else dict.fromkeys(effects)
+    return [(name, _flat(values or {})) for name, values in given.items()]
+
+
+def with_effects(sensor: Sensor, effects: Iterable[EffectInput]) -> Sensor:
+    """Add effects to a sensor, or change their parameters."""
+    for name, given in effects:
+        try:
+            effect = effect_named(name)
+            values = (
+                dict(sensor.values.get(name) or neutral(effect, sensor.axes))
+                if given
+                else typical(effect, sensor.axes)
+            )
+            for key, number in given.items():
+                _put(effect, values, sensor.axes, key, number)
+        except UserError as error:
+            parts = ','.join(f'{key}={number}' for key, number in given.items())
+            raise UserError(f'--effect {name}{":" * bool(given)}{parts}: {error}') from None
+        names = sensor.effects if name in sensor.effects else (*sensor.effects, name)
+        sensor = replace(sensor, effects=names, values={**sensor.values, name: values})
+    return sensor
+
+
+def _put(effect: Effect, values: dict[str, np.ndarray], axes: str, key: str, number: Any) -> None:
+    """Set a parameter for all its axes, or for one, as `gain.x`; the number may be a text."""
+    name, _, axis = key.partition('.')
+    parameters = {parameter.name: parameter for parameter in effect.parameters}
+    if name not in parameters:
+        raise UserError(f'{effect.name} has no parameter {name!r}, but {", ".join(parameters)}')
+    parameter, value = parameters[name], math.nan
+    with suppress(ValueError, TypeError):
+        value = float(number)
+    if not parameter.lower <= value <= parameter.upper:
+        raise UserError(
+            f'{number!r} is not a number from {parameter.lower:g} to '
+            f'{parameter.upper:g} ({parameter.unit}); a typical {name} is '
+            f'{parameter.scale:g}'
+        )
+    chosen = [a in parameter.axes and axis in ('', a) for a in axes]
+    if not any(chosen) and (parameter.axes or axis):
+        raise UserError(
+            f'no axis {axis!r} to act on; the sensor has {axes}, {name} acts on '
+            f'{parameter.axes or "none, it is one number"}'
+        )
+    values[name] = np.where(chosen if parameter.axes else True, value, values[name])
+
+
+def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values with one number a key: those by axis get the axis behind their names."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= {f'{key}.{axis}': number for axis, number in value.items()}
+        else:
+            flat[key] = value
+    return flat
 
 
 class GivenSensor(NamedTuple):

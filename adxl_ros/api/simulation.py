@@ -4,23 +4,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-import math
 from pathlib import Path
-from typing import Any
 
 from adxl_ros.api.recordings import as_recordings, read_ideal, RecordingInput
 from adxl_ros.api.result import no_progress, Progress, require_least
-from adxl_ros.api.sensors import as_input, SensorInput
+from adxl_ros.api.sensors import (
+    AddedEffects,
+    as_input,
+    effect_inputs,
+    EffectInput,
+    SensorInput,
+    with_effects,
+)
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.recording_columns import concatenate, Recording, sensor_info, TIME
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Concern, Effect
-from adxl_ros.model.sensor import neutral, Sensor, typical
+from adxl_ros.model.effects.base import Concern
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion
 from adxl_ros.simulate.response import simulate_blocks
 from adxl_ros.simulate.trajectories import (
@@ -31,52 +35,6 @@ from adxl_ros.simulate.trajectories import (
 import numpy as np
 
 IMU = 'imu'  # Trajectory of the specific force of another simulator
-EffectInput = tuple[str, Mapping[str, Any]]
-"""Name of an effect, and values by parameter, such as 'gain' or 'gain.x'; none for typical."""
-
-
-def with_effects(sensor: Sensor, effects: Iterable[EffectInput]) -> Sensor:
-    """Add effects to a sensor, or change their parameters."""
-    for name, given in effects:
-        try:
-            effect = effect_named(name)
-            values = (
-                dict(sensor.values.get(name) or neutral(effect, sensor.axes))
-                if given
-                else typical(effect, sensor.axes)
-            )
-            for key, number in given.items():
-                _put(effect, values, sensor.axes, key, number)
-        except UserError as error:
-            parts = ','.join(f'{key}={number}' for key, number in given.items())
-            raise UserError(f'--effect {name}{":" * bool(given)}{parts}: {error}') from None
-        names = sensor.effects if name in sensor.effects else (*sensor.effects, name)
-        sensor = replace(sensor, effects=names, values={**sensor.values, name: values})
-    return sensor
-
-
-def _put(effect: Effect, values: dict[str, np.ndarray], axes: str, key: str, number: Any) -> None:
-    """Set a parameter for all its axes, or for one, as `gain.x`; the number may be a text."""
-    name, _, axis = key.partition('.')
-    parameters = {parameter.name: parameter for parameter in effect.parameters}
-    if name not in parameters:
-        raise UserError(f'{effect.name} has no parameter {name!r}, but {", ".join(parameters)}')
-    parameter, value = parameters[name], math.nan
-    with suppress(ValueError, TypeError):
-        value = float(number)
-    if not parameter.lower <= value <= parameter.upper:
-        raise UserError(
-            f'{number!r} is not a number from {parameter.lower:g} to '
-            f'{parameter.upper:g} ({parameter.unit}); a typical {name} is '
-            f'{parameter.scale:g}'
-        )
-    chosen = [a in parameter.axes and axis in ('', a) for a in axes]
-    if not any(chosen) and (parameter.axes or axis):
-        raise UserError(
-            f'no axis {axis!r} to act on; the sensor has {axes}, {name} acts on '
-            f'{parameter.axes or "none, it is one number"}'
-        )
-    values[name] = np.where(chosen if parameter.axes else True, value, values[name])
 
 
 @dataclass(frozen=True)
@@ -204,7 +162,7 @@ def simulate(
     trajectory: RecordingInput,
     sensor: SensorInput | None = None,
     *,
-    effects: Mapping[str, Mapping[str, Any] | None] | Sequence[str] = (),
+    effects: AddedEffects = (),
     force: RecordingInput | None = None,
     rate: float | None = None,
     seed: int = 0,
@@ -247,28 +205,9 @@ def simulate(
         An effect, a parameter or a trajectory is unknown, or a value is out of bounds.
 
     """
-    given = effects if isinstance(effects, Mapping) else dict.fromkeys(effects)
-    made = prepare(
-        trajectory,
-        sensor,
-        [(name, _flat(values or {})) for name, values in given.items()],
-        force,
-        rate,
-        seed,
-    )
+    made = prepare(trajectory, sensor, effect_inputs(effects), force, rate, seed)
     blocks = []
     for block in made.blocks(seed):
         blocks.append(block)
         progress(block.done, 'simulate')
     return replace(concatenate(blocks), remarks=(*made.screen, *made.left_out))
-
-
-def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values with one number a key: those by axis get the axis behind their names."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            flat |= {f'{key}.{axis}': number for axis, number in value.items()}
-        else:
-            flat[key] = value
-    return flat

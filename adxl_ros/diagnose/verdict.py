@@ -666,7 +666,7 @@ def _powers(
 ) -> _Powers:
     """Weigh what the best set leaves, and drop the drifts where it is none."""
     explained = evidence.figure(evidence.gain(best, _NOTHING)).value
-    above = evidence.figure(evidence.left(best)).value
+    above = float(evidence.left(best)[0])
     repeats = evidence.figure(evidence.mean(rest.squares))
     steady = evidence.figure(evidence.mean(rest.steady_squares))
     drift = evidence.drift_power(best, drifts)

@@ -27,7 +27,7 @@ from adxl_ros.process import ended_by_closed_output
 from adxl_ros.report.screen import bar, COLUMNS, end_lines, entry_list, NextStep, program_parser
 
 if TYPE_CHECKING:
-    from adxl_ros.api.simulation import EffectInput
+    from adxl_ros.api.sensors import EffectInput
 
 _BAR_COLUMNS = 24
 """Columns of a progress bar: names of stages and times stand beside it in 80 columns."""

@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Noise of a sensor at rest: its Allan deviation, and a parameter file for simulation."""
+# %% [markdown]
+# # Allan deviation of a log
+#
+# The sensor lies still. `noise` separates white noise from slow drift, and writes a parameter file
+# for simulation. Here a minute of noise is made up, so that the truth is known.
 
+# %%
 import adxl_ros as adxl
 import numpy as np
 
@@ -19,5 +24,10 @@ recording = adxl.from_arrays(
 )
 noise = adxl.noise(recording)
 print(noise)
+
+# %% [markdown]
+# The curve with its interval, and the file that a simulator reads.
+
+# %%
 noise.plot().figure.savefig('allan.png')
 noise.save('noise.yaml')

@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""
-Let a MuJoCo arm swing freely; write its accelerometer and its joints as recordings.
+# %% [markdown]
+# # A free arm in MuJoCo
+#
+# It swings freely; its accelerometer and its joints are written as two recordings.
+#
+# ```bash
+# python mujoco_arm.py ideal.csv joints.csv
+# simulate imu --force ideal.csv -o from_mujoco.csv
+# simulate joints.csv --effect lever_arm:x_m=0.05,y_m=-0.03,z_m=0.1 -o from_joints.csv
+# ```
+#
+# The arm has the joints of the stage: alpha turns about −y of the base, beta about the z of what
+# alpha carries, so that its frames are those of the interfaces.
 
-    python mujoco_arm.py ideal.csv joints.csv
-    simulate imu --force ideal.csv -o from_mujoco.csv
-    simulate joints.csv --effect lever_arm:x_m=0.05,y_m=-0.03,z_m=0.1 -o from_joints.csv
-
-The arm has the joints of the stage: alpha turns about −y of the base, beta about the z of what
-alpha carries, so that its frames are those of the interfaces.
-"""
-
+# %%
 import sys
 
 import mujoco

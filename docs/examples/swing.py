@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Write the ideal specific force of a swinging arm, as a simulator would log it."""
+# %% [markdown]
+# # A swinging arm, by formulas
+#
+# Write the ideal specific force of a swinging arm, as a simulator would log it.
 
+# %%
 import sys
 
 import numpy as np

@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tilt of every sample with its standard deviation, and the covariance of the force."""
+# %% [markdown]
+# # Tilt with its covariance
+#
+# Tilt of every sample with its standard deviation, and the covariance of the force as
+# `sensor_msgs/Imu` has it.
 
+# %%
 import adxl_ros as adxl
 import numpy as np
 
@@ -9,7 +14,7 @@ recording = adxl.simulate('tilt_beta', 'adxl355', rate=50, seed=2)
 corrected = adxl.apply(recording, 'adxl355')
 roll_deg = np.degrees(corrected.columns['roll_rad'])
 std_deg = np.degrees(corrected.columns['roll_std_rad'])
-covariance = corrected.force_covariance  # (m/s²)², (n, 3, 3), as sensor_msgs/Imu has it
+covariance = corrected.force_covariance  # (m/s²)², (n, 3, 3)
 
 for row in range(0, len(roll_deg), 1000):
     print(
