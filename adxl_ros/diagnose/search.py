@@ -155,10 +155,7 @@ def linearise(
             changes.append({0: response.change_v[:, axis]})
     # The square of each deviation is that of a healthy unit's tolerance plus that of what a
     # calibration can take up of the effects.
-    parts = linear.parts_at_rest(
-        linear_model.comparisons, linear_model.nuisance_columns, changes, 1
-    )
-    taken_up = np.array([float(parts[n][0]) if n in parts else 0.0 for n in nuisances])
+    taken_up = _taken_up(linear_model, nuisances, changes)
     tolerance = np.array([linear_model.tolerance(name) for name in nuisances])
     return LinearisedHypothesis(
         effects=tuple(effects),
@@ -236,6 +233,18 @@ class _Point:
             self.values - self.prior_mean,
             output_v - comparison.simulated_v(replace(self.without, rate_hz=rate_hz)),
         )
+
+
+def _taken_up(
+    linear_model: LinearModel,
+    nuisances: Sequence[Coefficient],
+    changes: Sequence[Mapping[int, np.ndarray]],
+) -> np.ndarray:
+    """Return how much of a change of the output a calibration can take for nuisances, (k,)."""
+    parts = linear.parts_at_rest(
+        linear_model.comparisons, linear_model.nuisance_columns, changes, 1
+    )
+    return np.array([float(parts[name][0]) if name in parts else 0.0 for name in nuisances])
 
 
 def _fitted_names(linear_model: LinearModel, effects: Sequence[str]) -> list[Coefficient]:
