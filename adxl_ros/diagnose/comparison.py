@@ -24,7 +24,7 @@ from adxl_ros.model.effects.base import ActsOn
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.quantities import acceleration_text
-from adxl_ros.signals.block_statistics import held_values, true_runs
+from adxl_ros.signals.block_statistics import held_values, rms, true_runs
 from adxl_ros.simulate.motion import BAND_LIMITED_DEGREE, ForcePath, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import ChainMemo, Response
 from adxl_ros.simulate.trajectories import environment_paths, motion_from_references
@@ -34,12 +34,15 @@ import scipy
 SMALLEST_MOTION_G = 0.05
 """Standard deviation of the simulated force, g, from which an axis is compared. Chosen: ten times
 the noise of an ADXL203."""
-SEARCH_RATE_HZ, SEARCH_SAMPLES = 125.0, 25_000
-"""Rate of the samples in the search, Hz, and their largest number in a recording. Chosen: motion
-up to 60 Hz, and run time. Samples are left out, never averaged, so that aliases remain."""
-_LOWEST_INTERNAL_RATE_HZ, _MOST_STEPS = 250.0, 1_000_000
-"""Lowest internal rate of the simulator where something moves, Hz, and its largest number of steps
-beyond the samples. Chosen: twice the rate of the search, and an hour of it."""
+SEARCH_RATE_HZ = 125.0
+"""Rate of the samples in the search, Hz. Chosen: motion up to 60 Hz. Samples are left out, never
+averaged, so that aliases remain."""
+SEARCH_SAMPLES = 25_000  # Largest number of samples of a recording in the search. Chosen: run time
+_LOWEST_INTERNAL_RATE_HZ = 250.0
+"""Lowest internal rate of the simulator where something moves, Hz. Chosen: twice the rate of the
+search."""
+_MOST_STEPS = 1_000_000
+"""Largest number of steps of the simulator beyond the samples. Chosen: an hour at that rate."""
 _SMALLEST_MOVES = {'alpha': 2e-3, 'beta': 2e-3, 'shift': 1e-6}
 """Ranges of the joints, rad and m, from which they move. Chosen: above the step of an encoder."""
 _REST_RATE = 1e-3
@@ -49,28 +52,30 @@ SETTLING_S = 0.3
 """A sample rests if no joint moves within this time before it, s. Chosen: an RC filter of 15 Hz
 has settled."""
 _LONGEST_S = 1e3  # Time since the last move where there was none, s. Chosen: beyond any creep
-_LONGEST_BRIDGE_S, _SLOWEST_S = LONGEST_MOVE_NS / 1e9, 1.0
-"""Longest time without a reading that is bridged, s: of a joint, and of a slow encoder, whose
-readings are a move apart at most."""
-_BEFORE_S, _AFTER_S = 0.1, 0.3
-"""Times that are left out beside a gap, s. Chosen: the spline is uncertain before it, and an RC
-filter of 15 Hz has settled after it."""
-_FEWEST_CHANGES, _LARGEST_STEP_RAD, _COARSER = 100, 0.02, 1.05
-"""Fewest changes of a reading that show the step of its encoder, its largest step, rad, and the
-ratio to the stated one from which it counts. Chosen: two turns by hand; 1°; 1/12° may be 0.083°.
-"""
-_WHOLE, _WHOLE_SHARE = 0.2, 0.9
-"""Deviation from whole steps, and share of the changes within it, by encoders. Chosen: 40 % of the
-changes of exact readings are within it."""
-_SAME_POSE, _SAME_STEPS = 1e-4, 2.0
-"""Change of a joint over a gap without a move, rad or m, and in steps of its encoder. Chosen:
-0.1 mg, and two readings that scatter by one step."""
-_LAG_S, _SLOW = 0.02, 3.0
-"""Lag of differences, s, and standard deviation of the output, divided by theirs, up to which it
-rests. Chosen: an RC filter has forgotten its noise, and motion below 2 Hz exceeds it."""
-_WINDOW_S, _SHORTEST_WINDOW = 1.0, 64
-"""Length of a window whose spectrum is taken, s and readings. Chosen: shorter than a move, and
-some periods of a shaker."""
+_LONGEST_BRIDGE_S = LONGEST_MOVE_NS / 1e9
+"""Longest time without a reading of a joint that is bridged, s: that of a move."""
+_SLOWEST_S = 1.0
+"""The same of a slow encoder, s: its readings are a move apart at most."""
+_BEFORE_S = 0.1  # Time left out before a gap, s. Chosen: the spline is uncertain there
+_AFTER_S = 0.3  # Time left out after a gap, s. Chosen: an RC filter of 15 Hz has settled
+_FEWEST_CHANGES = 100
+"""Fewest changes of a reading that show the step of its encoder. Chosen: two turns by hand."""
+_LARGEST_STEP_RAD = 0.02  # Largest step of an encoder, rad. Chosen: 1°
+_COARSER = 1.05
+"""Ratio to the stated step from which one counts. Chosen: 1/12° may be stated as 0.083°."""
+_WHOLE = 0.2  # Deviation of a change from whole steps, in steps, up to which it is one. Chosen
+_WHOLE_SHARE = 0.9
+"""Share of such changes by encoders. Chosen: 40 % of the changes of exact readings are such."""
+_SAME_POSE = 1e-4  # Change of a joint over a gap without a move, rad or m. Chosen: 0.1 mg
+_SAME_STEPS = 2.0
+"""The same in steps of its encoder. Chosen: two readings that scatter by one step."""
+_LAG_S = 0.02
+"""Lag of differences that show the noise, s. Chosen: an RC filter has forgotten it."""
+_SLOW = 3.0
+"""Standard deviation of the output, divided by that noise, up to which it rests. Chosen: motion
+below 2 Hz exceeds it."""
+_WINDOW_S = 1.0  # Length of a window whose spectrum is taken, s. Chosen: shorter than a move
+_SHORTEST_WINDOW = 64  # Its fewest readings. Chosen: some periods of a shaker
 _LARGEST_ERROR = 0.3
 """Error of the force by the spline, divided by the noise, up to which a window is used. Chosen: it
 adds 4 % to the noise."""
@@ -79,16 +84,18 @@ _SAME_MOTION = 2.0
 """Ratio of recorded and simulated motion from which one is an alias. Chosen: an alias below 0.2 of
 the rate has a ratio of 4."""
 _NAMED_PARTS = 4  # Parts that a note names. Chosen: it stays one or two lines
-_FEWEST_WINDOWS, _BAND_HZ = 20, 2.0
-"""Fewest windows, and width of the bands, Hz, by which fading is judged. Chosen: noise then has a
-coherence of 0.05, and a line of the mains is one value."""
-_MOTION, _FADED = 10.0, 0.5
-"""Power over noise from which motion shows, and power of the reference, even without the filter of
-the sensor, divided by the recorded one, below which it has faded. Chosen."""
-_JERK_S, _LARGEST_JERK = 0.1, 4.0
-"""Time around a jerk of a robot that is left out, s, and error of the force, divided by the noise,
-from which it is one. Chosen: that of the splines' knots; the error of what stays is below the
-noise, rms, and the filter for errors weighs it."""
+_FEWEST_WINDOWS = 20
+"""Fewest windows by which fading is judged. Chosen: noise then has a coherence of 0.05."""
+_BAND_HZ = 2.0  # Width of its bands, Hz. Chosen: a line of the mains is one value
+_MOTION = 10.0  # Power over that of the noise from which motion shows. Chosen
+_FADED = 0.5
+"""Power of the reference, even without the filter of the sensor, divided by the recorded one,
+below which it has faded. Chosen: −3 dB, the usual corner of a filter."""
+_JERK_S = 0.1
+"""Time around a jerk of a robot that is left out, s. Chosen: that of the splines' knots."""
+_LARGEST_JERK = 4.0
+"""Error of the force, divided by the noise, from which it is a jerk. Chosen: the error of what
+stays is below the noise, rms, and the filter for errors weighs it."""
 
 
 @dataclass(frozen=True)
@@ -166,6 +173,23 @@ class BaselineComparison:
         return self.sensor.scale_v_per_g / G0_MPS2
 
     @property
+    def stated_force(self) -> ForcePath | None:
+        """Force that another simulator or a robot states; None without one."""
+        return self.motion.force if isinstance(self.motion.force, ForcePath) else None
+
+    @property
+    def simulated_force(self) -> ForcePath | None:
+        """Force that another simulator states; None without one."""
+        force = self.stated_force
+        return None if force is None or force.is_robot else force
+
+    @property
+    def robot_force(self) -> ForcePath | None:
+        """Force that a robot states by its encoders; None without one."""
+        force = self.stated_force
+        return force if force is not None and force.is_robot else None
+
+    @property
     def joints(self) -> tuple[Path, Path] | None:
         """Paths of alpha and beta; None without a stage."""
         return (self.motion.alpha, self.motion.beta) if self.reference is Reference.STAGE else None
@@ -222,19 +246,11 @@ class BaselineComparison:
     @cached_property
     def robot_error_mps2(self) -> float:
         """Rms over used samples and axes that the encoders of a robot leave open, m/s²."""
-        force = self.motion.force
-        if not isinstance(force, ForcePath):
+        force = self.stated_force
+        if force is None:
             return 0.0
-        return float(
-            np.sqrt(
-                np.mean(
-                    [
-                        np.square(force.errors(self.time_s, AXES.index(axis)).std[self.used])
-                        for axis in self.sensor.axes
-                    ]
-                )
-            )
-        )
+        errors = [force.errors(self.time_s, AXES.index(axis)) for axis in self.sensor.axes]
+        return rms(np.array([e.std[self.used] for e in errors]))
 
     def lost_motion_mps2(self) -> float:
         """Return the rms of the fast motion that a smooth reference lacks, m/s²."""
@@ -467,8 +483,8 @@ def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 def without_gaps(comparison: BaselineComparison) -> BaselineComparison:
     """Leave out samples in gaps of another simulator."""
-    time_s, force = comparison.time_s, comparison.motion.force
-    if not isinstance(force, ForcePath):
+    time_s, force = comparison.time_s, comparison.stated_force
+    if force is None:
         return comparison
     limit_s = max(_LONGEST_BRIDGE_S, USUAL_GAPS * float(np.median(np.diff(force.time_s))))
     unknown = np.zeros(len(time_s), bool)
@@ -605,9 +621,9 @@ class _Readings:
 
 def _readings(comparison: BaselineComparison, columns: dict[str, np.ndarray]) -> list[_Readings]:
     """Return the readings of another simulator, or of the joints that move."""
-    sensor, time_s, force = comparison.sensor, comparison.time_s, comparison.motion.force
+    sensor, time_s, force = comparison.sensor, comparison.time_s, comparison.stated_force
     axes = len(sensor.axes)
-    if isinstance(force, ForcePath):
+    if force is not None:
         force_g = np.array(force(force.time_s)) / G0_MPS2
         return [_Readings(force.name, force.time_s, force_g[:axes].T, (3, 5), 0, 0.0)]
     found = []
@@ -616,23 +632,12 @@ def _readings(comparison: BaselineComparison, columns: dict[str, np.ndarray]) ->
         read = np.isfinite(values)
         if read.sum() <= BAND_LIMITED_DEGREE or not np.ptp(values[read]):
             continue
+        unit, degrees, order, step = 1.0, (3, 5), 0, sensor.stage_resolution_rad
         if joint == 'shift':
-            found.append(
-                _Readings(
-                    name,
-                    time_s[read],
-                    values[read, None] / G0_MPS2,
-                    (BAND_LIMITED_DEGREE - 2, BAND_LIMITED_DEGREE),
-                    2,
-                    0.0,
-                )
-            )
-        else:
-            found.append(
-                _Readings(
-                    name, time_s[read], values[read, None], (3, 5), 0, sensor.stage_resolution_rad
-                )
-            )
+            unit, degrees = G0_MPS2, (BAND_LIMITED_DEGREE - 2, BAND_LIMITED_DEGREE)
+            order, step = 2, 0.0
+        readings_g = values[read, None] / unit
+        found.append(_Readings(name, time_s[read], readings_g, degrees, order, step))
     return found
 
 
@@ -645,10 +650,10 @@ def without_fast_motion(
     Rests that the sensor shows stay; a stage may move at an alias of its readings where it seems
     to rest. Where readings are missing, or the output is beyond the range, that is the reason.
     """
-    sensor, force = comparison.sensor, comparison.motion.force
+    sensor, robot = comparison.sensor, comparison.robot_force
     noise_g = float(np.min(noise.analog_std_v(sensor) / sensor.scale_v_per_g))
-    if isinstance(force, ForcePath) and force.is_robot:
-        return _without_jerks(comparison, force, noise_g)
+    if robot is not None:
+        return _without_jerks(comparison, robot, noise_g)
     limit_g = _LARGEST_ERROR * max(noise_g, float(np.min(sensor.lsb_v / sensor.scale_v_per_g)))
     margin = np.ones(2 * round(_WINDOW_S / 2 * sensor.rate_hz) + 1)
 
@@ -670,23 +675,21 @@ def without_fast_motion(
         lacks = near(readings.lacks(comparison.time_s))
         error = f'(error up to {1e3 * error_g[rows].max():.2g} mg)'
         rate_hz = stamped_rate_hz(readings.time_s)
-        comparison = leave_out(
-            comparison,
-            rows & beyond,
-            'the output is beyond the range of '
-            f'{sensor.range_g:g} g that the parameter file states, in motion '
-            f'that {readings.name} does not follow {error}',
-        )
-        comparison = leave_out(
-            comparison, rows & lacks, f'{readings.name} lacks readings there {error}'
-        )
-        comparison = leave_out(
-            comparison,
-            rows,
-            f'{readings.name} moves too fast for its '
-            f'{rate_hz:.4g} readings a second {error}; read it at a higher '
-            'rate',
-        )
+        reasons = [
+            (
+                beyond,
+                f'the output is beyond the range of {sensor.range_g:g} g that the parameter file '
+                f'states, in motion that {readings.name} does not follow {error}',
+            ),
+            (lacks, f'{readings.name} lacks readings there {error}'),
+            (
+                rows,
+                f'{readings.name} moves too fast for its {rate_hz:.4g} readings a second {error}; '
+                'read it at a higher rate',
+            ),
+        ]
+        for explained, reason in reasons:
+            comparison = leave_out(comparison, rows & explained, reason)
     return comparison
 
 
@@ -697,17 +700,14 @@ def _with_aliases(
     sensor, measured = comparison.sensor, comparison.measured
     length = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
     part = np.minimum(np.arange(len(coarse)) // length, max(len(coarse) // length - 1, 0))
-    recorded, simulated = (
-        np.sqrt(
-            [
-                noise_g**2 + np.bincount(part, c**2) / np.bincount(part)
-                for c in np.diff(
-                    bridged(v, measured) / sensor.scale_v_per_g, axis=0, prepend=0.0
-                ).T
-            ]
-        )
-        for v in (comparison.volts, comparison.simulated_v(sensor))
-    )
+
+    def motion_g(volts: np.ndarray) -> np.ndarray:
+        """Return the rms of the changes from sample to sample with noise, by part and axis."""
+        changes_g = np.diff(bridged(volts, measured) / sensor.scale_v_per_g, axis=0, prepend=0.0)
+        squares_g2 = [np.bincount(part, c**2) / np.bincount(part) for c in changes_g.T]
+        return np.sqrt(noise_g**2 + np.array(squares_g2))
+
+    recorded, simulated = motion_g(comparison.volts), motion_g(comparison.simulated_v(sensor))
     differs = np.any(np.abs(np.log(recorded / simulated)) > np.log(_SAME_MOTION), axis=0)
     touched = np.bincount(part, coarse) > 0
     extended = coarse.copy()

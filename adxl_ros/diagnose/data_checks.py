@@ -42,9 +42,9 @@ the stage."""
 LARGEST_LATENCY_S = 0.1
 """Largest shift, s, that may be a latency of the sensor. Chosen: twenty times the typical delay of
 `time_offset`; a buffer of ten samples at 100 Hz has it."""
-_SEARCH_STEP_S, _LONGEST_SEARCH = 0.02, 1 << 20
-"""Step of the first search of a shift, s, and its largest number of steps. Chosen: well below the
-largest latency, and six hours."""
+_SEARCH_STEP_S = 0.02
+"""Step of the first search of a shift, s. Chosen: well below the largest latency."""
+_LONGEST_SEARCH = 1 << 20  # Largest number of its steps. Chosen: six hours
 _CORRELATED = 0.9
 """Correlation from which two motions are the same one. Chosen: noise of half the motion."""
 _SAME_CORRELATION = 0.01
@@ -70,31 +70,42 @@ _SMALLEST_MOVE_RAD = 0.01
 """Range of an angle, rad, above which the stage moves. Chosen: beyond the jitter of an encoder."""
 _SAMPLES = 4000
 """Largest number of samples that are compared with angles. Chosen: a few for each second."""
-_WRONG, _RIGHT = 0.2, 0.1
-"""Share of the output's variance that angles do not explain, from which they may be wrong, and up
-to which changed ones are right. Chosen: it is 0.03 where the sensor is mounted 10° off."""
+_WRONG = 0.2
+"""Share of the output's variance that angles do not explain, from which they may be wrong. Chosen:
+it is 0.03 where the sensor is mounted 10° off."""
+_RIGHT = 0.1
+"""The same share up to which changed angles are right. Chosen: half of that of wrong ones."""
+_SIGNS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+"""Signs of both angles that are tried. The fewest changes come first."""
 _AGED_ZERO_G = 0.01
 """Zero-g, g, from which its sign tells an inverted axis from a wrong angle. Chosen: that of a
 healthy unit ages by less."""
 _FEWEST_SAMPLES = 50  # Fewest samples of any recording. Chosen: one for each of 48 blocks
-_LARGEST_UNEXPLAINED_MOTION_G, _RANGE_QUANTILES = 0.3, (0.02, 0.98)
-"""Range of the output between its quantiles, g, that drift and noise cannot explain without a
-reference. Chosen: 17° of tilt, and outliers."""
-_SWAPPED, _UNCORRELATED = 0.7, 0.5
-"""Correlation with its own reference below which an axis may be swapped, and below which nothing
-follows the reference. Chosen: noise of 1 and 1.7 times the signal."""
+_LARGEST_UNEXPLAINED_MOTION_G = 0.3
+"""Range of the output, g, that drift and noise cannot explain without a reference. Chosen: 17° of
+tilt."""
+_RANGE_QUANTILES = (0.02, 0.98)  # Quantiles at the ends of that range. Chosen: without outliers
+_SWAPPED = 0.7
+"""Correlation with its own reference below which an axis may be swapped. Chosen: that of noise as
+large as the signal."""
+_UNCORRELATED = 0.5
+"""Correlation below which nothing follows the reference. Chosen: that of noise 1.7 times as large
+as the signal."""
 _LARGEST_MISSING_SHARE = 0.3
 """Share of samples that may be missing, or at the end of the range. Chosen: the rest still
 shows the effects."""
-_SEARCHED_DELAY_S, _LARGEST_DELAY_S, _CORRELATION_GAIN = 1.0, 30.0, 0.05
-"""Largest delays that the effect of a time offset models and that are looked for, s, and what
-correlation one must gain. Chosen: a recording started by hand, and the error by noise."""
-_JUMP_STEPS, _LARGEST_JUMP_SHARE = 20.0, 0.2
-"""A step of the stamps of this many usual steps is a jump, and the share of the recording that
-jumps may have. Chosen: gaps of a lossy link are no fault of the clock."""
-_SMALLEST_RANGE_V, _SMALLEST_STEP_V, _DEAD_SHARE = 0.05, 1e-9, 1e-4
-"""Range of an output that moves, V; step of an ADC that stands for none, V; and share of its
-simulated range that a wired axis covers. Chosen: 50 mg; rounding errors; any wrong unit."""
+_SEARCHED_DELAY_S = 1.0  # Largest delay that the effect of a time offset models, s
+_LARGEST_DELAY_S = 30.0
+"""Largest delay that is looked for, s. Chosen: a recording started by hand."""
+_CORRELATION_GAIN = 0.05
+"""Correlation that a delay must gain. Chosen: above the error of a correlation by noise."""
+_JUMP_STEPS = 20.0  # A step of the stamps of this many usual steps is a jump. Chosen
+_LARGEST_JUMP_SHARE = 0.2
+"""Share of the recording that jumps may have. Chosen: gaps of a lossy link are no fault of the
+clock."""
+_SMALLEST_RANGE_V = 0.05  # Range of an output that moves, V. Chosen: 50 mg
+_SMALLEST_STEP_V = 1e-9  # Step of an ADC that stands for none, V. Chosen: rounding errors
+_DEAD_SHARE = 1e-4  # Share of its simulated range that a wired axis covers. Chosen: any wrong unit
 _LONGEST_HOLD_S = 1.0  # Longest time that an output may keep one value in motion, s. Chosen
 _LARGEST_LEVEL_G = 1e3  # Largest median output, g. Chosen: above that of any sensor on a stage
 _UNIT_TOLERANCE = 0.1
@@ -484,73 +495,107 @@ def even_stamps(stamps_s: np.ndarray) -> np.ndarray | None:
     return time_s if _EVEN_STAMPS < largest < _LARGEST_SCATTER else None
 
 
+@dataclass(frozen=True)
+class _StageReadings:
+    """Angles of a stage and outputs of a sensor, which is moved."""
+
+    angles_rad: np.ndarray  # (n, 2)
+    measured_g: np.ndarray  # (n, m)
+
+    @classmethod
+    def of(cls, recording: Recording, sensor: Sensor) -> _StageReadings | None:
+        """Return some readings of a recording; None where the sensor does not move."""
+        angles_rad = recording.stage_angles
+        if angles_rad is None:
+            return None
+        measured_g = (recording.volts(sensor) - sensor.zero_g_v) / sensor.scale_v_per_g
+        rows = np.flatnonzero(np.isfinite(np.hstack([angles_rad, measured_g])).all(axis=1))
+        rows = rows[:: max(1, len(rows) // _SAMPLES)]
+        readings = cls(angles_rad[rows], measured_g[rows])
+        moves = len(rows) > 1 and readings.variance_g2 >= SMALLEST_MOTION_G**2
+        return readings if moves else None
+
+    @property
+    def variance_g2(self) -> float:
+        """Variance of the output, summed over axes, g²."""
+        return float(np.var(self.measured_g, axis=0).sum())
+
+    def force_g(self, factors: Sequence[float]) -> np.ndarray:
+        """Return the force at angles times factors, g, (n, m)."""
+        alpha_rad, beta_rad = (self.angles_rad * factors).T
+        force_g = np.column_stack(specific_force(alpha_rad, beta_rad, 1.0))
+        return force_g[:, : self.measured_g.shape[1]]
+
+    def unexplained(self, factors: Sequence[float]) -> float:
+        """Return the share of the variance that angles times factors do not explain."""
+        left_g2 = np.var(self.measured_g - self.force_g(factors), axis=0).sum()
+        return float(left_g2) / self.variance_g2
+
+    def best_factors(self) -> tuple[float, float]:
+        """Return the signs, and factors from degrees, that explain most."""
+        reached_rad = np.abs(self.angles_rad).max(axis=0)
+        # Angles beyond a turn may be in degrees.
+        units = [(1.0, np.pi / 180) if rad > 2 * np.pi else (1.0,) for rad in reached_rad]
+        tried = [
+            (alpha_sign * alpha_unit, beta_sign * beta_unit)
+            for (alpha_unit, beta_unit), (alpha_sign, beta_sign) in product(
+                product(*units), _SIGNS
+            )
+        ]
+        return min(tried, key=self.unexplained)
+
+
 def _check_encoder(recording: Recording, sensor: Sensor) -> None:
     """Refuse an angle with the wrong sign, or in degrees."""
-    angles_rad, axes = recording.stage_angles, len(sensor.axes)
-    if angles_rad is None:
+    readings = _StageReadings.of(recording, sensor)
+    if readings is None:
         return
-    measured_g = (recording.volts(sensor) - sensor.zero_g_v) / sensor.scale_v_per_g
-    rows = np.flatnonzero(np.isfinite(np.hstack([angles_rad, measured_g])).all(axis=1))
-    rows = rows[:: max(1, len(rows) // _SAMPLES)]
-    angles_rad, measured_g = angles_rad[rows], measured_g[rows]
-    if len(rows) < 2 or np.sum(np.var(measured_g, axis=0)) < SMALLEST_MOTION_G**2:
+    factors = readings.best_factors()
+    recorded, changed = readings.unexplained((1.0, 1.0)), readings.unexplained(factors)
+    if recorded < _WRONG or changed > min(_RIGHT, recorded / 2):
         return
-
-    def force_g(factors: Sequence[float]) -> np.ndarray:
-        alpha_rad, beta_rad = (angles_rad * factors).T
-        return np.column_stack(specific_force(alpha_rad, beta_rad, 1.0)[:axes])
-
-    def unexplained(factors: Sequence[float]) -> float:
-        """Return the share of the variance that angles times factors do not explain."""
-        return float(
-            np.var(measured_g - force_g(factors), axis=0).sum() / np.var(measured_g, axis=0).sum()
-        )
-
-    recorded, largest = unexplained((1.0, 1.0)), np.abs(angles_rad).max(axis=0)
-    # The fewest changes come first, and of equal ones the first is the best.
-    factors = min(
-        (
-            [s * u for s, u in zip(signs, units)]
-            for units in product(*([1.0, np.pi / 180][: 1 + (rad > 2 * np.pi)] for rad in largest))
-            for signs in ((1, 1), (1, -1), (-1, 1), (-1, -1))
-        ),
-        key=unexplained,
-    )
-    if recorded < _WRONG or unexplained(factors) > min(_RIGHT, recorded / 2):
-        return
-    correlation, joints = np.sqrt(1 - unexplained(factors)), list(JOINTS.values())
-    in_degrees = [i for i in (0, 1) if abs(factors[i]) != 1]
+    correlation = f'correlation {np.sqrt(1 - changed):.2f}'
+    names = list(JOINTS.values())
+    in_degrees = [i for i, factor in enumerate(factors) if abs(factor) != 1]
     if in_degrees:
-        joined = ' and '.join(joints[i] for i in in_degrees)
-        reached = ' and '.join(f'{largest[i]:.4g}' for i in in_degrees)
+        reached = np.abs(readings.angles_rad).max(axis=0)
+        joined = ' and '.join(names[i] for i in in_degrees)
         raise DataFault(
             'unit',
-            f'{joined}: up to {reached}: degrees in a column of radians (as '
-            f'degrees it fits the output, correlation {correlation:.2f}); multiply '
+            f'{joined}: up to {" and ".join(f"{reached[i]:.4g}" for i in in_degrees)}: degrees in '
+            f'a column of radians (as degrees it fits the output, {correlation}); multiply '
             f'{joined} by π/180',
         )
-    names = [joints[i] for i in (0, 1) if factors[i] < 0]
-    mirrored = np.flatnonzero(
-        np.std(force_g(factors) - force_g((1.0, 1.0)), axis=0) > SMALLEST_MOTION_G
-    )
-    if len(mirrored) < len(names):
-        return
-    # The zero-g of an inverted axis is mirrored, too.
-    zero_g = ((sensor.zero_g_v - sensor.nominal_zero_g_v) / sensor.scale_v_per_g)[mirrored[0]]
-    offset_g = np.mean(measured_g - force_g(factors), axis=0)[mirrored[0]]
-    if (
-        len(mirrored) == len(names)
-        and abs(zero_g) > _AGED_ZERO_G
-        and abs(offset_g + 2 * zero_g) < abs(offset_g)
+    inverted = [name for name, factor in zip(names, factors) if factor < 0]
+    mirrored = _mirrored_axes(readings, factors)
+    if len(mirrored) < len(inverted) or (
+        len(mirrored) == len(inverted) and _zero_g_is_mirrored(readings, factors, sensor)
     ):
         return
-    joined, inverted = (' and '.join(n) for n in (names, [sensor.axes[d] for d in mirrored]))
+    joined = ' and '.join(inverted)
+    axes = ' and '.join(sensor.axes[d] for d in mirrored)
     raise DataFault(
         'encoder_sign',
-        f'{joined}: opposite sign of the encoder (correlation '
-        f'{correlation:.2f} with the sign changed); change the sign of {joined}, '
-        f'unless the axis {inverted} is inverted',
+        f'{joined}: opposite sign of the encoder ({correlation} with the sign changed); change '
+        f'the sign of {joined}, unless the axis {axes} is inverted',
     )
+
+
+def _mirrored_axes(readings: _StageReadings, factors: Sequence[float]) -> np.ndarray:
+    """Return the numbers of the axes whose force changes with the signs of the angles."""
+    change_g = readings.force_g(factors) - readings.force_g((1.0, 1.0))
+    return np.flatnonzero(np.std(change_g, axis=0) > SMALLEST_MOTION_G)
+
+
+def _zero_g_is_mirrored(
+    readings: _StageReadings, factors: Sequence[float], sensor: Sensor
+) -> bool:
+    """Determine whether an axis is inverted, not an angle: its zero-g is mirrored, too."""
+    axis = _mirrored_axes(readings, factors)[0]
+    aged_v = sensor.zero_g_v - sensor.nominal_zero_g_v
+    zero_g = float((aged_v / sensor.scale_v_per_g)[axis])
+    offset_g = float(np.mean(readings.measured_g - readings.force_g(factors), axis=0)[axis])
+    return abs(zero_g) > _AGED_ZERO_G and abs(offset_g + 2 * zero_g) < abs(offset_g)
 
 
 class CheckedRecording(NamedTuple):

@@ -36,7 +36,7 @@ from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_axes, with_neutral
 from adxl_ros.report.quantities import Interval
-from adxl_ros.signals.block_statistics import true_runs
+from adxl_ros.signals.block_statistics import rms, true_runs
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate
 import numpy as np
@@ -435,7 +435,7 @@ def _closure(
         for e in (frozenset[str](), best)
     )
     stated = noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2)
-    stated_mps2 = float(np.sqrt(np.mean(stated**2)))
+    stated_mps2 = rms(stated)
     draws = floor.draws_mps2(seed, len(before) - 1)
     floors = np.append(
         floor.rms_mps2, np.full(len(before) - 1, floor.rms_mps2) if draws is None else draws

@@ -40,29 +40,35 @@ from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, DriftSpectrum, Role
 from adxl_ros.model.sensor import parameter_of, Sensor
 from adxl_ros.signals.block_statistics import true_runs
-from adxl_ros.simulate.motion import ForcePath, SmoothedPath
+from adxl_ros.simulate.motion import SmoothedPath
 import numpy as np
 import scipy
 
-_REST_S, _PARTS_OF_REST = 1.0, 4
-"""Length of a rest whose mean is subtracted, s, and its parts for the interval of the noise.
-Chosen: slower changes are part of the gap, and a part is longer than its samples correlate."""
-_FEWEST_PARTS, _MOST_PARTS = 20, 100
-"""Parts from which an interval is drawn. Chosen: 20 parts show their spread to 16 %."""
+_REST_S = 1.0
+"""Length of a rest whose mean is subtracted, s. Chosen: slower changes are part of the gap."""
+_PARTS_OF_REST = 4
+"""Parts of a rest, for the interval of the noise. Chosen: longer than its samples correlate."""
+_FEWEST_PARTS = 20
+"""Parts from which an interval is drawn. Chosen: they show their spread to 16 %."""
+_MOST_PARTS = 100  # Largest number of parts that are drawn. Chosen: run time
 FEWEST_SAMPLES = 200  # Fewest samples of an estimate. Chosen: 5 % of the standard deviation
-_REPEAT_SHORTEST_S, _REPEAT_DELAY_S = 20.0, 10.0
-"""Shortest repeat of a trajectory, s, and smallest delay of one in the same recording. Chosen: a
-few moves, beyond the correlation of a move with itself."""
-_REPEAT_STEPS, _SMALLEST_RESOLUTION_RAD, _REPEAT_MOTION = 5.0, 1e-5, 0.05
-"""Largest rms angle between two repeats, in steps of the encoder; the smallest such step, rad; and
-smallest standard deviation of the direction of gravity in a repeat, rad. Chosen."""
+_REPEAT_SHORTEST_S = 20.0  # Shortest repeat of a trajectory, s. Chosen: a few moves
+_REPEAT_DELAY_S = 10.0
+"""Smallest delay of a repeat in the same recording, s. Chosen: beyond the correlation of a move
+with itself."""
+_REPEAT_STEPS = 5.0
+"""Largest rms angle between two repeats, in steps of the encoder. Chosen."""
+_SMALLEST_RESOLUTION_RAD = 1e-5  # Smallest such step, rad. Chosen: 0.01 mg
+_REPEAT_MOTION = 0.05
+"""Smallest standard deviation of the direction of gravity in a repeat, rad. Chosen: 50 mg, from
+which an axis is compared, too."""
 RANDOM_WALKS_G_PER_RTS = (1e-7, 1e-5, 3e-5, 7e-5, 1.5e-4, 4e-4, 1e-3, 3e-3)
 """Grid of densities of a random walk, g/√s, a factor of two to three apart."""
 FLICKERS_G_PER_RTHZ = (6e-5, 1.5e-4, 5e-4, 1.5e-3, 4e-3)
 """Grid of densities of 1/f noise at 1 Hz, g/√Hz, a factor of three apart."""
-_USUAL_DENSITY, _DENSITY_DECADES = 1e-5, 1.0
-"""Usual density of both drifts, and prior standard deviation of its logarithm, decades. Chosen:
-0.1 mg within 100 s, and a factor of ten."""
+_USUAL_DENSITY = 1e-5  # Usual density of both drifts, in their units. Chosen: 0.1 mg within 100 s
+_DENSITY_DECADES = 1.0
+"""Prior standard deviation of its logarithm, decades. Chosen: units differ by a factor of ten."""
 _LOWEST_NOISE_V = 1e-7
 """Smallest standard deviation of the noise, V, because whitening needs noise. Chosen: below that
 of any ADC."""
@@ -76,9 +82,12 @@ _ITERATIONS = 3
 _SMALLEST_SQUARES_V2 = 1e-300  # Smallest sum of squares, V², whose logarithm is taken: above zero
 _RIDGE = 1e-12
 """Ridge on the scaled precision. Chosen: columns that differ by a millionth are separable."""
-UNDETERMINED_SHARE, _UNDETERMINED_RATIO = 0.5, 3.0
+UNDETERMINED_SHARE = 0.5
 """A coefficient is not determined if its posterior standard deviation exceeds this share of the
-prior's, nor by some blocks if it exceeds that of all blocks by this factor. Chosen."""
+prior's. Chosen: three quarters of the precision are then of the samples."""
+_UNDETERMINED_RATIO = 3.0
+"""Nor is it by some blocks if it exceeds that of all blocks by this factor. Chosen: with a quarter
+of the samples less it usually exceeds it by 15 %."""
 
 
 @dataclass(frozen=True)
@@ -115,11 +124,9 @@ def estimate_floor(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
     The noise at rest is that about the mean of each second. The mean square of the encoder's steps
     is added: step²/12 times the squared slope of gravity, or what they leave open of a robot.
     """
-    sums: Squares = [
-        part
-        for c in comparisons
-        for part in squares_at_rest(c.volts, c.at_rest & c.used, c.sensor)
-    ]
+    sums: Squares = []
+    for c in comparisons:
+        sums += squares_at_rest(c.volts, c.at_rest & c.used, c.sensor)
     source, scale_v_per_mps2 = 'still', comparisons[0].scale_v_per_mps2
     if sum(count for _, count in sums) < FEWEST_SAMPLES:
         sums, source = _repeat_squares(comparisons), 'repeats'
@@ -128,32 +135,23 @@ def estimate_floor(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
         sums, noise_v, source = [], noise.sample_std_v(comparisons[0].sensor), 'assumed'
     else:
         noise_v = np.sqrt(np.sum([squares_v2 for squares_v2, _ in sums], axis=0) / count)
-    encoder = float(np.mean([c.robot_error_mps2**2 for c in comparisons]))
-    for c in comparisons:
-        if c.joints:
-            slopes = gravity_slopes(*(joint(c.time_s)[c.used] for joint in c.joints))
-            squares = np.mean((slopes[:, : len(c.sensor.axes)] ** 2).sum(axis=0))
-            encoder += float(
-                (c.sensor.local_gravity_mps2 * c.sensor.stage_std_rad) ** 2
-                * squares
-                / len(comparisons)
-            )
-    parts = (
-        np.array(
-            [
-                (np.mean(squares_v2 / scale_v_per_mps2**2) + count * encoder, count)
-                for squares_v2, count in sums
-            ]
-        )
-        .reshape(-1, 2)
-        .T
-    )
-    return NoiseFloor(
-        noise_v,
-        float(np.sqrt(np.mean((noise_v / scale_v_per_mps2) ** 2) + encoder)),
-        source,
-        parts,
-    )
+    unknown = np.mean([encoder_error_mps2(c) ** 2 for c in comparisons])
+    rows = [
+        (np.mean(squares_v2 / scale_v_per_mps2**2) + count * unknown, count)
+        for squares_v2, count in sums
+    ]
+    rms_mps2 = np.sqrt(np.mean((noise_v / scale_v_per_mps2) ** 2) + unknown)
+    return NoiseFloor(noise_v, float(rms_mps2), source, np.reshape(rows, (-1, 2)).T)
+
+
+def encoder_error_mps2(comparison: BaselineComparison) -> float:
+    """Return the rms over samples and axes that the steps of encoders leave open."""
+    if comparison.joints is None:
+        return comparison.robot_error_mps2
+    sensor, used = comparison.sensor, comparison.used
+    slopes = gravity_slopes(*(joint(comparison.time_s)[used] for joint in comparison.joints))
+    squares = (slopes[:, : len(sensor.axes)] ** 2).sum(axis=0).mean()
+    return float(sensor.local_gravity_mps2 * sensor.stage_std_rad * np.sqrt(squares))
 
 
 def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> Squares:
@@ -329,62 +327,81 @@ def _angle_errors(
             memory[1:] *= np.minimum(errors.std[:-1] / errors.std[1:], 1.0)
             v_per_rad = slope * sensor.scale_v_per_g[axis] * sensor.local_gravity_mps2 / G0_MPS2
             yield (v_per_rad * errors.std) ** 2, memory
-    force = comparison.motion.force
-    if isinstance(force, ForcePath) and force.is_robot:
-        errors = force.errors(time_s, AXES.index(sensor.axes[axis]))
+    robot = comparison.robot_force
+    if robot is not None:
+        errors = robot.errors(time_s, AXES.index(sensor.axes[axis]))
         v_per_mps2 = sensor.scale_v_per_g[axis] / G0_MPS2
         yield (v_per_mps2 * errors.std) ** 2, np.exp(-errors.forgetting_per_s * comparison.dt_s)
 
 
 def whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
     """Return the filters that are tried for the noise of an axis of a recording."""
-    sensor, dt_s = comparison.sensor, comparison.dt_s
+    sensor = comparison.sensor
     scale, rc_s = float(sensor.scale_v_per_g[axis]), float(noise.electronics(sensor).rc_s[axis])
-    # Pole of the RC filter, and standard deviation of the analog noise.
-    a = float(np.exp(-dt_s / rc_s)) if rc_s else 0.0
-    std_v = max(float(noise.analog_std_v(sensor)[axis]), _LOWEST_NOISE_V)
-    errors, step_v2 = _angle_error_filter(comparison, axis, a, std_v), sensor.lsb_v**2 / 12
+    usual = _UsualNoise(
+        dt_s=comparison.dt_s,
+        pole=float(np.exp(-comparison.dt_s / rc_s)) if rc_s else 0.0,
+        std_v=max(float(noise.analog_std_v(sensor)[axis]), _LOWEST_NOISE_V),
+        step_v2=sensor.lsb_v**2 / 12,
+    )
     by_spectrum = {effect_named(e).diagnosis.drift: e for e in drifts_among(library())}
-    pole, difference = np.array([1, -a]), np.array([1, -1.0])
-    filters = []
-    for density in RANDOM_WALKS_G_PER_RTS:
-        spectrum = (
-            std_v**2 * (1 - a * a) * _power(difference, 2)
-            + step_v2 * _power(np.convolve(pole, difference), 2)
-            + (density * scale) ** 2 * dt_s * _power(pole, 2)
-        )
-        filters.append(
-            Whitener(
-                scipy.signal.tf2sos(np.convolve(pole, difference), _spectral_factor(spectrum, 2)),
-                by_spectrum[DriftSpectrum.RANDOM_WALK],
-                density,
-            )
-        )
-    # Noise and ADC steps without drift are an ARMA(1, 1) sequence; this is the zero of its MA.
-    zero = -_spectral_factor(
-        std_v**2 * (1 - a * a) * _power(np.ones(1), 1) + step_v2 * _power(pole, 1), 1
-    )[1]
-    white_v2_per_hz = 2 * dt_s * (std_v**2 * (1 + a) / (1 - a) + step_v2)
+    filters = [
+        Whitener(usual.without_walk(d * scale), by_spectrum[DriftSpectrum.RANDOM_WALK], d)
+        for d in RANDOM_WALKS_G_PER_RTS
+    ]
     for density in FLICKERS_G_PER_RTHZ:
-        corner_hz = (density * scale) ** 2 / white_v2_per_hz
-        top_hz = min(corner_hz, _TOP_OF_RATE / dt_s)
-        # Zeros and poles, one pair a decade from the corner down: the gain of the filter rises
-        # with the root of the frequency.
-        decades = np.arange(int(np.ceil(max(np.log10(top_hz * comparison.span_s), 0.0))))
-        corners = 2 * np.pi * dt_s * top_hz * 10.0**-decades
-        filters.append(
-            Whitener(
-                scipy.signal.zpk2sos(
-                    [a, *np.exp(-corners * 10**-0.5)], [zero, *np.exp(-corners)], 1.0
-                ),
-                by_spectrum[DriftSpectrum.FLICKER],
-                density,
-            )
-        )
-        if corner_hz > top_hz:
+        sections = usual.without_flicker(density * scale, comparison.span_s)
+        filters.append(Whitener(sections, by_spectrum[DriftSpectrum.FLICKER], density))
+        if usual.corner_hz(density * scale) > usual.highest_corner_hz:
             break
+    errors = _angle_error_filter(comparison, axis, usual.pole, usual.std_v)
     largest = np.inf if errors is None else errors.rms_v / scale
     return [replace(f, errors=errors) if f.healthy or f.density < largest else f for f in filters]
+
+
+@dataclass(frozen=True)
+class _UsualNoise:
+    """The noise of one axis without drift: white noise behind an RC filter, and ADC steps."""
+
+    dt_s: float  # Time between samples, s
+    pole: float  # Pole of the RC filter
+    std_v: float  # Standard deviation of the analog noise, V
+    step_v2: float  # Mean square of the steps, V²
+
+    @property
+    def highest_corner_hz(self) -> float:
+        """Return the highest corner of 1/f noise that a filter has, Hz."""
+        return _TOP_OF_RATE / self.dt_s
+
+    def corner_hz(self, density_v: float) -> float:
+        """Return the frequency at which 1/f noise, V/√Hz at 1 Hz, is as dense as this one, Hz."""
+        analog_v2 = self.std_v**2 * (1 + self.pole) / (1 - self.pole)
+        return density_v**2 / (2 * self.dt_s * (analog_v2 + self.step_v2))
+
+    def without_walk(self, density_v: float) -> np.ndarray:
+        """Return the filter that makes noise with a random walk, V/√s, white."""
+        pole, difference = np.array([1, -self.pole]), np.array([1, -1.0])
+        both = np.convolve(pole, difference)
+        spectrum = (
+            self.std_v**2 * (1 - self.pole**2) * _power(difference, 2)
+            + self.step_v2 * _power(both, 2)
+            + density_v**2 * self.dt_s * _power(pole, 2)
+        )
+        return scipy.signal.tf2sos(both, _spectral_factor(spectrum, 2))
+
+    def without_flicker(self, density_v: float, span_s: float) -> np.ndarray:
+        """Return the filter that makes noise with 1/f noise, V/√Hz at 1 Hz, white."""
+        # Noise and steps without drift are an ARMA(1, 1) sequence; this is the zero of its MA.
+        spectrum = self.std_v**2 * (1 - self.pole**2) * _power(np.ones(1), 1)
+        spectrum += self.step_v2 * _power(np.array([1, -self.pole]), 1)
+        zero = -_spectral_factor(spectrum, 1)[1]
+        # Zeros and poles, one pair a decade from the corner down: the gain of the filter rises
+        # with the root of the frequency.
+        top_hz = min(self.corner_hz(density_v), self.highest_corner_hz)
+        decades = np.arange(int(np.ceil(max(np.log10(top_hz * span_s), 0.0))))
+        corners = 2 * np.pi * self.dt_s * top_hz * 10.0**-decades
+        poles, zeros = [self.pole, *np.exp(-corners * 10**-0.5)], [zero, *np.exp(-corners)]
+        return scipy.signal.zpk2sos(poles, zeros, 1.0)
 
 
 def expected_drift_g(effect: str, density: float, comparison: BaselineComparison) -> float:

@@ -12,6 +12,7 @@ from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.block_statistics import rms
 import numpy as np
 import scipy
 
@@ -52,7 +53,7 @@ def tilt_deg(time_s: np.ndarray, recorded: np.ndarray, simulated: np.ndarray) ->
     """Return the rms angle between the recorded and the simulated vector, deg."""
     cross = np.linalg.norm(np.cross(recorded, simulated), axis=1)
     angle = np.arctan2(cross, np.sum(recorded * simulated, axis=1))
-    return float(np.degrees(np.sqrt(np.mean(angle**2))))
+    return float(np.degrees(rms(angle)))
 
 
 def velocity_mps(time_s: np.ndarray, recorded: np.ndarray, simulated: np.ndarray) -> float:
@@ -69,7 +70,7 @@ def velocity_mps(time_s: np.ndarray, recorded: np.ndarray, simulated: np.ndarray
             f'has {np.ptp(time_s):.3g} s'
         )
     gained = velocity[later[within]] - velocity[: len(time_s)][within]
-    return float(np.sqrt(np.mean(np.sum(gained**2, axis=1))))
+    return rms(np.linalg.norm(gained, axis=1))
 
 
 _QUANTITIES = {
@@ -114,9 +115,6 @@ def gap_in(
             raise UserError(
                 f'--in {chosen.name}: {type(error).__name__}: {one_line(error)}'
             ) from None
-
-    def rms(figures: list[float]) -> float:
-        return float(np.sqrt(np.mean(np.square(figures))))
 
     before = [figure(c, c.volts, baseline) for c in comparisons]
     after = [figure(c, c.volts, found) for c in comparisons]

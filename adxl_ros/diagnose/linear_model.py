@@ -27,6 +27,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.effects import base, effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Concern, Effect, Parameter, Role
 from adxl_ros.model.sensor import names_of, parameter_of, put, Sensor, with_neutral
+from adxl_ros.signals.block_statistics import rms
 import numpy as np
 
 PRIOR_WIDTH = 5.0
@@ -315,7 +316,7 @@ class LinearModel:
     @cached_property
     def lost_motion_mps2(self) -> float:
         """Rms of the motion that smooth references lack, m/s²."""
-        return float(np.sqrt(np.mean([c.lost_motion_mps2() ** 2 for c in self.comparisons])))
+        return rms([c.lost_motion_mps2() for c in self.comparisons])
 
     @cached_property
     def places(self) -> list[Channel]:
@@ -621,7 +622,7 @@ def _straight_parts(lines: np.ndarray, others: np.ndarray, rows: np.ndarray) -> 
 
     lines, others: columns of one channel, (n, l) and (n, k); rows: samples at rest, (n,).
     """
-    rms = np.sqrt(np.mean(others[rows] ** 2, axis=0))
+    rms_of_rests = np.sqrt(np.mean(others[rows] ** 2, axis=0))
     at_rests = np.abs(np.linalg.lstsq(lines[rows], others[rows])[0])
     in_all = np.linalg.lstsq(lines, others)[0]
     # A calibration with an effect that is a straight line would have left nothing of it.
@@ -630,10 +631,10 @@ def _straight_parts(lines: np.ndarray, others: np.ndarray, rows: np.ndarray) -> 
     )
     parts = []
     for j, line in enumerate(lines.T):
-        size = max(float(np.sqrt(np.mean(line**2))), np.finfo(float).tiny)
+        size = max(rms(line), np.finfo(float).tiny)
         # The poses of a calibration may reach further than the rests of the recording.
         reach = np.abs(others).max(axis=0) / np.abs(line).max() if np.ptp(line) else 0.0
-        beyond_rests = np.minimum(np.maximum(np.abs(in_all[j]), reach), 2 * rms / size)
+        beyond_rests = np.minimum(np.maximum(np.abs(in_all[j]), reach), 2 * rms_of_rests / size)
         straight = np.maximum(at_rests[j], beyond_rests)
-        parts.append(bent * np.hypot(straight, _OTHER_RESTS_SHARE * rms / size))
+        parts.append(bent * np.hypot(straight, _OTHER_RESTS_SHARE * rms_of_rests / size))
     return parts

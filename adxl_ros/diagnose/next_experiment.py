@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from contextlib import suppress
-from itertools import combinations, count
+from itertools import chain, combinations, count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -44,9 +44,10 @@ import numpy as np
 _SHOWN_STDS = 4.0  # Size of a coefficient, in standard deviations, that shows: it gains 8 nats
 _RATE_HZ = 62.5
 """Sample rate of the simulated manoeuvres, Hz. Chosen: run time; a stage moves far slower."""
-_SMALLEST_PROBABILITY, _MOST_HYPOTHESES = 1e-3, 40
-"""Probability of a hypothesis that leads the choice, and their largest number. Chosen: the others
-together are far below the 5 % that remain at the end; run time."""
+_SMALLEST_PROBABILITY = 1e-3
+"""Probability of a hypothesis that leads the choice. Chosen: the others together are far below the
+5 % that remain at the end."""
+_MOST_HYPOTHESES = 40  # Largest number of such hypotheses. Chosen: run time
 _EVIDENCE_FACTOR = 0.3
 """Factor of the information, because no model of a sensor is exact (Miller and Dunson 2019)."""
 
@@ -76,55 +77,75 @@ def could_show(
     size of the shape that shows best. The sizes of effects on the noise are those of one
     recording at its full rate; `noise_v` is its noise, V, (m,).
     """
-    prior_std, free = model.prior(()), np.array(model.nuisance_ids, int)
+    rows = [
+        *_noise_could_show(comparison, noise_v, material_mps2),
+        *_mean_could_show(model, material_mps2),
+    ]
+    seen = {row.name.effect for row in rows}
+    limited = {variant.effect for variant in model.variants if variant.limit_start}
+    for effect in linear.candidates():
+        if effect.name not in seen | limited:
+            name = Coefficient(effect.name, effect.parameters[0].name)
+            rows.append(CouldShow(name, np.inf, 0.0))
+    # The last coefficient of each effect shows best, by smallest over typical size.
+    rows.sort(
+        key=lambda row: (row.smallest / parameter_of(row.name).scale, row.name), reverse=True
+    )
+    best = {row.name.effect: row for row in rows}
+    return [best[effect] for effect in sorted(best)]
+
+
+class _Information(NamedTuple):
+    """What recordings tell of the coefficients of all columns, (columns,) each."""
+
+    alone: np.ndarray  # Inverse variance where nothing else is free, 1/unit²
+    marginal: np.ndarray  # Inverse variance beside the nuisance parameters, 1/unit²
+    power_mps2: np.ndarray  # Mean square over samples and axes, (m/s²)²/unit²
+
+
+def _information(model: LinearModel) -> _Information:
+    """Multiply the whitened columns of a linear model."""
     fit, count = model.null_fit, len(model.names)
-    # Products of the whitened columns in units of the noise, and their squares, (m/s²)²/unit².
-    gram, plain, samples = np.zeros((count, count)), np.zeros(count), 0.0
-    for c, f, variance, columns, (recorded, axis) in zip(
+    # Products of the whitened columns in units of the noise.
+    gram = np.zeros((count, count))
+    squares_mps2, samples = np.zeros(count), 0
+    for white, f, variance_v2, columns, channel in zip(
         model.channels, fit.filter_indices, fit.innovation_variance_v2, model.columns, model.places
     ):
-        gram[np.ix_(c.column_ids, c.column_ids)] += c.total_grams[f][1:, 1:] / variance
-        for k, values in columns.items():
-            plain[k] += (
-                float(np.sum(values[recorded.used] ** 2))
-                / float(recorded.scale_v_per_mps2[axis]) ** 2
-            )
-        samples += recorded.used.sum()
-    precision = gram[np.ix_(free, free)] + np.diag(prior_std[free] ** -2.0)
-    marginal = np.diag(gram) - np.einsum(
-        'ij,ij->j', gram[free], np.linalg.solve(precision, gram[free])
-    )
-    rows = _noise_could_show(comparison, noise_v, material_mps2)
+        ids = white.column_ids
+        gram[np.ix_(ids, ids)] += white.total_grams[f][1:, 1:] / variance_v2
+        used = channel.comparison.used
+        scale = float(channel.comparison.scale_v_per_mps2[channel.axis])
+        for k, column_v in columns.items():
+            squares_mps2[k] += float(np.sum(column_v[used] ** 2)) / scale**2
+        samples += int(used.sum())
+    free = np.array(model.nuisance_ids, int)
+    precision = gram[np.ix_(free, free)] + np.diag(model.prior(())[free] ** -2.0)
+    taken_up = np.einsum('ij,ij->j', gram[free], np.linalg.solve(precision, gram[free]))
+    alone = np.diag(gram)
+    return _Information(alone, alone - taken_up, squares_mps2 / max(samples, 1))
+
+
+def _mean_could_show(model: LinearModel, material_mps2: float) -> list[CouldShow]:
+    """Return the smallest sizes of effects that show in the mean of the output."""
+    known, rows = _information(model), []
     for variant, ids in zip(model.variants, model.column_ids):
         hints = effect_named(variant.effect).diagnosis
-        if variant.limit_start or (hints.straight_line and not model.pose_known):
+        hides_in_pose = bool(hints.straight_line) and not model.pose_known
+        if variant.limit_start or hides_in_pose:
             continue
         for k in ids:
-            information = gram[k, k] if hints.nuisance else marginal[k]
-            share = float(np.clip(information / max(gram[k, k], 1e-300), 0.0, 1.0))
-            power = plain[k] * share / max(samples, 1.0)
-            size = (
-                max(_SHOWN_STDS * information**-0.5, material_mps2 * power**-0.5)
-                if information > 0 and power > 0
-                else np.inf
-            )
+            information = known.alone[k] if hints.nuisance else known.marginal[k]
+            share = float(np.clip(information / max(known.alone[k], 1e-300), 0.0, 1.0))
+            power_mps2 = known.power_mps2[k] * share
+            size = np.inf
+            if information > 0 and power_mps2 > 0:
+                certain = _SHOWN_STDS * information**-0.5
+                size = max(certain, material_mps2 * power_mps2**-0.5)
             if hints.nuisance:
                 size = np.hypot(size, 3 * model.tolerance(model.names[k]))
             rows.append(CouldShow(model.names[k], float(size), share))
-    seen = {r.name.effect for r in rows} | {v.effect for v in model.variants if v.limit_start}
-    rows += [
-        CouldShow(Coefficient(e.name, e.parameters[0].name), np.inf, 0.0)
-        for e in linear.candidates()
-        if e.name not in seen
-    ]
-    # The coefficient of each effect that shows best, by smallest over typical size.
-    best = {
-        r.name.effect: r
-        for r in sorted(
-            rows, reverse=True, key=lambda r: (r.smallest / parameter_of(r.name).scale, r.name)
-        )
-    }
-    return [best[effect] for effect in sorted(best)]
+    return rows
 
 
 def _noise_could_show(
@@ -155,15 +176,11 @@ def _noise_could_show(
         hints = effect.diagnosis
         if hints.drift is not None:
             unit_g = expected_drift_g(effect.name, 1.0, comparison)
-            parameter, size = (
-                effect.parameters[0].name,
-                max(material_mps2 / G0_MPS2 / unit_g, hints.healthy_density),
-            )
+            density = max(material_mps2 / G0_MPS2 / unit_g, hints.healthy_density)
+            rows.append(CouldShow(Coefficient(effect.name, effect.parameters[0].name), density))
         elif hints.detector in sizes:
             parameter, size = sizes[hints.detector]
-        else:
-            continue
-        rows.append(CouldShow(Coefficient(effect.name, parameter), float(size)))
+            rows.append(CouldShow(Coefficient(effect.name, parameter), float(size)))
     return rows
 
 
@@ -266,12 +283,11 @@ def predict(
 
 def _keys(model: LinearModel) -> dict[int, tuple]:
     """Return variant and coefficient of each column of a linear model by its number."""
-    return {
-        number: (v.key, model.names[number])
-        for v, ids in zip(model.variants, model.column_ids)
-        if not v.limit_start
-        for number in ids
-    }
+    keys: dict[int, tuple] = {}
+    for variant, ids in zip(model.variants, model.column_ids):
+        if not variant.limit_start:
+            keys |= {number: (variant.key, model.names[number]) for number in ids}
+    return keys
 
 
 def rank_responses(
@@ -283,35 +299,28 @@ def rank_responses(
     leaders, seen = leading(hypotheses), dict[str, int]()
     keys, fits = dict[int, tuple](), list[LinearFit | None]([None] * len(leaders))
     if model is not None:
+
+        def log_evidence(variant: int) -> float:
+            return model.fit_variants([variant], model.null_fit).log_evidence
+
         # The variant of each effect that fits the samples best.
-        seen = {
-            effect: max(
-                numbers, key=lambda i: model.fit_variants([i], model.null_fit).log_evidence
-            )
-            for effect in {e for h in leaders for e in h.effects}
-            if (numbers := _variants_of(model, effect))
-        }
-        keys, fits = (
-            _keys(model),
-            [
-                model.fit_variants([seen[e] for e in h.effects if e in seen], model.null_fit)
-                for h in leaders
-            ],
-        )
+        for effect in set(chain(*(h.effects for h in leaders))):
+            numbers = _variants_of(model, effect)
+            if numbers:
+                seen[effect] = max(numbers, key=log_evidence)
+        keys = _keys(model)
+        for i, hypothesis in enumerate(leaders):
+            chosen = [seen[e] for e in hypothesis.effects if e in seen]
+            fits[i] = model.fit_variants(chosen, model.null_fit)
     total = sum(h.probability for h in leaders)
-    worth = [
-        ManoeuvreWorth(
-            r.name,
-            r.minutes,
-            expected_information(
-                r.gram,
-                [h.probability / total for h in leaders],
-                [_belief(r, keys, fit, {*h.effects} - {*seen}) for h, fit in zip(leaders, fits)],
-                _EVIDENCE_FACTOR,
-            ),
-        )
-        for r in responses
-    ]
+    probabilities = [h.probability / total for h in leaders]
+    worth = []
+    for response in responses:
+        beliefs = [
+            _belief(response, keys, fit, {*h.effects} - {*seen}) for h, fit in zip(leaders, fits)
+        ]
+        information = expected_information(response.gram, probabilities, beliefs, _EVIDENCE_FACTOR)
+        worth.append(ManoeuvreWorth(response.name, response.minutes, information))
     return tuple(sorted(worth, key=lambda w: -w.per_minute))
 
 
@@ -338,7 +347,7 @@ def _belief(
         numbers[len(numbers) // 2] for effect in unseen if (numbers := _variants_of(model, effect))
     ]
     prior_std, mean, variance = model.prior(chosen), np.zeros(len(places)), np.zeros(len(places))
-    for k in {k for i in chosen for k in model.column_ids[i]}.union(model.nuisance_ids):
+    for k in {*model.nuisance_ids, *chain(*(model.column_ids[i] for i in chosen))}:
         variance[places[keys[k]]] = prior_std[k] ** 2
     covariance = np.diag(variance)
     if fit is not None:
@@ -449,7 +458,7 @@ def _ranked_menu(
     verdict: Verdict, sensor: Sensor, model: LinearModel | None, seed: int
 ) -> tuple[ManoeuvreWorth, ...]:
     """Rank the whole menu by its expected information."""
-    effects = sorted({effect for h in leading(verdict.hypotheses) for effect in h.effects})
+    effects = sorted({*chain(*(h.effects for h in leading(verdict.hypotheses)))})
     responses = []
     for described in MENU.values():
         motion = trajectories.TRAJECTORIES[described.trajectory](np.random.default_rng(seed))

@@ -22,47 +22,61 @@ from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Detector
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.block_statistics import true_runs
+from adxl_ros.signals.block_statistics import rms, true_runs
 from adxl_ros.simulate.response import Response
 import numpy as np
 import scipy
 
-_MAINS_HZ, _MAINS_TOLERANCE_HZ = (50.0, 60.0), 0.6
-"""Mains frequencies, Hz, and the largest deviation of a line. Chosen: 1 % of clock or mains."""
-_LINE_LOWEST_HZ, _LINE_FEWEST_ORDINATES, _LOCAL_ORDINATES = 1.0, 64, 201
-"""Lowest frequency of a line, Hz, fewest ordinates of a periodogram, and ordinates of the level
-around it. Chosen: below it slow effects are no line; much wider than a line."""
+_MAINS_HZ = (50.0, 60.0)  # Mains frequencies, Hz
+_MAINS_TOLERANCE_HZ = 0.6  # Largest deviation of a line, Hz. Chosen: 1 % of clock or mains
+_LINE_LOWEST_HZ = 1.0  # Lowest frequency of a line, Hz. Chosen: below it slow effects are no line
+_LINE_FEWEST_ORDINATES = 64  # Fewest ordinates of a periodogram that shows a line. Chosen
+_LOCAL_ORDINATES = 201  # Ordinates of the level around a line. Chosen: much wider than a line
 LINE_LOG_EXCESS = 14.0
 """Log likelihood ratio of a line, above that of the largest ordinate by chance, from which it is a
 line. Chosen: exp(−14) is one in a million."""
-_LINE_PART_S, _LINE_BESIDE = 4.0, 4.0
-"""Length of the parts of which the amplitude of a line is taken, s, and distance at which the
-power beside it is taken, in inverse parts. Chosen: the phase of the mains wanders little within
-it; beyond the main lobe of the window."""
-SPIKE_STDS, _SPIKE_FEWEST, _SPIKE_NEIGHBOUR = 7.0, 3, 2
-"""Deviation of a spike from its neighbours, in robust standard deviations, fewest spikes of an
-axis, and distance of the neighbours, samples. Chosen: normal noise exceeds it once in 4·10¹¹
-samples; one or two may be anything; the next sample shares an RC filter."""
-_SPIKE_LOCAL_S, _SPIKE_LOCAL_FEWEST = 0.2, 9
-"""Width of the blocks of the local scale, s and samples. Chosen: shorter than a move."""
-NOISE_EXCESS, _RESTING_FEWEST = 1.2, 500
-"""Noise, divided by the stated noise, from which it is excessive, and fewest resting samples that
-show it. Chosen: units differ by less; a standard deviation of 3 %."""
-COARSE_STEPS, _SMALLEST_CODE_STEPS, _NEAREST_CODES_RATIO, _CODES_FEWEST = 1.6, 0.3, 1.5, 8
-"""Distance of codes, in stated steps, from which they are coarse; distance below which two values
-are one code; distance over the smallest one without a code between; fewest distances. Chosen."""
-_BETWEEN_CODES_STEPS, _BETWEEN_CODES_SHARE = 0.2, 0.1
-"""Distance from a multiple of the step, in steps, at which a value is between codes, and share of
-such values from which the step is none of the ADC. Chosen: far above rounding."""
-_REPEAT_CHANCE, _REPEAT_SHORTEST = 1e-4, 3
-"""Probability of one run of equal samples by chance in a recording, and its shortest length,
-samples. Chosen: two may be equal by rounding."""
-_REPEAT_PROBABILITIES = (0.05, 1e-3, 0.5)
-"""Smallest assumed probability that a sample equals the last one on one axis, and on all of
-several axes; the largest one. Chosen: in 10⁵ samples, chance explains runs of 7, 3 and 30."""
-_BANDS, _LOWEST_EDGE_HZ, _TIMES_S = 5, 0.05, (0.1, 1.0, 10.0)
-"""Bands of frequency, smallest edge, Hz, and averaging times of the Allan deviation, s. Chosen:
-half a decade each; a period of 20 s."""
+_LINE_PART_S = 4.0
+"""Length of the parts of which the amplitude of a line is taken, s. Chosen: the phase of the mains
+wanders little within it."""
+_LINE_BESIDE = 4.0
+"""Distance at which the power beside a line is taken, in inverse parts. Chosen: beyond the main
+lobe of the window."""
+SPIKE_STDS = 7.0
+"""Deviation of a spike from its neighbours, in robust standard deviations. Chosen: normal noise
+exceeds it once in 4·10¹¹ samples."""
+_SPIKE_FEWEST = 3  # Fewest spikes of an axis. Chosen: one or two may be anything
+_SPIKE_NEIGHBOUR = 2
+"""Distance of the neighbours of a spike, samples. Chosen: the next sample shares an RC filter."""
+_SPIKE_LOCAL_S = 0.2  # Width of the blocks of the local scale, s. Chosen: shorter than a move
+_SPIKE_LOCAL_FEWEST = 9  # The same in samples. Chosen: a median of nine ignores a spike
+NOISE_EXCESS = 1.2
+"""Noise, divided by the stated noise, from which it is excessive. Chosen: units differ by less."""
+_RESTING_FEWEST = 500
+"""Fewest resting samples that show excess noise. Chosen: a standard deviation of 3 %."""
+COARSE_STEPS = 1.6
+"""Distance of codes, in stated steps, from which they are coarse. Chosen: below that of one lost
+bit."""
+_SMALLEST_CODE_STEPS = 0.3
+"""Distance, in stated steps, below which two values are one code. Chosen: above rounding."""
+_NEAREST_CODES_RATIO = 1.5
+"""Distance, divided by the smallest one, up to which no code is between. Chosen: below two."""
+_CODES_FEWEST = 8  # Fewest distances that show a step. Chosen
+_BETWEEN_CODES_STEPS = 0.2
+"""Distance from a multiple of the step, in steps, at which a value is between codes. Chosen: far
+above rounding."""
+_BETWEEN_CODES_SHARE = 0.1  # Share of such values from which the step is none of the ADC. Chosen
+_REPEAT_CHANCE = 1e-4
+"""Probability of one run of equal samples by chance in a recording. Chosen."""
+_REPEAT_SHORTEST = 3  # Shortest such run, samples. Chosen: two may be equal by rounding
+_REPEAT_LEAST = 0.05
+"""Smallest assumed probability that a sample equals the last one on one axis. Chosen: in 10⁵
+samples, chance explains runs of 7."""
+_REPEAT_LEAST_OF_SEVERAL = 1e-3
+"""The same on all of several axes. Chosen: chance explains runs of 3."""
+_REPEAT_MOST = 0.5  # The largest one. Chosen: chance explains runs of 30
+_BANDS = 5  # Bands of frequency in which noise is compared. Chosen: half a decade each
+_LOWEST_EDGE_HZ = 0.05  # Smallest edge of a band, Hz. Chosen: a period of 20 s
+_TIMES_S = (0.1, 1.0, 10.0)  # Averaging times of the Allan deviation, s. Chosen: a decade apart
 
 
 @dataclass(frozen=True)
@@ -123,8 +137,8 @@ def shortest_repeat(volts: np.ndarray, axes: int) -> int:
     """Return how many equal samples, (n, m), in a row are too many for chance."""
     # Neighbours are correlated, so that the root of the independent probability is safe.
     probability = float(np.sqrt(np.prod(np.mean(np.diff(volts, axis=0) == 0, axis=0))))
-    one, several, largest = _REPEAT_PROBABILITIES
-    probability = min(max(probability, several if axes > 1 else one), largest)
+    least = _REPEAT_LEAST_OF_SEVERAL if axes > 1 else _REPEAT_LEAST
+    probability = min(max(probability, least), _REPEAT_MOST)
     by_chance = int(np.ceil(np.log(_REPEAT_CHANCE / len(volts)) / np.log(probability)))
     return max(_REPEAT_SHORTEST, by_chance)
 
@@ -437,7 +451,7 @@ def compare_noise(
             float(recorded[band].sum() / simulated[band].sum()) for band in bands
         ]
         allan = [[allan_deviation(v, round(t * rate_hz)) for v in series] for t in times_s]
-        ratios[f'allan_ratio_{label}'] = [float(np.sqrt(np.mean((a / b) ** 2))) for a, b in allan]
+        ratios[f'allan_ratio_{label}'] = [rms(a / b) for a, b in allan]
         levels = [(recorded[band], simulated[band].mean(axis=0)) for band in bands if band.any()]
         log_likelihoods.append(
             -sum(float(np.sum(power / level + np.log(level))) for power, level in levels)

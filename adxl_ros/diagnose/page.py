@@ -29,18 +29,17 @@ from adxl_ros.report.quantities import decimals, mg, mg_text, percent
 import numpy as np
 import scipy
 
-_BINS, _FEWEST_SAMPLES = 10, 20
-"""Ranges of equal width, and of equal counts, of a proof, and fewest samples of one. Chosen: a
-curve is visible, and a mean is worth a point."""
+_BINS = 10
+"""Ranges of equal width, and of equal counts, of a proof. Chosen: a curve is visible."""
+_FEWEST_SAMPLES = 20  # Fewest samples of a range. Chosen: a mean is worth a point
 _RATE_S = 20.0
 """Time over which a temperature changes, s. Chosen: beyond the noise of a thermometer."""
 _SMALLEST_SHARE = 0.5
 """Share of the effect's variance that the variable must show. Chosen: half of it."""
 _CONTRIBUTION = 'what the model of the effect predicts, mg'
 """Variable of an effect that none of its own variables shows."""
-_SEGMENT, _POINTS_PER_OCTAVE = 4096, 12
-"""Samples in a segment of a spectrum, and points of its plot in an octave. Chosen: 0.06 Hz at
-250 Hz, and lines stay visible."""
+_SEGMENT = 4096  # Samples in a segment of a spectrum. Chosen: 0.06 Hz at 250 Hz
+_POINTS_PER_OCTAVE = 12  # Points of its plot in an octave. Chosen: lines stay visible
 COLOURS = {
     'explained': 'green',
     'partly': 'amber',
@@ -54,7 +53,8 @@ COLOURS = {
 TILES = 4  # Figures at the top of the page
 _PLOTTED_POINTS = 3000
 """Largest number of points of a line. Chosen: more than a wide screen has columns."""
-_INK, _EFFECT_COLOUR = '#1f2933', '#5b8fd6'
+_INK = '#1f2933'
+_EFFECT_COLOUR = '#5b8fd6'
 _CURVE_COLOURS = (
     {'recorded': _INK, 'stated noise': plots.QUIET_COLOUR}
     | dict.fromkeys(('before', 'without the effect'), plots.BEFORE_COLOUR)
@@ -120,25 +120,13 @@ def _page(diagnosis: Diagnosis, objects: dict[str, Any], run: Run, parameters: s
 def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> dict[str, Any]:
     """Return what the template shows of a diagnosis with a verdict."""
     named, proposal = words.named_effects(report, objects), objects['next_experiment']
-    shown = [
-        c
-        for c in objects['candidates']
-        if c['effect'] in named or c['probability'] >= words.PROBABLE
-    ]
-    shown.sort(key=lambda c: named.index(c['effect']) if c['effect'] in named else len(named))
+    probable = [c for c in objects['candidates'] if c['probability'] >= words.PROBABLE]
+    by_name = {c['effect']: c for c in objects['candidates']}
+    # The named effects come first, then those that are probable.
+    shown = list({c['effect']: c for c in (*map(by_name.get, named), *probable)}.values())
     best = report.hypotheses[0]
     compared, full_rate = diagnosis.comparisons[0], diagnosis.full_rate[0]
-    in_noise, proofs = {d.effect for d in report.detections} & {*report.sensor.effects}, {}
-    for name in (
-        c['effect'] for c in shown if Over.STEP not in effect_named(c['effect']).diagnosis.proof
-    ):
-        sensors = (
-            [report.sensor]
-            if name in in_noise
-            else [h.sensor for h in report.hypotheses if name in h.effects]
-        )
-        if sensors:
-            proofs[name] = _proof(name, compared, full_rate, sensors[0])
+    proofs = _proofs(diagnosis, report, [c['effect'] for c in shown])
     rows, scale = words.figure_rows(diagnosis), float(report.baseline.scale_v_per_g.mean())
     return {
         'has_verdict': True,
@@ -183,6 +171,23 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
         else [],
         'could_show': [(row.shows, *words.shows_row(row, scale)) for row in report.could_show],
     }
+
+
+def _proofs(
+    diagnosis: Diagnosis, report: Report, effects: Sequence[str]
+) -> dict[str, tuple[Figure, str]]:
+    """Return the proof of each effect that has one, and its text."""
+    compared, full_rate = diagnosis.comparisons[0], diagnosis.full_rate[0]
+    in_noise = {d.effect for d in report.detections} & {*report.sensor.effects}
+    proofs = {}
+    for name in effects:
+        sensors = [h.sensor for h in report.hypotheses if name in h.effects]
+        if name in in_noise:
+            sensors = [report.sensor]
+        is_step = Over.STEP in effect_named(name).diagnosis.proof
+        if sensors and not is_step:
+            proofs[name] = _proof(name, compared, full_rate, sensors[0])
+    return proofs
 
 
 def _cell(cell: ResidualCell) -> list[str]:

@@ -14,10 +14,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from adxl_ros.diagnose.comparison import BaselineComparison, bridged, Reference, SMALLEST_MOTION_G
+from adxl_ros.diagnose.comparison import BaselineComparison, bridged, SMALLEST_MOTION_G
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.report.quantities import mg_text
-from adxl_ros.simulate.motion import ForcePath
+from adxl_ros.signals.block_statistics import rms
 import numpy as np
 import scipy
 
@@ -34,14 +34,14 @@ the gap, up to which the factor explains both. Chosen: filters and noise leave a
 _SMALLEST_DYNAMICS_G = 5e-3
 """Rms of the length of a force about that of gravity from which it has dynamics, g. Chosen: the
 errors of a healthy, uncalibrated sensor's zero-g are larger, but those of its length are less."""
-_BLOCK_S, _LARGEST_STEP_S = 5.0, 1.0
-"""Length of the parts whose delay is taken, s, and largest delay. Chosen: some moves; what the
-effect of a time offset covers."""
+_BLOCK_S = 5.0  # Length of the parts whose delay is taken, s. Chosen: some moves
+_LARGEST_STEP_S = 1.0  # Largest delay, s. Chosen: what the effect of a time offset covers
 _FEWEST_PARTS = 3
 """Fewest parts on each side of a step of the clock. Chosen: they show their spread."""
-_SMALLEST_STEP_S, _STEP_STDS = 5e-3, 6.0
-"""Smallest step of a clock, s, and the same in standard deviations of the delays of the parts
-about their levels. Chosen: less is jitter; a drift has three."""
+_SMALLEST_STEP_S = 5e-3  # Smallest step of a clock, s. Chosen: less is jitter
+_STEP_STDS = 6.0
+"""The same in standard deviations of the delays of the parts about their levels. Chosen: a drift
+has three."""
 _FOLLOWS = 0.95  # Correlation of a part with its reference from which its delay counts. Chosen
 
 
@@ -55,13 +55,8 @@ def _smoothed_g(comparison: BaselineComparison, volts: np.ndarray) -> np.ndarray
 
 def wrong_dynamic_factor(comparison: BaselineComparison) -> str | None:
     """Return what is wrong with the factor of a simulator's dynamic part; None if it is right."""
-    sensor, force = comparison.sensor, comparison.motion.force
-    if (
-        comparison.reference is not Reference.SIMULATOR
-        or not isinstance(force, ForcePath)
-        or force.is_robot
-        or len(sensor.axes) < len(AXES)
-    ):
+    sensor, force = comparison.sensor, comparison.simulated_force
+    if force is None or len(sensor.axes) < len(AXES):
         return None
     measured_g = _smoothed_g(comparison, comparison.volts)
     stated_g = _smoothed_g(comparison, comparison.simulated_v(sensor))
@@ -72,9 +67,6 @@ def wrong_dynamic_factor(comparison: BaselineComparison) -> str | None:
         factor = np.exp(log_factor)
         turned_g = np.linalg.norm(factor * measured_g - stated_g, axis=1)
         return rms(turned_g - abs(factor - 1) * gravity_g)
-
-    def rms(values: np.ndarray) -> float:
-        return float(np.sqrt(np.mean(np.square(values))))
 
     gap_g = rms(measured_g - stated_g)
     dynamics_g = min(rms(np.linalg.norm(g, axis=1) - gravity_g) for g in (measured_g, stated_g))
@@ -115,12 +107,8 @@ class _Delay(NamedTuple):
 
 def clock_step(comparison: BaselineComparison) -> str | None:
     """Return when and how far the clock of a simulator steps; None where it does not."""
-    force = comparison.motion.force
-    if (
-        comparison.reference is not Reference.SIMULATOR
-        or not isinstance(force, ForcePath)
-        or force.is_robot
-    ):
+    force = comparison.simulated_force
+    if force is None:
         return None
     delays = _delays(comparison)
     if len(delays) < 2 * _FEWEST_PARTS:
@@ -172,7 +160,7 @@ def _delays(comparison: BaselineComparison) -> list[_Delay]:
 
 def _delay_samples(own: np.ndarray, other: np.ndarray) -> float | None:
     """Return the place in `other`, samples, where `own`, g, fits best; None where none fits."""
-    if np.sqrt(np.mean(own**2)) < SMALLEST_MOTION_G:
+    if rms(own) < SMALLEST_MOTION_G:
         return None
     window = np.ones(len(own))
     products, squares = np.zeros((2, len(other) - len(own) + 1))

@@ -545,9 +545,11 @@ def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]
     return effect.name, 'cannot show', typical, missing
 
 
-_BADGE_COLUMNS, _GAP_COLUMNS, _LABEL_COLUMNS = 29, 24, 9
-"""Columns of the verdict, of the gap before and after, and of the words before rows of text."""
-_SURE_COLUMNS, _SHARE_COLUMNS = 8, 7  # Columns of the table of effects
+_BADGE_COLUMNS = 29  # Columns of the verdict
+_GAP_COLUMNS = 24  # Columns of the gap before and after
+_LABEL_COLUMNS = 9  # Columns of the words before rows of text
+_SURE_COLUMNS = 8  # Columns of the probability in the table of effects
+_SHARE_COLUMNS = 7  # Columns of the share of the gap there
 
 
 def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:

@@ -15,6 +15,7 @@ from itertools import chain, combinations
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, linear_model as linear
+from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.evidence import LinearFit, LinearisedHypothesis, Whitener
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.errors import UserError
@@ -25,14 +26,16 @@ from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import fitted_of, get, parameter_of, put, Sensor, with_neutral
 import numpy as np
 
-_EVALUATIONS, _HALVINGS = 8, 2
-"""Largest number of simulations of a hypothesis, and of halvings of a step. Chosen: most need
-five, and a quarter of a step is enough for the library."""
+_EVALUATIONS = 8  # Largest number of simulations of a hypothesis. Chosen: most need five
+_HALVINGS = 2  # Largest number of halvings of a step. Chosen: a quarter is enough for the library
 _EVIDENCE_TOLERANCE = 1e-3  # A step may lower the log evidence by this. Chosen: far below one unit
-_SMALLEST_STEP, _SMALLEST_GAIN, _SMALLEST_GAIN_SHARE = 1e-3, 0.5, 1e-4
-"""Step, in prior standard deviations, and gain of log evidence, also divided by that of all steps,
-below which a fit has converged. Chosen: far below any interval; a large effect needs no more
-digits."""
+_SMALLEST_STEP = 1e-3
+"""Step, in prior standard deviations, below which a fit has converged. Chosen: far below any
+interval."""
+_SMALLEST_GAIN = 0.5
+"""Gain of log evidence below which a fit has converged. Chosen: no verdict depends on it."""
+_SMALLEST_GAIN_SHARE = 1e-4
+"""The same divided by the gain of all steps. Chosen: a large effect needs no more digits."""
 _FORM_ERROR = 0.03
 """Relative standard deviation of a coefficient because the form of its effect is not exact. Only
 geometry and clocks have exact forms. Tuned by hand on simulated recordings of the working seeds of
@@ -40,18 +43,22 @@ the blind check."""
 _HEALTHY_STDS = 3.0
 """Largest departure of a healthy unit, in standard deviations: one unit in 400 exceeds it."""
 LARGEST_SET = 3  # Largest number of effects in a set. Chosen: one recording hardly separates more
-_SINGLES, _FITTED_SINGLES, _FURTHER, _COMPLETED = 8, 5, 3, 4
-"""Singles whose pairs are ranked, singles that are fitted, further effects beside the best set,
-and sets that are fitted without each effect. Chosen: run time."""
+_SINGLES = 8  # Singles whose pairs are ranked. Chosen: run time
+_FITTED_SINGLES = 5  # Singles that are fitted. Chosen: run time
+_FURTHER = 3  # Further effects that are fitted beside the best set, and pairs. Chosen: run time
+_COMPLETED = 4  # Sets that are fitted without each of their effects. Chosen: run time
 _IMMATERIAL = 0.01
 """Share of the gain of a set that a further effect must gain, so that a third one is looked for.
 Chosen: a third of what each effect of a set must explain."""
 _WORTH_FITTING = -30.0
 """Gain of log evidence from which a set is fitted. Chosen: the wide priors of a small effect on
 three axes cost as much, and the held-out figures decide."""
-_HOPELESS_SHARE, _SMALLEST_DEFICIT = 0.2, 100.0
-"""A set that gains less than the best one by this share of it, and by this log evidence, is not
-refined or extended. Its form would have to be wrong by as much of the gap."""
+_HOPELESS_SHARE = 0.2
+"""A set that gains less than the best one by this share of its gain is not refined or extended.
+Its form would have to be wrong by as much of the gap."""
+_SMALLEST_DEFICIT = 100.0
+"""Log evidence by which such a set is below the best at least. Chosen: beyond any tolerance of the
+linear model, exp(−100)."""
 _LARGEST_GAIN_RATIO = 5.0  # What a fit in full may gain, divided by what the linear model promises
 _NEAR_START = 1.4
 """Largest ratio of the start of a size to the one at which the effect was simulated: the starts
@@ -80,12 +87,13 @@ class Hypothesis:
     def sizeless(self) -> frozenset[str]:
         """Effects whose determined sizes all agree with the baseline, by 90 % intervals."""
         differs = np.abs(self.values) > Z_90 * self.std
-        sizes = [
-            (name.effect, shows)
-            for name, shows, is_open in zip(self.names, differs, self.undetermined)
-            if parameter_of(name).is_size and not is_open
-        ]
-        return frozenset(e for e, _ in sizes) - {e for e, shows in sizes if shows}
+        sized, differing = set[str](), set[str]()
+        for name, shows, is_open in zip(self.names, differs, self.undetermined):
+            if parameter_of(name).is_size and not is_open:
+                sized.add(name.effect)
+                if shows:
+                    differing.add(name.effect)
+        return frozenset(sized - differing)
 
     @property
     def at_bound(self) -> bool:
@@ -95,8 +103,10 @@ class Hypothesis:
         ):
             p = parameter_of(name)
             margin = _AT_BOUND * (p.upper - p.lower)
-            within = p.lower + margin < value < p.upper - margin
-            if p.is_size and not is_open and not within and abs(value - p.neutral) > margin:
+            is_within = p.lower + margin < value < p.upper - margin
+            is_neutral = abs(value - p.neutral) <= margin
+            is_determined_size = p.is_size and not is_open
+            if is_determined_size and not (is_within or is_neutral):
                 return True
         return False
 
@@ -110,108 +120,156 @@ def linearise(
     """Linearise a hypothesis at the coefficients of a sensor."""
     filters = linear_model.usual_filters if filters is None else filters
     names = _fitted_names(linear_model, effects)
-    nuisances = [
-        n for n in dict.fromkeys(chain(*linear_model.nuisance_columns)) if n.effect not in effects
-    ]
+    every_nuisance = dict.fromkeys(chain(*linear_model.nuisance_columns))
+    nuisances = [n for n in every_nuisance if n.effect not in effects]
     start = with_neutral(
         linear_model.baseline, [*effects, *dict.fromkeys(n.effect for n in nuisances)]
     )
-    parameters, values = [parameter_of(name) for name in names], get(sensor, names)
-    prior_mean = _prior_mean(start, names)
-    prior_std = [p.scale * (linear.PRIOR_WIDTH if p.is_size else 1) for p in parameters]
-    sensor = put(start, names, values)
-    all_names, j = [*names, *nuisances], len(names)
-    # Without the effects that a calibration can take up.
-    without = replace(
-        sensor,
-        values={
-            **sensor.values,
-            **{e: start.values[e] for e in effects if linear.calibration_takes_up(e)},
-        },
-    )
+    point = _Point.of(start, effects, names, get(sensor, names))
     channels: list[evidence.WhitenedChannel] = []
     columns: list[evidence.ChannelColumns] = []
     changes: list[dict[int, np.ndarray]] = []
     for comparison in linear_model.comparisons:
-        at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
-        output_v = comparison.simulated_v(at_rate)
-        derivatives = linear.sensitivities_at(
-            comparison.simulated_v, at_rate, names, values, output_v
-        )
-        change_v = output_v - comparison.simulated_v(replace(without, rate_hz=at_rate.rate_hz))
-        for d, axis in enumerate(start.axes):
-            places = [i for i, n in enumerate(names) if n.axis in ('', axis)]
-            design = derivatives[:, d, places]
-            residual_v = (
-                comparison.volts[:, d] - output_v[:, d] + design @ (values - prior_mean)[places]
+        response = point.response(comparison)
+        for axis in range(len(start.axes)):
+            channel = linear_model.places[len(channels)]
+            own = linear_model.nuisance_columns[len(channels)]
+            shown = [n for n in nuisances if n in own]
+            places = point.places_on(start.axes[axis])
+            ids = np.array([*places, *(len(names) + nuisances.index(n) for n in shown)], int)
+            design = np.column_stack(
+                [response.columns(axis, places), *(own[name] for name in shown)]
             )
-            on_channel = linear_model.nuisance_columns[len(channels)]
-            own = [n for n in nuisances if n in on_channel]
-            ids = np.array([*places, *map(all_names.index, own)], int)
-            stacked = np.column_stack([residual_v, design, *(on_channel[n] for n in own)])
-            scale = float(comparison.scale_v_per_mps2[d]) * len(start.axes) ** 0.5
             columns.append(
                 evidence.ChannelColumns(
                     ids,
-                    stacked.astype(np.float32),
-                    evidence.plain_grams(stacked / scale, comparison.used),
+                    design.astype(np.float32),
+                    evidence.plain_grams(design / channel.v_per_mean_mps2, comparison.used),
                 )
             )
             channels.append(
                 evidence.whiten_channel(
-                    stacked[:, 0], stacked[:, 1:], ids, comparison.used, filters[len(channels)]
+                    design[:, 0], design[:, 1:], ids, comparison.used, filters[len(channels)]
                 )
             )
-            changes.append({0: change_v[:, d]})
+            changes.append({0: response.change_v[:, axis]})
     # The square of each deviation is that of a healthy unit's tolerance plus that of what a
     # calibration can take up of the effects.
+    taken_up = _taken_up(linear_model, nuisances, changes)
+    tolerance = np.array([linear_model.tolerance(name) for name in nuisances])
+    return LinearisedHypothesis(
+        effects=tuple(effects),
+        sensor=point.sensor,
+        names=(*names, *nuisances),
+        prior_mean=np.concatenate([point.prior_mean, get(start, nuisances)]),
+        prior_std=np.concatenate([_prior_std(names), np.hypot(tolerance, taken_up)]),
+        reach=np.hypot(_HEALTHY_STDS * tolerance, taken_up),
+        values=point.values,
+        channels=channels,
+        columns=columns,
+        filters=filters,
+    )
+
+
+class _Response(NamedTuple):
+    """What a recording shows about a point."""
+
+    residual_v: np.ndarray  # Recording minus output, by the linear model at the prior mean, V
+    derivatives: np.ndarray  # Derivatives by the coefficients, V per unit, (n, m, k)
+    departures: np.ndarray  # Departures of the point from the prior mean, (k,)
+    change_v: np.ndarray  # Part of the output that a calibration can take up, V, (n, m)
+
+    def columns(self, axis: int, places: list[int]) -> np.ndarray:
+        """Return the residual at the prior mean, and derivatives by some coefficients."""
+        derivatives = self.derivatives[:, axis, places]
+        residual_v = self.residual_v[:, axis] + derivatives @ self.departures[places]
+        return np.column_stack([residual_v, derivatives])
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Values of the k coefficients of effects, about which a hypothesis is linear."""
+
+    names: Sequence[Coefficient]
+    values: np.ndarray  # (k,)
+    prior_mean: np.ndarray  # (k,)
+    sensor: Sensor  # The sensor with the values
+    without: Sensor  # The same without the effects that a calibration can take up
+
+    @classmethod
+    def of(
+        cls,
+        neutral: Sensor,
+        effects: Sequence[str],
+        names: Sequence[Coefficient],
+        values: np.ndarray,
+    ) -> _Point:
+        """Give a sensor with neutral effects some values."""
+        sensor = put(neutral, names, values)
+        taken_up = [e for e in effects if linear.calibration_takes_up(e)]
+        without = {**sensor.values, **{e: neutral.values[e] for e in taken_up}}
+        return cls(
+            names,
+            values,
+            _prior_mean(neutral, names),
+            sensor,
+            replace(sensor, values=without),
+        )
+
+    def places_on(self, axis: str) -> list[int]:
+        """Return the places of the coefficients that an axis follows."""
+        return [i for i, name in enumerate(self.names) if name.axis in ('', axis)]
+
+    def response(self, comparison: BaselineComparison) -> _Response:
+        """Simulate and differentiate a recording."""
+        rate_hz = comparison.sensor.rate_hz
+        sensor = replace(self.sensor, rate_hz=rate_hz)
+        output_v = comparison.simulated_v(sensor)
+        return _Response(
+            comparison.volts - output_v,
+            linear.sensitivities_at(
+                comparison.simulated_v, sensor, self.names, self.values, output_v
+            ),
+            self.values - self.prior_mean,
+            output_v - comparison.simulated_v(replace(self.without, rate_hz=rate_hz)),
+        )
+
+
+def _taken_up(
+    linear_model: LinearModel,
+    nuisances: Sequence[Coefficient],
+    changes: Sequence[Mapping[int, np.ndarray]],
+) -> np.ndarray:
+    """Return how much of a change of the output a calibration can take for nuisances, (k,)."""
     parts = linear.parts_at_rest(
         linear_model.comparisons, linear_model.nuisance_columns, changes, 1
     )
-    nuisance_std, reach = (
-        np.array(
-            [
-                np.hypot(factor * linear_model.tolerance(n), parts.get(n, np.zeros(1))[0])
-                for n in nuisances
-            ]
-        )
-        for factor in (1.0, _HEALTHY_STDS)
-    )
-    return LinearisedHypothesis(
-        tuple(effects),
-        sensor,
-        tuple(all_names),
-        np.concatenate([prior_mean, get(start, nuisances)]),
-        np.array([*prior_std, *nuisance_std]),
-        reach,
-        values[:j],
-        channels,
-        columns,
-        filters,
-    )
+    return np.array([float(parts[name][0]) if name in parts else 0.0 for name in nuisances])
 
 
 def _fitted_names(linear_model: LinearModel, effects: Sequence[str]) -> list[Coefficient]:
     """Return the coefficients of effects that the recordings show, and limits and shapes."""
-    return [
-        name
-        for effect in effects
-        for name in fitted_of(effect_named(effect), linear_model.baseline.axes)
-        if not parameter_of(name).is_size
-        or name in linear_model.names
-        or effect_named(effect).limits
-    ]
+    fitted = []
+    for effect in map(effect_named, effects):
+        for name in fitted_of(effect, linear_model.baseline.axes):
+            is_form = bool(effect.limits) or not parameter_of(name).is_size
+            if is_form or name in linear_model.names:
+                fitted.append(name)
+    return fitted
 
 
 def _prior_mean(sensor: Sensor, names: Sequence[Coefficient]) -> np.ndarray:
     """Return prior means of coefficients: as in a sensor, typical of shapes and limits, (k,)."""
-    return np.array(
-        [
-            float(get(sensor, [name])[0]) if p.is_size else p.scale
-            for name in names
-            for p in (parameter_of(name),)
-        ]
-    )
+    parameters = [parameter_of(name) for name in names]
+    is_size = np.array([p.is_size for p in parameters], bool)
+    return np.where(is_size, get(sensor, names), [p.scale for p in parameters])
+
+
+def _prior_std(names: Sequence[Coefficient]) -> np.ndarray:
+    """Return prior standard deviations of coefficients, (k,)."""
+    parameters = [parameter_of(name) for name in names]
+    widths = [linear.PRIOR_WIDTH if p.is_size else 1.0 for p in parameters]
+    return np.array([p.scale * width for p, width in zip(parameters, widths)])
 
 
 @dataclass(frozen=True)
@@ -246,15 +304,8 @@ class _Refit:
         return last.linearised.sensor
 
     def _linearised_at(self, values: np.ndarray) -> _HypothesisIterate:
-        within = (
-            np.clip(
-                values,
-                [parameter_of(n).lower for n in self.names],
-                [parameter_of(n).upper for n in self.names],
-            )
-            if self.names
-            else values
-        )
+        parameters = [parameter_of(name) for name in self.names]
+        within = np.clip(values, [p.lower for p in parameters], [p.upper for p in parameters])
         filters = [[f[i]] for f, i in zip(self.linear_model.usual_filters, self.filter_indices)]
         linearised = linearise(
             self.linear_model, self.effects, put(self.sensor, self.names, within), filters
@@ -331,20 +382,20 @@ def _fitted_hypothesis(
     form = np.where([effect_named(n.effect).exact for n in names], 0.0, _FORM_ERROR * size)
     # The nuisance parameters are at their mean given the values of the effects.
     fitted = linearised.prior_mean + fit.given(np.arange(j), at_values)
-    low, high = (
-        [getattr(parameter_of(n), end) for n in linearised.names] for end in ('lower', 'upper')
-    )
+    low = [parameter_of(name).lower for name in linearised.names]
+    high = [parameter_of(name).upper for name in linearised.names]
+    angle_rad = np.where(in_rad, linear_model.smallest_angle_rad(), 0.0)
+    widest = np.maximum(linearised.prior_std[:j], np.abs(at_values))
     return Hypothesis(
-        linearised.effects,
-        put(linearised.sensor, linearised.names, np.clip(fitted, low, high)),
-        names,
-        at_values,
-        np.sqrt(std**2 + form**2 + np.where(in_rad, linear_model.smallest_angle_rad(), 0.0) ** 2),
-        std
-        > evidence.UNDETERMINED_SHARE * np.maximum(linearised.prior_std[:j], np.abs(at_values)),
-        fit.log_evidence - fit.loss(at_values),
-        fit,
-        linearised,
+        effects=linearised.effects,
+        sensor=put(linearised.sensor, linearised.names, np.clip(fitted, low, high)),
+        names=names,
+        values=at_values,
+        std=np.sqrt(std**2 + form**2 + angle_rad**2),
+        undetermined=std > evidence.UNDETERMINED_SHARE * widest,
+        log_evidence=fit.log_evidence - fit.loss(at_values),
+        fit=fit,
+        linearised=linearised,
     )
 
 
@@ -377,16 +428,14 @@ class Search:
 
     def run(self, show_share: Callable[[float], None]) -> None:
         """Fit singles, then further effects beside the best set, then pairs."""
-        singles = self._rank(self.model, (), [(i,) for i in _identifiable(self.model)])
+        variants = self.model.variants
+        identifiable = _identifiable(self.model)
         straight = [
-            i
-            for i in _identifiable(self.model)
-            if effect_named(self.model.variants[i].effect).diagnosis.straight_line
+            i for i in identifiable if effect_named(variants[i].effect).diagnosis.straight_line
         ]
-        first = [
-            *singles[:_FITTED_SINGLES],
-            *self._rank(self.model, (), [*((i,) for i in straight), *combinations(straight, 2)]),
-        ]
+        singles = self._rank(self.model, (), [(i,) for i in identifiable])
+        lines = self._rank(self.model, (), [*((i,) for i in straight), *combinations(straight, 2)])
+        first = [*singles[:_FITTED_SINGLES], *lines]
         for number, single in enumerate(first):
             show_share(0.5 * number / len(first))
             self._fit(self.model, single)
@@ -396,21 +445,18 @@ class Search:
             if not 0 < len(best.effects) < LARGEST_SET:
                 break
             self._extend(best)
-            if self.best.log_evidence - best.log_evidence < _IMMATERIAL * (
-                best.log_evidence - self.model.null_fit.log_evidence
-            ):
+            gained = best.log_evidence - self.model.null_fit.log_evidence
+            if self.best.log_evidence - best.log_evidence < _IMMATERIAL * gained:
                 break
         # Zero-g and scale factor of a unit are rarely exact, and may hide behind another effect.
         singles_found = [h for h in self.found.values() if len(h.effects) == 1]
         best_single = max(singles_found, key=lambda h: h.log_evidence, default=self.best)
         for beside in (self.best, best_single):
-            self._add_straight(beside, [self.model.variants[i].effect for i in straight])
+            self._add_straight(beside, [variants[i].effect for i in straight])
         show_share(0.8)
-        for pair in self._rank(
-            self.model,
-            (),
-            list(combinations(sorted(ranked.chosen[0] for ranked in singles[:_SINGLES]), 2)),
-        )[:_FURTHER]:
+        leading = sorted(ranked.chosen[0] for ranked in singles[:_SINGLES])
+        pairs = self._rank(self.model, (), list(combinations(leading, 2)))
+        for pair in pairs[:_FURTHER]:
             if pair.gain > (1 + _IMMATERIAL) * singles[0].gain:
                 self._fit(self.model, pair)
         for hypothesis in sorted(self.found.values(), key=lambda h: -h.log_evidence)[:_COMPLETED]:
@@ -475,25 +521,23 @@ class Search:
             return
         start = dict(zip(beside.names, beside.values)) if beside else {}
         shapes: dict[Coefficient, float] = {}
-        own = {k for i in ranked.chosen for k in model.column_ids[i]}
-        start |= {
-            model.names[k]: float(v)
-            for k, v in zip(ranked.fit.column_ids, ranked.fit.values)
-            if k in own
-        }
-        for variant in (model.variants[i] for i in ranked.chosen):
+        chosen = [model.variants[i] for i in ranked.chosen]
+        own = set(chain(*(model.column_ids[i] for i in ranked.chosen)))
+        for k, value in zip(ranked.fit.column_ids, ranked.fit.values):
+            if k in own:
+                start[model.names[k]] = float(value)
+        for variant in chosen:
             # Limits and sizes start where the effect was simulated.
-            start |= {
-                name: value - (0.0 if parameter_of(name).is_size else parameter_of(name).scale)
-                for name, value in variant.limit_start.items()
-            }
+            for name, value in variant.limit_start.items():
+                p = parameter_of(name)
+                start[name] = value - (0.0 if p.is_size else p.scale)
             # An effect that is far from linear stays near the sizes at which it was simulated.
-            start |= {
-                name: float(np.clip(start.get(name, size), size / _NEAR_START, size * _NEAR_START))
-                for name in variant.names
-                if (p := parameter_of(name)).starts and p.is_size
-                for size in (variant.step * p.scale,)
-            }
+            for name in variant.names:
+                p = parameter_of(name)
+                if p.starts and p.is_size:
+                    size = variant.step * p.scale
+                    near = np.clip(start.get(name, size), size / _NEAR_START, size * _NEAR_START)
+                    start[name] = float(near)
             shapes |= {Coefficient(variant.effect, p): v for p, v in variant.shape.items()}
         self._add(effects, start, shapes)
 
@@ -530,23 +574,23 @@ def _identifiable(model: LinearModel) -> list[int]:
     Without a known pose zero-g and scale factor cannot. What is constant in all recordings, as a
     scale factor is in one pose, is the zero-g.
     """
-    return [
-        i
-        for i, v in enumerate(model.variants)
-        if (model.pose_known or not effect_named(v.effect).diagnosis.straight_line)
-        and (
-            effect_named(v.effect).diagnosis.straight_line is StraightLine.ZERO_G
-            or not _is_constant(model, i)
-        )
-    ]
+    identifiable = []
+    for i, variant in enumerate(model.variants):
+        line = effect_named(variant.effect).diagnosis.straight_line
+        shows_in_pose = model.pose_known or not line
+        is_zero_g = line is StraightLine.ZERO_G
+        if shows_in_pose and (is_zero_g or not _is_constant(model, i)):
+            identifiable.append(i)
+    return identifiable
 
 
 def _is_constant(model: LinearModel, variant: int) -> bool:
     """Determine whether a variant changes the output of each axis by a constant alone."""
-    columns = [
-        channel[k] for channel in model.columns for k in model.column_ids[variant] if k in channel
-    ]
-    return all(np.ptp(column) <= _CONSTANT * np.abs(column).max() for column in columns)
+    for channel in model.columns:
+        for column in (channel[k] for k in model.column_ids[variant] if k in channel):
+            if np.ptp(column) > _CONSTANT * np.abs(column).max():
+                return False
+    return True
 
 
 def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:

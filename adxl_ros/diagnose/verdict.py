@@ -34,6 +34,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import FormDimension, ProofVariable
 from adxl_ros.report.quantities import Interval
+from adxl_ros.signals.block_statistics import rms
 import numpy as np
 import scipy
 
@@ -214,7 +215,7 @@ class HeldOutFits:
                 self._whiteners, self.drift_densities(), self.model.places
             )
         ]
-        return float(G0_MPS2 * np.sqrt(np.mean(np.square(sizes_g))))
+        return G0_MPS2 * rms(sizes_g)
 
 
 class _Decrease(NamedTuple):

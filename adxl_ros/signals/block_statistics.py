@@ -9,6 +9,7 @@ quietest windows of a stream have in common.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 
@@ -150,6 +151,11 @@ def angle_bounds(blocks: Blocks) -> np.ndarray:
             bounds[before[np.maximum(place - 1, 0)]], bounds[after[np.minimum(place + 1, last)]]
         ),
     )
+
+
+def rms(values: np.ndarray | Sequence[float]) -> float:
+    """Return the root of the mean square of all values."""
+    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def true_runs(mask: np.ndarray, group: np.ndarray | None = None) -> list[tuple[int, int]]:
