@@ -47,6 +47,8 @@ exceeds it once in 4·10¹¹ samples."""
 _SPIKE_FEWEST = 3  # Fewest spikes of an axis. Chosen: one or two may be anything
 _SPIKE_NEIGHBOUR = 2
 """Distance of the neighbours of a spike, samples. Chosen: the next sample shares an RC filter."""
+_OTHER_NEIGHBOUR = 3
+"""The same where another spike is the neighbour: two of the same sign hide each other."""
 _SPIKE_LOCAL_S = 0.2  # Width of the blocks of the local scale, s. Chosen: shorter than a move
 _SPIKE_LOCAL_FEWEST = 9  # The same in samples. Chosen: a median of nine ignores a spike
 NOISE_EXCESS = 1.2
@@ -182,10 +184,36 @@ def residual_shows_spikes(
     return bool(isolated[~used].sum() > expected / 2)
 
 
-def _deviation_v(volts: np.ndarray) -> np.ndarray:
+def _deviation_v(volts: np.ndarray, distance: int = _SPIKE_NEIGHBOUR) -> np.ndarray:
     """Return by how much each sample deviates from the line between its neighbours, V, (n, m)."""
-    around_v = np.roll(volts, _SPIKE_NEIGHBOUR, 0) + np.roll(volts, -_SPIKE_NEIGHBOUR, 0)
+    around_v = np.roll(volts, distance, 0) + np.roll(volts, -distance, 0)
     return np.nan_to_num(np.abs(volts - around_v / 2))
+
+
+def _usual_deviation_v(
+    volts: np.ndarray, used: np.ndarray, step_v: float, rate_hz: float, distance: int
+) -> np.ndarray:
+    """Return the deviation from the line between neighbours that is usual around a sample, V."""
+    deviation_v = _deviation_v(volts, distance)
+    std_v = max(MAD_TO_STD * np.median(deviation_v[used]), step_v)
+    # Motion also deviates from the line, so that a spike must exceed its surroundings, too.
+    width = round(max(rate_hz * _SPIKE_LOCAL_S, _SPIKE_LOCAL_FEWEST))
+    blocks = max(len(volts) // width, 1)
+    parts_v = deviation_v[: blocks * width].reshape(blocks, -1)
+    middles = (np.arange(blocks) + 0.5) * width
+    local_v = np.interp(np.arange(len(volts)), middles, MAD_TO_STD * np.median(parts_v, axis=1))
+    return np.maximum(local_v, std_v)
+
+
+def _stands_alone(volts: np.ndarray, smallest_v: np.ndarray, distance: int) -> np.ndarray:
+    """Determine which samples deviate by so much, and more than those around them, (n,) bool."""
+    deviation_v = _deviation_v(volts, distance)
+    # A spike differs from the samples on both sides, and a pulse from those on one.
+    before_v, after_v = (np.abs(volts - np.roll(volts, d)) for d in (distance, -distance))
+    on_both_sides = 2 * np.minimum(before_v, after_v) > deviation_v
+    # The neighbours of a spike deviate by half of it.
+    highest_v = scipy.ndimage.maximum_filter1d(deviation_v, 2 * distance + 1)
+    return (deviation_v > smallest_v) & on_both_sides & (deviation_v >= highest_v)
 
 
 def _spikes(
@@ -196,32 +224,30 @@ def _spikes(
 
     steps_v: smallest change of the recorded output by axis, V, (m,): rounding is no spike.
     """
-    near, count, deviation_v = _SPIKE_NEIGHBOUR, len(volts), _deviation_v(volts)
     isolated, size_v = np.zeros(volts.shape, bool), np.zeros(volts.shape[1])
+    far = 2 * _SPIKE_NEIGHBOUR
     # The first samples after repeated or missing ones may step, which is no spike.
-    undisturbed = np.convolve(used, np.ones(4 * near + 1), 'same') > 4 * near
-    undisturbed[:near] = undisturbed[-near:] = False
-    width = round(max(sensor.rate_hz * _SPIKE_LOCAL_S, _SPIKE_LOCAL_FEWEST))
-    blocks = max(count // width, 1)
-    for d, (deviation, step_v) in enumerate(zip(deviation_v.T, steps_v)):
-        std_v = max(MAD_TO_STD * np.median(deviation[used]), step_v, sensor.lsb_v)
-        # Motion also deviates from the line, so that a spike must exceed its surroundings, too.
-        local_v = MAD_TO_STD * np.median(deviation[: blocks * width].reshape(blocks, -1), axis=1)
-        local_v = np.interp(np.arange(count), (np.arange(blocks) + 0.5) * width, local_v)
-        before_v, after_v = (
-            np.abs(volts[:, d] - np.roll(volts[:, d], shift)) for shift in (near, -near)
-        )
-        # A spike differs from the samples on both sides, and a pulse from those on one.
-        stands_out = undisturbed & (2 * np.minimum(before_v, after_v) > deviation)
-        # The neighbours of a spike deviate by half of it.
-        spikes = (
-            (deviation > SPIKE_STDS * np.maximum(local_v, std_v))
-            & stands_out
-            & (deviation >= scipy.ndimage.maximum_filter1d(deviation, 2 * near + 1))
-        )
+    undisturbed = np.convolve(used, np.ones(2 * far + 1), 'same') > 2 * far
+    undisturbed[:far] = undisturbed[-far:] = False
+    for d, step_v in enumerate(np.maximum(steps_v, sensor.lsb_v)):
+        spikes = np.zeros(len(volts), bool)
+        bridged_v = volts[:, d].copy()
+        for distance in (_SPIKE_NEIGHBOUR, _OTHER_NEIGHBOUR):
+            usual_v = _usual_deviation_v(volts[:, d], used, step_v, sensor.rate_hz, distance)
+            # A spike next to a larger one stands alone once that one is bridged.
+            while True:
+                found = undisturbed & ~spikes
+                found &= _stands_alone(bridged_v, SPIKE_STDS * usual_v, distance)
+                if not found.any():
+                    break
+                spikes |= found
+                beside = scipy.ndimage.binary_dilation(spikes, iterations=_SPIKE_NEIGHBOUR - 1)
+                bridged_v[beside] = np.interp(
+                    np.flatnonzero(beside), np.flatnonzero(~beside), volts[~beside, d]
+                )
         if spikes.sum() >= _SPIKE_FEWEST:
             isolated[:, d] = spikes
-            size_v[d] = float(np.median(deviation[spikes]))
+            size_v[d] = float(np.median(np.abs(volts[:, d] - bridged_v)[spikes]))
     return isolated, size_v
 
 
