@@ -336,9 +336,9 @@ def increments_p(values: np.ndarray, used: np.ndarray, rate_hz: float) -> float:
     without a line (test of Fisher 1929); jumps between levels and slow oscillations have not.
     """
     longest = int(used.sum()) // _FEWEST_MEANS
-    lengths = np.unique(
-        np.geomspace(max(1.0, _FIRST_MEAN_S * rate_hz), max(longest, 1), 12).astype(int)
-    )
+    if not longest:
+        return 1.0
+    lengths = np.unique(np.geomspace(max(1.0, _FIRST_MEAN_S * rate_hz), longest, 12).astype(int))
 
     def increments(length: int) -> np.ndarray:
         whole = len(values) // length * length
