@@ -164,7 +164,7 @@ def diagnose(
     verdict = rule.decide(
         evidence,
         lambda effects, drift: rule.reproducible_rest(evidence.candidates[effects][drift], bases),
-        [d.effect for d in detections],
+        [rule.NoiseCause(d.effect, d.power_mps2, d.is_left_out) for d in detections],
         lambda effects: _simulate_again(model, search, effects),
     )
     left_out = _material_left_out(checked, verdict)

@@ -91,6 +91,12 @@ class Detection:
     # samples, because nobody knows what they hide
     power_mps2: float
 
+    @property
+    def is_left_out(self) -> bool:
+        """Whether its samples are left out of the comparison."""
+        detector = effect_named(self.effect).diagnosis.detector
+        return detector in (Detector.REPEATED_SAMPLES, Detector.ISOLATED_SAMPLES)
+
 
 def effect_of(detector: Detector) -> str:
     """Return the name of the effect that a detector finds."""

@@ -327,11 +327,13 @@ def headline(diagnosis: Diagnosis) -> str:
     of_reference = f' Error of the reference, not of the sensor: {in_words}.' if in_words else ''
     explained = f'Explained {sure} by {named}{separate}.{noise}{of_reference}'
     limit = mg_text(verdict.upper_limit_mps2)
+    possible = listed(sorted(verdict.best), 'and')
+    part = f' {percent(share)} of the gap may be {possible}.' if verdict.best else ''
     sentence = {
         'no_gap': f'No gap {sure}: one above {limit} would have shown.',
         'insufficient': 'No verdict: neither motion nor temperature nor supply changes, so that '
         'no effect can show.',
-        'unknown': f'Unknown {sure}: no effect of the library explains {rest}.{follows}',
+        'unknown': f'Unknown {sure}: no effect of the library explains {rest}.{follows}{part}',
         'partly': f'Partly explained {sure}: {percent(share)} of the gap is {named}; '
         f'{percent(1 - share)} ({rest}) is something else.{follows}{of_reference}',
     }.get(verdict.status, explained)

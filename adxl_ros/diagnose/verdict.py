@@ -630,6 +630,15 @@ def drifts_beside(evidence: Evidence, effects: frozenset[str], rest: Rest) -> li
     return [drifts[0], *others]
 
 
+class NoiseCause(NamedTuple):
+    """An effect that shows in the noise, not in the mean."""
+
+    effect: str
+    # Mean square that it adds, (m/s²)²; infinite for repeated samples, which hide what was
+    power_mps2: float
+    is_left_out: bool  # Whether its samples are not among the compared ones
+
+
 class _Answer(NamedTuple):
     """Status, certain effects, and groups of inseparable ones."""
 
@@ -647,11 +656,6 @@ class _Powers(NamedTuple):
     drift: float  # Power of the first drift
     drifts: Sequence[str]  # The drifts of the noise, the best first
 
-    @property
-    def is_unexplained(self) -> bool:
-        """Whether more repeats than effects and drift explain."""
-        return self.repeats > self.explained + self.drift
-
     def remaining(self, material: float) -> float:
         """Return what is left beside effects: what repeats, or all that no drift explains."""
         is_more = self.above > self.drift + material
@@ -664,10 +668,11 @@ def _powers(
     rest: Rest,
     rest_material: float,
     drifts: Sequence[str],
+    of_noise: float,
 ) -> _Powers:
-    """Weigh what the best set leaves, and drop the drifts where it is none."""
-    explained = evidence.figure(evidence.gain(best, _NOTHING)).value
-    above = float(evidence.left(best)[0])
+    """Weigh what the best set and the noise leave, and drop the drifts where it is none."""
+    explained = float(evidence.gain(best, _NOTHING)[0])
+    above = float(evidence.left(best)[0]) - of_noise
     repeats = evidence.figure(evidence.mean(rest.squares))
     steady = evidence.figure(evidence.mean(rest.steady_squares))
     drift = evidence.drift_power(best, drifts)
@@ -717,13 +722,19 @@ def _answer(
     rest: Rest,
     rest_material: float,
     drifts: Sequence[str],
-    detected: frozenset[str],
+    in_noise: Sequence[NoiseCause],
 ) -> _Answer:
     """Apply the rule to the figures of all blocks, or of one draw of them."""
     minimal = minimal_sets(evidence)
     best, material = minimal[0], evidence.material_power(1.0)
-    powers = _powers(evidence, best, rest, rest_material, drifts)
-    if powers.is_unexplained:
+    detected = frozenset(cause.effect for cause in in_noise)
+    of_noise = sum(cause.power_mps2 for cause in in_noise)
+    compared = sum(cause.power_mps2 for cause in in_noise if not cause.is_left_out)
+    powers = _powers(evidence, best, rest, rest_material, drifts, compared)
+    # A reference that lacks motion leaves more than a floor at rest.
+    only_repeats = evidence.fades or not best | detected
+    unexplained = powers.repeats if only_repeats else powers.remaining(material)
+    if unexplained > powers.explained + powers.drift + of_noise:
         return _Answer('unknown')
     named = frozenset(() if evidence.wanders else powers.drifts)
     if not best | detected | named:
@@ -749,12 +760,13 @@ def _answer(
 def decide(
     evidence: Evidence,
     rest_of: Callable[[frozenset[str], str], Rest],
-    detected: Sequence[str],
+    in_noise: Sequence[NoiseCause],
     simulate_again: Callable[[frozenset[str]], SimulatedAgain] | None = None,
 ) -> Verdict:
     """
     Apply the rule to the figures, and to draws of their blocks.
 
+    in_noise: the effects that show in the noise.
     simulate_again: simulates a set that could be the answer.
     """
     if simulate_again is not None:
@@ -777,7 +789,7 @@ def decide(
     rest_material = evidence.material_power(pose_share)
 
     def answer_of(weighed: Evidence) -> _Answer:
-        return _answer(weighed, rest, rest_material, drifts, frozenset(detected))
+        return _answer(weighed, rest, rest_material, drifts, in_noise)
 
     answer = answer_of(evidence)
     drawn = [answer_of(evidence.draw(number)) for number in range(1, len(evidence.weights))]

@@ -5,7 +5,15 @@
 from types import SimpleNamespace
 
 from adxl_ros.diagnose.evidence import BLOCKS
-from adxl_ros.diagnose.verdict import block_weights, decide, Evidence, HEALTHY, HeldOut, Rest
+from adxl_ros.diagnose.verdict import (
+    block_weights,
+    decide,
+    Evidence,
+    HEALTHY,
+    HeldOut,
+    NoiseCause,
+    Rest,
+)
 import numpy as np
 import pytest
 
@@ -35,7 +43,7 @@ def rest(power=0.0, dimension='force'):
     return Rest(squares, squares, squares / FLOOR / 2, {dimension: squares})
 
 
-def decided(candidates, left_over=0.0, detected=(), material=0.1, dimension='force'):
+def decided(candidates, left_over=0.0, in_noise=(), material=0.1, dimension='force'):
     evidence = Evidence(
         candidates=candidates,
         counts=np.full(BLOCKS, SAMPLES),
@@ -47,7 +55,7 @@ def decided(candidates, left_over=0.0, detected=(), material=0.1, dimension='for
         wanders=False,
         floor_mps2=FLOOR**0.5,
     )
-    return decide(evidence, lambda effects, drift: rest(left_over, dimension), detected)
+    return decide(evidence, lambda effects, drift: rest(left_over, dimension), in_noise)
 
 
 def test_nothing_above_the_noise_is_no_gap():
@@ -85,8 +93,18 @@ def test_what_repeats_and_no_effect_explains_is_unknown():
     assert (verdict.status, verdict.effects) == ('unknown', ())
 
 
+def test_effects_that_explain_less_than_they_leave_are_no_cause():
+    """What jumps from sample to sample repeats with nothing, and is left above the floor."""
+    verdict = decided({NOTHING: fits(5.0), BIAS: fits(3.0)})
+    assert (verdict.status, verdict.effects) == ('unknown', ())
+    assert decided({NOTHING: fits(5.0), BIAS: fits(2.0)}).status == 'partly'
+    hum = NoiseCause('mains_hum', 3.0, is_left_out=False)
+    beside = decided({NOTHING: fits(5.0), BIAS: fits(3.0)}, in_noise=[hum])
+    assert beside.effects == ('bias', 'mains_hum')
+
+
 def test_an_effect_of_the_noise_is_named_beside_no_gap_of_the_mean():
-    verdict = decided({NOTHING: fits(0.0)}, detected=['spikes'])
+    verdict = decided({NOTHING: fits(0.0)}, in_noise=[NoiseCause('spikes', 1.0, True)])
     assert (verdict.status, verdict.effects) == ('explained', ('spikes',))
 
 
