@@ -575,7 +575,7 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     lines += [
         f'{"":{_BADGE_COLUMNS}}{line}'
         for text in (remark, f'noise floor {first["noise floor"]}')
-        for line in wrap(text, COLUMNS - _BADGE_COLUMNS)
+        for line in wrapped(text, columns=COLUMNS - _BADGE_COLUMNS)
     ]
     if report.verdict.status != 'explained' or 'REFERENCE' in word:
         lines += wrapped(headline(diagnosis))

@@ -17,6 +17,7 @@ from adxl_ros.process import command, package_version, program
 P = TypeVar('P', bound=argparse.ArgumentParser)
 COLUMNS = 79  # Columns of a terminal that a tool uses
 _NO_BREAK = '\N{NO-BREAK SPACE}'  # A blank at which no line is wrapped
+_UNIT_AFTER_NUMBER = re.compile(r'(?<=\d) (?=[%°]|(?:mg|s|Hz)\b)')  # The blank before a unit
 _LABEL_COLUMNS = 8  # Columns of the words before files and commands
 _STEP_COLUMNS = _LABEL_COLUMNS + 3  # Columns before the purpose of one of several steps
 _GREEN, _RED, _YELLOW = '\x1b[32m', '\x1b[31m', '\x1b[33m'
@@ -75,15 +76,16 @@ def row(cells: Iterable[str], formats: Iterable[str | int]) -> str:
     return ''.join(f'{cell:{form}}' for cell, form in zip(cells, formats)).rstrip()
 
 
-def wrapped(text: str, indent: int = 0) -> list[str]:
-    """Wrap a text between words."""
-    return textwrap.wrap(
-        text,
-        COLUMNS,
+def wrapped(text: str, indent: int = 0, columns: int = COLUMNS) -> list[str]:
+    """Wrap a text between words, but not between a number and its unit."""
+    lines = textwrap.wrap(
+        _UNIT_AFTER_NUMBER.sub(_NO_BREAK, text),
+        columns,
         subsequent_indent=indent * ' ',
         break_long_words=False,
         break_on_hyphens=False,
     )
+    return [line.replace(_NO_BREAK, ' ') for line in lines]
 
 
 def entry_list(title: str, entries: Mapping[str, str]) -> str:

@@ -77,7 +77,7 @@ def test_the_documented_package_works(tmp_path, monkeypatch, run_tool):
     assert abs(np.mean(ax[0] - ax[1])) < 2e-4
     # The diagnosis knows it; what grows so little with the output is a zero-g as well.
     run = run_executable(
-        *line[0].split()[:2], *line[1].split()[1:], '--rate', '50', '-o', 'c.csv', cwd=tmp_path
+        'simulate', 'tilt_both', '--rate', '50', '--effect', effect, '-o', 'c.csv', cwd=tmp_path
     )
     assert run.returncode == 0, run.stderr
     run = run_executable('diagnose', 'c.csv', '-o', 'gap', cwd=tmp_path)

@@ -32,7 +32,7 @@ FAST = (
     '-p',
     'qos_overrides./stage/command.publisher.depth:=10000',
 )
-RATE_HZ = 100.0
+RATE_HZ = 50.0
 RATE_RAD_S = np.radians(60)
 LONG = '-p', 'limits.rate_deg_s:=10.0', '-p', 'limits.minutes:=0.9'
 """Manoeuvres that take long enough to be seen and ended."""
