@@ -14,7 +14,7 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stamps import period_s
-from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
+from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C, TINY
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.filters import loop, play, stop
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
@@ -198,7 +198,7 @@ def _history_output(blocks: Poses, effect: str, shape: float) -> np.ndarray:
     # The filter 1/(1 + τ·s), exact for straight lines between the samples.
     steps_s = np.diff(time_s)
     decay = np.exp(-steps_s / shape)
-    ramp = (1 - decay) * shape / np.maximum(steps_s, np.finfo(float).tiny)
+    ramp = (1 - decay) * shape / np.maximum(steps_s, TINY)
     lagging_c = [temperature_c[0]]
     for d, r, before, now in zip(decay, ramp, temperature_c, temperature_c[1:]):
         lagging_c.append(d * lagging_c[-1] + (r - d) * before + (1 - r) * now)
@@ -254,12 +254,10 @@ def _fit_axis(
         values = np.linalg.lstsq(white / size, target, rcond=None)[0] / size
         residual_g = output_g - design @ values
         rest = target - white @ values
-        neighbours = (
-            residual_g[1:] @ residual_g[:-1] / max(residual_g @ residual_g, np.finfo(float).tiny)
-        )
+        neighbours = residual_g[1:] @ residual_g[:-1] / max(residual_g @ residual_g, TINY)
         correlation = float(np.clip(neighbours, 0.0, _LARGEST_CORRELATION))
     degrees = max(len(output_g) - design.shape[1], 1)
-    variance_g2 = max(float(rest @ rest) / degrees, np.finfo(float).tiny)
+    variance_g2 = max(float(rest @ rest) / degrees, TINY)
     if history:
         # The shape is uncertain, too.
         design = np.column_stack([design, values[len(names) - 1] * by_shape])
@@ -403,8 +401,7 @@ def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
     temperature_c = recording.columns.get('temperature_c')
     if temperature_c is None or not np.isfinite(temperature_c).any():
         return None
-    volts, time_s = recording.volts(unit), recording.time_s
-    span_s = float(time_s[-1] - time_s[0])
+    volts, time_s, span_s = recording.volts(unit), recording.time_s, recording.span_s
     block_s = max(BLOCK_S, span_s / _MOST_BLOCKS, _FEWEST_SAMPLES * period_s(time_s))
     edges = np.unique(
         np.searchsorted(time_s, time_s[0] + block_s * np.arange(int(span_s / block_s) + 1))

@@ -10,7 +10,6 @@ Squares of contributions add. Those of noise, coefficients, stage and model are 
 from __future__ import annotations
 
 from dataclasses import dataclass
-import os
 from typing import Any, NamedTuple
 
 from adxl_ros.calibrate.poses import Poses, reference_force
@@ -18,7 +17,7 @@ from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.result import CalibrationResult, compare
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.sensor import MARGIN_K, Sensor
@@ -301,7 +300,7 @@ def _quantity(
     }
 
 
-def write(path: str | os.PathLike, result: CalibrationResult) -> None:
+def write(path: AnyPath, result: CalibrationResult) -> None:
     """Write the certificate of a calibration against a stage, by the template of its elements."""
     found = uncertainty(result)
     if found is None:

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-import os
 from pathlib import Path
 import re
 from typing import Any
@@ -17,7 +16,7 @@ from adxl_ros.calibrate.report.acceptance import Assessment, digits, FAIL, NOT_S
 from adxl_ros.calibrate.result import CalibrationResult, compare, history, rounded
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
-from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import get, Sensor
@@ -42,9 +41,7 @@ _BEYOND_WHISKER = 1.08
 """Half of a whisker's range divided by the largest value in it. Chosen: no dot is cut."""
 
 
-def write(
-    folder: str | os.PathLike, result: CalibrationResult, store: str | os.PathLike = ''
-) -> None:
+def write(folder: AnyPath, result: CalibrationResult, store: AnyPath = '') -> None:
     """Write the page."""
     html_page.check_libraries()
     past = (
