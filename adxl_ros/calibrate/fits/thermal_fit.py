@@ -225,31 +225,15 @@ def _fit_axis(
     by_shape: np.ndarray,
 ) -> _Axis:
     """Fit one axis, the correlation of neighbouring blocks included."""
-    warmer_k, correlation = temperature_c - NOMINAL_TEMPERATURE_C, 0.0
-    columns = {
-        ('temperature_bias', 'per_k'): warmer_k,
-        ('temperature_bias', 'per_k2'): warmer_k**2,
-    }
-    # The zero-g of each orientation has the last columns.
-    free = (orientation[:, None] == np.arange(orientation[-1] + 1)).astype(float)
-    forces_g = output_g @ free / free.sum(axis=0)
-    # The orientations must separate the scale factor of an axis from its zero-g.
-    if float(np.ptp(forces_g)) > _SCALE_FORCES_G:
-        columns['temperature_scale', 'per_k'] = forces_g[orientation] * warmer_k
+    columns = _columns(temperature_c - NOMINAL_TEMPERATURE_C, output_g, orientation)
     if history:
         columns[history, _SIZES[history]] = history_g
     names = [Coefficient(*name, axis) for name in columns]
-    design = np.column_stack([*columns.values(), free])
-    begins = np.diff(orientation, prepend=-1) > 0
-
-    def whitened(values: np.ndarray) -> np.ndarray:
-        """Return what neighbouring blocks do not predict; an orientation begins anew."""
-        white = values - correlation * np.roll(values, 1, axis=0)
-        white[begins] = values[begins] * np.sqrt(1 - correlation**2)
-        return white
-
+    # The zero-g of each orientation has the last columns.
+    design = np.column_stack([*columns.values(), _are_of(orientation)])
+    begins, correlation = np.diff(orientation, prepend=-1) > 0, 0.0
     for _ in range(_ITERATIONS):
-        white, target = whitened(design), whitened(output_g)
+        white, target = (_whitened(each, correlation, begins) for each in (design, output_g))
         size = np.sqrt((white**2).sum(axis=0))
         values = np.linalg.lstsq(white / size, target, rcond=None)[0] / size
         residual_g = output_g - design @ values
@@ -261,7 +245,7 @@ def _fit_axis(
     if history:
         # The shape is uncertain, too.
         design = np.column_stack([design, values[len(names) - 1] * by_shape])
-    white, white_free = np.hsplit(whitened(design), [len(names)])
+    white, white_free = np.hsplit(_whitened(design, correlation, begins), [len(names)])
     white = white - white_free @ np.linalg.lstsq(white_free, white, rcond=None)[0]
     precision = white.T @ white / variance_g2 + np.diag(
         [(PRIOR_WIDTH * parameter_of(name).scale) ** -2.0 for name in names]
@@ -270,6 +254,34 @@ def _fit_axis(
     return _Axis(
         names, values[: len(names)], np.linalg.inv(precision), residual_g, float(likelihood)
     )
+
+
+def _are_of(orientation: np.ndarray) -> np.ndarray:
+    """Return which blocks are of each of j orientations, (k, j), 1 or 0."""
+    return (orientation[:, None] == np.arange(orientation[-1] + 1)).astype(float)
+
+
+def _columns(
+    warmer_k: np.ndarray, output_g: np.ndarray, orientation: np.ndarray
+) -> dict[tuple[str, str], np.ndarray]:
+    """Return the derivatives of an output by effect and parameter, (k,)."""
+    columns = {
+        ('temperature_bias', 'per_k'): warmer_k,
+        ('temperature_bias', 'per_k2'): warmer_k**2,
+    }
+    is_of = _are_of(orientation)
+    forces_g = output_g @ is_of / is_of.sum(axis=0)
+    # The orientations must separate the scale factor of an axis from its zero-g.
+    if np.ptp(forces_g) > _SCALE_FORCES_G:
+        columns['temperature_scale', 'per_k'] = forces_g[orientation] * warmer_k
+    return columns
+
+
+def _whitened(values: np.ndarray, correlation: float, begins: np.ndarray) -> np.ndarray:
+    """Return what neighbouring blocks do not predict; an orientation begins anew."""
+    white = values - correlation * np.roll(values, 1, axis=0)
+    white[begins] = values[begins] * np.sqrt(1 - correlation**2)
+    return white
 
 
 _SIZES = {'thermal_lag': 'per_k', 'thermal_hysteresis': 'half_width_g'}

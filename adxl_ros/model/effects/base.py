@@ -369,13 +369,13 @@ class Parameter:
 
 def shape(*about: Any, **further: Any) -> Parameter:
     """Return a parameter of shape: it has no axes, and its neutral value is the typical one."""
-    parameter = Parameter(*about, axes='', role=Role.SHAPE, **further)
-    return replace(parameter, neutral=parameter.scale)
+    parameter = Parameter(*about, **further)
+    return replace(parameter, axes='', neutral=parameter.scale, role=Role.SHAPE)
 
 
 def optional(*about: Any, **further: Any) -> Parameter:
     """Return a size that is usually neutral."""
-    return Parameter(*about, typical=0.0, role=Role.OPTIONAL, **further)
+    return replace(Parameter(*about, **further), typical=0.0, role=Role.OPTIONAL)
 
 
 @dataclass(frozen=True)
