@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Many tasks in parallel: workers on this machine or a Dask cluster, retries, and what tasks write.
+Many tasks in parallel: workers on this machine or a Dask cluster, and retries.
 
 A worker may end at any time. Its task then raises `WorkerDied`, and no other task is touched.
 Nothing here knows what a task computes.
@@ -20,7 +20,6 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from multiprocessing.pool import ExceptionWithTraceback  # type: ignore[attr-defined]
 import os
-from pathlib import Path
 from queue import Empty, SimpleQueue
 import signal
 import sys
@@ -291,33 +290,3 @@ def finished_tasks(
         for future in running:
             with suppress(Exception):  # of a scheduler that is gone
                 future.cancel()
-
-
-def for_each(
-    pool: Pool,
-    work: Callable[..., Any],
-    jobs: Iterable[Callable[[], tuple]],
-    keep: Callable[..., None],
-    show: Callable[[float], None],
-    done: int = 0,
-) -> None:
-    """Run jobs in parallel and keep each result as soon as it is there."""
-    todo = list(jobs)
-    for number, end in enumerate(finished_tasks(pool, work, (job() for job in todo)), done + 1):
-        if end.error is not None:
-            raise end.error
-        keep(*end.value)
-        show(number / (done + len(todo)))
-
-
-def write(path: Path, data: bytes) -> None:
-    """Write a file as a whole or not at all; several processes may write the same one at once."""
-    temporary = path.with_name(f'.{path.name}.{os.uname().nodename}.{os.getpid()}')
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    except OSError as error:
-        with suppress(OSError):
-            temporary.unlink()
-        raise UserError(f'{path}: cannot be written: {error.strerror}') from None

@@ -7,8 +7,7 @@ import argparse
 import json
 from pathlib import Path
 
-from adxl_ros.api.result import make_folder
-from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.atomic_write import make_folder, write_text
 from adxl_ros.process import command
 from adxl_ros.report import page
 from adxl_ros.tools import command_line as cli

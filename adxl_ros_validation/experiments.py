@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.calibrate.fits import full_model, linear
 from adxl_ros.calibrate.fits.linearisation import StageError
-from adxl_ros.calibrate.guided.pose_plan import sweep
+from adxl_ros.calibrate.guided.pose_plan import spread, Target
 from adxl_ros.calibrate.poses import estimate_filters, extract_poses, Poses, stage_force
 from adxl_ros.compensate import inversions
 from adxl_ros.files.recording_columns import Recording, sensor_info
@@ -33,6 +33,17 @@ import scipy
 
 SEARCH_RAD = np.radians(np.arange(-5.0, 5.01, 0.5))
 """Angles about the case's axis, rad; chosen."""
+
+
+def sweep(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> list[Target]:
+    """Plan the paper's experiments 1 and 2: in each plane alpha, beta turns forth and back."""
+    forth = np.arange(round(2 * np.pi / step_rad) + 1) * step_rad
+    grid = [
+        Target(float(alpha), float(beta))
+        for alpha in planes_rad
+        for beta in (*forth, *forth[::-1])
+    ]
+    return grid + spread(check_poses)
 
 
 def search(truth: Sensor, seed: int) -> tuple[dict[str, float], np.ndarray]:

@@ -10,13 +10,12 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.api.result import make_folder
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.poses import extract_poses
 from adxl_ros.calibrate.report import acceptance, page as unit_page
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.files.atomic_write import write_bytes, write_text
+from adxl_ros.files.atomic_write import make_folder, write_bytes, write_text
 from adxl_ros.files.recording_columns import recorded_unit
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90

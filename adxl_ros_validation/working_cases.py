@@ -21,7 +21,7 @@ import sys
 from typing import Any, NamedTuple
 
 from adxl_ros.tools import command_line as cli
-from adxl_ros.workers import for_each, open_pool, write
+from adxl_ros.workers import open_pool
 from adxl_ros_validation import working_world as world
 from adxl_ros_validation.blind import diagnosis_runs, grading, scores, simulator, trials
 from adxl_ros_validation.blind.grading import Answer
@@ -29,6 +29,7 @@ from adxl_ros_validation.blind.ideal_observer import beyond_calibration, rms
 from adxl_ros_validation.blind.report import reliability, terminal_table
 from adxl_ros_validation.blind.simulator import Fault, G0, Scene
 from adxl_ros_validation.blind.trials import Label
+from adxl_ros_validation.kept_results import for_each, write
 import numpy as np
 
 GROUPS = ('null', 'single', 'pair', 'outside')

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adxl_ros.api.recordings import each_recording, RecordingInput, RobotInput
-from adxl_ros.api.result import FirstScreen, make_folder, no_progress, Progress, Result
+from adxl_ros.api.result import FirstScreen, no_progress, Progress, Result
 from adxl_ros.api.sensors import GivenSensor, sensor_of, SensorInput
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits import thermal_fit
@@ -27,6 +27,7 @@ from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.calibrate.result import CalibrationResult, compare, errors_in_words
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
+from adxl_ros.files.atomic_write import make_folder
 from adxl_ros.files.recording_columns import recorded_unit, Recording, unit_of
 from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.model.sensor import Sensor, with_axes

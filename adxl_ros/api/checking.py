@@ -12,14 +12,14 @@ import textwrap
 from typing import Any
 
 from adxl_ros.api.recordings import RecordingInput, RobotInput
-from adxl_ros.api.result import FirstScreen, make_folder, no_progress, Progress, Result
+from adxl_ros.api.result import FirstScreen, no_progress, Progress, Result
 from adxl_ros.api.sensors import as_input, sensor_of, SensorInput
 from adxl_ros.diagnose.data_checks import DataFault
 from adxl_ros.diagnose.diagnosis import what_shows
 from adxl_ros.diagnose.report import shows_row
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording as recording_files
-from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.atomic_write import make_folder, write_text
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.report import page as html_page

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 from adxl_ros.api.recordings import as_recordings, read_ideal, RecordingInput, RobotInput
 from adxl_ros.api.result import (
     FirstScreen,
-    make_folder,
     no_progress,
     Progress,
     require_least,
@@ -28,7 +27,7 @@ from adxl_ros.diagnose.gap_in_unit import gap_in, GapInUnit, quantity as quantit
 from adxl_ros.diagnose.next_experiment import CouldShow
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import free_name, write_text
+from adxl_ros.files.atomic_write import free_name, make_folder, write_text
 from adxl_ros.files.recording_columns import NO_UNIT, Recording
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.model.effects import effect_named
@@ -443,7 +442,7 @@ def _subject(recordings: Sequence[Recording], sensor: Sensor, sim: str) -> str:
     """Return what is compared with what."""
     first, count = recordings[0], len(recordings)
     name = Path(first.path).name if count == 1 else f'{count} recordings'
-    span_s = sum(float(r.time_s[-1] - r.time_s[0]) for r in recordings if len(r))
+    span_s = sum(read.span_s for read in recordings)
     unit = 'the nominal sensor' if sensor.serial == NO_UNIT else f'unit {sensor.serial}'
     simulated = f'{Path(sim).name} through the chain of {unit}' if sim else f'simulation of {unit}'
     return (

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from adxl_ros.api.recordings import RecordingInput
-from adxl_ros.api.result import FirstScreen, make_folder, no_progress, Progress, Result
+from adxl_ros.api.result import FirstScreen, no_progress, Progress, Result
 from adxl_ros.api.sensors import as_input, SensorInput
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording as recording_files
-from adxl_ros.files.atomic_write import write_bytes
+from adxl_ros.files.atomic_write import make_folder, write_bytes
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED

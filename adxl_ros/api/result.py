@@ -6,8 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from html import escape
-import os
-from pathlib import Path
 from typing import NamedTuple
 
 from adxl_ros.errors import UserError
@@ -70,13 +68,3 @@ def require_least(name: str, value: float | None, least: float) -> None:
     """Refuse a number that is too small; None is not given."""
     if value is not None and not value >= least:
         raise UserError(f'--{name} {value}: must be at least {least:g}')
-
-
-def make_folder(folder: str | os.PathLike) -> Path:
-    """Create a folder for the output, if it does not exist, and return it."""
-    path = Path(folder)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f'{path}: cannot be made: {error.strerror}') from None
-    return path

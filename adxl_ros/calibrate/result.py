@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import datetime, timezone
 import hashlib
-import os
 
 from adxl_ros.calibrate.fits.extrapolation import next_degree, NextDegree
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
@@ -17,7 +16,7 @@ from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
-from adxl_ros.files.atomic_write import keep_previous
+from adxl_ros.files.atomic_write import AnyPath, keep_previous
 from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
@@ -59,14 +58,14 @@ class CalibrationResult:
         """Return coefficients and assessment as text: the head of the parameter file."""
         return [*coefficient_lines(self.fitted), '', *self.report_lines]
 
-    def save(self, path: str | os.PathLike) -> None:
+    def save(self, path: AnyPath) -> None:
         """Write the parameter file atomically; a file of another fit becomes NAME.previous."""
         # A session that saves the same fit twice must not replace the previous calibration.
         if not self._is_in(path):
             keep_previous(path)
         parameter_file.save(path, self.fitted, self.comments())
 
-    def keep(self, folder: str | os.PathLike) -> str:
+    def keep(self, folder: AnyPath) -> str:
         """Copy the calibration to the store, if one is named; return one line on it."""
         if not str(folder):
             return 'not kept in a store'
@@ -84,7 +83,7 @@ class CalibrationResult:
             'sensor.serial'
         )
 
-    def _is_in(self, path: str | os.PathLike) -> bool:
+    def _is_in(self, path: AnyPath) -> bool:
         """Return whether a file holds this fit: the same data, model and coefficients."""
         try:
             saved = parameter_file.load(path)

@@ -20,11 +20,12 @@ from typing import BinaryIO
 
 from adxl_ros.errors import UserError
 
+AnyPath = str | os.PathLike  # A path, as the functions of Python take it
 _SUFFIX = '.part'  # End of the names of directories in which new files are written
 
 
 @contextmanager
-def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
+def atomic_path(path: AnyPath) -> Iterator[Path]:
     """
     Yield a path next to `path`; a file there replaces `path` if the block succeeds.
 
@@ -91,7 +92,7 @@ def _mark(path: Path) -> None:
         os.setxattr(path, _MARK, str(path.stat().st_mtime_ns).encode())
 
 
-def is_own(path: str | os.PathLike) -> bool:
+def is_own(path: AnyPath) -> bool:
     """
     Return whether this package wrote a file or directory that nobody has changed since.
 
@@ -103,26 +104,36 @@ def is_own(path: str | os.PathLike) -> bool:
         return False
 
 
-def free_name(path: str | os.PathLike) -> Path:
+def free_name(path: AnyPath) -> Path:
     """Return a path at which nothing is: the given one, or one with a number."""
     wanted = Path(path)
     names = (wanted.with_stem(f'{wanted.stem}_{number}') for number in count(2))
     return next(name for name in chain([wanted], names) if not name.exists())
 
 
-def write_text(path: str | os.PathLike, text: str) -> None:
+def write_text(path: AnyPath, text: str) -> None:
     """Write a text file, UTF-8, as a whole or not at all."""
     with atomic_path(path) as fresh:
         fresh.write_text(text, encoding='utf-8')
 
 
-def write_bytes(path: str | os.PathLike, data: bytes) -> None:
+def write_bytes(path: AnyPath, data: bytes) -> None:
     """Write a file as a whole or not at all."""
     with atomic_path(path) as fresh:
         fresh.write_bytes(data)
 
 
-def remove_unfinished(folder: str | os.PathLike, name: str) -> None:
+def make_folder(folder: AnyPath) -> Path:
+    """Create a folder for the output, if it does not exist, and return it."""
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f'{path}: cannot be made: {error.strerror}') from None
+    return path
+
+
+def remove_unfinished(folder: AnyPath, name: str) -> None:
     """Remove the unfinished files of writers that were killed; those of others are locked."""
     for unfinished in Path(folder).glob(f'.{escape(name)}*{_SUFFIX}'):
         with suppress(OSError), _locked(unfinished):
@@ -140,7 +151,7 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def keep_previous(path: str | os.PathLike) -> None:
+def keep_previous(path: AnyPath) -> None:
     """Copy the file `path`, if it exists, to `path`.previous before it is replaced."""
     if Path(path).is_file():
         with atomic_path(f'{path}.previous') as fresh:

@@ -21,6 +21,7 @@ import struct
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import install_hint, one_line, UserError
+from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.recording_columns import NOMINAL_KEYS
 from adxl_ros.model.constants import MEASURED_AXES
 import numpy as np
@@ -308,7 +309,7 @@ class Bag:
 
 
 @contextmanager
-def _readable(path: str | os.PathLike) -> Iterator[None]:
+def _readable(path: AnyPath) -> Iterator[None]:
     """Refuse a file that rosbags cannot read: it can raise errors of any kind."""
     try:
         yield
@@ -332,7 +333,7 @@ def import_rosbags() -> Any:
 
 
 @contextmanager
-def open_bag(path: str | os.PathLike) -> Iterator[Bag]:
+def open_bag(path: AnyPath) -> Iterator[Bag]:
     """Open a rosbag2 directory, or one .mcap or .db3 file."""
     rosbag2, bag_path = import_rosbags(), Path(path)
     with ExitStack() as stack:

@@ -6,10 +6,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping
 from functools import partial
-import os
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
+from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.bag_messages import (
     Bag,
     find_imu,
@@ -49,7 +49,7 @@ _EXACT_NS = 1 << 53  # Largest time, ns, that float64 resolves to single nanosec
 
 
 def blocks(
-    path: str | os.PathLike, rows: int, ideal: bool = False, reading: ReadingOptions = AS_IT_IS
+    path: AnyPath, rows: int, ideal: bool = False, reading: ReadingOptions = AS_IT_IS
 ) -> Generator[Recording, None, None]:
     """Read a bag in blocks of at most `rows` samples."""
     with open_bag(path) as bag:
@@ -209,8 +209,7 @@ def positions(table: cdr.Table, names: Mapping[str, str] | None = None) -> dict[
     """Return the positions of joints by column, or of all joints by name."""
     if 'position' not in table.layout.fields:
         return {}
-    joints = [text for key, text in table.layout.texts.items() if key != 'frame_id']
-    values = dict(zip(joints, table.numbers('position').T))
+    values = dict(zip(table.joints, table.numbers('position').T))
     return (
         values
         if names is None
@@ -306,7 +305,7 @@ def _block(
     )
 
 
-def log_times(path: str | os.PathLike, topic: str) -> Iterator[np.ndarray]:
+def log_times(path: AnyPath, topic: str) -> Iterator[np.ndarray]:
     """Yield header stamp and log time of the samples of a bag, ns, (k, 2), in blocks."""
     with open_bag(path) as bag:
         imu = find_imu(bag, topic)

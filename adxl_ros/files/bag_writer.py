@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.files.atomic_write import atomic_path, release_written
+from adxl_ros.files.atomic_write import AnyPath, atomic_path, release_written
 from adxl_ros.files.bag_messages import (
     Batch,
     BATTERY_STATE,
@@ -26,9 +26,7 @@ from adxl_ros.files.bag_messages import (
     write_messages,
 )
 from adxl_ros.files.recording_columns import COMMANDS, converted_info, JOINTS, Recording
-from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.covariance import UNMEASURED_VARIANCE
-from adxl_ros.model.noise import sample_std_v
+from adxl_ros.model.covariance import imu_covariance
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -88,7 +86,7 @@ class _NewBag:
 
 
 @contextmanager
-def _new_bag(path: str | os.PathLike) -> Iterator[_NewBag]:
+def _new_bag(path: AnyPath) -> Iterator[_NewBag]:
     """Open a rosbag2 directory, or one file for a name.mcap; it appears with the block's end."""
     rosbag2 = import_rosbags()
     with atomic_path(path) as fresh:
@@ -103,19 +101,14 @@ def _new_bag(path: str | os.PathLike) -> Iterator[_NewBag]:
 
 
 @contextmanager
-def recording_bag(
-    path: str | os.PathLike, sensor: Sensor
-) -> Iterator[Callable[[Recording], None]]:
+def recording_bag(path: AnyPath, sensor: Sensor) -> Iterator[Callable[[Recording], None]]:
     """
     Open a new bag, and yield a function that appends samples of a recording.
 
     References get the stamps of their samples. A command becomes a message where it changes, and
     once every 65536 samples. Columns with other names are left out.
     """
-    variance = np.full(3, UNMEASURED_VARIANCE)
-    noise = sample_std_v(sensor) / sensor.nominal_scale_v_per_g * G0_MPS2
-    variance[: len(sensor.axes)] = noise**2
-    imu = _imu_form(np.diag(variance).ravel())
+    imu = _imu_form(imu_covariance(sensor))
     with _new_bag(path) as bag:
 
         def append(recording: Recording) -> None:
@@ -255,7 +248,7 @@ _SCALARS = {
 
 
 @contextmanager
-def tilt_bag(path: str | os.PathLike) -> Iterator[Callable[..., None]]:
+def tilt_bag(path: AnyPath) -> Iterator[Callable[..., None]]:
     """
     Open a new bag, and yield a function that appends messages of `imu/data` and `tilt`.
 

@@ -23,7 +23,7 @@ from urllib.parse import quote
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.files.parameter_file import compose
 from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.model.population import PooledCoefficient, Population
@@ -94,7 +94,7 @@ def date_in(text: str) -> datetime | None:
     return date.astimezone(timezone.utc) if date.tzinfo else date.replace(tzinfo=timezone.utc)
 
 
-def unit_folder(folder: str | os.PathLike, serial: str) -> Path:
+def unit_folder(folder: AnyPath, serial: str) -> Path:
     """Return the folder of a unit."""
     return Path(folder) / _name(serial)
 
@@ -109,7 +109,7 @@ def _name(serial: str) -> str:
     return f'{quoted[:_MAX_NAME]}-{hashlib.sha256(serial.encode()).hexdigest()[:16]}'
 
 
-def put(folder: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) -> Path | None:
+def put(folder: AnyPath, sensor: Sensor, comments: Iterable[str] = ()) -> Path | None:
     """Store a calibration."""
     if sensor.serial == NO_UNIT:
         return None
@@ -125,7 +125,7 @@ def put(folder: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ())
     return path
 
 
-def history(folder: str | os.PathLike, serial: str) -> UnitHistory:
+def history(folder: AnyPath, serial: str) -> UnitHistory:
     """Return the calibrations of a unit by date."""
     calibrations, refused = [], []
     for path in sorted(unit_folder(folder, serial).glob('*.yaml')):
@@ -141,7 +141,7 @@ def history(folder: str | os.PathLike, serial: str) -> UnitHistory:
     return UnitHistory(calibrations, refused)
 
 
-def newest(folder: str | os.PathLike, serial: str, check: Callable[[Sensor], None]) -> Choice:
+def newest(folder: AnyPath, serial: str, check: Callable[[Sensor], None]) -> Choice:
     """Return the newest calibration of a unit that can be used."""
     calibrations, refused = history(folder, serial)
     for path, sensor in reversed(calibrations):
@@ -154,7 +154,7 @@ def newest(folder: str | os.PathLike, serial: str, check: Callable[[Sensor], Non
     return Choice(None, refused)
 
 
-def newer(folder: str | os.PathLike, sensor: Sensor) -> Path | None:
+def newer(folder: AnyPath, sensor: Sensor) -> Path | None:
     """Return the newest file of a unit if its name has a later date; no file is read."""
     begin = f'{_name(sensor.serial)}-'
     files = [
@@ -169,7 +169,7 @@ def newer(folder: str | os.PathLike, sensor: Sensor) -> Path | None:
     return last if is_newer else None
 
 
-def sha256(paths: Sequence[str | os.PathLike]) -> str:
+def sha256(paths: Sequence[AnyPath]) -> str:
     """
     Return the SHA-256 of recordings, hexadecimal; for one file, that of `sha256sum`.
 
@@ -205,7 +205,7 @@ _HEAD = """\
 """Comments at the begin of the file."""
 
 
-def write_population(path: str | os.PathLike, population: Population) -> None:
+def write_population(path: AnyPath, population: Population) -> None:
     """Write a population."""
     contents = {
         'format': FORMAT,
@@ -223,7 +223,7 @@ def write_population(path: str | os.PathLike, population: Population) -> None:
     write_text(path, _HEAD.format(command=use) + text)
 
 
-def read_population(path: str | os.PathLike) -> Population:
+def read_population(path: AnyPath) -> Population:
     """Read and check a population."""
     node = compose(path)
     contents = yaml.constructor.SafeConstructor().construct_document(node) if node else None

@@ -152,6 +152,11 @@ class Table:
         part = np.ascontiguousarray(self.data[:, field.offset : field.offset + size])
         return part.view(self.layout.order + field.code).astype(np.float64)
 
+    @property
+    def joints(self) -> list[str]:
+        """Return the names of joints."""
+        return [text for key, text in self.layout.texts.items() if key != 'frame_id']
+
     def stamp_ns(self) -> np.ndarray:
         """Return the headers' stamps, ns, (n,) int64."""
         sec, nanosec = (self.numbers(name)[:, 0].astype(np.int64) for name in ('sec', 'nanosec'))

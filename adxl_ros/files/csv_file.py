@@ -21,7 +21,7 @@ import re
 from typing import Any, BinaryIO
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import atomic_path, release_written
+from adxl_ros.files.atomic_write import AnyPath, atomic_path, release_written
 from adxl_ros.files.column_mapping import TableBlock
 import numpy as np
 
@@ -381,7 +381,7 @@ and the keys and values of the comments before the header."""
 
 
 @contextmanager
-def csv_writer(path: str | os.PathLike) -> Iterator[Append]:
+def csv_writer(path: AnyPath) -> Iterator[Append]:
     """
     Open a new CSV file, and yield a function that appends rows to it.
 

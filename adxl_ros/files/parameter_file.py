@@ -11,12 +11,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, Field, fields, MISSING
-import os
 from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Role
 from adxl_ros.model.sensor import Envelope, names_of, neutral, Sensor
@@ -99,7 +98,7 @@ def _params_folder() -> Path:
     )
 
 
-def installed_path(name: str | os.PathLike) -> Path:
+def installed_path(name: AnyPath) -> Path:
     """Return the installed file of a sensor by its name, such as MPU-6050; a path stays."""
     path = Path(name)
     if path.exists() or path.suffix or path.name != str(name):
@@ -112,7 +111,7 @@ def installed_path(name: str | os.PathLike) -> Path:
     return file
 
 
-def load(path: str | os.PathLike, may_measure: bool = False) -> Sensor:
+def load(path: AnyPath, may_measure: bool = False) -> Sensor:
     """
     Read and check the parameter file of a sensor, by its path or its name.
 
@@ -189,7 +188,7 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
     return flat
 
 
-def save(path: str | os.PathLike, sensor: Sensor, comments: Iterable[str] = ()) -> None:
+def save(path: AnyPath, sensor: Sensor, comments: Iterable[str] = ()) -> None:
     """Write a parameter file, with comments for people; reading it gives the same floats."""
     write_text(path, as_text(sensor, comments))
 
@@ -230,7 +229,7 @@ _Dumper.add_representer(
 )
 
 
-def compose(path: str | os.PathLike) -> yaml.Node | None:
+def compose(path: AnyPath) -> yaml.Node | None:
     """Read a YAML file as a tree of nodes, which know their places; None for an empty file."""
     try:
         return yaml.compose(Path(path).read_text(encoding='utf-8'), Loader=yaml.SafeLoader)
@@ -262,7 +261,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return flat, marks
 
 
-def _where(path: str | os.PathLike, mark: Any) -> str:
+def _where(path: AnyPath, mark: Any) -> str:
     """Return file:line:column of a mark of yaml; the file alone without a mark."""
     return f'{path}:{mark.line + 1}:{mark.column + 1}' if mark else f'{path}'
 

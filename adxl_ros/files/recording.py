@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-import os
 from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import mapped_recording
+from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.column_mapping import (
     AS_IT_IS,
     Mounting,
@@ -45,7 +45,7 @@ _ENDINGS = {
 """Usual ends of file names by the first bytes of the files."""
 
 
-def read(path: str | os.PathLike, reading: ReadingOptions = AS_IT_IS) -> Recording:
+def read(path: AnyPath, reading: ReadingOptions = AS_IT_IS) -> Recording:
     """
     Read a whole recording.
 
@@ -71,7 +71,7 @@ def read(path: str | os.PathLike, reading: ReadingOptions = AS_IT_IS) -> Recordi
 
 
 def blocks(
-    path: str | os.PathLike, rows: int, reading: ReadingOptions = AS_IT_IS
+    path: AnyPath, rows: int, reading: ReadingOptions = AS_IT_IS
 ) -> Generator[Recording, None, None]:
     """
     Read a recording in blocks of at most `rows` samples; the memory is bounded by a block.
@@ -89,9 +89,7 @@ def of_table(table: Table, reading: ReadingOptions = AS_IT_IS) -> Recording:
     return concatenate(_table_blocks(table, _BLOCK_ROWS, reading))
 
 
-def _bag_blocks(
-    path: str | os.PathLike, rows: int, **options: Any
-) -> Generator[Recording, None, None]:
+def _bag_blocks(path: AnyPath, rows: int, **options: Any) -> Generator[Recording, None, None]:
     from adxl_ros.files import bag_reader  # tables need none of it
 
     return bag_reader.blocks(path, rows, **options)
@@ -141,7 +139,7 @@ def _mounted(
         yield replace(block, columns={**block.columns, **dict(zip(names, turned))})
 
 
-def read_ideal(path: str | os.PathLike, epoch_ns: int = 0) -> Recording:
+def read_ideal(path: AnyPath, epoch_ns: int = 0) -> Recording:
     """
     Read the ideal specific force of another simulator.
 
@@ -179,7 +177,7 @@ def at_epoch(recording: Recording, epoch_ns: int) -> Recording:
 
 
 @contextmanager
-def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Recording], None]]:
+def writer(path: AnyPath, sensor: Sensor) -> Iterator[Callable[[Recording], None]]:
     """
     Open a new recording, and yield a function that appends a block of samples to it.
 
@@ -201,7 +199,7 @@ def writer(path: str | os.PathLike, sensor: Sensor) -> Iterator[Callable[[Record
         yield write_block
 
 
-def write(path: str | os.PathLike, recording: Recording, sensor: Sensor) -> None:
+def write(path: AnyPath, recording: Recording, sensor: Sensor) -> None:
     """
     Write a whole recording.
 
@@ -224,7 +222,7 @@ def write(path: str | os.PathLike, recording: Recording, sensor: Sensor) -> None
         append(recording)
 
 
-def is_bag(path: str | os.PathLike) -> bool:
+def is_bag(path: AnyPath) -> bool:
     """Return whether a recording is a bag; refuse bags that cannot be read under their name."""
     file_path = Path(path)
     if file_path.is_dir():

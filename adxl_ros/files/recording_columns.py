@@ -6,12 +6,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-import os
 from pathlib import Path
 import re
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.stamps import describe_bursts, stamped_rate_hz
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, to_volts, with_axes
@@ -151,15 +151,14 @@ class Recording:
 
     def __repr__(self) -> str:
         """Return name, length, rate, axes and references in one line."""
-        span_s = float(self.time_s[-1] - self.time_s[0]) if len(self) else 0.0
         rate = f', {self.rate_hz:.4g} Hz' if len(self) > 1 else ''
         further = [name for name in self.columns if name not in self.sensor_columns]
         return (
-            f'{Path(self.path).name}: {span_s:.4g} s{rate}, axes {" ".join(self.axes)}'
+            f'{Path(self.path).name}: {self.span_s:.4g} s{rate}, axes {" ".join(self.axes)}'
             + f', with {", ".join(further)}' * bool(further)
         )
 
-    def save(self, path: str | os.PathLike) -> None:
+    def save(self, path: AnyPath) -> None:
         """Write a CSV file NAME.csv, a bag NAME.mcap, or a rosbag2 directory."""
         from adxl_ros.files import parameter_file, recording
 
@@ -220,6 +219,11 @@ class Recording:
     def axes(self) -> str:
         """Return the measured axes: x, xy or xyz."""
         return AXES[: len(self.sensor_columns)]
+
+    @property
+    def span_s(self) -> float:
+        """Return the time from the first to the last sample, s; 0 without samples."""
+        return float(self.time_s[-1] - self.time_s[0]) if len(self) else 0.0
 
     @property
     def stamp_ns(self) -> np.ndarray:

@@ -5,11 +5,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-import os
 from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
+from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.bag_messages import Bag, choose_topic, JOINT_STATE, open_bag, typestore
 from adxl_ros.files.bag_reader import positions, series
 from adxl_ros.files.recording import is_bag
@@ -35,7 +35,7 @@ class Readings(NamedTuple):
 
 
 def read(
-    path: str | os.PathLike,
+    path: AnyPath,
     epoch_ns: int,
     topic: str = '',
     root: str = '',

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from adxl_ros.model.constants import TINY
 import numpy as np
 
 _LONG_QUANTILE = 0.985
@@ -135,7 +136,7 @@ def halves(time_s: np.ndarray) -> Halves:
     """Return the rates of both halves, in time, of three or more stamps, s, (n,)."""
     middle = int(np.searchsorted(time_s, (time_s[0] + time_s[-1]) / 2))
     middle = min(max(middle, 1), len(time_s) - 2)
-    span_s = max(float(time_s[-1] - time_s[0]), np.finfo(float).tiny)
+    span_s = max(float(time_s[-1] - time_s[0]), TINY)
     return Halves(
         stamped_rate_hz(time_s[: middle + 1]),
         stamped_rate_hz(time_s[middle:]),

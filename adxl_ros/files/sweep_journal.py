@@ -10,13 +10,12 @@ from datetime import datetime, timezone
 import fcntl
 import json
 import math
-import os
 from pathlib import Path
 import shutil
 from typing import Any, NamedTuple, TypeAlias
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import append_line, atomic_path, sync
+from adxl_ros.files.atomic_write import AnyPath, append_line, atomic_path, sync
 
 FORMAT = 1
 """Version of the format, in the head of each journal; raised with each change of the lines."""
@@ -29,9 +28,8 @@ class PoseRecord:
     pose: int  # Number of the pose in the pose plan, or of the rest of a hand-held sensor, from 0
     alpha_rad: float = math.nan  # Joint angles, rad; NaN without a stage
     beta_rad: float = math.nan
-    # Numbers of the settings of the joints; None without a stage and in earlier journals
-    alpha_setting: int | None = None
-    beta_setting: int | None = None
+    alpha_setting: int = 0  # Numbers of the settings of the joints; 0 without a stage
+    beta_setting: int = 0
     check: bool = False  # Whether the pose is kept out of the fit
     start_ns: int  # Stamps of the first and the last sample, ns
     stop_ns: int
@@ -42,12 +40,8 @@ class PoseRecord:
     supply_v: float = math.nan
 
     def to_json(self) -> dict[str, Any]:
-        """Return the keys and values of the record's line; NaN and None have no key."""
-        return {
-            key: value
-            for key, value in asdict(self).items()
-            if value is not None and value == value
-        }  # NaN differs from itself
+        """Return the keys and values of the record's line; NaN, which equals nothing, has none."""
+        return {key: value for key, value in asdict(self).items() if value == value}
 
     @classmethod
     def from_json(cls, line: Mapping[str, Any]) -> PoseRecord:
@@ -142,9 +136,7 @@ class Unfinished(NamedTuple):
 class Journal:
     """An append-only file of JSON lines, locked while it is open: a head, then entries."""
 
-    def __init__(
-        self, path: str | os.PathLike, head: Mapping[str, Any], start_over: bool = False
-    ) -> None:
+    def __init__(self, path: AnyPath, head: Mapping[str, Any], start_over: bool = False) -> None:
         self.path = Path(path)
         try:
             self._file = open(self.path, 'a+b', buffering=0)  # noqa: SIM115 (kept open)
@@ -219,7 +211,7 @@ class Journal:
         return found.entries
 
 
-def read(path: str | os.PathLike) -> JournalContents:
+def read(path: AnyPath) -> JournalContents:
     """Read the head and the entries of a journal."""
     found = _parse(Path(path))
     if found.damage or not found.head:
@@ -227,7 +219,7 @@ def read(path: str | os.PathLike) -> JournalContents:
     return found
 
 
-def unfinished(path: str | os.PathLike, head: Mapping[str, Any]) -> Unfinished | None:
+def unfinished(path: AnyPath, head: Mapping[str, Any]) -> Unfinished | None:
     """Look for an interrupted calibration, without a lock."""
     if not Path(path).exists():
         return None

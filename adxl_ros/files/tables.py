@@ -9,12 +9,12 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from io import StringIO
-import os
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from adxl_ros.errors import install_hint, one_line, UserError
+from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.column_mapping import Table, TableBlock
 from adxl_ros.files.csv_file import find_form, read_blocks
 import numpy as np
@@ -30,7 +30,7 @@ _MAPPINGS = {
 """Columns and units of messages by the definitions of PX4 (msg/*.msg), the raw readings first."""
 
 
-def open_table(path: str | os.PathLike, topic: str = '') -> Table:
+def open_table(path: AnyPath, topic: str = '') -> Table:
     """Open a table of any format, by the end of its name; `topic` is the message of a log."""
     path = str(path)
     ending = Path(path).suffix.lower()
@@ -246,7 +246,7 @@ _POSE_COLUMNS = ('alpha_deg', 'beta_deg')  # Columns of a table of poses
 _LEVEL_RAD = 1e-9  # Largest sine of alpha at which beta does not matter
 
 
-def read_pose_table(path: str | os.PathLike) -> np.ndarray:
+def read_pose_table(path: AnyPath) -> np.ndarray:
     """Read a table of `alpha_deg` and `beta_deg` as rad, (k, 2); NaN where a pose has none."""
     table = open_table(path)
     if not set(_POSE_COLUMNS) <= set(table.names):

@@ -33,7 +33,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from adxl_ros.model.constants import MAD_TO_STD
+from adxl_ros.model.constants import MAD_TO_STD, TINY
 from adxl_ros.model.population import PooledCoefficient
 import numpy as np
 import pandas as pd
@@ -173,7 +173,7 @@ class _Sums:
             )
         )
         det = np.where(self.has_slope, a * c - b * b, 1.0)
-        det = np.maximum(det, np.finfo(float).tiny)
+        det = np.maximum(det, TINY)
         slope = np.where(self.has_slope, (a * q - b * p) / det, 0.0)
         intercept = (p - b * slope) / a
         squares = np.maximum(r - intercept * p - slope * q, 0.0)
@@ -364,7 +364,7 @@ def random_effects(
     chance = _OUTLIER_CHANCE / (2 * (tests or len(estimates)))
     deviation = np.abs(estimates - np.median(estimates))
     scale = MAD_TO_STD * np.median(deviation)
-    kept = _largest_dropped(deviation / np.hypot(max(scale, np.finfo(float).tiny), std), _FAR_MADS)
+    kept = _largest_dropped(deviation / np.hypot(max(scale, TINY), std), _FAR_MADS)
     for _ in range(_MAX_ROUNDS):
         pooled = _of_units(estimates[kept], std[kept])
         distance = np.abs(estimates - pooled.mean) / np.sqrt(
@@ -390,7 +390,7 @@ def _largest_dropped(distance: np.ndarray, limit: float) -> np.ndarray:
 
 def _of_units(estimates: np.ndarray, std: np.ndarray) -> PooledCoefficient:
     """Return the population of the units that count."""
-    unit = max(float(np.ptp(estimates)), float(std.max()), np.finfo(float).tiny)
+    unit = max(float(np.ptp(estimates)), float(std.max()), TINY)
     y, variance = (estimates - estimates.mean()) / unit, (std / unit) ** 2
     spread2, low, high = _spreads2(y, variance)
     mean, _ = weighted_mean(y, variance, spread2)

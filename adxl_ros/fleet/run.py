@@ -22,11 +22,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import one_line, UserError
-from adxl_ros.files.atomic_write import atomic_path
+from adxl_ros.files.atomic_write import atomic_path, make_folder, write_bytes, write_text
 from adxl_ros.fleet.inputs import Source, stated_by
 from adxl_ros.fleet.row import arrow_schema, as_table, Recipe, Row, TABLE
 from adxl_ros.fleet.task import make_row, refused, Result, StagingError
-from adxl_ros.workers import Finished, finished_tasks, Pool, write
+from adxl_ros.workers import Finished, finished_tasks, Pool
 
 _ROWS = 'rows'  # Folder of the rows
 _REPORTS = 'reports'  # Folder of the files of single recordings
@@ -109,15 +109,14 @@ class Results:
         }
         if result.files:
             row['report'] = f'{_REPORTS}/{row["key"][:_NAME_DIGITS]}'
+            folder = make_folder(self.folder / row['report'])
             for file, data in result.files.items():
-                write(self.folder / row['report'] / file, data)
+                write_bytes(folder / file, data)
         of_url = hashlib.sha256(row['url'].encode()).hexdigest()[:_NAME_DIGITS]
         name = f'{row["key"]}-{of_url}.json'
         content = {'stamp': result.stamp, 'digest': result.digest, 'row': row}
-        write(
-            self.folder / _ROWS / name,
-            json.dumps(content, allow_nan=False, ensure_ascii=False).encode(),
-        )
+        text = json.dumps(content, allow_nan=False, ensure_ascii=False)
+        write_text(make_folder(self.folder / _ROWS) / name, text)
         self._add(name, content)
         return row
 

@@ -21,10 +21,10 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-import os
 from typing import NamedTuple
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.fleet import pooling
 from adxl_ros.fleet.pooling import Recordings
 from adxl_ros.model.constants import AXES, Z_90
@@ -103,7 +103,7 @@ class FleetTable:
         return rows, Recordings(self.unit, self.period, self.years, value, std)[rows]
 
 
-def read(path: str | os.PathLike) -> FleetTable:
+def read(path: AnyPath) -> FleetTable:
     """Read the columns of a table that the page uses."""
     import pyarrow as pa
     import pyarrow.parquet as pq

@@ -33,6 +33,14 @@ _ROOT_MEAN = 1.25
 Derived: there z² = 2·σ·g·n for normal noise n > 0, and the variance of z is 0.8·σ·g = σ·g/1.25."""
 
 
+def imu_covariance(sensor: Sensor) -> np.ndarray:
+    """Return the covariance of the acceleration of a sample by rows, as sensor_msgs/Imu has it."""
+    variance = np.full(3, UNMEASURED_VARIANCE)
+    std_mps2 = noise.sample_std_v(sensor) / sensor.nominal_scale_v_per_g * G0_MPS2
+    variance[: len(sensor.axes)] = std_mps2**2
+    return np.diag(variance).ravel()
+
+
 def force_covariance(
     sensor: Sensor,
     force: Components,

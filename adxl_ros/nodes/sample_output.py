@@ -12,9 +12,7 @@ from typing import Any
 from adxl_ros.files import cdr
 from adxl_ros.files.recording_columns import JOINTS, sensor_info
 from adxl_ros.links.support.base import Samples
-from adxl_ros.model import noise
-from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.covariance import UNMEASURED_VARIANCE
+from adxl_ros.model.covariance import imu_covariance
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.nodes import topics
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -179,10 +177,7 @@ def imu_message(sensor: Sensor, frame_id: str) -> Imu:
     message = Imu()
     message.header.frame_id = frame_id
     message.orientation_covariance[0] = message.angular_velocity_covariance[0] = -1.0
-    variance = np.full(3, UNMEASURED_VARIANCE)
-    noise_std_g = noise.sample_std_v(sensor) / sensor.nominal_scale_v_per_g
-    variance[: len(sensor.axes)] = (noise_std_g * G0_MPS2) ** 2
-    message.linear_acceleration_covariance = np.diag(variance).ravel()
+    message.linear_acceleration_covariance = imu_covariance(sensor)
     return message
 
 

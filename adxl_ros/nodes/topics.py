@@ -449,7 +449,6 @@ def joint_readings(messages: Sequence[bytes]) -> list[JointReading]:
     """Return the readings of serialized sensor_msgs/JointState, in their order."""
     readings: dict[int, JointReading] = {}
     for table in cdr.tables(messages, cdr.joint_state):
-        names = [text for key, text in table.layout.texts.items() if key != 'frame_id']
         positions, velocities = (
             table.numbers(field).tolist()
             if field in table.layout.fields
@@ -460,7 +459,7 @@ def joint_readings(messages: Sequence[bytes]) -> list[JointReading]:
             table.rows.tolist(), table.stamp_ns().tolist(), positions, velocities
         ):
             readings[row] = JointReading(
-                stamp_ns, dict(zip(names, position)), dict(zip(names, velocity))
+                stamp_ns, dict(zip(table.joints, position)), dict(zip(table.joints, velocity))
             )
     return [readings[row] for row in sorted(readings)]
 

@@ -15,6 +15,7 @@ import os
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
+from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.bag_reader import log_times
 from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import (
@@ -471,7 +472,7 @@ BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 
 
 def check_recording(
-    given: str | os.PathLike | Recording,
+    given: AnyPath | Recording,
     params: Sensor | str | None,
     reading: ReadingOptions,
     show: Callable[[float], None] = lambda done: None,

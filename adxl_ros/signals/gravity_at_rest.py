@@ -19,7 +19,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
-from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.constants import AXES, G0_MPS2, TINY
 from adxl_ros.model.effects.base import Coefficient, NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import get, Sensor, to_nominal_mps2
 from adxl_ros.report.quantities import counted, number
@@ -163,7 +163,7 @@ class RestReadings:
     @property
     def poses(self) -> int:
         """Whether the rests have one direction or more: 0, 1 or 2."""
-        length = np.maximum(self.length_mps2, np.finfo(float).tiny)
+        length = np.maximum(self.length_mps2, TINY)
         directions = self.mean_mps2 / length[:, None]
         if not len(directions):
             return 0
@@ -380,12 +380,12 @@ class _Case:
         """Return which rests no zero-g near a first guess, m/s², (m,), and scale explain, (k,)."""
         mean, axes, error_mps2 = self.readings.mean_mps2, len(zero_g_mps2), self.error_mps2
         allowed = _CORRECTABLE * np.concatenate([self.tolerance.zero_g_mps2, self.tolerance.scale])
-        shares = np.append(zero_g_mps2, np.zeros(axes)) / allowed.clip(min=np.finfo(float).tiny)
+        shares = np.append(zero_g_mps2, np.zeros(axes)) / allowed.clip(min=TINY)
         shares = shares.clip(-1.0, 1.0)
         for _ in range(_STEPS):
             zero_g, scale = np.split(shares * allowed, 2)
             force = (mean - zero_g) / (1 + scale)
-            length = np.maximum(np.linalg.norm(force, axis=1), np.finfo(float).tiny)
+            length = np.maximum(np.linalg.norm(force, axis=1), TINY)
             beyond = (length - self.gravity_mps2) / error_mps2
             if axes < len(AXES):
                 beyond = np.maximum(beyond, 0.0)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from adxl_ros.files.recording_columns import Recording, uncalibrated
+from adxl_ros.model.constants import TINY
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.signals.gravity_at_rest import GravityAtRest, of_volts, TURNED_COS
 from adxl_ros.signals.neighbouring_samples import NeighbouringSamples
@@ -113,10 +114,10 @@ def _with_rest(rests: list[RestMean], found: RestMean, sensor: Sensor) -> list[R
     def force_v(rest: RestMean) -> np.ndarray:
         return rest.mean_v - sensor.nominal_zero_g_v
 
-    length_v = max(float(np.linalg.norm(force_v(found))), np.finfo(float).tiny)
+    length_v = max(float(np.linalg.norm(force_v(found))), TINY)
     others = []
     for rest in rests:
-        other_v = max(float(np.linalg.norm(force_v(rest))), np.finfo(float).tiny)
+        other_v = max(float(np.linalg.norm(force_v(rest))), TINY)
         if force_v(rest) @ force_v(found) < TURNED_COS * length_v * other_v:
             others.append(rest)
         elif not 1 / _OTHER_STREAM < length_v / other_v < _OTHER_STREAM:

@@ -104,24 +104,7 @@ def _measured(
     blocks = stats.BlockCutter(unit.rate_hz, len(unit.axes)).feed(time_s, volts)
     windows = stats.window_variance(blocks, spans)
     if len(time_s) < FEWEST_SAMPLES or not np.isfinite(windows).any():
-        needed_s = max(SHORTEST_S, FEWEST_SAMPLES / unit.rate_hz)
-        gaps = stats.gap_s(unit.rate_hz)
-        why = (
-            f'; they come with gaps of up to {np.diff(time_s).max():.2g} s'
-            if np.diff(time_s).max() > gaps
-            else ''
-        )
-        keys = [
-            key
-            for key, field in parameter_file.SENSOR_FIELDS.items()
-            if field.name in unit.unstated
-        ]
-        raise UserError(
-            f'{where}{len(time_s)} samples at {unit.rate_hz:g} Hz do not show the '
-            f'noise of the sensor{why}; record at least {needed_s:.3g} s without '
-            f'gaps, or state {", ".join(keys)} in the parameter file; fit '
-            '--means takes a table of which each row is the mean of a rest'
-        )
+        raise UserError(f'{where}{_noise_is_hidden(unit, time_s)}')
     step_v = stats.adc_step(blocks)
     variance_v2, limit_v2 = stats.quiet_variance(blocks, windows, step_v)
     rc_s = unit.rc_s
@@ -160,6 +143,21 @@ def _measured(
         unknown.add('filter_rate_hz')  # The measured filter is that at this rate.
     used = {name: value for name, value in values.items() if name in unknown}
     return replace(unit, unstated=(), measured=unit.unstated, **used), lines
+
+
+def _noise_is_hidden(unit: Sensor, time_s: np.ndarray) -> str:
+    """Return that samples do not show the noise of a sensor, why, and what does."""
+    needed_s = max(SHORTEST_S, FEWEST_SAMPLES / unit.rate_hz)
+    longest_s = np.diff(time_s).max()
+    has_gaps = longest_s > stats.gap_s(unit.rate_hz)
+    why = f'; they come with gaps of up to {longest_s:.2g} s' if has_gaps else ''
+    fields = parameter_file.SENSOR_FIELDS.items()
+    keys = [key for key, field in fields if field.name in unit.unstated]
+    return (
+        f'{len(time_s)} samples at {unit.rate_hz:g} Hz do not show the noise of the sensor{why}; '
+        f'record at least {needed_s:.3g} s without gaps, or state {", ".join(keys)} in the '
+        'parameter file; fit --means takes a table of which each row is the mean of a rest'
+    )
 
 
 def _filter_s(rests: list[np.ndarray], rate_hz: float, step_v: float) -> float:

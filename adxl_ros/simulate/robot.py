@@ -17,6 +17,7 @@ from typing import Any
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import robot_readings
+from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.robot_readings import Readings
 from adxl_ros.files.stamps import period_s, stamped_rate_hz
@@ -56,7 +57,7 @@ _COMPLIANCE_S2 = 1e-5  # Compliance whose effect is taken, s². Chosen: a resona
 class Robot:
     """The kinematics of a robot, from its joints to one frame."""
 
-    def __init__(self, urdf: str | os.PathLike, frame: str, moves: bool = False) -> None:
+    def __init__(self, urdf: AnyPath, frame: str, moves: bool = False) -> None:
         """Read a URDF; `frame` is a link or frame, and a base that moves is a free joint."""
         try:
             import pinocchio
@@ -360,7 +361,7 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
 
 
 def robot_path(
-    urdf: str | os.PathLike,
+    urdf: AnyPath,
     frame: str,
     path: str,
     epoch_ns: int,

@@ -306,7 +306,7 @@ def motion_from_references(read: Recording, sensor: Sensor) -> Motion:
             paths[joint] = SmoothedPath(
                 read.time_s, read.columns[name], resolution, BAND_LIMITED_DEGREE
             )
-    return Motion(float(read.time_s[-1] - read.time_s[0]), **paths)
+    return Motion(read.span_s, **paths)
 
 
 def environment_paths(read: Recording) -> dict[str, Path]:

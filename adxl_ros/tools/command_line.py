@@ -7,7 +7,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-import os
 from pathlib import Path
 import shlex
 import signal
@@ -19,7 +18,7 @@ from adxl_ros.api import recordings
 from adxl_ros.api.result import require_least
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
-from adxl_ros.files.atomic_write import is_own
+from adxl_ros.files.atomic_write import AnyPath, is_own
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects.base import Effect
@@ -197,7 +196,7 @@ def effect_inputs(texts: Iterable[str]) -> list[EffectInput]:
 
 def print_end(
     result: Sequence[str],
-    files: Iterable[str | os.PathLike],
+    files: Iterable[AnyPath],
     following: str | Sequence[NextStep] = '',
     took_s: float | None = None,
 ) -> None:
@@ -211,7 +210,7 @@ def print_end(
     )
 
 
-def quoted(*words: str | os.PathLike) -> str:
+def quoted(*words: AnyPath) -> str:
     """Return words of a command line as a shell reads them."""
     return shlex.join(str(word) for word in words)
 
@@ -261,7 +260,7 @@ def add_overwrite_option(parse: argparse.ArgumentParser, name: str = '--force') 
     )
 
 
-def check_outputs(options: argparse.Namespace, *paths: str | os.PathLike | None) -> None:
+def check_outputs(options: argparse.Namespace, *paths: AnyPath | None) -> None:
     """Refuse to replace a file or folder of others; a path that is not given is None or ''."""
     for path in paths:
         if path and Path(path).exists() and not options.overwrite and not is_own(path):

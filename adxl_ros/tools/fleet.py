@@ -11,9 +11,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic
 
-from adxl_ros.api.result import make_folder
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
+from adxl_ros.files.atomic_write import make_folder
 from adxl_ros.files.recording_columns import NO_UNIT
 from adxl_ros.fleet.inputs import find_sources, stated_by
 from adxl_ros.fleet.row import (

@@ -18,11 +18,12 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.process import code_version, package_version
-from adxl_ros.workers import Pool, write
+from adxl_ros.workers import Pool
 from adxl_ros_validation.blind import grading, ideal_observer, scores, trials
 from adxl_ros_validation.blind.faults import NOISE_LIKE
 from adxl_ros_validation.blind.simulator import Fault, Scene
 from adxl_ros_validation.blind.trials import kept, Label, Show
+from adxl_ros_validation.kept_results import write
 import numpy as np
 import pandas as pd
 import yaml

@@ -21,7 +21,7 @@ import tempfile
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.workers import Pool, write
+from adxl_ros.workers import Pool
 from adxl_ros_validation.blind import diagnosis_runs, grading, scores, simulator as sim, trials
 from adxl_ros_validation.blind.faults import KINDS, KNOWN
 from adxl_ros_validation.blind.grading import Answer, UNKNOWN
@@ -29,6 +29,7 @@ from adxl_ros_validation.blind.ideal_observer import line, rms
 from adxl_ros_validation.blind.report import reliability, Report, Table
 from adxl_ros_validation.blind.simulator import Fault, G0, Unit
 from adxl_ros_validation.blind.trials import Drawn, Label, Plan, Show
+from adxl_ros_validation.kept_results import write
 import numpy as np
 import pandas as pd
 import scipy

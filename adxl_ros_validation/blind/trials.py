@@ -24,11 +24,12 @@ import shutil
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.workers import for_each, Pool, write
+from adxl_ros.workers import Pool
 from adxl_ros_validation.blind import ideal_observer, motion, simulator
 from adxl_ros_validation.blind.faults import KINDS, KNOWN, UNLISTED
 from adxl_ros_validation.blind.ideal_observer import IdealObserver
 from adxl_ros_validation.blind.simulator import Fault, G0, Kind, Scene, Unit
+from adxl_ros_validation.kept_results import for_each, write
 import numpy as np
 
 STRENGTHS_MPS2 = (0.02e-3 * G0, 15e-3 * G0)

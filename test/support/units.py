@@ -6,7 +6,6 @@ from dataclasses import replace
 
 from adxl_ros.api import simulation
 from adxl_ros.calibrate.fits.linear import EFFECTS
-from adxl_ros.calibrate.guided.pose_plan import sweep
 from adxl_ros.calibrate.poses import Poses, stage_force
 from adxl_ros.files import parameter_file
 from adxl_ros.files.sweep_journal import PoseRecord
@@ -16,6 +15,7 @@ from adxl_ros.model.kinematics import specific_force
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
 from adxl_ros.tools.command_line import effect_inputs
+from adxl_ros_validation.experiments import sweep
 import numpy as np
 from processes import REPO
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from adxl_ros.model.constants import TINY
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import departure_k, parameter_of
 import numpy as np
@@ -67,12 +68,12 @@ def next_degree(
     rest_g = residual_g - np.outer(shape, estimate)
     variance_g2 = (rest_g**2).sum(axis=0) / max(len(rest_g) - _DEGREE - 2, 1)
     neighbours = np.sum(rest_g[1:] * rest_g[:-1], axis=0) / np.maximum(
-        (rest_g**2).sum(axis=0), np.finfo(float).tiny
+        (rest_g**2).sum(axis=0), TINY
     )
     correlation = np.clip(neighbours, 0.0, _LARGEST_CORRELATION)
     # Correlated residuals count as fewer independent ones.
     variance_g2 *= (1 + correlation) / (1 - correlation)
-    information = squares / np.maximum(variance_g2, np.finfo(float).tiny)
+    information = squares / np.maximum(variance_g2, TINY)
     variance = 1 / (information + prior**-2)
     return NextDegree(nodes_c, np.sqrt((variance * information * estimate) ** 2 + variance))
 

@@ -14,7 +14,7 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stamps import period_s
-from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
+from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C, TINY
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.filters import loop, play, stop
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
@@ -198,7 +198,7 @@ def _history_output(blocks: Poses, effect: str, shape: float) -> np.ndarray:
     # The filter 1/(1 + τ·s), exact for straight lines between the samples.
     steps_s = np.diff(time_s)
     decay = np.exp(-steps_s / shape)
-    ramp = (1 - decay) * shape / np.maximum(steps_s, np.finfo(float).tiny)
+    ramp = (1 - decay) * shape / np.maximum(steps_s, TINY)
     lagging_c = [temperature_c[0]]
     for d, r, before, now in zip(decay, ramp, temperature_c, temperature_c[1:]):
         lagging_c.append(d * lagging_c[-1] + (r - d) * before + (1 - r) * now)
@@ -225,45 +225,27 @@ def _fit_axis(
     by_shape: np.ndarray,
 ) -> _Axis:
     """Fit one axis, the correlation of neighbouring blocks included."""
-    warmer_k, correlation = temperature_c - NOMINAL_TEMPERATURE_C, 0.0
-    columns = {
-        ('temperature_bias', 'per_k'): warmer_k,
-        ('temperature_bias', 'per_k2'): warmer_k**2,
-    }
-    # The zero-g of each orientation has the last columns.
-    free = (orientation[:, None] == np.arange(orientation[-1] + 1)).astype(float)
-    forces_g = output_g @ free / free.sum(axis=0)
-    # The orientations must separate the scale factor of an axis from its zero-g.
-    if float(np.ptp(forces_g)) > _SCALE_FORCES_G:
-        columns['temperature_scale', 'per_k'] = forces_g[orientation] * warmer_k
+    columns = _columns(temperature_c - NOMINAL_TEMPERATURE_C, output_g, orientation)
     if history:
         columns[history, _SIZES[history]] = history_g
     names = [Coefficient(*name, axis) for name in columns]
-    design = np.column_stack([*columns.values(), free])
-    begins = np.diff(orientation, prepend=-1) > 0
-
-    def whitened(values: np.ndarray) -> np.ndarray:
-        """Return what neighbouring blocks do not predict; an orientation begins anew."""
-        white = values - correlation * np.roll(values, 1, axis=0)
-        white[begins] = values[begins] * np.sqrt(1 - correlation**2)
-        return white
-
+    # The zero-g of each orientation has the last columns.
+    design = np.column_stack([*columns.values(), _are_of(orientation)])
+    begins, correlation = np.diff(orientation, prepend=-1) > 0, 0.0
     for _ in range(_ITERATIONS):
-        white, target = whitened(design), whitened(output_g)
+        white, target = (_whitened(each, correlation, begins) for each in (design, output_g))
         size = np.sqrt((white**2).sum(axis=0))
         values = np.linalg.lstsq(white / size, target, rcond=None)[0] / size
         residual_g = output_g - design @ values
         rest = target - white @ values
-        neighbours = (
-            residual_g[1:] @ residual_g[:-1] / max(residual_g @ residual_g, np.finfo(float).tiny)
-        )
+        neighbours = residual_g[1:] @ residual_g[:-1] / max(residual_g @ residual_g, TINY)
         correlation = float(np.clip(neighbours, 0.0, _LARGEST_CORRELATION))
     degrees = max(len(output_g) - design.shape[1], 1)
-    variance_g2 = max(float(rest @ rest) / degrees, np.finfo(float).tiny)
+    variance_g2 = max(float(rest @ rest) / degrees, TINY)
     if history:
         # The shape is uncertain, too.
         design = np.column_stack([design, values[len(names) - 1] * by_shape])
-    white, white_free = np.hsplit(whitened(design), [len(names)])
+    white, white_free = np.hsplit(_whitened(design, correlation, begins), [len(names)])
     white = white - white_free @ np.linalg.lstsq(white_free, white, rcond=None)[0]
     precision = white.T @ white / variance_g2 + np.diag(
         [(PRIOR_WIDTH * parameter_of(name).scale) ** -2.0 for name in names]
@@ -272,6 +254,34 @@ def _fit_axis(
     return _Axis(
         names, values[: len(names)], np.linalg.inv(precision), residual_g, float(likelihood)
     )
+
+
+def _are_of(orientation: np.ndarray) -> np.ndarray:
+    """Return which blocks are of each of j orientations, (k, j), 1 or 0."""
+    return (orientation[:, None] == np.arange(orientation[-1] + 1)).astype(float)
+
+
+def _columns(
+    warmer_k: np.ndarray, output_g: np.ndarray, orientation: np.ndarray
+) -> dict[tuple[str, str], np.ndarray]:
+    """Return the derivatives of an output by effect and parameter, (k,)."""
+    columns = {
+        ('temperature_bias', 'per_k'): warmer_k,
+        ('temperature_bias', 'per_k2'): warmer_k**2,
+    }
+    is_of = _are_of(orientation)
+    forces_g = output_g @ is_of / is_of.sum(axis=0)
+    # The orientations must separate the scale factor of an axis from its zero-g.
+    if np.ptp(forces_g) > _SCALE_FORCES_G:
+        columns['temperature_scale', 'per_k'] = forces_g[orientation] * warmer_k
+    return columns
+
+
+def _whitened(values: np.ndarray, correlation: float, begins: np.ndarray) -> np.ndarray:
+    """Return what neighbouring blocks do not predict; an orientation begins anew."""
+    white = values - correlation * np.roll(values, 1, axis=0)
+    white[begins] = values[begins] * np.sqrt(1 - correlation**2)
+    return white
 
 
 _SIZES = {'thermal_lag': 'per_k', 'thermal_hysteresis': 'half_width_g'}
@@ -403,8 +413,7 @@ def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
     temperature_c = recording.columns.get('temperature_c')
     if temperature_c is None or not np.isfinite(temperature_c).any():
         return None
-    volts, time_s = recording.volts(unit), recording.time_s
-    span_s = float(time_s[-1] - time_s[0])
+    volts, time_s, span_s = recording.volts(unit), recording.time_s, recording.span_s
     block_s = max(BLOCK_S, span_s / _MOST_BLOCKS, _FEWEST_SAMPLES * period_s(time_s))
     edges = np.unique(
         np.searchsorted(time_s, time_s[0] + block_s * np.arange(int(span_s / block_s) + 1))

@@ -34,17 +34,6 @@ class Target:
     check: bool = False  # Whether the pose is kept out of the fit, to show how good the fit is
 
 
-def sweep(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> list[Target]:
-    """Plan the paper's two experiments: in each plane alpha, beta turns forth and back."""
-    forth = _turn(planes_rad, step_rad)
-    grid = [
-        Target(float(alpha), float(beta))
-        for alpha in planes_rad
-        for beta in (*forth, *forth[::-1])
-    ]
-    return grid + spread(check_poses)
-
-
 def default_planes_rad(axes: str) -> tuple[float, ...]:
     """Return the planes alpha of a sweep, rad; without level ones z is calibrated to 0.87 g."""
     first_deg, last_deg = (0.0, 180.0) if 'z' in axes else (30.0, 150.0)
@@ -53,7 +42,7 @@ def default_planes_rad(axes: str) -> tuple[float, ...]:
 
 def guided(planes_rad: Sequence[float], step_rad: float, check_poses: int) -> list[Target]:
     """
-    Order the poses of `sweep` for a real stage, whose joints keep their error until they move.
+    Plan the planes of the paper for a real stage, whose joints keep their error until they move.
 
     Beta turns forth and then back. At each angle beta, alpha goes through all planes, up and down
     in turn: with one setting for a plane, the error of that setting would not average out. Each

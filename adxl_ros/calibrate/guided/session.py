@@ -19,7 +19,7 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import page
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
-from adxl_ros.files.atomic_write import remove_unfinished
+from adxl_ros.files.atomic_write import make_folder, remove_unfinished
 from adxl_ros.files.sweep_journal import MountingUnchecked, PoseRecord
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, with_axes
@@ -286,8 +286,7 @@ class Session:
     def write_report(self, result: calibration.CalibrationResult) -> None:
         """Write the report if one is asked for."""
         if self.settings.report:
-            Path(self.settings.report).mkdir(parents=True, exist_ok=True)
-            page.write(self.settings.report, result, self.settings.store)
+            page.write(make_folder(self.settings.report), result, self.settings.store)
 
     def end(self) -> None:
         """Note in the journal that the fit is written, else the next start writes it again."""

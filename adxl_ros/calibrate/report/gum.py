@@ -10,15 +10,15 @@ Squares of contributions add. Those of noise, coefficients, stage and model are 
 from __future__ import annotations
 
 from dataclasses import dataclass
-import os
 from typing import Any, NamedTuple
 
 from adxl_ros.calibrate.poses import Poses, reference_force
 from adxl_ros.calibrate.report import acceptance, held_out
-from adxl_ros.calibrate.report.acceptance import FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.report.held_out import ErrorBudget
 from adxl_ros.calibrate.result import CalibrationResult, compare
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.sensor import MARGIN_K, Sensor
@@ -123,68 +123,77 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
         for covariance in held_out.covariances(errors, held, force)
     )
     held, reference = held.subset(used), force[used][:, axes]
-    error, budget = errors.errors.accel_mps2[used], assessment.accel
-    model = np.full(error.shape, np.sqrt(budget.model))
-    # The poses may scatter more than the step of the encoder permits.
-    stage_mps2, stage_kind = by_stage, 'B, uniform within a step'
-    stage_rad, excess = fitted.stage_std_rad, budget.stage / max(np.mean(by_stage**2), 1e-30)
-    if excess > 1:
-        stage_mps2 = by_stage * excess**0.5 if stage_rad else model * 0 + budget.stage**0.5
-        stage_kind = 'A, scatter of the poses'
-        stage_rad = stage_rad * excess**0.5 or budget.stage**0.5 / gravity
-    gravity_std, gravity_kind = _LOCAL_STD_MPS2, 'B, anomalies of gravity'
-    if gravity in _NOT_LOCAL_MPS2:
-        gravity_std, gravity_kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, not local: anywhere'
+    error = errors.errors.accel_mps2[used]
+    model = np.full(error.shape, np.sqrt(assessment.accel.model))
     inputs = (
         Input('noise of the mean', 'A, normal', 1e3 * np.mean(held.std_v, axis=0), 'mV', by_noise),
         Input(
             'coefficients', 'A, covariance of the fit', mg(by_coefficients), 'mg', by_coefficients
         ),
-        Input('stage angles', stage_kind, np.degrees(stage_rad), '°', stage_mps2),
+        _stage_angles(by_stage, assessment.accel.stage, fitted),
         Input('model', 'A, held-out errors', mg(model), 'mg', model),
-        Input(
-            'local gravity',
-            gravity_kind,
-            gravity_std,
-            'm/s²',
-            np.abs(reference) / gravity * gravity_std,
-        ),
+        _local_gravity(gravity, reference),
         *(_surroundings(name, fitted, held, reference) for name in _SURROUNDINGS),
     )
-    limit_mps2, limit_name = acceptance.limit(fitted)
-    tilt_limit_rad = limit_mps2 * assessment.tilt.tilt_per_axis**0.5
-    decisions = tuple(
-        Decision(
-            quantity,
-            unit,
-            scale * part.calibration**0.5,
-            scale * (part.calibration_high**0.5 - part.calibration**0.5),
-            scale * limit,
-            outcome,
-        )
-        for quantity, unit, scale, part, limit, outcome in (
-            (
-                'acceleration',
-                'mg',
-                mg(1.0),
-                assessment.accel,
-                limit_mps2,
-                assessment.accel_outcome,
-            ),
-            (
-                'tilt',
-                '°',
-                float(np.degrees(1.0)),
-                assessment.tilt,
-                tilt_limit_rad,
-                assessment.tilt_outcome,
-            ),
-        )
-        if outcome
-    )
     return Uncertainty(
-        fitted.axes, held.alpha_rad, held.beta_rad, reference, error, inputs, limit_name, decisions
+        fitted.axes,
+        held.alpha_rad,
+        held.beta_rad,
+        reference,
+        error,
+        inputs,
+        acceptance.limit(fitted)[1],
+        _decisions(fitted, assessment),
     )
+
+
+def _stage_angles(by_step_mps2: np.ndarray, scatter: float, fitted: Sensor) -> Input:
+    """
+    Return the contribution of the stage, with that of a step of its encoders, m/s², (k, m).
+
+    The poses may scatter more than the step permits; scatter: their mean square, (m/s²)².
+    """
+    name, step_rad = 'stage angles', fitted.stage_std_rad
+    excess = (scatter / max(np.mean(by_step_mps2**2), 1e-30)) ** 0.5
+    if excess <= 1:
+        kind = 'B, uniform within a step'
+        return Input(name, kind, np.degrees(step_rad), '°', by_step_mps2)
+    scatter_mps2 = np.full(by_step_mps2.shape, scatter**0.5)
+    std_rad = step_rad * excess or scatter**0.5 / fitted.local_gravity_mps2
+    part_mps2 = by_step_mps2 * excess if step_rad else scatter_mps2
+    return Input(name, 'A, scatter of the poses', np.degrees(std_rad), '°', part_mps2)
+
+
+def _local_gravity(gravity_mps2: float, reference_mps2: np.ndarray) -> Input:
+    """Return the contribution of local gravity to accelerations, m/s², (k, m)."""
+    std_mps2, kind = _LOCAL_STD_MPS2, 'B, anomalies of gravity'
+    if gravity_mps2 in _NOT_LOCAL_MPS2:
+        std_mps2, kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, not local: anywhere'
+    part_mps2 = np.abs(reference_mps2) / gravity_mps2 * std_mps2
+    return Input('local gravity', kind, std_mps2, 'm/s²', part_mps2)
+
+
+def _decisions(fitted: Sensor, assessment: Assessment) -> tuple[Decision, ...]:
+    """Return the comparisons with limits; none of a quantity without a limit."""
+    limit_mps2, _ = acceptance.limit(fitted)
+
+    def decision(
+        quantity: str, unit: str, scale: float, budget: ErrorBudget, limit: float, outcome: str
+    ) -> Decision:
+        """Return a comparison; `scale` turns the SI unit of error and limit into `unit`."""
+        error, high = budget.calibration**0.5, budget.calibration_high**0.5
+        return Decision(
+            quantity, unit, scale * error, scale * (high - error), scale * limit, outcome
+        )
+
+    accel, tilt = assessment.accel, assessment.tilt
+    tilt_limit_rad = limit_mps2 * tilt.tilt_per_axis**0.5
+    degrees = float(np.degrees(1.0))
+    both = (
+        decision('acceleration', 'mg', mg(1.0), accel, limit_mps2, assessment.accel_outcome),
+        decision('tilt', '°', degrees, tilt, tilt_limit_rad, assessment.tilt_outcome),
+    )
+    return tuple(row for row in both if row.outcome)
 
 
 def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray) -> Input:
@@ -301,7 +310,7 @@ def _quantity(
     }
 
 
-def write(path: str | os.PathLike, result: CalibrationResult) -> None:
+def write(path: AnyPath, result: CalibrationResult) -> None:
     """Write the certificate of a calibration against a stage, by the template of its elements."""
     found = uncertainty(result)
     if found is None:

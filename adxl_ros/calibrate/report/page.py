@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-import os
 from pathlib import Path
 import re
 from typing import Any
@@ -17,7 +16,7 @@ from adxl_ros.calibrate.report.acceptance import Assessment, digits, FAIL, NOT_S
 from adxl_ros.calibrate.result import CalibrationResult, compare, history, rounded
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
-from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import get, Sensor
@@ -42,9 +41,7 @@ _BEYOND_WHISKER = 1.08
 """Half of a whisker's range divided by the largest value in it. Chosen: no dot is cut."""
 
 
-def write(
-    folder: str | os.PathLike, result: CalibrationResult, store: str | os.PathLike = ''
-) -> None:
+def write(folder: AnyPath, result: CalibrationResult, store: AnyPath = '') -> None:
     """Write the page."""
     html_page.check_libraries()
     past = (
@@ -333,6 +330,7 @@ def draw_sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:
     predicted = np.column_stack(signal_chain.static_response(fitted)(reference, swept.environment))
     figure = figures.new_figure(figsize=(17.6, 9))
     grid = figure.subplots(2, 4)
+    vertical = np.abs(np.sin(swept.alpha_rad)) > _VERTICAL
     for d, (row, regression) in enumerate(zip(grid, regressions)):
         linear_v = line.zero_g_v[d] + line.scale_v_per_g[d] * force_g[:, d]
         deviation_mv, model_mv = (
@@ -344,65 +342,52 @@ def draw_sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:
             xlabel=f'{name} reference, g',
             ylabel=f'{name} output minus linear, mV',
         )
-        backward = np.gradient(swept.beta_rad) < 0
-        for plane in planes(swept.alpha_rad):
-            index = np.sort(plane)
-            (curve,) = row[0].plot(
-                force_g[index, d],
-                model_mv[index],
-                lw=1,
-                label=f'{np.degrees(swept.alpha_rad[index]).mean():.0f}°',
-            )
-            for part, marker, fill in (
-                (index[~backward[index]], 'o', None),
-                (index[backward[index]], '<', 'none'),
-            ):
-                row[0].plot(
-                    force_g[part, d],
-                    deviation_mv[part],
-                    marker,
-                    ms=3,
-                    color=curve.get_color(),
-                    mfc=fill,
-                )
-        row[0].legend(title='alpha', fontsize=7)
-        vertical = np.abs(np.sin(swept.alpha_rad)) > _VERTICAL
+        _draw_planes(row[0], swept, force_g[:, d], deviation_mv, model_mv)
+        row[1].set(
+            title=f'fig. 4: residual against {other} (10, 11)',
+            xlabel=f'{other} reference, g',
+            ylabel=f'{name} residual, mV',
+        )
+        _draw_regression(
+            row[1], force_g[vertical, 1 - d], deviation_mv[vertical], 1e3 * regression.p
+        )
         az_g = regression.plane_az_g
-        for axis, title, x_label, y_label, x, y, polynomial in (
-            (
-                row[1],
-                f'fig. 4: residual against {other} (10, 11)',
-                f'{other} reference, g',
-                f'{name} residual, mV',
-                force_g[vertical, 1 - d],
-                deviation_mv[vertical],
-                1e3 * regression.p,
-            ),
-            (
-                row[2],
-                'fig. 6: zero-g against z (12, 13)',
-                'z reference, g',
-                f'{name} zero-g minus that at 90°, mV',
-                az_g,
-                1e3 * regression.plane_bias_v,
-                1e3 * regression.q,
-            ),
-            (
-                row[3],
-                'fig. 8: scale factor against z (15, 17)',
-                'z reference, g',
-                f'{name} scale factor, V/g',
-                az_g,
-                regression.plane_scale_v_per_g,
-                regression.r,
-            ),
-        ):
-            fine_g = np.linspace(x.min(), x.max(), 101)
-            axis.plot(x, y, 'o', ms=4)
-            axis.plot(fine_g, np.polynomial.polynomial.polyval(fine_g, polynomial))
-            axis.set(title=title, xlabel=x_label, ylabel=y_label)
+        row[2].set(
+            title='fig. 6: zero-g against z (12, 13)',
+            xlabel='z reference, g',
+            ylabel=f'{name} zero-g minus that at 90°, mV',
+        )
+        _draw_regression(row[2], az_g, 1e3 * regression.plane_bias_v, 1e3 * regression.q)
+        row[3].set(
+            title='fig. 8: scale factor against z (15, 17)',
+            xlabel='z reference, g',
+            ylabel=f'{name} scale factor, V/g',
+        )
+        _draw_regression(row[3], az_g, regression.plane_scale_v_per_g, regression.r)
     figure.suptitle(
         f'{fitted.serial}: deviation from the linear model, measured and by the '
         f'{fitted.model} model (Ang et al. 2007, figures 2 to 8)'
     )
     return figure
+
+
+def _draw_planes(
+    plot: Any, swept: Poses, force_g: np.ndarray, measured_mv: np.ndarray, model_mv: np.ndarray
+) -> None:
+    """Draw what an output departs from a line over its force, (k,), in a colour by plane."""
+    is_back = np.gradient(swept.beta_rad) < 0
+    for plane in map(np.sort, planes(swept.alpha_rad)):
+        alpha_deg = np.degrees(swept.alpha_rad[plane]).mean()
+        (curve,) = plot.plot(force_g[plane], model_mv[plane], lw=1, label=f'{alpha_deg:.0f}°')
+        style = {'ms': 3, 'color': curve.get_color()}
+        forth, back = plane[~is_back[plane]], plane[is_back[plane]]
+        plot.plot(force_g[forth], measured_mv[forth], 'o', **style)
+        plot.plot(force_g[back], measured_mv[back], '<', mfc='none', **style)
+    plot.legend(title='alpha', fontsize=7)
+
+
+def _draw_regression(plot: Any, x: np.ndarray, y: np.ndarray, coefficients: np.ndarray) -> None:
+    """Draw points, (n,), and a polynomial, its lowest power first."""
+    fine = np.linspace(x.min(), x.max(), 101)
+    plot.plot(x, y, 'o', ms=4)
+    plot.plot(fine, np.polynomial.polynomial.polyval(fine, coefficients))

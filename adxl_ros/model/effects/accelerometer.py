@@ -18,11 +18,13 @@ from adxl_ros.model.effects.base import (
     FormDimension,
     Manoeuvre,
     Need,
+    optional,
     Parameter,
     Parameters,
     Place,
     ProofVariable,
     Role,
+    shape,
     Signals,
     StraightLine,
     Value,
@@ -234,7 +236,7 @@ def quadratic(signals: Signals, p: Parameters) -> None:
         'physics: friction in die and package',
         'largest lag behind the input: half of the width of the loop',
     ),
-    Parameter(
+    shape(
         'reach_g',
         'g',
         1e-3,
@@ -242,9 +244,6 @@ def quadratic(signals: Signals, p: Parameters) -> None:
         0.2,
         'physics: part of the range',
         'change of the input after a reversal that builds up half of the lag',
-        '',
-        neutral=0.2,
-        role=Role.SHAPE,
         starts=(0.04, 0.2, 1.0),
     ),
     smooth=False,
@@ -282,7 +281,7 @@ def hysteresis(signals: Signals, p: Parameters) -> None:
         'physics: asymmetry of the element, clipping of fast peaks',
         'shift of the zero-g divided by the mean square of the vibration',
     ),
-    Parameter(
+    shape(
         'tau_s',
         's',
         0.01,
@@ -290,9 +289,6 @@ def hysteresis(signals: Signals, p: Parameters) -> None:
         0.5,
         'physics: slower than any vibration',
         'time over which the mean square is taken',
-        '',
-        neutral=0.5,
-        role=Role.SHAPE,
         starts=(0.1, 0.5, 2.5),
     ),
     cause='Vibration shifts the zero-g; damp the mount, or stay away from its resonance.',
@@ -384,7 +380,7 @@ def misalignment(signals: Signals, p: Parameters) -> None:
         'physics: 0 is rigid, 1 all through the mount',
         'part of the force that comes through the mount',
     ),
-    Parameter(
+    shape(
         'frequency_hz',
         'Hz',
         2.0,
@@ -392,12 +388,9 @@ def misalignment(signals: Signals, p: Parameters) -> None:
         120.0,
         'physics: a board on standoffs',
         'natural frequency, undamped',
-        '',
-        neutral=120.0,
-        role=Role.SHAPE,
         starts=(8.0, 14.0, 24.0, 40.0, 70.0, 120.0, 250.0),
     ),
-    Parameter(
+    shape(
         'damping_ratio',
         '1',
         0.001,
@@ -405,9 +398,6 @@ def misalignment(signals: Signals, p: Parameters) -> None:
         0.05,
         'physics: metal and FR4',
         'damping divided by the critical one',
-        '',
-        neutral=0.05,
-        role=Role.SHAPE,
     ),
     cause='The mount is a spring; stiffen it, or keep the motion away from its resonance.',
     diagnosis=DiagnosisHints(
@@ -514,7 +504,7 @@ _SCALE_EXPONENT = 1.135
         'ADXL203 datasheet: 560 mV/g at 3 V, not 600',
         'exponent of the supply voltage in the scale factor; 0 is independent of it',
     ),
-    Parameter(
+    shape(
         'nominal_v',
         'V of the supply',
         1.0,
@@ -522,10 +512,7 @@ _SCALE_EXPONENT = 1.135
         NOMINAL_SUPPLY_V,
         'ADXL203 datasheet: values at 5 V',
         'supply voltage of the datasheet values',
-        '',
-        neutral=NOMINAL_SUPPLY_V,
         held=True,
-        role=Role.SHAPE,
     ),
     invertible=True,
     follows=('supply_v',),
@@ -555,7 +542,7 @@ def supply(signals: Signals, p: Parameters) -> None:
         neutral=1000.0,
         role=Role.LIMIT,
     ),
-    Parameter(
+    optional(
         'knee_g',
         'g',
         0.0,
@@ -563,11 +550,9 @@ def supply(signals: Signals, p: Parameters) -> None:
         0.02,
         'physics: an amplifier near its rail',
         'width of a soft clip; 0 is hard',
-        '',
-        typical=0.0,
-        role=Role.OPTIONAL,
+        axes='',
     ),
-    Parameter(
+    optional(
         'offset_g',
         'g',
         -0.5,
@@ -575,8 +560,6 @@ def supply(signals: Signals, p: Parameters) -> None:
         0.02,
         'ADXL203 datasheet: zero-g 2.4 to 2.6 V between rails of 0 and 5 V',
         'middle of the two limits',
-        typical=0.0,
-        role=Role.OPTIONAL,
     ),
     smooth=False,
     cause='The output clips; raise the supply, lower the gain, or choose a wider range.',
@@ -654,7 +637,7 @@ def bandwidth(signals: Signals, p: Parameters) -> None:
         'ADXL203 datasheet: 0.1 mg/degC',
         'slope of the zero-g over temperature at 25 degC',
     ),
-    Parameter(
+    optional(
         'per_k2',
         'g/K^2',
         -0.01,
@@ -662,8 +645,6 @@ def bandwidth(signals: Signals, p: Parameters) -> None:
         1e-6,
         'physics: a slope that changes by 1 % a degree',
         'curvature of the zero-g over temperature',
-        typical=0.0,
-        role=Role.OPTIONAL,
     ),
     invertible=True,
     follows=('temperature_c',),
@@ -698,7 +679,7 @@ def temperature_bias(signals: Signals, p: Parameters) -> None:
         'ADXL203 datasheet: sensitivity +-0.3 % over temperature',
         'relative slope of the scale factor over temperature, from 25 degC on',
     ),
-    Parameter(
+    optional(
         'per_k2',
         '1/K^2',
         -0.001,
@@ -706,8 +687,6 @@ def temperature_bias(signals: Signals, p: Parameters) -> None:
         1e-6,
         'physics: a slope that changes by 1 % a degree',
         'relative curvature of the scale factor over temperature',
-        typical=0.0,
-        role=Role.OPTIONAL,
     ),
     invertible=True,
     follows=('temperature_c',),
@@ -742,7 +721,7 @@ def temperature_scale(signals: Signals, p: Parameters) -> None:
         'ADXL203 datasheet: 0.1 mg/degC',
         'slope of the zero-g over the temperature that lags the thermometer',
     ),
-    Parameter(
+    shape(
         'tau_s',
         's',
         1.0,
@@ -750,9 +729,6 @@ def temperature_scale(signals: Signals, p: Parameters) -> None:
         60.0,
         'physics: a small board in moving air',
         'time constant between thermometer and sensor',
-        '',
-        neutral=60.0,
-        role=Role.SHAPE,
         starts=(8.0, 25.0, 80.0, 250.0),
     ),
     follows=('temperature_c',),
@@ -792,7 +768,7 @@ def thermal_lag(signals: Signals, p: Parameters) -> None:
         'physics: friction and creep in solder and die attach',
         'zero-g while cooling minus that while warming, divided by 2',
     ),
-    Parameter(
+    shape(
         'reach_k',
         'K',
         0.1,
@@ -800,9 +776,6 @@ def thermal_lag(signals: Signals, p: Parameters) -> None:
         10.0,
         'physics: part of the range',
         'half of the change after a reversal that opens the loop',
-        '',
-        neutral=10.0,
-        role=Role.SHAPE,
         starts=(2.0, 10.0, 50.0),
     ),
     smooth=False,
@@ -842,7 +815,7 @@ def thermal_hysteresis(signals: Signals, p: Parameters) -> None:
         'physics: self-heating by 20 K, 0.1 mg/K',
         'zero-g at power-on minus the settled one',
     ),
-    Parameter(
+    shape(
         'tau_s',
         's',
         1.0,
@@ -850,9 +823,6 @@ def thermal_hysteresis(signals: Signals, p: Parameters) -> None:
         300.0,
         'physics: a board in still air',
         'time constant of settling',
-        '',
-        neutral=300.0,
-        role=Role.SHAPE,
         starts=(15.0, 60.0, 300.0, 1500.0),
     ),
     invertible=True,

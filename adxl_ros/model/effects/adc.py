@@ -16,11 +16,12 @@ from adxl_ros.model.effects.base import (
     FormDimension,
     Manoeuvre,
     Need,
+    optional,
     Parameter,
     Parameters,
     Place,
     ProofVariable,
-    Role,
+    shape,
     Signals,
 )
 from adxl_ros.model.filters import first_order_recursion
@@ -79,7 +80,7 @@ A start that differs by a third of a period there, 0.9, explains half of the pow
         'amplitude of the sine by which it deviates from the straight line',
         '',
     ),
-    Parameter(
+    optional(
         'cosine_v',
         'V',
         -0.05,
@@ -87,11 +88,9 @@ A start that differs by a third of a period there, 0.9, explains half of the pow
         3e-4,
         'physics: 4 LSB of 16 bit at 5 V',
         'amplitude of the cosine, which shifts the sine over the codes',
-        '',
-        typical=0.0,
-        role=Role.OPTIONAL,
+        axes='',
     ),
-    Parameter(
+    shape(
         'cycles',
         '1',
         0.5,
@@ -99,13 +98,10 @@ A start that differs by a third of a period there, 0.9, explains half of the pow
         8.0,
         'physics: segments of a converter',
         'periods of the deviation over the full scale',
-        '',
-        neutral=8.0,
-        role=Role.SHAPE,
         starts=_INL_STARTS,
     ),
     *(
-        Parameter(
+        optional(
             name,
             'V',
             -0.05,
@@ -113,9 +109,7 @@ A start that differs by a third of a period there, 0.9, explains half of the pow
             3e-4,
             'physics: 4 LSB of 16 bit at 5 V',
             f'error of the weight of bit {i}, the heaviest being 1',
-            '',
-            typical=0.0,
-            role=Role.OPTIONAL,
+            axes='',
             shaped=False,
         )
         for i, name in enumerate(_BITS, 1)
@@ -164,7 +158,7 @@ def adc_inl(signals: Signals, p: Parameters) -> None:
         'number of bits that the ADC loses',
         '',
     ),
-    Parameter(
+    optional(
         'axis_lost_bits',
         'bit',
         0.0,
@@ -172,8 +166,6 @@ def adc_inl(signals: Signals, p: Parameters) -> None:
         3.0,
         'physics: a converter for each axis',
         'number of further bits that the axis loses',
-        typical=0.0,
-        role=Role.OPTIONAL,
     ),
     smooth=False,
     acts_on=ActsOn.NOISE,
@@ -242,7 +234,7 @@ _NEVER = -(2**40)  # Index of a start that lies before any recording; chosen: fa
     Parameter(
         'rate_hz', 'Hz', 0.0, 1000.0, 0.1, 'physics: a bus that times out', 'starts per second', ''
     ),
-    Parameter(
+    shape(
         'duration_s',
         's',
         1e-4,
@@ -250,9 +242,6 @@ _NEVER = -(2**40)  # Index of a start that lies before any recording; chosen: fa
         0.05,
         'physics: a few frames',
         'time that the sample is held',
-        '',
-        neutral=0.05,
-        role=Role.SHAPE,
     ),
     smooth=False,
     acts_on=ActsOn.NOISE,
@@ -450,7 +439,7 @@ def flicker(signals: Signals, p: Parameters) -> None:
         'physics: slow stress in package and solder',
         'rms of the wandering zero-g divided by the root of time',
     ),
-    Parameter(
+    optional(
         'return_per_s',
         '1/s',
         0.0,
@@ -458,8 +447,6 @@ def flicker(signals: Signals, p: Parameters) -> None:
         1e-2,
         'physics: bounds of the stress',
         'inverse correlation time of a walk that has bounds',
-        typical=0.0,
-        role=Role.OPTIONAL,
     ),
     acts_on=ActsOn.NOISE,
     cause='The zero-g wanders; take the zero again more often, or choose a quieter sensor.',
@@ -508,7 +495,7 @@ def bias_walk(signals: Signals, p: Parameters) -> None:
     Parameter(
         'amplitude_v', 'V', -1.0, 1.0, 1e-3, 'physics: unshielded cable', 'amplitude of the sine'
     ),
-    Parameter(
+    shape(
         'frequency_hz',
         'Hz',
         1.0,
@@ -516,11 +503,8 @@ def bias_walk(signals: Signals, p: Parameters) -> None:
         50.0,
         'mains: 50 or 60 Hz',
         'frequency of the sine',
-        '',
-        neutral=50.0,
-        role=Role.SHAPE,
     ),
-    Parameter(
+    optional(
         'phase_rad',
         'rad',
         -7.0,
@@ -528,9 +512,7 @@ def bias_walk(signals: Signals, p: Parameters) -> None:
         1.0,
         'chosen: any',
         'phase at time 0',
-        '',
-        typical=0.0,
-        role=Role.OPTIONAL,
+        axes='',
     ),
     acts_on=ActsOn.NOISE,
     cause='The mains couple into the signal; shield and twist the cable, and ground one end.',

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import auto, Enum, IntEnum
 import math
 from typing import Any, NamedTuple
@@ -365,6 +365,17 @@ class Parameter:
     def is_size(self) -> bool:
         """Whether it is a strength of the effect, and not a shape or a limit."""
         return self.role in (Role.SIZE, Role.OPTIONAL)
+
+
+def shape(*about: Any, **further: Any) -> Parameter:
+    """Return a parameter of shape: it has no axes, and its neutral value is the typical one."""
+    parameter = Parameter(*about, **further)
+    return replace(parameter, axes='', neutral=parameter.scale, role=Role.SHAPE)
+
+
+def optional(*about: Any, **further: Any) -> Parameter:
+    """Return a size that is usually neutral."""
+    return replace(Parameter(*about, **further), typical=0.0, role=Role.OPTIONAL)
 
 
 @dataclass(frozen=True)

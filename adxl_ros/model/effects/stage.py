@@ -22,7 +22,7 @@ from adxl_ros.model.effects.base import (
     Parameters,
     Place,
     ProofVariable,
-    Role,
+    shape,
     Signals,
 )
 from adxl_ros.model.filters import play
@@ -374,7 +374,7 @@ def _restoring_gain(frequency_hz: np.ndarray, p: Parameters) -> np.ndarray:
         typical=0.02,
         starts=(0.003, 0.006, 0.012, 0.025, 0.05),
     ),
-    Parameter(
+    shape(
         'steepness',
         '1',
         1.5,
@@ -382,12 +382,9 @@ def _restoring_gain(frequency_hz: np.ndarray, p: Parameters) -> np.ndarray:
         2.0,
         'physics: 2.3 is a Gaussian, 3.2 a Butterworth filter of order 2',
         'exponent n of the attenuation',
-        '',
-        neutral=2.0,
-        role=Role.SHAPE,
         starts=(2.3, 4.5),
     ),
-    Parameter(
+    shape(
         'lost_gain',
         '1',
         0.1,
@@ -395,12 +392,9 @@ def _restoring_gain(frequency_hz: np.ndarray, p: Parameters) -> np.ndarray:
         0.2,
         'measured: optical tracking against an accelerometer, 0.1 to 0.4',
         'gain of the filter below which errors of the reference hide the motion',
-        '',
-        neutral=0.2,
-        role=Role.SHAPE,
         starts=(0.12, 0.35),
     ),
-    Parameter(
+    shape(
         'phase',
         '1',
         0.0,
@@ -408,9 +402,6 @@ def _restoring_gain(frequency_hz: np.ndarray, p: Parameters) -> np.ndarray:
         1.0,
         'physics: 0 is smoothed forth and back, 1 while it is recorded',
         'phase divided by that of a causal filter',
-        '',
-        neutral=1.0,
-        role=Role.SHAPE,
         starts=(0.0, 1.0),
     ),
     cause='The reference is smoother than the motion; use it with less smoothing, or compare '

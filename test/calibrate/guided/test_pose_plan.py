@@ -5,6 +5,7 @@
 
 from adxl_ros.calibrate.fits import full_model
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
+from adxl_ros_validation.experiments import sweep
 import numpy as np
 import pytest
 from units import drawn, nominal, swept
@@ -21,7 +22,7 @@ def expected_error_deg(axes, targets, resolution_deg=5 / 60):
 def test_the_guided_order_has_smaller_errors_on_a_stage_with_errors_by_setting(axes):
     """The guided order halves the expected tilt error."""
     planes = pose_plan.default_planes_rad('xy')
-    guided, paper = pose_plan.guided(planes, STEP, 0), pose_plan.sweep(planes, STEP, 0)
+    guided, paper = pose_plan.guided(planes, STEP, 0), sweep(planes, STEP, 0)
     assert sorted(map(str, guided)) == sorted(map(str, paper))
     assert expected_error_deg(axes, guided) < 0.5 * expected_error_deg(axes, paper)
 

@@ -2,10 +2,11 @@
 
 """The guided sweep without ROS: its waits, its messages and its accepted poses."""
 
-from adxl_ros.calibrate.guided.pose_plan import guided, sweep as plan_sweep, Target
+from adxl_ros.calibrate.guided.pose_plan import guided, Target
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Phase, StageMode
 from adxl_ros.calibrate.guided.stage_guide import StageGuide
 from adxl_ros.errors import UserError
+from adxl_ros_validation.experiments import sweep as paper_sweep
 import numpy as np
 import pytest
 from units import Bench, nominal
@@ -57,21 +58,21 @@ def test_a_pose_is_taken_after_the_capture_of_the_operator(mode, beta):
 
 def test_the_plan_of_the_paper_and_refused_settings():
     """Planes have steps of 30° in both directions, and check poses are beside the grid."""
-    targets = plan_sweep([np.pi / 2, 0.5], np.radians(30), 8)
+    targets = paper_sweep([np.pi / 2, 0.5], np.radians(30), 8)
     assert len(targets) == 2 * 26 + 8
     beta = np.degrees([t.beta_rad for t in targets[:26]])
     np.testing.assert_allclose(beta, [*range(0, 361, 30), *range(360, -1, -30)])
     assert [t.check for t in targets].count(True) == 8
     with pytest.raises(UserError, match='names no plane'):
-        plan_sweep([], 0.5, 0)
+        guided([], 0.5, 0)
     with pytest.raises(UserError, match='sweep.step_deg: 0 is'):
-        plan_sweep([1.0], 0.0, 0)
+        guided([1.0], 0.0, 0)
 
 
 def test_the_guided_order_saves_travel_and_reaches_angles_from_both_sides():
     planes = np.radians([90, 30, 150, 60, 120])
     targets = guided(planes, np.radians(30), 16)
-    paper = plan_sweep(sorted(planes), np.radians(30), 16)
+    paper = paper_sweep(sorted(planes), np.radians(30), 16)
 
     def poses(plan):
         return sorted((t.check, t.alpha_rad, t.beta_rad) for t in plan)
