@@ -123,14 +123,35 @@ _UNIT_RATIOS = {
 """Gain of an output in the wrong unit, and which unit it has instead of which."""
 
 
+DATA_FAULTS = {
+    'axis_inverted': 'an axis has the opposite sign',
+    'axis_swapped': 'two axes are swapped',
+    'clock_jump': 'a clock steps or runs backwards',
+    'constant': 'an axis does not change',
+    'encoder_sign': 'an angle has the opposite sign',
+    'gravity': 'gravity is missing at rest, as in linear acceleration',
+    'missing': 'many samples are no numbers',
+    'no_overlap': 'the reference has no time in common with the recording',
+    'reference': 'the reference is wrong, of another motion, or missing',
+    'saturated': 'many samples are at the end of the range',
+    'time_misaligned': 'one shift in time is needed that is no latency',
+    'too_short': 'too little can be compared; the status is insufficient',
+    'unit': 'readings, angles or stamps are in another unit',
+}
+"""Faults of the data by name, with their meaning."""
+
+
 @dataclass(eq=False)
 class DataFault(Exception):
     """A fault of the recording, with the recordings whose notes say more."""
 
-    name: str  # Name in the report: `verdict.data_fault`
+    name: str  # Name in the report, `verdict.data_fault`: one of `DATA_FAULTS`
     message: str  # What is wrong and what to do, one line
     status: str = 'bad_data'  # Status of the verdict: 'bad_data' or 'insufficient'
     comparisons: tuple[BaselineComparison, ...] = ()
+
+    def __post_init__(self) -> None:
+        assert self.name in DATA_FAULTS, 'a fault has a meaning for reports'
 
 
 def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> None:
