@@ -26,6 +26,7 @@ import textwrap
 from typing import Any
 
 import adxl_ros
+from adxl_ros.diagnose.data_checks import DATA_FAULTS
 from adxl_ros.files import parameter_file
 from adxl_ros.files.column_mapping import UNITS
 from adxl_ros.fleet.row import COLUMNS
@@ -212,7 +213,7 @@ REPORT = {
     'verdict.effects': 'effects that are named for certain; empty for no_gap and unknown',
     'verdict.groups': 'sets of effects; in each, the data cannot choose one',
     'verdict.of': 'what they are errors of: sensor, stage, reference; joined by "and", "or"',
-    'verdict.data_fault': 'with bad_data its fault: axis_swapped, unit, clock_jump; else null',
+    'verdict.data_fault': 'with bad_data its fault, one of those below; else null',
     'verdict.probability': 'how often such verdicts were right in the working cases',
     'hypotheses': 'sets with probabilities that sum to 1; `[]` is no gap; `["unknown"]`',
     'gap': 'rms of recording minus simulation over samples and axes; null for bad_data',
@@ -517,6 +518,9 @@ def report_keys() -> Iterator[str]:
     ]
     yield from table(
         'key | meaning', ((f'`{path}`', REPORT[path]) for path in paths if path in REPORT)
+    )
+    yield from table(
+        'fault | meaning', ((f'`{name}`', meaning) for name, meaning in DATA_FAULTS.items())
     )
 
 

@@ -33,7 +33,8 @@ from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
 from adxl_ros.report.quantities import mg
-from adxl_ros.signals.neighbouring_samples import neighbour_faults
+from adxl_ros.signals.gravity_at_rest import require_unit
+from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import BeyondRange, FilterNoise, listed
 
 _READING = 0.3  # Share of the work until the fit begins (chosen: a sweep of minutes)
@@ -374,14 +375,14 @@ class _Rests:
             raise UserError(_ONE_RECORDING)
         if self._are_rows:
             return poses_of_means(read, unit.sensor), (), []
+        look = RecordingLook(unit.sensor, read)
+        look.feed(read)
+        # Rests by the noise of the sensor may not tell the unit; of other faults, the poses tell.
+        require_unit(look.gravity(), read.path)
         poses = extract_poses(read, unit.sensor, self._records)
         if self._table:
             poses = with_table_angles(poses, str(self._table))
-        return (
-            poses,
-            estimate_filters(read, unit.sensor, poses),
-            neighbour_faults(read, unit.sensor),
-        )
+        return poses, estimate_filters(read, unit.sensor, poses), look.neighbour_faults()
 
 
 _ONE_RECORDING = '--journal, --poses and --means: one of them names the rests of one recording'

@@ -40,6 +40,18 @@ class Interval:
     obstacle: str = ''  # Why the sensor of the samples is still unknown, or ''
 
 
+def _side_text(sensor: Sensor) -> str:
+    """Return which way up a calibrated sensor of two axes is taken to be; '' for others."""
+    if sensor.axes != 'xy' or not sensor.effects:
+        return ''
+    if sensor.z_sign:
+        return f'; its z points {"up" if sensor.z_sign > 0 else "down"}, as sensor.z_sign states'
+    return (
+        '; its z is taken to point up, or down where mounting.rpy_rad turns it over: '
+        'sensor.z_sign states it'
+    )
+
+
 class CompensationPolicy:
     """
     Decides which calibration applies to a stream, and whether it applies at all.
@@ -90,7 +102,7 @@ class CompensationPolicy:
             if sensor.effects
             else f'{sensor.serial}, which is not calibrated'
         )
-        return f'compensating by {source}: {model}'
+        return f'compensating by {source}: {model}{_side_text(sensor)}'
 
     def assess(self) -> bool:
         """Update `refusal` by the sensor and the stream; return whether it has changed."""

@@ -45,6 +45,10 @@ LARGEST_LATENCY_S = 0.1
 _SEARCH_STEP_S = 0.02
 """Step of the first search of a shift, s. Chosen: well below the largest latency."""
 _LONGEST_SEARCH = 1 << 20  # Largest number of its steps. Chosen: six hours
+_PART_S = 15.0
+"""Shortest part of a recording whose shift is looked for, s. Chosen: half of the shortest
+recording, so that each has two."""
+_MOST_PARTS = 8  # Most parts. Chosen: a step then shows in all but an eighth at either end
 _CORRELATED = 0.9
 """Correlation from which two motions are the same one. Chosen: noise of half the motion."""
 _SAME_CORRELATION = 0.01
@@ -119,14 +123,35 @@ _UNIT_RATIOS = {
 """Gain of an output in the wrong unit, and which unit it has instead of which."""
 
 
+DATA_FAULTS = {
+    'axis_inverted': 'an axis has the opposite sign',
+    'axis_swapped': 'two axes are swapped',
+    'clock_jump': 'a clock steps or runs backwards',
+    'constant': 'an axis does not change',
+    'encoder_sign': 'an angle has the opposite sign',
+    'gravity': 'gravity is missing at rest, as in linear acceleration',
+    'missing': 'many samples are no numbers',
+    'no_overlap': 'the reference has no time in common with the recording',
+    'reference': 'the reference is wrong, of another motion, or missing',
+    'saturated': 'many samples are at the end of the range',
+    'time_misaligned': 'one shift in time is needed that is no latency',
+    'too_short': 'too little can be compared; the status is insufficient',
+    'unit': 'readings, angles or stamps are in another unit',
+}
+"""Faults of the data by name, with their meaning."""
+
+
 @dataclass(eq=False)
 class DataFault(Exception):
     """A fault of the recording, with the recordings whose notes say more."""
 
-    name: str  # Name in the report: `verdict.data_fault`
+    name: str  # Name in the report, `verdict.data_fault`: one of `DATA_FAULTS`
     message: str  # What is wrong and what to do, one line
     status: str = 'bad_data'  # Status of the verdict: 'bad_data' or 'insufficient'
     comparisons: tuple[BaselineComparison, ...] = ()
+
+    def __post_init__(self) -> None:
+        assert self.name in DATA_FAULTS, 'a fault has a meaning for reports'
 
 
 def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> None:
@@ -170,6 +195,7 @@ def _align_force(
     """
     force, notes = sim.force, []
     assert isinstance(force, ForcePath)
+    _check_one_shift(recording, sensor, force)
     late_s = _find_shift(recording, sensor, force)
     shift = f'{abs(late_s):.4f} s {"late" if late_s > 0 else "early"}' if late_s else ''
     if late_s and may_shift:
@@ -198,6 +224,10 @@ def _align_force(
             f'{recording.time_s[-1]:.6g} s; {advice}',
         )
     if late_s and not may_shift:
+        # --align helps if one shift is right from begin to end.
+        shifted = force.shifted(-late_s)
+        compared = _covered(recording, shifted)[0]
+        _check_simulator(compare(compared, sensor, replace(sim, force=shifted)))
         raise DataFault(
             'time_misaligned',
             f'{force.name} is {shift}; use --align, or shift its stamps by {-late_s:+.6g} s',
@@ -224,21 +254,115 @@ def _covered(recording: Recording, force: ForcePath) -> tuple[Recording, float, 
     )
 
 
+class _Motions(NamedTuple):
+    """The motion of a recording, and that of a simulator, at even instants."""
+
+    measured_s: np.ndarray  # Instants of the recording, s, (n,)
+    measured_g: np.ndarray  # Its readings, g, (n, m)
+    stated_s: np.ndarray  # Instants of the simulator, s, (n',)
+    stated_g: np.ndarray  # Its force, g, (n', m)
+    step_s: float  # Time between two instants, s
+
+
+def _motions(recording: Recording, sensor: Sensor, force: ForcePath) -> _Motions | None:
+    """Return both motions, coarse enough for a search over all shifts; None without samples."""
+    measured_g = (recording.volts(sensor) - sensor.zero_g_v) / sensor.scale_v_per_g
+    finite = np.isfinite(measured_g).all(axis=1)
+    if finite.sum() < 2:
+        return None
+    time_s, sim_s = recording.time_s[finite], force.time_s
+    step_s = max(_SEARCH_STEP_S, (np.ptp(time_s) + np.ptp(sim_s)) / _LONGEST_SEARCH)
+    measured_s, stated_s = (np.arange(t[0], t[-1], step_s) for t in (time_s, sim_s))
+    return _Motions(
+        measured_s,
+        np.column_stack([np.interp(measured_s, time_s, g) for g in measured_g[finite].T]),
+        stated_s,
+        np.column_stack(force(stated_s))[:, : measured_g.shape[1]] / G0_MPS2,
+        step_s,
+    )
+
+
+class _PartShift(NamedTuple):
+    """The shift at which the motion of a part of a recording fits best."""
+
+    best: int  # Index of that shift
+    lags_s: np.ndarray  # How much later the simulator is stamped, by index, s
+    correlation: np.ndarray  # How well the part fits, by index
+
+    @property
+    def late_s(self) -> float:
+        """Return the best shift, s."""
+        return float(self.lags_s[self.best])
+
+    def fits(self, late_s: float) -> bool:
+        """Return whether the part fits at a shift as well."""
+        return bool(self.correlation[np.argmin(np.abs(self.lags_s - late_s))] > _CORRELATED)
+
+    def contradicts(self, other: _PartShift) -> bool:
+        """Return whether neither part fits at the shift of the other."""
+        return (
+            abs(self.late_s - other.late_s) > LARGEST_LATENCY_S
+            and not self.fits(other.late_s)
+            and not other.fits(self.late_s)
+        )
+
+
+def _check_one_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> None:
+    """Refuse motions whose parts fit at different shifts only: one of their clocks steps."""
+    motions = _motions(recording, sensor, force)
+    if motions is None:
+        return
+    count = min(int(np.ptp(recording.time_s) / _PART_S), _MOST_PARTS)
+    levels: list[list[_PartShift]] = []  # Parts in a row of which one shift may be that of all
+    for rows in np.array_split(np.arange(len(motions.measured_s)), max(count, 1)):
+        lags, _, correlation = _correlations(motions.measured_g[rows], motions.stated_g, len(rows))
+        lags_s = motions.stated_s[0] - motions.measured_s[rows[0]] + lags * motions.step_s
+        part = _PartShift(int(np.argmax(correlation)), lags_s, correlation)
+        if not part.fits(part.late_s):
+            continue
+        if levels and not part.contradicts(levels[-1][-1]):
+            levels[-1].append(part)
+        else:
+            levels.append([part])
+    if len(levels) < 2:
+        return
+    # The part in which the clock steps fits less well than the others.
+    before_s, after_s = (
+        max(level, key=lambda part: float(part.correlation.max())).late_s for level in levels[:2]
+    )
+    raise DataFault(
+        'clock_jump',
+        f'the clock of {force.name} or that of the recording steps by '
+        f'{abs(after_s - before_s):.2g} s at about '
+        f'{_time_of_step(motions, before_s, after_s):.4g} s; cut the recording there, and '
+        'diagnose each part with --align',
+    )
+
+
+def _time_of_step(motions: _Motions, before_s: float, after_s: float) -> float:
+    """Return from when on the second of two shifts explains the recording better, s."""
+    left_g2 = []
+    for late_s in (before_s, after_s):
+        stated_g = [
+            np.interp(motions.measured_s + late_s, motions.stated_s, axis_g)
+            for axis_g in motions.stated_g.T
+        ]
+        left_g2.append(((motions.measured_g - np.column_stack(stated_g)) ** 2).sum(axis=1))
+    better = np.cumsum(left_g2[0] - left_g2[1])
+    return float(motions.measured_s[np.argmin(better)])
+
+
 def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> float | None:
     """
     Return how much later a simulator is stamped, s, by the cross-correlation of both motions.
 
     None where it may be a latency, or does not show.
     """
-    measured_g = recording.volts(sensor) / sensor.nominal_scale_v_per_g
-    finite = np.isfinite(measured_g).all(axis=1)
-    if finite.sum() < 2:
+    motions = _motions(recording, sensor, force)
+    if motions is None:
         return None
-    time_s, sim_s = recording.time_s[finite], force.time_s
-    step_s = max(_SEARCH_STEP_S, (np.ptp(time_s) + np.ptp(sim_s)) / _LONGEST_SEARCH)
-    first_s, second_s = (np.arange(t[0], t[-1], step_s) for t in (time_s, sim_s))
-    first = np.column_stack([np.interp(first_s, time_s, g) for g in measured_g[finite].T])
-    second = np.column_stack(force(second_s))[:, : first.shape[1]] / G0_MPS2
+    time_s, sim_s, step_s = recording.time_s, force.time_s, motions.step_s
+    first_s, first, second_s, second = motions[:4]
     shortest_s = min(SHORTEST_S, np.ptp(time_s) / 2, np.ptp(sim_s) / 2)
     lags, overlap, correlation = _correlations(first, second, max(round(shortest_s / step_s), 2))
     lags_s = second_s[0] - first_s[0] + lags * step_s

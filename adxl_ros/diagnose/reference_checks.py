@@ -133,7 +133,7 @@ def clock_step(comparison: BaselineComparison) -> str | None:
     return (
         f'the clock of {force.name} steps by {abs(step_s):.2g} s between '
         f'{delays[place - 1].time_s:.4g} and {delays[place].time_s:.4g} s, beside that of '
-        'the recording; simulate with one clock, or cut both there and diagnose the parts'
+        'the recording; cut the recording there, and diagnose each part with --align'
     )
 
 

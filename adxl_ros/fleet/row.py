@@ -78,6 +78,7 @@ COLUMNS: tuple[Column, ...] = (
     Column('outcome', 'text', f'one of {", ".join(OUTCOMES)}'),
     Column('refusal', 'text', 'why there is no result, in one line'),
     Column('refused_by', 'text', 'the task that refused; stage or read before the first one'),
+    Column('assumed', 'texts', 'what is assumed of temperature, supply and power-on'),
     Column('skipped', 'texts', 'tasks that do not fit the recording, with the reason'),
     Column('axes', 'text', 'measured axes: x, xy or xyz'),
     Column('duration_s', 'float', 'time from the first to the last sample', 's'),

@@ -26,6 +26,7 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.calibration_store import sha256
 from adxl_ros.files.recording_columns import NO_UNIT, Recording
+from adxl_ros.files.surroundings import assumed
 from adxl_ros.fleet import inputs
 from adxl_ros.fleet.inputs import begin_of, Source
 from adxl_ros.fleet.row import (
@@ -38,6 +39,7 @@ from adxl_ros.fleet.row import (
     sha256_of,
 )
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import code_version, package_version
 from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
 import numpy as np
@@ -356,6 +358,11 @@ class _Job:
             recording.read(self._staged.path, self._recipe.reading), path=self._source.url
         )
 
+    def _put_assumed(self, sensor: Sensor) -> None:
+        """Add what a task assumes of the surroundings that effects of a sensor follow."""
+        new = assumed(self._recording, sensor.effects)
+        self.row['assumed'] = list(dict.fromkeys([*self.row['assumed'], *new]))
+
     def _noise(self) -> None:
         """Find the noise of the longest rest."""
         from adxl_ros.api.noise import noise  # the client needs none
@@ -382,6 +389,7 @@ class _Job:
 
         found = fit(self._recording, self._params, data_sha256=self._staged.content)
         fitted = found.sensor
+        self._put_assumed(fitted)
         stds = dict(zip(fitted.covariance_names, np.sqrt(np.diag(fitted.covariance)).tolist()))
         for name, unit_name, coefficient, values in (
             ('zero_g', 'v', ('bias', 'offset_v'), fitted.zero_g_v),
@@ -404,6 +412,7 @@ class _Job:
         found = diagnose(self._recording, self._params)
         # The report names the file, and not the copy of the task.
         found = found.with_params(self._parameters.name if self._params else '')
+        self._put_assumed(found.sensor)
         self._put_verdict(found.to_dict())
         self.files |= {
             name: text.encode()

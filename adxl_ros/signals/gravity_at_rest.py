@@ -82,6 +82,7 @@ UNITS = (
     ReadingUnit('cm/s²', 1e2 * G0_MPS2, 'divide the readings by 100'),
     ReadingUnit('ft/s²', G0_MPS2 / 0.3048, 'multiply the readings by 0.3048'),
     ReadingUnit('m/s² divided by 1000', 1e-3 * G0_MPS2, 'multiply the readings by 1000'),
+    ReadingUnit('g divided by 1000', 1e-3, f'multiply the readings by {1e3 * G0_MPS2:g}'),
     ReadingUnit('m/s² that were stated as g', G0_MPS2**2, 'state it by --unit mps2'),
     *(
         ReadingUnit(

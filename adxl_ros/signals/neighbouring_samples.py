@@ -10,9 +10,7 @@ single wrong samples.
 
 from __future__ import annotations
 
-from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _FEWEST_RUNS = 20
@@ -254,13 +252,6 @@ class NeighbouringSamples:
             f'them, the first at {self._spike_s[0]:.6g} s: error values of the bus, a loose '
             'contact, or shocks shorter than a sample'
         )
-
-
-def neighbour_faults(read: Recording, unit: Sensor) -> list[str]:
-    """Return what is wrong between the samples of a whole recording, one line each."""
-    neighbours = NeighbouringSamples(unit.axes, read.rate_hz)
-    neighbours.feed(read.time_s, read.accel_mps2(unit))
-    return neighbours.faults()
 
 
 def _turn_rad(first: np.ndarray, second: np.ndarray) -> float:

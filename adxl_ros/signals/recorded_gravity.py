@@ -7,7 +7,7 @@ from __future__ import annotations
 from adxl_ros.files.recording_columns import Recording, uncalibrated
 from adxl_ros.model.constants import TINY
 from adxl_ros.model.sensor import Sensor, to_volts
-from adxl_ros.signals.gravity_at_rest import GravityAtRest, of_volts, TURNED_COS
+from adxl_ros.signals.gravity_at_rest import GravityAtRest, GravityFaultKind, of_volts, TURNED_COS
 from adxl_ros.signals.neighbouring_samples import NeighbouringSamples
 from adxl_ros.signals.rest_detection import datasheet_noise, RecordedRests, RestFinder, RestMean
 import numpy as np
@@ -30,9 +30,21 @@ class RecordingLook:
         self._neighbours.feed(block.time_s, block.accel_mps2(self.unit))
 
     def gravity(self) -> GravityAtRest:
-        """Return the length of gravity over the rests so far."""
+        """
+        Return the length of gravity over the rests so far.
+
+        In a small unit even motion is below the noise that is stated for the sensor, so that no
+        rest of it reads gravity: then rests by the noise of the readings themselves tell the unit.
+        """
         self.rests.take()
-        rests = self.rests.detected
+        gravity = self._look(self.rests.detected)
+        if gravity.fault is not None and gravity.fault.kind is GravityFaultKind.REMOVED:
+            by_own_noise = self._look(self.rests.by_own_noise())
+            if by_own_noise.fault is not None and by_own_noise.fault.is_unit:
+                return by_own_noise
+        return gravity
+
+    def _look(self, rests: list[RestMean]) -> GravityAtRest:
         shape = len(rests), len(self.unit.axes)
         mean_v = np.reshape([rest.mean_v for rest in rests], shape)
         std_v = np.reshape([rest.std_v for rest in rests], shape)
@@ -78,7 +90,7 @@ class LiveLook:
         volts = to_volts(accel_mps2[:, : len(sensor.axes)], sensor)
         by_stream = self._look(
             sensor,
-            RestFinder(rate_hz, len(sensor.axes), datasheet_noise(sensor), learn=True),
+            RestFinder(rate_hz, len(sensor.axes)),
             time_s,
             volts,
         )

@@ -15,6 +15,7 @@ that of the datasheet, learned from the quietest parts of the stream, or the lar
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -263,6 +264,12 @@ class RestFinder:
         """Return the rests so far; the last rest may not have ended yet."""
         return list(self._detect()[1])
 
+    def by_own_noise(self) -> RestFinder:
+        """Return a finder of the same samples that only uses the noise that they show."""
+        other = copy(self)
+        other.noise, other.learn, other._result = None, True, None
+        return other
+
     def forget(self) -> None:
         """Keep the newest blocks only, in which a drift may begin."""
         self._parts, self._result = [self.blocks()[-self._spans.longest :]], None
@@ -475,6 +482,12 @@ class RecordedRests:
             self.take()
             self._finder.forget()
             self._taken_s = float(block.time_s[-1])
+
+    def by_own_noise(self) -> list[RestMean]:
+        """Return the rests of the newest hour by the noise that the samples show alone."""
+        finder = self._finder.by_own_noise()
+        rests = finder.rests()
+        return [RestMean(*found) for found in zip(rests, *finder.means(rests))]
 
     def take(self) -> None:
         """Add the newest rests to `detected`; what was found twice is one rest."""

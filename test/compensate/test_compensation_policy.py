@@ -64,6 +64,14 @@ def test_the_source_of_a_calibration_is_stated_in_one_line() -> None:
     assert policy.use(unit(), 'the file').startswith('compensating by the file: 17, model ')
 
 
+@pytest.mark.parametrize(('z_sign', 'side'), [(0, 'up, or down'), (1, 'up,'), (-1, 'down,')])
+def test_the_side_that_a_sensor_of_two_axes_is_taken_for_is_stated(z_sign: int, side: str) -> None:
+    policy = CompensationPolicy(False, '', '/{}'.format)
+    assert f'point {side}' in policy.use(replace(unit(), z_sign=z_sign), 'a file').replace(
+        'points', 'point'
+    )
+
+
 @pytest.mark.parametrize(
     ('key', 'value', 'reason'),
     [

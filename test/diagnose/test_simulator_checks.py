@@ -3,6 +3,7 @@
 """What is wrong with another simulator, or was not measured, is named for its own reason."""
 
 from dataclasses import replace
+import re
 
 from adxl_ros.diagnose.data_checks import compare_checked, DataFault
 from adxl_ros.files import recording
@@ -54,7 +55,7 @@ class Carried:
         columns = {f'{axis}_v': v for axis, v in zip('xyz', volts.T)}
         return Recording('carried', self.time_s, columns, sensor_info(sensor))
 
-    def beside(self, folder, recorded, force=None, time_s=None):
+    def beside(self, folder, recorded, force=None, time_s=None, may_shift=False):
         """Put a recording beside a simulator."""
         time_s = self.time_s if time_s is None else time_s
         rows = [time_s, self.force() if force is None else force]
@@ -67,7 +68,7 @@ class Carried:
             header='time_s,ax_mps2,ay_mps2,az_mps2',
         )
         sim = motion_from_force(recording.read_ideal(folder / 'sim.csv'), False)[0]
-        return compare_checked(recorded, replace(nominal('xyz'), rate_hz=RATE_HZ), sim, False)
+        return compare_checked(recorded, replace(nominal('xyz'), rate_hz=RATE_HZ), sim, may_shift)
 
 
 @pytest.mark.parametrize('factor', [0.5, 1.5, 4.0])
@@ -101,6 +102,35 @@ def test_a_step_of_the_simulators_clock_is_named(tmp_path, step_s, fault):
         assert raised.name == fault and f'{step_s:g} s' in raised.message
     else:
         assert fault is None
+
+
+def only(recorded: Recording, rows: np.ndarray) -> Recording:
+    """Return some rows, (n,) bool, of a recording."""
+    columns = {name: values[rows] for name, values in recorded.columns.items()}
+    return replace(recorded, time_s=recorded.time_s[rows], columns=columns)
+
+
+@pytest.mark.parametrize('step_s', [0.4, 3.0, -0.4])
+def test_the_advice_on_a_clock_that_steps_can_be_followed(tmp_path, step_s):
+    """No shift makes both parts fit; each of them fits with --align."""
+    carried = Carried()
+    recorded, at_s = carried.recorded(), SECONDS / 2
+    stamps_s = carried.time_s + step_s * (carried.time_s > at_s)
+    kept = (carried.time_s <= at_s) | (stamps_s > at_s)
+    stepped = only(replace(recorded, time_s=stamps_s), kept)
+    for may_shift in (False, True):
+        with pytest.raises(DataFault) as raised:
+            carried.beside(tmp_path, stepped, may_shift=may_shift)
+        assert raised.value.name == 'clock_jump' and '--align' in raised.value.message
+    # 0.1 s late, the force is wrong by more.
+    largest_mps2 = 10 * NOISE_MPS2
+    stated = re.search(r'(?:at about|between ([\d.]+) and) ([\d.]+) s', raised.value.message)
+    begin_s, end_s = float(stated[1] or stated[2]), float(stated[2])
+    for rows in (stepped.time_s < begin_s, stepped.time_s > end_s):
+        comparison = carried.beside(tmp_path, only(stepped, rows), may_shift=True)
+        residual_g = comparison.residual_v(comparison.sensor) / comparison.sensor.scale_v_per_g
+        used_g = residual_g[comparison.used]
+        assert np.sqrt(np.mean(used_g**2)) * G0_MPS2 < largest_mps2
 
 
 @pytest.mark.parametrize('size_g, count', [(24.0, 8), (2.0, 60), (0.2, 30)])

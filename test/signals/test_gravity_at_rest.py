@@ -264,3 +264,17 @@ def test_volts_are_judged_by_the_nominal_values() -> None:
 @pytest.mark.parametrize('path', sorted(REAL.glob('*.csv')) if REAL.is_dir() else [], ids=str)
 def test_real_recordings_are_sound(path: Path) -> None:
     assert check_recording(str(path), None, recording.ReadingOptions()).faults == ()
+
+
+@pytest.mark.parametrize('name', ['m/s² divided by 1000', 'g divided by 1000'])
+def test_a_unit_in_which_motion_is_below_the_stated_noise(name: str) -> None:
+    """By the noise of the sensor all of it is one rest, whose mean is of no orientation."""
+    unit = replace(sensor(), noise_density_g_per_rthz=np.full(3, 4e-4), unstated=())
+    time_s, force = tumble(100.0)
+    made = read(
+        time_s, force * {'m/s² divided by 1000': 1e-3, 'g divided by 1000': 1e-3 / G}[name]
+    )
+    taken = RecordingLook(unit, made)
+    taken.feed(made)
+    fault = taken.gravity().fault
+    assert fault is not None and fault.unit == name

@@ -134,6 +134,7 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
         Input('model', 'A, held-out errors', mg(model), 'mg', model),
         _local_gravity(gravity, reference),
         *(_surroundings(name, fitted, held, reference) for name in _SURROUNDINGS),
+        *_next_degree(fitted, held),
     )
     return Uncertainty(
         fitted.axes,
@@ -229,6 +230,23 @@ def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray)
             + (reference * fitted.envelope.scale_per_k) ** 2
         )
     return Input(name, kind, std, unit, np.abs(np.nan_to_num(slope)) * std)
+
+
+def _next_degree(fitted: Sensor, held: Poses) -> list[Input]:
+    """Return what a polynomial over temperature lacks, as `Envelope` has it; none without one."""
+    std_g = fitted.envelope.zero_g_std_g(held.environment.temperature_c)
+    if not std_g:
+        return []
+    contribution_mps2 = G0_MPS2 * np.abs(np.broadcast_to(np.transpose(std_g), held.volts.shape))
+    return [
+        Input(
+            'zero-g over temperature',
+            'A, next degree of its polynomial',
+            mg(contribution_mps2),
+            'mg',
+            contribution_mps2,
+        )
+    ]
 
 
 def section(found: Uncertainty | None) -> dict[str, Any] | None:

@@ -194,3 +194,23 @@ def validate(path):
     for address, name in IMPORTS.items():
         text = text.replace(address, str(SCHEMA / name))
     etree.XMLSchema(etree.fromstring(text.encode())).assertValid(etree.parse(str(path)))
+
+
+def test_what_a_polynomial_over_temperature_lacks_is_a_part_of_the_uncertainty(found):
+    """The stated deviation of the corrected acceleration holds the same."""
+    result, table = found
+    envelope = replace(
+        result.fitted.envelope,
+        temperature_c=(20.0, 60.0),
+        zero_g_nodes_c=(22.0, 40.0, 58.0),
+        zero_g_next=(1e-7, 2e-7),
+        zero_g_at_c=25.0,
+    )
+    poses = replace(result.poses, temperature_c=np.full(len(result.poses), 75.0))
+    fitted = replace(result.fitted, envelope=envelope)
+    wider = gum.uncertainty(replace(result, fitted=fitted, poses=poses))
+    added = G0_MPS2 * np.array(envelope.zero_g_std_g(75.0))
+    assert wider.inputs[-1].contribution_mps2 == pytest.approx(
+        np.tile(np.abs(added), (len(wider.alpha_rad), 1))
+    )
+    assert (wider.combined_mps2 > table.combined_mps2).all()
