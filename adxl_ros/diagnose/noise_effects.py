@@ -215,11 +215,15 @@ def _stands_alone(volts: np.ndarray, smallest_v: np.ndarray, distance: int) -> n
     """Determine which samples deviate by so much, and more than those around them, (n,) bool."""
     deviation_v = _deviation_v(volts, distance)
     # A spike differs from the samples on both sides, and a pulse from those on one.
-    before_v, after_v = (np.abs(volts - np.roll(volts, d)) for d in (distance, -distance))
-    on_both_sides = 2 * np.minimum(before_v, after_v) > deviation_v
+    on_both_sides = 2 * _least_difference_v(volts, distance) > deviation_v
     # The neighbours of a spike deviate by half of it.
     highest_v = scipy.ndimage.maximum_filter1d(deviation_v, 2 * distance + 1)
     return (deviation_v > smallest_v) & on_both_sides & (deviation_v >= highest_v)
+
+
+def _least_difference_v(volts: np.ndarray, distance: int) -> np.ndarray:
+    """Return the smaller difference of each sample from those before and behind it, V, (n,)."""
+    return np.minimum(*(np.abs(volts - np.roll(volts, d)) for d in (distance, -distance)))
 
 
 def _spikes(
@@ -240,10 +244,14 @@ def _spikes(
         bridged_v = volts[:, d].copy()
         for distance in (_SPIKE_NEIGHBOUR, _OTHER_NEIGHBOUR):
             usual_v = _usual_deviation_v(volts[:, d], used, step_v, sensor.rate_hz, distance)
+            smallest_v = SPIKE_STDS * usual_v
+            # Over a larger distance, a pulse of some samples stands alone, too.
+            is_single = undisturbed
+            if distance > _SPIKE_NEIGHBOUR:
+                is_single = undisturbed & (_least_difference_v(volts[:, d], 1) > smallest_v)
             # A spike next to a larger one stands alone once that one is bridged.
             while True:
-                found = undisturbed & ~spikes
-                found &= _stands_alone(bridged_v, SPIKE_STDS * usual_v, distance)
+                found = is_single & ~spikes & _stands_alone(bridged_v, smallest_v, distance)
                 if not found.any():
                     break
                 spikes |= found

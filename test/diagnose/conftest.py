@@ -22,7 +22,7 @@ def diagnose_two_effects(folder):
         'simulate',
         'rich',
         '--rate',
-        '40',
+        '62.5',
         '--effect',
         'lever_arm:x_m=0.03,y_m=0.02',
         '--effect',
