@@ -567,11 +567,8 @@ def seen_step_rad(recording: Recording, sensor: Sensor) -> float:
         # Readings with decimals differ by one step more or less exactly.
         step_rad = float(few.sum() / np.rint(few / step_rad).sum())
         whole = np.abs(few / step_rad - np.rint(few / step_rad)) < _WHOLE
-        if (
-            whole.sum() >= _FEWEST_CHANGES
-            and whole.mean() > _WHOLE_SHARE
-            and _COARSER * largest_rad < step_rad < _LARGEST_STEP_RAD
-        ):
+        has_steps = whole.sum() >= _FEWEST_CHANGES and whole.mean() > _WHOLE_SHARE
+        if has_steps and _COARSER * largest_rad < step_rad < _LARGEST_STEP_RAD:
             largest_rad = step_rad
     return largest_rad
 

@@ -364,18 +364,15 @@ def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> float
     time_s, sim_s, step_s = recording.time_s, force.time_s, motions.step_s
     first_s, first, second_s, second = motions[:4]
     shortest_s = min(SHORTEST_S, np.ptp(time_s) / 2, np.ptp(sim_s) / 2)
-    lags, overlap, correlation = reference_checks.correlations(
-        first, second, max(round(shortest_s / step_s), 2)
-    )
-    lags_s = second_s[0] - first_s[0] + lags * step_s
+    found = reference_checks.correlations(first, second, max(round(shortest_s / step_s), 2))
+    lags_s, correlation = second_s[0] - first_s[0] + found.lags * step_s, found.correlation
     equal = np.flatnonzero(correlation > correlation.max() - _SAME_CORRELATION)
-    longest_s = lags_s[equal[np.argmax(overlap[equal])]]
+    longest_s = lags_s[equal[np.argmax(found.overlap[equal])]]
     best = int(np.argmax(np.where(np.abs(lags_s - longest_s) < 1.0, correlation, -1.0)))
     unshifted = int(np.argmin(np.abs(lags_s)))
-    if correlation[best] < _CORRELATED or (
-        abs(lags_s[unshifted]) < step_s
-        and 1 - correlation[best] > _LARGEST_ERROR_RATIO * (1 - correlation[unshifted])
-    ):
+    overlaps_unshifted = abs(lags_s[unshifted]) < step_s
+    gains_little = 1 - correlation[best] > _LARGEST_ERROR_RATIO * (1 - correlation[unshifted])
+    if correlation[best] < _CORRELATED or (overlaps_unshifted and gains_little):
         return None
     late_s = _fine_shift(recording, sensor, force, float(lags_s[best]))
     return late_s if abs(late_s) > LARGEST_LATENCY_S else None
@@ -549,13 +546,10 @@ def _check_clock(recording: Recording) -> None:
             f'{time_s[wide[0]]:.6g} s; cut the recording there, and diagnose the '
             'parts together',
         )
-    if (
-        step_s > _LONGEST_STEP_S
-        and angles_rad is not None
-        and np.any(
-            np.nanmax(angles_rad, axis=0) - np.nanmin(angles_rad, axis=0) >= _SMALLEST_MOVE_RAD
-        )
-    ):
+    if angles_rad is None or step_s <= _LONGEST_STEP_S:
+        return
+    range_rad = np.nanmax(angles_rad, axis=0) - np.nanmin(angles_rad, axis=0)
+    if np.any(range_rad >= _SMALLEST_MOVE_RAD):
         raise DataFault(
             'unit',
             f'time_s: {step_s:.3g} s between samples while the stage moves, '
@@ -654,9 +648,9 @@ def _check_encoder(recording: Recording, sensor: Sensor) -> None:
         )
     inverted = [name for name, factor in zip(names, factors) if factor < 0]
     mirrored = _mirrored_axes(readings, factors)
-    if len(mirrored) < len(inverted) or (
-        len(mirrored) == len(inverted) and _zero_g_is_mirrored(readings, factors, sensor)
-    ):
+    # As many axes as angles may be inverted instead, and their zero-g is then mirrored.
+    missing = len(inverted) - len(mirrored)
+    if missing > 0 or (not missing and _zero_g_is_mirrored(readings, factors, sensor)):
         return
     joined = ' and '.join(inverted)
     axes = ' and '.join(sensor.axes[d] for d in mirrored)

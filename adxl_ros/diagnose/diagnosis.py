@@ -222,11 +222,8 @@ def _material_left_out(
         for part in comparison.left_out:
             # Knocks look like lone samples, and a reference that is smoother lacks them.
             is_knock = bool(part.effect) and comparison.fading_hz is not None
-            if (
-                part.effect not in verdict.named
-                and not is_knock
-                and part.squares_mps2 > verdict.material_mps2**2 * len(comparison)
-            ):
+            is_material = part.squares_mps2 > verdict.material_mps2**2 * len(comparison)
+            if is_material and not is_knock and part.effect not in verdict.named:
                 parts.append(part)
     return tuple(parts)
 
@@ -376,21 +373,21 @@ def _named_sensor(
     if not verdict.closes:
         return baseline
     fitted, sensor = best.sensor, with_neutral(baseline, best.effects)
+    from_file = with_neutral(baseline, fitted.effects)
+    smallest_v = verdict.material_mps2 / G0_MPS2 * baseline.scale_v_per_g.min()
+
+    def has_changed(effect: str) -> bool:
+        before = from_file.values[effect]
+        changes_v = [value - before[name] for name, value in fitted.values[effect].items()]
+        return any(np.abs(change_v).max() > smallest_v for change_v in changes_v)
+
     if best.effects:
-        from_file = with_neutral(baseline, fitted.effects)
-        smallest_v = verdict.material_mps2 / G0_MPS2 * baseline.scale_v_per_g.min()
         straight = [
             e
             for e in fitted.effects
-            if effect_named(e).diagnosis.straight_line
-            and e not in best.effects
-            and (
-                e in baseline.effects
-                or any(
-                    np.abs(value - from_file.values[e][p]).max() > smallest_v
-                    for p, value in fitted.values[e].items()
-                )
-            )
+            if e not in best.effects
+            and effect_named(e).diagnosis.straight_line
+            and (e in baseline.effects or has_changed(e))
         ]
         sensor = with_neutral(sensor, straight)
         sensor = _as_printed(

@@ -84,11 +84,9 @@ def wrong_dynamic_factor(comparison: BaselineComparison) -> str | None:
     )
     factor = float(np.exp(best))
     left_g = length_error_g(best) / abs(factor - 1)
-    if (
-        abs(factor - 1) < _RIGHT_FACTOR
-        or left_g > _SAME_LENGTH * dynamics_g
-        or length_error_g(best) > _SAME_LENGTH * gap_g
-    ):
+    is_right = abs(factor - 1) < _RIGHT_FACTOR
+    largest_left = _SAME_LENGTH * min(dynamics_g * abs(factor - 1), gap_g)
+    if is_right or length_error_g(best) > largest_left:
         return None
     return (
         f'the dynamic part of {force.name} is {factor:.2g} times that of the recording, while '
@@ -162,23 +160,28 @@ def _delay_samples(own: np.ndarray, other: np.ndarray) -> float | None:
     """Return the place in `other`, samples, where `own`, g, fits best; None where none fits."""
     if rms(own) < SMALLEST_MOTION_G:
         return None
-    lags, _, correlation = correlations(own, other, len(own))
-    best = int(np.argmax(correlation))
-    around = correlation[best - 1 : best + 2]
-    if correlation[best] < _FOLLOWS or around.min() < 0:
+    found = correlations(own, other, len(own))
+    best = int(np.argmax(found.correlation))
+    around = found.correlation[best - 1 : best + 2]
+    if found.correlation[best] < _FOLLOWS or around.min() < 0:
         return None
     left, middle, right = 1 - around
-    return float(lags[best] + (left - right) / (2 * (left - 2 * middle + right)))
+    return float(found.lags[best] + (left - right) / (2 * (left - 2 * middle + right)))
 
 
-def correlations(
-    first: np.ndarray, second: np.ndarray, smallest: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+class Correlations(NamedTuple):
+    """Correlations of two motions by lag, (lags,) each."""
+
+    lags: np.ndarray  # Sample i of the first meets sample i + lag of the second
+    overlap: np.ndarray  # Number of samples that overlap
+    correlation: np.ndarray  # −1 where too few overlap, or one does not move
+
+
+def correlations(first: np.ndarray, second: np.ndarray, smallest: int) -> Correlations:
     """
     Correlate two motions, g, (n, m) and (n', m), at all lags, each over the samples that overlap.
 
-    Sample i of the first meets sample i + lag of the second. Return lags, counts of samples that
-    overlap, and correlations, −1 where fewer than `smallest` overlap or one does not move.
+    At least `smallest` samples must overlap.
     """
 
     def products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -195,7 +198,7 @@ def correlations(
     smallest_square = SMALLEST_MOTION_G**2 * overlap
     compared = (overlap >= smallest) & (squares > smallest_square).all(axis=0)
     correlation = covariance / np.sqrt(np.maximum(squares, smallest_square).prod(axis=0))
-    return (
+    return Correlations(
         scipy.signal.correlation_lags(len(second), len(first)),
         overlap,
         np.where(compared, correlation, -1.0),
