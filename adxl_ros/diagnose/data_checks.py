@@ -263,6 +263,12 @@ class _Motions(NamedTuple):
     stated_g: np.ndarray  # Its force, g, (n', m)
     step_s: float  # Time between two instants, s
 
+    def shifts(self, rows: np.ndarray, smallest: int) -> _Shifts:
+        """Correlate a part of the recording, rows, with the simulator at all shifts."""
+        found = reference_checks.correlations(self.measured_g[rows], self.stated_g, smallest)
+        lags_s = self.stated_s[0] - self.measured_s[rows[0]] + found.lags * self.step_s
+        return _Shifts(lags_s, found.overlap, found.correlation)
+
 
 def _motions(recording: Recording, sensor: Sensor, force: ForcePath) -> _Motions | None:
     """Return both motions, coarse enough for a search over all shifts; None without samples."""
@@ -282,23 +288,23 @@ def _motions(recording: Recording, sensor: Sensor, force: ForcePath) -> _Motions
     )
 
 
-class _PartShift(NamedTuple):
-    """The shift at which the motion of a part of a recording fits best."""
+class _Shifts(NamedTuple):
+    """How well a part of a recording fits a simulator, by shift, (lags,) each."""
 
-    best: int  # Index of that shift
-    lags_s: np.ndarray  # How much later the simulator is stamped, by index, s
-    correlation: np.ndarray  # How well the part fits, by index
+    lags_s: np.ndarray  # How much later the simulator is stamped, s
+    overlap: np.ndarray  # Number of instants that overlap
+    correlation: np.ndarray  # −1 where too few overlap
 
     @property
     def late_s(self) -> float:
         """Return the best shift, s."""
-        return float(self.lags_s[self.best])
+        return float(self.lags_s[np.argmax(self.correlation)])
 
     def fits(self, late_s: float) -> bool:
         """Return whether the part fits at a shift as well."""
         return bool(self.correlation[np.argmin(np.abs(self.lags_s - late_s))] > _CORRELATED)
 
-    def contradicts(self, other: _PartShift) -> bool:
+    def contradicts(self, other: _Shifts) -> bool:
         """Return whether neither part fits at the shift of the other."""
         return (
             abs(self.late_s - other.late_s) > LARGEST_LATENCY_S
@@ -313,11 +319,9 @@ def _check_one_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> 
     if motions is None:
         return
     count = min(int(np.ptp(recording.time_s) / _PART_S), _MOST_PARTS)
-    levels: list[list[_PartShift]] = []  # Parts in a row of which one shift may be that of all
+    levels: list[list[_Shifts]] = []  # Parts in a row of which one shift may be that of all
     for rows in np.array_split(np.arange(len(motions.measured_s)), max(count, 1)):
-        lags, _, correlation = _correlations(motions.measured_g[rows], motions.stated_g, len(rows))
-        lags_s = motions.stated_s[0] - motions.measured_s[rows[0]] + lags * motions.step_s
-        part = _PartShift(int(np.argmax(correlation)), lags_s, correlation)
+        part = motions.shifts(rows, len(rows))
         if not part.fits(part.late_s):
             continue
         if levels and not part.contradicts(levels[-1][-1]):
@@ -361,16 +365,15 @@ def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> float
     motions = _motions(recording, sensor, force)
     if motions is None:
         return None
-    time_s, sim_s, step_s = recording.time_s, force.time_s, motions.step_s
-    first_s, first, second_s, second = motions[:4]
-    shortest_s = min(SHORTEST_S, np.ptp(time_s) / 2, np.ptp(sim_s) / 2)
-    found = reference_checks.correlations(first, second, max(round(shortest_s / step_s), 2))
-    lags_s, correlation = second_s[0] - first_s[0] + found.lags * step_s, found.correlation
+    shortest_s = min(SHORTEST_S, np.ptp(recording.time_s) / 2, np.ptp(force.time_s) / 2)
+    every = np.arange(len(motions.measured_s))
+    shifts = motions.shifts(every, max(round(shortest_s / motions.step_s), 2))
+    lags_s, correlation = shifts.lags_s, shifts.correlation
     equal = np.flatnonzero(correlation > correlation.max() - _SAME_CORRELATION)
-    longest_s = lags_s[equal[np.argmax(found.overlap[equal])]]
+    longest_s = lags_s[equal[np.argmax(shifts.overlap[equal])]]
     best = int(np.argmax(np.where(np.abs(lags_s - longest_s) < 1.0, correlation, -1.0)))
     unshifted = int(np.argmin(np.abs(lags_s)))
-    overlaps_unshifted = abs(lags_s[unshifted]) < step_s
+    overlaps_unshifted = abs(lags_s[unshifted]) < motions.step_s
     gains_little = 1 - correlation[best] > _LARGEST_ERROR_RATIO * (1 - correlation[unshifted])
     if correlation[best] < _CORRELATED or (overlaps_unshifted and gains_little):
         return None
@@ -840,16 +843,16 @@ def _check_axes(comparison: BaselineComparison) -> None:
     moving = np.flatnonzero(simulated_g.std(axis=0) > SMALLEST_MOTION_G)
     if not len(moving):
         return
-    lags, _, by_lag = reference_checks.correlations(
+    found = reference_checks.correlations(
         simulated_g, np.nan_to_num(measured_g), 2 * len(simulated_g) // 3
     )
-    by_lag = np.where(np.abs(lags) <= _LARGEST_DELAY_S * sensor.rate_hz, by_lag, -1.0)
+    is_searched = np.abs(found.lags) <= _LARGEST_DELAY_S * sensor.rate_hz
+    by_lag = np.where(is_searched, found.correlation, -1.0)
     best = int(np.argmax(by_lag))
-    delay_s = lags[best] / sensor.rate_hz
-    if (
-        by_lag[best] > max(_CORRELATED, by_lag[lags == 0][0] + _CORRELATION_GAIN)
-        and abs(delay_s) > _SEARCHED_DELAY_S
-    ):
+    delay_s = found.lags[best] / sensor.rate_hz
+    undelayed = by_lag[found.lags == 0][0]
+    is_clear = by_lag[best] > max(_CORRELATED, undelayed + _CORRELATION_GAIN)
+    if is_clear and abs(delay_s) > _SEARCHED_DELAY_S:
         raise DataFault(
             'time_misaligned',
             f'the sensor is {abs(delay_s):.2f} s '
