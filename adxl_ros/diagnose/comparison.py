@@ -173,6 +173,11 @@ class BaselineComparison:
         return self.sensor.scale_v_per_g / G0_MPS2
 
     @property
+    def pose_known(self) -> bool:
+        """Whether a reference determines the motion."""
+        return self.reference is not Reference.NONE
+
+    @property
     def stated_force(self) -> ForcePath | None:
         """Force that another simulator or a robot states; None without one."""
         return self.motion.force if isinstance(self.motion.force, ForcePath) else None
@@ -233,9 +238,7 @@ class BaselineComparison:
         Without a reference the pose is unknown, and the mean of the residual is subtracted.
         """
         residual_v = self.volts - self.simulated_v(replace(sensor, rate_hz=self.sensor.rate_hz))
-        if self.reference is Reference.NONE:
-            return residual_v - np.nanmean(residual_v, axis=0)
-        return residual_v
+        return residual_v if self.pose_known else residual_v - np.nanmean(residual_v, axis=0)
 
     def simulated_noise_v(self, sensor: Sensor, seed: int) -> np.ndarray:
         """Draw a sensor's output about its own mean, V, (n, m)."""
@@ -320,7 +323,7 @@ def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
     span_s, rate_hz = max(comparison.span_s, 1.0), comparison.sensor.rate_hz
     motion = comparison.motion
     every = max(1, round(rate_hz / min(SEARCH_RATE_HZ, SEARCH_SAMPLES / span_s)))
-    if comparison.reference is not Reference.NONE:
+    if comparison.pose_known:
         motion = replace(
             motion, internal_rate_hz=min(_LOWEST_INTERNAL_RATE_HZ, _MOST_STEPS / span_s)
         )
@@ -564,11 +567,8 @@ def seen_step_rad(recording: Recording, sensor: Sensor) -> float:
         # Readings with decimals differ by one step more or less exactly.
         step_rad = float(few.sum() / np.rint(few / step_rad).sum())
         whole = np.abs(few / step_rad - np.rint(few / step_rad)) < _WHOLE
-        if (
-            whole.sum() >= _FEWEST_CHANGES
-            and whole.mean() > _WHOLE_SHARE
-            and _COARSER * largest_rad < step_rad < _LARGEST_STEP_RAD
-        ):
+        has_steps = whole.sum() >= _FEWEST_CHANGES and whole.mean() > _WHOLE_SHARE
+        if has_steps and _COARSER * largest_rad < step_rad < _LARGEST_STEP_RAD:
             largest_rad = step_rad
     return largest_rad
 

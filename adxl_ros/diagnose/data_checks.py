@@ -19,7 +19,7 @@ from os.path import basename
 from typing import NamedTuple
 
 from adxl_ros.diagnose import comparison as baseline, noise_effects, reference_checks
-from adxl_ros.diagnose.comparison import BaselineComparison, compare, Reference, SMALLEST_MOTION_G
+from adxl_ros.diagnose.comparison import BaselineComparison, compare, SMALLEST_MOTION_G
 from adxl_ros.files.recording_columns import JOINTS, Recording, stamped_rate_hz
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
@@ -263,6 +263,12 @@ class _Motions(NamedTuple):
     stated_g: np.ndarray  # Its force, g, (n', m)
     step_s: float  # Time between two instants, s
 
+    def shifts(self, rows: np.ndarray, smallest: int) -> _Shifts:
+        """Correlate a part of the recording, rows, with the simulator at all shifts."""
+        found = reference_checks.correlations(self.measured_g[rows], self.stated_g, smallest)
+        lags_s = self.stated_s[0] - self.measured_s[rows[0]] + found.lags * self.step_s
+        return _Shifts(lags_s, found.overlap, found.correlation)
+
 
 def _motions(recording: Recording, sensor: Sensor, force: ForcePath) -> _Motions | None:
     """Return both motions, coarse enough for a search over all shifts; None without samples."""
@@ -282,23 +288,23 @@ def _motions(recording: Recording, sensor: Sensor, force: ForcePath) -> _Motions
     )
 
 
-class _PartShift(NamedTuple):
-    """The shift at which the motion of a part of a recording fits best."""
+class _Shifts(NamedTuple):
+    """How well a part of a recording fits a simulator, by shift, (lags,) each."""
 
-    best: int  # Index of that shift
-    lags_s: np.ndarray  # How much later the simulator is stamped, by index, s
-    correlation: np.ndarray  # How well the part fits, by index
+    lags_s: np.ndarray  # How much later the simulator is stamped, s
+    overlap: np.ndarray  # Number of instants that overlap
+    correlation: np.ndarray  # −1 where too few overlap
 
     @property
     def late_s(self) -> float:
         """Return the best shift, s."""
-        return float(self.lags_s[self.best])
+        return float(self.lags_s[np.argmax(self.correlation)])
 
     def fits(self, late_s: float) -> bool:
         """Return whether the part fits at a shift as well."""
         return bool(self.correlation[np.argmin(np.abs(self.lags_s - late_s))] > _CORRELATED)
 
-    def contradicts(self, other: _PartShift) -> bool:
+    def contradicts(self, other: _Shifts) -> bool:
         """Return whether neither part fits at the shift of the other."""
         return (
             abs(self.late_s - other.late_s) > LARGEST_LATENCY_S
@@ -313,11 +319,9 @@ def _check_one_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> 
     if motions is None:
         return
     count = min(int(np.ptp(recording.time_s) / _PART_S), _MOST_PARTS)
-    levels: list[list[_PartShift]] = []  # Parts in a row of which one shift may be that of all
+    levels: list[list[_Shifts]] = []  # Parts in a row of which one shift may be that of all
     for rows in np.array_split(np.arange(len(motions.measured_s)), max(count, 1)):
-        lags, _, correlation = _correlations(motions.measured_g[rows], motions.stated_g, len(rows))
-        lags_s = motions.stated_s[0] - motions.measured_s[rows[0]] + lags * motions.step_s
-        part = _PartShift(int(np.argmax(correlation)), lags_s, correlation)
+        part = motions.shifts(rows, len(rows))
         if not part.fits(part.late_s):
             continue
         if levels and not part.contradicts(levels[-1][-1]):
@@ -361,53 +365,20 @@ def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> float
     motions = _motions(recording, sensor, force)
     if motions is None:
         return None
-    time_s, sim_s, step_s = recording.time_s, force.time_s, motions.step_s
-    first_s, first, second_s, second = motions[:4]
-    shortest_s = min(SHORTEST_S, np.ptp(time_s) / 2, np.ptp(sim_s) / 2)
-    lags, overlap, correlation = _correlations(first, second, max(round(shortest_s / step_s), 2))
-    lags_s = second_s[0] - first_s[0] + lags * step_s
+    shortest_s = min(SHORTEST_S, np.ptp(recording.time_s) / 2, np.ptp(force.time_s) / 2)
+    every = np.arange(len(motions.measured_s))
+    shifts = motions.shifts(every, max(round(shortest_s / motions.step_s), 2))
+    lags_s, correlation = shifts.lags_s, shifts.correlation
     equal = np.flatnonzero(correlation > correlation.max() - _SAME_CORRELATION)
-    longest_s = lags_s[equal[np.argmax(overlap[equal])]]
+    longest_s = lags_s[equal[np.argmax(shifts.overlap[equal])]]
     best = int(np.argmax(np.where(np.abs(lags_s - longest_s) < 1.0, correlation, -1.0)))
     unshifted = int(np.argmin(np.abs(lags_s)))
-    if correlation[best] < _CORRELATED or (
-        abs(lags_s[unshifted]) < step_s
-        and 1 - correlation[best] > _LARGEST_ERROR_RATIO * (1 - correlation[unshifted])
-    ):
+    overlaps_unshifted = abs(lags_s[unshifted]) < motions.step_s
+    gains_little = 1 - correlation[best] > _LARGEST_ERROR_RATIO * (1 - correlation[unshifted])
+    if correlation[best] < _CORRELATED or (overlaps_unshifted and gains_little):
         return None
     late_s = _fine_shift(recording, sensor, force, float(lags_s[best]))
     return late_s if abs(late_s) > LARGEST_LATENCY_S else None
-
-
-def _correlations(
-    first: np.ndarray, second: np.ndarray, smallest: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    Correlate two motions, g, (n, m) and (n', m), at all lags, each over the samples that overlap.
-
-    Sample i of the first meets sample i + lag of the second. Return lags, counts of samples that
-    overlap, and correlations, −1 where fewer than `smallest` overlap or one does not move.
-    """
-
-    def products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return scipy.signal.correlate(b, a, method='fft')
-
-    one, two = np.ones(len(first)), np.ones(len(second))
-    overlap = np.maximum(np.rint(products(one, two)), 1)
-    covariance, squares = np.zeros(len(overlap)), np.zeros((2, len(overlap)))
-    for a, b in zip((first - first.mean(axis=0)).T, (second - second.mean(axis=0)).T):
-        sum_a, sum_b = products(a, two), products(one, b)
-        covariance += np.abs(products(a, b) - sum_a * sum_b / overlap)
-        squares[0] += products(a * a, two) - sum_a**2 / overlap
-        squares[1] += products(one, b * b) - sum_b**2 / overlap
-    smallest_square = SMALLEST_MOTION_G**2 * overlap
-    compared = (overlap >= smallest) & (squares > smallest_square).all(axis=0)
-    correlation = covariance / np.sqrt(np.maximum(squares, smallest_square).prod(axis=0))
-    return (
-        scipy.signal.correlation_lags(len(second), len(first)),
-        overlap,
-        np.where(compared, correlation, -1.0),
-    )
 
 
 def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: float) -> float:
@@ -506,21 +477,17 @@ def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
     """Leave out what the sensor did not measure: no numbers, repeated, lone or stuck samples."""
     faults, sensor = noise_effects.sample_faults(comparison), comparison.sensor
     comparison = replace(comparison, disturbed=faults.repeated | faults.isolated)
-    comparison = baseline.leave_out(
-        comparison, ~np.isfinite(comparison.volts).all(axis=1), 'they are no numbers'
-    )
-    comparison = baseline.leave_out(
-        comparison,
-        faults.repeated,
-        'they repeat the one before',
-        noise_effects.effect_of(Detector.REPEATED_SAMPLES),
-    )
-    comparison = baseline.leave_out(
-        comparison,
-        faults.isolated,
-        'they stand alone, away from the samples around them',
-        noise_effects.effect_of(Detector.ISOLATED_SAMPLES),
-    )
+    for rows, reason, detector in (
+        (~np.isfinite(comparison.volts).all(axis=1), 'they are no numbers', None),
+        (faults.repeated, 'they repeat the one before', Detector.REPEATED_SAMPLES),
+        (
+            faults.isolated,
+            'they stand alone, away from the samples around them',
+            Detector.ISOLATED_SAMPLES,
+        ),
+    ):
+        effect = noise_effects.effect_of(detector) if detector else None
+        comparison = baseline.leave_out(comparison, rows, reason, effect)
     stuck = _stuck(comparison)
     for axis, rows in zip(sensor.axes, stuck.T):
         comparison = baseline.leave_out(
@@ -528,19 +495,14 @@ def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
         )
     beyond = comparison.out_of_range
     for d in np.flatnonzero(beyond.any(axis=0)):
-        output_g = (comparison.volts[beyond[:, d], d] - sensor.zero_g_v[d]) / sensor.scale_v_per_g[
-            d
-        ]
-        comparison = replace(
-            comparison,
-            notes=(
-                *comparison.notes,
-                f'{sensor.axes[d]}: {len(output_g)} samples, up to '
-                f'{np.abs(output_g).max():.3g} g, are at a rail or beyond the range of '
-                f'{sensor.range_g:g} g that the parameter file states; set the '
-                f'range of the sensor',
-            ),
+        output_v = comparison.volts[beyond[:, d], d] - sensor.zero_g_v[d]
+        largest_g = np.abs(output_v).max() / sensor.scale_v_per_g[d]
+        note = (
+            f'{sensor.axes[d]}: {len(output_v)} samples, up to {largest_g:.3g} g, are at a rail '
+            f'or beyond the range of {sensor.range_g:g} g that the parameter file states; set the '
+            'range of the sensor'
         )
+        comparison = replace(comparison, notes=(*comparison.notes, note))
     return comparison
 
 
@@ -587,13 +549,10 @@ def _check_clock(recording: Recording) -> None:
             f'{time_s[wide[0]]:.6g} s; cut the recording there, and diagnose the '
             'parts together',
         )
-    if (
-        step_s > _LONGEST_STEP_S
-        and angles_rad is not None
-        and np.any(
-            np.nanmax(angles_rad, axis=0) - np.nanmin(angles_rad, axis=0) >= _SMALLEST_MOVE_RAD
-        )
-    ):
+    if angles_rad is None or step_s <= _LONGEST_STEP_S:
+        return
+    range_rad = np.nanmax(angles_rad, axis=0) - np.nanmin(angles_rad, axis=0)
+    if np.any(range_rad >= _SMALLEST_MOVE_RAD):
         raise DataFault(
             'unit',
             f'time_s: {step_s:.3g} s between samples while the stage moves, '
@@ -692,9 +651,9 @@ def _check_encoder(recording: Recording, sensor: Sensor) -> None:
         )
     inverted = [name for name, factor in zip(names, factors) if factor < 0]
     mirrored = _mirrored_axes(readings, factors)
-    if len(mirrored) < len(inverted) or (
-        len(mirrored) == len(inverted) and _zero_g_is_mirrored(readings, factors, sensor)
-    ):
+    # As many axes as angles may be inverted instead, and their zero-g is then mirrored.
+    missing = len(inverted) - len(mirrored)
+    if missing > 0 or (not missing and _zero_g_is_mirrored(readings, factors, sensor)):
         return
     joined = ' and '.join(inverted)
     axes = ' and '.join(sensor.axes[d] for d in mirrored)
@@ -740,18 +699,16 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording:
 
     Where the codes of the ADC are coarser than stated, the baseline gets their number of bits.
     """
-    search_comparison = baseline.at_search_rate(comparison)
-    if comparison.reference is Reference.NONE:
-        _check_rest(comparison, np.isfinite(comparison.volts).all(axis=1))
-    else:
-        _check_axes(search_comparison)
     faults, stated_bits = noise_effects.sample_faults(comparison), comparison.sensor.adc_bits
     coarse = noise_effects.effect_of(Detector.COARSE_CODES)
     for detection in [d for d in faults.detections if d.effect == coarse]:
-        comparison, search_comparison = (
-            replace(c, sensor=noise_effects.with_bits(c.sensor, detection))
-            for c in (comparison, search_comparison)
-        )
+        sensor = noise_effects.with_bits(comparison.sensor, detection)
+        comparison = replace(comparison, sensor=sensor)
+    search_comparison = baseline.at_search_rate(comparison)
+    if comparison.pose_known:
+        _check_axes(search_comparison)
+    else:
+        _check_rest(comparison, np.isfinite(comparison.volts).all(axis=1))
     return CheckedRecording(
         comparison,
         search_comparison,
@@ -764,7 +721,7 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording:
 def check_length(comparisons: Sequence[BaselineComparison]) -> None:
     """Refuse recordings that are too short together; one at rest may have any length."""
     used_s = sum(c.span_s * float(c.used.mean()) for c in comparisons)
-    if used_s < SHORTEST_S and any(c.reference is not Reference.NONE for c in comparisons):
+    if used_s < SHORTEST_S and any(c.pose_known for c in comparisons):
         raise DataFault(
             'too_short',
             f'{used_s:.3g} of {sum(c.span_s for c in comparisons):.3g} s '
@@ -886,16 +843,16 @@ def _check_axes(comparison: BaselineComparison) -> None:
     moving = np.flatnonzero(simulated_g.std(axis=0) > SMALLEST_MOTION_G)
     if not len(moving):
         return
-    lags, _, by_lag = _correlations(
+    found = reference_checks.correlations(
         simulated_g, np.nan_to_num(measured_g), 2 * len(simulated_g) // 3
     )
-    by_lag = np.where(np.abs(lags) <= _LARGEST_DELAY_S * sensor.rate_hz, by_lag, -1.0)
+    is_searched = np.abs(found.lags) <= _LARGEST_DELAY_S * sensor.rate_hz
+    by_lag = np.where(is_searched, found.correlation, -1.0)
     best = int(np.argmax(by_lag))
-    delay_s = lags[best] / sensor.rate_hz
-    if (
-        by_lag[best] > max(_CORRELATED, by_lag[lags == 0][0] + _CORRELATION_GAIN)
-        and abs(delay_s) > _SEARCHED_DELAY_S
-    ):
+    delay_s = found.lags[best] / sensor.rate_hz
+    undelayed = by_lag[found.lags == 0][0]
+    is_clear = by_lag[best] > max(_CORRELATED, undelayed + _CORRELATION_GAIN)
+    if is_clear and abs(delay_s) > _SEARCHED_DELAY_S:
         raise DataFault(
             'time_misaligned',
             f'the sensor is {abs(delay_s):.2f} s '

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, NamedTuple
 
 from adxl_ros.diagnose import data_checks, next_experiment, noise_effects, verdict as rule
@@ -156,11 +157,7 @@ def diagnose(
     smallest_mps2 = material_mps2(model, floor, material_mg)
     evidence = _evidence(model, search, floor, smallest_mps2, seed)
     detections = _detections(checked, search.best, model.baseline, smallest_mps2)
-    bases = [
-        basis
-        for comparison, baseline_v in zip(compared, model.baseline_v)
-        for basis in flexible_bases(comparison, baseline_v)
-    ]
+    bases = list(chain(*map(flexible_bases, compared, model.baseline_v)))
     verdict = rule.decide(
         evidence,
         lambda effects, drift: rule.reproducible_rest(evidence.candidates[effects][drift], bases),
@@ -225,11 +222,8 @@ def _material_left_out(
         for part in comparison.left_out:
             # Knocks look like lone samples, and a reference that is smoother lacks them.
             is_knock = bool(part.effect) and comparison.fading_hz is not None
-            if (
-                part.effect not in verdict.named
-                and not is_knock
-                and part.squares_mps2 > verdict.material_mps2**2 * len(comparison)
-            ):
+            is_material = part.squares_mps2 > verdict.material_mps2**2 * len(comparison)
+            if is_material and not is_knock and part.effect not in verdict.named:
                 parts.append(part)
     return tuple(parts)
 
@@ -312,7 +306,7 @@ def _simulate_again(
         )
         left[~c.used] = 0.0
         squares += np.add.reduceat(left, block_edges(len(c))[:-1])
-        rests = true_runs(c.at_rest & c.used) if c.reference is not Reference.NONE else []
+        rests = true_runs(c.at_rest & c.used) if c.pose_known else []
         more_at_rest += [float(np.sum((fitted - without)[a:b])) for a, b in rests]
         resting += sum(b - a for a, b in rests)
     return rule.SimulatedAgain(
@@ -344,22 +338,21 @@ def _detections(
     Spikes count only where the residual of the best set shows them, too, and excess noise only
     where it exceeds that of the baseline, too: a filter also changes the noise.
     """
-    detections = [d for c in checked for d in c.detections]
+    detections: list[Detection] = []
     for c in checked:
         comparison, used = c.comparison, c.comparison.used
         residual_v = comparison.residual_v(best.sensor)
         # In motion, a smooth reference lacks knocks that look like spikes.
         regular = used if comparison.fading_hz is None else used | ~comparison.at_rest
-        detections += [
+        spikes = [
             d
             for d in c.possible_spikes
             if noise_effects.residual_shows_spikes(d, residual_v, regular, comparison.sensor)
         ]
-        found, of_baseline = (
-            noise_effects.residual_detections(comparison, residual_v, s)
-            for s in (best.sensor, baseline)
-        )
-        detections += [d for d in found if d.effect in {o.effect for o in of_baseline}]
+        found = noise_effects.residual_detections(comparison, residual_v, best.sensor)
+        of_baseline = noise_effects.residual_detections(comparison, residual_v, baseline)
+        usual = {d.effect for d in of_baseline}
+        detections += [*c.detections, *spikes, *(d for d in found if d.effect in usual)]
     material = [d for d in detections if d.power_mps2 > smallest_mps2**2]
     return list({d.effect: d for d in sorted(material, key=lambda d: d.power_mps2)}.values())
 
@@ -380,21 +373,21 @@ def _named_sensor(
     if not verdict.closes:
         return baseline
     fitted, sensor = best.sensor, with_neutral(baseline, best.effects)
+    from_file = with_neutral(baseline, fitted.effects)
+    smallest_v = verdict.material_mps2 / G0_MPS2 * baseline.scale_v_per_g.min()
+
+    def has_changed(effect: str) -> bool:
+        before = from_file.values[effect]
+        changes_v = [value - before[name] for name, value in fitted.values[effect].items()]
+        return any(np.abs(change_v).max() > smallest_v for change_v in changes_v)
+
     if best.effects:
-        from_file = with_neutral(baseline, fitted.effects)
-        smallest_v = verdict.material_mps2 / G0_MPS2 * baseline.scale_v_per_g.min()
         straight = [
             e
             for e in fitted.effects
-            if effect_named(e).diagnosis.straight_line
-            and e not in best.effects
-            and (
-                e in baseline.effects
-                or any(
-                    np.abs(value - from_file.values[e][p]).max() > smallest_v
-                    for p, value in fitted.values[e].items()
-                )
-            )
+            if e not in best.effects
+            and effect_named(e).diagnosis.straight_line
+            and (e in baseline.effects or has_changed(e))
         ]
         sensor = with_neutral(sensor, straight)
         sensor = _as_printed(
@@ -437,13 +430,13 @@ def _closure(
     stated = noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2)
     stated_mps2 = rms(stated)
     draws = floor.draws_mps2(seed, len(before) - 1)
-    floors = np.append(
-        floor.rms_mps2, np.full(len(before) - 1, floor.rms_mps2) if draws is None else draws
-    )
+    floors = np.full(len(before), floor.rms_mps2)
+    if draws is not None:
+        floors[1:] = draws
     lowest = np.array(
         [
-            noise_effects.floor_without(min(f, np.sqrt(a)), remainders, stated_mps2)
-            for f, a in zip(floors, after)
+            noise_effects.floor_without(f, remainders, stated_mps2)
+            for f in np.minimum(floors, np.sqrt(after))
         ]
     )
     with np.errstate(all='ignore'):
@@ -483,27 +476,28 @@ def _report(
     )
     ranked = sorted(search.found.values(), key=lambda h: -h.log_evidence)
     sensors = {'before': (baseline, baseline), 'after': (best.sensor, sensor)}
-    removed = sum(
-        part.squares_mps2 for c in comparisons for part in c.left_out if part.effect is not None
-    )
+    left_out = chain(*(c.left_out for c in comparisons))
+    removed = sum(part.squares_mps2 for part in left_out if part.effect is not None)
     removed_power = removed / sum(len(c) for c in comparisons)
     return Report(
-        verdict,
-        _closure(verdict, evidence, floor, remainders, baseline, removed_power, seed),
-        floor,
-        (best, *(h for h in ranked if h is not best)),
-        tuple(detections),
-        remainders,
-        tuple(compare_noise(c, sensors, seed) for c in comparisons),
-        tuple(residual_map(model.comparisons[0], seed)),
-        lacking,
-        tuple(
+        verdict=verdict,
+        closure=_closure(verdict, evidence, floor, remainders, baseline, removed_power, seed),
+        noise_floor=floor,
+        hypotheses=(best, *(h for h in ranked if h is not best)),
+        detections=tuple(detections),
+        noise_remainders=remainders,
+        noise=tuple(compare_noise(c, sensors, seed) for c in comparisons),
+        residual_cells=tuple(residual_map(model.comparisons[0], seed)),
+        not_covered=lacking,
+        could_show=tuple(
             next_experiment.could_show(model, comparisons[0], floor.noise_v, verdict.material_mps2)
         ),
-        next_experiment.propose_next_experiment(verdict, lacking, baseline, model, seed),
-        baseline,
-        sensor,
-        model,
+        next_experiment=next_experiment.propose_next_experiment(
+            verdict, lacking, baseline, model, seed
+        ),
+        baseline=baseline,
+        sensor=sensor,
+        linear_model=model,
     )
 
 

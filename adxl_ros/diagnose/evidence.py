@@ -113,8 +113,11 @@ class NoiseFloor:
         return np.sqrt(squares[drawn].sum(axis=1) / samples[drawn].sum(axis=1))
 
 
-Squares = list[tuple[np.ndarray, int]]
-"""Sums of squares by axis, V², (m,), and their numbers of samples, by part of a recording."""
+class PartSquares(NamedTuple):
+    """The squares of a part of a recording."""
+
+    squares_v2: np.ndarray  # Sum by axis, V², (m,)
+    samples: int
 
 
 def estimate_floor(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
@@ -124,13 +127,13 @@ def estimate_floor(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
     The noise at rest is that about the mean of each second. The mean square of the encoder's steps
     is added: step²/12 times the squared slope of gravity, or what they leave open of a robot.
     """
-    sums: Squares = []
+    sums: list[PartSquares] = []
     for c in comparisons:
         sums += squares_at_rest(c.volts, c.at_rest & c.used, c.sensor)
     source, scale_v_per_mps2 = 'still', comparisons[0].scale_v_per_mps2
-    if sum(count for _, count in sums) < FEWEST_SAMPLES:
+    if sum(part.samples for part in sums) < FEWEST_SAMPLES:
         sums, source = _repeat_squares(comparisons), 'repeats'
-    count = sum(count for _, count in sums)
+    count = sum(part.samples for part in sums)
     if count < FEWEST_SAMPLES:
         sums, noise_v, source = [], noise.sample_std_v(comparisons[0].sensor), 'assumed'
     else:
@@ -154,31 +157,31 @@ def encoder_error_mps2(comparison: BaselineComparison) -> float:
     return float(sensor.local_gravity_mps2 * sensor.stage_std_rad * np.sqrt(squares))
 
 
-def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> Squares:
+def squares_at_rest(volts: np.ndarray, at_rest: np.ndarray, sensor: Sensor) -> list[PartSquares]:
     """Sum the squares of an output, V, (n, m), about the mean of each second at rest."""
     length = max(round(_REST_S * sensor.rate_hz), 4)
     # The mean of correlated samples takes more out of their variance than one sample.
     independent = length / float(noise.effective_samples(length, 1 / sensor.rate_hz, sensor.rc_s))
-    squares: Squares = []
+    squares: list[PartSquares] = []
     for begin, end in true_runs(at_rest):
         for first in range(begin, end - length + 1, length):
             part = volts[first : first + length]
             squares_v2 = (part - part.mean(axis=0)) ** 2 * length / (length - independent)
             squares += [
-                (piece.sum(axis=0), len(piece))
+                PartSquares(piece.sum(axis=0), len(piece))
                 for piece in np.array_split(squares_v2, _PARTS_OF_REST)
             ]
     return squares
 
 
-def _repeat_squares(comparisons: Sequence[BaselineComparison]) -> Squares:
+def _repeat_squares(comparisons: Sequence[BaselineComparison]) -> list[PartSquares]:
     """Return half the squares of the differences between repeats of a trajectory on the stage."""
     staged = [
         (c, force)
         for c in comparisons
         if c.joints and (force := c.reference_force_g()) is not None
     ]
-    squares: Squares = []
+    squares: list[PartSquares] = []
     for i, (first, force) in enumerate(staged):
         for second, other in staged[i:]:
             rate_hz = first.sensor.rate_hz
@@ -198,10 +201,17 @@ def _repeat_squares(comparisons: Sequence[BaselineComparison]) -> Squares:
             squares_v2 = (difference_v - difference_v.mean(axis=0)) ** 2 / 2
             length = max(round(_REST_S * rate_hz), 1)
             squares += [
-                (part.sum(axis=0), len(part))
+                PartSquares(part.sum(axis=0), len(part))
                 for part in np.split(squares_v2, range(length, len(squares_v2), length))
             ]
     return squares
+
+
+class Repeat(NamedTuple):
+    """A part of a trajectory that is repeated later."""
+
+    lag: int  # How much later, samples
+    samples: int  # Length of the part
 
 
 def find_repeat(
@@ -210,7 +220,7 @@ def find_repeat(
     rate_hz: float,
     resolution_rad: float,
     same_recording: bool,
-) -> tuple[int, int] | None:
+) -> Repeat | None:
     """
     Find the lag, and its overlap, by which the directions of gravity in two recordings agree best.
 
@@ -230,9 +240,8 @@ def find_repeat(
     lag, count = int(lags[best]), int(overlap[best])
     largest_rad = _REPEAT_STEPS * max(resolution_rad, _SMALLEST_RESOLUTION_RAD)
     moved = first[:, :count].std(axis=1).max()
-    return (
-        (lag, count) if mean_square[best] <= largest_rad**2 and moved >= _REPEAT_MOTION else None
-    )
+    is_same = mean_square[best] <= largest_rad**2
+    return Repeat(lag, count) if is_same and moved >= _REPEAT_MOTION else None
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,9 @@ def variants(
 
 def _steps(effect: Effect) -> list[float]:
     """Return the steps of the derivatives by the sizes of an effect, in typical sizes."""
-    starts = [start / p.scale for p in effect.parameters if p.is_size for start in p.starts]
+    starts: list[float] = []
+    for p in (p for p in effect.parameters if p.is_size):
+        starts += [start / p.scale for start in p.starts]
     if starts:
         return starts
     # An effect with a shape parameter is nearly linear in its sizes.
@@ -164,14 +166,12 @@ def _limit_variants(
     """Try limits that clip small shares of the samples."""
     sensor = comparison.sensor
     axes, with_effect = sensor.axes, with_neutral(sensor, [effect.name])
-    names = names_of(replace(effect, parameters=(limit,)), axes)
+    names = _names_of_parameter(effect, limit, axes)
     # The other parameters have no effect until the limit clips; one-sided ones must leave 0.
-    start = {
-        name: p.scale if p.lower == p.neutral else p.neutral
-        for p in effect.parameters
-        if p.is_size
-        for name in names_of(replace(effect, parameters=(p,)), axes)
-    }
+    start: dict[Coefficient, float] = {}
+    for p in (p for p in effect.parameters if p.is_size):
+        value = p.scale if p.lower == p.neutral else p.neutral
+        start |= dict.fromkeys(_names_of_parameter(effect, p, axes), value)
     magnitude_g = np.abs(baseline_v - sensor.zero_g_v) / sensor.scale_v_per_g
     for number, share in enumerate(_CLIPPED_SHARES):
         values = np.clip(np.quantile(magnitude_g, 1 - share, axis=0), limit.lower, limit.upper)
@@ -186,6 +186,11 @@ def _limit_variants(
                 [{name: change_v[:, d]} if d in clipped else {} for d, name in enumerate(names)],
                 dict(zip(names, values)) | start,
             )
+
+
+def _names_of_parameter(effect: Effect, parameter: Parameter, axes: str) -> list[Coefficient]:
+    """Return the coefficients of one parameter of an effect."""
+    return [name for name in names_of(effect, axes) if name.parameter == parameter.name]
 
 
 def _variant(
@@ -212,12 +217,10 @@ def _variant(
             - baseline_v
         ) / size
         # Without a known pose only changes show, except of the zero-g itself.
-        if (
-            comparison.reference is Reference.NONE
-            and effect.diagnosis.straight_line is not base.StraightLine.ZERO_G
-        ):
+        is_zero_g = effect.diagnosis.straight_line is base.StraightLine.ZERO_G
+        if not (comparison.pose_known or is_zero_g):
             change -= change.mean(axis=0)
-        for name in names_of(replace(effect, parameters=(p,)), axes):
+        for name in _names_of_parameter(effect, p, axes):
             reached = [axes.index(name.axis)] if p.axes else list(range(len(axes)))
             if np.any(np.abs(change[:, reached]) * p.scale > _SMALLEST_V):
                 names.append(name)
@@ -292,11 +295,6 @@ class LinearModel:
     filters: list[list[Whitener]]  # Whitening filters of each channel
     # By channel: sensitivities by number of the column, V per unit, (n,)
     columns: list[dict[int, np.ndarray]]
-    # By channel: nuisance parameters and their sensitivities, V per unit, (n,)
-    nuisance_columns: list[dict[Coefficient, np.ndarray]]
-    # For each coefficient of zero-g and scale factor: how much of it a calibration can take up of
-    # one unit of each column, (columns,)
-    parts_at_rest: dict[Coefficient, np.ndarray]
 
     @property
     def baseline(self) -> Sensor:
@@ -306,7 +304,7 @@ class LinearModel:
     @property
     def pose_known(self) -> bool:
         """Whether all recordings have a reference."""
-        return all(c.reference is not Reference.NONE for c in self.comparisons)
+        return all(c.pose_known for c in self.comparisons)
 
     @cached_property
     def usual_filters(self) -> list[list[Whitener]]:
@@ -329,6 +327,38 @@ class LinearModel:
         return self.fit_variants([])
 
     @cached_property
+    def information(self) -> np.ndarray:
+        """Products of the whitened columns, in units of the noise, (columns, columns)."""
+        fit = self.null_fit
+        products = np.zeros((len(self.names), len(self.names)))
+        for channel, f, variance_v2 in zip(
+            self.channels, fit.filter_indices, fit.innovation_variance_v2
+        ):
+            places = np.ix_(channel.column_ids, channel.column_ids)
+            products[places] += channel.total_grams[f][1:, 1:] / variance_v2
+        return products
+
+    @cached_property
+    def nuisance_columns(self) -> list[dict[Coefficient, np.ndarray]]:
+        """By channel: nuisance parameters and their sensitivities, V per unit, (n,)."""
+        every = []
+        for channel in self.columns:
+            # Of several starts of an effect, the column is that of the smallest.
+            shown = [k for k in reversed(channel) if hints_of(self.names[k]).nuisance]
+            every.append({self.names[k]: channel[k] for k in shown})
+        return every
+
+    @cached_property
+    def nuisances(self) -> list[Coefficient]:
+        """Return the nuisance parameters that show in any channel."""
+        return list(dict.fromkeys(chain(*self.nuisance_columns)))
+
+    @cached_property
+    def parts_at_rest(self) -> dict[Coefficient, np.ndarray]:
+        """How much a calibration can take up of one unit of each column, (columns,)."""
+        return self.taken_up(self.columns, len(self.names))
+
+    @cached_property
     def nuisance_ids(self) -> list[int]:
         """Numbers of the columns of nuisance parameters, each for small departures."""
         first: dict[str, list[int]] = {}
@@ -345,20 +375,14 @@ class LinearModel:
         """Return prior standard deviations of all coefficients beside variants, (columns,)."""
         prior_std = self.prior_std.copy()
         effects = {self.variants[i].effect for i in chosen}
-        columns = [
-            k
-            for i in chosen
-            if calibration_takes_up(self.variants[i].effect)
-            for k in self.column_ids[i]
-        ]
+        taken_up = [i for i in chosen if calibration_takes_up(self.variants[i].effect)]
+        columns = list(chain(*(self.column_ids[i] for i in taken_up)))
         for i in self.nuisance_ids:
             name = self.names[i]
             if name.effect not in effects:
-                parts = (
-                    self.parts_at_rest.get(name, np.zeros(len(prior_std)))[columns]
-                    * prior_std[columns]
-                )
-                prior_std[i] = np.hypot(self.tolerance(name), np.sqrt(np.sum(parts**2)))
+                parts = self.parts_at_rest.get(name, np.zeros(len(prior_std)))
+                part = np.sqrt(np.sum((parts[columns] * prior_std[columns]) ** 2))
+                prior_std[i] = np.hypot(self.tolerance(name), part)
         return prior_std
 
     def tolerance(self, name: Coefficient) -> float:
@@ -385,6 +409,41 @@ class LinearModel:
             i = sensor.covariance_names.index(name)
             variance += float(sensor.covariance[i, i])
         return float(np.hypot(hints.healthy_std * scale, np.sqrt(variance)))
+
+    def taken_up(
+        self, columns: Sequence[Mapping[int, np.ndarray]], count: int
+    ) -> dict[Coefficient, np.ndarray]:
+        """
+        Compute how much of other columns a calibration can take for zero-g or scale factor.
+
+        A calibration uses rests. It takes the straight-line part of an effect at its own rests for
+        an error of zero-g and scale factor, and nothing of an effect that only acts in motion. The
+        rests of the calibration differ from those of the recording, so that a share of the whole
+        effect is added. Zero-g and scale factor that the baseline does not hold were not
+        calibrated, and took up nothing.
+
+        columns: other columns of each channel by numbers below `count`; returns: by coefficient of
+        zero-g or scale factor: the standard deviation of its part in one unit of each other
+        column, in its own unit, (count,).
+        """
+        parts: dict[Coefficient, np.ndarray] = {}
+        for nuisances, others, (comparison, _) in zip(self.nuisance_columns, columns, self.places):
+            lines = {
+                name: column
+                for name, column in nuisances.items()
+                if hints_of(name).straight_line and name.effect in self.baseline.effects
+            }
+            if not lines or not others:
+                continue
+            rests = comparison.at_rest & comparison.used
+            rows = rests if rests.any() else np.ones(len(rests), bool)
+            by_line = _straight_parts(
+                np.column_stack(list(lines.values())), np.column_stack(list(others.values())), rows
+            )
+            for name, part in zip(lines, by_line):
+                largest = parts.setdefault(name, np.zeros(count))
+                largest[list(others)] = np.maximum(largest[list(others)], part)
+        return parts
 
     def fit_variants(self, chosen: Sequence[int], start: LinearFit | None = None) -> LinearFit:
         """Fit a set of variants on the sensitivities at the baseline."""
@@ -432,9 +491,7 @@ def build_linear_model(
 
     filters: whitening filters of each channel, where not all are tried.
     """
-    filters = filters or [
-        evidence.whiteners(c, axis) for c in comparisons for axis in range(len(c.sensor.axes))
-    ]
+    filters = filters or [evidence.whiteners(*channel) for channel in channels_of(comparisons)]
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
     table = _ColumnTable(comparisons)
     for by_recording in _variants_by_key(
@@ -443,19 +500,16 @@ def build_linear_model(
         table.add(by_recording)
     channels = _whitened(comparisons, table.channels, filters)
     show_progress(1.0)
-    nuisance_columns = [table.nuisances(channel) for channel in table.channels]
     return LinearModel(
-        list(comparisons),
-        baseline_v,
-        table.variants,
-        table.ids,
-        table.names,
-        table.prior_std(),
-        channels,
-        list(filters),
-        table.channels,
-        nuisance_columns,
-        parts_at_rest(comparisons, nuisance_columns, table.channels, len(table.names)),
+        comparisons=list(comparisons),
+        baseline_v=baseline_v,
+        variants=table.variants,
+        column_ids=table.ids,
+        names=table.names,
+        prior_std=table.prior_std(),
+        channels=channels,
+        filters=list(filters),
+        columns=table.channels,
     )
 
 
@@ -538,14 +592,6 @@ class _ColumnTable:
             ]
         return np.array(stds)
 
-    def nuisances(self, channel: dict[int, np.ndarray]) -> dict[Coefficient, np.ndarray]:
-        """Return the nuisance columns of a channel; of several, that of the smallest start."""
-        return {
-            self.names[k]: values
-            for k, values in reversed(channel.items())
-            if hints_of(self.names[k]).nuisance
-        }
-
 
 def _whitened(
     comparisons: Sequence[BaselineComparison],
@@ -553,19 +599,20 @@ def _whitened(
     filters: Sequence[list[Whitener]],
 ) -> list[evidence.WhitenedChannel]:
     """Whiten residual and columns of each channel for noise that the baseline may have."""
-    residuals_v = [v for c in comparisons for v in c.residual_v(c.sensor).T]
-    used = [c.used for c in comparisons for _ in c.sensor.axes]
     chosen = filters_for(filters, comparisons[0].sensor.effects)
+    residuals_v = [c.residual_v(c.sensor).T for c in comparisons]
     return [
         evidence.whiten_channel(
             residual_v,
             np.array([*own.values()]).T,
             np.array([*own]),
-            of_channel,
+            channel.comparison.used,
             of_filters,
             False,
         )
-        for residual_v, own, of_channel, of_filters in zip(residuals_v, columns, used, chosen)
+        for residual_v, own, channel, of_filters in zip(
+            chain(*residuals_v), columns, channels_of(comparisons), chosen
+        )
     ]
 
 
@@ -573,47 +620,6 @@ def filters_for(filters: Sequence[list[Whitener]], effects: Sequence[str]) -> li
     """Return for each channel the filters of healthy units and of the drifts among effects."""
     drifts = evidence.drifts_among(effects)
     return [[f for f in every if f.healthy or f.effect in drifts] or every for every in filters]
-
-
-def parts_at_rest(
-    comparisons: Sequence[BaselineComparison],
-    nuisance_columns: Sequence[Mapping[Coefficient, np.ndarray]],
-    columns: Sequence[Mapping[int, np.ndarray]],
-    count: int,
-) -> dict[Coefficient, np.ndarray]:
-    """
-    Compute how much of other columns a calibration can take for zero-g or scale factor.
-
-    A calibration uses rests. It takes the straight-line part of an effect at its own rests for an
-    error of zero-g and scale factor, and nothing of an effect that only acts in motion. The rests
-    of the calibration differ from those of the recording, so that a share of the whole effect is
-    added. Zero-g and scale factor that the baseline does not hold were not calibrated, and took
-    up nothing.
-
-    columns: other columns of each channel by numbers below `count`; returns: by coefficient of
-    zero-g or scale factor: the standard deviation of its part in one unit of each other column,
-    in its own unit, (count,).
-    """
-    parts: dict[Coefficient, np.ndarray] = {}
-    calibrated = {*comparisons[0].sensor.effects}
-    resting = [c.at_rest & c.used for c in comparisons for _ in c.sensor.axes]
-    for nuisances, channel_columns, rests in zip(nuisance_columns, columns, resting):
-        lines = {
-            name: c
-            for name, c in nuisances.items()
-            if hints_of(name).straight_line and name.effect in calibrated
-        }
-        if not lines or not channel_columns:
-            continue
-        rows = rests if rests.any() else np.ones(len(rests), bool)
-        ids = list(channel_columns)
-        others = np.column_stack(list(channel_columns.values()))
-        for name, part in zip(
-            lines, _straight_parts(np.column_stack(list(lines.values())), others, rows)
-        ):
-            largest = parts.setdefault(name, np.zeros(count))
-            largest[ids] = np.maximum(largest[ids], part)
-    return parts
 
 
 def _straight_parts(lines: np.ndarray, others: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:

@@ -104,22 +104,14 @@ class _Information(NamedTuple):
 
 
 def _information(model: LinearModel) -> _Information:
-    """Multiply the whitened columns of a linear model."""
-    fit, count = model.null_fit, len(model.names)
-    # Products of the whitened columns in units of the noise.
-    gram = np.zeros((count, count))
-    squares_mps2, samples = np.zeros(count), 0
-    for white, f, variance_v2, columns, channel in zip(
-        model.channels, fit.filter_indices, fit.innovation_variance_v2, model.columns, model.places
-    ):
-        ids = white.column_ids
-        gram[np.ix_(ids, ids)] += white.total_grams[f][1:, 1:] / variance_v2
-        used = channel.comparison.used
-        scale = float(channel.comparison.scale_v_per_mps2[channel.axis])
+    """Return what the recordings of a linear model tell."""
+    squares_mps2, samples = np.zeros(len(model.names)), 0
+    for columns, (comparison, axis) in zip(model.columns, model.places):
+        scale = float(comparison.scale_v_per_mps2[axis])
         for k, column_v in columns.items():
-            squares_mps2[k] += float(np.sum(column_v[used] ** 2)) / scale**2
-        samples += int(used.sum())
-    free = np.array(model.nuisance_ids, int)
+            squares_mps2[k] += float(np.sum(column_v[comparison.used] ** 2)) / scale**2
+        samples += int(comparison.used.sum())
+    gram, free = model.information, np.array(model.nuisance_ids, int)
     precision = gram[np.ix_(free, free)] + np.diag(model.prior(())[free] ** -2.0)
     taken_up = np.einsum('ij,ij->j', gram[free], np.linalg.solve(precision, gram[free]))
     alone = np.diag(gram)
@@ -240,13 +232,12 @@ class ManoeuvreWorth(NamedTuple):
 
 
 class PredictedResponse(NamedTuple):
-    """Products of the sensitivities of one manoeuvre."""
+    """The sensitivities of one manoeuvre."""
 
     name: str
     minutes: float  # Duration, min
     linear_model: LinearModel  # Its variants are those that the manoeuvre excites
-    places: dict[tuple, int]  # Place of each column by its key
-    gram: np.ndarray  # Products, in units of the noise, (k, k)
+    places: dict[tuple, int]  # Number of each column by its key
 
 
 def leading(hypotheses: Sequence[WeightedHypothesis]) -> tuple[WeightedHypothesis, ...]:
@@ -269,16 +260,8 @@ def predict(
     recording = Recording(name, columns.pop('time_s'), columns)
     comparison = beside.at_search_rate(beside.compare(recording, at_rate))
     model = linear.build_linear_model([comparison], only=effects)
-    keys = _keys(model)
-    places = {key: place for place, key in enumerate(keys.values())}
-    gram = np.zeros((len(places), len(places)))
-    for channel, f, variance in zip(
-        model.channels, model.null_fit.filter_indices, model.null_fit.innovation_variance_v2
-    ):
-        shown = [i for i, number in enumerate(channel.column_ids) if number in keys]
-        ids = [places[keys[channel.column_ids[i]]] for i in shown]
-        gram[np.ix_(ids, ids)] += channel.total_grams[f][1:, 1:][np.ix_(shown, shown)] / variance
-    return PredictedResponse(name, motion.duration_s / 60, model, places, gram)
+    places = {key: number for number, key in _keys(model).items()}
+    return PredictedResponse(name, motion.duration_s / 60, model, places)
 
 
 def _keys(model: LinearModel) -> dict[int, tuple]:
@@ -319,7 +302,9 @@ def rank_responses(
         beliefs = [
             _belief(response, keys, fit, {*h.effects} - {*seen}) for h, fit in zip(leaders, fits)
         ]
-        information = expected_information(response.gram, probabilities, beliefs, _EVIDENCE_FACTOR)
+        information = expected_information(
+            response.linear_model.information, probabilities, beliefs, _EVIDENCE_FACTOR
+        )
         worth.append(ManoeuvreWorth(response.name, response.minutes, information))
     return tuple(sorted(worth, key=lambda w: -w.per_minute))
 
@@ -341,14 +326,14 @@ def _belief(
     fit: what the samples so far say of columns with some keys, None before there are samples. Of
     `unseen` effects only the prior is known.
     """
-    places, model, keys = response.places, response.linear_model, _keys(response.linear_model)
+    places, model = response.places, response.linear_model
     # The middle one of the shapes of an effect stands for all.
     chosen = [
         numbers[len(numbers) // 2] for effect in unseen if (numbers := _variants_of(model, effect))
     ]
-    prior_std, mean, variance = model.prior(chosen), np.zeros(len(places)), np.zeros(len(places))
-    for k in {*model.nuisance_ids, *chain(*(model.column_ids[i] for i in chosen))}:
-        variance[places[keys[k]]] = prior_std[k] ** 2
+    known = [*model.nuisance_ids, *chain(*(model.column_ids[i] for i in chosen))]
+    mean, variance = np.zeros((2, len(model.names)))
+    variance[known] = model.prior(chosen)[known] ** 2
     covariance = np.diag(variance)
     if fit is not None:
         columns = [fitted_keys[int(k)] for k in fit.column_ids]

@@ -27,7 +27,7 @@ from adxl_ros.simulate.response import Response
 import numpy as np
 import scipy
 
-_MAINS_HZ = (50.0, 60.0)  # Mains frequencies, Hz
+_MAINS_HZ = (50.0, 100.0, 60.0, 120.0)  # Mains frequencies and their doubles, Hz
 _MAINS_TOLERANCE_HZ = 0.6  # Largest deviation of a line, Hz. Chosen: 1 % of clock or mains
 _LINE_LOWEST_HZ = 1.0  # Lowest frequency of a line, Hz. Chosen: below it slow effects are no line
 _LINE_FEWEST_ORDINATES = 64  # Fewest ordinates of a periodogram that shows a line. Chosen
@@ -455,7 +455,7 @@ def line_amplitude_v(values_v: np.ndarray, time_s: np.ndarray, line_hz: float) -
 
 def _mains_frequency_hz(line_hz: float, rate_hz: float) -> float | None:
     """Return the true frequency of a line that is an alias of the mains or its double."""
-    for mains_hz in (harmonic * hz for hz in _MAINS_HZ for harmonic in (1, 2)):
+    for mains_hz in _MAINS_HZ:
         folded_hz = (mains_hz + rate_hz / 2) % rate_hz - rate_hz / 2
         deviation_hz = line_hz - abs(folded_hz)
         if abs(deviation_hz) < _MAINS_TOLERANCE_HZ:

@@ -84,11 +84,9 @@ def wrong_dynamic_factor(comparison: BaselineComparison) -> str | None:
     )
     factor = float(np.exp(best))
     left_g = length_error_g(best) / abs(factor - 1)
-    if (
-        abs(factor - 1) < _RIGHT_FACTOR
-        or left_g > _SAME_LENGTH * dynamics_g
-        or length_error_g(best) > _SAME_LENGTH * gap_g
-    ):
+    is_right = abs(factor - 1) < _RIGHT_FACTOR
+    largest_left = _SAME_LENGTH * min(dynamics_g * abs(factor - 1), gap_g)
+    if is_right or length_error_g(best) > largest_left:
         return None
     return (
         f'the dynamic part of {force.name} is {factor:.2g} times that of the recording, while '
@@ -162,17 +160,46 @@ def _delay_samples(own: np.ndarray, other: np.ndarray) -> float | None:
     """Return the place in `other`, samples, where `own`, g, fits best; None where none fits."""
     if rms(own) < SMALLEST_MOTION_G:
         return None
-    window = np.ones(len(own))
-    products, squares = np.zeros((2, len(other) - len(own) + 1))
-    for a, b in zip(own.T, other.T):
-        b = b - b.mean()
-        products += scipy.signal.correlate(b, a, 'valid')
-        sums, powers = (scipy.signal.correlate(v, window, 'valid') for v in (b, b * b))
-        squares += powers - sums**2 / len(own)
-    # What is left after the best line: its smallest value shows the delay.
-    correlation = products / np.sqrt(np.maximum(squares, 1e-12) * np.sum(own**2))
-    best = int(np.argmax(correlation))
-    if correlation[best] < _FOLLOWS or not 0 < best < len(correlation) - 1:
+    found = correlations(own, other, len(own))
+    best = int(np.argmax(found.correlation))
+    around = found.correlation[best - 1 : best + 2]
+    if found.correlation[best] < _FOLLOWS or around.min() < 0:
         return None
-    left, middle, right = 1 - correlation[best - 1 : best + 2]
-    return best + float((left - right) / (2 * (left - 2 * middle + right)))
+    left, middle, right = 1 - around
+    return float(found.lags[best] + (left - right) / (2 * (left - 2 * middle + right)))
+
+
+class Correlations(NamedTuple):
+    """Correlations of two motions by lag, (lags,) each."""
+
+    lags: np.ndarray  # Sample i of the first meets sample i + lag of the second
+    overlap: np.ndarray  # Number of samples that overlap
+    correlation: np.ndarray  # −1 where too few overlap, or one does not move
+
+
+def correlations(first: np.ndarray, second: np.ndarray, smallest: int) -> Correlations:
+    """
+    Correlate two motions, g, (n, m) and (n', m), at all lags, each over the samples that overlap.
+
+    At least `smallest` samples must overlap.
+    """
+
+    def products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return scipy.signal.correlate(b, a, method='fft')
+
+    one, two = np.ones(len(first)), np.ones(len(second))
+    overlap = np.maximum(np.rint(products(one, two)), 1)
+    covariance, squares = np.zeros(len(overlap)), np.zeros((2, len(overlap)))
+    for a, b in zip((first - first.mean(axis=0)).T, (second - second.mean(axis=0)).T):
+        sum_a, sum_b = products(a, two), products(one, b)
+        covariance += np.abs(products(a, b) - sum_a * sum_b / overlap)
+        squares[0] += products(a * a, two) - sum_a**2 / overlap
+        squares[1] += products(one, b * b) - sum_b**2 / overlap
+    smallest_square = SMALLEST_MOTION_G**2 * overlap
+    compared = (overlap >= smallest) & (squares > smallest_square).all(axis=0)
+    correlation = covariance / np.sqrt(np.maximum(squares, smallest_square).prod(axis=0))
+    return Correlations(
+        scipy.signal.correlation_lags(len(second), len(first)),
+        overlap,
+        np.where(compared, correlation, -1.0),
+    )

@@ -9,7 +9,6 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any, NamedTuple
 
-from adxl_ros.diagnose.comparison import Reference
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
 from adxl_ros.diagnose.next_experiment import CouldShow, MENU
 from adxl_ros.diagnose.search import Hypothesis
@@ -163,11 +162,11 @@ def as_text(values: dict[str, Any]) -> str:
 
 def notes(diagnosis: Diagnosis) -> list[str]:
     """Return what was corrected or left out, with the file where there are several."""
-    return [
-        f'{Path(c.name).name}: {note}' if len(diagnosis.comparisons) > 1 else note
-        for c in diagnosis.comparisons
-        for note in c.notes
-    ]
+    every: list[str] = []
+    for comparison in diagnosis.comparisons:
+        file = f'{Path(comparison.name).name}: ' if len(diagnosis.comparisons) > 1 else ''
+        every += [file + note for note in comparison.notes]
+    return every
 
 
 def _rounded(value: Any) -> Any:
@@ -380,7 +379,7 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
     report = diagnosis.report
     assert report is not None
     closure, verdict = report.closure, report.verdict
-    compared = any(c.reference is not Reference.NONE for c in diagnosis.comparisons)
+    compared = any(c.pose_known for c in diagnosis.comparisons)
     rows = [
         Row(
             'gap',
@@ -572,11 +571,9 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
         f'{mg_text(closure.floor.value)}'
     )
     remark = first.get('with the effects', '' if 'sim' in first['gap'] else f'gap {first["gap"]}')
-    lines += [
-        f'{"":{_BADGE_COLUMNS}}{line}'
-        for text in (remark, f'noise floor {first["noise floor"]}')
-        for line in wrapped(text, columns=COLUMNS - _BADGE_COLUMNS)
-    ]
+    for text in (remark, f'noise floor {first["noise floor"]}'):
+        beside = wrapped(text, columns=COLUMNS - _BADGE_COLUMNS)
+        lines += [' ' * _BADGE_COLUMNS + part for part in beside]
     if report.verdict.status != 'explained' or 'REFERENCE' in word:
         lines += wrapped(headline(diagnosis))
     elif is_only_noise(report):
@@ -634,11 +631,10 @@ def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
     )
     for name in named:
         share, sure = candidates[name]['share'], percent(candidates[name]['probability'])
-        first, *more = [
-            line
-            for size in size_lines(report, candidates[name])
-            for line in wrap(size, size_columns - 1, subsequent_indent='  ')
-        ] or ['']
+        sizes: list[str] = []
+        for size in size_lines(report, candidates[name]):
+            sizes += wrap(size, size_columns - 1, subsequent_indent='  ')
+        first, *more = sizes or ['']
         lines.append(
             f' {name:{width}}{sure:{_SURE_COLUMNS}}{first:{size_columns}}'
             f'{"" if share is None else percent(share):>{_SHARE_COLUMNS}}'.rstrip()

@@ -68,6 +68,10 @@ class _Cell(NamedTuple):
     sums_mps2: np.ndarray  # Sum of the residual in each block of time, m/s², (blocks,)
     samples: float  # Number of samples
 
+    def found(self, mean_mps2: float, share: float, p: float) -> ResidualCell:
+        """Return it with its mean, its share of the squares, and its probability."""
+        return ResidualCell(self.axis, self.dimension, self.low, self.high, mean_mps2, share, p)
+
 
 def dimensions(comparison: BaselineComparison) -> dict[str, np.ndarray]:
     """Return the dimensions of the map by name, (n,) each, without constant ones."""
@@ -119,7 +123,7 @@ def residual_map(comparison: BaselineComparison, seed: int) -> list[ResidualCell
     means = sums.sum(axis=1) / counts
     shares = np.minimum(means**2 * counts / max(float(np.sum(residual_mps2**2)), 1e-300), 1.0)
     significant = [
-        ResidualCell(*cell[:4], float(mean), float(share), float(p))
+        cell.found(float(mean), float(share), float(p))
         for cell, mean, share, p in zip(cells, means, shares, _family_wise_p(sums, seed))
         if p < _SIGNIFICANT_P
     ]

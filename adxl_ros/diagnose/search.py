@@ -9,7 +9,7 @@ held-out figures.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, combinations
 from typing import NamedTuple
@@ -120,42 +120,33 @@ def linearise(
     """Linearise a hypothesis at the coefficients of a sensor."""
     filters = linear_model.usual_filters if filters is None else filters
     names = _fitted_names(linear_model, effects)
-    every_nuisance = dict.fromkeys(chain(*linear_model.nuisance_columns))
-    nuisances = [n for n in every_nuisance if n.effect not in effects]
-    start = with_neutral(
-        linear_model.baseline, [*effects, *dict.fromkeys(n.effect for n in nuisances)]
-    )
+    nuisances = [n for n in linear_model.nuisances if n.effect not in effects]
+    start = with_neutral(linear_model.baseline, [*effects, *(n.effect for n in nuisances)])
     point = _Point.of(start, effects, names, get(sensor, names))
     channels: list[evidence.WhitenedChannel] = []
     columns: list[evidence.ChannelColumns] = []
     changes: list[dict[int, np.ndarray]] = []
-    for comparison in linear_model.comparisons:
-        response = point.response(comparison)
-        for axis in range(len(start.axes)):
-            channel = linear_model.places[len(channels)]
-            own = linear_model.nuisance_columns[len(channels)]
-            shown = [n for n in nuisances if n in own]
-            places = point.places_on(start.axes[axis])
-            ids = np.array([*places, *(len(names) + nuisances.index(n) for n in shown)], int)
-            design = np.column_stack(
-                [response.columns(axis, places), *(own[name] for name in shown)]
-            )
-            columns.append(
-                evidence.ChannelColumns(
-                    ids,
-                    design.astype(np.float32),
-                    evidence.plain_grams(design / channel.v_per_mean_mps2, comparison.used),
-                )
-            )
-            channels.append(
-                evidence.whiten_channel(
-                    design[:, 0], design[:, 1:], ids, comparison.used, filters[len(channels)]
-                )
-            )
-            changes.append({0: response.change_v[:, axis]})
+    for response, own, channel, of_channel in zip(
+        chain.from_iterable(map(point.responses, linear_model.comparisons)),
+        linear_model.nuisance_columns,
+        linear_model.places,
+        filters,
+    ):
+        shown = [n for n in nuisances if n in own]
+        nuisance_places = [len(names) + nuisances.index(name) for name in shown]
+        ids = np.array([*response.places, *nuisance_places], int)
+        design = np.column_stack([response.columns, *(own[name] for name in shown)])
+        used = channel.comparison.used
+        plain = evidence.plain_grams(design / channel.v_per_mean_mps2, used)
+        columns.append(evidence.ChannelColumns(ids, design.astype(np.float32), plain))
+        channels.append(
+            evidence.whiten_channel(design[:, 0], design[:, 1:], ids, used, of_channel)
+        )
+        changes.append({0: response.change_v})
     # The square of each deviation is that of a healthy unit's tolerance plus that of what a
     # calibration can take up of the effects.
-    taken_up = _taken_up(linear_model, nuisances, changes)
+    parts = linear_model.taken_up(changes, 1)
+    taken_up = np.array([float(parts[n][0]) if n in parts else 0.0 for n in nuisances])
     tolerance = np.array([linear_model.tolerance(name) for name in nuisances])
     return LinearisedHypothesis(
         effects=tuple(effects),
@@ -172,18 +163,12 @@ def linearise(
 
 
 class _Response(NamedTuple):
-    """What a recording shows about a point."""
+    """What one channel shows about a point."""
 
-    residual_v: np.ndarray  # Recording minus output, by the linear model at the prior mean, V
-    derivatives: np.ndarray  # Derivatives by the coefficients, V per unit, (n, m, k)
-    departures: np.ndarray  # Departures of the point from the prior mean, (k,)
-    change_v: np.ndarray  # Part of the output that a calibration can take up, V, (n, m)
-
-    def columns(self, axis: int, places: list[int]) -> np.ndarray:
-        """Return the residual at the prior mean, and derivatives by some coefficients."""
-        derivatives = self.derivatives[:, axis, places]
-        residual_v = self.residual_v[:, axis] + derivatives @ self.departures[places]
-        return np.column_stack([residual_v, derivatives])
+    places: list[int]  # Places of the k coefficients that the axis follows
+    # Residual at the prior mean, by the linear model, and derivatives, V, V per unit, (n, k + 1)
+    columns: np.ndarray
+    change_v: np.ndarray  # Part of the output that a calibration can take up, V, (n,)
 
 
 @dataclass(frozen=True)
@@ -216,35 +201,21 @@ class _Point:
             replace(sensor, values=without),
         )
 
-    def places_on(self, axis: str) -> list[int]:
-        """Return the places of the coefficients that an axis follows."""
-        return [i for i, name in enumerate(self.names) if name.axis in ('', axis)]
-
-    def response(self, comparison: BaselineComparison) -> _Response:
-        """Simulate and differentiate a recording."""
+    def responses(self, comparison: BaselineComparison) -> Iterator[_Response]:
+        """Simulate and differentiate a recording; yield each of its axes."""
         rate_hz = comparison.sensor.rate_hz
         sensor = replace(self.sensor, rate_hz=rate_hz)
         output_v = comparison.simulated_v(sensor)
-        return _Response(
-            comparison.volts - output_v,
-            linear.sensitivities_at(
-                comparison.simulated_v, sensor, self.names, self.values, output_v
-            ),
-            self.values - self.prior_mean,
-            output_v - comparison.simulated_v(replace(self.without, rate_hz=rate_hz)),
+        derivatives = linear.sensitivities_at(
+            comparison.simulated_v, sensor, self.names, self.values, output_v
         )
-
-
-def _taken_up(
-    linear_model: LinearModel,
-    nuisances: Sequence[Coefficient],
-    changes: Sequence[Mapping[int, np.ndarray]],
-) -> np.ndarray:
-    """Return how much of a change of the output a calibration can take for nuisances, (k,)."""
-    parts = linear.parts_at_rest(
-        linear_model.comparisons, linear_model.nuisance_columns, changes, 1
-    )
-    return np.array([float(parts[name][0]) if name in parts else 0.0 for name in nuisances])
+        change_v = output_v - comparison.simulated_v(replace(self.without, rate_hz=rate_hz))
+        departures = self.values - self.prior_mean
+        for d, axis in enumerate(sensor.axes):
+            places = [i for i, name in enumerate(self.names) if name.axis in ('', axis)]
+            own = derivatives[:, d, places]
+            residual_v = comparison.volts[:, d] - output_v[:, d] + own @ departures[places]
+            yield _Response(places, np.column_stack([residual_v, own]), change_v[:, d])
 
 
 def _fitted_names(linear_model: LinearModel, effects: Sequence[str]) -> list[Coefficient]:
@@ -280,63 +251,6 @@ class _HypothesisIterate(Iterate):
     fit: LinearFit
 
 
-@dataclass(frozen=True)
-class _Refit:
-    """The fit of a set of effects by re-simulation, for one noise."""
-
-    linear_model: LinearModel
-    effects: Sequence[str]
-    names: list[Coefficient]  # Coefficients of the effects, (k,)
-    sensor: Sensor  # The baseline with neutral effects
-    filter_indices: Sequence[int]  # Number of the whitening filter of each channel
-    lowest_log_evidence: float  # Log evidence below which the set is hopeless
-
-    def run(self, values: np.ndarray) -> Sensor:
-        """Iterate from values, (k,), until the log evidence no longer gains."""
-        last = gauss_newton(
-            self._linearised_at,
-            values,
-            self._has_ended,
-            _EVALUATIONS,
-            _HALVINGS,
-            _EVIDENCE_TOLERANCE,
-        )
-        return last.linearised.sensor
-
-    def _linearised_at(self, values: np.ndarray) -> _HypothesisIterate:
-        parameters = [parameter_of(name) for name in self.names]
-        within = np.clip(values, [p.lower for p in parameters], [p.upper for p in parameters])
-        filters = [[f[i]] for f, i in zip(self.linear_model.usual_filters, self.filter_indices)]
-        linearised = linearise(
-            self.linear_model, self.effects, put(self.sensor, self.names, within), filters
-        )
-        fit, j = linearised.fit(), len(linearised.values)
-        step = linearised.departures(fit)[:j] + linearised.prior_mean[:j] - linearised.values
-        loss = fit.loss(linearised.values - linearised.prior_mean[:j])
-        return _HypothesisIterate(
-            linearised.values, step, loss - fit.log_evidence, linearised, fit
-        )
-
-    def _has_ended(
-        self,
-        first: _HypothesisIterate,
-        previous: _HypothesisIterate | None,
-        present: _HypothesisIterate,
-    ) -> bool:
-        if previous is not None and (
-            present.fit.log_evidence < self.lowest_log_evidence
-            or previous.cost - present.cost < _SMALLEST_GAIN
-        ):
-            return True
-        smallest = max(_SMALLEST_GAIN, _SMALLEST_GAIN_SHARE * (first.cost - present.cost))
-        return present.fit.log_evidence + present.cost < smallest or bool(
-            np.all(
-                np.abs(present.step)
-                < _SMALLEST_STEP * present.linearised.prior_std[: len(self.names)]
-            )
-        )
-
-
 def fit_hypothesis(
     linear_model: LinearModel,
     effects: Sequence[str],
@@ -356,22 +270,47 @@ def fit_hypothesis(
     names = _fitted_names(linear_model, effects)
     first = _prior_mean(sensor, names) + [start.get(name, 0.0) for name in names]
     first = np.array([shapes.get(name.without_axis, value) for name, value in zip(names, first)])
-    refit = _Refit(
-        linear_model,
-        effects,
-        names,
-        sensor,
-        linear_model.null_fit.filter_indices,
-        lowest_log_evidence,
+    parameters = [parameter_of(name) for name in names]
+    low, high = [p.lower for p in parameters], [p.upper for p in parameters]
+    chosen = zip(linear_model.usual_filters, linear_model.null_fit.filter_indices)
+    filters = [[of_channel[i]] for of_channel, i in chosen]
+
+    def iterate_at(values: np.ndarray) -> _HypothesisIterate:
+        at_values = put(sensor, names, np.clip(values, low, high))
+        linearised = linearise(linear_model, effects, at_values, filters)
+        fit, j = linearised.fit(), len(names)
+        present = linearised.values - linearised.prior_mean[:j]
+        return _HypothesisIterate(
+            values=linearised.values,
+            step=linearised.departures(fit)[:j] - present,
+            cost=fit.loss(present) - fit.log_evidence,
+            linearised=linearised,
+            fit=fit,
+        )
+
+    def has_ended(
+        first: _HypothesisIterate,
+        previous: _HypothesisIterate | None,
+        present: _HypothesisIterate,
+    ) -> bool:
+        if previous is not None:
+            is_hopeless = present.fit.log_evidence < lowest_log_evidence
+            if is_hopeless or previous.cost - present.cost < _SMALLEST_GAIN:
+                return True
+        promised = present.fit.log_evidence + present.cost
+        smallest = max(_SMALLEST_GAIN, _SMALLEST_GAIN_SHARE * (first.cost - present.cost))
+        smallest_step = _SMALLEST_STEP * present.linearised.prior_std[: len(names)]
+        return promised < smallest or bool(np.all(np.abs(present.step) < smallest_step))
+
+    last = gauss_newton(iterate_at, first, has_ended, _EVALUATIONS, _HALVINGS, _EVIDENCE_TOLERANCE)
+    return _fitted_hypothesis(
+        linear_model, linearise(linear_model, effects, last.linearised.sensor)
     )
-    linearised = linearise(linear_model, effects, refit.run(first))
-    return _fitted_hypothesis(linear_model, linearised, linearised.fit())
 
 
-def _fitted_hypothesis(
-    linear_model: LinearModel, linearised: LinearisedHypothesis, fit: LinearFit
-) -> Hypothesis:
+def _fitted_hypothesis(linear_model: LinearModel, linearised: LinearisedHypothesis) -> Hypothesis:
     """Return a hypothesis at the values at which it was linearised, with their deviations."""
+    fit = linearised.fit()
     j = len(linearised.values)
     names = linearised.names[:j]
     at_values = linearised.values - linearised.prior_mean[:j]

@@ -576,6 +576,13 @@ def is_needed(evidence: Evidence, effects: frozenset[str], effect: str) -> bool:
     return lost.value > max(evidence.material_power(float(by_pose)), share * explained)
 
 
+def _is_minimal(evidence: Evidence, effects: frozenset[str]) -> bool:
+    """Determine whether all effects of a set are needed."""
+    return all(
+        effects - {e} in evidence.candidates and is_needed(evidence, effects, e) for e in effects
+    )
+
+
 def minimal_sets(evidence: Evidence) -> list[frozenset[str]]:
     """
     Return the sets all of whose effects are needed, the most probable first.
@@ -586,11 +593,7 @@ def minimal_sets(evidence: Evidence) -> list[frozenset[str]]:
     kept = [
         effects
         for effects in evidence.candidates
-        if all(
-            effects - {e} in evidence.candidates and is_needed(evidence, effects, e)
-            for e in effects
-        )
-        and not evidence.is_refuted(effects)
+        if _is_minimal(evidence, effects) and not evidence.is_refuted(effects)
     ]
     kept.sort(key=lambda effects: -evidence.nats(effects, _NOTHING)[0])
     first = kept[0]
