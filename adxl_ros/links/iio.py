@@ -14,6 +14,7 @@ from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.links.support import base, stamping
+from adxl_ros.links.support.clock_rate import ClockRate
 from adxl_ros.links.support.stamping import ClockMap, IdentityMap, Stamper
 from adxl_ros.links.support.wire_format import RATES_HZ
 from adxl_ros.model.constants import G0_MPS2
@@ -99,9 +100,11 @@ class IioLink(base.Link):
         self._stamper = Stamper(ClockMap(settings.delay, _DECISION_S), self.references)
         self._backoff = base.Backoff()
         self._error = ''
+        self._rate = ClockRate(sensor.rate_hz)
         self._adc: dict[str, float] = {}
         self._connections = self._repeated = 0
         self._newest_ns = -1
+        self._received = 0  # Samples of the present device
         self._last_buffer_s = time.monotonic()
 
     def read(self, now_ns: int) -> base.Samples:
@@ -151,6 +154,8 @@ class IioLink(base.Link):
         silent_s = time.monotonic() - self._last_buffer_s
         if silent_s > max(_SILENT_S, _SILENT_BUFFERS * stream.buffer_s):
             return base.Level.WARN, f'{uri}: silent, {stream.name} gives no samples'
+        if contradiction := self._rate.fault:
+            return base.Level.ERROR, f'{uri}: {stream.name} {contradiction}'
         return base.Level.OK, f'streaming at {stream.rate_hz:g} Hz'
 
     def _open(self) -> None:
@@ -166,6 +171,7 @@ class IioLink(base.Link):
         self._stream, self._error = stream, ''
         self._connections += 1
         self._last_buffer_s = time.monotonic()
+        self._rate, self._received = ClockRate(stream.rate_hz), 0
         adc = stream.adc
         if adc != self._adc:
             self._adc = adc
@@ -187,6 +193,11 @@ class IioLink(base.Link):
         new = device_ns > newest_ns[:-1]
         self._newest_ns = int(newest_ns[-1])
         self._repeated += len(new) - int(new.sum())
+        self._received += int(new.sum())
+        if self._rate.compare(self._received, 1e-3 * self._newest_ns):
+            assert self.sensor is not None, 'a device is open'
+            self.sensor = replace(self.sensor, rate_hz=self._rate.used_hz)
+            self._stamper.restart(1e9 / self._rate.used_hz)
         if new.any():
             volts = np.array([values[axis][new] for axis in self._declared.axes]).T
             references = {

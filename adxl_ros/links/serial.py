@@ -20,6 +20,7 @@ from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.links.support import base, stamping, wire_format
+from adxl_ros.links.support.clock_rate import ClockRate
 from adxl_ros.links.support.stamping import ClockMap, Stamper
 from adxl_ros.links.support.wire_format import BoardInfo, SampleFrame
 from adxl_ros.model.constants import AXES
@@ -137,64 +138,6 @@ class _Conversion:
         )
 
 
-_RATE_SAMPLES = 25
-"""Samples over which the clock of a board is compared with its stated rate. Chosen: all rates are
-known a fifth of a second after the start at 1 kHz."""
-_RATES = 8  # Rates in a row that must agree. Chosen: a board that stalls has other ones each time
-_RATE_SCATTER = 0.02
-"""Largest relative difference of rates that agree. Chosen: half a period of 25."""
-_MAX_RATE_ERROR = 0.05
-"""Largest relative error of a stated rate. Chosen: above the error of any oscillator."""
-
-
-class _ClockRate:
-    """The rate of samples by the clock of a board, where it is not the stated one."""
-
-    def __init__(self, stated_hz: float) -> None:
-        self.used_hz = self._stated_hz = stated_hz
-        self._first: SampleFrame | None = None
-        self._newest_hz: deque[float] = deque(maxlen=_RATES)
-
-    @property
-    def fault(self) -> str:
-        """Return that clock and stated rate contradict each other, or ''."""
-        return (
-            ''
-            if self.used_hz == self._stated_hz
-            else (
-                f'states {self._stated_hz:g} Hz, but its clock shows {self.used_hz:.4g} samples a '
-                'second, which is used; correct the rate in its info frame'
-            )
-        )
-
-    def compare(self, frame: SampleFrame) -> bool:
-        """Take a frame; return whether it changes the rate to use."""
-        first = self._first or frame
-        # The numbers of samples wrap at 2^32.
-        count = (frame.index - first.index) % 2**32
-        if first is not frame and count < _RATE_SAMPLES:
-            return False
-        self._first = frame
-        if first is frame:
-            return False
-        self._newest_hz.append(count / max(frame.time_us - first.time_us, 1) * 1e6)
-        clock_hz, low_hz, high_hz = (
-            float(f(self._newest_hz)) for f in (np.median, np.min, np.max)
-        )
-        if len(self._newest_hz) < _RATES or high_hz > (1 + _RATE_SCATTER) * low_hz:
-            return False
-        if abs(clock_hz / self._stated_hz - 1) <= _MAX_RATE_ERROR:
-            clock_hz = self._stated_hz
-        lowest_hz, highest_hz = wire_format.RATES_HZ
-        if (
-            abs(clock_hz / self.used_hz - 1) <= _MAX_RATE_ERROR
-            or not lowest_hz <= clock_hz <= highest_hz
-        ):
-            return False
-        self.used_hz = clock_hz
-        return True
-
-
 class SerialLink(base.Link):
     """
     The samples of a board, each once and in order, stamped by the clock of the board.
@@ -220,7 +163,7 @@ class SerialLink(base.Link):
         self._info: BoardInfo | None = None
         self._conversion: _Conversion | None = None
         self._misfit = ''
-        self._rate = _ClockRate(_UNSTATED_RATE_HZ)
+        self._rate = ClockRate(_UNSTATED_RATE_HZ)
         self._counter = wire_format.FrameCounter()
         self._stamper = Stamper(ClockMap(settings.delay), self.references)
         self._frame_s = 0.0  # Duration of the newest frame, s
@@ -293,7 +236,7 @@ class SerialLink(base.Link):
         if self._misfit:
             return base.Level.ERROR, self._misfit
         if contradiction := self._rate.fault:
-            return base.Level.ERROR, f'{port}: the board {contradiction}'
+            return base.Level.ERROR, f'{port}: the board {contradiction} in its info frame'
         return base.Level.OK, 'streaming'
 
     def _obstacle(self, now_s: float) -> str:
@@ -368,7 +311,7 @@ class SerialLink(base.Link):
         changed = info != self._info
         if not changed and not info.flags & wire_format.AFTER_RESET:
             return
-        self._info, self._rate = info, _ClockRate(info.rate_hz)
+        self._info, self._rate = info, ClockRate(info.rate_hz)
         self._use(info, changed)
 
     def _use(self, info: BoardInfo, changed: bool = True) -> None:
@@ -410,7 +353,7 @@ class SerialLink(base.Link):
             self._counts['bad_frames'] += 1  # whole, but it contradicts the info frame
             return
         self._last_sample_s = time.monotonic()
-        is_other_rate = self._rate.compare(frame)
+        is_other_rate = self._rate.compare(frame.index, frame.time_us)
         if is_other_rate:
             self._use(replace(info, rate_hz=self._rate.used_hz))
             conversion = self._conversion or conversion

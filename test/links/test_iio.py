@@ -132,6 +132,16 @@ def test_the_rate_is_set_and_read_back(served):
     assert link.status().text == 'streaming at 860 Hz'
 
 
+def test_a_device_that_samples_at_half_the_stated_rate_is_named(served):
+    _, link = served(nominal(rate_hz=500.0), {'share': 0.5})
+    parts = read_samples(link, 800)
+    status = link.status()
+    assert status.level is Level.ERROR
+    assert 'states 500 Hz' in status.text and '250 samples a second' in status.text
+    assert link.sensor.rate_hz == pytest.approx(250, rel=0.01)
+    assert not sum(part.missing for part in parts[-2:]), 'no sample is missing at 250 Hz'
+
+
 def test_a_digital_sensor_gives_pseudo_volts(served):
     sensor = nominal('xyz')
     _, link = served(

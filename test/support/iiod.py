@@ -78,12 +78,14 @@ class Adc:
 
     def __init__(self, options):
         self.options = options
-        self.rate = float(options.get('rate', 1000.0))
+        stated_hz = float(options.get('rate', 1000.0))
+        self.share = options.get('share', 1.0)  # Of the stated rate at which it samples
+        self.rate = self.share * stated_hz
         self.channels = [*options.get('channels', CHANNELS)]
         # libiio numbers the channels of the buffer first, with the time stamps as the last one.
         self.stamp_index = sum(not channel.get('unbuffered') for channel in self.channels)
         self.attributes = {
-            'sampling_frequency': str(self.rate),
+            'sampling_frequency': str(stated_hz),
             'current_timestamp_clock': 'realtime',
             **options.get('attributes', {}),
         }
@@ -195,7 +197,7 @@ class Adc:
             permitted = self.options.get('rates')
             if permitted and float(text) not in permitted:
                 return EINVAL
-            self.rate = float(text)
+            self.rate = self.share * float(text)
         if words[0] not in self.attributes:
             return EIO
         self.attributes[words[0]] = text

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Whether a device samples at the rate that it states, by its own clock."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from adxl_ros.links.support import wire_format
+import numpy as np
+
+_RATE_SAMPLES = 25
+"""Samples over which the clock of a device is compared with its stated rate. Chosen: all rates are
+known a fifth of a second after the start at 1 kHz."""
+_RATES = 8  # Rates in a row that must agree. Chosen: a device that stalls has other ones each time
+_RATE_SCATTER = 0.02
+"""Largest relative difference of rates that agree. Chosen: half a period of 25."""
+_MAX_RATE_ERROR = 0.05
+"""Largest relative error of a stated rate. Chosen: above the error of any oscillator."""
+
+
+class ClockRate:
+    """The rate of samples by the clock of a device, where it is not the stated one."""
+
+    def __init__(self, stated_hz: float) -> None:
+        self.used_hz = self._stated_hz = stated_hz
+        self._first: tuple[int, float] | None = None  # Number and time, µs, of a sample
+        self._newest_hz: deque[float] = deque(maxlen=_RATES)
+
+    @property
+    def fault(self) -> str:
+        """Return that clock and stated rate contradict each other, or ''."""
+        return (
+            ''
+            if self.used_hz == self._stated_hz
+            else (
+                f'states {self._stated_hz:g} Hz, but its clock shows {self.used_hz:.4g} samples a '
+                'second, which is used; correct the rate'
+            )
+        )
+
+    def compare(self, index: int, time_us: float) -> bool:
+        """Take number and time, µs, of a sample; return whether they change the rate to use."""
+        first = self._first
+        if first is None:
+            self._first = index, time_us
+            return False
+        # The numbers of samples may wrap at 2^32.
+        count = (index - first[0]) % 2**32
+        if count < _RATE_SAMPLES:
+            return False
+        self._first = index, time_us
+        self._newest_hz.append(count / max(time_us - first[1], 1.0) * 1e6)
+        clock_hz, low_hz, high_hz = (
+            float(f(self._newest_hz)) for f in (np.median, np.min, np.max)
+        )
+        if len(self._newest_hz) < _RATES or high_hz > (1 + _RATE_SCATTER) * low_hz:
+            return False
+        if abs(clock_hz / self._stated_hz - 1) <= _MAX_RATE_ERROR:
+            clock_hz = self._stated_hz
+        lowest_hz, highest_hz = wire_format.RATES_HZ
+        if (
+            abs(clock_hz / self.used_hz - 1) <= _MAX_RATE_ERROR
+            or not lowest_hz <= clock_hz <= highest_hz
+        ):
+            return False
+        self.used_hz = clock_hz
+        return True
