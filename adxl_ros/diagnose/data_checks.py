@@ -48,6 +48,8 @@ _LONGEST_SEARCH = 1 << 20  # Largest number of its steps. Chosen: six hours
 _PART_S = 15.0
 """Shortest part of a recording whose shift is looked for, s. Chosen: half of the shortest
 recording, so that each has two."""
+_OVERLAP_OF_PART = 0.9
+"""Share of a part that must overlap. Chosen: the ends of both recordings differ a little."""
 _MOST_PARTS = 8  # Most parts. Chosen: a step then shows in all but an eighth at either end
 _CORRELATED = 0.9
 """Correlation from which two motions are the same one. Chosen: noise of half the motion."""
@@ -321,7 +323,7 @@ def _check_one_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> 
     count = min(int(np.ptp(recording.time_s) / _PART_S), _MOST_PARTS)
     levels: list[list[_Shifts]] = []  # Parts in a row of which one shift may be that of all
     for rows in np.array_split(np.arange(len(motions.measured_s)), max(count, 1)):
-        part = motions.shifts(rows, len(rows))
+        part = motions.shifts(rows, round(_OVERLAP_OF_PART * len(rows)))
         if not part.fits(part.late_s):
             continue
         if levels and not part.contradicts(levels[-1][-1]):
