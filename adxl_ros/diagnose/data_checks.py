@@ -48,9 +48,11 @@ _LONGEST_SEARCH = 1 << 20  # Largest number of its steps. Chosen: six hours
 _PART_S = 15.0
 """Shortest part of a recording whose shift is looked for, s. Chosen: half of the shortest
 recording, so that each has two."""
-_OVERLAP_OF_PART = 0.9
-"""Share of a part that must overlap. Chosen: the ends of both recordings differ a little."""
+_OVERLAP_OF_PART = 0.5
+"""Share of a part that must overlap. Chosen: the ends of both recordings differ, and a clock may
+step by half of a part."""
 _MOST_PARTS = 8  # Most parts. Chosen: a step then shows in all but an eighth at either end
+_NOT_COMPARED = -1.0  # Correlation where too few samples overlap, or nothing moves
 _CORRELATED = 0.9
 """Correlation from which two motions are the same one. Chosen: noise of half the motion."""
 _SAME_CORRELATION = 0.01
@@ -302,16 +304,22 @@ class _Shifts(NamedTuple):
         """Return the best shift, s."""
         return float(self.lags_s[np.argmax(self.correlation)])
 
-    def fits(self, late_s: float) -> bool:
-        """Return whether the part fits at a shift as well."""
-        return bool(self.correlation[np.argmin(np.abs(self.lags_s - late_s))] > _CORRELATED)
+    @property
+    def fits(self) -> bool:
+        """Return whether the part fits at its best shift."""
+        return bool(self.correlation.max() > _CORRELATED)
+
+    def misfits(self, late_s: float) -> bool:
+        """Return whether the part can be compared at a shift, and does not fit there."""
+        there = self.correlation[np.argmin(np.abs(self.lags_s - late_s))]
+        return bool(_NOT_COMPARED < there <= _CORRELATED)
 
     def contradicts(self, other: _Shifts) -> bool:
         """Return whether neither part fits at the shift of the other."""
         return (
             abs(self.late_s - other.late_s) > LARGEST_LATENCY_S
-            and not self.fits(other.late_s)
-            and not other.fits(self.late_s)
+            and self.misfits(other.late_s)
+            and other.misfits(self.late_s)
         )
 
 
@@ -324,7 +332,7 @@ def _check_one_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> 
     levels: list[list[_Shifts]] = []  # Parts in a row of which one shift may be that of all
     for rows in np.array_split(np.arange(len(motions.measured_s)), max(count, 1)):
         part = motions.shifts(rows, round(_OVERLAP_OF_PART * len(rows)))
-        if not part.fits(part.late_s):
+        if not part.fits:
             continue
         if levels and not part.contradicts(levels[-1][-1]):
             levels[-1].append(part)
