@@ -152,8 +152,8 @@ def encoder_error_mps2(comparison: BaselineComparison) -> float:
     if comparison.joints is None:
         return comparison.robot_error_mps2
     sensor, used = comparison.sensor, comparison.used
-    slopes = gravity_slopes(*(joint(comparison.time_s)[used] for joint in comparison.joints))
-    squares = (slopes[:, : len(sensor.axes)] ** 2).sum(axis=0).mean()
+    slopes = gravity_slopes(*comparison.joint_values())[:, : len(sensor.axes), used]
+    squares = (slopes**2).sum(axis=0).mean()
     return float(sensor.local_gravity_mps2 * sensor.stage_std_rad * np.sqrt(squares))
 
 
@@ -328,7 +328,7 @@ def _angle_errors(
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield variance, V², and memory from sample to sample, (n,) each, of errors of angles."""
     sensor, time_s, joints = comparison.sensor, comparison.time_s, comparison.joints or ()
-    slopes = gravity_slopes(*(joint(time_s) for joint in joints))[:, axis] if joints else ()
+    slopes = gravity_slopes(*comparison.joint_values())[:, axis] if joints else ()
     for joint, slope in zip(joints, slopes):
         if isinstance(joint, SmoothedPath) and (errors := joint.errors(time_s)) is not None:
             # An error that grows, after a move, is a new one.
