@@ -199,6 +199,10 @@ class BaselineComparison:
         """Paths of alpha and beta; None without a stage."""
         return (self.motion.alpha, self.motion.beta) if self.reference is Reference.STAGE else None
 
+    def joint_values(self, order: int = 0) -> list[np.ndarray]:
+        """Return derivatives of alpha and beta, rad/s^order, (n,) each; none without a stage."""
+        return [joint(self.time_s, order) for joint in self.joints or ()]
+
     @property
     def measured(self) -> np.ndarray:
         """Return which samples are numbers and do not stand alone or repeat, (n,) bool."""
@@ -223,7 +227,7 @@ class BaselineComparison:
             return np.array(self.motion.force(self.time_s)) / G0_MPS2
         if self.joints is None:
             return None
-        alpha_rad, beta_rad = (joint(self.time_s) for joint in self.joints)
+        alpha_rad, beta_rad = self.joint_values()
         return np.array(specific_force(alpha_rad, beta_rad, 1.0))
 
     def simulated_v(self, sensor: Sensor) -> np.ndarray:
@@ -493,9 +497,8 @@ def without_gaps(comparison: BaselineComparison) -> BaselineComparison:
     unknown = np.zeros(len(time_s), bool)
     for begin, end in _in_gaps(time_s, force.time_s, limit_s):
         if end > begin:
-            unknown |= (time_s >= time_s[begin] - _BEFORE_S) & (
-                time_s <= time_s[end - 1] + _AFTER_S
-            )
+            begin_s, end_s = time_s[begin] - _BEFORE_S, time_s[end - 1] + _AFTER_S
+            unknown |= (time_s >= begin_s) & (time_s <= end_s)
     return leave_out(
         comparison, unknown, f'no reading of {force.name} for more than {limit_s:.3g} s'
     )

@@ -843,6 +843,24 @@ def _check_rest(comparison: BaselineComparison, finite: np.ndarray) -> None:
         )
 
 
+def _check_delay(simulated_g: np.ndarray, measured_g: np.ndarray, rate_hz: float) -> None:
+    """Refuse a sensor that is later or earlier than its reference than a latency explains."""
+    found = reference_checks.correlations(simulated_g, measured_g, 2 * len(simulated_g) // 3)
+    is_searched = np.abs(found.lags) <= _LARGEST_DELAY_S * rate_hz
+    by_lag = np.where(is_searched, found.correlation, -1.0)
+    best = int(np.argmax(by_lag))
+    delay_s = found.lags[best] / rate_hz
+    undelayed = by_lag[found.lags == 0][0]
+    is_clear = by_lag[best] > max(_CORRELATED, undelayed + _CORRELATION_GAIN)
+    if is_clear and abs(delay_s) > _SEARCHED_DELAY_S:
+        raise DataFault(
+            'time_misaligned',
+            f'the sensor is {abs(delay_s):.2f} s '
+            f'{"later" if delay_s > 0 else "earlier"} than the reference, but the '
+            f'search covers {_SEARCHED_DELAY_S:g} s; shift its stamps',
+        )
+
+
 def _check_axes(comparison: BaselineComparison) -> None:
     """Compare order, sign, unit and time of the axes with the simulated output."""
     sensor, finite = comparison.sensor, np.isfinite(comparison.volts).all(axis=1)
@@ -853,22 +871,7 @@ def _check_axes(comparison: BaselineComparison) -> None:
     moving = np.flatnonzero(simulated_g.std(axis=0) > SMALLEST_MOTION_G)
     if not len(moving):
         return
-    found = reference_checks.correlations(
-        simulated_g, np.nan_to_num(measured_g), 2 * len(simulated_g) // 3
-    )
-    is_searched = np.abs(found.lags) <= _LARGEST_DELAY_S * sensor.rate_hz
-    by_lag = np.where(is_searched, found.correlation, -1.0)
-    best = int(np.argmax(by_lag))
-    delay_s = found.lags[best] / sensor.rate_hz
-    undelayed = by_lag[found.lags == 0][0]
-    is_clear = by_lag[best] > max(_CORRELATED, undelayed + _CORRELATION_GAIN)
-    if is_clear and abs(delay_s) > _SEARCHED_DELAY_S:
-        raise DataFault(
-            'time_misaligned',
-            f'the sensor is {abs(delay_s):.2f} s '
-            f'{"later" if delay_s > 0 else "earlier"} than the reference, but the '
-            f'search covers {_SEARCHED_DELAY_S:g} s; shift its stamps',
-        )
+    _check_delay(simulated_g, np.nan_to_num(measured_g), sensor.rate_hz)
     simulated_g, measured_g = simulated_g[finite][:, moving], measured_g[finite][:, moving]
     count, axes = len(moving), [sensor.axes[d] for d in moving]
     with np.errstate(all='ignore'):

@@ -17,12 +17,11 @@ from adxl_ros.diagnose import data_checks, next_experiment, noise_effects, verdi
 from adxl_ros.diagnose.comparison import BaselineComparison, LeftOut, Reference, with_values
 from adxl_ros.diagnose.data_checks import CheckedRecording, DataFault
 from adxl_ros.diagnose.evidence import (
-    block_edges,
     BLOCKS,
     drifts_among,
     estimate_floor,
     NoiseFloor,
-    used_by_block,
+    sum_by_block,
 )
 from adxl_ros.diagnose.flexible_functions import flexible_bases
 from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
@@ -155,14 +154,14 @@ def diagnose(
     show_progress('4/5 held-out figures', 0.8)
     floor = estimate_floor([c.comparison for c in checked])
     smallest_mps2 = material_mps2(model, floor, material_mg)
-    evidence = _evidence(model, search, floor, smallest_mps2, seed)
+    evidence = _evidence(search, floor, smallest_mps2, seed)
     detections = _detections(checked, search.best, model.baseline, smallest_mps2)
     bases = list(chain(*map(flexible_bases, compared, model.baseline_v)))
     verdict = rule.decide(
         evidence,
         lambda effects, drift: rule.reproducible_rest(evidence.candidates[effects][drift], bases),
         [rule.NoiseCause(d.effect, d.power_mps2, d.is_left_out) for d in detections],
-        lambda effects: _simulate_again(model, search, effects),
+        lambda effects: _simulate_again(search, effects),
     )
     left_out = _material_left_out(checked, verdict)
     if verdict.status == 'no_gap' and not any(map(_could_show, model.comparisons)):
@@ -192,15 +191,13 @@ def _could_show(comparison: BaselineComparison) -> bool:
     )
 
 
-def _evidence(
-    model: LinearModel, search: Search, floor: NoiseFloor, smallest_mps2: float, seed: int
-) -> rule.Evidence:
+def _evidence(search: Search, floor: NoiseFloor, smallest_mps2: float, seed: int) -> rule.Evidence:
     """Fit all sets of effects to blocks, and predict those that were held out."""
-    comparisons = model.comparisons
-    counts = np.sum([used_by_block(c.used) for c in comparisons], axis=0)
+    model, comparisons = search.model, search.model.comparisons
+    counts = np.sum([sum_by_block(c.used) for c in comparisons], axis=0)
     robot_mps2 = max(c.robot_error_mps2 for c in comparisons)
     return rule.Evidence(
-        candidates=_held_out(model, search, floor, max(counts.sum(), 1.0)),
+        candidates=_held_out(search, floor, max(counts.sum(), 1.0)),
         counts=counts,
         weights=rule.block_weights(seed),
         material_mps2=smallest_mps2,
@@ -265,10 +262,10 @@ def material_mps2(
 
 
 def _held_out(
-    model: LinearModel, search: Search, floor: NoiseFloor, count: float
+    search: Search, floor: NoiseFloor, count: float
 ) -> dict[frozenset[str], dict[str, HeldOutFits]]:
     """Return held-out fits of all sets by the drift of their noise."""
-    best = search.best
+    best, model = search.best, search.model
     beside = linearise(model, best.effects, best.sensor, model.filters)
     drifts = (
         drifts_among(library())
@@ -292,11 +289,9 @@ def _held_out(
     return out
 
 
-def _simulate_again(
-    model: LinearModel, search: Search, effects: frozenset[str]
-) -> rule.SimulatedAgain:
+def _simulate_again(search: Search, effects: frozenset[str]) -> rule.SimulatedAgain:
     """Simulate a set as it is printed in all recordings, and as it was fitted at their rests."""
-    hypothesis = search.found[effects]
+    hypothesis, model = search.found[effects], search.model
     printed = _as_printed(hypothesis, with_neutral(model.baseline, hypothesis.effects))
     squares, more_at_rest, resting = np.zeros(BLOCKS), list[float](), 0
     for c in model.comparisons:
@@ -305,7 +300,7 @@ def _simulate_again(
             for s in (printed, hypothesis.sensor, search.found[frozenset()].sensor)
         )
         left[~c.used] = 0.0
-        squares += np.add.reduceat(left, block_edges(len(c))[:-1])
+        squares += sum_by_block(left)
         rests = true_runs(c.at_rest & c.used) if c.pose_known else []
         more_at_rest += [float(np.sum((fitted - without)[a:b])) for a, b in rests]
         resting += sum(b - a for a, b in rests)

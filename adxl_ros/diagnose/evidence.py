@@ -152,8 +152,8 @@ def encoder_error_mps2(comparison: BaselineComparison) -> float:
     if comparison.joints is None:
         return comparison.robot_error_mps2
     sensor, used = comparison.sensor, comparison.used
-    slopes = gravity_slopes(*(joint(comparison.time_s)[used] for joint in comparison.joints))
-    squares = (slopes[:, : len(sensor.axes)] ** 2).sum(axis=0).mean()
+    slopes = gravity_slopes(*comparison.joint_values())[:, : len(sensor.axes), used]
+    squares = (slopes**2).sum(axis=0).mean()
     return float(sensor.local_gravity_mps2 * sensor.stage_std_rad * np.sqrt(squares))
 
 
@@ -328,7 +328,7 @@ def _angle_errors(
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield variance, V², and memory from sample to sample, (n,) each, of errors of angles."""
     sensor, time_s, joints = comparison.sensor, comparison.time_s, comparison.joints or ()
-    slopes = gravity_slopes(*(joint(time_s) for joint in joints))[:, axis] if joints else ()
+    slopes = gravity_slopes(*comparison.joint_values())[:, axis] if joints else ()
     for joint, slope in zip(joints, slopes):
         if isinstance(joint, SmoothedPath) and (errors := joint.errors(time_s)) is not None:
             # An error that grows, after a move, is a new one.
@@ -457,8 +457,7 @@ class WhitenedChannel:
 
 
 def whiten_channel(
-    residual_v: np.ndarray,
-    columns: np.ndarray,
+    design: np.ndarray,
     column_ids: np.ndarray,
     used: np.ndarray,
     filters: Sequence[Whitener],
@@ -467,52 +466,40 @@ def whiten_channel(
     """
     Whiten one axis of one recording.
 
-    residual_v: residual, V, (n,); columns: columns, V per unit of their coefficients, (n, k);
-    column_ids: numbers of the columns, (k,); used: samples that are used, (n,) bool; the others
-    are bridged by straight lines.
+    design: residual, V, and columns, V per unit of their coefficients, (n, k + 1); column_ids:
+    numbers of the columns, (k,); used: samples that are used, (n,) bool; the others are bridged by
+    straight lines.
     """
-    data = np.empty((1 + columns.shape[1], len(used)))
-    data[0], data[1:] = residual_v, columns.T
-    if not used.all():
-        data = bridged(data.T, used).T
-    before = {
-        id(f.errors): data if f.errors is None else f.errors(data)
-        for f in {id(f.errors): f for f in filters}.values()
-    }
-    edges, dropped = block_edges(len(used)), np.append(np.flatnonzero(~used), 0)
-    grams = np.zeros((len(filters), BLOCKS if by_block else 0, len(data), len(data)))
-    total = np.zeros((len(filters), len(data), len(data)))
-    for i, whitener in enumerate(filters):
+    data = np.ascontiguousarray(bridged(design, used).T, float)
+    # Filters share that for errors of angles, which is applied once.
+    shared = {id(f.errors): f.errors for f in filters}
+    before = {key: data if e is None else e(data) for key, e in shared.items()}
+    # The first sample is a step from zero.
+    counted = used.copy()
+    counted[0] = False
+    block_grams, total_grams, log_scales = [], [], []
+    for whitener in filters:
         white = scipy.signal.sosfilt(whitener.sections, before[id(whitener.errors)])
-        # The first sample is a step from zero.
-        white[:, dropped] = 0.0
-        if by_block:
-            for b, (begin, end) in enumerate(pairwise(edges)):
-                grams[i, b] = white[:, begin:end] @ white[:, begin:end].T
-        total[i] = grams[i].sum(axis=0) if by_block else white @ white.T
-    # The log determinant of the filter for errors, sample by sample.
-    log_scales = np.array(
-        [
-            np.zeros(BLOCKS)
-            if f.errors is None
-            else np.add.reduceat(np.where(used, np.log(f.errors.scale), 0.0), edges[:-1])
-            for f in filters
-        ]
-    )
+        white[:, ~counted] = 0.0
+        block_grams.append(plain_grams(white.T, counted) if by_block else np.zeros((0, 0, 0)))
+        total_grams.append(block_grams[-1].sum(axis=0) if by_block else white @ white.T)
+        # The log determinant of the filter for errors, sample by sample.
+        scale = np.ones(len(used)) if whitener.errors is None else whitener.errors.scale
+        log_scales.append(sum_by_block(np.where(used, np.log(scale), 0.0)))
     return WhitenedChannel(
         column_ids,
-        grams,
-        total,
-        used_by_block(used),
-        log_scales,
+        np.array(block_grams),
+        np.array(total_grams),
+        sum_by_block(used),
+        np.array(log_scales),
         np.array([f.log_prior for f in filters]),
         np.array(['' if f.healthy else f.effect for f in filters]),
     )
 
 
-def used_by_block(used: np.ndarray) -> np.ndarray:
-    """Return the number of samples that are used, (n,) bool, by block."""
-    return np.add.reduceat(used, block_edges(len(used))[:-1]).astype(float)
+def sum_by_block(values: np.ndarray) -> np.ndarray:
+    """Return the sums of values, (n,), or how many of them are True, by block, (blocks,)."""
+    return np.add.reduceat(values, block_edges(len(values))[:-1]).astype(float)
 
 
 def plain_grams(columns: np.ndarray, used: np.ndarray) -> np.ndarray:

@@ -71,8 +71,7 @@ def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> li
     common = _common(comparison)
     slopes = np.zeros((2, len(AXES), 0))
     if comparison.joints:
-        angles_rad = [joint(comparison.time_s) for joint in comparison.joints]
-        slopes = beside.gravity_slopes(*angles_rad)
+        slopes = beside.gravity_slopes(*comparison.joint_values())
     bases = []
     for axis, along_g in enumerate(force_g):
         factors = {
@@ -111,7 +110,7 @@ def _common(comparison: BaselineComparison) -> Basis:
             if Form(name) is Form.TEMPERATURE:
                 basis[Form.WARMING] = _thermal_history(values, comparison.dt_s)
     if comparison.joints:
-        alpha_rad, beta_rad = (joint(comparison.time_s) for joint in comparison.joints)
+        alpha_rad, beta_rad = comparison.joint_values()
         basis[Form.ALPHA] = _modes(alpha_rad, Form.ALPHA)
         basis[Form.BETA] = _harmonics(beta_rad, _BETA_HARMONICS)
     return basis
@@ -188,15 +187,9 @@ class _Moves:
     @classmethod
     def of(cls, comparison: BaselineComparison) -> _Moves:
         """Return the moves of a recording; no joint moves where it has none."""
-        rates = [joint(comparison.time_s, 1) for joint in comparison.joints or ()]
-        return cls(
-            rates,
-            [
-                rate / np.abs(rate).max()
-                for rate in rates
-                if np.abs(rate).max() > _SMALLEST_RATE_RAD_S
-            ],
-        )
+        rates = comparison.joint_values(1)
+        moving = [rate for rate in rates if np.abs(rate).max() > _SMALLEST_RATE_RAD_S]
+        return cls(rates, [rate / np.abs(rate).max() for rate in moving])
 
 
 def _of_moves(moves: _Moves, along_g: np.ndarray, comparison: BaselineComparison) -> Basis:

@@ -603,8 +603,7 @@ def _whitened(
     residuals_v = [c.residual_v(c.sensor).T for c in comparisons]
     return [
         evidence.whiten_channel(
-            residual_v,
-            np.array([*own.values()]).T,
+            np.column_stack([residual_v, *own.values()]),
             np.array([*own]),
             channel.comparison.used,
             of_filters,

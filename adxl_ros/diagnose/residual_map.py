@@ -80,8 +80,8 @@ def dimensions(comparison: BaselineComparison) -> dict[str, np.ndarray]:
     if force_g is not None:
         values |= {f'force_{axis}_g': f for axis, f in zip(AXES, force_g)}
     if comparison.joints:
-        alpha_rad, beta_rad = (joint(time_s) for joint in comparison.joints)
-        rates = [joint(time_s, 1) for joint in comparison.joints]
+        alpha_rad, beta_rad = comparison.joint_values()
+        rates = comparison.joint_values(1)
         values |= {
             'alpha_rad': alpha_rad,
             'beta_rad': beta_rad % (2 * np.pi),

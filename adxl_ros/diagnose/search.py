@@ -139,9 +139,7 @@ def linearise(
         used = channel.comparison.used
         plain = evidence.plain_grams(design / channel.v_per_mean_mps2, used)
         columns.append(evidence.ChannelColumns(ids, design.astype(np.float32), plain))
-        channels.append(
-            evidence.whiten_channel(design[:, 0], design[:, 1:], ids, used, of_channel)
-        )
+        channels.append(evidence.whiten_channel(design, ids, used, of_channel))
         changes.append({0: response.change_v})
     # The square of each deviation is that of a healthy unit's tolerance plus that of what a
     # calibration can take up of the effects.

@@ -245,7 +245,7 @@ class _FlexibleFunctions:
         design = np.concatenate([columns.values, *(unit_v * b for b in basis.values())], axis=1)
         whitener = fits.linearised.filters[number][fits.full.filter_indices[number]]
         ids = np.arange(design.shape[1] - 1)
-        white = linear.whiten_channel(design[:, 0], design[:, 1:], ids, used, [whitener])
+        white = linear.whiten_channel(design, ids, used, [whitener])
         return cls(
             dimensions=np.repeat(
                 [d.value for d in basis], [functions.shape[1] for functions in basis.values()]

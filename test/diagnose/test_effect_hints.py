@@ -6,6 +6,7 @@ import ast
 from importlib import import_module
 from pathlib import Path
 
+from adxl_ros.diagnose.data_checks import DATA_FAULTS
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import ActsOn, FormDimension, Need, Place
 import pytest
@@ -22,7 +23,8 @@ def test_diagnosis_names_no_effect(module):
         for node in ast.walk(tree)
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     }
-    assert not texts & set(library())
+    # The fault of the data `gravity` is named like an effect.
+    assert not texts & (set(library()) - set(DATA_FAULTS))
 
 
 @pytest.mark.parametrize('effect', library().values(), ids=lambda effect: effect.name)

@@ -29,7 +29,8 @@ def problem(true=(0.3, -1.0, 0.0), noise_v=0.2, seed=1):
 
 def fitted(residual_v, columns, ids=(0, 1, 2), used=None, blocks=None):
     used = np.ones(COUNT, bool) if used is None else used
-    channel = whiten_channel(residual_v, columns, np.arange(3), used, [white_filter()])
+    design = np.column_stack([residual_v, columns])
+    channel = whiten_channel(design, np.arange(3), used, [white_filter()])
     return fit_columns([channel], ids, PRIOR_STD, blocks)
 
 

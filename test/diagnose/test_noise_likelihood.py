@@ -55,7 +55,7 @@ def test_innovations_have_the_likelihood_of_the_covariance(resting, number):
     white = np.random.default_rng(number).normal(size=COUNT)
     volts = np.linalg.cholesky(covariances_v2[1]) @ white
     whitened = evidence.whiten_channel(
-        volts, np.zeros((COUNT, 0)), np.zeros(0, int), np.ones(COUNT, bool), filters
+        volts[:, None], np.zeros(0, int), np.ones(COUNT, bool), filters
     )
     by_filter = -0.5 * COUNT * np.log(whitened.total_grams[:, 0, 0])
     exact = [log_likelihood(volts, covariance) for covariance in covariances_v2]
@@ -70,7 +70,7 @@ def test_a_fit_takes_the_drift_that_the_noise_has(resting):
     factor = np.linalg.cholesky(covariance_v2(resting, density * scale))
     volts = factor @ np.random.default_rng(1).normal(size=COUNT)
     channel = evidence.whiten_channel(
-        volts, np.zeros((COUNT, 0)), np.zeros(0, int), np.ones(COUNT, bool), filters
+        volts[:, None], np.zeros(0, int), np.ones(COUNT, bool), filters
     )
     free = evidence.fit_columns([channel], [], np.zeros(0), drifts=('bias_walk',))
     healthy = evidence.fit_columns([channel], [], np.zeros(0))
@@ -100,5 +100,5 @@ def test_a_repeat_is_found_with_its_lag():
 def test_each_used_sample_is_in_one_block():
     used = np.ones(COUNT, bool)
     used[:100] = False
-    assert evidence.used_by_block(used).sum() == COUNT - 100
+    assert evidence.sum_by_block(used).sum() == COUNT - 100
     assert evidence.plain_grams(np.ones((COUNT, 1)), used).sum() == COUNT - 100
