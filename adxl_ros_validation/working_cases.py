@@ -11,7 +11,7 @@ A case that has been looked at is a development case: draw a fresh seed for a sc
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 import json
@@ -25,7 +25,15 @@ from adxl_ros.workers import open_pool
 from adxl_ros_validation import working_world as world
 from adxl_ros_validation.blind import diagnosis_runs, grading, scores, simulator, trials
 from adxl_ros_validation.blind.grading import Answer
-from adxl_ros_validation.blind.ideal_observer import beyond_calibration, rms
+from adxl_ros_validation.blind.ideal_observer import (
+    beyond_calibration,
+    Bracket,
+    bracket,
+    IdealObserver,
+    line,
+    noise_visibility,
+    rms,
+)
 from adxl_ros_validation.blind.report import reliability, terminal_table
 from adxl_ros_validation.blind.simulator import Fault, G0, Scene
 from adxl_ros_validation.blind.trials import Label
@@ -41,6 +49,9 @@ _DIGITS = {**simulator.DIGITS, 'shift_m': 8}
 """Digits of the columns of a recording."""
 _NOTICED = 1.05
 """Ratio of true and stated noise from which a verdict may name the noise, too."""
+_DISTINCT = 1e-4
+"""Smallest length of a unit vector beside others that still is another direction. Chosen: far
+above rounding."""
 _HARM = 0.01
 """Smallest harm, as a share of the mean square before."""
 
@@ -153,6 +164,76 @@ def _harm(case: Case, fitted: str | None) -> bool:
     return compared.interval(after - before)[0] > _HARM * float(before.mean())
 
 
+def limit(case: Case) -> Bracket:
+    """
+    Return how probably an ideal observer names all causes of a case with causes of the library.
+
+    It knows the forms of this world, the noise and the motion. What a calibration took up of a
+    fault is not counted.
+    """
+    known = {name: world.KINDS[name] for name in world.LISTED}
+    observer = IdealObserver(case.scene, known)
+    rivals = observer.rivals()
+    faults = [fault for fault in case.faults if fault.kind is not world.COLOUR]
+    left_by_rivals: list[float] = []
+    for fault, row in zip(faults, case.label.faults):
+        change = case.scene.response([fault], coarse=True)
+        if row['calibrated']:
+            change = change - _straight_line(change, observer.force)
+        if fault.kind.random:
+            left_by_rivals.append(noise_visibility(observer, fault.kind, change))
+            continue
+        # The other causes are there in any case; one of them, or none, is in place of this one.
+        others = [f.kind.name for f in faults if f is not fault and not f.kind.random]
+        beside = np.hstack([rivals[name] for name in others] or [np.zeros((0, 0))])
+        left_by_rivals += _left(observer.project(change), beside, rivals, fault.kind.name)
+    return bracket(left_by_rivals)
+
+
+def _straight_line(change: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Return the zero-g and scale factor that are nearest to a change, m/s², (m, n)."""
+    return np.array(
+        [np.polyval(line(along, row)[::-1], along) for row, along in zip(change, force)]
+    )
+
+
+def _left(
+    vector: np.ndarray, beside: np.ndarray, rivals: Mapping[str, np.ndarray], truth: str
+) -> list[float]:
+    """Return the squares that no cause, and each rival beside others, leave of a vector."""
+    fixed = np.linalg.qr(beside)[0] if beside.size else np.zeros((len(vector), 0))
+    rest = vector - fixed @ (fixed.T @ vector)
+    left = [float(rest @ rest)]
+    for name, columns in rivals.items():
+        if name == truth:
+            continue
+        basis, sizes, _ = np.linalg.svd(columns - fixed @ (fixed.T @ columns), full_matrices=False)
+        basis = basis[:, sizes > _DISTINCT]
+        left.append(float(rest @ rest - np.sum((basis.T @ rest) ** 2)))
+    return left
+
+
+def limits(seed: int, number: int, only: str | None) -> tuple[tuple[str, Bracket | None]]:
+    """Draw a case; return its group, and its limit where it has causes of the library."""
+    case = draw(seed, number, only)
+    known = case.label.group in ('single', 'pair')
+    return ((case.label.group, limit(case) if known else None),)
+
+
+def limit_table(rows: Sequence[tuple[str, Bracket | None]]) -> str:
+    """Return what an ideal observer could have said, on average over the cases of a group."""
+    lines = []
+    for group in ('single', 'pair'):
+        found = [told for name, told in rows if told and name == group]
+        if found:
+            low, high = np.mean(found, axis=0)
+            lines.append(
+                f'{group + ", exactly, by an ideal observer":40} {100 * low:.0f} to '
+                f'{100 * high:.0f} %, n = {len(found)}'
+            )
+    return '\n'.join(lines)
+
+
 class Row(NamedTuple):
     """A diagnosed case."""
 
@@ -198,7 +279,7 @@ def diagnosed(seed: int, number: int, only: str | None, folder: Path) -> tuple[R
     )
 
 
-def line(row: Row) -> str:
+def line_of(row: Row) -> str:
     """Return truth, verdict, figures and time of a case in one line."""
     answer, label = row.answer, row.label
     report = row.result['report'] or {}
@@ -308,6 +389,11 @@ def parser() -> argparse.ArgumentParser:
     )
     parse.add_argument('--seed', type=int, default=1, help='seed of the cases (default 1)')
     parse.add_argument('--only', choices=GROUPS, help='cases of one group only')
+    parse.add_argument(
+        '--limit',
+        action='store_true',
+        help='do not diagnose: print what an ideal observer could have said of the cases',
+    )
     parse.add_argument('--jobs', type=int, default=2, help='processes at once (default 2)')
     return parse
 
@@ -315,21 +401,24 @@ def parser() -> argparse.ArgumentParser:
 def working(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     cli.check_least(options, count=1, jobs=1, first=0, seed=0)
-    folder, rows = Path(options.output), []
     numbers = range(options.first, options.first + options.count)
-
-    def keep(row: Row) -> None:
-        rows.append(row)
-        print(line(row), flush=True)
-
+    drawn = [(options.seed, number, options.only) for number in numbers]
+    folder = Path(options.output)
     with open_pool(None, options.jobs) as pool:
-        for_each(
-            pool,
-            diagnosed,
-            [partial(tuple, (options.seed, number, options.only, folder)) for number in numbers],
-            keep,
-            lambda done: None,
-        )
+        if options.limit:
+            told: list[tuple[str, Bracket | None]] = []
+            jobs = [partial(tuple, case) for case in drawn]
+            for_each(pool, limits, jobs, told.append, lambda done: None)
+            print(limit_table(told))
+            return 0
+        rows: list[Row] = []
+
+        def keep(row: Row) -> None:
+            rows.append(row)
+            print(line_of(row), flush=True)
+
+        jobs = [partial(tuple, (*case, folder)) for case in drawn]
+        for_each(pool, diagnosed, jobs, keep, lambda done: None)
     print(f'\n{table(rows)}')
     return 0
 

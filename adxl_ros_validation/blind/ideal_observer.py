@@ -3,14 +3,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 import math
+from typing import NamedTuple
 
 from adxl_ros_validation.blind import simulator as sim
 from adxl_ros_validation.blind.faults import KINDS, KNOWN
-from adxl_ros_validation.blind.simulator import Fault, G0, Kind, Scene, Unit
+from adxl_ros_validation.blind.simulator import Fault, G0, Kind, Scene, Shape, Unit
 import numpy as np
 import scipy
 
+KNOWN_KINDS = {name: KINDS[name] for name in KNOWN}
+"""Kinds of this world that have a counterpart in the library."""
 TEST_LEVEL = 0.05 / len(KNOWN)
 """Level of the test of one effect, so that the tests of all effects together have 5 %."""
 INSEPARABLE_BELOW = 9.0
@@ -20,6 +24,8 @@ These are three standard deviations; chosen.
 """
 _NOISE_STD = 0.02
 """Uncertainty of the stated noise density, a share; that of units is 0.015."""
+_DRAWN_FORMS = 6
+"""Draws of the numbers of a kind that states no list for them. Chosen: run time."""
 _RECOGNISABLE_SAMPLE = 7.0
 """Squared visibility of one repeated sample; chosen."""
 
@@ -73,8 +79,13 @@ class IdealObserver:
     their squares are twice a log likelihood ratio.
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene = scene
+    def __init__(self, scene: Scene, known: Mapping[str, Kind] = KNOWN_KINDS) -> None:
+        """
+        Prepare for the recordings of a scene.
+
+        known: the kinds that could be the cause, by name, in the forms of the world.
+        """
+        self.scene, self.known = scene, known
         self.force = scene.force()
         self.axes, self.count = self.force.shape
         self.weight = 1 / np.sqrt(_spectrum(scene.unit, self.count) * scene.unit.rate_hz / 2)
@@ -123,10 +134,12 @@ class IdealObserver:
     def rivals(self) -> dict[str, np.ndarray]:
         """Return columns that span the responses of each effect that is not like noise, (v, k)."""
         rivals = {}
-        for name, kind in ((name, KINDS[name]) for name in KNOWN if not KINDS[name].random):
+        for name, kind in self.known.items():
+            if kind.random:
+                continue
             changes = [
                 self.scene.response([Fault(kind, multiple * kind.start, shape)], True)
-                for shape in kind.spread(self.scene.unit)
+                for shape in _forms(kind, self.scene.unit)
                 for multiple in kind.sizes
             ]
             if kind.per_axis:
@@ -159,6 +172,16 @@ class IdealObserver:
             used += basis.shape[1]
         threshold = scipy.stats.chi2.isf(0.001, used)
         return float(scipy.stats.ncx2.sf(threshold, used, explained))
+
+
+def _forms(kind: Kind, unit: Unit) -> list[Shape]:
+    """Return shapes whose responses span those of a kind; numbers without a list are drawn."""
+    shapes = kind.spread(unit)
+    rng = np.random.default_rng(0)
+    drawn = [kind.draw(rng, unit) for _ in range(_DRAWN_FORMS)]
+    if not any(drawn[0].keys() - shape.keys() for shape in shapes):
+        return shapes
+    return [{**numbers, **shape} for shape in shapes for numbers in drawn]
 
 
 def _orthonormal(columns: list[np.ndarray], length: int) -> np.ndarray:
@@ -200,6 +223,24 @@ def power(strength: float) -> float:
 def separation_probability(strength: float) -> float:
     """Return the probability that the truth beats a rival that leaves a squared visibility."""
     return float(scipy.stats.norm.cdf(0.5 * math.sqrt(max(strength, 0.0))))
+
+
+class Bracket(NamedTuple):
+    """Bounds of the probability with which an ideal observer names the truth."""
+
+    low: float
+    high: float
+
+
+def bracket(left_by_rivals: Iterable[float]) -> Bracket:
+    """
+    Return the bounds by what each rival leaves of the truth, squared and whitened.
+
+    Two hypotheses at a distance d are confused with the probability Φ(-d/2). All of them together
+    are at most the sum of the single ones, and no more is told than about the nearest rival.
+    """
+    confused = [1 - separation_probability(squares) for squares in left_by_rivals]
+    return Bracket(max(1 - sum(confused), 0.0), 1 - max(confused))
 
 
 def noise_visibility(observer: IdealObserver, kind: Kind, change: np.ndarray) -> float:

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Working cases: every fault acts, a case is drawn again to the bit, and scores count right."""
 
+from dataclasses import replace
+
 from adxl_ros.model.effects import library
 from adxl_ros_validation import working_cases, working_world as world
-from adxl_ros_validation.blind.ideal_observer import rms
+from adxl_ros_validation.blind.ideal_observer import bracket, rms
 from adxl_ros_validation.blind.motion import Manoeuvre
 from adxl_ros_validation.blind.simulator import Fault, Scene
 from adxl_ros_validation.blind.trials import Label
@@ -84,3 +86,25 @@ def row(group, effects, status, named=(), probability=0.65, groups=()):
 )
 def test_exact_and_in_the_set(given, right, in_set):
     assert (working_cases.right(given), working_cases.in_set(given)) == (right, in_set)
+
+
+def test_the_bounds_of_an_ideal_observer() -> None:
+    """Two hypotheses at a distance of 2 are confused with Φ(-1); far rivals do not matter."""
+    single = bracket([4.0])
+    assert single.low == pytest.approx(single.high) == pytest.approx(0.8413, abs=1e-4)
+    several = bracket([4.0, 4.0, 1e4])
+    assert several.low == pytest.approx(1 - 2 * 0.1587, abs=1e-3)
+    assert several.high == pytest.approx(0.8413, abs=1e-4)
+    assert bracket([0.0] * 5) == (0.0, 0.5)
+
+
+@pytest.mark.long
+def test_the_limit_of_a_case() -> None:
+    """A strong cause can be told from others; the same one far below the noise cannot."""
+    case = working_cases.draw(5, 0, 'single')
+    strong, weak = (
+        [replace(fault, size=min(factor * fault.size, fault.kind.largest)) for fault in case.faults]
+        for factor in (10.0, 1e-4)
+    )
+    assert working_cases.limit(case._replace(faults=strong)).high > 0.9
+    assert working_cases.limit(case._replace(faults=weak)).high < 0.6
