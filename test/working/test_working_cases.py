@@ -103,7 +103,10 @@ def test_the_limit_of_a_case() -> None:
     """A strong cause can be told from others; the same one far below the noise cannot."""
     case = working_cases.draw(5, 0, 'single')
     strong, weak = (
-        [replace(fault, size=min(factor * fault.size, fault.kind.largest)) for fault in case.faults]
+        [
+            replace(fault, size=min(factor * fault.size, fault.kind.largest))
+            for fault in case.faults
+        ]
         for factor in (10.0, 1e-4)
     )
     assert working_cases.limit(case._replace(faults=strong)).high > 0.9
