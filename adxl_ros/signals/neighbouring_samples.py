@@ -4,13 +4,13 @@
 Faults between neighbouring samples, which means over a rest do not show.
 
 They are readings that stand for several samples each, the rows of several sensors in turn, counts
-that wrap at the end of their range, readings that jump from one rest to another at once, and
-single wrong samples.
+that wrap at the end of their range, readings that jump from one rest to another at once, single
+wrong samples, and rows that are means of rests.
 """
 
 from __future__ import annotations
 
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import G0_MPS2, TINY
 import numpy as np
 
 _FEWEST_RUNS = 20
@@ -46,6 +46,12 @@ _NEAREST = 3  # Samples on either side whose mean is compared
 _STEADY = 0.2  # Largest step among them, by the jump. Chosen: noise and slow motion are smaller
 _SMALLEST_JUMP_G = 0.3  # Smallest jump, g. Chosen: 17° of tilt, above any offset of the sensor
 
+_FEWEST_MEANS = 4  # Fewest rows that are means of rests. Chosen: zero-g needs as many
+_OFF_LENGTH_G = 0.15  # Largest deviation of a mean from 1 g, g. Chosen: above most zero-g
+_SMALLEST_TURN_COS = np.cos(np.radians(10.0))
+"""Cosine of the turn from one mean to the next. Chosen: far above that between two samples."""
+_SHARE_OF_MEANS = 0.8  # Share of the rows for which both hold. Chosen: poses may come twice
+
 _FEWEST_SPIKES = 3  # Fewest single wrong samples. Chosen: as with counts that wrap
 _ALIKE_SIZE = 0.75
 """Size from which another sample deviates as much as a spike, by the spike. The neighbours of a
@@ -69,6 +75,8 @@ class NeighbouringSamples:
         self._alternating = dict.fromkeys(_PHASES, 0)  # Those in which rows alternate
         self._distance_mps2 = dict.fromkeys(_PHASES, 0.0)  # Largest distance of their means
         self._ends = [_Ends() for _ in axes]
+        self._rows = 0  # Rows with one before
+        self._like_means = 0  # Those as long as gravity, and turned away from the one before
         self._jumps: list[tuple[float, float]] = []  # Times, s, and sizes, m/s², of jumps
         self._spike_s: list[float] = []  # Times of single samples away from steady ones, s
         self._spike_mps2: list[float] = []  # Their largest deviation of an axis, m/s²
@@ -87,6 +95,7 @@ class NeighbouringSamples:
         for ends, values in zip(self._ends, with_last.T):
             ends.feed(values)
         self._count_runs(with_last)
+        self._count_means(with_last)
         self._compare_rows(samples)
         # The sides of the last samples come with the next block.
         self._find_jumps(joined_s, joined)
@@ -95,6 +104,12 @@ class NeighbouringSamples:
 
     def faults(self) -> list[str]:
         """Return what is wrong, one line each."""
+        if self.are_means:
+            return [
+                f'{self._like_means} of {self._rows} rows are as long as gravity and turned by '
+                'more than 10° from the row before: each is the mean of a rest; fit --means '
+                'reads them'
+            ]
         # A value that wraps for one sample stands alone as well.
         found = (
             self._repeats(),
@@ -116,6 +131,21 @@ class NeighbouringSamples:
         lengths = np.append(self._run + begins[0] - 1, np.diff(begins))
         self._run = len(samples) - int(begins[-1])
         self._runs += np.bincount(lengths.clip(max=len(self._runs) - 1), minlength=len(self._runs))
+
+    def _count_means(self, samples: np.ndarray) -> None:
+        """Count rows as long as gravity whose direction is not that of the one before."""
+        length_mps2 = np.maximum(np.linalg.norm(samples, axis=1), TINY)
+        directions = samples / length_mps2[:, None]
+        turned = np.sum(directions[1:] * directions[:-1], axis=1) < _SMALLEST_TURN_COS
+        is_gravity = np.abs(length_mps2[1:] / G0_MPS2 - 1) < _OFF_LENGTH_G
+        self._rows += len(turned)
+        self._like_means += int(np.sum(turned & is_gravity))
+
+    @property
+    def are_means(self) -> bool:
+        """Whether each row is the mean of a rest."""
+        fewest = max(_FEWEST_MEANS, _SHARE_OF_MEANS * self._rows)
+        return len(self._axes) == 3 and self._like_means >= fewest
 
     def _repeats(self) -> str:
         """Return how often each reading stands, where that is no chance."""

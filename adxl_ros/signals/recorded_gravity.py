@@ -37,6 +37,8 @@ class RecordingLook:
         rest of it reads gravity: then rests by the noise of the readings themselves tell the unit.
         """
         self.rests.take()
+        if self._neighbours.are_means:
+            return self._look([])
         gravity = self._look(self.rests.detected)
         if gravity.fault is not None and gravity.fault.kind is GravityFaultKind.REMOVED:
             by_own_noise = self._look(self.rests.by_own_noise())

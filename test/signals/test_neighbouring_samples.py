@@ -123,3 +123,14 @@ def test_codes_that_change_for_one_sample_are_right() -> None:
     steady[100::50] += 0.04
     steady[125::50, 0] -= 0.04
     assert faults(np.round(steady / 0.04) * 0.04) == []
+
+
+def test_rows_that_are_means_of_rests() -> None:
+    directions = np.random.default_rng(3).normal(size=(49, 3))
+    means = G * directions / np.linalg.norm(directions, axis=1)[:, None] * [1.01, 0.99, 1.02]
+    (found,) = faults(means + [0.1, -0.2, 0.3])
+    assert 'fit --means' in found
+    assert (
+        faults(np.repeat(means, 50, axis=0) + 0.02 * np.sin(np.arange(2450 * 3)).reshape(-1, 3))
+        == []
+    )
