@@ -40,8 +40,9 @@ from adxl_ros.report.screen import NextStep
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.trajectories import motion_from_force
 
-PAGE, PARAMETERS, REPORT = 'report.html', 'params.yaml', 'report.json'
-"""Files of a diagnosis."""
+PAGE = 'report.html'  # File of the page of a diagnosis
+PARAMETERS = 'params.yaml'  # File of the sensor with the effects that were found
+REPORT = 'report.json'  # File of the figures
 _NO_VERDICT = ('bad_data', 'insufficient')
 """Outcomes without a verdict: a fault of a recording, or too little in it."""
 

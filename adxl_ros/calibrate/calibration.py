@@ -11,7 +11,7 @@ from functools import partial
 
 from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, thermal_fit
 from adxl_ros.calibrate.fits.linearisation import volts_covariance
-from adxl_ros.calibrate.poses import at_a_rail, Poses, predicted_volts, reference_force
+from adxl_ros.calibrate.poses import at_a_rail, Poses, predicted_volts, reference_force, residual_g
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.held_out import HeldOutErrors, rms_mg
@@ -21,7 +21,7 @@ from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import Population, posterior
-from adxl_ros.model.sensor import get, Sensor
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.quantities import mg, with_half_width
 from adxl_ros.signals import recorded_sensor
 from adxl_ros.signals.gravity_at_rest import of_volts, require_unit
@@ -174,9 +174,7 @@ def _against_stage(
     assessment = acceptance.judged(assessments[-1], fitted) if assessments else None
     assessments = (*assessments[:-1], assessment) if assessment else ()
     force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
-    residual_mg = ((poses.volts - predicted_volts(fitted, poses)) / fitted.scale_v_per_g * 1e3)[
-        fitting
-    ]
+    residual_mg = 1e3 * residual_g(fitted, poses)[fitting]
     if fitted.model == 'full':
         fitted, filter_lines = recorded_sensor.with_filter(
             fitted, [recording.filters for recording in recordings if recording.filters]
@@ -421,10 +419,11 @@ def _against_gravity(
     budgets = acceptance.gravity_error_budgets(fit, fitted, force, kept)
     assessment = acceptance.assess('gravity', budgets, fitted, fit.converged and not doubts)
     if fit.step.left_out:
+        determined = [name not in fit.step.left_out for name in fitted.covariance_names]
         assessment = acceptance.with_open(
             assessment,
             acceptance.gravity_error_budgets(
-                fit, _without(fitted, fit.step.left_out), force, kept
+                fit, fitted.with_covariance_of(determined), force, kept
             ),
             fitted,
         )
@@ -461,26 +460,12 @@ def _against_gravity(
     )
 
 
-def _without(sensor: Sensor, names: Sequence[Coefficient]) -> Sensor:
-    """Return a sensor for which some of the coefficients count as exact."""
-    kept = [i for i, name in enumerate(sensor.covariance_names) if name not in names]
-    return replace(
-        sensor,
-        covariance=sensor.covariance[np.ix_(kept, kept)],
-        covariance_names=tuple(sensor.covariance_names[i] for i in kept),
-    )
-
-
 def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
     """Report the scatter of the zero-g over recordings of one unit on the stage."""
     on_stage = [poses.subset(poses.has_angles) for poses in recordings if poses.has_angles.any()]
     if len(on_stage) < 2:
         return []
-    changes_mg = [
-        1e3
-        * np.mean((poses.volts - predicted_volts(fitted, poses)) / fitted.scale_v_per_g, axis=0)
-        for poses in on_stage
-    ]
+    changes_mg = [1e3 * np.mean(residual_g(fitted, poses), axis=0) for poses in on_stage]
     by_axis = ', '.join(
         f'{axis} {value:.2g}'
         for axis, value in zip(fitted.axes, np.std(changes_mg, axis=0, ddof=1))
@@ -500,7 +485,7 @@ def calibrate_thermal(
 ) -> CalibrationResult:
     """Fit zero-g over temperature, and the slope of the scale factor where orientations allow."""
     doubts = require_unit(of_volts(poses.volts, poses.std_v, base), source, True)
-    blocks = thermal_fit.blocks_of(poses)
+    blocks = poses.with_temperature()
     fit = thermal_fit.fit(base, blocks)
     calibrated_c = thermal_fit.calibrated_temperature_c(base)
     fitted = thermal_fit.applied(base, fit, calibrated_c)
@@ -533,27 +518,10 @@ def calibrate_thermal(
     )
     covered = thermal_fit.passed(blocks.temperature_c, (low_c, high_c))
     error_mg = thermal_fit.expected_error_mg(fit, covered, calibrated_c)
-    std = dict(zip(fit.names, Z_90 * np.sqrt(np.diag(fit.covariance))))
-    pairs = [
-        [Coefficient('temperature_bias', name, axis) for name in ('per_k', 'per_k2')]
-        for axis in fitted.axes
-    ]
     lines = [
         f'zero-g over temperature: {len(blocks)} blocks at rest, '
         f'{fit.span_c[0]:.1f} to {fit.span_c[1]:.1f} °C',
-        *(
-            f'  {slope.axis}  {with_half_width(k * 1e3, std[slope] * 1e3)} mg/K at 25 °C, '
-            f'{with_half_width(k2 * 1e6, std[curvature] * 1e6)} µg/K²'
-            for slope, curvature in pairs
-            for k, k2 in [get(fitted, [slope, curvature])]
-        ),
-        'residual '
-        + ', '.join(f'{axis} {value * 1e3:.2g}' for axis, value in zip(base.axes, fit.rms_g))
-        + ' mg rms',
-        f'warming and cooling differ: {fit.history} ({fit.shape:.3g} '
-        f'{"s" if fit.history == "thermal_lag" else "K"})'
-        if fit.history
-        else 'no thermal_lag or thermal_hysteresis shows',
+        *_thermal_lines(fit, base.axes),
         f'expected error of the zero-g over {low_c:.0f} to {high_c:.0f} °C: {error_mg:.2g} mg',
         f'zero-g stays as calibrated at {calibrated_c:.1f} °C',
     ]
@@ -562,3 +530,26 @@ def calibrate_thermal(
     return CalibrationResult(
         nominal=base, fitted=fitted, summary=lines, poses=poses, warnings=doubts
     )
+
+
+def _thermal_lines(fit: thermal_fit.ThermalFit, axes: str) -> list[str]:
+    """Return slope and curvature of each axis, the residuals, and the effect of the history."""
+    halves = Z_90 * np.sqrt(np.diag(fit.covariance))
+    intervals = dict(zip(fit.names, zip(fit.values, halves)))
+    lines = []
+    for axis in axes:
+        value_k, half_k = intervals[Coefficient('temperature_bias', 'per_k', axis)]
+        value_k2, half_k2 = intervals[Coefficient('temperature_bias', 'per_k2', axis)]
+        lines.append(
+            f'  {axis}  {with_half_width(value_k * 1e3, half_k * 1e3)} mg/K at 25 °C, '
+            f'{with_half_width(value_k2 * 1e6, half_k2 * 1e6)} µg/K²'
+        )
+    rms = ', '.join(f'{axis} {value * 1e3:.2g}' for axis, value in zip(axes, fit.rms_g))
+    unit = 's' if fit.history == 'thermal_lag' else 'K'
+    return [
+        *lines,
+        f'residual {rms} mg rms',
+        f'warming and cooling differ: {fit.history} ({fit.shape:.3g} {unit})'
+        if fit.history
+        else 'no thermal_lag or thermal_hysteresis shows',
+    ]

@@ -127,6 +127,11 @@ class Poses:
             }
         )
 
+    def with_temperature(self) -> Poses:
+        """Return the poses with a temperature, in the order of time."""
+        order = np.argsort(self.time_s[:, 0], kind='stable')
+        return self.subset(order[np.isfinite(self.temperature_c[order])])
+
     @property
     def has_angles(self) -> np.ndarray:
         """Return which poses have both angles, (k,) bool."""
@@ -206,6 +211,11 @@ def predicted_volts(
         unit, poses.alpha_rad + shift_rad[0], poses.beta_rad + shift_rad[1]
     )
     return np.column_stack(signal_chain.static_response(unit)(force, poses.environment))
+
+
+def residual_g(unit: Sensor, poses: Poses) -> np.ndarray:
+    """Return measured minus predicted output in poses, g, (k, m)."""
+    return (poses.volts - predicted_volts(unit, poses)) / unit.scale_v_per_g
 
 
 def stage_force(unit: Sensor, alpha_rad: np.ndarray, beta_rad: np.ndarray) -> Components:

@@ -11,7 +11,7 @@ import hashlib
 
 from adxl_ros.calibrate.fits.extrapolation import next_degree, NextDegree
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
-from adxl_ros.calibrate.poses import planes, Poses, predicted_volts
+from adxl_ros.calibrate.poses import planes, Poses, residual_g
 from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.errors import UserError
@@ -175,17 +175,15 @@ def envelope(fitted: Sensor, force: np.ndarray, poses: Poses, misfit_mps2: float
 
 def _next_degree(fitted: Sensor, poses: Poses) -> NextDegree | None:
     """Return what a fit lacks that follows temperature by slope and curvature; else None."""
-    order = np.argsort(poses.time_s[:, 0])
-    known = poses.subset(order[np.isfinite(poses.temperature_c[order])])
+    known = poses.with_temperature()
     if (
         'temperature_bias' not in fitted.effects
         or not len(known)
         or not np.ptp(known.temperature_c)
     ):
         return None
-    residual_g = (known.volts - predicted_volts(fitted, known)) / fitted.scale_v_per_g
     curvature_k2 = fitted.values['temperature_bias']['per_k2']
-    return next_degree(known.temperature_c, residual_g, curvature_k2)
+    return next_degree(known.temperature_c, residual_g(fitted, known), curvature_k2)
 
 
 def _unmodelled_slope(fitted: Sensor, effect: str) -> float:

@@ -164,7 +164,8 @@ it, so that its samples share them."""
 
 _MAX_CELLS = 4096  # Most cells in memory; chosen: the forces of all poses fill about as many
 
-_CELL_C, _CELL_V = 0.5, 0.01  # The same of temperature, °C, and supply, V
+_CELL_C = 0.5  # The same of temperature, °C
+_CELL_V = 0.01  # The same of the supply, V
 
 _MAX_ACCEL_MPS2 = 1e6  # Acceleration that no sensor outputs, m/s²; chosen: far beyond any range
 

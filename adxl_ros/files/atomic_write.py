@@ -60,7 +60,8 @@ def atomic_path(path: AnyPath) -> Iterator[Path]:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-_AT_FDCWD, _RENAME_EXCHANGE = -100, 2  # Of renameat2: paths of this process; swap both names
+_AT_FDCWD = -100  # Of renameat2: paths are those of this process
+_RENAME_EXCHANGE = 2  # Of renameat2: swap both names
 
 
 def _exchange(fresh: Path, target: Path) -> None:

@@ -27,7 +27,8 @@ from adxl_ros.model.constants import MEASURED_AXES
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-_MESSAGE, _MESSAGE_INDEX = 5, 7  # Operation codes of records (specification, "Records")
+_MESSAGE = 5  # Operation code of a message record (specification, "Records")
+_MESSAGE_INDEX = 7  # That of a message index record
 _RECORD_HEAD = struct.Struct('<BQ')  # Operation code and length of a record
 _CHUNK_HEAD = struct.Struct('<QQQII')
 """First and last time of a chunk, its size, CRC-32, and the length of its compression's name; the
@@ -369,8 +370,10 @@ def _files(path: Path) -> list[Path]:
     return sorted(files, key=lambda file: (len(file.name), file.name))  # 10 comes behind 9
 
 
-IMU, JOINT_STATE = 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/JointState'
-TEMPERATURE, BATTERY_STATE = 'sensor_msgs/msg/Temperature', 'sensor_msgs/msg/BatteryState'
+IMU = 'sensor_msgs/msg/Imu'
+JOINT_STATE = 'sensor_msgs/msg/JointState'
+TEMPERATURE = 'sensor_msgs/msg/Temperature'
+BATTERY_STATE = 'sensor_msgs/msg/BatteryState'
 DIAGNOSTIC_STATUS = 'diagnostic_msgs/msg/DiagnosticStatus'  # Type of `sensor_info`
 
 

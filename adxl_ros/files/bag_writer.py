@@ -25,6 +25,7 @@ from adxl_ros.files.bag_messages import (
     typestore,
     write_messages,
 )
+from adxl_ros.files.column_mapping import Columns
 from adxl_ros.files.recording_columns import COMMANDS, converted_info, JOINTS, Recording
 from adxl_ros.model.covariance import imu_covariance
 from adxl_ros.model.sensor import Sensor
@@ -62,9 +63,7 @@ class _NewBag:
             )
         return self.connections[topic]
 
-    def batch(
-        self, topic: str, form: Form, stamp_ns: np.ndarray, fields: Mapping[str, np.ndarray]
-    ) -> Batch:
+    def batch(self, topic: str, form: Form, stamp_ns: np.ndarray, fields: Columns) -> Batch:
         """Return the messages of a topic at stamps, ns, (n,), rising."""
         return Batch(
             self.connection(topic, form.kind),
@@ -178,7 +177,7 @@ def _write_info(bag: _NewBag, recording: Recording, sensor: Sensor) -> None:
 def _joint_batches(
     bag: _NewBag,
     stamp_ns: np.ndarray,
-    columns: Mapping[str, np.ndarray],
+    columns: Columns,
     names: Mapping[str, str],
     topic: str,
 ) -> Iterator[Batch]:
@@ -201,7 +200,7 @@ def _joint_batches(
             )
 
 
-def _changes(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _changes(columns: Columns) -> dict[str, np.ndarray]:
     """Return commands where they change and in the first row, NaN elsewhere."""
     return {
         name: np.where(
@@ -267,9 +266,7 @@ def tilt_bag(path: AnyPath) -> Iterator[Callable[..., None]]:
         for topic, form in forms.items():
             bag.connection(topic, form.kind)
 
-        def append(
-            stamp_ns: np.ndarray, imu_fields: Mapping[str, np.ndarray], tilt_rad: np.ndarray
-        ) -> None:
+        def append(stamp_ns: np.ndarray, imu_fields: Columns, tilt_rad: np.ndarray) -> None:
             if len(stamp_ns):
                 bag.append(
                     [

@@ -31,8 +31,8 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import command, package_version
 import yaml
 
-_DATE, _DATE_LETTERS = '%Y%m%dT%H%M%SZ', 16
-"""Date in file names, ISO 8601 basic format, and its length."""
+_DATE = '%Y%m%dT%H%M%SZ'  # Date in file names, ISO 8601 basic format
+_DATE_LETTERS = 16  # Length of such a date
 _OLDEST = datetime.min.replace(tzinfo=timezone.utc)
 """Date of a calibration without a date, which sorts first."""
 _MAX_NAME = 120

@@ -25,11 +25,14 @@ _ENTRY = re.compile(
 """An entry of a mapping: a role, its column in double, single or no quotes, and a unit."""
 
 
+Columns = Mapping[str, np.ndarray]  # Arrays (n,) by the name of their column or field
+
+
 @dataclass(frozen=True)
 class TableBlock:
     """Rows of a table."""
 
-    columns: Mapping[str, np.ndarray]  # Arrays (n,) by column name; an empty cell is NaN
+    columns: Columns  # Arrays (n,) by column name; an empty cell is NaN
     # Returns file and place of a cell for messages, by its row in the block and its column
     where: Callable[[int, str], str]
     info: Mapping[str, str] = field(default_factory=dict)  # Keys and values that the file states
@@ -199,8 +202,8 @@ ROLES: Mapping[str, Quantity] = {
 }
 """Quantity of each role that a column can have."""
 
-LSB, UNSIGNED = 'lsb', 'u16'
-"""Units of counts, which need the counts of 1 g: the second lost its sign, so that 65535 is −1."""
+LSB = 'lsb'  # Unit of counts, which needs the counts of 1 g
+UNSIGNED = 'u16'  # Unit of counts that lost their sign, so that 65535 is −1
 
 
 def signed(values: np.ndarray) -> np.ndarray:
@@ -376,8 +379,8 @@ _LISTED_NAMES = 12
 """Largest number of columns that a message names (chosen: some lines of a terminal)."""
 _NEAR = 0.25
 """Largest logarithm of the ratio of a length to gravity (chosen: above bias and scale errors)."""
-_SHORTEST_STEP_S, _LONGEST_STEP_S = 5e-5, 1.05
-"""Bounds of steps of stamps, s. Chosen: twice the fastest rate; 1 Hz, the slowest, with jitter."""
+_SHORTEST_STEP_S = 5e-5  # Shortest step of stamps, s. Chosen: half of that at the fastest rate
+_LONGEST_STEP_S = 1.05  # Longest step of stamps, s. Chosen: 1 Hz, the slowest, with jitter
 
 
 def listed(names: Sequence[str]) -> str:

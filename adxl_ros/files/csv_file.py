@@ -22,7 +22,7 @@ from typing import Any, BinaryIO
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import AnyPath, atomic_path, release_written
-from adxl_ros.files.column_mapping import TableBlock
+from adxl_ros.files.column_mapping import Columns, TableBlock
 import numpy as np
 
 _CHUNK_BYTES = 1 << 22
@@ -30,8 +30,8 @@ _CHUNK_BYTES = 1 << 22
 _PANDAS_BYTES = 1 << 20
 """Bytes of a block from which pandas parses it (chosen: its import takes 0.4 s, in which Python
 parses 2 MB)."""
-_HEAD_BYTES, _HEAD_LINES = 1 << 20, 200
-"""Beginning that shows the form of a file (chosen: more than any preamble seen)."""
+_HEAD_BYTES = 1 << 20  # Beginning that shows the form of a file, bytes
+_HEAD_LINES = 200  # Lines of it that are looked at (chosen: more than any preamble seen)
 _FEWEST_NUMBERS = 2
 """Fewest numbers of a line of samples with text (chosen: `rate, 100` is in a preamble)."""
 _DELIMITERS = ('\t', ';', ',', ' ')  # Delimiters; the first that fits is taken
@@ -389,9 +389,7 @@ def csv_writer(path: AnyPath) -> Iterator[Append]:
     """
     with atomic_path(path) as fresh, open(fresh, 'wb') as file:
 
-        def append(
-            columns: Mapping[str, np.ndarray], info: Mapping[str, str] | None = None
-        ) -> None:
+        def append(columns: Columns, info: Mapping[str, str] | None = None) -> None:
             if not file.tell():
                 file.writelines(
                     f'# {key}: {" ".join(value.split())}\n'.encode()
@@ -404,7 +402,7 @@ def csv_writer(path: AnyPath) -> Iterator[Append]:
         yield append
 
 
-def _csv_rows(columns: Mapping[str, np.ndarray]) -> bytes:
+def _csv_rows(columns: Columns) -> bytes:
     """Return rows of text: by pyarrow where it is installed, which takes a tenth of the time."""
     try:
         import pyarrow.csv

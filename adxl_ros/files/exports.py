@@ -30,8 +30,9 @@ from adxl_ros.process import command, package_version
 from adxl_ros.report import templates
 import numpy as np
 
-WHITE_NOISE, FILTER, STEPS = 'white noise', 'RC filter', 'ADC steps'
-"""Names of parts: noise of a sample before the ADC, low-pass of the output, and rounding."""
+WHITE_NOISE = 'white noise'  # Name of a part: noise of a sample before the ADC
+FILTER = 'RC filter'  # Name of a part: low-pass of the output
+STEPS = 'ADC steps'  # Name of a part: rounding
 _COLUMNS = 75  # Columns of the head without the signs of a comment; chosen: 79 with them
 _NOT_HELD = 'not held'  # In place of the place of a part that a file lacks
 _SMALLEST_MG = 5e-4  # Size below which a part counts as 0, mg; chosen: half of the last digit

@@ -16,11 +16,13 @@ from adxl_ros.files.column_mapping import GRAVITY
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import Mounting
 
-_STAMP_OFFSET, _FRAME_LENGTH = 4, slice(12, 16)
-"""Bytes of the header's stamp, and of the length of the frame's name."""
-_ANGULAR_VELOCITY, _ACCELERATION, _END = 13 * 8, 25 * 8, 37 * 8
-"""Offsets behind the header, bytes: first come a quaternion and its covariance, then each vector
+_STAMP_OFFSET = 4  # First byte of the header's stamp
+_FRAME_LENGTH = slice(12, 16)  # Bytes of the length of the frame's name
+_ANGULAR_VELOCITY = 13 * 8
+"""Offset behind the header, bytes. First come a quaternion and its covariance, then each vector
 with its covariance, all float64."""
+_ACCELERATION = 25 * 8  # The same of the linear acceleration
+_END = 37 * 8  # The same of the end
 _QUATERNION = 4  # Numbers of a quaternion, which stand before the orientation's covariance
 _UNSET = (0.0, 0.0, 0.0, 1.0, *[0.0] * 9)
 """Quaternion and covariance of an orientation that nobody has set."""

@@ -8,12 +8,13 @@ Where a table is not understood, `propose` finds the mapping that it most likely
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Generator, Sequence
 import re
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import (
     ColumnMapping,
+    Columns,
     DROP_SAMPLES,
     GRAVITY,
     is_sensor_step,
@@ -496,15 +497,8 @@ def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[s
     if not len(readings):
         return '', 0.0, 0.0
     unit = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
-    middle = (readings > _SIGN_GAP[0]) & (readings < _SIGN_GAP[1])
     is_whole = bool((readings == np.rint(readings)).all())
-    if (
-        unit in (None, LSB)
-        and is_whole
-        and readings.min() >= 0
-        and not middle.any()
-        and _SIGN_GAP[1] < readings.max() < 1 << 16
-    ):
+    if unit in (None, LSB) and is_whole and _have_lost_sign(readings):
         unit, readings = UNSIGNED, signed(readings)
     low, spread = readings.min(axis=0), np.ptp(readings, axis=0)
     zero = 0.0
@@ -523,6 +517,13 @@ def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[s
         and 0.5 < length / GRAVITY.get(unit, length) < 2
     )
     return (unit if is_gravity or len(outputs) < len(AXES) else ''), zero, length
+
+
+def _have_lost_sign(readings: np.ndarray) -> bool:
+    """Return whether counts of 16 bits, (n, m), are in both parts of their range, not between."""
+    is_between = (readings > _SIGN_GAP[0]) & (readings < _SIGN_GAP[1])
+    is_beyond = _SIGN_GAP[1] < readings.max() < 1 << 16
+    return bool(readings.min() >= 0 and is_beyond and not is_between.any())
 
 
 def _usual_counts(length: float) -> int:
@@ -550,7 +551,7 @@ def _stamp_options(values: np.ndarray, source: Source) -> str:
     return '--drop-bad-stamps'
 
 
-def _time_column(table: Table, values: Mapping[str, np.ndarray]) -> str | None:
+def _time_column(table: Table, values: Columns) -> str | None:
     """Return the column that is a time: it hardly ever decreases, and is no count of samples."""
     rising = []
     for name, column in values.items():
@@ -586,7 +587,7 @@ def _time_source(table: Table, name: str, values: np.ndarray) -> Source:
     return Source(name, unit)
 
 
-def _outputs(table: Table, names: list[str], values: Mapping[str, np.ndarray]) -> list[str]:
+def _outputs(table: Table, names: list[str], values: Columns) -> list[str]:
     """Return the columns of the axes: by their names, or three whose length is constant."""
     if table.has_names:
         own = [name for name in names if not _OTHER_SENSORS.search(name)]
@@ -620,7 +621,7 @@ def _by_axis(names: Sequence[str]) -> list[str]:
     return numbered[: len(AXES)] if len(numbered) >= len(AXES) else []
 
 
-def _references(values: Mapping[str, np.ndarray], used: set[str | None]) -> dict[str, Source]:
+def _references(values: Columns, used: set[str | None]) -> dict[str, Source]:
     """Return the columns of references, with their units."""
     sources: dict[str, Source] = {}
     for role, pattern in _REFERENCES.items():

@@ -61,8 +61,8 @@ DATASHEET = {
 }
 """Meaning of the keys `datasheet.*`; a file has all of them or none."""
 
-_LINK, _MOUNTING = 'link.', 'mounting.'
-"""Begins of keys that a file carries unchecked: driver and compensation check them."""
+_LINK = 'link.'  # Begin of keys that a file carries unchecked: the driver checks them
+_MOUNTING = 'mounting.'  # The same of keys that the compensation checks
 
 _SMALLEST_VARIANCE = 1e-300
 """Smaller variances count as this in the check of a covariance (chosen: near the smallest

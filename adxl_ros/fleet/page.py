@@ -87,31 +87,27 @@ def _trend_figure(
                 plotly.points([], value[shown], half[shown], name, colour)
                 | {'x': _stamps(years[shown])}
             )
-    # Calibrations between recordings, where a period ends
-    rows = table.rows_of(unit)
-    made = table.years[rows] - table['calibration_age_days'][rows] / fleet.DAYS_PER_YEAR
-    begins = made[1:][np.diff(table.period[rows]) > 0]
-    marks = [
-        {
-            'type': 'line',
-            'x0': stamp,
-            'x1': stamp,
-            'yref': 'paper',
-            'y0': 0,
-            'y1': 1,
-            'line': {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'},
-        }
-        for stamp in _stamps(begins[np.isfinite(begins)])
-    ]
     title = quantity.shown_unit + ' from the mean' * quantity.is_coefficient
     return plotly.figure(
         traces,
         _TREND_HEIGHT,
         showlegend=False,
-        shapes=marks,
+        shapes=_calibration_marks(table, unit),
         xaxis={'type': 'date', 'nticks': 3, 'tickangle': 0, 'tickformat': '%b %Y'},
         yaxis={'title': {'text': title}, 'nticks': 5},
     )
+
+
+def _calibration_marks(table: fleet.FleetTable, unit: int) -> list[plotly.Figure]:
+    """Return a line at each calibration between recordings of a unit, where a period ends."""
+    rows = table.rows_of(unit)
+    made = table.years[rows] - table['calibration_age_days'][rows] / fleet.DAYS_PER_YEAR
+    begins = made[1:][np.diff(table.period[rows]) > 0]
+    style = {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'}
+    return [
+        {'type': 'line', 'x0': x, 'x1': x, 'yref': 'paper', 'y0': 0, 'y1': 1, 'line': style}
+        for x in _stamps(begins[np.isfinite(begins)])
+    ]
 
 
 def _matrix_figure(table: fleet.FleetTable, share: pd.DataFrame) -> plotly.Figure:

@@ -155,36 +155,31 @@ class _Sums:
         step2, unit = scatter.calibration**2, self.recordings.unit
         weight = 1 / (self.recordings.std**2 + scatter.recording**2)
         t, y = self.time, self.value
-        w, wt, wy, wtt, wty, wyy = (
-            np.add.reduceat(weight * part, self.period_starts)
-            for part in (np.ones_like(t), t, y, t * t, t * y, y * y)
+        w, wt, wy, wtt, wty, wyy = self._by_period(
+            weight * [np.ones_like(t), t, y, t * t, t * y, y * y]
         )
         # The step of a period has one common part in all of its recordings (Woodbury).
         shared = step2 / (1 + step2 * w)
-        a, b, c, p, q, r = (
-            np.add.reduceat(part, self.unit_starts)
-            for part in (
+        a, b, c, p, q, r = self._by_unit(
+            [
                 w - shared * w * w,
                 wt - shared * w * wt,
                 wtt - shared * wt * wt,
                 wy - shared * w * wy,
                 wty - shared * wt * wy,
                 wyy - shared * wy * wy,
-            )
+            ]
         )
-        det = np.where(self.has_slope, a * c - b * b, 1.0)
-        det = np.maximum(det, TINY)
+        det = np.where(self.has_slope, np.maximum(a * c - b * b, TINY), 1.0)
         slope = np.where(self.has_slope, (a * q - b * p) / det, 0.0)
         intercept = (p - b * slope) / a
         squares = np.maximum(r - intercept * p - slope * q, 0.0)
-        log_det = (
-            np.add.reduceat(np.log1p(step2 * w), self.unit_starts).sum() - np.log(weight).sum()
-        )
+        log_det = self._by_unit(np.log1p(step2 * w)).sum() - np.log(weight).sum()
         log_likelihood = -0.5 * (
             log_det + np.log(np.where(self.has_slope, det, a)).sum() + squares.sum()
         )
         residual = y - intercept[unit] - slope[unit] * t
-        step = shared * np.add.reduceat(weight * residual, self.period_starts)
+        step = shared * self._by_period(weight * residual)
         residual = (residual - step[self.recordings.period]) * np.sqrt(weight)
         nan = np.where(self.has_slope, 1.0, np.nan)
         with np.errstate(invalid='ignore'):
@@ -200,6 +195,14 @@ class _Sums:
             residual,
             float(log_likelihood),
         )
+
+    def _by_period(self, values: np.ndarray) -> np.ndarray:
+        """Sum values of recordings, (..., n), within each period."""
+        return np.add.reduceat(values, self.period_starts, axis=-1)
+
+    def _by_unit(self, values: np.ndarray | list[np.ndarray]) -> np.ndarray:
+        """Sum values of periods, (..., k), within each unit."""
+        return np.add.reduceat(values, self.unit_starts, axis=-1)
 
 
 def _shared_scatter(sums: _Sums) -> Scatter:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, MISSING, replace
+from itertools import compress
 from typing import Any
 
 from adxl_ros.errors import UserError
@@ -326,6 +327,14 @@ class Sensor:
         """Return the sensor with coefficients that count as exact."""
         return replace(self, covariance=np.zeros((0, 0)), covariance_names=())
 
+    def with_covariance_of(self, kept: Sequence[bool]) -> Sensor:
+        """Return the sensor with the covariance of marked coefficients; others count as exact."""
+        return replace(
+            self,
+            covariance=self.covariance[np.ix_(kept, kept)],
+            covariance_names=tuple(compress(self.covariance_names, kept)),
+        )
+
     def without_temperature_range(self) -> Sensor:
         """Return the sensor for samples whose temperature is not known: none is outside."""
         return replace(self, envelope=replace(self.envelope, temperature_c=None))
@@ -421,13 +430,10 @@ def with_neutral(sensor: Sensor, effects: Iterable[str]) -> Sensor:
 
 def without_effect(sensor: Sensor, effect: str) -> Sensor:
     """Return the sensor without an effect and its covariance; it may not have it."""
-    kept = [i for i, name in enumerate(sensor.covariance_names) if name.effect != effect]
     return replace(
-        sensor,
+        sensor.with_covariance_of([name.effect != effect for name in sensor.covariance_names]),
         effects=tuple(name for name in sensor.effects if name != effect),
         values={name: value for name, value in sensor.values.items() if name != effect},
-        covariance=sensor.covariance[np.ix_(kept, kept)],
-        covariance_names=tuple(sensor.covariance_names[i] for i in kept),
     )
 
 

@@ -54,9 +54,10 @@ _PARTS = 10
 a step is in one part."""
 _FEWEST_OF_PART = 8
 """Fewest samples of a part; chosen: its variance is then known within a factor of two."""
-_ROBOT_NS, _MARGIN_NS = 1_000_000_000, 500_000_000
-"""Time whose forces of a robot are computed at once, and time of further readings on both sides,
-ns. Chosen: the ends of the splines then add less than a tenth to the error."""
+_ROBOT_NS = 1_000_000_000  # Time whose forces of a robot are computed at once, ns; chosen
+_MARGIN_NS = 500_000_000
+"""Time of further readings on both sides, ns. Chosen: the ends of the splines then add less than a
+tenth to the error."""
 _HISTORY_NS = 10_000_000_000
 """Time of readings by which a robot is smoothed, ns. Chosen: a joint moves at some time in it."""
 _GRID_NS = 4_000_000

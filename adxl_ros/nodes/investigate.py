@@ -89,7 +89,8 @@ def closing_lines(ended: Investigation, folder: OutputFolder) -> list[str]:
     ]
 
 
-_SAMPLES, _STAGE = 'imu/data_raw', 'stage/joint_states'
+_SAMPLES = 'imu/data_raw'
+_STAGE = 'stage/joint_states'
 _KINDS = {
     _SAMPLES: Imu,
     _STAGE: JointState,

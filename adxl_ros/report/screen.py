@@ -20,8 +20,9 @@ _NO_BREAK = '\N{NO-BREAK SPACE}'  # A blank at which no line is wrapped
 _UNIT_AFTER_NUMBER = re.compile(r'(?<=\d) (?=[%°]|(?:mg|s|Hz)\b)')  # The blank before a unit
 _LABEL_COLUMNS = 8  # Columns of the words before files and commands
 _STEP_COLUMNS = _LABEL_COLUMNS + 3  # Columns before the purpose of one of several steps
-_GREEN, _RED, _YELLOW = '\x1b[32m', '\x1b[31m', '\x1b[33m'
-"""Codes of xterm: good, bad, and not decided."""
+_GREEN = '\x1b[32m'  # Code of xterm for what is good
+_RED = '\x1b[31m'  # The same of what is bad
+_YELLOW = '\x1b[33m'  # The same of what is not decided
 _COLOURS = {
     'GAP EXPLAINED': _GREEN,
     'PARTLY EXPLAINED': _YELLOW,

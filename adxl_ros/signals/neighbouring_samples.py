@@ -36,7 +36,8 @@ _FEWEST_WRAPS = 3  # Fewest jumps across the range. Chosen: a single one may be 
 _CLIPPED = 3  # Most samples at the end of a range that does not clip. Chosen: by chance one is
 _FILLED = 0.005  # Largest distance of the samples from both ends of a range that they fill, by it
 _ROUNDING = 1e-3  # Relative error of a resolution that is found among rounded values
-_BIN_G, _LARGEST_STEP_G = 0.05, 70.0  # Width and end of the bins of steps, g. Chosen: fine enough
+_BIN_G = 0.05  # Width of the bins of steps, g. Chosen: fine enough
+_LARGEST_STEP_G = 70.0  # End of the bins of steps, g. Chosen: above twice the range of ±32 g
 
 _TURN_RAD_PER_S = np.radians(2000.0)
 """Fastest turn of a sensor, rad/s: the range of common gyroscopes, and above any hand or robot."""

@@ -47,11 +47,8 @@ class RecordingLook:
         return gravity
 
     def _look(self, rests: list[RestMean]) -> GravityAtRest:
-        shape = len(rests), len(self.unit.axes)
-        mean_v = np.reshape([rest.mean_v for rest in rests], shape)
-        std_v = np.reshape([rest.std_v for rest in rests], shape)
         is_calibrated = self._sensor.effects and self._sensor.axes == self.unit.axes
-        return of_volts(mean_v, std_v, self._sensor if is_calibrated else self.unit)
+        return _of_rests(rests, self._sensor if is_calibrated else self.unit)
 
     def neighbour_faults(self) -> list[str]:
         """Return what is wrong between neighbouring samples, one line each."""
@@ -113,13 +110,14 @@ class LiveLook:
         rests = finder.rests()
         for found in map(RestMean, rests, *finder.means(rests)):
             self._rests[finder.learn] = _with_rest(self._rests[finder.learn], found, sensor)
-        kept = self._rests[finder.learn]
-        shape = len(kept), len(sensor.axes)
-        return of_volts(
-            np.reshape([rest.mean_v for rest in kept], shape),
-            np.reshape([rest.std_v for rest in kept], shape),
-            sensor,
-        )
+        return _of_rests(self._rests[finder.learn], sensor)
+
+
+def _of_rests(rests: list[RestMean], sensor: Sensor) -> GravityAtRest:
+    """Look at the means of rests on the axes of a sensor."""
+    shape = len(rests), len(sensor.axes)
+    mean_v = np.reshape([rest.mean_v for rest in rests], shape)
+    return of_volts(mean_v, np.reshape([rest.std_v for rest in rests], shape), sensor)
 
 
 def _with_rest(rests: list[RestMean], found: RestMean, sensor: Sensor) -> list[RestMean]:

@@ -46,9 +46,8 @@ _KNOT_READINGS = 4
 """Largest distance of the knots of a joint's spline, in readings. Chosen: jerks of a move then
 show, and the penalty still averages over the steps of an encoder."""
 _SMALLEST_STEP = 1e-9  # Step of an exact encoder, rad or m. Chosen: rounding in a log
-_LONGEST_GAP_S, _USUAL_GAPS = 0.1, 5.0
-"""Longest time without a reading of a joint, s, and in usual gaps. Chosen: a robot moves within
-it, and a message may be late."""
+_LONGEST_GAP_S = 0.1  # Longest time without a reading of a joint, s. Chosen: a robot moves within
+_USUAL_GAPS = 5.0  # The same in usual gaps. Chosen: a message may be late
 _AROUND_S = 0.3  # Time around which the error of the force is taken, s. Chosen: a part of a move
 _OFFSET_RAD = 1e-4  # Offset of a joint whose effect is taken, rad. Chosen: linear to 1e-4
 _COMPLIANCE_S2 = 1e-5  # Compliance whose effect is taken, s². Chosen: a resonance of 50 Hz

@@ -445,12 +445,6 @@ def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
     return poses if len(poses) and np.max(range_g) < _SAME_ORIENTATION_G else None
 
 
-def blocks_of(poses: Poses) -> Poses:
-    """Return the poses with a temperature, in the order of time."""
-    order = np.argsort(poses.time_s[:, 0], kind='stable')
-    return poses.subset(order[np.isfinite(poses.temperature_c[order])])
-
-
 def calibrated_temperature_c(base: Sensor) -> float:
     """Return the temperature at which a unit was calibrated, °C; else that of the datasheet."""
     range_c = base.envelope.temperature_c

@@ -462,7 +462,7 @@ class ThermalGuide(Guide):
             return
         with suppress(UserError):
             self._fit = thermal_fit.fit(
-                self._base, thermal_fit.blocks_of(Poses.from_records(records)), False
+                self._base, Poses.from_records(records).with_temperature(), False
             )
             self._error_mg = thermal_fit.expected_error_mg(
                 self._fit, self._passed, thermal_fit.calibrated_temperature_c(self._base)

@@ -91,13 +91,9 @@ class RunningEstimate:
 
     def tilt_error_rad(self) -> float:
         """Return the expected rms error of alpha and beta over the sphere, rad."""
-        of_unit = [i for i, name in enumerate(self.names) if not full_model.belongs_to_stage(name)]
-        unit = replace(
-            self.unit,
-            covariance=self.covariance[np.ix_(of_unit, of_unit)],
-            covariance_names=tuple(self.names[i] for i in of_unit),
-        )
-        return tilt_error_rad(unit, self.pose_std_v)
+        unit = replace(self.unit, covariance=self.covariance, covariance_names=self.names)
+        of_unit = [not full_model.belongs_to_stage(name) for name in self.names]
+        return tilt_error_rad(unit.with_covariance_of(of_unit), self.pose_std_v)
 
     def rows(self) -> list[Row]:
         """Return the coefficients for the screen."""

@@ -338,21 +338,19 @@ class StageGuide(StageSweep):
         late = waited_s > self.settings.timeout_s
         since, place = f' for {waited_s:.0f} s' if late else '', self.destination()
         if self.dwell is not None:
-            stillness = self.dwell.stillness()
-            if stillness is not None and stillness.at_rest:
+            if self.dwell.at_rest():
                 return Status(Phase.DWELL, f'at {place}: averaging', late)
+            stillness = self.dwell.stillness()
             motion = stillness.describe_mps2(self.sensor) if stillness else 'waiting for samples'
             return Status(Phase.REST, f'at {place}: {motion}{since}', late)
         if not self.moves_itself:
             return Status(Phase.OPERATOR, f'turn the stage to {place}, then capture', False)
-        distance = (
-            silence
-            if silence or self.encoder.angles_rad is None
-            else pose_plan.angle_fault(
+        distance = silence
+        if not silence and self.encoder.angles_rad is not None:
+            distance = pose_plan.angle_fault(
                 target, *self.encoder.angles_rad, self.settings.tolerance_rad
             )
-            or 'arrived'
-        )
+            distance = distance or 'arrived'
         return Status(
             Phase.STAGE, f'the stage has not arrived at {place}{since}: {distance}', late
         )

@@ -28,7 +28,8 @@ _NONLINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
 """Parameter whose typical datasheet value limits the error of acceleration."""
 
 
-_ZERO_G, _SCALE = Coefficient('bias', 'offset_v'), Coefficient('scale_factor', 'offset_v_per_g')
+_ZERO_G = Coefficient('bias', 'offset_v')
+_SCALE = Coefficient('scale_factor', 'offset_v_per_g')
 _ANY_TOLERANCE = {_ZERO_G: 0.25, _SCALE: 0.1}
 """Tolerances of any accelerometer: of the zero-g, g, and of the scale factor, as a share. Chosen:
 the widest ones of the datasheets of consumer parts."""

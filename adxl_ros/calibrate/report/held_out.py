@@ -91,11 +91,7 @@ def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Po
 
     A sensor without z cannot distinguish α from π − α: the reference gives the sign of its z.
     """
-    reference = (
-        reference_force(poses, sensor.local_gravity_mps2)
-        if stage is None
-        else stage_force(stage, poses.alpha_rad, poses.beta_rad)
-    )
+    reference = _reference(poses, sensor, stage)
     z_sign = np.where(reference[2] < 0, -1, 1)
     force = signal_chain.inverse(sensor, z_sign)(list(poses.volts.T), poses.environment)
     covariance = force_covariance(
@@ -109,6 +105,13 @@ def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Po
         np.where(shows_tilt, tilt_error, np.nan),
         np.column_stack(force),
     )
+
+
+def _reference(poses: Poses, sensor: Sensor, stage: Sensor | None) -> Components:
+    """Return the specific force at the angles, on a stage with its fitted errors if there are."""
+    if stage is None:
+        return reference_force(poses, sensor.local_gravity_mps2)
+    return stage_force(stage, poses.alpha_rad, poses.beta_rad)
 
 
 def angle_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -294,11 +297,7 @@ def error_budgets(
     held, sensor, measured = poses.subset(errors.pose_index), errors.fitted[0], errors.errors
     gravity = sensor.local_gravity_mps2
     reference = np.column_stack(reference_force(held, gravity))
-    corrected = (
-        reference
-        if stage is None
-        else np.column_stack(stage_force(stage, held.alpha_rad, held.beta_rad))
-    )
+    corrected = np.column_stack(_reference(held, sensor, stage))
     has_tilt, used = np.isfinite(measured.tilt_rad), determining_alpha(measured)
     axes = [AXES.index(axis) for axis in sensor.axes]
     *by_cause, probe = covariances(errors, held, reference)

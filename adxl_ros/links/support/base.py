@@ -19,6 +19,7 @@ import time
 from typing import Any, cast, Protocol, runtime_checkable
 
 from adxl_ros.errors import one_line, UserError
+from adxl_ros.files.column_mapping import Columns
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -136,10 +137,10 @@ class Samples:
     missing: int = 0  # Samples lost since the last call
     # References by the column names of a recording, (n,) each; NaN where a reference was not
     # sampled
-    references: Mapping[str, np.ndarray] = field(default_factory=dict)
+    references: Columns = field(default_factory=dict)
     estimated: int = 0  # Part of `missing` that is estimated from time, not counted
     # Further fields of sensor_msgs/Imu by name, (n, k) each, such as `angular_velocity`
-    imu_fields: Mapping[str, np.ndarray] = field(default_factory=dict)
+    imu_fields: Columns = field(default_factory=dict)
 
     def finite(self) -> Samples:
         """Return the samples whose volts are finite, without references; others are missing."""
@@ -215,7 +216,7 @@ class ImuLink(Protocol):
     imu_unit: str  # Unit of its accelerations, a key of `GRAVITY`
     temperature_topic: str  # Topic of the temperature of the sensor
 
-    def sense_imu(self, stamp_ns: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
+    def sense_imu(self, stamp_ns: np.ndarray, fields: Columns) -> None:
         """Take samples: stamps, ns, (n,), and number fields of sensor_msgs/Imu, (n, k) each."""
 
     def sense_temperature(self, temperature_c: float) -> None:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 import os
 from pathlib import Path
@@ -13,6 +13,7 @@ import time
 import tty
 
 from adxl_ros.errors import UserError
+from adxl_ros.files.column_mapping import Columns
 from adxl_ros.links.support import base, wire_format
 from adxl_ros.links.support.base import samples_within
 from adxl_ros.model.sensor import Sensor
@@ -48,7 +49,7 @@ class Board:
         self._unsent = b''
         self._frame_samples = samples_within(_FRAME_S, sensor.rate_hz)
 
-    def send(self, columns: Mapping[str, np.ndarray]) -> None:
+    def send(self, columns: Columns) -> None:
         """Send the samples of columns, (n,) each, every frame at the time of its last sample."""
         volts = np.column_stack([_volts(role, columns) for role in self._roles])
         codes = (
@@ -87,7 +88,7 @@ class Board:
         return True
 
 
-def _volts(role: str, columns: Mapping[str, np.ndarray]) -> np.ndarray:
+def _volts(role: str, columns: Columns) -> np.ndarray:
     if role == base.SUPPLY:
         return columns[base.COLUMNS[role]] / _SUPPLY_SCALE
     if role == base.TEMPERATURE:
@@ -95,7 +96,7 @@ def _volts(role: str, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     return columns[f'{role}_v']
 
 
-def roles_of(sensor: Sensor, columns: Mapping[str, np.ndarray]) -> list[str]:
+def roles_of(sensor: Sensor, columns: Columns) -> list[str]:
     """Return the roles of the channels for columns of samples."""
     references = [role for role, column in base.COLUMNS.items() if column in columns]
     return [*sensor.axes, *references]

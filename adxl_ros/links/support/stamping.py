@@ -11,11 +11,12 @@ this line smoothly and never go backwards.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 import time
 from typing import Any, NamedTuple
 
+from adxl_ros.files.column_mapping import Columns
 from adxl_ros.links.support.base import Event, no_samples, Samples
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -286,7 +287,7 @@ class Block:
 
     device_ns: np.ndarray  # Device time, ns, (n,) int64, ascending
     volts: np.ndarray  # Output of the sensor by axis, V, (n, m)
-    references: Mapping[str, np.ndarray]  # References that the device has, by column, (n,) each
+    references: Columns  # References that the device has, by column, (n,) each
     lost: int | None = None  # Samples lost before it; None where only time shows them
 
 
@@ -415,9 +416,7 @@ class Stamper:
             self._counted = self._estimated = 0
         self._unstamped.clear()
 
-    def _thin(
-        self, host_ns: np.ndarray, references: Mapping[str, np.ndarray]
-    ) -> dict[str, np.ndarray]:
+    def _thin(self, host_ns: np.ndarray, references: Columns) -> dict[str, np.ndarray]:
         """Return each reference by its mean in the first row after a period, and NaN elsewhere."""
         thinned = {column: np.full(len(host_ns), np.nan) for column in self._references}
         if (period := int(host_ns[-1]) // _PERIOD_NS) != self._period:

@@ -32,15 +32,15 @@ from adxl_ros.model.effects.base import (
 from adxl_ros.model.filters import loop, low_pass, resonator, stop
 import numpy as np
 
-_IN_PLANE, _OUT_OF_PLANE = (1, 0, 0), (2, 2, 1)
+_IN_PLANE = (1, 0, 0)  # Index of the other in-plane axis for x, y and z, which has x
+_OUT_OF_PLANE = (2, 2, 1)  # Index of the out-of-plane axis for x, y and z, which has y
 OTHER_AXIS = {
     'cross_axis': _IN_PLANE,
     'scale_factor_cross': _IN_PLANE,
     'cross_axis_z': _OUT_OF_PLANE,
     'scale_factor_z': _OUT_OF_PLANE,
 }
-"""By effect: index of the axis c that acts on x, y and z; what is in plane for z is x, and what
-is out of plane is y."""
+"""By effect: index of the axis c that acts on x, y and z."""
 
 
 def _bias_by(others: tuple[int, int, int], signals: Signals, p: Parameters) -> None:
