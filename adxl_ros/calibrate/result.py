@@ -24,7 +24,7 @@ from adxl_ros.model.effects.accelerometer import OTHER_AXIS
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Envelope, get, parameter_of, Sensor, with_neutral
 from adxl_ros.process import package_version
-from adxl_ros.report.quantities import decimals, mg_text
+from adxl_ros.report.quantities import decimals, fixed, mg_text
 import numpy as np
 
 _SAME_FIT_TOLERANCE = 1e-6
@@ -302,8 +302,7 @@ def truth_table(comparisons: Sequence[Comparison]) -> list[str]:
 
 def rounded(row: Comparison, value: float) -> str:
     """Write a value with the decimals that show two digits of the interval."""
-    places = decimals(row.half_width)
-    return f'{round(value, places) + 0.0:.{places}f}'
+    return fixed(value, decimals(row.half_width))
 
 
 def history(newest: Sensor, stored: Sequence[Sensor]) -> tuple[list[str], list[list[str]]] | None:

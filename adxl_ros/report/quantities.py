@@ -36,10 +36,15 @@ def decimals(half_width: float) -> int:
     return min(max(1 - exponent, 0), _MOST_DECIMALS)
 
 
+def fixed(value: float, places: int) -> str:
+    """Write a value with a number of decimals; 0 has no sign."""
+    return f'{round(value, places) + 0.0:.{places}f}'
+
+
 def with_half_width(value: float, half_width: float) -> str:
     """Write a value and half of its interval, without an exponent."""
     places = decimals(half_width)
-    return f'{round(value, places) + 0.0:.{places}f} +- {half_width:.{places}f}'
+    return f'{fixed(value, places)} +- {half_width:.{places}f}'
 
 
 def counted(number: int, noun: str) -> str:
@@ -69,6 +74,22 @@ def number(value: float, signed: bool = False, digits: int = 3) -> str:
     )
     sign = '\N{MINUS SIGN}' if rounded < 0 else '+' if signed and rounded > 0 else ''
     return sign + text
+
+
+def signed(value: float) -> str:
+    """Return a value with two decimals and its sign."""
+    return f'{value:+.2f}'.replace('-', '\N{MINUS SIGN}')
+
+
+def two_digits(value: float) -> str:
+    """Return a positive value with two digits, the last zero too."""
+    return f'{value:.0f}' if value >= 10 else f'{value:#.2g}'
+
+
+def three_digits(value: float) -> str:
+    """Return a positive value with three digits at most, without an exponent."""
+    places = 1 if value >= 10 else 2 if value >= 1 else 3
+    return f'{value:.{places}f}' if value >= 5e-4 else '< 0.001'
 
 
 def short_time(seconds: float) -> str:
@@ -145,7 +166,7 @@ def parameter_text(
     if ci:
         width = max((values[2] - values[1]) / 4, 1e-12)
         places = int(np.clip(np.ceil(-np.log10(width)), 0, 6))
-        value, low, high = (f'{round(v, places) + 0.0:.{places}f}' for v in values)
+        value, low, high = (fixed(v, places) for v in values)
         return f'{value} ({low} to {high}) {unit}'.rstrip()
     texts = dict.fromkeys(
         np.format_float_positional(v, digits, fractional=False, trim='-')

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.quantities import signed
 import numpy as np
 
 ORDER = 3  # Version of the order of `guided`; an interrupted sweep resumes only in the same order
@@ -191,15 +192,10 @@ def saturation_fault(sensor: Sensor, volts: np.ndarray) -> str:
     reading_v = volts[rows[0], axis]
     reading_g = (reading_v - sensor.nominal_zero_g_v[axis]) / sensor.nominal_scale_v_per_g[axis]
     return (
-        f'saturated: {sensor.axes[axis]} reads {signed_text(reading_g)} g '
+        f'saturated: {sensor.axes[axis]} reads {signed(reading_g)} g '
         f'({reading_v:.3f} V), beyond its range of ±{sensor.range_g:g} g or at a rail of the '
         'ADC; check supply and wiring'
     )
-
-
-def signed_text(value: float) -> str:
-    """Return a value as text, with its sign."""
-    return f'{value:+.2f}'.replace('-', '−')
 
 
 def changed(sensor: Sensor, before: PoseRecord, now: PoseRecord, tolerance_rad: float) -> str:

@@ -11,7 +11,7 @@ import math
 from adxl_ros.calibrate.fits import full_model, linearisation
 from adxl_ros.calibrate.fits.linearisation import linearised, StageError
 from adxl_ros.calibrate.guided import pose_plan
-from adxl_ros.calibrate.guided.pose_plan import signed_text, Target
+from adxl_ros.calibrate.guided.pose_plan import Target
 from adxl_ros.calibrate.guided.screen_contents import Row
 from adxl_ros.calibrate.poses import coefficient_jacobian, Poses, predicted_volts
 from adxl_ros.calibrate.report import held_out
@@ -22,7 +22,7 @@ from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force, tilt
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
-from adxl_ros.report.quantities import with_half_width
+from adxl_ros.report.quantities import signed, with_half_width
 import numpy as np
 
 _ROUNDS = 2  # Linearised fits after each pose; chosen: the estimate changes little with each pose
@@ -70,8 +70,8 @@ class RunningEstimate:
             (v - sensor.zero_g_v) / sensor.scale_v_per_g for v in (volts, expected_v)
         )
         return (
-            f'{sensor.axes[axis]} reads {signed_text(measured_g[axis])} g where '
-            f'{signed_text(expected_g[axis])} g was expected: axis inverted or '
+            f'{sensor.axes[axis]} reads {signed(measured_g[axis])} g where '
+            f'{signed(expected_g[axis])} g was expected: axis inverted or '
             'swapped, or another pose; check wiring, mounting and pose'
         )
 

@@ -16,7 +16,7 @@ from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import parameter_of, Sensor
-from adxl_ros.report.quantities import duration, mg
+from adxl_ros.report.quantities import duration, mg, three_digits, two_digits
 import numpy as np
 import scipy
 
@@ -157,11 +157,6 @@ def limit(sensor: Sensor) -> tuple[float, str]:
     return G0_MPS2 * float(np.sqrt(np.mean(noise_g**2))), 'noise of one sample'
 
 
-def _two_digits(value: float) -> str:
-    """Write a value with two digits, the last zero too."""
-    return f'{value:.0f}' if value >= 10 else f'{value:#.2g}'
-
-
 LIMITS = {
     'open': 'coefficients that the poses do not determine',
     'noise': 'the noise of the means; longer rests reduce it',
@@ -212,7 +207,7 @@ def screen_table(models: Sequence[HeldOutErrors]) -> list[str]:
         for errors in models
         for tilt, accel in [
             [
-                '-   ' if np.isnan(value) else digits(value).ljust(len(f'{value:.3f}'))
+                '-   ' if np.isnan(value) else three_digits(value).ljust(len(f'{value:.3f}'))
                 for value in (errors.tilt_deg.rms, errors.accel_mg.rms)
             ]
         ]
@@ -230,12 +225,6 @@ _MODELS = {
 """Models in words."""
 
 
-def digits(value: float) -> str:
-    """Write a positive value with three digits at most, without an exponent."""
-    decimals = 1 if value >= 10 else 2 if value >= 1 else 3
-    return f'{value:.{decimals}f}' if value >= 5e-4 else '< 0.001'
-
-
 def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
     """Lay out the error of the calibration above its limit, with one outcome for each figure."""
     limit_mps2, _ = limit(sensor)
@@ -250,8 +239,8 @@ def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
         ),
     )
     return [
-        f' {name:24} {"-" if np.isnan(value_deg) else _two_digits(value_deg):>7} ° {tilt:9} '
-        f'{_two_digits(value_mg):>8} mg {accel}'.rstrip()
+        f' {name:24} {"-" if np.isnan(value_deg) else two_digits(value_deg):>7} ° {tilt:9} '
+        f'{two_digits(value_mg):>8} mg {accel}'.rstrip()
         for name, value_mg, value_deg, accel, tilt in rows[: 2 if limit_mps2 else 1]
     ]
 
@@ -315,15 +304,15 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
     limit_mps2, origin = limit(fitted)
     if not limit_mps2:
         return NOT_SHOWN, [
-            f'calibration error {_two_digits(float(provenance["own_accel_mg"]))} '
+            f'calibration error {two_digits(float(provenance["own_accel_mg"]))} '
             'mg; neither a datasheet nor the noise of a sample states a limit'
         ]
-    limit_text = f'{_two_digits(mg(limit_mps2))} mg'
+    limit_text = f'{two_digits(mg(limit_mps2))} mg'
     accel = provenance.get('verdict', '')
     outcomes = accel, provenance.get('verdict_tilt', '')
     outcome = next((word for word in (FAIL, NOT_SHOWN) if word in outcomes), PASS)
     error, verb = float(provenance['own_accel_mg']), 'allows' if origin == 'datasheet' else 'is'
-    lines = [f'calibration error {_two_digits(error)} mg; the {origin} {verb} {limit_text}']
+    lines = [f'calibration error {two_digits(error)} mg; the {origin} {verb} {limit_text}']
     if outcome == FAIL:
         if accel != FAIL:
             tilt_deg = float(provenance['own_tilt_deg'])

@@ -12,7 +12,7 @@ from typing import Any
 from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.poses import planes, Poses, reference_force
 from adxl_ros.calibrate.report import acceptance, gum, held_out
-from adxl_ros.calibrate.report.acceptance import Assessment, digits, FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.result import CalibrationResult, compare, history, rounded
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
@@ -23,7 +23,7 @@ from adxl_ros.model.sensor import get, Sensor
 from adxl_ros.process import command
 from adxl_ros.report import figures, page as html_page
 from adxl_ros.report.figures import AXIS_COLOURS, Figure
-from adxl_ros.report.quantities import mg
+from adxl_ros.report.quantities import mg, three_digits
 import numpy as np
 
 PAGE = 'report.html'  # The file of a report
@@ -123,7 +123,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
             'errors_of': errors_of,
             'row_of': row_of,
             'poses': len(result.poses),
-            'digits': digits,
+            'digits': three_digits,
             'mg': held_out.rms_mg,
             'limit': f'{origin} ({mg(limit_mps2):.2g} mg)',
             'budget': assessment.accel if assessment and errors else None,
@@ -157,7 +157,7 @@ def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict
     if (fit := result.gravity_fit) is not None:
         used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
         before, after = (
-            digits(held_out.rms_mg(float(np.mean(v[used] ** 2))))
+            three_digits(held_out.rms_mg(float(np.mean(v[used] ** 2))))
             for v in (fit.before_mps2, fit.held_out_mps2)
         )
         tiles = [
@@ -173,8 +173,8 @@ def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict
     ):
         statistics = [getattr(errors, name) for errors in result.held_out]
         if statistics and not np.isnan(statistics[-1].rms):
-            before, after = (digits(statistics[i].rms) for i in (0, -1))
-            low, high = map(digits, statistics[-1].interval)
+            before, after = (three_digits(statistics[i].rms) for i in (0, -1))
+            low, high = map(three_digits, statistics[-1].interval)
             tiles.append(
                 {
                     'label': label,
@@ -187,7 +187,7 @@ def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict
             {
                 'label': 'limited by',
                 'text': assessment.accel.limited_by,
-                'note': f'calibration error {digits(assessment.error_mg)} mg, without '
+                'note': f'calibration error {three_digits(assessment.error_mg)} mg, without '
                 'noise and stage error of the check',
             }
         )
