@@ -67,12 +67,7 @@ def draw(
     terms = (*full_model.default_terms(axes), *['stage_eccentricity'] * (stage == 'eccentric'))
     truth = _unit(sensor, terms, stage, rng)
     step = float(stated * np.exp(rng.uniform(*np.log((0.5, 2.0)))))
-    targets = (
-        pose_plan.guided(pose_plan.default_planes_rad(axes), pose_plan.STEP_RAD, 0)
-        if kind == 'full'
-        else running_estimate.quick(sensor, _DWELL_S, float(np.radians(0.1)), 0)
-    )
-    poses, true_rad = _swept(truth, targets, stage == STAGES[0], step, rng)
+    poses, true_rad = _swept(truth, _targets(sensor, kind), stage == STAGES[0], step, rng)
     fit, _ = full_model.fit_selected(sensor, poses)
     names = fit.fitted.covariance_names
     truth_of_fit = with_neutral(truth, {name.effect for name in names})
@@ -80,9 +75,7 @@ def draw(
     sigma = step / np.sqrt(12)
     levels = StageError(0.0, sigma) if stage == STAGES[0] else StageError(sigma)
     bound = experiments.sweep_bound(truth, poses, true_rad, levels, terms)
-    angles = np.column_stack(
-        [np.arccos(rng.uniform(-1, 1, _HELD_OUT)), rng.uniform(0, 2 * np.pi, _HELD_OUT)]
-    )
+    angles = _held_out_angles(rng)
     held_out = _measured(truth, angles, angles, rng), angles
     tilt = experiments.angle_errors(fit.fitted, bound, *held_out)
     force, force_std = experiments.force_errors(fit.fitted, truth, *held_out)
@@ -102,6 +95,20 @@ def draw(
             pd.DataFrame({'of': 'acceleration', 'z': (force / force_std).ravel()}),
         ]
     ).assign(draw=number, stage=stage, axes=axes, plan=kind, converged=fit.converged)
+
+
+def _targets(sensor: Sensor, kind: str) -> list[pose_plan.Target]:
+    """Return the poses of a plan, without check poses."""
+    if kind == 'full':
+        planes_rad = pose_plan.default_planes_rad(sensor.axes)
+        return pose_plan.guided(planes_rad, pose_plan.STEP_RAD, 0)
+    return running_estimate.quick(sensor, _DWELL_S, float(np.radians(0.1)), 0)
+
+
+def _held_out_angles(rng: np.random.Generator) -> np.ndarray:
+    """Draw alpha and beta, rad, (n, 2), evenly over the sphere."""
+    alpha_rad = np.arccos(rng.uniform(-1, 1, _HELD_OUT))
+    return np.column_stack([alpha_rad, rng.uniform(0, 2 * np.pi, _HELD_OUT)])
 
 
 def _unit(sensor: Sensor, terms: Sequence[str], stage: str, rng: np.random.Generator) -> Sensor:

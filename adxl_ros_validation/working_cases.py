@@ -70,16 +70,7 @@ def draw(seed: int, number: int, only: str | None = None) -> Case:
     """Draw a case; singles take the kinds in turn."""
     rng = np.random.default_rng([7_000_001, seed, number])
     group = only or str(rng.choice(GROUPS, p=_SHARES))
-    turn = np.random.default_rng([7_000_001, seed, number // len(world.LISTED)]).permutation(
-        world.LISTED
-    )
-    first = str(turn[number % len(turn)])
-    names = {
-        'null': [],
-        'single': [first],
-        'outside': [str(rng.choice(world.UNLISTED))],
-        'pair': [first, str(rng.choice([n for n in world.LISTED if n != first]))],
-    }[group]
+    names = _drawn_names(rng, group, seed, number)
     kinds = [world.KINDS[name] for name in names]
     unit = world.draw_unit(rng)
     moves = world.draw_motion(rng, unit, {kind.needs for kind in kinds if kind.needs})
@@ -136,6 +127,18 @@ def draw(seed: int, number: int, only: str | None = None) -> Case:
         scene.recording(acting, _DIGITS),
         simulator.parameter_file(scene.unit, label.name),
     )
+
+
+def _drawn_names(rng: np.random.Generator, group: str, seed: int, number: int) -> list[str]:
+    """Draw the effects of a case of a group; what other groups have is drawn, too."""
+    turn = np.random.default_rng([7_000_001, seed, number // len(world.LISTED)]).permutation(
+        world.LISTED
+    )
+    first = str(turn[number % len(turn)])
+    unlisted = str(rng.choice(world.UNLISTED))
+    second = str(rng.choice([name for name in world.LISTED if name != first]))
+    by_group = {'null': [], 'single': [first], 'outside': [unlisted], 'pair': [first, second]}
+    return by_group[group]
 
 
 def _strength(

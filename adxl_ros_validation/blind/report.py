@@ -108,22 +108,7 @@ def of_simulated(made: dict[str, Any]) -> Report:
         ],
         {
             'Result': (['score', 'diagnose (90 % interval)', 'bar', 'met'], result),
-            'Scores': (
-                ['score', 'value (90 % interval)'],
-                [
-                    *(
-                        [row.words, _score_text(scores[name])]
-                        for name, row in WITHOUT_BAR.items()
-                        if not row.result
-                    ),
-                    *(
-                        [f'pairs: {name.replace("_", " ")}', _score_text(score)]
-                        for name, score in scores['pairs'].items()
-                    ),
-                    ['run time, longest, s', f'{scores["longest_s"]:.0f}'],
-                    ['verdicts', ', '.join(f'{name} {n}' for name, n in scores['status'].items())],
-                ],
-            ),
+            'Scores': _score_table(scores),
             'Strength that is detected': (
                 ['effects', 'mg rms', 'detected', 'oracle'],
                 [
@@ -138,20 +123,7 @@ def of_simulated(made: dict[str, Any]) -> Report:
                 ],
             ),
             'How often verdicts of a probability are right': reliability(scores['reliability']),
-            'Controls': (
-                ['control', 'score', 'at chance', 'p', 'leaks'],
-                [
-                    [
-                        name.replace('_', ' '),
-                        *(
-                            '-' if control.get(key) is None else f'{control[key]:.3f}'
-                            for key in ('score', 'chance', 'p')
-                        ),
-                        'YES' if control['leaks'] else 'no',
-                    ]
-                    for name, control in made['controls'].items()
-                ],
-            ),
+            'Controls': _control_table(made['controls']),
             'Effect by effect, where the oracle sees it': (
                 ['effect', *names],
                 [
@@ -178,6 +150,35 @@ def of_simulated(made: dict[str, Any]) -> Report:
             ),
         },
     )
+
+
+def _score_table(scores: dict[str, Any]) -> Table:
+    """Return the scores that have neither a bar nor a place among the results."""
+    others = [
+        [row.words, _score_text(scores[name])]
+        for name, row in WITHOUT_BAR.items()
+        if not row.result
+    ]
+    pairs = [
+        [f'pairs: {name.replace("_", " ")}', _score_text(score)]
+        for name, score in scores['pairs'].items()
+    ]
+    return ['score', 'value (90 % interval)'], [
+        *others,
+        *pairs,
+        ['run time, longest, s', f'{scores["longest_s"]:.0f}'],
+        ['verdicts', ', '.join(f'{name} {n}' for name, n in scores['status'].items())],
+    ]
+
+
+def _control_table(controls: dict[str, Any]) -> Table:
+    """Return the scores of the controls beside those of chance."""
+    rows = []
+    for name, control in controls.items():
+        stated = [control.get(key) for key in ('score', 'chance', 'p')]
+        figures = ['-' if figure is None else f'{figure:.3f}' for figure in stated]
+        rows.append([name.replace('_', ' '), *figures, 'YES' if control['leaks'] else 'no'])
+    return ['control', 'score', 'at chance', 'p', 'leaks'], rows
 
 
 def reliability(rows: list[dict[str, Any]]) -> Table:
