@@ -86,7 +86,7 @@ class Poses:
             return np.array([getattr(record, name) for record in records])
 
         stamps_ns = np.column_stack([column('start_ns'), column('stop_ns')])
-        return Poses(
+        poses = Poses(
             column('mean_v'),
             column('std_v'),
             column('alpha_rad'),
@@ -95,8 +95,15 @@ class Poses:
             column('check').astype(bool),
             column('temperature_c'),
             column('supply_v'),
-            column('alpha_setting').astype(int),
-            column('beta_setting').astype(int),
+        )
+        # Poses without numbers of settings get those by the angles.
+        return replace(
+            poses,
+            **{
+                name: column(name).astype(int)
+                for name in ('alpha_setting', 'beta_setting')
+                if None not in column(name)
+            },
         )
 
     @staticmethod
@@ -400,7 +407,13 @@ class SettingTracker:
 
     def __init__(self, tolerance_rad: float, taken: Sequence[PoseRecord] = ()) -> None:
         self._tolerance_rad = tolerance_rad
-        numbers = [(record.alpha_setting, record.beta_setting) for record in taken]
+        numbers = [
+            [
+                -1 if number is None else number
+                for number in (record.alpha_setting, record.beta_setting)
+            ]
+            for record in taken
+        ]
         self._settings = np.max([[-1, -1], *numbers], axis=0)
         self._mean_rad = np.full(2, np.nan)
         self._readings, self._commands = (deque[_Stamped](maxlen=_MAX_READINGS) for _ in range(2))

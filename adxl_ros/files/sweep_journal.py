@@ -28,8 +28,9 @@ class PoseRecord:
     pose: int  # Number of the pose in the pose plan, or of the rest of a hand-held sensor, from 0
     alpha_rad: float = math.nan  # Joint angles, rad; NaN without a stage
     beta_rad: float = math.nan
-    alpha_setting: int = 0  # Numbers of the settings of the joints; 0 without a stage
-    beta_setting: int = 0
+    # Numbers of the settings of the joints; None without a stage, or where only angles are known
+    alpha_setting: int | None = None
+    beta_setting: int | None = None
     check: bool = False  # Whether the pose is kept out of the fit
     start_ns: int  # Stamps of the first and the last sample, ns
     stop_ns: int
@@ -40,8 +41,12 @@ class PoseRecord:
     supply_v: float = math.nan
 
     def to_json(self) -> dict[str, Any]:
-        """Return the keys and values of the record's line; NaN, which equals nothing, has none."""
-        return {key: value for key, value in asdict(self).items() if value == value}
+        """Return the keys and values of the record's line; NaN and None have no key."""
+        return {
+            key: value
+            for key, value in asdict(self).items()
+            if value is not None and value == value
+        }  # NaN differs from itself
 
     @classmethod
     def from_json(cls, line: Mapping[str, Any]) -> PoseRecord:
