@@ -171,5 +171,5 @@ working: build
 	OPENBLAS_NUM_THREADS=1 ./run --exec python -m adxl_ros_validation.working_cases $(ARGS)
 
 clean:
-	rm -rf .venv build install log demo_output blind_output working_output coverage_output site .*_cache .hypothesis
+	rm -rf .venv build install log demo_output blind_output working_output coverage_output site jupyter_execute .*_cache .hypothesis
 	find adxl_ros adxl_ros_validation launch test -name __pycache__ -prune -exec rm -rf {} +

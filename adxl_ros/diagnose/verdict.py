@@ -731,11 +731,11 @@ def _answer(
     minimal = minimal_sets(evidence)
     best, material = minimal[0], evidence.material_power(1.0)
     detected = frozenset(cause.effect for cause in in_noise)
-    of_noise = sum(cause.power_mps2 for cause in in_noise)
-    compared = sum(cause.power_mps2 for cause in in_noise if not cause.is_left_out)
-    powers = _powers(evidence, best, rest, rest_material, drifts, compared)
+    # Only samples that are compared say what is left.
+    of_noise = sum(cause.power_mps2 for cause in in_noise if not cause.is_left_out)
+    powers = _powers(evidence, best, rest, rest_material, drifts, of_noise)
     # A reference that lacks motion leaves more than a floor at rest.
-    only_repeats = evidence.fades or not best | detected
+    only_repeats = evidence.fades or not best
     unexplained = powers.repeats if only_repeats else powers.remaining(material)
     if unexplained > powers.explained + powers.drift + of_noise:
         return _Answer('unknown')

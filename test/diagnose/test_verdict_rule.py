@@ -103,6 +103,13 @@ def test_effects_that_explain_less_than_they_leave_are_no_cause():
     assert beside.effects == ('bias', 'mains_hum')
 
 
+def test_samples_that_are_left_out_explain_nothing_of_the_others():
+    stuck = NoiseCause('stuck', np.inf, is_left_out=True)
+    assert decided({NOTHING: fits(5.0)}, left_over=5.0, in_noise=[stuck]).status == 'unknown'
+    both = {NOTHING: fits(5.0), BIAS: fits(3.0)}
+    assert decided(both, in_noise=[stuck]).status == 'unknown'
+
+
 def test_an_effect_of_the_noise_is_named_beside_no_gap_of_the_mean():
     verdict = decided({NOTHING: fits(0.0)}, in_noise=[NoiseCause('spikes', 1.0, True)])
     assert (verdict.status, verdict.effects) == ('explained', ('spikes',))
