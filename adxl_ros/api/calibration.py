@@ -27,7 +27,7 @@ from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.calibrate.result import CalibrationResult, compare, errors_in_words
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
-from adxl_ros.files.atomic_write import make_folder
+from adxl_ros.files.atomic_write import make_folder, require_own
 from adxl_ros.files.recording_columns import recorded_unit, Recording, unit_of
 from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.model.sensor import Sensor, with_axes
@@ -120,24 +120,43 @@ class Fit(Result):
             [(tile['label'], tile['text'], tile['note']) for tile in tiles],
         )
 
-    def save(self, path: str | os.PathLike) -> None:
-        """Write the parameter file; that of another fit becomes NAME.previous."""
+    def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
+        """
+        Write the parameter file; that of another fit becomes NAME.previous.
+
+        overwrite: whether a file is replaced that this package did not write, or that was
+        changed since.
+        """
+        require_own(path, overwrite)
         self.result.save(path)
 
-    def report(self, folder: str | os.PathLike, store: str | os.PathLike = '') -> Path:
+    def report(
+        self,
+        folder: str | os.PathLike,
+        store: str | os.PathLike = '',
+        *,
+        overwrite: bool = False,
+    ) -> Path:
         """
         Write the page report.html into a folder, and return its path.
 
-        It compares with the earlier calibrations of the unit in `store`.
+        It compares with the earlier calibrations of the unit in `store`; overwrite: as in
+        `save`.
         """
         if self.is_over_temperature:
             raise UserError(f'--report {folder}: a fit over temperature has no page; leave it out')
+        require_own(Path(folder) / page.PAGE, overwrite)
         path = make_folder(folder)
         page.write(path, self.result, store)
         return path / page.PAGE
 
-    def certificate(self, path: str | os.PathLike) -> None:
-        """Write a Digital Calibration Certificate (DCC of PTB) of a calibration on a stage."""
+    def certificate(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
+        """
+        Write a Digital Calibration Certificate (DCC of PTB) of a calibration on a stage.
+
+        overwrite: as in `save`.
+        """
+        require_own(path, overwrite)
         gum.write(path, self.result)
 
     def keep(self, store: str | os.PathLike) -> str:

@@ -19,7 +19,7 @@ from adxl_ros.diagnose.diagnosis import what_shows
 from adxl_ros.diagnose.report import shows_row
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording as recording_files
-from adxl_ros.files.atomic_write import make_folder, write_text
+from adxl_ros.files.atomic_write import make_folder, require_own, write_text
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.report import page as html_page
@@ -205,8 +205,14 @@ class Check(Result):
 
         return DataFrame(map(_cells, self.recordings), columns=_HEAD)
 
-    def save(self, folder: str | os.PathLike) -> Path:
-        """Write the page check.html into a folder, and return its path."""
+    def save(self, folder: str | os.PathLike, *, overwrite: bool = False) -> Path:
+        """
+        Write the page check.html into a folder, and return its path.
+
+        overwrite: whether a page is replaced that this package did not write, or that was
+        changed since.
+        """
+        require_own(Path(folder) / PAGE, overwrite)
         path = make_folder(folder) / PAGE
         write_text(path, _page(self.recordings))
         return path

@@ -18,6 +18,7 @@ from adxl_ros.api.sensors import sensor_of, SensorInput
 from adxl_ros.compensate.estimators import Estimates, RecordingEstimator
 from adxl_ros.compensate.live_stream import ImuFields
 from adxl_ros.errors import UserError
+from adxl_ros.files.atomic_write import require_own
 from adxl_ros.files.bag_writer import tilt_bag
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import check_unit, Recording
@@ -231,8 +232,14 @@ class Corrected(Result):
         ax.legend()
         return ax
 
-    def save(self, path: str | os.PathLike) -> None:
-        """Write a table NAME.csv, or a bag NAME.mcap or a folder with imu/data and tilt."""
+    def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
+        """
+        Write a table NAME.csv, or a bag NAME.mcap or a folder with imu/data and tilt.
+
+        overwrite: whether a file or a bag is replaced that this package did not write, or that
+        was changed since; a folder with other files never is.
+        """
+        require_own(path, overwrite)
         with writer(path) as append:
             for block, estimates in self.parts:
                 append(block, estimates)

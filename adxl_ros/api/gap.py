@@ -27,7 +27,7 @@ from adxl_ros.diagnose.gap_in_unit import gap_in, GapInUnit, quantity as quantit
 from adxl_ros.diagnose.next_experiment import CouldShow
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import free_name, make_folder, write_text
+from adxl_ros.files.atomic_write import free_name, make_folder, require_own, write_text
 from adxl_ros.files.recording_columns import NO_UNIT, Recording
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.model.effects import effect_named
@@ -199,15 +199,20 @@ class Gap(Result):
         ax.set(xlabel='rms, mg', title=words.badge(self.diagnosis))
         return ax
 
-    def save(self, folder: str | os.PathLike, made_by: str = '') -> list[Path]:
+    def save(
+        self, folder: str | os.PathLike, made_by: str = '', *, overwrite: bool = False
+    ) -> list[Path]:
         """
         Write report.html, report.json and params.yaml into a folder; return their paths.
 
         A fault leaves params.yaml out. `made_by` is the command that the page shows, by default
-        one that repeats the diagnosis.
+        one that repeats the diagnosis. overwrite: whether files are replaced that this package
+        did not write, or that were changed since.
         """
-        path = make_folder(folder)
         texts = self.documents(folder, made_by)
+        for name in texts:
+            require_own(Path(folder) / name, overwrite)
+        path = make_folder(folder)
         for name, text in texts.items():
             write_text(path / name, text)
         return [path / name for name in (PAGE, PARAMETERS, REPORT) if name in texts]

@@ -16,7 +16,7 @@ from adxl_ros.api.result import FirstScreen, no_progress, Progress, Result
 from adxl_ros.api.sensors import as_input, SensorInput
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording as recording_files
-from adxl_ros.files.atomic_write import make_folder, write_bytes
+from adxl_ros.files.atomic_write import make_folder, require_own, write_bytes
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
@@ -234,8 +234,14 @@ class Noise(Result):
             'amber' if self.warnings else 'green', 'Noise', _head(self.result)[1], tiles
         )
 
-    def save(self, path: str | os.PathLike) -> None:
-        """Write a parameter file with the measured noise."""
+    def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
+        """
+        Write a parameter file with the measured noise.
+
+        overwrite: whether a file is replaced that this package did not write, or that was
+        changed since.
+        """
+        require_own(path, overwrite)
         parameter_file.save(
             path,
             self.sensor,
@@ -246,8 +252,9 @@ class Noise(Result):
             ],
         )
 
-    def report(self, folder: str | os.PathLike) -> Path:
-        """Write the curve allan.png into a folder, and return its path."""
+    def report(self, folder: str | os.PathLike, *, overwrite: bool = False) -> Path:
+        """Write the curve allan.png into a folder, and return its path; overwrite: as `save`."""
+        require_own(Path(folder) / PLOT, overwrite)
         path = make_folder(folder) / PLOT
         write_bytes(path, png(_plot(self.result)))
         return path

@@ -30,8 +30,10 @@ def atomic_path(path: AnyPath) -> Iterator[Path]:
     Yield a path next to `path`; a file there replaces `path` if the block succeeds.
 
     It is synced to disk before the exchange, so that a power cut leaves the old or the new one.
+    A folder at `path` is replaced only if it is empty, a bag, or was written by this package.
     """
     target = Path(path)
+    _refuse_folder_of_others(target)
     folder = ''
     # The directory is created within the block, so that a signal at any time removes it.
     try:
@@ -103,6 +105,39 @@ def is_own(path: AnyPath) -> bool:
         return os.getxattr(path, _MARK) == str(os.stat(path).st_mtime_ns).encode()
     except OSError:
         return False
+
+
+_BAG_FILES = ('*.mcap', '*.db3', 'metadata.yaml')  # Names of the files in a bag
+
+
+def _refuse_folder_of_others(path: Path) -> None:
+    """Refuse to replace a folder that holds anything but a bag, unless this package wrote it."""
+    if not path.is_dir() or is_own(path):
+        return
+    of_bag = {each for pattern in _BAG_FILES for each in path.glob(pattern)}
+    kept = [each.name for each in path.iterdir() if each not in of_bag]
+    if kept:
+        raise UserError(
+            f'{path}: is a folder that this package did not write, with {kept[0]} in it, and is '
+            'never replaced; choose another name'
+        )
+
+
+def require_own(
+    path: AnyPath, may_overwrite: bool = False, permission: str = 'overwrite=True'
+) -> None:
+    """
+    Refuse to replace a file or folder that others wrote or changed, but for an empty folder.
+
+    may_overwrite: whether the user permits it; permission: how the user does, for the message.
+    """
+    target = Path(path)
+    is_empty_folder = target.is_dir() and not any(target.iterdir())
+    if target.exists() and not (may_overwrite or is_own(target) or is_empty_folder):
+        raise UserError(
+            f'{path}: is there already, and was not written by this package, or was changed '
+            f'since; choose another name, or replace it with {permission}'
+        )
 
 
 def free_name(path: AnyPath) -> Path:

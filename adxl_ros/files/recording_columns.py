@@ -6,12 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+import os
 from pathlib import Path
 import re
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.atomic_write import AnyPath
+from adxl_ros.files.atomic_write import require_own
 from adxl_ros.files.stamps import describe_bursts, stamped_rate_hz
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, to_volts, with_axes
@@ -158,10 +159,16 @@ class Recording:
             + f', with {", ".join(further)}' * bool(further)
         )
 
-    def save(self, path: AnyPath) -> None:
-        """Write a CSV file NAME.csv, a bag NAME.mcap, or a rosbag2 directory."""
+    def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
+        """
+        Write a CSV file NAME.csv, a bag NAME.mcap, or a rosbag2 directory.
+
+        overwrite: whether a file or a bag is replaced that this package did not write, or that
+        was changed since; a folder with other files never is.
+        """
         from adxl_ros.files import parameter_file, recording
 
+        require_own(path, overwrite)
         unit = uncalibrated(
             parameter_file.usual(self.is_of_nominal), self.stream_info, self.axes, self.rate_hz
         )

@@ -55,7 +55,7 @@ def check(options: argparse.Namespace) -> int:
             reading=cli.reading_options(options),
             progress=show,
         )
-    page = [checked.save(options.report)] if options.report else []
+    page = [checked.save(options.report, overwrite=options.overwrite)] if options.report else []
     if options.json:
         print(json.dumps(checked.to_dict()['recordings'], indent=1))
     else:

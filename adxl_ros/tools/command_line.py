@@ -18,7 +18,7 @@ from adxl_ros.api import recordings
 from adxl_ros.api.result import require_least
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
-from adxl_ros.files.atomic_write import AnyPath, is_own
+from adxl_ros.files.atomic_write import AnyPath, require_own
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects.base import Effect
@@ -263,12 +263,8 @@ def add_overwrite_option(parse: argparse.ArgumentParser, name: str = '--force') 
 def check_outputs(options: argparse.Namespace, *paths: AnyPath | None) -> None:
     """Refuse to replace a file or folder of others; a path that is not given is None or ''."""
     for path in paths:
-        if path and Path(path).exists() and not options.overwrite and not is_own(path):
-            raise UserError(
-                f'{path}: is there already, and was not written by this package, or '
-                'was changed since; choose another name, or replace it with '
-                '--overwrite'
-            )
+        if path:
+            require_own(path, options.overwrite, '--overwrite')
 
 
 def refuse_same_file(output: str, source: str) -> None:

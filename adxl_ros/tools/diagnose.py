@@ -119,7 +119,9 @@ def diagnose(options: argparse.Namespace) -> int:
             seed=options.seed,
             progress=show,
         )
-        files = gap.save(options.output, html_page.command_of_this_process())
+        files = gap.save(
+            options.output, html_page.command_of_this_process(), overwrite=options.overwrite
+        )
     if options.json:
         print(as_text(gap.to_dict()), end='')
     else:

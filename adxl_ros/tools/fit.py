@@ -138,11 +138,13 @@ def fit(options: argparse.Namespace) -> int:
         cli.report_notes('fit', fitted.notes)
         if options.report:
             show(0.6, 'report')
-            report.append(fitted.report(options.report, options.store))
+            report.append(
+                fitted.report(options.report, options.store, overwrite=options.overwrite)
+            )
         if options.dcc:
-            fitted.certificate(options.dcc)
+            fitted.certificate(options.dcc, overwrite=options.overwrite)
             report.append(options.dcc)
-    fitted.save(options.output)
+    fitted.save(options.output, overwrite=options.overwrite)
     cli.note(f'fit: {fitted.keep(options.store)}')
     # No samples of a table of means can be corrected.
     applied = (

@@ -63,10 +63,10 @@ def noise(options: argparse.Namespace) -> int:
 
         found = find_noise(blocks, options.params, progress=show)
     cli.report_notes('noise', newest[-1].notes)
-    files = [found.report(options.report)] if options.report else []
+    files = [found.report(options.report, overwrite=options.overwrite)] if options.report else []
     lines = found.screen
     if options.output:
-        found.save(options.output)
+        found.save(options.output, overwrite=options.overwrite)
         files.insert(0, Path(options.output))
         lines += [f'WARNING {text}' for text in found.refuted_filter]
     following = (

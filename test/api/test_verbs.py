@@ -47,6 +47,9 @@ def test_a_fit_finds_the_zero_g_and_saves_itself(fit, tmp_path) -> None:
     np.testing.assert_allclose(
         adxl.load(tmp_path / 'unit.yaml').zero_g_v, fit.sensor.zero_g_v, rtol=1e-6
     )
+    (tmp_path / 'unit.yaml').write_text('precious')
+    with pytest.raises(adxl.UserError, match='overwrite=True'):
+        fit.save(tmp_path / 'unit.yaml')
     table = fit.to_pandas()
     assert len(table) == len(fit.coefficients) and set(table.unit) == {'V', 'V/g'}
     assert fit.to_dict()['coefficients'][0]['unit'] == 'V'
@@ -80,6 +83,9 @@ def test_a_gap_writes_what_it_returns(gap, tmp_path) -> None:
     report = json.loads((tmp_path / 'gap' / 'report.json').read_text())
     assert report == json.loads(json.dumps(gap.to_dict()))
     assert report['verdict']['status'] == gap.verdict
+    (tmp_path / 'gap' / 'report.html').write_text('precious')
+    with pytest.raises(adxl.UserError, match='overwrite=True'):
+        gap.save(tmp_path / 'gap')
     assert gap.command('again').endswith('diagnose arrays --params adxl203 -o again')
 
 

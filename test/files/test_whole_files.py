@@ -10,6 +10,7 @@ import subprocess
 import sys
 from threading import Event, Thread
 
+from adxl_ros.errors import UserError
 from adxl_ros.files import atomic_write
 from adxl_ros.files.atomic_write import atomic_path, free_name, is_own, write_text
 import pytest
@@ -18,7 +19,7 @@ import pytest
 def write_folder(path: Path, text: str) -> None:
     with atomic_path(path) as fresh:
         fresh.mkdir()
-        (fresh / 'content').write_text(text)
+        (fresh / 'bag_0.mcap').write_text(text)
 
 
 def test_a_folder_is_there_at_every_moment_of_its_replacement(tmp_path: Path) -> None:
@@ -37,7 +38,7 @@ def test_a_folder_is_there_at_every_moment_of_its_replacement(tmp_path: Path) ->
     ended.set()
     reader.join()
     assert seen == {True}
-    assert (path / 'content').read_text() == '199'
+    assert (path / 'bag_0.mcap').read_text() == '199'
     assert os.listdir(tmp_path) == ['bag']
 
 
@@ -47,7 +48,7 @@ def test_without_an_exchange_a_folder_is_replaced_all_the_same(
     monkeypatch.setattr(atomic_write.ctypes, 'CDLL', lambda *_, **__: object())
     for text in ('old', 'new'):
         write_folder(tmp_path / 'bag', text)
-    assert (tmp_path / 'bag' / 'content').read_text() == 'new'
+    assert (tmp_path / 'bag' / 'bag_0.mcap').read_text() == 'new'
     assert os.listdir(tmp_path) == ['bag']
 
 
@@ -65,7 +66,7 @@ def test_a_kill_while_a_folder_is_written_leaves_the_earlier_one(tmp_path: Path)
     ) as writer:
         assert writer.stdout is not None and writer.stdout.readline() == b'begun\n'
         writer.send_signal(signal.SIGKILL)
-    assert (path / 'content').read_text() == 'old'
+    assert (path / 'bag_0.mcap').read_text() == 'old'
 
 
 @pytest.fixture
@@ -96,3 +97,15 @@ def test_a_free_name_is_that_of_no_file(tmp_path: Path) -> None:
     for name in ('sim.csv', 'sim_2.csv'):
         (tmp_path / name).write_text('')
     assert free_name(tmp_path / 'sim.csv') == tmp_path / 'sim_3.csv'
+
+
+def test_a_folder_of_others_is_never_replaced(tmp_path: Path) -> None:
+    users = tmp_path / 'home'
+    users.mkdir()
+    write_folder(users, 'into an empty one')
+    assert (users / 'bag_0.mcap').exists()
+    (users / 'thesis.tex').write_text('precious')
+    with pytest.raises(UserError, match=r'thesis\.tex'):
+        write_folder(users, 'a bag')
+    assert (users / 'thesis.tex').read_text() == 'precious'
+    assert os.listdir(tmp_path) == ['home']
