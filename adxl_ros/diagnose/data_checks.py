@@ -42,6 +42,10 @@ the stage."""
 LARGEST_LATENCY_S = 0.1
 """Largest shift, s, that may be a latency of the sensor. Chosen: twenty times the typical delay of
 `time_offset`; a buffer of ten samples at 100 Hz has it."""
+_LARGEST_DRIFT_S = 2 * LARGEST_LATENCY_S
+"""Change of a shift, s, up to which one shift leaves no more than a latency at either end. The
+effect of a clock skew describes what is left."""
+_DRIFT_ACCURACY_S = 1e-4  # Accuracy of its ends, s. Chosen: far below a sample
 _SEARCH_STEP_S = 0.02
 """Step of the first search of a shift, s. Chosen: well below the largest latency."""
 _LONGEST_SEARCH = 1 << 20  # Largest number of its steps. Chosen: six hours
@@ -107,14 +111,18 @@ _LARGEST_DELAY_S = 30.0
 """Largest delay that is looked for, s. Chosen: a recording started by hand."""
 _CORRELATION_GAIN = 0.05
 """Correlation that a delay must gain. Chosen: above the error of a correlation by noise."""
-_JUMP_STEPS = 20.0  # A step of the stamps of this many usual steps is a jump. Chosen
+_JUMP_STEPS = 20.0
+"""A step of the stamps of this many usual steps is a jump. Chosen: a link that loses a
+buffer of ten samples stays below by a factor of two."""
 _LARGEST_JUMP_SHARE = 0.2
 """Share of the recording that jumps may have. Chosen: gaps of a lossy link are no fault of the
 clock."""
 _SMALLEST_RANGE_V = 0.05  # Range of an output that moves, V. Chosen: 50 mg
 _SMALLEST_STEP_V = 1e-9  # Step of an ADC that stands for none, V. Chosen: rounding errors
 _DEAD_SHARE = 1e-4  # Share of its simulated range that a wired axis covers. Chosen: any wrong unit
-_LONGEST_HOLD_S = 1.0  # Longest time that an output may keep one value in motion, s. Chosen
+_LONGEST_HOLD_S = 1.0
+"""Longest time that an output may keep one value in motion, s. Chosen: a link that
+holds its last value recovers sooner, and a broken wire does not."""
 _LARGEST_LEVEL_G = 1e3  # Largest median output, g. Chosen: above that of any sensor on a stage
 _UNIT_TOLERANCE = 0.1
 """Relative deviation of a gain from the ratio of two units. Chosen: above any scale error."""
@@ -130,6 +138,7 @@ _UNIT_RATIOS = {
 DATA_FAULTS = {
     'axis_inverted': 'an axis has the opposite sign',
     'axis_swapped': 'two axes are swapped',
+    'clock_drift': 'two clocks drift apart by more than one shift corrects',
     'clock_jump': 'a clock steps or runs backwards',
     'constant': 'an axis does not change',
     'encoder_sign': 'an angle has the opposite sign',
@@ -269,9 +278,34 @@ class _Motions(NamedTuple):
 
     def shifts(self, rows: np.ndarray, smallest: int) -> _Shifts:
         """Correlate a part of the recording, rows, with the simulator at all shifts."""
+        time_s = self.measured_s[rows]
         found = reference_checks.correlations(self.measured_g[rows], self.stated_g, smallest)
-        lags_s = self.stated_s[0] - self.measured_s[rows[0]] + found.lags * self.step_s
-        return _Shifts(lags_s, found.overlap, found.correlation)
+        lags_s = self.stated_s[0] - time_s[0] + found.lags * self.step_s
+        return _Shifts(time_s, lags_s, found.overlap, found.correlation)
+
+    def fitting_parts(self) -> list[_Shifts]:
+        """Return the parts of the recording that fit the simulator at one shift each."""
+        time_s = self.measured_s
+        count = max(min(int(np.ptp(time_s) / _PART_S), _MOST_PARTS), 1)
+        parts = [
+            self.shifts(rows, round(_OVERLAP_OF_PART * len(rows)))
+            for rows in np.array_split(np.arange(len(time_s)), count)
+        ]
+        return [part for part in parts if part.fits]
+
+    def stated_at(self, late_s: np.ndarray) -> np.ndarray:
+        """Return the simulator beside the recording, g, (n, m), at shifts, s, (n,) or ()."""
+        instants_s = self.measured_s + late_s
+        return np.column_stack(
+            [np.interp(instants_s, self.stated_s, axis_g) for axis_g in self.stated_g.T]
+        )
+
+    def left_g2(self, late_s: np.ndarray) -> float:
+        """Return the mean square, g², that shifts, s, (n,) or (), leave where both overlap."""
+        instants_s = self.measured_s + late_s
+        overlap = (instants_s >= self.stated_s[0]) & (instants_s <= self.stated_s[-1])
+        left = _unexplained(self.measured_g[overlap], self.stated_at(late_s)[overlap])
+        return left / max(int(overlap.sum()), 1)
 
 
 def _motions(recording: Recording, sensor: Sensor, force: ForcePath) -> _Motions | None:
@@ -295,6 +329,7 @@ def _motions(recording: Recording, sensor: Sensor, force: ForcePath) -> _Motions
 class _Shifts(NamedTuple):
     """How well a part of a recording fits a simulator, by shift, (lags,) each."""
 
+    time_s: np.ndarray  # Instants of the part, s, (k,)
     lags_s: np.ndarray  # How much later the simulator is stamped, s
     overlap: np.ndarray  # Number of instants that overlap
     correlation: np.ndarray  # −1 where too few overlap
@@ -323,17 +358,102 @@ class _Shifts(NamedTuple):
         )
 
 
+class _Drift(NamedTuple):
+    """Shifts of a simulator that change evenly from begin to end of a recording."""
+
+    begin_s: float  # How much later the simulator is stamped at the begin, s
+    end_s: float  # The same at the end, s
+
+    @property
+    def change_s(self) -> float:
+        """Return how much the shift changes, s."""
+        return self.end_s - self.begin_s
+
+    def late_s(self, motions: _Motions) -> np.ndarray:
+        """Return the shift at each instant of a recording, s, (n,)."""
+        return np.linspace(self.begin_s, self.end_s, len(motions.measured_s))
+
+    def explains(self, part: _Shifts, motions: _Motions) -> bool:
+        """Return whether the shift of a part is that of an instant in it, to half a step."""
+        ends_s = np.interp(
+            part.time_s[[0, -1]], motions.measured_s[[0, -1]], [self.begin_s, self.end_s]
+        )
+        resolution_s = motions.step_s / 2
+        return bool(ends_s.min() - resolution_s <= part.late_s <= ends_s.max() + resolution_s)
+
+
+def _find_drift(motions: _Motions, parts: Sequence[_Shifts]) -> _Drift | None:
+    """
+    Return the drift that explains the shifts of all parts.
+
+    None where one shift is near enough for all, or explains as much, or a step explains more.
+    """
+    if len(parts) < 2:
+        return None
+    time_s, span_s = motions.measured_s, np.ptp(motions.measured_s)
+    first, last = parts[0].late_s, parts[-1].late_s
+    line = np.polynomial.Polynomial.fit(
+        [part.time_s.mean() for part in parts], [part.late_s for part in parts], 1
+    )
+    ends_s = line(time_s[[0, -1]])
+    # No part shows its shift better than that of one of its instants.
+    uncertain_s = motions.step_s + abs(np.ptp(ends_s)) * np.ptp(parts[0].time_s) / span_s
+    if abs(np.ptp(ends_s)) + uncertain_s < _LARGEST_DRIFT_S:
+        return None
+    fitted = scipy.optimize.minimize(
+        lambda ends: motions.left_g2(_Drift(*ends).late_s(motions)),
+        ends_s,
+        method='Nelder-Mead',
+        options={
+            'initial_simplex': ends_s + motions.step_s * np.array([[0, 0], [1, 0], [0, 1]]),
+            'xatol': _DRIFT_ACCURACY_S,
+            'fatol': 0.0,
+        },
+    )
+    drift = _Drift(*map(float, fitted.x))
+    if abs(drift.change_s) < _LARGEST_DRIFT_S:
+        return None
+    one_shift = scipy.optimize.minimize_scalar(
+        motions.left_g2, bounds=sorted(drift), method='bounded'
+    )
+    step_at_s = _time_of_step(motions, first, last)
+    left_by_step_g2 = motions.left_g2(np.where(time_s < step_at_s, first, last))
+    is_better = fitted.fun < min(_LARGEST_ERROR_RATIO * one_shift.fun, left_by_step_g2)
+    return drift if is_better and all(drift.explains(part, motions) for part in parts) else None
+
+
+def _drift_fault(drift: _Drift, recording: Recording, force: ForcePath) -> DataFault:
+    """Return the fault of two clocks of different rates, with the rate that mends it."""
+    time_s = recording.time_s
+    ratio = drift.change_s / np.ptp(time_s)
+    steps_s = np.diff(time_s)
+    # The number of a sample tells its time only where none is missing.
+    counts_time = steps_s.max() < _USUAL_STEP * np.median(steps_s)
+    own_correction = (
+        f'use --rate {recording.rate_hz / (1 + ratio):.6g}'
+        if counts_time
+        else f'multiply its stamps by {1 + ratio:.6g} (--rate would miss the gaps)'
+    )
+    return DataFault(
+        'clock_drift',
+        f'the clocks of {force.name} and of the recording drift apart by '
+        f'{100 * abs(ratio):.3g} s in 100 s, so that no shift fits from begin to end; if that of '
+        f'the recording is wrong, {own_correction}, else divide the stamps of {force.name} by '
+        f'{1 + ratio:.6g}; a shift that is left then needs --align',
+    )
+
+
 def _check_one_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> None:
-    """Refuse motions whose parts fit at different shifts only: one of their clocks steps."""
+    """Refuse motions whose parts fit at different shifts only: a clock drifts or steps."""
     motions = _motions(recording, sensor, force)
     if motions is None:
         return
-    count = min(int(np.ptp(recording.time_s) / _PART_S), _MOST_PARTS)
+    parts = motions.fitting_parts()
+    drift = _find_drift(motions, parts)
+    if drift is not None:
+        raise _drift_fault(drift, recording, force)
     levels: list[list[_Shifts]] = []  # Parts in a row of which one shift may be that of all
-    for rows in np.array_split(np.arange(len(motions.measured_s)), max(count, 1)):
-        part = motions.shifts(rows, round(_OVERLAP_OF_PART * len(rows)))
-        if not part.fits:
-            continue
+    for part in parts:
         if levels and not part.contradicts(levels[-1][-1]):
             levels[-1].append(part)
         else:
@@ -355,15 +475,21 @@ def _check_one_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> 
 
 def _time_of_step(motions: _Motions, before_s: float, after_s: float) -> float:
     """Return from when on the second of two shifts explains the recording better, s."""
-    left_g2 = []
-    for late_s in (before_s, after_s):
-        stated_g = [
-            np.interp(motions.measured_s + late_s, motions.stated_s, axis_g)
-            for axis_g in motions.stated_g.T
-        ]
-        left_g2.append(((motions.measured_g - np.column_stack(stated_g)) ** 2).sum(axis=1))
-    better = np.cumsum(left_g2[0] - left_g2[1])
+    before_g2, after_g2 = (
+        ((motions.measured_g - motions.stated_at(np.array(late_s))) ** 2).sum(axis=1)
+        for late_s in (before_s, after_s)
+    )
+    better = np.cumsum(before_g2 - after_g2)
     return float(motions.measured_s[np.argmin(better)])
+
+
+def _unexplained(measured: np.ndarray, stated: np.ndarray) -> float:
+    """Return the squares, summed, that zero-g and scale factor of each axis leave, (n, m) each."""
+    left = 0.0
+    for own, other in zip(measured.T, stated.T):
+        line = np.column_stack([np.ones(len(other)), other])
+        left += float(np.sum((own - line @ np.linalg.lstsq(line, own)[0]) ** 2))
+    return left
 
 
 def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> float | None:
@@ -408,13 +534,9 @@ def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: 
 
     def left_v2(more_s: float) -> float:
         """Return what zero-g and scale factor leave after a further shift."""
-        left = 0.0
-        for measured, simulated in zip(volts[rows].T, simulated_v.T):
-            line = np.column_stack(
-                [np.ones(len(rows)), np.interp(time_s[rows] + more_s, time_s, simulated)]
-            )
-            left += float(np.sum((measured - line @ np.linalg.lstsq(line, measured)[0]) ** 2))
-        return left
+        later_s = time_s[rows] + more_s
+        shifted_v = [np.interp(later_s, time_s, axis_v) for axis_v in simulated_v.T]
+        return _unexplained(volts[rows], np.column_stack(shifted_v))
 
     return late_s + float(
         scipy.optimize.minimize_scalar(

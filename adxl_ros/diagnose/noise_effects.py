@@ -62,13 +62,18 @@ _SMALLEST_CODE_STEPS = 0.3
 """Distance, in stated steps, below which two values are one code. Chosen: above rounding."""
 _NEAREST_CODES_RATIO = 1.5
 """Distance, divided by the smallest one, up to which no code is between. Chosen: below two."""
-_CODES_FEWEST = 8  # Fewest distances that show a step. Chosen
+_CODES_FEWEST = 8
+"""Fewest distances of codes that show a step. Chosen: a distance is an even number of steps with
+a chance of one half at most, so that all of them are in one of 256 recordings."""
 _BETWEEN_CODES_STEPS = 0.2
 """Distance from a multiple of the step, in steps, at which a value is between codes. Chosen: far
 above rounding."""
-_BETWEEN_CODES_SHARE = 0.1  # Share of such values from which the step is none of the ADC. Chosen
+_BETWEEN_CODES_SHARE = 0.1
+"""Share of such values from which the step is none of the ADC. Chosen: values without a step have
+0.6 between codes, and one glitch in ten distances is none of the ADC."""
 _REPEAT_CHANCE = 1e-4
-"""Probability of one run of equal samples by chance in a recording. Chosen."""
+"""Probability of one run of equal samples by chance in a recording. Chosen: one of ten
+thousand sound recordings is said to repeat samples."""
 _REPEAT_SHORTEST = 3  # Shortest such run, samples. Chosen: two may be equal by rounding
 _REPEAT_LEAST = 0.05
 """Smallest assumed probability that a sample equals the last one on one axis. Chosen: in 10⁵

@@ -18,16 +18,17 @@ from units import nominal
 
 RATE_HZ, SECONDS, REST_S = 100.0, 60.0, 8.0
 NOISE_MPS2 = 0.006
+LARGEST_LEFT_MPS2 = 10 * NOISE_MPS2  # 0.1 s late, the force is wrong by more.
 
 
 class Carried:
     """A sensor that rests, is carried about, and rests again, and its simulator."""
 
-    def __init__(self, seed=3):
+    def __init__(self, seed=3, seconds=SECONDS):
         rng = np.random.default_rng(seed)
-        self.time_s = np.arange(int(SECONDS * RATE_HZ)) / RATE_HZ
+        self.time_s = np.arange(int(seconds * RATE_HZ)) / RATE_HZ
         begin = np.clip((self.time_s - REST_S) / 3, 0, 1)
-        end = np.clip((SECONDS - REST_S - self.time_s) / 3, 0, 1)
+        end = np.clip((seconds - REST_S - self.time_s) / 3, 0, 1)
         envelope = begin**2 * (3 - 2 * begin) * end**2 * (3 - 2 * end)
 
         def wander(highest_hz, rms):
@@ -104,6 +105,12 @@ def test_a_step_of_the_simulators_clock_is_named(tmp_path, step_s, fault):
         assert fault is None
 
 
+def left_mps2(comparison):
+    """Return the rms of the residual of a comparison, m/s², where it is used."""
+    residual_g = comparison.residual_v(comparison.sensor) / comparison.sensor.scale_v_per_g
+    return np.sqrt(np.mean(residual_g[comparison.used] ** 2)) * G0_MPS2
+
+
 def only(recorded: Recording, rows: np.ndarray) -> Recording:
     """Return some rows, (n,) bool, of a recording."""
     columns = {name: values[rows] for name, values in recorded.columns.items()}
@@ -122,15 +129,47 @@ def test_the_advice_on_a_clock_that_steps_can_be_followed(tmp_path, step_s):
         with pytest.raises(DataFault) as raised:
             carried.beside(tmp_path, stepped, may_shift=may_shift)
         assert raised.value.name == 'clock_jump' and '--align' in raised.value.message
-    # 0.1 s late, the force is wrong by more.
-    largest_mps2 = 10 * NOISE_MPS2
     stated = re.search(r'(?:at about|between ([\d.]+) and) ([\d.]+) s', raised.value.message)
     begin_s, end_s = float(stated[1] or stated[2]), float(stated[2])
     for rows in (stepped.time_s < begin_s, stepped.time_s > end_s):
         comparison = carried.beside(tmp_path, only(stepped, rows), may_shift=True)
-        residual_g = comparison.residual_v(comparison.sensor) / comparison.sensor.scale_v_per_g
-        used_g = residual_g[comparison.used]
-        assert np.sqrt(np.mean(used_g**2)) * G0_MPS2 < largest_mps2
+        assert left_mps2(comparison) < LARGEST_LEFT_MPS2
+
+
+@pytest.mark.parametrize('ratio, seconds', [(1e-2, 40.0), (-5e-3, 120.0), (2e-3, 300.0)])
+@pytest.mark.parametrize('may_shift', [False, True])
+def test_the_advice_on_clocks_that_drift_apart_can_be_followed(
+    tmp_path, ratio, seconds, may_shift
+):
+    """No shift fits from begin to end, and there is no place to cut; another rate fits."""
+    carried = Carried(seconds=seconds)
+    recorded, stated_s = carried.recorded(), 5.0 + (1 + ratio) * carried.time_s
+    with pytest.raises(DataFault) as raised:
+        carried.beside(tmp_path, recorded, time_s=stated_s, may_shift=may_shift)
+    assert raised.value.name == 'clock_drift'
+    drift_s = re.search(r'([\d.]+) s in 100 s', raised.value.message)
+    assert float(drift_s[1]) == pytest.approx(abs(100 * ratio), rel=0.02)
+    rate_hz = float(re.search(r'--rate ([\d.]+)', raised.value.message)[1])
+    mended = replace(recorded, time_s=np.arange(len(recorded)) / rate_hz)
+    comparison = carried.beside(tmp_path, mended, time_s=stated_s, may_shift=True)
+    assert left_mps2(comparison) < LARGEST_LEFT_MPS2
+
+
+def test_no_rate_is_advised_where_samples_are_missing(tmp_path):
+    """The number of a sample does not tell its time there."""
+    carried = Carried()
+    kept = (carried.time_s < 20) | (carried.time_s > 21)
+    with pytest.raises(DataFault) as raised:
+        carried.beside(tmp_path, only(carried.recorded(), kept), time_s=1.01 * carried.time_s)
+    assert raised.value.name == 'clock_drift'
+    factor = float(re.search(r'multiply its stamps by ([\d.]+)', raised.value.message)[1])
+    assert factor == pytest.approx(1.01, abs=1e-4)
+
+
+@pytest.mark.parametrize('ratio', [-1e-3, 2e-3])
+def test_a_small_drift_is_left_to_the_effect_of_a_clock_skew(tmp_path, ratio):
+    carried = Carried()
+    carried.beside(tmp_path, carried.recorded(), time_s=(1 + ratio) * carried.time_s)
 
 
 @pytest.mark.parametrize('size_g, count', [(24.0, 8), (2.0, 60), (0.2, 30)])
