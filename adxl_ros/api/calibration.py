@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adxl_ros.api.recordings import each_recording, RecordingInput, RobotInput
-from adxl_ros.api.result import FirstScreen, no_progress, Progress, Result
-from adxl_ros.api.sensors import GivenSensor, sensor_of, SensorInput
+from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Result
+from adxl_ros.api.sensors import effect_names, GivenSensor, sensor_of, SensorInput
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits import thermal_fit
 from adxl_ros.calibrate.poses import (
@@ -164,22 +164,24 @@ class Fit(Result):
         return self.result.keep(store)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return coefficients, errors and provenance as objects of JSON."""
+        """Return coefficients, errors and provenance; what is not finite is None."""
         errors = self.held_out[-1] if self.held_out else None
-        return {
-            'schema': 1,
-            'serial': self.sensor.serial,
-            'model': self.sensor.model,
-            'outcome': self.outcome,
-            'poses': self.poses,
-            'outliers': list(self.outliers),
-            'coefficients': [row._asdict() for row in self.coefficients],
-            'held_out_tilt_deg': errors and errors.tilt_deg.rms,
-            'held_out_accel_mg': errors and errors.accel_mg.rms,
-            'warnings': list(self.warnings),
-            'measured': list(self.measured),
-            'provenance': dict(self.sensor.provenance),
-        }
+        return as_json(
+            {
+                'schema': 1,
+                'serial': self.sensor.serial,
+                'model': self.sensor.model,
+                'outcome': self.outcome,
+                'poses': self.poses,
+                'outliers': self.outliers,
+                'coefficients': [row._asdict() for row in self.coefficients],
+                'held_out_tilt_deg': errors and errors.tilt_deg.rms,
+                'held_out_accel_mg': errors and errors.accel_mg.rms,
+                'warnings': self.warnings,
+                'measured': self.measured,
+                'provenance': self.sensor.provenance,
+            }
+        )
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with a row for each coefficient."""
@@ -260,6 +262,7 @@ def fit(
         The poses do not determine the model, or recordings contradict each other.
 
     """
+    effects = _checked_names(model, effects)
     rests = _Rests(journal, poses, means)
     population = calibration_store.read_population(prior) if prior else None
     robot = RobotInput(urdf, frame, joints) if urdf else None
@@ -296,6 +299,16 @@ def fit(
         unit.sensor, recorded, model, effects, data_sha256 or unit.sha256, population
     )
     return _fit(result, unit, False)
+
+
+def _checked_names(model: str | None, effects: Sequence[str]) -> tuple[str, ...]:
+    """Refuse a model or an effect that no fit has; return the names of the effects."""
+    if model is not None and model not in calibration.STAGE_FITS:
+        raise UserError(
+            f'model {model}: expected one of {", ".join(calibration.STAGE_FITS)}, or None for '
+            'the richest that the poses determine'
+        )
+    return effect_names(effects)
 
 
 class _Unit:

@@ -11,8 +11,8 @@ from pathlib import Path
 import textwrap
 from typing import Any
 
-from adxl_ros.api.recordings import RecordingInput, RobotInput
-from adxl_ros.api.result import FirstScreen, no_progress, Progress, Result
+from adxl_ros.api.recordings import is_several, one_recording, RecordingInput, RobotInput
+from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Result
 from adxl_ros.api.sensors import as_input, sensor_of, SensorInput
 from adxl_ros.diagnose.data_checks import DataFault
 from adxl_ros.diagnose.diagnosis import what_shows
@@ -197,7 +197,8 @@ class Check(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return what the tool prints with --json, below `recordings`."""
-        return {'schema': 1, 'recordings': [_as_json(result) for result in self.recordings]}
+        recordings = [_as_json(result) for result in self.recordings]
+        return as_json({'schema': 1, 'recordings': recordings})
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with a row for each recording, as the screen has them."""
@@ -234,7 +235,7 @@ def check(
     Parameters
     ----------
     recordings
-        One or more recordings or their paths. One that cannot be read is not sound.
+        One or more recordings, DataFrames or paths. One that cannot be read is not sound.
     sensor
         The sensor, for recordings in volts: a Sensor, a datasheet's name or the path of a
         parameter file. None for the nominal sensor, or any IMU.
@@ -256,9 +257,10 @@ def check(
         The parameter file of the sensor cannot be read.
 
     """
-    several = (
-        [recordings] if isinstance(recordings, (Recording, str, os.PathLike)) else list(recordings)
-    )
+    several = [
+        each if isinstance(each, (str, os.PathLike)) else one_recording(each)
+        for each in (recordings if is_several(recordings) else [recordings])
+    ]
     reading = replace(reading, drop_bad_stamps=True)
     results = []
     for number, each in enumerate(several):

@@ -12,8 +12,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.api.recordings import as_recordings, RecordingInput
-from adxl_ros.api.result import FirstScreen, Result
+from adxl_ros.api.recordings import one_recording, RecordingInput
+from adxl_ros.api.result import as_json, FirstScreen, Result
 from adxl_ros.api.sensors import sensor_of, SensorInput
 from adxl_ros.compensate.estimators import Estimates, RecordingEstimator
 from adxl_ros.compensate.live_stream import ImuFields
@@ -213,9 +213,17 @@ class Corrected(Result):
         return FirstScreen('grey', f'{len(self.time_s)} samples', ' '.join(self.screen), tiles)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the columns of `to_pandas` as lists, with the notes."""
-        columns = {name: values.tolist() for name, values in self.columns.items()}
-        return {'schema': 1, 'serial': self.sensor.serial, 'notes': list(self.notes), **columns}
+        """Return the columns of `to_pandas` as lists, None where not finite, with the notes."""
+        return as_json(
+            {
+                'schema': 1,
+                'serial': self.sensor.serial,
+                'notes': self.notes,
+                'epoch_ns': self.epoch_ns,
+                'time_s': self.time_s,
+                **self.columns,
+            }
+        )
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with the columns of the tool's table, m/s² and rad."""
@@ -279,7 +287,7 @@ def apply(
         The recording is of another unit, or has no samples.
 
     """
-    (read,) = as_recordings([recording])
+    read = one_recording(recording)
     if not len(read):
         raise UserError(f'{read.path}: has no samples to correct')
     correction = Correction(read, sensor, inverse, undo_filter)

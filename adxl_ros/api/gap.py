@@ -12,8 +12,15 @@ from pathlib import Path
 import shlex
 from typing import Any, NamedTuple
 
-from adxl_ros.api.recordings import as_recordings, read_ideal, RecordingInput, RobotInput
+from adxl_ros.api.recordings import (
+    as_recordings,
+    one_recording,
+    read_ideal,
+    RecordingInput,
+    RobotInput,
+)
 from adxl_ros.api.result import (
+    as_json,
     FirstScreen,
     no_progress,
     Progress,
@@ -165,7 +172,7 @@ class Gap(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return report.json; docs/reference/report_json.md has its keys."""
-        return self._report | ({'gap_in': self.in_unit._asdict()} if self.in_unit else {})
+        return self._report | ({'gap_in': as_json(self.in_unit._asdict())} if self.in_unit else {})
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with a row for each parameter of each effect of the verdict."""
@@ -365,6 +372,8 @@ def diagnose(
     if align and sim is None and not urdf:
         raise UserError('--align: shifts --sim or a robot, and neither is given')
     unit = quantity_named(quantity) if quantity else None
+    if not (sim is None or isinstance(sim, (Motion, str, os.PathLike))):
+        sim = one_recording(sim)
     read = as_recordings(recordings)
     _require_one_reference(sim, urdf, len(read))
     given = sensor_of(sensor, read[0])

@@ -11,8 +11,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.api.recordings import RecordingInput
-from adxl_ros.api.result import FirstScreen, no_progress, Progress, Result
+from adxl_ros.api.recordings import one_recording, RecordingInput
+from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Result
 from adxl_ros.api.sensors import as_input, SensorInput
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording as recording_files
@@ -260,20 +260,23 @@ class Noise(Result):
         return path
 
     def to_dict(self) -> dict[str, Any]:
-        """Return terms with their intervals, m/s² and s, as objects of JSON."""
-        return {
-            'schema': 1,
-            'recording': self.result.path,
-            'span_s': self.span_s,
-            'rate_hz': self.rate_hz,
-            'warnings': list(self.warnings),
-            'axes': {
-                noise.axis: {
-                    name: estimate._asdict() for name, estimate in zip(_FIELDS, noise.estimates)
-                }
-                for noise in self.axes
-            },
+        """Return terms with their intervals, m/s² and s; what is not finite is None."""
+        axes = {
+            noise.axis: {
+                name: estimate._asdict() for name, estimate in zip(_FIELDS, noise.estimates)
+            }
+            for noise in self.axes
         }
+        return as_json(
+            {
+                'schema': 1,
+                'recording': self.result.path,
+                'span_s': self.span_s,
+                'rate_hz': self.rate_hz,
+                'warnings': self.warnings,
+                'axes': axes,
+            }
+        )
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with a row for each axis and term: value and 90 % interval."""
@@ -307,8 +310,8 @@ def noise(
     Parameters
     ----------
     recording
-        The recording, or its path; or a function that yields its blocks, for one that is larger
-        than the memory. The longest rest in it is used.
+        The recording, a DataFrame or a path; or a function that yields its blocks, for one that
+        is larger than the memory. The longest rest in it is used.
     sensor
         The other values of the sensor: a Sensor, a datasheet's name or the path of a parameter
         file. None for the nominal sensor, or any IMU.
@@ -326,15 +329,14 @@ def noise(
         The rest is too short.
 
     """
-    if isinstance(recording, Recording):
-        whole = recording
-
-        def read() -> Iterable[Recording]:
-            return [whole]
-    elif isinstance(recording, (str, os.PathLike)):
+    read: Callable[[], Iterable[Recording]]
+    if isinstance(recording, (str, os.PathLike)):
         read = partial(recording_files.blocks, recording, BLOCK_ROWS)
-    else:
+    elif callable(recording):
         read = recording
+    else:
+        read = partial(iter, [one_recording(recording)])
+
     result = noise_parameters.recording_noise(
         read, as_input(sensor), lambda done: progress(done, 'fit')
     )

@@ -5,8 +5,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+import hashlib
 import math
 import os
+import re
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from adxl_ros.errors import UserError
@@ -18,7 +22,6 @@ from adxl_ros.files.column_mapping import (
     parse_unit,
     ReadingOptions,
     Source,
-    Table,
 )
 from adxl_ros.files.recording_columns import ACCEL, Recording, REFERENCES, TIME, VOLTS
 from adxl_ros.files.tables import in_memory
@@ -28,8 +31,8 @@ import numpy as np
 if TYPE_CHECKING:
     from adxl_ros.simulate.robot import RobotPath
 
-RecordingInput = Recording | str | os.PathLike
-"""A recording, or the path of one that is read as it is."""
+RecordingInput = Any
+"""A Recording, a DataFrame in the columns of the package, or the path of a file."""
 Counts = float | Sequence[float] | str
 """Counts of an ADC: one number for all axes, one for each, or their text with commas."""
 
@@ -67,7 +70,8 @@ def read(
         Unit of the samples of a topic, or of all axes of a table: g, mg, mps2, mmps2, lsb, v or
         mv; '' for what `columns`, the names or the type of the topic state.
     rate
-        Sample rate, Hz, which replaces the stamps; None keeps them.
+        Sample rate, Hz, which replaces the stamps; None keeps them. In a DataFrame, a row
+        without a reading is a gap.
     axes
         Axes of the sensor by those of the file, for a documented mounting: `'x=-y,y=x,z=z'`.
     lsb_per_g, lsb_at_0g
@@ -89,12 +93,23 @@ def read(
         The file cannot be read, or is not understood; the message proposes `columns`.
 
     """
-    options = reading_options(
-        topic, columns, unit, rate, axes, lsb_per_g, lsb_at_0g, drop_bad_stamps, drop_bad_samples
-    )
-    if isinstance(source, (str, os.PathLike)):
-        return recording_files.read(source, options)
-    return recording_files.of_table(_table(_numbers(source), 'DataFrame'), options)
+    with _arguments_for_options():
+        options = reading_options(
+            topic,
+            columns,
+            unit,
+            rate,
+            axes,
+            lsb_per_g,
+            lsb_at_0g,
+            drop_bad_stamps,
+            drop_bad_samples,
+        )
+        if isinstance(source, (str, os.PathLike)):
+            recording = recording_files.read(source, options)
+        else:
+            recording = _of_memory(_columns_of(source, 'read'), 'DataFrame', options)
+    return replace(recording, remarks=tuple(map(_as_arguments, recording.remarks)))
 
 
 def reading_options(
@@ -109,10 +124,10 @@ def reading_options(
     drop_bad_samples: bool = False,
 ) -> ReadingOptions:
     """Check how a recording is to be read; see `read`."""
-    if rate is not None and not 0 < rate <= _HIGHEST_RATE_HZ:
-        raise UserError(
-            f'--rate {rate:g}: expected samples a second, at most {_HIGHEST_RATE_HZ:g}'
-        )
+    if rate is not None and not (
+        isinstance(rate, (float, int, np.number)) and 0 < rate <= _HIGHEST_RATE_HZ
+    ):
+        raise UserError(f'--rate {rate}: expected samples a second, at most {_HIGHEST_RATE_HZ:g}')
     return ReadingOptions(
         topic,
         parse_mapping(_mapping_text(columns)) if columns else None,
@@ -160,6 +175,7 @@ def from_arrays(
     serial: str = '',
     name: str = 'arrays',
     drop_bad_stamps: bool = False,
+    drop_bad_samples: bool = False,
     **columns: Any,
 ) -> Recording:
     """
@@ -168,19 +184,23 @@ def from_arrays(
     Parameters
     ----------
     table
-        Arrays by name, or a pandas DataFrame, with the names below; others are kept, too.
+        Arrays by name, or a pandas DataFrame, with the names below; others of numbers are kept,
+        too. An index that has a name is a column.
     rate
-        Sample rate, Hz, in place of `time_s`.
+        Sample rate, Hz, in place of `time_s`; a row without a reading is a gap.
     serial
         Serial number of the sensor; '' for an unnamed one.
     name
         What messages call it.
     drop_bad_stamps
         Whether samples are left out whose stamp does not increase; else they are refused.
+    drop_bad_samples
+        Whether samples are left out that have no number as their stamp or on an axis.
     **columns
         Arrays (n,): `time_s`, s, rising; the output `ax_mps2, ay_mps2, az_mps2`, m/s², or
         `x_v, y_v, z_v`, V, of one, two or three axes; the references `alpha_rad, beta_rad` of a
-        stage, rad, `shift_m`, m, `temperature_c`, °C, `supply_v`, V. NaN where not measured.
+        stage, rad, `shift_m`, m, `temperature_c`, °C, `supply_v`, V. NaN or masked where
+        not measured.
 
     Returns
     -------
@@ -193,50 +213,169 @@ def from_arrays(
         There is no time or no output, lengths differ, or values are no readings of a sensor.
 
     """
-    arrays = _numbers({} if table is None else table)
-    for key, values in columns.items():
-        if key not in (TIME, *VOLTS, *ACCEL, *REFERENCES):
-            raise UserError(
-                f'{name}: no array {key!r} is known, but '
-                f'{", ".join((TIME, *ACCEL, *VOLTS, *REFERENCES))}'
-            )
-        arrays[key] = np.asarray(values, float)
-    lengths = {key: values.shape for key, values in arrays.items()}
-    if len(set(lengths.values())) > 1 or any(len(shape) != 1 for shape in lengths.values()):
-        raise UserError(
-            f'{name}: arrays must have one dimension and the same length, but have '
-            + ', '.join(f'{key} {shape}' for key, shape in lengths.items())
+    arrays = {} if table is None else _columns_of(table, 'from_arrays')
+    for key in columns:
+        if key not in _KNOWN:
+            raise UserError(f'{name}: no array {key!r} is known, but {", ".join(_KNOWN)}')
+    with _arguments_for_options():
+        options = reading_options(
+            rate=rate, drop_bad_stamps=drop_bad_stamps, drop_bad_samples=drop_bad_samples
         )
-    if rate is not None and arrays:
-        arrays = {TIME: np.arange(next(iter(arrays.values())).size) / rate, **arrays}
-    return recording_files.of_table(
-        _table(arrays, name, serial), reading_options(rate=rate, drop_bad_stamps=drop_bad_stamps)
-    )
+        return _of_memory({**arrays, **columns}, name, options, serial)
 
 
-def _numbers(table: Any) -> dict[str, np.ndarray]:
-    """Return the columns of numbers and times of a table, (n,) each; times as ns."""
-    columns = {}
-    for key in table:
-        values = np.asarray(table[key])
-        if values.dtype.kind == 'M':
-            values = values.astype('datetime64[ns]').astype(np.int64)
-        if values.dtype.kind in 'iufb':
-            columns[str(key)] = values
-    return columns
+_KNOWN = (TIME, *ACCEL, *VOLTS, *REFERENCES)  # Columns of the package
 
 
-def _table(columns: Mapping[str, np.ndarray], name: str, serial: str = '') -> Table:
-    """Return arrays as a table."""
+def is_frame(given: Any) -> bool:
+    """Return whether an object is a DataFrame, without the package pandas."""
+    return hasattr(given, 'columns') and hasattr(given, 'index')
+
+
+def _columns_of(table: Any, verb: str) -> dict[str, Any]:
+    """Return the columns of a table by name, a named index among them."""
+    if not isinstance(table, Mapping) and not is_frame(table):
+        raise UserError(
+            f'{verb}: {type(table).__name__} is no table; expected arrays by name, '
+            'for example {"time_s": t, "ax_mps2": x}, or a DataFrame'
+        )
+    index = getattr(table, 'index', None)
+    name = getattr(index, 'name', None)
+    columns = {} if name is None else {str(name): index}
+    return columns | {str(key): table[key] for key in table}
+
+
+def _of_memory(
+    given: Mapping[str, Any], name: str, options: ReadingOptions, serial: str = ''
+) -> Recording:
+    """Return the recording that arrays hold; those that are no numbers are left out and noted."""
+    arrays = {key: _floats(values) for key, values in given.items()}
+    columns = {key: values for key, values in arrays.items() if values is not None}
+    others = [key for key in arrays if key not in columns]
+    if refused := [key for key in others if key in _KNOWN]:
+        raise UserError(
+            f'{name}: {refused[0]} is no array of numbers; give floats, NaN where not measured'
+        )
     if not columns:
         raise UserError(f'{name}: holds no array of numbers')
-    return in_memory(name, columns, info={'serial': serial} if serial else {})
+    shapes = {key: values.shape for key, values in columns.items()}
+    if len(set(shapes.values())) > 1 or any(len(shape) != 1 for shape in shapes.values()):
+        raise UserError(
+            f'{name}: arrays must have one dimension and the same length, but have '
+            + ', '.join(f'{key} {shape}' for key, shape in shapes.items())
+        )
+    if options.mapping is None and not {*ACCEL, *VOLTS}.isdisjoint(columns):
+        if options.rate_hz is not None:
+            (rows,) = next(iter(shapes.values()))
+            columns[TIME] = np.arange(rows) / options.rate_hz
+        elif TIME not in columns:
+            raise UserError(f'{name}: has no time; give time_s or rate')
+    table = in_memory(
+        name, columns, info={'serial': serial} if serial else {}, is_every_row_a_step=True
+    )
+    recording = recording_files.of_table(table, options)
+    left_out = f'{name}: left out, columns without numbers: {", ".join(others)}'
+    return replace(recording, remarks=(*recording.remarks, *[left_out] * bool(others)))
+
+
+def _floats(given: Any) -> np.ndarray | None:
+    """Return numbers as floats and times as ns, NaN where masked or missing; None for others."""
+    try:
+        values: Any = np.ma.asarray(given)
+        if hasattr(given, 'isna'):
+            values = np.ma.array(values, mask=given.isna())
+        if values.dtype.kind in 'mM':
+            values = values.astype(f'{values.dtype.kind}8[ns]').astype(np.int64)
+        is_text = values.dtype.kind == 'O' and any(
+            isinstance(each, (str, bytes)) for each in values.flat
+        )
+        if values.dtype.kind not in 'iufbO' or is_text:
+            return None
+        if values.dtype.kind != 'O':
+            values = values.astype(float)
+        return np.asarray(values.filled(np.nan), float)
+    except (TypeError, ValueError):
+        return None
+
+
+_OPTION = re.compile(
+    r"""(?<!\S)--([a-z][a-z0-9-]*)(?:\ (HZ|'[^']*'|"[^"]*"|[-+]?\d[\d.]*(?:e[-+]?\d+)?))?"""
+)
+"""An option of a tool in a message, with its value if that is a number or quoted."""
+
+
+_BETWEEN_OPTIONS = re.compile(r"""(--\S+ (?:'[^']*'|\S+)) (?=--)""")
+
+
+def _as_arguments(text: str) -> str:
+    """Return a message that names arguments of Python for the options of a tool."""
+
+    def argument(option: re.Match) -> str:
+        name, value = option[1].replace('-', '_'), option[2]
+        is_switch = name.startswith('drop_bad')
+        return f'{name}={value or True}' if value or is_switch else name
+
+    return _OPTION.sub(argument, _BETWEEN_OPTIONS.sub(r'\1, ', text))
+
+
+@contextmanager
+def _arguments_for_options() -> Iterator[None]:
+    """Name arguments of Python, for options of a tool, in the errors of a block."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(_as_arguments(str(error))) from None
+
+
+def is_several(given: Any) -> bool:
+    """Return whether recordings are given in a series, and not one alone."""
+    is_one = isinstance(given, (str, Mapping, np.ndarray)) or is_frame(given)
+    return isinstance(given, Iterable) and not is_one
+
+
+def one_recording(given: RecordingInput) -> Recording:
+    """Return a recording; one that is named by its path is read as it is."""
+    if isinstance(given, (str, os.PathLike)):
+        return recording_files.read(given)
+    if is_frame(given):
+        return read(given)
+    if not isinstance(given, Recording):
+        raise UserError(
+            f'{type(given).__name__} is no recording; expected a Recording, a DataFrame, or '
+            'the path of a file'
+        )
+    for name, values in _samples(given).items():
+        numbers = _floats(values)
+        if numbers is None or numbers.shape != (len(given),) or not np.isfinite(numbers).all():
+            raise UserError(
+                f'{given.path}: {name} is masked or no finite number in some of the {len(given)} '
+                'samples; leave these out by from_arrays(..., drop_bad_samples=True)'
+            )
+    return given
+
+
+def _samples(recording: Recording) -> dict[str, np.ndarray]:
+    """Return the stamps and the output of the sensor."""
+    outputs = {name: recording.columns[name] for name in recording.sensor_columns}
+    return {TIME: recording.time_s, **outputs}
 
 
 def each_recording(given: RecordingInput | Iterable[RecordingInput]) -> Iterator[Recording]:
-    """Yield recordings, those that are named by their path read as they are."""
-    for each in [given] if isinstance(given, (Recording, str, os.PathLike)) else given:
-        yield each if isinstance(each, Recording) else recording_files.read(each)
+    """Yield recordings, those that are named by their path read as they are; each only once."""
+    known: dict[bytes, str] = {}  # Number and name of each recording by the hash of its samples
+    for number, each in enumerate(given if is_several(given) else [given], 1):
+        recording = one_recording(each)
+        digest = hashlib.blake2b()
+        for values in _samples(recording).values():
+            digest.update(np.ascontiguousarray(values, float).data)
+        key = digest.digest()
+        if key in known:
+            raise UserError(
+                f'recording {number} ({recording.path}) has the same samples as recording '
+                f'{known[key]}, which would count twice; leave one of them out'
+            )
+        known[key] = f'{number} ({recording.path})'
+        yield recording
 
 
 def as_recordings(given: RecordingInput | Iterable[RecordingInput]) -> list[Recording]:
@@ -265,9 +404,10 @@ class RobotInput(NamedTuple):
 
 def read_ideal(given: RecordingInput, epoch_ns: int) -> Recording:
     """Return the ideal specific force of a simulator; its times count from `epoch_ns`."""
-    if not isinstance(given, Recording):
+    if isinstance(given, (str, os.PathLike)):
         return recording_files.read_ideal(given, epoch_ns)
-    missing = [name for name in ACCEL if name not in given.columns]
+    ideal = one_recording(given)
+    missing = [name for name in ACCEL if name not in ideal.columns]
     if missing:
-        raise UserError(f'{given.path}: no column {missing[0]}')
-    return recording_files.at_epoch(given, epoch_ns)
+        raise UserError(f'{ideal.path}: no column {missing[0]}')
+    return recording_files.at_epoch(ideal, epoch_ns)

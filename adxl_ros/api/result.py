@@ -4,12 +4,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.report.screen import end_lines
+import numpy as np
 
 Progress = Callable[[float, str], None]
 """Called with the share of the work that is done, 0 to 1, and the name of the stage."""
@@ -29,6 +31,21 @@ class FirstScreen(NamedTuple):
     word: str  # The outcome
     sentence: str
     tiles: Sequence[tuple[str, ...]] = ()  # Label, value with unit, and perhaps a note
+
+
+def as_json(value: Any) -> Any:
+    """Return objects of JSON: arrays and tuples as lists, what is not finite as None."""
+    if isinstance(value, Mapping):
+        return {key: as_json(each) for key, each in value.items()}
+    if isinstance(value, np.ndarray):
+        plain = value.astype(object)
+        plain[~np.isfinite(value)] = None
+        return plain.tolist()
+    if isinstance(value, (list, tuple)):
+        return [as_json(each) for each in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class Result:

@@ -56,8 +56,25 @@ def load(name: str | os.PathLike, *, effects: AddedEffects = ()) -> Sensor:
 
 def effect_inputs(effects: AddedEffects) -> list[EffectInput]:
     """Return effects by their names, each with one number a key."""
-    given = effects if isinstance(effects, Mapping) else dict.fromkeys(effects)
-    return [(name, _flat(values or {})) for name, values in given.items()]
+    if isinstance(effects, Mapping):
+        for name, values in effects.items():
+            if not (values is None or isinstance(values, Mapping)):
+                raise UserError(
+                    f'effect {name}: {values!r} is no dict of values by parameter; write for '
+                    "example {'lever_arm': {'z_m': 0.03}}, or None for typical values"
+                )
+        return [(name, _flat(values or {})) for name, values in effects.items()]
+    return [(name, {}) for name in effect_names(effects)]
+
+
+def effect_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of effects; refuse what is no list of names, or names no effect."""
+    is_list = isinstance(names, Iterable) and not isinstance(names, (str, Mapping))
+    if not is_list or not all(isinstance(name, str) for name in names):
+        raise UserError(
+            f"effects: {names!r} is no list of names; write for example ['misalignment']"
+        )
+    return tuple(effect_named(name).name for name in names)
 
 
 def with_effects(sensor: Sensor, effects: Iterable[EffectInput]) -> Sensor:
@@ -74,7 +91,7 @@ def with_effects(sensor: Sensor, effects: Iterable[EffectInput]) -> Sensor:
                 _put(effect, values, sensor.axes, key, number)
         except UserError as error:
             parts = ','.join(f'{key}={number}' for key, number in given.items())
-            raise UserError(f'--effect {name}{":" * bool(given)}{parts}: {error}') from None
+            raise UserError(f'effect {name}{":" * bool(given)}{parts}: {error}') from None
         names = sensor.effects if name in sensor.effects else (*sensor.effects, name)
         sensor = replace(sensor, effects=names, values={**sensor.values, name: values})
     return sensor
@@ -144,4 +161,11 @@ def sensor_of(given: SensorInput | None, read: Recording, has_noise: bool = True
 def as_input(given: SensorInput | None) -> Sensor | str | None:
     """Return a sensor itself, or the name of its file; results hold their sensor."""
     sensor = getattr(given, 'sensor', given)
-    return sensor if sensor is None or isinstance(sensor, Sensor) else os.fspath(sensor)
+    if sensor is None or isinstance(sensor, Sensor):
+        return sensor
+    if not isinstance(sensor, (str, os.PathLike)):
+        raise UserError(
+            f'{type(given).__name__} is no sensor; expected a Sensor, a result that has one '
+            "(Fit, Gap, Noise), a datasheet's name, or the path of a parameter file"
+        )
+    return os.fspath(sensor)

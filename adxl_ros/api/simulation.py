@@ -6,9 +6,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+import os
 from pathlib import Path
 
-from adxl_ros.api.recordings import as_recordings, read_ideal, RecordingInput
+from adxl_ros.api.recordings import one_recording, read_ideal, RecordingInput
 from adxl_ros.api.result import no_progress, Progress, require_least
 from adxl_ros.api.sensors import (
     AddedEffects,
@@ -84,7 +85,8 @@ def prepare(
     bounds = parameter_file.SENSOR_FIELDS['sensor.rate_hz'].metadata
     if rate is not None and not bounds['lower'] <= rate <= bounds['upper']:
         raise UserError(f'--rate {rate:g}: outside {bounds["lower"]:g} to {bounds["upper"]:g} Hz')
-    if (trajectory == IMU) != (force is not None):
+    is_imu = isinstance(trajectory, str) and trajectory == IMU
+    if is_imu != (force is not None):
         raise UserError(
             '--force RECORDING and the trajectory imu need each other: '
             'simulate imu --force RECORDING'
@@ -98,7 +100,7 @@ def prepare(
         motion = TRAJECTORIES[trajectory](np.random.default_rng(seed))
         made = Simulation(trajectory, unit, motion)
     else:
-        made = _by_references(as_recordings(_existing(trajectory))[0], unit, rate)
+        made = _by_references(one_recording(_existing(trajectory)), unit, rate)
     return replace(made, left_out=left_out)
 
 
@@ -122,7 +124,7 @@ def _left_out(sensor: Sensor, asked: set[str]) -> list[str]:
         if effect_named(name).concern is Concern.REFERENCE:
             if name in asked:
                 raise UserError(
-                    f'--effect {name}: acts on the specific force of a recording; say '
+                    f'effect {name}: acts on the specific force of a recording; say '
                     'simulate imu --force RECORDING, or leave the effect out'
                 )
             lines.append(f'{name} is an error of the reference, and is left out')
@@ -131,7 +133,7 @@ def _left_out(sensor: Sensor, asked: set[str]) -> list[str]:
 
 def _existing(trajectory: RecordingInput) -> RecordingInput:
     """Refuse a text that is neither a recording nor a trajectory."""
-    if not isinstance(trajectory, Recording) and not Path(trajectory).exists():
+    if isinstance(trajectory, (str, os.PathLike)) and not Path(trajectory).exists():
         raise UserError(
             f'{trajectory}: neither a recording nor one of the trajectories '
             f'{", ".join((*TRAJECTORIES, IMU))}'

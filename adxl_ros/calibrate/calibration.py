@@ -122,6 +122,11 @@ def calibrate(
             'and beta_rad), which are missing; leave --model out to calibrate a '
             'three-axis sensor against gravity'
         )
+    elif effects:
+        raise UserError(
+            f'{source}: {", ".join(effects)} cannot be fitted against gravity; record stage '
+            'angles (alpha_rad and beta_rad), or leave the effects out'
+        )
     elif sensor.axes != AXES:
         raise UserError(
             f'{source}: no stage angles and only the axes {sensor.axes}: the '

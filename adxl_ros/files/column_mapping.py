@@ -53,6 +53,8 @@ class Table:
     default_mapping: str = ''  # Mapping that the definition of the format states
     header_line: int | None = None  # Line of a text file with the names; 0 where it has none
     repeated: str = ''  # A name that stands twice; empty for none
+    # Whether a row without a reading is a lost sample, and no row of something else
+    is_every_row_a_step: bool = False
 
     @property
     def has_names(self) -> bool:

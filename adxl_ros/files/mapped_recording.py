@@ -164,7 +164,8 @@ class _Converter:
         self._epoch_ns: int | None = None
         self._begin = 0.0  # Origin of the times in the unit of the stamps
         self._empty = self._incomplete = 0  # Rows without a reading, and with a part of one
-        self._rows = 0  # Rows with a reading or a part of one so far
+        self._is_every_row_a_step = table.is_every_row_a_step
+        self._rows = 0  # Steps of the sample rate so far
         self._last_beta_rad = 0.0
 
     def _source(self, table: Table, role: str, source: Source) -> Source:
@@ -305,8 +306,9 @@ class _Converter:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return stamps, s, (n,), and which rows are kept, (n,); a part of a reading has one."""
         if self._reading.rate_hz is not None:
-            number = self._rows + np.cumsum(is_row) - 1
-            self._rows += int(is_row.sum())
+            is_step = is_row | self._is_every_row_a_step
+            number = self._rows + np.cumsum(is_step) - 1
+            self._rows += int(is_step.sum())
             return number / self._reading.rate_hz, is_sample
         source, unit = self.sources['time'], self._unit('time')
         stamps = block.columns[source.column]
