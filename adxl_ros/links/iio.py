@@ -104,7 +104,6 @@ class IioLink(base.Link):
         self._adc: dict[str, float] = {}
         self._connections = self._repeated = 0
         self._newest_ns = -1
-        self._received = 0  # Samples of the present device
         self._last_buffer_s = time.monotonic()
 
     def read(self, now_ns: int) -> base.Samples:
@@ -155,11 +154,15 @@ class IioLink(base.Link):
         if silent_s > max(_SILENT_S, _SILENT_BUFFERS * stream.buffer_s):
             return base.Level.WARN, f'{uri}: silent, {stream.name} gives no samples'
         if contradiction := self._rate.fault:
-            return base.Level.ERROR, f'{uri}: {stream.name} {contradiction}'
+            return (
+                base.Level.ERROR,
+                f'{uri}: {stream.name} {contradiction}: its sampling_frequency, or '
+                'sensor.rate_hz where it has none',
+            )
         return base.Level.OK, f'streaming at {stream.rate_hz:g} Hz'
 
     def _open(self) -> None:
-        """Try to open the device; a new ADC begins a new clock."""
+        """Try to open the device; another ADC or rate than before begins a new clock."""
         uri = self._settings.uri
         try:
             stream = _open_stream(self._settings, self._entries, self._declared)
@@ -171,9 +174,9 @@ class IioLink(base.Link):
         self._stream, self._error = stream, ''
         self._connections += 1
         self._last_buffer_s = time.monotonic()
-        self._rate, self._received = ClockRate(stream.rate_hz), 0
-        adc = stream.adc
-        if adc != self._adc:
+        is_other_rate = self._rate.used_hz != stream.rate_hz
+        self._rate, adc = ClockRate(stream.rate_hz), stream.adc
+        if adc != self._adc or is_other_rate:
             self._adc = adc
             self.sensor = replace(self._declared, **adc)  # type: ignore[arg-type]
             if stream.by_host_clock:
@@ -191,10 +194,10 @@ class IioLink(base.Link):
             self._newest_ns = -1
         newest_ns = np.maximum.accumulate(np.append(self._newest_ns, device_ns))
         new = device_ns > newest_ns[:-1]
+        taken_ns = newest_ns[np.append(self._newest_ns >= 0, new)]
         self._newest_ns = int(newest_ns[-1])
         self._repeated += len(new) - int(new.sum())
-        self._received += int(new.sum())
-        if self._rate.compare(self._received, 1e-3 * self._newest_ns):
+        if self._rate.compare_steps(1e-3 * np.diff(taken_ns)):
             assert self.sensor is not None, 'a device is open'
             self.sensor = replace(self.sensor, rate_hz=self._rate.used_hz)
             self._stamper.restart(1e9 / self._rate.used_hz)

@@ -142,6 +142,34 @@ def test_a_device_that_samples_at_half_the_stated_rate_is_named(served):
     assert not sum(part.missing for part in parts[-2:]), 'no sample is missing at 250 Hz'
 
 
+def test_a_device_that_is_opened_again_has_the_rate_of_its_clock(served):
+    """A rate that was corrected before the loss is not kept as if it were the stated one."""
+    server, link = served(nominal(rate_hz=500.0), {'share': 0.5})
+    read_samples(link, 800)
+    assert link.sensor.rate_hz == pytest.approx(250, rel=0.01)
+    server.kill()
+    again = ScriptProcess('iiod.py', json.dumps({'port': int(server.first_line)}))
+    try:
+        end_s = time.monotonic() + PATIENCE * 10
+        while link.status().statistics['connections'] < 2 and time.monotonic() < end_s:
+            link.read(0)
+        parts = read_samples(link, 800)
+        assert link.status().text == 'streaming at 500 Hz'
+        assert link.sensor.rate_hz == 500
+        assert not sum(part.missing for part in parts[-2:])
+    finally:
+        again.kill()
+
+
+def test_steady_loss_is_no_other_rate(served):
+    _, link = served(nominal(rate_hz=500.0), {'loses': (50, 12)}, latency_ms=100.0)
+    parts = read_samples(link, 800)
+    assert link.status().text == 'streaming at 500 Hz'
+    assert link.sensor.rate_hz == 500
+    missing, taken = (sum(part.missing for part in parts), sum(len(p.stamp_ns) for p in parts))
+    assert missing / taken == pytest.approx(12 / 50, rel=0.2), 'the loss is counted'
+
+
 def test_a_digital_sensor_gives_pseudo_volts(served):
     sensor = nominal('xyz')
     _, link = served(

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from adxl_ros.errors import UserError
 from adxl_ros.links.support import emulated_board, stamping
+from adxl_ros.links.support.clock_rate import ClockRate
 from adxl_ros.links.support.stamping import ClockMap
 from adxl_ros.links.support.wire_format import AFTER_RESET, FrameCounter, SampleFrame
 from hypothesis import given, settings, strategies as st
@@ -213,3 +214,16 @@ def test_no_frame_is_accepted_twice_or_out_of_order(order):
 def test_a_sensor_beyond_the_wire_format_is_refused(change, reason):
     with pytest.raises(UserError, match=reason):
         emulated_board.check_sensor(replace(nominal(), **change))
+
+
+@pytest.mark.parametrize('true_hz, used_hz', [(500.0, 500.0), (505.0, 500.0), (250.0, 250.0)])
+@pytest.mark.parametrize('taken, lost', [(50, 0), (50, 12), (5, 40), (1, 0)])
+def test_the_rate_of_a_clock_is_that_between_losses(true_hz, used_hz, taken, lost):
+    """Buffers of some samples, with samples that are lost after each of them."""
+    rate, rng = ClockRate(500.0), np.random.default_rng(1)
+    numbers = np.flatnonzero(np.arange(2000) % (taken + lost) < taken)
+    stamps_us = (numbers + rng.normal(0, 0.02, len(numbers))) / true_hz * 1e6
+    for steps_us in np.array_split(np.diff(stamps_us), len(numbers) // taken):
+        rate.compare_steps(steps_us)
+    assert rate.used_hz == pytest.approx(used_hz, rel=0.01)
+    assert bool(rate.fault) == (used_hz != 500)

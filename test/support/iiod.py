@@ -96,6 +96,8 @@ class Adc:
         self.buffers, self.count = 4, 20
         self.next_sample = 0
         self.lost = 0
+        # After how many samples how many are lost, again and again
+        self.taken_of, self.lost_of = options.get('loses', (1, 0))
         self.enabled = []
         self.queue = deque()
 
@@ -126,7 +128,8 @@ class Adc:
             while self.queue and len(numbers) < count:
                 numbers.append(self.queue.popleft())
             while self.next_sample < available and len(numbers) < count:
-                numbers.append(self.next_sample)
+                if self.next_sample % (self.taken_of + self.lost_of) < self.taken_of:
+                    numbers.append(self.next_sample)
                 self.next_sample += 1
             if len(numbers) < count:
                 time.sleep(max(self.until_s(self.next_sample + count - len(numbers) - 1), 0))

@@ -15,6 +15,7 @@ known a fifth of a second after the start at 1 kHz."""
 _RATES = 8  # Rates in a row that must agree. Chosen: a device that stalls has other ones each time
 _RATE_SCATTER = 0.02
 """Largest relative difference of rates that agree. Chosen: half a period of 25."""
+_USUAL_STEP = 1.5  # Largest step of one sample, in medians of all steps: halfway to two samples
 _MAX_RATE_ERROR = 0.05
 """Largest relative error of a stated rate. Chosen: above the error of any oscillator."""
 
@@ -25,6 +26,7 @@ class ClockRate:
     def __init__(self, stated_hz: float) -> None:
         self.used_hz = self._stated_hz = stated_hz
         self._first: tuple[int, float] | None = None  # Number and time, µs, of a sample
+        self._steps_us: list[float] = []  # Times between samples that are not counted, µs
         self._newest_hz: deque[float] = deque(maxlen=_RATES)
 
     @property
@@ -40,7 +42,11 @@ class ClockRate:
         )
 
     def compare(self, index: int, time_us: float) -> bool:
-        """Take number and time, µs, of a sample; return whether they change the rate to use."""
+        """
+        Take number and time, µs, of a sample; return whether they change the rate to use.
+
+        The number counts lost samples, too.
+        """
         first = self._first
         if first is None:
             self._first = index, time_us
@@ -50,7 +56,25 @@ class ClockRate:
         if count < _RATE_SAMPLES:
             return False
         self._first = index, time_us
-        self._newest_hz.append(count / max(time_us - first[1], 1.0) * 1e6)
+        return self._take(count / max(time_us - first[1], 1.0) * 1e6)
+
+    def compare_steps(self, steps_us: np.ndarray) -> bool:
+        """
+        Take steps, µs, (n,), between samples; return whether they change the rate to use.
+
+        Nothing counts the samples, so that longer steps than usual are losses and no rate.
+        """
+        self._steps_us.extend(steps_us.tolist())
+        if len(self._steps_us) < _RATE_SAMPLES:
+            return False
+        taken_us = np.array(self._steps_us)
+        self._steps_us.clear()
+        usual_us = taken_us[taken_us < _USUAL_STEP * np.median(taken_us)]
+        return self._take(1e6 / float(usual_us.mean()))
+
+    def _take(self, newest_hz: float) -> bool:
+        """Take the rate of some samples, Hz; return whether it changes the rate to use."""
+        self._newest_hz.append(newest_hz)
         clock_hz, low_hz, high_hz = (
             float(f(self._newest_hz)) for f in (np.median, np.min, np.max)
         )
