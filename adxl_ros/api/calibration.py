@@ -225,9 +225,10 @@ def fit(
     Parameters
     ----------
     recordings
-        One or more recordings of rests in several poses, all of one unit; the path of a
-        recording is read as it is. With `alpha_rad` and `beta_rad` the reference is the stage.
-        Without, it is the length of gravity, which needs three axes and ten poses.
+        One or more recordings of rests in several poses, all of one unit, each once: a
+        Recording, a DataFrame, or the path of one that is read as it is. With `alpha_rad` and
+        `beta_rad` the reference is the stage. Without, it is the length of gravity, which needs
+        three axes: seven poses for zero-g and scale factor, ten for misalignment, too.
     sensor
         What is not fitted: a Sensor, a datasheet's name or the path of a parameter file. None
         for the nominal sensor, or any IMU; what a file leaves out is measured.
@@ -235,8 +236,8 @@ def fit(
         'linear', 'physical' or 'full' against the stage; None for the richest that the poses
         determine.
     effects
-        Further effects of the full model, by name. Temperature effects alone are fitted to a
-        sensor that rests while its temperature changes.
+        Further effects of the full model against the stage: a list of their names. Temperature
+        effects alone are fitted to a sensor that rests while its temperature changes.
     prior
         Path of the population.yaml of a fleet: prior of zero-g and scale factor.
     journal, poses

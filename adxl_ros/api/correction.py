@@ -266,8 +266,8 @@ def apply(
     Parameters
     ----------
     recording
-        The recording; the path of one is read as it is. Stage angles in it are not used,
-        temperature and supply are.
+        A Recording, a DataFrame, or the path of one that is read as it is. Stage angles in it are
+        not used, temperature and supply are.
     sensor
         The calibrated sensor: a `Fit`, a Sensor, or the path of a parameter file. None for the
         nominal sensor, or any IMU.

@@ -241,15 +241,19 @@ class Gap(Result):
         )
 
     def command(self, folder: str | os.PathLike) -> str:
-        """Return the command line that repeats the diagnosis into a folder."""
+        """
+        Return the command line that repeats the diagnosis into a folder.
+
+        RECORDING and SIMULATION stand for samples that are in no file yet.
+        """
         given = {
             '--params': self.compared.params,
-            '--sim': self.compared.sim,
+            '--sim': _stored(self.compared.sim, 'SIMULATION'),
             '--urdf': self.compared.urdf,
             '--frame': self._frame,
             '-o': str(folder),
         }
-        return _command(self.compared.recordings, given)
+        return _command(self._stored_recordings, given)
 
     def next_steps(self, folder: str | os.PathLike) -> list[NextStep]:
         """Return what to record, how to diagnose that, and how to simulate what was found."""
@@ -276,7 +280,7 @@ class Gap(Result):
                 '--frame': self._frame,
                 '-o': f'{folder}_2',
             }
-            before = () if is_alone else compared.recordings
+            before = [] if is_alone else self._stored_recordings
             steps.append(
                 NextStep(
                     'diagnose it' if is_alone else 'diagnose it together with this one',
@@ -295,8 +299,17 @@ class Gap(Result):
         return steps
 
     @property
+    def _stored_recordings(self) -> list[str]:
+        return [_stored(name, 'RECORDING') for name in self.compared.recordings]
+
+    @property
     def _frame(self) -> str:
         return self.compared.frame if self.compared.urdf else ''
+
+
+def _stored(name: str, otherwise: str) -> str:
+    """Return the name of a file; another word where samples are in none, '' for no samples."""
+    return name if not name or Path(name).exists() else otherwise
 
 
 def _command(recordings: Sequence[str], given: Mapping[str, str]) -> str:
@@ -327,14 +340,15 @@ def diagnose(
     Parameters
     ----------
     recordings
-        One or more recordings of one unit; the path of a recording is read as it is. The motion
-        is that of `alpha_rad` and `beta_rad` of a stage, or that of `sim` or `urdf`.
+        One or more recordings of one unit, each once: a Recording, a DataFrame, or the path of
+        one that is read as it is. The motion is that of `alpha_rad` and `beta_rad` of a
+        stage, or that of `sim` or `urdf`.
     sensor
         What the simulator models: a Sensor, a `Fit`, a datasheet's name or the path of a
         parameter file. None for the nominal sensor, or any IMU.
     sim
         Ideal specific force of the same motion by another simulator, with `ax_mps2, ay_mps2,
-        az_mps2`, m/s², in the frame of the sensor: a Recording or its path.
+        az_mps2`, m/s², in the frame of the sensor: a Recording, a DataFrame or a path.
     urdf
         Path of the robot that carries the sensor; its joints are in the bag of the recording.
     frame, joints
@@ -342,7 +356,8 @@ def diagnose(
     align
         Whether `sim` is shifted in time where its motion is late or early.
     material
-        Amplitude that matters, mg rms; smaller effects are no gap. At least a tenth of the noise.
+        Amplitude that matters, mg rms, at least 1e-6; smaller effects are no gap. Where a tenth
+        of the noise is larger, that is used.
     prior
         Path of the population.yaml of a fleet: prior of zero-g and scale factor.
     quantity

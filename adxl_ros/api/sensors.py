@@ -37,7 +37,8 @@ def load(name: str | os.PathLike, *, effects: AddedEffects = ()) -> Sensor:
     name
         Name of a datasheet, such as 'adxl203' or 'mpu6050', or the path of a parameter file.
     effects
-        Effects that are added, as in `simulate`: for a `SensorModel` in a simulator.
+        Effects that are added, for a `SensorModel` in a simulator: a list of names for typical
+        sizes, or a dict of values by parameter for each name, as in `simulate`.
 
     Returns
     -------

@@ -182,12 +182,13 @@ def simulate(
         The sensor: a Sensor, a `Fit` or a `Gap`, a datasheet's name or the path of a parameter
         file. None for the nominal sensor.
     effects
-        Effects that are added: names for typical values, or a dict of values by parameter, as
+        Effects that are added: a list of names for typical values, or a dict of values
+        by parameter for each name, None for typical ones, as
         `{'lever_arm': {'z_m': 0.03}, 'bias': {'offset_v.x': 1e-3}, 'hysteresis': None}`. A
         parameter is for all axes, with `.x` for one; those without a value are neutral.
     force
         Ideal specific force of another simulator for 'imu', with `ax_mps2, ay_mps2, az_mps2`,
-        m/s², in the frame of the sensor: a Recording or its path.
+        m/s², in the frame of the sensor: a Recording, a DataFrame or a path.
     rate
         Sample rate, Hz; None for that of the sensor, or of what is followed.
     seed

@@ -27,6 +27,7 @@ from adxl_ros.files.bag_messages import (
 )
 from adxl_ros.files.column_mapping import Columns
 from adxl_ros.files.recording_columns import COMMANDS, converted_info, JOINTS, Recording
+from adxl_ros.files.tables import TABLE_ENDINGS
 from adxl_ros.model.covariance import imu_covariance
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -84,9 +85,27 @@ class _NewBag:
         release_written(self.writer.storage.bio)
 
 
+_OTHER_FORMATS = {
+    *TABLE_ENDINGS,
+    *('.csv', '.tsv', '.txt', '.json', '.yaml', '.xlsx', '.h5', '.feather', '.npy', '.pkl'),
+    *('.mcap', '.db3', '.bag'),
+}
+"""Ends of the names of files, in lower case, that are no bags or only read."""
+
+
+def _check_ending(path: Path) -> None:
+    """Refuse a directory with the name of a file of another format."""
+    if path.suffix != '.mcap' and path.suffix.lower() in _OTHER_FORMATS:
+        raise UserError(
+            f'{path}: files that end in {path.suffix} are not written; write NAME.csv, '
+            'NAME.mcap, or NAME for a rosbag2 directory'
+        )
+
+
 @contextmanager
 def _new_bag(path: AnyPath) -> Iterator[_NewBag]:
     """Open a rosbag2 directory, or one file for a name.mcap; it appears with the block's end."""
+    _check_ending(Path(path))
     rosbag2 = import_rosbags()
     with atomic_path(path) as fresh:
         # rosbags writes directories; of a name.mcap, only the file inside is kept.

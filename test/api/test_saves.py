@@ -58,3 +58,11 @@ def test_an_empty_folder_becomes_the_bag_and_its_own_is_replaced(tmp_path: Path)
     for may_overwrite in (False, True):
         RECORDING.save(tmp_path / 'run', overwrite=may_overwrite)
     assert len(adxl.read(tmp_path / 'run')) == len(RECORDING)
+
+
+@pytest.mark.parametrize('name', ['log.npz', 'log.parquet', 'log.db3', 'LOG.CSV', 'log.xlsx'])
+@pytest.mark.parametrize('kind', ['recording', 'corrected'])
+def test_no_folder_gets_the_name_of_a_file(kind: str, name: str, tmp_path: Path) -> None:
+    with pytest.raises(adxl.UserError, match=r'NAME\.csv'):
+        SAVES[kind][0]()(tmp_path / name)
+    assert not any(tmp_path.iterdir())

@@ -87,7 +87,9 @@ def test_a_gap_writes_what_it_returns(gap, tmp_path) -> None:
     (tmp_path / 'gap' / 'report.html').write_text('precious')
     with pytest.raises(adxl.UserError, match='overwrite=True'):
         gap.save(tmp_path / 'gap')
-    assert gap.command('again').endswith('diagnose arrays --params adxl203 -o again')
+    assert gap.command('again').endswith('diagnose RECORDING --params adxl203 -o again')
+    commands = [step.command for step in gap.next_steps('gap')]
+    assert not any(' arrays' in command for command in commands), commands
 
 
 def test_results_print_their_screen_and_show_in_a_notebook(fit, gap, recording) -> None:
