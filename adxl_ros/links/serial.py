@@ -311,8 +311,9 @@ class SerialLink(base.Link):
         changed = info != self._info
         if not changed and not info.flags & wire_format.AFTER_RESET:
             return
+        is_other_rate = self._rate.used_hz != info.rate_hz
         self._info, self._rate = info, ClockRate(info.rate_hz)
-        self._use(info, changed)
+        self._use(info, changed or is_other_rate)
 
     def _use(self, info: BoardInfo, changed: bool = True) -> None:
         """Read further samples by a description of the board; its sensor may have changed."""

@@ -456,6 +456,17 @@ def test_a_rate_that_contradicts_the_clock_is_named_and_no_stamp_is_ahead(
     assert board.link.sensor.rate_hz == pytest.approx(1000)
 
 
+def test_a_board_that_was_reset_begins_with_its_stated_rate(connect):
+    """A rate that was corrected before the reset is not kept as if it were the stated one."""
+    board = connect(info=BoardInfo(500.0, 16, 2, 5.0, ''))
+    board.send_info()
+    board.wait_for('but its clock shows 1000', board.send_frames)
+    board.encoder, board.index = Encoder(board.info), 0
+    board.send_info()
+    board.wait_for('streaming')
+    assert board.link.sensor.rate_hz == 500
+
+
 def test_a_board_that_waits_for_its_info_is_asked_at_once(connect):
     """It answers with its info frame, so that the first samples need not wait for a second."""
     board = connect()
