@@ -63,7 +63,9 @@ _FEWEST_CHANGES = 100
 _LARGEST_STEP_RAD = 0.02  # Largest step of an encoder, rad. Chosen: 1°
 _COARSER = 1.05
 """Ratio to the stated step from which one counts. Chosen: 1/12° may be stated as 0.083°."""
-_WHOLE = 0.2  # Deviation of a change from whole steps, in steps, up to which it is one. Chosen
+_WHOLE = 0.2
+"""Deviation of a change from whole steps, in steps, up to which it is one. Chosen: above the
+rounding of written angles, and exact readings stay distinct."""
 _WHOLE_SHARE = 0.9
 """Share of such changes by encoders. Chosen: 40 % of the changes of exact readings are such."""
 _SAME_POSE = 1e-4  # Change of a joint over a gap without a move, rad or m. Chosen: 0.1 mg
@@ -87,7 +89,9 @@ _NAMED_PARTS = 4  # Parts that a note names. Chosen: it stays one or two lines
 _FEWEST_WINDOWS = 20
 """Fewest windows by which fading is judged. Chosen: noise then has a coherence of 0.05."""
 _BAND_HZ = 2.0  # Width of its bands, Hz. Chosen: a line of the mains is one value
-_MOTION = 10.0  # Power over that of the noise from which motion shows. Chosen
+_MOTION = 10.0
+"""Power over that of the noise from which motion shows. Chosen: a single ordinate of noise exceeds
+it once in e¹⁰, 22 000."""
 _FADED = 0.5
 """Power of the reference, even without the filter of the sensor, divided by the recorded one,
 below which it has faded. Chosen: −3 dB, the usual corner of a filter."""

@@ -30,7 +30,8 @@ import scipy
 _MAINS_HZ = (50.0, 100.0, 60.0, 120.0)  # Mains frequencies and their doubles, Hz
 _MAINS_TOLERANCE_HZ = 0.6  # Largest deviation of a line, Hz. Chosen: 1 % of clock or mains
 _LINE_LOWEST_HZ = 1.0  # Lowest frequency of a line, Hz. Chosen: below it slow effects are no line
-_LINE_FEWEST_ORDINATES = 64  # Fewest ordinates of a periodogram that shows a line. Chosen
+_LINE_FEWEST_ORDINATES = 64
+"""Fewest ordinates of a periodogram that shows a line. Chosen: their mean is then known to 1/8."""
 _LOCAL_ORDINATES = 201  # Ordinates of the level around a line. Chosen: much wider than a line
 LINE_LOG_EXCESS = 14.0
 """Log likelihood ratio of a line, above that of the largest ordinate by chance, from which it is a

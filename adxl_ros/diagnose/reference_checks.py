@@ -42,7 +42,9 @@ _SMALLEST_STEP_S = 5e-3  # Smallest step of a clock, s. Chosen: less is jitter
 _STEP_STDS = 6.0
 """The same in standard deviations of the delays of the parts about their levels. Chosen: a drift
 has three."""
-_FOLLOWS = 0.95  # Correlation of a part with its reference from which its delay counts. Chosen
+_FOLLOWS = 0.95
+"""Correlation of a part with its reference from which its delay counts. Chosen: that of noise of a
+third of the motion."""
 
 
 def _smoothed_g(comparison: BaselineComparison, volts: np.ndarray) -> np.ndarray:
