@@ -107,9 +107,8 @@ def read(
         )
         if isinstance(source, (str, os.PathLike)):
             recording = recording_files.read(source, options)
-        else:
-            recording = _of_memory(_columns_of(source, 'read'), 'DataFrame', options)
-    return replace(recording, remarks=tuple(map(_as_arguments, recording.remarks)))
+            return replace(recording, remarks=tuple(map(_as_arguments, recording.remarks)))
+        return _of_memory(_columns_of(source, 'read'), 'DataFrame', options)
 
 
 def reading_options(
@@ -237,7 +236,7 @@ def _columns_of(table: Any, verb: str) -> dict[str, Any]:
     if not isinstance(table, Mapping) and not is_frame(table):
         raise UserError(
             f'{verb}: {type(table).__name__} is no table; expected arrays by name, '
-            'for example {"time_s": t, "ax_mps2": x}, or a DataFrame'
+            'for example {"time_s": t, "ax_mps2": x}, or a pandas DataFrame'
         )
     index = getattr(table, 'index', None)
     name = getattr(index, 'name', None)
@@ -275,7 +274,8 @@ def _of_memory(
     )
     recording = recording_files.of_table(table, options)
     left_out = f'{name}: left out, columns without numbers: {", ".join(others)}'
-    return replace(recording, remarks=(*recording.remarks, *[left_out] * bool(others)))
+    remarks = map(_as_arguments, recording.remarks)
+    return replace(recording, remarks=(*remarks, *[left_out] * bool(others)))
 
 
 def _floats(given: Any) -> np.ndarray | None:
@@ -302,8 +302,6 @@ _OPTION = re.compile(
     r"""(?<!\S)--([a-z][a-z0-9-]*)(?:\ (HZ|'[^']*'|"[^"]*"|[-+]?\d[\d.]*(?:e[-+]?\d+)?))?"""
 )
 """An option of a tool in a message, with its value if that is a number or quoted."""
-
-
 _BETWEEN_OPTIONS = re.compile(r"""(--\S+ (?:'[^']*'|\S+)) (?=--)""")
 
 
@@ -341,8 +339,8 @@ def one_recording(given: RecordingInput) -> Recording:
         return read(given)
     if not isinstance(given, Recording):
         raise UserError(
-            f'{type(given).__name__} is no recording; expected a Recording, a DataFrame, or '
-            'the path of a file'
+            f'{type(given).__name__} is no recording; expected a Recording, a pandas '
+            'DataFrame, or the path of a file'
         )
     for name, values in _samples(given).items():
         numbers = _floats(values)

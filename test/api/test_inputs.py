@@ -49,6 +49,12 @@ def test_a_gap_in_samples_at_a_rate_stays_a_gap(gap, rate_hz: float) -> None:
         np.testing.assert_array_equal(adxl.read(gap, rate=rate_hz).time_s, recording.time_s)
 
 
+def test_notes_on_arrays_name_no_option_of_a_tool() -> None:
+    bursts_s = np.repeat(np.arange(50), 8) * 0.08 + np.tile(np.arange(8), 50) * 1e-5
+    (note,) = adxl.from_arrays(time_s=bursts_s, ax_mps2=np.sin(bursts_s)).notes
+    assert 'rate=' in note and '--' not in note
+
+
 def test_a_rate_is_in_place_of_the_stamps() -> None:
     recording = adxl.from_arrays(time_s=TIME_S, rate=50, **ACCEL)
     np.testing.assert_allclose(recording.time_s, 2 * TIME_S)
