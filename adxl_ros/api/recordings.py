@@ -126,7 +126,9 @@ def reading_options(
     if rate is not None and not (
         isinstance(rate, (float, int, np.number)) and 0 < rate <= _HIGHEST_RATE_HZ
     ):
-        raise UserError(f'--rate {rate}: expected samples a second, at most {_HIGHEST_RATE_HZ:g}')
+        raise UserError(
+            f'--rate {rate:g}: expected samples a second, at most {_HIGHEST_RATE_HZ:g}'
+        )
     return ReadingOptions(
         topic,
         parse_mapping(_mapping_text(columns)) if columns else None,

@@ -318,7 +318,7 @@ class LinearModel:
 
     @cached_property
     def places(self) -> list[Channel]:
-        """Recording and axis of each channel."""
+        """Return recording and axis of each channel."""
         return channels_of(self.comparisons)
 
     @cached_property

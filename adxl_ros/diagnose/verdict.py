@@ -166,7 +166,7 @@ class HeldOutFits:
 
     @cached_property
     def folds(self) -> list[Fold]:
-        """The fits to all blocks but one part of them, which is held out."""
+        """Return the fits to all blocks but one part of them, which is held out."""
         out = []
         for part in range(FOLDS):
             held_out = (np.arange(BLOCKS) // _RUN_BLOCKS) % FOLDS == part
