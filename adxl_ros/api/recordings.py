@@ -123,12 +123,10 @@ def reading_options(
     drop_bad_samples: bool = False,
 ) -> ReadingOptions:
     """Check how a recording is to be read; see `read`."""
-    if rate is not None and not (
-        isinstance(rate, (float, int, np.number)) and 0 < rate <= _HIGHEST_RATE_HZ
-    ):
-        raise UserError(
-            f'--rate {rate:g}: expected samples a second, at most {_HIGHEST_RATE_HZ:g}'
-        )
+    is_number = isinstance(rate, (float, int, np.number))
+    if rate is not None and not (is_number and 0 < rate <= _HIGHEST_RATE_HZ):
+        given = f'{rate:g}' if is_number else repr(rate)
+        raise UserError(f'--rate {given}: expected samples a second, at most {_HIGHEST_RATE_HZ:g}')
     return ReadingOptions(
         topic,
         parse_mapping(_mapping_text(columns)) if columns else None,

@@ -93,7 +93,7 @@ def test_arrays_without_a_time_need_one_or_a_rate(make) -> None:
         (lambda: adxl.read([1.0, 2.0]), 'list'),
         (lambda: adxl.from_arrays(time_s=TIME_S, ax_mps2=['a'] * 2000), 'ax_mps2'),
         (lambda: adxl.from_arrays(rate=0, **ACCEL), 'rate=0'),
-        (lambda: adxl.from_arrays(rate='fast', **ACCEL), 'rate fast'),
+        (lambda: adxl.from_arrays(rate='fast', **ACCEL), "rate='fast'"),
         (lambda: adxl.from_arrays(time_s=TIME_S[::-1], **ACCEL), 'drop_bad_stamps=True'),
         (lambda: adxl.from_arrays(time_s=1000 * TIME_S, **ACCEL), "columns='time=time_s:ms"),
         (lambda: adxl.read(TABLE, unit='furlongs'), 'furlongs'),
