@@ -118,9 +118,10 @@ class Graph:
         while not condition():
             self._executor.spin_once(timeout_sec=0.05)
             if time.monotonic() > end_s:
+                received = {topic: len(messages) for topic, messages in self.got.items()}
                 pytest.fail(
                     f'{purpose}: not after {PATIENCE} times {timeout_s} s; '
-                    f'diagnostics: {self.diagnostics}'
+                    f'received: {received}; diagnostics: {self.diagnostics}'
                 )
         self.drain()
 
