@@ -3,7 +3,7 @@
 """
 Results of many jobs, each on disk as soon as it is there.
 
-The blind check may not use the files of the package.
+The blind check may not import `adxl_ros.files`, which knows the package's model of a sensor.
 """
 
 from __future__ import annotations

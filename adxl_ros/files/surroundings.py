@@ -94,8 +94,8 @@ class Surroundings:
             *self._unknown(effects),
             *(
                 f'{name} is missing in {quantity.missing + quantity.unknown} of '
-                f'{quantity.samples} '
-                'samples: it is interpolated, and the nearest value holds at the ends'
+                f'{quantity.samples} samples: it is interpolated, and the nearest value holds '
+                'at the ends'
                 for name, quantity, _ in self._followed(effects)
                 if quantity.missing + quantity.unknown
             ),

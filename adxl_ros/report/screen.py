@@ -114,13 +114,7 @@ def end_lines(
     """Return the end of what a tool prints: result, files and what to do next."""
     lines = [part for line in result for part in wrapped(line, 2) or ['']]
     if files:
-        took = (
-            ''
-            if took_s is None
-            else f'  ({took_s:.0f}{_NO_BREAK}s)'
-            if took_s >= 1
-            else f'  (< 1{_NO_BREAK}s)'
-        )
+        took = '' if took_s is None else f'  ({took_s:.0f} s)' if took_s >= 1 else '  (< 1 s)'
         lines += wrapped(
             f' {"wrote":{_LABEL_COLUMNS - 1}}{"  ".join(files)}{took}', _LABEL_COLUMNS
         )

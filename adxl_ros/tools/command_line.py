@@ -11,7 +11,6 @@ from pathlib import Path
 import shlex
 import signal
 import sys
-import textwrap
 from typing import TYPE_CHECKING
 
 from adxl_ros.api import recordings
@@ -23,7 +22,7 @@ from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects.base import Effect
 from adxl_ros.process import ended_by_closed_output
-from adxl_ros.report.screen import bar, COLUMNS, end_lines, entry_list, NextStep, program_parser
+from adxl_ros.report.screen import bar, end_lines, entry_list, NextStep, program_parser, wrapped
 
 if TYPE_CHECKING:
     from adxl_ros.api.sensors import EffectInput
@@ -233,13 +232,7 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
 def note(text: str, paste: str = '') -> None:
     """Print a message on stderr: one line, which a terminal gets wrapped between words."""
     if sys.stderr.isatty():
-        text = textwrap.fill(
-            text.removesuffix(paste),
-            COLUMNS,
-            subsequent_indent='  ',
-            break_long_words=False,
-            break_on_hyphens=False,
-        )
+        text = '\n'.join(wrapped(text.removesuffix(paste), 2))
         text += f'\n{paste}' * bool(paste)
     print(text, file=sys.stderr)
 
