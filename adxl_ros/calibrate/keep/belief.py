@@ -8,8 +8,8 @@ the direction of the present stay. A rest reads r = H·δ + T·d + noise: H has 
 force by the coefficients, T spans the directions in which the force may turn. d is unknown at the
 begin of each stay, so that nothing is learnt of a slope, however long it lasts.
 
-How strongly a unit drifts, and how much its rests scatter, is not known beforehand. Each filter of
-the bank has a drift and a scatter of its own, and the weight by which it has predicted the rests
+How strongly a unit drifts with time and temperature, and how much its rests scatter, is not known
+beforehand. Each filter of the bank has its own, and the weight by which it has predicted the rests
 (multiple-model estimation; Bar-Shalom, Li and Kirubarajan 2001, 11.6).
 """
 
@@ -23,23 +23,23 @@ import numpy as np
 import scipy
 
 _DRIFTS = (1.0, 2.5, 6.0)
-"""Drifts of the filters, multiples of the stated one. Chosen: steps of 2.5, to beyond five times."""
+"""Drifts of the filters with time, and with temperature, multiples of the stated ones. Chosen:
+steps of 2.5, beyond five times."""
 _SCATTERS_G = (1e-4, 5e-4, 2.5e-3)
 """Scatters of the rests beyond the noise of their means, g. Chosen: of a good analog sensor, of a
 consumer's, and of one that is disturbed."""
-_MODELS = tuple(product(_DRIFTS, _SCATTERS_G))
-DRIFT = np.array([drift for drift, _ in _MODELS])  # Drift by filter, (l,)
 LARGEST_DRIFT = max(_DRIFTS)
-_SCATTER_G = np.array([scatter for _, scatter in _MODELS])
+_DRIFT, _SLOPE, _SCATTER_G = np.array([*product(_DRIFTS, _DRIFTS, _SCATTERS_G)]).T
+"""Drift with time and with temperature, and scatter, by filter, (l,) each."""
 _DIRECTION_STD_G = 0.1
 """Standard deviation of a direction before its stay, g; chosen: far above any zero-g error."""
 _CREEP_G2_PER_DAY = (3e-4**2) * 24
-"""Growth of its variance within a stay, g²/day. Chosen: 0.3 mg in an hour; tyres and floors give."""
+"""Growth of its variance within a stay, g²/day. Chosen: 0.3 mg in an hour, by tyres."""
 _LEAST_LOG_WEIGHT = -30.0
 """Least logarithm of a weight; chosen: a filter that was wrong can still come back."""
 _LEAST_LOG_SHARE = np.log(1e-3)
-"""Least logarithm of the share of a drift among the filters of one scatter. Chosen: the drift of a
-unit may grow, so that one change after a quiet time is no knock unless it is large."""
+"""Least logarithm of the share of a drift with time among filters that are else alike. Chosen: that
+of a unit may grow, so that one change after a quiet time is no knock unless it is large."""
 
 
 class Rest(NamedTuple):
@@ -81,14 +81,12 @@ class Belief:
         """
         Begin with the covariance of a calibration, (p, p).
 
-        drifting: covariance of what a unit of the stated drift may have beyond it, (p, p).
+        drifting: covariance that temperature adds in a unit of the stated drift, (p, p).
         """
         count = len(known) + directions
-        covariance = np.zeros((len(DRIFT), count, count))
-        covariance[:, : len(known), : len(known)] = (
-            known + DRIFT[:, None, None] ** 2 * drifting
-        )
-        return cls(np.zeros((len(DRIFT), count)), covariance, np.zeros(len(DRIFT)), directions)
+        covariance = np.zeros((len(_DRIFT), count, count))
+        covariance[:, : len(known), : len(known)] = known + _SLOPE[:, None, None] ** 2 * drifting
+        return cls(np.zeros((len(_DRIFT), count)), covariance, np.zeros(len(_DRIFT)), directions)
 
     @property
     def weight(self) -> np.ndarray:
@@ -107,7 +105,7 @@ class Belief:
     def aged(self, variance_per_day: np.ndarray, days: float) -> Belief:
         """Let the coefficients drift, and the direction creep; variances a day, (p,)."""
         growth = np.zeros_like(self.mean)
-        growth[:, : len(variance_per_day)] = DRIFT[:, None] ** 2 * variance_per_day
+        growth[:, : len(variance_per_day)] = _DRIFT[:, None] ** 2 * variance_per_day
         growth[:, len(variance_per_day) :] = _CREEP_G2_PER_DAY
         covariance = self.covariance.copy()
         diagonal = np.arange(covariance.shape[-1])
@@ -136,9 +134,7 @@ class Belief:
         noise = np.eye(len(design)) * (rest.variance_g2 + _SCATTER_G[:, None] ** 2)[:, None, :]
         covariance = design @ spread + noise
         gain = np.swapaxes(np.linalg.solve(covariance, np.swapaxes(spread, 1, 2)), 1, 2)
-        found = Innovation(
-            rest.residual_g - self.mean @ design.T, covariance, gain, design, 1.0
-        )
+        found = Innovation(rest.residual_g - self.mean @ design.T, covariance, gain, design, 1.0)
         if not freedom:
             return found
         chance = scipy.special.chdtrc(freedom, found.distance2)
@@ -159,6 +155,6 @@ class Belief:
 
 def _bounded(log_weight: np.ndarray) -> np.ndarray:
     """Return logarithms of weights, (l,), with the largest at 0 and none too small."""
-    by_drift = log_weight.reshape(len(_DRIFTS), len(_SCATTERS_G))
+    by_drift = log_weight.reshape(len(_DRIFTS), -1)
     shared = np.maximum(by_drift, by_drift.max(axis=0) + _LEAST_LOG_SHARE).ravel()
     return np.maximum(shared - shared.max(), _LEAST_LOG_WEIGHT)

@@ -19,6 +19,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
+from typing import NamedTuple
 
 from adxl_ros.calibrate.keep.belief import Belief, LARGEST_DRIFT, Rest
 from adxl_ros.calibrate.keep.prior import EFFECTS, KeptSensor, Linear
@@ -37,9 +38,9 @@ _HELD_OUT = 4  # One stay of so many is held out; chosen: a fifth to a third is 
 _FEWEST_HELD_OUT = 8  # Fewest stays that may decide; chosen: their scatter is known to a quarter
 _MOST_HELD_OUT = 400  # Most stays that are kept for that; chosen: some weeks
 _SURE = 0.99  # Confidence with which held-out stays must improve
-_IMPLAUSIBLE = 1e-4
-"""Probability below which a rest is not learnt; chosen: one false of ten thousand, in months."""
-_REJECTED = 3  # Rests in succession with one side up that are a change; chosen: no single accident
+_IMPLAUSIBLE = 3e-4
+"""Probability below which a rest is not learnt; chosen: one false rest in months."""
+_REJECTED = 2  # Rests in succession along one axis that are a change; chosen: no single accident
 _UNEXPLAINED = 1e-3  # Probability below which age and temperature do not explain a change
 KEPT = 'kept'
 """Key of the provenance that says how a calibration was adopted."""
@@ -54,10 +55,21 @@ class KeepSettings:
 
 @dataclass
 class _Rejection:
-    """Rests with one side up that were not learnt, since the last one that was."""
+    """Rests along one axis that were not learnt, since the last one that was."""
 
     since_ns: int  # Stamp of the first
-    departures_g: list[float] = field(default_factory=list)  # Along the side that is up
+    departures_g: list[float] = field(default_factory=list)  # Along the axis
+    returned: int = 0  # Rests in succession that read again as before a change
+
+    @property
+    def is_change(self) -> bool:
+        """Return whether no single accident explains them."""
+        return len(self.departures_g) >= _REJECTED
+
+    @property
+    def size_g(self) -> float:
+        """Return their median departure, g."""
+        return float(np.median(self.departures_g))
 
 
 @dataclass
@@ -79,6 +91,7 @@ class KeptState:
     age_days: float  # Since the date of the calibration in use; NaN without a date
     temperature_c: float  # Temperature of the figures, °C
     zero_g_mg: tuple[float, ...]  # Departure of each zero-g from the one in use, mg, (m,)
+    total_mg: tuple[float, ...]  # The same from the first calibration, mg, (m,)
     zero_g_90_mg: tuple[float, ...]  # Half of its 90 % interval, mg, (m,)
     error_90_mg: float  # Error of the acceleration that nine of ten are below, worst axis, mg
     tilt_90_deg: float  # The same of the tilt, degrees; NaN for less than three axes
@@ -90,13 +103,20 @@ class KeptState:
     proposal: str  # What would be adopted, and is not in a dry run; '' if nothing
 
 
+class ZeroG(NamedTuple):
+    """A zero-g."""
+
+    value: float  # Beyond the nominal one, mg
+    half_width: float  # Half of its 90 % interval, mg
+
+
 class Keeper:
     """Keeps one calibration."""
 
     def __init__(
         self,
         sensor: Sensor,
-        settings: KeepSettings = KeepSettings(),  # noqa: B008 (frozen)
+        settings: KeepSettings = KeepSettings(),
         entries: Sequence[JournalEntry] = (),
         write: Callable[[JournalEntry], None] = lambda _: None,
         may_adopt: bool = True,
@@ -216,16 +236,13 @@ class Keeper:
         if found.plausibility < _IMPLAUSIBLE and self._stay.rests:
             # The robot has moved without a motion that was seen: a new stay.
             self._arrive(rest.stay, measured_g)
-            seen = seen._replace(
-                residual_g=measured_g - self._stay.up_g, basis=self._stay.basis
-            )
+            seen = seen._replace(residual_g=measured_g - self._stay.up_g, basis=self._stay.basis)
             found = self._stay.belief.innovation(seen, first_freedom)
-        if found.plausibility < _IMPLAUSIBLE:
-            rejection = self._rejections.setdefault(side, _Rejection(rest.start_ns))
-            rejection.departures_g.append(float(seen.residual_g @ force_g))
+        departure_g = self._stay.belief.weight @ found.departure_g @ force_g
+        along_g = float(departure_g if side[0] == '+' else -departure_g)
+        if self._is_rejected(side[1], along_g, found.plausibility, rest.start_ns):
             self._stay = None
             return
-        self._rejections.pop(side, None)
         self._temperatures_c = [
             min(self._temperatures_c[0], temperature_c),
             max(self._temperatures_c[1], temperature_c),
@@ -234,6 +251,23 @@ class Keeper:
         self._stay.belief = self._stay.belief.learnt(found)
         if not self._stay.is_held_out:
             self._belief = self._stay.belief
+
+    def _is_rejected(self, axis: str, along_g: float, plausibility: float, stamp_ns: int) -> bool:
+        """Return whether a rest is not learnt, by its departure from the prediction, g."""
+        earlier = self._rejections.get(axis)
+        if earlier is not None and earlier.is_change:
+            # It stays until rests read again as before.
+            has_returned = abs(along_g) < abs(earlier.size_g) / 4
+            earlier.returned = earlier.returned + 1 if has_returned else 0
+            if earlier.returned < _REJECTED:
+                return True
+        elif plausibility < _IMPLAUSIBLE:
+            if earlier is None or earlier.departures_g[-1] * along_g < 0:
+                earlier = self._rejections[axis] = _Rejection(stamp_ns)
+            earlier.departures_g.append(along_g)
+            return True
+        self._rejections.pop(axis, None)
+        return False
 
     def _age(self, stamp_ns: int) -> None:
         """Let time pass until a stamp."""
@@ -351,9 +385,7 @@ class Keeper:
         low, high = sensor.envelope.temperature_c or self._temperatures_c
         adopted_at = datetime.fromtimestamp(adopted.stamp_ns * 1e-9, timezone.utc)
         kept_from = before.sensor.provenance.get(KEPT) or calibration_id(before.sensor)
-        provenance = {
-            key: text for key, text in before.sensor.provenance.items() if key != 'id'
-        }
+        provenance = {key: text for key, text in before.sensor.provenance.items() if key != 'id'}
         self._use(
             KeptSensor(
                 replace(
@@ -384,13 +416,12 @@ class Keeper:
     @property
     def changed(self) -> str:
         """Return what has changed beyond age and temperature, '' if nothing has."""
-        for side, rejection in self._rejections.items():
-            if len(rejection.departures_g) >= _REJECTED:
-                size_mg = 1e3 * float(np.median(rejection.departures_g))
+        for axis, rejection in self._rejections.items():
+            if rejection.is_change:
                 since = datetime.fromtimestamp(rejection.since_ns * 1e-9, timezone.utc)
                 return (
-                    f'changed: {size_mg if side[0] == "+" else -size_mg:+.2g} mg on {side[1]} '
-                    f'since {since:%A %Y-%m-%dT%H:%MZ}: knocked, or broken?'
+                    f'changed: {1e3 * rejection.size_g:+.2g} mg on {axis} since '
+                    f'{since:%A %Y-%m-%dT%H:%MZ}: knocked, or broken?'
                 )
         return self._unexplained
 
@@ -405,6 +436,7 @@ class Keeper:
         mean, covariance = belief.moments
         rows = self._linear.zero_g(temperature_c)
         zero_g, std = rows @ mean, np.sqrt(np.einsum('ij,jk,ik->i', rows, covariance, rows))
+        total = rows @ (self._kept.values + mean - self._original)
         up = np.array([0.0, 0.0, 1.0]) if self._stay is None else self._upright()
         error = self._linear.errors(up, temperature_c).by_coefficients
         spread = error @ (covariance + np.outer(mean, mean)) @ error.T
@@ -420,6 +452,7 @@ class Keeper:
             age_days=np.nan if date is None else (now_ns * 1e-9 - date.timestamp()) / 86_400,
             temperature_c=temperature_c,
             zero_g_mg=tuple((1e3 * zero_g).tolist()),
+            total_mg=tuple((1e3 * total).tolist()),
             zero_g_90_mg=tuple((1e3 * NORMAL_90 * std).tolist()),
             error_90_mg=float(1e3 * NORMAL_90 * np.sqrt(np.diag(spread).max())),
             tilt_90_deg=float(np.degrees(NORMAL_90 * tilt_rad)),
@@ -430,6 +463,14 @@ class Keeper:
             changed=self.changed,
             proposal=self._proposal,
         )
+
+    def zero_g_mg(self, temperature_c: float) -> list[ZeroG]:
+        """Return the zero-g of the calibration in use at a temperature, by axis, as known now."""
+        mean, covariance = self._stay_free.moments
+        rows = self._linear.zero_g(temperature_c)
+        values = rows @ (self._kept.values + mean)
+        std = np.sqrt(np.einsum('ij,jk,ik->i', rows, covariance, rows))
+        return [ZeroG(*pair) for pair in zip(1e3 * values, 1e3 * NORMAL_90 * std)]
 
     def _upright(self) -> np.ndarray:
         """Return the direction of the present stay, (3,); up for less than three axes."""

@@ -166,4 +166,3 @@ class Linear:
     def measured(self, force_g: np.ndarray) -> np.ndarray:
         """Return the components of a force along the measured axes, (m,)."""
         return force_g[self._measured]
-

@@ -50,7 +50,7 @@ class RestStream:
         self.counts: Counter[str] = Counter(rests=0, without_temperature=0)
 
     def go_on_after(self, stay: int) -> None:
-        """Number stays from here on, after those of a journal."""
+        """Give the stays that follow numbers after those of a journal."""
         self._stay = stay
 
     def add_temperature(self, stamps_ns: np.ndarray, celsius: np.ndarray) -> None:
