@@ -17,6 +17,7 @@ _NODES = (
     'stage',
     'calibration',
     'compensation',
+    'keep_calibrated',
     'investigate',
     'monitor',
     'screen',

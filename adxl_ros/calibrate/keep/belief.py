@@ -38,8 +38,8 @@ _CREEP_G2_PER_DAY = (3e-4**2) * 24
 _LEAST_LOG_WEIGHT = -30.0
 """Least logarithm of a weight; chosen: a filter that was wrong can still come back."""
 _LEAST_LOG_SHARE = np.log(1e-3)
-"""Least logarithm of the share of a drift with time among filters that are else alike. Chosen: that
-of a unit may grow, so that one change after a quiet time is no knock unless it is large."""
+"""Least logarithm of the share of a drift with time among filters that are else alike. Chosen: a
+unit may begin to drift, so that one change after a quiet time is no knock unless it is large."""
 
 
 class Rest(NamedTuple):
