@@ -58,10 +58,12 @@ of days on which the 90 % interval has the zero-g; of all days and axes it is
 Robots with a reported change and no knock.
 
 {markdown_table(KEPT_HEAD, kept)}
+
 A knock on day 31: robots that report it within a day, or in the two weeks after it, and robots
 that adopt anything after it.
 
-{markdown_table(KNOCK_HEAD, knocked)}""",
+{markdown_table(KNOCK_HEAD, knocked)}
+""",
     )
     return 0
 
