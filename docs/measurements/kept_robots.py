@@ -60,7 +60,8 @@ Robots with a reported change and no knock.
 {markdown_table(KEPT_HEAD, kept)}
 
 A knock on day 31: robots that report it within a day, or in the two weeks after it, and robots
-that adopt anything after it, of any axis. On a robot that stands level, a knock on x is like a slope:
+that adopt anything after it, of any axis. On a robot that stands level, a knock on x is like a
+slope:
 it is not seen; whether adoptions hold a part of it was not measured.
 
 {markdown_table(KNOCK_HEAD, knocked)}
