@@ -450,6 +450,10 @@ def file_keys() -> Iterator[str]:
             ),
             ('`datasheet.*`', 'typical and largest departures, for the comparison in reports'),
             ('`envelope.*`', 'range of force, temperature and supply of the calibration'),
+            *(
+                (f'`gyro.{name}`', f'gyroscope, x, y, z: {about["doc"]}, {about["unit"]}')
+                for name, about in parameter_file.GYRO.items()
+            ),
             ('`link.*`', 'how the driver reaches the unit'),
             ('`provenance.*`', 'id, date, source, hash of the data, errors and verdicts'),
         ],
