@@ -144,7 +144,7 @@ def _write(folder: Path, made: page.Made) -> int:
     if made.rows:
         (folder / 'benchmark.png').write_bytes(png(page.picture(made)))
     cli.print_end(
-        [*said.screen(), ''],
+        [said.said[0], '', *page.screen(made), ''],
         [folder / f'benchmark.{end}' for end in ('html', 'md', 'json', 'png')],
     )
     return 0

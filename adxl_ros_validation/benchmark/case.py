@@ -165,7 +165,7 @@ class LinearFit(NamedTuple):
     changes: dict[Coefficient, float]
     z: dict[Coefficient, float]  # Change over its standard error
     squares: float  # Sum of squares that is left, (m/s²)²
-    count: int  # Number of samples
+    samples: int  # Number of samples
 
 
 def linear_fit(case: Case, tangents: Mapping[Coefficient, np.ndarray]) -> LinearFit:

@@ -23,7 +23,7 @@ from adxl_ros_validation.benchmark.results import (
     Physical,
     Row,
 )
-from adxl_ros_validation.blind.report import Report, Table
+from adxl_ros_validation.blind.report import Report, Table, terminal_table
 from adxl_ros_validation.blind.scores import in_words, Score, share
 import numpy as np
 
@@ -83,6 +83,20 @@ def report(made: Made) -> Report:
             'Left out': (['what, and why'], [[text] for text in made.left_out]),
         },
     )
+
+
+def screen(made: Made) -> list[str]:
+    """Return the first table as lines of a terminal: right answers of all, without intervals."""
+    rows = []
+    for method in made.methods:
+        scores = [group_score(made.of(method), group, 'exact') for group in GROUPS]
+        cells = [f'{score["value"]:.2f} of {score["count"]}' for score in scores if score['count']]
+        rows.append([method, *cells])
+    groups = [
+        words for group, words in GROUPS.items() if group_score(made.rows, group, 'exact')['count']
+    ]
+    first = ['Level A, exactly right:', '']
+    return [*first, *terminal_table(['method', *groups], rows)] if made.rows else []
 
 
 def _naming(made: Made) -> Table:
@@ -153,7 +167,9 @@ def _by_recording(made: Made) -> Table:
             own = [row for row in made.of(method) if row.recording == recording]
             single = [row.exact for row in own if row.group == 'single']
             nothing = [row.exact for row in own if row.group == 'none']
-            rows.append([recording, method, in_words(share(single)), in_words(share(nothing))])
+            if single or nothing:
+                cells = [in_words(share(single)), in_words(share(nothing))]
+                rows.append([recording, method, *cells])
     return ['recording', 'method', GROUPS['single'], GROUPS['none']], rows
 
 

@@ -19,7 +19,9 @@ _MOST = 3
 
 def _criterion(case: Case, fit: LinearFit) -> float:
     """Return the Bayesian information criterion of a fit."""
-    return fit.count * math.log(fit.squares / fit.count) + len(fit.changes) * math.log(fit.count)
+    return fit.samples * math.log(fit.squares / fit.samples) + len(fit.changes) * math.log(
+        fit.samples
+    )
 
 
 def method(case: Case) -> Finding:

@@ -22,28 +22,32 @@ logging.set_verbosity(logging.ERROR)
 _EFFECTS = ('bias', 'scale_factor', 'misalignment', 'time_offset', 'bandwidth')
 _STEP = 3
 """Samples from one that is fitted to the next; chosen: run time."""
+_ITERATIONS = 10
+"""Most iterations; chosen: run time."""
 
 
 def method(case: Case) -> Finding:
     """Fit the parameters, and name those that are significant."""
-    tangents = {name: change for name, change in case.tangents(_EFFECTS).items() if np.any(change)}
-    names = list(tangents)
+    names = [name for name, change in case.tangents(_EFFECTS).items() if np.any(change)]
     scales = np.array([parameter_of(name).scale for name in names])
-    known = np.flatnonzero(case.known)[::_STEP]
-    rest = case.residual_mps2()[known].ravel()
-    matrix = np.column_stack(
-        [tangents[name][known].ravel() * scale for name, scale in zip(names, scales)]
-    )
+
+    def left(values: np.ndarray) -> np.ndarray:
+        """Return what parameters, in their typical sizes, leave of the recording, m/s²."""
+        sensor = case.with_changes(dict(zip(names, values * scales)))
+        return case.residual_mps2(sensor)[case.known][::_STEP].ravel()
 
     def residual(values: np.ndarray, *_: object) -> tuple[list[np.ndarray], None, None]:
-        """Return what the parameters leave, in the form that the toolbox expects."""
-        stated = rest if values.ndim == 1 else rest[:, None]  # several trials are columns
-        return [matrix @ values - stated], None, None
+        """Return what parameters leave, in the form of the toolbox: several sets are columns."""
+        if values.ndim == 1:
+            return [left(values)], None, None
+        return [np.column_stack([left(column) for column in values.T])], None, None
 
     limits = np.array([_bounds(name, scale) for name, scale in zip(names, scales)])
     given = Parameter('sensor', np.zeros(len(names)), limits[:, 0], limits[:, 1])
     with redirect_stdout(io.StringIO()):  # It prints each iteration, whatever it is told.
-        fitted, found = optimize(ParameterDict({'sensor': given}), residual, x_scale='jac')
+        fitted, found = optimize(
+            ParameterDict({'sensor': given}), residual, x_scale='jac', max_iters=_ITERATIONS
+        )
     values = fitted.as_vector()
     _, widths = calculate_intervals(residual(values)[0], np.asarray(found.jac))
     causes = {name.effect for name, v, w in zip(names, values, widths) if abs(v) > w}
