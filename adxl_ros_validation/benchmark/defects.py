@@ -43,6 +43,8 @@ GROUPS = {
 """Groups of trials in words."""
 _SHARES = (0.25, 0.4, 0.2, 0.15)
 """Shares of the groups; chosen as those of the blind check are."""
+_SHORTEST_S = 75.0
+"""Shortest recording of level A, s: 30 s of its later part, less a tenth and a quarter."""
 _BANDS = 60
 """Bands of the spectrum of what an untouched part leaves; as many as the blind check has."""
 
@@ -59,6 +61,11 @@ def halves(loaded: Sequence[Loaded], folder: Path) -> tuple[list[Half], list[str
         if force is not None:
             force.save(path.with_name(f'{source.name}_sim.csv'), overwrite=True)
         try:
+            if recording.span_s < _SHORTEST_S:
+                raise UserError(
+                    f'has {recording.span_s:.0f} s; level A needs {_SHORTEST_S:.0f} s, so that a '
+                    'method gets half a minute of a trial'
+                )
             made.append(real_sensors.later_part(path))
         except UserError as error:
             left_out.append(f'{source.name}, level A: {" ".join(str(error).split())}')
