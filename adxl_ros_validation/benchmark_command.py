@@ -119,14 +119,13 @@ def _ask(
 ) -> _Asked:
     """Draw and seal level A, ask all methods, and open the labels."""
     drawn, sealed = folder / 'level_a', ''
-    stems: list[Path] = []
+    physical = run.save_cases(folder / 'physical', loaded)
+    stems = [folder / 'physical' / name for name in physical]
     if parts and options.trials:
         sealed = defects.seal(drawn, parts, options.seed, options.trials, pool, cli.progress)
         print(f'SHA-256 of salt and labels: {sealed}', flush=True)
-        stems = [path.with_suffix('') for path in sorted(drawn.glob('recordings/*.csv'))]
         stems += defects.save_untouched(folder / 'untouched', parts)
-    physical = run.save_cases(folder / 'physical', loaded)
-    stems += [folder / 'physical' / name for name in physical]
+        stems += [path.with_suffix('') for path in sorted(drawn.glob('recordings/*.csv'))]
     answers = run.ask_all(folder, chosen, stems, pool, cli.progress)
     if not sealed:
         return _Asked(options.seed or 0, '', [], physical, answers)

@@ -84,6 +84,8 @@ def grade(facts: Sequence[Drawn], answers: Answers) -> list[Row]:
     rows = []
     for method, by_name in answers.items():
         for fact in facts:
+            if not {fact.label.name, fact.recording} <= by_name.keys():
+                continue  # It was interrupted.
             answered, base = by_name[fact.label.name], by_name[fact.recording].answer
             exact, in_set = _right(answered.answer, base, fact.label)
             others = [
@@ -181,6 +183,8 @@ def grade_physical(chosen: Mapping[str, Loaded], answers: Answers) -> list[Physi
     for name, (source, *_) in chosen.items():
         expected = [frozenset(each) for each in source.expected]
         for method, by_name in answers.items():
+            if name not in by_name:
+                continue  # It was interrupted.
             answered = by_name[name]
             right = None
             if 'B' in source.levels:

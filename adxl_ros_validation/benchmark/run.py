@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+import json
 from pathlib import Path
 import resource
 from typing import Any
@@ -15,6 +16,7 @@ import adxl_ros as adxl
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.process import code_version
+from adxl_ros.tools import command_line as cli
 from adxl_ros.workers import Pool
 from adxl_ros_validation.benchmark import methods
 from adxl_ros_validation.benchmark.case import Case, Finding, UNKNOWN
@@ -176,19 +178,24 @@ def ask_all(
     def job(place: str, name: str) -> tuple:
         return place, paths[name]
 
-    answers = {}
-    for method, place in chosen.items():
-        with show(method) as advance:
-            made = kept(
-                folder / 'answers' / method,
-                sorted(paths),
-                ask,
-                partial(job, place),
-                pool,
-                advance,
-            )
-        answers[method] = {name: Answered.of_json(row) for name, row in made.items()}
-    return answers
+    try:
+        for method, place in chosen.items():
+            with show(method) as advance:
+                places = folder / 'answers' / method
+                kept(places, list(paths), ask, partial(job, place), pool, advance)
+    except KeyboardInterrupt:
+        cli.note('interrupted: the page has what was answered; the same command continues')
+    return {method: _answers_in(folder / 'answers' / method, paths) for method in chosen}
+
+
+def _answers_in(folder: Path, names: Iterable[str]) -> dict[str, Answered]:
+    """Read the answers that a folder has."""
+    paths = {name: folder / f'{name}.json' for name in names}
+    return {
+        name: Answered.of_json(json.loads(path.read_bytes()))
+        for name, path in paths.items()
+        if path.exists()
+    }
 
 
 def untouched_case(folder: Path, part: Half) -> Case:

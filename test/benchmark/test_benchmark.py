@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`benchmark` by a manifest of synthetic recordings, with a method from outside."""
+"""`benchmark` by a manifest of synthetic recordings, with the method of the documentation."""
 
 import json
 from pathlib import Path
@@ -7,6 +7,7 @@ from pathlib import Path
 from adxl_ros_validation import benchmark_command
 from adxl_ros_validation.benchmark import manifest, methods
 import numpy as np
+from processes import REPO
 import pytest
 
 RATE_HZ, SECONDS = 25.0, 80.0
@@ -17,26 +18,11 @@ sources:
    read: {columns: 'time=t:ms,x=a:g,y=b:g,z=c:g'}}
 - {name: lost, file: lost.csv, licence: none, known: is not there, levels: A}
 """
-METHOD = '''
-"""Name the one of zero-g and scale factor that explains more."""
-
-from adxl_ros_validation.benchmark.case import Case, Finding, linear_fit
-
-
-def method(case: Case) -> Finding:
-    fits = {
-        effect: linear_fit(case, case.tangents([effect])) for effect in ('bias', 'scale_factor')
-    }
-    name, best = min(fits.items(), key=lambda item: item[1].squares)
-    if max(map(abs, best.z.values())) < 4:
-        return Finding(frozenset(), 0.9)
-    return Finding(frozenset({name}), 0.9, case.with_changes(best.changes))
-'''
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return a folder with a recording whose scale factors are 2 % too large, and a method."""
+    """Return a folder with a recording whose scale factors are 2 % too large, and the method."""
     rng = np.random.default_rng(3)
     time_s = np.arange(0, SECONDS, 1 / RATE_HZ)
     angle, turn = np.sin(0.5 * time_s), 0.3 * time_s
@@ -51,7 +37,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         table = np.column_stack([first, samples])
         np.savetxt(tmp_path / name, table, '%.6f', ',', header=head, comments='')
     (tmp_path / 'manifest.yaml').write_text(MANIFEST)
-    (tmp_path / 'my_method.py').write_text(METHOD)
+    page = (REPO / 'docs' / 'howto' / 'benchmark.md').read_text('utf-8')
+    method = page.split('```python\n')[1].split('```')[0]
+    (tmp_path / 'my_method.py').write_text(method)
     monkeypatch.syspath_prepend(tmp_path)
     return tmp_path
 
