@@ -32,6 +32,7 @@ EXECUTABLES = (
     'calibration',
     'stage',
     'monitor',
+    'keep_calibrated',
     'investigate',
     'screen',
     'demo',
