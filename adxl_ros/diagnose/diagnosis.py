@@ -303,9 +303,7 @@ def _held_out(
         linearised = linearise(model, hypothesis.effects, hypothesis.sensor, model.filters)
         fits = {d: HeldOutFits(linearised, model, (d,)) for d in drifts}
         # A drift that should be far larger than what is left is none.
-        return {
-            d: f for d, f in fits.items() if f.drift_mps2**2 <= _DRIFT_LIMIT * max(left, 0.0)
-        }
+        return {d: f for d, f in fits.items() if f.drift_mps2**2 <= _DRIFT_LIMIT * max(left, 0.0)}
 
     out = {}
     for effects, hypothesis in search.found.items():
