@@ -84,8 +84,10 @@ def test_it_goes_on_after_a_kill_adopts_hands_over_and_undoes(start, graph, tmp_
     again.wait_for('adopted: x', 30)
     (stored,) = (tmp_path / 'store').rglob('*.yaml')
     graph.spin_until(
-        lambda: graph.number('keep_calibrated', 'ramp') == 1
-        and 'in_use' in graph.value('compensation', 'calibration'),
+        lambda: (
+            graph.number('keep_calibrated', 'ramp') == 1
+            and 'in_use' in graph.value('compensation', 'calibration')
+        ),
         20,
         'the end of the ramp',
     )
