@@ -29,8 +29,11 @@ def main() -> int:
     is_module = os.path.basename(sys.argv[0]) == '__main__.py'
     os.environ[STARTED_BY] = f'python3 -m {ONE_COMMAND}' if is_module else ONE_COMMAND
     name = sys.argv[1] if len(sys.argv) > 1 else '--help'
-    package = 'tools' if name in _tools() else 'nodes' if name in _NODES else ''
-    if not package:
+    if name in _tools():
+        package = 'tools'
+    elif name in _NODES:
+        package = 'nodes'
+    else:
         return _answer(name)
     if package == 'nodes' and find_spec('rclpy') is None:
         print(

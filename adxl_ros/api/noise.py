@@ -282,11 +282,11 @@ class Noise(Result):
         """Return a DataFrame with a row for each axis and term: value and 90 % interval."""
         from pandas import DataFrame
 
-        rows = [
-            (noise.axis, name, *estimate)
-            for noise in self.axes
-            for name, estimate in zip(_FIELDS, noise.estimates)
-        ]
+        rows = []
+        for noise in self.axes:
+            rows += [
+                (noise.axis, name, *estimate) for name, estimate in zip(_FIELDS, noise.estimates)
+            ]
         return DataFrame(rows, columns=['axis', 'term', 'value', 'low', 'high'])
 
     def plot(self, ax: Any = None) -> Any:
