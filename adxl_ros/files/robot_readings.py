@@ -114,7 +114,7 @@ def _track(time_s: np.ndarray, values: np.ndarray) -> Track:
     return time_s, values[known][first]
 
 
-def _poses_in(message: Any, kind: str, root: str) -> list[tuple[Any, str, Any, Any]]:
+def _poses_in(message: Any, kind: str, root: str) -> list[tuple]:
     """Return header, moving frame, place and turn of odometry, or of the root in transforms."""
     if kind == _ODOMETRY:
         pose = message.pose.pose

@@ -104,7 +104,7 @@ def _poses(journal: Path) -> tuple[int, list[sweep_journal.PoseRecord]]:
     """Return how many poses are accepted, and those of the fit, once everything is written."""
     with suppress(UserError):
         entries = sweep_journal.read(journal).entries
-        fitted: list[sweep_journal.PoseRecord] = []
+        fitted: list = []
         for entry in entries:
             if isinstance(entry, sweep_journal.Fitted):
                 fitted += entry.rests or ()
