@@ -589,7 +589,8 @@ def saturation(signals: Signals, p: Parameters) -> None:
             signals.output[d] = x - knee_g * (beyond[0] - beyond[1])
 
 
-_WITHOUT_FILTER_S = 1e-3  # Time constant that r counts in where no filter is stated, s. Chosen
+_WITHOUT_FILTER_S = 1e-3
+"""Time constant that r counts in where no filter is stated, s; chosen: r is then one in ms."""
 
 
 @effect(
