@@ -36,8 +36,11 @@ def main() -> int:
     if further := entry_points(group=_COMMANDS, name=name):
         sys.argv = [name, *sys.argv[2:]]
         return next(iter(further)).load()()
-    package = 'tools' if name in _tools() else 'nodes' if name in _NODES else ''
-    if not package:
+    if name in _tools():
+        package = 'tools'
+    elif name in _NODES:
+        package = 'nodes'
+    else:
         return _answer(name)
     if package == 'nodes' and find_spec('rclpy') is None:
         print(
