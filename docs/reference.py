@@ -639,7 +639,9 @@ def figures() -> dict[Path, str]:
         'working cases': working_cases(),
         'sealed': sealed(),
         'benchmark': benchmark('Level A: exactly right'),
-        'better reference': benchmark('Level C: share of the squared gap that is closed'),
+        'better reference': benchmark(
+            'Level C: share of the squared gap that is closed on a later part'
+        ),
         'hand held': hand_held(),
         'units': units(),
     }

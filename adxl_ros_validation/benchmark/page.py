@@ -75,9 +75,9 @@ def report(made: Made) -> Report:
             'Level A: exactly right': _naming(made),
             'Level A: what else counts': _further(made),
             'Level A: one defect, by its strength': _single(made, _strength),
-            'Level A: one defect, by recording': _single(made, lambda row: row.recording),
+            'Level A: one defect, by recording': _single(made, lambda row: row.fact.recording),
             'Level B: a documented defect': _documented(made),
-            'Level C: share of the squared gap that is closed': _closed(made),
+            'Level C: share of the squared gap that is closed on a later part': _closed(made),
             'Answers without a verdict': _failed(made),
             'Recordings': _card(made),
             'Left out': (['what, and why'], [[text] for text in made.left_out]),
@@ -124,7 +124,7 @@ def _further(made: Made) -> Table:
                 _percent(median_closed(own)),
                 in_words(share([row.harm for row in own])),
                 f'{np.mean([row.by_chance for row in own]):.2f}',
-                f'{np.median([row.cpu_s for row in own]):.1f}',
+                f'{np.median([row.answered.cpu_s for row in own]):.1f}',
             ]
         )
     head = [
@@ -161,7 +161,7 @@ def _single(made: Made, name_of: Callable[[Row], str]) -> Table:
 
 def _strength(row: Row) -> str:
     """Return the strength of a defect in words."""
-    low, high = next(edges for edges in pairwise(_STRENGTHS) if row.noises < edges[1])
+    low, high = next(edges for edges in pairwise(_STRENGTHS) if row.fact.noises < edges[1])
     return f'{low:g} to {high:g} times the noise'
 
 
@@ -199,7 +199,7 @@ def _closed(made: Made) -> Table:
 
 def _failed(made: Made) -> Table:
     """Return the answers that are no verdict."""
-    cases = [(row.method, row.trial, row.error) for row in made.rows]
+    cases = [(row.method, row.fact.label.name, row.answered.error) for row in made.rows]
     cases += [(row.method, row.source.name, row.answered.error) for row in made.physical]
     rows = [list(case) for case in cases if case[-1]]
     return ['method', 'case', 'why'], rows
@@ -226,14 +226,16 @@ def picture(made: Made) -> Any:
     """Draw where each method fails: the share of right answers by defect."""
     from matplotlib.figure import Figure
 
-    kinds = sorted({name for row in made.rows for name in row.effects}) + ['no defect']
+    kinds = sorted({name for fact in made.facts for name in fact.label.effects}) + ['no defect']
     methods = made.methods
     shares = np.full((len(methods), len(kinds)), np.nan)
     texts: dict[tuple[int, int], str] = {}
     for i, method in enumerate(methods):
         for j, kind in enumerate(kinds):
             hits = [
-                row.exact for row in made.of(method) if kind in (row.effects or ('no defect',))
+                row.exact
+                for row in made.of(method)
+                if kind in (row.fact.label.effects or ('no defect',))
             ]
             if hits:
                 shares[i, j] = np.mean(hits)
