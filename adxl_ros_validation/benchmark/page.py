@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import date
 from itertools import pairwise
@@ -74,8 +74,8 @@ def report(made: Made) -> Report:
         {
             'Level A: exactly right': _naming(made),
             'Level A: what else counts': _further(made),
-            'Level A: one defect, by its strength': _by_strength(made),
-            'Level A: one defect, by recording': _by_recording(made),
+            'Level A: one defect, by its strength': _single(made, _strength),
+            'Level A: one defect, by recording': _single(made, lambda row: row.fact.recording),
             'Level B: a documented defect': _documented(made),
             'Level C: share of the squared gap that is closed on a later part': _closed(made),
             'Answers without a verdict': _failed(made),
@@ -87,16 +87,15 @@ def report(made: Made) -> Report:
 
 def screen(made: Made) -> list[str]:
     """Return the first table as lines of a terminal: right answers of all, without intervals."""
+    groups = {row.group for row in made.rows}
+    shown = {group: words for group, words in GROUPS.items() if group in groups}
     rows = []
     for method in made.methods:
-        scores = [group_score(made.of(method), group, 'exact') for group in GROUPS]
-        cells = [f'{score["value"]:.2f} of {score["count"]}' for score in scores if score['count']]
+        scores = [group_score(made.of(method), group, 'exact') for group in shown]
+        cells = [f'{s["value"]:.2f} of {s["count"]}' if s['count'] else '-' for s in scores]
         rows.append([method, *cells])
-    groups = [
-        words for group, words in GROUPS.items() if group_score(made.rows, group, 'exact')['count']
-    ]
     first = ['Level A, exactly right:', '']
-    return [*first, *terminal_table(['method', *groups], rows)] if made.rows else []
+    return [*first, *terminal_table(['method', *shown.values()], rows)] if made.rows else []
 
 
 def _naming(made: Made) -> Table:
@@ -125,7 +124,7 @@ def _further(made: Made) -> Table:
                 _percent(median_closed(own)),
                 in_words(share([row.harm for row in own])),
                 f'{np.mean([row.by_chance for row in own]):.2f}',
-                f'{np.median([row.cpu_s for row in own]):.1f}',
+                f'{np.median([row.answered.cpu_s for row in own]):.1f}',
             ]
         )
     head = [
@@ -147,30 +146,23 @@ def _percent(score: Score) -> str:
     return f'{value:.0f} % ({low:.0f} to {high:.0f}), n = {score["count"]}'
 
 
-def _by_strength(made: Made) -> Table:
-    """Return how often one defect is named, by its strength."""
-    bins = list(pairwise(_STRENGTHS))
+def _single(made: Made, name_of: Callable[[Row], str]) -> Table:
+    """Return how often one defect is named, by what a name of each trial says."""
+    single = [row for row in made.rows if row.group == 'single']
+    names = sorted({name_of(row) for row in single})
     rows = []
     for method in made.methods:
-        single = [row for row in made.of(method) if row.group == 'single']
-        parts = [[row.exact for row in single if low <= row.noises < high] for low, high in bins]
-        rows.append([method, *(in_words(share(part)) for part in parts)])
-    words = ['below 3 times the noise', '3 to 8 times', 'above 8 times']
-    return ['method', *words], rows if made.rows else []
+        own = [(name_of(row), row.exact) for row in single if row.method == method]
+        rows.append(
+            [method, *(in_words(share([hit for part, hit in own if part == n])) for n in names)]
+        )
+    return ['method', *names], rows if single else []
 
 
-def _by_recording(made: Made) -> Table:
-    """Return how often one defect is named, by recording."""
-    rows = []
-    for recording in dict.fromkeys(fact.recording for fact in made.facts):
-        for method in made.methods:
-            own = [row for row in made.of(method) if row.recording == recording]
-            single = [row.exact for row in own if row.group == 'single']
-            nothing = [row.exact for row in own if row.group == 'none']
-            if single or nothing:
-                cells = [in_words(share(single)), in_words(share(nothing))]
-                rows.append([recording, method, *cells])
-    return ['recording', 'method', GROUPS['single'], GROUPS['none']], rows
+def _strength(row: Row) -> str:
+    """Return the strength of a defect in words."""
+    low, high = next(edges for edges in pairwise(_STRENGTHS) if row.fact.noises < edges[1])
+    return f'{low:g} to {high:g} times the noise'
 
 
 def _documented(made: Made) -> Table:
@@ -207,12 +199,9 @@ def _closed(made: Made) -> Table:
 
 def _failed(made: Made) -> Table:
     """Return the answers that are no verdict."""
-    rows = [[row.method, row.trial, row.error] for row in made.rows if row.error]
-    rows += [
-        [row.method, row.source.name, row.answered.error]
-        for row in made.physical
-        if row.answered.error
-    ]
+    cases = [(row.method, row.fact.label.name, row.answered.error) for row in made.rows]
+    cases += [(row.method, row.source.name, row.answered.error) for row in made.physical]
+    rows = [list(case) for case in cases if case[-1]]
     return ['method', 'case', 'why'], rows
 
 
@@ -237,14 +226,16 @@ def picture(made: Made) -> Any:
     """Draw where each method fails: the share of right answers by defect."""
     from matplotlib.figure import Figure
 
-    kinds = sorted({name for row in made.rows for name in row.effects}) + ['no defect']
+    kinds = sorted({name for fact in made.facts for name in fact.label.effects}) + ['no defect']
     methods = made.methods
     shares = np.full((len(methods), len(kinds)), np.nan)
     texts: dict[tuple[int, int], str] = {}
     for i, method in enumerate(methods):
         for j, kind in enumerate(kinds):
             hits = [
-                row.exact for row in made.of(method) if kind in (row.effects or ('no defect',))
+                row.exact
+                for row in made.of(method)
+                if kind in (row.fact.label.effects or ('no defect',))
             ]
             if hits:
                 shares[i, j] = np.mean(hits)

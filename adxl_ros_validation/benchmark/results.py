@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,26 +39,38 @@ class Drawn(NamedTuple):
     limit: Bracket | None  # What an ideal observer could name; None without a defect
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """A graded answer of level A."""
 
     method: str
-    trial: str
-    recording: str
-    group: str
-    effects: tuple[str, ...]
-    noises: float
-    status: str
-    named: tuple[str, ...]
+    fact: Drawn
+    answered: Answered
     exact: bool
     in_set: bool
     by_chance: float  # How often it is exact by labels of other trials of the recording
-    closed: float | None  # Share of what the defect added that is closed on the later part
-    harm: bool
-    probability: float
-    cpu_s: float
-    error: str
+
+    @property
+    def group(self) -> str:
+        """Return the group of the trial."""
+        return self.fact.label.group
+
+    @property
+    def closed(self) -> float | None:
+        """Return the closed share of what a defect added; None where it adds too little."""
+        label, clean = self.fact.label, self.fact.clean
+        like_noise = any(KINDS[name].random for name in label.effects)
+        if not label.effects or like_noise or not self.answered.before:
+            return None
+        before, after = np.mean(self.answered.before), np.mean(self.answered.after)
+        added = before - clean
+        return float((before - after) / added) if added > _SEEN * clean else None
+
+    @property
+    def harm(self) -> bool:
+        """Return whether the later part is simulated worse than with the stated parameters."""
+        if not self.answered.before:
+            return False
+        return bool(np.mean(self.answered.after) > (1 + _HARM) * np.mean(self.answered.before))
 
 
 def draw_facts(folder: Path, parts: Sequence[Half], labels: Sequence[Label]) -> list[Drawn]:
@@ -93,26 +105,8 @@ def grade(facts: Sequence[Drawn], answers: Answers) -> list[Row]:
                 for other in facts
                 if other.recording == fact.recording and other is not fact
             ]
-            rows.append(
-                Row(
-                    method,
-                    fact.label.name,
-                    fact.recording,
-                    fact.label.group,
-                    fact.label.effects,
-                    fact.noises,
-                    answered.status,
-                    tuple(sorted(answered.answer.named)),
-                    exact,
-                    in_set,
-                    float(np.mean(others or [False])),
-                    _closed(fact, answered),
-                    _is_harm(answered),
-                    answered.probability,
-                    answered.cpu_s,
-                    answered.error,
-                )
-            )
+            chance = float(np.mean(others or [False]))
+            rows.append(Row(method, fact, answered, exact, in_set, chance))
     return rows
 
 
@@ -131,24 +125,6 @@ def _right(answer: Answer, base: Answer, label: Label) -> tuple[bool, bool]:
     if label.faults and same:
         return False, False
     return real_sensors.right(answer, base, label)
-
-
-def _closed(fact: Drawn, answered: Answered) -> float | None:
-    """Return the share of what a defect added that is closed; None where it adds too little."""
-    like_noise = any(KINDS[name].random for name in fact.label.effects)
-    if not fact.label.effects or like_noise or not answered.before:
-        return None
-    before, after = float(np.mean(answered.before)), float(np.mean(answered.after))
-    if not before - fact.clean > _SEEN * fact.clean:
-        return None
-    return (before - after) / (before - fact.clean)
-
-
-def _is_harm(answered: Answered) -> bool:
-    """Return whether the later part is simulated worse than with the stated parameters."""
-    if not answered.before:
-        return False
-    return bool(np.mean(answered.after) > (1 + _HARM) * np.mean(answered.before))
 
 
 def group_score(rows: Sequence[Row], group: str, key: str) -> Score:
@@ -206,29 +182,22 @@ def _share_closed(answered: Answered) -> Score:
 
 def as_json(facts: Sequence[Drawn], rows: Sequence[Row], physical: Sequence[Physical]) -> Any:
     """Return all figures as objects of JSON."""
+    keys = ('exact', 'in_set', 'by_chance', 'closed', 'harm')
     return {
         'trials': [
-            {
-                'name': fact.label.name,
-                'recording': fact.recording,
-                'group': fact.label.group,
-                'effects': fact.label.effects,
-                'noises': fact.noises,
-                'limit': fact.limit,
-            }
+            asdict(fact.label) | {'recording': fact.recording, 'limit': fact.limit}
             for fact in facts
         ],
-        'answers': [vars(row) for row in rows],
+        'answers': [
+            {'method': row.method, 'trial': row.fact.label.name}
+            | row.answered.as_json()
+            | {key: getattr(row, key) for key in keys}
+            for row in rows
+        ],
         'physical': [
-            {
-                'source': row.source.name,
-                'method': row.method,
-                'status': row.answered.status,
-                'named': sorted(row.answered.answer.named),
-                'right': row.right,
-                'closed': row.closed,
-                'error': row.answered.error,
-            }
+            {'method': row.method, 'source': row.source.name}
+            | row.answered.as_json()
+            | {'right': row.right, 'closed': row.closed}
             for row in physical
         ],
     }
