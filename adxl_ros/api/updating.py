@@ -96,7 +96,8 @@ class Update(Result):
     @property
     def _sentence(self) -> str:
         if self.state.changed:
-            return f'{self.state.changed} Nothing is adopted; calibrate again.'
+            what = self.state.changed.removeprefix('changed: ')
+            return f'{what} Nothing is adopted; calibrate again.'
         if self.adoptions:
             return 'held-out rests fit the new calibration better.'
         return 'the rests show no sure improvement, and the calibration stays as it is.'
