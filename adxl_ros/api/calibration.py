@@ -23,7 +23,7 @@ from adxl_ros.calibrate.poses import (
     poses_of_means,
     with_table_angles,
 )
-from adxl_ros.calibrate.report import acceptance, gum, page
+from adxl_ros.calibrate.report import acceptance, certificate_data, gum, page
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.calibrate.result import CalibrationResult, compare, errors_in_words, gyro_lines
 from adxl_ros.errors import UserError
@@ -31,6 +31,7 @@ from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.atomic_write import make_folder, require_own
 from adxl_ros.files.recording_columns import recorded_unit, Recording, unit_of
 from adxl_ros.files.surroundings import Surroundings
+from adxl_ros.files.tables import read_pose_table
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
 from adxl_ros.report.quantities import mg
@@ -160,14 +161,22 @@ class Fit(Result):
         page.write(path, self.result, store)
         return path / page.PAGE
 
-    def certificate(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
+    def certificate(
+        self,
+        path: str | os.PathLike,
+        data: str | os.PathLike | None = None,
+        *,
+        overwrite: bool = False,
+    ) -> None:
         """
         Write a Digital Calibration Certificate (DCC of PTB) of a calibration on a stage.
 
-        overwrite: as in `save`.
+        data: path of a YAML file with laboratory, customer, person, device and stage; what it
+        lacks is 'not stated'; overwrite: as in `save`.
         """
         require_own(path, overwrite)
-        gum.write(path, self.result)
+        stated = certificate_data.read(data) if data else certificate_data.DEFAULTS
+        gum.write(path, self.result, stated)
 
     def keep(self, store: str | os.PathLike) -> str:
         """Copy the calibration to a store; return one line on it."""
@@ -252,7 +261,8 @@ def fit(
         Path of the population.yaml of a fleet: prior of zero-g and scale factor.
     journal, poses
         Path of the journal of the sweep that names the rests, or of a table with `alpha_deg` and
-        `beta_deg` of each rest; for one recording.
+        `beta_deg`, or `roll_deg` and `pitch_deg`, of each rest, which `start_s` and `stop_s` may
+        name; for one recording.
     means
         Whether each row of the one recording is the mean of a rest; its stamps are not used.
     urdf, frame, joints
@@ -424,7 +434,8 @@ class _Rests:
         ways = [bool(way) for way in (journal, table, are_rows)]
         if sum(ways) > 1:
             raise UserError(_ONE_RECORDING)
-        self._table, self._are_rows, self._is_one = table, are_rows, any(ways)
+        self._table = read_pose_table(table) if table else None
+        self._are_rows, self._is_one = are_rows, any(ways)
         self._records = (
             sweep_journal.poses_to_fit(sweep_journal.read(journal).entries) if journal else None
         )
@@ -441,9 +452,9 @@ class _Rests:
         look.feed(read)
         # Rests by the noise of the sensor may not tell the unit; of other faults, the poses tell.
         require_unit(look.gravity(), read.path)
-        poses = extract_poses(read, unit.sensor, self._records)
+        poses = extract_poses(read, unit.sensor, self._records, self._table)
         if self._table:
-            poses = with_table_angles(poses, str(self._table))
+            poses = with_table_angles(poses, self._table)
         return poses, estimate_filters(read, unit.sensor, poses), look.neighbour_faults()
 
 

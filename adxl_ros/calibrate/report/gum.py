@@ -9,11 +9,12 @@ Squares of contributions add. Those of noise, coefficients, stage and model are 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from adxl_ros.calibrate.poses import Poses, reference_force
-from adxl_ros.calibrate.report import acceptance, held_out
+from adxl_ros.calibrate.report import acceptance, certificate_data, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.report.held_out import ErrorBudget
 from adxl_ros.calibrate.result import CalibrationResult, compare
@@ -24,7 +25,9 @@ from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.sensor import MARGIN_K, Sensor
 from adxl_ros.report import templates
 from adxl_ros.report.quantities import mg, number
+from adxl_ros.signals.rest_detection import MOST_BATCHES
 import numpy as np
+import scipy
 
 K = 2  # Coverage factor of an expanded uncertainty; about 95 % for a normal distribution
 _EARTH_HALF_RANGE_MPS2 = 0.027
@@ -33,6 +36,7 @@ _LOCAL_STD_MPS2 = 5e-4
 """Uncertainty of a stated local gravity, m/s². Chosen: 50 mGal, the size of gravity anomalies."""
 _NOT_LOCAL_MPS2 = (G0_MPS2, 9.8, 9.81)
 """Values of gravity that are those of no place in particular, m/s²."""
+_MANY = 1000  # Degrees of freedom beyond which nothing changes. Chosen: k is 1.96
 _UNIFORM = np.sqrt(3)  # Half-width of a uniform distribution divided by its standard deviation
 _SURROUNDINGS = {
     'temperature': ('temperature_c', 'K', MARGIN_K, 0.1),
@@ -71,6 +75,7 @@ class Input:
     std: Any  # Standard uncertainty, (k, m) or one for all
     unit: str  # Unit of `std`
     contribution_mps2: np.ndarray  # To the standard uncertainty of the acceleration, (k, m)
+    freedom: float = np.inf  # Degrees of freedom of `std`; infinite for type B
 
 
 class Decision(NamedTuple):
@@ -103,6 +108,12 @@ class Uncertainty:
         return np.asarray(np.sqrt(sum(row.contribution_mps2**2 for row in self.inputs)))
 
     @property
+    def freedom(self) -> np.ndarray:
+        """Return the effective degrees of freedom, (k, m) (Welch-Satterthwaite, GUM G.4.1)."""
+        shares = sum(row.contribution_mps2**4 / row.freedom for row in self.inputs)
+        return np.asarray(self.combined_mps2**4 / np.maximum(shares, np.finfo(float).tiny))
+
+    @property
     def worst(self) -> tuple[int, int]:
         """Return pose and axis of the largest combined uncertainty."""
         return divmod(int(np.argmax(self.combined_mps2)), self.error_mps2.shape[1])
@@ -126,12 +137,24 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
     error = errors.errors.accel_mps2[used]
     model = np.full(error.shape, np.sqrt(assessment.accel.model))
     inputs = (
-        Input('noise of the mean', 'A, normal', 1e3 * np.mean(held.std_v, axis=0), 'mV', by_noise),
         Input(
-            'coefficients', 'A, covariance of the fit', mg(by_coefficients), 'mg', by_coefficients
+            'noise of the mean',
+            'A, normal',
+            1e3 * np.mean(held.std_v, axis=0),
+            'mV',
+            by_noise,
+            MOST_BATCHES - 1,
+        ),
+        Input(
+            'coefficients',
+            'A, covariance of the fit',
+            mg(by_coefficients),
+            'mg',
+            by_coefficients,
+            max(int((~poses.check).sum()) * len(axes) - len(fitted.covariance_names), 1),
         ),
         _stage_angles(by_stage, assessment.accel.stage, fitted),
-        Input('model', 'A, held-out errors', mg(model), 'mg', model),
+        Input('model', 'A, held-out errors', mg(model), 'mg', model, error.size),
         _local_gravity(gravity, reference),
         *(_surroundings(name, fitted, held, reference) for name in _SURROUNDINGS),
         *_next_degree(fitted, held),
@@ -162,7 +185,9 @@ def _stage_angles(by_step_mps2: np.ndarray, scatter: float, fitted: Sensor) -> I
     scatter_mps2 = np.full(by_step_mps2.shape, scatter**0.5)
     std_rad = step_rad * excess or scatter**0.5 / fitted.local_gravity_mps2
     part_mps2 = by_step_mps2 * excess if step_rad else scatter_mps2
-    return Input(name, 'A, scatter of the poses', np.degrees(std_rad), '°', part_mps2)
+    return Input(
+        name, 'A, scatter of the poses', np.degrees(std_rad), '°', part_mps2, part_mps2.size
+    )
 
 
 def _local_gravity(gravity_mps2: float, reference_mps2: np.ndarray) -> Input:
@@ -264,10 +289,12 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
                 f'{number(std, digits=2)} {row.unit} ({row.kind})',
                 sensitivity,
                 f'{part_mg:.3f}',
+                f'{row.freedom:.0f}' if np.isfinite(row.freedom) else '∞',
             ]
         )
     expanded_mg = mg(K * found.combined_mps2)
     pose, axis = found.worst
+    freedom = float(found.freedom[pose, axis])
     alpha, beta = np.degrees([found.alpha_rad[pose], found.beta_rad[pose]])
     inside = np.abs(found.error_mps2) <= K * found.combined_mps2
     decisions = [
@@ -290,6 +317,8 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
         'decisions': decisions,
         'combined': f'{expanded_mg[pose, axis] / K:.3f} mg',
         'expanded': f'{expanded_mg[pose, axis]:.2f} mg',
+        'freedom': f'{freedom:.0f}' if freedom < _MANY else f'more than {_MANY}',
+        'factor': f'{scipy.stats.t.ppf(0.975, max(freedom, 1.0)):.2f}',
         'range': f'{expanded_mg.min():.2f} to {expanded_mg.max():.2f} mg',
         'inside': f'{int(inside.sum())} of {inside.size}',
     }
@@ -324,8 +353,14 @@ def _quantity(
     }
 
 
-def write(path: AnyPath, result: CalibrationResult) -> None:
-    """Write the certificate of a calibration against a stage, by the template of its elements."""
+def write(
+    path: AnyPath, result: CalibrationResult, data: Mapping[str, str] = certificate_data.DEFAULTS
+) -> None:
+    """
+    Write the certificate of a calibration against a stage, by the template of its elements.
+
+    data: what no recording shows, by the keys of `certificate_data`.
+    """
     found = uncertainty(result)
     if found is None:
         raise UserError(
@@ -342,6 +377,7 @@ def write(path: AnyPath, result: CalibrationResult) -> None:
             rule=RULE,
             method=f'{MEANING} {MODEL}',
             fitted=fitted,
+            data=data,
             provenance=fitted.provenance,
             step_deg=np.degrees(fitted.stage_resolution_rad),
             **_results(fitted, found),
