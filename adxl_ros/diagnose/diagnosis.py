@@ -305,7 +305,7 @@ def _held_out(
         # A drift that should be far larger than what is left is none.
         return {d: f for d, f in fits.items() if f.drift_mps2**2 <= _DRIFT_LIMIT * max(left, 0.0)}
 
-    out = {}
+    out: dict[frozenset[str], Mapping[str, HeldOutFits]] = {}
     for effects, hypothesis in search.found.items():
         healthy = HeldOutFits(hypothesis.linearised, model)
         out[effects] = _FitsByDrift(healthy, partial(with_drifts, hypothesis, healthy))
