@@ -472,6 +472,10 @@ def file_keys() -> Iterator[str]:
             ),
             ('`datasheet.*`', 'typical and largest departures, for the comparison in reports'),
             ('`envelope.*`', 'range of force, temperature and supply of the calibration'),
+            *(
+                (f'`gyro.{name}`', f'gyroscope, x, y, z: {about["doc"]}, {about["unit"]}')
+                for name, about in parameter_file.GYRO.items()
+            ),
             ('`link.*`', 'how the driver reaches the unit'),
             ('`provenance.*`', 'id, date, source, hash of the data, errors and verdicts'),
         ],
@@ -660,6 +664,10 @@ def figures() -> dict[Path, str]:
         'demo': demo_table(),
         'working cases': working_cases(),
         'sealed': sealed(),
+        'benchmark': benchmark('Level A: exactly right'),
+        'better reference': benchmark(
+            'Level C: share of the squared gap that is closed on a later part'
+        ),
         'hand held': hand_held(),
         'units': units(),
     }
@@ -779,6 +787,13 @@ def sealed() -> list[str]:
         'score | figure (90 % interval) | bar | met',
         [row for row in rows[1:] if row[-1] not in ('-', 'met')],
     )[1:-1]
+
+
+def benchmark(title: str) -> list[str]:
+    """Return a table of the benchmark on public recordings, under its command."""
+    text = (DOCS / 'measurements' / 'real_benchmark.md').read_text('utf-8')
+    command = next(line for line in text.splitlines() if line.startswith('`./run benchmark'))
+    return [command, '', *text.split(f'### {title}\n\n')[1].split('\n\n')[0].splitlines()]
 
 
 def units() -> list[str]:

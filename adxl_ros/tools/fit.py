@@ -11,6 +11,7 @@ from pathlib import Path
 from adxl_ros.api.calibration import fit as fit_unit
 from adxl_ros.api.updating import PAGE as UPDATE_PAGE, update
 from adxl_ros.calibrate.calibration import STAGE_FITS
+from adxl_ros.calibrate.report import certificate_data
 from adxl_ros.calibrate.report.gum import SCHEMA_VERSION
 from adxl_ros.calibrate.report.page import PAGE
 from adxl_ros.errors import UserError
@@ -77,7 +78,8 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--poses',
         metavar='FILE',
-        help='table with alpha_deg and beta_deg of each rest, in their order',
+        help='table with alpha_deg and beta_deg, or roll_deg and pitch_deg of an inclinometer, of '
+        'each rest: in their order, or between start_s and stop_s of the recording',
     )
     parse.add_argument(
         '--means',
@@ -97,6 +99,12 @@ def parser() -> argparse.ArgumentParser:
         metavar='FILE.xml',
         help='write a Digital Calibration Certificate of a calibration on a stage, '
         f'by the schema DCC {SCHEMA_VERSION} of PTB',
+    )
+    parse.add_argument(
+        '--dcc-data',
+        metavar='FILE.yaml',
+        help='what the certificate states of laboratory, customer, person and device; its keys: '
+        + ', '.join(certificate_data.DEFAULTS),
     )
     parse.add_argument(
         '--store',
@@ -157,6 +165,8 @@ def fit(options: argparse.Namespace) -> int:
     cli.check_outputs(
         options, options.output, options.dcc, options.report and Path(options.report, PAGE)
     )
+    if options.dcc_data and not options.dcc:
+        raise UserError(f'--dcc-data {options.dcc_data}: needs --dcc with the certificate')
     if options.report or options.dcc:
         html_page.check_libraries()
     reading = cli.reading_options(options)
@@ -185,7 +195,7 @@ def fit(options: argparse.Namespace) -> int:
                 fitted.report(options.report, options.store, overwrite=options.overwrite)
             )
         if options.dcc:
-            fitted.certificate(options.dcc, overwrite=options.overwrite)
+            fitted.certificate(options.dcc, options.dcc_data, overwrite=options.overwrite)
             report.append(options.dcc)
     fitted.save(options.output, overwrite=options.overwrite)
     cli.note(f'fit: {fitted.keep(options.store)}')

@@ -180,6 +180,12 @@ def test_the_pages_by_hand_stay_short() -> None:
     assert sum(len(text.split()) for text in texts) <= MOST_WORDS
 
 
+def test_the_first_page_stays_short() -> None:
+    """Of a front page, a newcomer reads one screen or two."""
+    assert len((REPO / 'README.md').read_text('utf-8').split()) <= 750
+    assert (DOCS / 'gap.svg').stat().st_size < 1_000_000
+
+
 def test_the_tilt_error_has_one_definition() -> None:
     """The glossary defines it, and each page that states one links there."""
     texts = {page: page.read_text('utf-8').lower() for page in BY_HAND}
