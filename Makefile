@@ -8,15 +8,17 @@
 # make gallery  the pictures of the effects
 # make site     the documentation as a site in site/, with search
 # make screenshots  docs/screenshots: terminals and pages from real runs, six minutes
+# make animation  docs/gap.svg, README's animation, from a simulated log and its diagnosis, two minutes
 # make reproduction  docs/measurements/reproduction.md and its plots: the paper's experiments on simulated units
 # make coverage do the intervals hold? 300 drawn units and stages, as a table
 # make investigate  minutes to a verdict of `investigate` over 60 simulated units, an hour
+# make kept     kept calibrations of simulated robots over 60 days, five minutes
 # make blind    the blind check of diagnose, 600 trials, into blind_output/ (make blind ARGS='--seed 1')
 # make working  working cases of diagnose, one line each, then the scores (make working ARGS='--count 20 --seed 3')
 # make lint     the linters alone
 # make clean    remove what these made
 
-.PHONY: build developed help demo check test perf bench reference gallery site screenshots reproduction coverage investigate blind working lint clean \
+.PHONY: build developed help demo check test perf bench reference gallery site screenshots reproduction coverage investigate kept blind working lint clean \
     FORCE
 .DEFAULT_GOAL := build
 
@@ -152,6 +154,9 @@ site: build .venv/.documented
 screenshots: developed
 	OPENBLAS_NUM_THREADS=1 ./run --exec python docs/screenshots.py docs $(ARGS)
 
+animation: build
+	OPENBLAS_NUM_THREADS=1 ./run --exec python docs/animation.py
+
 reproduction: build
 	OPENBLAS_NUM_THREADS=1 ./run reproduce --units 40 --draws 300 -o docs/measurements $(ARGS)
 
@@ -162,6 +167,9 @@ coverage: build
 investigate: build
 	OPENBLAS_NUM_THREADS=1 ./run --exec python docs/measurements/investigate_units.py \
 	    -o investigate_units.jsonl $(ARGS)
+
+kept: build
+	OPENBLAS_NUM_THREADS=1 ./run --exec python docs/measurements/kept_robots.py $(ARGS)
 
 # Goes on where it was cut short; with a seed of its own in ARGS, into another folder.
 blind: build

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,18 +23,20 @@ from adxl_ros.calibrate.poses import (
     poses_of_means,
     with_table_angles,
 )
-from adxl_ros.calibrate.report import acceptance, gum, page
+from adxl_ros.calibrate.report import acceptance, certificate_data, gum, page
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
-from adxl_ros.calibrate.result import CalibrationResult, compare, errors_in_words
+from adxl_ros.calibrate.result import CalibrationResult, compare, errors_in_words, gyro_lines
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.atomic_write import make_folder, require_own
 from adxl_ros.files.recording_columns import recorded_unit, Recording, unit_of
 from adxl_ros.files.surroundings import Surroundings
+from adxl_ros.files.tables import read_pose_table
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
 from adxl_ros.report.quantities import mg
 from adxl_ros.signals.gravity_at_rest import require_unit
+from adxl_ros.signals.gyroscope_at_rest import rest_turns, RestTurns, with_bias
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import BeyondRange, FilterNoise, listed
 
@@ -106,7 +109,15 @@ class Fit(Result):
                 '',
             ]
         )
-        return [*head, *self.result.summary, *self.warnings, *listed([*self.measured])]
+        gyro = gyro_lines(fitted.gyro)
+        return [
+            *head,
+            *self.result.summary,
+            *self.warnings,
+            *[''] * bool(gyro),
+            *gyro,
+            *listed([*self.measured]),
+        ]
 
     @property
     def first_screen(self) -> FirstScreen:
@@ -150,14 +161,22 @@ class Fit(Result):
         page.write(path, self.result, store)
         return path / page.PAGE
 
-    def certificate(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
+    def certificate(
+        self,
+        path: str | os.PathLike,
+        data: str | os.PathLike | None = None,
+        *,
+        overwrite: bool = False,
+    ) -> None:
         """
         Write a Digital Calibration Certificate (DCC of PTB) of a calibration on a stage.
 
-        overwrite: as in `save`.
+        data: path of a YAML file with laboratory, customer, person, device and stage; what it
+        lacks is 'not stated'; overwrite: as in `save`.
         """
         require_own(path, overwrite)
-        gum.write(path, self.result)
+        stated = certificate_data.read(data) if data else certificate_data.DEFAULTS
+        gum.write(path, self.result, stated)
 
     def keep(self, store: str | os.PathLike) -> str:
         """Copy the calibration to a store; return one line on it."""
@@ -242,7 +261,8 @@ def fit(
         Path of the population.yaml of a fleet: prior of zero-g and scale factor.
     journal, poses
         Path of the journal of the sweep that names the rests, or of a table with `alpha_deg` and
-        `beta_deg` of each rest; for one recording.
+        `beta_deg`, or `roll_deg` and `pitch_deg`, of each rest, which `start_s` and `stop_s` may
+        name; for one recording.
     means
         Whether each row of the one recording is the mean of a rest; its stamps are not used.
     urdf, frame, joints
@@ -282,7 +302,7 @@ def fit(
             raise UserError(f'--prior {prior}: a fit over temperature takes none; leave it out')
         progress(_READING, 'fit')
         result = calibration.calibrate_thermal(
-            with_axes(unit.base, unit.sensor.axes),
+            unit.with_gyro(with_axes(unit.base, unit.sensor.axes)),
             blocks,
             unit.names[0],
             data_sha256 or unit.sha256,
@@ -297,7 +317,12 @@ def fit(
         raise UserError('no recording is given')
     progress(_READING, 'fit')
     result = calibration.calibrate(
-        unit.sensor, recorded, model, effects, data_sha256 or unit.sha256, population
+        unit.with_gyro(unit.sensor),
+        recorded,
+        model,
+        effects,
+        data_sha256 or unit.sha256,
+        population,
     )
     return _fit(result, unit, False)
 
@@ -323,6 +348,7 @@ class _Unit:
         self._paths: list[str] = []
         self.notes: list[str] = []  # Readings beyond the stated range, and what means lack
         self._surroundings: list[Surroundings] = []  # Those of each recording
+        self._gyro_rests: list[RestTurns] = []  # The gyroscope in the rests of all recordings
 
     def add(self, read: Recording) -> Recording:
         """Take the next recording; return it, with the angles of a robot if there is one."""
@@ -346,6 +372,7 @@ class _Unit:
                 self.sensor,
                 stage_resolution_rad=max(self.sensor.stage_resolution_rad, path.step_rad),
             )
+        self._gyro_rests += rest_turns(read, self.sensor, self._has_means)
         beyond = BeyondRange()
         beyond.add(read.volts(self.sensor), self.sensor)
         text = beyond.describe(self.sensor)
@@ -353,11 +380,22 @@ class _Unit:
             self.notes.append(f'{read.path}: {text}')
         return read
 
+    def with_gyro(self, sensor: Sensor) -> Sensor:
+        """Return a sensor with the bias of the gyroscope of the recordings, if they have one."""
+        gyro = with_bias(sensor.gyro, self._gyro_rests)
+        if gyro is sensor.gyro:
+            return sensor
+        origin = {'gyro_from': ', '.join(self.names)}
+        return replace(sensor, gyro=gyro, provenance={**sensor.provenance, **origin})
+
     def thermal_blocks(self, several: Sequence[Recording]) -> Poses | None:
         """Return the blocks of one recording at rest over temperature; None for others."""
         if len(several) != 1:
             return None
-        return thermal_fit.rest_blocks(self.add(several[0]), self.sensor)
+        blocks = thermal_fit.rest_blocks(self.add(several[0]), self.sensor)
+        if blocks is None:
+            self._gyro_rests = []  # The recording is taken once more
+        return blocks
 
     @property
     def base(self) -> Sensor:
@@ -367,7 +405,8 @@ class _Unit:
 
     def assumed(self, effects: Sequence[str]) -> list[str]:
         """Return what was assumed of temperature and supply, which effects follow."""
-        return [line for each in self._surroundings for line in each.interpolated(effects)]
+        lines = [each.interpolated(effects) for each in self._surroundings]
+        return list(chain.from_iterable(lines))
 
     @property
     def measured(self) -> Sequence[str]:
@@ -395,7 +434,8 @@ class _Rests:
         ways = [bool(way) for way in (journal, table, are_rows)]
         if sum(ways) > 1:
             raise UserError(_ONE_RECORDING)
-        self._table, self._are_rows, self._is_one = table, are_rows, any(ways)
+        self._table = read_pose_table(table) if table else None
+        self._are_rows, self._is_one = are_rows, any(ways)
         self._records = (
             sweep_journal.poses_to_fit(sweep_journal.read(journal).entries) if journal else None
         )
@@ -412,9 +452,9 @@ class _Rests:
         look.feed(read)
         # Rests by the noise of the sensor may not tell the unit; of other faults, the poses tell.
         require_unit(look.gravity(), read.path)
-        poses = extract_poses(read, unit.sensor, self._records)
+        poses = extract_poses(read, unit.sensor, self._records, self._table)
         if self._table:
-            poses = with_table_angles(poses, str(self._table))
+            poses = with_table_angles(poses, self._table)
         return poses, estimate_filters(read, unit.sensor, poses), look.neighbour_faults()
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.sweep_journal import PoseRecord
-from adxl_ros.files.tables import read_pose_table
+from adxl_ros.files.tables import PoseTable
 from adxl_ros.model import signal_chain
 from adxl_ros.model.effects import base, effect_named
 from adxl_ros.model.effects.base import Coefficient, Components, Environment, NOMINAL_ENVIRONMENT
@@ -177,9 +177,9 @@ def at_a_rail(sensor: Sensor, poses: Poses) -> np.ndarray:
     return (np.abs(poses.volts[:, :, None] - rails_v).min(axis=2) < reach_v).any(axis=1)
 
 
-def with_table_angles(poses: Poses, path: str) -> Poses:
+def with_table_angles(poses: Poses, table: PoseTable) -> Poses:
     """Give rests the angles of a table of poses, in their order."""
-    angles = read_pose_table(path)
+    angles, path = table.angles_rad, table.path
     if len(angles) != len(poses):
         starts = ', '.join(f'{start_s:.1f}' for start_s in poses.time_s[:, 0]) + ' s'
         raise UserError(
@@ -488,6 +488,9 @@ _MIN_SAMPLES = 0.9
 """Smallest share of the samples of a pose in the journal that its recording must have."""
 
 
+_SHORTEST_SPAN_S = 0.5  # Shortest rest of a table, s. Chosen: ten blocks show the error of a mean
+
+
 def _named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Rest]:
     """Find the rows of the rests that a journal names by their first and last stamp."""
     rests, stamps_ns = [], recording.stamp_ns
@@ -506,12 +509,35 @@ def _named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Re
     return rests
 
 
+def _rests_of_table(recording: Recording, path: str, spans_s: np.ndarray) -> list[Rest]:
+    """Return the rests between stamps of a recording, s, (k, 2), that a table names."""
+    rests, fewest = [], _SHORTEST_SPAN_S * recording.rate_hz
+    # The stamps as the recording states them
+    time_s = recording.time_s + recording.epoch_ns * 1e-9
+    for number, (start_s, stop_s) in enumerate(spans_s.tolist(), 1):
+        start, stop = np.searchsorted(time_s, start_s), np.searchsorted(time_s, stop_s, 'right')
+        if not stop - start >= fewest:
+            raise UserError(
+                f'{path}: pose {number} is from {start_s:.6g} to {stop_s:.6g} s, in which '
+                f'{recording.path} has {max(stop - start, 0)} samples, expected {fewest:.0f} at '
+                f'least; its stamps are {time_s[0]:.6g} to {time_s[-1]:.6g} s'
+            )
+        first_s, last_s = recording.time_s[[start, stop - 1]].tolist()
+        rests.append(Rest(int(start), int(stop), first_s, last_s))
+    return rests
+
+
 def extract_poses(
-    recording: Recording, sensor: Sensor, records: Sequence[PoseRecord] | None = None
+    recording: Recording,
+    sensor: Sensor,
+    records: Sequence[PoseRecord] | None = None,
+    table: PoseTable | None = None,
 ) -> Poses:
-    """Find the rests of a recording, or take those of a journal, and average each."""
+    """Find the rests of a recording, or take those of a journal or a table, and average each."""
     volts, angles = recording.volts(sensor), recording.stage_angles
-    if records is None:
+    if table is not None and table.spans_s is not None:
+        rests = _rests_of_table(recording, table.path, table.spans_s)
+    elif records is None:
         finder = rest_detection.recording_finder(sensor, angles is not None)
         finder.feed(recording.time_s, volts, angles)
         rests = finder.rests()

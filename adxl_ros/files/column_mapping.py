@@ -142,6 +142,11 @@ def parse_mapping(text: str) -> ColumnMapping:
             f'{where}: names the axes {axes or "none"}, expected x, x and y, or x, y '
             f'and z; write for example {_EXAMPLE}'
         )
+    turns = [role for role in GYRO_ROLES if role in sources]
+    if len(turns) not in (0, len(GYRO_ROLES)):
+        raise UserError(
+            f'{where}: names {", ".join(turns)} of a gyroscope; name {", ".join(GYRO_ROLES)}'
+        )
     given = {'roll', 'pitch', 'alpha', 'beta'} & set(sources)
     if given & {'roll', 'pitch'} and given != {'roll', 'pitch'}:
         raise UserError(
@@ -192,7 +197,10 @@ class Quantity(Enum):
     LENGTH = 'm'
     TEMPERATURE = 'c'
     VOLTAGE = 'v'
+    TURN = 'radps'
 
+
+GYRO_ROLES = ('gx', 'gy', 'gz')  # Roles of the axes of a gyroscope
 
 ROLES: Mapping[str, Quantity] = {
     'time': Quantity.TIME,
@@ -201,6 +209,7 @@ ROLES: Mapping[str, Quantity] = {
     'shift': Quantity.LENGTH,
     'temperature': Quantity.TEMPERATURE,
     'supply': Quantity.VOLTAGE,
+    **dict.fromkeys(GYRO_ROLES, Quantity.TURN),
 }
 """Quantity of each role that a column can have."""
 
@@ -256,6 +265,11 @@ UNITS: Mapping[Quantity, Mapping[str, Unit]] = {
         'f': Unit(9.0, 5.0, -160.0 / 9.0),
     },
     Quantity.VOLTAGE: {'v': Unit(), 'mv': Unit(1e3)},
+    Quantity.TURN: {
+        'radps': Unit(),
+        'dps': Unit(180.0, np.pi),
+        'mdps': Unit(180e3, np.pi),
+    },
 }
 """Units by quantity and name."""
 
@@ -281,11 +295,16 @@ _SPELLINGS = {
     'mv': 'millivolt millivolts',
     'deg': '° degree degrees',
     'rad': 'radian radians',
+    'radps': 'rad/s rad_s rad_per_s rad·s⁻¹ rad.s-1',
+    'dps': 'deg/s °/s deg_s degps deg_per_s',
+    'mdps': 'mdeg/s m°/s',
     'c': '°c degc celsius deg_c',
     'f': '°f degf fahrenheit',
     'k': 'kelvin',
 }
-_ALIASES = {word: name for name, words in _SPELLINGS.items() for word in words.split()}
+_ALIASES: dict[str, str] = {}
+for _name, _words in _SPELLINGS.items():
+    _ALIASES |= dict.fromkeys(_words.split(), _name)
 """Names of units by their other spellings, in lower case, with _ for a blank."""
 
 _BRACKETS = re.compile(r'[(\[{]\s*([^()\[\]{}]+?)\s*[)\]}]')
@@ -381,7 +400,7 @@ _LISTED_NAMES = 12
 """Largest number of columns that a message names (chosen: some lines of a terminal)."""
 _NEAR = 0.25
 """Largest logarithm of the ratio of a length to gravity (chosen: above bias and scale errors)."""
-_SHORTEST_STEP_S = 5e-5  # Shortest step of stamps, s. Chosen: half of that at the fastest rate
+_SHORTEST_STEP_S = 2.5e-5  # Shortest step of stamps, s. Chosen: an IIS3DWB has steps of 3.75e-5 s
 _LONGEST_STEP_S = 1.05  # Longest step of stamps, s. Chosen: 1 Hz, the slowest, with jitter
 
 

@@ -11,12 +11,13 @@ from functools import partial
 from io import StringIO
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.column_mapping import Table, TableBlock
 from adxl_ros.files.csv_file import find_form, read_blocks
+from adxl_ros.model.kinematics import stage_angles
 import numpy as np
 
 _BLOCK_ROWS = 65536  # Rows that are read at a time (chosen: some MB)
@@ -24,7 +25,8 @@ _BLOCK_ROWS = 65536  # Rows that are read at a time (chosen: some MB)
 _MAPPINGS = {
     'sensor_accel': 'time={time}:us,x=x:mps2,y=y:mps2,z=z:mps2,temperature=temperature:c',
     'sensor_combined': 'time=timestamp:us,x=accelerometer_m_s2[0]:mps2,'
-    'y=accelerometer_m_s2[1]:mps2,z=accelerometer_m_s2[2]:mps2',
+    'y=accelerometer_m_s2[1]:mps2,z=accelerometer_m_s2[2]:mps2,'
+    'gx=gyro_rad[0]:radps,gy=gyro_rad[1]:radps,gz=gyro_rad[2]:radps',
     'vehicle_acceleration': 'time={time}:us,x=xyz[0]:mps2,y=xyz[1]:mps2,z=xyz[2]:mps2',
 }
 """Columns and units of messages by the definitions of PX4 (msg/*.msg), the raw readings first."""
@@ -197,9 +199,9 @@ def _open_ulog(path: str, topic: str) -> Table:
         f'{data.name}_{data.multi_id}' if data.multi_id else str(data.name): data
         for data in log.data_list
     }
-    accelerations = [
-        name for kind in _MAPPINGS for name in messages if messages[name].name == kind
-    ]
+    accelerations = []
+    for kind in _MAPPINGS:
+        accelerations += [name for name, data in messages.items() if data.name == kind]
     raw = [
         each for each in accelerations if messages[each].name == messages[accelerations[0]].name
     ]
@@ -220,6 +222,8 @@ def _open_ulog(path: str, topic: str) -> Table:
     mapping = _MAPPINGS.get(data.name, '').format(time=time)
     if 'temperature' not in columns:
         mapping = mapping.partition(',temperature=')[0]
+    if 'gyro_rad[0]' not in columns:
+        mapping = mapping.partition(',gx=')[0]
     cut = f'{path}: is damaged; what can be read of it is used' * bool(log.file_corruption)
     return in_memory(
         path,
@@ -242,20 +246,40 @@ TABLE_ENDINGS = (*_FORMATS, '.ulg')  # Ends of the names of tables that are no t
 
 
 _POSE_COLUMNS = ('alpha_deg', 'beta_deg')  # Columns of a table of poses
+_TILT_COLUMNS = ('roll_deg', 'pitch_deg')  # The same by an inclinometer
+_SPAN_COLUMNS = ('start_s', 'stop_s')  # When a pose rests; a table may have both or none
 
 _LEVEL_RAD = 1e-9  # Largest sine of alpha at which beta does not matter
 
 
-def read_pose_table(path: AnyPath) -> np.ndarray:
-    """Read a table of `alpha_deg` and `beta_deg` as rad, (k, 2); NaN where a pose has none."""
+class PoseTable(NamedTuple):
+    """A table of poses."""
+
+    path: str
+    angles_rad: np.ndarray  # alpha and beta, rad, (k, 2); NaN where a pose has none
+    spans_s: np.ndarray | None  # First and last stamp of each rest, s, (k, 2); None without them
+
+
+def read_pose_table(path: AnyPath) -> PoseTable:
+    """Read a table of poses: angles of a stage, or of an inclinometer, and when they rest."""
     table = open_table(path)
-    if not set(_POSE_COLUMNS) <= set(table.names):
+    pairs = [pair for pair in (_POSE_COLUMNS, _TILT_COLUMNS) if set(pair) <= set(table.names)]
+    if len(pairs) != 1:
         raise UserError(
-            f'{path}: has no angles of the poses; expected the columns '
-            f'{" and ".join(_POSE_COLUMNS)}; the columns are {", ".join(table.names)}'
+            f'{path}: has {"two" if pairs else "no"} kinds of angles of the poses; expected '
+            f'the columns {" and ".join(_POSE_COLUMNS)}, or {" and ".join(_TILT_COLUMNS)}; '
+            f'the columns are {", ".join(table.names)}'
         )
-    values = table.read(_POSE_COLUMNS)
-    alpha_rad, beta_rad = (np.radians(values[name]) for name in _POSE_COLUMNS)
+    spans = [name for name in _SPAN_COLUMNS if name in table.names]
+    if len(spans) == 1:
+        raise UserError(f'{path}: has {spans[0]}; expected both {" and ".join(_SPAN_COLUMNS)}')
+    values = table.read([*pairs[0], *spans])
+    angles_rad = [np.radians(values[name]) for name in pairs[0]]
+    alpha_rad, beta_rad = stage_angles(*angles_rad) if pairs[0] is _TILT_COLUMNS else angles_rad
     # At alpha 0 and 180 degrees beta does not matter, and people leave its cell empty.
     is_open = np.isnan(beta_rad) & (np.abs(np.sin(alpha_rad)) < _LEVEL_RAD)
-    return np.column_stack([alpha_rad, np.where(is_open, 0.0, beta_rad)])
+    return PoseTable(
+        str(path),
+        np.column_stack([alpha_rad, np.where(is_open, 0.0, beta_rad)]),
+        np.column_stack([values[name] for name in spans]) if spans else None,
+    )

@@ -108,7 +108,7 @@ class LinkReader:
         self._ros: Any = node.get_clock()
         self._is_real_time = False
         self._now_ns: int | None = None
-        self._subscribed_ns = 0
+        self._subscribed_ns: int | None = None  # Steady time at which a subscriber was seen
         self._ticked_ns = self._opened_ns = time.monotonic_ns()
         self._search_ns = self._opened_ns + _CLOCK_SEARCH_NS
         self._due_s = time.monotonic()
@@ -219,7 +219,7 @@ class LinkReader:
             self._search_ns = steady_ns + _CLOCK_SEARCH_NS
             self._output.follow_other_clock()
         if self._now_ns is None:
-            if not self._may_begin(step_ns):
+            if not self._may_begin():
                 return
             start_ns = self._link.start_ns if self._output.is_clock else None
             self._now_ns = self._ros.now().nanoseconds if start_ns is None else start_ns
@@ -233,15 +233,21 @@ class LinkReader:
         if samples.missing:
             self._on_level(Level.WARN)
 
-    def _may_begin(self, step_ns: int) -> bool:
+    def _may_begin(self) -> bool:
         """Return whether the link may begin: time runs, and some links wait for a subscriber."""
         if self._output.is_clock:
             if self._ticked_ns - self._opened_ns < _CLOCK_SEARCH_NS:
                 return False
         elif not self._ros.now().nanoseconds:
             return False
-        self._subscribed_ns = self._subscribed_ns + step_ns if self._output.subscribed() else 0
-        return not self._link.waits_for_listener or self._subscribed_ns >= _DISCOVERY_NS
+        if not self._link.waits_for_listener:
+            return True
+        if not self._output.subscribed():
+            self._subscribed_ns = None
+            return False
+        if self._subscribed_ns is None:
+            self._subscribed_ns = self._ticked_ns
+        return self._ticked_ns - self._subscribed_ns >= _DISCOVERY_NS
 
     def _due_ns(self, now_ns: int, step_ns: int) -> int:
         """Return the sensor time up to which samples are due, ns."""

@@ -82,7 +82,8 @@ class Tally:
         )
 
 
-_REFERENCE_QUEUE = 1000  # References that are kept for a slow subscriber: 10 s of stage angles
+_QUEUE = 5000
+"""Samples, and references beside them, that are kept for a slow subscriber: 5 s at 1 kHz."""
 _STAGE = 'stage/joint_states'  # Topic of the stage angles, which have several columns
 _COLUMNS = {
     _STAGE: tuple(JOINTS.values()),
@@ -111,7 +112,7 @@ class References:
             topic: (-1, np.full(len(names), np.inf)) for topic, names in self._columns.items()
         }
         self._publishers = {
-            topic: topics.create_publisher(node, _KINDS[topic], topic, _REFERENCE_QUEUE)
+            topic: topics.create_publisher(node, _KINDS[topic], topic, _QUEUE)
             for topic in self._columns
         }
 
@@ -162,7 +163,6 @@ class References:
 
 _UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'
 """Name that the middleware gives a node that it has not discovered yet (rmw_dds_common)."""
-_QUEUE = 5000  # Samples that are kept for a slow subscriber: 5 s at 1 kHz
 
 
 def imu_writer(sensor: Sensor, frame_id: str) -> topics.MessageWriter:

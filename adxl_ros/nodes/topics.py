@@ -257,7 +257,7 @@ class Inbox:
         """
         self._unit = unit
         self._node, self._kind, self._depth = node, kind, depth
-        self.heard_s = time.monotonic()  # When messages came last
+        self.heard_s = self._looked_s = time.monotonic()  # When messages came last; last look
         self._topic = node.resolve_topic_name(topic)
         self._number, self._back_s, self._mixed_until_s = 0, -_MIXED_S, 0.0
         self._subscription = create_subscription(
@@ -284,9 +284,10 @@ class Inbox:
     def take(self) -> list[bytes]:
         """Return the messages since the last call, at most as many as are kept."""
         accept = (self._accepts,) if self._kind is Imu else ()
+        self._looked_s = time.monotonic()
         messages = [*take_messages(self._subscription, self._kind, True, self._depth, *accept)]
         if messages:
-            self.heard_s = time.monotonic()
+            self.heard_s = self._looked_s
         return messages if self._unit == SI else [*map(self._in_si, messages)]
 
     def _in_si(self, raw: bytes) -> bytes:
@@ -308,8 +309,12 @@ class Inbox:
         return time.monotonic() > self._mixed_until_s
 
     def silence(self) -> str:
-        """Return why or for how long nothing has come; '' while messages come."""
-        silent_s = time.monotonic() - self.heard_s
+        """
+        Return why or for how long nothing has come; '' while messages come.
+
+        It ends with the last look: what came while the node was held up has not been taken yet.
+        """
+        silent_s = self._looked_s - self.heard_s
         if (fault := self.fault()) or silent_s < _SILENT_S:
             return fault
         nobody = '' if self._node.count_publishers(self._topic) else ', and nobody publishes it'

@@ -37,7 +37,7 @@ _HAND_HELD_S = 1.4  # Shortest rest by hand, s, without 0.3 s of margins. Chosen
 _STAGE_S = 0.6  # Shortest rest on a stage, s, without these margins. Chosen: dwells are longer
 _KNOCK_S = 1.0  # Longest disturbance within a rest, s. Chosen: a knock has decayed
 _PART_S = 3600.0  # Time after which old blocks are forgotten, s; it bounds the memory
-_BATCHES = 20  # Most batches that show the error of a mean. Chosen: the usual number
+MOST_BATCHES = 20  # Most batches that show the error of a mean. Chosen: the usual number
 _MIN_BATCH_BLOCKS = 2  # Smallest length of such a batch, blocks: 0.1 s
 _DRIFT_SIGMAS = 5.0  # Smallest drift, stds. Chosen: one false alarm in hours
 _SETTLE_TAUS = 8.0  # Settling time, RC. Chosen: 0.03 % of a step is below the noise of a mean
@@ -566,7 +566,7 @@ def _mean(
     """
     mean = part.mean.mean(axis=0)
     white = part.squares.sum(axis=0) / max((spans.size - 1) * len(part), 1)
-    length = max(-(-len(part) // _BATCHES), _MIN_BATCH_BLOCKS)
+    length = max(-(-len(part) // MOST_BATCHES), _MIN_BATCH_BLOCKS)
     count = len(part) // length
     long_run = np.zeros(len(mean))
     if count > 1:

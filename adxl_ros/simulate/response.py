@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Hashable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from math import ceil
 from typing import Any
 
@@ -116,6 +117,7 @@ class Response:
     def _key(self, *places: Place) -> tuple:
         """Return what the chain up to the element depends on, with effects of some places."""
         sensor = self.sensor
+        effects = chain.from_iterable(self._chain.effects[place] for place in places)
         return (
             self._motion,
             self._begin_s,
@@ -123,7 +125,7 @@ class Response:
             sensor.local_gravity_mps2,
             sensor.adc_vref_v,
             *sensor.nominal_scale_v_per_g.tolist(),
-            *(effect.key for place in places for effect in self._chain.effects[place]),
+            *(effect.key for effect in effects),
         )
 
     def _instants(self, stamps_s: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from math import exp
 from types import MappingProxyType
 from typing import Any
@@ -150,9 +151,7 @@ def _visit(poses_deg: Sequence[tuple[float, float]]) -> Motion:
 def sweep(_: np.random.Generator) -> Motion:
     """Visit planes alpha 90, 60, 30, 120, 150° forth and back (experiments 1 and 2)."""
     forth = list(range(0, 361, 30))
-    return _visit(
-        [(alpha, beta) for alpha in (90, 60, 30, 120, 150) for beta in forth + forth[::-1]]
-    )
+    return _visit(list(product((90, 60, 30, 120, 150), forth + forth[::-1])))
 
 
 def tilt_alpha(_: np.random.Generator) -> Motion:

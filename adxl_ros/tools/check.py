@@ -9,14 +9,20 @@ from collections.abc import Sequence
 import json
 from pathlib import Path
 
+from adxl_ros.api import gate
 from adxl_ros.api.checking import check as check_recordings, PAGE
+from adxl_ros.errors import UserError
 from adxl_ros.process import command
 from adxl_ros.report import page as html_page
+from adxl_ros.report.screen import wrapped
 from adxl_ros.signals.findings import Findings
 from adxl_ros.tools import command_line as cli
 
 _EXAMPLES = {
     'all recordings of a day, with a page': '*.mcap --report check',
+    'a gate: what became worse since an earlier log': (
+        'new.mcap --against old.mcap --fail-on gaps,noise --min rate_hz=95 --junit check.xml'
+    ),
     'a log of other software': 'log.csv --columns time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg',
 }
 """Examples of arguments, by their purpose."""
@@ -35,6 +41,28 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--report', metavar='DIR', help='write the page check.html there')
     cli.add_overwrite_option(parse)
     parse.add_argument('--json', action='store_true', help='print the result as JSON')
+    parse.add_argument(
+        '--against',
+        metavar='RECORDING',
+        help='an earlier recording of the same task: what became worse is named',
+    )
+    parse.add_argument(
+        '--fail-on',
+        metavar='KINDS',
+        default=','.join(gate.KINDS),
+        help='what makes the status 1, of %(default)s (default: all of them)',
+    )
+    parse.add_argument(
+        '--min',
+        dest='minima',
+        metavar='NAME=VALUE',
+        action='append',
+        default=[],
+        help=f'smallest value of {", ".join(gate.MINIMA)}',
+    )
+    parse.add_argument(
+        '--junit', metavar='FILE.xml', help='write the outcomes as a report of JUnit'
+    )
     cli.add_robot_options(parse)
     cli.add_recording_options(parse)
     return parse
@@ -42,7 +70,8 @@ def parser() -> argparse.ArgumentParser:
 
 def check(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    cli.check_outputs(options, options.report and Path(options.report, PAGE))
+    cli.check_outputs(options, options.report and Path(options.report, PAGE), options.junit)
+    fail_on, minima = _fail_on(options.fail_on), _minima(options.minima)
     if options.report:
         html_page.check_libraries()
     with cli.progress('check') as show:
@@ -55,14 +84,75 @@ def check(options: argparse.Namespace) -> int:
             reading=cli.reading_options(options),
             progress=show,
         )
+    outcomes = [_outcomes(each, options, minima) for each in checked.recordings]
+    if options.junit:
+        gate.write_junit(
+            options.junit, list(zip(checked.recordings, outcomes)), [*fail_on, *minima]
+        )
     page = [checked.save(options.report, overwrite=options.overwrite)] if options.report else []
     if options.json:
-        print(json.dumps(checked.to_dict()['recordings'], indent=1))
+        recordings = checked.to_dict()['recordings']
+        for entry, rows in zip(recordings, outcomes):
+            entry['outcomes'] = [gate.as_json(row) for row in rows]
+        print(json.dumps(recordings, indent=1))
     else:
         *lines, sentence = checked.screen
-        print('\n'.join(lines))
+        print('\n'.join([*lines, *_gate_lines(outcomes, options.against)]))
         cli.print_end([sentence], page, _next_command(checked.recordings, options))
-    return 0 if checked.is_sound else 1
+    is_failed = any(
+        row.is_worse and row.name in (*fail_on, *minima) for rows in outcomes for row in rows
+    )
+    return int(is_failed)
+
+
+def _fail_on(text: str) -> list[str]:
+    kinds = [kind for kind in text.split(',') if kind]
+    if unknown := [kind for kind in kinds if kind not in gate.KINDS]:
+        raise UserError(f'--fail-on {unknown[0]}: expected some of {", ".join(gate.KINDS)}')
+    return kinds
+
+
+def _minima(texts: Sequence[str]) -> dict[str, float]:
+    minima = {}
+    for text in texts:
+        name, _, value = text.partition('=')
+        try:
+            minima[name] = float(value)
+        except ValueError:
+            name = ''
+        if name not in gate.MINIMA:
+            raise UserError(
+                f'--min {text}: expected NAME=VALUE with one of {", ".join(gate.MINIMA)}'
+            )
+    return minima
+
+
+def _outcomes(
+    findings: Findings, options: argparse.Namespace, minima: dict[str, float]
+) -> list[gate.Outcome]:
+    """Return whether a recording is sound, its limits, and what became worse."""
+    text = 'sound' if findings.is_sound else findings.faults[0]
+    outcomes = [gate.Outcome('sound', not findings.is_sound, text)]
+    if options.against:
+        reading = cli.reading_options(options)
+        old = check_recordings(options.against, options.params, reading=reading)
+        compared = gate.compare(findings, old.recordings[0], options.params, reading)
+        outcomes += compared
+    if findings.contents is not None:
+        outcomes += gate.limits(findings.contents, minima)
+    return outcomes
+
+
+def _gate_lines(outcomes: Sequence[Sequence[gate.Outcome]], against: str | None) -> list[str]:
+    """Return what was compared, a line each."""
+    lines = []
+    for rows in outcomes:
+        compared = [row for row in rows if row.name != 'sound']
+        if compared:
+            lines.append(f'against {against}' if against else 'limits')
+        for row in compared:
+            lines += wrapped(f'  {"WORSE" if row.is_worse else "ok":7} {row.name}: {row.text}', 10)
+    return [*lines, *[''] * bool(lines)]
 
 
 def _next_command(results: Sequence[Findings], options: argparse.Namespace) -> str:

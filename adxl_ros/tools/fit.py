@@ -9,10 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from adxl_ros.api.calibration import fit as fit_unit
+from adxl_ros.api.updating import PAGE as UPDATE_PAGE, update
 from adxl_ros.calibrate.calibration import STAGE_FITS
+from adxl_ros.calibrate.report import certificate_data
 from adxl_ros.calibrate.report.gum import SCHEMA_VERSION
 from adxl_ros.calibrate.report.page import PAGE
-from adxl_ros.files.calibration_store import default_folder
+from adxl_ros.errors import UserError
+from adxl_ros.files.calibration_store import default_folder, put
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 from adxl_ros.process import command
@@ -24,6 +27,9 @@ _EXAMPLES = {
         'sweep.csv -o unit.yaml --report report'
     ),
     'two sweeps of one unit, the linear model': 'one.mcap two.mcap --model linear -o unit.yaml',
+    'a calibration kept up to date by the days of a robot at work': (
+        '--update unit.yaml day1.mcap day2.mcap -o updated.yaml --report report'
+    ),
     'a further effect': 'sweep.csv --effect temperature_bias -o unit.yaml',
 }
 """Examples of arguments, by their purpose."""
@@ -39,6 +45,12 @@ def parser() -> argparse.ArgumentParser:
         default=None,
         help='values that are not fitted (default: the nominal sensor; what '
         'a file leaves out is measured)',
+    )
+    parse.add_argument(
+        '--update',
+        metavar='FILE',
+        help='keep this calibration up to date by the rests of the recordings, in the order of '
+        'time, as the node keep_calibrated does',
     )
     parse.add_argument(
         '--model',
@@ -66,7 +78,8 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--poses',
         metavar='FILE',
-        help='table with alpha_deg and beta_deg of each rest, in their order',
+        help='table with alpha_deg and beta_deg, or roll_deg and pitch_deg of an inclinometer, of '
+        'each rest: in their order, or between start_s and stop_s of the recording',
     )
     parse.add_argument(
         '--means',
@@ -86,6 +99,12 @@ def parser() -> argparse.ArgumentParser:
         metavar='FILE.xml',
         help='write a Digital Calibration Certificate of a calibration on a stage, '
         f'by the schema DCC {SCHEMA_VERSION} of PTB',
+    )
+    parse.add_argument(
+        '--dcc-data',
+        metavar='FILE.yaml',
+        help='what the certificate states of laboratory, customer, person and device; its keys: '
+        + ', '.join(certificate_data.DEFAULTS),
     )
     parse.add_argument(
         '--store',
@@ -109,11 +128,45 @@ def _details() -> str:
 _MEANS_RATE_HZ = 1.0  # Stamps of a table of means, which have no meaning
 
 
+def _update(options: argparse.Namespace) -> int:
+    """Replay recordings of a robot at work."""
+    of_a_fit = ('params', 'model', 'effect', 'prior', 'journal', 'poses', 'means', 'dcc', 'urdf')
+    given = [name for name in of_a_fit if getattr(options, name)]
+    if given:
+        raise UserError(f'--update: changes a calibration; leave --{given[0]} out')
+    cli.check_outputs(
+        options, options.output, options.report and Path(options.report, UPDATE_PAGE)
+    )
+    reading = cli.reading_options(options)
+    with cli.progress('fit') as show:
+        updated = update(
+            (cli.read('fit', path, reading) for path in options.recording),
+            options.update,
+            progress=show,
+        )
+    pages = []
+    if options.report:
+        pages.append(updated.report(options.report, overwrite=options.overwrite))
+    updated.save(options.output, overwrite=options.overwrite)
+    if updated.adoptions and options.store:
+        cli.note(f'fit: stored {put(options.store, updated.sensor)}')
+    cli.print_end(
+        [*updated.screen],
+        [options.output, *pages],
+        command('apply', f'NEW.mcap --params {cli.quoted(options.output)} -o tilt.csv'),
+    )
+    return 0
+
+
 def fit(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
+    if options.update:
+        return _update(options)
     cli.check_outputs(
         options, options.output, options.dcc, options.report and Path(options.report, PAGE)
     )
+    if options.dcc_data and not options.dcc:
+        raise UserError(f'--dcc-data {options.dcc_data}: needs --dcc with the certificate')
     if options.report or options.dcc:
         html_page.check_libraries()
     reading = cli.reading_options(options)
@@ -142,7 +195,7 @@ def fit(options: argparse.Namespace) -> int:
                 fitted.report(options.report, options.store, overwrite=options.overwrite)
             )
         if options.dcc:
-            fitted.certificate(options.dcc, overwrite=options.overwrite)
+            fitted.certificate(options.dcc, options.dcc_data, overwrite=options.overwrite)
             report.append(options.dcc)
     fitted.save(options.output, overwrite=options.overwrite)
     cli.note(f'fit: {fitted.keep(options.store)}')

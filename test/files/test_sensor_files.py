@@ -13,6 +13,8 @@ import pytest
 FILES = sorted((REPO / 'params').glob('*.yaml'))
 
 COMPLETE = [path for path in FILES if not parameter_file.load(path, may_measure=True).unstated]
+PLACE = r'\([^()]*(table|page|section|figure|not the sheet|not verified)[^()]*\)$'
+"""Where a figure stands in the sheet, or that it was not read there."""
 each_file = pytest.mark.parametrize('path', COMPLETE, ids=lambda path: path.stem)
 
 
@@ -21,7 +23,11 @@ def test_a_file_is_a_nominal_sensor_with_its_source(path):
     sensor = parameter_file.load(path)
     head = re.match('(#.*\n)+', path.read_text('utf-8'))[0]
     assert (sensor.model, sensor.serial, sensor.effects) == ('nominal', 'nominal', ())
-    assert re.search(r'Rev\. \w', head)
+    assert re.search(r'Rev\. \w+(.|\n)*?(\d{4}|not verified)', head), 'sheet, revision and date'
+    figures = re.findall('^#   .*', head, re.MULTILINE)
+    assert figures
+    for figure in figures:
+        assert re.search(PLACE, figure), f'{figure}: no place in the sheet'
     for typical, maximum in sensor.datasheet.values():
         assert maximum == 0 or typical <= maximum
 

@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The driver's life cycle within one process: a failed activation leaves nothing open."""
+"""Nodes within one process: a failed activation leaves nothing open; what counts as silence."""
 
 from collections.abc import Iterator
 import os
 import pty
+import time
 from types import SimpleNamespace
 
 from adxl_ros.errors import UserError
 from adxl_ros.links import serial as serial_link
 from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.nodes import topics
 from adxl_ros.nodes.driver import Driver
+from processes import wait_until
 import pytest
 import rclpy
 from rclpy.lifecycle import TransitionCallbackReturn
+from sensor_msgs.msg import Imu
 import serial
 
 
@@ -103,8 +107,32 @@ def test_a_failed_activation_leaves_no_link_open(
         assert driver.trigger_configure() == TransitionCallbackReturn.SUCCESS
     assert driver.trigger_activate() == TransitionCallbackReturn.SUCCESS
     assert not is_free(port)
-    assert driver.count_publishers('imu/data_raw') == 1
+    wait_until(lambda: driver.count_publishers('imu/data_raw') == 1, 5, 'one publisher')
     assert driver.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
     assert is_free(port)
     assert driver.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
-    assert driver.count_publishers('imu/data_raw') == 0
+    wait_until(lambda: driver.count_publishers('imu/data_raw') == 0, 5, 'no publisher')
+
+
+def test_the_time_in_which_a_node_was_held_up_is_no_silence(
+    ros_env: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rclpy.init(args=[])
+    node = rclpy.create_node('listener')
+    inbox = topics.Inbox(node, Imu, 'imu/data_raw', 10)
+    publisher = node.create_publisher(Imu, 'imu/data_raw', 10)
+
+    def received() -> list[bytes]:
+        publisher.publish(Imu())
+        return inbox.take()
+
+    wait_until(received, 10, 'a sample')
+    late_s = time.monotonic() + 60
+    monkeypatch.setattr(topics, 'time', SimpleNamespace(monotonic=lambda: late_s))
+    assert inbox.silence() == ''
+    late_s += 60
+    while inbox.take():
+        late_s += 60
+    assert 'nothing on /imu/data_raw for ' in inbox.silence()
+    node.destroy_node()
+    rclpy.shutdown()

@@ -182,6 +182,31 @@ def test_a_table_of_poses_is_the_reference(run_tool, tmp_path) -> None:
     )
 
 
+def test_a_table_of_an_inclinometer_names_its_rests(run_tool, tmp_path) -> None:
+    written(tmp_path, 'log.csv', plain_text([LOG.time_s, *LOG.output_g.T]))
+    starts = np.flatnonzero(np.diff(np.isfinite(LOG.angles_rad[:, 0]).astype(int), prepend=0) > 0)
+    alpha, beta = LOG.angles_rad[starts].T
+    x, y = np.sin(alpha) * np.cos(beta), -np.sin(alpha) * np.sin(beta)
+    roll, pitch = np.degrees([np.arctan2(y, np.cos(alpha)), np.arcsin(-x)])
+    rows = [
+        f'{LOG.time_s[start]:.3f},{LOG.time_s[start + 150]:.3f},{r:.4f},{p:.4f}'
+        for start, r, p in zip(starts, roll, pitch)
+    ]
+    command = 'fit', 'log.csv', '--columns', XYZ_G, '--poses', 'poses.csv', '-o', 'u.yaml'
+    head = 'start_s,stop_s,roll_deg,pitch_deg\n'
+    # Some rests are enough, in any number.
+    written(tmp_path, 'poses.csv', head + '\n'.join(rows[:24]) + '\n')
+    done = run_tool(*command)
+    assert done.returncode == 0, done.stderr
+    fitted = parameter_file.load(tmp_path / 'u.yaml')
+    assert fitted.provenance['reference'] == 'stage'
+    check_errors(tmp_path / 'u.yaml', 1e-2)
+    written(tmp_path, 'poses.csv', head + rows[0] + '\n9e3,9.1e3,0,0\n')
+    assert 'poses.csv: pose 2 is from 9000 to 9100 s, in which' in run_tool(*command).stderr
+    written(tmp_path, 'poses.csv', 'start_s,roll_deg,pitch_deg\n1,0,0\n')
+    assert 'has start_s; expected both start_s and stop_s' in run_tool(*command).stderr
+
+
 @pytest.mark.parametrize('angles', ['', 'alpha_deg,beta_deg'])
 def test_each_row_may_be_the_mean_of_a_rest(run_tool, tmp_path, angles) -> None:
     """Without the option the refusal names it; with it, the coefficients have an uncertainty."""

@@ -275,7 +275,13 @@ class Controller:
         if unit is None:
             return
         if session is not None:
-            if changes := differences(self.settings.head(session.unit), self.settings.head(unit)):
+            changes = differences(self.settings.head(session.unit), self.settings.head(unit))
+            if changes and session.unit.measured and not session.accepted_count:
+                self._stop('INFO', 'sensor_info has come: the calibration begins again with it')
+                self.stream.take(unit)
+                self.start(start_over=True)
+                return
+            if changes:
                 self._stop(
                     'ERROR',
                     f'sensor_info: {changes}: changed during the '

@@ -9,11 +9,12 @@ Squares of contributions add. Those of noise, coefficients, stage and model are 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from adxl_ros.calibrate.poses import Poses, reference_force
-from adxl_ros.calibrate.report import acceptance, held_out
+from adxl_ros.calibrate.report import acceptance, certificate_data, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.report.held_out import ErrorBudget
 from adxl_ros.calibrate.result import CalibrationResult, compare
@@ -24,7 +25,9 @@ from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.sensor import MARGIN_K, Sensor
 from adxl_ros.report import templates
 from adxl_ros.report.quantities import mg, number
+from adxl_ros.signals.rest_detection import MOST_BATCHES
 import numpy as np
+import scipy
 
 K = 2  # Coverage factor of an expanded uncertainty; about 95 % for a normal distribution
 _EARTH_HALF_RANGE_MPS2 = 0.027
@@ -33,6 +36,7 @@ _LOCAL_STD_MPS2 = 5e-4
 """Uncertainty of a stated local gravity, m/s². Chosen: 50 mGal, the size of gravity anomalies."""
 _NOT_LOCAL_MPS2 = (G0_MPS2, 9.8, 9.81)
 """Values of gravity that are those of no place in particular, m/s²."""
+_MANY = 1000  # Degrees of freedom beyond which nothing changes. Chosen: k is 1.96
 _UNIFORM = np.sqrt(3)  # Half-width of a uniform distribution divided by its standard deviation
 _SURROUNDINGS = {
     'temperature': ('temperature_c', 'K', MARGIN_K, 0.1),
@@ -71,6 +75,7 @@ class Input:
     std: Any  # Standard uncertainty, (k, m) or one for all
     unit: str  # Unit of `std`
     contribution_mps2: np.ndarray  # To the standard uncertainty of the acceleration, (k, m)
+    freedom: float = np.inf  # Degrees of freedom of `std`; infinite for type B
 
 
 class Decision(NamedTuple):
@@ -103,6 +108,12 @@ class Uncertainty:
         return np.asarray(np.sqrt(sum(row.contribution_mps2**2 for row in self.inputs)))
 
     @property
+    def freedom(self) -> np.ndarray:
+        """Return the effective degrees of freedom, (k, m) (Welch-Satterthwaite, GUM G.4.1)."""
+        shares = sum(row.contribution_mps2**4 / row.freedom for row in self.inputs)
+        return np.asarray(self.combined_mps2**4 / np.maximum(shares, np.finfo(float).tiny))
+
+    @property
     def worst(self) -> tuple[int, int]:
         """Return pose and axis of the largest combined uncertainty."""
         return divmod(int(np.argmax(self.combined_mps2)), self.error_mps2.shape[1])
@@ -126,12 +137,24 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
     error = errors.errors.accel_mps2[used]
     model = np.full(error.shape, np.sqrt(assessment.accel.model))
     inputs = (
-        Input('noise of the mean', 'A, normal', 1e3 * np.mean(held.std_v, axis=0), 'mV', by_noise),
         Input(
-            'coefficients', 'A, covariance of the fit', mg(by_coefficients), 'mg', by_coefficients
+            'noise of the mean',
+            'A, normal',
+            1e3 * np.mean(held.std_v, axis=0),
+            'mV',
+            by_noise,
+            MOST_BATCHES - 1,
+        ),
+        Input(
+            'coefficients',
+            'A, covariance of the fit',
+            mg(by_coefficients),
+            'mg',
+            by_coefficients,
+            max(int((~poses.check).sum()) * len(axes) - len(fitted.covariance_names), 1),
         ),
         _stage_angles(by_stage, assessment.accel.stage, fitted),
-        Input('model', 'A, held-out errors', mg(model), 'mg', model),
+        Input('model', 'A, held-out errors', mg(model), 'mg', model, error.size),
         _local_gravity(gravity, reference),
         *(_surroundings(name, fitted, held, reference) for name in _SURROUNDINGS),
         *_next_degree(fitted, held),
@@ -162,7 +185,9 @@ def _stage_angles(by_step_mps2: np.ndarray, scatter: float, fitted: Sensor) -> I
     scatter_mps2 = np.full(by_step_mps2.shape, scatter**0.5)
     std_rad = step_rad * excess or scatter**0.5 / fitted.local_gravity_mps2
     part_mps2 = by_step_mps2 * excess if step_rad else scatter_mps2
-    return Input(name, 'A, scatter of the poses', np.degrees(std_rad), '°', part_mps2)
+    return Input(
+        name, 'A, scatter of the poses', np.degrees(std_rad), '°', part_mps2, part_mps2.size
+    )
 
 
 def _local_gravity(gravity_mps2: float, reference_mps2: np.ndarray) -> Input:
@@ -203,13 +228,12 @@ def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray)
     values, environment = getattr(held, field), held.environment
     seen = values[np.isfinite(values)]
     half_range = margin + (np.ptp(seen) / 2 if seen.size else 0.0)
-    kind = (
-        'B, range of the poses'
-        if seen.size
-        else f'B, ±{margin:g} {unit}, not measured'
-        if margin
-        else 'not measured, taken as constant'
-    )
+    if seen.size:
+        kind = 'B, range of the poses'
+    elif margin:
+        kind = f'B, ±{margin:g} {unit}, not measured'
+    else:
+        kind = 'not measured, taken as constant'
     std = half_range / _UNIFORM
     inverse = signal_chain.inverse(fitted, np.where(np.cos(held.alpha_rad) < 0, -1, 1))
     shifted = [
@@ -257,21 +281,20 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
     for row in found.inputs:
         std = float(np.broadcast_to(row.std, found.error_mps2.shape)[found.worst])
         part_mg = float(mg(row.contribution_mps2[found.worst]))
-        sensitivity = (
-            '1'
-            if row.unit == 'mg'
-            else f'{number(part_mg / std if std else 0.0, digits=2)} mg per {row.unit}'
-        )
+        ratio = part_mg / std if std else 0.0
+        sensitivity = '1' if row.unit == 'mg' else f'{number(ratio, digits=2)} mg per {row.unit}'
         rows.append(
             [
                 row.name,
                 f'{number(std, digits=2)} {row.unit} ({row.kind})',
                 sensitivity,
                 f'{part_mg:.3f}',
+                f'{row.freedom:.0f}' if np.isfinite(row.freedom) else '∞',
             ]
         )
     expanded_mg = mg(K * found.combined_mps2)
     pose, axis = found.worst
+    freedom = float(found.freedom[pose, axis])
     alpha, beta = np.degrees([found.alpha_rad[pose], found.beta_rad[pose]])
     inside = np.abs(found.error_mps2) <= K * found.combined_mps2
     decisions = [
@@ -294,6 +317,8 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
         'decisions': decisions,
         'combined': f'{expanded_mg[pose, axis] / K:.3f} mg',
         'expanded': f'{expanded_mg[pose, axis]:.2f} mg',
+        'freedom': f'{freedom:.0f}' if freedom < _MANY else f'more than {_MANY}',
+        'factor': f'{scipy.stats.t.ppf(0.975, max(freedom, 1.0)):.2f}',
         'range': f'{expanded_mg.min():.2f} to {expanded_mg.max():.2f} mg',
         'inside': f'{int(inside.sum())} of {inside.size}',
     }
@@ -328,8 +353,14 @@ def _quantity(
     }
 
 
-def write(path: AnyPath, result: CalibrationResult) -> None:
-    """Write the certificate of a calibration against a stage, by the template of its elements."""
+def write(
+    path: AnyPath, result: CalibrationResult, data: Mapping[str, str] = certificate_data.DEFAULTS
+) -> None:
+    """
+    Write the certificate of a calibration against a stage, by the template of its elements.
+
+    data: what no recording shows, by the keys of `certificate_data`.
+    """
     found = uncertainty(result)
     if found is None:
         raise UserError(
@@ -346,6 +377,7 @@ def write(path: AnyPath, result: CalibrationResult) -> None:
             rule=RULE,
             method=f'{MEANING} {MODEL}',
             fitted=fitted,
+            data=data,
             provenance=fitted.provenance,
             step_deg=np.degrees(fitted.stage_resolution_rad),
             **_results(fitted, found),
@@ -353,29 +385,27 @@ def write(path: AnyPath, result: CalibrationResult) -> None:
     )
 
 
+def _decision(row: Decision, limit_name: str) -> dict[str, Any]:
+    """Return a comparison of an error with its limit."""
+    unit, factor = (_ACCELERATION, 1e-3 * G0_MPS2) if row.unit == 'mg' else (r'\degree', 1.0)
+    conditional = 'conditionalPass' if row.error <= row.limit else 'conditionalFail'
+    return {
+        'quantity': row.quantity,
+        'outcome': row.outcome,
+        'conformity': {PASS: 'pass', FAIL: 'fail'}.get(row.outcome, conditional),
+        'figures': [
+            _quantity(name, factor * value, unit, kind=kind)
+            for name, value, kind in (
+                ('error of the calibration', row.error, 'basic_measuredValue'),
+                ('guard band', row.guard_band, ''),
+                (f'limit by the {limit_name}', row.limit, 'basic_acceptanceLimitUpper'),
+            )
+        ],
+    }
+
+
 def _results(fitted: Sensor, found: Uncertainty) -> dict[str, list[Any]]:
     """Return decisions, errors, coefficients and conditions as quantities."""
-    decisions = [
-        {
-            'quantity': row.quantity,
-            'outcome': row.outcome,
-            'conformity': {PASS: 'pass', FAIL: 'fail'}.get(
-                row.outcome, 'conditionalPass' if row.error <= row.limit else 'conditionalFail'
-            ),
-            'figures': [
-                _quantity(name, factor * value, unit, kind=kind)
-                for name, value, kind in (
-                    ('error of the calibration', row.error, 'basic_measuredValue'),
-                    ('guard band', row.guard_band, ''),
-                    (f'limit by the {found.limit_name}', row.limit, 'basic_acceptanceLimitUpper'),
-                )
-            ],
-        }
-        for row in found.decisions
-        for unit, factor in [
-            (_ACCELERATION, 1e-3 * G0_MPS2) if row.unit == 'mg' else (r'\degree', 1.0)
-        ]
-    ]
     errors = [
         [
             _quantity('alpha', np.degrees(found.alpha_rad), r'\degree'),
@@ -402,25 +432,26 @@ def _results(fitted: Sensor, found: Uncertainty) -> dict[str, list[Any]]:
         ]
         for d, name in enumerate(fitted.axes)
     ]
-    coefficients = [
-        _quantity(
-            f'{row.label} {row.axis}',
-            factor * row.fitted,
-            unit,
-            factor * row.half_width / Z_90,
-            row.name,
-        )
-        for row in compare(fitted, fitted)
-        if row.unit in _UNITS
-        for unit, factor in [_UNITS[row.unit]]
-    ]
+    coefficients = []
+    for row in compare(fitted, fitted):
+        if row.unit in _UNITS:
+            unit, factor = _UNITS[row.unit]
+            coefficients.append(
+                _quantity(
+                    f'{row.label} {row.axis}',
+                    factor * row.fitted,
+                    unit,
+                    factor * row.half_width / Z_90,
+                    row.name,
+                )
+            )
     conditions = [_quantity('local gravity', fitted.local_gravity_mps2, _ACCELERATION)]
     conditions += [
         _quantity(f'{name} temperature', value + 273.15, r'\kelvin')
         for name, value in zip(('lowest', 'highest'), fitted.envelope.temperature_c or ())
     ]
     return {
-        'decisions': decisions,
+        'decisions': [_decision(row, found.limit_name) for row in found.decisions],
         'errors': errors,
         'coefficients': coefficients,
         'conditions': conditions,

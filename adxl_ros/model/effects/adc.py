@@ -350,11 +350,13 @@ _HIGHEST_RATIO = 10**-0.5
 """Highest corner divided by the sample rate; chosen: aliasing replaces the missing corners."""
 _PER_DECADE = 2
 """Corners per decade; chosen: the density is 1/f within 3 % up to a fifth of the sample rate."""
-_MATCHED = 0.02  # Frequency divided by the sample rate at which the density is exact; chosen
+_MATCHED = 0.02
+"""Frequency divided by the sample rate at which the density is exact; chosen: well below the fifth
+up to which it is 1/f."""
 
 
 @lru_cache(maxsize=8)
-def _flicker_filter(rate_hz: float) -> np.ndarray:
+def flicker_filter(rate_hz: float) -> np.ndarray:
     """
     Return the sections that make flicker noise of k = 1 from white noise, as `sosfilt` takes them.
 
@@ -412,7 +414,7 @@ def flicker(signals: Signals, p: Parameters) -> None:
     # scipy.signal takes 0.5 s to import.
     from scipy.signal import sosfilt
 
-    sections = _flicker_filter(1 / signals.dt_s)
+    sections = flicker_filter(1 / signals.dt_s)
     noise, signals.memory['state'] = sosfilt(
         sections,
         signals.rng.standard_normal(shape),

@@ -24,6 +24,7 @@ class Rig:
 
     def __init__(self, folder, mode=StageMode.COMMANDED, resume='ask', **changes):
         self.fault = self.silence_text = ''
+        self.unstated = np.zeros(0, np.int64), np.zeros((0, 3))  # Too few to measure the sensor
         self.log_lines, self.answers, self.withdrawn = [], [], []
         self.pose, self.angles_rad = None, (0.0, 0.0)
         self.now_ns = 1_700_000_000_000_000_000
@@ -72,8 +73,8 @@ class Rig:
         return self.silence_text
 
     def waiting(self):
-        """Return no samples: they are too few to measure the sensor."""
-        return np.zeros(0, np.int64), np.zeros((0, 3))
+        """Return the samples that show a sensor which nothing states."""
+        return self.unstated
 
     def keep_newest(self, count=None):
         """Keep all waiting samples, as there are few, or none."""
@@ -252,6 +253,20 @@ def test_a_capture_has_its_answer_when_its_pose_is_on_disk_or_refused(rig):
     assert bench.controller.status().text == bench.fault
     bench.silence_text = 'nothing on imu/data_raw for 4 s'
     assert bench.controller.status().phase is Phase.SILENT
+
+
+def test_a_sensor_info_that_comes_late_begins_the_calibration_again(rig):
+    """The samples of 3 s were taken for those of a sensor that states nothing."""
+    bench = rig()
+    stamps_ns = bench.now_ns + 5_000_000 * np.arange(600)
+    noise_mps2 = np.random.default_rng(1).normal(0, [0.01, 0.01, 0], (600, 3))
+    bench.unstated = stamps_ns, noise_mps2 + [9.8, 0, 0]
+    bench.controller.start()
+    bench.turn_until(lambda: bench.controller.session is not None)
+    assert bench.controller.session.unit.measured
+    bench.say_info()
+    assert not bench.controller.session.unit.measured and not bench.lines('ERROR')
+    bench.turn_until(lambda: bench.controller.session.accepted_count == 1)
 
 
 def test_another_sensor_ends_the_session_and_a_restarted_driver_checks_the_mounting(rig):

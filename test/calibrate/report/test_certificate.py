@@ -9,7 +9,8 @@ from xml.etree import ElementTree
 
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits.full_model import TERMS
-from adxl_ros.calibrate.report import gum, held_out
+from adxl_ros.calibrate.report import certificate_data, gum, held_out
+from adxl_ros.errors import UserError
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.kinematics import specific_force
@@ -98,6 +99,35 @@ def test_the_table_adds_up_and_has_the_numbers_of_the_error_budget(found):
         == ('PASS', 'PASS')
     )
     assert accel.error + accel.guard_band <= accel.limit
+
+
+def test_degrees_of_freedom(found):
+    """They are at least those of the part with the fewest, and infinite without type A."""
+    _, table = found
+    assert [np.isfinite(row.freedom) for row in table.inputs[:2]] == [True, True]
+    assert (table.freedom >= min(row.freedom for row in table.inputs) - 1e-9).all()
+    certain = replace(table, inputs=tuple(replace(row, freedom=np.inf) for row in table.inputs))
+    assert (certain.freedom > 1e9).all()
+    section = gum.section(table)
+    assert 1.95 < float(section['factor']) < 2.2
+
+
+def test_a_certificate_states_what_the_laboratory_says(found, tmp_path):
+    path = tmp_path / 'lab.yaml'
+    path.write_text('laboratory_name: Lab & Sons\nlaboratory_country: DE\nstage: no. 7\n')
+    gum.write(tmp_path / 'cert.xml', found[0], certificate_data.read(path))
+    validate(tmp_path / 'cert.xml')
+    texts = [element.text for element in ElementTree.parse(tmp_path / 'cert.xml').iter()]
+    assert texts.count('Lab & Sons') == 1
+    assert texts.count('DE') == 2
+    assert any((text or '').endswith('certificate: no. 7') for text in texts)
+    for text, message in (
+        ('labratory_name: x\n', 'lab.yaml:1:1: labratory_name: unknown key'),
+        ('person: x\ncustomer_country: Germany\n', "lab.yaml:2:1: customer_country: 'Germany'"),
+    ):
+        path.write_text(text)
+        with pytest.raises(UserError, match=message):
+            certificate_data.read(path)
 
 
 def test_the_stage_knows_on_which_side_of_90_degrees_a_pose_is(found):

@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+A gate for logs: what became worse from one recording to another, and which limits are missed.
+
+Something counts as worse if the interval of its change excludes no change. Intervals have such a
+level that all of them together call chance worse in one of a hundred comparisons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+import os
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from adxl_ros.api.sensors import as_input, SensorInput
+from adxl_ros.errors import UserError
+from adxl_ros.files import recording as recording_files
+from adxl_ros.files.atomic_write import write_text
+from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
+from adxl_ros.files.recording_columns import recorded_unit
+from adxl_ros.model.constants import AXES
+from adxl_ros.report.quantities import mg
+from adxl_ros.signals.findings import Findings, RecordingContents
+from adxl_ros.signals.gyroscope_at_rest import rows_at_rest
+from adxl_ros.signals.recorded_sensor import load_sensor
+from adxl_ros.signals.rest_detection import RecordedRests
+import numpy as np
+import scipy
+
+KINDS = ('sound', 'gaps', 'rate', 'noise', 'zero-g', 'rests')
+"""What may fail: whether a recording is sound, and what is compared with an earlier one."""
+_CHANCE = 0.01  # Probability that chance alone is called worse in a comparison of two recordings
+_INTERVALS = 7  # Intervals that share it: gaps, noise of three axes, zero-g, rests, and rate
+_FEWEST_PARTS = 10  # Parts of the rests whose scatter is known within a quarter
+_FEWEST_POSES = 3  # Orientations that show a change of the zero-g. Chosen: one for each axis
+_SAME_RATE = 0.99  # Ratio of two rates of one setting: oscillators of sensors differ by 1 %
+MINIMA = ('samples', 'span_s', 'rate_hz', 'rest_share', 'longest_rest_s', 'rests', 'poses')
+"""Numbers of a recording that may have a minimum, as `check --json` names them."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One comparison, or one limit."""
+
+    name: str  # One of `KINDS`, or the number that has a minimum
+    is_worse: bool
+    text: str  # Figures, for people
+    # Interval of the ratio to the other recording, or of the change for the zero-g, m/s²; none
+    # where nothing was compared
+    interval: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class _AtRest:
+    """A recording at rest."""
+
+    log_std: np.ndarray  # Logarithm of the deviation of a sample by part and axis, (k, m)
+    departure_mps2: np.ndarray  # Length of each rest less gravity, m/s², (k,); none without z
+
+
+def limits(contents: RecordingContents, minima: Mapping[str, float]) -> list[Outcome]:
+    """Compare numbers of a recording with their minima."""
+    outcomes = []
+    for name, smallest in minima.items():
+        value = float(getattr(contents, name))
+        text = f'{value:.4g}, expected {smallest:.4g} at least'
+        outcomes.append(Outcome(name, value < smallest, text))
+    return outcomes
+
+
+def compare(
+    new: Findings,
+    old: Findings,
+    sensor: SensorInput | None = None,
+    reading: ReadingOptions = AS_IT_IS,
+) -> list[Outcome]:
+    """
+    Compare a recording with an earlier one of the same task.
+
+    Parameters
+    ----------
+    new, old
+        What `check` found of both, each of a file.
+    sensor
+        The sensor, as for `check`.
+    reading
+        How the files are read.
+
+    Returns
+    -------
+    list of Outcome
+        One for each of `KINDS` but the first; none where the new one cannot be read.
+
+    Raises
+    ------
+    UserError
+        The earlier recording cannot be read.
+
+    """
+    if old.contents is None:
+        raise UserError(f'{old.path}: {old.faults[0]}')
+    if new.contents is None:
+        return []
+    now, before = (_at_rest(each.path, sensor, reading) for each in (new, old))
+    return [
+        _events('gaps', new.contents, old.contents, 'gaps'),
+        _rate(new.contents, old.contents),
+        _noise(now, before),
+        _zero_g(now, before),
+        _events('rests', new.contents, old.contents, 'rests'),
+    ]
+
+
+def _events(name: str, new: RecordingContents, old: RecordingContents, field: str) -> Outcome:
+    """Compare how often something happens, as events of chance; fewer rests are worse."""
+    counts = [int(getattr(each, field)) for each in (new, old)]
+    text = ', before '.join(
+        f'{count} in {each.span_s:.4g} s' for count, each in zip(counts, (new, old))
+    )
+    if not sum(counts):
+        return Outcome(name, False, text)
+    # Of all events, the share of the new recording is binomial (Clopper and Pearson 1934).
+    share = scipy.stats.binomtest(counts[0], sum(counts)).proportion_ci(1 - _CHANCE / _INTERVALS)
+    exposure = old.span_s / new.span_s
+    low, high = (
+        exposure * value / (1 - value) if value < 1 else np.inf
+        for value in (share.low, share.high)
+    )
+    is_worse = high < 1 if field == 'rests' else low > 1
+    return Outcome(name, is_worse, f'{text}: {_ratio(low, high)}', (low, high))
+
+
+def _rate(new: RecordingContents, old: RecordingContents) -> Outcome:
+    ratio = new.rate_hz / old.rate_hz
+    # The first and the last stamp of each recording scatter by its jitter.
+    std = float(np.hypot(*(np.sqrt(2) * each.jitter_s / each.span_s for each in (new, old))))
+    width = -float(scipy.stats.norm.ppf(_CHANCE / _INTERVALS / 2)) * std
+    text = f'{new.rate_hz:.5g} Hz, before {old.rate_hz:.5g} Hz'
+    interval = ratio * (1 - width), ratio * (1 + width)
+    return Outcome('rate', interval[1] < _SAME_RATE, text, interval)
+
+
+def _noise(new: _AtRest, old: _AtRest) -> Outcome:
+    """Compare the deviation of a sample; the axis that became worst counts."""
+    axes = min(new.log_std.shape[1], old.log_std.shape[1])
+    if min(len(new.log_std), len(old.log_std)) < _FEWEST_PARTS or not axes:
+        return Outcome('noise', False, 'not compared: too little rests in one of both')
+    found = []
+    for axis in range(axes):
+        low, high = np.exp(_change(new.log_std[:, axis], old.log_std[:, axis]))
+        found.append((float(low), float(high), AXES[axis]))
+    low, high, axis_name = max(found)
+    return Outcome('noise', low > 1, f'{axis_name}: {_ratio(low, high)}', (low, high))
+
+
+def _zero_g(new: _AtRest, old: _AtRest) -> Outcome:
+    """Compare by how much the length of rests departs from gravity."""
+    if min(len(new.departure_mps2), len(old.departure_mps2)) < _FEWEST_POSES:
+        return Outcome(
+            'zero-g', False, f'not compared: needs three axes and {_FEWEST_POSES} rests in both'
+        )
+    low, high = _change(np.abs(new.departure_mps2), np.abs(old.departure_mps2))
+    now_mg, before_mg = (float(mg(np.mean(np.abs(each.departure_mps2)))) for each in (new, old))
+    text = (
+        f'length of gravity off by {now_mg:.3g} mg, before {before_mg:.3g} mg: change '
+        f'{float(mg(low)):.3g} to {float(mg(high)):.3g} mg'
+    )
+    return Outcome('zero-g', low > 0, text, (low, high))
+
+
+def _change(new: np.ndarray, old: np.ndarray) -> tuple[float, float]:
+    """Return the interval of the difference of two means (Welch 1947)."""
+    interval = scipy.stats.ttest_ind(new, old, equal_var=False).confidence_interval(
+        1 - _CHANCE / _INTERVALS
+    )
+    return float(interval.low), float(interval.high)
+
+
+def _ratio(low: float, high: float) -> str:
+    return f'{low:.3g} to {high:.3g} times'
+
+
+def _at_rest(path: str, sensor: SensorInput | None, reading: ReadingOptions) -> _AtRest:
+    """Return noise and lengths over the rests of a recording."""
+    read = recording_files.read(path, reading)
+    unit = recorded_unit(load_sensor(as_input(sensor), read), read)
+    rests = RecordedRests(unit, read)
+    rests.feed(read)
+    rests.take()
+    accel_mps2, found = read.accel_mps2(unit), rests.detected
+    samples = [accel_mps2[rows_at_rest(read.time_s, each.rest)] for each in found]
+    count = -(-_FEWEST_PARTS // max(len(samples), 1))
+    parts = [part for each in samples for part in np.array_split(each, count) if len(part) > 1]
+    std = np.array([part.std(axis=0) for part in parts]).reshape(len(parts), -1)
+    lengths = [float(np.linalg.norm(each.mean(axis=0))) for each in samples]
+    has_length = len(read.axes) == len(AXES)
+    return _AtRest(
+        np.log(np.maximum(std, np.finfo(float).tiny)),
+        np.array(lengths if has_length else []) - unit.local_gravity_mps2,
+    )
+
+
+def as_json(outcome: Outcome) -> dict[str, Any]:
+    """Return an outcome as JSON; an end that is not finite is null."""
+    ends = [end if np.isfinite(end) else None for end in outcome.interval or ()]
+    return {
+        'name': outcome.name,
+        'worse': outcome.is_worse,
+        'text': outcome.text,
+        'interval': ends or None,
+    }
+
+
+def write_junit(
+    path: str | os.PathLike,
+    results: Sequence[tuple[Findings, Sequence[Outcome]]],
+    fail_on: Sequence[str],
+) -> None:
+    """
+    Write the outcomes as a report of JUnit: a suite for each recording, a case for each outcome.
+
+    fail_on: names of outcomes that fail; of others a case is skipped where it is worse.
+    """
+    root = ElementTree.Element('testsuites', name='adxl_ros check')
+    for findings, outcomes in results:
+        suite = ElementTree.SubElement(root, 'testsuite', name=Path(findings.path).name)
+        failures = 0
+        for outcome in outcomes:
+            case = ElementTree.SubElement(
+                suite, 'testcase', name=outcome.name, classname=findings.path
+            )
+            if outcome.is_worse:
+                is_failure = outcome.name in fail_on
+                failures += is_failure
+                kind = 'failure' if is_failure else 'skipped'
+                ElementTree.SubElement(case, kind, message=outcome.text)
+        suite.set('tests', str(len(outcomes)))
+        suite.set('failures', str(failures))
+    ElementTree.indent(root)
+    text = ElementTree.tostring(root, encoding='unicode', xml_declaration=True)
+    write_text(path, text + '\n')
