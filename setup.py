@@ -106,5 +106,10 @@ setup(
     maintainer_email='adxl-ros-maintainers@users.noreply.github.com',
     description='Driver, calibration and compensation of low-g analog MEMS accelerometers',
     license='Apache-2.0',
-    entry_points={'console_scripts': scripts()},
+    entry_points={
+        'console_scripts': scripts(),
+        f'{PACKAGE}.commands': [
+            f'benchmark = {PACKAGE}_validation.benchmark_command:main',
+        ],
+    },
 )

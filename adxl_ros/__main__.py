@@ -4,6 +4,7 @@
 
 import ast
 from importlib import import_module
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 import os
 from pkgutil import iter_modules, resolve_name
@@ -17,11 +18,14 @@ _NODES = (
     'stage',
     'calibration',
     'compensation',
+    'keep_calibrated',
     'investigate',
     'monitor',
     'screen',
 )
 """What needs ROS 2."""
+_COMMANDS = 'adxl_ros.commands'
+"""Entry points by which another package adds a command."""
 
 
 def main() -> int:
@@ -29,8 +33,14 @@ def main() -> int:
     is_module = os.path.basename(sys.argv[0]) == '__main__.py'
     os.environ[STARTED_BY] = f'python3 -m {ONE_COMMAND}' if is_module else ONE_COMMAND
     name = sys.argv[1] if len(sys.argv) > 1 else '--help'
-    package = 'tools' if name in _tools() else 'nodes' if name in _NODES else ''
-    if not package:
+    if further := entry_points(group=_COMMANDS, name=name):
+        sys.argv = [name, *sys.argv[2:]]
+        return next(iter(further)).load()()
+    if name in _tools():
+        package = 'tools'
+    elif name in _NODES:
+        package = 'nodes'
+    else:
         return _answer(name)
     if package == 'nodes' and find_spec('rclpy') is None:
         print(
@@ -66,6 +76,7 @@ def _help() -> list[str]:
         *(f'  {name:10}{about}' for name, about in _tools().items()),
         '',
         f'with ROS 2 also: {", ".join(_NODES)}',
+        f'by other packages: {", ".join(entry_points(group=_COMMANDS).names) or "none"}',
         '',
         f'{ONE_COMMAND} TOOL --help shows options and examples.',
     ]

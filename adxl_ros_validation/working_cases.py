@@ -11,7 +11,7 @@ A case that has been looked at is a development case: draw a fresh seed for a sc
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 import json
@@ -28,11 +28,10 @@ from adxl_ros_validation.blind.grading import Answer
 from adxl_ros_validation.blind.ideal_observer import (
     beyond_calibration,
     Bracket,
-    bracket,
     IdealObserver,
     line,
-    noise_visibility,
     rms,
+    told_apart,
 )
 from adxl_ros_validation.blind.report import reliability, terminal_table
 from adxl_ros_validation.blind.simulator import Fault, G0, Scene
@@ -49,9 +48,6 @@ _DIGITS = {**simulator.DIGITS, 'shift_m': 8}
 """Digits of the columns of a recording."""
 _NOTICED = 1.05
 """Ratio of true and stated noise from which a verdict may name the noise, too."""
-_DISTINCT = 1e-4
-"""Smallest length of a unit vector beside others that still is another direction. Chosen: far
-above rounding."""
 _HARM = 0.01
 """Smallest harm, as a share of the mean square before."""
 
@@ -176,21 +172,14 @@ def limit(case: Case) -> Bracket:
     """
     known = {name: world.KINDS[name] for name in world.LISTED}
     observer = IdealObserver(case.scene, known)
-    rivals = observer.rivals()
     faults = [fault for fault in case.faults if fault.kind is not world.COLOUR]
-    left_by_rivals: list[float] = []
+    changes = []
     for fault, row in zip(faults, case.label.faults):
         change = case.scene.response([fault], coarse=True)
         if row['calibrated']:
             change = change - _straight_line(change, observer.force)
-        if fault.kind.random:
-            left_by_rivals.append(noise_visibility(observer, fault.kind, change))
-            continue
-        # The other causes are there in any case; one of them, or none, is in place of this one.
-        others = [f.kind.name for f in faults if f is not fault and not f.kind.random]
-        beside = np.hstack([rivals[name] for name in others] or [np.zeros((0, 0))])
-        left_by_rivals += _left(observer.project(change), beside, rivals, fault.kind.name)
-    return bracket(left_by_rivals)
+        changes.append(change)
+    return told_apart(observer, faults, changes)
 
 
 def _straight_line(change: np.ndarray, force: np.ndarray) -> np.ndarray:
@@ -198,22 +187,6 @@ def _straight_line(change: np.ndarray, force: np.ndarray) -> np.ndarray:
     return np.array(
         [np.polyval(line(along, row)[::-1], along) for row, along in zip(change, force)]
     )
-
-
-def _left(
-    vector: np.ndarray, beside: np.ndarray, rivals: Mapping[str, np.ndarray], truth: str
-) -> list[float]:
-    """Return the squares that no cause, and each rival beside others, leave of a vector."""
-    fixed = np.linalg.qr(beside)[0] if beside.size else np.zeros((len(vector), 0))
-    rest = vector - fixed @ (fixed.T @ vector)
-    left = [float(rest @ rest)]
-    for name, columns in rivals.items():
-        if name == truth:
-            continue
-        basis, sizes, _ = np.linalg.svd(columns - fixed @ (fixed.T @ columns), full_matrices=False)
-        basis = basis[:, sizes > _DISTINCT]
-        left.append(float(rest @ rest - np.sum((basis.T @ rest) ** 2)))
-    return left
 
 
 def limits(seed: int, number: int, only: str | None) -> tuple[tuple[str, Bracket | None]]:

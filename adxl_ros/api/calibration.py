@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -404,7 +405,8 @@ class _Unit:
 
     def assumed(self, effects: Sequence[str]) -> list[str]:
         """Return what was assumed of temperature and supply, which effects follow."""
-        return [line for each in self._surroundings for line in each.interpolated(effects)]
+        lines = [each.interpolated(effects) for each in self._surroundings]
+        return list(chain.from_iterable(lines))
 
     @property
     def measured(self) -> Sequence[str]:

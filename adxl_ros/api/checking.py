@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 import os
 from pathlib import Path
 import textwrap
@@ -195,7 +196,7 @@ class Check(Result):
     @property
     def faults(self) -> tuple[str, ...]:
         """Return why recordings are not sound, one line each."""
-        return tuple(fault for result in self.recordings for fault in result.faults)
+        return tuple(chain.from_iterable(result.faults for result in self.recordings))
 
     @property
     def screen(self) -> list[str]:

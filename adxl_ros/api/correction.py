@@ -205,11 +205,8 @@ def _gyro_columns(block: Recording, gyro: Gyroscope) -> dict[str, np.ndarray]:
 
 def _columns(estimates: Estimates) -> dict[str, np.ndarray]:
     """Return the columns of a table of estimates, (n,) each."""
-    columns = {
-        f'a{axis}{name}_mps2': values
-        for name, force in (('', estimates.force_mps2), ('_std', estimates.force_std_mps2))
-        for axis, values in zip(AXES, force)
-    }
+    columns = {f'a{axis}_mps2': force for axis, force in zip(AXES, estimates.force_mps2)}
+    columns |= {f'a{axis}_std_mps2': std for axis, std in zip(AXES, estimates.force_std_mps2)}
     for names in (('roll', 'pitch', 'inclination'), ('alpha', 'beta')):
         columns |= {f'{name}_rad': getattr(estimates.tilt, name) for name in names}
         columns |= {f'{name}_std_rad': getattr(estimates.tilt, f'{name}_std') for name in names}

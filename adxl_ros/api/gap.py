@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 import os
 from pathlib import Path
 import shlex
@@ -178,11 +179,12 @@ class Gap(Result):
         """Return a DataFrame with a row for each parameter of each effect of the verdict."""
         from pandas import DataFrame
 
-        rows = [
-            (effect.name, name, *parameter, effect.probability, effect.share)
-            for effect in self.effects
-            for name, parameter in effect.parameters.items()
-        ]
+        rows = []
+        for effect in self.effects:
+            rows += [
+                (effect.name, name, *parameter, effect.probability, effect.share)
+                for name, parameter in effect.parameters.items()
+            ]
         return DataFrame(
             rows, columns=['effect', 'parameter', *FoundParameter._fields, 'probability', 'share']
         )
@@ -314,8 +316,8 @@ def _stored(name: str, otherwise: str) -> str:
 
 def _command(recordings: Sequence[str], given: Mapping[str, str]) -> str:
     """Return the command of a diagnosis; options without a value are left out."""
-    options = [word for option in given.items() if option[1] for word in option]
-    return command('diagnose', shlex.join([*recordings, *options]))
+    options = {name: value for name, value in given.items() if value}
+    return command('diagnose', shlex.join([*recordings, *chain.from_iterable(options.items())]))
 
 
 def diagnose(
@@ -401,7 +403,8 @@ def diagnose(
     if prior:
         baseline, remark = _with_prior(baseline, prior)
         remarks.append(remark)
-    remarks += [f'assumed: {text}' for each in read for text in assumed(each, baseline.effects)]
+    for each in read:
+        remarks += [f'assumed: {text}' for text in assumed(each, baseline.effects)]
     diagnosis = core.diagnose(
         read, baseline, motion, seed, lambda stage, done: progress(done, stage), align, material
     )

@@ -94,7 +94,8 @@ def calibrate(
         ]
         poses = poses.subset(~at_rail)
     doubts = require_unit(of_volts(poses.volts, poses.std_v, sensor), source, True)
-    doubts += [fault for recording in recordings for fault in recording.faults]
+    for recording in recordings:
+        doubts += recording.faults
     if poses.has_angles.any():
         with_angles = [
             replace(recording, poses=recording.poses.subset(recording.poses.has_angles))
@@ -187,19 +188,14 @@ def _against_stage(
         fit_lines += filter_lines
     error_mps2 = np.nan_to_num(np.sqrt(assessment.accel.calibration)).item() if assessment else 0.0
     fitted = replace(fitted, envelope=envelope(fitted, force, poses, error_mps2))
-    fitted = with_provenance(
-        fitted,
-        source,
-        poses,
-        data_sha256,
-        {
-            'reference': 'stage',
-            **({'prior': population.name} if population else {}),
-            'residual_mg': f'{np.sqrt(np.mean(residual_mg**2)):.4f}',
-            **({'converged': 'yes' if full.converged else 'no'} if full else {}),
-            **acceptance.provenance_entries(assessment, errors, doubts),
-        },
-    )
+    entries = {'reference': 'stage'}
+    if population:
+        entries['prior'] = population.name
+    entries['residual_mg'] = f'{np.sqrt(np.mean(residual_mg**2)):.4f}'
+    if full:
+        entries['converged'] = 'yes' if full.converged else 'no'
+    entries |= acceptance.provenance_entries(assessment, errors, doubts)
+    fitted = with_provenance(fitted, source, poses, data_sha256, entries)
     summary = acceptance.summary_lines(
         fitted, assessment, acceptance.held_out_lines(errors, len(poses) - len(outliers))
     )

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import datetime, timezone
 import hashlib
+from itertools import product
 
 from adxl_ros.calibrate.fits.extrapolation import next_degree, NextDegree
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
@@ -353,6 +354,6 @@ def history(newest: Sensor, stored: Sequence[Sensor]) -> tuple[list[str], list[l
         'id',
         'model',
         'temperature, °C',
-        *(f'{label} {axis}' for label in ('zero-g', 'scale factor') for axis in newest.axes),
+        *map(' '.join, product(('zero-g', 'scale factor'), newest.axes)),
     ]
     return head, rows

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from math import exp
 from typing import NamedTuple
 
@@ -292,7 +293,9 @@ class LiveEstimator:
         force = self._inverse(volts)
         if force is None:
             return None
-        saturated = any(abs(v - rail) < self._half_lsb_v for v in volts for rail in self._rails_v)
+        saturated = any(
+            abs(v - rail) < self._half_lsb_v for v, rail in product(volts, self._rails_v)
+        )
         unknown = UNMEASURED_VARIANCE if saturated else 0.0
         motion = self._motion_variance(force, time_s) + unknown
         cell = self._cell(force)

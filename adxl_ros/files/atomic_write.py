@@ -114,7 +114,7 @@ def _refuse_folder_of_others(path: Path) -> None:
     """Refuse to replace a folder that holds anything but a bag, unless this package wrote it."""
     if not path.is_dir() or is_own(path):
         return
-    of_bag = {each for pattern in _BAG_FILES for each in path.glob(pattern)}
+    of_bag = set(chain.from_iterable(map(path.glob, _BAG_FILES)))
     kept = [each.name for each in path.iterdir() if each not in of_bag]
     if kept:
         raise UserError(

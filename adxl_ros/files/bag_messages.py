@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from itertools import chain, islice, pairwise
 import os
 from pathlib import Path
 import struct
@@ -174,11 +174,10 @@ def write_messages(writer: Any, batches: Sequence[Batch]) -> None:
     size = sum(batch.data.shape[1] + _MESSAGE_HEAD.itemsize for batch in batches)
     stamps = batches[0].stamp_ns
     for begin, end in pairwise([*stamps[:: max(_CHUNK_BYTES // size, 1)], stamps[-1] + 1]):
-        parts = [
-            Batch(connection, stamp_ns[part], data[part])
-            for connection, stamp_ns, data in batches
-            for part in [slice(*np.searchsorted(stamp_ns, (begin, end)))]
-        ]
+        parts = []
+        for connection, stamp_ns, data in batches:
+            within = slice(*np.searchsorted(stamp_ns, (begin, end)))
+            parts.append(Batch(connection, stamp_ns[within], data[within]))
         _write_chunk(writer, [part for part in parts if len(part.data)])
 
 
@@ -266,8 +265,7 @@ class Bag:
         # Topics that hold messages, each with its type
         self.types = {
             (connection.topic, connection.msgtype)
-            for storage in storages
-            for connection in storage.connections
+            for connection in chain.from_iterable(storage.connections for storage in storages)
             if connection.msgcount
         }
         self.done = 0.0  # Fraction of the recording that has been read

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping
 from functools import partial
+from itertools import chain
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
@@ -215,7 +216,7 @@ def series(
             name: np.concatenate(
                 [part.get(name, np.full(len(log), np.nan)) for part, log in zip(columns, logs)]
             )[order]
-            for name in dict.fromkeys(name for part in columns for name in part)
+            for name in dict.fromkeys(chain.from_iterable(columns))
         },
     )
 

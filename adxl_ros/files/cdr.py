@@ -169,16 +169,11 @@ def tables(raws: Sequence[bytes] | np.ndarray, find: Callable[[bytes], Layout]) 
         groups = [(np.arange(len(raws)), raws)]
     else:
         sizes = np.array([len(raw) for raw in raws])
-        groups = [
-            (
-                rows,
-                np.frombuffer(b''.join([raws[i] for i in rows.tolist()]), np.uint8).reshape(
-                    len(rows), size
-                ),
-            )
-            for size in dict.fromkeys(sizes.tolist())
-            for rows in [np.flatnonzero(sizes == size)]
-        ]
+        groups = []
+        for size in dict.fromkeys(sizes.tolist()):
+            rows = np.flatnonzero(sizes == size)
+            joined = b''.join([raws[i] for i in rows.tolist()])
+            groups.append((rows, np.frombuffer(joined, np.uint8).reshape(len(rows), size)))
     for rows, data in groups:
         while len(rows):
             layout = find(data[0].tobytes())

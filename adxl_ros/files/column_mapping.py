@@ -302,7 +302,9 @@ _SPELLINGS = {
     'f': '°f degf fahrenheit',
     'k': 'kelvin',
 }
-_ALIASES = {word: name for name, words in _SPELLINGS.items() for word in words.split()}
+_ALIASES: dict[str, str] = {}
+for _name, _words in _SPELLINGS.items():
+    _ALIASES |= dict.fromkeys(_words.split(), _name)
 """Names of units by their other spellings, in lower case, with _ for a blank."""
 
 _BRACKETS = re.compile(r'[(\[{]\s*([^()\[\]{}]+?)\s*[)\]}]')

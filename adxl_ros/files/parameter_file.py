@@ -19,7 +19,7 @@ from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Role
 from adxl_ros.model.gyroscope import AXES as GYRO_AXES, Gyroscope
-from adxl_ros.model.sensor import Envelope, names_of, neutral, Sensor
+from adxl_ros.model.sensor import coefficients_of, Envelope, neutral, Sensor
 import numpy as np
 import yaml
 
@@ -465,9 +465,7 @@ class _FlatReader:
     ) -> tuple[np.ndarray, tuple[Coefficient, ...]]:
         """Return the covariance, (k, k), symmetric and positive, and its k coefficients."""
         key, names = 'covariance', self._names('covariance_names')
-        coefficients = {
-            str(name): name for effect in effects for name in names_of(effect_named(effect), axes)
-        }
+        coefficients = {str(name): name for name in coefficients_of(effects, axes)}
         for name in names:
             self._require(
                 name in coefficients,

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
@@ -114,6 +114,18 @@ def _track(time_s: np.ndarray, values: np.ndarray) -> Track:
     return time_s, values[known][first]
 
 
+def _poses_in(message: Any, kind: str, root: str) -> list[tuple]:
+    """Return header, moving frame, place and turn of odometry, or of the root in transforms."""
+    if kind == _ODOMETRY:
+        pose = message.pose.pose
+        return [(message.header, message.child_frame_id, pose.position, pose.orientation)]
+    return [
+        (each.header, each.child_frame_id, each.transform.translation, each.transform.rotation)
+        for each in message.transforms
+        if each.child_frame_id.strip('/') == root
+    ]
+
+
 def _base(bag: Bag, root: str, epoch_ns: int) -> Track | None:
     """Return the pose of the base by odometry, or else by tf; None where neither moves it."""
     store, kinds = typestore(), dict(sorted(bag.types))
@@ -123,27 +135,13 @@ def _base(bag: Bag, root: str, epoch_ns: int) -> Track | None:
     ]
     # Stamps and poses by topic and the frame that moves
     moving: dict[tuple[str, str], tuple[list[int], list[list[float]]]] = {}
-    for topic, raw in ((name, raw) for name in topics for raw in bag.messages(name)):
-        message = store.deserialize_cdr(raw, kinds[topic])
-        for header, child, place, turn in (
-            [
-                (
-                    message.header,
-                    message.child_frame_id,
-                    message.pose.pose.position,
-                    message.pose.pose.orientation,
-                )
-            ]
-            if odometry
-            else [
-                (t.header, t.child_frame_id, t.transform.translation, t.transform.rotation)
-                for t in message.transforms
-                if t.child_frame_id.strip('/') == root
-            ]
-        ):
-            stamps, poses = moving.setdefault((topic, child.strip('/') or root), ([], []))
-            stamps.append(header.stamp.sec * 1_000_000_000 + header.stamp.nanosec)
-            poses.append([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
+    for topic in topics:
+        for raw in bag.messages(topic):
+            message = store.deserialize_cdr(raw, kinds[topic])
+            for header, child, place, turn in _poses_in(message, kinds[topic], root):
+                stamps, poses = moving.setdefault((topic, child.strip('/') or root), ([], []))
+                stamps.append(header.stamp.sec * 1_000_000_000 + header.stamp.nanosec)
+                poses.append([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
     moving = {key: track for key, track in moving.items() if np.ptp(track[1], axis=0).any()}
     if not moving:
         return None

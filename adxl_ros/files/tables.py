@@ -199,9 +199,9 @@ def _open_ulog(path: str, topic: str) -> Table:
         f'{data.name}_{data.multi_id}' if data.multi_id else str(data.name): data
         for data in log.data_list
     }
-    accelerations = [
-        name for kind in _MAPPINGS for name in messages if messages[name].name == kind
-    ]
+    accelerations = []
+    for kind in _MAPPINGS:
+        accelerations += [name for name, data in messages.items() if data.name == kind]
     raw = [
         each for each in accelerations if messages[each].name == messages[accelerations[0]].name
     ]

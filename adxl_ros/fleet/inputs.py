@@ -271,14 +271,12 @@ def _manifest_rows(text: str, fs: Any, path: str) -> list[dict[str, str]] | None
 
             content = parquet.ParquetFile(file)
             names = [name for name in _MANIFEST_COLUMNS if name in content.schema_arrow.names]
-            return (
-                [
-                    {name: '' if value is None else str(value) for name, value in row.items()}
-                    for row in content.read(names).to_pylist()
-                ]
-                if 'url' in names
-                else None
-            )
+            if 'url' not in names:
+                return None
+            return [
+                {name: '' if value is None else str(value) for name, value in row.items()}
+                for row in content.read(names).to_pylist()
+            ]
     except UserError:
         raise
     except Exception:

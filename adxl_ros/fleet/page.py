@@ -309,16 +309,13 @@ def _outlier_rows(
     table: fleet.FleetTable, results: Sequence[fleet.QuantityResult]
 ) -> list[dict[str, str]]:
     """Return the recordings that are far from others of their unit, the farthest first."""
-    outliers = [
-        (
-            float(result.distance[i]),
-            result.rows[i],
-            result.quantity,
-            result.quantity.factor * result.recordings.value[i],
-        )
-        for result in results
-        for i in np.flatnonzero(result.is_outlier)
-    ]
+    outliers = []
+    for result in results:
+        values = result.quantity.factor * result.recordings.value
+        outliers += [
+            (float(result.distance[i]), result.rows[i], result.quantity, values[i])
+            for i in np.flatnonzero(result.is_outlier)
+        ]
     outliers.sort(key=lambda item: -item[0])
     return [
         {

@@ -31,6 +31,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate, chain
 from typing import NamedTuple
 
 from adxl_ros.model.constants import MAD_TO_STD, TINY
@@ -477,7 +478,8 @@ def bad_batch(
     serials: Sequence[str], level: np.ndarray, tolerance: float, tests: int
 ) -> BadBatch | None:
     """Return the most certain batch whose level differs by more than a tolerance."""
-    counts = Counter(name[:length] for name in serials for length in range(1, len(name) + 1))
+    prefixes = chain.from_iterable(map(accumulate, serials))
+    counts = Counter(prefixes)
     batches: dict[bytes, tuple[str, np.ndarray]] = {}  # By their members, with the shortest prefix
     for prefix in sorted(counts, key=len):
         # The larger part of a fleet is what the others are compared with.

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
 import hashlib
+from itertools import product
 import json
 import math
 from pathlib import Path
@@ -64,6 +65,18 @@ _ENDS = (
     ('_low', ': lower end of the 90 % interval'),
     ('_high', ': upper end of the 90 % interval'),
 )
+_FITTED = (
+    ('zero_g', 'v', 'fitted zero-g', 'V'),
+    ('zero_g_std', 'v', 'standard deviation of the zero-g', 'V'),
+    ('scale', 'v_per_g', 'fitted scale factor', 'V/g'),
+    ('scale_std', 'v_per_g', 'standard deviation of the scale factor', 'V/g'),
+)
+_GAP = (
+    ('before', 'rms of recording minus simulation', 'm/s²'),
+    ('after', 'rms with the named effects, on held-out blocks', 'm/s²'),
+    ('floor', 'noise floor; without an interval if assumed', 'm/s²'),
+    ('closed', 'closed share of the squared gap above the floor', ''),
+)
 
 
 COLUMNS: tuple[Column, ...] = (
@@ -102,31 +115,17 @@ COLUMNS: tuple[Column, ...] = (
             f'{meaning}{note}, axis {axis}',
             unit,
         )
-        for letter, meaning, unit_name, unit in NOISE
-        for end, note in _ENDS
-        for axis in AXES
+        for (letter, meaning, unit_name, unit), (end, note), axis in product(NOISE, _ENDS, AXES)
     ),
     *(
         Column(f'{name}_{axis}_{unit_name}', 'float', f'{meaning}, axis {axis}', unit)
-        for name, unit_name, meaning, unit in (
-            ('zero_g', 'v', 'fitted zero-g', 'V'),
-            ('zero_g_std', 'v', 'standard deviation of the zero-g', 'V'),
-            ('scale', 'v_per_g', 'fitted scale factor', 'V/g'),
-            ('scale_std', 'v_per_g', 'standard deviation of the scale factor', 'V/g'),
-        )
-        for axis in AXES
+        for (name, unit_name, meaning, unit), axis in product(_FITTED, AXES)
     ),
     Column('fit_model', 'text', 'model that was fitted'),
     Column('fit_poses', 'integer', 'poses that were fitted'),
     *(
         Column(f'gap_{name}{end}{"_mps2" * bool(unit)}', 'float', f'{meaning}{note}', unit)
-        for name, meaning, unit in (
-            ('before', 'rms of recording minus simulation', 'm/s²'),
-            ('after', 'rms with the named effects, on held-out blocks', 'm/s²'),
-            ('floor', 'noise floor; without an interval if assumed', 'm/s²'),
-            ('closed', 'closed share of the squared gap above the floor', ''),
-        )
-        for end, note in _ENDS
+        for (name, meaning, unit), (end, note) in product(_GAP, _ENDS)
     ),
     Column('gap_floor_source', 'text', 'where the floor is from: still, repeats or assumed'),
     Column(

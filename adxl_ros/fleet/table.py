@@ -21,6 +21,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from itertools import chain
 from typing import NamedTuple
 
 from adxl_ros.errors import UserError
@@ -108,11 +109,9 @@ def read(path: AnyPath) -> FleetTable:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    numbers = [
-        name
-        for quantity in quantities(None)
-        for name in (quantity.column, *quantity.error_columns)
-    ]
+    numbers = []
+    for quantity in quantities(None):
+        numbers += [quantity.column, *quantity.error_columns]
     try:
         frame = pq.read_table(path, columns=[*_TEXTS, *_OTHERS, *numbers]).to_pandas()
     except (OSError, KeyError, pa.ArrowException) as error:
@@ -276,7 +275,7 @@ def effect_matrix(table: FleetTable) -> pd.DataFrame:
     """
     used = np.isin(table['status'].astype(str), _VERDICTS) & (table.unit >= 0) & table.first
     frame, unit = table.frame[used], table.unit[used]
-    counts = Counter(name for names in frame['effects'] for name in names)
+    counts = Counter(chain.from_iterable(frame['effects']))
     effects = sorted(counts, key=lambda name: (-counts[name], name))
     has = pd.DataFrame(
         [[name in names for name in effects] for names in frame['effects']],

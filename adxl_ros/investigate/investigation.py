@@ -154,12 +154,14 @@ def rank(
     only the manoeuvres can show, too.
     """
     seen = {v.effect for v in model.variants} if model else set()
-    considered = {e for h in next_experiment.leading(hypotheses) for e in h.effects}
+    leading = next_experiment.leading(hypotheses)
+    considered = set(chain.from_iterable(h.effects for h in leading))
     needed = sorted(considered | (set(library()) - seen))
     responses = [
         next_experiment.predict(m.name, m.motion, m.begin_s, sensor, needed) for m in manoeuvres
     ]
-    excited = {v.effect for response in responses for v in response.linear_model.variants}
+    variants = chain.from_iterable(response.linear_model.variants for response in responses)
+    excited = {v.effect for v in variants}
     # Effects that the samples could not show keep their prior odds over no gap.
     weights = {h.effects: h.probability for h in hypotheses}
     unseen = weights.get((), 0.0) * (1 / max(len(excited | seen), 1))

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 from adxl_ros.simulate.motion import Motion
@@ -136,6 +137,17 @@ class Manoeuvre(NamedTuple):
 
 _APPROACH_DEG = 20.0
 """Distance from which a pose is approached, degrees. Chosen: beyond every backlash."""
+
+
+def _approaches(beta_deg: float) -> list[tuple]:
+    """Return the moves that approach a pose from both sides of each joint."""
+    moves = []
+    for d_alpha, d_beta in ((0, -1), (0, 1), (-1, 0), (1, 0)):
+        beside = 60 + d_alpha * _APPROACH_DEG, beta_deg + d_beta * _APPROACH_DEG
+        moves += [('rest', *beside, 0.5), ('rest', 60, beta_deg, 3.0)]
+    return moves
+
+
 CATALOGUE = {
     'rests_upright': Manoeuvre(
         'rests',
@@ -191,8 +203,7 @@ CATALOGUE = {
             ('rest', 90, 0, 1.0),
             *(
                 ('turn', 'beta', to_rad, share)
-                for share in (1.0, 0.5, 0.25)
-                for to_rad in (np.pi, 0.0)
+                for share, to_rad in product((1.0, 0.5, 0.25), (np.pi, 0.0))
             ),
         ],
     ),
@@ -209,15 +220,7 @@ CATALOGUE = {
     'poses_from_both_sides': Manoeuvre(
         'reversals',
         'approach the same poses from both sides of each joint',
-        [
-            move
-            for beta_deg in (45, 225)
-            for d_alpha, d_beta in ((0, -1), (0, 1), (-1, 0), (1, 0))
-            for move in (
-                ('rest', 60 + d_alpha * _APPROACH_DEG, beta_deg + d_beta * _APPROACH_DEG, 0.5),
-                ('rest', 60, beta_deg, 3.0),
-            )
-        ],
+        [*_approaches(45), *_approaches(225)],
     ),
     'long_rests': Manoeuvre(
         'long rests',

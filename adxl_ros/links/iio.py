@@ -385,12 +385,10 @@ def _inputs(device: Any) -> list[Any]:
 def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, Any]:
     """Return the channels of a device by role."""
     inputs, order = _inputs(device), [*axes, base.SUPPLY, base.TEMPERATURE]
-    named = {
-        name: channel
-        for channel in reversed(inputs)
-        for name in (channel.name, _label(channel), channel.id)
-        if name
-    }
+    named: dict[str, Any] = {}
+    for channel in reversed(inputs):
+        names = channel.name, _label(channel), channel.id
+        named |= dict.fromkeys(filter(None, names), channel)
     if not entries and set(axes) <= set(named):
         entries = [role for role in order if role in named]
     elif not entries:

@@ -220,13 +220,13 @@ class EmulatedSensor(base.Link):
         if self._mixture:
             return base.Level.ERROR, self._mixture
         if self._newest_ns is None or time.monotonic() - self._heard_s > _SILENT_S:
-            return base.Level.WARN, f'{topic}: ' + (
-                'waiting for a sample'
-                if self._publishers is None
-                else 'no samples; is the simulation paused?'
-                if self._publishers
-                else 'nobody publishes it; start the simulator, or set link.topic'
-            )
+            if self._publishers is None:
+                reason = 'waiting for a sample'
+            elif self._publishers:
+                reason = 'no samples; is the simulation paused?'
+            else:
+                reason = 'nobody publishes it; start the simulator, or set link.topic'
+            return base.Level.WARN, f'{topic}: {reason}'
         if self._chain is None or sensor is None:
             return base.Level.WARN, f'{topic}: measuring the rate'
         return base.Level.OK, f'emulates {self._unit.serial} on {topic} at {sensor.rate_hz:.6g} Hz'

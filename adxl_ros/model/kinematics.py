@@ -142,7 +142,7 @@ class Tilt:
 def tilt(force: Components, covariance: np.ndarray, measures_z: bool = True) -> Tilt:
     """Return the angles of forces at rest, (n,), with a covariance, (m/s²)², (3, 3, n)."""
     force = [np.asarray(f, float) for f in force]
-    components = tuple(covariance[i, j] for i in range(3) for j in range(i, 3))
+    components = tuple(covariance[np.triu_indices(3)])
     with np.errstate(over='ignore', invalid='ignore'):
         roll, pitch, inclination, beta = (
             _shown(angle, variance) for angle, variance in angles(force, components, ARRAYS)

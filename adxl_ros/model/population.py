@@ -48,22 +48,19 @@ class Population:
 
     def prior(self, sensor: Sensor) -> Prior:
         """Return the prior of a unit's departures from its nominal values."""
-        rows = [
-            (Coefficient(effect, parameter, axis), pooled.mean - value, pooled.prediction_std)
-            for effect, parameter, column, nominal in (
-                ('bias', 'offset_v', 'zero_g_{}_v', sensor.nominal_zero_g_v),
-                (
-                    'scale_factor',
-                    'offset_v_per_g',
-                    'scale_{}_v_per_g',
-                    sensor.nominal_scale_v_per_g,
-                ),
-            )
-            for axis, value in zip(sensor.axes, nominal.tolist())
-            if (pooled := self.coefficients.get(column.format(axis)))
-        ]
-        mean, std = np.array([row[1:] for row in rows]).reshape(-1, 2).T
-        return Prior(tuple(name for name, *_ in rows), mean, std)
+        zero_g_v, scale_v_per_g = sensor.nominal_zero_g_v, sensor.nominal_scale_v_per_g
+        names, departures = [], []
+        for effect, parameter, column, nominal in (
+            ('bias', 'offset_v', 'zero_g_{}_v', zero_g_v),
+            ('scale_factor', 'offset_v_per_g', 'scale_{}_v_per_g', scale_v_per_g),
+        ):
+            for axis, value in zip(sensor.axes, nominal.tolist()):
+                pooled = self.coefficients.get(column.format(axis))
+                if pooled:
+                    names.append(Coefficient(effect, parameter, axis))
+                    departures.append((pooled.mean - value, pooled.prediction_std))
+        mean, std = np.array(departures).reshape(-1, 2).T
+        return Prior(tuple(names), mean, std)
 
 
 class Prior(NamedTuple):

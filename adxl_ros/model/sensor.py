@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, MISSING, replace
-from itertools import compress
+from itertools import chain, compress
 from typing import Any
 
 from adxl_ros.errors import UserError
@@ -385,14 +385,18 @@ def to_nominal_mps2(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
     return (volts - sensor.nominal_zero_g_v) / sensor.nominal_scale_v_per_g * G0_MPS2
 
 
+def coefficients_of(effects: Iterable[str], axes: str) -> list[Coefficient]:
+    """Name the coefficients of effects, effect by effect."""
+    return list(chain.from_iterable(names_of(effect_named(name), axes) for name in effects))
+
+
 def names_of(effect: Effect, axes: str) -> tuple[Coefficient, ...]:
     """Name the coefficients of an effect: by parameter, for those measured axes that it has."""
-    return tuple(
-        Coefficient(effect.name, p.name, axis)
-        for p in effect.parameters
-        for axis in (axes if p.axes else ('',))
-        if axis in p.axes
-    )
+    names = []
+    for p in effect.parameters:
+        owners = axes if p.axes else ('',)
+        names += [Coefficient(effect.name, p.name, axis) for axis in owners if axis in p.axes]
+    return tuple(names)
 
 
 def fitted_of(effect: Effect, axes: str) -> tuple[Coefficient, ...]:

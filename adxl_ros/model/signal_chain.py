@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
+import itertools
 from typing import Any
 import zlib
 
@@ -180,7 +181,7 @@ class Chain:
         return [effect.memory for effect in self._running()]
 
     def _running(self) -> list[RunningEffect]:
-        return [effect for effects in self.effects.values() for effect in effects]
+        return list(itertools.chain.from_iterable(self.effects.values()))
 
     def through_adc(self, input_v: Components) -> Components:
         """Return volts behind the ADC's effects, by measured axis, without its steps."""
@@ -486,5 +487,8 @@ def at_a_rail(volts: np.ndarray, sensor: Sensor) -> np.ndarray:
     """
     rails_v = 0.0, sensor.adc_vref_v - sensor.lsb_v
     return np.logical_or.reduce(
-        [np.abs(axis_v - rail_v) < sensor.lsb_v / 2 for axis_v in volts.T for rail_v in rails_v]
+        [
+            np.abs(axis_v - rail_v) < sensor.lsb_v / 2
+            for axis_v, rail_v in itertools.product(volts.T, rails_v)
+        ]
     )

@@ -330,13 +330,8 @@ class DisplayPublisher:
     def _publish(self, phase: Phase, text: str) -> None:
         controller, stream = self._controller, self._controller.stream
         unit, session, newest = stream.unit, controller.session, stream.newest
-        keys = (
-            ()
-            if phase is Phase.FIT
-            else _KEYS.get(
-                controller.state, _BY_HAND if controller.settings.operator_captures else _RUNNING
-            )
-        )
+        usual = _BY_HAND if controller.settings.operator_captures else _RUNNING
+        keys = () if phase is Phase.FIT else _KEYS.get(controller.state, usual)
         coefficients: list[screen_contents.Row] = []
         if session is not None:
             rows, coefficients = session.rows()

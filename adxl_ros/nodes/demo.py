@@ -104,12 +104,11 @@ def _poses(journal: Path) -> tuple[int, list[sweep_journal.PoseRecord]]:
     """Return how many poses are accepted, and those of the fit, once everything is written."""
     with suppress(UserError):
         entries = sweep_journal.read(journal).entries
-        return len(sweep_journal.accepted_poses(entries)), [
-            pose
-            for entry in entries
-            if isinstance(entry, sweep_journal.Fitted)
-            for pose in entry.rests or ()
-        ]
+        fitted: list = []
+        for entry in entries:
+            if isinstance(entry, sweep_journal.Fitted):
+                fitted += entry.rests or ()
+        return len(sweep_journal.accepted_poses(entries)), fitted
     return 0, []
 
 

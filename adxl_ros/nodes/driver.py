@@ -135,14 +135,13 @@ class Driver(LifecycleNode):
     def _refuse_silent_simulation(self) -> None:
         """Refuse a driver of a real unit without a link: no real unit gets simulated data."""
         given, serial = [*parameters.given_below(self, LINK)], self._sensor.serial
-        reason = (
-            f'{LINK}{given[0]} is given'
-            if given
-            else f'the sensor is the unit {serial}'
-            if serial != NO_UNIT
-            else ''
-        )
-        if reason and 'type' not in given:
+        if given:
+            reason = f'{LINK}{given[0]} is given'
+        elif serial != NO_UNIT:
+            reason = f'the sensor is the unit {serial}'
+        else:
+            return
+        if 'type' not in given:
             devices = [name for name in base.link_names() if name != base.DEFAULT_LINK]
             raise parameter_error(
                 'link.type',

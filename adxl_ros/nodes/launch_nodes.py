@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 import sys
 from typing import Any, NamedTuple
@@ -57,13 +57,11 @@ class Argument(NamedTuple):
         """Return the value of the parameter."""
         default = self.spec.default
         # A list of numbers has a unit; names with commas stay one text.
-        convert = (
-            _numbers
-            if default == () and self.spec.unit
-            else type(default)
-            if isinstance(default, int | float)
-            else str
-        )
+        convert: Callable = str
+        if default == () and self.spec.unit:
+            convert = _numbers
+        elif isinstance(default, int | float):
+            convert = type(default)
         try:
             return convert(text)
         except ValueError:
@@ -260,7 +258,7 @@ def static_transform(context: LaunchContext) -> list[Action]:
             package='tf2_ros',
             executable=executable,
             ros_arguments=_enclave(context, executable),
-            arguments=[part for option in options for part in option],
+            arguments=[*chain.from_iterable(options)],
         )
     ]
 

@@ -343,14 +343,9 @@ class Monitor(Node):
     def _status(self) -> Status:
         """Return the state for /diagnostics, with counts."""
         summary, axes = self._state()
-        values = {
-            **summary.values,
-            **{
-                f'{axis}_{key}': value
-                for axis, status in axes.items()
-                for key, value in status.values.items()
-            },
-        }
+        values = {**summary.values}
+        for axis, status in axes.items():
+            values |= {f'{axis}_{key}': value for key, value in status.values.items()}
         values |= {
             **self._live.counts,
             'diagnosis_runs': self._run is not None,

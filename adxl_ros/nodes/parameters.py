@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, fields, is_dataclass
 from difflib import get_close_matches
 from importlib import import_module
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 import re
 import sys
@@ -122,9 +122,8 @@ def specs_of(settings: Any) -> list[Spec]:
 
 def node_specs(module: ModuleType) -> list[Spec]:
     """Return the parameters that the dataclasses of a node's file declare."""
-    return [
-        spec for value in vars(module).values() if is_dataclass(value) for spec in specs_of(value)
-    ]
+    declaring = filter(is_dataclass, vars(module).values())
+    return list(chain.from_iterable(map(specs_of, declaring)))
 
 
 def link_specs(link: str) -> list[Spec]:
@@ -271,13 +270,11 @@ def declare(node: Node, spec: Spec) -> Any:
     except ParameterException:
         given = given_parameters(node).get(name)
         expected = ', '.join(filter(None, (kind.name, spec.limits, spec.unit)))
-        hint = (
-            f'; write {given}.0'
-            if kind == Kind.DOUBLE and isinstance(given, int)
-            else f"""; write '{name}:="{given}"'"""
-            if kind == Kind.STRING
-            else ''
-        )
+        hint = ''
+        if kind == Kind.DOUBLE and isinstance(given, int):
+            hint = f'; write {given}.0'
+        elif kind == Kind.STRING:
+            hint = f"""; write '{name}:="{given}"'"""
         raise parameter_error(name, f'{given!r} is refused; expected {expected}{hint}') from None
     if value is None:
         _show(node, spec, None)

@@ -60,7 +60,8 @@ def _parameter_groups(name: str, own: Iterable[Spec]) -> Iterator[tuple[str, lis
 
 def _help(spec: Spec) -> str:
     """Return type, default, meaning and limits of a parameter."""
-    kind = _TYPES[spec.kind] if spec.default != () else 'floats' if spec.unit else 'texts'
+    of_list = 'floats' if spec.unit else 'texts'
+    kind = of_list if spec.default == () else _TYPES[spec.kind]
     default = '' if isinstance(spec.default, Kind) else _value_text(spec.default)
     limits = f' ({spec.limits})' if spec.limits else ''
     return f'{kind}{default and f", {default}"}: {spec.meaning}{limits}'.replace('%', '%%')

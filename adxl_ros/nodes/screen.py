@@ -89,16 +89,17 @@ def draw(contents: ScreenContents, log: Iterable[Styled], columns: int, rows: in
         body += _styled('', [text] if len(text) <= width else wrap(text, width))
     if not contents.outcome:
         body += _styled('', _coefficients(contents.coefficients, width))
-    messages = [line for style, text in log for line in _styled(style, wrap(text, width))]
+    messages = []
+    for style, text in log:
+        messages += _styled(style, wrap(text, width))
     messages = messages[-_FEW_LINES:]
     # A small terminal keeps the keys and the first lines, which say what to do.
     room = max(rows - len(messages) - 1, _LEAST_LINES)
     body = [*body, *[('', '')] * room][:room]
-    keys = [(key.key, key.action) for key in contents.keys] + [('q', 'quit')]
-    return [
-        *([(style, line[:width])] for style, line in (*body, *messages)),
-        [part for key, action in keys for part in (('reverse', f' {key} '), ('', f' {action}  '))],
-    ]
+    keys = []
+    for key, action in (*((key.key, key.action) for key in contents.keys), ('q', 'quit')):
+        keys += [('reverse', f' {key} '), ('', f' {action}  ')]
+    return [*([(style, line[:width])] for style, line in (*body, *messages)), keys]
 
 
 def _styled(style: str, lines: Iterable[str]) -> list[Styled]:

@@ -72,8 +72,9 @@ def number(value: float, signed: bool = False, digits: int = 3) -> str:
         if abs(rounded) >= 100
         else np.format_float_positional(abs(rounded), trim='-')
     )
-    sign = '\N{MINUS SIGN}' if rounded < 0 else '+' if signed and rounded > 0 else ''
-    return sign + text
+    if rounded < 0:
+        return '\N{MINUS SIGN}' + text
+    return '+' + text if signed and rounded > 0 else text
 
 
 def signed(value: float) -> str:
@@ -88,8 +89,11 @@ def two_digits(value: float) -> str:
 
 def three_digits(value: float) -> str:
     """Return a positive value with three digits at most, without an exponent."""
-    places = 1 if value >= 10 else 2 if value >= 1 else 3
-    return f'{value:.{places}f}' if value >= 5e-4 else '< 0.001'
+    if value >= 10:
+        return f'{value:.1f}'
+    if value >= 1:
+        return f'{value:.2f}'
+    return f'{value:.3f}' if value >= 5e-4 else '< 0.001'
 
 
 def short_time(seconds: float) -> str:
@@ -119,7 +123,9 @@ def mg_text(value_mps2: float) -> str:
     value = float(mg(value_mps2))
     if abs(value) < _SMALLEST_MG:
         return '< 0.01 mg'
-    return f'{value:.{2 if abs(value) < 10 else 1 if abs(value) < 100 else 0}f} mg'
+    if abs(value) < 10:
+        return f'{value:.2f} mg'
+    return f'{value:.1f} mg' if abs(value) < 100 else f'{value:.0f} mg'
 
 
 def acceleration_text(value_mps2: float) -> str:
@@ -189,9 +195,10 @@ def _for_people(values: np.ndarray, unit: str, scale_v_per_g: float) -> tuple[np
     per = per.replace('^2', '²').replace('sqrt(', '√').replace(')', '')
     largest = float(np.abs(values).max())
     if base in ('g', 'm', 's', 'V', '1') and 0 < largest < 0.1:
-        factor = 1e6 if largest < 1e-4 else 1e2 if base == '1' else 1e3
+        if base == '1':
+            factor, base = (1e6, 'ppm') if largest < 1e-4 else (1e2, '%')
+        else:
+            factor, prefix = (1e6, 'µ') if largest < 1e-4 else (1e3, 'm')
+            base = prefix + base
         values = factor * values
-        base = (
-            {1e6: 'ppm', 1e2: '%'}[factor] if base == '1' else {1e6: 'µ', 1e3: 'm'}[factor] + base
-        )
     return values, (base + slash + per).removeprefix('1' if not per else '')

@@ -112,9 +112,13 @@ def end_lines(
     took_s: float | None = None,
 ) -> list[str]:
     """Return the end of what a tool prints: result, files and what to do next."""
-    lines = [part for line in result for part in wrapped(line, 2) or ['']]
+    lines = []
+    for line in result:
+        lines += wrapped(line, 2) or ['']
     if files:
-        took = '' if took_s is None else f'  ({took_s:.0f} s)' if took_s >= 1 else '  (< 1 s)'
+        took = ''
+        if took_s is not None:
+            took = f'  ({took_s:.0f} s)' if took_s >= 1 else '  (< 1 s)'
         lines += wrapped(
             f' {"wrote":{_LABEL_COLUMNS - 1}}{"  ".join(files)}{took}', _LABEL_COLUMNS
         )
@@ -158,14 +162,14 @@ def bar(stream: TextIO, *columns: str | int, transient: bool = True) -> Any:
         from rich import console, progress
     except ImportError:
         return None
-    drawn = [
-        progress.BarColumn(column)
-        if isinstance(column, int)
-        else getattr(progress, column)()
-        if column.isidentifier()
-        else progress.TextColumn(column, markup=False)
-        for column in ('{task.description}', *columns)
-    ]
+    drawn: list[Any] = []
+    for column in ('{task.description}', *columns):
+        if isinstance(column, int):
+            drawn.append(progress.BarColumn(column))
+        elif column.isidentifier():
+            drawn.append(getattr(progress, column)())
+        else:
+            drawn.append(progress.TextColumn(column, markup=False))
     screen = console.Console(file=stream, highlight=False, markup=False, emoji=False)
     return progress.Progress(*drawn, console=screen, transient=transient)
 

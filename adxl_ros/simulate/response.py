@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Hashable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from math import ceil
 from typing import Any
 
@@ -116,6 +117,7 @@ class Response:
     def _key(self, *places: Place) -> tuple:
         """Return what the chain up to the element depends on, with effects of some places."""
         sensor = self.sensor
+        effects = chain.from_iterable(self._chain.effects[place] for place in places)
         return (
             self._motion,
             self._begin_s,
@@ -123,7 +125,7 @@ class Response:
             sensor.local_gravity_mps2,
             sensor.adc_vref_v,
             *sensor.nominal_scale_v_per_g.tolist(),
-            *(effect.key for place in places for effect in self._chain.effects[place]),
+            *(effect.key for effect in effects),
         )
 
     def _instants(self, stamps_s: np.ndarray) -> np.ndarray:
@@ -187,11 +189,13 @@ class Response:
         stamps_s = self._begin_s + (self._done_steps + np.arange(count)) * self._step_s
         signals = self._chain.signals(NOMINAL_ENVIRONMENT, time_s=stamps_s, dt_s=self._dt_s)
         places = [Place.REFERENCE]
+        # Without an effect that follows it, the rotation of a robot is not computed.
+        rotates = bool(self._motion.force and self._chain.effects[Place.FORCE])
         for place in (Place.CLOCK, Place.STAGE, Place.FORCE, Place.MOUNTING, Place.ELEMENT):
             places.append(place)
             signals = self._kept(
                 place.name,
-                (*self._key(*places), self._done_steps, count),
+                (*self._key(*places), rotates, self._done_steps, count),
                 partial(self._through, place, signals),
             )
         return replace(signals)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 import math
 from typing import NamedTuple
 
@@ -28,6 +28,10 @@ _DRAWN_FORMS = 6
 """Draws of the numbers of a kind that states no list for them. Chosen: run time."""
 _RECOGNISABLE_SAMPLE = 7.0
 """Squared visibility of one repeated sample; chosen."""
+
+_DISTINCT = 1e-4
+"""Smallest length of a unit vector beside others that still is another direction. Chosen: far
+above rounding."""
 
 
 def beyond_calibration(unit: Unit, change: np.ndarray, force: np.ndarray) -> np.ndarray:
@@ -241,6 +245,39 @@ def bracket(left_by_rivals: Iterable[float]) -> Bracket:
     """
     confused = [1 - separation_probability(squares) for squares in left_by_rivals]
     return Bracket(max(1 - sum(confused), 0.0), 1 - max(confused))
+
+
+def told_apart(
+    observer: IdealObserver, faults: Sequence[Fault], changes: Sequence[np.ndarray]
+) -> Bracket:
+    """Return how probably the observer names all of some faults, by what each changes, m/s²."""
+    rivals = observer.rivals()
+    left_by_rivals: list[float] = []
+    for fault, change in zip(faults, changes):
+        if fault.kind.random:
+            left_by_rivals.append(noise_visibility(observer, fault.kind, change))
+            continue
+        # The other causes are there in any case; one of them, or none, is in place of this one.
+        others = [f.kind.name for f in faults if f is not fault and f.kind.name in rivals]
+        beside = np.hstack([rivals[name] for name in others] or [np.zeros((0, 0))])
+        left_by_rivals += _left(observer.project(change), beside, rivals, fault.kind.name)
+    return bracket(left_by_rivals)
+
+
+def _left(
+    vector: np.ndarray, beside: np.ndarray, rivals: Mapping[str, np.ndarray], truth: str
+) -> list[float]:
+    """Return the squares that no cause, and each rival beside others, leave of a vector."""
+    fixed = np.linalg.qr(beside)[0] if beside.size else np.zeros((len(vector), 0))
+    rest = vector - fixed @ (fixed.T @ vector)
+    left = [float(rest @ rest)]
+    for name, columns in rivals.items():
+        if name == truth:
+            continue
+        basis, sizes, _ = np.linalg.svd(columns - fixed @ (fixed.T @ columns), full_matrices=False)
+        basis = basis[:, sizes > _DISTINCT]
+        left.append(float(rest @ rest - np.sum((basis.T @ rest) ** 2)))
+    return left
 
 
 def noise_visibility(observer: IdealObserver, kind: Kind, change: np.ndarray) -> float:

@@ -87,6 +87,13 @@ class Half:
             ]
         )
 
+    @property
+    def known(self) -> np.ndarray:
+        """Return where the reference is known, (n,)."""
+        if self.reference != 'rests':
+            return np.ones(len(self.columns), bool)
+        return self.columns['alpha_rad'].notna().to_numpy()
+
     def texts(self) -> tuple[str, str, str | None]:
         """Return recording, parameters and another simulator's force as texts of files."""
         return (
@@ -142,7 +149,7 @@ def prepare(source: Path) -> tuple[list[Half], list[str]]:
                 raise UserError('no such file; the manifest has its address')
             if digest and hashlib.sha256(path.read_bytes()).hexdigest() != digest:
                 raise UserError('is not the file whose SHA-256 the manifest has')
-            halves.append(_half(path))
+            halves.append(later_part(path))
         except UserError as error:
             left_out.append(f'{path.name}: {error}')
     if not halves:
@@ -185,7 +192,7 @@ def _part(columns: pd.DataFrame | None, start: float, stop: float) -> pd.DataFra
     return part.assign(time_s=part['time_s'] - start)
 
 
-def _half(path: Path) -> Half:
+def later_part(path: Path) -> Half:
     """
     Make the parameters of the first part of a recording, and the reference of the later one.
 
@@ -330,13 +337,8 @@ def plans(halves: Sequence[Half], seed: int, count: int) -> list[Plan]:
 def draw(halves: Sequence[Half], plan: Plan) -> Drawn:
     """Cut a part of a later part and put the defect of a plan into it."""
     half, rng = halves[plan.seed[-1]], np.random.default_rng([*plan.seed, 0])
-    end = float(half.columns['time_s'].iloc[-1])
-    start = float(rng.uniform(0, (1 - _PART) * end))
-    columns, force = (
-        _part(whole, start, start + _PART * end) for whole in (half.columns, half.sim)
-    )
-    half = replace(half, columns=columns, sim=force)
-    faults, changed = [], half.g()
+    half = trial_part(half, rng)
+    faults = []
     for name in plan.effects:
         fault, _, strength, changed = trials.sized(
             rng,
@@ -347,12 +349,7 @@ def draw(halves: Sequence[Half], plan: Plan) -> Drawn:
             half.noise_mps2,
         )
         faults.append(trials.described(fault, strength))
-    columns = half.columns.assign(
-        **{
-            name: step * row + zero
-            for (name, (zero, step)), row in zip(half.samples.items(), changed)
-        }
-    )
+        half = with_samples(half, changed)
     return Drawn(
         Label(
             **asdict(plan),
@@ -361,12 +358,31 @@ def draw(halves: Sequence[Half], plan: Plan) -> Drawn:
             floor_mps2=half.noise_mps2,
             faults=faults,
         ),
-        *replace(half, columns=columns).texts(),
+        *half.texts(),
     )
 
 
-def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float, np.ndarray]:
-    """Let a fault act on recorded samples; return its strength, m/s², and samples, g."""
+def trial_part(half: Half, rng: np.random.Generator) -> Half:
+    """Draw the part of a later part that a trial has."""
+    end = float(half.columns['time_s'].iloc[-1])
+    start = float(rng.uniform(0, (1 - _PART) * end))
+    columns, force = (
+        _part(whole, start, start + _PART * end) for whole in (half.columns, half.sim)
+    )
+    return replace(half, columns=columns, sim=force)
+
+
+def with_samples(half: Half, samples_g: np.ndarray) -> Half:
+    """Return a part with other samples, g, (m, n)."""
+    columns = {
+        name: step * row + zero
+        for (name, (zero, step)), row in zip(half.samples.items(), samples_g)
+    }
+    return replace(half, columns=half.columns.assign(**columns))
+
+
+def acted_on(half: Half, seed: tuple[int, ...], fault: Fault) -> np.ndarray:
+    """Let a fault act on recorded samples; return samples, g, (m, n)."""
     unit, before = half.unit(), half.g()
     # The force without its noise; an axis that is not measured has 0.
     force = np.zeros((3, len(half.columns)))
@@ -399,14 +415,16 @@ def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float,
     run.volts = run.volts + run.u - sensed
     if run.late or run.skew:
         run.volts = np.stack([np.interp(t - run.late_s(t), t, row) for row in run.volts])
-    after = run.volts - _ZERO_V
+    return run.volts - _ZERO_V
+
+
+def _with_fault(half: Half, seed: tuple[int, ...], fault: Fault) -> tuple[float, np.ndarray]:
+    """Let a fault act on recorded samples; return its strength, m/s², and samples, g."""
+    before, after = half.g(), acted_on(half, seed, fault)
     # The rms counts where the reference is known; zero-g and scale factor are free.
-    known = (
-        half.columns['alpha_rad'].notna().to_numpy() if half.reference == 'rests' else slice(None)
-    )
-    rest = G0 * (after - before)[:, known]
+    rest = G0 * (after - before)[:, half.known]
     if fault.kind.name not in ('bias', 'scale_factor'):
-        for row, along in zip(rest, before[:, known]):
+        for row, along in zip(rest, before[:, half.known]):
             zero, scale = line(along, row)
             row -= zero + scale * along
     return rms(rest), after

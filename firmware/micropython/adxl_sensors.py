@@ -183,6 +183,7 @@ class Mpu6050(Chip):
         (0x1A, 0x03),  # CONFIG: low-pass 44 Hz
         (0x19, 0x09),  # SMPLRT_DIV: 1 kHz / 10
         (0x1C, 0x00),  # ACCEL_CONFIG: +-2 g
+        (0x38, 0x01),  # INT_ENABLE: DATA_RDY_EN, without which its bit may stay 0
     )
     STATUS = 0x3A, 0x01  # INT_STATUS: DATA_RDY_INT
 

@@ -34,6 +34,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 from adxl_ros.calibrate.fits import linear, linearisation
 from adxl_ros.calibrate.fits.linearisation import Linearised, linearised, StageError
@@ -43,7 +44,7 @@ from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Place, Role
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
-from adxl_ros.model.sensor import get, names_of, parameter_of, put, Sensor, with_neutral
+from adxl_ros.model.sensor import coefficients_of, get, parameter_of, put, Sensor, with_neutral
 from adxl_ros.report.quantities import with_half_width
 import numpy as np
 import scipy
@@ -189,12 +190,12 @@ def _likeliest_shapes(
     The volts are nearly linear in all other coefficients. The likelihood by a shape parameter has
     several maxima, so that its whole range is searched, and then the interval of the best value.
     """
-    shapes = [
-        (name, parameter)
-        for name in effects
-        for parameter in effect_named(name).parameters
-        if effect_named(name).invertible and parameter.role is Role.SHAPE and not parameter.held
-    ]
+    shapes = []
+    for name in effects:
+        for parameter in effect_named(name).parameters:
+            is_fitted = parameter.role is Role.SHAPE and not parameter.held
+            if is_fitted and effect_named(name).invertible:
+                shapes.append((name, parameter))
     for effect, parameter in shapes:
         of_effect = unit.values[effect]
         shape, value = np.shape(of_effect[parameter.name]), parameter.scale
@@ -390,8 +391,7 @@ def fitted_coefficients(axes: str, terms: Sequence[str]) -> tuple[Coefficient, .
     effects = dict.fromkeys(map(effect_of, terms))
     names = [
         name
-        for effect in effects
-        for name in names_of(effect_named(effect), axes)
+        for name in coefficients_of(effects, axes)
         if parameter_of(name).role not in (Role.SHAPE, Role.OPTIONAL) and term_of(name) in terms
     ]
     of_stage = [name for name in names if belongs_to_stage(name) and name not in _BASE_TILT]
@@ -411,21 +411,17 @@ def effect_of(term: str) -> str:
 
 def prior_precision(names: Sequence[Coefficient]) -> np.ndarray:
     """Return the inverse prior variances of coefficients about 0, (p,)."""
-    return 1 / np.square(
-        [
-            LEVEL_STD_RAD
-            if name in _BASE_TILT
-            else parameter_of(name).scale
-            * (
-                _GAUGE_PRIOR_SIZES
-                if term_of(name) in GAUGE
-                else _STAGE_PRIOR_SIZES
-                if belongs_to_stage(name)
-                else _SENSOR_PRIOR_SIZES
-            )
-            for name in names
-        ]
-    )
+    return 1 / np.square([_prior_std(name) for name in names])
+
+
+def _prior_std(name: Coefficient) -> float:
+    """Return the prior standard deviation of a coefficient."""
+    if name in _BASE_TILT:
+        return LEVEL_STD_RAD
+    sizes = _STAGE_PRIOR_SIZES if belongs_to_stage(name) else _SENSOR_PRIOR_SIZES
+    if term_of(name) in GAUGE:
+        sizes = _GAUGE_PRIOR_SIZES
+    return parameter_of(name).scale * sizes
 
 
 def fisher_information(
@@ -497,7 +493,7 @@ def require_determined(
         if undetermined
         else f'they have {poses.volts.size} values for {len(names)} coefficients'
     )
-    follows = {quantity for name in undetermined for quantity in effect_named(name.effect).follows}
+    follows = set(chain.from_iterable(effect_named(name.effect).follows for name in undetermined))
     advice = (
         f'poses with other values of {" and ".join(sorted(follows))}'
         if follows
@@ -629,13 +625,8 @@ def gauge_is_identifiable(full: FullFit) -> bool:
 def _linearised(full: FullFit, added: Sequence[str]) -> tuple[Linearised, np.ndarray]:
     """Linearise the fit with further terms; also return the term of each coefficient, (p,)."""
     unit = with_neutral(full.unit, map(effect_of, added))
-    further = [
-        name
-        for term in added
-        for name in fitted_coefficients(unit.axes, (term,))
-        if name not in full.names
-    ]
-    names = (*full.names, *further)
+    further = chain.from_iterable(fitted_coefficients(unit.axes, (term,)) for term in added)
+    names = (*full.names, *(name for name in further if name not in full.names))
     return (
         linearised(unit, full.linear_poses, names, prior_precision(names), full.kept),
         np.array([term_of(name) for name in names]),

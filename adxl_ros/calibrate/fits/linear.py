@@ -10,9 +10,8 @@ from adxl_ros.calibrate.poses import angle_jacobian, planes, Poses, reference_fo
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force
-from adxl_ros.model.sensor import get, Sensor
+from adxl_ros.model.sensor import coefficients_of, get, Sensor
 import numpy as np
 
 AFFINE = ('bias', 'scale_factor', 'misalignment')
@@ -65,19 +64,13 @@ def fit(sensor: Sensor, poses: Poses) -> Sensor:
         'bias': {'offset_v': lines[:, 0] - sensor.nominal_zero_g_v},
         'scale_factor': {'offset_v_per_g': lines[:, 1] - sensor.nominal_scale_v_per_g},
     }
-    names = [
-        Coefficient(effect, parameter, axis)
-        for effect, by_parameter in values.items()
-        for parameter in by_parameter
-        for axis in sensor.axes
-    ]
     return replace(
         sensor,
         model='linear',
         effects=('bias', 'scale_factor'),
         values=values,
         covariance=covariance,
-        covariance_names=tuple(names),
+        covariance_names=tuple(coefficients_of(values, sensor.axes)),
     )
 
 
@@ -206,12 +199,10 @@ def _assemble(sensor: Sensor, poses: Poses, regressions: list[AxisRegression]) -
         'scale_factor_z': {'linear_per_g': r1, 'quadratic_per_g2': r2},
     }
     names = [
-        Coefficient(effect, parameter, axis)
-        for effect, by_parameter in values.items()
-        for parameter in by_parameter
-        if (effect, parameter) not in _GAUGE
-        for axis in sensor.axes
-        if axis != 'z' or effect in _OF_Z_AXIS
+        name
+        for name in coefficients_of(EFFECTS, sensor.axes)
+        if (name.effect, name.parameter) not in _GAUGE
+        and (name.axis != 'z' or name.effect in _OF_Z_AXIS)
     ]
     return replace(
         sensor, model='physical', effects=EFFECTS, values=values, covariance_names=tuple(names)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import NamedTuple
 
 from adxl_ros.calibrate.fits.extrapolation import next_degree, NextDegree
@@ -114,17 +114,12 @@ def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
         best = solver.likeliest({'thermal_lag': _LAGS_S, 'thermal_hysteresis': _REACHES * span_k})
     solved = solver(*best)
     residual_g = np.column_stack([axis.residual_g for axis in solved])
-    curvature_k2 = np.array(
-        [
-            value
-            for axis in solved
-            for name, value in zip(axis.names, axis.values)
-            if name.parameter == 'per_k2'
-        ]
-    )
+    names = tuple(chain.from_iterable(axis.names for axis in solved))
+    values = np.concatenate([axis.values for axis in solved])
+    curvature_k2 = values[[name.parameter == 'per_k2' for name in names]]
     return ThermalFit(
-        tuple(name for axis in solved for name in axis.names),
-        np.concatenate([axis.values for axis in solved]),
+        names,
+        values,
         scipy.linalg.block_diag(*(axis.covariance for axis in solved)),
         *best,
         residual_g,

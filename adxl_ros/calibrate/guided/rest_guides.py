@@ -406,20 +406,13 @@ class ThermalGuide(Guide):
     def progress(self) -> list[Row]:
         """Return temperature, readings and progress, for the screen."""
         passed = self._passed
-        now = (
-            [
-                Row(
-                    'now',
-                    f'{self._blocks_c[-1]:.1f} °C, {"warming" if passed.rises else "cooling"}',
-                )
-            ]
-            if self.accepted
-            else []
-        )
+        rows = [Row('pose', f'{self.pose_number}: {self.destination()}')]
+        if self.accepted:
+            change = 'warming' if passed.rises else 'cooling'
+            rows.append(Row('now', f'{self._blocks_c[-1]:.1f} °C, {change}'))
         done = int(passed.warming.sum() + passed.cooling.sum())
         return [
-            Row('pose', f'{self.pose_number}: {self.destination()}'),
-            *now,
+            *rows,
             *self.newest.rows(self.stillness()),
             Row(
                 'parts', f'{done} done, {2 * PARTS - done} left for a good fit', done / (2 * PARTS)

@@ -79,8 +79,10 @@ def assess(
             return ''
         # Where stage and model are inseparable, the model part may be an error of the stage.
         certain = budget.calibration if budget.separable else budget.coefficients
+        if certain > limit_square:
+            return FAIL
         passes = is_certain and budget.calibration_high <= limit_square
-        return FAIL if certain > limit_square else PASS if passes else NOT_SHOWN
+        return PASS if passes else NOT_SHOWN
 
     (accel, tilt), square = budgets, limit(sensor)[0] ** 2
     return Assessment(
@@ -174,13 +176,12 @@ def summary_lines(
     """Return verdict, errors as given, and limits: what a terminal and the head of a file show."""
     lines = [*acceptance_lines(fitted), '', *errors]
     if assessment is not None:
-        cause = (
-            'open'
-            if open_coefficients(fitted)
-            else assessment.accel.limited_by
-            if limit(fitted)[0]
-            else 'noise or model'
-        )
+        if open_coefficients(fitted):
+            cause = 'open'
+        elif limit(fitted)[0]:
+            cause = assessment.accel.limited_by
+        else:
+            cause = 'noise or model'
         lines += [
             '',
             *limit_table(assessment, fitted),
@@ -200,20 +201,17 @@ def held_out_lines(models: Sequence[HeldOutErrors], inliers: int) -> list[str]:
 
 def screen_table(models: Sequence[HeldOutErrors]) -> list[str]:
     """Lay out the errors of the models on held-out poses for people; the last one is saved."""
-    # Padded so that the decimal points stand in one line.
     lines = [f' {"":24}tilt error     acceleration error     (rms)']
-    lines += [
-        f' {_MODELS[errors.model]:22} {tilt:>9} ° {accel:>18} mg'
-        for errors in models
-        for tilt, accel in [
-            [
-                '-   ' if np.isnan(value) else three_digits(value).ljust(len(f'{value:.3f}'))
-                for value in (errors.tilt_deg.rms, errors.accel_mg.rms)
-            ]
-        ]
-    ]
+    for errors in models:
+        tilt, accel = _padded(errors.tilt_deg.rms), _padded(errors.accel_mg.rms)
+        lines.append(f' {_MODELS[errors.model]:22} {tilt:>9} ° {accel:>18} mg')
     lines[-1] += '           <- saved'
     return lines
+
+
+def _padded(value: float) -> str:
+    """Write a value so that the decimal points of a column stand in one line."""
+    return '-   ' if np.isnan(value) else three_digits(value).ljust(len(f'{value:.3f}'))
 
 
 _MODELS = {

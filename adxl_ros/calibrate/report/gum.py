@@ -228,13 +228,12 @@ def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray)
     values, environment = getattr(held, field), held.environment
     seen = values[np.isfinite(values)]
     half_range = margin + (np.ptp(seen) / 2 if seen.size else 0.0)
-    kind = (
-        'B, range of the poses'
-        if seen.size
-        else f'B, ±{margin:g} {unit}, not measured'
-        if margin
-        else 'not measured, taken as constant'
-    )
+    if seen.size:
+        kind = 'B, range of the poses'
+    elif margin:
+        kind = f'B, ±{margin:g} {unit}, not measured'
+    else:
+        kind = 'not measured, taken as constant'
     std = half_range / _UNIFORM
     inverse = signal_chain.inverse(fitted, np.where(np.cos(held.alpha_rad) < 0, -1, 1))
     shifted = [
@@ -282,11 +281,8 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
     for row in found.inputs:
         std = float(np.broadcast_to(row.std, found.error_mps2.shape)[found.worst])
         part_mg = float(mg(row.contribution_mps2[found.worst]))
-        sensitivity = (
-            '1'
-            if row.unit == 'mg'
-            else f'{number(part_mg / std if std else 0.0, digits=2)} mg per {row.unit}'
-        )
+        ratio = part_mg / std if std else 0.0
+        sensitivity = '1' if row.unit == 'mg' else f'{number(ratio, digits=2)} mg per {row.unit}'
         rows.append(
             [
                 row.name,
@@ -389,29 +385,27 @@ def write(
     )
 
 
+def _decision(row: Decision, limit_name: str) -> dict[str, Any]:
+    """Return a comparison of an error with its limit."""
+    unit, factor = (_ACCELERATION, 1e-3 * G0_MPS2) if row.unit == 'mg' else (r'\degree', 1.0)
+    conditional = 'conditionalPass' if row.error <= row.limit else 'conditionalFail'
+    return {
+        'quantity': row.quantity,
+        'outcome': row.outcome,
+        'conformity': {PASS: 'pass', FAIL: 'fail'}.get(row.outcome, conditional),
+        'figures': [
+            _quantity(name, factor * value, unit, kind=kind)
+            for name, value, kind in (
+                ('error of the calibration', row.error, 'basic_measuredValue'),
+                ('guard band', row.guard_band, ''),
+                (f'limit by the {limit_name}', row.limit, 'basic_acceptanceLimitUpper'),
+            )
+        ],
+    }
+
+
 def _results(fitted: Sensor, found: Uncertainty) -> dict[str, list[Any]]:
     """Return decisions, errors, coefficients and conditions as quantities."""
-    decisions = [
-        {
-            'quantity': row.quantity,
-            'outcome': row.outcome,
-            'conformity': {PASS: 'pass', FAIL: 'fail'}.get(
-                row.outcome, 'conditionalPass' if row.error <= row.limit else 'conditionalFail'
-            ),
-            'figures': [
-                _quantity(name, factor * value, unit, kind=kind)
-                for name, value, kind in (
-                    ('error of the calibration', row.error, 'basic_measuredValue'),
-                    ('guard band', row.guard_band, ''),
-                    (f'limit by the {found.limit_name}', row.limit, 'basic_acceptanceLimitUpper'),
-                )
-            ],
-        }
-        for row in found.decisions
-        for unit, factor in [
-            (_ACCELERATION, 1e-3 * G0_MPS2) if row.unit == 'mg' else (r'\degree', 1.0)
-        ]
-    ]
     errors = [
         [
             _quantity('alpha', np.degrees(found.alpha_rad), r'\degree'),
@@ -438,25 +432,26 @@ def _results(fitted: Sensor, found: Uncertainty) -> dict[str, list[Any]]:
         ]
         for d, name in enumerate(fitted.axes)
     ]
-    coefficients = [
-        _quantity(
-            f'{row.label} {row.axis}',
-            factor * row.fitted,
-            unit,
-            factor * row.half_width / Z_90,
-            row.name,
-        )
-        for row in compare(fitted, fitted)
-        if row.unit in _UNITS
-        for unit, factor in [_UNITS[row.unit]]
-    ]
+    coefficients = []
+    for row in compare(fitted, fitted):
+        if row.unit in _UNITS:
+            unit, factor = _UNITS[row.unit]
+            coefficients.append(
+                _quantity(
+                    f'{row.label} {row.axis}',
+                    factor * row.fitted,
+                    unit,
+                    factor * row.half_width / Z_90,
+                    row.name,
+                )
+            )
     conditions = [_quantity('local gravity', fitted.local_gravity_mps2, _ACCELERATION)]
     conditions += [
         _quantity(f'{name} temperature', value + 273.15, r'\kelvin')
         for name, value in zip(('lowest', 'highest'), fitted.envelope.temperature_c or ())
     ]
     return {
-        'decisions': decisions,
+        'decisions': [_decision(row, found.limit_name) for row in found.decisions],
         'errors': errors,
         'coefficients': coefficients,
         'conditions': conditions,

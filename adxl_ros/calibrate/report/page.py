@@ -253,15 +253,12 @@ def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
         text = f'{rounded(row, row.fitted)} ± {rounded(row, row.half_width)}{unit}'
         # The lower end of the interval decides.
         lower = abs(value) - half_width
-        beyond = (
-            ''
-            if not (typical or maximum)
-            else _BEYOND
-            if 0 < maximum < lower
-            else 'beyond typical'
-            if 0 < typical < lower
-            else 'within'
-        )
+        if 0 < maximum < lower:
+            beyond = _BEYOND
+        elif 0 < typical < lower:
+            beyond = 'beyond typical'
+        else:
+            beyond = 'within' if typical or maximum else ''
         factor = float(np.degrees(1.0)) if row.unit == '°' else 1.0
         ranges = [
             f'{word} ±{factor * figure:.2g}'

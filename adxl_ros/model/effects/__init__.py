@@ -7,6 +7,7 @@ from __future__ import annotations
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from itertools import chain
 import pkgutil
 
 from adxl_ros.errors import UserError
@@ -24,9 +25,8 @@ def library() -> dict[str, Effect]:
     modules = [
         import_module(f'{__name__}.{module.name}') for module in pkgutil.iter_modules(__path__)
     ]
-    own = [
-        value for module in modules for value in vars(module).values() if isinstance(value, Effect)
-    ]
+    values = chain.from_iterable(vars(module).values() for module in modules)
+    own = [value for value in values if isinstance(value, Effect)]
     collected = sorted(own, key=lambda effect: effect.name)
     collected += [point.load() for point in entry_points(group='adxl_ros.effects')]
     effects: dict[str, Effect] = {}

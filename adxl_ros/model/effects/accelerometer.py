@@ -322,7 +322,8 @@ def direction(axis: int, alpha_rad: Value, beta_rad: Value) -> Components:
     Θz = R_x(α)·R_y(β)·[0 0 1]ᵀ.
     """
     maths = ARRAYS if np.ndim(alpha_rad) or np.ndim(beta_rad) else FLOATS
-    sa, ca, sb, cb = (f(angle) for angle in (alpha_rad, beta_rad) for f in (maths.sin, maths.cos))
+    sa, ca = maths.sin(alpha_rad), maths.cos(alpha_rad)
+    sb, cb = maths.sin(beta_rad), maths.cos(beta_rad)
     return [[ca * cb, sb, -sa * cb], [-sb, ca * cb, sa * cb], [sb, -sa * cb, ca * cb]][axis]
 
 
@@ -588,7 +589,8 @@ def saturation(signals: Signals, p: Parameters) -> None:
             signals.output[d] = x - knee_g * (beyond[0] - beyond[1])
 
 
-_WITHOUT_FILTER_S = 1e-3  # Time constant that r counts in where no filter is stated, s. Chosen
+_WITHOUT_FILTER_S = 1e-3
+"""Time constant that r counts in where no filter is stated, s; chosen: r is then one in ms."""
 
 
 @effect(

@@ -350,7 +350,9 @@ _HIGHEST_RATIO = 10**-0.5
 """Highest corner divided by the sample rate; chosen: aliasing replaces the missing corners."""
 _PER_DECADE = 2
 """Corners per decade; chosen: the density is 1/f within 3 % up to a fifth of the sample rate."""
-_MATCHED = 0.02  # Frequency divided by the sample rate at which the density is exact; chosen
+_MATCHED = 0.02
+"""Frequency divided by the sample rate at which the density is exact; chosen: well below the fifth
+up to which it is 1/f."""
 
 
 @lru_cache(maxsize=8)

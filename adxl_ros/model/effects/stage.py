@@ -7,6 +7,7 @@ Where another instrument or simulator states the specific force, the effects of 
 into the one that acts.
 """
 
+from itertools import product
 from math import cos, sin
 
 from adxl_ros.model.constants import AXES
@@ -155,8 +156,7 @@ def stage_offset(signals: Signals, p: Parameters) -> None:
             f'true {joint} minus the encoder, amplitude of the {wave}',
             '',
         )
-        for joint in ('alpha', 'beta')
-        for wave in ('sine', 'cosine')
+        for joint, wave in product(('alpha', 'beta'), ('sine', 'cosine'))
     ),
     needs=(Need.STAGE,),
     cause='The disc of an encoder is not centred on its axis; '

@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a benchmark: tables, a picture of where each method fails, the card of the data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date
+from itertools import pairwise
+import math
+from typing import Any
+
+from adxl_ros.process import code_version, package_version
+from adxl_ros.report import page
+from adxl_ros.report.figures import axes_for
+from adxl_ros_validation.benchmark.defects import GROUPS
+from adxl_ros_validation.benchmark.manifest import Loaded
+from adxl_ros_validation.benchmark.results import (
+    Drawn,
+    group_score,
+    limit_of,
+    median_closed,
+    Physical,
+    Row,
+)
+from adxl_ros_validation.blind.report import Report, Table, terminal_table
+from adxl_ros_validation.blind.scores import in_words, Score, share
+import numpy as np
+
+_STRENGTHS = (0.0, 3.0, 8.0, math.inf)
+"""Edges of the bins of strength, in the noise of one sample; those of the blind check."""
+
+
+@dataclass(frozen=True)
+class Made:
+    """A whole benchmark."""
+
+    seed: int
+    trials: int
+    sealed: str  # SHA-256 of salt and labels
+    loaded: Sequence[Loaded]
+    left_out: Sequence[str]
+    facts: Sequence[Drawn]
+    rows: Sequence[Row]
+    physical: Sequence[Physical]
+
+    @property
+    def methods(self) -> list[str]:
+        """Return the methods in their order."""
+        names = [row.method for row in self.rows] + [row.method for row in self.physical]
+        return list(dict.fromkeys(names))
+
+    def of(self, method: str) -> list[Row]:
+        """Return the answers of a method to level A."""
+        return [row for row in self.rows if row.method == method]
+
+
+def report(made: Made) -> Report:
+    """Return the benchmark in words and tables."""
+    names = ', '.join(sorted({fact.recording for fact in made.facts})) or 'none'
+    return Report(
+        'Benchmark on recordings of real sensors',
+        [
+            f'{date.today()}, adxl_ros {package_version()}, code {code_version()[:16]}, seed '
+            f'{made.seed}. Level A: {made.trials} trials on {names}; SHA-256 of salt and labels '
+            f'{made.sealed or "none"}. Intervals hold 90 %.',
+            'Level A puts one defect, two or none, of 1 to 20 times the noise of one sample, '
+            'into the later part of a recording. An answer is right if it names what was put in; '
+            'what a method names of the untouched part, too, is no error, but the same answer '
+            'with a defect as without it is wrong.',
+            'The ideal observer knows the forms of all defects, and what the untouched part '
+            'leaves; its two figures are bounds of what is possible.',
+        ],
+        {
+            'Level A: exactly right': _naming(made),
+            'Level A: what else counts': _further(made),
+            'Level A: one defect, by its strength': _by_strength(made),
+            'Level A: one defect, by recording': _by_recording(made),
+            'Level B: a documented defect': _documented(made),
+            'Level C: share of the squared gap that is closed on a later part': _closed(made),
+            'Answers without a verdict': _failed(made),
+            'Recordings': _card(made),
+            'Left out': (['what, and why'], [[text] for text in made.left_out]),
+        },
+    )
+
+
+def screen(made: Made) -> list[str]:
+    """Return the first table as lines of a terminal: right answers of all, without intervals."""
+    rows = []
+    for method in made.methods:
+        scores = [group_score(made.of(method), group, 'exact') for group in GROUPS]
+        cells = [f'{score["value"]:.2f} of {score["count"]}' for score in scores if score['count']]
+        rows.append([method, *cells])
+    groups = [
+        words for group, words in GROUPS.items() if group_score(made.rows, group, 'exact')['count']
+    ]
+    first = ['Level A, exactly right:', '']
+    return [*first, *terminal_table(['method', *groups], rows)] if made.rows else []
+
+
+def _naming(made: Made) -> Table:
+    """Return how often each method is exactly right."""
+    rows = []
+    for method in made.methods:
+        own = made.of(method)
+        rows.append([method, *(in_words(group_score(own, group, 'exact')) for group in GROUPS)])
+    bounds = ['ideal observer', '-']
+    for group in list(GROUPS)[1:]:
+        limit = limit_of(made.facts, group)
+        bounds.append(f'{100 * limit.low:.0f} to {100 * limit.high:.0f} %' if limit else '-')
+    return ['method', *GROUPS.values()], [*rows, bounds] if made.rows else []
+
+
+def _further(made: Made) -> Table:
+    """Return what a user of the answers gains and loses."""
+    rows = []
+    for method in made.methods:
+        own = made.of(method)
+        defect = [row for row in own if row.group != 'none']
+        rows.append(
+            [
+                method,
+                in_words(share([row.in_set for row in defect])),
+                _percent(median_closed(own)),
+                in_words(share([row.harm for row in own])),
+                f'{np.mean([row.by_chance for row in own]):.2f}',
+                f'{np.median([row.cpu_s for row in own]):.1f}',
+            ]
+        )
+    head = [
+        'method',
+        'defects in the named set',
+        'closed on the later part, median',
+        'later part made worse',
+        'right by labels of other trials',
+        'processor time, s',
+    ]
+    return head, rows if made.rows else []
+
+
+def _percent(score: Score) -> str:
+    """Return a share with its interval in percent; it may be negative."""
+    if score['value'] is None:
+        return '-'
+    value, low, high = (100 * part for part in (score['value'], *score['ci']))
+    return f'{value:.0f} % ({low:.0f} to {high:.0f}), n = {score["count"]}'
+
+
+def _by_strength(made: Made) -> Table:
+    """Return how often one defect is named, by its strength."""
+    bins = list(pairwise(_STRENGTHS))
+    rows = []
+    for method in made.methods:
+        single = [row for row in made.of(method) if row.group == 'single']
+        parts = [[row.exact for row in single if low <= row.noises < high] for low, high in bins]
+        rows.append([method, *(in_words(share(part)) for part in parts)])
+    words = ['below 3 times the noise', '3 to 8 times', 'above 8 times']
+    return ['method', *words], rows if made.rows else []
+
+
+def _by_recording(made: Made) -> Table:
+    """Return how often one defect is named, by recording."""
+    rows = []
+    for recording in dict.fromkeys(fact.recording for fact in made.facts):
+        for method in made.methods:
+            own = [row for row in made.of(method) if row.recording == recording]
+            single = [row.exact for row in own if row.group == 'single']
+            nothing = [row.exact for row in own if row.group == 'none']
+            if single or nothing:
+                cells = [in_words(share(single)), in_words(share(nothing))]
+                rows.append([recording, method, *cells])
+    return ['recording', 'method', GROUPS['single'], GROUPS['none']], rows
+
+
+def _documented(made: Made) -> Table:
+    """Return the answers to level B."""
+    rows = [
+        [
+            row.source.name,
+            ' or '.join(' and '.join(each) for each in row.source.expected),
+            row.method,
+            _said(row),
+            'yes' if row.right else 'NO',
+        ]
+        for row in made.physical
+        if 'B' in row.source.levels
+    ]
+    return ['recording', 'documented', 'method', 'named', 'right'], rows
+
+
+def _said(row: Physical) -> str:
+    """Return what an answer names."""
+    groups = [f'({" or ".join(sorted(group))})' for group in row.answered.one_of]
+    return ', '.join([*sorted(row.answered.causes), *groups]) or row.answered.status
+
+
+def _closed(made: Made) -> Table:
+    """Return the answers to level C."""
+    rows = [
+        [row.source.name, row.method, _said(row), _percent(row.closed)]
+        for row in made.physical
+        if 'C' in row.source.levels
+    ]
+    return ['recording', 'method', 'named', 'closed; n blocks'], rows
+
+
+def _failed(made: Made) -> Table:
+    """Return the answers that are no verdict."""
+    rows = [[row.method, row.trial, row.error] for row in made.rows if row.error]
+    rows += [
+        [row.method, row.source.name, row.answered.error]
+        for row in made.physical
+        if row.answered.error
+    ]
+    return ['method', 'case', 'why'], rows
+
+
+def _card(made: Made) -> Table:
+    """Return the card of the data: what is known of each recording, and what is not."""
+    rows = []
+    for source, recording, _ in made.loaded:
+        about = f'{source.known}; {recording.span_s:.0f} s, {recording.rate_hz:.4g} Hz'
+        rows.append(
+            [
+                f'{source.name} ({source.levels})',
+                about,
+                source.not_known or '-',
+                source.licence,
+                f'{source.address or source.file} {source.sha256[:16]}',
+            ]
+        )
+    return ['recording', 'known', 'not known', 'licence', 'where, SHA-256'], rows
+
+
+def picture(made: Made) -> Any:
+    """Draw where each method fails: the share of right answers by defect."""
+    from matplotlib.figure import Figure
+
+    kinds = sorted({name for row in made.rows for name in row.effects}) + ['no defect']
+    methods = made.methods
+    shares = np.full((len(methods), len(kinds)), np.nan)
+    texts: dict[tuple[int, int], str] = {}
+    for i, method in enumerate(methods):
+        for j, kind in enumerate(kinds):
+            hits = [
+                row.exact for row in made.of(method) if kind in (row.effects or ('no defect',))
+            ]
+            if hits:
+                shares[i, j] = np.mean(hits)
+                texts[i, j] = f'{sum(hits)}/{len(hits)}'
+    figure = Figure((3.0 + 0.42 * len(kinds), 2.6 + 0.4 * len(methods)), layout='constrained')
+    ax = axes_for(figure.add_subplot())
+    ax.imshow(shares, cmap='RdYlGn', vmin=0, vmax=1, aspect='auto')
+    ax.set_xticks(range(len(kinds)), kinds, rotation=90)
+    ax.set_yticks(range(len(methods)), methods)
+    for (i, j), text in texts.items():
+        ax.text(j, i, text, ha='center', va='center', fontsize=7)
+    ax.set_title('Right answers of all trials in which the defect acts')
+    return figure
+
+
+def html(made: Made, said: Report) -> str:
+    """Return the whole page."""
+    return page.render(
+        'adxl_ros_validation',
+        'pages/benchmark.html',
+        {
+            **said._asdict(),
+            'about': [],
+            'badge': None,
+            'figures': {},
+            'picture': page.picture_url(picture(made)) if made.rows else '',
+        },
+    )
