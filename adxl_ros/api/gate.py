@@ -46,7 +46,7 @@ MINIMA = ('samples', 'span_s', 'rate_hz', 'rest_share', 'longest_rest_s', 'rests
 class Outcome:
     """One comparison, or one limit."""
 
-    name: str  # One of `KINDS`, or the number that has a minimum
+    name: str  # One of `KINDS`, or 'min' with the number that has a minimum
     is_worse: bool
     text: str  # Figures, for people
     # Interval of the ratio to the other recording, or of the change for the zero-g, m/s²; none
@@ -68,7 +68,7 @@ def limits(contents: RecordingContents, minima: Mapping[str, float]) -> list[Out
     for name, smallest in minima.items():
         value = float(getattr(contents, name))
         text = f'{value:.4g}, expected {smallest:.4g} at least'
-        outcomes.append(Outcome(name, value < smallest, text))
+        outcomes.append(Outcome(f'min {name}', value < smallest, text))
     return outcomes
 
 

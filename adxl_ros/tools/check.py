@@ -84,11 +84,10 @@ def check(options: argparse.Namespace) -> int:
             reading=cli.reading_options(options),
             progress=show,
         )
+    failing = [*fail_on, *(f'min {name}' for name in minima)]
     outcomes = [_outcomes(each, options, minima) for each in checked.recordings]
     if options.junit:
-        gate.write_junit(
-            options.junit, list(zip(checked.recordings, outcomes)), [*fail_on, *minima]
-        )
+        gate.write_junit(options.junit, list(zip(checked.recordings, outcomes)), failing)
     page = [checked.save(options.report, overwrite=options.overwrite)] if options.report else []
     if options.json:
         recordings = checked.to_dict()['recordings']
@@ -99,9 +98,7 @@ def check(options: argparse.Namespace) -> int:
         *lines, sentence = checked.screen
         print('\n'.join([*lines, *_gate_lines(outcomes, options.against)]))
         cli.print_end([sentence], page, _next_command(checked.recordings, options))
-    is_failed = any(
-        row.is_worse and row.name in (*fail_on, *minima) for rows in outcomes for row in rows
-    )
+    is_failed = any(row.is_worse and row.name in failing for rows in outcomes for row in rows)
     return int(is_failed)
 
 

@@ -65,7 +65,7 @@ def test_status_limits_and_reports(run_tool, tmp_path: Path) -> None:
         case.get('name'): case for case in ElementTree.parse(tmp_path / 'c.xml').iter('testcase')
     }
     assert {name for name, case in cases.items() if case.find('failure') is not None} == {
-        'rate_hz'
+        'min rate_hz'
     }
     assert cases['noise'].find('skipped') is not None
     (entry,) = json.loads(run_tool(*command, '--json').stdout)
