@@ -8,6 +8,7 @@
 # make gallery  the pictures of the effects
 # make site     the documentation as a site in site/, with search
 # make screenshots  docs/screenshots: terminals and pages from real runs, six minutes
+# make animation  docs/gap.svg, README's animation, from a simulated log and its diagnosis, two minutes
 # make reproduction  docs/measurements/reproduction.md and its plots: the paper's experiments on simulated units
 # make coverage do the intervals hold? 300 drawn units and stages, as a table
 # make investigate  minutes to a verdict of `investigate` over 60 simulated units, an hour
@@ -151,6 +152,9 @@ site: build .venv/.documented
 # One of them: make screenshots ARGS=diagnose. Pages need Chromium: apt install chromium.
 screenshots: developed
 	OPENBLAS_NUM_THREADS=1 ./run --exec python docs/screenshots.py docs $(ARGS)
+
+animation: build
+	OPENBLAS_NUM_THREADS=1 ./run --exec python docs/animation.py
 
 reproduction: build
 	OPENBLAS_NUM_THREADS=1 ./run reproduce --units 40 --draws 300 -o docs/measurements $(ARGS)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from adxl_ros.api.recordings import from_arrays, read
     from adxl_ros.api.sensors import load
     from adxl_ros.api.simulation import simulate
+    from adxl_ros.api.updating import Update, update
     from adxl_ros.errors import UserError
     from adxl_ros.files.recording_columns import Recording
     from adxl_ros.model.sensor import Sensor
@@ -39,6 +40,7 @@ _MODULES = {
     'noise': 'api.noise',
     'read': 'api.recordings',
     'simulate': 'api.simulation',
+    'update': 'api.updating',
     'Check': 'api.checking',
     'Corrected': 'api.correction',
     'Fit': 'api.calibration',
@@ -47,6 +49,7 @@ _MODULES = {
     'Recording': 'files.recording_columns',
     'Sensor': 'model.sensor',
     'SensorModel': 'simulate.sensor_model',
+    'Update': 'api.updating',
     'UserError': 'errors',
 }
 """Module of each name that `import adxl_ros` gives: verbs, types of their results, the error."""
@@ -60,6 +63,7 @@ __all__ = [
     'Recording',
     'Sensor',
     'SensorModel',
+    'Update',
     'UserError',
     'apply',
     'check',
@@ -70,6 +74,7 @@ __all__ = [
     'noise',
     'read',
     'simulate',
+    'update',
 ]
 
 

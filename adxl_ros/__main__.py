@@ -18,6 +18,7 @@ _NODES = (
     'stage',
     'calibration',
     'compensation',
+    'keep_calibrated',
     'investigate',
     'monitor',
     'screen',

@@ -13,7 +13,16 @@ import select
 import signal
 import sys
 
-NODES = ('driver', 'stage', 'calibration', 'compensation', 'investigate', 'monitor', 'screen')
+NODES = (
+    'driver',
+    'stage',
+    'calibration',
+    'compensation',
+    'keep_calibrated',
+    'investigate',
+    'monitor',
+    'screen',
+)
 """The nodes, which set a handler of SIGINT of their own once they have loaded."""
 
 

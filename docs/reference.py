@@ -44,7 +44,16 @@ TOOLS = sorted(
     }
     - {'bench'}
 )
-NODES = ('driver', 'compensation', 'calibration', 'stage', 'monitor', 'investigate', 'screen')
+NODES = (
+    'driver',
+    'compensation',
+    'calibration',
+    'keep_calibrated',
+    'stage',
+    'monitor',
+    'investigate',
+    'screen',
+)
 PICTURED = {
     'stuck': '`rate_hz` = 1, `duration_s` = 0.2',
     'saturation': '`limit_g` = 0.9',
@@ -52,7 +61,7 @@ PICTURED = {
     'mount_resonance': '`frequency_hz` = 25',
 }
 """Values of parameters in the pictures, where the typical one would not show."""
-SERVED = 'compensation, calibration, monitor, investigate'
+SERVED = 'compensation, calibration, keep_calibrated, monitor, investigate'
 TOPICS = [
     (
         'imu/data_raw',
@@ -149,7 +158,7 @@ TOPICS = [
         'diagnostics',
         'diagnostic_msgs/DiagnosticArray',
         'state of each node, once a second; that of the driver at each change of level, too',
-        'driver, compensation, calibration, stage, monitor, investigate',
+        'driver, compensation, calibration, keep_calibrated, stage, monitor, investigate',
         'you',
     ),
     (
@@ -164,15 +173,28 @@ TOPICS = [
 SERVICES = {
     'calibration': 'start, resume, start_over, capture, redo, skip, finish, abort',
     'compensation': 'level',
+    'keep_calibrated': 'undo',
     'monitor': 'diagnose',
     'investigate': 'abort',
 }
 """Services (std_srvs/Trigger) by node."""
-VERBS = ('read', 'from_arrays', 'load', 'fit', 'apply', 'diagnose', 'check', 'noise', 'simulate')
+VERBS = (
+    'read',
+    'from_arrays',
+    'load',
+    'fit',
+    'update',
+    'apply',
+    'diagnose',
+    'check',
+    'noise',
+    'simulate',
+)
 """The verbs of the front door, in the order of the page."""
 RESULTS = (
     'adxl_ros.files.recording_columns:Recording',
     'adxl_ros.api.calibration:Fit',
+    'adxl_ros.api.updating:Update',
     'adxl_ros.api.calibration:FittedCoefficient',
     'adxl_ros.calibrate.report.held_out:HeldOutErrors',
     'adxl_ros.calibrate.report.held_out:ErrorStatistic',
@@ -450,6 +472,10 @@ def file_keys() -> Iterator[str]:
             ),
             ('`datasheet.*`', 'typical and largest departures, for the comparison in reports'),
             ('`envelope.*`', 'range of force, temperature and supply of the calibration'),
+            *(
+                (f'`gyro.{name}`', f'gyroscope, x, y, z: {about["doc"]}, {about["unit"]}')
+                for name, about in parameter_file.GYRO.items()
+            ),
             ('`link.*`', 'how the driver reaches the unit'),
             ('`provenance.*`', 'id, date, source, hash of the data, errors and verdicts'),
         ],

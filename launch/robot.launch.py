@@ -12,8 +12,11 @@ Start a calibrated sensor on a robot: the driver and the compensation.
     ros2 launch adxl_ros robot.launch.py params_file:=cam7.yaml imu_topic:=/camera/imu \
         output_rate_hz:=50
 
+    ros2 launch adxl_ros robot.launch.py params_file:=unit_17.yaml link_type:=serial keep:=true
+
 The second line also publishes the static transform from the robot to the case. The third one
-corrects the IMU of another driver, and publishes 50 samples a second. A node that ends is started
+corrects the IMU of another driver, and publishes 50 samples a second. The
+fourth one keeps the calibration up to date. A node that ends is started
 again, unless `respawn` is false. The launch ends with an error when a node refuses to start.
 """
 
@@ -39,6 +42,13 @@ def generate_launch_description() -> LaunchDescription:
                 'as /camera/imu, which is corrected in place of that of our driver; '
                 'empty: start our driver',
             ),
+            launch_nodes.declared(
+                'keep',
+                'false',
+                'keep the calibration up to date by the rests of the robot',
+                'true',
+                'false',
+            ),
             launch_nodes.declared('use_sim_time', 'false', 'follow /clock', 'true', 'false'),
             launch_nodes.declared(
                 'respawn', 'true', 'start a node again that ends', 'true', 'false'
@@ -54,6 +64,8 @@ def make_nodes(context: LaunchContext) -> list[Action]:
     if imu_topic and text(context, 'link_type'):
         raise UserError(f'imu_topic:={imu_topic} starts no driver; leave link_type out')
     nodes = {'compensation': launch_nodes.given_parameters(context, OUTPUT_RATE)}
+    if text(context, 'keep') == 'true':
+        nodes |= {'keep_calibrated': {}}
     if not imu_topic:
         nodes = {'driver': {}} | nodes
     sim_time = {'use_sim_time': True} if text(context, 'use_sim_time') == 'true' else {}

@@ -24,7 +24,7 @@ from adxl_ros.calibrate.poses import (
 )
 from adxl_ros.calibrate.report import acceptance, gum, page
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
-from adxl_ros.calibrate.result import CalibrationResult, compare, errors_in_words
+from adxl_ros.calibrate.result import CalibrationResult, compare, errors_in_words, gyro_lines
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.atomic_write import make_folder, require_own
@@ -34,6 +34,7 @@ from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
 from adxl_ros.report.quantities import mg
 from adxl_ros.signals.gravity_at_rest import require_unit
+from adxl_ros.signals.gyroscope_at_rest import rest_turns, RestTurns, with_bias
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import BeyondRange, FilterNoise, listed
 
@@ -106,7 +107,15 @@ class Fit(Result):
                 '',
             ]
         )
-        return [*head, *self.result.summary, *self.warnings, *listed([*self.measured])]
+        gyro = gyro_lines(fitted.gyro)
+        return [
+            *head,
+            *self.result.summary,
+            *self.warnings,
+            *[''] * bool(gyro),
+            *gyro,
+            *listed([*self.measured]),
+        ]
 
     @property
     def first_screen(self) -> FirstScreen:
@@ -282,7 +291,7 @@ def fit(
             raise UserError(f'--prior {prior}: a fit over temperature takes none; leave it out')
         progress(_READING, 'fit')
         result = calibration.calibrate_thermal(
-            with_axes(unit.base, unit.sensor.axes),
+            unit.with_gyro(with_axes(unit.base, unit.sensor.axes)),
             blocks,
             unit.names[0],
             data_sha256 or unit.sha256,
@@ -297,7 +306,12 @@ def fit(
         raise UserError('no recording is given')
     progress(_READING, 'fit')
     result = calibration.calibrate(
-        unit.sensor, recorded, model, effects, data_sha256 or unit.sha256, population
+        unit.with_gyro(unit.sensor),
+        recorded,
+        model,
+        effects,
+        data_sha256 or unit.sha256,
+        population,
     )
     return _fit(result, unit, False)
 
@@ -323,6 +337,7 @@ class _Unit:
         self._paths: list[str] = []
         self.notes: list[str] = []  # Readings beyond the stated range, and what means lack
         self._surroundings: list[Surroundings] = []  # Those of each recording
+        self._gyro_rests: list[RestTurns] = []  # The gyroscope in the rests of all recordings
 
     def add(self, read: Recording) -> Recording:
         """Take the next recording; return it, with the angles of a robot if there is one."""
@@ -346,6 +361,7 @@ class _Unit:
                 self.sensor,
                 stage_resolution_rad=max(self.sensor.stage_resolution_rad, path.step_rad),
             )
+        self._gyro_rests += rest_turns(read, self.sensor, self._has_means)
         beyond = BeyondRange()
         beyond.add(read.volts(self.sensor), self.sensor)
         text = beyond.describe(self.sensor)
@@ -353,11 +369,22 @@ class _Unit:
             self.notes.append(f'{read.path}: {text}')
         return read
 
+    def with_gyro(self, sensor: Sensor) -> Sensor:
+        """Return a sensor with the bias of the gyroscope of the recordings, if they have one."""
+        gyro = with_bias(sensor.gyro, self._gyro_rests)
+        if gyro is sensor.gyro:
+            return sensor
+        origin = {'gyro_from': ', '.join(self.names)}
+        return replace(sensor, gyro=gyro, provenance={**sensor.provenance, **origin})
+
     def thermal_blocks(self, several: Sequence[Recording]) -> Poses | None:
         """Return the blocks of one recording at rest over temperature; None for others."""
         if len(several) != 1:
             return None
-        return thermal_fit.rest_blocks(self.add(several[0]), self.sensor)
+        blocks = thermal_fit.rest_blocks(self.add(several[0]), self.sensor)
+        if blocks is None:
+            self._gyro_rests = []  # The recording is taken once more
+        return blocks
 
     @property
     def base(self) -> Sensor:

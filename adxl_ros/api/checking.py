@@ -23,9 +23,11 @@ from adxl_ros.files.atomic_write import make_folder, require_own, write_text
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.report import page as html_page
-from adxl_ros.report.quantities import column_unit, duration, short_time
+from adxl_ros.report.quantities import column_unit, counted, duration, short_time
 from adxl_ros.report.screen import COLUMNS, row, wrapped
 from adxl_ros.signals.findings import Ability, check_recording, Findings, RecordingContents
+from adxl_ros.signals.gyroscope_turns import GyroFindings
+import numpy as np
 
 _NAME_COLUMNS = 20  # Columns of the name of a recording
 _HEAD = ('recording', 'length', 'rate', 'missing', 'rest', 'axes', 'verdict')
@@ -125,10 +127,25 @@ def _value_lines(contents: RecordingContents) -> list[str]:
             for name, (low, high) in contents.reference_ranges.items()
         ),
         contents.gravity.text,
+        *[_gyro_text(contents.gyro)] * bool(contents.gyro),
     ]
     if contents.log_delay_s is not None:
         texts.append(f'log time minus header time {short_time(contents.log_delay_s)}')
     return texts
+
+
+def _gyro_text(gyro: GyroFindings | None) -> str:
+    """Return what a gyroscope reads at rest, and whether it follows the turns, for people."""
+    if gyro is None or not gyro.bias_radps:
+        return 'gyroscope: not checked, nothing rests'
+    bias = ', '.join(f'{np.degrees(bias):.3g}' for bias in gyro.bias_radps)
+    turns = (
+        f'it misses gravity by {np.degrees(gyro.error_rad):.3g}° rms after '
+        f'{counted(gyro.turns, "turn")}'
+        if gyro.turns
+        else 'no turn between two rests shows its axes'
+    )
+    return f'gyroscope at rest {bias} °/s; {turns}'
 
 
 def _page(results: Sequence[Findings]) -> str:

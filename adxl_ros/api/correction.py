@@ -19,12 +19,13 @@ from adxl_ros.compensate.estimators import Estimates, RecordingEstimator
 from adxl_ros.compensate.live_stream import ImuFields
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import require_own
-from adxl_ros.files.bag_writer import tilt_bag
+from adxl_ros.files.bag_writer import angular_velocity, tilt_bag
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.recording_columns import check_unit, Recording
+from adxl_ros.files.recording_columns import check_unit, GYRO, Recording
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects import base, effect_named
+from adxl_ros.model.gyroscope import Gyroscope, NO_TURN
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.report.figures import axes_for
 from adxl_ros.report.quantities import mg
@@ -72,6 +73,7 @@ class Correction:
         self._counts: Counter[str] = Counter()
         self._beyond = BeyondRange()
         self._look, self._path = RecordingLook(self.sensor, first), first.path
+        self._has_gyro = first.gyro_radps is not None
         self._doubts: list[str] = []  # What is wrong with gravity, or between samples
 
     def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
@@ -112,8 +114,17 @@ class Correction:
             f'Corrected {self._counts["rows"]} samples by {by_what}.',
             *(f'WARNING {text}' for text in self._doubts),
             *self._estimator.assumed,
+            *[_gyro_text(self.sensor.gyro)] * self._has_gyro,
             *listed([*self.measured]),
         ]
+
+
+def _gyro_text(gyro: Gyroscope) -> str:
+    """Say what is done to a gyroscope."""
+    if not gyro.is_calibrated:
+        return 'Gyroscope: kept as it is, because the parameters state no bias of it.'
+    by_temperature = ' by temperature' * gyro.follows_temperature
+    return f'Gyroscope: its bias is subtracted{by_temperature}.'
 
 
 def _effects_that_stay(sensor: Sensor, undo_filter: bool) -> Iterator[str]:
@@ -130,19 +141,66 @@ def _effects_that_stay(sensor: Sensor, undo_filter: bool) -> Iterator[str]:
 
 
 @contextmanager
-def writer(path: str | os.PathLike) -> Iterator[Callable[[Recording, Estimates], None]]:
-    """Open a CSV file or a bag, and yield a function that appends a block with its estimates."""
+def writer(
+    path: str | os.PathLike, sensor: Sensor
+) -> Iterator[Callable[[Recording, Estimates], None]]:
+    """
+    Open a CSV file or a bag, and yield a function that appends a block with its estimates.
+
+    sensor: what the samples are corrected by.
+    """
     if Path(path).suffix == '.csv':
         with csv_writer(path) as append_rows:
             yield lambda block, estimates: append_rows(
-                {'time_s': block.epoch_ns * 1e-9 + block.time_s, **_columns(estimates)}
+                {
+                    'time_s': block.epoch_ns * 1e-9 + block.time_s,
+                    **_columns(estimates),
+                    **_gyro_columns(block, sensor.gyro),
+                }
             )
     else:
         fields = ImuFields()
         with tilt_bag(path) as append:
-            yield lambda block, estimates: append(
-                block.stamp_ns[~estimates.unsolved], *fields(estimates)
-            )
+
+            def append_block(block: Recording, estimates: Estimates) -> None:
+                solved = ~estimates.unsolved
+                imu, tilt_rad = fields(estimates)
+                gyro_radps, std_radps = less_bias(block, sensor.gyro)
+                if gyro_radps is not None:
+                    # A variance of 0 says that it is not known.
+                    imu |= angular_velocity(gyro_radps[solved], std_radps[solved] ** 2)
+                append(block.stamp_ns[solved], imu, tilt_rad)
+
+            yield append_block
+
+
+def less_bias(block: Recording, gyro: Gyroscope) -> tuple[np.ndarray | None, np.ndarray]:
+    """
+    Return a gyroscope without its bias, rad/s, (n, 3), None where there is none, and its std.
+
+    The standard deviation is that of the bias and of the noise that the file states; 0 for none.
+    """
+    gyro_radps = block.gyro_radps
+    temperature_c = block.columns.get('temperature_c', np.full(len(block), np.nan))
+    density = np.array(gyro.noise_density_radps_per_rthz or NO_TURN)
+    noise_radps = density * np.sqrt(block.rate_hz / 2) if len(block) > 1 else density
+    std_radps = np.hypot(gyro.bias_std_at(temperature_c), noise_radps)
+    std_radps = np.broadcast_to(std_radps, (len(block), len(AXES)))
+    if gyro_radps is None:
+        return None, std_radps
+    return gyro_radps - gyro.bias_at(temperature_c), std_radps
+
+
+def _gyro_columns(block: Recording, gyro: Gyroscope) -> dict[str, np.ndarray]:
+    """Return the columns of a gyroscope without its bias, (n,) each; none without one."""
+    gyro_radps, std_radps = less_bias(block, gyro)
+    if gyro_radps is None:
+        return {}
+    columns = dict(zip(GYRO, gyro_radps.T))
+    if gyro.is_calibrated:
+        names = [name.replace('_', '_std_') for name in GYRO]
+        columns |= dict(zip(names, std_radps.T))
+    return columns
 
 
 def _columns(estimates: Estimates) -> dict[str, np.ndarray]:
@@ -180,7 +238,8 @@ class Corrected(Result):
     columns: Mapping[str, np.ndarray]
     """Columns of the tool's table, (n,) each: the force as `ax_mps2`, `ax_std_mps2`, ..., m/s²,
     and the angles `roll_rad`, `pitch_rad`, `inclination_rad`, and `alpha_rad`, `beta_rad` as a
-    stage has them, with `roll_std_rad`, ..., rad. Angles hold at rest."""
+    stage has them, with `roll_std_rad`, ..., rad. Angles hold at rest. A gyroscope without its
+    bias is `gx_radps`, `gx_std_radps`, ..., rad/s."""
     at_rail: np.ndarray
     """Whether the ADC is at a rail, (n,) bool."""
     outside: np.ndarray
@@ -248,7 +307,7 @@ class Corrected(Result):
         was changed since; a folder with other files never is.
         """
         require_own(path, overwrite)
-        with writer(path) as append:
+        with writer(path, self.sensor) as append:
             for block, estimates in self.parts:
                 append(block, estimates)
 
@@ -301,7 +360,10 @@ def apply(
         """Return a field of the estimates of all blocks; its last axis becomes the first."""
         return np.moveaxis(np.concatenate([getattr(each, name) for _, each in parts], -1), -1, 0)
 
-    tables = [_columns(estimates) for _, estimates in parts]
+    tables = [
+        {**_columns(estimates), **_gyro_columns(block, correction.sensor.gyro)}
+        for block, estimates in parts
+    ]
     columns = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     return Corrected(
         time_s=read.time_s,

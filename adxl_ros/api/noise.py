@@ -4,12 +4,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.api.recordings import one_recording, RecordingInput
 from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Result
@@ -17,6 +17,7 @@ from adxl_ros.api.sensors import as_input, SensorInput
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording as recording_files
 from adxl_ros.files.atomic_write import make_folder, require_own, write_bytes
+from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
@@ -25,15 +26,49 @@ from adxl_ros.report.figures import axes_for, AXIS_COLOURS, new_figure, png
 from adxl_ros.report.quantities import duration
 from adxl_ros.report.screen import row
 from adxl_ros.signals import noise_parameters
+from adxl_ros.signals.allan_deviation import StillStretch
 from adxl_ros.signals.noise_parameters import AxisNoise, RecordingNoise, settings
 import numpy as np
 import yaml
 
 PLOT = 'allan.png'  # Name of the curve in the folder of a report
+TABLE = 'allan.csv'  # Name of its table
 BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 MICRO_G = 1e6 / G0_MPS2  # 1 m/s² in µg
 _NAMES = ('white noise N', 'bias instability B', 'random walk K')  # Names of the terms
 _FIELDS = ('white', 'instability', 'walk')  # Their fields in `NoiseFit`
+
+
+class _Unit(NamedTuple):
+    """The units of a sensor's readings."""
+
+    symbol: str  # Unit of the files, as the samples have it
+    small: str  # Unit for people
+    factor: float  # How many of the latter are one of the former
+    column: str  # Unit at the end of a column's name
+
+
+_ACCEL = _Unit('m/s²', 'µg', MICRO_G, 'mps2')
+_GYRO = _Unit('rad/s', 'm°/s', float(np.degrees(1e3)), 'radps')
+
+
+class _Shown(NamedTuple):
+    """One sensor at rest."""
+
+    name: str
+    rest: StillStretch
+    axes: Sequence[AxisNoise]
+    unit: _Unit
+
+
+def _sensors(result: RecordingNoise) -> list[_Shown]:
+    """Return the accelerometer, and the gyroscope if there is one."""
+    shown = [_Shown('accelerometer', result.rest, result.axes, _ACCEL)]
+    if result.gyro_rest is not None:
+        shown.append(_Shown('gyroscope', result.gyro_rest, result.gyro, _GYRO))
+    return shown
+
+
 _YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
 
 
@@ -43,31 +78,42 @@ def _head(result: RecordingNoise) -> list[str]:
 
 
 def _tables(result: RecordingNoise) -> list[str]:
+    """Return the tables of each sensor."""
+    rows: list[str] = []
+    for shown in _sensors(result):
+        if result.gyro:
+            rows += [*[''] * bool(rows), shown.name]
+        rows += _table(shown)
+    return rows
+
+
+def _table(shown: _Shown) -> list[str]:
     """Return the terms with intervals, then in SI units and by sample, 79 columns at most."""
     wide, narrow = (6, 25, 25, 25), (6, 12, 12, 12, 13, 13, 9)
+    si, small = shown.unit.symbol, shown.unit.small
     rows = [
         row((' axis', *_NAMES), wide),
-        row(('', 'µg/√Hz (90 %)', 'µg (90 %)', 'µg/√s (90 %)'), wide),
-        *(row((f' {noise.axis}', *_micro_g_intervals(noise)), wide) for noise in result.axes),
-        *_walk_lines(result),
+        row(('', f'{small}/√Hz (90 %)', f'{small} (90 %)', f'{small}/√s (90 %)'), wide),
+        *(row((f' {noise.axis}', *_intervals(noise, shown.unit)), wide) for noise in shown.axes),
+        *_walk_lines(shown),
         '',
         row(('', 'N', 'B', 'K', 'N by sample', 'K by sample', 'datasheet'), narrow),
-        row((' axis', 'm/s²/√Hz', 'm/s²', 'm/s²/√s', 'm/s²', 'm/s²', 'µg/√Hz'), narrow),
+        row((' axis', f'{si}/√Hz', si, f'{si}/√s', si, si, f'{small}/√Hz'), narrow),
     ]
-    rate = np.sqrt(result.rest.rate_hz)
-    for noise in result.axes:
+    rate = np.sqrt(shown.rest.rate_hz)
+    for noise in shown.axes:
         white, _, walk = noise.estimates
-        shown = (
+        estimates = (
             *noise.estimates,
             white.scaled(rate),
             walk.scaled(1 / rate),
-            white.scaled(1e6 * ONE_SIDED / G0_MPS2),
+            white.scaled(ONE_SIDED * shown.unit.factor),
         )
         rows.append(
             row(
                 (
                     f' {noise.axis}',
-                    *(f'{e.value:.3g}' if e.is_seen else f'< {e.high:.3g}' for e in shown),
+                    *(f'{e.value:.3g}' if e.is_seen else f'< {e.high:.3g}' for e in estimates),
                 ),
                 narrow,
             )
@@ -75,33 +121,36 @@ def _tables(result: RecordingNoise) -> list[str]:
     return rows
 
 
-def _walk_lines(result: RecordingNoise) -> list[str]:
+def _walk_lines(shown: _Shown) -> list[str]:
     """Return the bounds of the walks."""
     rows = []
-    for noise in result.axes:
-        time_s, k = noise.fit.bound_s, MICRO_G * noise.fit.walk.value
+    for noise in shown.axes:
+        time_s, k = noise.fit.bound_s, shown.unit.factor * noise.fit.walk.value
         if np.isfinite(time_s):
             rows.append(
-                f' {noise.axis}: the walk has bounds, {k * np.sqrt(time_s / 2):.3g} µg '
-                f'rms; correlation time {time_s:.3g} s'
+                f' {noise.axis}: the walk has bounds, {k * np.sqrt(time_s / 2):.3g} '
+                f'{shown.unit.small} rms; correlation time {time_s:.3g} s'
             )
     return rows
 
 
-def _micro_g_intervals(noise: AxisNoise) -> list[str]:
+def _intervals(noise: AxisNoise, unit: _Unit) -> list[str]:
     """Return the estimates with their intervals, or their upper limits."""
     return [
         f'{e.value:.3g} ({e.low:.3g} to {e.high:.3g})' if e.is_seen else f'below {e.high:.3g}'
-        for e in (estimate.scaled(MICRO_G) for estimate in noise.estimates)
+        for e in (estimate.scaled(unit.factor) for estimate in noise.estimates)
     ]
 
 
 def _paste_lines(result: RecordingNoise) -> list[str]:
     """Return the settings of other programs in YAML, ready to paste."""
     lines = []
-    for program, entries in settings(result.axes, result.rest.rate_hz).items():
+    for program, entries in settings(result.axes, result.rest.rate_hz, result.gyro).items():
         lines.append(f'# {program}')
         for name, values, unit in entries:
+            if isinstance(values, str):
+                lines += [f'# {unit}', f'{name}: {values}']
+                continue
             rounded = [float(f'{value:.{6 if value >= 1 else 3}g}') for value in values]
             is_one = len(rounded) == 1
             lines += [
@@ -127,8 +176,14 @@ def _warnings(result: RecordingNoise) -> list[str]:
             f'{duration(rest.span_s)} of {duration(rest.recorded_s)}. Record again '
             'without touching the sensor.'
         )
-    for noise in result.axes:
-        texts += [f'{noise.axis}: {text}' for text in _axis_warnings(rest.span_s, noise)]
+    for shown in _sensors(result):
+        # The accelerometer is meant where no sensor is named.
+        begin = 'gyroscope ' * (shown.unit is _GYRO)
+        texts += [
+            f'{begin}{noise.axis}: {text}'
+            for noise in shown.axes
+            for text in _axis_warnings(rest.span_s, noise, shown.unit)
+        ]
     return texts
 
 
@@ -143,7 +198,7 @@ def _filter_warning(stated: Sensor, fresh: Sensor) -> list[str]:
     ]
 
 
-def _axis_warnings(span_s: float, noise: AxisNoise) -> list[str]:
+def _axis_warnings(span_s: float, noise: AxisNoise, unit: _Unit) -> list[str]:
     texts = []
     for term, name in enumerate(_NAMES):
         if not (noise.estimates[term].is_seen or noise.is_coarse):
@@ -158,7 +213,8 @@ def _axis_warnings(span_s: float, noise: AxisNoise) -> list[str]:
             )
     if noise.is_coarse:
         texts.append(
-            f'samples change in steps of {noise.resolution * MICRO_G:.3g} µg, which hide '
+            f'samples change in steps of {noise.resolution * unit.factor:.3g} {unit.small}, '
+            'which hide '
             'the noise. N, B and K are upper limits. Choose a smaller range.'
         )
     if not noise.fit.white.is_seen:
@@ -189,6 +245,10 @@ class Noise(Result):
     """Averaging times of the Allan deviation, s, (k,)."""
     allan_deviation_mps2: np.ndarray
     """Allan deviation of each axis, m/s², (k, m)."""
+    gyro: tuple[AxisNoise, ...]
+    """The gyroscope by axis, as `axes` in rad/s; empty without one."""
+    gyro_allan_deviation_radps: np.ndarray
+    """Allan deviation of the gyroscope at `tau_s`, rad/s, (k, 3); (k, 0) without one."""
     warnings: tuple[str, ...]
     """What is not seen, what hides it, and how long to record."""
     result: RecordingNoise
@@ -200,7 +260,9 @@ class Noise(Result):
         stated, name = _sensor(self.result), Path(self.result.path).name
         fresh = noise_parameters.with_noise(stated, self.result.axes, self.result.rest)
         return replace(
-            fresh, provenance={**fresh.provenance, 'noise_from': name, 'rate_from': name}
+            fresh,
+            gyro=noise_parameters.with_gyro_noise(stated.gyro, self.gyro),
+            provenance={**fresh.provenance, 'noise_from': name, 'rate_from': name},
         )
 
     @property
@@ -227,8 +289,12 @@ class Noise(Result):
     def first_screen(self) -> FirstScreen:
         """Return what a notebook shows."""
         tiles = [
-            (f'white noise of {noise.axis}', f'{_micro_g_intervals(noise)[0]} µg/√Hz')
-            for noise in self.axes
+            (
+                f'white noise, {shown.name} {noise.axis}',
+                f'{_intervals(noise, shown.unit)[0]} {shown.unit.small}/√Hz',
+            )
+            for shown in _sensors(self.result)
+            for noise in shown.axes
         ]
         return FirstScreen(
             'amber' if self.warnings else 'green', 'Noise', _head(self.result)[1], tiles
@@ -253,20 +319,51 @@ class Noise(Result):
         )
 
     def report(self, folder: str | os.PathLike, *, overwrite: bool = False) -> Path:
-        """Write the curve allan.png into a folder, and return its path; overwrite: as `save`."""
-        require_own(Path(folder) / PLOT, overwrite)
-        path = make_folder(folder) / PLOT
-        write_bytes(path, png(_plot(self.result)))
-        return path
+        """
+        Write the curve into a folder, allan.png and allan.csv, and return the path of the former.
+
+        overwrite: as `save`.
+        """
+        for name in (PLOT, TABLE):
+            require_own(Path(folder) / name, overwrite)
+        path = make_folder(folder)
+        write_bytes(path / PLOT, png(_plot(self.result)))
+        with csv_writer(path / TABLE) as append:
+            append(self.curve())
+        return path / PLOT
+
+    def curve(self) -> dict[str, np.ndarray]:
+        """
+        Return the Allan deviation as columns, (k,) each.
+
+        By averaging time `tau_s`: relative standard deviation of a point, then by axis what was
+        measured and what is fitted, m/s² and rad/s.
+        """
+        columns = {
+            'tau_s': self.tau_s,
+            'relative_std': self.result.rest.allan.relative_error,
+        }
+        for shown in _sensors(self.result):
+            for noise, deviation in zip(shown.axes, shown.rest.allan.deviation.T):
+                name = f'{"g" if shown.unit is _GYRO else "a"}{noise.axis}'
+                columns[f'{name}_{shown.unit.column}'] = deviation
+                columns[f'{name}_fitted_{shown.unit.column}'] = noise.fit.allan_deviation(
+                    self.tau_s
+                )
+        return columns
 
     def to_dict(self) -> dict[str, Any]:
-        """Return terms with their intervals, m/s² and s; what is not finite is None."""
-        axes = {
-            noise.axis: {
-                name: estimate._asdict() for name, estimate in zip(_FIELDS, noise.estimates)
+        """Return terms with their intervals, m/s², rad/s and s; what is not finite is None."""
+        sensors = [
+            {
+                noise.axis: {
+                    name: estimate._asdict() for name, estimate in zip(_FIELDS, noise.estimates)
+                }
+                for noise in each
             }
-            for noise in self.axes
-        }
+            for each in (self.axes, self.gyro)
+        ]
+        axes, gyro = sensors
         return as_json(
             {
                 'schema': 1,
@@ -275,25 +372,27 @@ class Noise(Result):
                 'rate_hz': self.rate_hz,
                 'warnings': self.warnings,
                 'axes': axes,
+                'gyroscope': gyro,
+                'allan_deviation': self.curve(),
             }
         )
 
     def to_pandas(self) -> Any:
-        """Return a DataFrame with a row for each axis and term: value and 90 % interval."""
+        """Return a DataFrame with a row for each sensor, axis and term: value, 90 % interval."""
         from pandas import DataFrame
 
-        rows = [
-            (noise.axis, name, *estimate)
-            for noise in self.axes
-            for name, estimate in zip(_FIELDS, noise.estimates)
-        ]
-        return DataFrame(rows, columns=['axis', 'term', 'value', 'low', 'high'])
+        rows = []
+        for shown in _sensors(self.result):
+            for noise in shown.axes:
+                for name, estimate in zip(_FIELDS, noise.estimates):
+                    rows.append((shown.name, noise.axis, name, *estimate))
+        return DataFrame(rows, columns=['sensor', 'axis', 'term', 'value', 'low', 'high'])
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the Allan deviations, µg, and what is fitted, into axes of matplotlib."""
+        """Draw the accelerometer's Allan deviations, µg, and fits, into axes of matplotlib."""
         ax = axes_for(ax)
         for number, noise in enumerate(self.axes):
-            _draw(ax, self.result, number, noise.axis)
+            _draw(ax, _sensors(self.result)[0], number, noise.axis)
         ax.set_ylabel('Allan deviation, µg')
         return ax
 
@@ -347,6 +446,10 @@ def noise(
         rest.rate_hz,
         rest.allan.tau_s,
         rest.allan.deviation,
+        tuple(result.gyro),
+        result.gyro_rest.allan.deviation
+        if result.gyro_rest
+        else np.zeros((len(rest.allan.tau_s), 0)),
         tuple(_warnings(result)),
         result,
     )
@@ -357,20 +460,27 @@ _INCHES = (5.0, 4.4)
 
 
 def _plot(result: RecordingNoise) -> Any:
-    """Draw the axes beside each other."""
-    figure = new_figure(figsize=(_INCHES[0] * len(result.axes), _INCHES[1]))
-    plots = figure.subplots(1, len(result.axes), squeeze=False, sharey=True)[0]
-    for number, (noise, plot) in enumerate(zip(result.axes, plots)):
-        _draw(plot, result, number, 'measured')
-        plot.set_title(f'axis {noise.axis}')
-    plots[0].set_ylabel('Allan deviation, µg')
+    """Draw the axes of each sensor beside each other."""
+    sensors = _sensors(result)
+    most = max(len(shown.axes) for shown in sensors)
+    figure = new_figure(figsize=(_INCHES[0] * most, _INCHES[1] * len(sensors)))
+    rows = figure.subplots(len(sensors), most, squeeze=False, sharey='row')
+    for shown, plots in zip(sensors, rows):
+        for number, (noise, plot) in enumerate(zip(shown.axes, plots)):
+            _draw(plot, shown, number, 'measured')
+            plot.set_title(
+                f'axis {noise.axis}' if not result.gyro else f'{shown.name} {noise.axis}'
+            )
+        for plot in plots[len(shown.axes) :]:
+            plot.set_visible(False)
+        plots[0].set_ylabel(f'Allan deviation, {shown.unit.small}')
     return figure
 
 
-def _draw(plot: Any, result: RecordingNoise, number: int, label: str) -> None:
+def _draw(plot: Any, shown: _Shown, number: int, label: str) -> None:
     """Draw the Allan deviation of an axis with the terms that are seen."""
-    allan, noise = result.rest.allan, result.axes[number]
-    tau_s, measured = allan.tau_s, allan.deviation[:, number] * MICRO_G
+    allan, noise, factor = shown.rest.allan, shown.axes[number], shown.unit.factor
+    tau_s, measured = allan.tau_s, allan.deviation[:, number] * factor
     plot.errorbar(
         tau_s,
         measured,
@@ -382,9 +492,9 @@ def _draw(plot: Any, result: RecordingNoise, number: int, label: str) -> None:
     )
     for name, line, estimate in zip(_NAMES, noise.fit.lines(tau_s), noise.estimates):
         if estimate.is_seen:
-            plot.plot(tau_s, line * MICRO_G, '--', lw=1, label=name)
+            plot.plot(tau_s, line * factor, '--', lw=1, label=name)
     plot.plot(
-        tau_s, noise.fit.allan_deviation(tau_s) * MICRO_G, color='#222', lw=1, label='all three'
+        tau_s, noise.fit.allan_deviation(tau_s) * factor, color='#222', lw=1, label='all three'
     )
     plot.set(
         xscale='log',

@@ -23,7 +23,7 @@ from adxl_ros.files.column_mapping import (
     ReadingOptions,
     Source,
 )
-from adxl_ros.files.recording_columns import ACCEL, Recording, REFERENCES, TIME, VOLTS
+from adxl_ros.files.recording_columns import ACCEL, GYRO, Recording, REFERENCES, TIME, VOLTS
 from adxl_ros.files.tables import in_memory
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -198,8 +198,8 @@ def from_arrays(
     **columns
         Arrays (n,): `time_s`, s, rising; the output `ax_mps2, ay_mps2, az_mps2`, m/s², or
         `x_v, y_v, z_v`, V, of one, two or three axes; the references `alpha_rad, beta_rad` of a
-        stage, rad, `shift_m`, m, `temperature_c`, °C, `supply_v`, V. NaN or masked where
-        not measured.
+        stage, rad, `shift_m`, m, `temperature_c`, °C, `supply_v`, V; a gyroscope's `gx_radps,
+        gy_radps, gz_radps`, rad/s. NaN or masked where not measured.
 
     Returns
     -------
@@ -223,7 +223,7 @@ def from_arrays(
         return _of_memory({**arrays, **columns}, name, options, serial)
 
 
-_KNOWN = (TIME, *ACCEL, *VOLTS, *REFERENCES)  # Columns of the package
+_KNOWN = (TIME, *ACCEL, *VOLTS, *GYRO, *REFERENCES)  # Columns of the package
 
 
 def is_frame(given: Any) -> bool:

@@ -22,9 +22,10 @@ from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.accelerometer import OTHER_AXIS
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.gyroscope import Gyroscope, NO_TURN
 from adxl_ros.model.sensor import Envelope, get, parameter_of, Sensor, with_neutral
 from adxl_ros.process import package_version
-from adxl_ros.report.quantities import decimals, fixed, mg_text
+from adxl_ros.report.quantities import decimals, fixed, mg_text, with_half_width
 import numpy as np
 
 _SAME_FIT_TOLERANCE = 1e-6
@@ -56,7 +57,12 @@ class CalibrationResult:
 
     def comments(self) -> list[str]:
         """Return coefficients and assessment as text: the head of the parameter file."""
-        return [*coefficient_lines(self.fitted), '', *self.report_lines]
+        return [
+            *coefficient_lines(self.fitted),
+            *gyro_lines(self.fitted.gyro),
+            '',
+            *self.report_lines,
+        ]
 
     def save(self, path: AnyPath) -> None:
         """Write the parameter file atomically; a file of another fit becomes NAME.previous."""
@@ -112,6 +118,28 @@ def coefficient_lines(sensor: Sensor) -> list[str]:
             f'{rounded(row, row.half_width)} {row.unit}'
             for row in compare(sensor, sensor)
         ),
+    ]
+
+
+def gyro_lines(gyro: Gyroscope) -> list[str]:
+    """Return the bias of a gyroscope with its 90 % interval as text; none without one."""
+    if not gyro.is_calibrated:
+        return []
+    rows = [('gyroscope, bias at rest', gyro.bias_radps, gyro.bias_std_radps, '°/s')]
+    if gyro.follows_temperature:
+        rows.append(
+            (
+                f'  its change, {gyro.temperature_c[0]:.0f} to {gyro.temperature_c[2]:.0f} °C',
+                gyro.bias_per_k_radps,
+                gyro.bias_per_k_std_radps,
+                '°/s/K',
+            )
+        )
+    return [
+        f'  {label:{_LONGEST_LABEL}} {axis:1} '
+        f'{with_half_width(np.degrees(value), Z_90 * np.degrees(std))} {unit}'
+        for label, values, stds, unit in rows
+        for axis, value, std in zip(AXES, values, stds or NO_TURN)
     ]
 
 

@@ -17,6 +17,7 @@ from adxl_ros.files.cdr import CdrError
 from adxl_ros.model import noise
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects.base import ARRAYS, Components, FLOATS
+from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.model.kinematics import (
     Mounting,
     quaternion,
@@ -38,6 +39,7 @@ class _Chain(NamedTuple):
     live: LiveEstimator
     delayed: DelayedInversion
     stride: int
+    gyro: Gyroscope
 
 
 class LiveStream:
@@ -105,7 +107,7 @@ class LiveStream:
         live.set_environment(**self.surroundings)
         stride = max(1, round(rate_hz / self._output_rate_hz)) if self._output_rate_hz else 1
         self._chain = _Chain(
-            live, DelayedInversion(noise.electronics(at_rate).rc_s, rate_hz), stride
+            live, DelayedInversion(noise.electronics(at_rate).rc_s, rate_hz), stride, sensor.gyro
         )
 
     @property
@@ -180,6 +182,13 @@ class LiveStream:
         self._corrected += 1
         if self._corrected % chain.stride:
             return
+        if chain.gyro.is_calibrated:
+            temperature_c = self.surroundings.get('temperature_c')
+            raw = imu_message.less_bias(
+                raw,
+                chain.gyro.bias_at(temperature_c).tolist(),
+                (chain.gyro.bias_std_at(temperature_c) ** 2).tolist(),
+            )
         if live.mounting is not None:
             raw = imu_message.with_frame(imu_message.turned(raw, live.mounting), self._frame_id)
         orientation: Sequence[float] | None = self._orientation(estimate)

@@ -8,8 +8,9 @@ the figures. What the report adds comes last.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -261,9 +262,31 @@ def material_mps2(
     )
 
 
+class _FitsByDrift(Mapping[str, HeldOutFits]):
+    """Held-out fits of a set by the drift of its noise; those with a drift once they are asked."""
+
+    def __init__(
+        self, healthy: HeldOutFits, fits_with_drifts: Callable[[], dict[str, HeldOutFits]]
+    ) -> None:
+        self._healthy, self._fits_with_drifts = healthy, fits_with_drifts
+
+    @cached_property
+    def _every(self) -> dict[str, HeldOutFits]:
+        return {HEALTHY: self._healthy, **self._fits_with_drifts()}
+
+    def __getitem__(self, drift: str) -> HeldOutFits:
+        return self._healthy if drift == HEALTHY else self._every[drift]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._every)
+
+    def __len__(self) -> int:
+        return len(self._every)
+
+
 def _held_out(
     search: Search, floor: NoiseFloor, count: float
-) -> dict[frozenset[str], dict[str, HeldOutFits]]:
+) -> dict[frozenset[str], Mapping[str, HeldOutFits]]:
     """Return held-out fits of all sets by the drift of their noise."""
     best, model = search.best, search.model
     beside = linearise(model, best.effects, best.sensor, model.filters)
@@ -272,20 +295,20 @@ def _held_out(
         if beside.fit(drifts=drifts_among(library())).log_evidence > beside.fit().log_evidence
         else ()
     )
-    out = {}
-    for effects, hypothesis in search.found.items():
-        healthy = HeldOutFits(hypothesis.linearised, model)
+
+    def with_drifts(hypothesis: Hypothesis, healthy: HeldOutFits) -> dict[str, HeldOutFits]:
+        if not drifts:
+            return {}
         left = healthy.figures.squares.sum() / count - floor.rms_mps2**2
-        linearised = (
-            linearise(model, hypothesis.effects, hypothesis.sensor, model.filters)
-            if drifts
-            else hypothesis.linearised
-        )
+        linearised = linearise(model, hypothesis.effects, hypothesis.sensor, model.filters)
         fits = {d: HeldOutFits(linearised, model, (d,)) for d in drifts}
         # A drift that should be far larger than what is left is none.
-        out[effects] = {HEALTHY: healthy} | {
-            d: f for d, f in fits.items() if f.drift_mps2**2 <= _DRIFT_LIMIT * max(left, 0.0)
-        }
+        return {d: f for d, f in fits.items() if f.drift_mps2**2 <= _DRIFT_LIMIT * max(left, 0.0)}
+
+    out: dict[frozenset[str], Mapping[str, HeldOutFits]] = {}
+    for effects, hypothesis in search.found.items():
+        healthy = HeldOutFits(hypothesis.linearised, model)
+        out[effects] = _FitsByDrift(healthy, partial(with_drifts, hypothesis, healthy))
     return out
 
 

@@ -55,7 +55,7 @@ _OTHER_RESTS_SHARE = 0.2
 """Share of an effect at rest by which its straight-line part differs between the rests of a
 calibration and those of a recording. Tuned on simulated units that are calibrated by a sweep over
 51 poses and recorded in other poses; shares there are up to 0.25."""
-_SMALLEST_BENT_SHARE = 0.1
+SMALLEST_BENT_SHARE = 0.1
 """Share of an effect that differs from a straight line over the force, below which the effect is
 a straight line itself. Chosen: a tenth of an effect is material."""
 
@@ -631,7 +631,7 @@ def _straight_parts(lines: np.ndarray, others: np.ndarray, rows: np.ndarray) -> 
     at_rests = np.abs(np.linalg.lstsq(lines[rows], others[rows])[0])
     in_all = np.linalg.lstsq(lines, others)[0]
     # A calibration with an effect that is a straight line would have left nothing of it.
-    bent = (others - lines @ in_all).std(axis=0) > _SMALLEST_BENT_SHARE * np.sqrt(
+    bent = (others - lines @ in_all).std(axis=0) > SMALLEST_BENT_SHARE * np.sqrt(
         np.mean(others**2, axis=0)
     )
     parts = []

@@ -95,6 +95,23 @@ class Hypothesis:
                     differing.add(name.effect)
         return frozenset(sized - differing)
 
+    def is_zero_g(self, effect: str) -> bool:
+        """Whether another effect than the zero-g does not change within the recordings."""
+        if effect_named(effect).diagnosis.straight_line:
+            return False
+        own = [
+            i
+            for i, name in enumerate(self.names)
+            if name.effect == effect and parameter_of(name).is_size
+        ]
+        squares, varying = 0.0, 0.0
+        for channel in self.linearised.columns:
+            shown = [(k, i) for k, i in enumerate(channel.places) if i in own]
+            change_v = sum(self.values[i] * channel.values[:, 1 + k] for k, i in shown)
+            squares += float(np.mean(np.square(change_v)))
+            varying += float(np.var(change_v))
+        return varying < linear.SMALLEST_BENT_SHARE**2 * squares
+
     @property
     def at_bound(self) -> bool:
         """Whether a determined size is at the end of what its parameter can have: no result."""
@@ -485,12 +502,14 @@ class Search:
         shapes: Mapping[Coefficient, float],
         lowest: float | None = None,
     ) -> None:
-        """Fit and keep a set, unless it cannot be simulated, is singular or does not show."""
+        """Fit and keep a set, unless it cannot be simulated, is singular or shows otherwise."""
         try:
             fitted = fit_hypothesis(
                 self.model, effects, start, shapes, self._lowest if lowest is None else lowest
             )
         except (UserError, np.linalg.LinAlgError):
+            return
+        if any(map(fitted.is_zero_g, fitted.effects)):
             return
         # Recordings that are not much longer than a time constant do not show it.
         longest_s = max(c.span_s for c in self.model.comparisons)

@@ -31,6 +31,7 @@ from adxl_ros.files.column_mapping import (
 from adxl_ros.files.recording_columns import (
     ACCEL,
     COMMANDS,
+    GYRO,
     JOINTS,
     LIMIT,
     LONGEST_MOVE_NS,
@@ -86,6 +87,8 @@ class _Samples:
         self.incomplete = 0  # Those of them that were left out, because an axis has no number
         self.stamp_ns = np.zeros(0, np.int64)  # Stamps of the waiting samples, ns, (n,)
         self.force = np.zeros((0, 3))  # Their specific force, m/s², (n, 3)
+        self.gyro_radps = np.zeros((0, 3))  # Their angular velocity, rad/s, (n, 3)
+        self.has_gyro = False  # Whether the messages state an angular velocity
         self._reading = reading
         self._unit = reading.unit or 'mps2'  # Unit of the accelerations of the topic
         if UNITS[Quantity.OUTPUT][self._unit].is_volts:
@@ -102,11 +105,20 @@ class _Samples:
             self.where,
             raws,
             cdr.imu,
-            lambda table: dict(zip(ACCEL, table.numbers('linear_acceleration').T)),
+            lambda table: {
+                **dict(zip(ACCEL, table.numbers('linear_acceleration').T)),
+                **dict(zip(GYRO, table.numbers('angular_velocity').T)),
+            },
         )
-        force = self._reading.outputs(np.column_stack(list(columns.values())), 3 * [self._unit])
+        readings, gyro_radps = (
+            np.column_stack([columns[name] for name in names]) for names in (ACCEL, GYRO)
+        )
+        force = self._reading.outputs(readings, 3 * [self._unit])
+        # A value beyond every gyroscope is no reading.
+        gyro_radps[~(np.abs(gyro_radps) <= LIMIT)] = np.nan
         if not self.count:
             self._begin(raws[:1], int(stamp_ns[0]))
+            self.has_gyro &= bool(gyro_radps.any())
         if self._reading.rate_hz is not None:
             number = self.count + np.arange(len(stamp_ns))
             since_first_ns = np.rint(number * 1e9 / self._reading.rate_hz)
@@ -133,6 +145,7 @@ class _Samples:
         self.count += len(stamp_ns)
         self.stamp_ns = np.concatenate([self.stamp_ns, stamp_ns[is_kept]])
         self.force = np.concatenate([self.force, force[is_kept]])
+        self.gyro_radps = np.concatenate([self.gyro_radps, gyro_radps[is_kept]])
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -147,6 +160,8 @@ class _Samples:
         if stamp_ns > _EXACT_NS:
             self.epoch_ns = stamp_ns // 1_000_000_000 * 1_000_000_000
         table = next(cdr.tables(first, cdr.imu))
+        # REP-145; messages that are all 0 are of a driver that never sets it.
+        self.has_gyro = bool(table.numbers('angular_velocity_covariance')[0, 0] != -1)
         variance = table.numbers('linear_acceleration_covariance')[0, [0, 4, 8]]
         if self.axes is None:
             is_there = (variance < _ABSENT_VARIANCE) & (variance[0] != -1)
@@ -282,7 +297,10 @@ def _block(
     """Take a block of waiting samples, with references and commands at their stamps."""
     stamp_ns, samples.stamp_ns = samples.stamp_ns[:rows], samples.stamp_ns[rows:]
     force, samples.force = samples.force[:rows], samples.force[rows:]
+    gyro_radps, samples.gyro_radps = samples.gyro_radps[:rows], samples.gyro_radps[rows:]
     columns = dict(zip(ACCEL[: len(samples.axes or '')], force.T.copy()))
+    if samples.has_gyro:
+        columns |= dict(zip(GYRO, gyro_radps.T.copy()))
     columns |= {name: track.interpolate(stamp_ns) for name, track in tracks.items()}
     alignments = {name: track.alignment for name, track in tracks.items()}
     for name, (begin_ns, value) in commands.items():

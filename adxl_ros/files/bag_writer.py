@@ -124,7 +124,8 @@ def recording_bag(path: AnyPath, sensor: Sensor) -> Iterator[Callable[[Recording
     Open a new bag, and yield a function that appends samples of a recording.
 
     References get the stamps of their samples. A command becomes a message where it changes, and
-    once every 65536 samples. Columns with other names are left out.
+    once every 65536 samples. The gyroscope is the angular velocity. Columns with other names
+    are left out.
     """
     imu = _imu_form(imu_covariance(sensor))
     with _new_bag(path) as bag:
@@ -138,7 +139,12 @@ def recording_bag(path: AnyPath, sensor: Sensor) -> Iterator[Callable[[Recording
                 force = np.zeros((len(part), 3))
                 force[:, : accel.shape[1]] = accel
                 batches = [
-                    bag.batch('/imu/data_raw', imu, part.stamp_ns, {'linear_acceleration': force}),
+                    bag.batch(
+                        '/imu/data_raw',
+                        imu,
+                        part.stamp_ns,
+                        {'linear_acceleration': force, **angular_velocity(part.gyro_radps)},
+                    ),
                     *_joint_batches(
                         bag, part.stamp_ns, part.columns, JOINTS, '/stage/joint_states'
                     ),
@@ -230,14 +236,37 @@ def _changes(columns: Columns) -> dict[str, np.ndarray]:
     }
 
 
+def angular_velocity(
+    gyro_radps: np.ndarray | None, variance: np.ndarray | float = 0.0
+) -> dict[str, np.ndarray]:
+    """
+    Return the fields of sensor_msgs/Imu by name for a gyroscope, rad/s, (n, 3); none for None.
+
+    variance: that of each axis, (rad/s)², 0 where it is not known (REP-145). A sample that was
+    not taken has no angular velocity.
+    """
+    if gyro_radps is None:
+        return {}
+    is_taken = np.isfinite(gyro_radps).all(axis=1)[:, None]
+    covariance = np.zeros((len(gyro_radps), 9))
+    covariance[:, [0, 4, 8]] = variance
+    return {
+        'angular_velocity': np.where(is_taken, gyro_radps, 0.0),
+        'angular_velocity_covariance': np.where(is_taken, covariance, _ABSENT),
+    }
+
+
+_ABSENT = np.array([-1.0, *[0.0] * 8])
+"""Covariance of a quantity that is not measured (REP-145)."""
+
+
 def _imu_form(covariance: np.ndarray) -> Form:
     """Return the form of an Imu without orientation and rate, by its covariance, (9,)."""
-    absent = [-1.0, *[0.0] * 8]
     return Form(
         IMU,
         cdr.imu,
         cdr.message(
-            FRAME, [0.0, 0.0, 0.0, 1.0], absent, np.zeros(3), absent, np.zeros(3), covariance
+            FRAME, [0.0, 0.0, 0.0, 1.0], _ABSENT, np.zeros(3), _ABSENT, np.zeros(3), covariance
         ),
     )
 

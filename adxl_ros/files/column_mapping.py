@@ -142,6 +142,11 @@ def parse_mapping(text: str) -> ColumnMapping:
             f'{where}: names the axes {axes or "none"}, expected x, x and y, or x, y '
             f'and z; write for example {_EXAMPLE}'
         )
+    turns = [role for role in GYRO_ROLES if role in sources]
+    if len(turns) not in (0, len(GYRO_ROLES)):
+        raise UserError(
+            f'{where}: names {", ".join(turns)} of a gyroscope; name {", ".join(GYRO_ROLES)}'
+        )
     given = {'roll', 'pitch', 'alpha', 'beta'} & set(sources)
     if given & {'roll', 'pitch'} and given != {'roll', 'pitch'}:
         raise UserError(
@@ -192,7 +197,10 @@ class Quantity(Enum):
     LENGTH = 'm'
     TEMPERATURE = 'c'
     VOLTAGE = 'v'
+    TURN = 'radps'
 
+
+GYRO_ROLES = ('gx', 'gy', 'gz')  # Roles of the axes of a gyroscope
 
 ROLES: Mapping[str, Quantity] = {
     'time': Quantity.TIME,
@@ -201,6 +209,7 @@ ROLES: Mapping[str, Quantity] = {
     'shift': Quantity.LENGTH,
     'temperature': Quantity.TEMPERATURE,
     'supply': Quantity.VOLTAGE,
+    **dict.fromkeys(GYRO_ROLES, Quantity.TURN),
 }
 """Quantity of each role that a column can have."""
 
@@ -256,6 +265,11 @@ UNITS: Mapping[Quantity, Mapping[str, Unit]] = {
         'f': Unit(9.0, 5.0, -160.0 / 9.0),
     },
     Quantity.VOLTAGE: {'v': Unit(), 'mv': Unit(1e3)},
+    Quantity.TURN: {
+        'radps': Unit(),
+        'dps': Unit(180.0, np.pi),
+        'mdps': Unit(180e3, np.pi),
+    },
 }
 """Units by quantity and name."""
 
@@ -281,6 +295,9 @@ _SPELLINGS = {
     'mv': 'millivolt millivolts',
     'deg': '° degree degrees',
     'rad': 'radian radians',
+    'radps': 'rad/s rad_s rad_per_s rad·s⁻¹ rad.s-1',
+    'dps': 'deg/s °/s deg_s degps deg_per_s',
+    'mdps': 'mdeg/s m°/s',
     'c': '°c degc celsius deg_c',
     'f': '°f degf fahrenheit',
     'k': 'kelvin',

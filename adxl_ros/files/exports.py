@@ -248,13 +248,54 @@ def _json(export: Export) -> str:
     )
 
 
-def kalibr_settings(white: float, walk: float, rate_hz: float) -> list[tuple[str, float, str]]:
-    """Return the settings of Kalibr, which are densities over both signs of the frequency."""
-    return [
-        ('accelerometer_noise_density', white, 'm/s^2/sqrt(Hz)'),
-        ('accelerometer_random_walk', walk, 'm/s^3/sqrt(Hz)'),
-        ('update_rate', rate_hz, 'Hz'),
+def kalibr_settings(
+    accel: tuple[float, float], gyro: tuple[float, float] | None
+) -> list[tuple[str, float, str]]:
+    """
+    Return the settings of Kalibr, which are densities over both signs of the frequency.
+
+    accel, gyro: white noise and random walk; None without a gyroscope.
+    """
+    settings = [
+        ('accelerometer_noise_density', accel[0], 'm/s^2/sqrt(Hz)'),
+        ('accelerometer_random_walk', accel[1], 'm/s^3/sqrt(Hz)'),
     ]
+    if gyro is not None:
+        settings += [
+            ('gyroscope_noise_density', gyro[0], 'rad/s/sqrt(Hz)'),
+            ('gyroscope_random_walk', gyro[1], 'rad/s^2/sqrt(Hz)'),
+        ]
+    return settings
+
+
+_HIDDEN_S = 3600.0  # Rest that does not show an unstated walk, s. Chosen: an hour
+
+
+class GyroFigures(NamedTuple):
+    """The noise of a gyroscope for software that has one value for all axes."""
+
+    white: float  # Density over both signs of the frequency, rad/s/√Hz
+    walk: float  # Random walk, rad/s/√s
+    variances: list[float]  # Variance of a sample by axis, (rad/s)²
+    bias: list[float]  # Bias by axis, rad/s; 0 where it is not known
+    remark: str  # Where the figures are from, one line for people
+
+
+def gyro_figures(sensor: Sensor) -> GyroFigures | None:
+    """Return the noise of the gyroscope; None where the file states none."""
+    gyro = sensor.gyro
+    if not gyro.noise_density_radps_per_rthz:
+        return None
+    white = np.array(gyro.noise_density_radps_per_rthz) / ONE_SIDED
+    remark, walk = 'Gyroscope: noise as it was measured.', max(gyro.walk_radps_per_rts, default=0)
+    if not walk:
+        # Its Allan deviation K·√(τ/3) is that of white noise, N/√τ, after this time.
+        walk = float(np.sqrt(3) * white.max() / _HIDDEN_S)
+        remark = 'Gyroscope: its random walk is one that an hour at rest does not show.'
+    variances = white**2 * sensor.rate_hz
+    return GyroFigures(
+        float(white.max()), walk, variances.tolist(), gyro.bias_at().tolist(), f'# {remark}'
+    )
 
 
 def _white_density(export: Export, software: str) -> float:
@@ -299,6 +340,7 @@ def text(name: str, export: Export) -> str:
     if not walk:
         walk = effect_named('bias_walk').diagnosis.healthy_density * G0_MPS2
         remark += '\n# The random walk is that of a healthy unit: the file states none.'
+    gyro = gyro_figures(sensor)
     formats = templates.environment(
         f'--to {name}', ('adxl_ros', 'files/export_templates'), escapes=False
     )
@@ -309,6 +351,8 @@ def text(name: str, export: Export) -> str:
         walk=walk,
         walk_remark=f'# {remark}',
         kalibr_settings=kalibr_settings,
+        gyro=gyro,
+        gyro_covariance=np.diag(gyro.variances).ravel().tolist() if gyro else [],
         sensor=sensor,
         source=export.source,
         axes=axes(sensor),
@@ -357,11 +401,11 @@ FORMATS = {
         },
     ),
     'kalibr': Format(
-        'the part of the accelerometer in imu.yaml of Kalibr',
+        'imu.yaml of Kalibr; without a gyroscope its part of the accelerometer',
         {**_at('accelerometer_noise_density', *_SAMPLE), 'bias_walk': 'accelerometer_random_walk'},
     ),
     'okvis2': Format(
-        'the part of the accelerometer in the configuration of OKVIS2',
+        'noise of the sensors in the configuration of OKVIS2',
         {
             **_at('sigma_a_c', *_SAMPLE),
             'bias': 'a0',
@@ -370,7 +414,7 @@ FORMATS = {
         },
     ),
     'point_lio': Format(
-        'the part of the accelerometer in the configuration of Point-LIO',
+        'noise of the sensors in the configuration of Point-LIO',
         {**_at('imu_meas_acc_cov', *_SAMPLE), 'bias_walk': 'b_acc_cov', 'saturation': 'satu_acc'},
     ),
     'genesis': Format(

@@ -24,6 +24,8 @@ with its covariance, all float64."""
 _ACCELERATION = 25 * 8  # The same of the linear acceleration
 _END = 37 * 8  # The same of the end
 _QUATERNION = 4  # Numbers of a quaternion, which stand before the orientation's covariance
+_VECTOR = 3  # Numbers of a vector, which stand before its covariance
+_DIAGONAL = 4  # Distance of the variances of two axes in a covariance of three
 _UNSET = (0.0, 0.0, 0.0, 1.0, *[0.0] * 9)
 """Quaternion and covariance of an orientation that nobody has set."""
 
@@ -100,6 +102,27 @@ def turned(raw: bytes, mounting: Mounting) -> bytes:
             *mounting.rotate(rate[:3]),
             *mounting.rotate_matrix(rate[3:]),
         )
+    return bytes(message)
+
+
+def less_bias(raw: bytes, bias_radps: Sequence[float], variances: Sequence[float]) -> bytes:
+    """
+    Return an Imu whose angular velocity is less by a bias, rad/s; one without any stays.
+
+    variances: those of the bias, (rad/s)², which a covariance that is stated grows by.
+    """
+    order, begin = _numbers_begin(raw)
+    place = begin + _ANGULAR_VELOCITY
+    rate = list(struct.unpack_from(order + '12d', raw, place))
+    if rate[_VECTOR] == -1.0:
+        return raw
+    is_stated = any(rate[_VECTOR:])
+    for axis, (bias, variance) in enumerate(zip(bias_radps, variances)):
+        rate[axis] -= bias
+        if is_stated:
+            rate[_VECTOR + _DIAGONAL * axis] += variance
+    message = bytearray(raw)
+    struct.pack_into(order + '12d', message, place, *rate)
     return bytes(message)
 
 

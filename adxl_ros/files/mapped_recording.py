@@ -17,6 +17,7 @@ from adxl_ros.files.column_mapping import (
     Columns,
     DROP_SAMPLES,
     GRAVITY,
+    GYRO_ROLES,
     is_sensor_step,
     likely_unit,
     listed,
@@ -38,6 +39,7 @@ from adxl_ros.files.column_mapping import (
 )
 from adxl_ros.files.recording_columns import (
     ACCEL,
+    GYRO,
     JOINTS,
     LIMIT,
     Recording,
@@ -63,6 +65,7 @@ _NATIVE = {
     **{column: joint for joint, column in JOINTS.items()},
     'temperature_c': 'temperature',
     'supply_v': 'supply',
+    **dict(zip(GYRO, GYRO_ROLES)),
 }
 """Role of the package's columns besides those of the sensor."""
 
@@ -89,7 +92,8 @@ def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
     for number, name in enumerate(names, 1):
         stem, _, unit = name.lower().rpartition('_')
         column = stems.get(stem, name)
-        if column not in names and unit_name(unit, ROLES[roles[column]]):
+        is_wrong = column not in names and roles[column] not in GYRO_ROLES
+        if is_wrong and unit_name(unit, ROLES[roles[column]]):
             raise NotNativeError(
                 f'{table.header}:{number}: column {name} is in another unit; '
                 f'expected the column {column}'
@@ -104,14 +108,22 @@ def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
         outputs = output or sensor_columns(names, table.header)
     except UserError as error:
         raise NotNativeError(str(error)) from None
-    return ColumnMapping(
-        {
-            role: Source(name, name.rpartition('_')[2])
-            for name, role in {**_NATIVE, **dict(zip(outputs, AXES))}.items()
-            if name in names
-        },
-        table.path,
-    )
+    sources = {
+        role: Source(name, name.rpartition('_')[2])
+        for name, role in {**_NATIVE, **dict(zip(outputs, AXES))}.items()
+        if name in names
+    }
+    return ColumnMapping({**_gyro_sources(names), **sources}, table.path)
+
+
+def _gyro_sources(names: Sequence[str]) -> dict[str, Source]:
+    """Return the columns of a gyroscope in any unit; none where one of its axes is missing."""
+    sources = {}
+    for name in names:
+        stem, _, unit = name.lower().rpartition('_')
+        if stem in GYRO_ROLES and (known := unit_name(unit, Quantity.TURN)):
+            sources[stem] = Source(name, known)
+    return sources if len(sources) == len(GYRO_ROLES) else {}
 
 
 def blocks(

@@ -18,6 +18,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Role
+from adxl_ros.model.gyroscope import AXES as GYRO_AXES, Gyroscope
 from adxl_ros.model.sensor import Envelope, names_of, neutral, Sensor
 import numpy as np
 import yaml
@@ -52,6 +53,9 @@ ENVELOPE_LISTS = {
     'zero_g_next': 0,
 }
 """Number of values of the keys `envelope.*` that have more than one; 0 is one for each axis."""
+
+GYRO = {field.name: field.metadata for field in fields(Gyroscope)}
+"""Meaning and unit of the keys `gyro.*`, three numbers each; each may be missing."""
 
 DATASHEET = {
     'name': 'datasheet that the values are from',
@@ -175,6 +179,7 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
         value = getattr(sensor.envelope, key)
         if value:
             flat[f'envelope.{key}'] = list(value) if key in ENVELOPE_LISTS else value
+    flat |= _gyro_flat(sensor.gyro)
     for key, text in sensor.provenance.items():
         flat[f'provenance.{key}'] = text
     if sensor.datasheet:
@@ -186,6 +191,12 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
             'datasheet.maximum': list(maximum),
         }
     return flat
+
+
+def _gyro_flat(gyro: Gyroscope) -> dict[str, Any]:
+    """Return what is known of a gyroscope by dotted key."""
+    values = {f'gyro.{name}': list(getattr(gyro, name)) for name in GYRO}
+    return {key: value for key, value in values.items() if value}
 
 
 def save(path: AnyPath, sensor: Sensor, comments: Iterable[str] = ()) -> None:
@@ -317,6 +328,7 @@ class _FlatReader:
             covariance=covariance,
             covariance_names=covariance_names,
             envelope=self._envelope(),
+            gyro=self._gyro(),
             provenance={key: str(value) for key, value in self._below('provenance.').items()},
             datasheet_name=str(self.flat.get('datasheet.name', '')),
             datasheet=self._datasheet(),
@@ -497,6 +509,24 @@ class _FlatReader:
                 self._require(len(values) == count, key, f'{self.flat[key]} is not the {meaning}')
                 stated[name] = values[0].item() if count == 1 else tuple(values.tolist())
         return Envelope(**stated)
+
+    def _gyro(self) -> Gyroscope:
+        """Return the gyroscope, as far as the file states it."""
+        stated: dict[str, Any] = {}
+        for name, about in GYRO.items():
+            key = f'gyro.{name}'
+            # A node has an empty list where nothing is given.
+            if self.flat.get(key):
+                values = self._numbers(key, self.flat[key])
+                self._require(
+                    len(values) == GYRO_AXES,
+                    key,
+                    f'{len(values)} values, expected three: {about["doc"]}, {about["unit"]}',
+                )
+                is_size = not name.startswith(('bias_radps', 'bias_per_k_radps', 'temperature'))
+                self._require(not is_size or (values >= 0).all(), key, 'is below 0')
+                stated[name] = tuple(values.tolist())
+        return Gyroscope(**stated)
 
     def _datasheet(self) -> dict[Coefficient, tuple[float, float]]:
         """Return the typical and the greatest departure by `effect.parameter`."""

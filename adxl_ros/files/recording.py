@@ -26,7 +26,7 @@ from adxl_ros.files.column_mapping import (
     Table,
 )
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.recording_columns import ACCEL, concatenate, Recording, TIME, VOLTS
+from adxl_ros.files.recording_columns import ACCEL, concatenate, GYRO, Recording, TIME, VOLTS
 from adxl_ros.files.tables import open_table
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
@@ -136,7 +136,14 @@ def _mounted(
                 )
         outputs = np.column_stack([block.columns[name] for name in names]) - zero
         turned = (outputs[:, columns] * signs + zero).T.copy()
-        yield replace(block, columns={**block.columns, **dict(zip(names, turned))})
+        changed = dict(zip(names, turned))
+        gyro_radps = block.gyro_radps
+        if gyro_radps is not None:
+            # A rotation turns an axis of rotation as it turns a force, if it names three axes.
+            is_turned = len(mounting) == len(AXES)
+            gyro_radps = gyro_radps[:, columns] * signs if is_turned else gyro_radps * np.nan
+            changed |= dict(zip(GYRO, gyro_radps.T.copy()))
+        yield replace(block, columns={**block.columns, **changed})
 
 
 def read_ideal(path: AnyPath, epoch_ns: int = 0) -> Recording:

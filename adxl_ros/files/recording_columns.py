@@ -103,6 +103,8 @@ TIME = 'time_s'
 VOLTS = ('x_v', 'y_v', 'z_v')  # Columns of the ADC volts by axis
 ACCEL = ('ax_mps2', 'ay_mps2', 'az_mps2')
 """Columns of the specific force by axis after the nominal conversion."""
+GYRO = ('gx_radps', 'gy_radps', 'gz_radps')
+"""Columns of the gyroscope by axis, in the frame of the sensor; NaN where it was not sampled."""
 JOINTS = {'alpha': 'alpha_rad', 'beta': 'beta_rad', 'shift': 'shift_m'}
 """Columns of the encoders by joint."""
 REFERENCES = (*JOINTS.values(), 'temperature_c', 'supply_v')
@@ -226,6 +228,13 @@ class Recording:
     def axes(self) -> str:
         """Return the measured axes: x, xy or xyz."""
         return AXES[: len(self.sensor_columns)]
+
+    @property
+    def gyro_radps(self) -> np.ndarray | None:
+        """Return what the gyroscope reads, rad/s, (n, 3); None without one."""
+        if not all(name in self.columns for name in GYRO):
+            return None
+        return np.column_stack([self.columns[name] for name in GYRO])
 
     @property
     def span_s(self) -> float:

@@ -81,7 +81,43 @@ class Fitted:
     done: bool  # Whether no pose was open, so that the calibration is over
 
 
-JournalEntry: TypeAlias = PoseRecord | PoseDropped | PoseSkipped | MountingUnchecked | Fitted
+@dataclass(frozen=True, kw_only=True)
+class NaturalRest:
+    """A rest of a robot at work, by which its calibration is kept."""
+
+    stay: int  # Number of the stay: between two rests of one stay the robot has not moved
+    start_ns: int  # Stamps of the first and the last sample, ns
+    stop_ns: int
+    mean_v: tuple[float, ...]  # Mean output of each axis, and its standard deviation, V, (m,)
+    std_v: tuple[float, ...]
+    temperature_c: float  # Mean over the rest, °C
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adopted:
+    """A calibration that is in use from here on."""
+
+    stamp_ns: int  # Stamp of the newest rest in it, ns
+    values: tuple[float, ...]  # Its coefficients, in the order of the head's names
+
+
+@dataclass(frozen=True)
+class Undone:
+    """A note that the newest adoption was undone."""
+
+    undone_ns: int  # When, ns
+
+
+JournalEntry: TypeAlias = (
+    PoseRecord
+    | PoseDropped
+    | PoseSkipped
+    | MountingUnchecked
+    | Fitted
+    | NaturalRest
+    | Adopted
+    | Undone
+)
 """What a line of a journal after its head may hold."""
 
 
@@ -91,6 +127,9 @@ _LINES: Mapping[type, Callable[[Any], dict[str, Any]]] = {
     PoseSkipped: lambda entry: {'skip': entry.pose, 'drop': entry.pose},
     MountingUnchecked: lambda entry: {'mounting': 'not checked'},
     Fitted: lambda entry: {'rests': [rest.to_json() for rest in entry.rests], 'done': entry.done},
+    NaturalRest: asdict,
+    Adopted: asdict,
+    Undone: asdict,
 }
 """What makes the keys and values of the line of an entry."""
 
@@ -100,6 +139,11 @@ _ENTRIES: Mapping[str, Callable[[Any], JournalEntry]] = {
     'drop': lambda line: PoseDropped(line['drop']),
     'mounting': lambda line: MountingUnchecked(),
     'rests': lambda line: Fitted(tuple(map(PoseRecord.from_json, line['rests'])), line['done']),
+    'stay': lambda line: NaturalRest(
+        **{**line, 'mean_v': tuple(line['mean_v']), 'std_v': tuple(line['std_v'])}
+    ),
+    'values': lambda line: Adopted(**{**line, 'values': tuple(line['values'])}),
+    'undone_ns': lambda line: Undone(**line),
 }
 """What makes an entry of a line, by the first of these keys that the line has."""
 

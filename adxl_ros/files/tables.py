@@ -24,7 +24,8 @@ _BLOCK_ROWS = 65536  # Rows that are read at a time (chosen: some MB)
 _MAPPINGS = {
     'sensor_accel': 'time={time}:us,x=x:mps2,y=y:mps2,z=z:mps2,temperature=temperature:c',
     'sensor_combined': 'time=timestamp:us,x=accelerometer_m_s2[0]:mps2,'
-    'y=accelerometer_m_s2[1]:mps2,z=accelerometer_m_s2[2]:mps2',
+    'y=accelerometer_m_s2[1]:mps2,z=accelerometer_m_s2[2]:mps2,'
+    'gx=gyro_rad[0]:radps,gy=gyro_rad[1]:radps,gz=gyro_rad[2]:radps',
     'vehicle_acceleration': 'time={time}:us,x=xyz[0]:mps2,y=xyz[1]:mps2,z=xyz[2]:mps2',
 }
 """Columns and units of messages by the definitions of PX4 (msg/*.msg), the raw readings first."""
@@ -220,6 +221,8 @@ def _open_ulog(path: str, topic: str) -> Table:
     mapping = _MAPPINGS.get(data.name, '').format(time=time)
     if 'temperature' not in columns:
         mapping = mapping.partition(',temperature=')[0]
+    if 'gyro_rad[0]' not in columns:
+        mapping = mapping.partition(',gx=')[0]
     cut = f'{path}: is damaged; what can be read of it is used' * bool(log.file_corruption)
     return in_memory(
         path,

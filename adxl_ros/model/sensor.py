@@ -13,6 +13,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.constants import G0_MPS2, MEASURED_AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Parameters
+from adxl_ros.model.gyroscope import Gyroscope
 import numpy as np
 
 MODELS = ('nominal', 'linear', 'physical', 'full', 'gravity')
@@ -260,6 +261,7 @@ class Sensor:
     link: dict[str, Any] = field(default_factory=dict)
     # How the case sits on the robot: values of `mounting.*` by name, which its file carries, too
     mounting: dict[str, Any] = field(default_factory=dict)
+    gyro: Gyroscope = Gyroscope()  # The gyroscope beside it
     # Names of the nominal values that the parameter file leaves out. Their fields hold
     # placeholders until `signals.recorded_sensor` measures them.
     unstated: tuple[str, ...] = ()

@@ -514,6 +514,8 @@ def sensor_specs() -> Iterator[Spec]:
     for name, description in parameter_file.ENVELOPE.items():
         kind = Kind.DOUBLE_ARRAY if name in parameter_file.ENVELOPE_LISTS else Kind.DOUBLE
         yield Spec(f'envelope.{name}', kind, description)
+    for name, about in parameter_file.GYRO.items():
+        yield Spec(f'gyro.{name}', Kind.DOUBLE_ARRAY, about['doc'], about['unit'])
     for name, description in parameter_file.DATASHEET.items():
         yield Spec(f'datasheet.{name}', _DATASHEET_KINDS.get(name, Kind.DOUBLE_ARRAY), description)
 

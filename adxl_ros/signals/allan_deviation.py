@@ -4,14 +4,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 import os
 import tempfile
 from typing import IO
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.recording_columns import GYRO, Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import gap_s
 from adxl_ros.signals.recorded_gravity import RecordingLook
@@ -115,18 +115,22 @@ SHORTEST_S = 10.0  # Shortest rest, s. Chosen: fewer seconds hold no average of 
 
 @dataclass(frozen=True)
 class StillStretch:
-    """The samples of the longest rest."""
+    """
+    The samples of the longest rest; u is their unit.
+
+    It is m/s² for an accelerometer, and rad/s for a gyroscope.
+    """
 
     start_s: float  # Its first stamp, s
     stop_s: float  # Its last stamp, s
     rate_hz: float  # Sample rate by its stamps, Hz
     count: int  # Number of its samples
-    allan: AllanDeviation  # Their Allan deviation, m/s²
+    allan: AllanDeviation  # Their Allan deviation, u
     step_s: float  # Length of a cell, s
-    means: np.ndarray  # Means of the cells by axis, m/s², (k, m)
-    # Standard deviation of a sample within some seconds by axis, m/s², (m,)
+    means: np.ndarray  # Means of the cells by axis, u, (k, m)
+    # Standard deviation of a sample within some seconds by axis, u, (m,)
     sample_std: np.ndarray
-    resolution: np.ndarray  # Smallest change of a sample by axis, m/s², (m,)
+    resolution: np.ndarray  # Smallest change of a sample by axis, u, (m,)
     recorded_s: float  # Time of the whole recording, s
     motion_s: list[tuple[float, float]]  # Times at which it moves or has long gaps, s, (j, 2)
     beyond_range: str  # Readings of the whole recording beyond the stated range, for people, or ''
@@ -151,10 +155,23 @@ def shortest_rest_s(rate_hz: float) -> float:
     return max(SHORTEST_S, _FEWEST_SAMPLES / rate_hz) - 1 / rate_hz
 
 
+@dataclass(frozen=True)
+class StillSensors:
+    """The longest rest of a recording, of accelerometer and gyroscope."""
+
+    accelerometer: StillStretch
+    gyroscope: StillStretch | None  # None where there is none
+    gyro_doubt: str = ''  # Why the gyroscope of the recording is left out, for people
+
+
 def longest_rest(
     read: Callable[[], Iterable[Recording]], unit: Sensor, first: Recording, look: RecordingLook
-) -> StillStretch:
-    """Find the longest rest of a recording, which is read twice; `look` is fed meanwhile."""
+) -> StillSensors:
+    """
+    Find the longest rest of a recording, which is read twice; `look` is fed meanwhile.
+
+    The gyroscope rests where the accelerometer does.
+    """
     if len(first) < 2:
         raise UserError(f'{first.path}: {len(first)} samples; record longer')
     first_s, beyond = float(first.time_s[0]), BeyondRange()
@@ -185,36 +202,58 @@ def longest_rest(
     ]
     if not motion_s:
         rest = replace(rest, time_start_s=first_s, time_stop_s=last_s)
-    with tempfile.TemporaryFile() as file:
-        samples = _Samples(first, file)
+    with tempfile.TemporaryFile() as file, tempfile.TemporaryFile() as gyro_file:
+        samples = _Samples(first, first.sensor_columns, file)
+        turns = _Samples(first, GYRO, gyro_file) if first.gyro_radps is not None else None
         for block in read():
-            samples.feed(block, unit, rest)
-        return samples.stretch(last_s - first_s, motion_s, beyond.describe(unit))
+            samples.feed(block.time_s, block.accel_mps2(unit), rest)
+            gyro_radps = block.gyro_radps
+            if turns is not None and gyro_radps is not None:
+                is_taken = np.isfinite(gyro_radps).all(axis=1)
+                turns.feed(block.time_s[is_taken], gyro_radps[is_taken], rest)
+        accelerometer = samples.stretch(last_s - first_s, motion_s, beyond.describe(unit))
+        if turns is None or not turns.count:
+            return StillSensors(accelerometer, None)
+        if turns.count < accelerometer.count:
+            return StillSensors(
+                accelerometer,
+                None,
+                f'the gyroscope has {turns.count} readings at rest, and the accelerometer '
+                f'{accelerometer.count}: it is left out',
+            )
+        try:
+            return StillSensors(accelerometer, turns.stretch(last_s - first_s, motion_s, ''))
+        except UserError as error:
+            return StillSensors(accelerometer, None, f'the gyroscope is left out: {error}')
 
 
 class _Samples:
     """The undisturbed samples of a rest; those after a gap follow those before it."""
 
-    def __init__(self, first: Recording, file: IO[bytes]) -> None:
-        self._first, columns = first, len(first.sensor_columns)
-        self._phase = Phase(columns, file)
-        self._resolution = np.full(columns, np.inf)
+    def __init__(self, first: Recording, names: Sequence[str], file: IO[bytes]) -> None:
+        self._path, self._rate_hz, self._names = first.path, first.rate_hz, names
+        self._phase = Phase(len(names), file)
+        self._resolution = np.full(len(names), np.inf)
         self._start_s = self._stop_s = 0.0  # Stamps of the first and the newest sample
         self._gaps, self._gaps_s = 0, 0.0  # Number and time of the gaps
 
-    def feed(self, block: Recording, unit: Sensor, rest: Rest) -> None:
-        """Add the samples of a block that are part of the rest."""
-        time_s = block.time_s
+    @property
+    def count(self) -> int:
+        """Return the number of samples so far."""
+        return self._phase.count
+
+    def feed(self, time_s: np.ndarray, samples: np.ndarray, rest: Rest) -> None:
+        """Add those of samples at stamps, (n, m), that are part of the rest."""
         inside = (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
         for start_s, stop_s in rest.disturbed_s:
             inside &= (time_s <= start_s) | (time_s >= stop_s)
         if not inside.any():
             return
-        rows, time_s = block.accel_mps2(unit)[inside], time_s[inside]
+        rows, time_s = samples[inside], time_s[inside]
         if not self._phase.count:
             self._start_s = self._stop_s = float(time_s[0])
         steps_s = np.diff(time_s, prepend=self._stop_s)
-        gaps_s = steps_s[steps_s > gap_s(self._first.rate_hz)]
+        gaps_s = steps_s[steps_s > gap_s(self._rate_hz)]
         self._gaps += len(gaps_s)
         self._gaps_s += float(gaps_s.sum())
         self._stop_s = float(time_s[-1])
@@ -228,10 +267,10 @@ class _Samples:
         self, recorded_s: float, motion_s: list[tuple[float, float]], beyond_range: str
     ) -> StillStretch:
         """Return the samples as a rest; refuse an axis that never changes."""
-        for name, resolution in zip(self._first.sensor_columns, self._resolution):
+        for name, resolution in zip(self._names, self._resolution):
             if not np.isfinite(resolution):
                 raise UserError(
-                    f'{self._first.path}: {name} never changes from '
+                    f'{self._path}: {name} never changes from '
                     f'{self._start_s:.4g} s to {self._stop_s:.4g} s; the axis is '
                     'stuck, or not connected'
                 )

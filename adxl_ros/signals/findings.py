@@ -20,6 +20,7 @@ from adxl_ros.files.bag_reader import log_times
 from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import (
     BadStamps,
+    GYRO,
     Recording,
     REFERENCES,
 )
@@ -30,8 +31,10 @@ from adxl_ros.report.quantities import counted, duration
 from adxl_ros.signals.allan_deviation import shortest_rest_s
 from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.signals.gravity_at_rest import GravityAtRest
+from adxl_ros.signals.gyroscope_turns import GyroFindings, GyroLook
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import load_sensor
+from adxl_ros.signals.rest_detection import Rest
 import numpy as np
 
 _SAME_POSE_G = 0.1  # Distance of the means of two rests of one orientation, g. Chosen: 6° of tilt
@@ -90,6 +93,7 @@ class RecordingContents:
     log_delay_s: float | None
     remarks: tuple[str, ...]  # What was assumed or left out in reading
     cut: str  # Where a damaged file ends; empty if it is whole
+    gyro: GyroFindings | None = None  # What it shows of its gyroscope; None without one
 
 
 def examine(
@@ -106,6 +110,7 @@ def examine(
     look = RecordingLook(sensor, first)
     unit = look.unit
     axes = [_Axis(name, stamps.period_s) for name in first.sensor_columns]
+    gyro = _Gyro(first, stamps.period_s) if first.gyro_radps is not None else None
     # Lowest and highest value, sum and count of each reference by block
     references: dict[str, list[tuple[float, float, float, int]]] = {}
     for block in chain([first], blocks):
@@ -115,12 +120,9 @@ def examine(
         for axis, values in zip(axes, block.accel_mps2(unit).T):
             axis.feed(values)
         look.feed(block)
-        for name, values in block.columns.items():
-            read = values[np.isfinite(values)]
-            if name in REFERENCES and len(read):
-                references.setdefault(name, []).append(
-                    (float(read.min()), float(read.max()), float(read.sum()), len(read))
-                )
+        if gyro is not None:
+            gyro.feed(block)
+        _add_references(block, references)
     gravity = look.gravity()
     # By reference: lowest and highest values, sums, counts
     parts = {name: list(zip(*rows)) for name, rows in references.items()}
@@ -153,7 +155,19 @@ def examine(
         log_delay_s=log_delay_s,
         remarks=block.remarks,
         cut=block.cut,
+        gyro=gyro.result([found.rest for found in rests], means_mps2) if gyro else None,
     )
+
+
+def _add_references(
+    block: Recording, references: dict[str, list[tuple[float, float, float, int]]]
+) -> None:
+    for name, values in block.columns.items():
+        read = values[np.isfinite(values)]
+        if name in REFERENCES and len(read):
+            references.setdefault(name, []).append(
+                (float(read.min()), float(read.max()), float(read.sum()), len(read))
+            )
 
 
 def log_delay_s(times_ns: Iterable[np.ndarray]) -> float | None:
@@ -211,7 +225,7 @@ class _Axis:
     """Extreme values of an axis, and the longest time in which it does not change."""
 
     def __init__(self, name: str, period_s: float) -> None:
-        self._name, self._period_s = name, period_s
+        self.name, self._period_s = name, period_s
         # Largest value of minus the samples and of the samples, and how often they stay there
         self._largest, self._clipped = [-np.inf, -np.inf], [0, 0]
         self._last, self._count, self._changes = np.nan, 0, 0
@@ -254,13 +268,40 @@ class _Axis:
             and self._changes > _CHANGING * (self._count - self._most_equal)
         )
         return AxisRange(
-            self._name,
+            self.name,
             low,
             high,
             sum(self._clipped),
             low == high,
             stuck_s * (is_reported or low == high),
         )
+
+
+class _Gyro:
+    """What a recording shows of its gyroscope."""
+
+    def __init__(self, first: Recording, period_s: float) -> None:
+        self._look = GyroLook(first)
+        self._axes = [_Axis(name, period_s) for name in GYRO]
+
+    def feed(self, block: Recording) -> None:
+        """Add a block of the recording."""
+        self._look.feed(block)
+        for axis in self._axes:
+            values = block.columns[axis.name]
+            taken = values[np.isfinite(values)]
+            if len(taken):
+                axis.feed(taken)
+
+    def result(self, rests: list[Rest], means_mps2: list[np.ndarray]) -> GyroFindings | None:
+        """Return the findings; None where it was never sampled."""
+        ranges = [axis.result() for axis in self._axes]
+        if not np.isfinite([axis.lowest_mps2 for axis in ranges]).all():
+            return None
+        found = self._look.result(rests, means_mps2)
+        stuck = _stuck_faults(ranges)
+        # What is stuck follows no turn.
+        return replace(found, faults=tuple(stuck or found.faults))
 
 
 def _count_poses(means_mps2: Sequence[np.ndarray]) -> int:
@@ -362,14 +403,7 @@ def _stamp_faults(contents: RecordingContents) -> list[str]:
 
 
 def _sample_faults(contents: RecordingContents) -> list[str]:
-    faults = [
-        f'{axis.name} never changes; the axis is stuck, or not connected'
-        if axis.is_stuck
-        else f'{axis.name} does not change for {axis.stuck_s:.3g} s; the axis is stuck, or '
-        'the driver repeats a sample'
-        for axis in contents.axes
-        if axis.stuck_s
-    ]
+    faults = _stuck_faults(contents.axes)
     faults += [
         f'{axis.name} stays at its extreme value {axis.clipped} times in motion; its range '
         f'ends at {axis.lowest_mps2 / G0_MPS2:.3g} or {axis.highest_mps2 / G0_MPS2:.3g} g'
@@ -379,7 +413,20 @@ def _sample_faults(contents: RecordingContents) -> list[str]:
     faults += contents.neighbour_faults
     if contents.gravity.fault:
         faults.append(contents.gravity.fault.text)
+    if contents.gyro:
+        faults += contents.gyro.faults
     return faults
+
+
+def _stuck_faults(axes: Iterable[AxisRange]) -> list[str]:
+    return [
+        f'{axis.name} never changes; the axis is stuck, or not connected'
+        if axis.is_stuck
+        else f'{axis.name} does not change for {axis.stuck_s:.3g} s; the axis is stuck, or '
+        'the driver repeats a sample'
+        for axis in axes
+        if axis.stuck_s
+    ]
 
 
 def _remarks(contents: RecordingContents) -> list[str]:

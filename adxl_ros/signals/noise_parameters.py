@@ -13,14 +13,15 @@ a Gauss-Markov process (IEEE Std 952, annex B).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.exports import kalibr_settings
 from adxl_ros.files.recording_columns import Recording, unit_of
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.model.noise import (
     density_for_variance,
     electronics,
@@ -401,21 +402,21 @@ class FilterEvidence(NamedTuple):
 
 @dataclass(frozen=True)
 class AxisNoise:
-    """The noise of one axis."""
+    """The noise of one axis; u is m/s² for an accelerometer, rad/s for a gyroscope."""
 
     axis: str  # Its letter
-    fit: NoiseFit  # White noise, bias instability and random walk, in m/s²
-    sample_std: float  # Standard deviation of a sample, m/s²
-    resolution: float  # Smallest change of a sample, m/s²
-    rounding: float  # N of the rounding to this resolution, m/s²/√Hz, which `fit` does not contain
-    # Variance of a sample without rounding, bias instability and random walk, (m/s²)²
+    fit: NoiseFit  # White noise, bias instability and random walk, in u
+    sample_std: float  # Standard deviation of a sample, u
+    resolution: float  # Smallest change of a sample, u
+    rounding: float  # N of the rounding to this resolution, u/√Hz, which `fit` does not contain
+    # Variance of a sample without rounding, bias instability and random walk, u²
     white_variance: float
-    # Half of the mean square of the differences of neighbouring samples without rounding, (m/s²)²
+    # Half of the mean square of the differences of neighbouring samples without rounding, u²
     change_variance: float
 
     @property
     def estimates(self) -> tuple[Estimate, Estimate, Estimate]:
-        """N in m/s²/√Hz, B in m/s², and K in m/s²/√s."""
+        """N in u/√Hz, B in u, and K in u/√s."""
         return self.fit.white, self.fit.instability, self.fit.walk
 
     @property
@@ -442,7 +443,7 @@ class AxisNoise:
 
     @property
     def sample_white(self) -> float:
-        """N of the samples with their rounding, or its upper limit, m/s²/√Hz."""
+        """N of the samples with their rounding, or its upper limit, u/√Hz."""
         white = self.fit.white
         return float(np.hypot(white.value if white.is_seen else white.high, self.rounding))
 
@@ -458,6 +459,8 @@ class RecordingNoise:
     axes: list[AxisNoise]  # The noise by axis
     # What is wrong with the length of gravity and between neighbouring samples, one line each
     doubts: tuple[str, ...] = ()
+    gyro_rest: StillStretch | None = None  # The samples of the gyroscope in the same rest
+    gyro: Sequence[AxisNoise] = ()  # Its noise by axis; none without a gyroscope
 
 
 def recording_noise(
@@ -472,11 +475,23 @@ def recording_noise(
     sensor = load_sensor(params, first)
     unit = unit_of(sensor, first.stream_info, first.axes)
     look = RecordingLook(sensor, first)
-    rest = longest_rest(read, unit, first, look)
+    still = longest_rest(read, unit, first, look)
+    rest, gyro_rest = still.accelerometer, still.gyroscope
     doubts = require_unit(look.gravity(), first.path)
+    share = 1.0 if gyro_rest is None else 0.5
+    noises = _axis_noises(rest, unit.axes, lambda done: show(share * done))
+    gyro = (
+        _axis_noises(gyro_rest, AXES, lambda done: show(share * (1 + done))) if gyro_rest else []
+    )
+    doubts = [*doubts, *[still.gyro_doubt] * bool(still.gyro_doubt), *look.neighbour_faults()]
+    return RecordingNoise(first.path, sensor, unit, rest, noises, tuple(doubts), gyro_rest, gyro)
+
+
+def _axis_noises(rest: StillStretch, axes: str, show: Callable[[float], None]) -> list[AxisNoise]:
+    """Fit the noise of each axis of one sensor at rest."""
     variances = coefficient_variances(len(rest.means), rest.step_s)
     noises = []
-    for i, axis in enumerate(unit.axes):
+    for i, axis in enumerate(axes):
         std, resolution = float(rest.sample_std[i]), float(rest.resolution[i])
         rounding = resolution / float(np.sqrt(12 * rest.rate_hz))
         fit = fit_noise(rest.means[:, i], rest.step_s, variances, rounding)
@@ -499,10 +514,8 @@ def recording_noise(
                 max(float(rest.allan.deviation[0, i]) ** 2 - rounding_variance, 0.0),
             )
         )
-        show((i + 1) / len(unit.axes))
-    return RecordingNoise(
-        first.path, sensor, unit, rest, noises, (*doubts, *look.neighbour_faults())
-    )
+        show((i + 1) / len(axes))
+    return noises
 
 
 def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: float) -> NoiseFit:
@@ -572,6 +585,33 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise], rest: StillStretch) -> S
     return replace(filtered, **changed)
 
 
+def with_gyro_noise(gyro: Gyroscope, noises: Sequence[AxisNoise]) -> Gyroscope:
+    """
+    Give a gyroscope the measured noise, by the conventions of `with_noise`.
+
+    A term that is not seen on an axis is 0 there, but for white noise, which is its upper limit.
+    """
+    if not noises:
+        return gyro
+    densities = [
+        tuple(
+            factor * (estimate.value if estimate.is_seen else unseen * estimate.high)
+            for noise in noises
+            for estimate in [noise.estimates[term]]
+        )
+        for term, (factor, unseen) in enumerate(
+            ((ONE_SIDED, 1.0), (1 / float(np.sqrt(np.pi)), 0.0), (1.0, 0.0))
+        )
+    ]
+    white, flicker, walk = (each if any(each) else () for each in densities)
+    return replace(
+        gyro,
+        noise_density_radps_per_rthz=white,
+        flicker_radps_per_rthz=flicker,
+        walk_radps_per_rts=walk,
+    )
+
+
 def _density(sensor: Sensor, noises: list[AxisNoise], is_repeated: bool) -> np.ndarray:
     """
     Return the white noise before the filter by axis, g/√Hz over positive frequencies, (m,).
@@ -637,11 +677,35 @@ def _with_filter(
 _PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000
 
 
-Setting = tuple[str, list[float], str]
-"""A line of another program's settings: name, one value or nine of a matrix, and their unit."""
+Setting = tuple[str, list[float] | str, str]
+"""A line of another program's settings: name, one value or nine of a matrix, or text; its unit."""
 
 
-def settings(noises: list[AxisNoise], rate_hz: float) -> dict[str, list[Setting]]:
+class _OneForAll(NamedTuple):
+    """The noise of the loudest axis of a sensor, for programs with one value for all axes."""
+
+    white: float  # N of a sample with its rounding, u/√Hz
+    walk: float  # K, u/√s
+    white_note: str  # Whether N is an upper limit, for people
+    note: str  # Whether K is one
+    matrix: list[float]  # Variances of a sample, rows of a matrix, u²
+
+
+def _one_for_all(noises: Sequence[AxisNoise]) -> _OneForAll:
+    loudest = max(noises, key=lambda noise: noise.sample_white)
+    walk = max((noise.fit.walk for noise in noises), key=lambda walk: walk.value)
+    k = walk.value if walk.is_seen else max(noise.fit.walk.high for noise in noises)
+    white_note, note = (
+        '' if term.is_seen else ', an upper limit' for term in (loudest.fit.white, walk)
+    )
+    variances = [noise.sample_std**2 for noise in noises]
+    matrix = np.diag((variances + [1e6] * 3)[:3]).ravel().tolist()
+    return _OneForAll(loudest.sample_white, k, white_note, note, matrix)
+
+
+def settings(
+    noises: Sequence[AxisNoise], rate_hz: float, gyro_noises: Sequence[AxisNoise] = ()
+) -> dict[str, list[Setting]]:
     """
     Return the settings of other programs.
 
@@ -650,36 +714,44 @@ def settings(noises: list[AxisNoise], rate_hz: float) -> dict[str, list[Setting]
     robot_localization takes the variance of a sample from the message. Programs that have one
     value for all axes get the largest one. A term that is not seen is its upper limit.
     """
-    loudest = max(noises, key=lambda noise: noise.sample_white)
-    walk = max((noise.fit.walk for noise in noises), key=lambda walk: walk.value)
-    white, k = loudest.sample_white, walk.value
-    if not walk.is_seen:
-        k = max(noise.fit.walk.high for noise in noises)
-    white_note, note = (
-        '' if term.is_seen else ', an upper limit' for term in (loudest.fit.white, walk)
-    )
-    variances = [noise.sample_std**2 for noise in noises]
-    matrix = np.diag((variances + [1e6] * 3)[:3]).ravel()
+    accel = _one_for_all(noises)
+    gyro = _one_for_all(gyro_noises) if gyro_noises else None
+    # Each sensor with its name in settings and the units of its readings and their change.
+    sensors = [('acc', 'm/s^2', 'm/s^3', accel)]
+    sensors += [('gyr', 'rad/s', 'rad/s^2', gyro)] if gyro else []
 
-    def both(names: tuple[str, str], filter_hz: float, remark: str = '') -> list[Setting]:
+    def both(names: tuple[str, str], filter_hz: float) -> list[Setting]:
+        """Return N and K of each sensor for a filter at a rate."""
         root = float(np.sqrt(filter_hz))
-        return [
-            (names[0], [white * root], f'm/s^2{remark}{white_note}'),
-            (names[1], [k * root], f'm/s^3{note}'),
-        ]
+        rows: list[Setting] = []
+        for sensor, unit, walk_unit, of in sensors:
+            white_name, walk_name = (
+                name.format(small=sensor, large=sensor.upper()) for name in names
+            )
+            rows += [
+                (white_name, [of.white * root], f'{unit}{of.white_note}'),
+                (walk_name, [of.walk * root], f'{walk_unit}{of.note}'),
+            ]
+        return rows
 
+    notes = [accel.white_note, accel.note]
+    if gyro:
+        notes += [gyro.white_note, gyro.note]
+    densities = kalibr_settings(
+        (accel.white, accel.walk), (gyro.white, gyro.walk) if gyro else None
+    )
     return {
         'kalibr, imu.yaml': [
-            (name, [value], unit + remark)
-            for (name, value, unit), remark in zip(
-                kalibr_settings(white, k, rate_hz), (white_note, note, '')
-            )
+            *([('rostopic', '/imu/data_raw', 'write your topic')] if gyro else []),
+            *((name, [value], unit + note) for (name, value, unit), note in zip(densities, notes)),
+            ('update_rate', [rate_hz], 'Hz'),
         ],
-        f'VINS-Fusion, at {rate_hz:.4g} Hz': both(('acc_n', 'acc_w'), rate_hz),
+        f'VINS-Fusion, at {rate_hz:.4g} Hz': both(('{small}_n', '{small}_w'), rate_hz),
         'robot_localization, in sensor_msgs/Imu of the driver': [
-            ('linear_acceleration_covariance', matrix.tolist(), '(m/s^2)^2')
+            ('linear_acceleration_covariance', accel.matrix, '(m/s^2)^2'),
+            *([('angular_velocity_covariance', gyro.matrix, '(rad/s)^2')] if gyro else []),
         ],
-        'PX4, its filter at 100 Hz; vibration in flight needs more': both(
-            ('EKF2_ACC_NOISE', 'EKF2_ACC_B_NOISE'), _PX4_HZ, ', at least 0.01'
+        'PX4, its filter at 100 Hz; EKF2_ACC_NOISE at least 0.01; vibration needs more': both(
+            ('EKF2_{large}_NOISE', 'EKF2_{large}_B_NOISE'), _PX4_HZ
         ),
     }

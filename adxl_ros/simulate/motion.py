@@ -355,6 +355,16 @@ def visible_step(reading: np.ndarray, step: float) -> float:
     return finer if finer > _SMALLEST_CHANGE * step else 0.0
 
 
+def rounding_step(reading: np.ndarray) -> float:
+    """Return the step to which readings, (n,), are rounded; 0 where they show none."""
+    changes = np.abs(np.diff(reading))
+    changes = changes[changes > 0]
+    if len(changes) < _MIN_MOVING:
+        return 0.0
+    steps = changes / changes.min()
+    return float(changes.min()) if np.all(np.abs(steps - np.rint(steps)) < _WHOLE) else 0.0
+
+
 def _is_interpolated(reading: np.ndarray, step: float) -> bool:
     """Return whether readings, (n,), change often, and not by whole steps."""
     changes = np.abs(np.diff(reading))

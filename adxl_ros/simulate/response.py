@@ -187,11 +187,13 @@ class Response:
         stamps_s = self._begin_s + (self._done_steps + np.arange(count)) * self._step_s
         signals = self._chain.signals(NOMINAL_ENVIRONMENT, time_s=stamps_s, dt_s=self._dt_s)
         places = [Place.REFERENCE]
+        # Without an effect that follows it, the rotation of a robot is not computed.
+        rotates = bool(self._motion.force and self._chain.effects[Place.FORCE])
         for place in (Place.CLOCK, Place.STAGE, Place.FORCE, Place.MOUNTING, Place.ELEMENT):
             places.append(place)
             signals = self._kept(
                 place.name,
-                (*self._key(*places), self._done_steps, count),
+                (*self._key(*places), rotates, self._done_steps, count),
                 partial(self._through, place, signals),
             )
         return replace(signals)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
 
-from adxl_ros.errors import install_hint, UserError
+from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
@@ -31,6 +31,8 @@ from adxl_ros.model.sensor import (
     with_neutral,
 )
 from adxl_ros.model.signal_chain import Chain
+from adxl_ros.simulate.gyroscope_model import GyroscopeModel
+from adxl_ros.simulate.host_arrays import chosen, like, of_each, on_host
 from adxl_ros.simulate.motion import check_needs, lagrange_weights, Motion, POINTS
 import numpy as np
 from scipy.special import ndtr, ndtri
@@ -164,6 +166,8 @@ class SensorModel:
         self._chain = Chain(
             simulated, [name for name in simulated.effects if name not in self.left_out], seed
         )
+        # The gyroscope beside it: angular velocity of each step in, readings out
+        self.gyro = GyroscopeModel(self.sensor.gyro, seed)
         self._past_weights = np.zeros(0)
         self._shape: tuple[int, ...] = ()
         self._dt_s, self._std_v = 0.0, np.zeros(0)
@@ -194,14 +198,9 @@ class SensorModel:
         if seed is not None:
             self._units_rng, self._white = _generators(seed)
             self._chain.seed(seed)
+        self.gyro.reset(env_ids, seed)
         if count := len(self._memory['steps']):
-            rows = np.arange(count)[
-                slice(None)
-                if env_ids is None
-                else env_ids
-                if isinstance(env_ids, slice | list)
-                else _on_host(env_ids)
-            ]
+            rows = chosen(env_ids, count)
             self._reset = np.union1d(self._reset, rows)
             self._draw(rows)
 
@@ -249,11 +248,11 @@ class SensorModel:
             The shape or the time step is wrong, or changes, or a value is not finite.
 
         """
-        force = np.asarray(_on_host(specific_force), float)
+        force = np.asarray(on_host(specific_force), float)
         count = force.size // 3
         self._check(force, dt)
         environment = [
-            _of_each(name, values, count)
+            of_each(name, values, count)
             for name, values in (('temperature', temperature), ('supply', supply))
         ]
         rows = force.reshape(-1, 3)
@@ -276,7 +275,7 @@ class SensorModel:
                 begun,
             )
             self._reset = np.zeros(0, int)
-        return _like(readings.reshape(force.shape), specific_force)
+        return like(readings.reshape(force.shape), specific_force)
 
     def _advance(self, rows: np.ndarray, environment: list[np.ndarray]) -> np.ndarray:
         """Return the readings of all sensors at the next step, m/s², (n, 3)."""
@@ -376,41 +375,6 @@ class SensorNoise:
     def __call__(self, data: Any) -> Any:
         """Return the readings of the specific force of one step, m/s², (num_envs, 3)."""
         return self._model(data, self._dt_s)
-
-
-def _of_each(name: str, values: float | np.ndarray, count: int) -> np.ndarray:
-    """Return a number, or a number for each sensor, as (1, n)."""
-    numbers = np.asarray(_on_host(values), float)
-    if numbers.shape not in ((), (count,)):
-        raise UserError(f'{name} has the shape {numbers.shape}; expected a number or ({count},)')
-    if not np.isfinite(numbers).all():
-        raise UserError(f'{name} is not finite; check the simulation')
-    return np.broadcast_to(numbers, (1, count))
-
-
-def _on_host(array: Any) -> np.ndarray:
-    """Return an array of any library and device as one of numpy."""
-    return np.asarray(array.detach().cpu() if hasattr(array, 'detach') else array)
-
-
-def _like(values: np.ndarray, like: Any) -> Any:
-    """Return values as an array of the same library, floating type and device as another one."""
-    if isinstance(like, np.ndarray):
-        return values.astype(like.dtype) if np.issubdtype(like.dtype, np.floating) else values
-    if isinstance(like, list | tuple):
-        return values
-    try:
-        from array_api_compat import array_namespace, device
-    except ImportError:
-        raise UserError(
-            'arrays of other libraries than numpy need array-api-compat; '
-            f'{install_hint("array-api-compat")}'
-        ) from None
-    space = array_namespace(like)
-    is_floating = space.isdtype(like.dtype, 'real floating')
-    return space.asarray(
-        values, dtype=like.dtype if is_floating else space.float32, device=device(like)
-    )
 
 
 def _generators(seed: int) -> list[np.random.Generator]:

@@ -13,7 +13,8 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import ACCEL, JOINTS, Recording
 from adxl_ros.files.stamps import stamped_rate_hz
-from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
+from adxl_ros.model import noise
+from adxl_ros.model.constants import G0_MPS2, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import (
     BAND_LIMITED_DEGREE,
@@ -25,6 +26,7 @@ from adxl_ros.simulate.motion import (
     Motion,
     Path,
     Pieces,
+    rounding_step,
     SmoothedPath,
 )
 import numpy as np
@@ -40,6 +42,9 @@ _SHAKE_HIGH_HZ = 40.0  # Highest frequency, Hz; chosen: near the bandwidth
 _SHAKE_MPS2 = 1.0  # Amplitude of the shaker, m/s²; chosen: a tenth of gravity
 _SHAKE_S = 40.0  # Duration of the shaker, s; chosen: some 9 s for each octave
 _FADE_S = 2.0  # Fade in and out, s; chosen: four of the longest periods
+_ROUNDING_OF_NOISE = 0.1
+"""Force by the rounding of the shift, divided by the noise, from which it is smoothed. Chosen: it
+adds half a per cent to the rms."""
 _SHAKE_KNOTS_HZ = 1000.0  # Knots of its spline a second; chosen: the force is exact to 0.4 µg
 
 
@@ -299,14 +304,40 @@ def motion_from_references(read: Recording, sensor: Sensor) -> Motion:
             )
     paths: dict[str, Any] = environment_paths(read)
     for joint, name in JOINTS.items():
-        resolution = 0.0 if joint == 'shift' else sensor.stage_resolution_rad
         if joint != 'shift':
-            _check_speed(read, name, resolution)
-        if np.isfinite(read.columns.get(name, np.nan)).any():
+            _check_speed(read, name, sensor.stage_resolution_rad)
+        if not np.isfinite(read.columns.get(name, np.nan)).any():
+            continue
+        if joint == 'shift':
+            paths[joint] = _shift_path(read, sensor)
+        else:
             paths[joint] = SmoothedPath(
-                read.time_s, read.columns[name], resolution, BAND_LIMITED_DEGREE
+                read.time_s, read.columns[name], sensor.stage_resolution_rad, BAND_LIMITED_DEGREE
             )
     return Motion(read.span_s, **paths)
+
+
+def _shift_path(read: Recording, sensor: Sensor) -> SmoothedPath:
+    """
+    Return the path of the shift, whose second derivative is a force.
+
+    Its readings are exact but for their digits. Where fast readings make the rounding, twice
+    differentiated, a force that shows beside the noise, the path is smoothed by as much as they
+    are rounded.
+    """
+    readings = read.columns['shift_m']
+    sampled = np.isfinite(readings)
+    exact = SmoothedPath(read.time_s, readings, 0.0, BAND_LIMITED_DEGREE)
+    step_m = rounding_step(readings[sampled])
+    if not step_m:
+        return exact
+    rate_hz = stamped_rate_hz(read.time_s[sampled])
+    # The rounding of a reading is step/√12 rms, and weighs 1, −2 and 1 in a second difference.
+    rounding_mps2 = step_m * np.sqrt(6 / 12) * rate_hz**2
+    noise_mps2 = np.min(noise.analog_std_v(sensor) / sensor.scale_v_per_g) * G0_MPS2
+    if rounding_mps2 < _ROUNDING_OF_NOISE * noise_mps2:
+        return exact
+    return SmoothedPath(read.time_s, readings, step_m, is_seen=True, knot_s=2 / rate_hz)
 
 
 def environment_paths(read: Recording) -> dict[str, Path]:

@@ -68,7 +68,7 @@ def apply(options: argparse.Namespace) -> int:
         raise UserError(f'{options.recording}: has no samples to correct')
     correction = Correction(first, options.params, options.inverse, options.undo_filter)
     block = first
-    with writer(options.output) as write, cli.progress('apply') as show:
+    with writer(options.output, correction.sensor) as write, cli.progress('apply') as show:
         for block, estimates in correction.blocks(itertools.chain([first], blocks)):
             write(block, estimates)
             show(block.done)

@@ -9,10 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from adxl_ros.api.calibration import fit as fit_unit
+from adxl_ros.api.updating import PAGE as UPDATE_PAGE, update
 from adxl_ros.calibrate.calibration import STAGE_FITS
 from adxl_ros.calibrate.report.gum import SCHEMA_VERSION
 from adxl_ros.calibrate.report.page import PAGE
-from adxl_ros.files.calibration_store import default_folder
+from adxl_ros.errors import UserError
+from adxl_ros.files.calibration_store import default_folder, put
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Place
 from adxl_ros.process import command
@@ -24,6 +26,9 @@ _EXAMPLES = {
         'sweep.csv -o unit.yaml --report report'
     ),
     'two sweeps of one unit, the linear model': 'one.mcap two.mcap --model linear -o unit.yaml',
+    'a calibration kept up to date by the days of a robot at work': (
+        '--update unit.yaml day1.mcap day2.mcap -o updated.yaml --report report'
+    ),
     'a further effect': 'sweep.csv --effect temperature_bias -o unit.yaml',
 }
 """Examples of arguments, by their purpose."""
@@ -39,6 +44,12 @@ def parser() -> argparse.ArgumentParser:
         default=None,
         help='values that are not fitted (default: the nominal sensor; what '
         'a file leaves out is measured)',
+    )
+    parse.add_argument(
+        '--update',
+        metavar='FILE',
+        help='keep this calibration up to date by the rests of the recordings, in the order of '
+        'time, as the node keep_calibrated does',
     )
     parse.add_argument(
         '--model',
@@ -109,8 +120,40 @@ def _details() -> str:
 _MEANS_RATE_HZ = 1.0  # Stamps of a table of means, which have no meaning
 
 
+def _update(options: argparse.Namespace) -> int:
+    """Replay recordings of a robot at work."""
+    of_a_fit = ('params', 'model', 'effect', 'prior', 'journal', 'poses', 'means', 'dcc', 'urdf')
+    given = [name for name in of_a_fit if getattr(options, name)]
+    if given:
+        raise UserError(f'--update: changes a calibration; leave --{given[0]} out')
+    cli.check_outputs(
+        options, options.output, options.report and Path(options.report, UPDATE_PAGE)
+    )
+    reading = cli.reading_options(options)
+    with cli.progress('fit') as show:
+        updated = update(
+            (cli.read('fit', path, reading) for path in options.recording),
+            options.update,
+            progress=show,
+        )
+    pages = []
+    if options.report:
+        pages.append(updated.report(options.report, overwrite=options.overwrite))
+    updated.save(options.output, overwrite=options.overwrite)
+    if updated.adoptions and options.store:
+        cli.note(f'fit: stored {put(options.store, updated.sensor)}')
+    cli.print_end(
+        [*updated.screen],
+        [options.output, *pages],
+        command('apply', f'NEW.mcap --params {cli.quoted(options.output)} -o tilt.csv'),
+    )
+    return 0
+
+
 def fit(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
+    if options.update:
+        return _update(options)
     cli.check_outputs(
         options, options.output, options.dcc, options.report and Path(options.report, PAGE)
     )

@@ -6,9 +6,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+import json
 from pathlib import Path
 
-from adxl_ros.api.noise import BLOCK_ROWS, noise as find_noise, PLOT
+from adxl_ros.api.noise import BLOCK_ROWS, noise as find_noise, PLOT, TABLE
 from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.process import command
@@ -42,15 +43,21 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '-o', dest='output', metavar='FILE.yaml', help='a parameter file with the measured noise'
     )
-    parse.add_argument('--report', metavar='DIR', help='write the curve allan.png there')
+    parse.add_argument(
+        '--report', metavar='DIR', help='write the curve there, allan.png and allan.csv'
+    )
     cli.add_overwrite_option(parse)
+    parse.add_argument(
+        '--json', action='store_true', help='print figures and curve as JSON, in SI units'
+    )
     cli.add_recording_options(parse)
     return parse
 
 
 def noise(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
-    cli.check_outputs(options, options.output, options.report and Path(options.report, PLOT))
+    curves = [Path(options.report, name) for name in (PLOT, TABLE)] if options.report else []
+    cli.check_outputs(options, options.output, *curves)
     reading = cli.reading_options(options)
     newest: list[Recording] = []
     with cli.progress('noise') as show:
@@ -63,12 +70,16 @@ def noise(options: argparse.Namespace) -> int:
 
         found = find_noise(blocks, options.params, progress=show)
     cli.report_notes('noise', newest[-1].notes)
-    files = [found.report(options.report, overwrite=options.overwrite)] if options.report else []
-    lines = found.screen
+    if options.report:
+        found.report(options.report, overwrite=options.overwrite)
+    lines, files = found.screen, curves
     if options.output:
         found.save(options.output, overwrite=options.overwrite)
-        files.insert(0, Path(options.output))
+        files = [Path(options.output), *curves]
         lines += [f'WARNING {text}' for text in found.refuted_filter]
+    if options.json:
+        print(json.dumps(found.to_dict(), indent=1))
+        return 0
     following = (
         command('diagnose', f'RECORDING --params {cli.quoted(options.output)} -o gap')
         if options.output

@@ -2,6 +2,8 @@
 
 """The search on effects that are linear in their sizes, so that a fit has a closed form."""
 
+from dataclasses import replace
+
 from adxl_ros.diagnose.comparison import compare
 from adxl_ros.diagnose.linear_model import build_linear_model
 from adxl_ros.diagnose.search import fit_hypothesis, linearise, Search
@@ -10,6 +12,7 @@ from adxl_ros.model.sensor import put, with_neutral
 from gaps import simulated, turning, unit, warm
 import numpy as np
 import pytest
+from units import nominal
 
 LIBRARY = ('temperature_bias', 'lever_arm', 'quadratic')
 PER_K = 4e-4
@@ -75,6 +78,16 @@ def test_a_true_effect_gains_evidence_and_another_one_none(warmed):
     false = fit_hypothesis(warmed, ['lever_arm'], {}, {})
     assert true.log_evidence > nothing.log_evidence + 10
     assert false.log_evidence < nothing.log_evidence + 3
+
+
+def test_a_decay_that_takes_for_ever_is_a_zero_g():
+    """A warm-up of hours is constant within a minute; it is not named beside the zero-g."""
+    sensor = replace(nominal('xy'), rate_hz=125.0, stage_resolution_rad=1e-4)
+    recording = simulated(sensor, 'bias:offset_v=0.009', motion=turning())
+    search = Search(build_linear_model([compare(recording, sensor)], only=('bias', 'warm_up')))
+    search.run(lambda share: None)
+    assert frozenset({'bias'}) in search.found
+    assert frozenset({'warm_up'}) not in search.found
 
 
 def test_the_search_ends_with_the_effects_that_act():

@@ -8,7 +8,7 @@ from functools import cache
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.adc import _flicker_filter
+from adxl_ros.model.effects.adc import flicker_filter
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Need, Place
 from adxl_ros.model.filters import play, resonator
 from adxl_ros.model.sensor import get, names_of, parameter_of, put, typical, with_neutral
@@ -250,7 +250,7 @@ def test_flicker_is_one_over_f():
     shape = np.mean(densities, axis=0) * f / 1e-8
     for low, tolerance in ((0.03, 0.15), (0.3, 0.05), (2.0, 0.03), (6.0, 0.03)):
         assert shape[(f > low) & (f < 2 * low)].mean() == pytest.approx(1.0, abs=tolerance)
-    f, response = sosfreqz(_flicker_filter(100.0), [0.001, 0.02, 0.1, 0.7, 3.0, 9.0, 19.0], fs=100)
+    f, response = sosfreqz(flicker_filter(100.0), [0.001, 0.02, 0.1, 0.7, 3.0, 9.0, 19.0], fs=100)
     assert 2 / 100 * f * abs(response) ** 2 == pytest.approx(np.ones(7), abs=0.03)
 
 

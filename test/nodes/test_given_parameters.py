@@ -163,7 +163,7 @@ def test_a_text_with_a_colon_gets_the_hint_of_its_quotes(refusal):
 
 
 @pytest.mark.parametrize(
-    'node', ['stage', 'calibration', 'compensation', 'investigate', 'monitor']
+    'node', ['stage', 'calibration', 'compensation', 'investigate', 'monitor', 'keep_calibrated']
 )
 def test_an_unknown_parameter_of_a_file_is_refused_at_its_line(refusal, tmp_path, node):
     text = NOMINAL.read_text() + '    sweep: {dwel_s: 2.0}\n'

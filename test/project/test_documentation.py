@@ -32,6 +32,7 @@ EXECUTABLES = (
     'calibration',
     'stage',
     'monitor',
+    'keep_calibrated',
     'investigate',
     'screen',
     'demo',
@@ -177,6 +178,12 @@ def test_the_pages_by_hand_stay_short() -> None:
         if 'reference' not in page.parts
     )
     assert sum(len(text.split()) for text in texts) <= MOST_WORDS
+
+
+def test_the_first_page_stays_short() -> None:
+    """Of a front page, a newcomer reads one screen or two."""
+    assert len((REPO / 'README.md').read_text('utf-8').split()) <= 750
+    assert (DOCS / 'gap.svg').stat().st_size < 1_000_000
 
 
 def test_the_tilt_error_has_one_definition() -> None:

@@ -5,10 +5,13 @@
 from adxl_ros.errors import UserError
 from adxl_ros.files.robot_readings import Readings
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.simulate.motion import ForcePath, Motion
+from adxl_ros.simulate.response import ChainMemo, Response
 from adxl_ros.simulate.robot import Robot, robot_path, RobotPath
 import numpy as np
 import pytest
 from robots import encoded, urdf
+from units import nominal, with_effects
 
 pytest.importorskip('pinocchio')
 ARM_M, PENDULUM = 0.5, [('0 1 0', '0 0 1')]
@@ -169,3 +172,22 @@ def test_a_file_that_is_no_urdf(tmp_path):
         Robot(tmp_path / 'robot.urdf', 'imu_link')
     with pytest.raises(UserError, match='no such file'):
         Robot(tmp_path / 'none.urdf', 'imu_link')
+
+
+def test_an_effect_of_the_rotation_shows_after_a_simulation_without_it():
+    """What a recording keeps of its simulations has a rotation only where one was asked for."""
+
+    class Turning(ForcePath):
+        is_robot = True
+
+        def rotation(self, time_s):
+            ones, zeros = np.ones(len(time_s)), np.zeros(len(time_s))
+            return [zeros, zeros, 2 * ones], [zeros] * 3
+
+    time_s = np.arange(200) / 100
+    motion = Motion(2.0, force=Turning(time_s, np.tile([0.0, 0.0, G0_MPS2], (200, 1))))
+    sensor, memo = nominal('xyz', rate_hz=100.0), ChainMemo()
+    arm = with_effects(sensor, ['lever_arm:x_m=0.1'])
+    without, beside = (Response(s, motion, 0).whole(time_s, memo) for s in (sensor, arm))
+    change_mps2 = (beside - without)[-1, 0] / sensor.scale_v_per_g[0] * G0_MPS2
+    assert change_mps2 == pytest.approx(-0.1 * 2**2, rel=0.05)

@@ -5,6 +5,7 @@
 import fcntl
 import os
 import pty
+import re
 import signal
 import struct
 import subprocess
@@ -71,14 +72,21 @@ class Terminal:
         os.write(self._master, key.encode())
 
     def wait_for(self, *texts, timeout_s=30.0):
-        """Return the screen when it shows all of some texts; wait for a multiple of the time."""
+        """
+        Return the screen when it shows all of some texts; wait for a multiple of the time.
+
+        A text may be a compiled pattern: a number that goes on is not waited for alone.
+        """
         end_s = time.monotonic() + PATIENCE * timeout_s
         # The terminal folds long lines.
-        expected = [' '.join(text.split()) for text in texts]
+        expected = [
+            text if isinstance(text, re.Pattern) else re.compile(re.escape(' '.join(text.split())))
+            for text in texts
+        ]
         while True:
             screen = self.text()
             unfolded = ' '.join(screen.split())
-            if all(text in unfolded for text in expected):
+            if all(text.search(unfolded) for text in expected):
                 return screen
             if time.monotonic() > end_s:
                 pytest.fail(

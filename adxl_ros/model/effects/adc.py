@@ -354,7 +354,7 @@ _MATCHED = 0.02  # Frequency divided by the sample rate at which the density is 
 
 
 @lru_cache(maxsize=8)
-def _flicker_filter(rate_hz: float) -> np.ndarray:
+def flicker_filter(rate_hz: float) -> np.ndarray:
     """
     Return the sections that make flicker noise of k = 1 from white noise, as `sosfilt` takes them.
 
@@ -412,7 +412,7 @@ def flicker(signals: Signals, p: Parameters) -> None:
     # scipy.signal takes 0.5 s to import.
     from scipy.signal import sosfilt
 
-    sections = _flicker_filter(1 / signals.dt_s)
+    sections = flicker_filter(1 / signals.dt_s)
     noise, signals.memory['state'] = sosfilt(
         sections,
         signals.rng.standard_normal(shape),

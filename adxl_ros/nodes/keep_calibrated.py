@@ -1,0 +1,371 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""Keep the calibration of a robot at work up to date by its rests, and say how sure it is."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+import math
+from pathlib import Path
+import time
+from typing import Any
+
+from adxl_ros.calibrate.keep.keeper import Keeper, KeepSettings, KEPT, KeptState
+from adxl_ros.calibrate.keep.stays import RestStream
+from adxl_ros.errors import UserError
+from adxl_ros.files import calibration_store, parameter_file
+from adxl_ros.files.atomic_write import make_folder
+from adxl_ros.files.recording_columns import check_unit, NO_UNIT, StreamInfo
+from adxl_ros.files.sweep_journal import Journal, NaturalRest, read
+from adxl_ros.model.sensor import get, put, Sensor, to_volts
+from adxl_ros.nodes import parameters, topics
+from adxl_ros.nodes.parameters import parameter, sample_unit
+from adxl_ros.nodes.run_node import run
+from adxl_ros.nodes.topics import Inbox, Level, Status
+from diagnostic_msgs.msg import DiagnosticStatus
+import numpy as np
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from rclpy.node import Node
+from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
+
+
+@dataclass(frozen=True)
+class KeepCalibratedSettings:
+    """The node that keeps a calibration."""
+
+    samples_unit: str = sample_unit()
+    drift_mg_per_year: float = parameter(
+        KeepSettings.drift_mg_per_year, 'usual drift of the zero-g in a year', 'mg', 0.01, 1000.0
+    )
+    dry_run: bool = parameter(False, 'only report; nothing is adopted or sent')
+    ramp_s: float = parameter(
+        60.0, 'time over which an adopted calibration replaces the one before', 's', 0.0, 3600.0
+    )
+    compensation: str = parameter(
+        'compensation', 'node that gets the calibration and its covariance; empty: none'
+    )
+    store: str = parameter(
+        str(calibration_store.default_folder()),
+        'folder of calibrations, which gets each adopted one; empty: none',
+    )
+    output: str = parameter(
+        str(calibration_store.default_folder().with_name('kept')), 'folder of the journal'
+    )
+
+
+_INPUT_QUEUE = 10000  # Messages that are kept while the node is busy: 10 s at 1 kHz
+_TURN_S = 0.2  # Time between two looks at the topics, s; chosen: a turn costs as ten messages
+_STEPS = 20  # Steps of a ramp; chosen: each is below the noise of a sample
+_SENT_AGAIN_S = 3600.0  # Time after which a grown covariance is sent, s; chosen: drift of weeks
+_EXAMPLES = {
+    'a robot at work': '--ros-args --params-file unit.yaml',
+    'only report what would be adopted': '--ros-args --params-file unit.yaml -p dry_run:=true',
+}
+"""Examples of arguments, by their purpose."""
+
+
+class _Receiver:
+    """The compensation that gets calibrations, whole and live."""
+
+    def __init__(self, node: Node, name: str, folder: Path, ramp_s: float) -> None:
+        self._folder, self._step_s = folder, ramp_s / _STEPS
+        self._client = (
+            node.create_client(SetParameters, f'{name}/set_parameters') if name else None
+        )
+        self._waiting: deque[Sensor] = deque()
+        self._answer: object = None
+        self._due_s = 0.0
+        self._number = 0
+        self._was_there = False
+        self.refusal = ''
+
+    @property
+    def is_there(self) -> bool:
+        """Return whether the compensation runs."""
+        return self._client is not None and self._client.service_is_ready()
+
+    @property
+    def ramp(self) -> float:
+        """Return the share of the newest change that is in use, 0 to 1."""
+        return 1.0 - len(self._waiting) / _STEPS if len(self._waiting) > 1 else 1.0
+
+    def change(self, before: Sensor, after: Sensor) -> None:
+        """Send a calibration in small steps from the one before."""
+        names = after.covariance_names
+        begin, end = get(before, names), get(after, names)
+        shares = np.linspace(0, 1, _STEPS + 1)[1:]
+        self._waiting = deque(put(after, names, begin + share * (end - begin)) for share in shares)
+
+    def send(self, sensor: Sensor) -> None:
+        """Send a calibration at once, unless a ramp runs."""
+        if not self._waiting:
+            self._waiting.append(sensor)
+
+    def has_come(self) -> bool:
+        """Return whether the compensation has started since the last call."""
+        before, self._was_there = self._was_there, self.is_there
+        return self._was_there and not before
+
+    def turn(self, now_s: float) -> None:
+        """Send what is due."""
+        if not self._waiting or not self.is_there or now_s < self._due_s:
+            return
+        assert self._client is not None
+        self._due_s = now_s + self._step_s
+        # The one before may still be read.
+        self._number = 1 - self._number
+        path = self._folder / f'in_use_{self._number}.yaml'
+        parameter_file.save(path, self._waiting.popleft())
+        value = ParameterValue(
+            type=ParameterType.PARAMETER_STRING, string_value=str(path.resolve())
+        )
+        request = SetParameters.Request(parameters=[Parameter(name='calibration', value=value)])
+        future = self._client.call_async(request)
+        future.add_done_callback(lambda done: self._note(done.result()))
+
+    def _note(self, response: SetParameters.Response | None) -> None:
+        results = response.results if response else []
+        self.refusal = next((each.reason for each in results if not each.successful), '')
+
+
+class KeepCalibrated(Node):
+    """The node: it connects topics and services to the package `calibrate.keep`."""
+
+    def __init__(self) -> None:
+        super().__init__('keep_calibrated')
+        parameters.check_given(self)
+        flat = parameters.given_sensor(self)
+        self._own = own = parameters.declare_all(self, KeepCalibratedSettings)
+        self._keeper: Keeper | None = None
+        self._stream: RestStream
+        self._journal: Journal
+        self._receiver: _Receiver | None = None
+        self._newest_ns = 0
+        self._sent_s = -_SENT_AGAIN_S
+        self._obstacle = 'waiting for sensor_info, which names the unit'
+        self._samples = Inbox(self, Imu, 'imu/data_raw', _INPUT_QUEUE, own.samples_unit)
+        self._surroundings = topics.Surroundings(self, _INPUT_QUEUE)
+        self._info_topic = self.resolve_topic_name('sensor_info')
+        given = parameters.make_sensor(flat, may_measure=True)
+        if given.effects:
+            self._begin(given)
+        topics.create_subscription(
+            self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True
+        )
+        topics.DiagnosticsReporter(self, 'calibration', self._status)
+        self.create_service(Trigger, '~/undo', self._on_undo)
+        self.create_timer(_TURN_S, self._turn, clock=topics.STEADY)
+
+    def close(self) -> None:
+        """Close the journal."""
+        if self._keeper is not None:
+            self._journal.close()
+
+    def _begin(self, sensor: Sensor) -> None:
+        """Keep a calibration, or go on with its journal."""
+        own, first = self._own, sensor.provenance.get(KEPT)
+        name = first or calibration_store.calibration_id(sensor)
+        folder = make_folder(
+            calibration_store.unit_folder(Path(own.output).expanduser(), sensor.serial)
+        )
+        path = folder / f'{calibration_store.unit_folder("", name)}.jsonl'
+        head: dict[str, Any] = {'kind': 'kept', 'base': parameter_file.to_flat(sensor)}
+        if path.exists() and path.stat().st_size:
+            head = read(path).head
+            sensor = parameter_file.from_flat(head['base'], parameters.parameter_error)
+        elif first:
+            self.get_logger().info(f'{path}: is not there; the journal begins anew')
+        self._journal = Journal(path, head)
+        entries = self._journal.entries
+        self._keeper = Keeper(
+            sensor,
+            KeepSettings(own.drift_mg_per_year),
+            entries,
+            self._journal.append,
+            may_adopt=not own.dry_run,
+        )
+        self._stream = RestStream(sensor)
+        self._stream.go_on_after(
+            max((entry.stay for entry in entries if isinstance(entry, NaturalRest)), default=0)
+        )
+        name = '' if own.dry_run else own.compensation
+        self._receiver = _Receiver(self, name, folder, own.ramp_s)
+        self._obstacle = ''
+        self.get_logger().info(
+            f'keeping {calibration_store.calibration_id(sensor)} up to date, '
+            f'{len(entries)} entries in {path}'
+        )
+
+    def _on_info(self, message: DiagnosticStatus) -> None:
+        info = topics.stream_info(message, self._info_topic)
+        try:
+            if self._keeper is None:
+                self._begin(self._stored(info))
+            assert self._keeper is not None
+            check_unit(info, info.axes or self._keeper.sensor.axes, self._keeper.sensor)
+            self._obstacle = ''
+        except UserError as error:
+            self._obstacle = str(error)
+            self.get_logger().error(self._obstacle)
+
+    def _stored(self, info: StreamInfo) -> Sensor:
+        """Return the newest calibration of the unit in the store."""
+        own = self._own
+        if not own.store or info.serial == NO_UNIT:
+            raise UserError('no calibration is given; start with --params-file unit.yaml')
+
+        def check(sensor: Sensor) -> None:
+            check_unit(info, info.axes or sensor.axes, sensor)
+
+        choice = calibration_store.newest(own.store, info.serial, check)
+        if choice.path is None:
+            raise UserError(
+                f'no calibration of {info.serial} in {own.store}; start with --params-file'
+            )
+        return parameter_file.load(choice.path)
+
+    def _turn(self) -> None:
+        """Take what has come."""
+        stamps_ns, accel_mps2 = topics.imu_samples(self._samples.take())
+        surroundings = [*self._surroundings.take()]
+        if self._keeper is None or self._receiver is None or self._obstacle:
+            return
+        for topic, times_ns, values in surroundings:
+            if topic == 'temperature':
+                self._stream.add_temperature(times_ns, values[:, 0])
+        if len(stamps_ns):
+            self._newest_ns = int(stamps_ns[-1])
+            sensor = self._keeper.sensor
+            volts = to_volts(accel_mps2[:, : len(sensor.axes)], sensor)
+            for rest in self._stream.add(stamps_ns, volts):
+                self._take(self._keeper, rest)
+        now_s = time.monotonic()
+        if self._receiver.has_come() or now_s - self._sent_s > _SENT_AGAIN_S:
+            self._receiver.send(self._keeper.sensor)
+            self._sent_s = now_s
+        self._receiver.turn(now_s)
+
+    def _take(self, keeper: Keeper, rest: NaturalRest) -> None:
+        """Take a rest, and adopt what it decides."""
+        before = keeper.sensor
+        try:
+            adopted = keeper.add(rest)
+        except UserError as error:
+            self._obstacle = str(error)
+            self.get_logger().error(self._obstacle)
+            return
+        if adopted is not None:
+            stored = self._exchange(before, keeper.sensor)
+            state = keeper.state(rest.stop_ns)
+            self.get_logger().info(
+                f'adopted: {_by_axis(keeper.sensor, state.total_mg)} since the calibration; '
+                f'{stored}'
+            )
+
+    def _exchange(self, before: Sensor, after: Sensor) -> str:
+        """Store a calibration and send it in a ramp; return where it is."""
+        assert self._receiver is not None
+        self._receiver.change(before, after)
+        self._sent_s = time.monotonic()
+        path = calibration_store.put(self._own.store, after) if self._own.store else None
+        return f'stored as {path}' if path else 'not stored'
+
+    def _on_undo(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        keeper = self._keeper
+        try:
+            if keeper is None:
+                raise UserError(self._obstacle)
+            before = keeper.sensor
+            first = before.provenance.get(KEPT, '')
+            now = self.get_clock().now().nanoseconds
+            keeper.undo(self._newest_ns or now)
+            date = datetime.fromtimestamp(now * 1e-9, timezone.utc).isoformat(timespec='seconds')
+            provenance = {**keeper.sensor.provenance, 'date': date, KEPT: first}
+            provenance.pop('id', None)
+            stored = self._exchange(before, replace(keeper.sensor, provenance=provenance))
+        except UserError as error:
+            response.message = str(error)
+            return response
+        response.success = True
+        response.message = f'undone: the calibration before is in use again, {stored}'
+        self.get_logger().info(response.message)
+        return response
+
+    def _status(self) -> Status:
+        """Return what is known now."""
+        keeper, receiver = self._keeper, self._receiver
+        serial = keeper.sensor.serial if keeper else NO_UNIT
+        silence = self._obstacle or self._samples.silence()
+        if keeper is None or receiver is None:
+            return Status(Level.WARN, silence, serial, {})
+        state = keeper.state(self._newest_ns or self.get_clock().now().nanoseconds)
+        values = _values(keeper.sensor, state)
+        values |= {
+            **self._stream.counts,
+            'dry_run': self._own.dry_run,
+            'ramp': receiver.ramp,
+            'compensation': 'runs' if receiver.is_there else 'not there',
+        }
+        fault = self._samples.fault() or receiver.refusal
+        if fault or state.changed:
+            return Status(Level.ERROR, fault or state.changed, serial, values)
+        if silence:
+            return Status(Level.WARN, silence, serial, values)
+        if self._stream.counts['without_temperature'] and not self._stream.counts['rests']:
+            return Status(
+                Level.WARN,
+                f'nothing on {self.resolve_topic_name("temperature")}, which tells age from '
+                'temperature: no rest is used',
+                serial,
+                values,
+            )
+        if state.proposal and self._own.dry_run:
+            return Status(Level.OK, f'dry run, would adopt: {state.proposal}', serial, values)
+        text = f'kept: acceleration within {state.error_90_mg:.2g} mg (90 %)'
+        if math.isfinite(state.tilt_90_deg):
+            text += f', tilt within {state.tilt_90_deg:.2g}°'
+        if receiver.ramp < 1:
+            text += f'; a new calibration comes into use, {receiver.ramp:.0%}'
+        return Status(Level.OK, text, serial, values)
+
+
+def _values(sensor: Sensor, state: KeptState) -> dict[str, object]:
+    """Return what diagnostics report."""
+    values: dict[str, object] = {
+        'age_days': round(state.age_days, 3) if math.isfinite(state.age_days) else '',
+        'temperature_c': round(state.temperature_c, 2),
+        'error_90_mg': state.error_90_mg,
+        'tilt_90_deg': state.tilt_90_deg if math.isfinite(state.tilt_90_deg) else '',
+        'determined': '; '.join(state.determined),
+        'held_out_stays': state.held_out,
+        'adopted': _date_text(state.adopted_ns),
+        'changed': state.changed,
+        'proposal': state.proposal,
+    }
+    for place, axis in enumerate(sensor.axes):
+        values[f'zero_g_{axis}_mg'] = state.total_mg[place]
+        values[f'zero_g_{axis}_90_mg'] = state.zero_g_90_mg[place]
+    for side, count in state.rests_a_day.items():
+        values[f'rests_a_day_{side}'] = count
+    return values
+
+
+def _date_text(stamp_ns: int) -> str:
+    """Return a stamp as a date, UTC; '' without one."""
+    if not stamp_ns:
+        return ''
+    return datetime.fromtimestamp(stamp_ns * 1e-9, timezone.utc).isoformat(timespec='seconds')
+
+
+def _by_axis(sensor: Sensor, values_mg: Sequence[float]) -> str:
+    return ', '.join(f'{axis} {value:+.2g} mg' for axis, value in zip(sensor.axes, values_mg))
+
+
+def main() -> int:
+    """Run the node."""
+    return run(KeepCalibrated, __doc__, _EXAMPLES)

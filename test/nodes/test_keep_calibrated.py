@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""keep_calibrated over DDS: after a kill it goes on, adopts, hands over in a ramp, and undoes."""
+
+from dataclasses import replace
+
+from adxl_ros.calibrate.keep.keeper import Keeper
+from adxl_ros.files import parameter_file
+from adxl_ros.files.sweep_journal import Journal, read
+from adxl_ros_validation.kept_robots import calibrated, Kind, Robot
+from builtin_interfaces.msg import Time
+from graph import Graph
+import numpy as np
+import pytest
+from sensor_msgs.msg import Imu, Temperature
+from std_srvs.srv import Trigger
+
+UNIT = replace(calibrated(), rate_hz=100.0)
+STEP_NS = 10_000_000
+NOISE_G = 4e-4  # Of a sample, below that of the datasheet
+
+
+@pytest.fixture
+def graph(ros_env):
+    with Graph() as graph:
+        yield graph
+
+
+def decisive():
+    """Return the rests before the first adoption, and the one that leads to it."""
+    robot, taken = Robot(Kind(lies_down=True, slope=5), np.random.default_rng(3)), []
+    keeper = Keeper(UNIT)
+    for day in range(40):
+        for rest, _ in robot.rests(day):
+            if keeper.add(rest) is not None:
+                return taken, rest
+            taken.append(rest)
+    raise AssertionError('no adoption in 40 days')
+
+
+def play(graph, rest):
+    """Publish a rest of 62 s, which fills two windows."""
+    samples = graph.node.create_publisher(Imu, 'imu/data_raw', 10000)
+    readings = graph.node.create_publisher(Temperature, 'temperature', 100)
+    graph.spin_until(
+        lambda: samples.get_subscription_count() and readings.get_subscription_count(),
+        20,
+        'a subscriber',
+    )
+    accel = (np.array(rest.mean_v) - 2.5) * 9.80665
+    noise = np.random.default_rng(1).normal(size=(6200, 3)) * NOISE_G * 9.80665
+    for number, values in enumerate((accel + noise).tolist()):
+        sec, nanosec = divmod(rest.start_ns + number * STEP_NS, 10**9)
+        message = Imu()
+        message.header.stamp = Time(sec=sec, nanosec=nanosec)
+        for axis, value in zip('xyz', values):
+            setattr(message.linear_acceleration, axis, value)
+        if number % 100 == 0:
+            reading = Temperature(temperature=rest.temperature_c)
+            reading.header.stamp = message.header.stamp
+            readings.publish(reading)
+            graph.spin(0.02)
+        samples.publish(message)
+
+
+def test_it_goes_on_after_a_kill_adopts_hands_over_and_undoes(start, graph, tmp_path):
+    parameter_file.save(tmp_path / 'unit.yaml', UNIT)
+    file, kept = ('--ros-args', '--params-file', 'unit.yaml'), ('-p', 'output:=kept')
+    own = (*kept, '-p', 'store:=store', '-p', 'ramp_s:=2.0')
+    first = start('keep_calibrated', *file, *own)
+    first.wait_for('keeping K1', 30)
+    first.popen.kill()
+    first.wait()
+    (path,) = (tmp_path / 'kept').rglob('*.jsonl')
+    before, rest = decisive()
+    journal = Journal(path, read(path).head)
+    for each in before:
+        journal.append(each)
+    journal.close()
+    start('compensation', *file)
+    again = start('keep_calibrated', *file, *own)
+    again.wait_for(f'{len(before)} entries in', 30)
+    play(graph, rest)
+    again.wait_for('adopted: x', 30)
+    (stored,) = (tmp_path / 'store').rglob('*.yaml')
+    graph.spin_until(
+        lambda: (
+            graph.number('keep_calibrated', 'ramp') == 1
+            and 'in_use' in graph.value('compensation', 'calibration')
+        ),
+        20,
+        'the end of the ramp',
+    )
+    assert graph.number('keep_calibrated', 'tilt_90_deg') < 1
+    adopted = parameter_file.load(stored)
+    assert len(adopted.covariance) and adopted.provenance['kept']
+    answer = graph.call(Trigger, 'keep_calibrated/undo', Trigger.Request())
+    assert answer.success and 'the calibration before is in use again' in answer.message
+    assert not graph.call(Trigger, 'keep_calibrated/undo', Trigger.Request()).success
+    graph.spin_until(
+        lambda: graph.value('keep_calibrated', 'adopted') == '', 20, 'the end of the adoption'
+    )
