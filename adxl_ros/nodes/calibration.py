@@ -14,7 +14,6 @@ import signal
 import subprocess
 import sys
 import termios
-import time
 from typing import Any
 
 from adxl_ros.calibrate.guided import controller, pose_plan, screen_contents
@@ -388,11 +387,8 @@ class Samples:
         self.fault = ''  # Why the newest samples cannot be used, or ''
         self._inbox = topics.Inbox(node, Imu, _SAMPLES, _SAMPLES_QUEUE, unit)
         self.silence = self._inbox.silence  # Why or for how long no sample has come
+        self.restart_silence = self._inbox.restart_silence  # Of the time without samples
         self.mixture = self._inbox.fault  # That several nodes publish the samples, or ''
-
-    def restart_silence(self) -> None:
-        """Restart the time without samples."""
-        self._inbox.heard_s = time.monotonic()
 
     def keep_newest(self, count: int = _SAMPLES_QUEUE) -> None:
         """Forget all samples but the newest, as many as the queue holds."""

@@ -48,6 +48,9 @@ _OVERRIDING = QoSOverridingOptions([QoSPolicyKind[name.upper()] for name in QOS_
 """What parameters can override."""
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # The clock of intervals
 _SILENT_S = 3.0  # Time without messages after which a topic is silent, s; chosen
+_LONGEST_LOOK_S = 1.0
+"""Longest time between two looks that counts as silence, s; chosen: above the period of each node,
+and a process that was held up as a whole looks before its middleware has received."""
 _LONGEST_WAIT_NS = 100_000_000
 """Longest wait for a message, ns; chosen: a thread that waits sees within it that it shall end."""
 _MIXED_S = 3.0
@@ -257,7 +260,8 @@ class Inbox:
         """
         self._unit = unit
         self._node, self._kind, self._depth = node, kind, depth
-        self.heard_s = self._looked_s = time.monotonic()  # When messages came last; last look
+        self._looked_s = time.monotonic()  # When messages were taken last
+        self._silent_s = 0.0  # Time without a message until then
         self._topic = node.resolve_topic_name(topic)
         self._number, self._back_s, self._mixed_until_s = 0, -_MIXED_S, 0.0
         self._subscription = create_subscription(
@@ -284,10 +288,12 @@ class Inbox:
     def take(self) -> list[bytes]:
         """Return the messages since the last call, at most as many as are kept."""
         accept = (self._accepts,) if self._kind is Imu else ()
-        self._looked_s = time.monotonic()
+        now_s = time.monotonic()
+        self._silent_s += min(now_s - self._looked_s, _LONGEST_LOOK_S)
+        self._looked_s = now_s
         messages = [*take_messages(self._subscription, self._kind, True, self._depth, *accept)]
         if messages:
-            self.heard_s = self._looked_s
+            self._silent_s = 0.0
         return messages if self._unit == SI else [*map(self._in_si, messages)]
 
     def _in_si(self, raw: bytes) -> bytes:
@@ -312,13 +318,16 @@ class Inbox:
         """
         Return why or for how long nothing has come; '' while messages come.
 
-        It ends with the last look: what came while the node was held up has not been taken yet.
+        It ends with the last look. Where the node was held up, what came has not been taken yet.
         """
-        silent_s = self._looked_s - self.heard_s
-        if (fault := self.fault()) or silent_s < _SILENT_S:
+        if (fault := self.fault()) or self._silent_s < _SILENT_S:
             return fault
         nobody = '' if self._node.count_publishers(self._topic) else ', and nobody publishes it'
-        return f'nothing on {self._topic} for {silent_s:.0f} s{nobody}'
+        return f'nothing on {self._topic} for {self._silent_s:.0f} s{nobody}'
+
+    def restart_silence(self) -> None:
+        """Restart the time without messages."""
+        self._silent_s = 0.0
 
     def fault(self) -> str:
         """Return that several nodes publish on the topic, so that nothing is taken, or ''."""

@@ -63,13 +63,13 @@ def play(graph, rest):
         samples.publish(message)
 
 
-def test_it_goes_on_after_a_kill_adopts_hands_over_and_undoes(start, graph, tmp_path):
+def test_it_goes_on_after_a_kill_adopts_hands_over_and_undoes(start, kill, graph, tmp_path):
     parameter_file.save(tmp_path / 'unit.yaml', UNIT)
     file, kept = ('--ros-args', '--params-file', 'unit.yaml'), ('-p', 'output:=kept')
     own = (*kept, '-p', 'store:=store', '-p', 'ramp_s:=2.0')
     first = start('keep_calibrated', *file, *own)
     first.wait_for('keeping K1', 30)
-    first.popen.kill()
+    kill(first.popen.pid)
     first.wait()
     (path,) = (tmp_path / 'kept').rglob('*.jsonl')
     before, rest = decisive()
