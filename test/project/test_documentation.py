@@ -24,8 +24,11 @@ BY_HAND = [
     and 'Made by `make reference`' not in page.read_text('utf-8')
 ]
 MOST_WORDS = 24_000 + 2_300
-"""Words of the pages by hand: what they have more, somebody has to read and to keep true. The second
-number is for boards, gyroscope, gate, benchmark and kept calibrations."""
+"""
+Words of the pages by hand: what they have more, somebody has to read and to keep true.
+
+The second number is for boards, gyroscope, gate, benchmark and kept calibrations.
+"""
 EXECUTABLES = (
     *TOOLS,
     'driver',
