@@ -9,7 +9,7 @@ from adxl_ros.files import parameter_file
 from adxl_ros.files.sweep_journal import Journal, read
 from adxl_ros_validation.kept_robots import calibrated, Kind, Robot
 from builtin_interfaces.msg import Time
-from graph import Graph
+from graph import Graph, RELIABLE
 import numpy as np
 import pytest
 from sensor_msgs.msg import Imu, Temperature
@@ -42,10 +42,11 @@ def play(graph, rest):
     """Publish a rest of 62 s, which fills two windows."""
     samples = graph.node.create_publisher(Imu, 'imu/data_raw', 10000)
     readings = graph.node.create_publisher(Temperature, 'temperature', 100)
+    # Node and compensation take both topics.
     graph.spin_until(
-        lambda: samples.get_subscription_count() and readings.get_subscription_count(),
+        lambda: samples.get_subscription_count() == readings.get_subscription_count() == 2,
         20,
-        'a subscriber',
+        'both subscribers',
     )
     accel = (np.array(rest.mean_v) - 2.5) * 9.80665
     noise = np.random.default_rng(1).normal(size=(6200, 3)) * NOISE_G * 9.80665
@@ -66,7 +67,7 @@ def play(graph, rest):
 def test_it_goes_on_after_a_kill_adopts_hands_over_and_undoes(start, kill, graph, tmp_path):
     parameter_file.save(tmp_path / 'unit.yaml', UNIT)
     file, kept = ('--ros-args', '--params-file', 'unit.yaml'), ('-p', 'output:=kept')
-    own = (*kept, '-p', 'store:=store', '-p', 'ramp_s:=2.0')
+    own = (*kept, '-p', 'store:=store', '-p', 'ramp_s:=2.0', *RELIABLE)
     first = start('keep_calibrated', *file, *own)
     first.wait_for('keeping K1', 30)
     kill(first.popen.pid)
@@ -81,7 +82,7 @@ def test_it_goes_on_after_a_kill_adopts_hands_over_and_undoes(start, kill, graph
     again = start('keep_calibrated', *file, *own)
     again.wait_for(f'{len(before)} entries in', 30)
     play(graph, rest)
-    again.wait_for('adopted: x', 30)
+    graph.spin_until(lambda: 'adopted: x' in again.output(), 30, 'the adoption')
     (stored,) = (tmp_path / 'store').rglob('*.yaml')
     graph.spin_until(
         lambda: (

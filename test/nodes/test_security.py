@@ -7,6 +7,8 @@ import pty
 import subprocess
 from xml.etree import ElementTree
 
+from adxl_ros.files import parameter_file
+from adxl_ros_validation.kept_robots import calibrated
 from ament_index_python.packages import get_package_share_directory
 from graph import Graph
 import pytest
@@ -68,9 +70,10 @@ def existing(graph, node):
 
 
 @pytest.fixture
-def run_node(start, in_terminal):
+def run_node(start, in_terminal, tmp_path):
     """Give a function that starts a node with all topics that one set of parameters can give."""
     pty_fds = pty.openpty()
+    parameter_file.save(tmp_path / 'unit.yaml', calibrated())
 
     def run(node):
         if node == 'screen':  # it needs a terminal
@@ -85,7 +88,10 @@ def run_node(start, in_terminal):
             '-p',
             f'link.port:={os.ttyname(pty_fds[1])}',
         )
-        start(node, *(port if node == 'driver' else ()))
+        # Only with a calibration has it something to hand over.
+        calibration = '--ros-args', '--params-file', tmp_path / 'unit.yaml'
+        arguments = {'driver': port, 'keep_calibrated': calibration}
+        start(node, *arguments.get(node, ()))
 
     yield run
     for fd in pty_fds:
