@@ -11,19 +11,12 @@ from adxl_ros_validation.kept_robots import calibrated, Kind, Robot
 from builtin_interfaces.msg import Time
 from graph import Graph, RELIABLE
 import numpy as np
-import pytest
 from sensor_msgs.msg import Imu, Temperature
 from std_srvs.srv import Trigger
 
 UNIT = replace(calibrated(), rate_hz=100.0)
 STEP_NS = 10_000_000
 NOISE_G = 4e-4  # Of a sample, below that of the datasheet
-
-
-@pytest.fixture
-def graph(ros_env):
-    with Graph() as graph:
-        yield graph
 
 
 def decisive():
@@ -64,7 +57,7 @@ def play(graph, rest):
         samples.publish(message)
 
 
-def test_it_goes_on_after_a_kill_adopts_hands_over_and_undoes(start, kill, graph, tmp_path):
+def test_it_goes_on_after_a_kill_adopts_hands_over_and_undoes(start, kill, tmp_path):
     parameter_file.save(tmp_path / 'unit.yaml', UNIT)
     file, kept = ('--ros-args', '--params-file', 'unit.yaml'), ('-p', 'output:=kept')
     own = (*kept, '-p', 'store:=store', '-p', 'ramp_s:=2.0', *RELIABLE)
@@ -78,26 +71,28 @@ def test_it_goes_on_after_a_kill_adopts_hands_over_and_undoes(start, kill, graph
     for each in before:
         journal.append(each)
     journal.close()
-    start('compensation', *file)
-    again = start('keep_calibrated', *file, *own)
-    again.wait_for(f'{len(before)} entries in', 30)
-    play(graph, rest)
-    graph.spin_until(lambda: 'adopted: x' in again.output(), 30, 'the adoption')
-    (stored,) = (tmp_path / 'store').rglob('*.yaml')
-    graph.spin_until(
-        lambda: (
-            graph.number('keep_calibrated', 'ramp') == 1
-            and 'in_use' in graph.value('compensation', 'calibration')
-        ),
-        20,
-        'the end of the ramp',
-    )
-    assert graph.number('keep_calibrated', 'tilt_90_deg') < 1
-    adopted = parameter_file.load(stored)
-    assert len(adopted.covariance) and adopted.provenance['kept']
-    answer = graph.call(Trigger, 'keep_calibrated/undo', Trigger.Request())
-    assert answer.success and 'the calibration before is in use again' in answer.message
-    assert not graph.call(Trigger, 'keep_calibrated/undo', Trigger.Request()).success
-    graph.spin_until(
-        lambda: graph.value('keep_calibrated', 'adopted') == '', 20, 'the end of the adoption'
-    )
+    # It finds no node that was killed before.
+    with Graph() as graph:
+        start('compensation', *file)
+        again = start('keep_calibrated', *file, *own)
+        again.wait_for(f'{len(before)} entries in', 30)
+        play(graph, rest)
+        graph.spin_until(lambda: 'adopted: x' in again.output(), 30, 'the adoption')
+        (stored,) = (tmp_path / 'store').rglob('*.yaml')
+        graph.spin_until(
+            lambda: (
+                graph.number('keep_calibrated', 'ramp') == 1
+                and 'in_use' in graph.value('compensation', 'calibration')
+            ),
+            20,
+            'the end of the ramp',
+        )
+        assert graph.number('keep_calibrated', 'tilt_90_deg') < 1
+        adopted = parameter_file.load(stored)
+        assert len(adopted.covariance) and adopted.provenance['kept']
+        answer = graph.call(Trigger, 'keep_calibrated/undo', Trigger.Request())
+        assert answer.success and 'the calibration before is in use again' in answer.message
+        assert not graph.call(Trigger, 'keep_calibrated/undo', Trigger.Request()).success
+        graph.spin_until(
+            lambda: graph.value('keep_calibrated', 'adopted') == '', 20, 'the end of the adoption'
+        )
