@@ -296,8 +296,10 @@ def fit(
         and not (model or journal or poses or means)
     ):
         several = list(several)
-        blocks = unit.thermal_blocks(several)
+        at_rest = _Unit(sensor, robot, means)
+        blocks = at_rest.thermal_blocks(several)
     if blocks is not None:
+        unit = at_rest
         if prior:
             raise UserError(f'--prior {prior}: a fit over temperature takes none; leave it out')
         progress(_READING, 'fit')
@@ -392,10 +394,7 @@ class _Unit:
         """Return the blocks of one recording at rest over temperature; None for others."""
         if len(several) != 1:
             return None
-        blocks = thermal_fit.rest_blocks(self.add(several[0]), self.sensor)
-        if blocks is None:
-            self._gyro_rests = []  # The recording is taken once more
-        return blocks
+        return thermal_fit.rest_blocks(self.add(several[0]), self.sensor)
 
     @property
     def base(self) -> Sensor:
