@@ -1,7 +1,7 @@
 # make build    ROS 2 Jazzy (the sourced one, else its wheels in .venv) and the package in install/
 # make demo     the main job on a simulated sensor: a table, and plots in demo_output/
 # make check    linters, types and fast tests: what a change needs, about two minutes on two cores
-# make test     every test, ten to twelve minutes on two cores   (make test ARGS='-k fit')
+# make test     every test, eight to twelve minutes on two cores  (make test ARGS='-k fit')
 # make perf     limits of processor time, for a quiet machine
 # make bench    latency and CPU of the live nodes, and each job beside its rivals
 # make reference  docs/reference, and figures in the pages, from the package and the measurements
