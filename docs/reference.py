@@ -193,8 +193,12 @@ VERBS = (
 """The verbs of the front door, in the order of the page."""
 RESULTS = (
     'adxl_ros.files.recording_columns:Recording',
+    'adxl_ros.files.column_mapping:ReadingOptions',
+    'adxl_ros.model.sensor:Sensor',
     'adxl_ros.api.calibration:Fit',
     'adxl_ros.api.updating:Update',
+    'adxl_ros.api.updating:UpdatedDay',
+    'adxl_ros.calibrate.keep.keeper:KeptState',
     'adxl_ros.api.calibration:FittedCoefficient',
     'adxl_ros.calibrate.report.held_out:HeldOutErrors',
     'adxl_ros.calibrate.report.held_out:ErrorStatistic',
@@ -204,6 +208,7 @@ RESULTS = (
     'adxl_ros.api.gap:FoundParameter',
     'adxl_ros.api.gap:GapFigures',
     'adxl_ros.report.quantities:Interval',
+    'adxl_ros.diagnose.gap_in_unit:GapInUnit',
     'adxl_ros.diagnose.next_experiment:CouldShow',
     'adxl_ros.api.checking:Check',
     'adxl_ros.signals.findings:Findings',
@@ -211,8 +216,9 @@ RESULTS = (
     'adxl_ros.api.noise:Noise',
     'adxl_ros.signals.noise_parameters:AxisNoise',
     'adxl_ros.signals.noise_parameters:Estimate',
+    'adxl_ros.signals.noise_parameters:NoiseFit',
 )
-"""What the verbs return."""
+"""What the verbs take and return."""
 FIVE_LINES = """\
 import adxl_ros as adxl
 recording = adxl.from_arrays(time_s=t, x_v=x, y_v=y, alpha_rad=alpha, beta_rad=beta)
