@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+from adxl_ros.api import result
 from adxl_ros.api.sensors import as_input, SensorInput
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording as recording_files
@@ -204,15 +205,16 @@ def _at_rest(path: str, sensor: SensorInput | None, reading: ReadingOptions) -> 
     )
 
 
-def as_json(outcome: Outcome) -> dict[str, Any]:
+def as_json(outcome: Outcome) -> Any:
     """Return an outcome as JSON; an end that is not finite is null."""
-    ends = [end if np.isfinite(end) else None for end in outcome.interval or ()]
-    return {
-        'name': outcome.name,
-        'worse': outcome.is_worse,
-        'text': outcome.text,
-        'interval': ends or None,
-    }
+    return result.as_json(
+        {
+            'name': outcome.name,
+            'worse': outcome.is_worse,
+            'text': outcome.text,
+            'interval': outcome.interval or None,
+        }
+    )
 
 
 def write_junit(
