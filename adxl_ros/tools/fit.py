@@ -130,10 +130,23 @@ _MEANS_RATE_HZ = 1.0  # Stamps of a table of means, which have no meaning
 
 def _update(options: argparse.Namespace) -> int:
     """Replay recordings of a robot at work."""
-    of_a_fit = ('params', 'model', 'effect', 'prior', 'journal', 'poses', 'means', 'dcc', 'urdf')
+    of_a_fit = (
+        'params',
+        'model',
+        'effect',
+        'prior',
+        'journal',
+        'poses',
+        'means',
+        'dcc',
+        'dcc_data',
+        'urdf',
+    )
     given = [name for name in of_a_fit if getattr(options, name)]
     if given:
-        raise UserError(f'--update: changes a calibration; leave --{given[0]} out')
+        raise UserError(
+            f'--update: changes a calibration; leave --{given[0].replace("_", "-")} out'
+        )
     cli.check_outputs(
         options, options.output, options.report and Path(options.report, UPDATE_PAGE)
     )
