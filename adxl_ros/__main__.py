@@ -10,19 +10,15 @@ import os
 from pkgutil import iter_modules, resolve_name
 import sys
 
-from adxl_ros.process import ended_by_closed_output, ONE_COMMAND, package_version, STARTED_BY
-
-_NODES = (
-    'demo',
-    'driver',
-    'stage',
-    'calibration',
-    'compensation',
-    'keep_calibrated',
-    'investigate',
-    'monitor',
-    'screen',
+from adxl_ros.process import (
+    ended_by_closed_output,
+    NODES,
+    ONE_COMMAND,
+    package_version,
+    STARTED_BY,
 )
+
+_NODES = ('demo', *NODES)
 """What needs ROS 2."""
 _COMMANDS = 'adxl_ros.commands'
 """Entry points by which another package adds a command."""

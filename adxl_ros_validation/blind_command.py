@@ -107,8 +107,8 @@ def _check(options: argparse.Namespace, folder: Path) -> int:
         folder / 'blind.html',
         page.render(
             'adxl_ros_validation',
-            'pages/blind.html',
-            {**said._asdict(), 'about': [], 'badge': None, 'figures': {}},
+            'pages/tables.html',
+            {**said._asdict(), 'about': [], 'badge': None, 'figures': {}, 'picture': ''},
         ),
     )
     cli.print_end(

@@ -26,7 +26,6 @@ from adxl_ros.files.recording_columns import recorded_unit
 from adxl_ros.model.constants import AXES
 from adxl_ros.report.quantities import mg
 from adxl_ros.signals.findings import Findings, RecordingContents
-from adxl_ros.signals.gyroscope_at_rest import rows_at_rest
 from adxl_ros.signals.recorded_sensor import load_sensor
 from adxl_ros.signals.rest_detection import RecordedRests
 import numpy as np
@@ -73,47 +72,49 @@ def limits(contents: RecordingContents, minima: Mapping[str, float]) -> list[Out
     return outcomes
 
 
-def compare(
-    new: Findings,
-    old: Findings,
-    sensor: SensorInput | None = None,
-    reading: ReadingOptions = AS_IT_IS,
-) -> list[Outcome]:
+class Earlier:
     """
-    Compare a recording with an earlier one of the same task.
+    An earlier recording of the same task, with which others are compared.
 
     Parameters
     ----------
-    new, old
-        What `check` found of both, each of a file.
+    found
+        What `check` found of it, a file.
     sensor
         The sensor, as for `check`.
     reading
         How the files are read.
 
-    Returns
-    -------
-    list of Outcome
-        One for each of `KINDS` but the first; none where the new one cannot be read.
-
     Raises
     ------
     UserError
-        The earlier recording cannot be read.
+        It cannot be read.
 
     """
-    if old.contents is None:
-        raise UserError(f'{old.path}: {old.faults[0]}')
-    if new.contents is None:
-        return []
-    now, before = (_at_rest(each.path, sensor, reading) for each in (new, old))
-    return [
-        _events('gaps', new.contents, old.contents, 'gaps'),
-        _rate(new.contents, old.contents),
-        _noise(now, before),
-        _zero_g(now, before),
-        _events('rests', new.contents, old.contents, 'rests'),
-    ]
+
+    def __init__(
+        self,
+        found: Findings,
+        sensor: SensorInput | None = None,
+        reading: ReadingOptions = AS_IT_IS,
+    ) -> None:
+        if found.contents is None:
+            raise UserError(f'{found.path}: {found.faults[0]}')
+        self._contents, self._sensor, self._reading = found.contents, sensor, reading
+        self._at_rest = _at_rest(found.path, sensor, reading)
+
+    def compare(self, new: Findings) -> list[Outcome]:
+        """Return one outcome for each of `KINDS` but the first; none of one that is unreadable."""
+        if new.contents is None:
+            return []
+        now = _at_rest(new.path, self._sensor, self._reading)
+        return [
+            _events('gaps', new.contents, self._contents, 'gaps'),
+            _rate(new.contents, self._contents),
+            _noise(now, self._at_rest),
+            _zero_g(now, self._at_rest),
+            _events('rests', new.contents, self._contents, 'rests'),
+        ]
 
 
 def _events(name: str, new: RecordingContents, old: RecordingContents, field: str) -> Outcome:
@@ -193,7 +194,7 @@ def _at_rest(path: str, sensor: SensorInput | None, reading: ReadingOptions) -> 
     rests.feed(read)
     rests.take()
     accel_mps2, found = read.accel_mps2(unit), rests.detected
-    samples = [accel_mps2[rows_at_rest(read.time_s, each.rest)] for each in found]
+    samples = [accel_mps2[each.rest.includes(read.time_s)] for each in found]
     count = -(-_FEWEST_PARTS // max(len(samples), 1))
     parts = [part for each in samples for part in np.array_split(each, count) if len(part) > 1]
     std = np.array([part.std(axis=0) for part in parts]).reshape(len(parts), -1)
@@ -212,7 +213,7 @@ def as_json(outcome: Outcome) -> Any:
             'name': outcome.name,
             'worse': outcome.is_worse,
             'text': outcome.text,
-            'interval': outcome.interval or None,
+            'interval': outcome.interval,
         }
     )
 

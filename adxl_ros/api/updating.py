@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from datetime import datetime, timezone
 import os
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +22,7 @@ from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import page
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS, figure, line, points, QUIET_COLOUR
-from adxl_ros.report.quantities import counted, number
+from adxl_ros.report.quantities import counted, number, utc
 import numpy as np
 
 PAGE = 'report.html'
@@ -46,7 +45,7 @@ class UpdatedDay(NamedTuple):
     @property
     def date(self) -> str:
         """Return the date, UTC."""
-        return f'{datetime.fromtimestamp(self.stamp_ns * 1e-9, timezone.utc):%Y-%m-%d}'
+        return f'{utc(self.stamp_ns):%Y-%m-%d}'
 
 
 @dataclass(frozen=True, repr=False)
@@ -241,7 +240,7 @@ class Update(Result):
         ax = axes_for(ax)
         for place, axis in enumerate(self.sensor.axes):
             ax.errorbar(
-                [datetime.fromtimestamp(day.stamp_ns * 1e-9, timezone.utc) for day in self.days],
+                [utc(day.stamp_ns) for day in self.days],
                 [day.zero_g_mg[place] for day in self.days],
                 yerr=[day.zero_g_90_mg[place] for day in self.days],
                 fmt='o',

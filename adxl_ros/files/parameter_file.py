@@ -16,9 +16,10 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import AnyPath, write_text
+from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Role
-from adxl_ros.model.gyroscope import AXES as GYRO_AXES, Gyroscope
+from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.model.sensor import coefficients_of, Envelope, neutral, Sensor
 import numpy as np
 import yaml
@@ -517,7 +518,7 @@ class _FlatReader:
             if self.flat.get(key):
                 values = self._numbers(key, self.flat[key])
                 self._require(
-                    len(values) == GYRO_AXES,
+                    len(values) == len(AXES),
                     key,
                     f'{len(values)} values, expected three: {about["doc"]}, {about["unit"]}',
                 )

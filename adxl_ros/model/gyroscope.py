@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-AXES = 3  # A gyroscope has three axes, in the frame of the accelerometer
-
 NO_TURN = (0.0, 0.0, 0.0)
+"""A value by axis that is not known, in the frame of the accelerometer."""
 
 
 def _by_axis(doc: str, unit: str) -> Any:

@@ -5,15 +5,13 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
 import math
 from pathlib import Path
 import time
 from typing import Any
 
-from adxl_ros.calibrate.keep.keeper import Keeper, KeepSettings, KEPT, KeptState
+from adxl_ros.calibrate.keep.keeper import by_axis, Keeper, KeepSettings, KEPT, KeptState
 from adxl_ros.calibrate.keep.stays import RestStream
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
@@ -25,6 +23,7 @@ from adxl_ros.nodes import parameters, topics
 from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Inbox, Level, Status
+from adxl_ros.report.quantities import utc
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -263,7 +262,7 @@ class KeepCalibrated(Node):
             stored = self._exchange(before, keeper.sensor)
             state = keeper.state(rest.stop_ns)
             self.get_logger().info(
-                f'adopted: {_by_axis(keeper.sensor, state.total_mg)} since the calibration; '
+                f'adopted: {by_axis(keeper.sensor.axes, state.total_mg)} since the calibration; '
                 f'{stored}'
             )
 
@@ -284,7 +283,7 @@ class KeepCalibrated(Node):
             first = before.provenance.get(KEPT, '')
             now = self.get_clock().now().nanoseconds
             keeper.undo(self._newest_ns or now)
-            date = datetime.fromtimestamp(now * 1e-9, timezone.utc).isoformat(timespec='seconds')
+            date = utc(now).isoformat(timespec='seconds')
             provenance = {**keeper.sensor.provenance, 'date': date, KEPT: first}
             provenance.pop('id', None)
             stored = self._exchange(before, replace(keeper.sensor, provenance=provenance))
@@ -343,7 +342,7 @@ def _values(sensor: Sensor, state: KeptState) -> dict[str, object]:
         'tilt_90_deg': state.tilt_90_deg if math.isfinite(state.tilt_90_deg) else '',
         'determined': '; '.join(state.determined),
         'held_out_stays': state.held_out,
-        'adopted': _date_text(state.adopted_ns),
+        'adopted': utc(state.adopted_ns).isoformat(timespec='seconds') if state.adopted_ns else '',
         'changed': state.changed,
         'proposal': state.proposal,
     }
@@ -353,17 +352,6 @@ def _values(sensor: Sensor, state: KeptState) -> dict[str, object]:
     for side, count in state.rests_a_day.items():
         values[f'rests_a_day_{side}'] = count
     return values
-
-
-def _date_text(stamp_ns: int) -> str:
-    """Return a stamp as a date, UTC; '' without one."""
-    if not stamp_ns:
-        return ''
-    return datetime.fromtimestamp(stamp_ns * 1e-9, timezone.utc).isoformat(timespec='seconds')
-
-
-def _by_axis(sensor: Sensor, values_mg: Sequence[float]) -> str:
-    return ', '.join(f'{axis} {value:+.2g} mg' for axis, value in zip(sensor.axes, values_mg))
 
 
 def main() -> int:

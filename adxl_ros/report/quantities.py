@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from typing import Any
 
 from adxl_ros.model.constants import G0_MPS2
@@ -26,6 +27,11 @@ class Interval:
     value: float
     low: float
     high: float
+
+
+def utc(stamp_ns: int) -> datetime:
+    """Return a stamp, ns, as a date in UTC."""
+    return datetime.fromtimestamp(stamp_ns * 1e-9, timezone.utc)
 
 
 def decimals(half_width: float) -> int:

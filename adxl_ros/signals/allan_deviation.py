@@ -244,9 +244,7 @@ class _Samples:
 
     def feed(self, time_s: np.ndarray, samples: np.ndarray, rest: Rest) -> None:
         """Add those of samples at stamps, (n, m), that are part of the rest."""
-        inside = (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
-        for start_s, stop_s in rest.disturbed_s:
-            inside &= (time_s <= start_s) | (time_s >= stop_s)
+        inside = rest.includes(time_s)
         if not inside.any():
             return
         rows, time_s = samples[inside], time_s[inside]

@@ -20,7 +20,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.rest_detection import RecordedRests, Rest
+from adxl_ros.signals.rest_detection import RecordedRests
 import numpy as np
 import scipy
 
@@ -40,14 +40,6 @@ class RestTurns(NamedTuple):
     temperature_c: np.ndarray  # Temperature of each, °C, (n,); NaN where it is not known
 
 
-def rows_at_rest(time_s: np.ndarray, rest: Rest) -> np.ndarray:
-    """Return which stamps are in a rest and not in a disturbance of it, (n,)."""
-    inside = (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
-    for start_s, stop_s in rest.disturbed_s:
-        inside &= (time_s <= start_s) | (time_s >= stop_s)
-    return np.asarray(inside)
-
-
 def rest_turns(read: Recording, unit: Sensor, are_rows: bool = False) -> list[RestTurns]:
     """Return the gyroscope in each rest of a recording, or in each row; none without one."""
     gyro_radps = read.gyro_radps
@@ -61,7 +53,7 @@ def rest_turns(read: Recording, unit: Sensor, are_rows: bool = False) -> list[Re
         rests = RecordedRests(unit, read)
         rests.feed(read)
         rests.take()
-        places = [rows_at_rest(read.time_s, found.rest) for found in rests.detected]
+        places = [found.rest.includes(read.time_s) for found in rests.detected]
     turns = [
         RestTurns(gyro_radps[place & is_taken], temperature_c[place & is_taken])
         for place in places

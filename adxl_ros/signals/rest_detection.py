@@ -198,6 +198,13 @@ class Rest:
         """Return the time of the rest, s."""
         return self.time_stop_s - self.time_start_s
 
+    def includes(self, time_s: np.ndarray) -> np.ndarray:
+        """Return which stamps, s, (n,), are in the rest and not in a disturbance of it, (n,)."""
+        inside = (time_s >= self.time_start_s) & (time_s <= self.time_stop_s)
+        for start_s, stop_s in self.disturbed_s:
+            inside &= (time_s <= start_s) | (time_s >= stop_s)
+        return np.asarray(inside)
+
 
 @dataclass(frozen=True)
 class Stillness:

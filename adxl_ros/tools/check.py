@@ -85,7 +85,8 @@ def check(options: argparse.Namespace) -> int:
             progress=show,
         )
     failing = [*fail_on, *(f'min {name}' for name in minima)]
-    outcomes = [_outcomes(each, options, minima) for each in checked.recordings]
+    earlier = _earlier(options)
+    outcomes = [_outcomes(each, earlier, minima) for each in checked.recordings]
     if options.junit:
         gate.write_junit(options.junit, list(zip(checked.recordings, outcomes)), failing)
     page = [checked.save(options.report, overwrite=options.overwrite)] if options.report else []
@@ -124,17 +125,23 @@ def _minima(texts: Sequence[str]) -> dict[str, float]:
     return minima
 
 
+def _earlier(options: argparse.Namespace) -> gate.Earlier | None:
+    """Return the recording that all others are compared with, if there is one."""
+    if not options.against:
+        return None
+    reading = cli.reading_options(options)
+    (found,) = check_recordings(options.against, options.params, reading=reading).recordings
+    return gate.Earlier(found, options.params, reading)
+
+
 def _outcomes(
-    findings: Findings, options: argparse.Namespace, minima: dict[str, float]
+    findings: Findings, earlier: gate.Earlier | None, minima: dict[str, float]
 ) -> list[gate.Outcome]:
     """Return whether a recording is sound, its limits, and what became worse."""
     text = 'sound' if findings.is_sound else findings.faults[0]
     outcomes = [gate.Outcome('sound', not findings.is_sound, text)]
-    if options.against:
-        reading = cli.reading_options(options)
-        old = check_recordings(options.against, options.params, reading=reading)
-        compared = gate.compare(findings, old.recordings[0], options.params, reading)
-        outcomes += compared
+    if earlier is not None:
+        outcomes += earlier.compare(findings)
     if findings.contents is not None:
         outcomes += gate.limits(findings.contents, minima)
     return outcomes

@@ -8,7 +8,6 @@ sealed by a hash before the first diagnosis.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
@@ -19,7 +18,6 @@ from adxl_ros.errors import UserError
 from adxl_ros.workers import Pool
 from adxl_ros_validation.benchmark.manifest import Loaded
 from adxl_ros_validation.blind import real_sensors, trials
-from adxl_ros_validation.blind.faults import KNOWN
 from adxl_ros_validation.blind.ideal_observer import (
     Bracket,
     bracket,
@@ -31,7 +29,7 @@ from adxl_ros_validation.blind.ideal_observer import (
 )
 from adxl_ros_validation.blind.real_sensors import Half
 from adxl_ros_validation.blind.simulator import Fault, G0, SCALE_STD, Unit, ZERO_G_STD_G
-from adxl_ros_validation.blind.trials import Label, Plan, Show
+from adxl_ros_validation.blind.trials import Label, Show
 import numpy as np
 
 GROUPS = {
@@ -41,8 +39,10 @@ GROUPS = {
     'outside': 'one outside the library',
 }
 """Groups of trials in words."""
-_SHARES = (0.25, 0.4, 0.2, 0.15)
-"""Shares of the groups; chosen as those of the blind check are."""
+_TRIALS = real_sensors.PlanRule(
+    {'none': 0.25, 'single': 0.4, 'pair': 0.2, 'outside': 0.15}, 5, 't'
+)
+"""How trials are planned; the shares are chosen as those of the blind check are."""
 _SHORTEST_S = 75.0
 """Shortest recording of level A, s: 30 s of its later part, less a tenth and a quarter."""
 _BANDS = 60
@@ -72,26 +72,6 @@ def halves(loaded: Sequence[Loaded], folder: Path) -> tuple[list[Half], list[str
     return made, left_out
 
 
-def plans(parts: Sequence[Half], seed: int, count: int) -> list[Plan]:
-    """Plan trials: recordings in turn, the rarest defects first."""
-    rng = np.random.default_rng([seed, 5])
-    rows: list[tuple[str, tuple[str, ...], tuple[int, ...]]] = []
-    used: Counter[str] = Counter()
-    for k in range(count):
-        part = k % len(parts)
-        group = str(rng.choice(list(GROUPS), p=_SHARES))
-        kinds = [name for name in parts[part].kinds() if (name in KNOWN) is (group != 'outside')]
-        effects: list[str] = []
-        for _ in range({'none': 0, 'pair': 2}.get(group, 1)):
-            others = [name for name in kinds if name not in effects]
-            fewest = min((used[name] for name in others), default=0)
-            rarest = [name for name in others if used[name] == fewest]
-            effects += [str(rng.choice(rarest))] if rarest else []
-        used.update(effects)
-        rows.append((group if effects else 'none', tuple(effects), (seed, 6, k, part)))
-    return [Plan(f't{i:04d}', *rows[k]) for i, k in enumerate(rng.permutation(count))]
-
-
 def save_untouched(folder: Path, parts: Sequence[Half]) -> list[Path]:
     """Write the later parts without a defect; return their names without an ending."""
     for part in parts:
@@ -104,7 +84,13 @@ def seal(
 ) -> str:
     """Draw the trials of level A into a folder; return the published hash of their labels."""
     return trials.seal(
-        folder, partial(plans, parts), partial(real_sensors.draw, parts), seed, count, pool, show
+        folder,
+        partial(real_sensors.plans, parts, rule=_TRIALS),
+        partial(real_sensors.draw, parts),
+        seed,
+        count,
+        pool,
+        show,
     )
 
 

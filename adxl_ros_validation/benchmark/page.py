@@ -255,7 +255,7 @@ def html(made: Made, said: Report) -> str:
     """Return the whole page."""
     return page.render(
         'adxl_ros_validation',
-        'pages/benchmark.html',
+        'pages/tables.html',
         {
             **said._asdict(),
             'about': [],

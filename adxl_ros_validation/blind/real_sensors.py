@@ -10,7 +10,7 @@ rest (the baseline) is there already, and no error.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 import hashlib
@@ -18,7 +18,7 @@ import json
 import math
 from pathlib import Path
 import tempfile
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.workers import Pool
@@ -35,8 +35,6 @@ import pandas as pd
 import scipy
 import yaml
 
-_SHARES = (0.25, 0.2)
-"""Shares of trials without a defect, and with one outside the library."""
 _NOISES = (1.0, 20.0)
 """Weakest and strongest defect, in the recording's own noise; log-uniform."""
 _FIRST = 0.4
@@ -314,24 +312,38 @@ def _noise(half: Half) -> float:
     return float(np.sqrt(np.mean(quiet)) * G0)
 
 
-def plans(halves: Sequence[Half], seed: int, count: int) -> list[Plan]:
-    """Plan trials: recordings and defects in turn, a quarter without any."""
-    rng = np.random.default_rng([seed, 3])
+class PlanRule(NamedTuple):
+    """How trials on recordings are planned."""
+
+    shares: Mapping[str, float]  # Share of each group; 'pair' puts in two defects, 'none' none
+    stream: int  # Part of the seed that is this rule's; the trials have the next one
+    letter: str  # First letter of the names of trials
+
+
+REAL_TRIALS = PlanRule({'none': 0.25, 'outside': 0.2, 'single': 0.55}, 3, 'r')
+
+
+def plans(
+    halves: Sequence[Half], seed: int, count: int, rule: PlanRule = REAL_TRIALS
+) -> list[Plan]:
+    """Plan trials: recordings in turn, and of the defects those that were drawn least."""
+    rng = np.random.default_rng([seed, rule.stream])
     rows: list[tuple[str, tuple[str, ...], tuple[int, ...]]] = []
     used: Counter[str] = Counter()
     for k in range(count):
         half = k % len(halves)
-        group = str(rng.choice(['none', 'outside', 'single'], p=(*_SHARES, 1 - sum(_SHARES))))
-        names = [
-            name
-            for name in halves[half].kinds()
-            if group == ('single' if name in KNOWN else 'outside')
-        ]
-        rarest = [name for name in names if used[name] == min(used[other] for other in names)]
-        effects = (str(rng.choice(rarest)),) if rarest else ()
+        group = str(rng.choice(list(rule.shares), p=list(rule.shares.values())))
+        kinds = [name for name in halves[half].kinds() if (name in KNOWN) is (group != 'outside')]
+        effects: list[str] = []
+        for _ in range({'none': 0, 'pair': 2}.get(group, 1)):
+            others = [name for name in kinds if name not in effects]
+            fewest = min((used[name] for name in others), default=0)
+            rarest = [name for name in others if used[name] == fewest]
+            effects += [str(rng.choice(rarest))] if rarest else []
         used.update(effects)
-        rows.append((group if effects else 'none', effects, (seed, 4, k, half)))
-    return [Plan(f'r{i:04d}', *rows[k]) for i, k in enumerate(rng.permutation(count))]
+        trial_seed = (seed, rule.stream + 1, k, half)
+        rows.append((group if effects else 'none', tuple(effects), trial_seed))
+    return [Plan(f'{rule.letter}{i:04d}', *rows[k]) for i, k in enumerate(rng.permutation(count))]
 
 
 def draw(halves: Sequence[Half], plan: Plan) -> Drawn:

@@ -24,8 +24,8 @@ def log(path: Path, seed: int, noise: float = 0.0, zero_g: float = 0.0) -> Path:
 
 
 def worse(new: Path, old: Path) -> set[str]:
-    found = [adxl.check(str(path)).recordings[0] for path in (new, old)]
-    outcomes = gate.compare(*found)
+    now, before = (adxl.check(str(path)).recordings[0] for path in (new, old))
+    outcomes = gate.Earlier(before).compare(now)
     assert {each.name for each in outcomes} == KINDS
     return {each.name for each in outcomes if each.is_worse}
 

@@ -16,9 +16,8 @@ Several of them with the same side up are a change of the sensor, which is repor
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timezone
 from typing import NamedTuple
 
 from adxl_ros.calibrate.keep.belief import Belief, LARGEST_DRIFT, Rest
@@ -29,6 +28,7 @@ from adxl_ros.files.sweep_journal import Adopted, JournalEntry, NaturalRest, Und
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import get, put, Sensor
+from adxl_ros.report.quantities import utc
 import numpy as np
 import scipy
 
@@ -370,10 +370,7 @@ class Keeper:
         """Return the change of each zero-g at the last temperature, for people."""
         change = values - self._kept.values
         rows = self._linear.zero_g(self.last_temperature_c)
-        return ', '.join(
-            f'{axis} {1e3 * shift:+.2g} mg'
-            for axis, shift in zip(self._kept.sensor.axes, rows @ change)
-        )
+        return by_axis(self._kept.sensor.axes, 1e3 * rows @ change)
 
     def _exchange(self, adopted: Adopted) -> None:
         """Use adopted coefficients from here on."""
@@ -383,7 +380,6 @@ class Keeper:
         self.adoptions.append(adopted)
         sensor = put(before.sensor, before.names, adopted.values)
         low, high = sensor.envelope.temperature_c or self._temperatures_c
-        adopted_at = datetime.fromtimestamp(adopted.stamp_ns * 1e-9, timezone.utc)
         kept_from = before.sensor.provenance.get(KEPT) or calibration_id(before.sensor)
         provenance = {key: text for key, text in before.sensor.provenance.items() if key != 'id'}
         self._use(
@@ -402,7 +398,7 @@ class Keeper:
                     ),
                     provenance={
                         **provenance,
-                        'date': adopted_at.isoformat(timespec='seconds'),
+                        'date': utc(adopted.stamp_ns).isoformat(timespec='seconds'),
                         KEPT: kept_from,
                     },
                 )
@@ -418,10 +414,9 @@ class Keeper:
         """Return what has changed beyond age and temperature, '' if nothing has."""
         for axis, rejection in self._rejections.items():
             if rejection.is_change:
-                since = datetime.fromtimestamp(rejection.since_ns * 1e-9, timezone.utc)
                 return (
                     f'changed: {1e3 * rejection.size_g:+.2g} mg on {axis} since '
-                    f'{since:%A %Y-%m-%dT%H:%MZ}: knocked, or broken?'
+                    f'{utc(rejection.since_ns):%A %Y-%m-%dT%H:%MZ}: knocked, or broken?'
                 )
         return self._unexplained
 
@@ -493,6 +488,11 @@ class Keeper:
                 for axis in sorted(sides - both)
             ]
         return tuple(texts)
+
+
+def by_axis(axes: str, values_mg: Iterable[float]) -> str:
+    """Return values by axis, mg, as text."""
+    return ', '.join(f'{axis} {value:+.2g} mg' for axis, value in zip(axes, values_mg))
 
 
 def _is_kept(name: Coefficient, axis: str) -> bool:
