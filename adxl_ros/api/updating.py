@@ -22,12 +22,17 @@ from adxl_ros.files.recording_columns import check_unit, Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import page
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS, figure, line, points, QUIET_COLOUR
-from adxl_ros.report.quantities import counted, number, utc
+from adxl_ros.report.quantities import counted, number, utc, with_half_width
 import numpy as np
 
 PAGE = 'report.html'
 _CURVE_POINTS = 30  # Points of a curve over temperature
 _HEIGHT = 320  # Of a plot, pixels
+
+
+def _interval(value: float, half: float) -> str:
+    """Write a value and half of its interval with the digits that this allows."""
+    return with_half_width(value, half).replace('+-', '±')
 
 
 class UpdatedDay(NamedTuple):
@@ -82,7 +87,7 @@ class Update(Result):
             *[f'{lost} rests without a temperature were not used'] * bool(lost),
             '',
             *(
-                f'zero-g {axis}  {number(value, True)} ± {number(half)} mg since the calibration, '
+                f'zero-g {axis}  {_interval(value, half)} mg since the calibration, '
                 f'at {self.state.temperature_c:.1f} °C'
                 for axis, value, half in zip(
                     self.sensor.axes, self.state.total_mg, self.state.zero_g_90_mg
@@ -144,7 +149,7 @@ class Update(Result):
 
     def _row(self, day: UpdatedDay) -> list[str]:
         zero_g = ', '.join(
-            f'{axis} {number(value, True)} ± {number(half)}'
+            f'{axis} {_interval(value, half)}'
             for axis, value, half in zip(self.sensor.axes, day.zero_g_mg, day.zero_g_90_mg)
         )
         event = day.changed or 'adopted' * day.adopted
@@ -180,8 +185,8 @@ class Update(Result):
             traces,
             _HEIGHT,
             shapes=adopted,
-            xaxis={'title': f'days since {self.days[0].date}' if self.days else 'days'},
-            yaxis={'title': 'zero-g since the calibration, mg'},
+            xaxis={'title': {'text': f'days since {self.days[0].date}' if self.days else 'days'}},
+            yaxis={'title': {'text': 'zero-g since the calibration, mg'}},
         )
 
     def _by_temperature(self) -> dict[str, Any]:
@@ -206,8 +211,8 @@ class Update(Result):
         return figure(
             traces,
             _HEIGHT,
-            xaxis={'title': 'temperature, °C'},
-            yaxis={'title': 'zero-g from the mean temperature, mg'},
+            xaxis={'title': {'text': 'temperature, °C'}},
+            yaxis={'title': {'text': 'zero-g from the mean temperature, mg'}},
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -162,6 +162,8 @@ def _single(made: Made, name_of: Callable[[Row], str]) -> Table:
 def _strength(row: Row) -> str:
     """Return the strength of a defect in words."""
     low, high = next(edges for edges in pairwise(_STRENGTHS) if row.fact.noises < edges[1])
+    if math.isinf(high):
+        return f'above {low:g} times the noise'
     return f'{low:g} to {high:g} times the noise'
 
 
