@@ -243,6 +243,30 @@ class Sensor:
         100000.0,
         default=0.0,
     )
+    self_test_g: tuple[float, ...] = _nominal(
+        'sensor.self_test_g',
+        'typical change of the output by the self-test, by axis; empty where not stated',
+        'g',
+        -100.0,
+        100.0,
+        default=(),
+    )
+    self_test_lower_g: tuple[float, ...] = _nominal(
+        'sensor.self_test_lower_g',
+        'lowest change by the self-test, with its sign, by axis',
+        'g',
+        -100.0,
+        100.0,
+        default=(),
+    )
+    self_test_upper_g: tuple[float, ...] = _nominal(
+        'sensor.self_test_upper_g',
+        'highest change by the self-test, with its sign, by axis',
+        'g',
+        -100.0,
+        100.0,
+        default=(),
+    )
     effects: tuple[str, ...] = ()  # Names of the effects
     # Values by effect and parameter, (m,) or (), each in the unit of its parameter
     values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
@@ -298,6 +322,12 @@ class Sensor:
         """
         stated_s = self.rc_resistance_ohm * self.rc_capacitance_f
         return stated_s * self.filter_rate_hz / self.rate_hz if self.filter_rate_hz else stated_s
+
+    @property
+    def self_test_step_g(self) -> np.ndarray:
+        """Change of a usual unit by the self-test, g, (m,); () where the sheet states nothing."""
+        middle_g = (np.array(self.self_test_lower_g) + np.array(self.self_test_upper_g)) / 2
+        return np.array(self.self_test_g) if self.self_test_g else middle_g
 
     @property
     def lsb_v(self) -> float:
@@ -369,6 +399,9 @@ def with_axes(sensor: Sensor, axes: str) -> Sensor:
                 f'file for {axes}'
             )
         changed[name] = np.array([*values, *[values[0]] * 3])[: len(axes)]
+    for name in ('self_test_g', 'self_test_lower_g', 'self_test_upper_g'):
+        values = getattr(sensor, name)
+        changed[name] = values[: len(axes)] if len(axes) <= len(values) else ()
     if len(axes) > len(sensor.axes):
         # A part with more axes has another datasheet.
         changed |= {'datasheet_name': '', 'datasheet': {}}
