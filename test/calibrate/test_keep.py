@@ -8,6 +8,7 @@ from adxl_ros.calibrate.keep.keeper import Keeper
 from adxl_ros.calibrate.keep.stays import RestStream
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import Adopted, Journal
+from adxl_ros.model.sensor import with_axes
 from adxl_ros_validation import kept_robots
 from adxl_ros_validation.kept_robots import BEGIN_NS, calibrated, Kind, Robot
 import numpy as np
@@ -37,6 +38,32 @@ def test_a_knock_is_reported_and_never_learnt(kind):
     assert outcome.reported_days < 2
     assert outcome.adoptions_after == 0
     assert outcome.false_changes == 0
+
+
+def test_the_interval_of_a_sensor_of_two_axes_holds():
+    """Two axes do not show the length of gravity: it learns from the changes within stays."""
+    whole = calibrated()
+    names = tuple(name for name in whole.covariance_names if name.axis != 'z')
+    unit = replace(with_axes(replace(whole, effects=()), 'xy'), effects=whole.effects)
+    values = {
+        effect: {name: value[:2] for name, value in parameters.items()}
+        for effect, parameters in whole.values.items()
+    }
+    unit = replace(
+        unit, values=values, covariance=whole.covariance[:4, :4], covariance_names=names
+    )
+    inside = []
+    for seed in (0, 1):
+        robot, keeper = Robot(Kind(True, slope=5), np.random.default_rng(seed)), Keeper(unit)
+        for day in range(20):
+            for rest, _ in robot.rests(day):
+                keeper.add(replace(rest, mean_v=rest.mean_v[:2], std_v=rest.std_v[:2]))
+            state = keeper.state(rest.stop_ns)
+            true_mg = 1e3 * robot.zero_g(rest.temperature_c)[:2]
+            inside += [*(np.abs(true_mg - state.total_mg) <= state.zero_g_90_mg)]
+    assert np.mean(inside) > 0.75
+    assert np.isnan(state.tilt_90_deg) and not state.changed
+    assert state.determined[0] == 'zero-g x: as calibrated, and ageing'
 
 
 def test_a_slope_of_weeks_is_not_learnt_as_zero_g():
