@@ -3,11 +3,14 @@
 """A calibration that is kept: what is learnt, what never is, and what a kill leaves."""
 
 from dataclasses import replace
+import os
+import signal
+import time
 
 from adxl_ros.calibrate.keep.keeper import Keeper
 from adxl_ros.calibrate.keep.stays import RestStream
 from adxl_ros.errors import UserError
-from adxl_ros.files.sweep_journal import Adopted, Journal
+from adxl_ros.files.sweep_journal import Adopted, Journal, read
 from adxl_ros.model.sensor import with_axes
 from adxl_ros_validation import kept_robots
 from adxl_ros_validation.kept_robots import BEGIN_NS, calibrated, Kind, Robot
@@ -113,6 +116,39 @@ def test_a_restart_after_any_line_goes_on_and_undo_goes_back(tmp_path):
         restarted.sensor.values['bias']['offset_v'], again.sensor.values['bias']['offset_v']
     )
     journal.close()
+
+
+def keep_on(path, days, acknowledge_fd):
+    """Take the rests that the journal lacks, and acknowledge each; for a process of its own."""
+    journal = Journal(path, HEAD)
+    keeper = Keeper(calibrated(), entries=journal.entries, write=journal.append)
+    for rest in days[len(journal.entries) :]:
+        keeper.add(rest)
+        os.write(acknowledge_fd, b'.')
+    os._exit(0)
+
+
+def test_no_kill_at_a_random_moment_loses_a_rest(tmp_path):
+    days, path, rng = rests(Kind(), 6), tmp_path / 'j', np.random.default_rng(4)
+    kept = 0
+    for _ in range(10):
+        acknowledged_fd, acknowledge_fd = os.pipe()
+        process = os.fork()
+        if not process:
+            keep_on(path, days, acknowledge_fd)
+        os.close(acknowledge_fd)
+        count = len(os.read(acknowledged_fd, 1))
+        time.sleep(rng.uniform(0, 0.03))  # the random moment
+        os.kill(process, signal.SIGKILL)
+        os.waitpid(process, 0)
+        while acknowledged := os.read(acknowledged_fd, 4096):
+            count += len(acknowledged)
+        os.close(acknowledged_fd)
+        entries = read(path).entries
+        assert [*entries] == days[: len(entries)]
+        assert len(entries) >= kept + count
+        kept = len(entries)
+    assert kept > 10
 
 
 def test_a_dry_run_reports_and_adopts_nothing():
