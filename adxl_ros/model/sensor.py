@@ -324,12 +324,6 @@ class Sensor:
         return stated_s * self.filter_rate_hz / self.rate_hz if self.filter_rate_hz else stated_s
 
     @property
-    def self_test_step_g(self) -> np.ndarray:
-        """Change of a usual unit by the self-test, g, (m,); () where the sheet states nothing."""
-        middle_g = (np.array(self.self_test_lower_g) + np.array(self.self_test_upper_g)) / 2
-        return np.array(self.self_test_g) if self.self_test_g else middle_g
-
-    @property
     def lsb_v(self) -> float:
         """Step of the ADC, V; 0 where it does not quantise."""
         return self.adc_vref_v / 2**self.adc_bits if self.adc_bits else 0.0
@@ -399,9 +393,8 @@ def with_axes(sensor: Sensor, axes: str) -> Sensor:
                 f'file for {axes}'
             )
         changed[name] = np.array([*values, *[values[0]] * 3])[: len(axes)]
-    for name in ('self_test_g', 'self_test_lower_g', 'self_test_upper_g'):
-        values = getattr(sensor, name)
-        changed[name] = values[: len(axes)] if len(axes) <= len(values) else ()
+    # Another part has another self-test.
+    changed |= dict.fromkeys(('self_test_g', 'self_test_lower_g', 'self_test_upper_g'), ())
     if len(axes) > len(sensor.axes):
         # A part with more axes has another datasheet.
         changed |= {'datasheet_name': '', 'datasheet': {}}

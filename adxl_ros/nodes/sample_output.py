@@ -76,11 +76,8 @@ class Tally:
         self._reported = totals
         elapsed_ns = max(new['sensor_ns'], 0)
         values: dict[str, Any] = {
-            'missing': totals['missing'],
+            **{name: totals[name] for name in ('samples', *_FAULTS)},
             'missing_estimated': totals['estimated'],
-            'saturated': totals['saturated'],
-            'withheld': totals['withheld'],
-            'samples': totals['samples'],
             'rate_hz': round(new['samples'] / elapsed_ns * 1e9, 3) if elapsed_ns else 0.0,
             'speed': round(elapsed_ns / new['steady_ns'], 3),
         }

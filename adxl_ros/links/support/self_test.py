@@ -87,8 +87,7 @@ class SelfTest:
         if len(stamps_ns):
             self._was_on, self._changed_ns = bool(is_on[-1]), int(changed_ns[-1])
         answer = self._step(_Batch(samples, sensor, is_on, is_settled, settling_ns))
-        published = is_settled & ~is_on
-        return samples.where(published), answer
+        return samples.where(is_settled & ~is_on), answer
 
     def _step(self, batch: _Batch | None) -> Answer | None:
         if self._steps is None:
@@ -116,15 +115,14 @@ class SelfTest:
     ) -> Generator[None, Any, tuple[np.ndarray, Sensor]]:
         """Hold the self-test again and again; return the means of blocks that are settled, V."""
         taken: list[np.ndarray] = []
-        count, until_ns = 0, None
+        until_ns = None
         while True:
             batch: _Batch = yield
             self._hold(hold_s)
             rows = batch.is_settled & (batch.is_on == (hold_s > 0))
             taken.append(batch.samples.volts[rows])
-            count += int(rows.sum())
             needed = max(ceil(_WINDOW_S * batch.sensor.rate_hz), _FEWEST)
-            if count >= needed:
+            if sum(map(len, taken)) >= needed:
                 blocks = np.array_split(np.concatenate(taken), _BLOCKS)
                 return np.array([block.mean(axis=0) for block in blocks]), batch.sensor
             longest_ns = 1e9 * (_LONGEST_S + needed / batch.sensor.rate_hz)
@@ -178,7 +176,10 @@ class EmulatedLine:
     """The self-test of a simulated sensor, which ends by itself."""
 
     def __init__(self, sensor: Sensor) -> None:
-        step_g = sensor.self_test_step_g
+        typical_g = sensor.self_test_g
+        step_g = np.mean(
+            [typical_g or sensor.self_test_lower_g, typical_g or sensor.self_test_upper_g], axis=0
+        )
         self.has_step = len(step_g) > 0  # Whether the parameters state what it does
         self._step_v = step_g * sensor.scale_v_per_g if self.has_step else np.zeros(1)
         self._rc_s = max(sensor.rc_s, _SHORTEST_RC_S)
