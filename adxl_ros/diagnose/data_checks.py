@@ -194,7 +194,7 @@ def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> N
         if gravity.fault is not None and gravity.fault.is_clear:
             raise DataFault(
                 gravity.fault.data_fault,
-                f'{sim.force.name}: {gravity.fault.reason}; {gravity.fault.conversion}',
+                f'{sim.force.name}: {gravity.fault.stated_by("--sim-unit ")}',
             )
 
 
@@ -1013,7 +1013,8 @@ def _check_axes(comparison: BaselineComparison) -> None:
             raise DataFault(
                 'unit',
                 f'the output is {np.median(gains):.4g} times the simulated '
-                f'output, as values in {units} are; correct the unit of the columns',
+                f'output, as values in {units} are; correct the unit of the columns'
+                + (', by --unit or --sim-unit' if comparison.simulated_force else ''),
             )
     largest = float(np.max(np.abs(correlation)))
     if largest < _UNCORRELATED:
