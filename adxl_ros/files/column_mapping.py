@@ -444,7 +444,7 @@ def parse_unit(
 ) -> str:
     """Return the name of a unit of the sensor's output, one of the known; '' for no text."""
     name = unit_name(text, Quantity.OUTPUT) if text else ''
-    if name and name not in known or name is None:
+    if name is None or (name and name not in known):
         raise UserError(f'{option} {text}: unknown unit; write one of {", ".join(known)}')
     return name
 

@@ -190,21 +190,16 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
     """Return the page of a fleet."""
     units = fleet.rank(table, results)
     share = fleet.effect_matrix(table)
-    # Units that drift come first, although others may be more urgent.
-    plotted = [
-        (unit, shown[0])
-        for unit in sorted(units, key=lambda unit: not unit.drifts)
-        if (
-            shown := [
-                *(drift.result for drift in unit.drifts),
-                *(result for result in results if result.place_of(unit.unit) is not None),
-            ]
-        )
-    ][:_SHOWN]
-    figures = {
-        f'trend-{i}': _trend_figure(table, result, unit.unit)
-        for i, (unit, result) in enumerate(plotted)
-    }
+    plots = {name: _plotted(units, results, name == 'noise') for name in ('trend', 'noise')}
+    figures, trends = {}, {name: list[dict[str, str]]() for name in plots}
+    for name, plotted in plots.items():
+        for number_of_plot, (unit, result) in enumerate(plotted):
+            figure = f'{name}-{number_of_plot}'
+            figures[figure] = _trend_figure(table, result, unit.unit)
+            claimed = [f'{drift.text}.' for drift in unit.drifts if drift.result is result]
+            title = f'{unit.serial}: {result.quantity.label}'
+            text = [*claimed, 'No slope is claimed.'][0]
+            trends[name].append({'figure': figure, 'title': title, 'text': text})
     if len(share.columns):
         figures['matrix'] = _matrix_figure(table, share)
     counts = Counter(unit.state for unit in units)
@@ -228,14 +223,7 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
             'date': date_text,
             'link': partial(_link, folder),
             'without_unit': int((table.unit < 0).sum()),
-            'trends': [
-                {
-                    'figure': f'trend-{i}',
-                    'title': f'{unit.serial}: {result.quantity.label}',
-                    'text': f'{unit.drifts[0].text}.' if unit.drifts else 'No slope is claimed.',
-                }
-                for i, (unit, result) in enumerate(plotted)
-            ],
+            'trends': trends,
             'batches': _batches(results),
             'has_effects': 'matrix' in figures,
             'judged': len(share),
@@ -248,6 +236,21 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
             'drifts': sum(int(result.is_claimed.sum()) for result in results),
         },
     )
+
+
+def _plotted(
+    units: Sequence[fleet.UnitState], results: Sequence[fleet.QuantityResult], is_noise: bool
+) -> list[tuple[fleet.UnitState, fleet.QuantityResult]]:
+    """Return the quantity that is plotted of each unit: one with a claimed slope, or the first."""
+    claimed, others = [], []
+    for unit in units:
+        drifting = [d.result for d in unit.drifts if d.result.quantity.is_noise == is_noise]
+        for result in drifting or results:
+            if result.quantity.is_noise == is_noise and result.place_of(unit.unit) is not None:
+                # Units that drift come first, although others may be more urgent.
+                (claimed if drifting else others).append((unit, result))
+                break
+    return [*claimed, *others][:_SHOWN]
 
 
 def _badge(
