@@ -398,8 +398,7 @@ def test_broadcaster(exported):
         assert parameters[f'static_covariance_{absent}'] == [-1.0] + 8 * [0.0]
 
 
-@pytest.mark.parametrize('walk', [(2e-6, 3e-6, 4e-6), ()], ids=['walk', 'no walk'])
-def test_the_gyroscope_in_each_format_that_holds_one(tmp_path, walk):
+def test_the_gyroscope_in_each_format_that_holds_one(tmp_path):
     """
     A density d over positive frequencies is d/√2 over both, with a variance of d²·rate/2 a sample.
 
@@ -411,11 +410,10 @@ def test_the_gyroscope_in_each_format_that_holds_one(tmp_path, walk):
         gyro=Gyroscope(
             bias_radps=tuple(bias),
             noise_density_radps_per_rthz=density,
-            walk_radps_per_rts=walk,
+            walk_radps_per_rts=(2e-6, 4e-6, 3e-6),
         ),
     )
-    white, rate_hz = 3e-4 / np.sqrt(2), sensor.rate_hz
-    k = max(walk, default=white * np.sqrt(3) / 3600)
+    white, k, rate_hz = 3e-4 / np.sqrt(2), 4e-6, sensor.rate_hz
     expected = {
         'kalibr': {
             'gyroscope_noise_density': (white, 'rad/s/sqrt(Hz)'),
@@ -449,6 +447,9 @@ def test_the_gyroscope_in_each_format_that_holds_one(tmp_path, walk):
             written, _, comment = line.partition('  # ')
             assert yaml.safe_load(written)[key] == pytest.approx(value, rel=1e-9), line
             assert comment == stated_unit
+    hidden = replace(sensor, gyro=replace(sensor.gyro, walk_radps_per_rts=()))
+    kalibr = yaml.safe_load(export(tmp_path, 'kalibr', hidden).text)
+    assert kalibr['gyroscope_random_walk'] == pytest.approx(white * np.sqrt(3) / 3600)
 
 
 def test_json(exported, tmp_path):
