@@ -76,6 +76,17 @@ class Carried:
         return compare_checked(recorded, replace(nominal('xyz'), rate_hz=RATE_HZ), sim, may_shift)
 
 
+@pytest.mark.parametrize('gravity_mps2', [1.62, 3.73])
+def test_a_world_with_another_gravity_is_no_fault_of_the_sensor(tmp_path, gravity_mps2):
+    carried = Carried()
+    force = carried.frame.apply(carried.acceleration + [0, 0, gravity_mps2])
+    sensor, sim = replace(nominal('xyz'), rate_hz=RATE_HZ), carried.simulated(tmp_path, force)
+    with pytest.raises(DataFault) as raised:
+        check_gravity(carried.recorded(), sensor, sim)
+    assert raised.value.name == 'reference'
+    assert f'{gravity_mps2:g} m/s² long' in raised.value.message
+
+
 @pytest.mark.parametrize('factor', [0.5, 1.5, 4.0])
 def test_a_wrong_dynamic_part_is_an_error_of_the_simulator(tmp_path, factor):
     carried = Carried()
