@@ -190,16 +190,15 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
     """Return the page of a fleet."""
     units = fleet.rank(table, results)
     share = fleet.effect_matrix(table)
-    plots = {name: _plotted(units, results, name == 'noise') for name in ('trend', 'noise')}
-    figures, trends = {}, {name: list[dict[str, str]]() for name in plots}
-    for name, plotted in plots.items():
-        for number_of_plot, (unit, result) in enumerate(plotted):
-            figure = f'{name}-{number_of_plot}'
-            figures[figure] = _trend_figure(table, result, unit.unit)
-            claimed = [f'{drift.text}.' for drift in unit.drifts if drift.result is result]
-            title = f'{unit.serial}: {result.quantity.label}'
-            text = [*claimed, 'No slope is claimed.'][0]
-            trends[name].append({'figure': figure, 'title': title, 'text': text})
+    figures: dict[str, plotly.Figure] = {}
+    trends: dict[str, list[dict[str, str]]] = {'trend': [], 'noise': []}
+    for name, shown in trends.items():
+        for count, plot in enumerate(_plots(units, results, name == 'noise')):
+            figure = f'{name}-{count}'
+            figures[figure] = _trend_figure(table, plot.result, plot.unit.unit)
+            title = f'{plot.unit.serial}: {plot.result.quantity.label}'
+            text = f'{plot.drifts[0].text}.' if plot.drifts else 'No slope is claimed.'
+            shown.append({'figure': figure, 'title': title, 'text': text})
     if len(share.columns):
         figures['matrix'] = _matrix_figure(table, share)
     counts = Counter(unit.state for unit in units)
@@ -238,19 +237,26 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
     )
 
 
-def _plotted(
+class _Plot(NamedTuple):
+    """A quantity that is plotted of a unit."""
+
+    unit: fleet.UnitState
+    result: fleet.QuantityResult
+    drifts: Sequence[fleet.Drift]  # Its claimed slopes of this kind, the most urgent first
+
+
+def _plots(
     units: Sequence[fleet.UnitState], results: Sequence[fleet.QuantityResult], is_noise: bool
-) -> list[tuple[fleet.UnitState, fleet.QuantityResult]]:
-    """Return the quantity that is plotted of each unit: one with a claimed slope, or the first."""
-    claimed, others = [], []
+) -> list[_Plot]:
+    """Return the most urgent drift of each unit, or its first quantity; those that drift first."""
+    kind = [result for result in results if result.quantity.is_noise == is_noise]
+    plots = []
     for unit in units:
-        drifting = [d.result for d in unit.drifts if d.result.quantity.is_noise == is_noise]
-        for result in drifting or results:
-            if result.quantity.is_noise == is_noise and result.place_of(unit.unit) is not None:
-                # Units that drift come first, although others may be more urgent.
-                (claimed if drifting else others).append((unit, result))
-                break
-    return [*claimed, *others][:_SHOWN]
+        drifts = [drift for drift in unit.drifts if drift.result.quantity.is_noise == is_noise]
+        measured = [result for result in kind if result.place_of(unit.unit) is not None]
+        shown = [drift.result for drift in drifts] or measured
+        plots += [_Plot(unit, result, drifts) for result in shown[:1]]
+    return sorted(plots, key=lambda plot: not plot.drifts)[:_SHOWN]
 
 
 def _badge(
