@@ -65,6 +65,7 @@ motion that repeats fits at several shifts."""
 _LARGEST_STEP_S = 1.0
 """Largest step of a clock that is looked for anywhere, s; of a larger one, the parts tell. Chosen:
 what the effect of a time offset covers."""
+_SMALLEST_STEP_S = 5e-3  # Smallest step of a clock, s. Chosen: less is jitter
 _LARGEST_ERROR_RATIO = 0.5
 """A shift shows if it reduces 1 − correlation below this share. Chosen: noise that is not shifted
 keeps it."""
@@ -506,9 +507,13 @@ def _check_step(recording: Recording, sensor: Sensor, force: ForcePath, about_s:
     motions = _motions(recording, sensor, force)
     if motions is None:
         return
-    motions = motions.part(
-        np.arange(0, len(motions.measured_s), 1 + len(recording) // _FINE_SAMPLES)
-    )
+    # What all shifts can be compared in
+    begin_s, end_s = motions.stated_s[[0, -1]] - about_s + np.array([1, -1]) * _LARGEST_STEP_S
+    inside = np.flatnonzero((motions.measured_s > begin_s) & (motions.measured_s < end_s))
+    motions = motions.part(inside[:: 1 + len(inside) // _FINE_SAMPLES])
+    rows = np.arange(len(motions.measured_s))
+    if not len(rows):
+        return
     near_s = about_s + np.arange(-_LARGEST_STEP_S, _LARGEST_STEP_S, motions.step_s)
     one_s = motions.best_shift_s(near_s)
     one_g = motions.stated_at(one_s)
@@ -518,16 +523,16 @@ def _check_step(recording: Recording, sensor: Sensor, force: ForcePath, about_s:
     def error_g2(stated_g: np.ndarray) -> np.ndarray:
         return np.cumsum(((own_g - stated_g) ** 2).sum(axis=1))
 
+    one_g2 = error_g2(one_g)
     best_g2, first = 0.0, 0  # First row behind the step
     for other_s in near_s:
-        gain_g2 = error_g2(one_g) - error_g2(motions.stated_at(other_s))
+        gain_g2 = one_g2 - error_g2(motions.stated_at(other_s))
         for row, gained_g2 in (
             (int(gain_g2.argmax()), gain_g2.max()),
             (int(gain_g2.argmin()), gain_g2[-1] - gain_g2.min()),
         ):
             if gained_g2 > best_g2:
                 best_g2, first = gained_g2, row + 1
-    rows = np.arange(len(own_g))
     if min(first, len(rows) - first) * motions.step_s < LARGEST_LATENCY_S:
         return
     before_s, after_s = (
@@ -535,7 +540,8 @@ def _check_step(recording: Recording, sensor: Sensor, force: ForcePath, about_s:
     )
     _, drift_g2 = _fit_drift(motions, np.full(2, one_s))
     left_g2 = motions.left_g2(np.where(rows < first, before_s, after_s))
-    if left_g2 < _LARGEST_ERROR_RATIO * min(motions.left_g2(one_s), drift_g2):
+    explains = left_g2 < _LARGEST_ERROR_RATIO * min(motions.left_g2(one_s), drift_g2)
+    if explains and abs(after_s - before_s) > _SMALLEST_STEP_S:
         at_s = _time_of_step(motions, before_s, after_s)
         raise _step_fault(force, after_s - before_s, at_s)
 
