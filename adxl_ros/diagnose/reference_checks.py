@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose.comparison import BaselineComparison, bridged, SMALLEST_MOTION_G
 from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.process import option
 from adxl_ros.report.quantities import mg_text
 from adxl_ros.signals.block_statistics import rms
 import numpy as np
@@ -133,7 +134,7 @@ def clock_step(comparison: BaselineComparison) -> str | None:
     return (
         f'the clock of {force.name} steps by {abs(step_s):.2g} s between '
         f'{delays[place - 1].time_s:.4g} and {delays[place].time_s:.4g} s, beside that of '
-        'the recording; cut the recording there, and diagnose each part with --align'
+        f'the recording; cut the recording there, and diagnose each part with {option(align=True)}'
     )
 
 

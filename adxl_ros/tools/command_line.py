@@ -21,7 +21,7 @@ from adxl_ros.files.atomic_write import AnyPath, require_own
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects.base import Effect
-from adxl_ros.process import ended_by_closed_output
+from adxl_ros.process import ended_by_closed_output, options_named
 from adxl_ros.report.screen import bar, end_lines, entry_list, NextStep, program_parser, wrapped
 
 if TYPE_CHECKING:
@@ -150,15 +150,15 @@ def add_robot_options(parse: argparse.ArgumentParser) -> None:
 def reading_options(options: argparse.Namespace) -> ReadingOptions:
     """Return how recordings are to be read."""
     return recordings.reading_options(
-        options.topic,
-        options.columns,
-        options.unit,
-        options.rate,
-        options.axes,
-        options.lsb_per_g,
-        options.lsb_at_0g,
-        options.drop_bad_stamps,
-        options.drop_bad_samples,
+        topic=options.topic,
+        columns=options.columns,
+        unit=options.unit,
+        rate=options.rate,
+        axes=options.axes,
+        lsb_per_g=options.lsb_per_g,
+        lsb_at_0g=options.lsb_at_0g,
+        drop_bad_stamps=options.drop_bad_stamps,
+        drop_bad_samples=options.drop_bad_samples,
     )
 
 
@@ -169,7 +169,8 @@ def reading_text(options: argparse.Namespace) -> str:
         if value := getattr(options, name):
             words += [f'--{name.replace("_", "-")}', str(value)]
     for name in ('drop_bad_stamps', 'drop_bad_samples'):
-        words += [f'--{name.replace("_", "-")}'] * getattr(options, name)
+        if getattr(options, name):
+            words.append(f'--{name.replace("_", "-")}')
     return f' {shlex.join(words)}' if words else ''
 
 
@@ -214,6 +215,7 @@ def quoted(*words: AnyPath) -> str:
     return shlex.join(str(word) for word in words)
 
 
+@options_named()
 @ended_by_closed_output()
 def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int]) -> int:
     """Parse the command line and run a tool."""
@@ -232,15 +234,15 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
 def note(text: str, paste: str = '') -> None:
     """Print a message on stderr: one line, which a terminal gets wrapped between words."""
     if sys.stderr.isatty():
-        text = '\n'.join(wrapped(text.removesuffix(paste), 2))
-        text += f'\n{paste}' * bool(paste)
+        lines = wrapped(text.removesuffix(paste), 2)
+        text = '\n'.join([*lines, paste] if paste else lines)
     print(text, file=sys.stderr)
 
 
 def check_least(options: argparse.Namespace, **least: float) -> None:
     """Refuse numbers of options that are too small; an option that is not given has none."""
     for name, lowest in least.items():
-        require_least(name.replace('_', '-'), getattr(options, name), lowest)
+        require_least(name, getattr(options, name), lowest)
 
 
 def add_overwrite_option(parse: argparse.ArgumentParser, name: str = '--force') -> None:
@@ -257,7 +259,7 @@ def check_outputs(options: argparse.Namespace, *paths: AnyPath | None) -> None:
     """Refuse to replace a file or folder of others; a path that is not given is None or ''."""
     for path in paths:
         if path:
-            require_own(path, options.overwrite, '--overwrite')
+            require_own(path, options.overwrite)
 
 
 def refuse_same_file(output: str, source: str) -> None:

@@ -99,10 +99,10 @@ def simulate(options: argparse.Namespace) -> int:
     made = prepare(
         options.trajectory if is_named else cli.read('simulate', options.trajectory),
         options.params,
-        cli.effect_inputs(options.effect),
-        options.force,
-        options.rate,
-        options.seed,
+        effects=cli.effect_inputs(options.effect),
+        force=options.force,
+        rate=options.rate,
+        seed=options.seed,
     )
     cli.report_notes('simulate', made.left_out)
     with ExitStack() as stack:
