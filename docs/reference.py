@@ -652,7 +652,7 @@ def input_types() -> Iterator[tuple[str, ...]]:
         module, name = path.split(':')
         source = inspect.getsource(importlib.import_module(module))
         found = re.search(rf'^{name}\b[^\n]* = (.*)\n"""(.*?)"""', source, re.MULTILINE)
-        yield f'`{name}`', f'`{found[1]}`', found[2]
+        yield f'`{name}`', '`{}`'.format(found[1].strip("'")), found[2]
 
 
 def verb(name: str) -> Iterator[str]:

@@ -186,7 +186,9 @@ class Noise(Result):
         ax = axes_for(ax)
         accelerometer = words.sensors_at_rest(self.result)[0]
         for number, noise in enumerate(self.axes):
-            words.draw(ax, accelerometer, number, noise.axis, AXIS_COLOURS[noise.axis])
+            words.draw(ax, accelerometer, number, noise.axis)
+            words.draw_sum(ax, accelerometer, number, color=AXIS_COLOURS[noise.axis])
+        ax.legend()
         ax.set_ylabel('Allan deviation, µg')
         return ax
 

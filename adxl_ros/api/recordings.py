@@ -9,7 +9,7 @@ from dataclasses import replace
 import hashlib
 import math
 import os
-from typing import Any, NamedTuple, Protocol, TYPE_CHECKING, TypeAlias, TypeGuard
+from typing import Any, NamedTuple, TYPE_CHECKING, TypeAlias
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording as recording_files
@@ -29,22 +29,9 @@ import numpy as np
 
 if TYPE_CHECKING:
     from adxl_ros.simulate.robot import RobotPath
+    from pandas import DataFrame
 
-
-class Frame(Protocol):
-    """A DataFrame of pandas, by what is used of it."""
-
-    columns: Any
-    index: Any
-
-    def __iter__(self) -> Iterator[Any]:
-        """Yield the names of the columns."""
-
-    def __getitem__(self, name: Any, /) -> Any:
-        """Return a column."""
-
-
-RecordingInput: TypeAlias = Recording | Frame | Mapping[str, Any] | str | os.PathLike
+RecordingInput: TypeAlias = 'Recording | DataFrame | Mapping[str, Any] | str | os.PathLike'
 """A recording, a DataFrame or arrays by name in the columns of the package, or a path."""
 Counts: TypeAlias = float | Sequence[float] | str
 """Counts of an ADC: one number for all axes, one for each, or their text with commas."""
@@ -182,7 +169,7 @@ def _counts(argument: str, given: Counts, above: float) -> tuple[float, ...]:
 
 
 def from_arrays(
-    table: Mapping[str, Any] | Frame | None = None,
+    table: Mapping[str, Any] | DataFrame | None = None,
     /,
     *,
     rate: float | None = None,
@@ -240,7 +227,7 @@ def from_arrays(
 _KNOWN = (TIME, *ACCEL, *VOLTS, *GYRO, *REFERENCES)  # Columns of the package
 
 
-def _is_frame(given: Any) -> TypeGuard[Frame]:
+def _is_frame(given: Any) -> bool:
     """Return whether an object is a DataFrame, without the package pandas."""
     return hasattr(given, 'columns') and hasattr(given, 'index')
 

@@ -37,7 +37,7 @@ class GapInUnit(NamedTuple):
 
     quantity: str
     unit: str
-    before: float  # Recording and simulation by --params
+    before: float  # Recording and simulation by the sensor that was given
     after: float  # Recording and simulation by params.yaml
     floor: float  # Two simulations, one with noise
 

@@ -225,8 +225,9 @@ def curves(result: RecordingNoise) -> Any:
     for shown, plots in zip(sensors, rows):
         name = shown.name if result.gyro else 'axis'
         for number, (noise, plot) in enumerate(zip(shown.axes, plots)):
+            draw(plot, shown, number, 'measured')
             _draw_terms(plot, shown, number)
-            draw(plot, shown, number, 'measured, and all terms')
+            plot.legend(fontsize=8)
             plot.set_title(f'{name} {noise.axis}')
         for unused in plots[len(shown.axes) :]:
             unused.set_visible(False)
@@ -235,29 +236,34 @@ def curves(result: RecordingNoise) -> Any:
 
 
 def _draw_terms(plot: Any, shown: SensorNoise, number: int) -> None:
-    """Draw the terms of an axis that are seen."""
-    tau_s, noise = shown.rest.allan.tau_s, shown.axes[number]
+    """Draw the terms of an axis that are seen, and their sum."""
+    tau_s, noise, factor = shown.rest.allan.tau_s, shown.axes[number], shown.unit.factor
     for name, line, estimate in zip(_NAMES, noise.fit.lines(tau_s), noise.estimates):
         if estimate.is_seen:
-            plot.plot(tau_s, line * shown.unit.factor, '--', lw=1, label=name)
+            plot.plot(tau_s, line * factor, '--', lw=1, label=name)
+    draw_sum(plot, shown, number, color='#222', label='all three')
 
 
-def draw(
-    plot: Any, shown: SensorNoise, number: int, label: str, colour_of_fit: str = '#222'
-) -> None:
-    """Draw the Allan deviation of an axis and its fit."""
-    allan, noise, factor = shown.rest.allan, shown.axes[number], shown.unit.factor
-    tau_s, measured = allan.tau_s, allan.deviation[:, number] * factor
+def draw_sum(plot: Any, shown: SensorNoise, number: int, **looks: str) -> None:
+    """Draw the Allan deviation that the terms of an axis have together."""
+    tau_s, noise = shown.rest.allan.tau_s, shown.axes[number]
+    plot.plot(tau_s, noise.fit.allan_deviation(tau_s) * shown.unit.factor, lw=1, **looks)
+
+
+def draw(plot: Any, shown: SensorNoise, number: int, label: str) -> None:
+    """Draw the Allan deviation of an axis; the plot has room for those of all axes."""
+    allan = shown.rest.allan
+    measured = allan.deviation * shown.unit.factor
+    of_axis = measured[:, number]
     plot.errorbar(
-        tau_s,
-        measured,
-        yerr=measured * allan.relative_error.clip(max=0.9),
+        allan.tau_s,
+        of_axis,
+        yerr=of_axis * allan.relative_error.clip(max=0.9),
         fmt='o',
         ms=4,
-        color=AXIS_COLOURS[noise.axis],
+        color=AXIS_COLOURS[shown.axes[number].axis],
         label=label,
     )
-    plot.plot(tau_s, noise.fit.allan_deviation(tau_s) * factor, color=colour_of_fit, lw=1)
     plot.set(
         xscale='log',
         yscale='log',
@@ -265,4 +271,3 @@ def draw(
         ylim=(measured.min() / 3, measured.max() * 2),
     )
     plot.grid(True, which='both', alpha=0.3)
-    plot.legend(fontsize=8)

@@ -30,7 +30,6 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--params',
         metavar='FILE',
-        default=None,
         help='the calibrated sensor (default: the nominal sensor)',
     )
     parse.add_argument(

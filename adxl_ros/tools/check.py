@@ -35,7 +35,6 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--params',
         metavar='FILE',
-        default=None,
         help='the sensor, for recordings in volts (default: the nominal sensor)',
     )
     parse.add_argument('--report', metavar='DIR', help='write the page check.html there')

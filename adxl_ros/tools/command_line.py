@@ -106,7 +106,6 @@ def add_recording_options(parse: argparse.ArgumentParser) -> None:
         '--rate',
         metavar='HZ',
         type=float,
-        default=None,
         help='stamp the samples by their index at this rate',
     )
     group.add_argument(

@@ -43,7 +43,6 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--params',
         metavar='FILE',
-        default=None,
         help='values that are not fitted (default: the nominal sensor; what '
         'a file leaves out is measured)',
     )

@@ -74,7 +74,6 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--params',
         metavar='FILE',
-        default=None,
         help='parameter file of all recordings (default: the calibration of each '
         'unit at the date of the recording, else the nominal sensor)',
     )

@@ -42,9 +42,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         'trajectory', metavar='TRAJECTORY', help=f'{", ".join(TRAJECTORIES)}, imu, or a recording'
     )
-    parse.add_argument(
-        '--params', metavar='FILE', default=None, help='the sensor (default: the nominal sensor)'
-    )
+    parse.add_argument('--params', metavar='FILE', help='the sensor (default: the nominal sensor)')
     parse.add_argument(
         '--effect',
         action='append',
