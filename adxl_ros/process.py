@@ -103,6 +103,11 @@ def options_named() -> Iterator[None]:
             os.environ[NAMES_OPTIONS] = before
 
 
+def names_options() -> bool:
+    """Return whether a tool or a node is running, and no program in Python."""
+    return NAMES_OPTIONS in os.environ
+
+
 def option(*names: str, **values: Any) -> str:
     """
     Return how a text names what its reader may give: `--unit g` to a tool, `unit='g'` to a verb.
@@ -111,21 +116,21 @@ def option(*names: str, **values: Any) -> str:
     be repeated. Both have the names of the arguments in Python.
     """
     given = {**dict.fromkeys(names), **values}
-    if NAMES_OPTIONS in os.environ:
+    if names_options():
         return ' '.join(_of_tool(name, value) for name, value in given.items())
     return ', '.join(_of_verb(name, value) for name, value in given.items())
 
 
 def usage(verb: str, *inputs: str, **values: Any) -> str:
     """Return how a verb is used with an option: `fit --means` as a tool, `fit(means=True)`."""
-    if NAMES_OPTIONS in os.environ:
+    if names_options():
         return ' '.join((verb, *inputs, option(**values)))
     return f'{verb}({", ".join((*map(repr, inputs), option(**values)))})'
 
 
 def pasted(columns: str, **values: Any) -> str:
     """Return options with a mapping of columns, which a shell or Python reads as they are."""
-    if NAMES_OPTIONS in os.environ:
+    if names_options():
         quoted = shlex.quote(columns)
         columns = quoted if quoted != columns else f"'{columns}'"
     return option(columns=columns, **values)

@@ -21,7 +21,7 @@ from adxl_ros.files.atomic_write import AnyPath, require_own
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects.base import Effect
-from adxl_ros.process import ended_by_closed_output, options_named
+from adxl_ros.process import ended_by_closed_output, option, options_named
 from adxl_ros.report.screen import bar, end_lines, entry_list, NextStep, program_parser, wrapped
 
 if TYPE_CHECKING:
@@ -146,31 +146,32 @@ def add_robot_options(parse: argparse.ArgumentParser) -> None:
     )
 
 
+_READING = (
+    'topic',
+    'columns',
+    'unit',
+    'lsb_per_g',
+    'lsb_at_0g',
+    'rate',
+    'axes',
+    'drop_bad_stamps',
+    'drop_bad_samples',
+)
+"""Arguments of `read` that are options of tools."""
+
+
 def reading_options(options: argparse.Namespace) -> ReadingOptions:
     """Return how recordings are to be read."""
-    return recordings.reading_options(
-        topic=options.topic,
-        columns=options.columns,
-        unit=options.unit,
-        rate=options.rate,
-        axes=options.axes,
-        lsb_per_g=options.lsb_per_g,
-        lsb_at_0g=options.lsb_at_0g,
-        drop_bad_stamps=options.drop_bad_stamps,
-        drop_bad_samples=options.drop_bad_samples,
-    )
+    return recordings.reading_options(**{name: getattr(options, name) for name in _READING})
 
 
 def reading_text(options: argparse.Namespace) -> str:
     """Return the given options for a command line that reads the same recording."""
-    words = []
-    for name in ('topic', 'columns', 'unit', 'lsb_per_g', 'lsb_at_0g', 'rate', 'axes'):
+    text = ''
+    for name in _READING:
         if value := getattr(options, name):
-            words += [f'--{name.replace("_", "-")}', str(value)]
-    for name in ('drop_bad_stamps', 'drop_bad_samples'):
-        if getattr(options, name):
-            words.append(f'--{name.replace("_", "-")}')
-    return f' {shlex.join(words)}' if words else ''
+            text += f' {option(**{name: value if value is True else shlex.quote(str(value))})}'
+    return text
 
 
 SYNTAX = (
