@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from os.path import basename
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from adxl_ros.diagnose import comparison as baseline, noise_effects, reference_checks
 from adxl_ros.diagnose.comparison import BaselineComparison, compare, SMALLEST_MOTION_G
@@ -26,6 +26,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Detector
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import option
 from adxl_ros.signals import gravity_at_rest
 from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.signals.gravity_at_rest import GravityFaultKind, RestReadings
@@ -170,6 +171,10 @@ class DataFault(Exception):
     def __post_init__(self) -> None:
         assert self.name in DATA_FAULTS, 'a fault has a meaning for reports'
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle it, which exceptions with names do not by themselves."""
+        return DataFault, (self.name, self.message, self.status, self.comparisons)
+
 
 def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> None:
     """
@@ -196,7 +201,8 @@ def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> N
         fault = gravity_at_rest.look(readings, gravity_at_rest.IDEAL, gravity_mps2).fault
         if fault is not None and fault.is_clear:
             raise DataFault(
-                fault.data_fault, f'{sim.force.name}: {fault.stated_by("--sim-unit ")}'
+                fault.data_fault,
+                f'{sim.force.name}: {fault.stated_by(option(sim_unit=fault.symbol))}',
             )
         # A simulator may have the errors of a sensor, but none beyond its tolerance.
         tolerance = gravity_at_rest.nominal_tolerance(sensor)
@@ -224,19 +230,21 @@ def _align_force(
     if late_s and may_shift:
         force = force.shifted(-late_s)
         notes = [
-            f'--align: {force.name} was {shift}, and is shifted by {-late_s:+.6g} s; a '
+            f'{option(align=True)}: {force.name} was {shift}, and is shifted by '
+            f'{-late_s:+.6g} s; a '
             'latency of the sensor is a part of that and cannot show'
         ]
     elif may_shift:
         notes = [
-            f'--align: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may be an '
+            f'{option(align=True)}: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may '
+            'be an '
             'effect of the sensor (time_offset), and nothing is shifted'
         ]
     covered, begin_s, end_s = _covered(recording, force)
     span = f'it is from {begin_s:.6g} to {end_s:.6g} s'
     if not len(covered):
         advice = (
-            f'its motion fits, but is {shift}; use --align'
+            f'its motion fits, but is {shift}; use {option(align=True)}'
             if shift
             else 'no shift makes its motion fit; give that of this recording'
         )
@@ -249,7 +257,8 @@ def _align_force(
     if late_s and not may_shift:
         raise DataFault(
             'time_misaligned',
-            f'{force.name} is {shift}; use --align, or shift its stamps by {-late_s:+.6g} s',
+            f'{force.name} is {shift}; use {option(align=True)}, or shift its stamps by '
+            f'{-late_s:+.6g} s',
         )
     if len(covered) < len(recording):
         outside_s = (1 - len(covered) / len(recording)) * float(np.ptp(recording.time_s))
@@ -452,16 +461,16 @@ def _drift_fault(drift: _Drift, recording: Recording, force: ForcePath) -> DataF
     # The number of a sample tells its time only where none is missing.
     counts_time = steps_s.max() < _USUAL_STEP * np.median(steps_s)
     own_correction = (
-        f'use --rate {recording.rate_hz / (1 + ratio):.6g}'
+        f'use {option(rate=f"{recording.rate_hz / (1 + ratio):.6g}")}'
         if counts_time
-        else f'multiply its stamps by {1 + ratio:.6g} (--rate would miss the gaps)'
+        else f'multiply its stamps by {1 + ratio:.6g} ({option("rate")} would miss the gaps)'
     )
     return DataFault(
         'clock_drift',
         f'the clocks of {force.name} and of the recording drift apart by '
         f'{100 * abs(ratio):.3g} s in 100 s, so that no shift fits from begin to end; if that of '
         f'the recording is wrong, {own_correction}, else divide the stamps of {force.name} by '
-        f'{1 + ratio:.6g}; a shift that is left then needs --align',
+        f'{1 + ratio:.6g}; a shift that is left then needs {option(align=True)}',
     )
 
 
@@ -493,7 +502,8 @@ def _step_fault(force: ForcePath, step_s: float, at_s: float) -> DataFault:
     return DataFault(
         'clock_jump',
         f'the clock of {force.name} or that of the recording steps by {abs(step_s):.2g} s at '
-        f'about {at_s:.4g} s; cut the recording there, and diagnose each part with --align',
+        f'about {at_s:.4g} s; cut the recording there, and diagnose each part with '
+        f'{option(align=True)}',
     )
 
 
@@ -962,7 +972,7 @@ def _check_output(comparison: BaselineComparison) -> None:
         raise DataFault(
             'unit',
             f'{sensor.axes[worst]} is at {level_g[worst]:.3g} g; correct the '
-            'unit of its column, or --params',
+            f'unit of its column, or {option("sensor")}',
         )
 
 
@@ -1030,7 +1040,7 @@ def _check_rest(comparison: BaselineComparison, finite: np.ndarray) -> None:
             'reference',
             f'{comparison.sensor.axes[worst]} moves by '
             f'{range_g[worst]:.2f} g, but no stage angles that change; give '
-            'alpha_rad and beta_rad, or --sim with the specific force of the same '
+            f'alpha_rad and beta_rad, or {option("sim")} with the specific force of the same '
             'manoeuvre',
         )
 
@@ -1084,7 +1094,11 @@ def _check_axes(comparison: BaselineComparison) -> None:
                 'unit',
                 f'the output is {np.median(gains):.4g} times the simulated '
                 f'output, as values in {units} are; correct the unit of the columns'
-                + (', by --unit or --sim-unit' if comparison.simulated_force else ''),
+                + (
+                    f', by {option("unit")} or {option("sim_unit")}'
+                    if comparison.simulated_force
+                    else ''
+                ),
             )
     largest = float(np.max(np.abs(correlation)))
     if largest < _UNCORRELATED:

@@ -159,7 +159,7 @@ def _nominal(
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Sensor:
     """
     One unit: the nominal chain by its nominal values, and the effects that depart from it.
@@ -322,6 +322,10 @@ class Sensor:
         """
         stated_s = self.rc_resistance_ohm * self.rc_capacitance_f
         return stated_s * self.filter_rate_hz / self.rate_hz if self.filter_rate_hz else stated_s
+
+    def __repr__(self) -> str:
+        effects = ', '.join(self.effects) or 'none'
+        return f'<Sensor {self.serial}: axes {" ".join(self.axes)}, effects: {effects}>'
 
     @property
     def lsb_v(self) -> float:
