@@ -513,8 +513,8 @@ def _check_step(recording: Recording, sensor: Sensor, force: ForcePath, about_s:
     inside = (motions.measured_s > begin_s) & (motions.measured_s < end_s)
     before = np.searchsorted(recording.time_s, motions.measured_s, 'right') - 1
     inside &= np.diff(recording.time_s, append=np.inf)[before] < _COARSE_S + 2 / recording.rate_hz
-    inside = np.flatnonzero(inside)
-    motions = motions.part(inside[:: 1 + len(inside) // _FINE_SAMPLES])
+    compared = np.flatnonzero(inside)
+    motions = motions.part(compared[:: 1 + len(compared) // _FINE_SAMPLES])
     rows = np.arange(len(motions.measured_s))
     if not len(rows):
         return
@@ -523,23 +523,9 @@ def _check_step(recording: Recording, sensor: Sensor, force: ForcePath, about_s:
         np.arange(-LARGEST_LATENCY_S, LARGEST_LATENCY_S, motions.step_s),
     )
     one_s = motions.best_shift_s(near_s)
-    one_g = motions.stated_at(one_s)
-    own_g = motions.measured_g - (motions.measured_g - one_g).mean(axis=0)
-    motions = motions._replace(measured_g=own_g)
-
-    def error_g2(stated_g: np.ndarray) -> np.ndarray:
-        return np.cumsum(((own_g - stated_g) ** 2).sum(axis=1))
-
-    one_g2 = error_g2(one_g)
-    best_g2, first = 0.0, 0  # First row behind the step
-    for other_s in near_s:
-        gain_g2 = one_g2 - error_g2(motions.stated_at(other_s))
-        for row, gained_g2 in (
-            (int(gain_g2.argmax()), gain_g2.max()),
-            (int(gain_g2.argmin()), gain_g2[-1] - gain_g2.min()),
-        ):
-            if gained_g2 > best_g2:
-                best_g2, first = gained_g2, row + 1
+    zero_g = (motions.measured_g - motions.stated_at(one_s)).mean(axis=0)
+    motions = motions._replace(measured_g=motions.measured_g - zero_g)
+    first = _first_row_behind(motions, one_s, near_s)
     if min(first, len(rows) - first) * motions.step_s < LARGEST_LATENCY_S:
         return
     before_s, after_s = (
@@ -551,6 +537,22 @@ def _check_step(recording: Recording, sensor: Sensor, force: ForcePath, about_s:
     if explains and abs(after_s - before_s) > _SMALLEST_STEP_S:
         at_s = _time_of_step(motions, before_s, after_s)
         raise _step_fault(force, after_s - before_s, at_s)
+
+
+def _first_row_behind(motions: _Motions, one_s: float, near_s: np.ndarray) -> int:
+    """Return the row on one side of which another shift gains most, of some, s, (k,)."""
+    own_g, one_g = motions.measured_g, motions.stated_at(one_s)
+    most_g2, first = 0.0, 0
+    for other_s in near_s:
+        other_g = motions.stated_at(other_s)
+        gain_g2 = np.cumsum(((own_g - one_g) ** 2 - (own_g - other_g) ** 2).sum(axis=1))
+        for row, gained_g2 in (
+            (gain_g2.argmax(), gain_g2.max()),
+            (gain_g2.argmin(), gain_g2[-1] - gain_g2.min()),
+        ):
+            if gained_g2 > most_g2:
+                most_g2, first = gained_g2, int(row) + 1
+    return first
 
 
 def _time_of_step(motions: _Motions, before_s: float, after_s: float) -> float:
