@@ -712,6 +712,7 @@ def figures() -> dict[Path, str]:
         'better reference': benchmark(
             'Level C: share of the squared gap that is closed on a later part'
         ),
+        'simulators': simulators(),
         'hand held': hand_held(),
         'units': units(),
     }
@@ -838,6 +839,15 @@ def benchmark(title: str) -> list[str]:
     text = (DOCS / 'measurements' / 'real_benchmark.md').read_text('utf-8')
     command = next(line for line in text.splitlines() if line.startswith('`./run benchmark'))
     return [command, '', *text.split(f'### {title}\n\n')[1].split('\n\n')[0].splitlines()]
+
+
+def simulators() -> list[str]:
+    """Return the verdicts on simulated accelerometers, under their command."""
+    text = (DOCS / 'measurements' / 'simulators.md').read_text('utf-8')
+    command = next(line for line in text.splitlines() if line.startswith('`./run simulators'))
+    rows = text.split('### Verdicts\n\n')[1].split('\n\n')[0].splitlines()
+    # What would have shown stands in the last column, for which this page has no room.
+    return [command, '', *(row.rstrip('|').rpartition('|')[0] + '|' for row in rows)]
 
 
 def units() -> list[str]:

@@ -6,10 +6,12 @@ from dataclasses import replace
 import re
 
 from adxl_ros.api.recordings import read_ideal
+from adxl_ros.diagnose.comparison import compare
 from adxl_ros.diagnose.data_checks import check_gravity, compare_checked, DataFault
 from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import to_volts
+from adxl_ros.simulate.motion import ForcePath, Motion
 from adxl_ros.simulate.trajectories import motion_from_force
 import numpy as np
 import pytest
@@ -278,3 +280,22 @@ def test_pulses_beyond_the_range_are_named(tmp_path):
     notes = ' '.join(carried.beside(tmp_path, carried.recorded(pulses)).notes)
     assert f'range of {sensor.range_g:g} g' in notes and '12 samples' in notes
     assert 'too fast' not in notes
+
+
+def test_a_sensor_that_always_moves_has_no_rest():
+    """No part of it is quiet enough to tell what moves, but the simulator does."""
+    time_s = np.arange(0, 40, 0.004)
+    angle = 0.3 * np.sin(np.outer(time_s, [6.2, 9.1, 13.3]))
+    swinging = Rotation.from_rotvec(angle).apply([0, 0, G0_MPS2])
+    noise = np.random.default_rng(0).normal(0, 0.003, swinging.shape)
+    sensor = replace(nominal('xyz'), rate_hz=250.0)
+
+    def at_rest(force):
+        volts = to_volts(force + noise, sensor)
+        columns = {f'{axis}_v': v for axis, v in zip('xyz', volts.T)}
+        read = Recording('run', time_s, columns, sensor_info(sensor))
+        return compare(read, sensor, Motion(40.0, force=ForcePath(time_s, force))).at_rest
+
+    assert not at_rest(swinging).any()
+    halted = np.where(time_s[:, None] < 20, swinging, swinging[5000])
+    assert not at_rest(halted)[:4900].any() and at_rest(halted)[5200:].mean() > 0.9
