@@ -22,7 +22,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import recording as recording_files
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
-from adxl_ros.files.recording_columns import recorded_unit
+from adxl_ros.files.recording_columns import recorded_nominal
 from adxl_ros.model.constants import AXES
 from adxl_ros.report.quantities import mg
 from adxl_ros.signals.findings import Findings, RecordingContents
@@ -189,7 +189,7 @@ def _ratio(low: float, high: float) -> str:
 def _at_rest(path: str, sensor: SensorInput | None, reading: ReadingOptions) -> _AtRest:
     """Return noise and lengths over the rests of a recording."""
     read = recording_files.read(path, reading)
-    unit = recorded_unit(load_sensor(as_input(sensor), read), read)
+    unit = recorded_nominal(load_sensor(as_input(sensor), read), read)
     rests = RecordedRests(unit, read)
     rests.feed(read)
     rests.take()

@@ -508,7 +508,7 @@ def _draw(plot: Any, shown: _Shown, number: int, label: str) -> None:
 
 def _sensor(result: RecordingNoise) -> Sensor:
     """Return the sensor of the parameter file, with the axes and rate of the recording."""
-    sensor, unit = result.sensor, result.unit
+    sensor, unit = result.sensor, result.nominal
     if sensor.effects and sensor.axes != unit.axes:
         raise UserError(
             f'{result.path}: has the axes {unit.axes}, but the parameters of '

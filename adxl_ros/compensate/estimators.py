@@ -149,7 +149,7 @@ def length_excess(length_mps2: Value, error2: Value, gravity_mps2: float, maths:
     Return how much the length of a force departs from gravity beyond its error, m/s².
 
     The tilt is that of gravity. A force whose length is not gravity's is in motion, in another
-    unit, or has lost gravity, and at least this much of it is no gravity. error2: the largest
+    sensor, or has lost gravity, and at least this much of it is no gravity. error2: the largest
     variance of an axis, (m/s²)².
     """
     departure = length_mps2 - gravity_mps2
@@ -241,7 +241,7 @@ class LiveEstimator:
         undo_filter: bool = False,
         mounting: Mounting | None = None,
     ) -> None:
-        """Prepare for a unit."""
+        """Prepare for a sensor."""
         if mounting is not None and not sensor.z_sign:
             # A robot stands upright, so that its mounting says which way up the case is.
             sensor = replace(sensor, z_sign=-1 if mounting.rows[2, 2] < 0 else 1)
@@ -334,7 +334,7 @@ class LiveEstimator:
         self._last_volts = self._respond(self._force, self._environment)
 
     def _use(self, sensor: Sensor) -> None:
-        """Take covariance and validity range from the unit, with or without temperature range."""
+        """Take covariance and range of validity from the sensor, of temperature as well or not."""
         self._measured_covariance = force_errors.measured_covariance(
             sensor, self._variance_v2, bool(self.sensor.z_sign)
         )

@@ -44,7 +44,7 @@ _ABSENT = np.diag([-1.0, 0.0, 0.0])
 class Export:
     """A sensor that is written for other software."""
 
-    sensor: Sensor  # The unit
+    sensor: Sensor  # The sensor
     source: str  # Name of its parameter file
     holds: Mapping[str, str]  # Place in the file by name of the part that it holds
     # Rms of what each part of the sensor changes, mg, by its name: effects but those of the stage,

@@ -24,7 +24,7 @@ from urllib.parse import urlsplit
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import recording
-from adxl_ros.files.recording_columns import NO_UNIT, Recording
+from adxl_ros.files.recording_columns import NO_SERIAL, Recording
 from adxl_ros.files.tables import TABLE_ENDINGS
 from adxl_ros.fleet.row import as_date, TABLE
 from adxl_ros.report.page import as_utf_8, without_secrets
@@ -322,7 +322,7 @@ def _of_manifest(text: str, rows: list[dict[str, str]]) -> Iterable[Source]:
             recorded = Source(plain, fault=one_line(error).removeprefix(f'{plain}: '))
         return replace(
             recorded,
-            serial='' if serial == NO_UNIT else serial,
+            serial='' if serial == NO_SERIAL else serial,
             params=_beside(folder, params) if set(params) & set('/.') else params,
             date=as_date(row.get('date', '')),
         )

@@ -3,7 +3,7 @@
 """
 The task of a worker: from the address of a recording to one row.
 
-The recording is staged, its unit and calibration are looked up, and the tasks run one after the
+The recording is staged, its sensor and calibration are looked up, and the tasks run one after the
 other. A task that refuses leaves its reason. What a recording does not hold is skipped.
 """
 
@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.calibration_store import sha256
-from adxl_ros.files.recording_columns import NO_UNIT, Recording
+from adxl_ros.files.recording_columns import NO_SERIAL, Recording
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.fleet import inputs
 from adxl_ros.fleet.inputs import begin_of, Source
@@ -190,14 +190,14 @@ def _of_staged(recipe: Recipe, source: Source, earlier: frozenset[str], staged: 
         )
     except UserError as error:
         fault = one_line(error)
-    recorded = first.stream_info.serial if first else NO_UNIT
-    is_other = bool(source.serial) and recorded not in (NO_UNIT, '', source.serial)
+    recorded = first.stream_info.serial if first else NO_SERIAL
+    is_other = bool(source.serial) and recorded not in (NO_SERIAL, '', source.serial)
     serial = source.serial or recorded
     dates = ((source.date, 'manifest'), begin_of(first) if first else ('', ''))
     date = next((date for date in dates if date[0]), (source.modified, 'file'))
     parameters = recipe.parameters_of(serial, date[0], source.params)
     digest = recipe.digest(parameters, source.serial)
-    # Which of both units it is of is not known.
+    # Which of both sensors it is of is not known.
     row = _identity(recipe, source, staged, '' if is_other else serial, date, parameters)
     row['key'] = sha256_of(staged.content, digest)
     if row['key'] in earlier:
@@ -229,7 +229,7 @@ def _identity(
         'url': source.url,
         'hash': staged and staged.content,
         'size_bytes': staged.size_bytes if staged else source.size_bytes,
-        'serial': serial if serial not in ('', NO_UNIT) else None,
+        'serial': serial if serial not in ('', NO_SERIAL) else None,
         'date': date[0] or None,
         'date_source': date[1] if date[0] else None,
         'tasks': list(recipe.tasks),

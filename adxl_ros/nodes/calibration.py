@@ -328,7 +328,7 @@ class DisplayPublisher:
 
     def _publish(self, phase: Phase, text: str) -> None:
         controller, stream = self._controller, self._controller.stream
-        unit, session, newest = stream.unit, controller.session, stream.newest
+        nominal, session, newest = stream.nominal, controller.session, stream.newest
         usual = _BY_HAND if controller.settings.operator_captures else _RUNNING
         keys = () if phase is Phase.FIT else _KEYS.get(controller.state, usual)
         coefficients: list[screen_contents.Row] = []
@@ -341,7 +341,7 @@ class DisplayPublisher:
                 data=screen_contents.ScreenContents(
                     phase=phase.value,
                     text=text,
-                    unit=f'{unit.serial} ({unit.axes})' if unit else '',
+                    unit=f'{nominal.serial} ({nominal.axes})' if nominal else '',
                     output=str(controller.settings.output),
                     keys=keys,
                     rows=tuple(rows),
@@ -405,7 +405,7 @@ class Samples:
         may_come = STEADY.now().nanoseconds - self._begun_ns < _INFO_NS
         return topics.finite_samples([] if may_come else self._raw)
 
-    def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    def take(self, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m), finite."""
         self._receive()
         batch, self._raw = self._raw, []
@@ -415,12 +415,12 @@ class Samples:
         accel, covariance = fields['linear_acceleration'], fields['orientation_covariance']
         # -1 in the first place means that a message has no orientation.
         yaw_rad2 = np.where(covariance[:, 0] >= 0, covariance[:, _YAW_VARIANCE], 0.0)
-        accel = accel[:, : len(unit.axes)]
+        accel = accel[:, : len(sensor.axes)]
         finite = np.isfinite(accel)
         if batch:
-            self.fault = self._fault(bool((yaw_rad2 != UNKNOWN_ANGLE_RAD2).all()), finite, unit)
+            self.fault = self._fault(bool((yaw_rad2 != UNKNOWN_ANGLE_RAD2).all()), finite, sensor)
         complete = finite.all(axis=1)
-        return stamps[complete], to_volts(accel[complete], unit)
+        return stamps[complete], to_volts(accel[complete], sensor)
 
     def _receive(self) -> None:
         """Take the messages that have come since the last call."""
@@ -428,7 +428,7 @@ class Samples:
         if self._raw:
             self._begun_ns = self._begun_ns or STEADY.now().nanoseconds
 
-    def _fault(self, is_raw: bool, finite: np.ndarray, unit: Sensor) -> str:
+    def _fault(self, is_raw: bool, finite: np.ndarray, sensor: Sensor) -> str:
         """Return why samples with these finite values, (n, m), cannot be used, or ''."""
         if not is_raw:
             return (
@@ -439,7 +439,7 @@ class Samples:
         if finite.all(axis=1).any():
             return ''
         dead = ' and '.join(
-            axis for axis, lives in zip(unit.axes, np.asarray(finite.any(axis=0))) if not lives
+            axis for axis, lives in zip(sensor.axes, np.asarray(finite.any(axis=0))) if not lives
         )
         return (
             f'{dead or "one axis or another"} is not a number in all samples; check its '

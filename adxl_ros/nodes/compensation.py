@@ -31,7 +31,7 @@ from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.sample_output import age_report, MOST_AGES
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.signals.recorded_gravity import LIVE_WINDOW_S, LiveLook
-from adxl_ros.signals.recorded_sensor import unit_of_stream
+from adxl_ros.signals.recorded_sensor import sensor_of_stream
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 import numpy as np
@@ -367,13 +367,13 @@ class Compensation(Node):
         named, _ = self._named
         try:
             sensor = named if named.unstated else parameters.anonymous_sensor(self, self._flat)
-            unit, lines = unit_of_stream(sensor, *topics.finite_samples([*samples]))
+            measured, lines = sensor_of_stream(sensor, *topics.finite_samples([*samples]))
         except UserError as error:
             self._obstacle = f'{error}'
             return
         self.get_logger().info(f'measured from the stream: {"; ".join(lines)}')
         self._stream.release()
-        self._correct_by(unit, 'what the stream shows')
+        self._correct_by(measured, 'what the stream shows')
 
     def _check_gravity(self) -> None:
         """Look whether the newest rests read gravity."""

@@ -152,13 +152,13 @@ def main() -> int:
 
 def _run_sweep(folder: Path, seed: int) -> None:
     """Sweep a simulated sensor whose coefficients are drawn at datasheet spread."""
-    unit, nominal = folder / 'simulated_unit.yaml', folder / 'nominal.yaml'
+    truth_path, nominal_path = folder / 'simulated_unit.yaml', folder / 'nominal.yaml'
     sensor = replace(
         parameter_file.load(parameter_file.nominal_path()), serial='demo', rate_hz=_RATE_HZ
     )
     truth = _draw_unit(sensor, seed)
-    parameter_file.save(nominal, sensor)
-    parameter_file.save(unit, truth, ['The truth of the simulated unit.'])
+    parameter_file.save(nominal_path, sensor)
+    parameter_file.save(truth_path, truth, ['The truth of the simulated unit.'])
     name = parameter_file.nominal_path().stem
     output, report = folder / f'{name}_demo.yaml', folder / 'sweep'
     _print(
@@ -171,11 +171,11 @@ def _run_sweep(folder: Path, seed: int) -> None:
     for path in (output, journal):
         path.unlink(missing_ok=True)
     commands = [
-        _command('driver', unit, _KEEPING | {'link.type': 'sim', 'link.speed': _SPEED}),
-        _command('stage', nominal, {'delay_s': _DELAY_S, 'seed': seed}),
+        _command('driver', truth_path, _KEEPING | {'link.type': 'sim', 'link.speed': _SPEED}),
+        _command('stage', nominal_path, {'delay_s': _DELAY_S, 'seed': seed}),
         _command(
             'calibration',
-            nominal,
+            nominal_path,
             {
                 **_UNATTENDED,
                 'output': output,

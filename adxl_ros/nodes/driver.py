@@ -10,7 +10,7 @@ import traceback
 from typing import Any
 
 from adxl_ros.errors import one_line, UserError
-from adxl_ros.files.recording_columns import NO_UNIT
+from adxl_ros.files.recording_columns import NO_SERIAL
 from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import parameters
@@ -68,9 +68,9 @@ def _transition(goal: str, *acts: str) -> Callable[..., TransitionCallbackReturn
     return callback
 
 
-def other_unit(given: Sensor, found: Sensor) -> str:
+def other_sensor(given: Sensor, found: Sensor) -> str:
     """Return that a link has found another unit than the parameters name, or ''."""
-    if NO_UNIT in (given.serial, found.serial) or given.serial == found.serial:
+    if NO_SERIAL in (given.serial, found.serial) or given.serial == found.serial:
         return ''
     return (
         f'the samples are of the unit {found.serial}, but the parameters are those of '
@@ -137,7 +137,7 @@ class Driver(LifecycleNode):
         given, serial = [*parameters.given_below(self, LINK)], self._sensor.serial
         if given:
             reason = f'{LINK}{given[0]} is given'
-        elif serial != NO_UNIT:
+        elif serial != NO_SERIAL:
             reason = f'the sensor is the unit {serial}'
         else:
             return
@@ -285,7 +285,7 @@ class Driver(LifecycleNode):
             return base.LinkStatus(Level.WARN, 'inactive, no samples are published')
         status = self._reader.status()
         found = self._output.sensor if self._output else self._sensor
-        fault = '' if status.level is Level.ERROR else other_unit(self._sensor, found)
+        fault = '' if status.level is Level.ERROR else other_sensor(self._sensor, found)
         if fault and fault != self._told:
             self.get_logger().error(fault)
             self._told = fault

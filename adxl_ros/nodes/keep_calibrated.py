@@ -16,7 +16,7 @@ from adxl_ros.calibrate.keep.stays import RestStream
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import make_folder
-from adxl_ros.files.recording_columns import check_unit, NO_UNIT, StreamInfo
+from adxl_ros.files.recording_columns import check_same_sensor, NO_SERIAL, StreamInfo
 from adxl_ros.files.sweep_journal import Journal, NaturalRest, read
 from adxl_ros.model.sensor import get, put, Sensor, to_volts
 from adxl_ros.nodes import parameters, topics
@@ -170,9 +170,9 @@ class KeepCalibrated(Node):
         own, first = self._own, sensor.provenance.get(KEPT)
         name = first or calibration_store.calibration_id(sensor)
         folder = make_folder(
-            calibration_store.unit_folder(Path(own.output).expanduser(), sensor.serial)
+            calibration_store.sensor_folder(Path(own.output).expanduser(), sensor.serial)
         )
-        path = folder / f'{calibration_store.unit_folder("", name)}.jsonl'
+        path = folder / f'{calibration_store.sensor_folder("", name)}.jsonl'
         head: dict[str, Any] = {'kind': 'kept', 'base': parameter_file.to_flat(sensor)}
         if path.exists() and path.stat().st_size:
             head = read(path).head
@@ -206,7 +206,7 @@ class KeepCalibrated(Node):
             if self._keeper is None:
                 self._begin(self._stored(info))
             assert self._keeper is not None
-            check_unit(info, info.axes or self._keeper.sensor.axes, self._keeper.sensor)
+            check_same_sensor(info, info.axes or self._keeper.sensor.axes, self._keeper.sensor)
             self._obstacle = ''
         except UserError as error:
             self._obstacle = str(error)
@@ -215,11 +215,11 @@ class KeepCalibrated(Node):
     def _stored(self, info: StreamInfo) -> Sensor:
         """Return the newest calibration of the unit in the store."""
         own = self._own
-        if not own.store or info.serial == NO_UNIT:
+        if not own.store or info.serial == NO_SERIAL:
             raise UserError('no calibration is given; start with --params-file unit.yaml')
 
         def check(sensor: Sensor) -> None:
-            check_unit(info, info.axes or sensor.axes, sensor)
+            check_same_sensor(info, info.axes or sensor.axes, sensor)
 
         choice = calibration_store.newest(own.store, info.serial, check)
         if choice.path is None:
@@ -298,7 +298,7 @@ class KeepCalibrated(Node):
     def _status(self) -> Status:
         """Return what is known now."""
         keeper, receiver = self._keeper, self._receiver
-        serial = keeper.sensor.serial if keeper else NO_UNIT
+        serial = keeper.sensor.serial if keeper else NO_SERIAL
         silence = self._obstacle or self._samples.silence()
         if keeper is None or receiver is None:
             return Status(Level.WARN, silence, serial, {})

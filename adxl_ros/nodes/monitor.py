@@ -11,7 +11,7 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
-from adxl_ros.files.recording_columns import check_unit, NO_UNIT, StreamInfo, unit_of
+from adxl_ros.files.recording_columns import check_same_sensor, NO_SERIAL, nominal_of, StreamInfo
 from adxl_ros.links.support.base import COLUMNS
 from adxl_ros.monitor import changes
 from adxl_ros.monitor.changes import DiagnosisResult, DiagnosisRun, iso_time
@@ -209,11 +209,11 @@ class Monitor(Node):
             return
         self._info, self._refusal, sensor = info, '', self._file_sensor
         try:
-            if sensor.effects or sensor.serial != NO_UNIT:
-                check_unit(info, info.axes or sensor.axes, sensor)
+            if sensor.effects or sensor.serial != NO_SERIAL:
+                check_same_sensor(info, info.axes or sensor.axes, sensor)
                 sensor = replace(sensor, rate_hz=info.rate_hz or sensor.rate_hz)
             else:
-                sensor = unit_of(sensor, info)
+                sensor = nominal_of(sensor, info)
         except UserError as error:
             self._refusal = str(error)
             self.get_logger().error(self._refusal)

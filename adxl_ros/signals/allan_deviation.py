@@ -165,7 +165,7 @@ class StillSensors:
 
 
 def longest_rest(
-    read: Callable[[], Iterable[Recording]], unit: Sensor, first: Recording, look: RecordingLook
+    read: Callable[[], Iterable[Recording]], nominal: Sensor, first: Recording, look: RecordingLook
 ) -> StillSensors:
     """
     Find the longest rest of a recording, which is read twice; `look` is fed meanwhile.
@@ -177,7 +177,7 @@ def longest_rest(
     first_s, beyond = float(first.time_s[0]), BeyondRange()
     for block in read():
         look.feed(block)
-        beyond.add(block.volts(unit), unit)
+        beyond.add(block.volts(nominal), nominal)
         last_s = float(block.time_s[-1])
     look.rests.take()
     rests = [found.rest for found in look.rests.detected]
@@ -206,12 +206,12 @@ def longest_rest(
         samples = _Samples(first, first.sensor_columns, file)
         turns = _Samples(first, GYRO, gyro_file) if first.gyro_radps is not None else None
         for block in read():
-            samples.feed(block.time_s, block.accel_mps2(unit), rest)
+            samples.feed(block.time_s, block.accel_mps2(nominal), rest)
             gyro_radps = block.gyro_radps
             if turns is not None and gyro_radps is not None:
                 is_taken = np.isfinite(gyro_radps).all(axis=1)
                 turns.feed(block.time_s[is_taken], gyro_radps[is_taken], rest)
-        accelerometer = samples.stretch(last_s - first_s, motion_s, beyond.describe(unit))
+        accelerometer = samples.stretch(last_s - first_s, motion_s, beyond.describe(nominal))
         if turns is None or not turns.count:
             return StillSensors(accelerometer, None)
         if turns.count < accelerometer.count:

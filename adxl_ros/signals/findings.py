@@ -108,7 +108,6 @@ def examine(
         raise UserError('the recording holds no samples')
     sensor, stamps = sensor_of(first), _Stamps(first)
     look = RecordingLook(sensor, first)
-    unit = look.unit
     axes = [_Axis(name, stamps.period_s) for name in first.sensor_columns]
     gyro = _Gyro(first, stamps.period_s) if first.gyro_radps is not None else None
     # Lowest and highest value, sum and count of each reference by block
@@ -117,7 +116,7 @@ def examine(
         if not len(block):
             continue
         stamps.feed(block.time_s)
-        for axis, values in zip(axes, block.accel_mps2(unit).T):
+        for axis, values in zip(axes, block.accel_mps2(look.nominal).T):
             axis.feed(values)
         look.feed(block)
         if gyro is not None:
@@ -128,7 +127,7 @@ def examine(
     parts = {name: list(zip(*rows)) for name, rows in references.items()}
     rests = look.rests.detected
     spans_s = [found.rest.span_s for found in rests]
-    means_mps2 = [to_nominal_mps2(found.mean_v, unit) for found in rests]
+    means_mps2 = [to_nominal_mps2(found.mean_v, look.nominal) for found in rests]
     span_s = stamps.last_s - stamps.first_s
     return RecordingContents(
         path=block.path,

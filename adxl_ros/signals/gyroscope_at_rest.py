@@ -40,7 +40,7 @@ class RestTurns(NamedTuple):
     temperature_c: np.ndarray  # Temperature of each, °C, (n,); NaN where it is not known
 
 
-def rest_turns(read: Recording, unit: Sensor, are_rows: bool = False) -> list[RestTurns]:
+def rest_turns(read: Recording, sensor: Sensor, are_rows: bool = False) -> list[RestTurns]:
     """Return the gyroscope in each rest of a recording, or in each row; none without one."""
     gyro_radps = read.gyro_radps
     if gyro_radps is None:
@@ -50,7 +50,7 @@ def rest_turns(read: Recording, unit: Sensor, are_rows: bool = False) -> list[Re
     if are_rows:
         places = [np.arange(len(read)) == row for row in range(len(read))]
     else:
-        rests = RecordedRests(unit, read)
+        rests = RecordedRests(sensor, read)
         rests.feed(read)
         rests.take()
         places = [found.rest.includes(read.time_s) for found in rests.detected]

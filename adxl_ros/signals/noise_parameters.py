@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.exports import kalibr_settings
-from adxl_ros.files.recording_columns import Recording, unit_of
+from adxl_ros.files.recording_columns import nominal_of, Recording
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.model.noise import (
@@ -454,7 +454,7 @@ class RecordingNoise:
 
     path: str  # The recording
     sensor: Sensor  # Its parameter file
-    unit: Sensor  # The nominal sensor that it comes from
+    nominal: Sensor  # The nominal sensor that it comes from
     rest: StillStretch  # Its samples at rest
     axes: list[AxisNoise]  # The noise by axis
     # What is wrong with the length of gravity and between neighbouring samples, one line each
@@ -473,18 +473,20 @@ def recording_noise(
     if first is None:
         raise UserError('the recording holds no samples')
     sensor = load_sensor(params, first)
-    unit = unit_of(sensor, first.stream_info, first.axes)
+    nominal = nominal_of(sensor, first.stream_info, first.axes)
     look = RecordingLook(sensor, first)
-    still = longest_rest(read, unit, first, look)
+    still = longest_rest(read, nominal, first, look)
     rest, gyro_rest = still.accelerometer, still.gyroscope
     doubts = require_unit(look.gravity(), first.path)
     share = 1.0 if gyro_rest is None else 0.5
-    noises = _axis_noises(rest, unit.axes, lambda done: show(share * done))
+    noises = _axis_noises(rest, nominal.axes, lambda done: show(share * done))
     gyro = (
         _axis_noises(gyro_rest, AXES, lambda done: show(share * (1 + done))) if gyro_rest else []
     )
     doubts = [*doubts, *[still.gyro_doubt] * bool(still.gyro_doubt), *look.neighbour_faults()]
-    return RecordingNoise(first.path, sensor, unit, rest, noises, tuple(doubts), gyro_rest, gyro)
+    return RecordingNoise(
+        first.path, sensor, nominal, rest, noises, tuple(doubts), gyro_rest, gyro
+    )
 
 
 def _axis_noises(rest: StillStretch, axes: str, show: Callable[[float], None]) -> list[AxisNoise]:
@@ -618,8 +620,8 @@ def _density(sensor: Sensor, noises: list[AxisNoise], is_repeated: bool) -> np.n
 
     is_repeated: whether the variance of a sample is that of white noise behind the filter.
     """
-    unit, rate_hz = electronics(sensor), sensor.rate_hz
-    share = white_share(unit.rc_s, rate_hz)
+    circuit, rate_hz = electronics(sensor), sensor.rate_hz
+    share = white_share(circuit.rc_s, rate_hz)
     variances = []
     for noise, axis_share in zip(noises, share):
         white = noise.fit.white
@@ -632,8 +634,8 @@ def _density(sensor: Sensor, noises: list[AxisNoise], is_repeated: bool) -> np.n
         if not sensor.adc_bits and white.is_seen:
             variance += noise.rounding**2 * rate_hz
         variances.append(variance / G0_MPS2**2)
-    measured = np.sqrt(density_for_variance(np.array(variances), unit.rc_s, rate_hz))
-    measured /= unit.noise_ratio
+    measured = np.sqrt(density_for_variance(np.array(variances), circuit.rc_s, rate_hz))
+    measured /= circuit.noise_ratio
     before = sensor.noise_density_g_per_rthz
     stated = np.where(before > 0, before, np.inf)
     is_seen = [noise.fit.white.is_seen for noise in noises]

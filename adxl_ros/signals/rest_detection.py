@@ -452,11 +452,11 @@ class RestFinder:
         return not (bounds.sum(axis=0) > allowed).any()
 
 
-def recording_finder(unit: Sensor, has_angles: bool) -> RestFinder:
+def recording_finder(sensor: Sensor, has_angles: bool) -> RestFinder:
     """Return the finder of rests in a recording that all tools use."""
-    noise = None if 'noise_density_g_per_rthz' in unit.unstated else datasheet_noise(unit)
-    tolerance_rad = max(unit.stage_resolution_rad, SAME_ANGLE_RAD) if has_angles else None
-    return RestFinder(unit.rate_hz, len(unit.axes), noise, True, tolerance_rad)
+    noise = None if 'noise_density_g_per_rthz' in sensor.unstated else datasheet_noise(sensor)
+    tolerance_rad = max(sensor.stage_resolution_rad, SAME_ANGLE_RAD) if has_angles else None
+    return RestFinder(sensor.rate_hz, len(sensor.axes), noise, True, tolerance_rad)
 
 
 class RestMean(NamedTuple):
@@ -470,10 +470,10 @@ class RestMean(NamedTuple):
 class RecordedRests:
     """Finds the rests of a recording of any length; the memory is that of an hour."""
 
-    def __init__(self, unit: Sensor, first: Recording) -> None:
-        self._unit = replace(unit, rate_hz=first.rate_hz)
+    def __init__(self, sensor: Sensor, first: Recording) -> None:
+        self._sensor = replace(sensor, rate_hz=first.rate_hz)
         self._has_angles = set(_ANGLES) <= set(first.columns)
-        self._finder = recording_finder(self._unit, self._has_angles)
+        self._finder = recording_finder(self._sensor, self._has_angles)
         self._taken_s = float(first.time_s[0])
         self.detected: list[RestMean] = []  # Rests of all blocks up to the last `take`
 
@@ -484,7 +484,7 @@ class RecordedRests:
             if self._has_angles
             else None
         )
-        self._finder.feed(block.time_s, block.volts(self._unit), angles_rad)
+        self._finder.feed(block.time_s, block.volts(self._sensor), angles_rad)
         if block.time_s[-1] - self._taken_s > _PART_S:
             self.take()
             self._finder.forget()

@@ -21,7 +21,7 @@ import numpy as np
 
 _DEGREE = 2  # Degree of the zero-g over temperature: slope and curvature
 _TYPICAL_K2 = parameter_of(Coefficient('temperature_bias', 'per_k2', 'x')).scale
-"""Typical curvature, g/K²: a unit with a smaller one may still have the next degree."""
+"""Typical curvature, g/K²: a sensor with a smaller one may still have the next degree."""
 _LARGEST_CORRELATION = 0.95
 """Largest correlation of neighbouring residuals. Chosen: beyond it the drift is a random walk."""
 

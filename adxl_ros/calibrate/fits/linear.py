@@ -6,7 +6,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from adxl_ros.calibrate.poses import angle_jacobian, planes, Poses, reference_force
+from adxl_ros.calibrate.pose_model import angle_jacobian, reference_force
+from adxl_ros.calibrate.poses import planes, Poses
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -15,7 +16,7 @@ from adxl_ros.model.sensor import coefficients_of, get, Sensor
 import numpy as np
 
 AFFINE = ('bias', 'scale_factor', 'misalignment')
-"""Terms of the twelve coefficients of a three-axis unit that six known faces determine."""
+"""Terms of the twelve coefficients of a three-axis sensor that six known faces determine."""
 
 _UPRIGHT_COS = np.cos(np.radians(0.5))
 """Smallest cosine of an axis at ±1 g: it is within 0.5° of the vertical, an error of 40 µg."""

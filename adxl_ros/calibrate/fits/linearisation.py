@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The covariance of poses about a unit, a fit linearised at its coefficients, and D-optimal poses.
+The covariance of poses about a sensor, a fit linearised at its coefficients, and D-optimal poses.
 
 About coefficients θ₀ the volts are V = h(θ₀) + X·(θ − θ₀) + error with a covariance S(σ_s, σ_p),
 and θ has a normal prior. The angles of the stage have an error with one part for each setting of a
@@ -18,7 +18,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from adxl_ros.calibrate.poses import angle_jacobian, coefficient_jacobian, Poses, predicted_volts
+from adxl_ros.calibrate.pose_model import angle_jacobian, coefficient_jacobian, predicted_volts
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import get, Sensor
 import numpy as np
@@ -194,9 +195,9 @@ def shared_settings(poses: Poses) -> tuple[np.ndarray, int]:
     return numbers, count
 
 
-def volts_covariance(unit: Sensor, poses: Poses, error: StageError) -> PoseCovariance:
+def volts_covariance(sensor: Sensor, poses: Poses, error: StageError) -> PoseCovariance:
     """Return the covariance of the volts of poses about the model."""
-    return PoseCovariance(angle_jacobian(unit, poses), poses, shared_settings(poses), error)
+    return PoseCovariance(angle_jacobian(sensor, poses), poses, shared_settings(poses), error)
 
 
 _MIN_TOTAL_RAD = 1e-7
@@ -227,7 +228,7 @@ _LEAST_WEIGHT = 1e-3  # Least posterior probability of a level that counts
 
 @dataclass(frozen=True)
 class Linearised:
-    """Poses of a unit about its coefficients: k poses, m axes, p coefficients."""
+    """Poses of a sensor about its coefficients: k poses, m axes, p coefficients."""
 
     poses: Poses  # Poses with their noise, angles and settings
     angle_jacobian: np.ndarray  # Derivatives of the volts by alpha and beta, V/rad, (k, m, 2)
@@ -376,19 +377,19 @@ def _from_search(x: np.ndarray) -> StageError:
 
 
 def linearised(
-    unit: Sensor,
+    sensor: Sensor,
     poses: Poses,
     names: Sequence[Coefficient],
     precision: np.ndarray,
     kept: np.ndarray | None = None,
 ) -> Linearised:
-    """Linearise the volts of poses about the coefficients of a unit; see `Linearised`."""
+    """Linearise the volts of poses about the coefficients of a sensor; see `Linearised`."""
     return Linearised(
         poses,
-        angle_jacobian(unit, poses),
-        coefficient_jacobian(unit, poses, names),
-        poses.volts - predicted_volts(unit, poses),
-        get(unit, names),
+        angle_jacobian(sensor, poses),
+        coefficient_jacobian(sensor, poses, names),
+        poses.volts - predicted_volts(sensor, poses),
+        get(sensor, names),
         precision,
         np.ones(len(poses), bool) if kept is None else kept,
     )
@@ -431,8 +432,8 @@ def candidate_poses(std_v: np.ndarray) -> Poses:
 
 
 def whitened_jacobian(
-    unit: Sensor, poses: Poses, names: tuple[Coefficient, ...], stage: StageError
+    sensor: Sensor, poses: Poses, names: tuple[Coefficient, ...], stage: StageError
 ) -> np.ndarray:
     """Return the Jacobian, (k, m, p), whitened by noise and stage error, without settings."""
-    design = coefficient_jacobian(unit, poses, names)
-    return volts_covariance(unit, poses, stage).whiten_by_pose(design).reshape(design.shape)
+    design = coefficient_jacobian(sensor, poses, names)
+    return volts_covariance(sensor, poses, stage).whiten_by_pose(design).reshape(design.shape)

@@ -285,7 +285,7 @@ _SHAPES = {'thermal_lag': 'tau_s', 'thermal_hysteresis': 'reach_k'}
 
 
 def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
-    """Put a fit into a calibrated unit, whose zero-g stays right at `calibrated_c`."""
+    """Put a fit into a calibrated sensor, whose zero-g stays right at `calibrated_c`."""
     names, effects = fitted.names, dict.fromkeys(name.effect for name in fitted.names)
     kept = [i for i, name in enumerate(base.covariance_names) if name.effect not in EFFECTS]
     kept_names = tuple(base.covariance_names[i] for i in kept)
@@ -403,12 +403,12 @@ _SAME_ORIENTATION_G = 0.1
 zero-g over temperature."""
 
 
-def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
+def rest_blocks(recording: Recording, sensor: Sensor) -> Poses | None:
     """Cut a recording of a resting sensor into blocks with a temperature."""
     temperature_c = recording.columns.get('temperature_c')
     if temperature_c is None or not np.isfinite(temperature_c).any():
         return None
-    volts, time_s, span_s = recording.volts(unit), recording.time_s, recording.span_s
+    volts, time_s, span_s = recording.volts(sensor), recording.time_s, recording.span_s
     block_s = max(BLOCK_S, span_s / _MOST_BLOCKS, _FEWEST_SAMPLES * period_s(time_s))
     edges = np.unique(
         np.searchsorted(time_s, time_s[0] + block_s * np.arange(int(span_s / block_s) + 1))
@@ -424,7 +424,7 @@ def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
         return None
     mean_v = np.array([volts[p].mean(axis=0) for p in parts])
     scatter_v = np.array([volts[p].std(axis=0) for p in parts])
-    at_rest = (scatter_v <= _MOVING * np.median(scatter_v, axis=0) + unit.lsb_v).all(axis=1)
+    at_rest = (scatter_v <= _MOVING * np.median(scatter_v, axis=0) + sensor.lsb_v).all(axis=1)
     counts = np.array([p.stop - p.start for p in parts])[:, None]
     missing = np.full(len(parts), np.nan)
     poses = Poses(
@@ -436,11 +436,11 @@ def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
         check=np.zeros(len(parts), bool),
         temperature_c=np.array([np.nanmean(temperature_c[p]) for p in parts]),
     ).subset(at_rest)
-    range_g = np.ptp(poses.volts, axis=0) / unit.nominal_scale_v_per_g if len(poses) else 0.0
+    range_g = np.ptp(poses.volts, axis=0) / sensor.nominal_scale_v_per_g if len(poses) else 0.0
     return poses if len(poses) and np.max(range_g) < _SAME_ORIENTATION_G else None
 
 
 def calibrated_temperature_c(base: Sensor) -> float:
-    """Return the temperature at which a unit was calibrated, °C; else that of the datasheet."""
+    """Return the temperature at which a sensor was calibrated, °C; else that of the datasheet."""
     range_c = base.envelope.temperature_c
     return float(np.mean(range_c)) if range_c else NOMINAL_TEMPERATURE_C

@@ -34,7 +34,7 @@ _ANY_TOLERANCE = {_ZERO_G: 0.25, _SCALE: 0.1}
 """Tolerances of any accelerometer: of the zero-g, g, and of the scale factor, as a share. Chosen:
 the widest ones of the datasheets of consumer parts."""
 _FAR = 2.0
-"""Multiple of a tolerance that is far outside. Chosen: solder, housing and age shift a sound unit
+"""Multiple of a tolerance that is far outside. Chosen: solder, housing and age shift a sound one
 beyond its datasheet, but by less than the datasheet's width."""
 _OPEN = 0.9
 """Share of the variance of a prior above which it alone says what a coefficient is. Chosen: the
@@ -104,7 +104,7 @@ def with_open(assessment: Assessment, determined: ErrorBudgets, sensor: Sensor) 
 
 
 def judged(assessment: Assessment, fitted: Sensor) -> Assessment:
-    """Return an assessment that fails if the fitted unit is implausible, however well it fits."""
+    """Return an assessment that fails for an implausible sensor, however well it fits."""
     return replace(assessment, accel_outcome=FAIL) if implausible(fitted) else assessment
 
 
@@ -335,7 +335,7 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
 
 
 def implausible(fitted: Sensor) -> str:
-    """Return a fitted zero-g or scale factor that no sound unit has, for people; '' if none."""
+    """Return a fitted zero-g or scale factor that no sound sensor has, for people; '' if none."""
     for name, unit in (_ZERO_G, 'V'), (_SCALE, 'V/g'):
         typical, largest = fitted.datasheet.get(name, (0.0, 0.0))
         shifts = fitted.values.get(name.effect, {}).get(name.parameter, np.zeros(0))

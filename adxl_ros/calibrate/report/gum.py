@@ -13,7 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from adxl_ros.calibrate.poses import Poses, reference_force
+from adxl_ros.calibrate.pose_model import reference_force
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, certificate_data, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.report.held_out import ErrorBudget

@@ -27,7 +27,8 @@ from dataclasses import dataclass, fields, replace
 from math import sqrt
 from typing import NamedTuple
 
-from adxl_ros.calibrate.poses import Poses, reference_force, stage_force
+from adxl_ros.calibrate.pose_model import reference_force, stage_force
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -40,7 +41,7 @@ import numpy as np
 import scipy
 
 Fit = Callable[[Sensor, Poses], Sensor]
-"""A function that fits a nominal sensor to poses and returns the fitted unit."""
+"""A function that fits a nominal sensor to poses and returns the fitted sensor."""
 
 _FOLDS = 5  # Number of folds where no pose is marked as a check pose; chosen: the usual number
 _MAX_ALPHA_STD_RAD = np.radians(1.0)

@@ -10,7 +10,8 @@ import re
 from typing import Any
 
 from adxl_ros.calibrate.fits import linear
-from adxl_ros.calibrate.poses import planes, Poses, reference_force
+from adxl_ros.calibrate.pose_model import reference_force
+from adxl_ros.calibrate.poses import planes, Poses
 from adxl_ros.calibrate.report import acceptance, gum, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.result import CalibrationResult, compare, history, rounded
@@ -51,15 +52,15 @@ def write(folder: AnyPath, result: CalibrationResult, store: AnyPath = '') -> No
 
 
 def paper_figure(result: CalibrationResult) -> Any:
-    """Draw figures 2 to 8 of the paper for a unit, by its model or at least the physical one."""
+    """Draw figures 2 to 8 of the paper for a sensor, by its model or at least the physical one."""
     if result.gravity_fit is not None:
         raise UserError('they need the angles of a stage')
-    unit = (
+    sensor = (
         result.fitted
         if result.fitted.model in ('physical', 'full')
         else linear.fit_physical(result.nominal, result.poses.subset(~result.poses.check))
     )
-    return draw_sweep(result.nominal, unit, result.poses)
+    return draw_sweep(result.nominal, sensor, result.poses)
 
 
 def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
@@ -209,10 +210,10 @@ def _sphere(result: CalibrationResult) -> dict[str, Any]:
         labels = [f'rest {i + 1}' for i in range(len(poses))]
     else:
         force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
-        units = {row.model: row.fitted[0] for row in result.held_out} | {fitted.model: fitted}
+        sensors = {row.model: row.fitted[0] for row in result.held_out} | {fitted.model: fitted}
         errors = {}
-        for model, unit in units.items():
-            of_unit = held_out.pose_errors(unit, poses)
+        for model, sensor in sensors.items():
+            of_unit = held_out.pose_errors(sensor, poses)
             errors[model] = np.column_stack([np.degrees(of_unit.tilt_rad), mg(of_unit.accel_mps2)])
         quantities = [['tilt error', '°'], *([f'error of {a}', 'mg'] for a in fitted.axes)]
         labels = [
