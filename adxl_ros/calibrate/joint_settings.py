@@ -23,7 +23,7 @@ ENCODER_STEPS = 1.5
 """Largest change of an encoder at rest, in its steps. It may flicker by one step; a move of two is
 seen."""
 COMMAND_RAD = 1e-9
-"""Commands that differ by less are equal, rad: above rounding in float64, and below the step of any
+"""Commands that differ by less are equal, rad: above rounding in float64, below the step of any
 encoder."""
 _MAX_READINGS = 100_000
 """Largest number of readings in memory; older ones are forgotten. They are 1000 s at 100 Hz, more

@@ -137,12 +137,12 @@ def gyro_lines(gyro: Gyroscope) -> list[str]:
                 '°/s/K',
             )
         )
-    return [
-        f'  {label:{_LONGEST_LABEL}} {axis:1} '
-        f'{with_half_width(np.degrees(value), Z_90 * np.degrees(std))} {unit}'
-        for label, values, stds, unit in rows
-        for axis, value, std in zip(AXES, values, stds or NO_TURN)
-    ]
+    lines = []
+    for label, values, stds, unit in rows:
+        for axis, value, std in zip(AXES, values, stds or NO_TURN):
+            text = with_half_width(np.degrees(value), Z_90 * np.degrees(std))
+            lines.append(f'  {label:{_LONGEST_LABEL}} {axis:1} {text} {unit}')
+    return lines
 
 
 def with_provenance(

@@ -132,7 +132,15 @@ class RecordingEstimator:
         if sensor.axes == 'x':
             force_mps2[1:] = np.nan
         force_std_mps2[np.isnan(force_mps2)] = np.inf
-        return Estimates(force_mps2, force_std_mps2, covariance, angles, at_rail, outside, volts)
+        return Estimates(
+            force_mps2=force_mps2,
+            force_std_mps2=force_std_mps2,
+            covariance=covariance,
+            tilt=angles,
+            at_rail=at_rail,
+            outside=outside,
+            volts=volts,
+        )
 
     def _excess_variance(self, force: Components, covariance: np.ndarray) -> np.ndarray:
         """Return the square of what a force is beyond gravity and its error, (m/s²)², (n,)."""

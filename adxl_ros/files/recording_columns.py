@@ -155,11 +155,10 @@ class Recording:
     def __repr__(self) -> str:
         """Return name, length, rate, axes and references in one line."""
         rate = f', {self.rate_hz:.4g} Hz' if len(self) > 1 else ''
-        further = [name for name in self.columns if name not in self.sensor_columns]
-        return (
-            f'{Path(self.path).name}: {self.span_s:.4g} s{rate}, axes {" ".join(self.axes)}'
-            + f', with {", ".join(further)}' * bool(further)
-        )
+        references = [name for name in self.columns if name not in self.sensor_columns]
+        further = f', with {", ".join(references)}' if references else ''
+        axes = ' '.join(self.axes)
+        return f'{Path(self.path).name}: {self.span_s:.4g} s{rate}, axes {axes}{further}'
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
         """
@@ -203,7 +202,8 @@ class Recording:
             for name, residual in self.alignments.items()
             if residual
         ]
-        return (*self.remarks, *[self.cut] * bool(self.cut), *aligned)
+        cut = [self.cut] if self.cut else []
+        return (*self.remarks, *cut, *aligned)
 
     def rows(self, start: int, stop: int) -> Recording:
         """Return a part of the samples."""

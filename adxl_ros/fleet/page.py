@@ -87,14 +87,14 @@ def _trend_figure(
                 plotly.points([], value[shown], half[shown], name, colour)
                 | {'x': _stamps(years[shown])}
             )
-    title = quantity.shown_unit + ' from the mean' * quantity.is_coefficient
+    origin = ' from the mean' if quantity.is_coefficient else ''
     return plotly.figure(
         traces,
         _TREND_HEIGHT,
         showlegend=False,
         shapes=_calibration_marks(table, sensor),
         xaxis={'type': 'date', 'nticks': 3, 'tickangle': 0, 'tickformat': '%b %Y'},
-        yaxis={'title': {'text': title}, 'nticks': 5},
+        yaxis={'title': {'text': quantity.shown_unit + origin}, 'nticks': 5},
     )
 
 

@@ -186,15 +186,15 @@ class _Sums:
         with np.errstate(invalid='ignore'):
             slope_std = nan * np.sqrt(a / det)
         return Trends(
-            scatter,
-            self.centre_value + p / a,
-            a**-0.5,
-            nan * slope,
-            slope_std,
-            np.full(len(a), np.inf),
-            squares,
-            residual,
-            float(log_likelihood),
+            scatter=scatter,
+            level=self.centre_value + p / a,
+            level_std=a**-0.5,
+            slope=nan * slope,
+            slope_std=slope_std,
+            freedom=np.full(len(a), np.inf),
+            squares=squares,
+            residual=residual,
+            log_likelihood=float(log_likelihood),
         )
 
     def _by_period(self, values: np.ndarray) -> np.ndarray:

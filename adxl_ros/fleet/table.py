@@ -135,12 +135,12 @@ def read(path: AnyPath) -> FleetTable:
     # A copy says nothing twice.
     first = ~frame.assign(unit=sensor).duplicated(['unit', 'hash']) | (frame['hash'] == '')
     return FleetTable(
-        frame,
-        tuple(map(str, serials)),
-        sensor,
-        (date - np.datetime64(0, 'us')) / _YEAR,
-        np.cumsum(begins) - 1,
-        first.to_numpy(bool),
+        frame=frame,
+        serials=tuple(map(str, serials)),
+        sensor=sensor,
+        years=(date - np.datetime64(0, 'us')) / _YEAR,
+        period=np.cumsum(begins) - 1,
+        first=first.to_numpy(bool),
     )
 
 
@@ -230,17 +230,17 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
         none = np.zeros(len(sensors), bool)
         results.append(
             QuantityResult(
-                quantity,
-                rows,
-                recordings,
-                distance,
-                is_outlier,
-                sensors,
-                trends,
-                none,
-                np.zeros(len(sensors)),
-                population,
-                batch,
+                quantity=quantity,
+                rows=rows,
+                recordings=recordings,
+                distance=distance,
+                is_outlier=is_outlier,
+                sensors=sensors,
+                trends=trends,
+                is_claimed=none,
+                half_width=np.zeros(len(sensors)),
+                population=population,
+                batch=batch,
             )
         )
     if not results:
@@ -369,17 +369,17 @@ def _state_of(sensor: int, table: FleetTable, results: Sequence[QuantityResult])
             f'{table["refusal"][rows[-1]] or table["outcome"][rows[-1]]}'
         )
     return SensorState(
-        urgency,
-        sensor,
-        table.serials[sensor],
-        state,
-        reason[:1].upper() + reason[1:],
-        drifts,
-        f'{number(gap_mg)} / {number(floor_mg)}' if np.isfinite(gap_mg) else '-',
-        f'{len(rows)} ({refused.sum()})',
-        f'{age_days:.0f}' if np.isfinite(age_days) else '-',
-        float(table.years[rows[-1]]),
-        next((text for text in table['report'][rows[::-1]] if text), ''),
+        urgency=urgency,
+        sensor=sensor,
+        serial=table.serials[sensor],
+        state=state,
+        reason=reason[:1].upper() + reason[1:],
+        drifts=drifts,
+        gap=f'{number(gap_mg)} / {number(floor_mg)}' if np.isfinite(gap_mg) else '-',
+        recordings=f'{len(rows)} ({refused.sum()})',
+        age=f'{age_days:.0f}' if np.isfinite(age_days) else '-',
+        last_year=float(table.years[rows[-1]]),
+        report=next((text for text in table['report'][rows[::-1]] if text), ''),
     )
 
 

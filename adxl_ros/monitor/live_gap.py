@@ -321,7 +321,12 @@ class LiveGap:
                 np.clip((datasheet**2 - gap.value**2) / (datasheet**2 - floor.value**2), 0.0, 1.0)
             )
         return AxisGap(
-            axis, gap, floor, source, float(of_blocks('mean_mps2').mean()) / _MG, explained
+            axis=axis,
+            gap=gap,
+            floor=floor,
+            floor_source=source,
+            offset_mg=float(of_blocks('mean_mps2').mean()) / _MG,
+            explained=explained,
         )
 
 

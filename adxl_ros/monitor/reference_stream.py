@@ -157,12 +157,12 @@ class ReferenceStream:
         self._origin_ns = origin_ns
         alpha, beta, shift = (partial(self._joint, number) for number in range(len(JOINTS)))
         motion = Motion(
-            np.inf,
-            alpha,
-            beta,
-            shift,
-            partial(self._surrounding, 'temperature_c'),
-            partial(self._surrounding, 'supply_v'),
+            duration_s=np.inf,
+            alpha=alpha,
+            beta=beta,
+            shift=shift,
+            temperature_c=partial(self._surrounding, 'temperature_c'),
+            supply_v=partial(self._surrounding, 'supply_v'),
         )
         if self.kind is ReferenceKind.STAGE:
             return motion

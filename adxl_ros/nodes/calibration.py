@@ -471,7 +471,12 @@ class Calibration(Node):
         self.announce, self.withdraw_pose = announcer.announce, announcer.withdraw
         self._samples = Samples(self, own.samples_unit)
         self._controller = controller.Controller(
-            settings, sensor, own.resume, self._samples, self, anonymous
+            settings=settings,
+            sensor=sensor,
+            resume=own.resume,
+            samples=self._samples,
+            outputs=self,
+            anonymous=anonymous,
         )
         if own.autostart:
             self._controller.start()
@@ -616,12 +621,12 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
     )
     step_rad = float(np.radians(own.step_deg))
     capture = screen_contents.CaptureSettings(
-        own.dwell_s,
-        own.tolerance_rad,
-        own.timeout_s,
-        StageMode(own.stage_mode),
-        float(np.radians(own.near_deg)),
-        own.temperature_span_c,
+        dwell_s=own.dwell_s,
+        tolerance_rad=own.tolerance_rad,
+        timeout_s=own.timeout_s,
+        stage_mode=StageMode(own.stage_mode),
+        near_rad=float(np.radians(own.near_deg)),
+        temperature_span_c=own.temperature_span_c,
     )
     kind = own.plan
     if kind == 'auto':

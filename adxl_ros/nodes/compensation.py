@@ -273,13 +273,13 @@ class Compensation(Node):
             else None
         )
         self._stream = LiveStream(
-            paper,
-            settings.undo_filter,
-            self._publish,
-            tilt.publish,
-            settings.orientation == 'keep',
-            free.publish if free else None,
-            settings.output_rate_hz,
+            paper=paper,
+            undo_filter=settings.undo_filter,
+            publish_imu=self._publish,
+            publish_tilt=tilt.publish,
+            keep_orientation=settings.orientation == 'keep',
+            publish_free=free.publish if free else None,
+            output_rate_hz=settings.output_rate_hz,
         )
         self._policy = CompensationPolicy(paper, settings.store, self.resolve_topic_name)
         self._look_at_gravity = LiveLook()

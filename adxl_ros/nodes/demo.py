@@ -23,6 +23,7 @@ from adxl_ros.calibrate.result import compare, truth_table
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, sweep_journal
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Parameter
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import jobs
 from adxl_ros.process import ended_by_closed_output
@@ -228,24 +229,18 @@ def _draw_unit(sensor: Sensor, seed: int) -> Sensor:
     The linear cross-axis terms are part of the misalignment, as in the fits.
     """
     rng = np.random.default_rng(seed)
-    values = {
-        name: {
-            p.name: np.array(
-                [
-                    multiple
-                    * p.scale
-                    * rng.choice((-1, 1))
-                    * rng.uniform(*_SPREAD)
-                    * (p.name != 'linear')
-                    if axis in p.axes
-                    else 0.0
-                    for axis in sensor.axes
-                ]
-            )
-            for p in effect_named(name).parameters
-        }
-        for name, multiple in _UNIT_EFFECTS.items()
-    }
+
+    def drawn(parameter: Parameter, multiple: float) -> np.ndarray:
+        size = 0.0 if parameter.name == 'linear' else multiple * parameter.scale
+        values = np.zeros(len(sensor.axes))
+        for place, axis in enumerate(sensor.axes):
+            if axis in parameter.axes:
+                values[place] = size * rng.choice((-1, 1)) * rng.uniform(*_SPREAD)
+        return values
+
+    values = {}
+    for name, multiple in _UNIT_EFFECTS.items():
+        values[name] = {p.name: drawn(p, multiple) for p in effect_named(name).parameters}
     return replace(sensor, effects=tuple(_UNIT_EFFECTS), values=values)
 
 

@@ -169,13 +169,13 @@ class Driver(LifecycleNode):
         """Create the topics."""
         self._fault = ''
         self._output = SampleOutput(
-            self,
-            self._sensor,
-            self._frame_id,
-            self._delay_ns,
-            self._is_clock,
-            self._stamp_clock,
-            self._tally,
+            node=self,
+            sensor=self._sensor,
+            frame_id=self._frame_id,
+            delay_ns=self._delay_ns,
+            is_clock=self._is_clock,
+            clock=self._stamp_clock,
+            tally=self._tally,
         )
 
     def activate(self) -> None:
@@ -184,7 +184,12 @@ class Driver(LifecycleNode):
         self._fault = ''
         link = self._module.open_link(self._sensor, self._settings)
         self._reader = LinkReader(
-            self, link, self._output, self._settings, self._fail, self._diagnostics.notice
+            node=self,
+            link=link,
+            output=self._output,
+            settings=self._settings,
+            on_error=self._fail,
+            on_level=self._diagnostics.notice,
         )
 
     def close(self) -> None:

@@ -49,8 +49,7 @@ class Argument(NamedTuple):
             self.name,
             '',
             f'{self.spec.meaning}; not given: as in params_file, or the default',
-            *('',) * bool(self.spec.choices),
-            *self.spec.choices,
+            *(('', *self.spec.choices) if self.spec.choices else ()),
         )
 
     def value(self, text: str) -> Any:
@@ -219,13 +218,16 @@ def make_node(
         options |= {'respawn': respawn, 'respawn_delay': 2.0, 'on_exit': end_with_refusal}
     # The nominal sensor is what a node without a file has; a file would name it for any stream.
     is_named &= path != str(parameter_file.nominal_path())
+    given_files: list[Any] = [path] if is_named else []
+    if given:
+        given_files.append(given)
     # With its name a node gets the parameters in a section of its own, which counts before others.
     return Node(
         package=_PACKAGE,
         executable=executable,
         name=executable,
         namespace=text(context, 'namespace'),
-        parameters=[path] * is_named + [given] * bool(given),
+        parameters=given_files,
         ros_arguments=[*_enclave(context, executable), '--log-level', text(context, 'log_level')],
         **options,
     )

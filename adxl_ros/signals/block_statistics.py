@@ -122,13 +122,13 @@ class BlockCutter:
         squares = ((samples - mean[..., None]) ** 2).sum(axis=2)
         bounds = np.stack([np.fmin.reduce(angles, axis=2), np.fmax.reduce(angles, axis=2)])
         return Blocks(
-            self._row + start,
-            block[0][:, [0, -1]],
-            run,
-            mean.T,
-            squares.T,
-            step.T,
-            bounds.transpose(2, 0, 1),
+            start=self._row + start,
+            time_s=block[0][:, [0, -1]],
+            run=run,
+            mean=mean.T,
+            squares=squares.T,
+            step=step.T,
+            angle=bounds.transpose(2, 0, 1),
         )
 
 

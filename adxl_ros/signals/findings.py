@@ -267,12 +267,12 @@ class _Axis:
             and self._changes > _CHANGING * (self._count - self._most_equal)
         )
         return AxisRange(
-            self.name,
-            low,
-            high,
-            sum(self._clipped),
-            low == high,
-            stuck_s * (is_reported or low == high),
+            name=self.name,
+            lowest_mps2=low,
+            highest_mps2=high,
+            clipped=sum(self._clipped),
+            is_stuck=low == high,
+            stuck_s=stuck_s if is_reported or low == high else 0.0,
         )
 
 

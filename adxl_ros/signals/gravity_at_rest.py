@@ -293,20 +293,32 @@ def look(
     readings = RestReadings(readings.mean_mps2[::every], readings.std_mps2[::every])
     count, axes = readings.mean_mps2.shape
     if not count:
-        return GravityAtRest(0, axes, gravity_mps2, np.nan, np.nan, np.nan, (np.nan, np.nan), None)
+        return GravityAtRest(
+            rests=0,
+            axes=axes,
+            gravity_mps2=gravity_mps2,
+            length_mps2=np.nan,
+            spread_mps2=np.nan,
+            std_mps2=np.nan,
+            allowed_mps2=(np.nan, np.nan),
+            fault=None,
+        )
     length, case = readings.length_mps2, _Case(readings, tolerance, gravity_mps2)
     # A reading of the length g in these poses is that of a force between these lengths.
     upright = readings.divided(np.maximum(length, _LEAST_MPS2)[:, None] / gravity_mps2)
     low, high = (np.median(limits) for limits in replace(case, readings=upright).force_limits())
     return GravityAtRest(
-        count * every,
-        axes,
-        gravity_mps2,
-        float(np.median(length)),
-        float(np.subtract(*np.quantile(length, [0.75, 0.25]))),
-        float(np.median(np.linalg.norm(readings.std_mps2, axis=1))),
-        (float(gravity_mps2**2 / high), float(gravity_mps2**2 / low) if low > 0 else np.inf),
-        case.fault(),
+        rests=count * every,
+        axes=axes,
+        gravity_mps2=gravity_mps2,
+        length_mps2=float(np.median(length)),
+        spread_mps2=float(np.subtract(*np.quantile(length, [0.75, 0.25]))),
+        std_mps2=float(np.median(np.linalg.norm(readings.std_mps2, axis=1))),
+        allowed_mps2=(
+            float(gravity_mps2**2 / high),
+            float(gravity_mps2**2 / low) if low > 0 else np.inf,
+        ),
+        fault=case.fault(),
     )
 
 
@@ -466,12 +478,12 @@ class _Case:
         names = ' or '.join(unit.name for unit in likely)
         remedies = ', or '.join(unit.remedy for unit in likely)
         return GravityFault(
-            GravityFaultKind.UNIT,
-            f'at rest {self._read()}, as values in {names} are',
-            remedies,
-            names,
-            likely[0].symbol,
-            self.gravity_mps2 / likely[0].gravity,
+            kind=GravityFaultKind.UNIT,
+            reason=f'at rest {self._read()}, as values in {names} are',
+            remedy=remedies,
+            unit=names,
+            symbol=likely[0].symbol,
+            factor=self.gravity_mps2 / likely[0].gravity,
         )
 
     def _fits(self, unit: ReadingUnit) -> bool:

@@ -79,7 +79,9 @@ def with_bias(gyro: Gyroscope, rests: Sequence[RestTurns]) -> Gyroscope:
     middle_c = float(np.average(temperature_c, weights=weight)) if is_known else np.nan
     departure_k = temperature_c - middle_c
     has_slope = is_known and bool(np.ptp(temperature_c) >= _TEMPERATURES_K)
-    design = np.column_stack([np.ones(len(parts)), *[departure_k] * has_slope])
+    design = np.ones((len(parts), 1))
+    if has_slope:
+        design = np.column_stack([design, departure_k])
     root = np.sqrt(weight / weight.mean())[:, None]
     values = np.linalg.lstsq(design * root, means * root, rcond=None)[0]
     freedom = len(parts) - design.shape[1]

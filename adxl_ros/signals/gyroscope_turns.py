@@ -53,17 +53,19 @@ class _Way(NamedTuple):
         axes = []
         for axis, weights in zip(AXES, self.matrix):
             column = int(np.abs(weights).argmax())
-            axes.append(f'{axis} is {"-" * bool(weights[column] < 0)}g{AXES[column]}')
+            sign = '-' if weights[column] < 0 else ''
+            axes.append(f'{axis} is {sign}g{AXES[column]}')
         return ', '.join(axes)
 
 
 def _ways() -> list[_Way]:
     """Return all ways, those with fewer changes first."""
-    ways = [
-        _Way(np.eye(3)[list(order)] * np.array(signs)[:, None] * factor, is_degrees)
-        for is_degrees, factor in ((False, 1.0), (True, np.pi / 180))
-        for order, signs in product(permutations(range(3)), product((1, -1), repeat=3))
-    ]
+    ways = []
+    for is_degrees in (False, True):
+        factor = np.pi / 180 if is_degrees else 1.0
+        for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
+            matrix = np.eye(3)[list(order)] * np.array(signs)[:, None] * factor
+            ways.append(_Way(matrix, is_degrees))
     return sorted(ways, key=lambda way: way.changes)
 
 
@@ -205,7 +207,7 @@ def _disagreement(turns: Sequence[_Turn]) -> tuple[float, list[str]]:
             f'{np.degrees(2 * np.arcsin(errors.min() / 2)):.0f}°; state dps by --columns, or '
             'convert it to rad/s'
         ]
-    unit = ' in °/s' * best.is_degrees
+    unit = ' in °/s' if best.is_degrees else ''
     return error, [
         f'the gyroscope has its axes or signs against those of the accelerometer: {compared}, '
         f'and by {np.degrees(2 * np.arcsin(errors.min() / 2)):.0f}° if the rotation about '

@@ -192,39 +192,35 @@ def _likeliest_shapes(
     The volts are nearly linear in all other coefficients. The likelihood by a shape parameter has
     several maxima, so that its whole range is searched, and then the interval of the best value.
     """
-    shapes = []
-    for name in effects:
-        for parameter in effect_named(name).parameters:
-            is_fitted = parameter.role is Role.SHAPE and not parameter.held
-            if is_fitted and effect_named(name).invertible:
-                shapes.append((name, parameter))
-    for effect, parameter in shapes:
-        of_effect = sensor.values[effect]
-        shape, value = np.shape(of_effect[parameter.name]), parameter.scale
-        for steps in (
-            np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1),
-            np.linspace(-1, 1, _FINE_SHAPES),
-        ):
-            values = value * _SHAPE_STEP**steps
-            trials = [
-                replace(
-                    sensor,
-                    values={
-                        **sensor.values,
-                        effect: {**of_effect, parameter.name: np.full(shape, trial)},
-                    },
-                )
-                for trial in values
-                if parameter.lower <= trial <= parameter.upper
-            ]
-            sensor = min(
-                trials,
-                key=lambda trial: linearised(trial, poses, names, prior_precision(names)).misfit(
-                    stated
-                ),
-            )
-            value = float(np.ravel(sensor.values[effect][parameter.name])[0])
+    precision = prior_precision(names)
+
+    def misfit(trial: Sensor) -> float:
+        return linearised(trial, poses, names, precision).misfit(stated)
+
+    coarse = np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1)
+    fine = np.linspace(-1, 1, _FINE_SHAPES)
+    for effect in map(effect_named, effects):
+        for parameter in effect.parameters if effect.invertible else ():
+            if parameter.role is not Role.SHAPE or parameter.held:
+                continue
+            value = parameter.scale
+            for steps in (coarse, fine):
+                values = value * _SHAPE_STEP**steps
+                trials = [
+                    _with_shape(sensor, effect.name, parameter.name, trial)
+                    for trial in values
+                    if parameter.lower <= trial <= parameter.upper
+                ]
+                sensor = min(trials, key=misfit)
+                value = float(np.ravel(sensor.values[effect.name][parameter.name])[0])
     return sensor
+
+
+def _with_shape(sensor: Sensor, effect: str, name: str, value: float) -> Sensor:
+    """Give a shape parameter of a sensor the same value on each axis."""
+    of_effect = sensor.values[effect]
+    shape = np.full(np.shape(of_effect[name]), value)
+    return replace(sensor, values={**sensor.values, effect: {**of_effect, name: shape}})
 
 
 class _Search:
@@ -297,12 +293,10 @@ class _Search:
             step *= min(1.0, _MAX_STEP_SIZES / np.abs(step / sizes).max())
             return _Iterate(values, step, 0.0, about, covariance, information)
 
-        return gauss_newton(
-            linearise,
-            get(self._sensor, self._names),
-            lambda _, previous, __: previous is not None and previous.step_std < _LAST_STEP_STD,
-            steps + 1,
-        )
+        def is_last(_: _Iterate, previous: _Iterate | None, __: _Iterate) -> bool:
+            return previous is not None and previous.step_std < _LAST_STEP_STD
+
+        return gauss_newton(linearise, get(self._sensor, self._names), is_last, steps + 1)
 
     def _step(self) -> float:
         """Move coefficients and angles to likelier ones; return the longest step, in stds."""
@@ -321,11 +315,13 @@ class _Search:
                 + solved.covariance.penalty(angles)
             )
 
-        highest, before = cost(start, self._errors), self._errors
+        # The step is halved until it does not raise the cost.
+        before = self._errors
+        cost_before = cost(start, before)
         for share in 0.5 ** np.arange(_MAX_HALVINGS + 1):
             values = start + share * (solved.values - start)
             self._errors = before.interpolated(errors, share)
-            if cost(values, self._errors) <= highest:
+            if cost(values, self._errors) <= cost_before:
                 break
         self._sensor = put(self._sensor, self._names, values)
         self._poses = _turned_linearly(self._sensor, self._measured, self._errors.total_rad)
@@ -465,22 +461,19 @@ def open_coefficients(
 ) -> list[Coefficient]:
     """Return the sensor's coefficients that poses leave as uncertain as their typical size."""
     scale = _sizes(names)
-    required = [
-        not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_PRIOR_SUFFICES)
-        for name in names
-    ]
+    is_required = np.array(
+        [
+            not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_PRIOR_SUFFICES)
+            for name in names
+        ]
+    )
     # The poses must determine a required coefficient without its prior.
-    information = fisher_information(sensor, poses, names, stage) - np.diag(
-        prior_precision(names) * required
-    )
-    variances = np.diag(
-        np.linalg.inv(information * np.outer(scale, scale) + _REGULARISATION * np.eye(len(names)))
-    )
-    return [
-        name
-        for name, variance, is_required in zip(names, variances, required)
-        if is_required and variance > 1.0
-    ]
+    of_priors = np.where(is_required, prior_precision(names), 0.0)
+    information = fisher_information(sensor, poses, names, stage) - np.diag(of_priors)
+    # In typical sizes, of which 1 is the size of the coefficient itself
+    scaled = information * np.outer(scale, scale) + _REGULARISATION * np.eye(len(names))
+    is_open = is_required & (np.diag(np.linalg.inv(scaled)) > 1.0)
+    return [name for name, leaves_open in zip(names, is_open) if leaves_open]
 
 
 def require_determined(
@@ -494,17 +487,14 @@ def require_determined(
     undetermined = open_coefficients(sensor, poses, names, stage)
     if len(undetermined) <= max_open and poses.volts.size > len(names) - max_open:
         return
-    reason = (
-        f'they do not determine {", ".join(map(str, undetermined))}'
-        if undetermined
-        else f'they have {poses.volts.size} values for {len(names)} coefficients'
-    )
+    reason = f'they have {poses.volts.size} values for {len(names)} coefficients'
+    if undetermined:
+        reason = f'they do not determine {", ".join(map(str, undetermined))}'
     follows = set(chain.from_iterable(effect_named(name.effect).follows for name in undetermined))
-    advice = (
-        f'poses with other values of {" and ".join(sorted(follows))}'
-        if follows
-        else f'poses (alpha, beta) = {next_poses(sensor, poses, names, stage)} deg'
-    )
+    if follows:
+        advice = f'poses with other values of {" and ".join(sorted(follows))}'
+    else:
+        advice = f'poses (alpha, beta) = {next_poses(sensor, poses, names, stage)} deg'
     raise UserError(
         f'the full model is not determined by {len(poses)} poses: {reason}; add '
         f'{advice}, or fit --model physical or linear'
@@ -659,30 +649,28 @@ _MIN_PART = 0.2  # Smallest component of the weakest direction, a unit vector, i
 def report_lines(full: FullFit, poses: Poses, terms: Sequence[Term]) -> list[str]:
     """Report the stage, the weakest direction and the terms of a fit of poses."""
     helpful = next_poses(full.with_stage, poses, full.names, full.stage)
-    setting_deg, pose_deg = (
-        np.degrees(rad * full.stage.joints)
-        for rad in (full.stage.setting_rad, full.stage.pose_rad)
-    )
+    setting_deg = np.degrees(full.stage.setting_rad * full.stage.joints)
+    pose_deg = np.degrees(full.stage.pose_rad * full.stage.joints)
     std = np.sqrt(np.diag(np.linalg.inv(full.information)))
     values = [
         f'{name} {with_half_width(float(value), Z_90 * value_std)} {parameter_of(name).unit}'
         for name, value, value_std in zip(full.names, get(full.with_stage, full.names), std)
         if belongs_to_stage(name)
     ]
-    return [
+    lines = [
         f'stage error: alpha {setting_deg[0]:.2g}, beta {setting_deg[1]:.2g} deg rms by setting, '
         f'{pose_deg[0]:.2g} and {pose_deg[1]:.2g} deg by pose (stated '
         f'{np.degrees(full.stated_std_rad):.2g} deg)',
         f'stage: {", ".join(values)} (90 % intervals)',
         _weakest_direction(full.fitted),
         f'next poses that would help most, (alpha, beta) in deg: {helpful}',
-        *(['log Bayes factor of each term, nats; above 0 the poses support it:'] if terms else []),
-        *(
-            f'  {term.name:20} {term.log_bayes_factor:10.1f}'
-            f'{"" if term.is_supported else "   not supported by these poses"}'
-            for term in terms
-        ),
     ]
+    if terms:
+        lines.append('log Bayes factor of each term, nats; above 0 the poses support it:')
+    for term in terms:
+        note = '' if term.is_supported else '   not supported by these poses'
+        lines.append(f'  {term.name:20} {term.log_bayes_factor:10.1f}{note}')
+    return lines
 
 
 def _weakest_direction(fitted: Sensor) -> str:

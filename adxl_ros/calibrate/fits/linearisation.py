@@ -26,7 +26,7 @@ import numpy as np
 import scipy
 
 _MIN_VARIANCE_RAD2 = 1e-24
-"""Smallest variance of an angle as a divisor, rad². Chosen: avoids 0/0 on a perfect stage."""
+"""Smallest variance of an angle as a divisor, rad²: it avoids 0/0 on a stage without errors."""
 
 
 @dataclass(frozen=True)
@@ -127,9 +127,8 @@ class PoseCovariance:
 
     def penalty(self, errors: AngleErrors) -> float:
         """Return the sum of the squared angle errors over their variances."""
-        pose_rad, setting_rad = (
-            part / self._error.joints for part in (errors.pose_rad, errors.setting_rad)
-        )
+        pose_rad = errors.pose_rad / self._error.joints
+        setting_rad = errors.setting_rad / self._error.joints
         total = np.sum((pose_rad**2 / np.maximum(self._pose_rad2, _MIN_VARIANCE_RAD2))[self._kept])
         for joint in range(2):
             _, first = np.unique(self._number[:, joint], return_index=True)
@@ -153,10 +152,10 @@ class PoseCovariance:
         pose = self._pose_rad2 * (np.swapaxes(self._jacobian, 1, 2) @ weighted)[:, :, 0]
         joints = self._error.joints
         return AngleErrors(
-            np.where(self._number >= 0, setting, 0.0) * joints,
-            pose * joints,
-            np.sum(white**2, axis=1),
-            float(factor @ factor),
+            setting_rad=np.where(self._number >= 0, setting, 0.0) * joints,
+            pose_rad=pose * joints,
+            squared_distances=np.sum(white**2, axis=1),
+            setting_penalty=float(factor @ factor),
         )
 
 
@@ -211,9 +210,9 @@ _RATIO_PRIOR_STD = 0.35
 two."""
 _MAX_LOG_RATIO = 1.5
 """Largest |ln(ratio)|. Chosen: a joint is at most twenty times as good as the other."""
-_SEARCH_UNIT = 0.05
-"""Unit of a step of the search, in ln(total), share and ln(ratio): the accuracy with which some
-hundred poses determine them."""
+_SEARCH_STEP = 0.05
+"""Step of the search that counts as 1, in ln(total), share and ln(ratio): the accuracy with which
+some hundred poses determine them."""
 _SEARCH_OPTIONS = {'eps': 1e-3, 'ftol': 1e-8, 'gtol': 0.5, 'maxiter': 20, 'maxls': 5}
 """Options of L-BFGS-B. Chosen: the deviance is found to 0.1, where χ² has the unit 1."""
 _HUBER_CHANCE = 1e-3
@@ -309,23 +308,20 @@ class Linearised:
     def stage_error(self, stated_rad: float, start: StageError | None = None) -> StageError:
         """Estimate the stage error by restricted maximum likelihood."""
         start = start or StageError(stated_rad)
-        total = float(np.log(np.clip(start.total_rad, 10 * _MIN_TOTAL_RAD, _MAX_TOTAL_RAD)))
+        # Searched are ln(total), the poses' share of its square, and ln(ratio).
+        log_total = np.log(np.clip(start.total_rad, 10 * _MIN_TOTAL_RAD, _MAX_TOTAL_RAD))
         share = (start.pose_rad / max(start.total_rad, _MIN_TOTAL_RAD)) ** 2
-        bounds = np.array(
-            [
-                np.log((_MIN_TOTAL_RAD, _MAX_TOTAL_RAD)),
-                (0.0, 1.0),
-                (-_MAX_LOG_RATIO, _MAX_LOG_RATIO),
-            ]
-        )
+        of_start = np.array([log_total, share, np.log(start.ratio)])
+        lowest = np.array([np.log(_MIN_TOTAL_RAD), 0.0, -_MAX_LOG_RATIO])
+        highest = np.array([np.log(_MAX_TOTAL_RAD), 1.0, _MAX_LOG_RATIO])
         search = scipy.optimize.minimize(
-            lambda x: self._level_deviance(_from_search(x * _SEARCH_UNIT), stated_rad),
-            np.array([total, share, np.log(start.ratio)]) / _SEARCH_UNIT,
+            lambda x: self._level_deviance(_from_search(x * _SEARCH_STEP), stated_rad),
+            of_start / _SEARCH_STEP,
             method='L-BFGS-B',
             options=_SEARCH_OPTIONS,
-            bounds=bounds / _SEARCH_UNIT,
+            bounds=np.column_stack([lowest, highest]) / _SEARCH_STEP,
         )
-        return _from_search(search.x * _SEARCH_UNIT)
+        return _from_search(search.x * _SEARCH_STEP)
 
     def _level_deviance(self, error: StageError, stated_rad: float) -> float:
         """Return −2 times the log posterior of a stage error, up to a constant."""
@@ -370,9 +366,12 @@ class Linearised:
 
 def _from_search(x: np.ndarray) -> StageError:
     """Return the stage error from ln(total), the poses' share of its square, and ln(ratio)."""
-    total = np.exp(x[0])
+    log_total, pose_share, log_ratio = x
+    total_rad = np.exp(log_total)
     return StageError(
-        float(total * np.sqrt(1 - x[1])), float(total * np.sqrt(x[1])), float(np.exp(x[2]))
+        setting_rad=float(total_rad * np.sqrt(1 - pose_share)),
+        pose_rad=float(total_rad * np.sqrt(pose_share)),
+        ratio=float(np.exp(log_ratio)),
     )
 
 
@@ -385,13 +384,13 @@ def linearised(
 ) -> Linearised:
     """Linearise the volts of poses about the coefficients of a sensor; see `Linearised`."""
     return Linearised(
-        poses,
-        angle_jacobian(sensor, poses),
-        coefficient_jacobian(sensor, poses, names),
-        poses.volts - predicted_volts(sensor, poses),
-        get(sensor, names),
-        precision,
-        np.ones(len(poses), bool) if kept is None else kept,
+        poses=poses,
+        angle_jacobian=angle_jacobian(sensor, poses),
+        design=coefficient_jacobian(sensor, poses, names),
+        residual=poses.volts - predicted_volts(sensor, poses),
+        values=get(sensor, names),
+        precision=precision,
+        kept=np.ones(len(poses), bool) if kept is None else kept,
     )
 
 

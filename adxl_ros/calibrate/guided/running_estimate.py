@@ -149,7 +149,14 @@ def from_poses(
         round(dwell_s * sensor.rate_hz), 1 / sensor.rate_hz, sensor.rc_s
     )
     pose_std_v = np.maximum(noise.sample_std_v(sensor) / np.sqrt(samples), _LEAST_STD_V)
-    return RunningEstimate(estimated, names, np.linalg.inv(information), prior, stage, pose_std_v)
+    return RunningEstimate(
+        sensor=estimated,
+        names=names,
+        covariance=np.linalg.inv(information),
+        prior=prior,
+        stage=stage,
+        pose_std_v=pose_std_v,
+    )
 
 
 def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:

@@ -132,14 +132,21 @@ def gravity_error_budgets(
     spread = held_out.coefficient_spread(fitted, list(force[kept].T))
     # Each of three axes has the error of a magnitude; two of the three turn the vertical.
     return ErrorBudgets(
-        ErrorBudget(measured, by_noise, 0.0, accel, excess, spread * accel + upper),
         ErrorBudget(
-            3 * measured / gravity**2,
-            2 * by_noise / gravity**2,
-            0.0,
-            tilt,
-            2 * excess / gravity**2,
-            spread * tilt + 2 * upper / gravity**2,
+            measured=measured,
+            noise=by_noise,
+            stage=0.0,
+            coefficients=accel,
+            model=excess,
+            calibration_high=spread * accel + upper,
+        ),
+        ErrorBudget(
+            measured=3 * measured / gravity**2,
+            noise=2 * by_noise / gravity**2,
+            stage=0.0,
+            coefficients=tilt,
+            model=2 * excess / gravity**2,
+            calibration_high=spread * tilt + 2 * upper / gravity**2,
             tilt_per_axis=2 / gravity**2,
         ),
     )

@@ -139,36 +139,43 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
     model = np.full(error.shape, np.sqrt(assessment.accel.model))
     inputs = (
         Input(
-            'noise of the mean',
-            'A, normal',
-            1e3 * np.mean(held.std_v, axis=0),
-            'mV',
-            by_noise,
-            MOST_BATCHES - 1,
+            name='noise of the mean',
+            kind='A, normal',
+            std=1e3 * np.mean(held.std_v, axis=0),
+            unit='mV',
+            contribution_mps2=by_noise,
+            freedom=MOST_BATCHES - 1,
         ),
         Input(
-            'coefficients',
-            'A, covariance of the fit',
-            mg(by_coefficients),
-            'mg',
-            by_coefficients,
-            max(int((~poses.check).sum()) * len(axes) - len(fitted.covariance_names), 1),
+            name='coefficients',
+            kind='A, covariance of the fit',
+            std=mg(by_coefficients),
+            unit='mg',
+            contribution_mps2=by_coefficients,
+            freedom=max(int((~poses.check).sum()) * len(axes) - len(fitted.covariance_names), 1),
         ),
         _stage_angles(by_stage, assessment.accel.stage, fitted),
-        Input('model', 'A, held-out errors', mg(model), 'mg', model, error.size),
+        Input(
+            name='model',
+            kind='A, held-out errors',
+            std=mg(model),
+            unit='mg',
+            contribution_mps2=model,
+            freedom=error.size,
+        ),
         _local_gravity(gravity, reference),
         *(_surroundings(name, fitted, held, reference) for name in _SURROUNDINGS),
         *_next_degree(fitted, held),
     )
     return Uncertainty(
-        fitted.axes,
-        held.alpha_rad,
-        held.beta_rad,
-        reference,
-        error,
-        inputs,
-        acceptance.limit(fitted)[1],
-        _decisions(fitted, assessment),
+        axes=fitted.axes,
+        alpha_rad=held.alpha_rad,
+        beta_rad=held.beta_rad,
+        reference_mps2=reference,
+        error_mps2=error,
+        inputs=inputs,
+        limit_name=acceptance.limit(fitted)[1],
+        decisions=_decisions(fitted, assessment),
     )
 
 
@@ -187,7 +194,12 @@ def _stage_angles(by_step_mps2: np.ndarray, scatter: float, fitted: Sensor) -> I
     std_rad = step_rad * excess or scatter**0.5 / fitted.local_gravity_mps2
     part_mps2 = by_step_mps2 * excess if step_rad else scatter_mps2
     return Input(
-        name, 'A, scatter of the poses', np.degrees(std_rad), '°', part_mps2, part_mps2.size
+        name=name,
+        kind='A, scatter of the poses',
+        std=np.degrees(std_rad),
+        unit='°',
+        contribution_mps2=part_mps2,
+        freedom=part_mps2.size,
     )
 
 
@@ -210,7 +222,12 @@ def _decisions(fitted: Sensor, assessment: Assessment) -> tuple[Decision, ...]:
         """Return a comparison; `scale` turns the SI unit of error and limit into `unit`."""
         error, high = budget.calibration**0.5, budget.calibration_high**0.5
         return Decision(
-            quantity, unit, scale * error, scale * (high - error), scale * limit, outcome
+            quantity=quantity,
+            unit=unit,
+            error=scale * error,
+            guard_band=scale * (high - error),
+            limit=scale * limit,
+            outcome=outcome,
         )
 
     accel, tilt = assessment.accel, assessment.tilt

@@ -132,13 +132,13 @@ def summarise(
     count = len(errors.accel_mps2)
     accel_mg = mg(errors.accel_mps2[determining_alpha(errors)])
     return HeldOutErrors(
-        model,
-        statistic(np.degrees(errors.tilt_rad)),
-        statistic(accel_mg),
-        errors,
-        np.arange(count) if pose_index is None else pose_index,
-        tuple(fitted),
-        np.zeros(count, int) if fold is None else fold,
+        model=model,
+        tilt_deg=statistic(np.degrees(errors.tilt_rad)),
+        accel_mg=statistic(accel_mg),
+        errors=errors,
+        pose_index=np.arange(count) if pose_index is None else pose_index,
+        fitted=tuple(fitted),
+        fold=np.zeros(count, int) if fold is None else fold,
     )
 
 
@@ -377,13 +377,13 @@ def _budget(
     model = mean_square - explained if lower > explained else 0.0
     stage = min(max(mean_square - by_noise - by_coefficients, 0.0), largest_stage)
     return ErrorBudget(
-        measured,
-        by_noise,
-        max(measured - mean_square, 0.0) + stage,
-        by_coefficients,
-        model,
-        spread * by_coefficients + max(upper - explained, 0.0),
-        bool(np.isfinite(unexplainable)),
+        measured=measured,
+        noise=by_noise,
+        stage=max(measured - mean_square, 0.0) + stage,
+        coefficients=by_coefficients,
+        model=model,
+        calibration_high=spread * by_coefficients + max(upper - explained, 0.0),
+        separable=bool(np.isfinite(unexplainable)),
     )
 
 
