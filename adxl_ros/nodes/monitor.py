@@ -126,15 +126,22 @@ _TOPICS = {
 }
 """Usual topic of each reference."""
 _TURN_S = 0.05
-"""Time between two looks at the topics, s; chosen: a turn costs as much as ten messages."""
+"""Time between two looks at the topics, s. A look costs as much as ten messages, so that at 1 kHz
+it adds a fifth to their work; half of the time would add two fifths, and twice only delays by 0.1
+s."""
 _PERIOD_S = 1.0  # Time between two messages on `gap`, s
-_QUEUE = 10  # Messages that are kept for a slow subscriber; chosen: 10 s
+_QUEUE = 10
+"""Messages that are kept for a slow subscriber: those of the 10 s after which blocks are
+reported."""
 _INFO_S = 3.0
-"""Time that samples wait for `sensor_info`, s; chosen: a latched message comes within 1 s."""
+"""Time that samples wait for `sensor_info`, s. A latched message comes within 1 s of discovery on
+a busy host; with half of that a driver's own values would be replaced by those of any IMU."""
 _SHORTEST_S = 20.0
-"""Shortest time of samples that is diagnosed, s; chosen: `diagnose` needs some rests or moves."""
+"""Shortest time of samples that is diagnosed, s. Four rests of 5 s, or as many moves, fit into it;
+half of them hardly tell one effect from another."""
 _PAUSE_S = 600.0
-"""Shortest time between two automatic diagnoses, s; chosen: each may cost minutes of a core."""
+"""Shortest time between two automatic diagnoses, s: twice `changes._BUDGET_S`, so that the
+diagnoses take at most half of a core."""
 _EXAMPLES = {
     'a sensor on a stage': '--ros-args --params-file unit.yaml',
     'a sensor on a robot': '--ros-args --params-file unit.yaml -p reference:=robot '

@@ -47,15 +47,18 @@ sys.modules.setdefault('rosidl_generator_py.generate_py_impl', None)  # type: ig
 _OVERRIDING = QoSOverridingOptions([QoSPolicyKind[name.upper()] for name in QOS_POLICIES])
 """What parameters can override."""
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # The clock of intervals
-_SILENT_S = 3.0  # Time without messages after which a topic is silent, s; chosen
+_SILENT_S = 3.0
+"""Time without messages after which a topic is silent, s: three of the slowest usual periods, 1 s.
+With half, one late message would warn; twice hides a broken cable for longer."""
 _LONGEST_LOOK_S = 1.0
-"""Longest time between two looks that counts as silence, s; chosen: above the period of each node,
-and a process that was held up as a whole looks before its middleware has received."""
+"""Longest time between two looks that counts as silence, s. It is above the period of each node; a
+process that was held up as a whole looks before its middleware has received."""
 _LONGEST_WAIT_NS = 100_000_000
-"""Longest wait for a message, ns; chosen: a thread that waits sees within it that it shall end."""
+"""Longest wait for a message, ns: a thread sees within it that it shall end, and wakes 10 times a
+s."""
 _MIXED_S = 3.0
-"""Time within which sequence numbers step back twice where two publishers mix, s; chosen: longer
-than the period of slow samples, shorter than two starts of a driver."""
+"""Time within which sequence numbers step back twice where two publishers mix, s: longer than the
+period of slow samples, 1 s, and shorter than two starts of a driver."""
 
 
 def create_publisher(
