@@ -166,15 +166,13 @@ def _against_stage(
     if population is not None:
         fit = _with_population(fit, population)
     full, fitted, fitting = fit.full, fit.fitted, np.flatnonzero(~poses.check)
-    fit_lines, warnings, outliers = (
-        ([], [], ())
-        if full is None
-        else (
-            full_model.report_lines(full, poses.subset(fitting), fit.terms),
-            full_model.warnings(full, poses.subset(fitting)),
-            tuple(fitting[list(full.outliers)].tolist()),
-        )
-    )
+    fit_lines: list[str] = []
+    warnings: list[str] = []
+    outliers: tuple[int, ...] = ()
+    if full is not None:
+        fit_lines = full_model.report_lines(full, poses.subset(fitting), fit.terms)
+        warnings = full_model.warnings(full, poses.subset(fitting))
+        outliers = tuple(fitting[list(full.outliers)].tolist())
     errors, assessments = _assessed(
         sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit, not doubts
     )
@@ -357,11 +355,10 @@ def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[Recorde
         worst = int(np.argmax(deviations))
         if deviations[worst] <= _MIN_DEVIATIONS:
             continue
-        change = (
-            f'case is turned by {np.degrees(changes[worst]):.2f} deg about {AXES[worst]}'
-            if worst < 3
-            else f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
-        )
+        if worst < 3:
+            change = f'case is turned by {np.degrees(changes[worst]):.2f} deg about {AXES[worst]}'
+        else:
+            change = f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
         raise _ContradictionError(
             f'{recording.source}: {change} from the fit of all recordings '
             f'({deviations[worst]:.0f} standard deviations): another unit or another '
@@ -399,9 +396,8 @@ def _against_gravity(
 ) -> CalibrationResult:
     fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
-    after, unseen = (
-        rms_mg(np.mean(values[kept] ** 2)) for values in (fit.residual_mps2, fit.held_out_mps2)
-    )
+    after_mg = rms_mg(np.mean(fit.residual_mps2[kept] ** 2))
+    unseen_mg = rms_mg(np.mean(fit.held_out_mps2[kept] ** 2))
     fitted = replace(
         sensor,
         model='gravity',
@@ -410,7 +406,9 @@ def _against_gravity(
         covariance=fit.covariance,
         covariance_names=gravity_fit.NAMES,
     )
-    warnings = [*doubts, *([] if fit.converged else [full_model.NOT_CONVERGED])]
+    warnings = list(doubts)
+    if not fit.converged:
+        warnings.append(full_model.NOT_CONVERGED)
     if fit.note:
         warnings.append(fit.note)
     if population is not None:
@@ -441,8 +439,8 @@ def _against_gravity(
         {
             'reference': 'gravity',
             **({'prior': population.name} if population else {}),
-            'residual_mg': f'{after:.4f}',
-            'held_out_mg': f'{unseen:.4f}',
+            'residual_mg': f'{after_mg:.4f}',
+            'held_out_mg': f'{unseen_mg:.4f}',
             **({'span_s': f'{span_s:.1f}'} if span_s else {}),
             'converged': 'yes' if fit.converged else 'no',
             **acceptance.provenance_entries(assessment, (), doubts),

@@ -65,12 +65,12 @@ def undo_filter(
     constants (m,).
     """
     distance = np.diff(time_s) * rate_hz
-    breaks = np.concatenate(
-        [[0], np.flatnonzero(~((distance > 0) & (distance < MAX_GAP))) + 1, [len(time_s)]]
-    )
-    run = np.searchsorted(breaks, np.arange(len(time_s)), 'right')
+    is_gap = ~((distance > 0) & (distance < MAX_GAP))
+    edges = np.concatenate([[0], np.flatnonzero(is_gap) + 1, [len(time_s)]])
     row = np.arange(len(time_s))
-    reach = np.minimum(HALF, np.minimum(row - breaks[run - 1], breaks[run] - 1 - row))
+    next_edge = np.searchsorted(edges, row, 'right')
+    before, after = row - edges[next_edge - 1], edges[next_edge] - 1 - row
+    reach = np.minimum(HALF, np.minimum(before, after))
     slope = np.zeros_like(volts, dtype=float)
     for half in range(1, HALF + 1):
         rows = np.flatnonzero(reach == half)

@@ -26,7 +26,7 @@ from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
 from adxl_ros.files import calibration_store, cdr
 from adxl_ros.files.recording_columns import JOINTS
 from adxl_ros.model.sensor import Sensor, to_volts
-from adxl_ros.nodes import parameters, topics
+from adxl_ros.nodes import parameter_checks, parameters, params_files, sensor_parameters, topics
 from adxl_ros.nodes.jobs import executable, held_output
 from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
@@ -465,13 +465,13 @@ class Calibration(Node):
 
     def __init__(self) -> None:
         super().__init__('calibration')
-        parameters.check_given(self)
-        flat = parameters.declare_sensor(self)
+        parameter_checks.check_given(self)
+        flat = sensor_parameters.declare_sensor(self)
         carried: dict[str, Any] = {
             name: parameters.given_below(self, f'{name}.') for name in ('link', 'mounting')
         }
-        sensor = replace(parameters.make_sensor(flat, may_measure=True), **carried)
-        anonymous = replace(parameters.anonymous_sensor(self, flat), **carried)
+        sensor = replace(sensor_parameters.make_sensor(flat, may_measure=True), **carried)
+        anonymous = replace(sensor_parameters.anonymous_sensor(self, flat), **carried)
         self._own = own = parameters.declare_all(self, CalibrationSettings)
         settings = _session_settings(own)
         self._captures: list[object] = []  # Requests that wait for the end of a capture
@@ -619,10 +619,10 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
     output = Path(own.output)
     journal = Path(own.journal or f'{output}.journal')
     if own.mode == 'thermal' and own.report:
-        raise parameters.parameter_error('report', 'mode thermal writes no page; leave it empty')
+        raise params_files.parameter_error('report', 'mode thermal writes no page; leave it empty')
     for name, path in (('output', output), ('journal', journal)):
         if path.is_dir():
-            raise parameters.parameter_error(name, f'{path} is a directory; name a file')
+            raise params_files.parameter_error(name, f'{path} is a directory; name a file')
     planes_rad = tuple(
         np.radians(
             parameters.numbers('sweep.planes_deg', own.planes_deg or [], '[30.0, 60.0, 90.0]')

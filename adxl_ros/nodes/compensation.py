@@ -25,7 +25,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import Mounting
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes import parameters, topics
+from adxl_ros.nodes import parameter_checks, parameters, params_files, sensor_parameters, topics
 from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.sample_output import age_report, MOST_AGES
@@ -164,9 +164,9 @@ class MountingParameters:
     def _kept(self, rpy_rad: list[float], before_rad: list[float]) -> str:
         """Write a new mounting where the next start finds it; return where that is."""
         path = (
-            parameters.file_of(_RPY)
+            params_files.file_of(_RPY)
             if self._is_given
-            else self._path or parameters.file_of('format')
+            else self._path or params_files.file_of('format')
         )
         begin = f'level: {_RPY} is {rpy_rad}'
         option = f"to keep it, start the node with -p '{_RPY}:={rpy_rad}'"
@@ -174,7 +174,7 @@ class MountingParameters:
             return f'{begin} until this node ends; {option}'
         date = datetime.now(timezone.utc).isoformat(timespec='seconds')
         try:
-            parameters.write_into(
+            params_files.write_into(
                 path,
                 self._node.get_fully_qualified_name(),
                 {
@@ -217,7 +217,7 @@ def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounti
 
 
 def _mounting(
-    rpy_rad: Any, make_error: parameter_file.MakeError = parameters.parameter_error
+    rpy_rad: Any, make_error: parameter_file.MakeError = params_files.parameter_error
 ) -> Mounting:
     """Return the mounting of three angles, rad; refuse what is none."""
     try:
@@ -261,7 +261,7 @@ class Compensation(Node):
 
     def __init__(self) -> None:
         super().__init__('compensation')
-        parameters.check_given(self)
+        parameter_checks.check_given(self)
         self._settings = settings = parameters.declare_all(self, CompensationSettings)
         paper, mounting = settings.inverse == 'paper', _mounting(settings.rpy_rad)
         self._heard_ns: dict[str, int] = {}
@@ -290,12 +290,12 @@ class Compensation(Node):
         self._policy = CompensationPolicy(paper, settings.store, self.resolve_topic_name)
         self._look_at_gravity = LiveLook()
         self._samples = topics.Inbox(self, Imu, 'imu/data_raw', _DEPTH, settings.samples_unit)
-        self._flat = parameters.given_sensor(self)
+        self._flat = sensor_parameters.given_sensor(self)
         own = (
-            parameters.make_sensor(self._flat, may_measure=True),
+            sensor_parameters.make_sensor(self._flat, may_measure=True),
             (
                 'the parameters given'
-                if parameters.is_from_file(self)
+                if sensor_parameters.is_from_file(self)
                 else f'the nominal {parameter_file.nominal_path()}'
             ),
         )
@@ -344,7 +344,7 @@ class Compensation(Node):
         """Correct samples by a sensor from the next one on; `source` says where it is from."""
         self._named = sensor, source
         self._stream.release()
-        is_named = sensor.effects or self._calibration() or parameters.is_from_file(self)
+        is_named = sensor.effects or self._calibration() or sensor_parameters.is_from_file(self)
         self._stream.may_be_foreign = not (is_named or self._policy.info)
         if sensor.unstated:
             self._stream.hold()
@@ -356,7 +356,7 @@ class Compensation(Node):
         self._newest: deque[bytes] = deque(
             maxlen=round(max(LIVE_WINDOW_S * self._policy.rate_hz, _FEWEST_SAMPLES))
         )
-        parameters.show_sensor(self, sensor)
+        sensor_parameters.show_sensor(self, sensor)
         if self._stream.unknown is None and text != self._told:
             self.get_logger().info(text)
             self._told = text
@@ -372,7 +372,9 @@ class Compensation(Node):
             return
         named, _ = self._named
         try:
-            sensor = named if named.unstated else parameters.anonymous_sensor(self, self._flat)
+            sensor = (
+                named if named.unstated else sensor_parameters.anonymous_sensor(self, self._flat)
+            )
             measured, lines = sensor_of_stream(sensor, *topics.finite_samples([*samples]))
         except UserError as error:
             self._obstacle = f'{error}'

@@ -13,9 +13,10 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.files.recording_columns import NO_SERIAL
 from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes import parameters
+from adxl_ros.nodes import parameter_checks, parameters, sensor_parameters
 from adxl_ros.nodes.link_reader import LinkReader
-from adxl_ros.nodes.parameters import LINK, parameter, parameter_error
+from adxl_ros.nodes.parameters import LINK, parameter
+from adxl_ros.nodes.params_files import parameter_error
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.sample_output import SampleOutput, Tally
 from adxl_ros.nodes.topics import DiagnosticsReporter, Level, Status, STEADY
@@ -96,8 +97,8 @@ class Driver(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__('driver')
-        parameters.check_given(self)
-        self._sensor = parameters.make_sensor(parameters.declare_sensor(self))
+        parameter_checks.check_given(self)
+        self._sensor = sensor_parameters.make_sensor(sensor_parameters.declare_sensor(self))
         self._refuse_silent_simulation()
         own = parameters.declare_all(self, DriverSettings)
         self._delay_ns, self._link = round(1e9 * own.stamp_offset_s), own.link

@@ -18,7 +18,7 @@ from adxl_ros.files.bag_writer import LiveBag
 from adxl_ros.investigate import investigation
 from adxl_ros.investigate.investigation import Answer, Investigation, OutputFolder, State
 from adxl_ros.investigate.manoeuvres import CATALOGUE, Pose, StageLimits
-from adxl_ros.nodes import parameters, topics
+from adxl_ros.nodes import parameter_checks, parameters, sensor_parameters, topics
 from adxl_ros.nodes.jobs import LiveLine
 from adxl_ros.nodes.parameters import low_and_high, parameter, SEEDS
 from adxl_ros.nodes.run_node import run
@@ -130,8 +130,8 @@ class Investigate(Node):
 
     def __init__(self) -> None:
         super().__init__('investigate')
-        parameters.check_given(self)
-        self._sensor = parameters.make_sensor(parameters.declare_sensor(self))
+        parameter_checks.check_given(self)
+        self._sensor = sensor_parameters.make_sensor(sensor_parameters.declare_sensor(self))
         own = parameters.declare_all(self, InvestigateSettings)
         alpha_deg = low_and_high('limits.alpha_deg', own.alpha_deg, (0.0, 180.0))
         beta_deg = low_and_high('limits.beta_deg', own.beta_deg, (0.0, 360.0))

@@ -19,7 +19,7 @@ from adxl_ros.files.atomic_write import make_folder
 from adxl_ros.files.recording_columns import check_same_sensor, NO_SERIAL, StreamInfo
 from adxl_ros.files.sweep_journal import Journal, NaturalRest, read
 from adxl_ros.model.sensor import get, put, Sensor, to_volts
-from adxl_ros.nodes import parameters, topics
+from adxl_ros.nodes import parameter_checks, parameters, params_files, sensor_parameters, topics
 from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Inbox, Level, Status
@@ -143,8 +143,8 @@ class KeepCalibrated(Node):
 
     def __init__(self) -> None:
         super().__init__('keep_calibrated')
-        parameters.check_given(self)
-        flat = parameters.given_sensor(self)
+        parameter_checks.check_given(self)
+        flat = sensor_parameters.given_sensor(self)
         self._own = own = parameters.declare_all(self, KeepCalibratedSettings)
         self._keeper: Keeper | None = None
         self._stream: RestStream
@@ -156,7 +156,7 @@ class KeepCalibrated(Node):
         self._samples = Inbox(self, Imu, 'imu/data_raw', _INPUT_QUEUE, own.samples_unit)
         self._surroundings = topics.Surroundings(self, _INPUT_QUEUE)
         self._info_topic = self.resolve_topic_name('sensor_info')
-        given = parameters.make_sensor(flat, may_measure=True)
+        given = sensor_parameters.make_sensor(flat, may_measure=True)
         if given.effects:
             self._begin(given)
         topics.create_subscription(
@@ -182,7 +182,7 @@ class KeepCalibrated(Node):
         head: dict[str, Any] = {'kind': 'kept', 'base': parameter_file.to_flat(sensor)}
         if path.exists() and path.stat().st_size:
             head = read(path).head
-            sensor = parameter_file.from_flat(head['base'], parameters.parameter_error)
+            sensor = parameter_file.from_flat(head['base'], params_files.parameter_error)
         elif first:
             self.get_logger().info(f'{path}: is not there; the journal begins anew')
         self._journal = Journal(path, head)

@@ -15,7 +15,8 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.links.support.base import link_names
 from adxl_ros.nodes import driver, stage
-from adxl_ros.nodes.parameters import given_text, has_section, link_specs, Spec, specs_of
+from adxl_ros.nodes.parameters import link_specs, Spec, specs_of
+from adxl_ros.nodes.params_files import given_text, has_section
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutdown
 from launch.events.process import ProcessExited

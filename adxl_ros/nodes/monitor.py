@@ -17,7 +17,7 @@ from adxl_ros.monitor import changes
 from adxl_ros.monitor.changes import DiagnosisResult, DiagnosisRun, iso_time
 from adxl_ros.monitor.live_gap import AxisGap, GapSettings, LiveGap
 from adxl_ros.monitor.reference_stream import ReferenceKind, ReferenceStream, RobotForce
-from adxl_ros.nodes import parameters, topics
+from adxl_ros.nodes import parameter_checks, parameters, sensor_parameters, topics
 from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Inbox, Level, Status
@@ -159,8 +159,8 @@ class Monitor(Node):
 
     def __init__(self) -> None:
         super().__init__('monitor')
-        parameters.check_given(self)
-        self._file_sensor = parameters.make_sensor(parameters.declare_sensor(self))
+        parameter_checks.check_given(self)
+        self._file_sensor = sensor_parameters.make_sensor(sensor_parameters.declare_sensor(self))
         self._own = own = parameters.declare_all(self, MonitorSettings)
         self._kind = ReferenceKind(own.reference)
         self._reference_topic = own.reference_topic or _TOPICS[self._kind]

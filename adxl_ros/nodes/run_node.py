@@ -17,7 +17,7 @@ from typing import Any
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.links.support import base
-from adxl_ros.nodes import parameters
+from adxl_ros.nodes import parameter_checks, parameters, params_files, sensor_parameters
 from adxl_ros.nodes.parameters import Kind, Spec
 from adxl_ros.process import ended_by_closed_output
 from adxl_ros.report.screen import program_parser
@@ -52,7 +52,7 @@ def _parameter_groups(name: str, own: Iterable[Spec]) -> Iterator[tuple[str, lis
             'parameters of the sensor, usually from --params-file',
             sorted(
                 spec
-                for spec in parameters.nominal_specs()
+                for spec in sensor_parameters.nominal_specs()
                 if spec.name.startswith(_LISTED_OF_SENSOR)
             ),
         )
@@ -108,7 +108,7 @@ def run(
     interrupts: list[int] = []
     try:
         # It names a fault of a file by its place; rclpy does not.
-        parameters.check_params_files()
+        params_files.check_params_files()
         parser = program_parser(argparse.ArgumentParser, name, description, examples)
         parser.usage = _USAGE
         # People ask for help behind --ros-args, too.
@@ -132,8 +132,8 @@ def run(
             # The signal came before rclpy's handler.
             rclpy.try_shutdown()
         node = make_node()
-        parameters.warn_of_unused_qos(node)
-        parameters.explain_read_only(node)
+        parameter_checks.warn_of_unused_qos(node)
+        parameter_checks.explain_read_only(node)
     except Exception as error:
         if is_initialised and not rclpy.ok():
             # A signal has ended the context during the start.

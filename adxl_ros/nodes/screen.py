@@ -19,7 +19,8 @@ from typing import Any, TextIO
 from adxl_ros.calibrate.guided.screen_contents import Row, ScreenContents
 from adxl_ros.errors import UserError
 from adxl_ros.nodes.jobs import held_output
-from adxl_ros.nodes.parameters import check_given, declare_all, parameter
+from adxl_ros.nodes.parameter_checks import check_given
+from adxl_ros.nodes.parameters import declare_all, parameter
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import create_subscription
 from rcl_interfaces.msg import Log

@@ -12,8 +12,9 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.parameter_file import SENSOR_FIELDS
 from adxl_ros.files.recording_columns import JOINTS
-from adxl_ros.nodes import parameters, topics
-from adxl_ros.nodes.parameters import declare_all, parameter, parameter_error
+from adxl_ros.nodes import parameter_checks, parameters, topics
+from adxl_ros.nodes.parameters import declare_all, parameter
+from adxl_ros.nodes.params_files import parameter_error
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.simulate.trajectories import SimulatedStage
@@ -409,7 +410,7 @@ class Stage(Node):
 
     def __init__(self) -> None:
         super().__init__('stage')
-        parameters.check_given(self)
+        parameter_checks.check_given(self)
         kind = declare_all(self, StageSettings).kind
         self._stage = SimulatedStageNode(self) if kind == 'simulated' else StageBridge(self, kind)
 

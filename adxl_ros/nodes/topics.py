@@ -23,7 +23,8 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import cdr, imu_message
 from adxl_ros.files.recording_columns import StreamInfo
 from adxl_ros.links.support.base import Level
-from adxl_ros.nodes.parameters import QOS_POLICIES, SI
+from adxl_ros.nodes.parameter_checks import QOS_POLICIES
+from adxl_ros.nodes.parameters import SI
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np

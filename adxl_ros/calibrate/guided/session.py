@@ -26,7 +26,7 @@ from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.signals.gravity_at_rest import of_volts
 import numpy as np
 
-_UNIT_FIELDS = (
+_SENSOR_FIELDS = (
     'serial',
     'axes',
     'rate_hz',
@@ -103,17 +103,12 @@ class SessionSettings:
 
     def head(self, nominal: Sensor) -> dict[str, Any]:
         """Return the settings and values, by key, that an interrupted calibration must share."""
-        unit_fields = {
-            name: 'measured'
-            if name in nominal.measured
-            else np.asarray(getattr(nominal, name)).tolist()
-            for name in _UNIT_FIELDS
-        }
-        head = {
-            'mode': self.mode,
-            **unit_fields,
-            'sweep.temperature_span_c': self.capture.temperature_span_c,
-        }
+        head: dict[str, Any] = {'mode': self.mode}
+        for name in _SENSOR_FIELDS:
+            is_measured = name in nominal.measured
+            value = getattr(nominal, name)
+            head[name] = 'measured' if is_measured else np.asarray(value).tolist()
+        head['sweep.temperature_span_c'] = self.capture.temperature_span_c
         if self.mode == 'gravity':
             return head
         if self.mode == 'thermal':
@@ -273,13 +268,12 @@ class Session:
                 'only check poses are taken, which the fit does not use; take other poses, too'
             )
         poses = Poses.from_records(records)
-        result = (
-            calibration.calibrate_thermal(
-                self._base, poses, source, range_c=self.settings.thermal.range_c
-            )
-            if self.settings.mode == 'thermal'
-            else calibration.calibrate(self.nominal, [calibration.RecordedPoses(source, poses)])
-        )
+        if self.settings.mode == 'thermal':
+            range_c = self.settings.thermal.range_c
+            result = calibration.calibrate_thermal(self._base, poses, source, range_c=range_c)
+        else:
+            recorded = calibration.RecordedPoses(source, poses)
+            result = calibration.calibrate(self.nominal, [recorded])
         entries = sweep_journal.read(self.journal.path).entries
         if any(isinstance(entry, MountingUnchecked) for entry in entries):
             provenance = {
