@@ -166,26 +166,26 @@ def _against_stage(
     if population is not None:
         fit = _with_population(fit, population)
     full, fitted, fitting = fit.full, fit.fitted, np.flatnonzero(~poses.check)
-    fit_lines: list[str] = []
-    warnings: list[str] = []
-    outliers: tuple[int, ...] = ()
-    if full is not None:
-        fit_lines = full_model.report_lines(full, poses.subset(fitting), fit.terms)
-        warnings = full_model.warnings(full, poses.subset(fitting))
-        outliers = tuple(fitting[list(full.outliers)].tolist())
-    errors, assessments = _assessed(
-        sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit, not doubts
-    )
-    assessment = acceptance.judged(assessments[-1], fitted) if assessments else None
-    assessments = (*assessments[:-1], assessment) if assessment else ()
+    outliers = tuple(fitting[list(full.outliers)].tolist()) if full else ()
+    inliers = poses.subset(~np.isin(np.arange(len(poses)), outliers))
+    errors, assessments = _assessed(sensor, inliers, fit, not doubts)
+    assessment, error_mps2 = None, 0.0
+    if assessments:
+        assessment = acceptance.judged(assessments[-1], fitted)
+        assessments = (*assessments[:-1], assessment)
+        error_mps2 = float(np.nan_to_num(np.sqrt(assessment.accel.calibration)))
     force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
     residual_mg = 1e3 * residual_g(fitted, poses)[fitting]
+    details: list[str] = []
+    warnings = list(doubts)
+    if full:
+        details += full_model.report_lines(full, poses.subset(fitting), fit.terms)
+        warnings += full_model.warnings(full, poses.subset(fitting))
     if fitted.model == 'full':
         fitted, filter_lines = recorded_sensor.with_filter(
             fitted, [recording.filters for recording in recordings if recording.filters]
         )
-        fit_lines += filter_lines
-    error_mps2 = np.nan_to_num(np.sqrt(assessment.accel.calibration)).item() if assessment else 0.0
+        details += filter_lines
     fitted = replace(fitted, envelope=envelope(fitted, force, poses, error_mps2))
     entries = {'reference': 'stage'}
     if population:
@@ -196,7 +196,7 @@ def _against_stage(
     entries |= acceptance.provenance_entries(assessment, errors, doubts)
     fitted = with_provenance(fitted, source, poses, data_sha256, entries)
     summary = acceptance.summary_lines(
-        fitted, assessment, acceptance.held_out_lines(errors, len(poses) - len(outliers))
+        fitted, assessment, acceptance.held_out_lines(errors, len(inliers))
     )
     return CalibrationResult(
         nominal=sensor,
@@ -206,8 +206,8 @@ def _against_stage(
         assessments=assessments,
         held_out=errors,
         outliers=outliers,
-        warnings=[*doubts, *warnings, *fit.notes],
-        details=fit_lines,
+        warnings=[*warnings, *fit.notes],
+        details=details,
     )
 
 

@@ -145,7 +145,7 @@ class _Sums:
         sensor = recordings.sensor
         self.counts = np.bincount(sensor)
         self.period_starts = np.flatnonzero(np.diff(recordings.period, prepend=-1))
-        self.unit_starts = np.flatnonzero(np.diff(sensor[self.period_starts], prepend=-1))
+        self.sensor_starts = np.flatnonzero(np.diff(sensor[self.period_starts], prepend=-1))
         self.centre_value = np.bincount(sensor, recordings.value) / self.counts
         self.time = recordings.time - (np.bincount(sensor, recordings.time) / self.counts)[sensor]
         self.value = recordings.value - self.centre_value[sensor]
@@ -156,21 +156,15 @@ class _Sums:
         step2, sensor = scatter.calibration**2, self.recordings.sensor
         weight = 1 / (self.recordings.std**2 + scatter.recording**2)
         t, y = self.time, self.value
-        w, wt, wy, wtt, wty, wyy = self._by_period(
-            weight * [np.ones_like(t), t, y, t * t, t * y, y * y]
-        )
+        # Weighted sums over each period of the products of 1, t and y
+        one = np.ones_like(t)
+        products = self._by_period(weight * [one, t, t * t, y, t * y, y * y])
+        w, wt, _, wy, _, _ = products
         # The step of a period has one common part in all of its recordings (Woodbury).
         shared = step2 / (1 + step2 * w)
-        a, b, c, p, q, r = self._by_sensor(
-            [
-                w - shared * w * w,
-                wt - shared * w * wt,
-                wtt - shared * wt * wt,
-                wy - shared * w * wy,
-                wty - shared * wt * wy,
-                wyy - shared * wy * wy,
-            ]
-        )
+        first, second = np.array([w, w, wt, w, wt, wy]), np.array([w, wt, wt, wy, wy, wy])
+        # The normal equations are a·intercept + b·slope = p and b·intercept + c·slope = q.
+        a, b, c, p, q, r = self._by_sensor(products - shared * first * second)
         det = np.where(self.has_slope, np.maximum(a * c - b * b, TINY), 1.0)
         slope = np.where(self.has_slope, (a * q - b * p) / det, 0.0)
         intercept = (p - b * slope) / a
@@ -203,7 +197,7 @@ class _Sums:
 
     def _by_sensor(self, values: np.ndarray | list[np.ndarray]) -> np.ndarray:
         """Sum values of periods, (..., k), within each sensor."""
-        return np.add.reduceat(values, self.unit_starts, axis=-1)
+        return np.add.reduceat(values, self.sensor_starts, axis=-1)
 
 
 def _shared_scatter(sums: _Sums) -> Scatter:

@@ -197,41 +197,54 @@ def angles(
     """
     x, y, z = force
     xx, xy, xz, yy, yz, zz = covariance
-    # Squares of the force in the planes xy and yz, and as a whole
-    plane2 = x * x + y * y + _FORCE2_FLOOR
-    side2 = y * y + z * z + _FORCE2_FLOOR
-    total2 = plane2 + z * z
-    total4 = total2 * total2
-    # Variances of the noise in these planes, and along the force in yz, times its square
-    in_plane, in_side = xx + yy, yy + zz
-    along_side = y * y * yy + 2 * y * z * yz + z * z * zz
-    roll = maths.where(
-        side2 > in_side + _FORCE2_FLOOR,
-        (z * z * yy - 2 * y * z * yz + y * y * zz) / (side2 * side2),
-        INFINITE,
-    )
-    pitch = maths.where(
-        side2 > in_side,
-        (side2 * xx - 2 * x * (y * xy + z * xz) + x * x * along_side / side2) / total4,
-        in_side / total2,
-    )
-    along_plane = x * x * xx + 2 * x * y * xy + y * y * yy
-    inclination = maths.where(
-        plane2 > in_plane,
-        (z * z * along_plane / plane2 - 2 * z * (x * xz + y * yz) + plane2 * zz) / total4,
-        in_plane / total2,
-    )
-    beta = maths.where(
-        plane2 > in_plane + _FORCE2_FLOOR,
-        (y * y * xx - 2 * x * y * xy + x * x * yy) / (plane2 * plane2),
-        INFINITE,
-    )
+    plane = _Plane(x, y, xx, xy, yy)
+    side = _Plane(y, z, yy, yz, zz)
     return (
-        AngleEstimate(maths.atan2(y, z), roll),
-        AngleEstimate(maths.atan2(-x, maths.sqrt(side2)), pitch),
-        AngleEstimate(maths.atan2(maths.sqrt(plane2), z), inclination),
-        AngleEstimate(maths.atan2(0.0 - y, x), beta),
+        AngleEstimate(maths.atan2(y, z), side.turn_variance(maths)),
+        AngleEstimate(
+            maths.atan2(-x, maths.sqrt(side.square)),
+            side.tilt_variance(x, xx, y * xy + z * xz, maths),
+        ),
+        AngleEstimate(
+            maths.atan2(maths.sqrt(plane.square), z),
+            plane.tilt_variance(z, zz, x * xz + y * yz, maths),
+        ),
+        AngleEstimate(maths.atan2(0.0 - y, x), plane.turn_variance(maths)),
     )
+
+
+class _Plane:
+    """The part a, b of a force in a plane of two axes, with its covariance aa, ab, bb."""
+
+    def __init__(self, a: Value, b: Value, aa: Value, ab: Value, bb: Value) -> None:
+        self.square = a * a + b * b + _FORCE2_FLOOR
+        self._noise = aa + bb  # Variance in the plane
+        # Variances along the part and across it, times its square
+        self._along = a * a * aa + 2 * a * b * ab + b * b * bb
+        self._across = b * b * aa - 2 * a * b * ab + a * a * bb
+
+    def turn_variance(self, maths: Maths) -> Value:
+        """Return the variance of its angle in the plane, rad²."""
+        return maths.where(
+            self.square > self._noise + _FORCE2_FLOOR,
+            self._across / (self.square * self.square),
+            INFINITE,
+        )
+
+    def tilt_variance(self, c: Value, cc: Value, with_c: Value, maths: Maths) -> Value:
+        """
+        Return the variance of the angle between the force and the plane, rad².
+
+        c, cc: the part of the force across the plane, and its variance; with_c: its covariance
+        with the part in the plane, times the length of that part.
+        """
+        total2 = self.square + c * c
+        return maths.where(
+            self.square > self._noise,
+            (self.square * cc - 2 * c * with_c + c * c * self._along / self.square)
+            / (total2 * total2),
+            self._noise / total2,
+        )
 
 
 def quaternion(roll_rad: Value, pitch_rad: Value, maths: Maths) -> tuple[Value, ...]:
