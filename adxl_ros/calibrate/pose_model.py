@@ -82,10 +82,8 @@ def coefficient_jacobian(sensor: Sensor, poses: Poses, names: Sequence[Coefficie
     def slope(name: Coefficient) -> np.ndarray:
         value, step = get(sensor, [name]), _COEFFICIENT_STEP * parameter_of(name).scale
         shared = None if _is_of_stage(name.effect) else force
-        above, below = (
-            predicted_volts(put(sensor, [name], value + change), poses, force=shared)
-            for change in (step, -step)
-        )
+        above = predicted_volts(put(sensor, [name], value + step), poses, force=shared)
+        below = predicted_volts(put(sensor, [name], value - step), poses, force=shared)
         return (above - below) / (2 * step)
 
     return np.stack([slope(name) for name in names], axis=2)

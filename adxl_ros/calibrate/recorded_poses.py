@@ -106,7 +106,8 @@ def extract_poses(
         return replace(Poses.from_records(records), **measured)
     alpha_rad = beta_rad = np.full(len(rests), np.nan)
     if recording.stage_angles is not None:
-        alpha_rad, beta_rad = (_means(angle, rests) for angle in recording.stage_angles.T)
+        alpha_rad = _means(recording.stage_angles[:, 0], rests)
+        beta_rad = _means(recording.stage_angles[:, 1], rests)
     return Poses(
         alpha_rad=alpha_rad,
         beta_rad=beta_rad,

@@ -80,16 +80,13 @@ class RecordingEstimator:
     def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
         """Yield each block of the recording with its estimates."""
         measured = ((block, block.volts(self._sensor)) for block in recording)
-        before_filter = (
-            ((pair, pair[1]) for pair in measured)
-            if not self._undo_filter
-            else undo_filter_blocks(
-                ((pair, pair[0].time_s, pair[1]) for pair in measured),
-                noise.electronics(self._sensor).rc_s,
-                self._sensor.rate_hz,
-            )
-        )
-        for (block, volts), input_v in before_filter:
+        if not self._undo_filter:
+            for block, volts in measured:
+                yield block, self._estimate(volts, volts, self._environment(block))
+            return
+        stamped = ((pair, pair[0].time_s, pair[1]) for pair in measured)
+        rc_s = noise.electronics(self._sensor).rc_s
+        for (block, volts), input_v in undo_filter_blocks(stamped, rc_s, self._sensor.rate_hz):
             yield block, self._estimate(volts, input_v, self._environment(block))
 
     @property
@@ -321,10 +318,9 @@ class LiveEstimator:
         )
         if self.mounting is not None:
             force = self.mounting.rotate(force)
-            covariance, moved = (
-                self._with_yaw(force, self.mounting.rotate_covariance(part))
-                for part in (covariance, moved)
-            )
+            turned = self.mounting.rotate_covariance
+            covariance = self._with_yaw(force, turned(covariance))
+            moved = self._with_yaw(force, turned(moved))
         roll, pitch, inclination, _ = angles(force, moved, FLOATS)
         return Estimate(force, covariance, roll, pitch, inclination, saturated, cell.outside)
 

@@ -111,9 +111,8 @@ class _Samples:
                 **dict(zip(GYRO, table.numbers('angular_velocity').T)),
             },
         )
-        readings, gyro_radps = (
-            np.column_stack([columns[name] for name in names]) for names in (ACCEL, GYRO)
-        )
+        readings = np.column_stack([columns[name] for name in ACCEL])
+        gyro_radps = np.column_stack([columns[name] for name in GYRO])
         force = self._reading.outputs(readings, 3 * [self._unit])
         # A value beyond every gyroscope is no reading.
         gyro_radps[~(np.abs(gyro_radps) <= LIMIT)] = np.nan

@@ -314,7 +314,7 @@ def _of_manifest(text: str, rows: list[dict[str, str]]) -> Iterable[Source]:
             )
 
     def source(row: dict[str, str]) -> Source:
-        url, params, serial = (row.get(name, '') for name in ('url', 'params', 'serial'))
+        url, params, serial = row.get('url', ''), row.get('params', ''), row.get('serial', '')
         try:
             recorded = look_up(*file_system(_beside(folder, url)))
         except UserError as error:

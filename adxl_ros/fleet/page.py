@@ -191,18 +191,14 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
     sensors = fleet.rank(table, results)
     share = fleet.effect_matrix(table)
     # Sensors that drift come first, although others may be more urgent.
-    plotted = [
-        (sensor, shown[0])
-        for sensor in sorted(sensors, key=lambda sensor: not sensor.drifts)
-        if (
-            shown := [
-                *(drift.result for drift in sensor.drifts),
-                *(result for result in results if result.place_of(sensor.sensor) is not None),
-            ]
-        )
-    ][:_SHOWN]
+    plotted = []
+    for sensor in sorted(sensors, key=lambda sensor: not sensor.drifts):
+        shown = [drift.result for drift in sensor.drifts]
+        shown += [each for each in results if each.place_of(sensor.number) is not None]
+        plotted += [(sensor, result) for result in shown[:1]]
+    plotted = plotted[:_SHOWN]
     figures = {
-        f'trend-{i}': _trend_figure(table, result, sensor.sensor)
+        f'trend-{i}': _trend_figure(table, result, sensor.number)
         for i, (sensor, result) in enumerate(plotted)
     }
     if len(share.columns):

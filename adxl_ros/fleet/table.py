@@ -321,7 +321,7 @@ class SensorState:
     """One sensor; its texts are for people."""
 
     urgency: float  # Its rank among the units of its state; the least is the most urgent
-    sensor: int  # Its number
+    number: int  # Its number
     serial: str  # Its serial number
     state: State  # Its state
     reason: str  # Why it has this state, in one sentence; empty for none
@@ -370,7 +370,7 @@ def _state_of(sensor: int, table: FleetTable, results: Sequence[QuantityResult])
         )
     return SensorState(
         urgency=urgency,
-        sensor=sensor,
+        number=sensor,
         serial=table.serials[sensor],
         state=state,
         reason=reason[:1].upper() + reason[1:],

@@ -191,7 +191,7 @@ class ReferenceStream:
         ]
         largest = max(_STILL_STEPS * step_rad, _STILL_RAD)
         time_s = (np.linspace(begin_ns, end_ns, 3) - self._origin_ns) * 1e-9
-        alpha, beta = (path(time_s) for path in self._paths[:2])
+        alpha, beta = self._paths[0](time_s), self._paths[1](time_s)
         stds = [
             errors.std
             if isinstance(path, SmoothedPath) and (errors := path.errors(time_s))

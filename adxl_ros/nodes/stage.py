@@ -193,7 +193,7 @@ class SimulatedStageNode:
         if not len(stamps_ns):
             return
         self._simulated_ns = int(stamps_ns[-1])
-        position, velocity, encoder = (np.empty((len(stamps_ns), len(JOINTS))) for _ in range(3))
+        position, velocity, encoder = np.empty((3, len(stamps_ns), len(JOINTS)))
         for i in range(len(stamps_ns)):
             self._stage.step(_STEP_NS * 1e-9)
             position[i], velocity[i] = self._stage.position, self._stage.velocity

@@ -358,7 +358,8 @@ def _highest(groups: _Groups, count: int, span_s: float, rounding: float) -> int
     while stop > 2 * _FEWEST:
         lower = groups.below(max(stop // 2, _FEWEST))
         bound_s = _walks(lower, span_s, stop // 2)[1]
-        used, lower = (part.bounded(bound_s, span_s) for part in (groups.below(stop), lower))
+        used = groups.below(stop).bounded(bound_s, span_s)
+        lower = lower.bounded(bound_s, span_s)
         theta = _fit(lower)[0]
         chances = scipy.stats.chi2.sf(used.count * used.power / (used.shapes @ theta), used.count)
         octave = used.where(used.first >= stop // 2)
@@ -723,9 +724,9 @@ def _one_for_all(noises: Sequence[AxisNoise]) -> _OneForAll:
     loudest = max(noises, key=lambda noise: noise.sample_white)
     walk = max((noise.fit.walk for noise in noises), key=lambda walk: walk.value)
     k = walk.value if walk.is_seen else max(noise.fit.walk.high for noise in noises)
-    white_note, note = (
-        '' if term.is_seen else ', an upper limit' for term in (loudest.fit.white, walk)
-    )
+    limit = ', an upper limit'
+    white_note = '' if loudest.fit.white.is_seen else limit
+    note = '' if walk.is_seen else limit
     variances = [noise.sample_std**2 for noise in noises]
     matrix = np.diag((variances + [1e6] * 3)[:3]).ravel().tolist()
     return _OneForAll(loudest.sample_white, k, white_note, note, matrix)

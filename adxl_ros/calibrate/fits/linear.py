@@ -185,7 +185,7 @@ def _assemble(sensor: Sensor, poses: Poses, regressions: list[AxisRegression]) -
     """Fix the gauge and convert the regressions into parameters of effects."""
     count = len(sensor.axes)
     zero, scale = sensor.nominal_zero_g_v.copy(), sensor.nominal_scale_v_per_g.copy()
-    alpha, beta, p2, q2, r1, r2 = (np.zeros(count) for _ in range(6))
+    alpha, beta, p2, q2, r1, r2 = np.zeros((6, count))
     for d, axis in enumerate(regressions):
         slope = axis.r[0]
         if max(abs(axis.p[1]), abs(axis.q[1])) >= abs(slope):

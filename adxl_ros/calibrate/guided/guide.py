@@ -389,10 +389,12 @@ class Guide:
 
 def with_ambient(record: PoseRecord, readings: Mapping[str, Readings]) -> PoseRecord:
     """Add temperature and supply to a record."""
-    temperature_c, supply_v = (
-        quantity.mean(record.start_ns, record.stop_ns) for quantity in readings.values()
+    span_ns = record.start_ns, record.stop_ns
+    return replace(
+        record,
+        temperature_c=readings['temperature'].mean(*span_ns),
+        supply_v=readings['supply'].mean(*span_ns),
     )
-    return replace(record, temperature_c=temperature_c, supply_v=supply_v)
 
 
 def temperature_fault(accepted: Mapping[int, PoseRecord], now_c: float, span_c: float) -> str:

@@ -67,9 +67,8 @@ class RunningEstimate:
         if residual_stds.max() <= _OUTLIER_STDS:
             return ''
         axis = int(residual_stds.argmax())
-        measured_g, expected_g = (
-            (v - sensor.zero_g_v) / sensor.scale_v_per_g for v in (volts, expected_v)
-        )
+        measured_g = (volts - sensor.zero_g_v) / sensor.scale_v_per_g
+        expected_g = (expected_v - sensor.zero_g_v) / sensor.scale_v_per_g
         return (
             f'{sensor.axes[axis]} reads {signed(measured_g[axis])} g where '
             f'{signed(expected_g[axis])} g was expected: axis inverted or '
@@ -165,10 +164,8 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
         [(target.alpha_rad, target.beta_rad) for target in pose_plan.spread(_EVALUATION_POSES)]
     ).T
     force = specific_force(alpha_rad, beta_rad, sensor.local_gravity_mps2)
-    by_noise, by_all = (
-        force_covariance(unit, force, pose_std_v**2)
-        for unit in (sensor.without_covariance(), sensor)
-    )
+    by_noise = force_covariance(sensor.without_covariance(), force, pose_std_v**2)
+    by_all = force_covariance(sensor, force, pose_std_v**2)
     used = tilt(force, by_noise, 'z' in sensor.axes).alpha_std < _VISIBLE_RAD
     if not used.any():
         return float('nan')

@@ -253,10 +253,9 @@ def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
 def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:
     """State the errors against gravity of rests that begin at times, (k,), and the outliers."""
     kept = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-    before, after, unseen = (
-        held_out.statistic(mg(values[kept]))
-        for values in (fit.before_mps2, fit.residual_mps2, fit.held_out_mps2)
-    )
+    before = held_out.statistic(mg(fit.before_mps2[kept]))
+    after = held_out.statistic(mg(fit.residual_mps2[kept]))
+    unseen = held_out.statistic(mg(fit.held_out_mps2[kept]))
     low, high = unseen.interval
     lines = [
         f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before.rms:.2f}, '

@@ -357,9 +357,8 @@ def _quantity(
 ) -> dict[str, Any]:
     """Describe a quantity of one value, or of a list, with the expanded uncertainty of each."""
     expanded: Any = [] if std is None else K * np.asarray(std)
-    numbers, expanded = (
-        ' '.join(f'{value:.7g}' for value in np.ravel(each)) for each in (values, expanded)
-    )
+    numbers = ' '.join(f'{value:.7g}' for value in np.ravel(values))
+    half_widths = ' '.join(f'{value:.7g}' for value in np.ravel(expanded))
     return {
         'name': name,
         'about': about,
@@ -367,7 +366,7 @@ def _quantity(
         'unit': unit,
         'numbers': numbers,
         'is_list': np.ndim(values) > 0,
-        'expanded': expanded,
+        'expanded': half_widths,
     }
 
 

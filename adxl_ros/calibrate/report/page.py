@@ -157,10 +157,8 @@ def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict
     tiles = []
     if (fit := result.gravity_fit) is not None:
         used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-        before, after = (
-            three_digits(held_out.rms_mg(float(np.mean(v[used] ** 2))))
-            for v in (fit.before_mps2, fit.held_out_mps2)
-        )
+        before = three_digits(held_out.rms_mg(float(np.mean(fit.before_mps2[used] ** 2))))
+        after = three_digits(held_out.rms_mg(float(np.mean(fit.held_out_mps2[used] ** 2))))
         tiles = [
             {
                 'label': 'error of the magnitude of gravity',
@@ -174,7 +172,8 @@ def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict
     ):
         statistics = [getattr(errors, name) for errors in result.held_out]
         if statistics and not np.isnan(statistics[-1].rms):
-            before, after = (three_digits(statistics[i].rms) for i in (0, -1))
+            before = three_digits(statistics[0].rms)
+            after = three_digits(statistics[-1].rms)
             low, high = map(three_digits, statistics[-1].interval)
             tiles.append(
                 {
@@ -331,9 +330,8 @@ def draw_sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:
     vertical = np.abs(np.sin(swept.alpha_rad)) > _VERTICAL
     for d, (row, regression) in enumerate(zip(grid, regressions)):
         linear_v = line.zero_g_v[d] + line.scale_v_per_g[d] * force_g[:, d]
-        deviation_mv, model_mv = (
-            1e3 * (volts[:, d] - linear_v) for volts in (swept.volts, predicted)
-        )
+        deviation_mv = 1e3 * (swept.volts[:, d] - linear_v)
+        model_mv = 1e3 * (predicted[:, d] - linear_v)
         name, other = ('x', 'y') if d == 0 else ('y', 'x')
         row[0].set(
             title='figs. 2, 3, 5, 7: forth ●, back ◁, model ─',
