@@ -54,7 +54,8 @@ _INDEX_BYTE = 32
 size of the message indices."""
 _CHUNK_BYTES = 1 << 20  # Size that a chunk hardly exceeds, bytes; that of rosbags
 _LARGE_BYTES = 2 << 30
-"""Size from which a file that is read leaves the cache (chosen): smaller ones are read again."""
+"""Size from which a file that is read leaves the cache. Smaller ones are read again by the next
+tool; larger ones would push out what other programs have there."""
 _PIECE_MESSAGES = 4096  # Messages that are collected to a piece (chosen: some MB)
 
 Raws = Sequence[bytes] | np.ndarray

@@ -41,7 +41,8 @@ import pandas as pd
 import scipy
 
 FALSE_DISCOVERY_RATE = 0.05
-"""Share of the claimed slopes that may be false. Chosen: the usual value."""
+"""Share of the claimed slopes that may be false: of twenty that are looked into, one is none. That
+is the usual value."""
 _INTERVAL = 0.9  # Probability of the intervals. Chosen: that of all intervals of the package
 _MIN_RECORDINGS = 3  # Fewest recordings with a slope: one more than level and slope
 _LARGEST_CORRELATION = 0.95
@@ -50,7 +51,8 @@ _ROUNDS = 20  # Rounds of the factor by correlation; it changes by less than 1e-
 _SMALLEST_SHARE = 1e-8
 """Smallest variance beside the stated errors, relative to that of the values."""
 _FIT_TOLERANCE = 1e-3  # Tolerance of the logarithms of both variances
-FALSE_OUTLIERS = 0.05  # Probability that a fleet without outliers has one on its page. Chosen
+FALSE_OUTLIERS = 0.05
+"""Probability that a fleet without outliers has one on its page: as that of a false slope."""
 _MIN_OF_OUTLIERS = 5  # Fewest recordings of a sensor with outliers. Chosen: a median needs them
 _MAD_EFFICIENCY = 0.37  # Efficiency of that median for normal values (Rousseeuw and Croux 1993)
 _MAD_BIAS = 0.8
@@ -303,7 +305,8 @@ _GRID = (np.arange(400) + 0.5) / 400
 """Shares x of the spreads s·x/(1 − x) over which the likelihood is integrated. Chosen: more change
 the integrals by less than 1e-3."""
 _OUTLIER_CHANCE = 0.05
-"""Probability that a sensor does not count although all sensors are of one population. Chosen."""
+"""Probability that a sensor does not count although all sensors are of one population: one of
+twenty populations is then a little too narrow."""
 _MAX_ROUNDS = 10
 """Largest count of rounds of spread and outliers; a round seldom changes after the second."""
 _MAX_OUTLIERS = 0.25
@@ -312,7 +315,9 @@ _FAR_MADS = 5.0
 """Sensors further from the median do not count in the first round. Chosen: far beyond normal."""
 _MIN_BATCH = 5
 """Fewest units of a batch. Chosen: fewer have nothing in common that a test could show."""
-_CHANCE = 0.01  # Probability of a false batch among all batches. Chosen
+_CHANCE = 0.01
+"""Probability of a false batch among all batches. It is less than that of a slope, because a batch
+is sent back."""
 
 
 def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

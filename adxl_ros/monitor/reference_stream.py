@@ -54,7 +54,9 @@ _PARTS = 10
 a step is in one part."""
 _FEWEST_OF_PART = 8
 """Fewest samples of a part; chosen: its variance is then known within a factor of two."""
-_ROBOT_NS = 1_000_000_000  # Time whose forces of a robot are computed at once, ns; chosen
+_ROBOT_NS = 1_000_000_000
+"""Time whose forces of a robot are computed at once, ns: that of a block, so that each is computed
+once."""
 _MARGIN_NS = 500_000_000
 """Time of further readings on both sides, ns. Chosen: the ends of the splines then add less than a
 tenth to the error."""

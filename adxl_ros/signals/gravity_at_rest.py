@@ -46,7 +46,10 @@ its datasheet has a large error, and its rests still do not contradict each othe
 _LEAST_MPS2 = 1e-6  # Least zero-g error and length, m/s², so that they can be divisors
 _STEPS = 20  # Most steps of that search. Chosen: it has converged after some
 _PRIOR = 1.0  # Information about each share of a tolerance: its standard deviation is all of it
-_LARGEST_ERROR = 0.2  # Error of a length, by gravity, with which it tells no unit. Chosen
+_LARGEST_ERROR = 0.2
+"""Error of a length, by gravity, with which it tells no unit: counts of 1 g differ by factors of
+two, so that errors of up to 0.41 would still tell them apart; half of it leaves room for the
+scatter of the rests."""
 _MOST_RESTS = 300  # Rests that are compared at most, evenly spread. Chosen: some milliseconds
 TURNED_COS = 0.9  # Cosine between the directions of two rests of different poses: 26°
 _ALIKE = 0.04  # Logarithm of the ratio of two units that a usual zero-g makes alike: 40 mg

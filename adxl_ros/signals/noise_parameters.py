@@ -38,7 +38,9 @@ import numpy as np
 import scipy
 
 _DROP = 2.705543454095404  # Twice log likelihood at the ends of a 90 % interval: χ², 1 degree
-_SINGLE = 64  # Lowest coefficients that are fitted one by one; further terms change little. Chosen
+_SINGLE = 64
+"""Lowest coefficients that are fitted one by one: from there on a group of `_WIDTH` has two or
+more."""
 _WIDTH = 1.03  # Ratio of frequencies of further groups. Chosen: a term changes by 6 %
 _ROUNDS = 60  # Largest number of rounds of a fit. Chosen: usual are ten
 _HALVINGS = 20  # Largest number of halvings of a step that does not raise the likelihood

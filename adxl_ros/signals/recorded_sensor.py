@@ -90,6 +90,7 @@ _STEADY = 0.05  # Largest difference of the rate of half of the samples. Chosen:
 _SMALLEST_RANGE_G = 2.0  # Smallest range that is taken, g: of common digital sensors
 _FILTER_START_SAMPLES = 2.0  # First RC of the search, periods. Chosen: slower ones are reached
 _MAX_NOISE_G_PER_RTHZ = 0.1  # Largest density of a parameter file, g/√Hz
+_NO_FILTER = 'filter: the noise at rest shows none'
 RESISTANCE_OHM = 1.0e4  # Resistor of a measured filter, Ω: only R·C has a meaning
 
 
@@ -120,11 +121,11 @@ def _measured(
     largest_g = float(np.max(np.abs(volts - sensor.nominal_zero_g_v) / scale_v_per_g))
     # A common range: a power of two
     range_g = 2.0 ** ceil(log2(max(largest_g, _SMALLEST_RANGE_G)))
+    # Noise bandwidth of the filter, or that of samples without one
     bandwidth_hz = 0.25 / rc_s if rc_s else sensor.rate_hz / 2
+    density_g_per_rthz = noise_g / np.sqrt(bandwidth_hz)
     values = {
-        'noise_density_g_per_rthz': np.minimum(
-            noise_g / np.sqrt(bandwidth_hz), _MAX_NOISE_G_PER_RTHZ
-        ),
+        'noise_density_g_per_rthz': np.minimum(density_g_per_rthz, _MAX_NOISE_G_PER_RTHZ),
         'range_g': range_g,
         'rc_resistance_ohm': RESISTANCE_OHM,
         'rc_capacitance_f': rc_s / RESISTANCE_OHM,
@@ -133,9 +134,7 @@ def _measured(
     texts = {
         'noise_density_g_per_rthz': 'noise of a sample: ' + _by_axis(sensor, noise_g),
         'adc_bits': 'resolution: ' + _by_axis(sensor, step_v / scale_v_per_g),
-        'rc_capacitance_f': f'filter: {rc_s * 1e3:.3g} ms'
-        if rc_s
-        else 'filter: the noise at rest shows none',
+        'rc_capacitance_f': f'filter: {rc_s * 1e3:.3g} ms' if rc_s else _NO_FILTER,
         'range_g': f'range: ±{range_g:g} g (largest reading {largest_g:.3g} g)',
     }
     lines = [text for name, text in texts.items() if name in sensor.unstated]

@@ -21,7 +21,9 @@ import numpy as np
 _LONGEST_DWELL_S = 60.0
 """Time beyond two dwells after which a moving sensor's samples are dropped, s; chosen: it bounds
 the memory and the time of the rest detection."""
-_FEWEST_INTERVALS = 2  # Times between poses whose median predicts those of the open ones; chosen
+_FEWEST_INTERVALS = 2
+"""Times between poses whose median predicts those of the open ones: the first alone has the time
+in it in which an operator learns what to do."""
 
 
 class MountingError(UserError):
