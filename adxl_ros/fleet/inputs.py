@@ -209,14 +209,16 @@ def _source(fs: Any, path: str, **known: Any) -> Source:
     """Return a recording by its address, which is the path itself on this machine."""
     # A name that is not UTF-8 has no place in a table.
     address = as_utf_8(str(fs.unstrip_protocol(path)))
-    user, password, host, port = (
-        fs.storage_options.get(name) for name in ('username', 'password', 'host', 'port')
-    )
+    options = fs.storage_options
+    host, port = options.get('host'), options.get('port')
+    user, password = options.get('username'), options.get('password')
     if host:
         # The path in a server does not name the server.
         server = f'{host}:{port}' if port else host
-        if user:
-            server = f'{user}:{password}@{server}' if password else f'{user}@{server}'
+        if user and password:
+            server = f'{user}:{password}@{server}'
+        elif user:
+            server = f'{user}@{server}'
         address = address.replace(':///', f'://{server}/', 1)
     url = without_secrets(address)
     return Source(url.removeprefix('file://'), **known, address=address if address != url else '')

@@ -467,12 +467,12 @@ def joint_readings(messages: Sequence[bytes]) -> list[JointReading]:
     """Return the readings of serialized sensor_msgs/JointState, in their order."""
     readings: dict[int, JointReading] = {}
     for table in cdr.tables(messages, cdr.joint_state):
-        positions, velocities = (
-            table.numbers(field).tolist()
-            if field in table.layout.fields
-            else [[]] * len(table.rows)
-            for field in ('position', 'velocity')
-        )
+
+        def numbers(field: str, table: cdr.Table = table) -> list[list[float]]:
+            has_field = field in table.layout.fields
+            return table.numbers(field).tolist() if has_field else [[]] * len(table.rows)
+
+        positions, velocities = numbers('position'), numbers('velocity')
         for row, stamp_ns, position, velocity in zip(
             table.rows.tolist(), table.stamp_ns().tolist(), positions, velocities
         ):

@@ -130,10 +130,14 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
     poses = result.poses.subset(result.inliers)
     held, used = poses.subset(errors.pose_index), held_out.determining_alpha(errors.errors)
     force = np.column_stack(reference_force(held, gravity))
-    by_noise, by_coefficients, by_stage, _ = (
-        np.sqrt(np.maximum([covariance[d, d][used] for d in axes], 0.0)).T
-        for covariance in held_out.covariances(errors, held, force)
-    )
+
+    def stds_mps2(covariance: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.maximum([covariance[d, d][used] for d in axes], 0.0)).T
+
+    covariances = held_out.covariances(errors, held, force)
+    by_noise = stds_mps2(covariances.by_noise)
+    by_coefficients = stds_mps2(covariances.by_coefficients)
+    by_stage = stds_mps2(covariances.by_stage)
     held, reference = held.subset(used), force[used][:, axes]
     error = errors.errors.accel_mps2[used]
     model = np.full(error.shape, np.sqrt(assessment.accel.model))

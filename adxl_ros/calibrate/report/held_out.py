@@ -392,33 +392,35 @@ def _budget(
     )
 
 
-def covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> list[np.ndarray]:
-    """
-    Return covariances of the specific force in the held-out poses, (m/s²)², each (3, 3, k).
+class Covariances(NamedTuple):
+    """Covariances of the specific force in k held-out poses, (m/s²)², (3, 3, k) each."""
 
-    They are those by the noise of the mean, by the coefficients, by the stated stage error, and by
-    an independent error `_PROBE_MPS2` on each measured axis.
-    """
+    by_noise: np.ndarray  # By the noise of the mean
+    by_coefficients: np.ndarray
+    by_stage: np.ndarray  # By the stated stage error
+    by_probe: np.ndarray  # By an independent error `_PROBE_MPS2` on each measured axis
+
+
+def covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> Covariances:
+    """Return the covariances of the specific force in the held-out poses, by their causes."""
     shape = (3, 3, len(held))
     by_noise, by_coefficients, by_probe = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     for number, sensor in enumerate(errors.fitted):
         fold = errors.fold == number
         force, environment = list(reference[fold].T), held.subset(fold).environment
         exact, none_v2 = sensor.without_covariance(), np.zeros(len(sensor.axes))
+        noise_v2 = np.mean(held.std_v[fold], axis=0) ** 2
+        probe_v2 = (sensor.scale_v_per_g / G0_MPS2 * _PROBE_MPS2) ** 2
+        total = force_covariance(sensor, force, noise_v2, environment)
+        without_noise = force_covariance(sensor, force, none_v2, environment)
         # Without both the doubt is left on which side of 90° alpha is, but the stage knows it.
-        total, without_noise, by_side, probed = (
-            force_covariance(unit, force, variance_v2, environment)
-            for unit, variance_v2 in (
-                (sensor, np.mean(held.std_v[fold], axis=0) ** 2),
-                (sensor, none_v2),
-                (exact, none_v2),
-                (exact, (sensor.scale_v_per_g / G0_MPS2 * _PROBE_MPS2) ** 2),
-            )
-        )
+        by_side = force_covariance(exact, force, none_v2, environment)
+        probed = force_covariance(exact, force, probe_v2, environment)
         by_noise[:, :, fold] = total - without_noise
         by_coefficients[:, :, fold] = without_noise - by_side
         by_probe[:, :, fold] = probed - by_side
-    return [by_noise, by_coefficients, _stage_covariance(errors.fitted[0], held), by_probe]
+    by_stage = _stage_covariance(errors.fitted[0], held)
+    return Covariances(by_noise, by_coefficients, by_stage, by_probe)
 
 
 def _stage_covariance(sensor: Sensor, held: Poses) -> np.ndarray:
