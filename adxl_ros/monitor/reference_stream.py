@@ -350,20 +350,21 @@ class Prediction:
         )
         if is_first:
             return None
-        mean_mps2, (moves, error_mps2) = scipy.stats.trim_mean(modelled, _TRIMMED, axis=0), motion
+        mean_mps2 = scipy.stats.trim_mean(modelled, _TRIMMED, axis=0)
+        moves, error_mps2 = motion
         independent = float(
             noise.effective_samples(len(stamp_ns), 1 / self._sensor.rate_hz, self._sensor.rc_s)
         )
         freedom = max(1 - 1 / max(independent, 1.0), 0.5)
         return Block(
-            end_ns,
-            mean_mps2,
-            (modelled**2).mean(axis=0),
-            modelled.var(axis=0) / freedom + _SMALLEST_MPS2**2,
-            _log_noise(modelled),
-            (datasheet**2).mean(axis=0),
-            error_mps2[: len(mean_mps2)] ** 2,
-            moves,
+            end_ns=end_ns,
+            mean_mps2=mean_mps2,
+            square=(modelled**2).mean(axis=0),
+            noise_square=modelled.var(axis=0) / freedom + _SMALLEST_MPS2**2,
+            log_noise=_log_noise(modelled),
+            datasheet_square=(datasheet**2).mean(axis=0),
+            reference_square=error_mps2[: len(mean_mps2)] ** 2,
+            moves=moves,
         )
 
 
