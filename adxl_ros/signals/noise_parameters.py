@@ -79,11 +79,6 @@ class Estimate(NamedTuple):
         """Whether the interval excludes 0."""
         return self.low > 0
 
-    @property
-    def seen_value(self) -> float:
-        """The value; 0 where the term is not seen."""
-        return self.value if self.is_seen else 0.0
-
     def scaled(self, factor: float) -> Estimate:
         """Return the estimate in another unit."""
         return Estimate(self.value * factor, self.low * factor, self.high * factor)
@@ -637,10 +632,14 @@ def with_gyro_noise(gyro: Gyroscope, noises: Sequence[AxisNoise]) -> Gyroscope:
         gyro,
         noise_density_radps_per_rthz=scaled(ONE_SIDED, whites),
         flicker_radps_per_rthz=scaled(
-            _FLICKER_OF_INSTABILITY, (fit.instability.seen_value for fit in fits)
+            _FLICKER_OF_INSTABILITY, (_seen(fit.instability) for fit in fits)
         ),
-        walk_radps_per_rts=scaled(1.0, (fit.walk.seen_value for fit in fits)),
+        walk_radps_per_rts=scaled(1.0, (_seen(fit.walk) for fit in fits)),
     )
+
+
+def _seen(estimate: Estimate) -> float:
+    return estimate.value if estimate.is_seen else 0.0
 
 
 def _density(sensor: Sensor, noises: list[AxisNoise], is_repeated: bool) -> np.ndarray:
