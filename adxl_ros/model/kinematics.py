@@ -197,54 +197,55 @@ def angles(
     """
     x, y, z = force
     xx, xy, xz, yy, yz, zz = covariance
-    plane = _Plane(x, y, xx, xy, yy)
-    side = _Plane(y, z, yy, yz, zz)
+    # Squares of the force in the planes xy and yz
+    plane2 = x * x + y * y + _FORCE2_FLOOR
+    side2 = y * y + z * z + _FORCE2_FLOOR
     return (
-        AngleEstimate(maths.atan2(y, z), side.turn_variance(maths)),
+        AngleEstimate(maths.atan2(y, z), _turn_variance(y, z, yy, yz, zz, maths)),
         AngleEstimate(
-            maths.atan2(-x, maths.sqrt(side.square)),
-            side.tilt_variance(x, xx, y * xy + z * xz, maths),
+            maths.atan2(-x, maths.sqrt(side2)),
+            _tilt_variance(x, xx, y, z, yy, yz, zz, y * xy + z * xz, maths),
         ),
         AngleEstimate(
-            maths.atan2(maths.sqrt(plane.square), z),
-            plane.tilt_variance(z, zz, x * xz + y * yz, maths),
+            maths.atan2(maths.sqrt(plane2), z),
+            _tilt_variance(z, zz, x, y, xx, xy, yy, x * xz + y * yz, maths),
         ),
-        AngleEstimate(maths.atan2(0.0 - y, x), plane.turn_variance(maths)),
+        AngleEstimate(maths.atan2(0.0 - y, x), _turn_variance(x, y, xx, xy, yy, maths)),
     )
 
 
-class _Plane:
-    """The part a, b of a force in a plane of two axes, with its covariance aa, ab, bb."""
+def _turn_variance(a: Value, b: Value, aa: Value, ab: Value, bb: Value, maths: Maths) -> Value:
+    """Return the variance of the angle of a vector a, b in its plane by its covariance, rad²."""
+    square = a * a + b * b + _FORCE2_FLOOR
+    across = b * b * aa - 2 * a * b * ab + a * a * bb
+    return maths.where(square > aa + bb + _FORCE2_FLOOR, across / (square * square), INFINITE)
 
-    def __init__(self, a: Value, b: Value, aa: Value, ab: Value, bb: Value) -> None:
-        self.square = a * a + b * b + _FORCE2_FLOOR
-        self._noise = aa + bb  # Variance in the plane
-        # Variances along the part and across it, times its square
-        self._along = a * a * aa + 2 * a * b * ab + b * b * bb
-        self._across = b * b * aa - 2 * a * b * ab + a * a * bb
 
-    def turn_variance(self, maths: Maths) -> Value:
-        """Return the variance of its angle in the plane, rad²."""
-        return maths.where(
-            self.square > self._noise + _FORCE2_FLOOR,
-            self._across / (self.square * self.square),
-            INFINITE,
-        )
+def _tilt_variance(
+    c: Value,
+    cc: Value,
+    a: Value,
+    b: Value,
+    aa: Value,
+    ab: Value,
+    bb: Value,
+    with_c: Value,
+    maths: Maths,
+) -> Value:
+    """
+    Return the variance of the angle between a force a, b, c and the plane of a and b, rad².
 
-    def tilt_variance(self, c: Value, cc: Value, with_c: Value, maths: Maths) -> Value:
-        """
-        Return the variance of the angle between the force and the plane, rad².
-
-        c, cc: the part of the force across the plane, and its variance; with_c: its covariance
-        with the part in the plane, times the length of that part.
-        """
-        total2 = self.square + c * c
-        return maths.where(
-            self.square > self._noise,
-            (self.square * cc - 2 * c * with_c + c * c * self._along / self.square)
-            / (total2 * total2),
-            self._noise / total2,
-        )
+    aa, ab, bb, cc: its covariance; with_c: a·ac + b·bc.
+    """
+    square = a * a + b * b + _FORCE2_FLOOR
+    total2 = square + c * c
+    noise = aa + bb
+    along = a * a * aa + 2 * a * b * ab + b * b * bb
+    return maths.where(
+        square > noise,
+        (square * cc - 2 * c * with_c + c * c * along / square) / (total2 * total2),
+        noise / total2,
+    )
 
 
 def quaternion(roll_rad: Value, pitch_rad: Value, maths: Maths) -> tuple[Value, ...]:
