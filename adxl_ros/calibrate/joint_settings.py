@@ -14,9 +14,9 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from adxl_ros.files.sweep_journal import PoseRecord
+from adxl_ros.model.constants import SAME_ANGLE_RAD
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import held_values
-from adxl_ros.signals.rest_detection import SAME_ANGLE_RAD
 import numpy as np
 
 ENCODER_STEPS = 1.5

@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 from adxl_ros.files.sweep_journal import PoseRecord
+from adxl_ros.model.constants import SAME_ANGLE_RAD
 from adxl_ros.model.effects.base import Environment, NOMINAL_ENVIRONMENT
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.rest_detection import SAME_ANGLE_RAD
 import numpy as np
 
 _SAME_PLANE_RAD = np.radians(1.0)  # Largest difference of neighbouring angles alpha in one plane

@@ -21,17 +21,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from adxl_ros.files.recording_columns import JOINTS, Recording
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import G0_MPS2, SAME_ANGLE_RAD
 from adxl_ros.model.noise import effective_samples, sample_std_v
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import block_statistics as stats
 from adxl_ros.signals.block_statistics import Blocks, Spans
 import numpy as np
 import scipy
-
-SAME_ANGLE_RAD = 1e-5
-"""Angles that differ by less are equal, rad. Chosen: above the rounding of angles in a file, and
-far below the step of an encoder."""
 
 _HAND_HELD_S = 1.4  # Shortest rest by hand, s, without 0.3 s of margins. Chosen: beyond pauses
 _STAGE_S = 0.6  # Shortest rest on a stage, s, without these margins. Chosen: dwells are longer
