@@ -190,17 +190,15 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
     """Return the page of a fleet."""
     sensors = fleet.rank(table, results)
     share = fleet.effect_matrix(table)
-    # Sensors that drift come first, although others may be more urgent.
-    plotted = []
-    for sensor in sorted(sensors, key=lambda sensor: not sensor.drifts):
-        shown = [drift.result for drift in sensor.drifts]
-        shown += [each for each in results if each.place_of(sensor.number) is not None]
-        plotted += [(sensor, result) for result in shown[:1]]
-    plotted = plotted[:_SHOWN]
-    figures = {
-        f'trend-{i}': _trend_figure(table, result, sensor.number)
-        for i, (sensor, result) in enumerate(plotted)
-    }
+    figures: dict[str, plotly.Figure] = {}
+    trends: dict[str, list[dict[str, str]]] = {'trend': [], 'noise': []}
+    for name, shown in trends.items():
+        for count, plot in enumerate(_plots(sensors, results, name == 'noise')):
+            figure = f'{name}-{count}'
+            figures[figure] = _trend_figure(table, plot.result, plot.sensor.number)
+            title = f'{plot.sensor.serial}: {plot.result.quantity.label}'
+            text = f'{plot.drifts[0].text}.' if plot.drifts else 'No slope is claimed.'
+            shown.append({'figure': figure, 'title': title, 'text': text})
     if len(share.columns):
         figures['matrix'] = _matrix_figure(table, share)
     counts = Counter(sensor.state for sensor in sensors)
@@ -224,16 +222,7 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
             'date': date_text,
             'link': partial(_link, folder),
             'without_unit': int((table.sensor < 0).sum()),
-            'trends': [
-                {
-                    'figure': f'trend-{i}',
-                    'title': f'{sensor.serial}: {result.quantity.label}',
-                    'text': f'{sensor.drifts[0].text}.'
-                    if sensor.drifts
-                    else 'No slope is claimed.',
-                }
-                for i, (sensor, result) in enumerate(plotted)
-            ],
+            'trends': trends,
             'batches': _batches(results),
             'has_effects': 'matrix' in figures,
             'judged': len(share),
@@ -246,6 +235,28 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
             'drifts': sum(int(result.is_claimed.sum()) for result in results),
         },
     )
+
+
+class _Plot(NamedTuple):
+    """A quantity that is plotted of a sensor."""
+
+    sensor: fleet.SensorState
+    result: fleet.QuantityResult
+    drifts: Sequence[fleet.Drift]  # Its claimed slopes of this kind, the most urgent first
+
+
+def _plots(
+    sensors: Sequence[fleet.SensorState], results: Sequence[fleet.QuantityResult], is_noise: bool
+) -> list[_Plot]:
+    """Return the most urgent drift of each sensor, or its first quantity; drifts come first."""
+    kind = [result for result in results if result.quantity.is_noise == is_noise]
+    plots = []
+    for sensor in sensors:
+        drifts = [drift for drift in sensor.drifts if drift.result.quantity.is_noise == is_noise]
+        measured = [result for result in kind if result.place_of(sensor.number) is not None]
+        shown = [drift.result for drift in drifts] or measured
+        plots += [_Plot(sensor, result, drifts) for result in shown[:1]]
+    return sorted(plots, key=lambda plot: not plot.drifts)[:_SHOWN]
 
 
 def _badge(

@@ -17,6 +17,7 @@ from rclpy.node import Node
 
 _FIELD_KINDS = {
     'np.ndarray': Kind.DOUBLE_ARRAY,
+    'tuple[float, ...]': Kind.DOUBLE_ARRAY,
     'float': Kind.DOUBLE,
     'int': Kind.INTEGER,
     'str': Kind.STRING,

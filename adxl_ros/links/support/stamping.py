@@ -291,6 +291,7 @@ class Block:
     volts: np.ndarray  # Output of the sensor by axis, V, (n, m)
     references: Columns  # References that the device has, by column, (n,) each
     lost: int | None = None  # Samples lost before it; None where only time shows them
+    in_self_test: bool = False  # Whether a self-test of the sensor has changed them
 
 
 _FOLLOW_NS = 10_000_000
@@ -359,6 +360,7 @@ class Stamper:
         if not self._stamped:
             return no_samples(sensor, time.time_ns())
         parts, self._stamped = self._stamped, []
+        marks = np.concatenate([part.in_self_test for part in parts])
         return Samples(
             stamp_ns=np.concatenate([part.stamp_ns for part in parts]),
             volts=np.concatenate([part.volts for part in parts]),
@@ -369,6 +371,7 @@ class Stamper:
                 for name in parts[0].references
             },
             estimated=sum(part.estimated for part in parts),
+            in_self_test=marks if marks.any() else None,
         )
 
     def statistics(self) -> dict[str, Any]:
@@ -413,6 +416,7 @@ class Stamper:
                     missing=self._counted + self._estimated,
                     references=self._thin(host_ns, block.references),
                     estimated=self._estimated,
+                    in_self_test=np.full(len(host_ns), block.in_self_test),
                 )
             )
             self._counted = self._estimated = 0
