@@ -16,10 +16,10 @@ from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Res
 from adxl_ros.api.sensors import effect_names, GivenSensor, sensor_of, SensorInput
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits import thermal_fit
-from adxl_ros.calibrate.poses import (
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.recorded_poses import (
     estimate_filters,
     extract_poses,
-    Poses,
     poses_of_means,
     with_table_angles,
 )
@@ -29,7 +29,7 @@ from adxl_ros.calibrate.result import CalibrationResult, compare, errors_in_word
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.atomic_write import make_folder, require_own
-from adxl_ros.files.recording_columns import recorded_unit, Recording, unit_of
+from adxl_ros.files.recording_columns import nominal_of, recorded_nominal, Recording
 from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.files.tables import read_pose_table
 from adxl_ros.model.sensor import Sensor, with_axes
@@ -355,9 +355,9 @@ class _Unit:
             if self.sensor.unstated:
                 self.notes.append(_MEANS_LACK)
         self.sensor = (
-            unit_of(self.sensor, read.stream_info, read.axes)
+            nominal_of(self.sensor, read.stream_info, read.axes)
             if self._has_means
-            else recorded_unit(self.sensor, read)
+            else recorded_nominal(self.sensor, read)
         )
         self._paths.append(read.path)
         self._surroundings.append(Surroundings())

@@ -21,7 +21,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import require_own
 from adxl_ros.files.bag_writer import angular_velocity, tilt_bag
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.recording_columns import check_unit, GYRO, Recording
+from adxl_ros.files.recording_columns import check_same_sensor, GYRO, Recording
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects import base, effect_named
@@ -64,7 +64,7 @@ class Correction:
         given = sensor_of(sensor, first)
         self.sensor = given.sensor if given.sensor.effects else with_axes(given.sensor, first.axes)
         self.measured = given.measured
-        check_unit(first.stream_info, first.axes, self.sensor)
+        check_same_sensor(first.stream_info, first.axes, self.sensor)
         self._before = list(_effects_that_stay(self.sensor, undo_filter))
         if self.sensor.mounting.get('rpy_rad'):
             self._before.append(

@@ -36,7 +36,7 @@ from adxl_ros.diagnose.next_experiment import CouldShow
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import free_name, make_folder, require_own, write_text
-from adxl_ros.files.recording_columns import NO_UNIT, Recording
+from adxl_ros.files.recording_columns import NO_SERIAL, Recording
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern
@@ -494,7 +494,7 @@ def _subject(recordings: Sequence[Recording], sensor: Sensor, sim: str) -> str:
     first, count = recordings[0], len(recordings)
     name = Path(first.path).name if count == 1 else f'{count} recordings'
     span_s = sum(read.span_s for read in recordings)
-    unit = 'the nominal sensor' if sensor.serial == NO_UNIT else f'unit {sensor.serial}'
+    unit = 'the nominal sensor' if sensor.serial == NO_SERIAL else f'unit {sensor.serial}'
     simulated = f'{Path(sim).name} through the chain of {unit}' if sim else f'simulation of {unit}'
     return (
         f'{name} ({span_s:.0f} s, {first.rate_hz:.4g} Hz, {" ".join(first.axes)})  minus  '

@@ -263,7 +263,7 @@ def _terms(axes: Iterable[AxisNoise]) -> dict[str, dict[str, Any]]:
 
 def _sensor(result: RecordingNoise) -> Sensor:
     """Return the sensor of the parameter file, with the axes and rate of the recording."""
-    sensor, unit = result.sensor, result.unit
+    sensor, unit = result.sensor, result.nominal
     if sensor.effects and sensor.axes != unit.axes:
         raise UserError(
             f'{result.path}: has the axes {unit.axes}, but the parameters of '

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.files.recording_columns import NO_UNIT, Recording
+from adxl_ros.files.recording_columns import NO_SERIAL, Recording
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Effect
 from adxl_ros.model.sensor import neutral, Sensor, typical
@@ -164,7 +164,7 @@ def sensor_of(given: SensorInput | None, read: Recording, has_noise: bool = True
     if has_noise:
         sensor, measured = measure_unstated(sensor, read)
     if isinstance(stated, Sensor):
-        stated = '' if sensor.serial == NO_UNIT else f'{sensor.serial}.yaml'
+        stated = '' if sensor.serial == NO_SERIAL else f'{sensor.serial}.yaml'
     usual = parameter_file.usual_path(read.is_of_nominal)
     return GivenSensor(sensor, stated or '', os.path.basename(stated or usual), measured)
 

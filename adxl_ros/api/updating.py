@@ -20,7 +20,7 @@ from adxl_ros.calibrate.keep.update_report import UpdatedDay
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import make_folder, require_own, write_text
-from adxl_ros.files.recording_columns import check_unit, Recording
+from adxl_ros.files.recording_columns import check_same_sensor, Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
 from adxl_ros.report.quantities import counted, number, utc
@@ -197,7 +197,7 @@ def update(
     days: dict[str, UpdatedDay] = {}
     newest_ns, name = 0, ''
     for place, read in enumerate(each_recording(recordings)):
-        check_unit(read.stream_info, read.axes, before)
+        check_same_sensor(read.stream_info, read.axes, before)
         if read.stamp_ns[0] < newest_ns:
             raise UserError(
                 f'{read.path}: begins before {name} ends; give recordings in the order of time'

@@ -55,7 +55,8 @@ _INDEX_BYTE = 32
 size of the message indices."""
 _CHUNK_BYTES = 1 << 20  # Size that a chunk hardly exceeds, bytes; that of rosbags
 _LARGE_BYTES = 2 << 30
-"""Size from which a file that is read leaves the cache (chosen): smaller ones are read again."""
+"""Size from which a file that is read leaves the cache. Smaller ones are read again by the next
+tool; larger ones would push out what other programs have there."""
 _PIECE_MESSAGES = 4096  # Messages that are collected to a piece (chosen: some MB)
 
 Raws = Sequence[bytes] | np.ndarray
@@ -412,7 +413,14 @@ def find_topics(bag: Bag, topic: str = '', has_stage: bool = True) -> Topics:
     if info is None and (is_own or [kind for _, kind in bag.types].count(IMU) == 1):
         info = _only(bag, 'sensor_info', DIAGNOSTIC_STATUS)
     space = joints.removesuffix('joint_states') if joints else f'{space}stage/'
-    return Topics(imu, joints, info, temperature, supply, beside('command', JOINT_STATE))
+    return Topics(
+        imu=imu,
+        joints=joints,
+        info=info,
+        temperature=temperature,
+        supply=supply,
+        command=beside('command', JOINT_STATE),
+    )
 
 
 def choose_topic(bag: Bag, kind: str, own: str, named: str, argument: str = 'topic') -> str:
@@ -420,9 +428,9 @@ def choose_topic(bag: Bag, kind: str, own: str, named: str, argument: str = 'top
     topics = sorted(topic for topic, other in bag.types if other == kind)
     if not topics:
         held = ', '.join(f'{topic} ({kind})' for topic, kind in sorted(bag.types))
+        cut = f'; {bag.cut}' if bag.cut else ''
         raise UserError(
-            f'{bag.path}: no topic of type {kind}; it holds {held or "no messages"}'
-            + f'; {bag.cut}' * bool(bag.cut)
+            f'{bag.path}: no topic of type {kind}; it holds {held or "no messages"}{cut}'
         )
     chosen = (
         [topic for topic in topics if topic.strip('/') == named.strip('/')]

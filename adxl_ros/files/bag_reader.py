@@ -113,9 +113,8 @@ class _Samples:
                 **dict(zip(GYRO, table.numbers('angular_velocity').T)),
             },
         )
-        readings, gyro_radps = (
-            np.column_stack([columns[name] for name in names]) for names in (ACCEL, GYRO)
-        )
+        readings = np.column_stack([columns[name] for name in ACCEL])
+        gyro_radps = np.column_stack([columns[name] for name in GYRO])
         force = self._reading.outputs(readings, 3 * [self._unit])
         # A value beyond every gyroscope is no reading.
         gyro_radps[~(np.abs(gyro_radps) <= LIMIT)] = np.nan
@@ -153,10 +152,12 @@ class _Samples:
     @property
     def remarks(self) -> tuple[str, ...]:
         """Return what was left out, for people."""
-        left_out = (
-            f'{self.where}: left out, samples without a number on each axis: {self.incomplete}'
+        if not self.incomplete:
+            return self.stamps.remarks
+        return (
+            f'{self.where}: left out, samples without a number on each axis: {self.incomplete}',
+            *self.stamps.remarks,
         )
-        return (*[left_out] * bool(self.incomplete), *self.stamps.remarks)
 
     def _begin(self, first: Raws, stamp_ns: int) -> None:
         self._first_ns = stamp_ns
@@ -314,16 +315,16 @@ def _block(
     time_s = (stamp_ns - samples.epoch_ns) / 1e9
     cut = f'{bag.cut}; the last sample read is at {seconds(stamp_ns[-1])}' if bag.cut else ''
     return Recording(
-        bag.path,
-        time_s,
-        columns,
-        dict(info),
-        alignments,
-        cut,
-        samples.epoch_ns,
-        bag.done,
-        samples.remarks,
-        samples.stamps.bad,
+        path=bag.path,
+        time_s=time_s,
+        columns=columns,
+        info=dict(info),
+        alignments=alignments,
+        cut=cut,
+        epoch_ns=samples.epoch_ns,
+        done=bag.done,
+        remarks=samples.remarks,
+        bad_stamps=samples.stamps.bad,
     )
 
 

@@ -90,10 +90,11 @@ class ColumnMapping:
 
     def __str__(self) -> str:
         """Return the text that states the mapping."""
-        return ','.join(
-            f'{role}={_quoted(column)}{":" * bool(unit)}{unit}'
-            for role, (column, unit) in self.sources.items()
-        )
+        entries = []
+        for role, (column, unit) in self.sources.items():
+            of_unit = f':{unit}' if unit else ''
+            entries.append(f'{role}={_quoted(column)}{of_unit}')
+        return ','.join(entries)
 
 
 def _quoted(column: str) -> str:
@@ -393,8 +394,10 @@ class ReadingOptions:
         zero = np.broadcast_to(np.array(self.lsb_at_0g or 0.0), len(units))
         outputs = []
         for values, unit, scale, offset in zip(readings.T, units, per_g, zero):
+            if unit == UNSIGNED:
+                values = signed(values)
             if unit in (LSB, UNSIGNED):
-                values = ((signed(values) if unit == UNSIGNED else values) - offset) / scale
+                values = (values - offset) / scale
             outputs.append(UNITS[Quantity.OUTPUT][unit].convert(values))
         return np.column_stack(outputs)
 
@@ -412,8 +415,8 @@ _LONGEST_STEP_S = 1.05  # Longest step of stamps, s. Chosen: 1 Hz, the slowest, 
 
 def listed(names: Sequence[str]) -> str:
     """Return the first names of columns for a message."""
-    further = len(names) - _LISTED_NAMES
-    return ', '.join(names[:_LISTED_NAMES]) + f' and {further} more' * (further > 0)
+    more = len(names) - _LISTED_NAMES
+    return ', '.join(names[:_LISTED_NAMES]) + (f' and {more} more' if more > 0 else '')
 
 
 def likely_unit(length: float) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import mapped_recording
+from adxl_ros.files import mapped_recording, mapping_proposal
 from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.column_mapping import (
     AS_IT_IS,
@@ -107,7 +107,7 @@ def _table_blocks(
         blocks = mapped_recording.blocks(table, mapping, reading, rows)
         yield from _mounted(blocks, reading.mounting)
     except mapped_recording.NotNativeError as error:
-        text, options = mapped_recording.propose(table)
+        text, options = mapping_proposal.propose(table)
         raise UserError(f'{error}; {text}', options) from None
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from io import StringIO
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -200,18 +201,19 @@ def _open_ulog(path: str, topic: str) -> Table:
         f'{data.name}_{data.multi_id}' if data.multi_id else str(data.name): data
         for data in log.data_list
     }
-    accelerations = []
-    for kind in _MAPPINGS:
-        accelerations += [name for name, data in messages.items() if data.name == kind]
-    raw = [
-        each for each in accelerations if messages[each].name == messages[accelerations[0]].name
+    # The messages of accelerometers, by kind; those of the first kind are the raw readings.
+    of_kinds = [
+        [name for name, data in messages.items() if data.name == kind] for kind in _MAPPINGS
     ]
+    raw = next(filter(None, of_kinds), [])
+    accelerations = list(chain.from_iterable(of_kinds))
     name = topic.removesuffix('_0') or ', '.join(raw)
+    if name not in messages and topic:
+        raise UserError(f'{path}: no message {topic}')
     if name not in messages:
         raise UserError(
-            f'{path}: no message {topic}' * bool(topic)
-            or f'{path}: {len(raw) or "no"} accelerometers'
-            f'; choose one with {option("topic")}: {", ".join(accelerations or messages)}'
+            f'{path}: {len(raw) or "no"} accelerometers; choose one with {option("topic")}: '
+            f'{", ".join(accelerations or messages)}'
         )
     data = messages[name]
     columns = {
@@ -225,7 +227,8 @@ def _open_ulog(path: str, topic: str) -> Table:
         mapping = mapping.partition(',temperature=')[0]
     if 'gyro_rad[0]' not in columns:
         mapping = mapping.partition(',gx=')[0]
-    cut = f'{path}: is damaged; what can be read of it is used' * bool(log.file_corruption)
+    is_damaged = log.file_corruption
+    cut = f'{path}: is damaged; what can be read of it is used' if is_damaged else ''
     return in_memory(
         path,
         columns,

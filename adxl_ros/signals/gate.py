@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.files.recording_columns import recorded_unit, Recording
+from adxl_ros.files.recording_columns import recorded_nominal, Recording
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
@@ -213,7 +213,7 @@ def _ratio(low: float, high: float) -> str:
 
 def _at_rest(read: Recording, sensor: Sensor | str | None) -> _AtRest:
     """Return noise and lengths over the rests of a recording."""
-    unit = recorded_unit(load_sensor(sensor, read), read)
+    unit = recorded_nominal(load_sensor(sensor, read), read)
     rests = RecordedRests(unit, read)
     rests.feed(read)
     rests.take()

@@ -48,7 +48,10 @@ its datasheet has a large error, and its rests still do not contradict each othe
 _LEAST_MPS2 = 1e-6  # Least zero-g error and length, m/s², so that they can be divisors
 _STEPS = 20  # Most steps of that search. Chosen: it has converged after some
 _PRIOR = 1.0  # Information about each share of a tolerance: its standard deviation is all of it
-_LARGEST_ERROR = 0.2  # Error of a length, by gravity, with which it tells no unit. Chosen
+_LARGEST_ERROR = 0.2
+"""Error of a length, by gravity, with which it tells no unit: counts of 1 g differ by factors of
+two, so that errors of up to 0.41 would still tell them apart; half of it leaves room for the
+scatter of the rests."""
 _MOST_RESTS = 300  # Rests that are compared at most, evenly spread. Chosen: some milliseconds
 TURNED_COS = 0.9  # Cosine between the directions of two rests of different poses: 26°
 _ALIKE = 0.04  # Logarithm of the ratio of two units that a usual zero-g makes alike: 40 mg
@@ -306,20 +309,32 @@ def look(
     readings = RestReadings(readings.mean_mps2[::every], readings.std_mps2[::every])
     count, axes = readings.mean_mps2.shape
     if not count:
-        return GravityAtRest(0, axes, gravity_mps2, np.nan, np.nan, np.nan, (np.nan, np.nan), None)
+        return GravityAtRest(
+            rests=0,
+            axes=axes,
+            gravity_mps2=gravity_mps2,
+            length_mps2=np.nan,
+            spread_mps2=np.nan,
+            std_mps2=np.nan,
+            allowed_mps2=(np.nan, np.nan),
+            fault=None,
+        )
     length, case = readings.length_mps2, _Case(readings, tolerance, gravity_mps2)
     # A reading of the length g in these poses is that of a force between these lengths.
     upright = readings.divided(np.maximum(length, _LEAST_MPS2)[:, None] / gravity_mps2)
     low, high = (np.median(limits) for limits in replace(case, readings=upright).force_limits())
     return GravityAtRest(
-        count * every,
-        axes,
-        gravity_mps2,
-        float(np.median(length)),
-        float(np.subtract(*np.quantile(length, [0.75, 0.25]))),
-        float(np.median(np.linalg.norm(readings.std_mps2, axis=1))),
-        (float(gravity_mps2**2 / high), float(gravity_mps2**2 / low) if low > 0 else np.inf),
-        case.fault(),
+        rests=count * every,
+        axes=axes,
+        gravity_mps2=gravity_mps2,
+        length_mps2=float(np.median(length)),
+        spread_mps2=float(np.subtract(*np.quantile(length, [0.75, 0.25]))),
+        std_mps2=float(np.median(np.linalg.norm(readings.std_mps2, axis=1))),
+        allowed_mps2=(
+            float(gravity_mps2**2 / high),
+            float(gravity_mps2**2 / low) if low > 0 else np.inf,
+        ),
+        fault=case.fault(),
     )
 
 
@@ -484,12 +499,12 @@ class _Case:
         names = ' or '.join(unit.name for unit in likely)
         remedies = ', or '.join(unit.remedy for unit in likely)
         return GravityFault(
-            GravityFaultKind.UNIT,
-            f'at rest {self._read()}, as values in {names} are',
-            remedies,
-            names,
-            likely[0].symbol,
-            self.gravity_mps2 / likely[0].gravity,
+            kind=GravityFaultKind.UNIT,
+            reason=f'at rest {self._read()}, as values in {names} are',
+            remedy=remedies,
+            unit=names,
+            symbol=likely[0].symbol,
+            factor=self.gravity_mps2 / likely[0].gravity,
         )
 
     def _fits(self, unit: ReadingUnit) -> bool:

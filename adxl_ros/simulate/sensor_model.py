@@ -68,16 +68,16 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
     """
     limit: float | np.ndarray = np.inf
     if units == 'datasheet':
-        rows = [
-            (name, typical or maximum / _STDS_OF_MAXIMUM, maximum or np.inf)
-            for parameter, (typical, maximum) in sensor.datasheet.items()
-            for name in names_of(effect_named(parameter.effect), sensor.axes)
-            if name.without_axis == parameter
-        ]
-        names = [name for name, *_ in rows]
-        std, largest = np.array([row[1:] for row in rows], float).reshape(-1, 2).T
+        names, stds, limits = [], [], []
+        for parameter, (typical, maximum) in sensor.datasheet.items():
+            std = typical or maximum / _STDS_OF_MAXIMUM
+            for name in names_of(effect_named(parameter.effect), sensor.axes):
+                if name.without_axis == parameter:
+                    names.append(name)
+                    stds.append(std)
+                    limits.append((maximum or np.inf) / std)
         mean = np.array([parameter_of(name).neutral for name in names])
-        root, limit = np.diag(std), largest / std
+        root, limit = np.diag(np.array(stds)), np.array(limits)
     elif units == 'calibration':
         names = list(sensor.covariance_names)
         size, vectors = np.linalg.eigh(sensor.covariance)

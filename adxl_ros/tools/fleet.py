@@ -15,7 +15,7 @@ from time import monotonic
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import make_folder
-from adxl_ros.files.recording_columns import NO_UNIT
+from adxl_ros.files.recording_columns import NO_SERIAL
 from adxl_ros.fleet.inputs import find_sources, stated_by
 from adxl_ros.fleet.row import (
     as_date,
@@ -198,10 +198,10 @@ def _written(folder: Path, results: Results) -> tuple[list[Path], list[str]]:
 def _plan_lines(to_do: Plan, results: Results) -> list[str]:
     known = {url: entry.row['serial'] for url, entry in results.newest.items()}
     units = Counter(
-        source.serial or stated or known.get(source.url) or NO_UNIT
+        source.serial or stated or known.get(source.url) or NO_SERIAL
         for source, (stated, _) in zip(to_do.todo, stated_by(to_do.todo))
     )
-    unknown = units.pop(NO_UNIT, 0)
+    unknown = units.pop(NO_SERIAL, 0)
     largest = ', '.join(f'{serial} ({count})' for serial, count in units.most_common(_UNITS))
     rows = {
         'done already': str(to_do.done),

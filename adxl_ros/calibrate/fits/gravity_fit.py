@@ -548,7 +548,7 @@ def _advice(rests: NominalRests, parameters: np.ndarray) -> str:
     """Return which directions are missing among rests, for people: faces first, then others."""
     force = force_g(rests.mean, parameters)
     has = covered(force / np.linalg.norm(force, axis=1, keepdims=True))
-    faces, edges = (np.flatnonzero(~has & (axes == AXES_UP)) for axes in (1, 2))
+    faces, edges = np.flatnonzero(~has & (AXES_UP == 1)), np.flatnonzero(~has & (AXES_UP == 2))
     if len(faces):
         return f'add rests in which {", or ".join(map(points_up, faces.tolist()))}'
     if len(edges):
