@@ -28,7 +28,7 @@ from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import gravity_at_rest
 from adxl_ros.signals.block_statistics import true_runs
-from adxl_ros.signals.gravity_at_rest import RestReadings
+from adxl_ros.signals.gravity_at_rest import GravityFaultKind, RestReadings
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import find_polarity_fault
 from adxl_ros.signals.rest_detection import find_rests, rest_means
@@ -188,13 +188,18 @@ def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> N
         mean, std = (
             np.reshape(values, shape) for values in rest_means(time_s, force_mps2, rests, rate_hz)
         )
-        gravity = gravity_at_rest.look(
-            RestReadings(mean, std), gravity_at_rest.IDEAL, sensor.local_gravity_mps2
-        )
-        if gravity.fault is not None and gravity.fault.is_clear:
+        readings, gravity_mps2 = RestReadings(mean, std), sensor.local_gravity_mps2
+        fault = gravity_at_rest.look(readings, gravity_at_rest.IDEAL, gravity_mps2).fault
+        if fault is not None and fault.is_clear:
             raise DataFault(
-                gravity.fault.data_fault,
-                f'{sim.force.name}: {gravity.fault.reason}; {gravity.fault.conversion}',
+                fault.data_fault, f'{sim.force.name}: {fault.reason}; {fault.conversion}'
+            )
+        # A simulator may have the errors of a sensor, but none beyond its tolerance.
+        tolerance = gravity_at_rest.nominal_tolerance(sensor)
+        fault = gravity_at_rest.look(readings, tolerance, gravity_mps2).fault
+        if fault is not None and fault.kind is GravityFaultKind.SCALE:
+            raise DataFault(
+                'reference', f'{sim.force.name}: {fault.reason}; check the gravity of its world'
             )
 
 

@@ -35,6 +35,7 @@ from adxl_ros.files.recording_columns import (
     GYRO,
     JOINTS,
     LIMIT,
+    limits,
     LONGEST_MOVE_NS,
     Recording,
     seconds,
@@ -256,11 +257,12 @@ def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
         where = f'{bag.path}: topic {topic}'
         stamp_ns, _, columns = series(bag, topic, find, values)
         for name, value in columns.items():
-            wrong = np.abs(value) > LIMIT
+            lowest, highest = limits(name)
+            wrong = (value < lowest) | (value > highest)
             if wrong.any():
                 raise UserError(
                     f'{where}: {name} is {value[wrong.argmax()]:g} at '
-                    f'{seconds(stamp_ns[wrong.argmax()])}, beyond ±{LIMIT:g}'
+                    f'{seconds(stamp_ns[wrong.argmax()])}, expected {lowest:g} to {highest:g}'
                 )
             tracks[name] = Track(where, stamp_ns, value, longest_ns)
     return tracks

@@ -42,6 +42,7 @@ from adxl_ros.files.recording_columns import (
     GYRO,
     JOINTS,
     LIMIT,
+    limits,
     Recording,
     sensor_columns,
     StampCheck,
@@ -68,6 +69,8 @@ _NATIVE = {
     **dict(zip(GYRO, GYRO_ROLES)),
 }
 """Role of the package's columns besides those of the sensor."""
+_COLUMNS = {role: column for column, role in _NATIVE.items()}
+"""Column of the package by its role."""
 
 
 class NotNativeError(UserError):
@@ -297,13 +300,13 @@ class _Converter:
                 continue
             stated = block.columns[source.column]
             is_tilt = role in ('roll', 'pitch') and source.unit == 'rad'
-            _refuse(
-                block,
-                source,
-                np.abs(stated) > (_TURN_RAD if is_tilt else LIMIT),
-                f'no {role} in {source.unit}',
+            converted = self._unit(role).convert(stated)
+            lowest, highest = (
+                (-_TURN_RAD, _TURN_RAD) if is_tilt else limits(_COLUMNS.get(role, role))
             )
-            values[role] = self._unit(role).convert(stated)
+            is_wrong = (converted < lowest) | (converted > highest)
+            _refuse(block, source, is_wrong, f'no {role} in {source.unit}')
+            values[role] = converted
         if 'roll' in values:
             values['alpha'], beta_rad = stage_angles(values['roll'], values['pitch'])
             # Without steps of a turn; rows without an angle stay NaN.

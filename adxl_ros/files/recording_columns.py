@@ -114,6 +114,14 @@ COMMANDS = {'alpha': 'alpha_command_rad', 'beta': 'beta_command_rad'}
 LIMIT = 1e6
 """Largest magnitude of a sensor's output or a reference, in the column's unit (chosen: beyond
 every sensor, stage and reference of the package)."""
+_REFERENCE_LIMITS = {'temperature_c': (-100.0, 230.0), 'supply_v': (-100.0, 100.0)}
+"""Lowest and highest value of a reference; values beyond are in another unit. No accelerometer
+works colder or hotter, and a room in kelvin is above it; millivolts of a supply are above 100."""
+
+
+def limits(column: str) -> tuple[float, float]:
+    """Return the lowest and highest value of a column, in its unit."""
+    return _REFERENCE_LIMITS.get(column, (-LIMIT, LIMIT))
 
 
 class BadStamps(NamedTuple):

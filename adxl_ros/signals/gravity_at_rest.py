@@ -350,20 +350,25 @@ class _Case:
         is_noise = np.median(self.error_mps2) > _LARGEST_ERROR * self.gravity_mps2
         return bool(wrong.mean() <= _LARGEST_FALSE_SHARE and not is_noise)
 
+    def is_explained(self) -> bool:
+        """Return whether one zero-g and scale factor of a sound sensor explain most rests."""
+        return self.is_allowed() and self.contradicting().mean() <= _LARGEST_FALSE_SHARE
+
     def contradicting(self) -> np.ndarray:
         """Return which rests contradict the others: no zero-g and scale fit both, (k,)."""
         wrong = self._unexplained(np.zeros(self.readings.mean_mps2.shape[1]))
         if not wrong.any():
             return wrong
         # A zero-g near the length of gravity is far from the first guess.
-        return min(wrong, self._unexplained(self._sphere_middle_mps2()), key=np.sum)
+        return min(wrong, self._unexplained(self._sphere_middle_mps2(prior=1.0)), key=np.sum)
 
-    def _sphere_middle_mps2(self) -> np.ndarray:
-        """Return the middle of the sphere nearest to the readings, within the tolerance, (m,)."""
+    def _sphere_middle_mps2(self, prior: float) -> np.ndarray:
+        """Return the middle of the sphere nearest to the readings, near 0 by a prior, (m,)."""
         mean, axes = self.readings.mean_mps2, self.readings.mean_mps2.shape[1]
         # |r|² = 2·r·b + (|f|² − |b|²) is linear in b and in the bracket.
-        prior = np.diag(
-            2
+        near_0 = np.diag(
+            prior
+            * 2
             * self.gravity_mps2
             * self.error_mps2.mean()
             / self.tolerance.zero_g_mps2.clip(min=_LEAST_MPS2)
@@ -371,7 +376,7 @@ class _Case:
         rows = np.vstack(
             [
                 np.column_stack([2 * mean, np.ones(len(mean))]),
-                np.column_stack([prior, np.zeros(axes)]),
+                np.column_stack([near_0, np.zeros(axes)]),
             ]
         )
         squares = np.append((mean**2).sum(axis=1), np.zeros(axes))
@@ -425,8 +430,8 @@ class _Case:
         if is_off:
             return GravityFault(
                 GravityFaultKind.SCALE,
-                f'at rest {self._read()}{self._range()}',
-                'check unit and scale factor',
+                f'at rest {self._read()}{self._range() or self._offset()}',
+                'check unit, zero-g and scale factor',
             )
         if is_spread:
             return self._spread(wrong)
@@ -476,11 +481,13 @@ class _Case:
 
     def _fits(self, unit: ReadingUnit) -> bool:
         case = self.divided(unit.gravity / self.gravity_mps2)
+        if not case.is_explained():
+            return False
         if self.readings.mean_mps2.shape[1] == len(AXES):
-            return case.is_allowed()
+            return True
         # An upper limit fits all larger units: that of the longest rest counts.
         longest = case.readings.length_mps2.max() / self.gravity_mps2
-        return case.is_allowed() and longest > 1 - case.tolerance.scale.max()
+        return bool(longest > 1 - case.tolerance.scale.max())
 
     def _is_removed(self) -> bool:
         """Return whether most rests may read a sound sensor without any force."""
@@ -524,9 +531,23 @@ class _Case:
     def _range(self) -> str:
         """Return the range of a digital sensor that explains a scale factor, or ''."""
         for power in (1, -1, 2, -2, 3, -3):
-            if self.divided(2.0**power).is_allowed():
+            if self.divided(2.0**power).is_explained():
                 return f', {2.0**power:g} times, as with the scale factor of another range'
         return ''
+
+    def _offset(self) -> str:
+        """Return the zero-g beyond the tolerance that explains rests in several poses, or ''."""
+        zero_g_mps2 = self._sphere_middle_mps2(prior=0.0)
+        about_mps2 = np.linalg.norm(self.readings.mean_mps2 - zero_g_mps2, axis=1)
+        is_sphere = len(about_mps2) > len(zero_g_mps2) + 1 and np.allclose(
+            about_mps2, self.gravity_mps2, rtol=float(self.tolerance.scale.max())
+        )
+        if not is_sphere:
+            return ''
+        stated = ', '.join(
+            f'{axis} {value:.3g}' for axis, value in zip(AXES, zero_g_mps2 / G0_MPS2)
+        )
+        return f', as with a zero-g of {stated} g'
 
     def _spread(self, wrong: np.ndarray) -> GravityFault:
         return GravityFault(

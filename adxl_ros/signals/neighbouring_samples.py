@@ -10,6 +10,8 @@ wrong samples, and rows that are means of rests.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from adxl_ros.model.constants import G0_MPS2, TINY
 import numpy as np
 
@@ -62,6 +64,14 @@ _SMALLEST_BIN_MPS2 = 1e-6  # Deviations below this are rounding, m/s²: that of 
 _SIZE_BINS = 40 * _BINS_PER_OCTAVE  # Number of these bins: up to 1e6 m/s²
 
 
+class _Jump(NamedTuple):
+    """A step from one steady part to another."""
+
+    time_s: float
+    size_mps2: float
+    is_held: bool  # Whether one side alone repeats a reading exactly
+
+
 class NeighbouringSamples:
     """Looks at neighbouring samples of a stream, in blocks of any length."""
 
@@ -78,7 +88,7 @@ class NeighbouringSamples:
         self._ends = [_Ends() for _ in axes]
         self._rows = 0  # Rows with one before
         self._like_means = 0  # Those as long as gravity, and turned away from the one before
-        self._jumps: list[tuple[float, float]] = []  # Times, s, and sizes, m/s², of jumps
+        self._jumps: list[_Jump] = []
         self._spike_s: list[float] = []  # Times of single samples away from steady ones, s
         self._spike_mps2: list[float] = []  # Their largest deviation of an axis, m/s²
         # Number of samples by how much they deviate from the mean of their neighbours
@@ -216,24 +226,30 @@ class NeighbouringSamples:
         both = size[_SIDE - 1 : len(size) - _SIDE + 1]
         places = _SIDE - 1 + np.flatnonzero(both > _SMALLEST_JUMP_G * G0_MPS2)
         for i in places.tolist():
-            beside = np.concatenate([size[i - _SIDE + 1 : i], size[i + 1 : i + _SIDE]])
-            if beside.max() > _STEADY * size[i]:
+            left, right = size[i - _SIDE + 1 : i].max(), size[i + 1 : i + _SIDE].max()
+            if max(left, right) > _STEADY * size[i]:
                 continue
             before = samples[i - _NEAREST + 1 : i + 1].mean(axis=0)
             after = samples[i + 1 : i + 1 + _NEAREST].mean(axis=0)
             step_s = max(float(time_s[i + 1] - time_s[i]), 1 / self._rate_hz)
             if _turn_rad(before, after) > _TURN_RAD_PER_S * step_s:
-                self._jumps.append((float(time_s[i]), float(size[i])))
+                is_held = bool((left == 0) != (right == 0))
+                self._jumps.append(_Jump(float(time_s[i]), float(size[i]), is_held))
 
     def _jumped(self) -> str:
         # Rests that were cut out of a recording and joined jump at each of their ends.
         if not 0 < len(self._jumps) <= _MOST_TURNS:
             return ''
-        at_s, jump_mps2 = self._jumps[0]
+        jump = self._jumps[0]
+        text = f'the readings jump by {jump.size_mps2 / G0_MPS2:.3g} g at {jump.time_s:.6g} s'
+        if jump.is_held:
+            return (
+                f'{text} from or to a reading that is repeated: the driver or the bus stood '
+                'still; use the parts'
+            )
         return (
-            f'the readings jump by {jump_mps2 / G0_MPS2:.3g} g at {at_s:.6g} s from one '
-            'steady value to another, faster than a sensor turns: it was turned over, '
-            'exchanged or read in another way; use the parts'
+            f'{text} from one steady value to another, faster than a sensor turns: it was '
+            'turned over, exchanged or read in another way; use the parts'
         )
 
     def _find_spikes(self, time_s: np.ndarray, samples: np.ndarray) -> None:

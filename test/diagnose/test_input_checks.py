@@ -102,6 +102,7 @@ def test_a_simulator_of_another_motion_is_no_shift(run_tool, tmp_path):
     time_s = recorded.time_s
     rng = np.random.default_rng(1)
     wander = np.cumsum(rng.normal(size=(3, len(time_s))), axis=1) * 0.02
+    wander[2] += G0_MPS2
     np.savetxt(
         tmp_path / 'sim.csv',
         np.column_stack([time_s + 500.0, *wander]),

@@ -5,9 +5,9 @@
 from dataclasses import replace
 import re
 
-from adxl_ros.diagnose.data_checks import compare_checked, DataFault
+from adxl_ros.diagnose.data_checks import check_gravity, compare_checked, DataFault
 from adxl_ros.files import recording
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import ACCEL, Recording, sensor_info
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import to_volts
 from adxl_ros.simulate.trajectories import motion_from_force
@@ -70,6 +70,17 @@ class Carried:
         )
         sim = motion_from_force(recording.read_ideal(folder / 'sim.csv'), False)[0]
         return compare_checked(recorded, replace(nominal('xyz'), rate_hz=RATE_HZ), sim, may_shift)
+
+
+@pytest.mark.parametrize('gravity_mps2', [1.62, 3.73])
+def test_a_world_with_another_gravity_is_no_fault_of_the_sensor(tmp_path, gravity_mps2):
+    carried = Carried()
+    force = carried.frame.apply(carried.acceleration + [0, 0, gravity_mps2])
+    sim = motion_from_force(Recording('sim', carried.time_s, dict(zip(ACCEL, force.T))), False)[0]
+    with pytest.raises(DataFault) as raised:
+        check_gravity(carried.recorded(), replace(nominal('xyz'), rate_hz=RATE_HZ), sim)
+    assert raised.value.name == 'reference'
+    assert f'{gravity_mps2:g} m/s² long' in raised.value.message
 
 
 @pytest.mark.parametrize('factor', [0.5, 1.5, 4.0])

@@ -191,6 +191,11 @@ def test_forms_that_are_read(tmp_path: Path, text: str | bytes) -> None:
             ':5:3: y_v is inf, no reading of a sensor in v',
         ),
         (f'{HEADER}\n{GOOD}0.003,2.5,2.5,1,-1e38\n', ':5:5: beta_rad is -1e+38, no beta in rad'),
+        (
+            f'{HEADER},temperature_c\n0,2.5,2.5,1,1,298\n',
+            ':2:6: temperature_c is 298, no temperature in c; delete the line, or correct',
+        ),
+        (f'{HEADER},supply_v\n0,2.5,2.5,1,1,5000\n', ':2:6: supply_v is 5000, no supply in v'),
         (f'{HEADER}\n{GOOD}1e38,2.5,2.5,1,1\n', ':5:1: time_s is 1e+38, no time in s (200 years'),
         (
             f'{HEADER}\n{GOOD}0.0015,2.5,2.5,1,1\n',

@@ -107,6 +107,12 @@ def test_a_scale_that_no_unit_explains_is_a_warning(scale: float) -> None:
     assert f'{scale * G:.3g} m/s²' in line
 
 
+def test_counts_around_the_middle_of_their_range_are_in_no_other_unit() -> None:
+    fault = looked(G * (FACES + 2.0)).fault
+    assert fault is not None and fault.kind is GravityFaultKind.SCALE
+    assert 'zero-g of x 2, y 2, z 2 g' in fault.reason
+
+
 def test_gravity_that_was_taken_away() -> None:
     readings = np.tile([0.25, -0.15, 0.4], (5, 1))
     assert kind(readings) is GravityFaultKind.REMOVED

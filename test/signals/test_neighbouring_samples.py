@@ -87,6 +87,14 @@ def test_a_sensor_that_is_turned_over_between_two_samples(signs: list[int], bloc
     assert 'at 19.99 s' in found
 
 
+def test_a_reading_that_is_repeated_for_a_while_is_no_turn() -> None:
+    samples = turning()
+    samples[1990:2300] = samples[1990]
+    samples[2300:] *= -1
+    (found,) = faults(samples)
+    assert 'repeated' in found and 'turned over' not in found
+
+
 def test_rests_that_were_joined_are_no_turns() -> None:
     """A table of rests that were cut out of a recording jumps at each of their ends."""
     directions = np.random.default_rng(3).normal(size=(12, 3))
