@@ -158,7 +158,7 @@ def _weights(z: complex, order: int) -> np.ndarray:
     return np.array([np.dot(c[::-1], moments) for c in lagrange])
 
 
-_MOST_TURNS = 0.1  # Largest share of the inputs at which one turns, for a play by them; chosen
+_MOST_TURNS = 0.5  # Largest share of the inputs at which one turns, for a play by them; chosen
 _THRESHOLDS = (0.25, 0.5, 0.75, 1.0)  # Of stop operators, by the reach; chosen: four equal
 
 
