@@ -41,7 +41,7 @@ from adxl_ros.files.surroundings import assumed
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import command
+from adxl_ros.process import command, option
 from adxl_ros.report.figures import axes_for
 from adxl_ros.report.quantities import Interval, mg
 from adxl_ros.report.screen import NextStep
@@ -94,12 +94,13 @@ class Compared(NamedTuple):
     params: str  # What names the sensor on a command line; '' for the nominal one
     params_name: str  # Name of its file
     sim: str  # Path of the recording of another simulator; '' for none
+    sim_unit: str  # Unit of that, as it was given; '' for m/s²
     urdf: str  # Path of the robot; '' for none
     frame: str  # Its frame that carries the sensor
     subject: str  # All of it in one line
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Gap(Result):
     """
     The gap between recordings and their simulation.
@@ -152,7 +153,9 @@ class Gap(Result):
         lines = words.screen_lines(self.diagnosis, self.compared.subject)
         for remark in self.remarks:
             lines += ['', f' {remark}']
-        return [*lines, '', f' in      {self.in_unit.text}'] if self.in_unit else lines
+        if self.in_unit:
+            lines += ['', f' in      {self.in_unit.text}']
+        return lines
 
     @property
     def first_screen(self) -> FirstScreen:
@@ -173,7 +176,9 @@ class Gap(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return report.json; docs/reference/report_json.md has its keys."""
-        return self._report | ({'gap_in': as_json(self.in_unit._asdict())} if self.in_unit else {})
+        if self.in_unit is None:
+            return self._report
+        return self._report | {'gap_in': as_json(self.in_unit._asdict())}
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with a row for each parameter of each effect of the verdict."""
@@ -233,10 +238,10 @@ class Gap(Result):
         from adxl_ros.diagnose import page
 
         run = page.Run(
-            self.compared.subject,
-            self.compared.params_name,
-            self.next_steps(folder),
-            made_by or self.command(folder),
+            subject=self.compared.subject,
+            parameter_file=self.compared.params_name,
+            steps=self.next_steps(folder),
+            command=made_by or self.command(folder),
         )
         return page.documents(
             self.diagnosis, self.to_dict(), self.screen, run if has_page else None
@@ -251,6 +256,7 @@ class Gap(Result):
         given = {
             '--params': self.compared.params,
             '--sim': _stored(self.compared.sim, 'SIMULATION'),
+            '--sim-unit': self.compared.sim_unit,
             '--urdf': self.compared.urdf,
             '--frame': self._frame,
             '-o': str(folder),
@@ -278,6 +284,7 @@ class Gap(Result):
             given = {
                 '--params': params if is_closed else compared.params,
                 '--sim': f'{proposal.stem}_simulated.csv' if compared.sim else '',
+                '--sim-unit': compared.sim_unit,
                 '--urdf': compared.urdf,
                 '--frame': self._frame,
                 '-o': f'{folder}_2',
@@ -325,6 +332,7 @@ def diagnose(
     sensor: SensorInput | None = None,
     *,
     sim: RecordingInput | Motion | None = None,
+    sim_unit: str = '',
     urdf: str | os.PathLike | None = None,
     frame: str = 'imu_link',
     joints: str = '',
@@ -351,6 +359,8 @@ def diagnose(
     sim
         Ideal specific force of the same motion by another simulator, with `ax_mps2, ay_mps2,
         az_mps2`, m/s², in the frame of the sensor: a Recording, a DataFrame or a path.
+    sim_unit
+        Unit of the file `sim`: g, mg or mmps2; '' for m/s². `read` has other samples' `unit`.
     urdf
         Path of the robot that carries the sensor; its joints are in the bag of the recording.
     frame, joints
@@ -384,10 +394,17 @@ def diagnose(
 
     """
     require_least('seed', seed, 0)
-    require_least('self-check', self_check, 0)
+    require_least('self_check', self_check, 0)
     require_least('material', material, 1e-6)
     if align and sim is None and not urdf:
-        raise UserError('--align: shifts --sim or a robot, and neither is given')
+        raise UserError(
+            f'{option(align=True)}: shifts {option("sim")} or a robot, and neither is given'
+        )
+    if sim_unit and not isinstance(sim, (str, os.PathLike)):
+        raise UserError(
+            f'{option(sim_unit=sim_unit)}: states the unit of a file that {option("sim")} names, '
+            'and none is named; samples in memory are given by read(..., unit=...)'
+        )
     unit = quantity_named(quantity) if quantity else None
     if not (sim is None or isinstance(sim, (Motion, str, os.PathLike))):
         sim = one_recording(sim)
@@ -398,7 +415,7 @@ def diagnose(
     motion = (
         RobotInput(urdf, frame, joints).path(read[0], baseline).as_motion()
         if urdf
-        else _motion(read[0], sim)
+        else _motion(read[0], sim, sim_unit)
     )
     if prior:
         baseline, remark = _with_prior(baseline, prior)
@@ -424,13 +441,14 @@ def diagnose(
         in_unit = gap_in(unit, diagnosis.full_rate, found.baseline, found.sensor, seed)
     simulator, robot = _name_of(sim), os.fspath(urdf or '')
     compared = Compared(
-        tuple(r.path for r in read),
-        given.file,
-        given.file_name,
-        simulator,
-        robot,
-        frame,
-        _subject(read, baseline, simulator or robot),
+        recordings=tuple(each.path for each in read),
+        params=given.file,
+        params_name=given.file_name,
+        sim=simulator,
+        sim_unit=sim_unit,
+        urdf=robot,
+        frame=frame,
+        subject=_subject(read, baseline, simulator or robot),
     )
     return _gap(diagnosis, baseline, compared, in_unit, remarks)
 
@@ -443,8 +461,8 @@ def _require_one_reference(
         return
     if count > 1 or (sim is not None and urdf):
         raise UserError(
-            f'{_name_of(sim) or urdf}: --sim or --urdf, one of them, goes with one '
-            f'recording, but {count} are given'
+            f'{_name_of(sim) or urdf}: {option("sim")} or {option("urdf")}, one of them, goes '
+            f'with one recording, but {count} are given'
         )
 
 
@@ -464,11 +482,11 @@ def _name_of(sim: RecordingInput | Motion | None) -> str:
     return os.fspath(sim) if isinstance(sim, (str, os.PathLike)) else ''
 
 
-def _motion(read: Recording, sim: RecordingInput | Motion | None) -> Motion | None:
+def _motion(read: Recording, sim: RecordingInput | Motion | None, unit: str) -> Motion | None:
     """Return the motion of another simulator; None for that of the stage."""
     if sim is None or isinstance(sim, Motion):
         return sim
-    return motion_from_force(read_ideal(sim, read.epoch_ns), False)[0]
+    return motion_from_force(read_ideal(sim, read.epoch_ns, unit), False)[0]
 
 
 def _subject(recordings: Sequence[Recording], sensor: Sensor, sim: str) -> str:
@@ -498,11 +516,15 @@ def _gap(
     if report is not None:
         candidates = {c['effect']: c for c in objects['candidates']}
         effects = tuple(_effect(candidates[name]) for name in words.named_effects(report, objects))
+        before, after, floor, closed = report.closure
         figures = GapFigures(
-            *report.closure,
-            report.verdict.upper_limit_mps2,
-            report.verdict.material_mps2,
-            report.verdict.reference_mps2,
+            before_mps2=before,
+            after_mps2=after,
+            floor_mps2=floor,
+            closed=closed,
+            upper_limit_mps2=report.verdict.upper_limit_mps2,
+            material_mps2=report.verdict.material_mps2,
+            reference_mps2=report.verdict.reference_mps2,
         )
     return Gap(
         verdict=objects['verdict']['status'],
@@ -526,12 +548,14 @@ def _effect(candidate: Mapping[str, Any]) -> FoundEffect:
     parameters = {}
     for name, parameter in candidate['parameters'].items():
         low, high = parameter.get('ci') or (None, None)
-        parameters[name] = FoundParameter(parameter['value'], low, high, parameter['unit'])
+        parameters[name] = FoundParameter(
+            value=parameter['value'], low=low, high=high, unit=parameter['unit']
+        )
     return FoundEffect(
-        candidate['effect'],
-        candidate['probability'],
-        candidate['share'],
-        parameters,
-        tuple(candidate['inseparable_from']),
-        candidate['cause'],
+        name=candidate['effect'],
+        probability=candidate['probability'],
+        share=candidate['share'],
+        parameters=parameters,
+        rivals=tuple(candidate['inseparable_from']),
+        cause=candidate['cause'],
     )

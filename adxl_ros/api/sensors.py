@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import replace
 import math
 import os
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
@@ -20,11 +20,20 @@ from adxl_ros.model.sensor import neutral, Sensor, typical
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 import numpy as np
 
-SensorInput = Any
-"""A Sensor, a result that has one (`Fit`, `Gap`), a datasheet's name or the path of a file."""
-EffectInput = tuple[str, Mapping[str, Any]]
+
+class HasSensor(Protocol):
+    """A result that has a sensor: Fit, Gap, Noise, Update or Corrected."""
+
+    @property
+    def sensor(self) -> Sensor:
+        """Return the sensor."""
+
+
+SensorInput: TypeAlias = Sensor | HasSensor | str | os.PathLike
+"""A Sensor, a result that has one, a datasheet's name or the path of a parameter file."""
+EffectInput: TypeAlias = tuple[str, Mapping[str, Any]]
 """Name of an effect, and values by parameter, such as 'gain' or 'gain.x'; none for typical."""
-AddedEffects = Mapping[str, Mapping[str, Any] | None] | Sequence[str]
+AddedEffects: TypeAlias = Mapping[str, Mapping[str, Any] | None] | Sequence[str]
 """Names of effects of typical size, or a dict of values by parameter for each name."""
 
 
@@ -92,7 +101,8 @@ def with_effects(sensor: Sensor, effects: Iterable[EffectInput]) -> Sensor:
                 _put(effect, values, sensor.axes, key, number)
         except UserError as error:
             parts = ','.join(f'{key}={number}' for key, number in given.items())
-            raise UserError(f'effect {name}{":" * bool(given)}{parts}: {error}') from None
+            text = f'{name}:{parts}' if given else name
+            raise UserError(f'effect {text}: {error}') from None
         names = sensor.effects if name in sensor.effects else (*sensor.effects, name)
         sensor = replace(sensor, effects=names, values={**sensor.values, name: values})
     return sensor

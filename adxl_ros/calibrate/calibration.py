@@ -22,6 +22,7 @@ from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import option
 from adxl_ros.report.quantities import mg, with_half_width
 from adxl_ros.signals import recorded_sensor
 from adxl_ros.signals.gravity_at_rest import of_volts, require_unit
@@ -120,7 +121,7 @@ def calibrate(
     elif model not in (None, 'full'):
         raise UserError(
             f'{source}: the {model} model is fitted against stage angles (alpha_rad '
-            'and beta_rad), which are missing; leave --model out to calibrate a '
+            f'and beta_rad), which are missing; leave {option("model")} out to calibrate a '
             'three-axis sensor against gravity'
         )
     elif effects:

@@ -19,6 +19,7 @@ from adxl_ros.model.effects.base import Coefficient, Components, Environment, NO
 from adxl_ros.model.kinematics import specific_force, UPRIGHT
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor
+from adxl_ros.process import option
 from adxl_ros.signals import block_statistics, recorded_sensor, rest_detection
 from adxl_ros.signals.rest_detection import Rest, SAME_ANGLE_RAD
 import numpy as np
@@ -362,7 +363,7 @@ def poses_of_means(recording: Recording, sensor: Sensor) -> Poses:
     if angles is not None and not std_v.any():
         raise UserError(
             f'{recording.path}: nothing states the noise of means with stage angles; '
-            'state sensor.noise_density_g_per_rthz in the file of --params, or leave '
+            f'state sensor.noise_density_g_per_rthz in the file of {option("sensor")}, or leave '
             'alpha and beta out'
         )
     return Poses(

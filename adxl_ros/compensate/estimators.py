@@ -29,6 +29,7 @@ from adxl_ros.model.effects.base import (
 )
 from adxl_ros.model.kinematics import angles, Mounting, Tilt, tilt
 from adxl_ros.model.sensor import parameter_of, Sensor
+from adxl_ros.process import option
 import numpy as np
 
 
@@ -64,7 +65,8 @@ class RecordingEstimator:
         """Prepare for a recording."""
         if paper and sensor.axes == 'x':
             raise UserError(
-                '--inverse paper: needs the axes x and y, the sensor has x; leave it out'
+                f'{option(inverse="paper")}: needs the axes x and y, the sensor has x; '
+                'leave it out'
             )
         if 'temperature_c' not in first.columns:
             sensor = sensor.without_temperature_range()

@@ -24,6 +24,7 @@ from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.recording_columns import NOMINAL_KEYS
 from adxl_ros.model.constants import MEASURED_AXES
+from adxl_ros.process import option
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
@@ -414,7 +415,7 @@ def find_topics(bag: Bag, topic: str = '', has_stage: bool = True) -> Topics:
     return Topics(imu, joints, info, temperature, supply, beside('command', JOINT_STATE))
 
 
-def choose_topic(bag: Bag, kind: str, own: str, named: str, option: str = '--topic') -> str:
+def choose_topic(bag: Bag, kind: str, own: str, named: str, argument: str = 'topic') -> str:
     """Return the topic of a type that the user has named, that of the usual name, or the only."""
     topics = sorted(topic for topic, other in bag.types if other == kind)
     if not topics:
@@ -431,7 +432,7 @@ def choose_topic(bag: Bag, kind: str, own: str, named: str, option: str = '--top
     if len(chosen) != 1:
         raise UserError(
             f'{bag.path}: {len(chosen) or "no"} topics {named or kind}; choose one '
-            f'with {option}: {", ".join(chosen or topics)}'
+            f'with {option(argument)}: {", ".join(chosen or topics)}'
         )
     return chosen[0]
 
@@ -449,7 +450,7 @@ def _only(bag: Bag, name: str, kind: str) -> str | None:
     if len(topics) > 1:
         raise UserError(
             f'{bag.path}: several topics {name}: {", ".join(topics)}; record one '
-            f'sensor, or choose one: --topic {topics[0]}'
+            f'sensor, or choose one: {option(topic=topics[0])}'
         )
     return topics[0] if topics else None
 

@@ -22,7 +22,7 @@ from adxl_ros.files.bag_messages import (
 )
 from adxl_ros.files.column_mapping import (
     AS_IT_IS,
-    DROP_SAMPLES,
+    drop_samples,
     GRAVITY,
     LSB,
     Quantity,
@@ -43,6 +43,7 @@ from adxl_ros.files.recording_columns import (
     Track,
 )
 from adxl_ros.model.constants import AXES, MEASURED_AXES
+from adxl_ros.process import option
 import numpy as np
 
 _ABSENT_VARIANCE = 1e5
@@ -58,8 +59,8 @@ def blocks(
     with open_bag(path) as bag:
         if reading.mapping is not None:
             raise UserError(
-                f'{bag.path}: is a bag, which has no columns; leave --columns out: '
-                '--topic names a topic, and --unit states its unit'
+                f'{bag.path}: is a bag, which has no columns; leave {option("columns")} out: '
+                f'{option("topic")} names a topic, and {option("unit")} states its unit'
             )
         topics = find_topics(bag, reading.topic, has_stage=not ideal)
         info = read_info(bag, topics.info)
@@ -95,7 +96,7 @@ class _Samples:
         self._unit = reading.unit or 'mps2'  # Unit of the accelerations of the topic
         if UNITS[Quantity.OUTPUT][self._unit].is_volts:
             raise UserError(
-                f'--unit {self._unit}: {where} has accelerations; write one of '
+                f'{option(unit=self._unit)}: {where} has accelerations; write one of '
                 f'{", ".join((*GRAVITY, LSB))}'
             )
         reading.check_counts(where, dict.fromkeys(ACCEL, self._unit))
@@ -138,7 +139,7 @@ class _Samples:
         wrong = is_kept[:, None] & ~(np.abs(force) <= LIMIT)
         if wrong.any():
             row, axis = np.argwhere(wrong)[0]
-            advice = '' if np.isfinite(force[row, axis]) else f'; {DROP_SAMPLES}'
+            advice = '' if np.isfinite(force[row, axis]) else f'; {drop_samples()}'
             raise UserError(
                 f'{place(row)}: linear_acceleration.{AXES[axis]} is '
                 f'{force[row, axis]:g} m/s², expected a number within ±{LIMIT:g}'

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Generator, Sequence
 import re
+from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import (
     ColumnMapping,
     Columns,
-    DROP_SAMPLES,
+    drop_samples,
     GRAVITY,
     GYRO_ROLES,
     is_sensor_step,
@@ -25,7 +26,6 @@ from adxl_ros.files.column_mapping import (
     Quantity,
     ReadingOptions,
     ROLES,
-    shell_quoted,
     signed,
     Source,
     Table,
@@ -52,6 +52,7 @@ from adxl_ros.files.recording_columns import (
 from adxl_ros.files.stamps import burst_samples, describe_bursts, stamped_rate_hz
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.kinematics import stage_angles
+from adxl_ros.process import option, pasted
 import numpy as np
 
 _TIME_LIMIT_S = 9e9  # Largest magnitude of a time, s: in nanoseconds it fits into 64 bits (9.2e18)
@@ -165,7 +166,7 @@ class _Converter:
         if 'time' not in mapping.sources and reading.rate_hz is None:
             raise UserError(
                 f'{mapping.where}: has no time; add time=COLUMN:UNIT, or give '
-                '--rate HZ to stamp by index'
+                f'{option(rate="HZ")} to stamp by index'
             )
         # Column and unit by role
         self.sources = {
@@ -221,8 +222,8 @@ class _Converter:
             and self._is_volts != (self._axes[0].column in VOLTS)
         ):
             raise UserError(
-                f'--unit {self._reading.unit}: {self._axes[0].column} of '
-                f'{self._path} says another quantity; name the columns by --columns'
+                f'{option(unit=self._reading.unit)}: {self._axes[0].column} of '
+                f'{self._path} says another quantity; name the columns by {option("columns")}'
             )
         self._reading.check_counts(self._where, {axis.column: axis.unit for axis in self._axes})
 
@@ -243,7 +244,7 @@ class _Converter:
                 source,
                 is_sample & ~(np.abs(values) <= LIMIT),
                 f'no reading of a sensor in {source.unit}',
-                f'every sample needs it; {DROP_SAMPLES}',
+                f'every sample needs it; {drop_samples()}',
             )
         time_s, is_kept = self._times(block, is_row, is_sample)
         columns = dict(zip(VOLTS if self._is_volts else ACCEL, outputs.T))
@@ -332,8 +333,8 @@ class _Converter:
             source,
             is_sample & ~(np.abs(unit.convert(stamps)) < _TIME_LIMIT_S),
             f'no time in {source.unit} (200 years at most)',
-            'every sample needs a time: give --rate HZ to stamp by index, or delete the line; '
-            f'{DROP_SAMPLES}',
+            f'every sample needs a time: give {option(rate="HZ")} to stamp by index, or delete '
+            f'the line; {drop_samples()}',
         )
         if self._epoch_ns is None and is_sample.any():
             text = block.info.get('epoch_ns', '0')
@@ -357,7 +358,7 @@ class _Converter:
         if bursts := describe_bursts(time_s):
             self._remarks.append(
                 f'{self._path}: {bursts.removeprefix("; ")}; this rate is '
-                'used, and --rate HZ stamps by index'
+                f'used, and {option(rate="HZ")} stamps by index'
             )
 
     def _check_step(self, time_s: np.ndarray) -> None:
@@ -371,9 +372,9 @@ class _Converter:
             fitting = ColumnMapping({**self.sources, 'time': Source(source.column, unit)})
             raise UserError(
                 f'{self._path}: {source.column} has steps of {step:.4g}, which as '
-                f'{source.unit} are {rate_hz:.3g} Hz; if that is right, give --rate '
-                f'{rate_hz:.3g}, and if they are {unit}:',
-                f'--columns {shell_quoted(str(fitting))}',
+                f'{source.unit} are {rate_hz:.3g} Hz; if that is right, give '
+                f'{option(rate=f"{rate_hz:.3g}")}, and if they are {unit}:',
+                pasted(columns=str(fitting)),
             )
 
 
@@ -463,6 +464,9 @@ sensor makes less)."""
 
 _LARGEST = 1e30  # Larger magnitudes are no readings and no stamps
 
+_AT_REST = 0.05
+"""Largest spread of a sensor that rests, as a share of its readings. Chosen: noise is far below
+it, and 1 g of an analog sensor that is read about the middle of its supply above it."""
 _TURNED = 0.3  # Smallest spread of an axis in that of another one of a sensor that is turned
 
 _COUNTS = (64, 100, 128, 256, 512, 1000, 1024, 1365, 2048, 4096, 8192, 16384, 32768)
@@ -488,21 +492,25 @@ def propose(table: Table) -> tuple[str, str]:
     if not unit:
         return (
             f'{seen}; none looks like an accelerometer: name the columns, for example',
-            "--columns 'time=COLUMN:s,x=COLUMN:g,y=COLUMN:g,z=COLUMN:g'",
+            pasted(columns='time=COLUMN:s,x=COLUMN:g,y=COLUMN:g,z=COLUMN:g'),
         )
     sources = {axis: Source(name, unit) for axis, name in zip(AXES, outputs)}
-    stamps, note = '--rate HZ', ' (write the sample rate for HZ)'
+    stamps: dict[str, Any] = {'rate': 'HZ'}
+    note = ' (write the sample rate for HZ)'
     if time:
         source = _time_source(table, time, values[time])
         sources = {'time': source, **sources}
         stamps = _stamp_options(values[time], source)
-        note = ' (add --params with the parameter file of the sensor)' * (unit in ('v', 'mv'))
+        note = ''
+        if unit in ('v', 'mv'):
+            note = f' (add {option("sensor")} with the parameter file of the sensor)'
     sources |= _references(values, {*outputs, time}) if table.has_names else {}
-    options = f'--columns {shell_quoted(str(ColumnMapping(sources)))} {stamps}'.rstrip()
+    options = {'columns': str(ColumnMapping(sources)), **stamps}
     if unit in (LSB, UNSIGNED):
-        options += f' --lsb-per-g {round(length) if zero else _usual_counts(length)}'
-        options += f' --lsb-at-0g {zero:.0f}' * bool(zero)
-    return f'{seen}; the best guess{note}:', options
+        options['lsb_per_g'] = round(length) if zero else _usual_counts(length)
+        if zero:
+            options['lsb_at_0g'] = f'{zero:.0f}'
+    return f'{seen}; the best guess{note}:', pasted(**options)
 
 
 def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[str, float, float]:
@@ -519,7 +527,8 @@ def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[s
         unit, readings = UNSIGNED, signed(readings)
     low, spread = readings.min(axis=0), np.ptp(readings, axis=0)
     zero = 0.0
-    if low.min() > 0 and spread.min() > _TURNED * spread.max():
+    is_turned = spread.min() > max(_TURNED * spread.max(), _AT_REST * readings.max())
+    if low.min() > 0 and is_turned:
         zero = float(np.mean(low + spread / 2))
     lengths = np.linalg.norm(readings - zero, axis=1)
     length = float(np.median(lengths))
@@ -557,15 +566,15 @@ def _gravity_unit(length: float, is_whole: bool) -> str:
     return unit if departure <= abs(np.log(length / _usual_counts(length))) else ''
 
 
-def _stamp_options(values: np.ndarray, source: Source) -> str:
+def _stamp_options(values: np.ndarray, source: Source) -> dict[str, Any]:
     """Return the option that stamps need which stand still or step back; empty for none."""
     known = values[np.isfinite(values)]
     time_s = UNITS[Quantity.TIME][source.unit].convert(known - known[0])
     if (np.diff(time_s) > 0).all():
-        return ''
+        return {}
     if burst_samples(time_s) > 1:
-        return f'--rate {stamped_rate_hz(time_s):.4g}'
-    return '--drop-bad-stamps'
+        return {'rate': f'{stamped_rate_hz(time_s):.4g}'}
+    return {'drop_bad_stamps': True}
 
 
 def _time_column(table: Table, values: Columns) -> str | None:

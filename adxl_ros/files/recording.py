@@ -30,6 +30,7 @@ from adxl_ros.files.recording_columns import ACCEL, concatenate, GYRO, Recording
 from adxl_ros.files.tables import open_table
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import option
 import numpy as np
 
 _BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
@@ -122,7 +123,7 @@ def _mounted(
         names = block.sensor_columns
         if len(names) != len(mounting):
             raise UserError(
-                f'--axes: names the axes {AXES[: len(mounting)]}, but {block.path} has '
+                f'{option("axes")}: names the axes {AXES[: len(mounting)]}, but {block.path} has '
                 f'{block.axes}'
             )
         zero = np.zeros(1)
@@ -130,7 +131,7 @@ def _mounted(
             zero = block.stream_info.nominal_values(block.axes).get('nominal_zero_g_v', np.ones(0))
             if len(set(zero)) != 1:
                 raise UserError(
-                    f'--axes: inverts an axis of {block.path} in volts about an '
+                    f'{option("axes")}: inverts an axis of {block.path} in volts about an '
                     'unknown zero; write a line "# nominal_zero_g_v: ..." with the '
                     'same value for each axis'
                 )
@@ -146,7 +147,7 @@ def _mounted(
         yield replace(block, columns={**block.columns, **changed})
 
 
-def read_ideal(path: AnyPath, epoch_ns: int = 0) -> Recording:
+def read_ideal(path: AnyPath, epoch_ns: int = 0, unit: str = '') -> Recording:
     """
     Read the ideal specific force of another simulator.
 
@@ -157,6 +158,8 @@ def read_ideal(path: AnyPath, epoch_ns: int = 0) -> Recording:
         sensor_msgs/Imu, or several of which one is `imu/data_raw`.
     epoch_ns
         Origin of the times, ns: `epoch_ns` of the real recording of the manoeuvre.
+    unit
+        Unit of the samples, one of `GRAVITY`; '' for m/s².
 
     Returns
     -------
@@ -169,10 +172,11 @@ def read_ideal(path: AnyPath, epoch_ns: int = 0) -> Recording:
         The file cannot be read, or an axis is missing.
 
     """
+    reading = ReadingOptions(unit=unit)
     parts = (
-        _bag_blocks(path, _BLOCK_ROWS, ideal=True)
+        _bag_blocks(path, _BLOCK_ROWS, ideal=True, reading=reading)
         if is_bag(path)
-        else mapped_recording.blocks(open_table(path), None, AS_IT_IS, _BLOCK_ROWS, ACCEL)
+        else mapped_recording.blocks(open_table(path), None, reading, _BLOCK_ROWS, ACCEL)
     )
     return at_epoch(concatenate(parts), epoch_ns)
 

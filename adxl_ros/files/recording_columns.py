@@ -16,6 +16,7 @@ from adxl_ros.files.atomic_write import require_own
 from adxl_ros.files.stamps import describe_bursts, stamped_rate_hz
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, to_volts, with_axes
+from adxl_ros.process import option
 from adxl_ros.report.quantities import column_unit
 import numpy as np
 
@@ -131,7 +132,7 @@ class BadStamps(NamedTuple):
     backward: int  # Samples whose stamp is earlier
 
 
-@dataclass(repr=False)
+@dataclass(repr=False, eq=False)
 class Recording:
     """Samples of one sensor, with references."""
 
@@ -364,8 +365,9 @@ class StampCheck:
             raise UserError(
                 f'{where(row)}: time {"stands still" if stands[row] else "runs backwards"}, '
                 f'{latest[row] - time_s[row]:.3g} s before the newest sample'
-                f'{describe_bursts(time_s[is_sample])}; --drop-bad-stamps leaves such samples '
-                'out, --rate HZ stamps by index'
+                f'{describe_bursts(time_s[is_sample])}; '
+                f'{option(drop_bad_stamps=True)} leaves such '
+                f'samples out, {option(rate="HZ")} stamps by index'
             )
         duplicates = int(stands.sum())
         self.bad = BadStamps(

@@ -18,6 +18,7 @@ from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.column_mapping import Table, TableBlock
 from adxl_ros.files.csv_file import find_form, read_blocks
 from adxl_ros.model.kinematics import stage_angles
+from adxl_ros.process import option
 import numpy as np
 
 _BLOCK_ROWS = 65536  # Rows that are read at a time (chosen: some MB)
@@ -39,7 +40,7 @@ def open_table(path: AnyPath, topic: str = '') -> Table:
     if ending == '.ulg':
         return _open_ulog(path, topic)
     if topic:
-        raise UserError(f'--topic {topic}: {path} is no bag; leave --topic out')
+        raise UserError(f'{option(topic=topic)}: {path} is no bag; leave {option("topic")} out')
     if ending in _FORMATS:
         return _FORMATS[ending](path)
     form = find_form(path)
@@ -210,7 +211,7 @@ def _open_ulog(path: str, topic: str) -> Table:
         raise UserError(
             f'{path}: no message {topic}' * bool(topic)
             or f'{path}: {len(raw) or "no"} accelerometers'
-            f'; choose one with --topic: {", ".join(accelerations or messages)}'
+            f'; choose one with {option("topic")}: {", ".join(accelerations or messages)}'
         )
     data = messages[name]
     columns = {

@@ -40,7 +40,7 @@ from adxl_ros.fleet.row import (
 )
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import code_version, package_version
+from adxl_ros.process import code_version, options_named, package_version
 from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
 import numpy as np
 
@@ -138,6 +138,7 @@ class Result(NamedTuple):
     is_known: bool = False  # Whether there is a row with this key
 
 
+@options_named()
 def make_row(recipe: Recipe, earlier: frozenset[str], source: Source, is_again: bool) -> Result:
     """Make the row of a recording; one with an `earlier` key is only made where `is_again`."""
     worker = f'{os.uname().nodename}:{os.getpid()}'

@@ -159,7 +159,7 @@ def _nominal(
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Sensor:
     """
     One unit: the nominal chain by its nominal values, and the effects that depart from it.
@@ -243,6 +243,30 @@ class Sensor:
         100000.0,
         default=0.0,
     )
+    self_test_g: tuple[float, ...] = _nominal(
+        'sensor.self_test_g',
+        'typical change of the output by the self-test, by axis; empty where not stated',
+        'g',
+        -100.0,
+        100.0,
+        default=(),
+    )
+    self_test_lower_g: tuple[float, ...] = _nominal(
+        'sensor.self_test_lower_g',
+        'lowest change by the self-test, with its sign, by axis',
+        'g',
+        -100.0,
+        100.0,
+        default=(),
+    )
+    self_test_upper_g: tuple[float, ...] = _nominal(
+        'sensor.self_test_upper_g',
+        'highest change by the self-test, with its sign, by axis',
+        'g',
+        -100.0,
+        100.0,
+        default=(),
+    )
     effects: tuple[str, ...] = ()  # Names of the effects
     # Values by effect and parameter, (m,) or (), each in the unit of its parameter
     values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
@@ -298,6 +322,10 @@ class Sensor:
         """
         stated_s = self.rc_resistance_ohm * self.rc_capacitance_f
         return stated_s * self.filter_rate_hz / self.rate_hz if self.filter_rate_hz else stated_s
+
+    def __repr__(self) -> str:
+        effects = ', '.join(self.effects) or 'none'
+        return f'<Sensor {self.serial}: axes {" ".join(self.axes)}, effects: {effects}>'
 
     @property
     def lsb_v(self) -> float:
@@ -369,6 +397,8 @@ def with_axes(sensor: Sensor, axes: str) -> Sensor:
                 f'file for {axes}'
             )
         changed[name] = np.array([*values, *[values[0]] * 3])[: len(axes)]
+    # Another part has another self-test.
+    changed |= dict.fromkeys(('self_test_g', 'self_test_lower_g', 'self_test_upper_g'), ())
     if len(axes) > len(sensor.axes):
         # A part with more axes has another datasheet.
         changed |= {'datasheet_name': '', 'datasheet': {}}

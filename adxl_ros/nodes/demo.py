@@ -25,7 +25,7 @@ from adxl_ros.files import parameter_file, sweep_journal
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import jobs
-from adxl_ros.process import ended_by_closed_output
+from adxl_ros.process import ended_by_closed_output, options_named
 from adxl_ros.report.screen import coloured, program_parser
 import numpy as np
 
@@ -113,6 +113,7 @@ def _poses(journal: Path) -> tuple[int, list[sweep_journal.PoseRecord]]:
 
 
 @ended_by_closed_output()
+@options_named()
 def main() -> int:
     """Run the demonstration; return the exit status."""
     parser = program_parser(argparse.ArgumentParser, 'demo', __doc__, _EXAMPLES)

@@ -19,7 +19,7 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.links.support import base
 from adxl_ros.nodes import parameters
 from adxl_ros.nodes.parameters import Kind, Spec
-from adxl_ros.process import ended_by_closed_output
+from adxl_ros.process import ended_by_closed_output, options_named
 from adxl_ros.report.screen import program_parser
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
@@ -91,6 +91,7 @@ _WITH_COLON = r"rule: '-p ([^:]+):=(.*:.*)'\. Error"
 _QUOTES = """; a text with a colon needs quotes of its own: -p '{}:="{}"'"""
 
 
+@options_named()
 @ended_by_closed_output()
 def run(
     make_node: Callable[[], Node],

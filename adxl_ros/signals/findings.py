@@ -27,6 +27,7 @@ from adxl_ros.files.recording_columns import (
 from adxl_ros.files.stamps import burst_samples, lacks_samples, period_s
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.process import option
 from adxl_ros.report.quantities import counted, duration
 from adxl_ros.signals.allan_deviation import shortest_rest_s
 from adxl_ros.signals.block_statistics import true_runs
@@ -184,7 +185,7 @@ class _Stamps:
         if len(first) < 2:
             raise UserError(
                 f'{first.path}: {len(first)} sample with a usable stamp; at least 2 '
-                'are needed; --rate HZ stamps by index'
+                f'are needed; {option(rate="HZ")} stamps by index'
             )
         self.burst = burst_samples(first.time_s)
         self.period_s = period_s(first.time_s)
@@ -384,7 +385,7 @@ def _has_wide_gaps(contents: RecordingContents) -> bool:
 def _stamp_faults(contents: RecordingContents) -> list[str]:
     which = 'with the stamp of the one before', 'whose stamp steps back'
     faults = [
-        f'samples {text}: {count}; --drop-bad-stamps leaves them out'
+        f'samples {text}: {count}; {option(drop_bad_stamps=True)} leaves them out'
         for text, count in zip(which, contents.bad_stamps)
         if count
     ]
@@ -394,8 +395,8 @@ def _stamp_faults(contents: RecordingContents) -> list[str]:
     if contents.jitter_s > _LARGEST_JITTER * period_s and contents.burst == 1:
         faults.append(
             f'stamps scatter by {1e3 * contents.jitter_s:.3g} ms rms, expected '
-            f'{1e3 * _LARGEST_JITTER * period_s:.3g} ms at most; --rate HZ stamps by '
-            'index'
+            f'{1e3 * _LARGEST_JITTER * period_s:.3g} ms at most; {option(rate="HZ")} stamps '
+            'by index'
         )
     if contents.cut:
         faults.append(contents.cut)
@@ -435,8 +436,8 @@ def _remarks(contents: RecordingContents) -> list[str]:
         remarks.append(_missing(contents))
     if contents.burst > 1:
         remarks.append(
-            f'stamps come in bursts of {contents.burst} samples; --rate '
-            f'{contents.rate_hz:.4g} stamps by index'
+            f'stamps come in bursts of {contents.burst} samples; '
+            f'{option(rate=f"{contents.rate_hz:.4g}")} stamps by index'
         )
     delay_s = contents.log_delay_s or 0.0
     if abs(delay_s) > _LARGEST_DELAY_S:
@@ -493,7 +494,8 @@ def _diagnose(contents: RecordingContents) -> Ability:
         return Ability(
             'diagnose',
             False,
-            'has no stage angles; give --sim with the specific force of the same motion',
+            f'has no stage angles; give {option("sim")} with the specific force of the '
+            'same motion',
         )
     if range_rad < _MOVED_RAD:
         return Ability('diagnose', False, 'has stage angles that do not change; move the stage')

@@ -12,7 +12,8 @@ than g in most poses, so that they have an upper limit only.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 from itertools import product
 from typing import Any
@@ -22,6 +23,7 @@ from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, TINY
 from adxl_ros.model.effects.base import Coefficient, NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import get, Sensor, to_nominal_mps2
+from adxl_ros.process import option
 from adxl_ros.report.quantities import counted, number
 import numpy as np
 
@@ -68,25 +70,32 @@ class ReadingUnit:
 
     name: str  # For people
     gravity: float  # Number of this unit that gravity has
-    remedy: str  # What states or converts it
+    conversion: str = ''  # What converts it
+    # Options that state it, in place of a conversion
+    options: Mapping[str, Any] = field(default_factory=dict, compare=False)
     symbol: str = ''  # Its name in options and parameters; empty where they do not have it
+
+    @property
+    def remedy(self) -> str:
+        """Return what states or converts it."""
+        return self.conversion or f'state it by {option(**self.options)}'
 
 
 _COUNTS_PER_G = [2**k for k in range(6, 19)]
 """Counts of 1 g of digital sensors: from 6 bits of ±2 g to 20 bits of ±2 g, by powers of two."""
 
 UNITS = (
-    ReadingUnit('g', 1.0, 'state it by --unit g', 'g'),
-    ReadingUnit('mg', 1e3, 'state it by --unit mg', 'mg'),
-    ReadingUnit('mm/s²', 1e3 * G0_MPS2, 'state it by --unit mmps2', 'mmps2'),
+    ReadingUnit('g', 1.0, options={'unit': 'g'}, symbol='g'),
+    ReadingUnit('mg', 1e3, options={'unit': 'mg'}, symbol='mg'),
+    ReadingUnit('mm/s²', 1e3 * G0_MPS2, options={'unit': 'mmps2'}, symbol='mmps2'),
     ReadingUnit('cm/s²', 1e2 * G0_MPS2, 'divide the readings by 100'),
     ReadingUnit('ft/s²', G0_MPS2 / 0.3048, 'multiply the readings by 0.3048'),
     ReadingUnit('m/s² divided by 1000', 1e-3 * G0_MPS2, 'multiply the readings by 1000'),
     ReadingUnit('g divided by 1000', 1e-3, f'multiply the readings by {1e3 * G0_MPS2:g}'),
-    ReadingUnit('m/s² that were stated as g', G0_MPS2**2, 'state it by --unit mps2'),
+    ReadingUnit('m/s² that were stated as g', G0_MPS2**2, options={'unit': 'mps2'}, symbol='mps2'),
     *(
         ReadingUnit(
-            f'counts of {count} per g', float(count), f'state it by --unit lsb --lsb-per-g {count}'
+            f'counts of {count} per g', float(count), options={'unit': 'lsb', 'lsb_per_g': count}
         )
         for count in _COUNTS_PER_G
     ),
@@ -213,7 +222,11 @@ class GravityFault:
     @property
     def live_text(self) -> str:
         """Return figure, explanation and remedy for a stream as one line."""
-        remedy = f'state it by samples.unit:={self.symbol}' if self.symbol else self.conversion
+        return self.stated_by(f'samples.unit:={self.symbol}')
+
+    def stated_by(self, statement: str) -> str:
+        """Return figure, explanation and remedy as one line, where a statement has the unit."""
+        remedy = f'state it by {statement}' if self.symbol else self.conversion
         return f'{self.reason}; {remedy}'
 
     @property
@@ -524,7 +537,7 @@ class _Case:
         return GravityFault(
             GravityFaultKind.MIXED_UNITS,
             f'{self._read_over_poses()}: the axes are in different units ({stated})',
-            'state the unit of each axis by --columns',
+            f'state the unit of each axis by {option("columns")}',
             stated,
         )
 

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import AXES
+from adxl_ros.process import option
 from adxl_ros.signals.rest_detection import Rest
 import numpy as np
 
@@ -159,7 +160,8 @@ class GyroLook:
         if self._largest_radps > _ROUNDED * _LARGEST_RADPS:
             faults.append(
                 f'the gyroscope reads up to {self._largest_radps:.3g} rad/s, and none measures '
-                f'more than {_LARGEST_RADPS:.3g} rad/s; if it is in °/s, state dps by --columns, '
+                f'more than {_LARGEST_RADPS:.3g} rad/s; if it is in °/s, state dps '
+                f'by {option("columns")}, '
                 'or convert it to rad/s'
             )
         worst = int(np.abs(bias).argmax())
@@ -202,7 +204,8 @@ def _disagreement(turns: Sequence[_Turn]) -> tuple[float, list[str]]:
     if best.is_degrees and not best.changes:
         return error, [
             f'the gyroscope is in °/s: {compared}, and as °/s by '
-            f'{np.degrees(2 * np.arcsin(errors.min() / 2)):.0f}°; state dps by --columns, or '
+            f'{np.degrees(2 * np.arcsin(errors.min() / 2)):.0f}°; state '
+            f'dps by {option("columns")}, or '
             'convert it to rad/s'
         ]
     unit = ' in °/s' * best.is_degrees

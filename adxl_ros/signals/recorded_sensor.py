@@ -16,6 +16,7 @@ from adxl_ros.files.stamps import halves, late_by, stamped_rate_hz
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import names_of, put, Sensor, to_volts, with_axes, with_neutral
+from adxl_ros.process import usage
 from adxl_ros.signals import block_statistics as stats
 from adxl_ros.signals.block_statistics import Spans
 import numpy as np
@@ -148,7 +149,7 @@ def _measured(
 def _noise_is_hidden(unit: Sensor, time_s: np.ndarray) -> str:
     """Return that samples do not show the noise of a sensor, why, and what does."""
     needed_s = max(SHORTEST_S, FEWEST_SAMPLES / unit.rate_hz)
-    longest_s = np.diff(time_s).max()
+    longest_s = np.diff(time_s).max(initial=0.0)
     has_gaps = longest_s > stats.gap_s(unit.rate_hz)
     why = f'; they come with gaps of up to {longest_s:.2g} s' if has_gaps else ''
     fields = parameter_file.SENSOR_FIELDS.items()
@@ -156,7 +157,8 @@ def _noise_is_hidden(unit: Sensor, time_s: np.ndarray) -> str:
     return (
         f'{len(time_s)} samples at {unit.rate_hz:g} Hz do not show the noise of the sensor{why}; '
         f'record at least {needed_s:.3g} s without gaps, or state {", ".join(keys)} in the '
-        'parameter file; fit --means takes a table of which each row is the mean of a rest'
+        f'parameter file; {usage("fit", means=True)} takes a table of which each '
+        'row is the mean of a rest'
     )
 
 

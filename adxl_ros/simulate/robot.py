@@ -23,6 +23,7 @@ from adxl_ros.files.robot_readings import Readings
 from adxl_ros.files.stamps import period_s, stamped_rate_hz
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Components
+from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
 from adxl_ros.simulate.motion import (
     ForcePath,
@@ -62,7 +63,7 @@ class Robot:
             import pinocchio
         except ImportError:
             raise UserError(
-                '--urdf needs pinocchio: apt install ros-jazzy-pinocchio, or '
+                f'{option("urdf")} needs pinocchio: apt install ros-jazzy-pinocchio, or '
                 f'{install_hint("pin")}'
             ) from None
         self._pin: Any = pinocchio

@@ -173,6 +173,9 @@ class SensorModel:
         self._dt_s, self._std_v = 0.0, np.zeros(0)
         self._switch_on(0)
 
+    def __repr__(self) -> str:
+        return f'<SensorModel of {self.sensor!r}>'
+
     def _switch_on(self, count: int) -> None:
         """Forget all that sensors remember: steps since power-on, filters, noise, past forces."""
         self._memory: dict[str, Any] = {

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 import json
 from pathlib import Path
 
-from adxl_ros.api import gate
-from adxl_ros.api.checking import check as check_recordings, PAGE
+from adxl_ros.api.checking import check as check_recordings
 from adxl_ros.errors import UserError
 from adxl_ros.process import command
 from adxl_ros.report import page as html_page
-from adxl_ros.report.screen import wrapped
+from adxl_ros.signals import gate
 from adxl_ros.signals.findings import Findings
+from adxl_ros.signals.findings_report import PAGE
 from adxl_ros.tools import command_line as cli
 
 _EXAMPLES = {
@@ -35,7 +35,6 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--params',
         metavar='FILE',
-        default=None,
         help='the sensor, for recordings in volts (default: the nominal sensor)',
     )
     parse.add_argument('--report', metavar='DIR', help='write the page check.html there')
@@ -71,43 +70,32 @@ def parser() -> argparse.ArgumentParser:
 def check(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     cli.check_outputs(options, options.report and Path(options.report, PAGE), options.junit)
-    fail_on, minima = _fail_on(options.fail_on), _minima(options.minima)
+    fail_on = [kind for kind in options.fail_on.split(',') if kind]
+    gate.require_kinds(fail_on)
     if options.report:
         html_page.check_libraries()
     with cli.progress('check') as show:
         checked = check_recordings(
             options.recording,
             options.params,
+            against=options.against,
+            minima=_minima(options.minima),
             urdf=options.urdf,
             frame=options.frame,
             joints=options.joints,
             reading=cli.reading_options(options),
             progress=show,
         )
-    failing = [*fail_on, *(f'min {name}' for name in minima)]
-    earlier = _earlier(options)
-    outcomes = [_outcomes(each, earlier, minima) for each in checked.recordings]
     if options.junit:
-        gate.write_junit(options.junit, list(zip(checked.recordings, outcomes)), failing)
+        checked.junit(options.junit, fail_on, overwrite=options.overwrite)
     page = [checked.save(options.report, overwrite=options.overwrite)] if options.report else []
     if options.json:
-        recordings = checked.to_dict()['recordings']
-        for entry, rows in zip(recordings, outcomes):
-            entry['outcomes'] = [gate.as_json(row) for row in rows]
-        print(json.dumps(recordings, indent=1))
+        print(json.dumps(checked.to_dict()['recordings'], indent=1))
     else:
         *lines, sentence = checked.screen
-        print('\n'.join([*lines, *_gate_lines(outcomes, options.against)]))
+        print('\n'.join(lines))
         cli.print_end([sentence], page, _next_command(checked.recordings, options))
-    is_failed = any(row.is_worse and row.name in failing for rows in outcomes for row in rows)
-    return int(is_failed)
-
-
-def _fail_on(text: str) -> list[str]:
-    kinds = [kind for kind in text.split(',') if kind]
-    if unknown := [kind for kind in kinds if kind not in gate.KINDS]:
-        raise UserError(f'--fail-on {unknown[0]}: expected some of {", ".join(gate.KINDS)}')
-    return kinds
+    return 1 if checked.failures(fail_on) else 0
 
 
 def _minima(texts: Sequence[str]) -> dict[str, float]:
@@ -123,40 +111,6 @@ def _minima(texts: Sequence[str]) -> dict[str, float]:
                 f'--min {text}: expected NAME=VALUE with one of {", ".join(gate.MINIMA)}'
             )
     return minima
-
-
-def _earlier(options: argparse.Namespace) -> gate.Earlier | None:
-    """Return the recording that all others are compared with, if there is one."""
-    if not options.against:
-        return None
-    reading = cli.reading_options(options)
-    (found,) = check_recordings(options.against, options.params, reading=reading).recordings
-    return gate.Earlier(found, options.params, reading)
-
-
-def _outcomes(
-    findings: Findings, earlier: gate.Earlier | None, minima: dict[str, float]
-) -> list[gate.Outcome]:
-    """Return whether a recording is sound, its limits, and what became worse."""
-    text = 'sound' if findings.is_sound else findings.faults[0]
-    outcomes = [gate.Outcome('sound', not findings.is_sound, text)]
-    if earlier is not None:
-        outcomes += earlier.compare(findings)
-    if findings.contents is not None:
-        outcomes += gate.limits(findings.contents, minima)
-    return outcomes
-
-
-def _gate_lines(outcomes: Sequence[Sequence[gate.Outcome]], against: str | None) -> list[str]:
-    """Return what was compared, a line each."""
-    lines = []
-    for rows in outcomes:
-        compared = [row for row in rows if row.name != 'sound']
-        if compared:
-            lines.append(f'against {against}' if against else 'limits')
-        for row in compared:
-            lines += wrapped(f'  {"WORSE" if row.is_worse else "ok":7} {row.name}: {row.text}', 10)
-    return [*lines, *[''] * bool(lines)]
 
 
 def _next_command(results: Sequence[Findings], options: argparse.Namespace) -> str:

@@ -31,7 +31,6 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--params',
         metavar='FILE',
-        default=None,
         help='what the simulator models (default: the nominal sensor)',
     )
     parse.add_argument(
@@ -43,6 +42,12 @@ def parser() -> argparse.ArgumentParser:
         '--sim',
         metavar='RECORDING',
         help='ideal specific force of the same manoeuvre by another simulator',
+    )
+    parse.add_argument(
+        '--sim-unit',
+        metavar='UNIT',
+        default='',
+        help='unit of --sim: g, mg, mmps2 (default: m/s²)',
     )
     parse.add_argument(
         '--in',
@@ -108,6 +113,7 @@ def diagnose(options: argparse.Namespace) -> int:
             [cli.read('diagnose', path, reading) for path in options.recording],
             options.params,
             sim=options.sim,
+            sim_unit=options.sim_unit,
             urdf=options.urdf,
             frame=options.frame,
             joints=options.joints,

@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic
@@ -73,7 +74,6 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--params',
         metavar='FILE',
-        default=None,
         help='parameter file of all recordings (default: the calibration of each '
         'unit at the date of the recording, else the nominal sensor)',
     )
@@ -137,11 +137,18 @@ def fleet(options: argparse.Namespace) -> int:
     )
     folder = Path(options.output)
     cli.check_outputs(options, folder / TABLE, folder / PAGE)
-    selection = (options.only_failed, since, options.limit)
+    plan_after = partial(
+        plan,
+        sources,
+        recipe,
+        only_failed=options.only_failed,
+        since=since,
+        limit=options.limit,
+    )
     if options.dry_run:
         results = Results(folder)
         cli.print_end(
-            _plan_lines(plan(sources, recipe, results, *selection), results),
+            _plan_lines(plan_after(results), results),
             [],
             command_of_this_process().replace(' --dry-run', ''),
         )
@@ -149,7 +156,7 @@ def fleet(options: argparse.Namespace) -> int:
     make_folder(folder)
     with only_client(folder):
         results = Results(folder)
-        to_do, rows = plan(sources, recipe, results, *selection), []
+        to_do, rows = plan_after(results), []
         try:
             if to_do.todo:
                 shared = (recipe, frozenset(results.known))
@@ -163,8 +170,11 @@ def fleet(options: argparse.Namespace) -> int:
             # Ctrl-C leaves table and page of what is done.
             files, findings = _written(folder, results)
     is_repeated = any(row['outcome'] == 'crashed' or row['refused_by'] == 'stage' for row in rows)
+    lines = [*_result_lines(rows, to_do), '']
+    if findings:
+        lines += [*findings, '']
     cli.print_end(
-        [*_result_lines(rows, to_do), '', *findings, *[''] * bool(findings)],
+        lines,
         files,
         f'{command_of_this_process()} --only-failed' if is_repeated else '',
         monotonic() - begin_s,
@@ -216,10 +226,8 @@ def _left_out(to_do: Plan) -> str:
 
 def _result_lines(rows: Sequence[Row], to_do: Plan) -> list[str]:
     if not rows:
-        return [
-            f'Nothing to do: {counted(to_do.done, "recording")} had a row before',
-            f' left out  {_left_out(to_do)}' * bool(to_do.outside),
-        ]
+        left_out = f' left out  {_left_out(to_do)}' if to_do.outside else ''
+        return [f'Nothing to do: {counted(to_do.done, "recording")} had a row before', left_out]
     outcomes = Counter(row['outcome'] for row in rows)
     parts = [f'{outcomes[name]} {name}' for name in OUTCOMES if outcomes[name] or name == 'done']
 

@@ -45,6 +45,7 @@ from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Place, Role
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import coefficients_of, get, parameter_of, put, Sensor, with_neutral
+from adxl_ros.process import usage
 from adxl_ros.report.quantities import with_half_width
 import numpy as np
 import scipy
@@ -501,7 +502,7 @@ def require_determined(
     )
     raise UserError(
         f'the full model is not determined by {len(poses)} poses: {reason}; add '
-        f'{advice}, or fit --model physical or linear'
+        f'{advice}, or {usage("fit", model="physical")} or linear'
     )
 
 
@@ -713,6 +714,6 @@ def warnings(full: FullFit, poses: Poses) -> list[str]:
     if change_k > _MAX_WARMING_K and 'temperature_bias' not in full.fitted.effects:
         lines.append(
             f'temperature moved by {change_k:.1f} degC, which the model ignores; keep it '
-            'steady, or fit --effect temperature_bias'
+            f'steady, or {usage("fit", effects=["temperature_bias"])}'
         )
     return lines

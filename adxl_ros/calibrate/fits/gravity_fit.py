@@ -24,6 +24,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import parameter_of, Sensor
+from adxl_ros.process import option, usage
 import numpy as np
 import scipy
 
@@ -536,8 +537,10 @@ def _require_determined(
     )
     scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
     raise _UndeterminedError(
-        f'gravity: without their angles (fit --poses), the {count} rests {reason}{scatter}; '
-        f'{_advice(rests, parameters)}; if they have them, --params needs the file of this sensor'
+        f'gravity: without their angles ({usage("fit", poses=None)}), the {count} rests '
+        f'{reason}{scatter}; '
+        f'{_advice(rests, parameters)}; if they have them, {option("sensor")} '
+        'needs the file of this sensor'
     )
 
 

@@ -12,6 +12,7 @@ from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import coefficients_of, get, Sensor
+from adxl_ros.process import usage
 import numpy as np
 
 AFFINE = ('bias', 'scale_factor', 'misalignment')
@@ -114,7 +115,8 @@ def regress_axes(sensor: Sensor, poses: Poses) -> list[AxisRegression]:
     """Fit the regressions of the x and y axes (equations 8 to 17)."""
     if not sensor.axes.startswith('xy'):
         raise UserError(
-            f'the physical model needs the axes x and y, not {sensor.axes}; fit --model linear'
+            f'the physical model needs the axes x and y, not {sensor.axes}; '
+            + usage('fit', model='linear')
         )
     start = fit(sensor, poses)
     return [_regress_axis(d, start, poses) for d in range(2)]

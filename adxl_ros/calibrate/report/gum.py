@@ -23,6 +23,7 @@ from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.sensor import MARGIN_K, Sensor
+from adxl_ros.process import option
 from adxl_ros.report import templates
 from adxl_ros.report.quantities import mg, number
 from adxl_ros.signals.rest_detection import MOST_BATCHES
@@ -365,7 +366,7 @@ def write(
     if found is None:
         raise UserError(
             f'{path}: a certificate states errors at stage angles, and no pose with '
-            'angles was kept out of the fit; leave --dcc out'
+            f'angles was kept out of the fit; leave {option("certificate")} out'
         )
     elements = templates.environment('a certificate', ('adxl_ros.calibrate.report', ''))
     fitted = result.fitted
