@@ -507,7 +507,7 @@ def bridged(data: np.ndarray, used: np.ndarray) -> np.ndarray:
     if used.all() or not used.any():
         return data
     number, kept = np.arange(len(used)), np.flatnonzero(used)
-    return np.column_stack([np.interp(number, kept, column[kept]) for column in data.T])
+    return np.array([np.interp(number, kept, column[kept]) for column in data.T]).T
 
 
 def without_gaps(comparison: BaselineComparison) -> BaselineComparison:

@@ -259,12 +259,14 @@ class AngleErrorFilter:
         """Filter k series, (k, n)."""
         lower = np.ones((2, len(self.gain)))
         lower[1, :-1] = -self.transition[1:]
-        changes = np.zeros_like(values)
-        changes[:, 1:] = values[:, 1:] - self.pole * values[:, :-1]
-        estimates = scipy.linalg.lapack.dtbtrs(lower, (changes * self.gain).T, uplo='L', diag='U')[
-            0
-        ].T
-        changes[:, 1:] -= self.weight[1:] * estimates[:, :-1]
+        changes = values.copy()
+        changes[:, 0] = 0.0
+        changes[:, 1:] -= self.pole * values[:, :-1]
+        estimates = scipy.linalg.lapack.dtbtrs(
+            lower, (changes * self.gain).T, uplo='L', diag='U', overwrite_b=True
+        )[0].T
+        estimates[:, :-1] *= self.weight[1:]
+        changes[:, 1:] -= estimates[:, :-1]
         changes *= self.scale
         changes[:, 0] = values[:, 0]
         return scipy.signal.lfilter([1.0], [1.0, -self.pole], changes)
@@ -480,8 +482,8 @@ def whiten_channel(
     block_grams, total_grams, log_scales = [], [], []
     for whitener in filters:
         white = scipy.signal.sosfilt(whitener.sections, before[id(whitener.errors)])
-        white[:, ~counted] = 0.0
-        block_grams.append(plain_grams(white.T, counted) if by_block else np.zeros((0, 0, 0)))
+        white *= counted
+        block_grams.append(_grams(white) if by_block else np.zeros((0, 0, 0)))
         total_grams.append(block_grams[-1].sum(axis=0) if by_block else white @ white.T)
         # The log determinant of the filter for errors, sample by sample.
         scale = np.ones(len(used)) if whitener.errors is None else whitener.errors.scale
@@ -504,8 +506,13 @@ def sum_by_block(values: np.ndarray) -> np.ndarray:
 
 def plain_grams(columns: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Return the products of k columns, (n, k), over used samples, by block, (blocks, k, k)."""
-    kept = np.where(used[:, None], columns, 0.0)
-    return np.array([kept[a:b].T @ kept[a:b] for a, b in pairwise(block_edges(len(used)))])
+    return _grams(columns.T * used)
+
+
+def _grams(rows: np.ndarray) -> np.ndarray:
+    """Return the products of k rows, (k, n), by block, (blocks, k, k)."""
+    edges = pairwise(block_edges(rows.shape[1]).tolist())
+    return np.array([rows[:, a:b] @ rows[:, a:b].T for a, b in edges])
 
 
 def block_edges(count: int) -> np.ndarray:

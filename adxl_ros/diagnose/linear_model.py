@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain, product
 from typing import NamedTuple
 
@@ -28,6 +28,7 @@ from adxl_ros.model.effects import base, effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Concern, Effect, Parameter, Role
 from adxl_ros.model.sensor import names_of, parameter_of, put, Sensor, with_neutral
 from adxl_ros.signals.block_statistics import rms
+from adxl_ros.simulate.response import ChainMemo
 import numpy as np
 
 PRIOR_WIDTH = 5.0
@@ -241,7 +242,8 @@ def sensitivities_at(
 
     Coefficients of one parameter change together, because each axis only follows its own one.
     """
-    out = np.zeros((*output_v.shape, len(names)))
+    # Samples are next to each other in memory, as filters take them.
+    out = np.zeros((len(names), *output_v.shape[::-1])).T
     groups: dict[Coefficient, list[int]] = {}
     for i, name in enumerate(names):
         groups.setdefault(name.without_axis, []).append(i)
@@ -295,6 +297,8 @@ class LinearModel:
     filters: list[list[Whitener]]  # Whitening filters of each channel
     # By channel: sensitivities by number of the column, V per unit, (n,)
     columns: list[dict[int, np.ndarray]]
+    # Responses of the newest hypotheses
+    memo: ChainMemo = field(default_factory=partial(ChainMemo, 2), compare=False, repr=False)
 
     @property
     def baseline(self) -> Sensor:
@@ -603,7 +607,7 @@ def _whitened(
     residuals_v = [c.residual_v(c.sensor).T for c in comparisons]
     return [
         evidence.whiten_channel(
-            np.column_stack([residual_v, *own.values()]),
+            np.array([residual_v, *own.values()]).T,
             np.array([*own]),
             channel.comparison.used,
             of_filters,

@@ -390,6 +390,14 @@ def _excess(
     )
 
 
+def _periodogram(
+    values: np.ndarray, rate_hz: float, window: str = 'boxcar'
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return frequencies, Hz, (k,), and spectra of m axes, (n, m); one by one, to save memory."""
+    spectra = [scipy.signal.periodogram(v, rate_hz, window) for v in values.T]
+    return spectra[0][0], np.array([power for _, power in spectra]).T
+
+
 def white_noise_v(
     noise_v: np.ndarray, sensor: Sensor, rows: np.ndarray | None = None
 ) -> np.ndarray:
@@ -400,7 +408,7 @@ def white_noise_v(
     first differences of samples, (n,) bool, ignores spikes. The smaller one counts.
     """
     innovations, decay = _innovations(noise_v, sensor)
-    frequency_hz, power = scipy.signal.periodogram(innovations, sensor.rate_hz, 'hann', axis=0)
+    frequency_hz, power = _periodogram(innovations, sensor.rate_hz, 'hann')
     level = np.median(power[frequency_hz > sensor.rate_hz / 4], axis=0) / np.log(2)
     changes = np.abs(np.diff(innovations, axis=0)) / np.sqrt(2)
     std = np.minimum(
@@ -414,7 +422,7 @@ def _line(
     white: np.ndarray, residual_v: np.ndarray, time_s: np.ndarray, sensor: Sensor
 ) -> Detection | None:
     """Return the mains line that is the strongest of a whitened residual, or None."""
-    frequency_hz, power = scipy.signal.periodogram(white, sensor.rate_hz, 'hann', axis=0)
+    frequency_hz, power = _periodogram(white, sensor.rate_hz, 'hann')
     kept = frequency_hz > _LINE_LOWEST_HZ
     frequency_hz, power = frequency_hz[kept], power[kept]
     if len(frequency_hz) < _LINE_FEWEST_ORDINATES:
@@ -492,7 +500,7 @@ def compare_noise(
             bridged(v, comparison.used) / scale
             for v in (comparison.residual_v(mean), comparison.simulated_noise_v(noisy, seed))
         ]
-        recorded, simulated = (scipy.signal.periodogram(v, rate_hz, axis=0)[1] for v in series)
+        recorded, simulated = (_periodogram(v, rate_hz)[1] for v in series)
         ratios[f'power_ratio_{label}'] = [
             float(recorded[band].sum() / simulated[band].sum()) for band in bands
         ]

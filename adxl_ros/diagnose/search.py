@@ -140,19 +140,22 @@ def linearise(
     nuisances = [n for n in linear_model.nuisances if n.effect not in effects]
     start = with_neutral(linear_model.baseline, [*effects, *(n.effect for n in nuisances)])
     point = _Point.of(start, effects, names, get(sensor, names))
+    # The last iterate of a fit is linearised again, for more filters.
+    responses = linear_model.memo(
+        'responses',
+        (tuple(effects), point.values.tobytes()),
+        lambda: list(chain.from_iterable(map(point.responses, linear_model.comparisons))),
+    )
     channels: list[evidence.WhitenedChannel] = []
     columns: list[evidence.ChannelColumns] = []
     changes: list[dict[int, np.ndarray]] = []
     for response, own, channel, of_channel in zip(
-        chain.from_iterable(map(point.responses, linear_model.comparisons)),
-        linear_model.nuisance_columns,
-        linear_model.places,
-        filters,
+        responses, linear_model.nuisance_columns, linear_model.places, filters
     ):
         shown = [n for n in nuisances if n in own]
         nuisance_places = [len(names) + nuisances.index(name) for name in shown]
         ids = np.array([*response.places, *nuisance_places], int)
-        design = np.column_stack([response.columns, *(own[name] for name in shown)])
+        design = np.vstack([response.columns.T, *(own[name] for name in shown)]).T
         used = channel.comparison.used
         plain = evidence.plain_grams(design / channel.v_per_mean_mps2, used)
         columns.append(evidence.ChannelColumns(ids, design.astype(np.float32), plain))
@@ -230,7 +233,7 @@ class _Point:
             places = [i for i, name in enumerate(self.names) if name.axis in ('', axis)]
             own = derivatives[:, d, places]
             residual_v = comparison.volts[:, d] - output_v[:, d] + own @ departures[places]
-            yield _Response(places, np.column_stack([residual_v, own]), change_v[:, d])
+            yield _Response(places, np.vstack([residual_v, own.T]).T, change_v[:, d])
 
 
 def _fitted_names(linear_model: LinearModel, effects: Sequence[str]) -> list[Coefficient]:

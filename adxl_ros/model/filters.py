@@ -158,6 +158,7 @@ def _weights(z: complex, order: int) -> np.ndarray:
     return np.array([np.dot(c[::-1], moments) for c in lagrange])
 
 
+_MOST_TURNS = 0.5  # Largest share of the inputs at which one turns, for a play by them; chosen
 _THRESHOLDS = (0.25, 0.5, 0.75, 1.0)  # Of stop operators, by the reach; chosen: four equal
 
 
@@ -169,10 +170,10 @@ def stop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:
     (Prandtl-Ishlinskii; Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996). The
     input is (n,), or (n, k) for k independent operators, as in `play`.
     """
-    lag = np.zeros(x.shape)
+    lag, turns = np.zeros(x.shape), _turns(x)
     for i, fraction in enumerate(_THRESHOLDS):
         threshold = fraction * reach
-        lag = lag + (x - play(x, threshold, memory.setdefault(i, {}))) / threshold
+        lag += (x - play(x, threshold, memory.setdefault(i, {}), turns)) / threshold
     return lag / len(_THRESHOLDS)
 
 
@@ -189,17 +190,44 @@ def loop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:
     return stop(x, reach, memory) - first_branch / len(_THRESHOLDS)
 
 
-def play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray:
+def play(
+    x: np.ndarray, half_width: float, memory: dict[str, Any], turns: np.ndarray | None = None
+) -> np.ndarray:
     """
     Follow the input with a dead band: yₙ = max(xₙ − r, min(xₙ + r, yₙ₋₁)).
 
-    A step clamps the output between xₙ − r and xₙ + r. Consecutive clamps combine to one clamp.
-    The input, (n,), or (n, k) for k operators, is therefore split into stretches, which run in
-    parallel and are joined afterwards. With an empty memory the output is in the middle of its
-    dead band.
+    The input is (n,), or (n, k) for k operators. With an empty memory the output is in the middle
+    of its dead band. While the input rises or falls, a step clamps the output before the stretch:
+    only the few inputs at which it turns follow each other. `turns` are those of `_turns`.
     """
     if not half_width or not len(x):
         return x
+    turns = _turns(x) if turns is None else turns
+    if len(turns) > _MOST_TURNS * len(x):
+        return _stepwise_play(x, half_width, memory)
+    at_turns = _stepwise_play(x[turns], half_width, memory)
+    before = np.repeat(at_turns[:-1], np.diff(turns), axis=0)
+    outputs = np.concatenate([before, at_turns[-1:]])
+    np.minimum(outputs, x + half_width, out=outputs)
+    return np.maximum(outputs, x - half_width, out=outputs)
+
+
+def _turns(x: np.ndarray) -> np.ndarray:
+    """Return the first and the last input of each stretch that only rises, or never does."""
+    if len(x) < 2:
+        return np.arange(len(x))
+    rises = (x[1:] > x[:-1]).reshape(len(x) - 1, -1)
+    changes = (rises[1:] != rises[:-1]).any(axis=1)
+    return np.concatenate([[0], np.flatnonzero(changes) + 1, [len(x) - 1]])
+
+
+def _stepwise_play(x: np.ndarray, half_width: float, memory: dict[str, Any]) -> np.ndarray:
+    """
+    Run `play` over all inputs.
+
+    A step clamps the output between xₙ − r and xₙ + r. Consecutive clamps combine to one clamp.
+    The input is therefore split into stretches, which run in parallel and are joined afterwards.
+    """
     rows = x.reshape(len(x), -1)
     length = ceil(np.sqrt(len(x)) / 3)
     padded = np.concatenate([rows, np.repeat(rows[-1:], -len(x) % length, axis=0)])

@@ -470,9 +470,10 @@ def quantise(volts: np.ndarray, sensor: Sensor, lsb_v: np.ndarray) -> np.ndarray
     if not np.any(lsb_v):
         return volts
     highest = sensor.adc_vref_v - sensor.lsb_v
-    codes = volts / lsb_v
-    np.rint(codes, out=codes)
-    return np.clip(codes * lsb_v, 0.0, np.floor(highest / lsb_v) * lsb_v)
+    coded = volts / lsb_v
+    np.rint(coded, out=coded)
+    coded *= lsb_v
+    return np.clip(coded, 0.0, np.floor(highest / lsb_v) * lsb_v, out=coded)
 
 
 def at_a_rail(volts: np.ndarray, sensor: Sensor) -> np.ndarray:

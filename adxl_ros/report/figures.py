@@ -99,8 +99,10 @@ def axis_number(name: str, number: int) -> str:
 
 def rounded(values: Iterable[float]) -> list[float | None]:
     """Return values with the digits of a plot; None where they are not finite."""
+    numbers = np.asarray(values, float)
     return [
-        float(f'{v:.{_DIGITS}g}') if np.isfinite(v) else None for v in np.asarray(values, float)
+        float(f'{v:.{_DIGITS}g}') if is_finite else None
+        for v, is_finite in zip(numbers.tolist(), np.isfinite(numbers).tolist())
     ]
 
 
@@ -113,11 +115,9 @@ def extremes(values: np.ndarray, count: int) -> np.ndarray:
     if len(values) <= count:
         return np.arange(len(values))
     size = -(-len(values) // (count // 2))
-    chosen = []
-    for begin in range(0, len(values), size):
-        block = np.nan_to_num(values[begin : begin + size])
-        chosen += sorted({begin + int(np.argmin(block)), begin + int(np.argmax(block))})
-    return np.array(chosen)
+    blocks = np.pad(np.nan_to_num(values), (0, -len(values) % size), 'edge').reshape(-1, size)
+    begins = np.arange(0, len(values), size)
+    return np.unique([begins + blocks.argmin(axis=1), begins + blocks.argmax(axis=1)])
 
 
 def whisker(

@@ -41,7 +41,8 @@ import numpy as np
 Columns = dict[str, np.ndarray]  # Columns of a recording by canonical name, (n,) each
 _BLOCK_ROWS = 32768  # Samples of a block; chosen: its arrays stay smaller than the internal grid
 _BLOCK_STEPS = 65536  # Steps of the internal grid in memory at once; chosen: some 10 MB of signals
-_WHOLE_STEPS = 300_000  # Most steps that are kept at once; chosen: 20 min at 250 Hz, 200 MB
+_WHOLE_STEPS = 300_000
+"""Most steps whose signals are kept. Chosen: 20 min at 250 Hz, 200 MB."""
 _ALIGNED_STEPS = 1e-4  # Distance of an aligned sample, steps; chosen: above rounding
 _ROUNDING = 1e-9  # Rounding error of a ratio of two rates
 _NOISE_MEMORY = 50  # RC over which missing noise is drawn; chosen: e⁻⁵⁰ is left
@@ -88,31 +89,26 @@ class Response:
             half = len(stamps_s) // 2
             return np.concatenate([self(stamps_s[:half]), self(stamps_s[half:])])
         instants_s = self._instants(stamps_s)
-        analog_v, signals = self._sampled(steps)
-        signals.dt_s = 1 / self.sensor.rate_hz
+        key = (self._analog_key(), stamps_s.tobytes())
+        analog_v, signals = self._kept('analog', key, partial(self._sampled, steps))
+        signals = replace(signals, dt_s=1 / self.sensor.rate_hz)
         if self._chain.effects[Place.ADC] or self._chain.effects[Place.CODE]:
-            signals.environment = self._environment(instants_s)
+            signals.environment = self._kept(
+                'surroundings',
+                (*self._key(Place.CLOCK), stamps_s.tobytes()),
+                partial(self._environment, instants_s),
+            )
         signals.input_v = list((analog_v + self._draw_noise(stamps_s, signals)).T)
         return self._chain.convert(signals)
 
     def whole(self, stamps_s: np.ndarray, memo: ChainMemo) -> np.ndarray:
         """Simulate all samples of a recording as `__call__` does; nothing can follow."""
         steps = ceil((float(stamps_s[-1]) - self._begin_s) / self._step_s) + POINTS
-        if steps > _WHOLE_STEPS:
-            return self(stamps_s)
-        self._kept, self._block_steps = memo, steps
-        sensor = self.sensor
-        key = (
-            *self._key(*Place),
-            self._seed,
-            sensor.rate_hz,
-            sensor.rc_s,
-            sensor.lsb_v,
-            *sensor.nominal_zero_g_v.tolist(),
-            *sensor.noise_density_g_per_rthz.tolist(),
-            stamps_s.tobytes(),
-        )
-        return self._kept('volts', key, lambda: self(stamps_s)).copy()
+        if steps <= _WHOLE_STEPS:
+            self._kept, self._block_steps = memo, steps
+        noise_density = self.sensor.noise_density_g_per_rthz.tolist()
+        key = (self._analog_key(), self._key(*Place), *noise_density, stamps_s.tobytes())
+        return memo('volts', key, lambda: self(stamps_s)).copy()
 
     def _key(self, *places: Place) -> tuple:
         """Return what the chain up to the element depends on, with effects of some places."""
@@ -126,6 +122,19 @@ class Response:
             sensor.adc_vref_v,
             *sensor.nominal_scale_v_per_g.tolist(),
             *(effect.key for effect in effects),
+        )
+
+    def _analog_key(self) -> tuple:
+        """Return what the chain up to the filter depends on."""
+        sensor = self.sensor
+        digital = (Place.ADC, Place.CODE)
+        return (
+            *self._key(*(place for place in Place if place not in digital)),
+            self._seed,
+            sensor.rate_hz,
+            sensor.rc_s,
+            sensor.lsb_v,
+            *sensor.nominal_zero_g_v.tolist(),
         )
 
     def _instants(self, stamps_s: np.ndarray) -> np.ndarray:
