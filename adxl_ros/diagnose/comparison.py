@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 from adxl_ros.files.recording_columns import JOINTS, LONGEST_MOVE_NS, Recording, USUAL_GAPS
@@ -375,9 +375,14 @@ def _motion(
     return Motion(
         float(recording.time_s[-1] - recording.time_s[0]),
         internal_rate_hz=1e-3,
-        force=lambda time_s: [np.full(len(time_s), f) for f in force],
+        force=partial(_constant, force),
         **paths,
     ), Reference.NONE
+
+
+def _constant(force: Sequence[float], time_s: np.ndarray) -> list[np.ndarray]:
+    """Return components that stay, at times, (n,)."""
+    return [np.full(len(time_s), component) for component in force]
 
 
 def _at_rest(
