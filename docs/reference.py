@@ -172,6 +172,7 @@ TOPICS = [
 """Topics: name, type, content, from, to."""
 SERVICES = {
     'calibration': 'start, resume, start_over, capture, redo, skip, finish, abort',
+    'driver': 'self_test',
     'compensation': 'level',
     'keep_calibrated': 'undo',
     'monitor': 'diagnose',

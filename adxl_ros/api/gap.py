@@ -94,6 +94,7 @@ class Compared(NamedTuple):
     params: str  # What names the sensor on a command line; '' for the nominal one
     params_name: str  # Name of its file
     sim: str  # Path of the recording of another simulator; '' for none
+    sim_unit: str  # Unit of that, as it was given; '' for m/s²
     urdf: str  # Path of the robot; '' for none
     frame: str  # Its frame that carries the sensor
     subject: str  # All of it in one line
@@ -251,6 +252,7 @@ class Gap(Result):
         given = {
             '--params': self.compared.params,
             '--sim': _stored(self.compared.sim, 'SIMULATION'),
+            '--sim-unit': self.compared.sim_unit,
             '--urdf': self.compared.urdf,
             '--frame': self._frame,
             '-o': str(folder),
@@ -278,6 +280,7 @@ class Gap(Result):
             given = {
                 '--params': params if is_closed else compared.params,
                 '--sim': f'{proposal.stem}_simulated.csv' if compared.sim else '',
+                '--sim-unit': compared.sim_unit,
                 '--urdf': compared.urdf,
                 '--frame': self._frame,
                 '-o': f'{folder}_2',
@@ -325,6 +328,7 @@ def diagnose(
     sensor: SensorInput | None = None,
     *,
     sim: RecordingInput | Motion | None = None,
+    sim_unit: str = '',
     urdf: str | os.PathLike | None = None,
     frame: str = 'imu_link',
     joints: str = '',
@@ -351,6 +355,8 @@ def diagnose(
     sim
         Ideal specific force of the same motion by another simulator, with `ax_mps2, ay_mps2,
         az_mps2`, m/s², in the frame of the sensor: a Recording, a DataFrame or a path.
+    sim_unit
+        Unit of the file `sim`: g, mg or mmps2; '' for m/s². `read` has other samples' `unit`.
     urdf
         Path of the robot that carries the sensor; its joints are in the bag of the recording.
     frame, joints
@@ -388,6 +394,11 @@ def diagnose(
     require_least('material', material, 1e-6)
     if align and sim is None and not urdf:
         raise UserError('--align: shifts --sim or a robot, and neither is given')
+    if sim_unit and not isinstance(sim, (str, os.PathLike)):
+        raise UserError(
+            '--sim-unit: states the unit of a file that --sim names, and none is named; samples '
+            'in memory are given by read(..., unit=...)'
+        )
     unit = quantity_named(quantity) if quantity else None
     if not (sim is None or isinstance(sim, (Motion, str, os.PathLike))):
         sim = one_recording(sim)
@@ -398,7 +409,7 @@ def diagnose(
     motion = (
         RobotInput(urdf, frame, joints).path(read[0], baseline).as_motion()
         if urdf
-        else _motion(read[0], sim)
+        else _motion(read[0], sim, sim_unit)
     )
     if prior:
         baseline, remark = _with_prior(baseline, prior)
@@ -428,6 +439,7 @@ def diagnose(
         given.file,
         given.file_name,
         simulator,
+        sim_unit,
         robot,
         frame,
         _subject(read, baseline, simulator or robot),
@@ -464,11 +476,11 @@ def _name_of(sim: RecordingInput | Motion | None) -> str:
     return os.fspath(sim) if isinstance(sim, (str, os.PathLike)) else ''
 
 
-def _motion(read: Recording, sim: RecordingInput | Motion | None) -> Motion | None:
+def _motion(read: Recording, sim: RecordingInput | Motion | None, unit: str) -> Motion | None:
     """Return the motion of another simulator; None for that of the stage."""
     if sim is None or isinstance(sim, Motion):
         return sim
-    return motion_from_force(read_ideal(sim, read.epoch_ns), False)[0]
+    return motion_from_force(read_ideal(sim, read.epoch_ns, unit), False)[0]
 
 
 def _subject(recordings: Sequence[Recording], sensor: Sensor, sim: str) -> str:

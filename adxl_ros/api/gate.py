@@ -100,6 +100,7 @@ class Earlier:
     ) -> None:
         if found.contents is None:
             raise UserError(f'{found.path}: {found.faults[0]}')
+        self.found = found
         self._contents, self._sensor, self._reading = found.contents, sensor, reading
         self._at_rest = _at_rest(found.path, sensor, reading)
 
@@ -197,7 +198,7 @@ def _at_rest(path: str, sensor: SensorInput | None, reading: ReadingOptions) -> 
     samples = [accel_mps2[each.rest.includes(read.time_s)] for each in found]
     count = -(-_FEWEST_PARTS // max(len(samples), 1))
     parts = [part for each in samples for part in np.array_split(each, count) if len(part) > 1]
-    std = np.array([part.std(axis=0) for part in parts]).reshape(len(parts), -1)
+    std = np.reshape([part.std(axis=0) for part in parts], (len(parts), len(read.axes)))
     lengths = [float(np.linalg.norm(each.mean(axis=0))) for each in samples]
     has_length = len(read.axes) == len(AXES)
     return _AtRest(

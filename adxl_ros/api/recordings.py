@@ -17,6 +17,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import recording as recording_files
 from adxl_ros.files.column_mapping import (
     ColumnMapping,
+    GRAVITY,
     parse_mapping,
     parse_mounting,
     parse_unit,
@@ -400,10 +401,15 @@ class RobotInput(NamedTuple):
         )
 
 
-def read_ideal(given: RecordingInput, epoch_ns: int) -> Recording:
-    """Return the ideal specific force of a simulator; its times count from `epoch_ns`."""
+def read_ideal(given: RecordingInput, epoch_ns: int, unit: str = '') -> Recording:
+    """
+    Return the ideal specific force of a simulator; its times count from `epoch_ns`.
+
+    unit: that of the samples of a file; '' for m/s².
+    """
     if isinstance(given, (str, os.PathLike)):
-        return recording_files.read_ideal(given, epoch_ns)
+        unit = parse_unit(unit, '--sim-unit', GRAVITY)
+        return recording_files.read_ideal(given, epoch_ns, unit)
     ideal = one_recording(given)
     missing = [name for name in ACCEL if name not in ideal.columns]
     if missing:

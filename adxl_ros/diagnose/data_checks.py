@@ -62,6 +62,10 @@ _CORRELATED = 0.9
 _SAME_CORRELATION = 0.01
 """Correlations that differ by less are equal, and the one of the longest overlap counts. Chosen: a
 motion that repeats fits at several shifts."""
+_LARGEST_STEP_S = 1.0
+"""Largest step of a clock that is looked for anywhere, s; of a larger one, the parts tell. Chosen:
+what the effect of a time offset covers."""
+_SMALLEST_STEP_S = 5e-3  # Smallest step of a clock, s. Chosen: less is jitter
 _LARGEST_ERROR_RATIO = 0.5
 """A shift shows if it reduces 1 − correlation below this share. Chosen: noise that is not shifted
 keeps it."""
@@ -192,7 +196,7 @@ def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> N
         fault = gravity_at_rest.look(readings, gravity_at_rest.IDEAL, gravity_mps2).fault
         if fault is not None and fault.is_clear:
             raise DataFault(
-                fault.data_fault, f'{sim.force.name}: {fault.reason}; {fault.conversion}'
+                fault.data_fault, f'{sim.force.name}: {fault.stated_by("--sim-unit ")}'
             )
         # A simulator may have the errors of a sensor, but none beyond its tolerance.
         tolerance = gravity_at_rest.nominal_tolerance(sensor)
@@ -215,6 +219,7 @@ def _align_force(
     assert isinstance(force, ForcePath)
     _check_one_shift(recording, sensor, force)
     late_s = _find_shift(recording, sensor, force)
+    _check_step(recording, sensor, force, late_s or 0.0)
     shift = f'{abs(late_s):.4f} s {"late" if late_s > 0 else "early"}' if late_s else ''
     if late_s and may_shift:
         force = force.shifted(-late_s)
@@ -242,10 +247,6 @@ def _align_force(
             f'{recording.time_s[-1]:.6g} s; {advice}',
         )
     if late_s and not may_shift:
-        # --align helps if one shift is right from begin to end.
-        shifted = force.shifted(-late_s)
-        compared = _covered(recording, shifted)[0]
-        _check_simulator(compare(compared, sensor, replace(sim, force=shifted)))
         raise DataFault(
             'time_misaligned',
             f'{force.name} is {shift}; use --align, or shift its stamps by {-late_s:+.6g} s',
@@ -298,19 +299,30 @@ class _Motions(NamedTuple):
         ]
         return [part for part in parts if part.fits]
 
-    def stated_at(self, late_s: np.ndarray) -> np.ndarray:
+    def stated_at(self, late_s: np.ndarray | float) -> np.ndarray:
         """Return the simulator beside the recording, g, (n, m), at shifts, s, (n,) or ()."""
         instants_s = self.measured_s + late_s
         return np.column_stack(
             [np.interp(instants_s, self.stated_s, axis_g) for axis_g in self.stated_g.T]
         )
 
-    def left_g2(self, late_s: np.ndarray) -> float:
+    def left_g2(self, late_s: np.ndarray | float) -> float:
         """Return the mean square, g², that shifts, s, (n,) or (), leave where both overlap."""
         instants_s = self.measured_s + late_s
         overlap = (instants_s >= self.stated_s[0]) & (instants_s <= self.stated_s[-1])
         left = _unexplained(self.measured_g[overlap], self.stated_at(late_s)[overlap])
         return left / max(int(overlap.sum()), 1)
+
+    def part(self, rows: np.ndarray) -> _Motions:
+        """Return the part of the recording that has these rows."""
+        return self._replace(measured_s=self.measured_s[rows], measured_g=self.measured_g[rows])
+
+    def best_shift_s(self, near_s: np.ndarray) -> float:
+        """Return the shift that leaves least, near some, s, (k,)."""
+        best_s = min(near_s.tolist(), key=self.left_g2)
+        ends_s = best_s - self.step_s, best_s + self.step_s
+        found = scipy.optimize.minimize_scalar(self.left_g2, bounds=ends_s, method='bounded')
+        return float(found.x)
 
 
 def _motions(recording: Recording, sensor: Sensor, force: ForcePath) -> _Motions | None:
@@ -387,6 +399,21 @@ class _Drift(NamedTuple):
         return bool(ends_s.min() - resolution_s <= part.late_s <= ends_s.max() + resolution_s)
 
 
+def _fit_drift(motions: _Motions, ends_s: np.ndarray) -> tuple[_Drift, float]:
+    """Fit the shifts at begin and end, from rough ones, s, (2,); return the g² that they leave."""
+    fitted = scipy.optimize.minimize(
+        lambda ends: motions.left_g2(_Drift(*ends).late_s(motions)),
+        ends_s,
+        method='Nelder-Mead',
+        options={
+            'initial_simplex': ends_s + motions.step_s * np.array([[0, 0], [1, 0], [0, 1]]),
+            'xatol': _DRIFT_ACCURACY_S,
+            'fatol': 0.0,
+        },
+    )
+    return _Drift(*map(float, fitted.x)), float(fitted.fun)
+
+
 def _find_drift(motions: _Motions, parts: Sequence[_Shifts]) -> _Drift | None:
     """
     Return the drift that explains the shifts of all parts.
@@ -405,17 +432,7 @@ def _find_drift(motions: _Motions, parts: Sequence[_Shifts]) -> _Drift | None:
     uncertain_s = motions.step_s + abs(np.ptp(ends_s)) * np.ptp(parts[0].time_s) / span_s
     if abs(np.ptp(ends_s)) + uncertain_s < _LARGEST_DRIFT_S:
         return None
-    fitted = scipy.optimize.minimize(
-        lambda ends: motions.left_g2(_Drift(*ends).late_s(motions)),
-        ends_s,
-        method='Nelder-Mead',
-        options={
-            'initial_simplex': ends_s + motions.step_s * np.array([[0, 0], [1, 0], [0, 1]]),
-            'xatol': _DRIFT_ACCURACY_S,
-            'fatol': 0.0,
-        },
-    )
-    drift = _Drift(*map(float, fitted.x))
+    drift, left_g2 = _fit_drift(motions, ends_s)
     if abs(drift.change_s) < _LARGEST_DRIFT_S:
         return None
     one_shift = scipy.optimize.minimize_scalar(
@@ -423,7 +440,7 @@ def _find_drift(motions: _Motions, parts: Sequence[_Shifts]) -> _Drift | None:
     )
     step_at_s = _time_of_step(motions, first, last)
     left_by_step_g2 = motions.left_g2(np.where(time_s < step_at_s, first, last))
-    is_better = fitted.fun < min(_LARGEST_ERROR_RATIO * one_shift.fun, left_by_step_g2)
+    is_better = left_g2 < min(_LARGEST_ERROR_RATIO * one_shift.fun, left_by_step_g2)
     return drift if is_better and all(drift.explains(part, motions) for part in parts) else None
 
 
@@ -469,13 +486,64 @@ def _check_one_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> 
     before_s, after_s = (
         max(level, key=lambda part: float(part.correlation.max())).late_s for level in levels[:2]
     )
-    raise DataFault(
+    raise _step_fault(force, after_s - before_s, _time_of_step(motions, before_s, after_s))
+
+
+def _step_fault(force: ForcePath, step_s: float, at_s: float) -> DataFault:
+    return DataFault(
         'clock_jump',
-        f'the clock of {force.name} or that of the recording steps by '
-        f'{abs(after_s - before_s):.2g} s at about '
-        f'{_time_of_step(motions, before_s, after_s):.4g} s; cut the recording there, and '
-        'diagnose each part with --align',
+        f'the clock of {force.name} or that of the recording steps by {abs(step_s):.2g} s at '
+        f'about {at_s:.4g} s; cut the recording there, and diagnose each part with --align',
     )
+
+
+def _check_step(recording: Recording, sensor: Sensor, force: ForcePath, about_s: float) -> None:
+    """
+    Refuse motions whose shift steps by some tenths of a second, wherever it does.
+
+    A step shows if two shifts leave far less than one, and than shifts that drift. It needs no
+    whole parts on both sides: a recording may move for some seconds only before its step.
+    """
+    motions = _motions(recording, sensor, force)
+    if motions is None:
+        return
+    # What all shifts can be compared in
+    begin_s, end_s = motions.stated_s[[0, -1]] - about_s + np.array([1, -1]) * _LARGEST_STEP_S
+    inside = np.flatnonzero((motions.measured_s > begin_s) & (motions.measured_s < end_s))
+    motions = motions.part(inside[:: 1 + len(inside) // _FINE_SAMPLES])
+    rows = np.arange(len(motions.measured_s))
+    if not len(rows):
+        return
+    near_s = about_s + np.arange(-_LARGEST_STEP_S, _LARGEST_STEP_S, motions.step_s)
+    one_s = motions.best_shift_s(near_s)
+    one_g = motions.stated_at(one_s)
+    own_g = motions.measured_g - (motions.measured_g - one_g).mean(axis=0)
+    motions = motions._replace(measured_g=own_g)
+
+    def error_g2(stated_g: np.ndarray) -> np.ndarray:
+        return np.cumsum(((own_g - stated_g) ** 2).sum(axis=1))
+
+    one_g2 = error_g2(one_g)
+    best_g2, first = 0.0, 0  # First row behind the step
+    for other_s in near_s:
+        gain_g2 = one_g2 - error_g2(motions.stated_at(other_s))
+        for row, gained_g2 in (
+            (int(gain_g2.argmax()), gain_g2.max()),
+            (int(gain_g2.argmin()), gain_g2[-1] - gain_g2.min()),
+        ):
+            if gained_g2 > best_g2:
+                best_g2, first = gained_g2, row + 1
+    if min(first, len(rows) - first) * motions.step_s < LARGEST_LATENCY_S:
+        return
+    before_s, after_s = (
+        motions.part(side).best_shift_s(near_s) for side in np.split(rows, [first])
+    )
+    _, drift_g2 = _fit_drift(motions, np.full(2, one_s))
+    left_g2 = motions.left_g2(np.where(rows < first, before_s, after_s))
+    explains = left_g2 < _LARGEST_ERROR_RATIO * min(motions.left_g2(one_s), drift_g2)
+    if explains and abs(after_s - before_s) > _SMALLEST_STEP_S:
+        at_s = _time_of_step(motions, before_s, after_s)
+        raise _step_fault(force, after_s - before_s, at_s)
 
 
 def _time_of_step(motions: _Motions, before_s: float, after_s: float) -> float:
@@ -903,9 +971,6 @@ def _check_simulator(comparison: BaselineComparison) -> None:
     factor = reference_checks.wrong_dynamic_factor(comparison)
     if factor is not None:
         raise DataFault('reference', factor)
-    step = reference_checks.clock_step(comparison)
-    if step is not None:
-        raise DataFault('clock_jump', step)
 
 
 def _check_range(comparison: BaselineComparison, finite: np.ndarray) -> None:
@@ -1018,7 +1083,8 @@ def _check_axes(comparison: BaselineComparison) -> None:
             raise DataFault(
                 'unit',
                 f'the output is {np.median(gains):.4g} times the simulated '
-                f'output, as values in {units} are; correct the unit of the columns',
+                f'output, as values in {units} are; correct the unit of the columns'
+                + (', by --unit or --sim-unit' if comparison.simulated_force else ''),
             )
     largest = float(np.max(np.abs(correlation)))
     if largest < _UNCORRELATED:

@@ -6,8 +6,6 @@ With a the acceleration of the case and g gravity, the specific force in the tur
 f = R·(a + g), and a simulator with k times the dynamic part states s = R·(k·a + g). Then
 (k·f − s)/(k − 1) = R·g has the length of gravity at all times, whatever the rotation was. Only
 the right k does so, where the recording has dynamics at all.
-
-A clock that steps gives its two sides different delays.
 """
 
 from __future__ import annotations
@@ -34,17 +32,6 @@ the gap, up to which the factor explains both. Chosen: filters and noise leave a
 _SMALLEST_DYNAMICS_G = 5e-3
 """Rms of the length of a force about that of gravity from which it has dynamics, g. Chosen: the
 errors of a healthy, uncalibrated sensor's zero-g are larger, but those of its length are less."""
-_BLOCK_S = 5.0  # Length of the parts whose delay is taken, s. Chosen: some moves
-_LARGEST_STEP_S = 1.0  # Largest delay, s. Chosen: what the effect of a time offset covers
-_FEWEST_PARTS = 3
-"""Fewest parts on each side of a step of the clock. Chosen: they show their spread."""
-_SMALLEST_STEP_S = 5e-3  # Smallest step of a clock, s. Chosen: less is jitter
-_STEP_STDS = 6.0
-"""The same in standard deviations of the delays of the parts about their levels. Chosen: a drift
-has three."""
-_FOLLOWS = 0.95
-"""Correlation of a part with its reference from which its delay counts. Chosen: that of noise of a
-third of the motion."""
 
 
 def _smoothed_g(comparison: BaselineComparison, volts: np.ndarray) -> np.ndarray:
@@ -96,79 +83,6 @@ def wrong_dynamic_factor(comparison: BaselineComparison) -> str | None:
         f'{mg_text(left_g * G0_MPS2)} rms; check how the simulator differentiates its '
         'velocity, and its time step'
     )
-
-
-class _Delay(NamedTuple):
-    """The delay of a recording behind another simulator, in one part."""
-
-    time_s: float
-    delay_s: float
-
-
-def clock_step(comparison: BaselineComparison) -> str | None:
-    """Return when and how far the clock of a simulator steps; None where it does not."""
-    force = comparison.simulated_force
-    if force is None:
-        return None
-    delays = _delays(comparison)
-    if len(delays) < 2 * _FEWEST_PARTS:
-        return None
-    delay_s = np.array([d.delay_s for d in delays])
-    places = range(_FEWEST_PARTS, len(delays) - _FEWEST_PARTS + 1)
-
-    def about_levels_s(place: int) -> np.ndarray:
-        return np.concatenate([part - np.median(part) for part in np.split(delay_s, [place])])
-
-    place = min(places, key=lambda k: float(np.abs(about_levels_s(k)).sum()))
-    before_s, after_s = (float(np.median(part)) for part in np.split(delay_s, [place]))
-    spread_s = 1.4826 * float(np.median(np.abs(about_levels_s(place))))
-    drift = np.polynomial.Polynomial.fit([d.time_s for d in delays], delay_s, 1)
-    about_drift_s = np.abs(delay_s - drift(np.array([d.time_s for d in delays]))).sum()
-    step_s = after_s - before_s
-    if (
-        abs(step_s) < max(_SMALLEST_STEP_S, _STEP_STDS * spread_s)
-        or np.abs(about_levels_s(place)).sum() > about_drift_s / 2
-    ):
-        return None
-    return (
-        f'the clock of {force.name} steps by {abs(step_s):.2g} s between '
-        f'{delays[place - 1].time_s:.4g} and {delays[place].time_s:.4g} s, beside that of '
-        'the recording; cut the recording there, and diagnose each part with --align'
-    )
-
-
-def _delays(comparison: BaselineComparison) -> list[_Delay]:
-    """Return the delays of the parts of a recording that move."""
-    sensor, measured = comparison.sensor, comparison.measured
-    every = max(1, round(sensor.rate_hz * 0.01))
-    rate_hz = sensor.rate_hz / every
-    measured_g, stated_g = (
-        (bridged(v, measured) / sensor.scale_v_per_g)[::every]
-        for v in (comparison.volts, comparison.simulated_v(sensor))
-    )
-    time_s = comparison.time_s[::every]
-    length, margin = round(_BLOCK_S * rate_hz), round(_LARGEST_STEP_S * rate_hz)
-    delays = []
-    for begin in range(margin, len(time_s) - length - margin, length):
-        own = measured_g[begin : begin + length]
-        other = stated_g[begin - margin : begin + length + margin]
-        found = _delay_samples(own - own.mean(axis=0), other)
-        if found is not None:
-            delays.append(_Delay(float(time_s[begin + length // 2]), (margin - found) / rate_hz))
-    return delays
-
-
-def _delay_samples(own: np.ndarray, other: np.ndarray) -> float | None:
-    """Return the place in `other`, samples, where `own`, g, fits best; None where none fits."""
-    if rms(own) < SMALLEST_MOTION_G:
-        return None
-    found = correlations(own, other, len(own))
-    best = int(np.argmax(found.correlation))
-    around = found.correlation[best - 1 : best + 2]
-    if found.correlation[best] < _FOLLOWS or around.min() < 0:
-        return None
-    left, middle, right = 1 - around
-    return float(found.lags[best] + (left - right) / (2 * (left - 2 * middle + right)))
 
 
 class Correlations(NamedTuple):

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -439,13 +439,13 @@ def time_unit_of_step(step: float, is_whole: bool) -> str:
     )
 
 
-def parse_unit(text: str) -> str:
-    """Return the name of a unit of the sensor's output; empty for no text."""
+def parse_unit(
+    text: str, option: str = '--unit', known: Iterable[str] = UNITS[Quantity.OUTPUT]
+) -> str:
+    """Return the name of a unit of the sensor's output, one of the known; '' for no text."""
     name = unit_name(text, Quantity.OUTPUT) if text else ''
-    if name is None:
-        raise UserError(
-            f'--unit {text}: unknown unit; write one of {", ".join(UNITS[Quantity.OUTPUT])}'
-        )
+    if name is None or (name and name not in known):
+        raise UserError(f'{option} {text}: unknown unit; write one of {", ".join(known)}')
     return name
 
 

@@ -165,7 +165,7 @@ def to_flat(sensor: Sensor) -> dict[str, Any]:
         value = getattr(sensor, field.name)
         is_default = field.default is not MISSING and value == field.default
         if field.name not in sensor.unstated and not is_default:
-            flat[key] = value.tolist() if isinstance(value, np.ndarray) else value
+            flat[key] = value if isinstance(value, str) else np.asarray(value).tolist()
     flat |= {f'{_LINK}{name}': value for name, value in sensor.link.items()}
     flat |= {f'{_MOUNTING}{name}': value for name, value in sensor.mounting.items()}
     if sensor.effects:
@@ -358,6 +358,9 @@ class _FlatReader:
         value = self.flat[key]
         if kind == 'np.ndarray':
             value = self._numbers(key, value, axes)
+        elif kind.startswith('tuple'):
+            # A node has an empty list where nothing is given.
+            value = tuple(self._numbers(key, value, axes if value else '').tolist())
         elif kind == 'float':
             value = self._numbers(key, [value])[0].item()
         else:

@@ -146,7 +146,7 @@ def _mounted(
         yield replace(block, columns={**block.columns, **changed})
 
 
-def read_ideal(path: AnyPath, epoch_ns: int = 0) -> Recording:
+def read_ideal(path: AnyPath, epoch_ns: int = 0, unit: str = '') -> Recording:
     """
     Read the ideal specific force of another simulator.
 
@@ -157,6 +157,8 @@ def read_ideal(path: AnyPath, epoch_ns: int = 0) -> Recording:
         sensor_msgs/Imu, or several of which one is `imu/data_raw`.
     epoch_ns
         Origin of the times, ns: `epoch_ns` of the real recording of the manoeuvre.
+    unit
+        Unit of the samples, one of `GRAVITY`; '' for m/s².
 
     Returns
     -------
@@ -169,10 +171,11 @@ def read_ideal(path: AnyPath, epoch_ns: int = 0) -> Recording:
         The file cannot be read, or an axis is missing.
 
     """
+    reading = ReadingOptions(unit=unit)
     parts = (
-        _bag_blocks(path, _BLOCK_ROWS, ideal=True)
+        _bag_blocks(path, _BLOCK_ROWS, ideal=True, reading=reading)
         if is_bag(path)
-        else mapped_recording.blocks(open_table(path), None, AS_IT_IS, _BLOCK_ROWS, ACCEL)
+        else mapped_recording.blocks(open_table(path), None, reading, _BLOCK_ROWS, ACCEL)
     )
     return at_epoch(concatenate(parts), epoch_ns)
 

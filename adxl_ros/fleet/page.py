@@ -190,21 +190,15 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
     """Return the page of a fleet."""
     units = fleet.rank(table, results)
     share = fleet.effect_matrix(table)
-    # Units that drift come first, although others may be more urgent.
-    plotted = [
-        (unit, shown[0])
-        for unit in sorted(units, key=lambda unit: not unit.drifts)
-        if (
-            shown := [
-                *(drift.result for drift in unit.drifts),
-                *(result for result in results if result.place_of(unit.unit) is not None),
-            ]
-        )
-    ][:_SHOWN]
-    figures = {
-        f'trend-{i}': _trend_figure(table, result, unit.unit)
-        for i, (unit, result) in enumerate(plotted)
-    }
+    figures: dict[str, plotly.Figure] = {}
+    trends: dict[str, list[dict[str, str]]] = {'trend': [], 'noise': []}
+    for name, shown in trends.items():
+        for count, plot in enumerate(_plots(units, results, name == 'noise')):
+            figure = f'{name}-{count}'
+            figures[figure] = _trend_figure(table, plot.result, plot.unit.unit)
+            title = f'{plot.unit.serial}: {plot.result.quantity.label}'
+            text = f'{plot.drifts[0].text}.' if plot.drifts else 'No slope is claimed.'
+            shown.append({'figure': figure, 'title': title, 'text': text})
     if len(share.columns):
         figures['matrix'] = _matrix_figure(table, share)
     counts = Counter(unit.state for unit in units)
@@ -228,14 +222,7 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
             'date': date_text,
             'link': partial(_link, folder),
             'without_unit': int((table.unit < 0).sum()),
-            'trends': [
-                {
-                    'figure': f'trend-{i}',
-                    'title': f'{unit.serial}: {result.quantity.label}',
-                    'text': f'{unit.drifts[0].text}.' if unit.drifts else 'No slope is claimed.',
-                }
-                for i, (unit, result) in enumerate(plotted)
-            ],
+            'trends': trends,
             'batches': _batches(results),
             'has_effects': 'matrix' in figures,
             'judged': len(share),
@@ -248,6 +235,28 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
             'drifts': sum(int(result.is_claimed.sum()) for result in results),
         },
     )
+
+
+class _Plot(NamedTuple):
+    """A quantity that is plotted of a unit."""
+
+    unit: fleet.UnitState
+    result: fleet.QuantityResult
+    drifts: Sequence[fleet.Drift]  # Its claimed slopes of this kind, the most urgent first
+
+
+def _plots(
+    units: Sequence[fleet.UnitState], results: Sequence[fleet.QuantityResult], is_noise: bool
+) -> list[_Plot]:
+    """Return the most urgent drift of each unit, or its first quantity; those that drift first."""
+    kind = [result for result in results if result.quantity.is_noise == is_noise]
+    plots = []
+    for unit in units:
+        drifts = [drift for drift in unit.drifts if drift.result.quantity.is_noise == is_noise]
+        measured = [result for result in kind if result.place_of(unit.unit) is not None]
+        shown = [drift.result for drift in drifts] or measured
+        plots += [_Plot(unit, result, drifts) for result in shown[:1]]
+    return sorted(plots, key=lambda plot: not plot.drifts)[:_SHOWN]
 
 
 def _badge(

@@ -10,7 +10,8 @@ state that fits:
 
 1. Out of tolerance: its gap exceeds the tolerance now, or without a gap its drift since the
    calibration. The largest comes first.
-2. Drifts: a claimed slope takes it out of the tolerance. The nearest date comes first.
+2. Drifts: a claimed slope takes it out of the tolerance. The nearest date comes first, and units
+   whose noise rises last.
 3. Not judged: its last recordings are refused. The longest series comes first.
 4. In order.
 """
@@ -21,13 +22,14 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from itertools import chain
+from itertools import chain, product
 from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.fleet import pooling
 from adxl_ros.fleet.pooling import Recordings
+from adxl_ros.fleet.row import NOISE
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.population import PooledCoefficient
 from adxl_ros.report.quantities import counted, mg, number
@@ -64,6 +66,7 @@ class Quantity:
     # Column of its standard deviation, or columns of both ends of its 90 % interval
     error_columns: tuple[str, ...]
     is_coefficient: bool = True  # Whether the units of a fleet have a population of it
+    is_noise: bool = False  # Whether it is a term of the noise, which has no tolerance in mg
 
     def text(self, value: float, low: float, high: float) -> str:
         """Return a difference with its interval, in the unit of the page."""
@@ -170,6 +173,20 @@ def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
                 (f'scale_std_{axis}_v_per_g',),
             ),
         ]
+    for (letter, label, unit, shown), axis in product(NOISE, AXES):
+        column, *ends = (f'noise_{letter}{end}_{axis}_{unit}' for end in ('', '_low', '_high'))
+        # The unit of the files begins with that of an acceleration.
+        listed.append(
+            Quantity(
+                column,
+                f'{label}, {axis}',
+                shown.replace('m/s²', 'µg', 1),
+                1e3 * MG,
+                tuple(ends),
+                is_coefficient=False,
+                is_noise=True,
+            )
+        )
     return tuple(listed)
 
 
@@ -309,9 +326,10 @@ class Drift(NamedTuple):
 
     result: QuantityResult  # Its quantity
     text: str  # The slope with its interval, for people
-    days: float  # Days until the unit is out of its tolerance; infinite for a gap that shrinks
-    # Gap now, or the drift since the calibration where there is no gap; NaN for a gap that shrinks
+    days: float  # Days until the unit is out of its tolerance; infinite if it never is
+    # Gap now, or the drift since the calibration where there is no gap; NaN if days are infinite
     reached_mg: float
+    is_rising_noise: bool  # Whether it is of a noise that grows, for which there is no tolerance
 
 
 @dataclass(frozen=True)
@@ -360,6 +378,9 @@ def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult]) -
         reason = f'{drift.text}: out of tolerance ' + (
             f'in {number(drift.days, digits=2)} days.' if drift.days else 'now.'
         )
+    elif any(drift.is_rising_noise for drift in drifts):
+        state, urgency = State.DRIFTS, _FARTHEST_DAYS
+        reason = f'{next(drift.text for drift in drifts if drift.is_rising_noise)}.'
     elif series:
         state, urgency = State.NOT_JUDGED, -series
         reason = (
@@ -405,10 +426,10 @@ def _drifts(
         slope, half = float(result.trends.slope[place]), float(result.half_width[place])
         text = f'{quantity.label} {quantity.text(slope, slope - half, slope + half)} per year'
         days, reached_mg = np.inf, np.nan
-        if quantity.is_coefficient or slope > 0:
+        if quantity.is_coefficient or (slope > 0 and not quantity.is_noise):
             # A coefficient is right at its calibration, and the gap shows what it is now.
             mg_per_day = abs(quantity.factor * slope) / DAYS_PER_YEAR
             reached_mg = over_mg if np.isfinite(over_mg) else mg_per_day * np.nan_to_num(age_days)
             days = max(TOLERANCE_MG - reached_mg, 0.0) / mg_per_day
-        drifts.append(Drift(result, text, days, reached_mg))
+        drifts.append(Drift(result, text, days, reached_mg, quantity.is_noise and slope > 0))
     return tuple(sorted(drifts, key=lambda drift: drift.days))

@@ -38,6 +38,7 @@ _INFO_WAIT_S = 1.5
 """Longest time without an info frame after opening, s. Derived: a board sends one each second."""
 _COMMAND_PAUSE_S = 0.5
 """Shortest time between two commands, s. Chosen: a board has answered by then."""
+_SELF_TEST_S = 0.1  # Time between two commands that keep the self-test as it is, s
 _DEAD_S = 3.0
 """Time without a sample after which a board counts as failed, s. Chosen: a reset and its info
 frame take less."""
@@ -135,6 +136,7 @@ class _Conversion:
             values[:, self._axes],
             {column: values[:, i] for column, i in self._references.items()},
             lost,
+            bool(frame.flags & wire_format.IN_SELF_TEST),
         )
 
 
@@ -168,7 +170,7 @@ class SerialLink(base.Link):
         self._stamper = Stamper(ClockMap(settings.delay), self.references)
         self._frame_s = 0.0  # Duration of the newest frame, s
         self._unjudged = self._commands = 0  # Samples of a frame that is new; commands so far
-        self._command_due_s = 0.0
+        self._command_due_s = self._self_test_due_s = self._held_s = 0.0
         self._counts: Counter[str] = Counter()
         self._last_frame_s = self._last_sample_s = self._created_s = time.monotonic()
         self._busy_until_s = self._unpaid_s = 0.0
@@ -214,9 +216,27 @@ class SerialLink(base.Link):
         )
         return base.LinkStatus(level, text, statistics, (reset, *self._stamper.events()))
 
+    def hold_self_test(self, hold_s: float) -> None:
+        """Tell the board again and again; it ends the self-test by itself when this stops."""
+        if self._info is None or not self._info.flags & wire_format.HAS_SELF_TEST:
+            raise UserError(
+                f'{self._settings.port}: no board that has a self-test line answers: connect that '
+                'of the sensor, and state its pin in the firmware'
+            )
+        now_s = time.monotonic()
+        if hold_s != self._held_s or now_s >= self._self_test_due_s:
+            self._held_s, self._self_test_due_s = hold_s, now_s + _SELF_TEST_S
+            self._command(round(hold_s * 1e6), wire_format.SELF_TEST_TYPE)
+
     def close(self) -> None:
-        """Close the port."""
+        """Close the port; a self-test ends before."""
+        if self._held_s:
+            self._command(0, wire_format.SELF_TEST_TYPE)
         self._port.close()
+
+    def _command(self, time_us: int, kind: int = wire_format.LATENCY_TYPE) -> None:
+        self._port.write(wire_format.encode_command(self._commands, time_us, kind))
+        self._commands += 1
 
     def _condition(self) -> tuple[base.Level, str]:
         """Return level and text of the status: the first fault of port, frames and board."""
@@ -270,8 +290,7 @@ class SerialLink(base.Link):
             if count == wanted:
                 return
             latency_us = max(latency_us, round(wanted / info.rate_hz * 1e6))
-        self._port.write(wire_format.encode_command(self._commands, latency_us))
-        self._commands += 1
+        self._command(latency_us)
         self._command_due_s = now_s + _COMMAND_PAUSE_S
 
     def _receive(self) -> None:

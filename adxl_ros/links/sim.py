@@ -10,8 +10,10 @@ from functools import partial
 from math import inf
 from typing import NamedTuple
 
+from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import JOINTS
 from adxl_ros.links.support import base
+from adxl_ros.links.support.self_test import EmulatedLine
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
@@ -79,6 +81,7 @@ class SimulatedSensor(base.Link):
         self._seed = settings.seed
         self._knots = [_resting((settings.alpha_rad, settings.beta_rad, 0.0))]
         self._respond = self._settled_response()
+        self._line = EmulatedLine(sensor)
         self._watchdog: base.Watchdog | None = None
         self._status = base.LinkStatus(base.Level.OK, 'at rest, no stage')
         self._origin_ns = self._made = self._until_ns = self._next_ns = 0
@@ -134,10 +137,21 @@ class SimulatedSensor(base.Link):
         while until_ns >= self._next_ns:
             self._make(until_ns)
         due = int(self._stamps.searchsorted(until_ns, 'right'))
-        samples = base.Samples(self._stamps[:due], self._volts[:due], until_ns)
+        stamps, volts = self._stamps[:due], self._volts[:due]
+        is_in_test = self._line.add(stamps * 1e-9, volts)
+        samples = base.Samples(stamps, volts, until_ns, in_self_test=is_in_test)
         self._stamps, self._volts = self._stamps[due:], self._volts[due:]
         self._until_ns = until_ns
         return samples
+
+    def hold_self_test(self, hold_s: float) -> None:
+        """Change the samples by the usual step of the datasheet."""
+        if not self._line.has_step:
+            raise UserError(
+                f'the parameters of {self.sensor.serial} state no self-test; write '
+                'sensor.self_test_g, by axis'
+            )
+        self._line.hold(self._until_ns * 1e-9, hold_s)
 
     def status(self) -> base.LinkStatus:
         """Return whether a stage moves the sensor."""

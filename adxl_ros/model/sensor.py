@@ -243,6 +243,30 @@ class Sensor:
         100000.0,
         default=0.0,
     )
+    self_test_g: tuple[float, ...] = _nominal(
+        'sensor.self_test_g',
+        'typical change of the output by the self-test, by axis; empty where not stated',
+        'g',
+        -100.0,
+        100.0,
+        default=(),
+    )
+    self_test_lower_g: tuple[float, ...] = _nominal(
+        'sensor.self_test_lower_g',
+        'lowest change by the self-test, with its sign, by axis',
+        'g',
+        -100.0,
+        100.0,
+        default=(),
+    )
+    self_test_upper_g: tuple[float, ...] = _nominal(
+        'sensor.self_test_upper_g',
+        'highest change by the self-test, with its sign, by axis',
+        'g',
+        -100.0,
+        100.0,
+        default=(),
+    )
     effects: tuple[str, ...] = ()  # Names of the effects
     # Values by effect and parameter, (m,) or (), each in the unit of its parameter
     values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
@@ -369,6 +393,8 @@ def with_axes(sensor: Sensor, axes: str) -> Sensor:
                 f'file for {axes}'
             )
         changed[name] = np.array([*values, *[values[0]] * 3])[: len(axes)]
+    # Another part has another self-test.
+    changed |= dict.fromkeys(('self_test_g', 'self_test_lower_g', 'self_test_upper_g'), ())
     if len(axes) > len(sensor.axes):
         # A part with more axes has another datasheet.
         changed |= {'datasheet_name': '', 'datasheet': {}}

@@ -11,7 +11,8 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
-from adxl_ros.links.support.base import ImuLink, Level, Link, LinkStatus, StageLink
+from adxl_ros.links.support.base import ImuLink, Level, Link, LinkStatus, Samples, StageLink
+from adxl_ros.links.support.self_test import Answer, SelfTest
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.sample_output import References, SampleOutput
 from rclpy.node import Node
@@ -128,6 +129,11 @@ class LinkReader:
             self._counts: dict[str, int] = {}
             if link.sensor is not None:
                 output.use(link.sensor)
+            self._self_test = SelfTest(link.hold_self_test)
+            # Only a driver that reads its link has the service.
+            self._service = topics.LateService(node, '~/self_test')
+            self._requests: list[Any] = []
+            on_close.callback(self._end_service)
             if isinstance(link, StageLink):
                 self._stage = topics.Inbox(
                     node, JointState, link.joint_state_topic, _QUEUE, reliable=True
@@ -168,6 +174,7 @@ class LinkReader:
 
     def _live_turn(self) -> None:
         """Publish what a device sends; the link waits for it."""
+        self._serve()
         if self._simulator is not None:
             self._simulator.wait()
             self._output.follow_frame(self._simulator.frame_id)
@@ -180,16 +187,44 @@ class LinkReader:
         if self._now_ns is None or samples.until_ns < self._now_ns:
             self._output.tally.begin(samples.until_ns)
         self._now_ns = samples.until_ns
-        self._output.publish(samples, self._references)
+        is_incomplete = self._publish(samples)
         level = self._link.status().level
-        if samples.missing and level is Level.OK:
+        if is_incomplete and level is Level.OK:
             self._on_level(Level.WARN)
         elif level is not self._level:
             self._on_level(level)
         self._level = level
 
+    def _publish(self, samples: Samples) -> bool:
+        """Publish samples but those of a self-test; return whether any is missing or withheld."""
+        published, answer = self._self_test.take(samples, self._output.sensor)
+        self._output.publish(published, self._references)
+        withheld = len(samples.stamp_ns) - len(published.stamp_ns)
+        self._output.tally.counts['withheld'] += withheld
+        self._answer(answer)
+        return samples.missing + withheld > 0
+
+    def _serve(self) -> None:
+        """Begin a self-test where it is asked for."""
+        if asked := self._service.take():
+            self._requests += asked
+            self._answer(self._self_test.begin())
+
+    def _answer(self, answer: Answer | None) -> None:
+        """Answer all who have asked for a self-test once it has ended."""
+        if answer is not None:
+            topics.log(self._node, 'INFO' if answer.is_passed else 'WARN', answer.text)
+            self._service.answer(self._requests, *answer)
+            self._requests = []
+
+    def _end_service(self) -> None:
+        if self._node.context.ok():
+            self._service.answer(self._requests, False, 'no result: the driver closes its link')
+        self._service.destroy()
+
     def _paced_turn(self) -> None:
         """Wait until samples are due, and publish them."""
+        self._serve()
         self._is_real_time = not (self._output.is_clock or self._ros.ros_time_is_active)
         pause_s = self._due_s - time.monotonic()
         time.sleep(min(max(pause_s, 0.0), _LONGEST_PAUSE_S))
@@ -229,8 +264,7 @@ class LinkReader:
         self._now_ns = samples.until_ns
         if len(samples.stamp_ns):
             self._newest_ns = int(samples.stamp_ns[-1])
-        self._output.publish(samples, self._references)
-        if samples.missing:
+        if self._publish(samples):
             self._on_level(Level.WARN)
 
     def _may_begin(self) -> bool:

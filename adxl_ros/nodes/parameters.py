@@ -447,6 +447,7 @@ def _matches(pattern: str, node_name: str) -> bool:
 
 _FIELD_KINDS = {
     'np.ndarray': Kind.DOUBLE_ARRAY,
+    'tuple[float, ...]': Kind.DOUBLE_ARRAY,
     'float': Kind.DOUBLE,
     'int': Kind.INTEGER,
     'str': Kind.STRING,

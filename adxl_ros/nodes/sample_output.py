@@ -37,13 +37,21 @@ def age_report(ages_s: deque[float]) -> dict[str, float]:
     return {'age_p50_ms': round(float(p50_ms), 3), 'age_p99_ms': round(float(p99_ms), 3)}
 
 
+_FAULTS = {
+    'missing': 'missing',
+    'saturated': 'saturated',
+    'withheld': 'withheld during the self-test',
+}
+"""Words of a warning by the count that has risen."""
+
+
 class Tally:
     """
     Counts samples, and what went wrong with them, between two reports.
 
     samples: published samples; missing: samples that are lost; estimated: part of `missing` that
     is estimated by time, not counted; saturated: samples at a rail of the ADC or beyond the
-    sensor's range.
+    sensor's range; withheld: samples that a self-test of the sensor has changed.
     """
 
     def __init__(self, steady_ns: int) -> None:
@@ -63,22 +71,20 @@ class Tally:
         totals = Counter({**self.counts, 'steady_ns': steady_ns, 'sensor_ns': sensor_ns})
         new = {
             name: totals[name] - self._reported[name]
-            for name in ('samples', 'missing', 'saturated', 'steady_ns', 'sensor_ns')
+            for name in ('samples', *_FAULTS, 'steady_ns', 'sensor_ns')
         }
         self._reported = totals
         elapsed_ns = max(new['sensor_ns'], 0)
         values: dict[str, Any] = {
-            'missing': totals['missing'],
+            **{name: totals[name] for name in ('samples', *_FAULTS)},
             'missing_estimated': totals['estimated'],
-            'saturated': totals['saturated'],
-            'samples': totals['samples'],
             'rate_hz': round(new['samples'] / elapsed_ns * 1e9, 3) if elapsed_ns else 0.0,
             'speed': round(elapsed_ns / new['steady_ns'], 3),
         }
         if self.newest_ns is not None:
             values['age_s'] = round((sensor_ns - self.newest_ns) * 1e-9, 6)
         return values | age_report(self.ages_s), ', '.join(
-            f'{new[name]} samples {name}' for name in ('missing', 'saturated') if new[name]
+            f'{new[name]} samples {words}' for name, words in _FAULTS.items() if new[name]
         )
 
 

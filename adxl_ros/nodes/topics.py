@@ -224,6 +224,7 @@ class LateService:
     """
 
     def __init__(self, node: Node, name: str) -> None:
+        self._node = node
         self._service = node.create_service(
             Trigger, name, lambda _, answer: answer, callback_group=NotForExecutors()
         )
@@ -238,6 +239,10 @@ class LateService:
         """Answer requests."""
         for request in requests:
             self._service.send_response(Trigger.Response(success=success, message=text), request)
+
+    def destroy(self) -> None:
+        """Remove the service; a request that waits gets no answer."""
+        self._node.destroy_service(self._service)
 
 
 class Inbox:

@@ -83,7 +83,7 @@ UNITS = (
     ReadingUnit('ft/s²', G0_MPS2 / 0.3048, 'multiply the readings by 0.3048'),
     ReadingUnit('m/s² divided by 1000', 1e-3 * G0_MPS2, 'multiply the readings by 1000'),
     ReadingUnit('g divided by 1000', 1e-3, f'multiply the readings by {1e3 * G0_MPS2:g}'),
-    ReadingUnit('m/s² that were stated as g', G0_MPS2**2, 'state it by --unit mps2'),
+    ReadingUnit('m/s² that were stated as g', G0_MPS2**2, 'state it by --unit mps2', 'mps2'),
     *(
         ReadingUnit(
             f'counts of {count} per g', float(count), f'state it by --unit lsb --lsb-per-g {count}'
@@ -213,7 +213,11 @@ class GravityFault:
     @property
     def live_text(self) -> str:
         """Return figure, explanation and remedy for a stream as one line."""
-        remedy = f'state it by samples.unit:={self.symbol}' if self.symbol else self.conversion
+        return self.stated_by('samples.unit:=')
+
+    def stated_by(self, option: str) -> str:
+        """Return figure, explanation and remedy as one line, where an option states the unit."""
+        remedy = f'state it by {option}{self.symbol}' if self.symbol else self.conversion
         return f'{self.reason}; {remedy}'
 
     @property

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 import json
 from pathlib import Path
 
@@ -74,18 +75,22 @@ def check(options: argparse.Namespace) -> int:
     fail_on, minima = _fail_on(options.fail_on), _minima(options.minima)
     if options.report:
         html_page.check_libraries()
+    check_like = partial(
+        check_recordings,
+        sensor=options.params,
+        urdf=options.urdf,
+        frame=options.frame,
+        joints=options.joints,
+        reading=cli.reading_options(options),
+    )
     with cli.progress('check') as show:
-        checked = check_recordings(
-            options.recording,
-            options.params,
-            urdf=options.urdf,
-            frame=options.frame,
-            joints=options.joints,
-            reading=cli.reading_options(options),
-            progress=show,
-        )
+        checked = check_like(options.recording, progress=show)
     failing = [*fail_on, *(f'min {name}' for name in minima)]
-    earlier = _earlier(options)
+    earlier = None
+    if options.against:
+        # The recording that all others are compared with
+        (found,) = check_like(options.against).recordings
+        earlier = gate.Earlier(found, options.params, cli.reading_options(options))
     outcomes = [_outcomes(each, earlier, minima) for each in checked.recordings]
     if options.junit:
         gate.write_junit(options.junit, list(zip(checked.recordings, outcomes)), failing)
@@ -97,7 +102,7 @@ def check(options: argparse.Namespace) -> int:
         print(json.dumps(recordings, indent=1))
     else:
         *lines, sentence = checked.screen
-        print('\n'.join([*lines, *_gate_lines(outcomes, options.against)]))
+        print('\n'.join([*lines, *_gate_lines(outcomes, earlier)]))
         cli.print_end([sentence], page, _next_command(checked.recordings, options))
     is_failed = any(row.is_worse and row.name in failing for rows in outcomes for row in rows)
     return int(is_failed)
@@ -125,15 +130,6 @@ def _minima(texts: Sequence[str]) -> dict[str, float]:
     return minima
 
 
-def _earlier(options: argparse.Namespace) -> gate.Earlier | None:
-    """Return the recording that all others are compared with, if there is one."""
-    if not options.against:
-        return None
-    reading = cli.reading_options(options)
-    (found,) = check_recordings(options.against, options.params, reading=reading).recordings
-    return gate.Earlier(found, options.params, reading)
-
-
 def _outcomes(
     findings: Findings, earlier: gate.Earlier | None, minima: dict[str, float]
 ) -> list[gate.Outcome]:
@@ -147,13 +143,19 @@ def _outcomes(
     return outcomes
 
 
-def _gate_lines(outcomes: Sequence[Sequence[gate.Outcome]], against: str | None) -> list[str]:
+def _gate_lines(
+    outcomes: Sequence[Sequence[gate.Outcome]], earlier: gate.Earlier | None
+) -> list[str]:
     """Return what was compared, a line each."""
+    head = 'limits'
+    if earlier is not None:
+        head = f'against {earlier.found.path}'
+        head += f', not sound: {earlier.found.faults[0]}' if earlier.found.faults else ''
     lines = []
     for rows in outcomes:
         compared = [row for row in rows if row.name != 'sound']
         if compared:
-            lines.append(f'against {against}' if against else 'limits')
+            lines += wrapped(head, 10)
         for row in compared:
             lines += wrapped(f'  {"WORSE" if row.is_worse else "ok":7} {row.name}: {row.text}', 10)
     return [*lines, *[''] * bool(lines)]

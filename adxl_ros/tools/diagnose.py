@@ -45,6 +45,12 @@ def parser() -> argparse.ArgumentParser:
         help='ideal specific force of the same manoeuvre by another simulator',
     )
     parse.add_argument(
+        '--sim-unit',
+        metavar='UNIT',
+        default='',
+        help='unit of --sim: g, mg, mmps2 (default: m/s²)',
+    )
+    parse.add_argument(
         '--in',
         dest='quantity',
         metavar='QUANTITY',
@@ -108,6 +114,7 @@ def diagnose(options: argparse.Namespace) -> int:
             [cli.read('diagnose', path, reading) for path in options.recording],
             options.params,
             sim=options.sim,
+            sim_unit=options.sim_unit,
             urdf=options.urdf,
             frame=options.frame,
             joints=options.joints,

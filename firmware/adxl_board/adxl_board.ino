@@ -12,7 +12,10 @@
  * A timer takes the samples, and the loop sends them in blocks. A command of the host sets how many
  * samples make a block, at most ten. Blocks grow to ten while others wait, so a slow wire gets
  * longer frames. When the host does not read, blocks are dropped and their samples are counted. So
- * the driver knows exactly how many samples are missing. */
+ * the driver knows exactly how many samples are missing.
+ *
+ * Another command switches the self-test of the sensor on. The timer switches it off, whatever the
+ * host and the port do, and marks the samples that it has changed. */
 
 #include <SPI.h>
 
@@ -28,6 +31,12 @@ const float VREF_V = 5.0f;  /* reference voltage of the ADC, V */
 const uint8_t CS_PIN = 10;  /* chip select of the ADC */
 const SPISettings ADC_BUS(2000000, MSBFIRST, SPI_MODE0); /* the ADS8344 permits 2.4 MHz */
 
+#ifndef ST_PIN
+#define ST_PIN -1 /* pin of the board at the ST pin of the sensor; -1: not connected */
+#endif
+const float SETTLING_S = 0.2f;    /* after a self-test samples are marked for, s; >= 20 R*C */
+const float MAX_SELF_TEST_S = 5.0f; /* longest time of a self-test without a new command, s */
+
 const uint8_t BLOCK = 10; /* most samples of a block, and those before the first command */
 const uint8_t BLOCKS = 8; /* blocks that wait for the host; 80 ms of samples */
 
@@ -36,6 +45,7 @@ struct block {
     uint32_t first_index;
     uint16_t overruns;
     uint8_t samples;
+    uint8_t flags;
     uint16_t codes[BLOCK * CHANNELS];
 };
 
@@ -43,6 +53,7 @@ struct block {
 static struct block blocks[BLOCKS];
 static volatile uint8_t made, sent;
 static volatile uint8_t wanted = BLOCK; /* samples of a block while no other one waits */
+static volatile uint32_t in_self_test; /* samples to come that are marked; ST is on for the first */
 static struct frame_counts counts = {0, FRAME_AFTER_RESET};
 static uint8_t frame[FRAME_ROOM(BLOCK, CHANNELS)];
 
@@ -68,11 +79,23 @@ static uint64_t now_us() {
     return ((uint64_t)wraps << 32) | us;
 }
 
+/* Count a sample; return its flags. */
+static uint8_t count_self_test() {
+    if (!in_self_test) {
+        return 0;
+    }
+    if (--in_self_test == (uint32_t)(SETTLING_S * RATE_HZ)) {
+        digitalWrite(ST_PIN, LOW);
+    }
+    return FRAME_IN_SELF_TEST;
+}
+
 static void take_sample() {
     static uint32_t index = 0;
     static uint16_t overruns = 0;
     static uint8_t filled = 0;
     const uint64_t t_us = now_us();
+    const uint8_t flags = ST_PIN < 0 ? 0 : count_self_test();
     struct block *b = &blocks[made % BLOCKS];
     if (!filled && (uint8_t)(made - sent) == BLOCKS) { /* all blocks wait for the host */
         index++;
@@ -83,7 +106,9 @@ static void take_sample() {
         b->t_us = t_us;
         b->first_index = index;
         b->overruns = overruns;
+        b->flags = 0;
     }
+    b->flags |= flags;
     SPI.beginTransaction(ADC_BUS);
     for (uint8_t c = 0; c < CHANNELS; c++) {
         b->codes[filled * CHANNELS + c] = read_adc(c);
@@ -115,7 +140,31 @@ static void start_timer() {
 #error "No timer for this board: add one that calls take_sample() RATE_HZ times a second"
 #endif
 
+/* Switch the self-test on for a time from now; 0 ends it. */
+static void hold_self_test(uint32_t time_us) {
+    const uint32_t settling = (uint32_t)(SETTLING_S * RATE_HZ);
+    float time_s = (float)time_us * 1e-6f;
+    uint32_t samples;
+    if (ST_PIN < 0) {
+        return;
+    }
+    time_s = time_s < MAX_SELF_TEST_S ? time_s : MAX_SELF_TEST_S;
+    samples = (uint32_t)(time_s * RATE_HZ);
+    noInterrupts();
+    if (samples) {
+        in_self_test = samples + settling;
+    } else if (in_self_test > settling) {
+        in_self_test = settling;
+    }
+    digitalWrite(ST_PIN, samples ? HIGH : LOW);
+    interrupts();
+}
+
 void setup() {
+    if (ST_PIN >= 0) {
+        pinMode(ST_PIN, OUTPUT);
+        digitalWrite(ST_PIN, LOW);
+    }
     pinMode(CS_PIN, OUTPUT);
     digitalWrite(CS_PIN, HIGH);
     SPI.begin();
@@ -136,11 +185,14 @@ static bool receive() {
     static struct frame_receiver receiver;
     bool commanded = false;
     while (Serial.available() > 0) {
-        uint32_t latency_us;
-        if (frame_command(&receiver, (uint8_t)Serial.read(), &latency_us)) {
-            wanted = frame_samples(latency_us, RATE_HZ, BLOCK);
-            commanded = true;
+        uint32_t time_us;
+        const int command = frame_command(&receiver, (uint8_t)Serial.read(), &time_us);
+        if (command == FRAME_LATENCY) {
+            wanted = frame_samples(time_us, RATE_HZ, BLOCK);
+        } else if (command == FRAME_SELF_TEST) {
+            hold_self_test(time_us);
         }
+        commanded |= command != 0;
     }
     return commanded;
 }
@@ -155,12 +207,14 @@ void loop() {
         informed = false; /* the info frame is the answer */
     }
     if (!informed || millis() - informed_ms >= 1000) {
+        counts.flags |= ST_PIN < 0 ? 0 : FRAME_HAS_SELF_TEST;
         send(frame_info(&counts, RATE_HZ, BITS, CHANNELS, VREF_V, SERIAL_NUMBER, frame));
         informed_ms = millis();
         informed = true;
     }
     if (made != sent) {
         const struct block *b = &blocks[sent % BLOCKS];
+        counts.flags |= b->flags;
         send(frame_data(&counts, b->t_us, b->first_index, b->overruns, b->samples, CHANNELS,
                         b->codes, BITS, frame));
         sent++;

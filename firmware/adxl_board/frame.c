@@ -135,7 +135,7 @@ static uint8_t unstuff(uint8_t *raw, uint8_t length) {
     return made;
 }
 
-int frame_command(struct frame_receiver *receiver, uint8_t byte, uint32_t *latency_us) {
+int frame_command(struct frame_receiver *receiver, uint8_t byte, uint32_t *time_us) {
     uint8_t *raw = receiver->raw;
     uint8_t i, length = receiver->length;
     uint32_t crc = 0xFFFFFFFFu;
@@ -153,11 +153,12 @@ int frame_command(struct frame_receiver *receiver, uint8_t byte, uint32_t *laten
     for (i = 0; i < FRAME_COMMAND_ROOM - 5; i++) {
         crc = crc_step(crc, raw[i]);
     }
-    if (~crc != number(raw + FRAME_COMMAND_ROOM - 5) || raw[0] != 3 || raw[1] != 1) {
+    if (~crc != number(raw + FRAME_COMMAND_ROOM - 5) || raw[1] != 1 ||
+        (raw[0] != FRAME_LATENCY && raw[0] != FRAME_SELF_TEST)) {
         return 0;
     }
-    *latency_us = number(raw + 8);
-    return 1;
+    *time_us = number(raw + 8);
+    return raw[0];
 }
 
 uint8_t frame_samples(uint32_t latency_us, float rate_hz, uint8_t most) {

@@ -15,7 +15,11 @@
 extern "C" {
 #endif
 
-enum { FRAME_RAIL = 1, FRAME_AFTER_RESET = 2 };
+/* Flags. The last two are of a board that switches the self-test of its sensor. */
+enum { FRAME_RAIL = 1, FRAME_AFTER_RESET = 2, FRAME_IN_SELF_TEST = 4, FRAME_HAS_SELF_TEST = 8 };
+
+/* Commands of the host. */
+enum { FRAME_LATENCY = 3, FRAME_SELF_TEST = 4 };
 
 /* Counts of the board. After a reset: block_seq = 0, flags = FRAME_AFTER_RESET. */
 struct frame_counts {
@@ -50,9 +54,10 @@ size_t frame_data(struct frame_counts *counts, uint64_t t_dev_us, uint32_t first
 size_t frame_info(struct frame_counts *counts, float rate_hz, uint8_t bits, uint8_t nch,
                   float vref_v, const char *serial, uint8_t *out);
 
-/* Take one byte from the host; return 1 if it completes a command, else 0.
- * latency_us: gets the longest time over which the samples of a frame shall be collected. */
-int frame_command(struct frame_receiver *receiver, uint8_t byte, uint32_t *latency_us);
+/* Take one byte from the host; return the command that it completes, else 0.
+ * time_us: gets its time. FRAME_LATENCY: the longest over which the samples of a frame shall be
+ * collected. FRAME_SELF_TEST: for how long the self-test shall be on from now, 0 to end it. */
+int frame_command(struct frame_receiver *receiver, uint8_t byte, uint32_t *time_us);
 
 /* Return how many samples are collected within latency_us: 1 to most. */
 uint8_t frame_samples(uint32_t latency_us, float rate_hz, uint8_t most);

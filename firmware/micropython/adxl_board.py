@@ -14,6 +14,8 @@ _MOST_SAMPLES = 10  # Of a frame, and those before the first command
 _TIMED_SAMPLES = 64  # Over which the rate of a chip is measured by the clock of the board
 _SILENT_PERIODS = 50  # Without a new sample, after which a chip counts as gone
 _INFO_US = 1_000_000  # Time between two descriptions of the board
+_SETTLING_US = 200_000  # Time after a self-test for which samples are marked
+_LONGEST_US = 5_000_000  # Longest time of a self-test without a new command
 _AGAIN_MS = 200  # Pause before a chip that does not answer is tried again
 
 
@@ -28,12 +30,21 @@ class Board:
     def __init__(self, sensor, serial_number):
         self._sensor = sensor
         self._encoder = adxl_frames.Encoder(
-            serial_number, sensor.bits, sensor.vref_v, sensor.channels
+            serial_number,
+            sensor.bits,
+            sensor.vref_v,
+            sensor.channels,
+            adxl_frames.HAS_SELF_TEST if sensor.has_self_test else 0,
         )
         self._receiver = adxl_frames.Receiver()
         self._host = select.poll()
         self._host.register(sys.stdin, select.POLLIN)
-        self._commands = {adxl_frames.COMMAND: self._set_latency}  # By the type of their frame
+        self._commands = {  # By the type of their frame
+            adxl_frames.LATENCY: self._set_latency,
+            adxl_frames.SELF_TEST: self._hold_self_test,
+        }
+        self._off_us = None  # When the self-test ends; None where none is on
+        self._marked_us = 0  # Until when samples are marked
         self._rate_hz = 0.0
         self._wanted = _MOST_SAMPLES
         self._ticks, self._now_us = time.ticks_us(), 0
@@ -41,6 +52,7 @@ class Board:
         self._awake_us = 0  # When the sensor last worked
         self._index, self._overruns = -1, 0  # Number of the newest sample; samples that were lost
         self._block, self._block_us = [], 0  # Samples that are not sent, and the time of the first
+        self._block_flags = 0
         self._informed_us = 0
 
     def run(self):
@@ -49,6 +61,7 @@ class Board:
         while True:
             try:
                 self._sensor.open()
+                self._off_us = None
                 self._awake_us = self._now()
                 if not self._rate_hz:
                     self._measure_rate()
@@ -97,6 +110,8 @@ class Board:
     def _step(self):
         """Take a sample if there is one, and serve the host."""
         now_us, period_us = self._now(), 1e6 / self._rate_hz
+        if self._off_us is not None and now_us >= self._off_us:
+            self._end_self_test()
         if self._sensor.ready(now_us):
             self._take(now_us, self._sensor.read(), period_us)
         elif now_us - self._awake_us > _SILENT_PERIODS * period_us:
@@ -124,6 +139,8 @@ class Board:
         self._awake_us = now_us
         if not self._block:
             self._block_us = self._due_us
+        if now_us < self._marked_us:
+            self._block_flags |= adxl_frames.IN_SELF_TEST
         self._block.append(codes)
         if len(self._block) >= self._wanted:
             self._send()
@@ -132,8 +149,9 @@ class Board:
         """Send the samples of the block."""
         if self._block:
             first = self._index - len(self._block) + 1
-            self._write(self._encoder.samples(self._block_us, first, self._overruns, self._block))
-            self._block = []
+            counts = self._block_us, first, self._overruns
+            self._write(self._encoder.samples(*counts, self._block, self._block_flags))
+            self._block, self._block_flags = [], 0
 
     def _inform(self):
         self._informed_us = self._now_us
@@ -150,12 +168,29 @@ class Board:
                 return
             payload = self._receiver.take(byte[0])
             if payload and payload[0] in self._commands and self._rate_hz:
-                self._commands[payload[0]](payload[8:])
+                if len(payload) == 12:
+                    self._commands[payload[0]](struct.unpack('<I', payload[8:])[0])
                 self._inform()
 
-    def _set_latency(self, body):
+    def _set_latency(self, latency_us):
         """Collect the samples of so many µs in a frame."""
-        if len(body) == 4:
-            (latency_us,) = struct.unpack('<I', body)
-            samples = int(latency_us * self._rate_hz / 1e6 + 1e-3)
-            self._wanted = min(max(samples, 1), _MOST_SAMPLES)
+        samples = int(latency_us * self._rate_hz / 1e6 + 1e-3)
+        self._wanted = min(max(samples, 1), _MOST_SAMPLES)
+
+    def _hold_self_test(self, time_us):
+        """Switch the self-test on for so many µs from now; 0 ends it."""
+        if not self._sensor.has_self_test:
+            return
+        if not time_us:
+            self._end_self_test()
+            return
+        if self._off_us is None:
+            self._sensor.self_test(True)
+        self._off_us = self._now() + min(time_us, _LONGEST_US)
+        self._marked_us = self._off_us + _SETTLING_US
+
+    def _end_self_test(self):
+        if self._off_us is not None:
+            self._off_us = None
+            self._sensor.self_test(False)
+            self._marked_us = self._now() + _SETTLING_US

@@ -6,9 +6,11 @@ import binascii
 import struct
 
 VERSION = 1
-SAMPLES, INFO, COMMAND = 1, 2, 3  # Types of frames
+SAMPLES, INFO, LATENCY, SELF_TEST = 1, 2, 3, 4  # Types of frames; the last two are commands
 RAIL = 1  # Flag: a code is at a rail of the ADC
 AFTER_RESET = 2  # Flag of all frames from a reset to the first one with samples
+IN_SELF_TEST = 4  # Flag: a self-test has changed the samples
+HAS_SELF_TEST = 8  # Flag of a description: the board switches the self-test of its sensor
 STOP = b'\r\x03'  # What mpremote sends to stop a program; no command begins so
 _LONGEST = 64  # Bytes that are kept of the host; a command has 17
 
@@ -48,21 +50,24 @@ def frame(payload):
 class Encoder:
     """Numbers and encodes the frames of a board."""
 
-    def __init__(self, serial_number, bits, vref_v, channels):
+    def __init__(self, serial_number, bits, vref_v, channels, info_flags):
         self._serial = serial_number.encode()
         self._bits, self._vref_v, self._channels = bits, vref_v, channels
         self._sequence, self._flags = 0, AFTER_RESET
+        self._info_flags = info_flags
 
     def info(self, rate_hz):
         """Return the frame that describes the board."""
         fields = self._bits, self._channels, self._vref_v, self._serial
-        return frame(self._head(INFO, self._flags) + struct.pack('<fBBf16s', rate_hz, *fields))
+        head = self._head(INFO, self._flags | self._info_flags)
+        return frame(head + struct.pack('<fBBf16s', rate_hz, *fields))
 
-    def samples(self, time_us, index, overruns, codes):
+    def samples(self, time_us, index, overruns, codes, flags):
         """Return the frame of some samples, which is a list of lists of codes."""
         flat = [code for sample in codes for code in sample]
-        is_at_rail = min(flat) == 0 or max(flat) >= (1 << self._bits) - 1
-        payload = self._head(SAMPLES, self._flags | (RAIL if is_at_rail else 0))
+        if min(flat) == 0 or max(flat) >= (1 << self._bits) - 1:
+            flags |= RAIL
+        payload = self._head(SAMPLES, self._flags | flags)
         self._flags = 0
         counts = index & 0xFFFFFFFF, overruns & 0xFFFF, len(codes), self._channels
         payload += struct.pack('<QIHBB', time_us, *counts)

@@ -5,8 +5,9 @@ Accelerometers that a board reads.
 
 A sensor has `rate_hz`, `bits`, `vref_v` and `channels`. `open` sets it up, `ready` says whether
 there is a new sample, and `read` returns its codes: signed counts with 0 g in the middle of the
-range, as in the files of params/. A chip with a thermometer adds a channel that reads as a TMP36
-does, 0.5 V at 0 degC and 10 mV/K, which is the default of the driver.
+range, as in the files of params/. `self_test` switches its self-test where it `has_self_test`. A
+chip with a thermometer adds a channel that reads as a TMP36 does, 0.5 V at 0 degC and 10 mV/K,
+which is the default of the driver.
 """
 
 import struct
@@ -71,7 +72,9 @@ class Chip:
     IDENTITY = 0, 0  # Register and value by which it is known
     SETUP = ()  # Registers and values in order
     STATUS = 0, 0  # Register and bit that say that there is a new sample
+    SELF_TEST = 0, 0, 0  # Register, and its values while the self-test is off and on
     channels = 4
+    has_self_test = True
     has_clock = True  # It samples by itself, at about `rate_hz`
 
     def __init__(self, bus):
@@ -85,6 +88,12 @@ class Chip:
             raise OSError(f'register {register:#x} has {found:#x}, not {identity:#x}')
         for register, value in self.SETUP:
             self._bus.write(register, value)
+        self.self_test(False)  # a program that has ended may have left it on
+
+    def self_test(self, is_on):
+        """Switch the self-test on or off."""
+        register, off, on = self.SELF_TEST
+        self._bus.write(register, on if is_on else off)
 
     def ready(self, now_us):
         """Return whether there is a new sample; raises OSError where nothing drives the bus."""
@@ -115,6 +124,7 @@ class Adxl345(Chip):
         (0x2D, 0x08),  # POWER_CTL: measure
     )
     STATUS = 0x30, 0x80  # INT_SOURCE: DATA_READY
+    SELF_TEST = 0x31, 0x00, 0x80  # DATA_FORMAT: SELF_TEST
 
     def __init__(self, pins):
         super().__init__(Spi(pins['spi'], 1, lambda r: r | 0xC0, lambda r: r))
@@ -136,6 +146,7 @@ class Adxl355(Chip):
         (0x2D, 0x00),  # POWER_CTL: measure, with temperature
     )
     STATUS = 0x04, 0x01  # STATUS: DATA_RDY
+    SELF_TEST = 0x2E, 0x00, 0x03  # SELF_TEST: ST1 and ST2
 
     def __init__(self, pins):
         super().__init__(Spi(pins['spi'], 0, lambda r: r << 1 | 1, lambda r: r << 1))
@@ -162,6 +173,7 @@ class Lsm6dso(Chip):
         (0x10, 0x40),  # CTRL1_XL: 104 Hz, +-2 g, low-pass 52 Hz
     )
     STATUS = 0x1E, 0x01  # STATUS_REG: XLDA
+    SELF_TEST = 0x14, 0x00, 0x01  # CTRL5_C: ST0_XL, positive
 
     def __init__(self, pins):
         super().__init__(I2c(pins['i2c'], pins.get('address', 0x6A)))
@@ -186,6 +198,7 @@ class Mpu6050(Chip):
         (0x38, 0x01),  # INT_ENABLE: DATA_RDY_EN, without which its bit may stay 0
     )
     STATUS = 0x3A, 0x01  # INT_STATUS: DATA_RDY_INT
+    SELF_TEST = 0x1C, 0x00, 0xE0  # ACCEL_CONFIG: XA_ST, YA_ST, ZA_ST, at +-2 g
 
     def __init__(self, pins):
         super().__init__(I2c(pins['i2c'], pins.get('address', 0x68)))
@@ -204,15 +217,23 @@ class Analog:
 
     def __init__(self, pins, axes):
         self._adcs = [ADC(Pin(pin)) for pin in pins['adc'][:axes]]
+        self._st = Pin(pins['st'], Pin.OUT, value=0) if 'st' in pins else None
+        self.has_self_test = self._st is not None
         self.channels = axes
         self._next_us = None
 
     def open(self):
         """Begin with the next call of `ready`."""
         self._next_us = None
+        if self.has_self_test:
+            self.self_test(False)
         for adc in self._adcs:
             if hasattr(adc, 'atten'):
                 adc.atten(ADC.ATTN_11DB)  # an ESP32 reads 1 V without it
+
+    def self_test(self, is_on):
+        """Switch the pin at ST of the sensor."""
+        self._st(is_on)
 
     def ready(self, now_us):
         """Return whether the time of a sample has come; a late one is left out."""

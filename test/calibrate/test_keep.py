@@ -3,11 +3,15 @@
 """A calibration that is kept: what is learnt, what never is, and what a kill leaves."""
 
 from dataclasses import replace
+import os
+import signal
+import time
 
 from adxl_ros.calibrate.keep.keeper import Keeper
 from adxl_ros.calibrate.keep.stays import RestStream
 from adxl_ros.errors import UserError
-from adxl_ros.files.sweep_journal import Adopted, Journal
+from adxl_ros.files.sweep_journal import Adopted, Journal, read
+from adxl_ros.model.sensor import with_axes
 from adxl_ros_validation import kept_robots
 from adxl_ros_validation.kept_robots import BEGIN_NS, calibrated, Kind, Robot
 import numpy as np
@@ -37,6 +41,32 @@ def test_a_knock_is_reported_and_never_learnt(kind):
     assert outcome.reported_days < 2
     assert outcome.adoptions_after == 0
     assert outcome.false_changes == 0
+
+
+def test_the_interval_of_a_sensor_of_two_axes_holds():
+    """Two axes do not show the length of gravity: it learns from the changes within stays."""
+    whole = calibrated()
+    names = tuple(name for name in whole.covariance_names if name.axis != 'z')
+    unit = replace(with_axes(replace(whole, effects=()), 'xy'), effects=whole.effects)
+    values = {
+        effect: {name: value[:2] for name, value in parameters.items()}
+        for effect, parameters in whole.values.items()
+    }
+    unit = replace(
+        unit, values=values, covariance=whole.covariance[:4, :4], covariance_names=names
+    )
+    inside = []
+    for seed in (0, 1):
+        robot, keeper = Robot(Kind(True, slope=5), np.random.default_rng(seed)), Keeper(unit)
+        for day in range(20):
+            for rest, _ in robot.rests(day):
+                keeper.add(replace(rest, mean_v=rest.mean_v[:2], std_v=rest.std_v[:2]))
+            state = keeper.state(rest.stop_ns)
+            true_mg = 1e3 * robot.zero_g(rest.temperature_c)[:2]
+            inside += [*(np.abs(true_mg - state.total_mg) <= state.zero_g_90_mg)]
+    assert np.mean(inside) > 0.75
+    assert np.isnan(state.tilt_90_deg) and not state.changed
+    assert state.determined[0] == 'zero-g x: as calibrated, and ageing'
 
 
 def test_a_slope_of_weeks_is_not_learnt_as_zero_g():
@@ -86,6 +116,39 @@ def test_a_restart_after_any_line_goes_on_and_undo_goes_back(tmp_path):
         restarted.sensor.values['bias']['offset_v'], again.sensor.values['bias']['offset_v']
     )
     journal.close()
+
+
+def keep_on(path, days, acknowledge_fd):
+    """Take the rests that the journal lacks, and acknowledge each; for a process of its own."""
+    journal = Journal(path, HEAD)
+    keeper = Keeper(calibrated(), entries=journal.entries, write=journal.append)
+    for rest in days[len(journal.entries) :]:
+        keeper.add(rest)
+        os.write(acknowledge_fd, b'.')
+    os._exit(0)
+
+
+def test_no_kill_at_a_random_moment_loses_a_rest(tmp_path):
+    days, path, rng = rests(Kind(), 6), tmp_path / 'j', np.random.default_rng(4)
+    kept = 0
+    for _ in range(10):
+        acknowledged_fd, acknowledge_fd = os.pipe()
+        process = os.fork()
+        if not process:
+            keep_on(path, days, acknowledge_fd)
+        os.close(acknowledge_fd)
+        count = len(os.read(acknowledged_fd, 1))
+        time.sleep(rng.uniform(0, 0.03))  # the random moment
+        os.kill(process, signal.SIGKILL)
+        os.waitpid(process, 0)
+        while acknowledged := os.read(acknowledged_fd, 4096):
+            count += len(acknowledged)
+        os.close(acknowledged_fd)
+        entries = read(path).entries
+        assert [*entries] == days[: len(entries)]
+        assert len(entries) >= kept + count
+        kept = len(entries)
+    assert kept > 10
 
 
 def test_a_dry_run_reports_and_adopts_nothing():

@@ -5,9 +5,9 @@
 from dataclasses import replace
 import re
 
+from adxl_ros.api.recordings import read_ideal
 from adxl_ros.diagnose.data_checks import check_gravity, compare_checked, DataFault
-from adxl_ros.files import recording
-from adxl_ros.files.recording_columns import ACCEL, Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import to_volts
 from adxl_ros.simulate.trajectories import motion_from_force
@@ -56,8 +56,8 @@ class Carried:
         columns = {f'{axis}_v': v for axis, v in zip('xyz', volts.T)}
         return Recording('carried', self.time_s, columns, sensor_info(sensor))
 
-    def beside(self, folder, recorded, force=None, time_s=None, may_shift=False):
-        """Put a recording beside a simulator."""
+    def simulated(self, folder, force=None, time_s=None, unit=''):
+        """Return the motion that a file of a simulator has."""
         time_s = self.time_s if time_s is None else time_s
         rows = [time_s, self.force() if force is None else force]
         np.savetxt(
@@ -68,7 +68,11 @@ class Carried:
             comments='',
             header='time_s,ax_mps2,ay_mps2,az_mps2',
         )
-        sim = motion_from_force(recording.read_ideal(folder / 'sim.csv'), False)[0]
+        return motion_from_force(read_ideal(folder / 'sim.csv', 0, unit), False)[0]
+
+    def beside(self, folder, recorded, force=None, time_s=None, may_shift=False):
+        """Put a recording beside a simulator."""
+        sim = self.simulated(folder, force, time_s)
         return compare_checked(recorded, replace(nominal('xyz'), rate_hz=RATE_HZ), sim, may_shift)
 
 
@@ -76,9 +80,9 @@ class Carried:
 def test_a_world_with_another_gravity_is_no_fault_of_the_sensor(tmp_path, gravity_mps2):
     carried = Carried()
     force = carried.frame.apply(carried.acceleration + [0, 0, gravity_mps2])
-    sim = motion_from_force(Recording('sim', carried.time_s, dict(zip(ACCEL, force.T))), False)[0]
+    sensor, sim = replace(nominal('xyz'), rate_hz=RATE_HZ), carried.simulated(tmp_path, force)
     with pytest.raises(DataFault) as raised:
-        check_gravity(carried.recorded(), replace(nominal('xyz'), rate_hz=RATE_HZ), sim)
+        check_gravity(carried.recorded(), sensor, sim)
     assert raised.value.name == 'reference'
     assert f'{gravity_mps2:g} m/s² long' in raised.value.message
 
@@ -101,6 +105,32 @@ def test_a_right_simulator_is_compared(tmp_path, change):
     carried = Carried()
     comparison = carried.beside(tmp_path, carried.recorded(change))
     assert comparison.used[comparison.at_rest].all() and comparison.used.mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    'per_mps2, advice',
+    [
+        (1 / G0_MPS2, 'state it by --sim-unit g'),
+        (1e3 / G0_MPS2, 'state it by --sim-unit mg'),
+        (1e3, 'state it by --sim-unit mmps2'),
+        (1e-3, 'multiply its readings by 1000'),
+        (16384 / G0_MPS2, 'multiply its readings by 0.00059855'),
+    ],
+)
+def test_the_advice_on_a_simulator_in_another_unit_works(tmp_path, per_mps2, advice):
+    carried, sensor = Carried(), replace(nominal('xyz'), rate_hz=RATE_HZ)
+    recorded, force = carried.recorded(), carried.force() * per_mps2
+    with pytest.raises(DataFault) as raised:
+        check_gravity(recorded, sensor, carried.simulated(tmp_path, force))
+    assert raised.value.name == 'unit' and raised.value.message.endswith(f'; {advice}')
+    value = advice.split()[-1]
+    mended = (
+        carried.simulated(tmp_path, force, unit=value)
+        if '--sim-unit' in advice
+        else carried.simulated(tmp_path, force * float(value))
+    )
+    check_gravity(recorded, sensor, mended)
+    assert left_mps2(compare_checked(recorded, sensor, mended, False)) < LARGEST_LEFT_MPS2
 
 
 @pytest.mark.parametrize('step_s, fault', [(0.05, 'clock_jump'), (0.0, None)])
@@ -128,11 +158,22 @@ def only(recorded: Recording, rows: np.ndarray) -> Recording:
     return replace(recorded, time_s=recorded.time_s[rows], columns=columns)
 
 
-@pytest.mark.parametrize('step_s', [0.4, 3.0, -0.4])
-def test_the_advice_on_a_clock_that_steps_can_be_followed(tmp_path, step_s):
+@pytest.mark.parametrize(
+    'step_s, at_s',
+    [
+        (0.4, 30.0),
+        (3.0, 30.0),
+        (-0.4, 30.0),
+        (0.15, 11.0),
+        (0.4, 13.0),
+        (-0.25, 15.0),
+        (0.3, 49.0),
+    ],
+)
+def test_the_advice_on_a_clock_that_steps_can_be_followed(tmp_path, step_s, at_s):
     """No shift makes both parts fit; each of them fits with --align."""
     carried = Carried()
-    recorded, at_s = carried.recorded(), SECONDS / 2
+    recorded = carried.recorded()
     stamps_s = carried.time_s + step_s * (carried.time_s > at_s)
     kept = (carried.time_s <= at_s) | (stamps_s > at_s)
     stepped = only(replace(recorded, time_s=stamps_s), kept)
@@ -140,9 +181,10 @@ def test_the_advice_on_a_clock_that_steps_can_be_followed(tmp_path, step_s):
         with pytest.raises(DataFault) as raised:
             carried.beside(tmp_path, stepped, may_shift=may_shift)
         assert raised.value.name == 'clock_jump' and '--align' in raised.value.message
-    stated = re.search(r'(?:at about|between ([\d.]+) and) ([\d.]+) s', raised.value.message)
-    begin_s, end_s = float(stated[1] or stated[2]), float(stated[2])
-    for rows in (stepped.time_s < begin_s, stepped.time_s > end_s):
+    stated_s = float(re.search(r'at about ([\d.]+) s', raised.value.message)[1])
+    # Stamps that jump leave a part without samples.
+    assert at_s - 0.1 < stated_s < at_s + max(step_s, 0.0) + 0.1
+    for rows in (stepped.time_s < stated_s, stepped.time_s > stated_s):
         comparison = carried.beside(tmp_path, only(stepped, rows), may_shift=True)
         assert left_mps2(comparison) < LARGEST_LEFT_MPS2
 

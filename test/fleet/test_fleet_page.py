@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a made-up fleet in a real browser: what it names, its layout, and its size."""
 
+import re
+
 from adxl_ros.errors import UserError
 from adxl_ros.files.calibration_store import read_population
 from adxl_ros.fleet import page as fleet_page
@@ -49,6 +51,7 @@ def test_the_end_of_a_run_names_batch_and_drifts(tmp_path):
     fleets = {
         'batch': MadeUpFleet(units=24, per_unit=3, batch=6, batch_scale=1.05),
         'drift': FLEETS['bad'],
+        'noise': MadeUpFleet(units=12, rising_noise=0.2),
         'sound': FLEETS['sound'],
     }
     findings = {}
@@ -58,6 +61,11 @@ def test_the_end_of_a_run_names_batch_and_drifts(tmp_path):
         findings[name] = ' '.join(fleet_page.write(tmp_path / name).findings)
     assert '6 units with a serial number B… have a scale factor x' in findings['batch']
     assert 'A-0003 drifts' in findings['drift']
+    drift = re.fullmatch(
+        r'A-0005 drifts: white noise N, y \+(.*) \(\+(.*) to \+(.*)\) µg/√Hz per year.',
+        findings['noise'],
+    )
+    assert drift and float(drift[2]) < 0.2 * 110 < float(drift[3])
     assert findings['sound'] == ''
 
 

@@ -16,10 +16,13 @@ from adxl_ros.links.support.wire_format import (
     _unstuff,
     AFTER_RESET,
     BoardInfo,
+    Command,
     decode,
     encode_command,
     Encoder,
+    LATENCY_TYPE,
     RAIL,
+    SELF_TEST_TYPE,
 )
 from hypothesis import given, settings, strategies as st
 from needs import lack
@@ -137,15 +140,15 @@ def test_every_frame_equals_that_of_the_reference(library):
 
 
 def received(library, raw, receiver=None):
-    """Return the latencies of the commands in some bytes, µs, as the firmware takes them."""
-    receiver, latency_us = receiver or Receiver(), ctypes.c_uint32()
-    return [
-        latency_us.value
-        for byte in raw
-        if library.frame_command(
-            ctypes.byref(receiver), ctypes.c_uint8(byte), ctypes.byref(latency_us)
+    """Return the commands in some bytes, as the firmware takes them."""
+    receiver, time_us, commands = receiver or Receiver(), ctypes.c_uint32(), []
+    for byte in raw:
+        kind = library.frame_command(
+            ctypes.byref(receiver), ctypes.c_uint8(byte), ctypes.byref(time_us)
         )
-    ]
+        if kind:
+            commands.append(Command(kind, time_us.value))
+    return commands
 
 
 @settings(deadline=None)
@@ -155,7 +158,13 @@ def test_no_stream_breaks_the_receiver(library, parts):
     for part in parts:
         received(library, part.replace(b'\0', b'\1') + b'\0', receiver)
         assert receiver.length <= 18
-    assert received(library, encode_command(0, 7), receiver) == [7]
+    assert received(
+        library,
+        encode_command(0, 7)
+        + encode_command(1, 8, 5)
+        + encode_command(2, 500_000, SELF_TEST_TYPE),
+        receiver,
+    ) == [Command(LATENCY_TYPE, 7), Command(SELF_TEST_TYPE, 500_000)]
 
 
 @pytest.fixture(scope='module')
@@ -175,6 +184,7 @@ def sketch(made_once):
                     '-Wextra',
                     '-Werror',
                     '-pthread',
+                    '-DST_PIN=9',
                     '-x',
                     'c++',
                     '-I',
@@ -239,3 +249,26 @@ def test_the_sketch_obeys(sketch, tmp_path, latency_ms):
             link, lambda: value(link, 'frames') > frames + 30 and link.status().text == 'streaming'
         )
         assert link.sensor.serial == 'adxl-0001'
+
+
+def test_the_sketch_ends_a_self_test_by_itself(sketch, tmp_path):
+    """The pin is high for as long as the command says; each sample that it changes is marked."""
+    with running_sketch(sketch, tmp_path, 0, latency_ms=2.0) as link:
+        read_until(link, lambda: link.sensor)
+        link.hold_self_test(0.3)
+        codes, is_marked, end_s = [], [], time.monotonic() + 10 * PATIENCE
+        while not any(is_marked) or any(is_marked[-50:]):
+            assert time.monotonic() < end_s, link.status()
+            samples = link.read(0)
+            if len(samples.volts):
+                codes += np.rint(samples.volts[:, 0] / 5.0 * 65536).astype(int).tolist()
+                marks = samples.in_self_test
+                is_marked += [False] * len(samples.volts) if marks is None else marks.tolist()
+            assert not samples.missing
+    step = (np.array(codes) - codes[-1] + np.arange(len(codes))[::-1]) % 65534
+    is_changed = step > 0
+    assert set(step.tolist()) == {0, 7000}
+    assert not (is_changed & ~np.array(is_marked)).any()
+    # The last sample of the time is taken after the pin has fallen. Whole frames are marked, of at
+    # most ten samples.
+    assert is_changed.sum() == 299 and 500 <= sum(is_marked) <= 518

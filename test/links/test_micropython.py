@@ -3,6 +3,7 @@
 """The program for MicroPython on its unix port, with emulated chips, read byte by byte."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 import os
 import pty
 import shutil
@@ -18,7 +19,10 @@ from adxl_ros.links.support.wire_format import (
     encode_command,
     encode_payload,
     Encoder,
+    HAS_SELF_TEST,
+    IN_SELF_TEST,
     SampleFrame,
+    SELF_TEST_TYPE,
     Splitter,
     WireError,
 )
@@ -113,8 +117,8 @@ def test_each_frame_is_that_of_the_reference_encoder(name):
     assert (info.bits, info.channels, info.serial) == (sent.bits, channels, 'adxl-0001')
     assert info.vref_v == pytest.approx(sent.vref_v, rel=1e-6)
     assert info.rate_hz == pytest.approx(RATE_HZ, rel=1e-3)
-    assert info.flags == AFTER_RESET and reader.text == b''
-    reference = Encoder(info)
+    assert info.flags == AFTER_RESET | HAS_SELF_TEST and reader.text == b''
+    reference = Encoder(replace(info, flags=HAS_SELF_TEST))
     for frame, run in zip(reader.frames, reader.runs):
         if isinstance(frame, BoardInfo):
             expected = reference.info_frame()
@@ -145,6 +149,29 @@ def test_an_analog_sensor_is_read_in_sixteenths_of_a_step():
     volts = samples_of(reader.frames)[0].codes * 3.3 / 65536
     assert reader.frames[0].rate_hz == 100.0
     assert volts[0] == pytest.approx([1.65, 1.60, 1.98], abs=1e-3)
+
+
+@pytest.mark.parametrize('name', [*SENT, 'adxl335'])
+def test_a_self_test_ends_by_itself(name):
+    with running_board(name) as (_, host, _):
+        reader = Reader(host)
+        reader.until(lambda frames: len(samples_of(frames)) >= 1)
+        os.write(host, encode_command(1, 500_000, SELF_TEST_TYPE))
+        reader.until(
+            lambda frames: (
+                any(frame.flags & IN_SELF_TEST for frame in samples_of(frames))
+                and not samples_of(frames)[-1].flags & IN_SELF_TEST
+            )
+        )
+    frames = samples_of(reader.frames)
+    marks = [bool(frame.flags & IN_SELF_TEST) for frame in frames]
+    rest = frames[0].codes[0, 1]
+    changed = [int((frame.codes[:, 1] != rest).sum()) for frame in frames]
+    assert all(mark or not count for mark, count in zip(marks, changed))
+    rate_hz = reader.frames[0].rate_hz
+    assert sum(changed) == pytest.approx(0.5 * rate_hz, abs=2)
+    # Whole frames are marked, of ten samples each.
+    assert 10 * sum(marks) == pytest.approx(0.7 * rate_hz + 10, abs=10)
 
 
 def test_commands_are_obeyed_and_other_bytes_are_not():

@@ -15,11 +15,11 @@ from adxl_ros.links import serial
 from adxl_ros.links.support import base, emulated_board
 from adxl_ros.links.support.wire_format import (
     BoardInfo,
+    decode_command,
     encode_payload,
     Encoder,
     Splitter,
 )
-from faulty_board import decode_command
 import numpy as np
 import pytest
 from units import nominal
@@ -91,7 +91,7 @@ class ConnectedBoard:
             received = os.read(self.board_fd, 4096)
         except BlockingIOError:
             return []
-        return [decode_command(raw) for raw in Splitter().split(received)]
+        return [decode_command(raw).time_us for raw in Splitter().split(received)]
 
     def value(self, name):
         return self.link.status().statistics[name]

@@ -8,16 +8,21 @@ import zlib
 from adxl_ros.links.support.wire_format import (
     AFTER_RESET,
     BoardInfo,
+    Command,
     decode,
+    decode_command,
     encode_command,
     encode_payload,
     Encoder,
+    HAS_SELF_TEST,
+    IN_SELF_TEST,
+    LATENCY_TYPE,
     RAIL,
     SampleFrame,
+    SELF_TEST_TYPE,
     Splitter,
     WireError,
 )
-from faulty_board import decode_command
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
@@ -48,7 +53,24 @@ def test_the_vector_of_a_command():
     assert zlib.crc32(payload).to_bytes(4, 'little') == bytes.fromhex('5a6d1be4')
     frame = bytes.fromhex('00030301010207010103d00701055a6d1be400')
     assert encode_command(7, 2000) == frame
-    assert decode_command(frame[1:-1]) == 2000
+    assert decode_command(frame[1:-1]) == Command(LATENCY_TYPE, 2000)
+    # The self-test for half a second
+    payload = bytes.fromhex('040100000800000020a10700')
+    assert zlib.crc32(payload).to_bytes(4, 'little') == bytes.fromhex('cb37715d')
+    frame = bytes.fromhex('0003040101020801010420a10705cb37715d00')
+    assert encode_command(8, 500_000, SELF_TEST_TYPE) == frame
+    assert decode_command(frame[1:-1]) == Command(SELF_TEST_TYPE, 500_000)
+
+
+def test_the_marks_of_the_self_test():
+    encoder = Encoder(replace(INFO, flags=HAS_SELF_TEST))
+    assert decode(encoder.info_frame()[:-1]).flags == AFTER_RESET | HAS_SELF_TEST
+    codes = np.array([[7, 7]], np.uint16)
+    marked = encoder.sample_frame(0, 0, codes, flags=IN_SELF_TEST)
+    assert decode(marked[:-1]).flags == AFTER_RESET | IN_SELF_TEST
+    assert decode(encoder.sample_frame(0, 1, codes)[:-1]).flags == 0
+    with pytest.raises(WireError):
+        decode_command(marked[:-1])
 
 
 def test_the_encoder_makes_the_vector_and_sets_flags():

@@ -53,6 +53,7 @@ class Camera:
         message.orientation.x, message.orientation.w = 0.6, 0.8
         message.orientation_covariance = [0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.02]
         message.angular_velocity.x, message.angular_velocity.z = 0.25, -0.5
+        message.angular_velocity_covariance = [0.04, 0.0, 0.0, 0.0, 0.04, 0.0, 0.0, 0.0, 0.04]
         a = message.linear_acceleration
         a.x, a.y, a.z = map(float, force_mps2)
         self._publisher.publish(message)
@@ -95,6 +96,7 @@ def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(
     """
     Acceleration, covariance, gyroscope and tilt are those of the robot, after ~/level, too.
 
+    The bias of the gyroscope is subtracted in the frame of the sensor, and its variance added.
     The level is written into the file of the mounting.
     """
     mounted = tmp_path / 'mounted.yaml'
@@ -114,6 +116,10 @@ def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(
         mounted,
         '-p',
         'free_acceleration:=true',
+        '-p',
+        'gyro.bias_radps:=[0.05, 0.02, -0.1]',
+        '-p',
+        'gyro.bias_std_radps:=[0.01, 0.01, 0.03]',
     )
     camera.connected()
 
@@ -129,7 +135,9 @@ def test_a_mounted_sensor_is_turned_into_the_frame_of_the_robot(
     assert data[-1].header.frame_id == tilt[-1].header.frame_id == 'base_link'
     np.testing.assert_allclose(accel(data[-1]), [0, -1, G], atol=0.2)
     w = data[-1].angular_velocity
-    np.testing.assert_allclose([w.x, w.y, w.z], [0.25, 0, 0.5], atol=1e-12)
+    np.testing.assert_allclose([w.x, w.y, w.z], [0.2, 0.02, 0.4], atol=1e-12)
+    variances = np.reshape(data[-1].angular_velocity_covariance, (3, 3)).diagonal()
+    np.testing.assert_allclose(variances, [4.01e-2, 4.01e-2, 4.09e-2], rtol=1e-9)
     assert tilt[-1].vector.x == pytest.approx(-0.1, abs=0.02)
     stated = data[-1].orientation
     assert [abs(stated.x), abs(stated.w)] == pytest.approx([0.8, 0.6]), 'kept, of another frame'

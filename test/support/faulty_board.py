@@ -47,14 +47,6 @@ BANNER = b'\r\nets Jun  8 2016 00:22:57\r\nrst:0x1 (POWERON_RESET)\0\r\nboot\r\n
 """What an ESP32 prints when it starts."""
 
 
-def decode_command(raw):
-    """Decode a frame from the host; return its latency, µs."""
-    payload = wire_format._checked_payload(raw)
-    if payload[0] != wire_format.COMMAND_TYPE:
-        raise WireError('no command')
-    return wire_format._COMMAND.unpack(payload)[-1]
-
-
 def mark(k):
     """Return the code of channel y at sample k."""
     return (k * 40503 + 12345) % CODES + 1
@@ -124,8 +116,9 @@ class FaultyBoard:
             return
         for raw in self.received.split(received):
             with suppress(WireError):
-                latency_s = decode_command(raw) * 1e-6
-                self.block = min(samples_within(latency_s, self.rate), BLOCK)
+                command = wire_format.decode_command(raw)
+                if command.kind == wire_format.LATENCY_TYPE:
+                    self.block = min(samples_within(command.time_us * 1e-6, self.rate), BLOCK)
                 self.informed_ns = 0
 
     def send_frame(self):

@@ -24,6 +24,8 @@ class MadeUpFleet:
     batch: int = 0
     batch_scale: float = 1.0  # Scale factor of these units over that of the others
     drifting_mg: float = 0.0  # Drift of the zero-g of unit A-0003, mg per year
+    # Rise of the noise of unit A-0005 on y, of its value, per year
+    rising_noise: float = 0.0
     refused: float = 0.0  # Share of refused recordings
     # Whether the recordings on stage 2, a fifth of all, have stage_eccentricity
     stage_fault: bool = False
@@ -73,6 +75,7 @@ class MadeUpFleet:
             columns[f'scale_{axis}_v_per_g'] = scale + 1e-4 * rng.normal(size=n)
             columns[f'scale_std_{axis}_v_per_g'] = np.full(n, 1e-4)
             noise = 1.08e-3 * (1 + rng.normal(0, 0.05, m))[unit] * (1 + rng.normal(0, 0.02, n))
+            noise *= np.where((unit == 5) & (axis == 'y'), 1 + self.rising_noise * year, 1.0)
             columns[f'noise_n_{axis}_mps2_per_rthz'] = noise
             columns[f'noise_n_low_{axis}_mps2_per_rthz'] = 0.97 * noise
             columns[f'noise_n_high_{axis}_mps2_per_rthz'] = 1.03 * noise

@@ -30,6 +30,7 @@ def nominal(axes='xy', **changes):
         name: np.full(count, getattr(sensor, name)[0])
         for name in ('nominal_zero_g_v', 'nominal_scale_v_per_g', 'noise_density_g_per_rthz')
     }
+    arrays['self_test_g'] = sensor.self_test_g[:1] * count
     return replace(sensor, axes=axes, **{'z_sign': 1, **arrays, **changes})
 
 

@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 from adxl_ros.files import parameter_file
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.simulate.sensor_model import SensorModel
 from adxl_ros.tools.export import FORMATS
 import numpy as np
@@ -395,6 +396,60 @@ def test_broadcaster(exported):
     )
     for absent in ('orientation', 'angular_velocity'):
         assert parameters[f'static_covariance_{absent}'] == [-1.0] + 8 * [0.0]
+
+
+def test_the_gyroscope_in_each_format_that_holds_one(tmp_path):
+    """
+    A density d over positive frequencies is d/√2 over both, with a variance of d²·rate/2 a sample.
+
+    A walk that is not known is the largest that an hour at rest hides: K·√(τ/3) = N/√τ.
+    """
+    density, bias = (1e-4, 3e-4, 2e-4), [0.01, -0.02, 0.03]
+    sensor = replace(
+        unit(),
+        gyro=Gyroscope(
+            bias_radps=tuple(bias),
+            noise_density_radps_per_rthz=density,
+            walk_radps_per_rts=(2e-6, 4e-6, 3e-6),
+        ),
+    )
+    white, k, rate_hz = 3e-4 / np.sqrt(2), 4e-6, sensor.rate_hz
+    expected = {
+        'kalibr': {
+            'gyroscope_noise_density': (white, 'rad/s/sqrt(Hz)'),
+            'gyroscope_random_walk': (k, 'rad/s^2/sqrt(Hz)'),
+        },
+        'okvis2': {
+            'sigma_g_c': (white, 'rad/s/sqrt(Hz)'),
+            'sigma_gw_c': (k, 'rad/s^2/sqrt(Hz)'),
+            'g0': (bias, 'rad/s'),
+        },
+        'fusioncore': {
+            'imu.gyro_noise': (white * np.sqrt(rate_hz), 'rad/s'),
+            'ukf.q_gyro_bias': (k**2 / rate_hz, '(rad/s)^2 a sample'),
+        },
+        'point_lio': {
+            'imu_meas_omg_cov': (white**2 * rate_hz, '(rad/s)^2'),
+            'gyr_cov_input': (white**2 * rate_hz, '(rad/s)^2'),
+            'b_gyr_cov': (k**2 * rate_hz, '(rad/s)^2/s^2'),
+        },
+        'broadcaster': {
+            'static_covariance_angular_velocity': (
+                np.diag(np.square(density) / 2 * rate_hz).ravel().tolist(),
+                '',
+            )
+        },
+    }
+    for name, lines in expected.items():
+        text = export(tmp_path, name, sensor).text
+        for key, (value, stated_unit) in lines.items():
+            (line,) = (each for each in text.splitlines() if each.strip().startswith(f'{key}:'))
+            written, _, comment = line.partition('  # ')
+            assert yaml.safe_load(written)[key] == pytest.approx(value, rel=1e-9), line
+            assert comment == stated_unit
+    hidden = replace(sensor, gyro=replace(sensor.gyro, walk_radps_per_rts=()))
+    kalibr = yaml.safe_load(export(tmp_path, 'kalibr', hidden).text)
+    assert kalibr['gyroscope_random_walk'] == pytest.approx(white * np.sqrt(3) / 3600)
 
 
 def test_json(exported, tmp_path):

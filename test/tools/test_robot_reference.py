@@ -137,9 +137,15 @@ def test_fit_takes_poses_of_the_robot(robot, run_tool):
 
 
 def test_a_recording_without_joints_is_refused(robot, run_tool, tmp_path):
-    bag_of(tmp_path / 'bare', [imu(EPOCH_NS + k * 10_000_000) for k in range(400)])
-    folder = robot('any').parent
-    done = run_tool('diagnose', tmp_path / 'bare', '--urdf', folder / 'robot.urdf', '-o', 'gap')
+    """It is named as well where it is the earlier one of a comparison."""
+    accel = np.random.default_rng(3).normal([0, 0, 9.8], 0.05, (400, 3))
+    messages = [imu(EPOCH_NS + k * 10_000_000, tuple(row)) for k, row in enumerate(accel)]
+    bag_of(tmp_path / 'bare', messages)
+    bag = robot('any')
+    urdf = '--urdf', bag.parent / 'robot.urdf'
+    done = run_tool('diagnose', tmp_path / 'bare', *urdf, '-o', 'gap')
     assert done.returncode == 1
     assert 'no topic of type sensor_msgs/msg/JointState' in done.stderr
     assert len(done.stderr.splitlines()) == 1
+    done = run_tool('check', bag, '--against', tmp_path / 'bare', *urdf, '--fail-on', 'rate')
+    assert 'no topic of type sensor_msgs/msg/JointState' in ' '.join(done.stdout.split())

@@ -238,9 +238,15 @@ class Keeper:
             self._arrive(rest.stay, measured_g)
             seen = seen._replace(residual_g=measured_g - self._stay.up_g, basis=self._stay.basis)
             found = self._stay.belief.innovation(seen, first_freedom)
-        departure_g = self._stay.belief.weight @ found.departure_g @ force_g
-        along_g = float(departure_g if side[0] == '+' else -departure_g)
-        if self._is_rejected(side[1], along_g, found.plausibility, rest.start_ns):
+        departure_g = self._stay.belief.weight @ found.departure_g
+        if len(departure_g) == len(AXES):
+            axis = side[1]
+            along_g = (1 if side[0] == '+' else -1) * float(departure_g @ force_g)
+        else:
+            # Less axes do not show which side is up: the one that departs most.
+            largest = int(np.abs(departure_g).argmax())
+            axis, along_g = self._kept.sensor.axes[largest], float(departure_g[largest])
+        if self._is_rejected(axis, along_g, found.plausibility, rest.start_ns):
             self._stay = None
             return
         self._temperatures_c = [

@@ -10,7 +10,7 @@ Each module of the package `links` is one link, found by its file name. It holds
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from importlib import import_module
 import os
@@ -141,20 +141,26 @@ class Samples:
     estimated: int = 0  # Part of `missing` that is estimated from time, not counted
     # Further fields of sensor_msgs/Imu by name, (n, k) each, such as `angular_velocity`
     imu_fields: Columns = field(default_factory=dict)
+    # Samples that a self-test of the sensor has changed, (n,) bool; None for none
+    in_self_test: np.ndarray | None = None
 
     def finite(self) -> Samples:
-        """Return the samples whose volts are finite, without references; others are missing."""
+        """Return the samples whose volts are finite; others are missing."""
         finite = np.isfinite(self.volts)
         if finite.all():
             return self
         rows = finite.all(axis=1)
-        return Samples(
-            self.stamp_ns[rows],
-            self.volts[rows],
-            self.until_ns,
-            self.missing + int((~rows).sum()),
-            estimated=self.estimated,
+        return replace(self.where(rows), missing=self.missing + int((~rows).sum()))
+
+    def where(self, rows: np.ndarray) -> Samples:
+        """Return some of the samples."""
+        return replace(
+            self,
+            stamp_ns=self.stamp_ns[rows],
+            volts=self.volts[rows],
+            references={name: values[rows] for name, values in self.references.items()},
             imu_fields={name: values[rows] for name, values in self.imu_fields.items()},
+            in_self_test=None,
         )
 
 
@@ -190,6 +196,17 @@ class Link(Protocol):
         Another thread may ask while the samples of the last read are not published yet. A link
         that ends says so after the next read, so that the end comes after its samples.
         """
+
+    def hold_self_test(self, hold_s: float) -> None:
+        """
+        Keep the self-test of the sensor on for a time from now, s; 0 ends it.
+
+        `read` marks the samples that it changes. Raises `UserError` where the link has none.
+        """
+        raise UserError(
+            'this link reaches no self-test of a sensor; serial (a board that has its line) and '
+            'sim do'
+        )
 
     def close(self) -> None:
         """Close what the link holds open."""

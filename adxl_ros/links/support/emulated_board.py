@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import pty
@@ -16,11 +16,13 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import Columns
 from adxl_ros.links.support import base, wire_format
 from adxl_ros.links.support.base import samples_within
+from adxl_ros.links.support.self_test import EmulatedLine
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import command
 import numpy as np
 
 _FRAME_S = 0.002  # Duration of the samples of a frame, s: the usual latency of a driver
+_MOST_BYTES = 4096  # Bytes of commands that are read at once
 _INFO_S = 1.0  # Period of the info frames, s, as the firmware sends them
 _SUPPLY_SCALE = 2.0
 """Ratio of the supply's divider, V/V, as in the firmware: the ADC cannot measure its own
@@ -31,16 +33,23 @@ _TEMPERATURE_V_PER_C = 0.01  # Slope of the temperature sensor, V/degC, as a TMP
 
 class Board:
     """
-    Sends the samples of a sensor.
+    Sends the samples of a sensor, and obeys the commands of its self-test.
 
     Frames that nobody reads are dropped and counted, as on a board without a host.
     """
 
     def __init__(self, sensor: Sensor, roles: list[str], fd: int) -> None:
         self._sensor, self._roles, self._fd = sensor, roles, fd
+        self._line, self._received = EmulatedLine(sensor), wire_format.Splitter()
+        flags = wire_format.HAS_SELF_TEST if self._line.has_step else 0
         self._encoder = wire_format.Encoder(
             wire_format.BoardInfo(
-                sensor.rate_hz, sensor.adc_bits, len(roles), sensor.adc_vref_v, sensor.serial
+                sensor.rate_hz,
+                sensor.adc_bits,
+                len(roles),
+                sensor.adc_vref_v,
+                sensor.serial,
+                flags,
             )
         )
         self._began_s: float | None = None
@@ -52,26 +61,43 @@ class Board:
     def send(self, columns: Columns) -> None:
         """Send the samples of columns, (n,) each, every frame at the time of its last sample."""
         volts = np.column_stack([_volts(role, columns) for role in self._roles])
-        codes = (
-            np.rint(volts / self._sensor.lsb_v)
-            .clip(0, 2**self._sensor.adc_bits - 1)
-            .astype(np.uint16)
-        )
         if self._began_s is None:
             self._began_s = time.monotonic()
-        while len(codes):
-            block, codes = codes[: self._frame_samples], codes[self._frame_samples :]
+        while len(volts):
+            block, volts = volts[: self._frame_samples], volts[self._frame_samples :]
             first_s = self._index / self._sensor.rate_hz
+            self._obey(first_s)
+            is_in_test = self._line.add(
+                first_s + np.arange(len(block)) / self._sensor.rate_hz,
+                block[:, : len(self._sensor.axes)],
+            )
             if first_s - self._informed_s >= _INFO_S and self._write(self._encoder.info_frame()):
                 self._informed_s = first_s
             due_s = self._began_s + (self._index + len(block) - 1) / self._sensor.rate_hz
             time.sleep(max(due_s - time.monotonic(), 0))
             frame = self._encoder.sample_frame(
-                round(first_s * 1e6), self._index, block, self._overruns
+                round(first_s * 1e6),
+                self._index,
+                self._codes(block),
+                self._overruns,
+                wire_format.IN_SELF_TEST if is_in_test.any() else 0,
             )
             if not self._write(frame):
                 self._overruns += len(block)
             self._index += len(block)
+
+    def _codes(self, volts: np.ndarray) -> np.ndarray:
+        codes = np.rint(volts / self._sensor.lsb_v).clip(0, 2**self._sensor.adc_bits - 1)
+        return codes.astype(np.uint16)
+
+    def _obey(self, now_s: float) -> None:
+        """Take the commands of the host at a time of the board, s."""
+        with suppress(OSError):  # nothing has come, or the terminal is gone
+            for raw in self._received.split(os.read(self._fd, _MOST_BYTES)):
+                with suppress(wire_format.WireError):
+                    command = wire_format.decode_command(raw)
+                    if command.kind == wire_format.SELF_TEST_TYPE:
+                        self._line.hold(now_s, command.time_us * 1e-6)
 
     def _write(self, frame: bytes) -> bool:
         """Write a frame, after the rest of a previous one; return whether it was taken."""

@@ -289,6 +289,7 @@ class Block:
     volts: np.ndarray  # Output of the sensor by axis, V, (n, m)
     references: Columns  # References that the device has, by column, (n,) each
     lost: int | None = None  # Samples lost before it; None where only time shows them
+    in_self_test: bool = False  # Whether a self-test of the sensor has changed them
 
 
 _FOLLOW_NS = 10_000_000
@@ -357,6 +358,7 @@ class Stamper:
         if not self._stamped:
             return no_samples(sensor, time.time_ns())
         parts, self._stamped = self._stamped, []
+        marks = np.concatenate([part.in_self_test for part in parts])
         return Samples(
             np.concatenate([part.stamp_ns for part in parts]),
             np.concatenate([part.volts for part in parts]),
@@ -367,6 +369,7 @@ class Stamper:
                 for name in parts[0].references
             },
             sum(part.estimated for part in parts),
+            in_self_test=marks if marks.any() else None,
         )
 
     def statistics(self) -> dict[str, Any]:
@@ -411,6 +414,7 @@ class Stamper:
                     self._counted + self._estimated,
                     self._thin(host_ns, block.references),
                     self._estimated,
+                    in_self_test=np.full(len(host_ns), block.in_self_test),
                 )
             )
             self._counted = self._estimated = 0

@@ -20,10 +20,14 @@ import numpy as np
 VERSION = 1  # Version of the format
 SAMPLES_TYPE = 1  # Type of a frame with samples
 INFO_TYPE = 2  # Type of a frame that describes the board
-COMMAND_TYPE = 3
-"""Type of a frame from the host to the board, which sets how many samples a frame has."""
+LATENCY_TYPE = 3
+"""Type of a command, a frame from the host to the board: how many samples a frame has."""
+SELF_TEST_TYPE = 4  # Type of a command: for how long the self-test of the sensor is on
 RAIL = 1  # Flag of a frame with samples: a code is at a rail of the ADC
 AFTER_RESET = 2  # Flag of all frames from a reset to the first one with samples
+IN_SELF_TEST = 4
+"""Flag of a frame with samples: the self-test moves the sensor, or has moved it just before."""
+HAS_SELF_TEST = 8  # Flag of an info frame: the board switches the self-test of its sensor
 MAX_CHANNELS = 8  # Most channels of a board; a frame with more of them is invalid
 
 _SAMPLES = struct.Struct('<BBHIQIHBB')
@@ -32,7 +36,7 @@ samples and channels."""
 _INFO = struct.Struct('<BBHIfBBf16s')
 """An info payload: the same four, then sample rate, bits, channels, vref, serial number."""
 _COMMAND = struct.Struct('<BBHII')
-"""A command, the shortest payload: the same four, then latency in µs."""
+"""A command, the shortest payload: the same four, then a time in µs."""
 _CRC = struct.Struct('<I')  # CRC-32 behind the payload, as zlib computes it
 MAX_COUNT = 255  # Most samples of a frame: their number is a u8
 _BLOCK = 254  # Most bytes of a block of COBS
@@ -62,7 +66,7 @@ class BoardInfo:
     channels: int  # Number of channels
     vref_v: float  # Reference voltage of the ADC, V
     serial: str  # Serial number of the sensor; '' without one
-    # `AFTER_RESET`; two descriptions are equal whatever their flags
+    # `AFTER_RESET`, `HAS_SELF_TEST`; two descriptions are equal whatever their flags
     flags: int = field(default=0, compare=False)
 
 
@@ -70,7 +74,7 @@ class BoardInfo:
 class SampleFrame:
     """Samples at equal steps of the device clock."""
 
-    flags: int  # `RAIL`, `AFTER_RESET`
+    flags: int  # `RAIL`, `AFTER_RESET`, `IN_SELF_TEST`
     sequence: int  # Number of the frame, wraps at 2^32
     time_us: int  # Device clock at the first sample, µs
     index: int  # Number of the first sample, dropped samples included, wraps at 2^32
@@ -93,7 +97,7 @@ class Encoder:
             _INFO.pack(
                 INFO_TYPE,
                 VERSION,
-                self._flags,
+                i.flags | self._flags,
                 next(self._sequence) % 2**32,
                 i.rate_hz,
                 i.bits,
@@ -138,10 +142,28 @@ def decode(raw: bytes) -> BoardInfo | SampleFrame:
     raise WireError(f'unknown type {payload[0]}')
 
 
-def encode_command(sequence: int, latency_us: int) -> bytes:
-    """Encode the frame by which the host asks for small frames."""
-    payload = _COMMAND.pack(COMMAND_TYPE, VERSION, 0, sequence % 2**32, min(latency_us, 2**32 - 1))
+@dataclass(frozen=True)
+class Command:
+    """What the host asks of a board."""
+
+    kind: int  # `LATENCY_TYPE`, `SELF_TEST_TYPE`, or one that this version does not know
+    # Longest time for which the samples of a frame are collected, or time for which the self-test
+    # is on from now, µs; 0 ends it
+    time_us: int
+
+
+def encode_command(sequence: int, time_us: int, kind: int = LATENCY_TYPE) -> bytes:
+    """Encode the frame of a command."""
+    payload = _COMMAND.pack(kind, VERSION, 0, sequence % 2**32, min(time_us, 2**32 - 1))
     return b'\0' + encode_payload(payload)
+
+
+def decode_command(raw: bytes) -> Command:
+    """Decode the frame of a command."""
+    payload = _checked_payload(raw)
+    if len(payload) != _COMMAND.size:
+        raise WireError('no command')
+    return Command(payload[0], _COMMAND.unpack(payload)[-1])
 
 
 def samples_that_fit(count: int, info: BoardInfo, bytes_per_s: float) -> int:

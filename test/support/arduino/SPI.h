@@ -4,7 +4,8 @@
  *
  * The program gets the open file of a terminal and the baud rate of its UART, 0 for USB. A thread is
  * the timer; in it the time is that for which it was set, because an interrupt is not late where a
- * thread of a busy machine is. Channel c has the code (k + 20000 c) mod 65534 + 1 at sample k. */
+ * thread of a busy machine is. Channel c has the code (k + 20000 c) mod 65534 + 1 at sample k, and
+ * during the self-test the code of 7000 samples later. */
 
 #include <poll.h>
 #include <stdint.h>
@@ -13,12 +14,21 @@
 #include <unistd.h>
 
 #include <chrono>
+#include <mutex>
 #include <thread>
 
 #define TEENSYDUINO 1
 enum { OUTPUT, HIGH, LOW, MSBFIRST, SPI_MODE0 };
 static void pinMode(int, int) {}
-static void digitalWrite(int, int) {}
+static volatile uint32_t step; /* of the codes, by the self-test */
+static void digitalWrite(int pin, int level) {
+    if (pin == ST_PIN) {
+        step = level == HIGH ? 7000 : 0;
+    }
+}
+static std::recursive_mutex interrupt;
+static void noInterrupts() { interrupt.lock(); }
+static void interrupts() { interrupt.unlock(); }
 
 static uint64_t host_us() {
     struct timespec now;
@@ -44,7 +54,7 @@ static struct {
         shifted <<= 8;
         if (control & 0x80) {
             const uint8_t channel = (uint8_t)((control >> 6 & 1) | (control >> 4 & 3) << 1);
-            const uint32_t sample = conversions++ / 3;
+            const uint32_t sample = conversions++ / 3 + step;
             shifted = ((sample + 20000u * channel) % 65534u + 1u) << 7;
         }
         return out;
@@ -60,7 +70,9 @@ struct IntervalTimer {
                 std::this_thread::sleep_until(due);
                 interrupt_us = (uint64_t)std::chrono::duration_cast<std::chrono::microseconds>(
                     due.time_since_epoch()).count();
+                noInterrupts();
                 call();
+                interrupts();
             }
         }).detach();
     }
