@@ -75,7 +75,7 @@ setup(
         PACKAGE: [
             'commit.txt',
             'py.typed',
-            'api/*.html',
+            'calibrate/keep/*.html',
             'calibrate/report/*.html',
             'calibrate/report/*.js',
             'calibrate/report/*.xml',
@@ -83,6 +83,7 @@ setup(
             'files/export_templates/*',
             'fleet/*.html',
             'report/page_templates/*',
+            'signals/*.html',
         ],
         f'{PACKAGE}_validation': ['*.yaml', 'blind/*.yaml', 'pages/*'],
         f'{PACKAGE}.params': ['*.yaml'],

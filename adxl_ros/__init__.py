@@ -12,7 +12,9 @@ The verbs of the package load when they are used, and need no ROS:
     gap = adxl.diagnose(recording, fit)
 """
 
+from collections.abc import Callable
 from importlib import import_module
+from types import ModuleType
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -78,11 +80,37 @@ __all__ = [
 ]
 
 
-# Two verbs have the names of packages. A package becomes an attribute when it is first imported:
-# here, and not later in place of the verb.
+class _VerbPackage(ModuleType):
+    """
+    A package that has the name of a verb, and is called as that verb.
+
+    Both stay what they are in any order of imports: `adxl_ros.diagnose(...)` as well as
+    `import adxl_ros.diagnose.verdict`.
+    """
+
+    @property
+    def __wrapped__(self) -> Callable[..., Any]:
+        """Return the verb, for its signature."""
+        return getattr(import_module(f'adxl_ros.{_MODULES[self._verb]}'), self._verb)
+
+    @property
+    def _verb(self) -> str:
+        return self.__name__.rpartition('.')[2]
+
+    @property
+    def __doc__(self) -> str | None:  # type: ignore[override]
+        return self.__wrapped__.__doc__
+
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
+        return self.__wrapped__(*arguments, **named)
+
+    def __reduce__(self) -> str:
+        """Pickle it by its name, as functions are."""
+        return self._verb
+
+
 for _package in ('diagnose', 'simulate'):
-    import_module(f'{__name__}.{_package}')
-    del globals()[_package]
+    import_module(f'{__name__}.{_package}').__class__ = _VerbPackage
 
 
 def __getattr__(name: str) -> Any:

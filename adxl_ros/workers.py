@@ -31,19 +31,23 @@ import warnings
 from adxl_ros.errors import install_hint, one_line, UserError
 
 RETRIES = 2
-"""Further attempts of a task that fails, by default; chosen."""
+"""Further attempts of a task that fails, by default. A machine that is shut down fails a task
+once, rarely twice; a task that fails three times fails by itself."""
 _TASKS_PER_WORKER = 3
-"""Tasks that are submitted for each worker: one runs, two wait. Chosen: a worker is not idle where
-the client is slow, and no more arguments are in memory."""
+"""Tasks that are submitted for each worker: one runs, two wait. With one waiting, a client that is
+slow for a task leaves a worker idle; each further one is more arguments in memory."""
 _FEWEST_TASKS = 4
-"""Tasks that are submitted to a cluster at least. Chosen: one that grows by demand sees it."""
+"""Tasks that are submitted to a cluster at least, so that one that grows by demand sees some."""
 _CONNECT_S = 20.0
-"""Time in which a scheduler must answer, s; chosen."""
+"""Time in which a scheduler must answer, s: one that runs answers within 1 s, and behind a slow
+network within some."""
 _FETCH_S = 60.0
-"""Time in which a cluster must deliver a result, s; chosen: some MB over a slow line."""
+"""Time in which a cluster must deliver a result, s: a page of 3 MB over 0.4 Mbit/s takes as
+long."""
 _DIED = 'the worker ended while it ran the task'
 _WAIT_S = 1.0
-"""Time after which the number of slots is asked for again, s; chosen."""
+"""Time after which the number of slots is asked for again, s: a cluster starts workers over
+minutes."""
 
 
 class WorkerDied(Exception):

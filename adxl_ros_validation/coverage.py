@@ -16,7 +16,8 @@ from itertools import product
 from adxl_ros.calibrate.fits import full_model
 from adxl_ros.calibrate.fits.linearisation import StageError
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
-from adxl_ros.calibrate.poses import Poses, predicted_volts
+from adxl_ros.calibrate.pose_model import predicted_volts
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model import noise
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_axes, with_neutral

@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 from adxl_ros.calibrate.fits import full_model, linear
 from adxl_ros.calibrate.fits.linearisation import StageError
 from adxl_ros.calibrate.guided.pose_plan import spread, Target
-from adxl_ros.calibrate.poses import estimate_filters, extract_poses, Poses, stage_force
+from adxl_ros.calibrate.pose_model import stage_force
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.recorded_poses import estimate_filters, extract_poses
 from adxl_ros.compensate import inversions
 from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.files.sweep_journal import PoseRecord

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from adxl_ros.calibrate import calibration
-from adxl_ros.calibrate.poses import extract_poses
+from adxl_ros.calibrate.recorded_poses import extract_poses
 from adxl_ros.calibrate.report import acceptance, page as unit_page
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import make_folder, write_bytes, write_text
-from adxl_ros.files.recording_columns import recorded_unit
+from adxl_ros.files.recording_columns import recorded_nominal
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import Sensor
@@ -95,7 +95,7 @@ def _of_recordings(sensor: Sensor, paths: Sequence[str], folder: Path) -> _Repro
     unit, recordings = sensor, []
     for path in paths:
         read = cli.read('reproduce', path)
-        unit = recorded_unit(unit, read)
+        unit = recorded_nominal(unit, read)
         recordings.append(calibration.RecordedPoses(Path(path).name, extract_poses(read, unit)))
     result = calibration.calibrate(unit, recordings, 'full')
     make_folder(folder / FIGURES)

@@ -198,36 +198,36 @@ RESULTS = (
     'adxl_ros.model.sensor:Sensor',
     'adxl_ros.api.calibration:Fit',
     'adxl_ros.api.updating:Update',
-    'adxl_ros.api.updating:UpdatedDay',
-    'adxl_ros.calibrate.keep.keeper:KeptState',
-    'adxl_ros.api.calibration:FittedCoefficient',
-    'adxl_ros.calibrate.report.held_out:HeldOutErrors',
-    'adxl_ros.calibrate.report.held_out:ErrorStatistic',
     'adxl_ros.api.correction:Corrected',
     'adxl_ros.api.gap:Gap',
-    'adxl_ros.api.gap:FoundEffect',
-    'adxl_ros.api.gap:FoundParameter',
-    'adxl_ros.api.gap:GapFigures',
-    'adxl_ros.report.quantities:Interval',
-    'adxl_ros.diagnose.gap_in_unit:GapInUnit',
-    'adxl_ros.diagnose.next_experiment:CouldShow',
     'adxl_ros.api.checking:Check',
-    'adxl_ros.signals.findings:Findings',
-    'adxl_ros.signals.findings:RecordingContents',
     'adxl_ros.api.noise:Noise',
-    'adxl_ros.signals.noise_parameters:AxisNoise',
-    'adxl_ros.signals.noise_parameters:Estimate',
-    'adxl_ros.signals.noise_parameters:NoiseFit',
 )
-"""What the verbs take and return."""
-FIVE_LINES = """\
+"""What the verbs take and return; the types of their fields follow each."""
+STEPS = ('result', 'diagnosis', 'parts', 'mapping', 'mounting')
+"""Fields whose types are no part of the interface: steps of the work, and what is parsed."""
+INPUTS = (
+    'adxl_ros.api.recordings:RecordingInput',
+    'adxl_ros.api.sensors:SensorInput',
+    'adxl_ros.api.sensors:AddedEffects',
+    'adxl_ros.api.recordings:Counts',
+    'adxl_ros.api.result:Progress',
+)
+"""Types of arguments."""
+USAGE = """\
 import adxl_ros as adxl
 recording = adxl.from_arrays(time_s=t, x_v=x, y_v=y, alpha_rad=alpha, beta_rad=beta)
 fit = adxl.fit(recording, 'adxl203')                  # print(fit); fit.save('unit.yaml')
-corrected = adxl.apply(recording, fit)                # corrected.to_pandas()
+corrected = adxl.apply(recording, fit)                # corrected.force_mps2, .to_pandas()
 gap = adxl.diagnose(recording, fit)                   # gap.verdict, gap.effects; gap.save('gap')
+checked = adxl.check(recording)                       # checked.is_sound, checked.faults
+checked = adxl.check(recording, against=earlier)      # checked.failures(): what became worse
+noise = adxl.noise(still)                             # noise.axes[0].fit.white.value, m/s²/√Hz
+updated = adxl.update([day_1, day_2], 'unit.yaml')    # updated.outcome; updated.save('new.yaml')
+made = adxl.simulate('rich', fit, effects=['lever_arm'])  # made.columns['x_v'], V; made.save(...)
+readings_mps2 = adxl.SensorModel(fit, seed=1)(force_mps2, dt_s)  # (n, 3), in a simulator's loop
 """
-"""The way from arrays to a diagnosis."""
+"""The way from arrays to a diagnosis, and the other verbs."""
 LIBRARY = (
     'adxl_ros.simulate.sensor_model:SensorModel',
     'adxl_ros.model.effects.base:Effect',
@@ -595,10 +595,11 @@ def documented_classes() -> Iterator[str]:
         'result prints as the screen of its tool, and shows the top of its page in a '
         'notebook. Errors are `adxl.UserError`. [calibrate_arrays.py]'
         '(../examples/calibrate_arrays.py) and the files beside it run as they are.',
-        *block(FIVE_LINES, 'python'),
+        *block(USAGE, 'python'),
     ]
     for name in VERBS:
         yield from verb(name)
+    yield from ['## Arguments', *table('type | is | meaning', input_types())]
     yield from [
         '## Results',
         '',
@@ -606,7 +607,7 @@ def documented_classes() -> Iterator[str]:
         '`print`, and `plot(ax=None)` draws with matplotlib.',
         '',
     ]
-    for path in RESULTS:
+    for path in with_fields(RESULTS):
         yield from described(path, 3)
     yield from [
         '## What programs extend',
@@ -617,6 +618,42 @@ def documented_classes() -> Iterator[str]:
     ]
     for path in LIBRARY:
         yield from described(path, 3)
+
+
+def with_fields(paths: Iterable[str]) -> list[str]:
+    """Return types, each followed by the types of its fields that this package has."""
+    found: list[str] = []
+    todo = list(paths)
+    while todo:
+        path = todo.pop(0)
+        if path in found:
+            continue
+        found.append(path)
+        module, name = path.split(':')
+        item = getattr(importlib.import_module(module), name)
+        words = [
+            word
+            for field, annotation in inspect.get_annotations(item).items()
+            if field not in STEPS
+            for word in re.findall(r'[A-Z]\w+', str(annotation))
+        ]
+        types = [vars(sys.modules[module]).get(word) for word in words]
+        todo[:0] = [
+            f'{each.__module__}:{each.__name__}'
+            for each in types
+            if getattr(each, '__module__', '').startswith('adxl_ros')
+            and (dataclasses.is_dataclass(each) or hasattr(each, '_fields'))
+        ]
+    return found
+
+
+def input_types() -> Iterator[tuple[str, ...]]:
+    """Show what arguments may be."""
+    for path in INPUTS:
+        module, name = path.split(':')
+        source = inspect.getsource(importlib.import_module(module))
+        found = re.search(rf'^{name}\b[^\n]* = (.*)\n"""(.*?)"""', source, re.MULTILINE)
+        yield f'`{name}`', '`{}`'.format(found[1].strip("'")), found[2]
 
 
 def verb(name: str) -> Iterator[str]:
@@ -675,6 +712,7 @@ def figures() -> dict[Path, str]:
         'better reference': benchmark(
             'Level C: share of the squared gap that is closed on a later part'
         ),
+        'simulators': simulators(),
         'hand held': hand_held(),
         'units': units(),
     }
@@ -801,6 +839,15 @@ def benchmark(title: str) -> list[str]:
     text = (DOCS / 'measurements' / 'real_benchmark.md').read_text('utf-8')
     command = next(line for line in text.splitlines() if line.startswith('`./run benchmark'))
     return [command, '', *text.split(f'### {title}\n\n')[1].split('\n\n')[0].splitlines()]
+
+
+def simulators() -> list[str]:
+    """Return the verdicts on simulated accelerometers, under their command."""
+    text = (DOCS / 'measurements' / 'simulators.md').read_text('utf-8')
+    command = next(line for line in text.splitlines() if line.startswith('`./run simulators'))
+    rows = text.split('### Verdicts\n\n')[1].split('\n\n')[0].splitlines()
+    # What would have shown stands in the last column, for which this page has no room.
+    return [command, '', *(row.rstrip('|').rpartition('|')[0] + '|' for row in rows)]
 
 
 def units() -> list[str]:

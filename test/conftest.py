@@ -19,6 +19,7 @@ import signal
 import subprocess
 import sys
 
+from adxl_ros.process import NAMES_OPTIONS
 from domain import BY_UDP, own_domain
 from hypothesis import settings
 import needs
@@ -88,6 +89,13 @@ def opened(browser: object) -> Iterator[Callable]:
 def private_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep the calibration store and other files of the user out of the tests."""
     monkeypatch.setenv('ROS_HOME', str(tmp_path / 'ros_home'))
+
+
+@pytest.fixture(autouse=True)
+def words_of_tools(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let texts name options, as tools and nodes do; the tests of the library see arguments."""
+    if request.path.parent.name != 'api':
+        monkeypatch.setenv(NAMES_OPTIONS, '1')
 
 
 @pytest.fixture

@@ -16,10 +16,10 @@ from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Res
 from adxl_ros.api.sensors import effect_names, GivenSensor, sensor_of, SensorInput
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits import thermal_fit
-from adxl_ros.calibrate.poses import (
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.recorded_poses import (
     estimate_filters,
     extract_poses,
-    Poses,
     poses_of_means,
     with_table_angles,
 )
@@ -29,10 +29,11 @@ from adxl_ros.calibrate.result import CalibrationResult, compare, errors_in_word
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, sweep_journal
 from adxl_ros.files.atomic_write import make_folder, require_own
-from adxl_ros.files.recording_columns import recorded_unit, Recording, unit_of
+from adxl_ros.files.recording_columns import nominal_of, recorded_nominal, Recording
 from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.files.tables import read_pose_table
 from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.process import option
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
 from adxl_ros.report.quantities import mg
 from adxl_ros.signals.gravity_at_rest import require_unit
@@ -60,7 +61,7 @@ class FittedCoefficient(NamedTuple):
     unit: str  # Degrees for an angle, else the unit of the parameter file
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Fit(Result):
     """
     A calibrated unit.
@@ -96,39 +97,28 @@ class Fit(Result):
     @property
     def screen(self) -> list[str]:
         """Return the lines of the tool's screen."""
-        fitted = self.sensor
-        # What was wrong with the unit, and what is fitted
-        head = (
-            []
-            if self.is_over_temperature
-            else [
+        fitted, lines = self.sensor, []
+        if not self.is_over_temperature:
+            lines = [
                 errors_in_words(fitted),
                 '',
                 f'{fitted.serial}: {fitted.model} model of {self.poses} poses, '
                 f'{len(fitted.covariance_names)} coefficients',
                 '',
             ]
-        )
-        gyro = gyro_lines(fitted.gyro)
-        return [
-            *head,
-            *self.result.summary,
-            *self.warnings,
-            *[''] * bool(gyro),
-            *gyro,
-            *listed([*self.measured]),
-        ]
+        lines += [*self.result.summary, *self.warnings]
+        if gyro := gyro_lines(fitted.gyro):
+            lines += ['', *gyro]
+        return [*lines, *listed([*self.measured])]
 
     @property
     def first_screen(self) -> FirstScreen:
         """Return the top of the page."""
-        badge, assessments = page.badge(self.sensor), self.result.assessments
+        assessments = self.result.assessments
         tiles = page.tiles(self.result, assessments[-1] if assessments else None)
         return FirstScreen(
-            badge['colour'],
-            badge['word'],
-            badge['sentence'],
-            [(tile['label'], tile['text'], tile['note']) for tile in tiles],
+            **page.badge(self.sensor),
+            tiles=[(tile['label'], tile['text'], tile['note']) for tile in tiles],
         )
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
@@ -155,7 +145,9 @@ class Fit(Result):
         `save`.
         """
         if self.is_over_temperature:
-            raise UserError(f'--report {folder}: a fit over temperature has no page; leave it out')
+            raise UserError(
+                f'{option(report=folder)}: a fit over temperature has no page; leave it out'
+            )
         require_own(Path(folder) / page.PAGE, overwrite)
         path = make_folder(folder)
         page.write(path, self.result, store)
@@ -289,27 +281,19 @@ def fit(
     robot = RobotInput(urdf, frame, joints) if urdf else None
     unit = _Unit(sensor, robot, means)
     several: Iterable[Recording] = each_recording(recordings)
-    blocks: Poses | None = None
-    if (
-        effects
-        and set(effects) <= set(thermal_fit.EFFECTS)
-        and not (model or journal or poses or means)
-    ):
+    has_thermal_effects_alone = bool(effects) and set(effects) <= set(thermal_fit.EFFECTS)
+    has_poses = bool(model or journal or poses or means)
+    if has_thermal_effects_alone and not has_poses:
         several = list(several)
         at_rest = _Unit(sensor, robot, means)
         blocks = at_rest.thermal_blocks(several)
-    if blocks is not None:
-        unit = at_rest
-        if prior:
-            raise UserError(f'--prior {prior}: a fit over temperature takes none; leave it out')
-        progress(_READING, 'fit')
-        result = calibration.calibrate_thermal(
-            unit.with_gyro(with_axes(unit.base, unit.sensor.axes)),
-            blocks,
-            unit.names[0],
-            data_sha256 or unit.sha256,
-        )
-        return _fit(result, unit, True)
+        if blocks is not None and prior:
+            raise UserError(
+                f'{option(prior=prior)}: a fit over temperature takes none; leave it out'
+            )
+        if blocks is not None:
+            progress(_READING, 'fit')
+            return _fit_over_temperature(at_rest, blocks, data_sha256)
     recorded = []
     for number, read in enumerate(several):
         read = unit.add(read)
@@ -326,7 +310,18 @@ def fit(
         data_sha256 or unit.sha256,
         population,
     )
-    return _fit(result, unit, False)
+    return _fit(result, unit)
+
+
+def _fit_over_temperature(unit: _Unit, blocks: Poses, data_sha256: str) -> Fit:
+    """Fit temperature effects to blocks of a sensor at rest."""
+    result = calibration.calibrate_thermal(
+        unit.with_gyro(with_axes(unit.base, unit.sensor.axes)),
+        blocks,
+        unit.names[0],
+        data_sha256 or unit.sha256,
+    )
+    return _fit(result, unit, is_over_temperature=True)
 
 
 def _checked_names(model: str | None, effects: Sequence[str]) -> tuple[str, ...]:
@@ -360,9 +355,9 @@ class _Unit:
             if self.sensor.unstated:
                 self.notes.append(_MEANS_LACK)
         self.sensor = (
-            unit_of(self.sensor, read.stream_info, read.axes)
+            nominal_of(self.sensor, read.stream_info, read.axes)
             if self._has_means
-            else recorded_unit(self.sensor, read)
+            else recorded_nominal(self.sensor, read)
         )
         self._paths.append(read.path)
         self._surroundings.append(Surroundings())
@@ -432,7 +427,7 @@ class _Rests:
     ) -> None:
         ways = [bool(way) for way in (journal, table, are_rows)]
         if sum(ways) > 1:
-            raise UserError(_ONE_RECORDING)
+            raise _one_recording_only()
         self._table = read_pose_table(table) if table else None
         self._are_rows, self._is_one = are_rows, any(ways)
         self._records = (
@@ -444,7 +439,7 @@ class _Rests:
     ) -> tuple[Poses, Sequence[FilterNoise | None], list[str]]:
         """Return the poses of a recording, their filters, and faults between its samples."""
         if number and self._is_one:
-            raise UserError(_ONE_RECORDING)
+            raise _one_recording_only()
         if self._are_rows:
             return poses_of_means(read, unit.sensor), (), []
         look = RecordingLook(unit.sensor, read)
@@ -457,11 +452,15 @@ class _Rests:
         return poses, estimate_filters(read, unit.sensor, poses), look.neighbour_faults()
 
 
-_ONE_RECORDING = '--journal, --poses and --means: one of them names the rests of one recording'
-"""Message where rests of several recordings are named."""
+def _one_recording_only() -> UserError:
+    """Return the error where rests of several recordings are named."""
+    return UserError(
+        f'{option("journal")}, {option("poses")} and {option("means")}: one of them names the '
+        'rests of one recording'
+    )
 
 
-def _fit(result: CalibrationResult, unit: _Unit, is_over_temperature: bool) -> Fit:
+def _fit(result: CalibrationResult, unit: _Unit, is_over_temperature: bool = False) -> Fit:
     """Collect what a user reads of a calibration."""
     measured = listed([*unit.measured])
     fitted = result.fitted
@@ -471,7 +470,14 @@ def _fit(result: CalibrationResult, unit: _Unit, is_over_temperature: bool) -> F
         details=[*result.details, *measured],
     )
     coefficients = tuple(
-        FittedCoefficient(row.name, row.axis, row.label, row.fitted, row.half_width, row.unit)
+        FittedCoefficient(
+            name=row.name,
+            axis=row.axis,
+            label=row.label,
+            value=row.fitted,
+            half_width=row.half_width,
+            unit=row.unit,
+        )
         for row in compare(fitted, fitted)
     )
     return Fit(

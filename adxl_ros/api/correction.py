@@ -21,12 +21,13 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import require_own
 from adxl_ros.files.bag_writer import angular_velocity, tilt_bag
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.recording_columns import check_unit, GYRO, Recording
+from adxl_ros.files.recording_columns import check_same_sensor, GYRO, Recording
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects import base, effect_named
 from adxl_ros.model.gyroscope import Gyroscope, NO_TURN
 from adxl_ros.model.sensor import Sensor, with_axes
+from adxl_ros.process import option
 from adxl_ros.report.figures import axes_for
 from adxl_ros.report.quantities import mg
 from adxl_ros.signals.gravity_at_rest import require_unit
@@ -53,16 +54,17 @@ class Correction:
         self,
         first: Recording,
         sensor: SensorInput | None,
+        *,
         inverse: str = INVERSES[0],
         undo_filter: bool = False,
     ) -> None:
         """Prepare for the recording that begins with a block; see `apply`."""
         if inverse not in INVERSES:
-            raise UserError(f'--inverse {inverse}: expected {" or ".join(INVERSES)}')
+            raise UserError(f'{option(inverse=inverse)}: expected {" or ".join(INVERSES)}')
         given = sensor_of(sensor, first)
         self.sensor = given.sensor if given.sensor.effects else with_axes(given.sensor, first.axes)
         self.measured = given.measured
-        check_unit(first.stream_info, first.axes, self.sensor)
+        check_same_sensor(first.stream_info, first.axes, self.sensor)
         self._before = list(_effects_that_stay(self.sensor, undo_filter))
         if self.sensor.mounting.get('rpy_rad'):
             self._before.append(
@@ -99,8 +101,8 @@ class Correction:
             for name, statement in _COUNTED.items()
             if self._counts[name]
         ]
-        beyond = self._beyond.describe(self.sensor)
-        return [*self._before, *counted, *[beyond] * bool(beyond)]
+        notes = [*self._before, *counted, self._beyond.describe(self.sensor)]
+        return [note for note in notes if note]
 
     @property
     def screen(self) -> list[str]:
@@ -110,20 +112,21 @@ class Correction:
             if self.sensor.effects
             else 'the datasheet values: the sensor is not calibrated'
         )
-        return [
+        lines = [
             f'Corrected {self._counts["rows"]} samples by {by_what}.',
             *(f'WARNING {text}' for text in self._doubts),
             *self._estimator.assumed,
-            *[_gyro_text(self.sensor.gyro)] * self._has_gyro,
-            *listed([*self.measured]),
         ]
+        if self._has_gyro:
+            lines.append(_gyro_text(self.sensor.gyro))
+        return [*lines, *listed([*self.measured])]
 
 
 def _gyro_text(gyro: Gyroscope) -> str:
     """Say what is done to a gyroscope."""
     if not gyro.is_calibrated:
         return 'Gyroscope: kept as it is, because the parameters state no bias of it.'
-    by_temperature = ' by temperature' * gyro.follows_temperature
+    by_temperature = ' by temperature' if gyro.follows_temperature else ''
     return f'Gyroscope: its bias is subtracted{by_temperature}.'
 
 
@@ -213,7 +216,7 @@ def _columns(estimates: Estimates) -> dict[str, np.ndarray]:
     return columns
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Corrected(Result):
     """
     Acceleration and tilt of n samples, with their standard deviations.
@@ -346,12 +349,9 @@ def apply(
     read = one_recording(recording)
     if not len(read):
         raise UserError(f'{read.path}: has no samples to correct')
-    correction = Correction(read, sensor, inverse, undo_filter)
-    parts = tuple(
-        correction.blocks(
-            read.rows(start, start + BLOCK_ROWS) for start in range(0, len(read), BLOCK_ROWS)
-        )
-    )
+    correction = Correction(read, sensor, inverse=inverse, undo_filter=undo_filter)
+    starts = range(0, len(read), BLOCK_ROWS)
+    parts = tuple(correction.blocks(read.rows(start, start + BLOCK_ROWS) for start in starts))
 
     def joined(name: str) -> np.ndarray:
         """Return a field of the estimates of all blocks; its last axis becomes the first."""

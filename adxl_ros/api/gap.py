@@ -36,12 +36,12 @@ from adxl_ros.diagnose.next_experiment import CouldShow
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import free_name, make_folder, require_own, write_text
-from adxl_ros.files.recording_columns import NO_UNIT, Recording
+from adxl_ros.files.recording_columns import NO_SERIAL, Recording
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import command
+from adxl_ros.process import command, option
 from adxl_ros.report.figures import axes_for
 from adxl_ros.report.quantities import Interval, mg
 from adxl_ros.report.screen import NextStep
@@ -100,7 +100,7 @@ class Compared(NamedTuple):
     subject: str  # All of it in one line
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Gap(Result):
     """
     The gap between recordings and their simulation.
@@ -153,7 +153,9 @@ class Gap(Result):
         lines = words.screen_lines(self.diagnosis, self.compared.subject)
         for remark in self.remarks:
             lines += ['', f' {remark}']
-        return [*lines, '', f' in      {self.in_unit.text}'] if self.in_unit else lines
+        if self.in_unit:
+            lines += ['', f' in      {self.in_unit.text}']
+        return lines
 
     @property
     def first_screen(self) -> FirstScreen:
@@ -174,7 +176,9 @@ class Gap(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return report.json; docs/reference/report_json.md has its keys."""
-        return self._report | ({'gap_in': as_json(self.in_unit._asdict())} if self.in_unit else {})
+        if self.in_unit is None:
+            return self._report
+        return self._report | {'gap_in': as_json(self.in_unit._asdict())}
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with a row for each parameter of each effect of the verdict."""
@@ -234,10 +238,10 @@ class Gap(Result):
         from adxl_ros.diagnose import page
 
         run = page.Run(
-            self.compared.subject,
-            self.compared.params_name,
-            self.next_steps(folder),
-            made_by or self.command(folder),
+            subject=self.compared.subject,
+            parameter_file=self.compared.params_name,
+            steps=self.next_steps(folder),
+            command=made_by or self.command(folder),
         )
         return page.documents(
             self.diagnosis, self.to_dict(), self.screen, run if has_page else None
@@ -390,14 +394,16 @@ def diagnose(
 
     """
     require_least('seed', seed, 0)
-    require_least('self-check', self_check, 0)
+    require_least('self_check', self_check, 0)
     require_least('material', material, 1e-6)
     if align and sim is None and not urdf:
-        raise UserError('--align: shifts --sim or a robot, and neither is given')
+        raise UserError(
+            f'{option(align=True)}: shifts {option("sim")} or a robot, and neither is given'
+        )
     if sim_unit and not isinstance(sim, (str, os.PathLike)):
         raise UserError(
-            '--sim-unit: states the unit of a file that --sim names, and none is named; samples '
-            'in memory are given by read(..., unit=...)'
+            f'{option(sim_unit=sim_unit)}: states the unit of a file that {option("sim")} names, '
+            'and none is named; samples in memory are given by read(..., unit=...)'
         )
     unit = quantity_named(quantity) if quantity else None
     if not (sim is None or isinstance(sim, (Motion, str, os.PathLike))):
@@ -435,14 +441,14 @@ def diagnose(
         in_unit = gap_in(unit, diagnosis.full_rate, found.baseline, found.sensor, seed)
     simulator, robot = _name_of(sim), os.fspath(urdf or '')
     compared = Compared(
-        tuple(r.path for r in read),
-        given.file,
-        given.file_name,
-        simulator,
-        sim_unit,
-        robot,
-        frame,
-        _subject(read, baseline, simulator or robot),
+        recordings=tuple(each.path for each in read),
+        params=given.file,
+        params_name=given.file_name,
+        sim=simulator,
+        sim_unit=sim_unit,
+        urdf=robot,
+        frame=frame,
+        subject=_subject(read, baseline, simulator or robot),
     )
     return _gap(diagnosis, baseline, compared, in_unit, remarks)
 
@@ -455,8 +461,8 @@ def _require_one_reference(
         return
     if count > 1 or (sim is not None and urdf):
         raise UserError(
-            f'{_name_of(sim) or urdf}: --sim or --urdf, one of them, goes with one '
-            f'recording, but {count} are given'
+            f'{_name_of(sim) or urdf}: {option("sim")} or {option("urdf")}, one of them, goes '
+            f'with one recording, but {count} are given'
         )
 
 
@@ -488,7 +494,7 @@ def _subject(recordings: Sequence[Recording], sensor: Sensor, sim: str) -> str:
     first, count = recordings[0], len(recordings)
     name = Path(first.path).name if count == 1 else f'{count} recordings'
     span_s = sum(read.span_s for read in recordings)
-    unit = 'the nominal sensor' if sensor.serial == NO_UNIT else f'unit {sensor.serial}'
+    unit = 'the nominal sensor' if sensor.serial == NO_SERIAL else f'unit {sensor.serial}'
     simulated = f'{Path(sim).name} through the chain of {unit}' if sim else f'simulation of {unit}'
     return (
         f'{name} ({span_s:.0f} s, {first.rate_hz:.4g} Hz, {" ".join(first.axes)})  minus  '
@@ -510,11 +516,15 @@ def _gap(
     if report is not None:
         candidates = {c['effect']: c for c in objects['candidates']}
         effects = tuple(_effect(candidates[name]) for name in words.named_effects(report, objects))
+        before, after, floor, closed = report.closure
         figures = GapFigures(
-            *report.closure,
-            report.verdict.upper_limit_mps2,
-            report.verdict.material_mps2,
-            report.verdict.reference_mps2,
+            before_mps2=before,
+            after_mps2=after,
+            floor_mps2=floor,
+            closed=closed,
+            upper_limit_mps2=report.verdict.upper_limit_mps2,
+            material_mps2=report.verdict.material_mps2,
+            reference_mps2=report.verdict.reference_mps2,
         )
     return Gap(
         verdict=objects['verdict']['status'],
@@ -538,12 +548,14 @@ def _effect(candidate: Mapping[str, Any]) -> FoundEffect:
     parameters = {}
     for name, parameter in candidate['parameters'].items():
         low, high = parameter.get('ci') or (None, None)
-        parameters[name] = FoundParameter(parameter['value'], low, high, parameter['unit'])
+        parameters[name] = FoundParameter(
+            value=parameter['value'], low=low, high=high, unit=parameter['unit']
+        )
     return FoundEffect(
-        candidate['effect'],
-        candidate['probability'],
-        candidate['share'],
-        parameters,
-        tuple(candidate['inseparable_from']),
-        candidate['cause'],
+        name=candidate['effect'],
+        probability=candidate['probability'],
+        share=candidate['share'],
+        parameters=parameters,
+        rivals=tuple(candidate['inseparable_from']),
+        cause=candidate['cause'],
     )

@@ -4,12 +4,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from adxl_ros.api.recordings import one_recording, RecordingInput
 from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Result
@@ -19,213 +19,19 @@ from adxl_ros.files import parameter_file, recording as recording_files
 from adxl_ros.files.atomic_write import make_folder, require_own, write_bytes
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report.figures import axes_for, AXIS_COLOURS, new_figure, png
+from adxl_ros.report.figures import axes_for, AXIS_COLOURS, png
 from adxl_ros.report.quantities import duration
-from adxl_ros.report.screen import row
-from adxl_ros.signals import noise_parameters
-from adxl_ros.signals.allan_deviation import StillStretch
-from adxl_ros.signals.noise_parameters import AxisNoise, RecordingNoise, settings
+from adxl_ros.signals import noise_parameters, noise_report as words
+from adxl_ros.signals.noise_parameters import AxisNoise, RecordingNoise
 import numpy as np
-import yaml
 
 PLOT = 'allan.png'  # Name of the curve in the folder of a report
 TABLE = 'allan.csv'  # Name of its table
 BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
-MICRO_G = 1e6 / G0_MPS2  # 1 m/s² in µg
-_NAMES = ('white noise N', 'bias instability B', 'random walk K')  # Names of the terms
-_FIELDS = ('white', 'instability', 'walk')  # Their fields in `NoiseFit`
 
 
-class _Unit(NamedTuple):
-    """The units of a sensor's readings."""
-
-    symbol: str  # Unit of the files, as the samples have it
-    small: str  # Unit for people
-    factor: float  # How many of the latter are one of the former
-    column: str  # Unit at the end of a column's name
-
-
-_ACCEL = _Unit('m/s²', 'µg', MICRO_G, 'mps2')
-_GYRO = _Unit('rad/s', 'm°/s', float(np.degrees(1e3)), 'radps')
-
-
-class _Shown(NamedTuple):
-    """One sensor at rest."""
-
-    name: str
-    rest: StillStretch
-    axes: Sequence[AxisNoise]
-    unit: _Unit
-
-
-def _sensors(result: RecordingNoise) -> list[_Shown]:
-    """Return the accelerometer, and the gyroscope if there is one."""
-    shown = [_Shown('accelerometer', result.rest, result.axes, _ACCEL)]
-    if result.gyro_rest is not None:
-        shown.append(_Shown('gyroscope', result.gyro_rest, result.gyro, _GYRO))
-    return shown
-
-
-_YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
-
-
-def _head(result: RecordingNoise) -> list[str]:
-    rest, axes = result.rest, ' '.join(noise.axis for noise in result.axes)
-    return [result.path, f'{duration(rest.span_s)} at rest, {rest.rate_hz:.5g} Hz, axes {axes}']
-
-
-def _tables(result: RecordingNoise) -> list[str]:
-    """Return the tables of each sensor."""
-    rows: list[str] = []
-    for shown in _sensors(result):
-        if result.gyro:
-            rows += [*[''] * bool(rows), shown.name]
-        rows += _table(shown)
-    return rows
-
-
-def _table(shown: _Shown) -> list[str]:
-    """Return the terms with intervals, then in SI units and by sample, 79 columns at most."""
-    wide, narrow = (6, 25, 25, 25), (6, 12, 12, 12, 13, 13, 9)
-    si, small = shown.unit.symbol, shown.unit.small
-    rows = [
-        row((' axis', *_NAMES), wide),
-        row(('', f'{small}/√Hz (90 %)', f'{small} (90 %)', f'{small}/√s (90 %)'), wide),
-        *(row((f' {noise.axis}', *_intervals(noise, shown.unit)), wide) for noise in shown.axes),
-        *_walk_lines(shown),
-        '',
-        row(('', 'N', 'B', 'K', 'N by sample', 'K by sample', 'datasheet'), narrow),
-        row((' axis', f'{si}/√Hz', si, f'{si}/√s', si, si, f'{small}/√Hz'), narrow),
-    ]
-    rate = np.sqrt(shown.rest.rate_hz)
-    for noise in shown.axes:
-        white, _, walk = noise.estimates
-        estimates = (
-            *noise.estimates,
-            white.scaled(rate),
-            walk.scaled(1 / rate),
-            white.scaled(ONE_SIDED * shown.unit.factor),
-        )
-        rows.append(
-            row(
-                (
-                    f' {noise.axis}',
-                    *(f'{e.value:.3g}' if e.is_seen else f'< {e.high:.3g}' for e in estimates),
-                ),
-                narrow,
-            )
-        )
-    return rows
-
-
-def _walk_lines(shown: _Shown) -> list[str]:
-    """Return the bounds of the walks."""
-    rows = []
-    for noise in shown.axes:
-        time_s, k = noise.fit.bound_s, shown.unit.factor * noise.fit.walk.value
-        if np.isfinite(time_s):
-            rows.append(
-                f' {noise.axis}: the walk has bounds, {k * np.sqrt(time_s / 2):.3g} '
-                f'{shown.unit.small} rms; correlation time {time_s:.3g} s'
-            )
-    return rows
-
-
-def _intervals(noise: AxisNoise, unit: _Unit) -> list[str]:
-    """Return the estimates with their intervals, or their upper limits."""
-    return [
-        f'{e.value:.3g} ({e.low:.3g} to {e.high:.3g})' if e.is_seen else f'below {e.high:.3g}'
-        for e in (estimate.scaled(unit.factor) for estimate in noise.estimates)
-    ]
-
-
-def _paste_lines(result: RecordingNoise) -> list[str]:
-    """Return the settings of other programs in YAML, ready to paste."""
-    lines = []
-    for program, entries in settings(result.axes, result.rest.rate_hz, result.gyro).items():
-        lines.append(f'# {program}')
-        for name, values, unit in entries:
-            if isinstance(values, str):
-                lines += [f'# {unit}', f'{name}: {values}']
-                continue
-            rounded = [float(f'{value:.{6 if value >= 1 else 3}g}') for value in values]
-            is_one = len(rounded) == 1
-            lines += [
-                f'# {unit}',
-                *yaml.safe_dump(
-                    {name: rounded[0] if is_one else rounded},
-                    width=_YAML_COLUMNS,
-                    default_flow_style=False if is_one else None,
-                ).splitlines(),
-            ]
-    return lines
-
-
-def _warnings(result: RecordingNoise) -> list[str]:
-    rest, texts = result.rest, [*result.doubts]
-    if rest.beyond_range:
-        texts.append(f'{rest.beyond_range}.')
-    if rest.motion_s:
-        begin_s, end_s = rest.motion_s[0][:2]
-        texts.append(
-            f'not still or interrupted {len(rest.motion_s)} times, first from '
-            f'{begin_s:.5g} s to {end_s:.5g} s. Used is the longest rest, '
-            f'{duration(rest.span_s)} of {duration(rest.recorded_s)}. Record again '
-            'without touching the sensor.'
-        )
-    for shown in _sensors(result):
-        # The accelerometer is meant where no sensor is named.
-        begin = 'gyroscope ' * (shown.unit is _GYRO)
-        texts += [
-            f'{begin}{noise.axis}: {text}'
-            for noise in shown.axes
-            for text in _axis_warnings(rest.span_s, noise, shown.unit)
-        ]
-    return texts
-
-
-def _filter_warning(stated: Sensor, fresh: Sensor) -> list[str]:
-    """Say that the noise refutes the stated filter, and what the file states in its place."""
-    if 'rc_capacitance_f' in stated.unstated or fresh.rc_s == stated.rc_s:
-        return []
-    found = f'a filter of {fresh.rc_s * 1e3:.3g} ms' if fresh.rc_s else 'no filter'
-    return [
-        f'the noise at {fresh.rate_hz:.5g} Hz shows {found}, not the stated one of '
-        f'{stated.rc_s * 1e3:.3g} ms. The new file states what the noise shows.'
-    ]
-
-
-def _axis_warnings(span_s: float, noise: AxisNoise, unit: _Unit) -> list[str]:
-    texts = []
-    for term, name in enumerate(_NAMES):
-        if not (noise.estimates[term].is_seen or noise.is_coarse):
-            needed_s = noise.fit.needed_s(term)
-            texts.append(
-                f'{duration(span_s)} is too short to see the {name}. '
-                + (
-                    'The other terms hide it, in longer recordings, too.'
-                    if np.isinf(needed_s)
-                    else f'To see half of the limit above, record about {duration(needed_s)}.'
-                )
-            )
-    if noise.is_coarse:
-        texts.append(
-            f'samples change in steps of {noise.resolution * unit.factor:.3g} {unit.small}, '
-            'which hide '
-            'the noise. N, B and K are upper limits. Choose a smaller range.'
-        )
-    if not noise.fit.white.is_seen:
-        texts.append(
-            'N is not determined. A parameter file keeps the figure of --params, or '
-            'states no white noise.'
-        )
-    return texts
-
-
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Noise(Result):
     """
     The noise of a sensor in the longest rest of a recording.
@@ -268,37 +74,34 @@ class Noise(Result):
     @property
     def refuted_filter(self) -> list[str]:
         """Return that the noise refutes the stated filter, one line; none where it does not."""
-        return _filter_warning(_sensor(self.result), self.sensor)
+        return words.filter_warning(_sensor(self.result), self.sensor)
 
     @property
     def screen(self) -> list[str]:
         """Return the lines of the tool's screen."""
-        warnings = [f'WARNING {text}' for text in self.warnings]
-        return [
-            *_head(self.result),
+        lines = [
+            *words.head(self.result),
             '',
-            *_tables(self.result),
+            *words.tables(self.result),
             '',
-            *_paste_lines(self.result),
+            *words.paste_lines(self.result),
             '',
-            *warnings,
-            *[''] * bool(warnings),
         ]
+        if self.warnings:
+            lines += [*(f'WARNING {text}' for text in self.warnings), '']
+        return lines
 
     @property
     def first_screen(self) -> FirstScreen:
         """Return what a notebook shows."""
-        tiles = [
-            (
-                f'white noise, {shown.name} {noise.axis}',
-                f'{_intervals(noise, shown.unit)[0]} {shown.unit.small}/√Hz',
-            )
-            for shown in _sensors(self.result)
-            for noise in shown.axes
-        ]
-        return FirstScreen(
-            'amber' if self.warnings else 'green', 'Noise', _head(self.result)[1], tiles
-        )
+        tiles = []
+        for shown in words.sensors_at_rest(self.result):
+            for noise in shown.axes:
+                white = words.intervals(noise, shown.unit)[0]
+                label = f'white noise, {shown.name} {noise.axis}'
+                tiles.append((label, f'{white} {shown.unit.small}/√Hz'))
+        colour = 'amber' if self.warnings else 'green'
+        return FirstScreen(colour, 'Noise', words.head(self.result)[1], tiles)
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
         """
@@ -314,7 +117,7 @@ class Noise(Result):
             [
                 f'Noise measured in {duration(self.span_s)} at rest of {self.result.path}.',
                 'Density: over positive frequencies, as datasheets state it.',
-                *_tables(self.result),
+                *words.tables(self.result),
             ],
         )
 
@@ -327,7 +130,7 @@ class Noise(Result):
         for name in (PLOT, TABLE):
             require_own(Path(folder) / name, overwrite)
         path = make_folder(folder)
-        write_bytes(path / PLOT, png(_plot(self.result)))
+        write_bytes(path / PLOT, png(words.curves(self.result)))
         with csv_writer(path / TABLE) as append:
             append(self.curve())
         return path / PLOT
@@ -343,9 +146,9 @@ class Noise(Result):
             'tau_s': self.tau_s,
             'relative_std': self.result.rest.allan.relative_error,
         }
-        for shown in _sensors(self.result):
+        for shown in words.sensors_at_rest(self.result):
             for noise, deviation in zip(shown.axes, shown.rest.allan.deviation.T):
-                name = f'{"g" if shown.unit is _GYRO else "a"}{noise.axis}'
+                name = f'{shown.unit.letter}{noise.axis}'
                 columns[f'{name}_{shown.unit.column}'] = deviation
                 columns[f'{name}_fitted_{shown.unit.column}'] = noise.fit.allan_deviation(
                     self.tau_s
@@ -354,16 +157,6 @@ class Noise(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return terms with their intervals, m/s², rad/s and s; what is not finite is None."""
-        sensors = [
-            {
-                noise.axis: {
-                    name: estimate._asdict() for name, estimate in zip(_FIELDS, noise.estimates)
-                }
-                for noise in each
-            }
-            for each in (self.axes, self.gyro)
-        ]
-        axes, gyro = sensors
         return as_json(
             {
                 'schema': 1,
@@ -371,8 +164,8 @@ class Noise(Result):
                 'span_s': self.span_s,
                 'rate_hz': self.rate_hz,
                 'warnings': self.warnings,
-                'axes': axes,
-                'gyroscope': gyro,
+                'axes': _terms(self.axes),
+                'gyroscope': _terms(self.gyro),
                 'allan_deviation': self.curve(),
             }
         )
@@ -382,17 +175,20 @@ class Noise(Result):
         from pandas import DataFrame
 
         rows = []
-        for shown in _sensors(self.result):
+        for shown in words.sensors_at_rest(self.result):
             for noise in shown.axes:
-                for name, estimate in zip(_FIELDS, noise.estimates):
+                for name, estimate in zip(words.TERMS, noise.estimates):
                     rows.append((shown.name, noise.axis, name, *estimate))
         return DataFrame(rows, columns=['sensor', 'axis', 'term', 'value', 'low', 'high'])
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the accelerometer's Allan deviations, µg, and fits, into axes of matplotlib."""
         ax = axes_for(ax)
+        accelerometer = words.sensors_at_rest(self.result)[0]
         for number, noise in enumerate(self.axes):
-            _draw(ax, _sensors(self.result)[0], number, noise.axis)
+            words.draw(ax, accelerometer, number, noise.axis)
+            words.draw_sum(ax, accelerometer, number, color=AXIS_COLOURS[noise.axis])
+        ax.legend()
         ax.set_ylabel('Allan deviation, µg')
         return ax
 
@@ -440,75 +236,34 @@ def noise(
         read, as_input(sensor), lambda done: progress(done, 'fit')
     )
     rest = result.rest
+    no_gyro = np.zeros((len(rest.allan.tau_s), 0))
     return Noise(
-        tuple(result.axes),
-        rest.span_s,
-        rest.rate_hz,
-        rest.allan.tau_s,
-        rest.allan.deviation,
-        tuple(result.gyro),
-        result.gyro_rest.allan.deviation
-        if result.gyro_rest
-        else np.zeros((len(rest.allan.tau_s), 0)),
-        tuple(_warnings(result)),
-        result,
+        axes=tuple(result.axes),
+        span_s=rest.span_s,
+        rate_hz=rest.rate_hz,
+        tau_s=rest.allan.tau_s,
+        allan_deviation_mps2=rest.allan.deviation,
+        gyro=tuple(result.gyro),
+        gyro_allan_deviation_radps=(
+            result.gyro_rest.allan.deviation if result.gyro_rest else no_gyro
+        ),
+        warnings=tuple(words.warnings(result)),
+        result=result,
     )
 
 
-_INCHES = (5.0, 4.4)
-"""Width and height of the plot of an axis, inches. Chosen: three fit beside each other."""
-
-
-def _plot(result: RecordingNoise) -> Any:
-    """Draw the axes of each sensor beside each other."""
-    sensors = _sensors(result)
-    most = max(len(shown.axes) for shown in sensors)
-    figure = new_figure(figsize=(_INCHES[0] * most, _INCHES[1] * len(sensors)))
-    rows = figure.subplots(len(sensors), most, squeeze=False, sharey='row')
-    for shown, plots in zip(sensors, rows):
-        for number, (noise, plot) in enumerate(zip(shown.axes, plots)):
-            _draw(plot, shown, number, 'measured')
-            plot.set_title(
-                f'axis {noise.axis}' if not result.gyro else f'{shown.name} {noise.axis}'
-            )
-        for plot in plots[len(shown.axes) :]:
-            plot.set_visible(False)
-        plots[0].set_ylabel(f'Allan deviation, {shown.unit.small}')
-    return figure
-
-
-def _draw(plot: Any, shown: _Shown, number: int, label: str) -> None:
-    """Draw the Allan deviation of an axis with the terms that are seen."""
-    allan, noise, factor = shown.rest.allan, shown.axes[number], shown.unit.factor
-    tau_s, measured = allan.tau_s, allan.deviation[:, number] * factor
-    plot.errorbar(
-        tau_s,
-        measured,
-        yerr=measured * allan.relative_error.clip(max=0.9),
-        fmt='o',
-        ms=4,
-        color=AXIS_COLOURS[noise.axis],
-        label=label,
-    )
-    for name, line, estimate in zip(_NAMES, noise.fit.lines(tau_s), noise.estimates):
-        if estimate.is_seen:
-            plot.plot(tau_s, line * factor, '--', lw=1, label=name)
-    plot.plot(
-        tau_s, noise.fit.allan_deviation(tau_s) * factor, color='#222', lw=1, label='all three'
-    )
-    plot.set(
-        xscale='log',
-        yscale='log',
-        xlabel='averaging time τ, s',
-        ylim=(measured.min() / 3, measured.max() * 2),
-    )
-    plot.grid(True, which='both', alpha=0.3)
-    plot.legend(fontsize=8)
+def _terms(axes: Iterable[AxisNoise]) -> dict[str, dict[str, Any]]:
+    """Return the terms of each axis with their intervals."""
+    terms = {}
+    for noise in axes:
+        estimates = zip(words.TERMS, noise.estimates)
+        terms[noise.axis] = {name: estimate._asdict() for name, estimate in estimates}
+    return terms
 
 
 def _sensor(result: RecordingNoise) -> Sensor:
     """Return the sensor of the parameter file, with the axes and rate of the recording."""
-    sensor, unit = result.sensor, result.unit
+    sensor, unit = result.sensor, result.nominal
     if sensor.effects and sensor.axes != unit.axes:
         raise UserError(
             f'{result.path}: has the axes {unit.axes}, but the parameters of '

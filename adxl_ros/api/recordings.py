@@ -5,13 +5,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 import hashlib
 import math
 import os
-import re
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, NamedTuple, TYPE_CHECKING, TypeAlias
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording as recording_files
@@ -27,21 +25,23 @@ from adxl_ros.files.column_mapping import (
 from adxl_ros.files.recording_columns import ACCEL, GYRO, Recording, REFERENCES, TIME, VOLTS
 from adxl_ros.files.tables import in_memory
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import option
 import numpy as np
 
 if TYPE_CHECKING:
     from adxl_ros.simulate.robot import RobotPath
+    from pandas import DataFrame
 
-RecordingInput = Any
-"""A Recording, a DataFrame in the columns of the package, or the path of a file."""
-Counts = float | Sequence[float] | str
+RecordingInput: TypeAlias = 'Recording | DataFrame | Mapping[str, Any] | str | os.PathLike'
+"""A recording, a DataFrame or arrays by name in the columns of the package, or a path."""
+Counts: TypeAlias = float | Sequence[float] | str
 """Counts of an ADC: one number for all axes, one for each, or their text with commas."""
 
 _HIGHEST_RATE_HZ = 1e5  # Largest sample rate, Hz: that of a parameter file
 
 
 def read(
-    source: str | os.PathLike | Any,
+    source: RecordingInput,
     *,
     topic: str = '',
     columns: str | Mapping[str, str | tuple[str, str]] | None = None,
@@ -59,7 +59,8 @@ def read(
     Parameters
     ----------
     source
-        A rosbag2 directory, .mcap, .db3, CSV, .npz, .parquet or .ulg; or a pandas DataFrame.
+        A rosbag2 directory, .mcap, .db3, CSV, .npz, .parquet or .ulg; or a pandas DataFrame, or
+        arrays by name.
     topic
         Topic of type sensor_msgs/Imu in a bag, or message of a .ulg; '' for `imu/data_raw`, or
         the only one.
@@ -94,25 +95,25 @@ def read(
         The file cannot be read, or is not understood; the message proposes `columns`.
 
     """
-    with _arguments_for_options():
-        options = reading_options(
-            topic,
-            columns,
-            unit,
-            rate,
-            axes,
-            lsb_per_g,
-            lsb_at_0g,
-            drop_bad_stamps,
-            drop_bad_samples,
-        )
-        if isinstance(source, (str, os.PathLike)):
-            recording = recording_files.read(source, options)
-            return replace(recording, remarks=tuple(map(_as_arguments, recording.remarks)))
-        return _of_memory(_columns_of(source, 'read'), 'DataFrame', options)
+    options = reading_options(
+        topic=topic,
+        columns=columns,
+        unit=unit,
+        rate=rate,
+        axes=axes,
+        lsb_per_g=lsb_per_g,
+        lsb_at_0g=lsb_at_0g,
+        drop_bad_stamps=drop_bad_stamps,
+        drop_bad_samples=drop_bad_samples,
+    )
+    if isinstance(source, (str, os.PathLike)):
+        return recording_files.read(source, options)
+    name = 'arrays' if isinstance(source, Mapping) else 'DataFrame'
+    return _of_memory(_columns_of(source, 'read'), name, options)
 
 
 def reading_options(
+    *,
     topic: str = '',
     columns: str | Mapping[str, Any] | None = None,
     unit: str = '',
@@ -126,18 +127,18 @@ def reading_options(
     """Check how a recording is to be read; see `read`."""
     is_number = isinstance(rate, (float, int, np.number))
     if rate is not None and not (is_number and 0 < rate <= _HIGHEST_RATE_HZ):
-        given = f'{rate:g}' if is_number else repr(rate)
-        raise UserError(f'--rate {given}: expected samples a second, at most {_HIGHEST_RATE_HZ:g}')
+        given = option(rate=f'{rate:g}' if is_number else rate)
+        raise UserError(f'{given}: expected samples a second, at most {_HIGHEST_RATE_HZ:g}')
     return ReadingOptions(
-        topic,
-        parse_mapping(_mapping_text(columns)) if columns else None,
-        parse_unit(unit),
-        _counts('--lsb-per-g', lsb_per_g, 0.0),
-        _counts('--lsb-at-0g', lsb_at_0g, -math.inf),
-        rate,
-        drop_bad_stamps,
-        drop_bad_samples,
-        parse_mounting(axes) if axes else None,
+        topic=topic,
+        mapping=parse_mapping(_mapping_text(columns)) if columns else None,
+        unit=parse_unit(unit),
+        lsb_per_g=_counts('lsb_per_g', lsb_per_g, above=0.0),
+        lsb_at_0g=_counts('lsb_at_0g', lsb_at_0g, above=-math.inf),
+        rate_hz=rate,
+        drop_bad_stamps=drop_bad_stamps,
+        drop_bad_samples=drop_bad_samples,
+        mounting=parse_mounting(axes) if axes else None,
     )
 
 
@@ -153,7 +154,7 @@ def _mapping_text(columns: str | Mapping[str, str | tuple[str, str]]) -> str:
     )
 
 
-def _counts(option: str, given: Counts, above: float) -> tuple[float, ...]:
+def _counts(argument: str, given: Counts, above: float) -> tuple[float, ...]:
     """Return counts by axis; none where none are given."""
     words = given.split(',') if isinstance(given, str) and given else given or ()
     try:
@@ -162,13 +163,14 @@ def _counts(option: str, given: Counts, above: float) -> tuple[float, ...]:
         values = (math.nan,)
     if not all(above < value < math.inf for value in values):
         raise UserError(
-            f'{option} {given}: expected counts, for example 16384 or 16384,16384,16500'
+            f'{option(**{argument: given})}: expected counts, for example 16384 or '
+            '16384,16384,16500'
         )
     return values
 
 
 def from_arrays(
-    table: Mapping[str, Any] | Any = None,
+    table: Mapping[str, Any] | DataFrame | None = None,
     /,
     *,
     rate: float | None = None,
@@ -185,7 +187,7 @@ def from_arrays(
     ----------
     table
         Arrays by name, or a pandas DataFrame, with the names below; others of numbers are kept,
-        too. An index that has a name is a column.
+        too. An index that has a name is a column, and one of dates is the time.
     rate
         Sample rate, Hz, in place of `time_s`; a row without a reading is a gap.
     serial
@@ -197,7 +199,7 @@ def from_arrays(
     drop_bad_samples
         Whether samples are left out that have no number as their stamp or on an axis.
     **columns
-        Arrays (n,): `time_s`, s, rising; the output `ax_mps2, ay_mps2, az_mps2`, m/s², or
+        Arrays (n,): `time_s`, s or dates, rising; the output `ax_mps2, ay_mps2, az_mps2`, m/s², or
         `x_v, y_v, z_v`, V, of one, two or three axes; the references `alpha_rad, beta_rad` of a
         stage, rad, `shift_m`, m, `temperature_c`, °C, `supply_v`, V; a gyroscope's `gx_radps,
         gy_radps, gz_radps`, rad/s. NaN or masked where not measured.
@@ -217,24 +219,23 @@ def from_arrays(
     for key in columns:
         if key not in _KNOWN:
             raise UserError(f'{name}: no array {key!r} is known, but {", ".join(_KNOWN)}')
-    with _arguments_for_options():
-        options = reading_options(
-            rate=rate, drop_bad_stamps=drop_bad_stamps, drop_bad_samples=drop_bad_samples
-        )
-        return _of_memory({**arrays, **columns}, name, options, serial)
+    options = reading_options(
+        rate=rate, drop_bad_stamps=drop_bad_stamps, drop_bad_samples=drop_bad_samples
+    )
+    return _of_memory({**arrays, **columns}, name, options, serial)
 
 
 _KNOWN = (TIME, *ACCEL, *VOLTS, *GYRO, *REFERENCES)  # Columns of the package
 
 
-def is_frame(given: Any) -> bool:
+def _is_frame(given: Any) -> bool:
     """Return whether an object is a DataFrame, without the package pandas."""
     return hasattr(given, 'columns') and hasattr(given, 'index')
 
 
 def _columns_of(table: Any, verb: str) -> dict[str, Any]:
     """Return the columns of a table by name, a named index among them."""
-    if not isinstance(table, Mapping) and not is_frame(table):
+    if not isinstance(table, Mapping) and not _is_frame(table):
         raise UserError(
             f'{verb}: {type(table).__name__} is no table; expected arrays by name, '
             'for example {"time_s": t, "ax_mps2": x}, or a pandas DataFrame'
@@ -242,7 +243,21 @@ def _columns_of(table: Any, verb: str) -> dict[str, Any]:
     index = getattr(table, 'index', None)
     name = getattr(index, 'name', None)
     columns = {} if name is None else {str(name): index}
+    if _are_dates(index):
+        columns[TIME] = index
     return columns | {str(key): table[key] for key in table}
+
+
+def _are_dates(given: Any) -> bool:
+    return getattr(getattr(given, 'dtype', None), 'kind', '') == 'M'
+
+
+def _since_first(dates: Any) -> tuple[np.ndarray, int]:
+    """Return dates as seconds, NaN where missing, since a whole second, and that second in ns."""
+    stamps = np.asarray(dates, 'M8[ns]')
+    stamps_ns, is_date = stamps.astype(np.int64), ~np.isnat(stamps)
+    epoch_ns = int(stamps_ns[is_date][0]) // 10**9 * 10**9 if is_date.any() else 0
+    return np.where(is_date, (stamps_ns - epoch_ns) * 1e-9, np.nan), epoch_ns
 
 
 def _of_memory(
@@ -270,13 +285,16 @@ def _of_memory(
             columns[TIME] = np.arange(rows) / options.rate_hz
         elif TIME not in columns:
             raise UserError(f'{name}: has no time; give time_s or rate')
-    table = in_memory(
-        name, columns, info={'serial': serial} if serial else {}, is_every_row_a_step=True
-    )
+    info = {'serial': serial} if serial else {}
+    if options.rate_hz is None and _are_dates(given.get(TIME)):
+        columns[TIME], epoch_ns = _since_first(given[TIME])
+        info['epoch_ns'] = str(epoch_ns)
+    table = in_memory(name, columns, info=info, is_every_row_a_step=True)
     recording = recording_files.of_table(table, options)
+    if not others:
+        return recording
     left_out = f'{name}: left out, columns without numbers: {", ".join(others)}'
-    remarks = map(_as_arguments, recording.remarks)
-    return replace(recording, remarks=(*remarks, *[left_out] * bool(others)))
+    return replace(recording, remarks=(*recording.remarks, left_out))
 
 
 def _floats(given: Any) -> np.ndarray | None:
@@ -299,49 +317,21 @@ def _floats(given: Any) -> np.ndarray | None:
         return None
 
 
-_OPTION = re.compile(
-    r"""(?<!\S)--([a-z][a-z0-9-]*)(?:\ (HZ|'[^']*'|"[^"]*"|[-+]?\d[\d.]*(?:e[-+]?\d+)?))?"""
-)
-"""An option of a tool in a message, with its value if that is a number or quoted."""
-_BETWEEN_OPTIONS = re.compile(r"""(--\S+ (?:'[^']*'|\S+)) (?=--)""")
-
-
-def _as_arguments(text: str) -> str:
-    """Return a message that names arguments of Python for the options of a tool."""
-
-    def argument(option: re.Match) -> str:
-        name, value = option[1].replace('-', '_'), option[2]
-        is_switch = name.startswith('drop_bad')
-        return f'{name}={value or True}' if value or is_switch else name
-
-    return _OPTION.sub(argument, _BETWEEN_OPTIONS.sub(r'\1, ', text))
-
-
-@contextmanager
-def _arguments_for_options() -> Iterator[None]:
-    """Name arguments of Python, for options of a tool, in the errors of a block."""
-    try:
-        yield
-    except UserError as error:
-        raise UserError(_as_arguments(str(error))) from None
-
-
-def is_several(given: Any) -> bool:
-    """Return whether recordings are given in a series, and not one alone."""
-    is_one = isinstance(given, (str, Mapping, np.ndarray)) or is_frame(given)
-    return isinstance(given, Iterable) and not is_one
+def as_series(given: RecordingInput | Iterable[RecordingInput]) -> Iterable[RecordingInput]:
+    """Return recordings that are given in a series; one that is given alone is a series, too."""
+    if isinstance(given, (str, os.PathLike, Mapping, np.ndarray)) or _is_frame(given):
+        return [given]  # type: ignore[list-item]  # an array is refused by name
+    return given if isinstance(given, Iterable) else [given]
 
 
 def one_recording(given: RecordingInput) -> Recording:
-    """Return a recording; one that is named by its path is read as it is."""
-    if isinstance(given, (str, os.PathLike)):
-        return recording_files.read(given)
-    if is_frame(given):
+    """Return a recording; one that is named by its path, or a table, is read as it is."""
+    if isinstance(given, (str, os.PathLike, Mapping)) or _is_frame(given):
         return read(given)
     if not isinstance(given, Recording):
         raise UserError(
             f'{type(given).__name__} is no recording; expected a Recording, a pandas '
-            'DataFrame, or the path of a file'
+            'DataFrame, arrays by name, or the path of a file'
         )
     for name, values in _samples(given).items():
         numbers = _floats(values)
@@ -362,7 +352,7 @@ def _samples(recording: Recording) -> dict[str, np.ndarray]:
 def each_recording(given: RecordingInput | Iterable[RecordingInput]) -> Iterator[Recording]:
     """Yield recordings, those that are named by their path read as they are; each only once."""
     known: dict[bytes, str] = {}  # Number and name of each recording by the hash of its samples
-    for number, each in enumerate(given if is_several(given) else [given], 1):
+    for number, each in enumerate(as_series(given), 1):
         recording = one_recording(each)
         digest = hashlib.blake2b()
         for values in _samples(recording).values():
@@ -408,7 +398,7 @@ def read_ideal(given: RecordingInput, epoch_ns: int, unit: str = '') -> Recordin
     unit: that of the samples of a file; '' for m/s².
     """
     if isinstance(given, (str, os.PathLike)):
-        unit = parse_unit(unit, '--sim-unit', GRAVITY)
+        unit = parse_unit(unit, 'sim_unit', GRAVITY)
         return recording_files.read_ideal(given, epoch_ns, unit)
     ideal = one_recording(given)
     missing = [name for name in ACCEL if name not in ideal.columns]

@@ -10,6 +10,7 @@ import math
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
+from adxl_ros.process import option
 from adxl_ros.report.screen import end_lines
 import numpy as np
 
@@ -84,4 +85,4 @@ class Result:
 def require_least(name: str, value: float | None, least: float) -> None:
     """Refuse a number that is too small; None is not given."""
     if value is not None and not value >= least:
-        raise UserError(f'--{name} {value}: must be at least {least:g}')
+        raise UserError(f'{option(**{name: value})}: must be at least {least:g}')

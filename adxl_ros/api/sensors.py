@@ -9,22 +9,31 @@ from contextlib import suppress
 from dataclasses import replace
 import math
 import os
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.files.recording_columns import NO_UNIT, Recording
+from adxl_ros.files.recording_columns import NO_SERIAL, Recording
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Effect
 from adxl_ros.model.sensor import neutral, Sensor, typical
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 import numpy as np
 
-SensorInput = Any
-"""A Sensor, a result that has one (`Fit`, `Gap`), a datasheet's name or the path of a file."""
-EffectInput = tuple[str, Mapping[str, Any]]
+
+class HasSensor(Protocol):
+    """A result that has a sensor: Fit, Gap, Noise, Update or Corrected."""
+
+    @property
+    def sensor(self) -> Sensor:
+        """Return the sensor."""
+
+
+SensorInput: TypeAlias = Sensor | HasSensor | str | os.PathLike
+"""A Sensor, a result that has one, a datasheet's name or the path of a parameter file."""
+EffectInput: TypeAlias = tuple[str, Mapping[str, Any]]
 """Name of an effect, and values by parameter, such as 'gain' or 'gain.x'; none for typical."""
-AddedEffects = Mapping[str, Mapping[str, Any] | None] | Sequence[str]
+AddedEffects: TypeAlias = Mapping[str, Mapping[str, Any] | None] | Sequence[str]
 """Names of effects of typical size, or a dict of values by parameter for each name."""
 
 
@@ -92,7 +101,8 @@ def with_effects(sensor: Sensor, effects: Iterable[EffectInput]) -> Sensor:
                 _put(effect, values, sensor.axes, key, number)
         except UserError as error:
             parts = ','.join(f'{key}={number}' for key, number in given.items())
-            raise UserError(f'effect {name}{":" * bool(given)}{parts}: {error}') from None
+            text = f'{name}:{parts}' if given else name
+            raise UserError(f'effect {text}: {error}') from None
         names = sensor.effects if name in sensor.effects else (*sensor.effects, name)
         sensor = replace(sensor, effects=names, values={**sensor.values, name: values})
     return sensor
@@ -154,7 +164,7 @@ def sensor_of(given: SensorInput | None, read: Recording, has_noise: bool = True
     if has_noise:
         sensor, measured = measure_unstated(sensor, read)
     if isinstance(stated, Sensor):
-        stated = '' if sensor.serial == NO_UNIT else f'{sensor.serial}.yaml'
+        stated = '' if sensor.serial == NO_SERIAL else f'{sensor.serial}.yaml'
     usual = parameter_file.usual_path(read.is_of_nominal)
     return GivenSensor(sensor, stated or '', os.path.basename(stated or usual), measured)
 

@@ -26,6 +26,7 @@ from adxl_ros.files.surroundings import assumed
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import option, usage
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion
 from adxl_ros.simulate.response import simulate_blocks
 from adxl_ros.simulate.trajectories import (
@@ -57,7 +58,9 @@ class Simulation:
         duration_s = self.motion.duration_s
         for columns in samples:
             time_s = columns.pop(TIME)
-            done = min((time_s[-1] - self.begin_s) / duration_s, 1.0) if duration_s else 1.0
+            done = 1.0
+            if duration_s:
+                done = min((time_s[-1] - self.begin_s) / duration_s, 1.0)
             yield Recording(self.name, time_s, columns, sensor_info(self.sensor), done=done)
 
     @property
@@ -75,6 +78,7 @@ class Simulation:
 def prepare(
     trajectory: RecordingInput,
     sensor: SensorInput | None = None,
+    *,
     effects: Sequence[EffectInput] = (),
     force: RecordingInput | None = None,
     rate: float | None = None,
@@ -84,21 +88,25 @@ def prepare(
     require_least('seed', seed, 0)
     bounds = parameter_file.SENSOR_FIELDS['sensor.rate_hz'].metadata
     if rate is not None and not bounds['lower'] <= rate <= bounds['upper']:
-        raise UserError(f'--rate {rate:g}: outside {bounds["lower"]:g} to {bounds["upper"]:g} Hz')
-    is_imu = isinstance(trajectory, str) and trajectory == IMU
-    if is_imu != (force is not None):
         raise UserError(
-            '--force RECORDING and the trajectory imu need each other: '
-            'simulate imu --force RECORDING'
+            f'{option(rate=f"{rate:g}")}: outside {bounds["lower"]:g} to {bounds["upper"]:g} Hz'
+        )
+    name = trajectory if isinstance(trajectory, str) else ''
+    if (name == IMU) != (force is not None):
+        raise UserError(
+            f'{option(force="RECORDING")} and the trajectory imu need each other: '
+            + usage('simulate', IMU, force='RECORDING')
         )
     unit = _stated(sensor)
-    unit = with_effects(unit if rate is None else replace(unit, rate_hz=rate), effects)
-    left_out = [] if force is not None else _left_out(unit, {name for name, _ in effects})
+    if rate is not None:
+        unit = replace(unit, rate_hz=rate)
+    unit = with_effects(unit, effects)
     if force is not None:
-        made = _by_force(read_ideal(force, 0), unit, rate)
-    elif isinstance(trajectory, str) and trajectory in TRAJECTORIES:
-        motion = TRAJECTORIES[trajectory](np.random.default_rng(seed))
-        made = Simulation(trajectory, unit, motion)
+        return _by_force(read_ideal(force, 0), unit, rate)
+    left_out = _left_out(unit, {effect for effect, _ in effects})
+    if name in TRAJECTORIES:
+        motion = TRAJECTORIES[name](np.random.default_rng(seed))
+        made = Simulation(name, unit, motion)
     else:
         made = _by_references(one_recording(_existing(trajectory)), unit, rate)
     return replace(made, left_out=left_out)
@@ -125,7 +133,7 @@ def _left_out(sensor: Sensor, asked: set[str]) -> list[str]:
             if name in asked:
                 raise UserError(
                     f'effect {name}: acts on the specific force of a recording; say '
-                    'simulate imu --force RECORDING, or leave the effect out'
+                    f'{usage("simulate", IMU, force="RECORDING")}, or leave the effect out'
                 )
             lines.append(f'{name} is an error of the reference, and is left out')
     return lines
@@ -147,7 +155,13 @@ def _by_force(ideal: Recording, sensor: Sensor, rate_hz: float | None) -> Simula
     if rate_hz is None:
         sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
         motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, INTERNAL_RATE_HZ))
-    return Simulation(IMU, sensor, motion, begin_s, assumed=assumed(ideal, sensor.effects))
+    return Simulation(
+        name=IMU,
+        sensor=sensor,
+        motion=motion,
+        begin_s=begin_s,
+        assumed=assumed(ideal, sensor.effects),
+    )
 
 
 def _by_references(read: Recording, sensor: Sensor, rate_hz: float | None) -> Simulation:
@@ -156,7 +170,12 @@ def _by_references(read: Recording, sensor: Sensor, rate_hz: float | None) -> Si
     if rate_hz is None:
         sensor, like = replace(sensor, rate_hz=read.rate_hz), read
     return Simulation(
-        read.path, sensor, motion, float(read.time_s[0]), like, assumed(read, sensor.effects)
+        name=read.path,
+        sensor=sensor,
+        motion=motion,
+        begin_s=float(read.time_s[0]),
+        like=like,
+        assumed=assumed(read, sensor.effects),
     )
 
 
@@ -208,7 +227,14 @@ def simulate(
         An effect, a parameter or a trajectory is unknown, or a value is out of bounds.
 
     """
-    made = prepare(trajectory, sensor, effect_inputs(effects), force, rate, seed)
+    made = prepare(
+        trajectory,
+        sensor,
+        effects=effect_inputs(effects),
+        force=force,
+        rate=rate,
+        seed=seed,
+    )
     blocks = []
     for block in made.blocks(seed):
         blocks.append(block)

@@ -8,52 +8,25 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from adxl_ros.api.recordings import each_recording, RecordingInput
 from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Result
 from adxl_ros.api.sensors import as_input, load, SensorInput
+from adxl_ros.calibrate.keep import update_report as words
 from adxl_ros.calibrate.keep.keeper import Keeper, KeepSettings, KeptState
 from adxl_ros.calibrate.keep.stays import RestStream
+from adxl_ros.calibrate.keep.update_report import UpdatedDay
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import make_folder, require_own, write_text
-from adxl_ros.files.recording_columns import check_unit, Recording
+from adxl_ros.files.recording_columns import check_same_sensor, Recording
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report import page
-from adxl_ros.report.figures import axes_for, AXIS_COLOURS, figure, line, points, QUIET_COLOUR
-from adxl_ros.report.quantities import counted, number, utc, with_half_width
-import numpy as np
-
-PAGE = 'report.html'
-_CURVE_POINTS = 30  # Points of a curve over temperature
-_HEIGHT = 320  # Of a plot, pixels
+from adxl_ros.report.figures import axes_for, AXIS_COLOURS
+from adxl_ros.report.quantities import counted, number, utc
 
 
-def _interval(value: float, half: float) -> str:
-    """Write a value and half of its interval with the digits that this allows."""
-    return with_half_width(value, half).replace('+-', '±')
-
-
-class UpdatedDay(NamedTuple):
-    """What is known at the last rest of a day."""
-
-    stamp_ns: int  # Stamp of that rest, ns
-    temperature_c: float  # Its temperature, °C
-    zero_g_mg: tuple[float, ...]  # Zero-g beyond the calibration given, by axis, mg
-    zero_g_90_mg: tuple[float, ...]  # Halves of the 90 % intervals, mg
-    tilt_90_deg: float  # Tilt error that nine of ten are below, degrees; NaN without three axes
-    rests: int  # Rests of the last 24 hours
-    adopted: bool  # Whether a calibration was adopted on this day
-    changed: str  # What changed beyond age and temperature, ''
-
-    @property
-    def date(self) -> str:
-        """Return the date, UTC."""
-        return f'{utc(self.stamp_ns):%Y-%m-%d}'
-
-
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Update(Result):
     """
     A calibration after the rests of recordings.
@@ -79,23 +52,21 @@ class Update(Result):
     @property
     def screen(self) -> list[str]:
         """Return the lines of the tool's screen."""
-        lost = self.counts['without_temperature']
-        return [
+        lines = [
             f'{self.outcome}: {self._sentence}',
             f'{counted(self.counts["rests"], "rest")} on {counted(len(self.days), "day")}, '
             f'{counted(self.adoptions, "adoption")}, age {number(self.state.age_days)} days',
-            *[f'{lost} rests without a temperature were not used'] * bool(lost),
-            '',
-            *(
-                f'zero-g {axis}  {_interval(value, half)} mg since the calibration, '
-                f'at {self.state.temperature_c:.1f} °C'
-                for axis, value, half in zip(
-                    self.sensor.axes, self.state.total_mg, self.state.zero_g_90_mg
-                )
-            ),
-            *self.state.determined,
-            '',
         ]
+        if lost := self.counts['without_temperature']:
+            lines.append(f'{lost} rests without a temperature were not used')
+        lines.append('')
+        zero_g = zip(self.sensor.axes, self.state.total_mg, self.state.zero_g_90_mg)
+        for axis, value, half in zero_g:
+            lines.append(
+                f'zero-g {axis}  {words.with_interval(value, half)} mg since the calibration, '
+                f'at {self.state.temperature_c:.1f} °C'
+            )
+        return [*lines, *self.state.determined, '']
 
     @property
     def _sentence(self) -> str:
@@ -132,88 +103,12 @@ class Update(Result):
 
     def report(self, folder: str | os.PathLike, *, overwrite: bool = False) -> Path:
         """Write the page report.html into a folder, and return its path."""
-        require_own(Path(folder) / PAGE, overwrite)
-        path, top = make_folder(folder) / PAGE, self.first_screen
-        values = {
-            'title': f'Calibration of {self.sensor.serial} over {counted(len(self.days), "day")}',
-            'about': [],
-            'badge': {'colour': top.colour, 'word': top.word, 'sentence': top.sentence},
-            'tiles': [dict(zip(('label', 'text', 'note'), tile)) for tile in top.tiles],
-            'figures': {'days': self._by_day(), 'temperature': self._by_temperature()},
-            'determined': self.state.determined,
-            'head': ['day', 'temperature', 'zero-g since the calibration, mg', 'rests', ''],
-            'rows': [self._row(day) for day in self.days],
-        }
-        write_text(path, page.render('adxl_ros.api', 'update.html', values))
+        require_own(Path(folder) / words.PAGE, overwrite)
+        path, top = make_folder(folder) / words.PAGE, self.first_screen
+        badge = {'colour': top.colour, 'word': top.word, 'sentence': top.sentence}
+        tiles = [dict(zip(('label', 'text', 'note'), tile)) for tile in top.tiles]
+        write_text(path, words.page(self.sensor, self.days, self.state, badge, tiles))
         return path
-
-    def _row(self, day: UpdatedDay) -> list[str]:
-        zero_g = ', '.join(
-            f'{axis} {_interval(value, half)}'
-            for axis, value, half in zip(self.sensor.axes, day.zero_g_mg, day.zero_g_90_mg)
-        )
-        event = day.changed or 'adopted' * day.adopted
-        return [day.date, f'{day.temperature_c:.1f} °C', zero_g, str(day.rests), event]
-
-    def _by_day(self) -> dict[str, Any]:
-        """Return the plot of the zero-g by day; dotted lines are adoptions."""
-        since = [(day.stamp_ns - self.days[0].stamp_ns) / 86_400e9 for day in self.days]
-        traces = [
-            points(
-                since,
-                [day.zero_g_mg[place] for day in self.days],
-                [day.zero_g_90_mg[place] for day in self.days],
-                axis,
-                AXIS_COLOURS[axis],
-            )
-            for place, axis in enumerate(self.sensor.axes)
-        ]
-        adopted = [
-            {
-                'type': 'line',
-                'yref': 'paper',
-                'x0': x,
-                'x1': x,
-                'y0': 0,
-                'y1': 1,
-                'line': {'color': QUIET_COLOUR, 'dash': 'dot', 'width': 1},
-            }
-            for x, day in zip(since, self.days)
-            if day.adopted
-        ]
-        return figure(
-            traces,
-            _HEIGHT,
-            shapes=adopted,
-            xaxis={'title': {'text': f'days since {self.days[0].date}' if self.days else 'days'}},
-            yaxis={'title': {'text': 'zero-g since the calibration, mg'}},
-        )
-
-    def _by_temperature(self) -> dict[str, Any]:
-        """Return the plot of the zero-g of the last calibration, with its 90 % interval."""
-        seen_c = [day.temperature_c for day in self.days] or [self.state.temperature_c]
-        celsius = np.linspace(min(seen_c) - 5, max(seen_c) + 5, _CURVE_POINTS)
-        keeper = Keeper(self.sensor)
-        traces = []
-        for place, axis in enumerate(self.sensor.axes):
-            curve = [keeper.zero_g_mg(temperature_c)[place] for temperature_c in celsius]
-            start = keeper.zero_g_mg(float(np.mean(seen_c)))[place].value
-            colour = AXIS_COLOURS[axis]
-            middle = [estimate.value - start for estimate in curve]
-            half = [estimate.half_width for estimate in curve]
-            traces.append(line(celsius, middle, axis, colour))
-            for sign in (-1, 1):
-                edge = np.add(middle, np.multiply(half, sign))
-                dashed = {'color': colour, 'width': 0.8, 'dash': 'dash'}
-                traces.append(
-                    line(celsius, edge, f'{axis}, 90 %', colour, line=dashed, showlegend=False)
-                )
-        return figure(
-            traces,
-            _HEIGHT,
-            xaxis={'title': {'text': 'temperature, °C'}},
-            yaxis={'title': {'text': 'zero-g from the mean temperature, mg'}},
-        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the days and the state; what is not finite is None."""
@@ -252,7 +147,7 @@ class Update(Result):
                 label=axis,
                 color=AXIS_COLOURS[axis],
             )
-        ax.set_ylabel('zero-g since the calibration, mg')
+        ax.set(xlabel='day, UTC', ylabel='zero-g since the calibration, mg')
         ax.legend()
         return ax
 
@@ -302,7 +197,7 @@ def update(
     days: dict[str, UpdatedDay] = {}
     newest_ns, name = 0, ''
     for place, read in enumerate(each_recording(recordings)):
-        check_unit(read.stream_info, read.axes, before)
+        check_same_sensor(read.stream_info, read.axes, before)
         if read.stamp_ns[0] < newest_ns:
             raise UserError(
                 f'{read.path}: begins before {name} ends; give recordings in the order of time'
@@ -319,7 +214,9 @@ def update(
         )
         raise UserError(f'{name or "no recording"}: {reason}; nothing can be updated')
     state = keeper.state(keeper.newest_ns)
-    outcome = 'CHANGED' if state.changed else 'ADOPTED' if keeper.adoptions else 'KEPT'
+    outcome = 'ADOPTED' if keeper.adoptions else 'KEPT'
+    if state.changed:
+        outcome = 'CHANGED'
     return Update(
         before=before,
         sensor=keeper.sensor,
@@ -348,15 +245,14 @@ def _take(
             adopted = keeper.add(rest)
             state = keeper.state(rest.stop_ns)
             day = UpdatedDay(
-                rest.stop_ns,
-                rest.temperature_c,
-                state.total_mg,
-                state.zero_g_90_mg,
-                state.tilt_90_deg,
-                sum(state.rests_a_day.values()),
-                adopted is not None,
-                state.changed,
+                stamp_ns=rest.stop_ns,
+                temperature_c=rest.temperature_c,
+                zero_g_mg=state.total_mg,
+                zero_g_90_mg=state.zero_g_90_mg,
+                tilt_90_deg=state.tilt_90_deg,
+                rests=sum(state.rests_a_day.values()),
+                adopted=adopted is not None,
+                changed=state.changed,
             )
-            earlier = days.get(day.date)
-            was_adopted = earlier is not None and earlier.adopted
+            was_adopted = day.date in days and days[day.date].adopted
             days[day.date] = day._replace(adopted=day.adopted or was_adopted)

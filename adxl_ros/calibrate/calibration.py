@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Calibration of a unit from poses: fit, assessment, provenance, and its report."""
+"""Calibration of a sensor from poses: fit, assessment, provenance, and its report."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from functools import partial
 
 from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, thermal_fit
 from adxl_ros.calibrate.fits.linearisation import volts_covariance
-from adxl_ros.calibrate.poses import at_a_rail, Poses, predicted_volts, reference_force, residual_g
+from adxl_ros.calibrate.pose_model import predicted_volts, reference_force, residual_g
+from adxl_ros.calibrate.poses import at_a_rail, Poses
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.held_out import HeldOutErrors, rms_mg
@@ -22,6 +23,7 @@ from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import option
 from adxl_ros.report.quantities import mg, with_half_width
 from adxl_ros.signals import recorded_sensor
 from adxl_ros.signals.gravity_at_rest import of_volts, require_unit
@@ -51,12 +53,12 @@ def calibrate(
     population: Population | None = None,
 ) -> CalibrationResult:
     """
-    Fit the poses of one unit: against the stage where there are angles, else against gravity.
+    Fit the poses of one sensor: against the stage where there are angles, else against gravity.
 
     Parameters
     ----------
     sensor
-        The nominal sensor of the unit.
+        The nominal sensor.
     recordings
         Poses of each recording.
     model
@@ -71,7 +73,7 @@ def calibrate(
     Returns
     -------
     CalibrationResult
-        The calibrated unit with its assessment.
+        The calibrated sensor with its assessment.
 
     Raises
     ------
@@ -120,7 +122,7 @@ def calibrate(
     elif model not in (None, 'full'):
         raise UserError(
             f'{source}: the {model} model is fitted against stage angles (alpha_rad '
-            'and beta_rad), which are missing; leave --model out to calibrate a '
+            f'and beta_rad), which are missing; leave {option("model")} out to calibrate a '
             'three-axis sensor against gravity'
         )
     elif effects:
@@ -165,28 +167,26 @@ def _against_stage(
     if population is not None:
         fit = _with_population(fit, population)
     full, fitted, fitting = fit.full, fit.fitted, np.flatnonzero(~poses.check)
-    fit_lines, warnings, outliers = (
-        ([], [], ())
-        if full is None
-        else (
-            full_model.report_lines(full, poses.subset(fitting), fit.terms),
-            full_model.warnings(full, poses.subset(fitting)),
-            tuple(fitting[list(full.outliers)].tolist()),
-        )
-    )
-    errors, assessments = _assessed(
-        sensor, poses.subset(~np.isin(np.arange(len(poses)), outliers)), fit, not doubts
-    )
-    assessment = acceptance.judged(assessments[-1], fitted) if assessments else None
-    assessments = (*assessments[:-1], assessment) if assessment else ()
+    outliers = tuple(fitting[list(full.outliers)].tolist()) if full else ()
+    inliers = poses.subset(~np.isin(np.arange(len(poses)), outliers))
+    errors, assessments = _assessed(sensor, inliers, fit, not doubts)
+    assessment, error_mps2 = None, 0.0
+    if assessments:
+        assessment = acceptance.judged(assessments[-1], fitted)
+        assessments = (*assessments[:-1], assessment)
+        error_mps2 = float(np.nan_to_num(np.sqrt(assessment.accel.calibration)))
     force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
     residual_mg = 1e3 * residual_g(fitted, poses)[fitting]
+    details: list[str] = []
+    warnings = list(doubts)
+    if full:
+        details += full_model.report_lines(full, poses.subset(fitting), fit.terms)
+        warnings += full_model.warnings(full, poses.subset(fitting))
     if fitted.model == 'full':
         fitted, filter_lines = recorded_sensor.with_filter(
             fitted, [recording.filters for recording in recordings if recording.filters]
         )
-        fit_lines += filter_lines
-    error_mps2 = np.nan_to_num(np.sqrt(assessment.accel.calibration)).item() if assessment else 0.0
+        details += filter_lines
     fitted = replace(fitted, envelope=envelope(fitted, force, poses, error_mps2))
     entries = {'reference': 'stage'}
     if population:
@@ -197,7 +197,7 @@ def _against_stage(
     entries |= acceptance.provenance_entries(assessment, errors, doubts)
     fitted = with_provenance(fitted, source, poses, data_sha256, entries)
     summary = acceptance.summary_lines(
-        fitted, assessment, acceptance.held_out_lines(errors, len(poses) - len(outliers))
+        fitted, assessment, acceptance.held_out_lines(errors, len(inliers))
     )
     return CalibrationResult(
         nominal=sensor,
@@ -207,13 +207,13 @@ def _against_stage(
         assessments=assessments,
         held_out=errors,
         outliers=outliers,
-        warnings=[*doubts, *warnings, *fit.notes],
-        details=fit_lines,
+        warnings=[*warnings, *fit.notes],
+        details=details,
     )
 
 
 def _check_polarity(sensor: Sensor, poses: Poses) -> None:
-    """Refuse a unit with an inverted axis or with swapped axes."""
+    """Refuse a sensor with an inverted axis or with swapped axes."""
     if len(poses) < 2:
         return
     reference = reference_force(poses, sensor.local_gravity_mps2)
@@ -229,7 +229,7 @@ def _check_polarity(sensor: Sensor, poses: Poses) -> None:
 
 
 def _with_population(fit: _StageFit, population: Population) -> _StageFit:
-    """Combine a fit with the population of the unit, those of cross-validation as well."""
+    """Combine a fit with the population of the sensor, those of cross-validation as well."""
     combined = posterior(fit.fitted, population)
 
     def refit(sensor: Sensor, poses: Poses) -> Sensor:
@@ -246,7 +246,7 @@ def _assessed(
 ) -> tuple[tuple[HeldOutErrors, ...], tuple[Assessment, ...]]:
     """Return held-out errors and acceptance of the fit and of all simpler models."""
     # The reference of all models is the stage with its fitted errors.
-    stage = fit.full.unit if fit.full else None
+    stage = fit.full.with_stage if fit.full else None
     models = list(STAGE_FITS)
     simpler = {name: STAGE_FITS[name] for name in models[: models.index(fit.fitted.model)]}
     errors = held_out.cross_validate(
@@ -309,7 +309,7 @@ def _richest_fit(
 
 
 def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
-    """Fit the twelve coefficients of a three-axis unit to poses that determine no more."""
+    """Fit the twelve coefficients of a three-axis sensor to poses that determine no more."""
     full = full_model.fit_full(sensor, poses, linear.AFFINE, full_model.MAX_OPEN)
     still_open = acceptance.open_coefficients(full.fitted)
     notes = [
@@ -333,7 +333,7 @@ _MAX_TURN_RAD = np.radians(0.3)
 """Largest turn of the case between recordings, rad. Chosen: above the 0.1° of the stage's level in
 either recording, far below a new mounting."""
 _MAX_ZERO_G_SHIFT_G = 0.02
-"""Largest shift of the zero-g between recordings, g. Chosen: a healthy unit may shift by so much
+"""Largest shift of the zero-g between recordings, g. Chosen: a healthy sensor may shift by so much
 between two days."""
 _MIN_DEVIATIONS = 6.0  # Smallest turn or shift that counts, in its stds; chosen: never by chance
 _MIN_EIGENVALUE_RATIO = 1e-10
@@ -348,7 +348,7 @@ class _ContradictionError(UserError):
 
 def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[RecordedPoses]) -> None:
     """Refuse recordings if a turn of the case or a shift of the zero-g shows in one of them."""
-    axes = full.unit.axes
+    axes = full.with_stage.axes
     limits = np.repeat([_MAX_TURN_RAD, _MAX_ZERO_G_SHIFT_G], [3, len(axes)])
     for recording in recordings:
         changes, std = _turn_and_shifts(full, recording.poses)
@@ -356,11 +356,10 @@ def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[Recorde
         worst = int(np.argmax(deviations))
         if deviations[worst] <= _MIN_DEVIATIONS:
             continue
-        change = (
-            f'case is turned by {np.degrees(changes[worst]):.2f} deg about {AXES[worst]}'
-            if worst < 3
-            else f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
-        )
+        if worst < 3:
+            change = f'case is turned by {np.degrees(changes[worst]):.2f} deg about {AXES[worst]}'
+        else:
+            change = f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
         raise _ContradictionError(
             f'{recording.source}: {change} from the fit of all recordings '
             f'({deviations[worst]:.0f} standard deviations): another unit or another '
@@ -370,18 +369,18 @@ def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[Recorde
 
 def _turn_and_shifts(full: full_model.FullFit, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
     """Fit turn, rad, (3,), and zero-g shifts, g, (m,), to residuals; return values and std."""
-    unit = full.unit
-    force = reference_force(poses, unit.local_gravity_mps2)
+    sensor = full.with_stage
+    force = reference_force(poses, sensor.local_gravity_mps2)
     by_force = np.moveaxis(
-        signal_chain.jacobian(signal_chain.analog_response(unit), force, poses.environment), 2, 0
+        signal_chain.jacobian(signal_chain.analog_response(sensor), force, poses.environment), 2, 0
     )
     turned = np.stack([np.cross(axis, np.column_stack(force)) for axis in np.eye(3)], axis=2)
     shifted = np.broadcast_to(
-        np.diag(unit.scale_v_per_g), (len(poses), len(unit.axes), len(unit.axes))
+        np.diag(sensor.scale_v_per_g), (len(poses), len(sensor.axes), len(sensor.axes))
     )
-    information, gradient = volts_covariance(unit, poses, full.stage).normal_equations(
+    information, gradient = volts_covariance(sensor, poses, full.stage).normal_equations(
         np.concatenate([by_force @ turned, shifted], axis=2),
-        poses.volts - predicted_volts(unit, poses),
+        poses.volts - predicted_volts(sensor, poses),
     )
     covariance = np.linalg.pinv(information, rcond=_MIN_EIGENVALUE_RATIO)
     return covariance @ gradient, np.sqrt(np.maximum(np.diag(covariance), _MIN_VARIANCE))
@@ -398,9 +397,8 @@ def _against_gravity(
 ) -> CalibrationResult:
     fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
-    after, unseen = (
-        rms_mg(np.mean(values[kept] ** 2)) for values in (fit.residual_mps2, fit.held_out_mps2)
-    )
+    after_mg = rms_mg(np.mean(fit.residual_mps2[kept] ** 2))
+    unseen_mg = rms_mg(np.mean(fit.held_out_mps2[kept] ** 2))
     fitted = replace(
         sensor,
         model='gravity',
@@ -409,7 +407,9 @@ def _against_gravity(
         covariance=fit.covariance,
         covariance_names=gravity_fit.NAMES,
     )
-    warnings = [*doubts, *([] if fit.converged else [full_model.NOT_CONVERGED])]
+    warnings = list(doubts)
+    if not fit.converged:
+        warnings.append(full_model.NOT_CONVERGED)
     if fit.note:
         warnings.append(fit.note)
     if population is not None:
@@ -440,8 +440,8 @@ def _against_gravity(
         {
             'reference': 'gravity',
             **({'prior': population.name} if population else {}),
-            'residual_mg': f'{after:.4f}',
-            'held_out_mg': f'{unseen:.4f}',
+            'residual_mg': f'{after_mg:.4f}',
+            'held_out_mg': f'{unseen_mg:.4f}',
             **({'span_s': f'{span_s:.1f}'} if span_s else {}),
             'converged': 'yes' if fit.converged else 'no',
             **acceptance.provenance_entries(assessment, (), doubts),
@@ -462,7 +462,7 @@ def _against_gravity(
 
 
 def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
-    """Report the scatter of the zero-g over recordings of one unit on the stage."""
+    """Report the scatter of the zero-g over recordings of one sensor on the stage."""
     on_stage = [poses.subset(poses.has_angles) for poses in recordings if poses.has_angles.any()]
     if len(on_stage) < 2:
         return []

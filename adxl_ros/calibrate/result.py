@@ -12,13 +12,14 @@ from itertools import product
 
 from adxl_ros.calibrate.fits.extrapolation import next_degree, NextDegree
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
-from adxl_ros.calibrate.poses import planes, Poses, residual_g
+from adxl_ros.calibrate.pose_model import residual_g
+from adxl_ros.calibrate.poses import planes, Poses
 from adxl_ros.calibrate.report.acceptance import Assessment
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import AnyPath, keep_previous
-from adxl_ros.files.recording_columns import NO_UNIT
+from adxl_ros.files.recording_columns import NO_SERIAL
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.accelerometer import OTHER_AXIS
@@ -35,10 +36,10 @@ _SAME_FIT_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """A calibrated unit with its assessment."""
+    """A calibrated sensor with its assessment."""
 
-    nominal: Sensor  # The unit before the fit
-    fitted: Sensor  # The unit after the fit
+    nominal: Sensor  # The sensor before the fit
+    fitted: Sensor  # The sensor after the fit
     summary: Sequence[str]  # Verdict, errors and limits as text
     poses: Poses  # k poses, check poses among them
     # Acceptance of each model; the last one is that of `fitted`
@@ -86,7 +87,7 @@ class CalibrationResult:
         return (
             f'kept as {path}'
             if path
-            else f'not kept in {folder}: the serial number {NO_UNIT} names no unit; set '
+            else f'not kept in {folder}: the serial number {NO_SERIAL} names no unit; set '
             'sensor.serial'
         )
 
@@ -136,18 +137,18 @@ def gyro_lines(gyro: Gyroscope) -> list[str]:
                 '°/s/K',
             )
         )
-    return [
-        f'  {label:{_LONGEST_LABEL}} {axis:1} '
-        f'{with_half_width(np.degrees(value), Z_90 * np.degrees(std))} {unit}'
-        for label, values, stds, unit in rows
-        for axis, value, std in zip(AXES, values, stds or NO_TURN)
-    ]
+    lines = []
+    for label, values, stds, unit in rows:
+        for axis, value, std in zip(AXES, values, stds or NO_TURN):
+            text = with_half_width(np.degrees(value), Z_90 * np.degrees(std))
+            lines.append(f'  {label:{_LONGEST_LABEL}} {axis:1} {text} {unit}')
+    return lines
 
 
 def with_provenance(
     fitted: Sensor, source: str, poses: Poses, data_sha256: str, results: Mapping[str, str]
 ) -> Sensor:
-    """Add date, sources, sweep, data hash, results and id to a fitted unit."""
+    """Add date, sources, sweep, data hash, results and id to a fitted sensor."""
     alpha_rad = poses.alpha_rad[~poses.check]
     sweep = f'{len(planes(alpha_rad))} planes alpha' if np.isfinite(alpha_rad).all() else 'rests'
     entries = {
@@ -255,7 +256,7 @@ class Comparison:
     unit: str  # Unit of the values: degrees for an angle, else the unit of the parameter
     fitted: float  # The fitted value. Zero-g and scale factor are absolute, in V and V/g.
     half_width: float  # Half of the 90 % interval
-    truth: float  # The true value; 0 for an effect that the unit does not have
+    truth: float  # The true value; 0 for an effect that the sensor does not have
 
     @property
     def inside(self) -> bool:
@@ -267,7 +268,7 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
     """
     Compare each fitted coefficient with the true one, in the order of the fit.
 
-    A misalignment and a linear cross-axis term are the same to first order, so that the true unit
+    A misalignment and a linear cross-axis term are the same to first order: the true sensor
     must have the gauge of the fits: no linear cross-axis terms.
     """
     names, rows = fitted.covariance_names, []
@@ -335,7 +336,7 @@ def rounded(row: Comparison, value: float) -> str:
 
 
 def history(newest: Sensor, stored: Sequence[Sensor]) -> tuple[list[str], list[list[str]]] | None:
-    """Return head and rows of the calibrations of a unit; None without an earlier one."""
+    """Return head and rows of the calibrations of a sensor; None without an earlier one."""
     rows = [
         [
             sensor.provenance.get('date', '-')[:16].replace('T', ' '),

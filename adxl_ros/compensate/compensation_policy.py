@@ -13,7 +13,7 @@ from typing import Any
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
-from adxl_ros.files.recording_columns import check_unit, NO_UNIT, StreamInfo
+from adxl_ros.files.recording_columns import check_same_sensor, NO_SERIAL, StreamInfo
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import Sensor
@@ -56,7 +56,7 @@ class CompensationPolicy:
     """
     Decides which calibration applies to a stream, and whether it applies at all.
 
-    A calibration that is named stands. Otherwise the newest one of the unit in the store applies,
+    A calibration that is named stands. Otherwise the sensor's newest one in the store applies,
     as soon as the stream states its serial number.
 
     mixture: that several nodes publish the samples, so that none counts, or ''; no_gravity: that
@@ -91,7 +91,7 @@ class CompensationPolicy:
         if self._paper and sensor.axes == 'x':
             raise UserError("inverse: the paper's needs the axes x and y, the sensor has x")
         if self.info is not None:
-            check_unit(self.info, self.info.axes or sensor.axes, sensor)
+            check_same_sensor(self.info, self.info.axes or sensor.axes, sensor)
             _ = self.info.rate_hz  # raises where it is no rate
 
     def use(self, sensor: Sensor, source: str) -> str:
@@ -118,9 +118,9 @@ class CompensationPolicy:
         return calibration != self.stored_path if calibration else bool(self.sensor.effects)
 
     def choose(self, calibration: str) -> tuple[str, list[str]]:
-        """Choose the newest calibration of the stream's unit, unless one was named."""
-        serial = self.info.serial if self.info else NO_UNIT
-        if not self._store or serial == NO_UNIT or self.is_named(calibration):
+        """Choose the newest calibration of the stream's sensor, unless one was named."""
+        serial = self.info.serial if self.info else NO_SERIAL
+        if not self._store or serial == NO_SERIAL or self.is_named(calibration):
             return '', []
         path, refused = calibration_store.newest(self._store, serial, self.check)
         warnings = [f'passed over: {reason}' for reason in refused]
@@ -138,7 +138,7 @@ class CompensationPolicy:
     def newer(self) -> Path | None:
         """Return a calibration that was put into the store after the one in use."""
         sensor = self.sensor
-        if not self._store or not sensor.effects or sensor.serial == NO_UNIT:
+        if not self._store or not sensor.effects or sensor.serial == NO_SERIAL:
             return None
         return calibration_store.newer(self._store, sensor)
 
@@ -223,10 +223,10 @@ class CompensationPolicy:
     def _unit(self) -> str:
         if self.refusal or self.info is None:
             return 'other' if self.refusal else 'not confirmed'
-        # A stream or a file without a serial number goes with every unit.
+        # A stream or a file without a serial number goes with every sensor.
         return (
             'no serial number'
-            if NO_UNIT in (self.info.serial, self.sensor.serial)
+            if NO_SERIAL in (self.info.serial, self.sensor.serial)
             else 'confirmed'
         )
 

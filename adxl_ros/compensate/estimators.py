@@ -29,6 +29,7 @@ from adxl_ros.model.effects.base import (
 )
 from adxl_ros.model.kinematics import angles, Mounting, Tilt, tilt
 from adxl_ros.model.sensor import parameter_of, Sensor
+from adxl_ros.process import option
 import numpy as np
 
 
@@ -64,7 +65,8 @@ class RecordingEstimator:
         """Prepare for a recording."""
         if paper and sensor.axes == 'x':
             raise UserError(
-                '--inverse paper: needs the axes x and y, the sensor has x; leave it out'
+                f'{option(inverse="paper")}: needs the axes x and y, the sensor has x; '
+                'leave it out'
             )
         if 'temperature_c' not in first.columns:
             sensor = sensor.without_temperature_range()
@@ -80,16 +82,13 @@ class RecordingEstimator:
     def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
         """Yield each block of the recording with its estimates."""
         measured = ((block, block.volts(self._sensor)) for block in recording)
-        before_filter = (
-            ((pair, pair[1]) for pair in measured)
-            if not self._undo_filter
-            else undo_filter_blocks(
-                ((pair, pair[0].time_s, pair[1]) for pair in measured),
-                noise.electronics(self._sensor).rc_s,
-                self._sensor.rate_hz,
-            )
-        )
-        for (block, volts), input_v in before_filter:
+        if not self._undo_filter:
+            for block, volts in measured:
+                yield block, self._estimate(volts, volts, self._environment(block))
+            return
+        stamped = ((pair, pair[0].time_s, pair[1]) for pair in measured)
+        rc_s = noise.electronics(self._sensor).rc_s
+        for (block, volts), input_v in undo_filter_blocks(stamped, rc_s, self._sensor.rate_hz):
             yield block, self._estimate(volts, input_v, self._environment(block))
 
     @property
@@ -132,7 +131,15 @@ class RecordingEstimator:
         if sensor.axes == 'x':
             force_mps2[1:] = np.nan
         force_std_mps2[np.isnan(force_mps2)] = np.inf
-        return Estimates(force_mps2, force_std_mps2, covariance, angles, at_rail, outside, volts)
+        return Estimates(
+            force_mps2=force_mps2,
+            force_std_mps2=force_std_mps2,
+            covariance=covariance,
+            tilt=angles,
+            at_rail=at_rail,
+            outside=outside,
+            volts=volts,
+        )
 
     def _excess_variance(self, force: Components, covariance: np.ndarray) -> np.ndarray:
         """Return the square of what a force is beyond gravity and its error, (m/s²)², (n,)."""
@@ -149,7 +156,7 @@ def length_excess(length_mps2: Value, error2: Value, gravity_mps2: float, maths:
     Return how much the length of a force departs from gravity beyond its error, m/s².
 
     The tilt is that of gravity. A force whose length is not gravity's is in motion, in another
-    unit, or has lost gravity, and at least this much of it is no gravity. error2: the largest
+    sensor, or has lost gravity, and at least this much of it is no gravity. error2: the largest
     variance of an axis, (m/s²)².
     """
     departure = length_mps2 - gravity_mps2
@@ -241,7 +248,7 @@ class LiveEstimator:
         undo_filter: bool = False,
         mounting: Mounting | None = None,
     ) -> None:
-        """Prepare for a unit."""
+        """Prepare for a sensor."""
         if mounting is not None and not sensor.z_sign:
             # A robot stands upright, so that its mounting says which way up the case is.
             sensor = replace(sensor, z_sign=-1 if mounting.rows[2, 2] < 0 else 1)
@@ -313,10 +320,9 @@ class LiveEstimator:
         )
         if self.mounting is not None:
             force = self.mounting.rotate(force)
-            covariance, moved = (
-                self._with_yaw(force, self.mounting.rotate_covariance(part))
-                for part in (covariance, moved)
-            )
+            turned = self.mounting.rotate_covariance
+            covariance = self._with_yaw(force, turned(covariance))
+            moved = self._with_yaw(force, turned(moved))
         roll, pitch, inclination, _ = angles(force, moved, FLOATS)
         return Estimate(force, covariance, roll, pitch, inclination, saturated, cell.outside)
 
@@ -334,7 +340,7 @@ class LiveEstimator:
         self._last_volts = self._respond(self._force, self._environment)
 
     def _use(self, sensor: Sensor) -> None:
-        """Take covariance and validity range from the unit, with or without temperature range."""
+        """Take covariance and range of validity from the sensor, of temperature as well or not."""
         self._measured_covariance = force_errors.measured_covariance(
             sensor, self._variance_v2, bool(self.sensor.z_sign)
         )

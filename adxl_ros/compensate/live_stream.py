@@ -78,7 +78,7 @@ class LiveStream:
         self.outside: tuple[str, ...] = ()
         # Temperature, °C, and supply, V, that the inverse uses, by name; those that are known
         self.surroundings: dict[str, float] = {}
-        # Whether the stream belongs to another unit; then its samples are counted only
+        # Whether the stream belongs to another sensor; then its samples are counted only
         self.refused = False
         # Whether nobody has named the sensor. The stream is then held as soon as it has a value on
         # an axis that the sensor lacks.

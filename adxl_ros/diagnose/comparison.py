@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 from adxl_ros.files.recording_columns import JOINTS, LONGEST_MOVE_NS, Recording, USUAL_GAPS
@@ -58,6 +58,9 @@ specific force then changes by less than the noise within a second."""
 SETTLING_S = 0.3
 """A sample rests if no joint moves within this time before it, s. Chosen: an RC filter of 15 Hz
 has settled."""
+_MOVED = 0.5
+"""Share of the scatter within a rest that its reference leaves, below which it is motion. Chosen:
+noise leaves all of it, and a reference that is in phase less than half."""
 _LONGEST_S = 1e3  # Time since the last move where there was none, s. Chosen: beyond any creep
 _LONGEST_BRIDGE_S = LONGEST_MOVE_NS / 1e9
 """Longest time without a reading of a joint that is bridged, s: that of a move."""
@@ -317,7 +320,7 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None) -> 
                 _MOST_STEPS / max(float(np.ptp(time_s)), 1.0),
             ),
         )
-    at_rest = _at_rest(motion, time_s, reference, volts)
+    at_rest = _at_rest(motion, time_s, reference, volts / sensor.scale_v_per_g * G0_MPS2)
     # Where another simulator moves from its first sample on, the filter has not settled.
     used = at_rest | (time_s > time_s[0] + SETTLING_S) | (reference is not Reference.SIMULATOR)
     return BaselineComparison(
@@ -379,13 +382,18 @@ def _motion(
     return Motion(
         float(recording.time_s[-1] - recording.time_s[0]),
         internal_rate_hz=1e-3,
-        force=lambda time_s: [np.full(len(time_s), f) for f in force],
+        force=partial(_constant, force),
         **paths,
     ), Reference.NONE
 
 
+def _constant(force: Sequence[float], time_s: np.ndarray) -> list[np.ndarray]:
+    """Return components that stay, at times, (n,)."""
+    return [np.full(len(time_s), component) for component in force]
+
+
 def _at_rest(
-    motion: Motion, time_s: np.ndarray, reference: Reference, volts: np.ndarray
+    motion: Motion, time_s: np.ndarray, reference: Reference, output_mps2: np.ndarray
 ) -> np.ndarray:
     """Return which samples rest, (n,) bool."""
     if reference is Reference.NONE:
@@ -393,13 +401,23 @@ def _at_rest(
     if reference is Reference.SIMULATOR:
         from adxl_ros.signals.rest_detection import find_rests
 
+        assert motion.force is not None, 'the reference states it'
         # The force of another simulator may be noisy, so that the sensor itself shows its rests.
-        finite, at_rest = np.isfinite(volts).all(axis=1), np.zeros(len(time_s), bool)
-        for rest in find_rests(time_s[finite], volts[finite], stamped_rate_hz(time_s)):
-            at_rest |= (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
+        finite, at_rest = np.isfinite(output_mps2).all(axis=1), np.zeros(len(time_s), bool)
+        for rest in find_rests(time_s[finite], output_mps2[finite], stamped_rate_hz(time_s)):
+            rows = (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
+            output = output_mps2[rows & finite]
+            stated = np.array(motion.force(time_s[rows & finite])[: output.shape[1]]).T
+            # A sensor that always moves has no quiet part that would show what moves.
+            at_rest |= rows & (_scatter(output - stated) > _MOVED * _scatter(output))
         return at_rest
     rates = [motion.alpha(time_s, 1), motion.beta(time_s, 1), motion.shift(time_s, 2)]
     return time_since_move_s(time_s, rates) > SETTLING_S
+
+
+def _scatter(values: np.ndarray) -> float:
+    """Return the mean square of values, (n, m), about their means."""
+    return float(np.mean(np.var(values, axis=0)))
 
 
 def direction_of_last_move(rate: np.ndarray, smallest: float = _REST_RATE) -> np.ndarray:

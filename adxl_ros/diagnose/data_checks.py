@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from os.path import basename
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from adxl_ros.diagnose import comparison as baseline, noise_effects, reference_checks
 from adxl_ros.diagnose.comparison import BaselineComparison, compare, SMALLEST_MOTION_G
@@ -26,6 +26,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Detector
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import option
 from adxl_ros.signals import gravity_at_rest
 from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.signals.gravity_at_rest import GravityFaultKind, RestReadings
@@ -62,9 +63,10 @@ _CORRELATED = 0.9
 _SAME_CORRELATION = 0.01
 """Correlations that differ by less are equal, and the one of the longest overlap counts. Chosen: a
 motion that repeats fits at several shifts."""
-_LARGEST_STEP_S = 1.0
+_LARGEST_STEP_S = 4.0
 """Largest step of a clock that is looked for anywhere, s; of a larger one, the parts tell. Chosen:
-what the effect of a time offset covers."""
+a quarter of a part."""
+_COARSE_S = 0.05  # Step of the search for a step, s. Chosen: below a period of most motion
 _SMALLEST_STEP_S = 5e-3  # Smallest step of a clock, s. Chosen: less is jitter
 _LARGEST_ERROR_RATIO = 0.5
 """A shift shows if it reduces 1 − correlation below this share. Chosen: noise that is not shifted
@@ -170,6 +172,10 @@ class DataFault(Exception):
     def __post_init__(self) -> None:
         assert self.name in DATA_FAULTS, 'a fault has a meaning for reports'
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copy and pickle it, which exceptions with names do not by themselves."""
+        return DataFault, (self.name, self.message, self.status, self.comparisons)
+
 
 def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> None:
     """
@@ -196,7 +202,8 @@ def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> N
         fault = gravity_at_rest.look(readings, gravity_at_rest.IDEAL, gravity_mps2).fault
         if fault is not None and fault.is_clear:
             raise DataFault(
-                fault.data_fault, f'{sim.force.name}: {fault.stated_by("--sim-unit ")}'
+                fault.data_fault,
+                f'{sim.force.name}: {fault.stated_by(option(sim_unit=fault.symbol))}',
             )
         # A simulator may have the errors of a sensor, but none beyond its tolerance.
         tolerance = gravity_at_rest.nominal_tolerance(sensor)
@@ -217,26 +224,28 @@ def _align_force(
     """
     force, notes = sim.force, []
     assert isinstance(force, ForcePath)
-    _check_one_shift(recording, sensor, force)
     late_s = _find_shift(recording, sensor, force)
     _check_step(recording, sensor, force, late_s or 0.0)
+    _check_one_shift(recording, sensor, force)
     shift = f'{abs(late_s):.4f} s {"late" if late_s > 0 else "early"}' if late_s else ''
     if late_s and may_shift:
         force = force.shifted(-late_s)
         notes = [
-            f'--align: {force.name} was {shift}, and is shifted by {-late_s:+.6g} s; a '
+            f'{option(align=True)}: {force.name} was {shift}, and is shifted by '
+            f'{-late_s:+.6g} s; a '
             'latency of the sensor is a part of that and cannot show'
         ]
     elif may_shift:
         notes = [
-            f'--align: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may be an '
+            f'{option(align=True)}: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may '
+            'be an '
             'effect of the sensor (time_offset), and nothing is shifted'
         ]
     covered, begin_s, end_s = _covered(recording, force)
     span = f'it is from {begin_s:.6g} to {end_s:.6g} s'
     if not len(covered):
         advice = (
-            f'its motion fits, but is {shift}; use --align'
+            f'its motion fits, but is {shift}; use {option(align=True)}'
             if shift
             else 'no shift makes its motion fit; give that of this recording'
         )
@@ -249,7 +258,8 @@ def _align_force(
     if late_s and not may_shift:
         raise DataFault(
             'time_misaligned',
-            f'{force.name} is {shift}; use --align, or shift its stamps by {-late_s:+.6g} s',
+            f'{force.name} is {shift}; use {option(align=True)}, or shift its stamps by '
+            f'{-late_s:+.6g} s',
         )
     if len(covered) < len(recording):
         outside_s = (1 - len(covered) / len(recording)) * float(np.ptp(recording.time_s))
@@ -320,7 +330,7 @@ class _Motions(NamedTuple):
     def best_shift_s(self, near_s: np.ndarray) -> float:
         """Return the shift that leaves least, near some, s, (k,)."""
         best_s = min(near_s.tolist(), key=self.left_g2)
-        ends_s = best_s - self.step_s, best_s + self.step_s
+        ends_s = best_s - _COARSE_S, best_s + _COARSE_S
         found = scipy.optimize.minimize_scalar(self.left_g2, bounds=ends_s, method='bounded')
         return float(found.x)
 
@@ -452,16 +462,16 @@ def _drift_fault(drift: _Drift, recording: Recording, force: ForcePath) -> DataF
     # The number of a sample tells its time only where none is missing.
     counts_time = steps_s.max() < _USUAL_STEP * np.median(steps_s)
     own_correction = (
-        f'use --rate {recording.rate_hz / (1 + ratio):.6g}'
+        f'use {option(rate=f"{recording.rate_hz / (1 + ratio):.6g}")}'
         if counts_time
-        else f'multiply its stamps by {1 + ratio:.6g} (--rate would miss the gaps)'
+        else f'multiply its stamps by {1 + ratio:.6g} ({option("rate")} would miss the gaps)'
     )
     return DataFault(
         'clock_drift',
         f'the clocks of {force.name} and of the recording drift apart by '
         f'{100 * abs(ratio):.3g} s in 100 s, so that no shift fits from begin to end; if that of '
         f'the recording is wrong, {own_correction}, else divide the stamps of {force.name} by '
-        f'{1 + ratio:.6g}; a shift that is left then needs --align',
+        f'{1 + ratio:.6g}; a shift that is left then needs {option(align=True)}',
     )
 
 
@@ -493,13 +503,14 @@ def _step_fault(force: ForcePath, step_s: float, at_s: float) -> DataFault:
     return DataFault(
         'clock_jump',
         f'the clock of {force.name} or that of the recording steps by {abs(step_s):.2g} s at '
-        f'about {at_s:.4g} s; cut the recording there, and diagnose each part with --align',
+        f'about {at_s:.4g} s; cut the recording there, and diagnose each part with '
+        f'{option(align=True)}',
     )
 
 
 def _check_step(recording: Recording, sensor: Sensor, force: ForcePath, about_s: float) -> None:
     """
-    Refuse motions whose shift steps by some tenths of a second, wherever it does.
+    Refuse motions whose shift steps by some seconds at most, wherever it does.
 
     A step shows if two shifts leave far less than one, and than shifts that drift. It needs no
     whole parts on both sides: a recording may move for some seconds only before its step.
@@ -507,32 +518,24 @@ def _check_step(recording: Recording, sensor: Sensor, force: ForcePath, about_s:
     motions = _motions(recording, sensor, force)
     if motions is None:
         return
-    # What all shifts can be compared in
+    # What all shifts can be compared in, without gaps
     begin_s, end_s = motions.stated_s[[0, -1]] - about_s + np.array([1, -1]) * _LARGEST_STEP_S
-    inside = np.flatnonzero((motions.measured_s > begin_s) & (motions.measured_s < end_s))
-    motions = motions.part(inside[:: 1 + len(inside) // _FINE_SAMPLES])
+    inside = (motions.measured_s > begin_s) & (motions.measured_s < end_s)
+    before = np.searchsorted(recording.time_s, motions.measured_s, 'right') - 1
+    inside &= np.diff(recording.time_s, append=np.inf)[before] < _COARSE_S + 2 / recording.rate_hz
+    compared = np.flatnonzero(inside)
+    motions = motions.part(compared[:: 1 + len(compared) // _FINE_SAMPLES])
     rows = np.arange(len(motions.measured_s))
     if not len(rows):
         return
-    near_s = about_s + np.arange(-_LARGEST_STEP_S, _LARGEST_STEP_S, motions.step_s)
+    near_s = about_s + np.union1d(
+        np.arange(-_LARGEST_STEP_S, _LARGEST_STEP_S, _COARSE_S),
+        np.arange(-LARGEST_LATENCY_S, LARGEST_LATENCY_S, motions.step_s),
+    )
     one_s = motions.best_shift_s(near_s)
-    one_g = motions.stated_at(one_s)
-    own_g = motions.measured_g - (motions.measured_g - one_g).mean(axis=0)
-    motions = motions._replace(measured_g=own_g)
-
-    def error_g2(stated_g: np.ndarray) -> np.ndarray:
-        return np.cumsum(((own_g - stated_g) ** 2).sum(axis=1))
-
-    one_g2 = error_g2(one_g)
-    best_g2, first = 0.0, 0  # First row behind the step
-    for other_s in near_s:
-        gain_g2 = one_g2 - error_g2(motions.stated_at(other_s))
-        for row, gained_g2 in (
-            (int(gain_g2.argmax()), gain_g2.max()),
-            (int(gain_g2.argmin()), gain_g2[-1] - gain_g2.min()),
-        ):
-            if gained_g2 > best_g2:
-                best_g2, first = gained_g2, row + 1
+    zero_g = (motions.measured_g - motions.stated_at(one_s)).mean(axis=0)
+    motions = motions._replace(measured_g=motions.measured_g - zero_g)
+    first = _first_row_behind(motions, one_s, near_s)
     if min(first, len(rows) - first) * motions.step_s < LARGEST_LATENCY_S:
         return
     before_s, after_s = (
@@ -546,14 +549,31 @@ def _check_step(recording: Recording, sensor: Sensor, force: ForcePath, about_s:
         raise _step_fault(force, after_s - before_s, at_s)
 
 
+def _first_row_behind(motions: _Motions, one_s: float, near_s: np.ndarray) -> int:
+    """Return the row on one side of which another shift gains most, of some, s, (k,)."""
+    own_g, one_g = motions.measured_g, motions.stated_at(one_s)
+    most_g2, first = 0.0, 0
+    for other_s in near_s:
+        other_g = motions.stated_at(other_s)
+        gain_g2 = np.cumsum(((own_g - one_g) ** 2 - (own_g - other_g) ** 2).sum(axis=1))
+        for row, gained_g2 in (
+            (gain_g2.argmax(), gain_g2.max()),
+            (gain_g2.argmin(), gain_g2[-1] - gain_g2.min()),
+        ):
+            if gained_g2 > most_g2:
+                most_g2, first = gained_g2, int(row) + 1
+    return first
+
+
 def _time_of_step(motions: _Motions, before_s: float, after_s: float) -> float:
     """Return from when on the second of two shifts explains the recording better, s."""
     before_g2, after_g2 = (
         ((motions.measured_g - motions.stated_at(np.array(late_s))) ** 2).sum(axis=1)
         for late_s in (before_s, after_s)
     )
-    better = np.cumsum(before_g2 - after_g2)
-    return float(motions.measured_s[np.argmin(better)])
+    last = int(np.argmin(np.cumsum(before_g2 - after_g2)))
+    # In the middle of a gap
+    return float(motions.measured_s[last : last + 2].mean())
 
 
 def _unexplained(measured: np.ndarray, stated: np.ndarray) -> float:
@@ -962,7 +982,7 @@ def _check_output(comparison: BaselineComparison) -> None:
         raise DataFault(
             'unit',
             f'{sensor.axes[worst]} is at {level_g[worst]:.3g} g; correct the '
-            'unit of its column, or --params',
+            f'unit of its column, or {option("sensor")}',
         )
 
 
@@ -1030,7 +1050,7 @@ def _check_rest(comparison: BaselineComparison, finite: np.ndarray) -> None:
             'reference',
             f'{comparison.sensor.axes[worst]} moves by '
             f'{range_g[worst]:.2f} g, but no stage angles that change; give '
-            'alpha_rad and beta_rad, or --sim with the specific force of the same '
+            f'alpha_rad and beta_rad, or {option("sim")} with the specific force of the same '
             'manoeuvre',
         )
 
@@ -1084,7 +1104,11 @@ def _check_axes(comparison: BaselineComparison) -> None:
                 'unit',
                 f'the output is {np.median(gains):.4g} times the simulated '
                 f'output, as values in {units} are; correct the unit of the columns'
-                + (', by --unit or --sim-unit' if comparison.simulated_force else ''),
+                + (
+                    f', by {option("unit")} or {option("sim_unit")}'
+                    if comparison.simulated_force
+                    else ''
+                ),
             )
     largest = float(np.max(np.abs(correlation)))
     if largest < _UNCORRELATED:

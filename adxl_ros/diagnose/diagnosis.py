@@ -31,7 +31,7 @@ from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemai
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
 from adxl_ros.diagnose.search import Hypothesis, linearise, Search
 from adxl_ros.diagnose.verdict import HEALTHY, HeldOutFits, MATERIAL_MG, Verdict
-from adxl_ros.files.recording_columns import check_unit, Recording
+from adxl_ros.files.recording_columns import check_same_sensor, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named, library
@@ -235,7 +235,7 @@ def check(
     if not sensor.effects:
         sensor = with_axes(sensor, recordings[0].axes)
     for recording in recordings:
-        check_unit(recording.stream_info, recording.axes, sensor)
+        check_same_sensor(recording.stream_info, recording.axes, sensor)
         follows_stage = sim is None and {'alpha_rad', 'beta_rad'} <= {*recording.columns}
         # The angles of a stage show the unit of each axis, its sign, and which axis it is.
         if not follows_stage:

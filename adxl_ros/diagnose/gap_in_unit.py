@@ -12,6 +12,7 @@ from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import option
 from adxl_ros.signals.block_statistics import rms
 import numpy as np
 import scipy
@@ -36,7 +37,7 @@ class GapInUnit(NamedTuple):
 
     quantity: str
     unit: str
-    before: float  # Recording and simulation by --params
+    before: float  # Recording and simulation by the sensor that was given
     after: float  # Recording and simulation by params.yaml
     floor: float  # Two simulations, one with noise
 
@@ -66,7 +67,7 @@ def velocity_mps(time_s: np.ndarray, recorded: np.ndarray, simulated: np.ndarray
     within = later < len(time_s)
     if not within.any():
         raise UserError(
-            f'--in velocity: integrates for {INTEGRATED_S:g} s, but the recording '
+            f'{option(quantity="velocity")}: integrates for {INTEGRATED_S:g} s, but the recording '
             f'has {np.ptp(time_s):.3g} s'
         )
     gained = velocity[later[within]] - velocity[: len(time_s)][within]
@@ -89,7 +90,7 @@ def quantity(text: str) -> Quantity:
         return Quantity(name, getattr(figure, 'unit', ''), figure)
     except (ImportError, AttributeError, ValueError) as error:
         raise UserError(
-            f'--in {text}: {one_line(error)}; give {", ".join(_QUANTITIES)}, or '
+            f'{option(quantity=text)}: {one_line(error)}; give {", ".join(_QUANTITIES)}, or '
             'MODULE:FUNCTION of a module that Python can import'
         ) from None
 
@@ -113,7 +114,7 @@ def gap_in(
             raise
         except Exception as error:
             raise UserError(
-                f'--in {chosen.name}: {type(error).__name__}: {one_line(error)}'
+                f'{option(quantity=chosen.name)}: {type(error).__name__}: {one_line(error)}'
             ) from None
 
     before = [figure(c, c.volts, baseline) for c in comparisons]

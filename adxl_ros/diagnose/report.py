@@ -17,6 +17,7 @@ from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern, Need
 from adxl_ros.model.sensor import fitted_of, get, parameter_of, with_neutral
+from adxl_ros.process import option
 from adxl_ros.report import quantities
 from adxl_ros.report.quantities import amplitude_text, Interval, listed, mg_text, percent
 from adxl_ros.report.screen import COLUMNS, wrapped
@@ -535,7 +536,7 @@ def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]
     if row.shows:
         return effect.name, smallest, typical, ''
     revealed_by = effect.diagnosis.revealed_by
-    reference = 'needs --urdf' if Need.ROBOT in effect.needs else 'needs --sim'
+    reference = f'needs {option("urdf" if Need.ROBOT in effect.needs else "sim")}'
     missing = (
         reference
         if effect.concern is Concern.REFERENCE

@@ -19,6 +19,7 @@ import tempfile
 from typing import BinaryIO
 
 from adxl_ros.errors import UserError
+from adxl_ros.process import option
 
 AnyPath = str | os.PathLike  # A path, as the functions of Python take it
 _SUFFIX = '.part'  # End of the names of directories in which new files are written
@@ -123,20 +124,14 @@ def _refuse_folder_of_others(path: Path) -> None:
         )
 
 
-def require_own(
-    path: AnyPath, may_overwrite: bool = False, permission: str = 'overwrite=True'
-) -> None:
-    """
-    Refuse to replace a file or folder that others wrote or changed, but for an empty folder.
-
-    may_overwrite: whether the user permits it; permission: how the user does, for the message.
-    """
+def require_own(path: AnyPath, may_overwrite: bool = False) -> None:
+    """Refuse to replace what others wrote or changed, unless the user permits it."""
     target = Path(path)
     is_empty_folder = target.is_dir() and not any(target.iterdir())
     if target.exists() and not (may_overwrite or is_own(target) or is_empty_folder):
         raise UserError(
             f'{path}: is there already, and was not written by this package, or was changed '
-            f'since; choose another name, or replace it with {permission}'
+            f'since; choose another name, or replace it with {option(overwrite=True)}'
         )
 
 
@@ -223,7 +218,8 @@ def append_line(file: FileIO, line: str) -> None:
 
 
 _KEPT_BYTES = 256 << 20
-"""Part of a file that stays in the cache for whoever reads it next (chosen)."""
+"""Part of a file that stays in the cache for whoever reads it next: a recording of an hour at 1
+kHz is smaller, and every computer has so much to spare."""
 
 
 def release_written(file: BinaryIO) -> None:

@@ -24,6 +24,7 @@ from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.recording_columns import NOMINAL_KEYS
 from adxl_ros.model.constants import MEASURED_AXES
+from adxl_ros.process import option
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
@@ -54,7 +55,8 @@ _INDEX_BYTE = 32
 size of the message indices."""
 _CHUNK_BYTES = 1 << 20  # Size that a chunk hardly exceeds, bytes; that of rosbags
 _LARGE_BYTES = 2 << 30
-"""Size from which a file that is read leaves the cache (chosen): smaller ones are read again."""
+"""Size from which a file that is read leaves the cache. Smaller ones are read again by the next
+tool; larger ones would push out what other programs have there."""
 _PIECE_MESSAGES = 4096  # Messages that are collected to a piece (chosen: some MB)
 
 Raws = Sequence[bytes] | np.ndarray
@@ -411,17 +413,24 @@ def find_topics(bag: Bag, topic: str = '', has_stage: bool = True) -> Topics:
     if info is None and (is_own or [kind for _, kind in bag.types].count(IMU) == 1):
         info = _only(bag, 'sensor_info', DIAGNOSTIC_STATUS)
     space = joints.removesuffix('joint_states') if joints else f'{space}stage/'
-    return Topics(imu, joints, info, temperature, supply, beside('command', JOINT_STATE))
+    return Topics(
+        imu=imu,
+        joints=joints,
+        info=info,
+        temperature=temperature,
+        supply=supply,
+        command=beside('command', JOINT_STATE),
+    )
 
 
-def choose_topic(bag: Bag, kind: str, own: str, named: str, option: str = '--topic') -> str:
+def choose_topic(bag: Bag, kind: str, own: str, named: str, argument: str = 'topic') -> str:
     """Return the topic of a type that the user has named, that of the usual name, or the only."""
     topics = sorted(topic for topic, other in bag.types if other == kind)
     if not topics:
         held = ', '.join(f'{topic} ({kind})' for topic, kind in sorted(bag.types))
+        cut = f'; {bag.cut}' if bag.cut else ''
         raise UserError(
-            f'{bag.path}: no topic of type {kind}; it holds {held or "no messages"}'
-            + f'; {bag.cut}' * bool(bag.cut)
+            f'{bag.path}: no topic of type {kind}; it holds {held or "no messages"}{cut}'
         )
     chosen = (
         [topic for topic in topics if topic.strip('/') == named.strip('/')]
@@ -431,7 +440,7 @@ def choose_topic(bag: Bag, kind: str, own: str, named: str, option: str = '--top
     if len(chosen) != 1:
         raise UserError(
             f'{bag.path}: {len(chosen) or "no"} topics {named or kind}; choose one '
-            f'with {option}: {", ".join(chosen or topics)}'
+            f'with {option(argument)}: {", ".join(chosen or topics)}'
         )
     return chosen[0]
 
@@ -449,7 +458,7 @@ def _only(bag: Bag, name: str, kind: str) -> str | None:
     if len(topics) > 1:
         raise UserError(
             f'{bag.path}: several topics {name}: {", ".join(topics)}; record one '
-            f'sensor, or choose one: --topic {topics[0]}'
+            f'sensor, or choose one: {option(topic=topics[0])}'
         )
     return topics[0] if topics else None
 

@@ -22,7 +22,7 @@ from adxl_ros.files.bag_messages import (
 )
 from adxl_ros.files.column_mapping import (
     AS_IT_IS,
-    DROP_SAMPLES,
+    drop_samples,
     GRAVITY,
     LSB,
     Quantity,
@@ -43,6 +43,7 @@ from adxl_ros.files.recording_columns import (
     Track,
 )
 from adxl_ros.model.constants import AXES, MEASURED_AXES
+from adxl_ros.process import option
 import numpy as np
 
 _ABSENT_VARIANCE = 1e5
@@ -58,8 +59,8 @@ def blocks(
     with open_bag(path) as bag:
         if reading.mapping is not None:
             raise UserError(
-                f'{bag.path}: is a bag, which has no columns; leave --columns out: '
-                '--topic names a topic, and --unit states its unit'
+                f'{bag.path}: is a bag, which has no columns; leave {option("columns")} out: '
+                f'{option("topic")} names a topic, and {option("unit")} states its unit'
             )
         topics = find_topics(bag, reading.topic, has_stage=not ideal)
         info = read_info(bag, topics.info)
@@ -95,7 +96,7 @@ class _Samples:
         self._unit = reading.unit or 'mps2'  # Unit of the accelerations of the topic
         if UNITS[Quantity.OUTPUT][self._unit].is_volts:
             raise UserError(
-                f'--unit {self._unit}: {where} has accelerations; write one of '
+                f'{option(unit=self._unit)}: {where} has accelerations; write one of '
                 f'{", ".join((*GRAVITY, LSB))}'
             )
         reading.check_counts(where, dict.fromkeys(ACCEL, self._unit))
@@ -112,9 +113,8 @@ class _Samples:
                 **dict(zip(GYRO, table.numbers('angular_velocity').T)),
             },
         )
-        readings, gyro_radps = (
-            np.column_stack([columns[name] for name in names]) for names in (ACCEL, GYRO)
-        )
+        readings = np.column_stack([columns[name] for name in ACCEL])
+        gyro_radps = np.column_stack([columns[name] for name in GYRO])
         force = self._reading.outputs(readings, 3 * [self._unit])
         # A value beyond every gyroscope is no reading.
         gyro_radps[~(np.abs(gyro_radps) <= LIMIT)] = np.nan
@@ -138,7 +138,7 @@ class _Samples:
         wrong = is_kept[:, None] & ~(np.abs(force) <= LIMIT)
         if wrong.any():
             row, axis = np.argwhere(wrong)[0]
-            advice = '' if np.isfinite(force[row, axis]) else f'; {DROP_SAMPLES}'
+            advice = '' if np.isfinite(force[row, axis]) else f'; {drop_samples()}'
             raise UserError(
                 f'{place(row)}: linear_acceleration.{AXES[axis]} is '
                 f'{force[row, axis]:g} m/s², expected a number within ±{LIMIT:g}'
@@ -152,10 +152,12 @@ class _Samples:
     @property
     def remarks(self) -> tuple[str, ...]:
         """Return what was left out, for people."""
-        left_out = (
-            f'{self.where}: left out, samples without a number on each axis: {self.incomplete}'
+        if not self.incomplete:
+            return self.stamps.remarks
+        return (
+            f'{self.where}: left out, samples without a number on each axis: {self.incomplete}',
+            *self.stamps.remarks,
         )
-        return (*[left_out] * bool(self.incomplete), *self.stamps.remarks)
 
     def _begin(self, first: Raws, stamp_ns: int) -> None:
         self._first_ns = stamp_ns
@@ -313,16 +315,16 @@ def _block(
     time_s = (stamp_ns - samples.epoch_ns) / 1e9
     cut = f'{bag.cut}; the last sample read is at {seconds(stamp_ns[-1])}' if bag.cut else ''
     return Recording(
-        bag.path,
-        time_s,
-        columns,
-        dict(info),
-        alignments,
-        cut,
-        samples.epoch_ns,
-        bag.done,
-        samples.remarks,
-        samples.stamps.bad,
+        path=bag.path,
+        time_s=time_s,
+        columns=columns,
+        info=dict(info),
+        alignments=alignments,
+        cut=cut,
+        epoch_ns=samples.epoch_ns,
+        done=bag.done,
+        remarks=samples.remarks,
+        bad_stamps=samples.stamps.bad,
     )
 
 

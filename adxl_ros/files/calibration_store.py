@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The calibration store: a folder for each unit, and in it a parameter file for each calibration.
+The calibration store: a folder for each sensor, and in it a parameter file for each calibration.
 
 Its name is serial number, date (UTC) and the beginning of the data's SHA-256, such as
-`17-20261121T143000Z-5f3a09c1`, so that the files of a unit sort by date. Files that people add
+`17-20261121T143000Z-5f3a09c1`, so that the files of a sensor sort by date. Files that people add
 count by the date inside. The population of a fleet is a file of its own.
 """
 
@@ -25,7 +25,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.files.parameter_file import compose
-from adxl_ros.files.recording_columns import NO_UNIT
+from adxl_ros.files.recording_columns import NO_SERIAL
 from adxl_ros.model.population import PooledCoefficient, Population
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import command, package_version
@@ -42,14 +42,14 @@ _HASH_DIGITS = 8
 
 
 class StoredCalibration(NamedTuple):
-    """One calibration of a unit."""
+    """One calibration of a sensor."""
 
     path: Path
     sensor: Sensor
 
 
-class UnitHistory(NamedTuple):
-    """All calibrations of a unit."""
+class SensorHistory(NamedTuple):
+    """All calibrations of a sensor."""
 
     calibrations: list[StoredCalibration]  # Oldest first; those without a date come before them
     refused: list[str]  # Why further files cannot be used
@@ -73,7 +73,7 @@ def calibration_id(sensor: Sensor) -> str:
 
 
 def _version(sensor: Sensor) -> str:
-    """Return date and hash, which differ between the calibrations of a unit and sort by date."""
+    """Return date and hash, which differ between the calibrations of a sensor and sort by date."""
     date = date_of(sensor)
     text = f'{date:{_DATE}}' if date else '00000000T000000Z'
     checksum = sensor.provenance.get('data_sha256', '')[:_HASH_DIGITS]
@@ -94,8 +94,8 @@ def date_in(text: str) -> datetime | None:
     return date.astimezone(timezone.utc) if date.tzinfo else date.replace(tzinfo=timezone.utc)
 
 
-def unit_folder(folder: AnyPath, serial: str) -> Path:
-    """Return the folder of a unit."""
+def sensor_folder(folder: AnyPath, serial: str) -> Path:
+    """Return the folder of a sensor."""
     return Path(folder) / _name(serial)
 
 
@@ -111,24 +111,24 @@ def _name(serial: str) -> str:
 
 def put(folder: AnyPath, sensor: Sensor, comments: Iterable[str] = ()) -> Path | None:
     """Store a calibration."""
-    if sensor.serial == NO_UNIT:
+    if sensor.serial == NO_SERIAL:
         return None
-    folder_of_unit = unit_folder(folder, sensor.serial)
+    folder_of_sensor = sensor_folder(folder, sensor.serial)
     try:
-        folder_of_unit.mkdir(parents=True, exist_ok=True)
+        folder_of_sensor.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(
-            f'{folder_of_unit}: cannot be made: {error.strerror}; name another store'
+            f'{folder_of_sensor}: cannot be made: {error.strerror}; name another store'
         ) from None
-    path = folder_of_unit / f'{_name(sensor.serial)}-{_version(sensor)}.yaml'
+    path = folder_of_sensor / f'{_name(sensor.serial)}-{_version(sensor)}.yaml'
     parameter_file.save(path, sensor, comments)
     return path
 
 
-def history(folder: AnyPath, serial: str) -> UnitHistory:
-    """Return the calibrations of a unit by date."""
+def history(folder: AnyPath, serial: str) -> SensorHistory:
+    """Return the calibrations of a sensor by date."""
     calibrations, refused = [], []
-    for path in sorted(unit_folder(folder, serial).glob('*.yaml')):
+    for path in sorted(sensor_folder(folder, serial).glob('*.yaml')):
         try:
             sensor = parameter_file.load(path)
             if sensor.serial != serial:
@@ -138,11 +138,11 @@ def history(folder: AnyPath, serial: str) -> UnitHistory:
             continue
         calibrations.append(StoredCalibration(path, sensor))
     calibrations.sort(key=lambda stored: date_of(stored.sensor) or _OLDEST)
-    return UnitHistory(calibrations, refused)
+    return SensorHistory(calibrations, refused)
 
 
 def newest(folder: AnyPath, serial: str, check: Callable[[Sensor], None]) -> Choice:
-    """Return the newest calibration of a unit that can be used."""
+    """Return the newest calibration of a sensor that can be used."""
     calibrations, refused = history(folder, serial)
     for path, sensor in reversed(calibrations):
         try:
@@ -155,11 +155,11 @@ def newest(folder: AnyPath, serial: str, check: Callable[[Sensor], None]) -> Cho
 
 
 def newer(folder: AnyPath, sensor: Sensor) -> Path | None:
-    """Return the newest file of a unit if its name has a later date; no file is read."""
+    """Return the newest file of a sensor if its name has a later date; no file is read."""
     begin = f'{_name(sensor.serial)}-'
     files = [
         path
-        for path in unit_folder(folder, sensor.serial).glob('*.yaml')
+        for path in sensor_folder(folder, sensor.serial).glob('*.yaml')
         if re.match(r'\d{8}T\d{6}Z', path.name.removeprefix(begin))
     ]
     last, date = max(files, default=None), date_of(sensor)

@@ -159,7 +159,8 @@ class Table:
 
     def stamp_ns(self) -> np.ndarray:
         """Return the headers' stamps, ns, (n,) int64."""
-        sec, nanosec = (self.numbers(name)[:, 0].astype(np.int64) for name in ('sec', 'nanosec'))
+        sec = self.numbers('sec')[:, 0].astype(np.int64)
+        nanosec = self.numbers('nanosec')[:, 0].astype(np.int64)
         return sec * 1_000_000_000 + nanosec
 
 

@@ -7,13 +7,14 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import partial
 from pathlib import Path
 import re
-import shlex
 from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, G0_MPS2, MEASURED_AXES
+from adxl_ros.process import option
 import numpy as np
 
 _EXAMPLE = 'time=t_ms:ms,x=accX:mg,y=accY:mg,z=accZ:mg'  # A mapping, for messages
@@ -84,14 +85,16 @@ class ColumnMapping:
     """Which columns of a file hold a recording."""
 
     sources: Mapping[str, Source]  # Column and unit by role, a key of `ROLES`
-    where: str = '--columns'  # What states the mapping, for messages
+    # What states the mapping, for messages
+    where: str = field(default_factory=partial(option, 'columns'))
 
     def __str__(self) -> str:
         """Return the text that states the mapping."""
-        return ','.join(
-            f'{role}={_quoted(column)}{":" * bool(unit)}{unit}'
-            for role, (column, unit) in self.sources.items()
-        )
+        entries = []
+        for role, (column, unit) in self.sources.items():
+            of_unit = f':{unit}' if unit else ''
+            entries.append(f'{role}={_quoted(column)}{of_unit}')
+        return ','.join(entries)
 
 
 def _quoted(column: str) -> str:
@@ -103,9 +106,9 @@ def _quoted(column: str) -> str:
 
 def parse_mapping(text: str) -> ColumnMapping:
     """Parse a mapping, or the file that holds it."""
-    where = '--columns'
+    where = option('columns')
     if '=' not in text:
-        where = f'--columns {text}'
+        where = option(columns=text)
         try:
             text = re.sub('#.*', '', Path(text).read_text(encoding='utf-8'))
         except (OSError, UnicodeDecodeError):
@@ -167,13 +170,13 @@ def parse_mounting(text: str) -> Mounting:
     mounting = {axis: (AXES.index(of), -1 if sign == '-' else 1) for axis, sign, of in entries}
     if set(mounting) != set(axes) or {AXES[index] for index, _ in mounting.values()} != set(axes):
         raise UserError(
-            f'--axes {text}: each axis of the sensor must stand once on both sides; '
+            f'{option(axes=text)}: each axis of the sensor must stand once on both sides; '
             'write for example x=-y,y=x,z=z'
         )
     signed_axes = tuple(mounting[axis] for axis in axes)
     if len(axes) == len(AXES) and _is_mirror(signed_axes):
         raise UserError(
-            f'--axes {text}: no rotation of the sensor gives this, because it turns a '
+            f'{option(axes=text)}: no rotation of the sensor gives this, because it turns a '
             'right-handed frame into a left-handed one; correct one sign, or the '
             'order of two axes'
         )
@@ -331,7 +334,9 @@ def unit_in_name(column: str, quantity: Quantity) -> str | None:
     return next((name for name in (unit_name(word, quantity) for word in words) if name), None)
 
 
-DROP_SAMPLES = '--drop-bad-samples leaves such samples out'  # For messages
+def drop_samples() -> str:
+    """Return advice for messages."""
+    return f'{option(drop_bad_samples=True)} leaves such samples out'
 
 
 @dataclass(frozen=True)
@@ -355,7 +360,8 @@ class ReadingOptions:
         stated = {sources[axis].unit for axis in AXES if axis in sources}
         if self.unit and stated - {'', self.unit}:
             raise UserError(
-                f'--unit {self.unit}: --columns states another unit; leave one of them out'
+                f'{option(unit=self.unit)}: {option("columns")} states another unit; '
+                'leave one of them out'
             )
 
     def check_counts(self, where: str, units: Mapping[str, str]) -> None:
@@ -367,17 +373,18 @@ class ReadingOptions:
         counts = [column for column, unit in units.items() if unit in (LSB, UNSIGNED)]
         if counts and not self.lsb_per_g:
             raise UserError(
-                f'{where}: {counts[0]} is in LSB; add --lsb-per-g with the counts of '
+                f'{where}: {counts[0]} is in LSB; add {option("lsb_per_g")} with the counts of '
                 '1 g, as in the datasheet'
             )
         if not counts and (self.lsb_per_g or self.lsb_at_0g):
             raise UserError(
-                f'--lsb-per-g: no column is in LSB; add --unit {LSB}, or leave '
-                '--lsb-per-g and --lsb-at-0g out'
+                f'{option("lsb_per_g")}: no column is in LSB; add {option(unit=LSB)}, or leave '
+                f'{option("lsb_per_g")} and {option("lsb_at_0g")} out'
             )
         if not {len(self.lsb_per_g), len(self.lsb_at_0g)} <= {0, 1, len(units)}:
             raise UserError(
-                f'--lsb-per-g, --lsb-at-0g: write one value for all {len(units)} '
+                f'{option("lsb_per_g")}, {option("lsb_at_0g")}: write one value '
+                f'for all {len(units)} '
                 'axes, or one for each'
             )
 
@@ -387,8 +394,10 @@ class ReadingOptions:
         zero = np.broadcast_to(np.array(self.lsb_at_0g or 0.0), len(units))
         outputs = []
         for values, unit, scale, offset in zip(readings.T, units, per_g, zero):
+            if unit == UNSIGNED:
+                values = signed(values)
             if unit in (LSB, UNSIGNED):
-                values = ((signed(values) if unit == UNSIGNED else values) - offset) / scale
+                values = (values - offset) / scale
             outputs.append(UNITS[Quantity.OUTPUT][unit].convert(values))
         return np.column_stack(outputs)
 
@@ -406,8 +415,8 @@ _LONGEST_STEP_S = 1.05  # Longest step of stamps, s. Chosen: 1 Hz, the slowest, 
 
 def listed(names: Sequence[str]) -> str:
     """Return the first names of columns for a message."""
-    further = len(names) - _LISTED_NAMES
-    return ', '.join(names[:_LISTED_NAMES]) + f' and {further} more' * (further > 0)
+    more = len(names) - _LISTED_NAMES
+    return ', '.join(names[:_LISTED_NAMES]) + (f' and {more} more' if more > 0 else '')
 
 
 def likely_unit(length: float) -> str:
@@ -440,16 +449,12 @@ def time_unit_of_step(step: float, is_whole: bool) -> str:
 
 
 def parse_unit(
-    text: str, option: str = '--unit', known: Iterable[str] = UNITS[Quantity.OUTPUT]
+    text: str, argument: str = 'unit', known: Iterable[str] = UNITS[Quantity.OUTPUT]
 ) -> str:
     """Return the name of a unit of the sensor's output, one of the known; '' for no text."""
     name = unit_name(text, Quantity.OUTPUT) if text else ''
     if name is None or (name and name not in known):
-        raise UserError(f'{option} {text}: unknown unit; write one of {", ".join(known)}')
+        raise UserError(
+            f'{option(**{argument: text})}: unknown unit; write one of {", ".join(known)}'
+        )
     return name
-
-
-def shell_quoted(text: str) -> str:
-    """Return a word for a shell, in quotes even where it needs none."""
-    quoted = shlex.quote(text)
-    return quoted if quoted != text else f"'{text}'"

@@ -330,7 +330,8 @@ def _names(line: str, delimiter: str, count: int) -> list[str] | None:
     for mark in dict.fromkeys((delimiter, ',', '\t', ';')):
         fields = _fields(text, mark)
         # A row of samples may end in a delimiter, and its header not.
-        fields += [''] * (len(fields) == count - 1 and count > 2)
+        if len(fields) == count - 1 > 1:
+            fields.append('')
         if len(fields) == count and any(fields) and not _numbers(text, mark):
             return fields
     return None

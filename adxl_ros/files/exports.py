@@ -44,7 +44,7 @@ _ABSENT = np.diag([-1.0, 0.0, 0.0])
 class Export:
     """A sensor that is written for other software."""
 
-    sensor: Sensor  # The unit
+    sensor: Sensor  # The sensor
     source: str  # Name of its parameter file
     holds: Mapping[str, str]  # Place in the file by name of the part that it holds
     # Rms of what each part of the sensor changes, mg, by its name: effects but those of the stage,
@@ -86,28 +86,12 @@ def axes(sensor: Sensor) -> list[Axis]:
     step = noise.electronics(sensor).lsb_v * mps2_per_v
     std = noise.analog_std_v(sensor) * mps2_per_v
     density = np.sqrt(noise.density_v2_per_hz(sensor, np.zeros(1)))[0] * mps2_per_v
-    walk, returns = (
-        np.broadcast_to(sensor.values.get('bias_walk', {}).get(name, 0.0), len(sensor.axes))
-        for name in ('density_g_per_rts', 'return_per_s')
-    )
-    return [
-        Axis(
-            name,
-            *(
-                float(values[d])
-                for values in (
-                    zero_g,
-                    std,
-                    std**2 + step**2 / 12,
-                    density,
-                    walk * G0_MPS2,
-                    returns,
-                    step,
-                )
-            ),
-        )
-        for d, name in enumerate(sensor.axes)
-    ]
+    of_walk, count = sensor.values.get('bias_walk', {}), len(sensor.axes)
+    walk = np.broadcast_to(of_walk.get('density_g_per_rts', 0.0), count) * G0_MPS2
+    returns = np.broadcast_to(of_walk.get('return_per_s', 0.0), count)
+    # The columns are the fields of `Axis` behind its name.
+    fields = np.column_stack([zero_g, std, std**2 + step**2 / 12, density, walk, returns, step])
+    return [Axis(name, *values) for name, values in zip(sensor.axes, fields.tolist())]
 
 
 def by_axis(sensor: Sensor, field: str) -> tuple[float, ...]:

@@ -94,13 +94,13 @@ def turned(raw: bytes, mounting: Mounting) -> bytes:
             order + '4d', message, begin, *mounting.rotate_orientation(orientation(raw))
         )
     rate = struct.unpack_from(order + '12d', raw, begin + _ANGULAR_VELOCITY)
-    if rate[3] != -1.0:
+    if rate[_VECTOR] != -1.0:
         struct.pack_into(
             order + '12d',
             message,
             begin + _ANGULAR_VELOCITY,
-            *mounting.rotate(rate[:3]),
-            *mounting.rotate_matrix(rate[3:]),
+            *mounting.rotate(rate[:_VECTOR]),
+            *mounting.rotate_matrix(rate[_VECTOR:]),
         )
     return bytes(message)
 

@@ -3,7 +3,7 @@
 """
 Recordings from the columns of a table: units, stamps and references become the package's.
 
-Where a table is not understood, `propose` finds the mapping that it most likely needs.
+Where a table is not understood, `mapping_proposal` finds the mapping that it most likely needs.
 """
 
 from __future__ import annotations
@@ -14,19 +14,13 @@ import re
 from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import (
     ColumnMapping,
-    Columns,
-    DROP_SAMPLES,
-    GRAVITY,
+    drop_samples,
     GYRO_ROLES,
     is_sensor_step,
-    likely_unit,
     listed,
-    LSB,
     Quantity,
     ReadingOptions,
     ROLES,
-    shell_quoted,
-    signed,
     Source,
     Table,
     TableBlock,
@@ -35,7 +29,6 @@ from adxl_ros.files.column_mapping import (
     unit_in_name,
     unit_name,
     UNITS,
-    UNSIGNED,
 )
 from adxl_ros.files.recording_columns import (
     ACCEL,
@@ -49,9 +42,10 @@ from adxl_ros.files.recording_columns import (
     TIME,
     VOLTS,
 )
-from adxl_ros.files.stamps import burst_samples, describe_bursts, stamped_rate_hz
+from adxl_ros.files.stamps import describe_bursts, stamped_rate_hz
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.kinematics import stage_angles
+from adxl_ros.process import option, pasted
 import numpy as np
 
 _TIME_LIMIT_S = 9e9  # Largest magnitude of a time, s: in nanoseconds it fits into 64 bits (9.2e18)
@@ -103,10 +97,8 @@ def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
             )
     missing = [column for column in (TIME, *output) if column not in names]
     if missing:
-        raise NotNativeError(
-            f'{table.header}: no column {missing[0]}'
-            + f'; the columns are {listed(names)}' * bool(output)
-        )
+        present = f'; the columns are {listed(names)}' if output else ''
+        raise NotNativeError(f'{table.header}: no column {missing[0]}{present}')
     try:
         outputs = output or sensor_columns(names, table.header)
     except UserError as error:
@@ -165,7 +157,7 @@ class _Converter:
         if 'time' not in mapping.sources and reading.rate_hz is None:
             raise UserError(
                 f'{mapping.where}: has no time; add time=COLUMN:UNIT, or give '
-                '--rate HZ to stamp by index'
+                f'{option(rate="HZ")} to stamp by index'
             )
         # Column and unit by role
         self.sources = {
@@ -193,12 +185,9 @@ class _Converter:
                     f'the columns are {listed(names)}'
                 )
             name = names[int(name) - 1]
-        unit = (
-            (self._reading.unit if role in AXES else '')
-            or source.unit
-            or table.units.get(name)
-            or unit_in_name(name, ROLES[role])
-        )
+        unit = source.unit or table.units.get(name) or unit_in_name(name, ROLES[role])
+        if role in AXES and self._reading.unit:
+            unit = self._reading.unit
         if not unit:
             raise UserError(
                 f'{self._where}: nothing states the unit of {name}; write for example '
@@ -215,14 +204,11 @@ class _Converter:
             raise UserError(
                 f'{self._where}: some axes are in volts and others are not; state one kind'
             )
-        if (
-            self._is_native
-            and self._reading.unit
-            and self._is_volts != (self._axes[0].column in VOLTS)
-        ):
+        is_named_volts = self._axes[0].column in VOLTS
+        if self._is_native and self._reading.unit and self._is_volts != is_named_volts:
             raise UserError(
-                f'--unit {self._reading.unit}: {self._axes[0].column} of '
-                f'{self._path} says another quantity; name the columns by --columns'
+                f'{option(unit=self._reading.unit)}: {self._axes[0].column} of '
+                f'{self._path} says another quantity; name the columns by {option("columns")}'
             )
         self._reading.check_counts(self._where, {axis.column: axis.unit for axis in self._axes})
 
@@ -231,11 +217,9 @@ class _Converter:
         outputs = self._outputs(block)
         is_row = ~np.isnan(outputs).all(axis=1)
         self._empty += int((~is_row).sum())
-        is_sample = (
-            is_row & self._is_complete(block, outputs)
-            if self._reading.drop_bad_samples
-            else is_row
-        )
+        is_sample = is_row
+        if self._reading.drop_bad_samples:
+            is_sample = is_row & self._is_complete(block, outputs)
         self._incomplete += int((is_row & ~is_sample).sum())
         for source, values in zip(self._axes, outputs.T):
             _refuse(
@@ -243,7 +227,7 @@ class _Converter:
                 source,
                 is_sample & ~(np.abs(values) <= LIMIT),
                 f'no reading of a sensor in {source.unit}',
-                f'every sample needs it; {DROP_SAMPLES}',
+                f'every sample needs it; {drop_samples()}',
             )
         time_s, is_kept = self._times(block, is_row, is_sample)
         columns = dict(zip(VOLTS if self._is_volts else ACCEL, outputs.T))
@@ -255,30 +239,27 @@ class _Converter:
         if not self.count and is_kept.any():
             self._look_at_first(time_s[is_kept])
         self.count += int(is_kept.sum())
-        info = {key: text for key, text in block.info.items() if key != 'epoch_ns'}
-        left_out = {
-            'lines without a reading of the sensor': self._empty,
-            'samples without a number on each axis, or without a time': self._incomplete,
-        }
         return Recording(
             self._path,
             time_s[is_kept],
             columns,
-            info,
+            {key: text for key, text in block.info.items() if key != 'epoch_ns'},
             cut=block.cut,
             epoch_ns=self._epoch_ns or 0,
             done=block.done,
-            remarks=(
-                *self._remarks,
-                *(
-                    f'{self._path}: left out, {kind}: {count}'
-                    for kind, count in left_out.items()
-                    if count
-                ),
-                *self._stamps.remarks,
-            ),
+            remarks=(*self._remarks, *self._left_out(), *self._stamps.remarks),
             bad_stamps=self._stamps.bad,
         )
+
+    def _left_out(self) -> list[str]:
+        """Return what was left out so far, for people."""
+        counts = {
+            'lines without a reading of the sensor': self._empty,
+            'samples without a number on each axis, or without a time': self._incomplete,
+        }
+        return [
+            f'{self._path}: left out, {kind}: {count}' for kind, count in counts.items() if count
+        ]
 
     def _is_complete(self, block: TableBlock, outputs: np.ndarray) -> np.ndarray:
         """Return which rows have a number on each axis, and a time where stamps are used, (n,)."""
@@ -311,8 +292,9 @@ class _Converter:
             values['alpha'], beta_rad = stage_angles(values['roll'], values['pitch'])
             # Without steps of a turn; rows without an angle stay NaN.
             known = np.isfinite(beta_rad)
-            turned = np.unwrap(np.concatenate([[self._last_beta_rad], beta_rad[known]]))
-            beta_rad[known], self._last_beta_rad = turned[1:], float(turned[-1])
+            turned = np.unwrap(np.append(self._last_beta_rad, beta_rad[known]))
+            beta_rad[known] = turned[1:]
+            self._last_beta_rad = float(turned[-1])
             values['beta'] = beta_rad
         return {name: values[role] for name, role in _NATIVE.items() if role in values}
 
@@ -332,22 +314,25 @@ class _Converter:
             source,
             is_sample & ~(np.abs(unit.convert(stamps)) < _TIME_LIMIT_S),
             f'no time in {source.unit} (200 years at most)',
-            'every sample needs a time: give --rate HZ to stamp by index, or delete the line; '
-            f'{DROP_SAMPLES}',
+            f'every sample needs a time: give {option(rate="HZ")} to stamp by index, or delete '
+            f'the line; {drop_samples()}',
         )
         if self._epoch_ns is None and is_sample.any():
-            text = block.info.get('epoch_ns', '0')
-            if not re.fullmatch(r'-?\d{1,18}|-?[1-8]\d{18}', text):
-                raise UserError(f'{self._path}: epoch_ns is {text!r}, expected whole nanoseconds')
-            self._epoch_ns = int(text)
             first_s = float(unit.convert(stamps[is_sample][:1])[0])
-            if first_s > _EPOCH_S and not self._is_native and not self._epoch_ns:
-                self._epoch_ns = int(first_s) * 1_000_000_000
-                self._begin = int(first_s) * unit.divisor
+            self._set_epoch(block.info.get('epoch_ns', '0'), first_s)
         time_s = unit.convert(stamps - self._begin)
         return time_s, self._stamps.increasing(
             time_s, is_sample, lambda row: block.where(row, source.column)
         )
+
+    def _set_epoch(self, stated: str, first_s: float) -> None:
+        """Take the epoch that a file states, or the first time where it counts from 1970."""
+        if not re.fullmatch(r'-?\d{1,18}|-?[1-8]\d{18}', stated):
+            raise UserError(f'{self._path}: epoch_ns is {stated!r}, expected whole nanoseconds')
+        self._epoch_ns = int(stated)
+        if first_s > _EPOCH_S and not self._is_native and not self._epoch_ns:
+            self._epoch_ns = int(first_s) * 1_000_000_000
+            self._begin = int(first_s) * self._unit('time').divisor
 
     def _look_at_first(self, time_s: np.ndarray) -> None:
         """Refuse stamps that are in another unit, and note those in bursts."""
@@ -357,7 +342,7 @@ class _Converter:
         if bursts := describe_bursts(time_s):
             self._remarks.append(
                 f'{self._path}: {bursts.removeprefix("; ")}; this rate is '
-                'used, and --rate HZ stamps by index'
+                f'used, and {option(rate="HZ")} stamps by index'
             )
 
     def _check_step(self, time_s: np.ndarray) -> None:
@@ -371,9 +356,9 @@ class _Converter:
             fitting = ColumnMapping({**self.sources, 'time': Source(source.column, unit)})
             raise UserError(
                 f'{self._path}: {source.column} has steps of {step:.4g}, which as '
-                f'{source.unit} are {rate_hz:.3g} Hz; if that is right, give --rate '
-                f'{rate_hz:.3g}, and if they are {unit}:',
-                f'--columns {shell_quoted(str(fitting))}',
+                f'{source.unit} are {rate_hz:.3g} Hz; if that is right, give '
+                f'{option(rate=f"{rate_hz:.3g}")}, and if they are {unit}:',
+                pasted(columns=str(fitting)),
             )
 
 
@@ -384,272 +369,7 @@ def _refuse(
     if wrong.any():
         row = int(wrong.argmax())
         value = block.columns[source.column][row]
-        text = (
-            f'empty or NaN; {reason_of_none}'
-            if np.isnan(value)
-            else f'{value:g}, {reason}; delete the line, or correct the unit'
-        )
+        text = f'{value:g}, {reason}; delete the line, or correct the unit'
+        if np.isnan(value):
+            text = f'empty or NaN; {reason_of_none}'
         raise UserError(f'{block.where(row, source.column)} is {text}')
-
-
-_TIME_NAMES = re.compile(
-    r'(?i).*(time|stamp|zeit|date|clock|elapsed|epoch|millis|micros).*|'
-    r'\W*(t|m?s|ms|us|ns|secs?|seconds?|(t|sec)[_\W].*)\W*'
-)
-"""Names of a time."""
-
-_COUNTER_WORDS = {
-    'packet',
-    'pkt',
-    'index',
-    'idx',
-    'count',
-    'counter',
-    'number',
-    'num',
-    'nr',
-    'no',
-    'seq',
-    'sequence',
-    'sample',
-    'frame',
-    'row',
-    'line',
-    'id',
-}
-"""Words in the name of a counter, which is no time."""
-
-_OTHER_SENSORS = re.compile(
-    r'(?i)gyr|mag(?!nit)|\bm[xyz]\b|(?<![a-z])(pos|dist|height|alt|lat|lon|hum)|'
-    r'angular|omega|rate|\bw[xyz]\b|g[xyz]r|rot|orient|quat|press|baro|vel|\bg[xyz]\b|'
-    r'abs|total|norm|std|cov|user|gravity|without|\brad\b|dps|(deg|°)\s?/\s?s|angle'
-)
-"""Names of columns of other sensors."""
-
-_ACCEL_NAMES = tuple(
-    map(
-        re.compile,
-        (
-            r'(?i)^acc(el(eration|erometer)?)?\b|acc',
-            r'(?i)^(a|f|g_?f|ad)_?[xyz]',
-            r'(?i)^[xyz](\b|_|$)',
-            r'(?i)[xyz]|^a\d',
-        ),
-    )
-)
-"""Names of acceleration, the surest first."""
-
-_VOLT_NAMES = re.compile(r'(?i)volt|analog|(?<![a-z])m?v(?![a-z])|^v_?[xyz]|[xyz]_?v$')
-"""Names of volts."""
-
-_AXIS_WORD = re.compile(
-    r'(?i)(?:a|acc|accel|g_?f|f|ad|adc|raw|gf|v)?([xyz])|([xyz])(?:acc|accel|adc|raw|v)'
-)
-"""A word in which x, y or z is the axis."""
-
-_REFERENCES = {
-    'alpha': r'(?i)^(alpha|angle(?!_?[xyz]\b)|winkel|tilt|inclination)',
-    'beta': r'(?i)^(beta|azimuth)',
-    'roll': r'(?i)^roll',
-    'pitch': r'(?i)^pitch',
-    'temperature': r'(?i)temp',
-    'supply': r'(?i)^(supply|vcc|vdd|v_?bat|batt)',
-}
-"""Names of references by role."""
-
-_CONSTANT = 0.3
-"""Largest relative scatter of a length that is that of gravity (chosen: a hand that turns a
-sensor makes less)."""
-
-_LARGEST = 1e30  # Larger magnitudes are no readings and no stamps
-
-_TURNED = 0.3  # Smallest spread of an axis in that of another one of a sensor that is turned
-
-_COUNTS = (64, 100, 128, 256, 512, 1000, 1024, 1365, 2048, 4096, 8192, 16384, 32768)
-"""Usual counts of 1 g."""
-
-_SIGN_GAP = (24576, 40960)
-"""Counts of 16 bits that are beyond the range, 1.5 times ±16384, where their sign was lost."""
-
-
-def propose(table: Table) -> tuple[str, str]:
-    """Describe the columns of a table, and the options that most likely read it."""
-    seen = f'the columns are {listed(table.names)}'
-    sample = next((block.columns for block in table.blocks(table.names, ())), {})
-    values = {
-        name: np.where(np.abs(column) < _LARGEST, column, np.nan)
-        for name, column in sample.items()
-        if np.isfinite(column).any()
-    }
-    time = _time_column(table, values)
-    outputs = _outputs(table, [name for name in values if name != time], values)
-    readings = np.column_stack([values[name] for name in outputs]) if outputs else np.zeros((0, 1))
-    unit, zero, length = _unit(table, outputs, readings[np.isfinite(readings).all(axis=1)])
-    if not unit:
-        return (
-            f'{seen}; none looks like an accelerometer: name the columns, for example',
-            "--columns 'time=COLUMN:s,x=COLUMN:g,y=COLUMN:g,z=COLUMN:g'",
-        )
-    sources = {axis: Source(name, unit) for axis, name in zip(AXES, outputs)}
-    stamps, note = '--rate HZ', ' (write the sample rate for HZ)'
-    if time:
-        source = _time_source(table, time, values[time])
-        sources = {'time': source, **sources}
-        stamps = _stamp_options(values[time], source)
-        note = ' (add --params with the parameter file of the sensor)' * (unit in ('v', 'mv'))
-    sources |= _references(values, {*outputs, time}) if table.has_names else {}
-    options = f'--columns {shell_quoted(str(ColumnMapping(sources)))} {stamps}'.rstrip()
-    if unit in (LSB, UNSIGNED):
-        options += f' --lsb-per-g {round(length) if zero else _usual_counts(length)}'
-        options += f' --lsb-at-0g {zero:.0f}' * bool(zero)
-    return f'{seen}; the best guess{note}:', options
-
-
-def _unit(table: Table, outputs: Sequence[str], readings: np.ndarray) -> tuple[str, float, float]:
-    """
-    Return the unit of readings, (n, m); empty where they are not those of an accelerometer.
-
-    Also the reading at 0 g and the length of gravity about it.
-    """
-    if not len(readings):
-        return '', 0.0, 0.0
-    unit = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
-    is_whole = bool((readings == np.rint(readings)).all())
-    if unit in (None, LSB) and is_whole and _have_lost_sign(readings):
-        unit, readings = UNSIGNED, signed(readings)
-    low, spread = readings.min(axis=0), np.ptp(readings, axis=0)
-    zero = 0.0
-    if low.min() > 0 and spread.min() > _TURNED * spread.max():
-        zero = float(np.mean(low + spread / 2))
-    lengths = np.linalg.norm(readings - zero, axis=1)
-    length = float(np.median(lengths))
-    if not unit:
-        is_volts = table.has_names and all(map(_VOLT_NAMES.search, outputs))
-        unit = ('' if zero else _gravity_unit(length, is_whole)) or (
-            'v' if is_volts and length < 9 else LSB
-        )
-        unit = '' if unit == LSB and length + zero < 40 else unit
-    is_gravity = (
-        np.median(np.abs(lengths - length)) <= _CONSTANT * length
-        and 0.5 < length / GRAVITY.get(unit, length) < 2
-    )
-    return (unit if is_gravity or len(outputs) < len(AXES) else ''), zero, length
-
-
-def _have_lost_sign(readings: np.ndarray) -> bool:
-    """Return whether counts of 16 bits, (n, m), are in both parts of their range, not between."""
-    is_between = (readings > _SIGN_GAP[0]) & (readings < _SIGN_GAP[1])
-    is_beyond = _SIGN_GAP[1] < readings.max() < 1 << 16
-    return bool(readings.min() >= 0 and is_beyond and not is_between.any())
-
-
-def _usual_counts(length: float) -> int:
-    """Return the usual counts of 1 g that are nearest to a length of gravity."""
-    return min(_COUNTS, key=lambda count: abs(np.log(count / length)))
-
-
-def _gravity_unit(length: float, is_whole: bool) -> str:
-    """Return the unit in which a length is that of gravity; none where counts fit better."""
-    unit = likely_unit(length)
-    if not unit or not is_whole:
-        return unit
-    departure = abs(np.log(length / GRAVITY[unit]))
-    return unit if departure <= abs(np.log(length / _usual_counts(length))) else ''
-
-
-def _stamp_options(values: np.ndarray, source: Source) -> str:
-    """Return the option that stamps need which stand still or step back; empty for none."""
-    known = values[np.isfinite(values)]
-    time_s = UNITS[Quantity.TIME][source.unit].convert(known - known[0])
-    if (np.diff(time_s) > 0).all():
-        return ''
-    if burst_samples(time_s) > 1:
-        return f'--rate {stamped_rate_hz(time_s):.4g}'
-    return '--drop-bad-stamps'
-
-
-def _time_column(table: Table, values: Columns) -> str | None:
-    """Return the column that is a time: it hardly ever decreases, and is no count of samples."""
-    rising = []
-    for name, column in values.items():
-        steps = np.diff(column[np.isfinite(column)])
-        if len(steps) > 2 and np.mean(steps >= 0) > 0.99 and np.mean(steps > 0) > 0.05:
-            rising.append(name)
-    named = [name for name in rising if table.has_names and _TIME_NAMES.fullmatch(name)]
-    others = [name for name in rising if not _is_counter(name, values[name])]
-    return next(iter([*named, *others]), None)
-
-
-def _is_counter(name: str, column: np.ndarray) -> bool:
-    """Return whether a column numbers the samples: by its name, or because it rises by one."""
-    known = column[np.isfinite(column)]
-    steps = np.diff(known)
-    rises_by_one = (known == np.rint(known)).all() and np.median(steps[steps != 0]) == 1
-    return bool(rises_by_one) or not _COUNTER_WORDS.isdisjoint(map(str.lower, _words(name)))
-
-
-def _words(name: str) -> list[str]:
-    """Return the words in the name of a column."""
-    return re.split(r'[_\W]+|(?<=[a-z])(?=[A-Z])', name)
-
-
-def _time_source(table: Table, name: str, values: np.ndarray) -> Source:
-    """Return a time with the unit that its name states, or in which its steps are usual."""
-    finite = values[np.isfinite(values)]
-    steps = np.diff(finite)
-    step = float(np.median(steps[steps > 0]))
-    unit = table.units.get(name) or unit_in_name(name, Quantity.TIME)
-    if not unit or not is_sensor_step(step / UNITS[Quantity.TIME][unit].divisor, False):
-        unit = time_unit_of_step(step, bool((finite == np.rint(finite)).all()))
-    return Source(name, unit)
-
-
-def _outputs(table: Table, names: list[str], values: Columns) -> list[str]:
-    """Return the columns of the axes: by their names, or three whose length is constant."""
-    if table.has_names:
-        own = [name for name in names if not _OTHER_SENSORS.search(name)]
-        stated = [name for name in own if unit_in_name(name, Quantity.OUTPUT) in GRAVITY]
-        groups = [
-            stated,
-            *([name for name in own if pattern.search(name)] for pattern in _ACCEL_NAMES),
-        ]
-        return next(filter(None, map(_by_axis, groups)), [])
-
-    def scatter(triple: list[str]) -> float:
-        length = np.linalg.norm([values[name] for name in triple], axis=0)
-        median = np.nanmedian(length)
-        return float(np.nanmedian(np.abs(length - median)) / max(median, 1e-12))
-
-    return min((names[i : i + 3] for i in range(len(names) - 2)), key=scatter, default=[])
-
-
-def _by_axis(names: Sequence[str]) -> list[str]:
-    """Return the names of x, y and z in this order, as far as there are any; or acc[0] ..."""
-    by_letter: dict[str, str] = {}
-    for name in names:
-        bare = re.sub(r'[(\[{].*?[)\]}]', '', name).strip()
-        matches = list(filter(None, map(_AXIS_WORD.fullmatch, _words(bare))))
-        if matches:
-            by_letter.setdefault((matches[-1][1] or matches[-1][2]).lower(), name)
-    if by_letter:
-        axes = AXES[: len(by_letter)]
-        return [by_letter[axis] for axis in axes] if set(axes) == set(by_letter) else []
-    numbered = [name for name in names if re.search(r'(?<!\d)[0-3]\]?$', name)]
-    return numbered[: len(AXES)] if len(numbered) >= len(AXES) else []
-
-
-def _references(values: Columns, used: set[str | None]) -> dict[str, Source]:
-    """Return the columns of references, with their units."""
-    sources: dict[str, Source] = {}
-    for role, pattern in _REFERENCES.items():
-        name = next((name for name in values if name not in used and re.search(pattern, name)), '')
-        if name:
-            usual = ROLES[role].value
-            if usual == 'rad' and (np.abs(values[name]) > 2 * np.pi).any():
-                usual = 'deg'
-            sources[role] = Source(name, unit_in_name(name, ROLES[role]) or usual)
-    # An estimate of attitude, which has a yaw, is made of the readings and is no reference.
-    is_estimate = any(re.search('(?i)yaw|heading|quat', name) for name in values)
-    if not {'roll', 'pitch'} <= set(sources) or 'alpha' in sources or is_estimate:
-        sources.pop('roll', None), sources.pop('pitch', None)
-    return sources

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.files import mapped_recording
+from adxl_ros.files import mapped_recording, mapping_proposal
 from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.column_mapping import (
     AS_IT_IS,
@@ -30,6 +30,7 @@ from adxl_ros.files.recording_columns import ACCEL, concatenate, GYRO, Recording
 from adxl_ros.files.tables import open_table
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import option
 import numpy as np
 
 _BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
@@ -106,7 +107,7 @@ def _table_blocks(
         blocks = mapped_recording.blocks(table, mapping, reading, rows)
         yield from _mounted(blocks, reading.mounting)
     except mapped_recording.NotNativeError as error:
-        text, options = mapped_recording.propose(table)
+        text, options = mapping_proposal.propose(table)
         raise UserError(f'{error}; {text}', options) from None
 
 
@@ -122,7 +123,7 @@ def _mounted(
         names = block.sensor_columns
         if len(names) != len(mounting):
             raise UserError(
-                f'--axes: names the axes {AXES[: len(mounting)]}, but {block.path} has '
+                f'{option("axes")}: names the axes {AXES[: len(mounting)]}, but {block.path} has '
                 f'{block.axes}'
             )
         zero = np.zeros(1)
@@ -130,7 +131,7 @@ def _mounted(
             zero = block.stream_info.nominal_values(block.axes).get('nominal_zero_g_v', np.ones(0))
             if len(set(zero)) != 1:
                 raise UserError(
-                    f'--axes: inverts an axis of {block.path} in volts about an '
+                    f'{option("axes")}: inverts an axis of {block.path} in volts about an '
                     'unknown zero; write a line "# nominal_zero_g_v: ..." with the '
                     'same value for each axis'
                 )

@@ -16,12 +16,13 @@ from adxl_ros.files.atomic_write import require_own
 from adxl_ros.files.stamps import describe_bursts, stamped_rate_hz
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, to_volts, with_axes
+from adxl_ros.process import option
 from adxl_ros.report.quantities import column_unit
 import numpy as np
 
 FORMAT = '1'  # Version of the recording format, the key `format`
 
-NO_UNIT = 'nominal'  # Serial number that stands for no particular unit
+NO_SERIAL = 'nominal'  # Serial number that stands for no particular unit
 
 NOMINAL_KEYS = ('nominal_zero_g_v', 'nominal_scale_v_per_g')
 """Keys of the nominal values, V and V/g; each is a field of `Sensor`, too."""
@@ -39,8 +40,8 @@ class StreamInfo:
 
     @property
     def serial(self) -> str:
-        """Return the serial number of the unit; `NO_UNIT` where none is stated."""
-        return self.texts.get('serial', NO_UNIT)
+        """Return the serial number of the unit; `NO_SERIAL` where none is stated."""
+        return self.texts.get('serial', NO_SERIAL)
 
     @property
     def axes(self) -> str | None:
@@ -131,7 +132,7 @@ class BadStamps(NamedTuple):
     backward: int  # Samples whose stamp is earlier
 
 
-@dataclass(repr=False)
+@dataclass(repr=False, eq=False)
 class Recording:
     """Samples of one sensor, with references."""
 
@@ -163,11 +164,10 @@ class Recording:
     def __repr__(self) -> str:
         """Return name, length, rate, axes and references in one line."""
         rate = f', {self.rate_hz:.4g} Hz' if len(self) > 1 else ''
-        further = [name for name in self.columns if name not in self.sensor_columns]
-        return (
-            f'{Path(self.path).name}: {self.span_s:.4g} s{rate}, axes {" ".join(self.axes)}'
-            + f', with {", ".join(further)}' * bool(further)
-        )
+        references = [name for name in self.columns if name not in self.sensor_columns]
+        further = f', with {", ".join(references)}' if references else ''
+        axes = ' '.join(self.axes)
+        return f'{Path(self.path).name}: {self.span_s:.4g} s{rate}, axes {axes}{further}'
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
         """
@@ -179,10 +179,10 @@ class Recording:
         from adxl_ros.files import parameter_file, recording
 
         require_own(path, overwrite)
-        unit = uncalibrated(
+        nominal = uncalibrated(
             parameter_file.usual(self.is_of_nominal), self.stream_info, self.axes, self.rate_hz
         )
-        recording.write(path, self, unit)
+        recording.write(path, self, nominal)
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with the stamps as index, s, and a column for each of `columns`."""
@@ -211,7 +211,8 @@ class Recording:
             for name, residual in self.alignments.items()
             if residual
         ]
-        return (*self.remarks, *[self.cut] * bool(self.cut), *aligned)
+        cut = [self.cut] if self.cut else []
+        return (*self.remarks, *cut, *aligned)
 
     def rows(self, start: int, stop: int) -> Recording:
         """Return a part of the samples."""
@@ -364,8 +365,9 @@ class StampCheck:
             raise UserError(
                 f'{where(row)}: time {"stands still" if stands[row] else "runs backwards"}, '
                 f'{latest[row] - time_s[row]:.3g} s before the newest sample'
-                f'{describe_bursts(time_s[is_sample])}; --drop-bad-stamps leaves such samples '
-                'out, --rate HZ stamps by index'
+                f'{describe_bursts(time_s[is_sample])}; '
+                f'{option(drop_bad_stamps=True)} leaves such '
+                f'samples out, {option(rate="HZ")} stamps by index'
             )
         duplicates = int(stands.sum())
         self.bad = BadStamps(
@@ -384,8 +386,8 @@ class StampCheck:
         )
 
 
-def check_unit(info: StreamInfo, axes: str, sensor: Sensor) -> None:
-    """Refuse samples that state another unit than the one that `sensor` describes."""
+def check_same_sensor(info: StreamInfo, axes: str, sensor: Sensor) -> None:
+    """Refuse samples of another sensor, or with other axes or nominal values."""
     version = info.texts.get('format', FORMAT)
     if version != FORMAT:
         raise UserError(
@@ -409,7 +411,7 @@ def check_unit(info: StreamInfo, axes: str, sensor: Sensor) -> None:
 
 
 def _check_serial(info: StreamInfo, sensor: Sensor) -> None:
-    if info.serial != sensor.serial and NO_UNIT not in (info.serial, sensor.serial):
+    if info.serial != sensor.serial and NO_SERIAL not in (info.serial, sensor.serial):
         raise UserError(
             f'{info.where}: is of the sensor {info.serial}, but the parameters are of '
             f'{sensor.serial}; give the parameters of that sensor, or nominal ones'
@@ -433,20 +435,22 @@ def uncalibrated(sensor: Sensor, info: StreamInfo, axes: str, rate_hz: float) ->
     return replace(bare, serial=info.texts.get('serial', sensor.serial), rate_hz=rate_hz, **stated)
 
 
-def unit_of(
+def nominal_of(
     sensor: Sensor, info: StreamInfo, axes: str | None = None, rate_hz: float | None = None
 ) -> Sensor:
     """Return the nominal sensor of a stream, whose serial number must not contradict `sensor`."""
     _check_serial(info, sensor)
     axes = axes or info.axes or sensor.axes
-    unit = uncalibrated(sensor, info, axes, rate_hz or info.rate_hz or sensor.rate_hz)
-    return replace(unit, serial=sensor.serial) if info.serial == NO_UNIT else unit
+    nominal = uncalibrated(sensor, info, axes, rate_hz or info.rate_hz or sensor.rate_hz)
+    return replace(nominal, serial=sensor.serial) if info.serial == NO_SERIAL else nominal
 
 
-def recorded_unit(sensor: Sensor, recording: Recording) -> Sensor:
+def recorded_nominal(sensor: Sensor, recording: Recording) -> Sensor:
     """Return the nominal sensor of a recording, with the sample rate of its stamps."""
-    unit = unit_of(sensor, recording.stream_info, recording.axes, recording.rate_hz)
-    return replace(unit, provenance={**unit.provenance, 'rate_from': Path(recording.path).name})
+    nominal = nominal_of(sensor, recording.stream_info, recording.axes, recording.rate_hz)
+    return replace(
+        nominal, provenance={**nominal.provenance, 'rate_from': Path(recording.path).name}
+    )
 
 
 LONGEST_MOVE_NS = 1e8

@@ -76,7 +76,7 @@ def read(
         if needs_joints:
             stamp_ns, _, columns = series(
                 bag,
-                choose_topic(bag, JOINT_STATE, 'joint_states', topic, '--joints'),
+                choose_topic(bag, JOINT_STATE, 'joint_states', topic, 'joints'),
                 cdr.joint_state,
                 positions,
             )

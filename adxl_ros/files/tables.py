@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from io import StringIO
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.column_mapping import Table, TableBlock
 from adxl_ros.files.csv_file import find_form, read_blocks
 from adxl_ros.model.kinematics import stage_angles
+from adxl_ros.process import option
 import numpy as np
 
 _BLOCK_ROWS = 65536  # Rows that are read at a time (chosen: some MB)
@@ -39,7 +41,7 @@ def open_table(path: AnyPath, topic: str = '') -> Table:
     if ending == '.ulg':
         return _open_ulog(path, topic)
     if topic:
-        raise UserError(f'--topic {topic}: {path} is no bag; leave --topic out')
+        raise UserError(f'{option(topic=topic)}: {path} is no bag; leave {option("topic")} out')
     if ending in _FORMATS:
         return _FORMATS[ending](path)
     form = find_form(path)
@@ -199,18 +201,19 @@ def _open_ulog(path: str, topic: str) -> Table:
         f'{data.name}_{data.multi_id}' if data.multi_id else str(data.name): data
         for data in log.data_list
     }
-    accelerations = []
-    for kind in _MAPPINGS:
-        accelerations += [name for name, data in messages.items() if data.name == kind]
-    raw = [
-        each for each in accelerations if messages[each].name == messages[accelerations[0]].name
+    # The messages of accelerometers, by kind; those of the first kind are the raw readings.
+    of_kinds = [
+        [name for name, data in messages.items() if data.name == kind] for kind in _MAPPINGS
     ]
+    raw = next(filter(None, of_kinds), [])
+    accelerations = list(chain.from_iterable(of_kinds))
     name = topic.removesuffix('_0') or ', '.join(raw)
+    if name not in messages and topic:
+        raise UserError(f'{path}: no message {topic}')
     if name not in messages:
         raise UserError(
-            f'{path}: no message {topic}' * bool(topic)
-            or f'{path}: {len(raw) or "no"} accelerometers'
-            f'; choose one with --topic: {", ".join(accelerations or messages)}'
+            f'{path}: {len(raw) or "no"} accelerometers; choose one with {option("topic")}: '
+            f'{", ".join(accelerations or messages)}'
         )
     data = messages[name]
     columns = {
@@ -224,7 +227,8 @@ def _open_ulog(path: str, topic: str) -> Table:
         mapping = mapping.partition(',temperature=')[0]
     if 'gyro_rad[0]' not in columns:
         mapping = mapping.partition(',gx=')[0]
-    cut = f'{path}: is damaged; what can be read of it is used' * bool(log.file_corruption)
+    is_damaged = log.file_corruption
+    cut = f'{path}: is damaged; what can be read of it is used' if is_damaged else ''
     return in_memory(
         path,
         columns,

@@ -24,7 +24,7 @@ from urllib.parse import urlsplit
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import recording
-from adxl_ros.files.recording_columns import NO_UNIT, Recording
+from adxl_ros.files.recording_columns import NO_SERIAL, Recording
 from adxl_ros.files.tables import TABLE_ENDINGS
 from adxl_ros.fleet.row import as_date, TABLE
 from adxl_ros.report.page import as_utf_8, without_secrets
@@ -209,14 +209,16 @@ def _source(fs: Any, path: str, **known: Any) -> Source:
     """Return a recording by its address, which is the path itself on this machine."""
     # A name that is not UTF-8 has no place in a table.
     address = as_utf_8(str(fs.unstrip_protocol(path)))
-    user, password, host, port = (
-        fs.storage_options.get(name) for name in ('username', 'password', 'host', 'port')
-    )
+    options = fs.storage_options
+    host, port = options.get('host'), options.get('port')
+    user, password = options.get('username'), options.get('password')
     if host:
         # The path in a server does not name the server.
         server = f'{host}:{port}' if port else host
-        if user:
-            server = f'{user}:{password}@{server}' if password else f'{user}@{server}'
+        if user and password:
+            server = f'{user}:{password}@{server}'
+        elif user:
+            server = f'{user}@{server}'
         address = address.replace(':///', f'://{server}/', 1)
     url = without_secrets(address)
     return Source(url.removeprefix('file://'), **known, address=address if address != url else '')
@@ -314,7 +316,7 @@ def _of_manifest(text: str, rows: list[dict[str, str]]) -> Iterable[Source]:
             )
 
     def source(row: dict[str, str]) -> Source:
-        url, params, serial = (row.get(name, '') for name in ('url', 'params', 'serial'))
+        url, params, serial = row.get('url', ''), row.get('params', ''), row.get('serial', '')
         try:
             recorded = look_up(*file_system(_beside(folder, url)))
         except UserError as error:
@@ -322,7 +324,7 @@ def _of_manifest(text: str, rows: list[dict[str, str]]) -> Iterable[Source]:
             recorded = Source(plain, fault=one_line(error).removeprefix(f'{plain}: '))
         return replace(
             recorded,
-            serial='' if serial == NO_UNIT else serial,
+            serial='' if serial == NO_SERIAL else serial,
             params=_beside(folder, params) if set(params) & set('/.') else params,
             date=as_date(row.get('date', '')),
         )

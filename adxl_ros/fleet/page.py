@@ -29,13 +29,13 @@ _MOST_EFFECTS = 20
 _ROW_PIXELS = 16
 _MOST_PIXELS = 640
 _MATRIX_HEAD_PIXELS = 150
-"""Heights of the matrix: of a unit with a name, of all units, and of the names of effects."""
+"""Heights of the matrix: of a sensor with a name, of all sensors, and of the names of effects."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
-_SHOWN = 12  # Number of units in the first table and with a plot. Chosen: they fit on one screen
-_NAMED = 3  # Number of drifting units that a screen names. Chosen: some lines
+_SHOWN = 12  # Number of sensors in the first table and with a plot. Chosen: they fit on one screen
+_NAMED = 3  # Number of drifting sensors that a screen names. Chosen: some lines
 _MOST_ROWS = 50  # Largest count of outliers and of reasons on the page; the table holds them all
 _MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))
-"""Columns that tell whether a unit is within the tolerance."""
+"""Columns that tell whether a sensor is within the tolerance."""
 _SENTENCES = {
     fleet.State.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
     fleet.State.IN_ORDER: 'All units are within the tolerance.',
@@ -56,12 +56,12 @@ def _stamps(years: Iterable[float]) -> list[str]:
 
 
 def _trend_figure(
-    table: fleet.FleetTable, result: fleet.QuantityResult, unit: int
+    table: fleet.FleetTable, result: fleet.QuantityResult, sensor: int
 ) -> plotly.Figure:
-    """Plot a quantity of a unit over time, about its mean where units differ by far more."""
-    quantity, place = result.quantity, result.place_of(unit)
+    """Plot a quantity of a sensor over time, about its mean where sensors differ by far more."""
+    quantity, place = result.quantity, result.place_of(sensor)
     origin = result.trends.level[place] if quantity.is_coefficient and place is not None else 0.0
-    part = table.unit[result.rows] == unit
+    part = table.sensor[result.rows] == sensor
     years, is_outlier = result.recordings.time[part], result.is_outlier[part]
     value = quantity.factor * (result.recordings.value[part] - origin)
     half = Z_90 * quantity.factor * result.recordings.std[part]
@@ -87,20 +87,20 @@ def _trend_figure(
                 plotly.points([], value[shown], half[shown], name, colour)
                 | {'x': _stamps(years[shown])}
             )
-    title = quantity.shown_unit + ' from the mean' * quantity.is_coefficient
+    origin = ' from the mean' if quantity.is_coefficient else ''
     return plotly.figure(
         traces,
         _TREND_HEIGHT,
         showlegend=False,
-        shapes=_calibration_marks(table, unit),
+        shapes=_calibration_marks(table, sensor),
         xaxis={'type': 'date', 'nticks': 3, 'tickangle': 0, 'tickformat': '%b %Y'},
-        yaxis={'title': {'text': title}, 'nticks': 5},
+        yaxis={'title': {'text': quantity.shown_unit + origin}, 'nticks': 5},
     )
 
 
-def _calibration_marks(table: fleet.FleetTable, unit: int) -> list[plotly.Figure]:
-    """Return a line at each calibration between recordings of a unit, where a period ends."""
-    rows = table.rows_of(unit)
+def _calibration_marks(table: fleet.FleetTable, sensor: int) -> list[plotly.Figure]:
+    """Return a line at each calibration between recordings of a sensor, where a period ends."""
+    rows = table.rows_of(sensor)
     made = table.years[rows] - table['calibration_age_days'][rows] / fleet.DAYS_PER_YEAR
     begins = made[1:][np.diff(table.period[rows]) > 0]
     style = {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'}
@@ -111,13 +111,13 @@ def _calibration_marks(table: fleet.FleetTable, unit: int) -> list[plotly.Figure
 
 
 def _matrix_figure(table: fleet.FleetTable, share: pd.DataFrame) -> plotly.Figure:
-    """Plot how often each effect is named in each unit."""
+    """Plot how often each effect is named in each sensor."""
     share = share.iloc[:, :_MOST_EFFECTS]
     columns = list(share)
     trace = {
         'type': 'heatmap',
         'x': columns,
-        'y': [table.serials[unit] for unit in share.index],
+        'y': [table.serials[sensor] for sensor in share.index],
         'z': (100 * share.to_numpy()).round(1).tolist(),
         'zmin': 0,
         'zmax': 100,
@@ -177,10 +177,10 @@ def _batches(results: Sequence[fleet.QuantityResult]) -> list[str]:
     ]
 
 
-def _drifting(units: Sequence[fleet.UnitState]) -> list[str]:
-    """Return a sentence for the most urgent units that drift, and the number of all."""
-    drifting = [unit for unit in units if unit.drifts]
-    lines = [f'{unit.serial} drifts: {unit.drifts[0].text}.' for unit in drifting[:_NAMED]]
+def _drifting(sensors: Sequence[fleet.SensorState]) -> list[str]:
+    """Return a sentence for the most urgent sensors that drift, and the number of all."""
+    drifting = [sensor for sensor in sensors if sensor.drifts]
+    lines = [f'{sensor.serial} drifts: {sensor.drifts[0].text}.' for sensor in drifting[:_NAMED]]
     if len(drifting) > _NAMED:
         lines.append(f'{len(drifting) - _NAMED} more units drift; the page has them.')
     return lines
@@ -188,20 +188,20 @@ def _drifting(units: Sequence[fleet.UnitState]) -> list[str]:
 
 def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folder: Path) -> str:
     """Return the page of a fleet."""
-    units = fleet.rank(table, results)
+    sensors = fleet.rank(table, results)
     share = fleet.effect_matrix(table)
     figures: dict[str, plotly.Figure] = {}
     trends: dict[str, list[dict[str, str]]] = {'trend': [], 'noise': []}
     for name, shown in trends.items():
-        for count, plot in enumerate(_plots(units, results, name == 'noise')):
+        for count, plot in enumerate(_plots(sensors, results, name == 'noise')):
             figure = f'{name}-{count}'
-            figures[figure] = _trend_figure(table, plot.result, plot.unit.unit)
-            title = f'{plot.unit.serial}: {plot.result.quantity.label}'
+            figures[figure] = _trend_figure(table, plot.result, plot.sensor.number)
+            title = f'{plot.sensor.serial}: {plot.result.quantity.label}'
             text = f'{plot.drifts[0].text}.' if plot.drifts else 'No slope is claimed.'
             shown.append({'figure': figure, 'title': title, 'text': text})
     if len(share.columns):
         figures['matrix'] = _matrix_figure(table, share)
-    counts = Counter(unit.state for unit in units)
+    counts = Counter(sensor.state for sensor in sensors)
     years = table.years[np.isfinite(table.years)]
     about = [
         f'{len(table)} recordings',
@@ -214,14 +214,14 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
         {
             'title': 'Fleet',
             'about': about,
-            'badge': _badge(table, units, counts),
+            'badge': _badge(table, sensors, counts),
             'tiles': _tiles(table, counts),
             'shown': _SHOWN,
             'figures': figures,
-            'units': units,
+            'units': sensors,
             'date': date_text,
             'link': partial(_link, folder),
-            'without_unit': int((table.unit < 0).sum()),
+            'without_unit': int((table.sensor < 0).sum()),
             'trends': trends,
             'batches': _batches(results),
             'has_effects': 'matrix' in figures,
@@ -238,37 +238,37 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
 
 
 class _Plot(NamedTuple):
-    """A quantity that is plotted of a unit."""
+    """A quantity that is plotted of a sensor."""
 
-    unit: fleet.UnitState
+    sensor: fleet.SensorState
     result: fleet.QuantityResult
     drifts: Sequence[fleet.Drift]  # Its claimed slopes of this kind, the most urgent first
 
 
 def _plots(
-    units: Sequence[fleet.UnitState], results: Sequence[fleet.QuantityResult], is_noise: bool
+    sensors: Sequence[fleet.SensorState], results: Sequence[fleet.QuantityResult], is_noise: bool
 ) -> list[_Plot]:
-    """Return the most urgent drift of each unit, or its first quantity; those that drift first."""
+    """Return the most urgent drift of each sensor, or its first quantity; drifts come first."""
     kind = [result for result in results if result.quantity.is_noise == is_noise]
     plots = []
-    for unit in units:
-        drifts = [drift for drift in unit.drifts if drift.result.quantity.is_noise == is_noise]
-        measured = [result for result in kind if result.place_of(unit.unit) is not None]
+    for sensor in sensors:
+        drifts = [drift for drift in sensor.drifts if drift.result.quantity.is_noise == is_noise]
+        measured = [result for result in kind if result.place_of(sensor.number) is not None]
         shown = [drift.result for drift in drifts] or measured
-        plots += [_Plot(unit, result, drifts) for result in shown[:1]]
+        plots += [_Plot(sensor, result, drifts) for result in shown[:1]]
     return sorted(plots, key=lambda plot: not plot.drifts)[:_SHOWN]
 
 
 def _badge(
-    table: fleet.FleetTable, units: Sequence[fleet.UnitState], counts: Counter[fleet.State]
+    table: fleet.FleetTable, sensors: Sequence[fleet.SensorState], counts: Counter[fleet.State]
 ) -> dict[str, str]:
-    if not units:
+    if not sensors:
         return {
             'colour': 'grey',
             'word': 'NO UNITS',
             'sentence': 'No recording states a serial number.',
         }
-    worst = units[0].state
+    worst = sensors[0].state
     if worst is fleet.State.IN_ORDER and table.frame[[*_MEASURES]].isna().all(axis=None):
         # What was not measured is not within the tolerance.
         return {
@@ -280,7 +280,7 @@ def _badge(
         'colour': worst.colour,
         'word': 'IN ORDER'
         if worst is fleet.State.IN_ORDER
-        else f'{counts[worst]} of {len(units)} {worst.words}'.upper(),
+        else f'{counts[worst]} of {len(sensors)} {worst.words}'.upper(),
         'sentence': _SENTENCES.get(
             worst, 'No unit is out of tolerance. Look at the head of the list.'
         ),
@@ -317,7 +317,7 @@ def _link(folder: Path, report: str) -> str:
 def _outlier_rows(
     table: fleet.FleetTable, results: Sequence[fleet.QuantityResult]
 ) -> list[dict[str, str]]:
-    """Return the recordings that are far from others of their unit, the farthest first."""
+    """Return the recordings that are far from others of their sensor, the farthest first."""
     outliers = []
     for result in results:
         values = result.quantity.factor * result.recordings.value
@@ -328,7 +328,7 @@ def _outlier_rows(
     outliers.sort(key=lambda item: -item[0])
     return [
         {
-            'serial': table.serials[table.unit[row]],
+            'serial': table.serials[table.sensor[row]],
             'date': date_text(table.years[row]),
             'quantity': quantity.label,
             'distance': number(distance),
@@ -341,10 +341,10 @@ def _outlier_rows(
 
 
 def _refusal_rows(table: fleet.FleetTable) -> list[list[str]]:
-    """Return the reasons of refusals: how often, in how many units, and an example."""
-    failed = table.frame.assign(unit=table.unit)[table['outcome'] != 'done']
+    """Return the reasons of refusals: how often, in how many sensors, and an example."""
+    failed = table.frame.assign(unit=table.sensor)[table['outcome'] != 'done']
     kinds = np.array([reason_kind(row) for row in failed.to_dict('records')], object)
-    # A recording without a serial number is of no unit.
+    # A recording without a serial number is of no sensor.
     rows = [
         [
             str(len(group)),

@@ -1,28 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-Units from repeated recordings: levels and slopes of each, and what all of them share.
+Sensors from repeated recordings: levels and slopes of each, and what all of them share.
 
-**Trends.** The value of a recording is the level of its unit, a slope in time, a step that each
+**Trends.** The value of a recording is the level of its sensor, a slope in time, a step that each
 calibration may cause, a scatter from recording to recording, and the stated error of the value.
-Scatter and steps have variances that all units share. They maximise the restricted likelihood of
-all recordings, with levels and slopes of the units free. The own scatter of a unit moderates the
-shared one, as variances that have a scaled inverse χ² distribution over units (Smyth 2004, section
-6.2), and its slope has a t distribution. So a weak drift shows that the recordings of the unit
-alone would not show. The correlation ρ of neighbouring recordings, which the units share,
+Scatter and steps have variances that all sensors share. They maximise the restricted likelihood of
+all recordings, with levels and slopes of the sensors free. A sensor's own scatter moderates the
+shared one, as variances with a scaled inverse χ² distribution over sensors (Smyth 2004, section
+6.2), and its slope has a t distribution. So a weak drift shows that the recordings of the sensor
+alone would not show. The correlation ρ of neighbouring recordings, which the sensors share,
 multiplies the variances of levels and slopes by 1 + 2cρ/(1 − ρ), where c is the share of the
 scatter in the variance (Bartlett 1946). A slope is claimed only if it survives the control of the
 false discovery rate (Benjamini and Hochberg 1995); intervals of claims hold for that share of them
 (Benjamini and Yekutieli 2005).
 
-**Populations.** The estimate of unit u is y = μ + b + e. Its own error e has the known standard
-deviation v, and the unit's departure b from the mean has the standard deviation τ, the spread. At
+**Populations.** The estimate of sensor u is y = μ + b + e. Its own error e has the known standard
+deviation v, and the departure b from the mean has the standard deviation τ, the spread. At
 the spread the weighted squares about the mean are as large as expected (Paule and Mandel 1982),
 and at the ends of its interval as large as quantiles of χ² (Viechtbauer 2007). The errors of the
-mean and of a further unit are those over all spreads by their restricted likelihood, with all
-spreads equally likely before (Gelman 2006), because few units hardly determine the spread.
+mean and of a further sensor are those over all spreads by their restricted likelihood, with all
+spreads equally likely before (Gelman 2006), because few sensors hardly determine the spread.
 
-**Batches** are units whose serial numbers begin alike, and whose levels are not those of the
+**Batches** are sensors whose serial numbers begin alike, and whose levels are not those of the
 others by Welch's t test, whose chance all batches share (Bonferroni), and by more than matters.
 """
 
@@ -41,7 +41,8 @@ import pandas as pd
 import scipy
 
 FALSE_DISCOVERY_RATE = 0.05
-"""Share of the claimed slopes that may be false. Chosen: the usual value."""
+"""Share of the claimed slopes that may be false: of twenty that are looked into, one is none. That
+is the usual value."""
 _INTERVAL = 0.9  # Probability of the intervals. Chosen: that of all intervals of the package
 _MIN_RECORDINGS = 3  # Fewest recordings with a slope: one more than level and slope
 _LARGEST_CORRELATION = 0.95
@@ -50,8 +51,9 @@ _ROUNDS = 20  # Rounds of the factor by correlation; it changes by less than 1e-
 _SMALLEST_SHARE = 1e-8
 """Smallest variance beside the stated errors, relative to that of the values."""
 _FIT_TOLERANCE = 1e-3  # Tolerance of the logarithms of both variances
-FALSE_OUTLIERS = 0.05  # Probability that a fleet without outliers has one on its page. Chosen
-_MIN_OF_OUTLIERS = 5  # Fewest recordings of a unit with outliers. Chosen: a median needs them
+FALSE_OUTLIERS = 0.05
+"""Probability that a fleet without outliers has one on its page: as that of a false slope."""
+_MIN_OF_OUTLIERS = 5  # Fewest recordings of a sensor with outliers. Chosen: a median needs them
 _MAD_EFFICIENCY = 0.37  # Efficiency of that median for normal values (Rousseeuw and Croux 1993)
 _MAD_BIAS = 0.8
 """That median of n values is too small by the factor 1 − 0.8/n (Croux and Rousseeuw 1992)."""
@@ -59,9 +61,9 @@ _MAD_BIAS = 0.8
 
 @dataclass(frozen=True)
 class Recordings:
-    """A quantity in n recordings, in the order of units and time."""
+    """A quantity in n recordings, in the order of sensors and time."""
 
-    unit: np.ndarray  # Numbers of the units from 0, (n,)
+    sensor: np.ndarray  # Numbers of the sensors from 0, (n,)
     # Numbers of the periods between calibrations from 0, which rise along the array, (n,)
     period: np.ndarray
     time: np.ndarray  # Times, in the unit of time of the slopes, (n,)
@@ -70,7 +72,7 @@ class Recordings:
 
     def __getitem__(self, part: np.ndarray) -> Recordings:
         return Recordings(
-            _numbered(self.unit[part]),
+            _numbered(self.sensor[part]),
             _numbered(self.period[part]),
             self.time[part],
             self.value[part],
@@ -85,7 +87,7 @@ def _numbered(labels: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Scatter:
-    """What all units share."""
+    """What all sensors share."""
 
     recording: float  # Standard deviation from recording to recording, beyond the stated errors
     calibration: float  # Standard deviation of the steps at calibrations
@@ -94,17 +96,17 @@ class Scatter:
 
 @dataclass(frozen=True)
 class Trends:
-    """Levels and slopes of m units; NaN stands for a slope that the recordings do not have."""
+    """Levels and slopes of m sensors; NaN stands for a slope that the recordings do not have."""
 
-    scatter: Scatter  # What the units share
-    # level, level_std: Mean of each unit over its recordings and its standard deviation, (m,)
+    scatter: Scatter  # What the sensors share
+    # level, level_std: Mean of each sensor over its recordings and its standard deviation, (m,)
     level: np.ndarray
     level_std: np.ndarray
-    # slope, slope_std: Slope of each unit and its standard deviation, (m,)
+    # slope, slope_std: Slope of each sensor and its standard deviation, (m,)
     slope: np.ndarray
     slope_std: np.ndarray
     freedom: np.ndarray  # Degrees of freedom of the slopes, (m,)
-    squares: np.ndarray  # Weighted squares of the residuals of each unit, (m,)
+    squares: np.ndarray  # Weighted squares of the residuals of each sensor, (m,)
     residual: np.ndarray  # Residuals over the expected scatter, (n,)
     log_likelihood: float  # Restricted log-likelihood of the scatter
 
@@ -116,7 +118,7 @@ class Trends:
 
 
 def fit_trends(recordings: Recordings) -> Trends:
-    """Fit levels and slopes of all units."""
+    """Fit levels and slopes of all sensors."""
     sums = _Sums(recordings)
     scatter = _shared_scatter(sums)
     fit = sums.fit(scatter)
@@ -138,76 +140,70 @@ def fit_trends(recordings: Recordings) -> Trends:
 
 
 class _Sums:
-    """Recordings about the centre of their unit, with where units and periods begin."""
+    """Recordings about the centre of their sensor, with where sensors and periods begin."""
 
     def __init__(self, recordings: Recordings) -> None:
         self.recordings = recordings
-        unit = recordings.unit
-        self.counts = np.bincount(unit)
+        sensor = recordings.sensor
+        self.counts = np.bincount(sensor)
         self.period_starts = np.flatnonzero(np.diff(recordings.period, prepend=-1))
-        self.unit_starts = np.flatnonzero(np.diff(unit[self.period_starts], prepend=-1))
-        self.centre_value = np.bincount(unit, recordings.value) / self.counts
-        self.time = recordings.time - (np.bincount(unit, recordings.time) / self.counts)[unit]
-        self.value = recordings.value - self.centre_value[unit]
-        self.has_slope = (self.counts >= _MIN_RECORDINGS) & (np.bincount(unit, self.time**2) > 0)
+        self.sensor_starts = np.flatnonzero(np.diff(sensor[self.period_starts], prepend=-1))
+        self.centre_value = np.bincount(sensor, recordings.value) / self.counts
+        self.time = recordings.time - (np.bincount(sensor, recordings.time) / self.counts)[sensor]
+        self.value = recordings.value - self.centre_value[sensor]
+        self.has_slope = (self.counts >= _MIN_RECORDINGS) & (np.bincount(sensor, self.time**2) > 0)
 
     def fit(self, scatter: Scatter) -> Trends:
-        """Fit the lines of all units for given variances, by generalised least squares."""
-        step2, unit = scatter.calibration**2, self.recordings.unit
+        """Fit the lines of all sensors for given variances, by generalised least squares."""
+        step2, sensor = scatter.calibration**2, self.recordings.sensor
         weight = 1 / (self.recordings.std**2 + scatter.recording**2)
         t, y = self.time, self.value
-        w, wt, wy, wtt, wty, wyy = self._by_period(
-            weight * [np.ones_like(t), t, y, t * t, t * y, y * y]
-        )
+        # Weighted sums over each period of the products of 1, t and y
+        one = np.ones_like(t)
+        products = self._by_period(weight * [one, t, t * t, y, t * y, y * y])
+        w, wt, _, wy, _, _ = products
         # The step of a period has one common part in all of its recordings (Woodbury).
         shared = step2 / (1 + step2 * w)
-        a, b, c, p, q, r = self._by_unit(
-            [
-                w - shared * w * w,
-                wt - shared * w * wt,
-                wtt - shared * wt * wt,
-                wy - shared * w * wy,
-                wty - shared * wt * wy,
-                wyy - shared * wy * wy,
-            ]
-        )
+        first, second = np.array([w, w, wt, w, wt, wy]), np.array([w, wt, wt, wy, wy, wy])
+        # The normal equations are a·intercept + b·slope = p and b·intercept + c·slope = q.
+        a, b, c, p, q, r = self._by_sensor(products - shared * first * second)
         det = np.where(self.has_slope, np.maximum(a * c - b * b, TINY), 1.0)
         slope = np.where(self.has_slope, (a * q - b * p) / det, 0.0)
         intercept = (p - b * slope) / a
         squares = np.maximum(r - intercept * p - slope * q, 0.0)
-        log_det = self._by_unit(np.log1p(step2 * w)).sum() - np.log(weight).sum()
+        log_det = self._by_sensor(np.log1p(step2 * w)).sum() - np.log(weight).sum()
         log_likelihood = -0.5 * (
             log_det + np.log(np.where(self.has_slope, det, a)).sum() + squares.sum()
         )
-        residual = y - intercept[unit] - slope[unit] * t
+        residual = y - intercept[sensor] - slope[sensor] * t
         step = shared * self._by_period(weight * residual)
         residual = (residual - step[self.recordings.period]) * np.sqrt(weight)
         nan = np.where(self.has_slope, 1.0, np.nan)
         with np.errstate(invalid='ignore'):
             slope_std = nan * np.sqrt(a / det)
         return Trends(
-            scatter,
-            self.centre_value + p / a,
-            a**-0.5,
-            nan * slope,
-            slope_std,
-            np.full(len(a), np.inf),
-            squares,
-            residual,
-            float(log_likelihood),
+            scatter=scatter,
+            level=self.centre_value + p / a,
+            level_std=a**-0.5,
+            slope=nan * slope,
+            slope_std=slope_std,
+            freedom=np.full(len(a), np.inf),
+            squares=squares,
+            residual=residual,
+            log_likelihood=float(log_likelihood),
         )
 
     def _by_period(self, values: np.ndarray) -> np.ndarray:
         """Sum values of recordings, (..., n), within each period."""
         return np.add.reduceat(values, self.period_starts, axis=-1)
 
-    def _by_unit(self, values: np.ndarray | list[np.ndarray]) -> np.ndarray:
-        """Sum values of periods, (..., k), within each unit."""
-        return np.add.reduceat(values, self.unit_starts, axis=-1)
+    def _by_sensor(self, values: np.ndarray | list[np.ndarray]) -> np.ndarray:
+        """Sum values of periods, (..., k), within each sensor."""
+        return np.add.reduceat(values, self.sensor_starts, axis=-1)
 
 
 def _shared_scatter(sums: _Sums) -> Scatter:
-    """Estimate the variances that all units share."""
+    """Estimate the variances that all sensors share."""
     recordings = sums.recordings
     spread2 = float(np.mean(sums.value**2)) + float(np.min(recordings.std)) ** 2
     several = len(sums.period_starts) > len(sums.counts)
@@ -231,15 +227,15 @@ def _shared_scatter(sums: _Sums) -> Scatter:
 
 def _widening(sums: _Sums, fit: Trends) -> float:
     """Estimate the factor of the variances of levels and slopes by correlation in time."""
-    unit, residual = sums.recordings.unit, fit.residual
+    sensor, residual = sums.recordings.sensor, fit.residual
     used = sums.has_slope & (sums.counts > 2 * _MIN_RECORDINGS)
-    same = (unit[1:] == unit[:-1]) & used[unit[1:]]
+    same = (sensor[1:] == sensor[:-1]) & used[sensor[1:]]
     if not same.any() or fit.scatter.recording == 0:
         return 1.0
     variance = fit.scatter.recording**2
-    share = float(np.mean((variance / (variance + sums.recordings.std**2))[used[unit]]))
+    share = float(np.mean((variance / (variance + sums.recordings.std**2))[used[sensor]]))
     products = float((residual[1:] * residual[:-1])[same].sum())
-    squares, count = float((residual**2)[used[unit]].sum()), int(sums.counts[used].sum())
+    squares, count = float((residual**2)[used[sensor]].sum()), int(sums.counts[used].sum())
     lines, widening = 2 * int(used.sum()), 1.0
     for _ in range(_ROUNDS):
         # A line removes as much from squares and products of its residuals.
@@ -269,7 +265,7 @@ def interval_factor(freedom: np.ndarray, is_claimed: np.ndarray) -> np.ndarray:
 
 def outliers(recordings: Recordings, tests: int) -> tuple[np.ndarray, np.ndarray]:
     """
-    Mark the recordings that are too far from the median of their unit and period to be chance.
+    Mark the recordings that are too far from the median of their sensor and period to be chance.
 
     tests: number of recordings that share the chance of a false outlier; returns: the distance of
     each recording in robust standard deviations, (n,), which is 0 where a period has too few
@@ -300,30 +296,33 @@ def _medians(label: np.ndarray, value: np.ndarray) -> np.ndarray:
 
 
 _EQUAL_VARIANCES = 1e6
-"""Degrees of freedom of the common variance where units do not differ. Chosen: infinite."""
+"""Degrees of freedom of the common variance where sensors do not differ. Chosen: infinite."""
 _NO_FREEDOM = 1e-6
-"""Degrees of freedom of the common variance of one unit, which moderates none. Chosen: small."""
-MIN_UNITS = 5
-"""Smallest count of units with a spread: with fewer, a further unit has no finite variance."""
+"""Degrees of freedom of the common variance of one sensor, which moderates none. Chosen: small."""
+MIN_SENSORS = 5
+"""Smallest count of sensors with a spread: with fewer, a further sensor has no finite variance."""
 _GRID = (np.arange(400) + 0.5) / 400
 """Shares x of the spreads s·x/(1 − x) over which the likelihood is integrated. Chosen: more change
 the integrals by less than 1e-3."""
 _OUTLIER_CHANCE = 0.05
-"""Probability that a unit does not count although all units are of one population. Chosen."""
+"""Probability that a sensor does not count although all sensors are of one population: one of
+twenty populations is then a little too narrow."""
 _MAX_ROUNDS = 10
 """Largest count of rounds of spread and outliers; a round seldom changes after the second."""
 _MAX_OUTLIERS = 0.25
-"""Largest share of units that are far out. Chosen: more of them are a population of their own."""
+"""Largest share of sensors that are far out. Chosen: more are a population of their own."""
 _FAR_MADS = 5.0
-"""Units further from the median do not count in the first round. Chosen: far beyond normal."""
+"""Sensors further from the median do not count in the first round. Chosen: far beyond normal."""
 _MIN_BATCH = 5
 """Fewest units of a batch. Chosen: fewer have nothing in common that a test could show."""
-_CHANCE = 0.01  # Probability of a false batch among all batches. Chosen
+_CHANCE = 0.01
+"""Probability of a false batch among all batches. It is less than that of a slope, because a batch
+is sent back."""
 
 
 def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
-    Moderate the variances of units, (m,), by their degrees of freedom, (m,), 0 for none.
+    Moderate the variances of sensors, (m,), by their degrees of freedom, (m,), 0 for none.
 
     returns: moderated variances and their degrees of freedom. Without any variance all are 1.
     """
@@ -331,7 +330,7 @@ def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np
     common, common_freedom = _common_variance(variance[determined], freedom[determined])
     squares = np.where(determined, freedom * np.nan_to_num(variance), 0.0)
     total = common_freedom + freedom
-    # What all units share is no better known than from all of their recordings (limma).
+    # What all sensors share is no better known than from all of their recordings (limma).
     largest = float(freedom[determined].sum())
     return (common_freedom * common + squares) / total, np.minimum(total, largest or np.inf)
 
@@ -363,14 +362,14 @@ def random_effects(
     """
     Estimate mean and spread of a population, without the units that are not of it.
 
-    estimates: estimates of at least `MIN_UNITS` units, (n,); std: their standard deviations, (n,).
+    estimates: those of at least `MIN_SENSORS` sensors, (n,); std: their standard deviations, (n,).
     """
     chance = _OUTLIER_CHANCE / (2 * (tests or len(estimates)))
     deviation = np.abs(estimates - np.median(estimates))
     scale = MAD_TO_STD * np.median(deviation)
     kept = _largest_dropped(deviation / np.hypot(max(scale, TINY), std), _FAR_MADS)
     for _ in range(_MAX_ROUNDS):
-        pooled = _of_units(estimates[kept], std[kept])
+        pooled = _of_sensors(estimates[kept], std[kept])
         distance = np.abs(estimates - pooled.mean) / np.sqrt(
             pooled.spread**2 + pooled.mean_std**2 + std**2
         )
@@ -383,35 +382,35 @@ def random_effects(
 
 
 def _largest_dropped(distance: np.ndarray, limit: float) -> np.ndarray:
-    """Mark the units within a limit, (n,) bool; of too many others, the nearest count, too."""
+    """Mark the sensors within a limit, (n,) bool; of too many others, the nearest count, too."""
     count = len(distance)
-    limit_count = min(int(_MAX_OUTLIERS * count), count - MIN_UNITS)
+    limit_count = min(int(_MAX_OUTLIERS * count), count - MIN_SENSORS)
     farthest = np.argsort(-distance)[:limit_count]
     kept = np.ones(count, bool)
     kept[farthest[distance[farthest] > limit]] = False
     return kept
 
 
-def _of_units(estimates: np.ndarray, std: np.ndarray) -> PooledCoefficient:
+def _of_sensors(estimates: np.ndarray, std: np.ndarray) -> PooledCoefficient:
     """Return the population of the units that count."""
-    unit = max(float(np.ptp(estimates)), float(std.max()), TINY)
-    y, variance = (estimates - estimates.mean()) / unit, (std / unit) ** 2
+    scale = max(float(np.ptp(estimates)), float(std.max()), TINY)
+    y, variance = (estimates - estimates.mean()) / scale, (std / scale) ** 2
     spread2, low, high = _spreads2(y, variance)
     mean, _ = weighted_mean(y, variance, spread2)
     mean_variance, prediction_variance = _variances(y, variance, mean)
     return PooledCoefficient(
-        mean=float(estimates.mean() + unit * mean),
-        mean_std=unit * mean_variance**0.5,
-        spread=unit * spread2**0.5,
-        spread_low=unit * low**0.5,
-        spread_high=unit * high**0.5,
-        prediction_std=unit * prediction_variance**0.5,
+        mean=float(estimates.mean() + scale * mean),
+        mean_std=scale * mean_variance**0.5,
+        spread=scale * spread2**0.5,
+        spread_low=scale * low**0.5,
+        spread_high=scale * high**0.5,
+        prediction_std=scale * prediction_variance**0.5,
         units=len(estimates),
     )
 
 
 def _variances(y: np.ndarray, variance: np.ndarray, mean: float) -> tuple[float, float]:
-    """Return the variances of mean and of a further unit, over all spreads."""
+    """Return the variances of mean and of a further sensor, over all spreads."""
     scale = float(np.sqrt(np.var(y) + variance.mean()))
     if scale == 0:
         return 0.0, 0.0
@@ -437,7 +436,7 @@ def weighted_mean(y: np.ndarray, variance: np.ndarray, spread2: float) -> tuple[
 
 
 def _spreads2(y: np.ndarray, variance: np.ndarray) -> list[float]:
-    """Return the variance between units, and the ends of its 90 % interval; see the module."""
+    """Return the variance between sensors, and the ends of its 90 % interval; see the module."""
 
     def squares(spread2: float) -> float:
         mean, _ = weighted_mean(y, variance, spread2)
@@ -465,7 +464,7 @@ def _spreads2(y: np.ndarray, variance: np.ndarray) -> list[float]:
 
 
 class BadBatch(NamedTuple):
-    """Units with a serial number `prefix`…, and how far their mean is above that of the others."""
+    """Sensors with a serial number `prefix`…; how far their mean is above that of the others."""
 
     prefix: str
     members: np.ndarray

@@ -124,7 +124,7 @@ COLUMNS: tuple[Column, ...] = (
     Column('fit_model', 'text', 'model that was fitted'),
     Column('fit_poses', 'integer', 'poses that were fitted'),
     *(
-        Column(f'gap_{name}{end}{"_mps2" * bool(unit)}', 'float', f'{meaning}{note}', unit)
+        Column(f'gap_{name}{end}{"_mps2" if unit else ""}', 'float', f'{meaning}{note}', unit)
         for (name, meaning, unit), (end, note) in product(_GAP, _ENDS)
     ),
     Column('gap_floor_source', 'text', 'where the floor is from: still, repeats or assumed'),
@@ -287,12 +287,12 @@ def make_recipe(
 ) -> Recipe:
     """Read all parameter files of a run."""
     return Recipe(
-        tuple(tasks),
-        code_version(),
-        _read(params) if params else None,
-        {name: _read(name) for name in set(stated) if name},
-        _stored(store) if store else {},
-        reading,
+        tasks=tuple(tasks),
+        code=code_version(),
+        params=_read(params) if params else None,
+        stated={name: _read(name) for name in set(stated) if name},
+        store=_stored(store) if store else {},
+        reading=reading,
     )
 
 

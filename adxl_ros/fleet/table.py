@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The table of a fleet in the order of units and time, and what it says.
+The table of a fleet in the order of sensors and time, and what it says.
 
 Each quantity has trends, a population and outliers.
 
-The order of units by urgency is that of the table in docs/howto/fleet.md. A unit has the first
+The order of sensors by urgency is that of the table in docs/howto/fleet.md. A sensor has the first
 state that fits:
 
 1. Out of tolerance: its gap exceeds the tolerance now, or without a gap its drift since the
@@ -51,7 +51,9 @@ _TEXTS = [
 _OTHERS = ['date', 'effects', 'calibration_age_days', 'gap_floor_mps2']
 """Columns that the page uses, beside those of the quantities."""
 _YEAR = np.timedelta64(31_557_600_000_000, 'us')  # A year of 365.25 days
-TOLERANCE_MG = 3.5  # Largest gap of a unit that is in order, mg. Chosen: an error of 0.2° in tilt
+TOLERANCE_MG = (
+    3.5  # Largest gap of a sensor that is in order, mg. Chosen: an error of 0.2° in tilt
+)
 MG = mg(1.0)  # Milli-g in 1 m/s²
 
 
@@ -61,7 +63,7 @@ class Quantity:
 
     column: str  # Column of its value; the quantity is named by it
     label: str  # Its name for people
-    shown_unit: str  # Unit on the page
+    shown_unit: str  # Sensor on the page
     factor: float  # Factor from the column's unit to that of the page
     # Column of its standard deviation, or columns of both ends of its 90 % interval
     error_columns: tuple[str, ...]
@@ -79,22 +81,22 @@ class FleetTable:
     """The recordings of n rows, in the order of serial numbers and dates."""
 
     frame: pd.DataFrame  # The columns that the page uses; a text is '' where there is none
-    serials: tuple[str, ...]  # Serial numbers of the units, (m,)
-    unit: np.ndarray  # Number of the unit of each row, (n,); −1 without a serial number
+    serials: tuple[str, ...]  # Serial numbers of the sensors, (m,)
+    sensor: np.ndarray  # Number of the sensor of each row, (n,); −1 without a serial number
     years: np.ndarray  # Dates in years since 1970, (n,); NaN without a date
     # Number of the period between calibrations, (n,), which rises along the rows
     period: np.ndarray
-    first: np.ndarray  # Rows whose content the unit has not had before, (n,) bool
+    first: np.ndarray  # Rows whose content the sensor has not had before, (n,) bool
 
     def __len__(self) -> int:
-        return len(self.unit)
+        return len(self.sensor)
 
     def __getitem__(self, column: str) -> np.ndarray:
         return self.frame[column].to_numpy()
 
-    def rows_of(self, unit: int) -> np.ndarray:
-        """Return the numbers of the rows of a unit, in the order of time."""
-        begin, end = np.searchsorted(self.unit, [unit, unit + 1])
+    def rows_of(self, sensor: int) -> np.ndarray:
+        """Return the numbers of the rows of a sensor, in the order of time."""
+        begin, end = np.searchsorted(self.sensor, [sensor, sensor + 1])
         return np.arange(begin, end)
 
     def recordings(self, quantity: Quantity) -> tuple[np.ndarray, Recordings]:
@@ -102,9 +104,9 @@ class FleetTable:
         value = self[quantity.column]
         low, *high = (self[name] for name in quantity.error_columns)
         std = (high[0] - low) / (2 * Z_90) if high else low
-        used = np.isfinite(value) & np.isfinite(self.years) & (self.unit >= 0) & self.first
+        used = np.isfinite(value) & np.isfinite(self.years) & (self.sensor >= 0) & self.first
         rows = np.flatnonzero(used & np.isfinite(std) & (std >= 0))
-        return rows, Recordings(self.unit, self.period, self.years, value, std)[rows]
+        return rows, Recordings(self.sensor, self.period, self.years, value, std)[rows]
 
 
 def read(path: AnyPath) -> FleetTable:
@@ -123,25 +125,25 @@ def read(path: AnyPath) -> FleetTable:
     frame[_TEXTS] = frame[_TEXTS].astype(object).fillna('')
     frame['effects'] = [[] if names is None else list(names) for names in frame['effects']]
     frame = frame.sort_values(['serial', 'date'], kind='stable', ignore_index=True)
-    serials, unit = np.unique(frame['serial'].to_numpy(str), return_inverse=True)
+    serials, sensor = np.unique(frame['serial'].to_numpy(str), return_inverse=True)
     if len(serials) and not serials[0]:
-        serials, unit = serials[1:], unit - 1
+        serials, sensor = serials[1:], sensor - 1
     date = frame['date'].dt.tz_localize(None).to_numpy('datetime64[us]')
-    # A period ends where the unit is calibrated again, and lasts where none is stated.
-    named = frame['calibration_id'].mask(frame['calibration_id'] == '').groupby(unit).ffill()
+    # A period ends where the sensor is calibrated again, and lasts where none is stated.
+    named = frame['calibration_id'].mask(frame['calibration_id'] == '').groupby(sensor).ffill()
     last = named.shift()
-    begins = (np.diff(unit, prepend=-2) != 0) | (
+    begins = (np.diff(sensor, prepend=-2) != 0) | (
         named.notna() & last.notna() & (named != last)
     ).to_numpy(bool)
     # A copy says nothing twice.
-    first = ~frame.assign(unit=unit).duplicated(['unit', 'hash']) | (frame['hash'] == '')
+    first = ~frame.assign(unit=sensor).duplicated(['unit', 'hash']) | (frame['hash'] == '')
     return FleetTable(
-        frame,
-        tuple(map(str, serials)),
-        unit,
-        (date - np.datetime64(0, 'us')) / _YEAR,
-        np.cumsum(begins) - 1,
-        first.to_numpy(bool),
+        frame=frame,
+        serials=tuple(map(str, serials)),
+        sensor=sensor,
+        years=(date - np.datetime64(0, 'us')) / _YEAR,
+        period=np.cumsum(begins) - 1,
+        first=first.to_numpy(bool),
     )
 
 
@@ -192,30 +194,30 @@ def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
 
 @dataclass(frozen=True)
 class QuantityResult:
-    """A quantity over the k units that have it, in n recordings."""
+    """A quantity over the k sensors that have it, in n recordings."""
 
     quantity: Quantity  # The quantity
     rows: np.ndarray  # Rows of the recordings in the table, (n,)
     recordings: Recordings  # Its values in the unit of its column
-    # Distance of each recording from those of its unit, robust standard deviations, (n,)
+    # Distance of each recording from those of its sensor, robust standard deviations, (n,)
     distance: np.ndarray
-    # Recordings that are too far from the others of their unit, (n,) bool. They do not count.
+    # Recordings that are too far from the others of their sensor, (n,) bool. They do not count.
     is_outlier: np.ndarray
-    units: np.ndarray  # Numbers of the units, (k,)
-    trends: pooling.Trends  # Levels and slopes of the units
-    # Slopes that survive the control of the false discovery rate over all units and quantities,
+    sensors: np.ndarray  # Numbers of the sensors, (k,)
+    trends: pooling.Trends  # Levels and slopes of the sensors
+    # Slopes that survive the control of the false discovery rate over all sensors and quantities,
     # (k,) bool
     is_claimed: np.ndarray
     half_width: np.ndarray  # Half of the interval of each slope, (k,)
-    # Mean and spread over the units, None where they are too few, and units of one batch that are
+    # Mean and spread over the sensors, None where they are too few; those of one batch that are
     # not of this population
     population: PooledCoefficient | None
     batch: pooling.BadBatch | None
 
-    def place_of(self, unit: int) -> int | None:
-        """Return where a unit stands among those of the quantity; None if it is not there."""
-        place = int(np.searchsorted(self.units, unit))
-        return place if place < len(self.units) and self.units[place] == unit else None
+    def place_of(self, sensor: int) -> int | None:
+        """Return where a sensor stands among those of the quantity; None if it is not there."""
+        place = int(np.searchsorted(self.sensors, sensor))
+        return place if place < len(self.sensors) and self.sensors[place] == sensor else None
 
 
 def analyse(table: FleetTable) -> list[QuantityResult]:
@@ -223,17 +225,17 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
     measured = [(quantity, *table.recordings(quantity)) for quantity in quantities(table)]
     measured = [item for item in measured if len(item[1])]
     values = sum(len(rows) for _, rows, _ in measured)
-    # Each unit has each coefficient: the chance of a false outlier is shared by them all.
+    # Each sensor has each coefficient: the chance of a false outlier is shared by them all.
     coefficients = sum(item[0].is_coefficient for item in measured) * len(table.serials)
     results = []
     for quantity, rows, recordings in measured:
         distance, is_outlier = pooling.outliers(recordings, values)
         trends = pooling.fit_trends(recordings[~is_outlier])
-        units = np.unique(table.unit[rows[~is_outlier]])
+        sensors = np.unique(table.sensor[rows[~is_outlier]])
         population, batch = None, None
-        if quantity.is_coefficient and len(units) >= pooling.MIN_UNITS:
+        if quantity.is_coefficient and len(sensors) >= pooling.MIN_SENSORS:
             batch = pooling.bad_batch(
-                [table.serials[unit] for unit in units],
+                [table.serials[sensor] for sensor in sensors],
                 trends.level,
                 TOLERANCE_MG / quantity.factor,
                 len(measured),
@@ -242,20 +244,20 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
             population = pooling.random_effects(
                 trends.level[usual], trends.level_std[usual], coefficients
             )
-        none = np.zeros(len(units), bool)
+        none = np.zeros(len(sensors), bool)
         results.append(
             QuantityResult(
-                quantity,
-                rows,
-                recordings,
-                distance,
-                is_outlier,
-                units,
-                trends,
-                none,
-                np.zeros(len(units)),
-                population,
-                batch,
+                quantity=quantity,
+                rows=rows,
+                recordings=recordings,
+                distance=distance,
+                is_outlier=is_outlier,
+                sensors=sensors,
+                trends=trends,
+                is_claimed=none,
+                half_width=np.zeros(len(sensors)),
+                population=population,
+                batch=batch,
             )
         )
     if not results:
@@ -265,7 +267,7 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
     factor = pooling.interval_factor(
         np.concatenate([r.trends.freedom for r in results]), is_claimed
     )
-    splits = np.cumsum([len(result.units) for result in results])[:-1]
+    splits = np.cumsum([len(result.sensors) for result in results])[:-1]
     return [
         replace(result, is_claimed=claimed, half_width=factors * result.trends.slope_std)
         for result, claimed, factors in zip(
@@ -277,7 +279,7 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
 _VERDICTS = ('no_gap', 'explained', 'partly', 'inseparable', 'unknown')
 """Statuses of recordings whose effects are judged."""
 RECENT = 5
-"""Number of recordings whose median is the gap of a unit now. Chosen: one odd one is no gap."""
+"""Number of recordings whose median is the gap of a sensor now. Chosen: one odd one is no gap."""
 DAYS_PER_YEAR = 365.25
 _FARTHEST_DAYS = 10 * DAYS_PER_YEAR
 """A drift that needs longer is no matter of urgency. Chosen: the life of a robot."""
@@ -285,13 +287,13 @@ _FARTHEST_DAYS = 10 * DAYS_PER_YEAR
 
 def effect_matrix(table: FleetTable) -> pd.DataFrame:
     """
-    Return the share of the recordings of each unit in which each effect is named.
+    Return the share of the recordings of each sensor in which each effect is named.
 
-    The rows are the numbers of the units with a verdict, the columns the effects, the most
+    The rows are the numbers of the sensors with a verdict, the columns the effects, the most
     frequent first.
     """
-    used = np.isin(table['status'].astype(str), _VERDICTS) & (table.unit >= 0) & table.first
-    frame, unit = table.frame[used], table.unit[used]
+    used = np.isin(table['status'].astype(str), _VERDICTS) & (table.sensor >= 0) & table.first
+    frame, sensor = table.frame[used], table.sensor[used]
     counts = Counter(chain.from_iterable(frame['effects']))
     effects = sorted(counts, key=lambda name: (-counts[name], name))
     has = pd.DataFrame(
@@ -299,11 +301,11 @@ def effect_matrix(table: FleetTable) -> pd.DataFrame:
         columns=effects,
         dtype=float,
     )
-    return has.groupby(unit).mean()
+    return has.groupby(sensor).mean()
 
 
 class State(IntEnum):
-    """State of a unit; the most urgent is the least."""
+    """State of a sensor; the most urgent is the least."""
 
     OUT_OF_TOLERANCE = 1
     DRIFTS = 2
@@ -317,27 +319,27 @@ class State(IntEnum):
 
     @property
     def colour(self) -> str:
-        """Return the colour of the badge of a unit."""
+        """Return the colour of the badge of a sensor."""
         return ('red', 'amber', 'amber', 'green')[self - 1]
 
 
 class Drift(NamedTuple):
-    """A claimed slope of a unit."""
+    """A claimed slope of a sensor."""
 
     result: QuantityResult  # Its quantity
     text: str  # The slope with its interval, for people
-    days: float  # Days until the unit is out of its tolerance; infinite if it never is
+    days: float  # Days until the sensor is out of its tolerance; infinite if it never is
     # Gap now, or the drift since the calibration where there is no gap; NaN if days are infinite
     reached_mg: float
     is_rising_noise: bool  # Whether it is of a noise that grows, for which there is no tolerance
 
 
 @dataclass(frozen=True)
-class UnitState:
-    """One unit; its texts are for people."""
+class SensorState:
+    """One sensor; its texts are for people."""
 
     urgency: float  # Its rank among the units of its state; the least is the most urgent
-    unit: int  # Its number
+    number: int  # Its number
     serial: str  # Its serial number
     state: State  # Its state
     reason: str  # Why it has this state, in one sentence; empty for none
@@ -349,19 +351,19 @@ class UnitState:
     report: str  # Folder of the single reports of its last recording; empty for none
 
 
-def rank(table: FleetTable, results: Sequence[QuantityResult]) -> list[UnitState]:
-    """Return all units, the most urgent first."""
-    states = [_state_of(unit, table, results) for unit in range(len(table.serials))]
-    return sorted(states, key=lambda unit: (unit.state, unit.urgency, unit.serial))
+def rank(table: FleetTable, results: Sequence[QuantityResult]) -> list[SensorState]:
+    """Return all sensors, the most urgent first."""
+    states = [_state_of(sensor, table, results) for sensor in range(len(table.serials))]
+    return sorted(states, key=lambda sensor: (sensor.state, sensor.urgency, sensor.serial))
 
 
-def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult]) -> UnitState:
-    """Return a unit with the first state that fits."""
-    rows = table.rows_of(unit)
+def _state_of(sensor: int, table: FleetTable, results: Sequence[QuantityResult]) -> SensorState:
+    """Return a sensor with the first state that fits."""
+    rows = table.rows_of(sensor)
     gap_mg, floor_mg, over_mg = _gap_now(table, rows)
     ages = table['calibration_age_days'][rows]
     age_days = float(next((age for age in ages[::-1] if np.isfinite(age)), np.nan))
-    drifts = _drifts(unit, results, over_mg, age_days)
+    drifts = _drifts(sensor, results, over_mg, age_days)
     refused = table['outcome'][rows] != 'done'
     series = len(refused) if refused.all() else int(np.argmin(refused[::-1]))
     drift = drifts[0] if drifts and drifts[0].days < _FARTHEST_DAYS else None
@@ -387,18 +389,18 @@ def _state_of(unit: int, table: FleetTable, results: Sequence[QuantityResult]) -
             f'Refused, {counted(series, "recording")} in a row: '
             f'{table["refusal"][rows[-1]] or table["outcome"][rows[-1]]}'
         )
-    return UnitState(
-        urgency,
-        unit,
-        table.serials[unit],
-        state,
-        reason[:1].upper() + reason[1:],
-        drifts,
-        f'{number(gap_mg)} / {number(floor_mg)}' if np.isfinite(gap_mg) else '-',
-        f'{len(rows)} ({refused.sum()})',
-        f'{age_days:.0f}' if np.isfinite(age_days) else '-',
-        float(table.years[rows[-1]]),
-        next((text for text in table['report'][rows[::-1]] if text), ''),
+    return SensorState(
+        urgency=urgency,
+        number=sensor,
+        serial=table.serials[sensor],
+        state=state,
+        reason=reason[:1].upper() + reason[1:],
+        drifts=drifts,
+        gap=f'{number(gap_mg)} / {number(floor_mg)}' if np.isfinite(gap_mg) else '-',
+        recordings=f'{len(rows)} ({refused.sum()})',
+        age=f'{age_days:.0f}' if np.isfinite(age_days) else '-',
+        last_year=float(table.years[rows[-1]]),
+        report=next((text for text in table['report'][rows[::-1]] if text), ''),
     )
 
 
@@ -415,12 +417,12 @@ def _gap_now(table: FleetTable, rows: np.ndarray) -> tuple[float, float, float]:
 
 
 def _drifts(
-    unit: int, results: Sequence[QuantityResult], over_mg: float, age_days: float
+    sensor: int, results: Sequence[QuantityResult], over_mg: float, age_days: float
 ) -> tuple[Drift, ...]:
-    """Return the claimed slopes of a unit, the most urgent first."""
+    """Return the claimed slopes of a sensor, the most urgent first."""
     drifts = []
     for result in results:
-        place, quantity = result.place_of(unit), result.quantity
+        place, quantity = result.place_of(sensor), result.quantity
         if place is None or not result.is_claimed[place]:
             continue
         slope, half = float(result.trends.slope[place]), float(result.half_width[place])

@@ -3,7 +3,7 @@
 """
 The task of a worker: from the address of a recording to one row.
 
-The recording is staged, its unit and calibration are looked up, and the tasks run one after the
+The recording is staged, its sensor and calibration are looked up, and the tasks run one after the
 other. A task that refuses leaves its reason. What a recording does not hold is skipped.
 """
 
@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.calibration_store import sha256
-from adxl_ros.files.recording_columns import NO_UNIT, Recording
+from adxl_ros.files.recording_columns import NO_SERIAL, Recording
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.fleet import inputs
 from adxl_ros.fleet.inputs import begin_of, Source
@@ -40,7 +40,7 @@ from adxl_ros.fleet.row import (
 )
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import code_version, package_version
+from adxl_ros.process import code_version, options_named, package_version
 from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
 import numpy as np
 
@@ -116,16 +116,21 @@ def stage(source: Source, folder: Path) -> Staged:
     size_bytes = sum(
         copy.stat().st_size for copy in [target, *target.rglob('*')] if copy.is_file()
     )
-    if (after.stamp, after.size_bytes) != (
-        before.stamp,
-        before.size_bytes,
-    ) or before.size_bytes not in (None, size_bytes):
+    has_changed = (after.stamp, after.size_bytes) != (before.stamp, before.size_bytes)
+    if has_changed or before.size_bytes not in (None, size_bytes):
         raise StagingError(f'{url}: changed while it was read; is it still being written?')
     return Staged(target, sha256([target]), size_bytes)
 
 
 _PAGES = ('explained', 'partly', 'inseparable', 'unknown')
 """Statuses of a diagnosis that get a page. Chosen: it has 2 MB, and without a gap shows little."""
+
+
+class Date(NamedTuple):
+    """When a recording was made."""
+
+    text: str  # By ISO 8601; empty where it is not known
+    source: str  # What states it: manifest, header, stamps or file
 
 
 class Result(NamedTuple):
@@ -138,6 +143,7 @@ class Result(NamedTuple):
     is_known: bool = False  # Whether there is a row with this key
 
 
+@options_named()
 def make_row(recipe: Recipe, earlier: frozenset[str], source: Source, is_again: bool) -> Result:
     """Make the row of a recording; one with an `earlier` key is only made where `is_again`."""
     worker = f'{os.uname().nodename}:{os.getpid()}'
@@ -171,7 +177,7 @@ def refused(recipe: Recipe, source: Source, reason: str, outcome: str = 'refused
     """Return the row of a recording whose content is not known."""
     parameters = recipe.parameters_of(source.serial, source.date, source.params)
     digest = recipe.digest(parameters, source.serial)
-    row = _identity(recipe, source, None, source.serial, (source.date, 'manifest'), parameters)
+    row = _identity(recipe, source, None, source.serial, Date(source.date, 'manifest'), parameters)
     row |= {
         'key': sha256_of(f'{source.url} {source.stamp}', digest),
         'outcome': outcome,
@@ -190,14 +196,17 @@ def _of_staged(recipe: Recipe, source: Source, earlier: frozenset[str], staged: 
         )
     except UserError as error:
         fault = one_line(error)
-    recorded = first.stream_info.serial if first else NO_UNIT
-    is_other = bool(source.serial) and recorded not in (NO_UNIT, '', source.serial)
+    recorded = first.stream_info.serial if first else NO_SERIAL
+    is_other = bool(source.serial) and recorded not in (NO_SERIAL, '', source.serial)
     serial = source.serial or recorded
-    dates = ((source.date, 'manifest'), begin_of(first) if first else ('', ''))
-    date = next((date for date in dates if date[0]), (source.modified, 'file'))
-    parameters = recipe.parameters_of(serial, date[0], source.params)
+    date = Date(source.date, 'manifest')
+    if not date.text and first:
+        date = Date(*begin_of(first))
+    if not date.text:
+        date = Date(source.modified, 'file')
+    parameters = recipe.parameters_of(serial, date.text, source.params)
     digest = recipe.digest(parameters, source.serial)
-    # Which of both units it is of is not known.
+    # Which of both sensors it is of is not known.
     row = _identity(recipe, source, staged, '' if is_other else serial, date, parameters)
     row['key'] = sha256_of(staged.content, digest)
     if row['key'] in earlier:
@@ -217,24 +226,25 @@ def _identity(
     source: Source,
     staged: Staged | None,
     serial: str,
-    date: tuple[str, str],
+    date: Date,
     parameters: ParameterText,
 ) -> Row:
     """Return the columns that do not depend on the tasks."""
-    begun, made = (
-        datetime.fromisoformat(text) if text else None for text in (date[0], parameters.date)
-    )
+    age_days = None
+    if date.text and parameters.date:
+        age = datetime.fromisoformat(date.text) - datetime.fromisoformat(parameters.date)
+        age_days = age / timedelta(days=1)
     return {
         **empty_row(),
         'url': source.url,
         'hash': staged and staged.content,
         'size_bytes': staged.size_bytes if staged else source.size_bytes,
-        'serial': serial if serial not in ('', NO_UNIT) else None,
-        'date': date[0] or None,
-        'date_source': date[1] if date[0] else None,
+        'serial': serial if serial not in ('', NO_SERIAL) else None,
+        'date': date.text or None,
+        'date_source': date.source if date.text else None,
         'tasks': list(recipe.tasks),
         'calibration_id': parameters.calibration_id or None,
-        'calibration_age_days': (begun - made) / timedelta(days=1) if begun and made else None,
+        'calibration_age_days': age_days,
         'validity': None if parameters.calibration_id else 'not calibrated',
         'version': package_version(),
         'code': recipe.code,

@@ -229,14 +229,19 @@ def hypothesis_text(effects: Sequence[str]) -> str:
     """Return a hypothesis for people."""
     if not effects:
         return 'no gap'
-    named = [e for e in effects if e != UNKNOWN]
-    return ' with '.join(named + ['something unknown'] * (UNKNOWN in effects))
+    # What is unknown stands at the end.
+    named = [effect for effect in effects if effect != UNKNOWN]
+    if UNKNOWN in effects:
+        named.append('something unknown')
+    return ' with '.join(named)
 
 
 def listed(names: Sequence[str]) -> str:
     """Return the first names in a sentence, and how many others there are."""
-    more = [f'{len(names) - _LARGEST_NAMED} others'] * (len(names) > _LARGEST_NAMED)
-    return quantities.listed([*names[:_LARGEST_NAMED], *more], 'or')
+    shown, others = list(names[:_LARGEST_NAMED]), len(names) - _LARGEST_NAMED
+    if others > 0:
+        shown.append(f'{others} others')
+    return quantities.listed(shown, 'or')
 
 
 _NICENESS = 10  # Niceness of the process. Chosen: the node that records comes first
@@ -456,12 +461,12 @@ class Investigation:
         self._flush()
         self._diagnoser.ask(
             Question(
-                self._command or self._limits.nearest(*pose),
-                self._asked_minutes,
-                max(self._longest_s - self.moved_s, 0.0) / 60,
-                bool(self.answers),
-                tuple(answer.manoeuvre for _, answer in self.answers),
-                self.answers[-1][1].verdict if self.answers else '',
+                pose=self._command or self._limits.nearest(*pose),
+                minutes=self._asked_minutes,
+                remaining_minutes=max(self._longest_s - self.moved_s, 0.0) / 60,
+                has_samples=bool(self.answers),
+                recorded=tuple(answer.manoeuvre for _, answer in self.answers),
+                verdict=self.answers[-1][1].verdict if self.answers else '',
             )
         )
 

@@ -141,7 +141,7 @@ class EmulatedSensor(base.Link):
         left_out = SensorModel(sensor).left_out
         self._left_out = '; '.join(f'{name} {reason}' for name, reason in left_out.items())
         effects = tuple(name for name in sensor.effects if name not in left_out)
-        self._unit = replace(
+        self._sensor = replace(
             sensor, effects=effects, values={name: sensor.values[name] for name in effects}
         )
         self._counts = dict.fromkeys(('resets', 'gaps', 'late', 'not_finite'), 0)
@@ -183,7 +183,7 @@ class EmulatedSensor(base.Link):
         made, self._made = self._made, []
         missing, self._missing = self._missing, 0
         if not made:
-            empty = base.no_samples(self._unit, self._newest_ns or 0)
+            empty = base.no_samples(self._sensor, self._newest_ns or 0)
             return replace(empty, missing=missing, estimated=missing)
         stamps_ns, fields, volts = zip(*made)
         passed = {
@@ -229,7 +229,10 @@ class EmulatedSensor(base.Link):
             return base.Level.WARN, f'{topic}: {reason}'
         if self._chain is None or sensor is None:
             return base.Level.WARN, f'{topic}: measuring the rate'
-        return base.Level.OK, f'emulates {self._unit.serial} on {topic} at {sensor.rate_hz:.6g} Hz'
+        return (
+            base.Level.OK,
+            f'emulates {self._sensor.serial} on {topic} at {sensor.rate_hz:.6g} Hz',
+        )
 
     def _restart(self) -> None:
         """Put the sensor at its power-on, at a rate that the next samples determine."""
@@ -270,7 +273,7 @@ class EmulatedSensor(base.Link):
                 self._shows_losses = bool(
                     np.quantile(np.abs(steps - np.rint(steps).clip(1)), 0.99) < _STEP_SCATTER
                 )
-                self.sensor = replace(self._unit, rate_hz=rate_hz)
+                self.sensor = replace(self._sensor, rate_hz=rate_hz)
                 self._period_ns = 1e9 / rate_hz
                 self._longest_ns = max(_MAX_FILLED_NS, _LATE_PERIODS * self._period_ns)
                 self._chain = _Chain(self.sensor, self._seed)

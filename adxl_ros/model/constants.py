@@ -15,3 +15,6 @@ NOMINAL_TEMPERATURE_C = 25.0
 """Temperature of the datasheet values, °C (ADXL203 datasheet, specifications)."""
 NOMINAL_SUPPLY_V = 5.0
 """Supply voltage of the datasheet values, V (ADXL203 datasheet, specifications)."""
+SAME_ANGLE_RAD = 1e-5
+"""Angles that differ by less are equal, rad: above the rounding of angles in a file, and far below
+the step of an encoder."""

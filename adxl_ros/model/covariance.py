@@ -15,6 +15,7 @@ from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import (
     ARRAYS,
+    Coefficient,
     Components,
     Environment,
     Maths,
@@ -184,21 +185,20 @@ def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:
     """
     names = sensor.covariance_names
     steps = [_RELATIVE_STEP * parameter_of(name).scale for name in names]
-    pairs = [
-        [
-            static_response(put(sensor, [name], get(sensor, [name]) + change))
-            for change in (step, -step)
-        ]
-        for name, step in zip(names, steps)
-    ]
+
+    def response_at(name: Coefficient, change: float) -> Callable[..., Components]:
+        return static_response(put(sensor, [name], get(sensor, [name]) + change))
+
+    above = [response_at(name, step) for name, step in zip(names, steps)]
+    below = [response_at(name, -step) for name, step in zip(names, steps)]
 
     def by_coefficient(
         force: Components, environment: Environment = NOMINAL_ENVIRONMENT
     ) -> np.ndarray:
         slopes = np.zeros((len(sensor.axes), len(names), np.size(force[0])))
-        for row, (step, pair) in enumerate(zip(steps, pairs)):
-            above, below = (respond(force, environment) for respond in pair)
-            for axis, (a, b) in enumerate(zip(above, below)):
+        for row, step in enumerate(steps):
+            high, low = above[row](force, environment), below[row](force, environment)
+            for axis, (a, b) in enumerate(zip(high, low)):
                 slopes[axis, row] = (a - b) / (2 * step)
         return slopes
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import atan2, hypot
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.model.effects.base import ARRAYS, Components, Joint, Maths, Value
 import numpy as np
@@ -114,7 +114,8 @@ UNKNOWN_ANGLE_RAD2 = 1e6
 π²/3, that of a uniform angle, would let a filter that fuses 1000 samples a second believe in
 yaw = 0 before long. 1e6, as for an axis that is not there, never counts."""
 INFINITE = float('inf')  # Variance of an angle that the force does not determine, rad²
-_FORCE2_FLOOR = 1e-30  # Negligible force, (m/s²)²; chosen: below noise, keeps divisors from 0
+_FORCE2_FLOOR = 1e-30
+"""Square of a negligible force, (m/s²)²: it keeps divisors from 0, and is far below any noise."""
 
 
 @dataclass(frozen=True)
@@ -144,38 +145,51 @@ def tilt(force: Components, covariance: np.ndarray, measures_z: bool = True) -> 
     force = [np.asarray(f, float) for f in force]
     components = tuple(covariance[np.triu_indices(3)])
     with np.errstate(over='ignore', invalid='ignore'):
-        roll, pitch, inclination, beta = (
-            _shown(angle, variance) for angle, variance in angles(force, components, ARRAYS)
-        )
-    alpha = inclination[0] if measures_z else np.minimum(inclination[0], np.pi - inclination[0])
+        roll, pitch, inclination, beta = map(_shown, angles(force, components, ARRAYS))
+    alpha = inclination.angle_rad
+    if not measures_z:
+        alpha = np.minimum(alpha, np.pi - alpha)
     return Tilt(
-        roll[0],
-        pitch[0],
-        inclination[0],
-        alpha,
-        beta[0],
-        roll[1],
-        pitch[1],
-        inclination[1],
-        inclination[1],
-        beta[1],
+        roll=roll.angle_rad,
+        pitch=pitch.angle_rad,
+        inclination=inclination.angle_rad,
+        alpha=alpha,
+        beta=beta.angle_rad,
+        roll_std=roll.std_rad,
+        pitch_std=pitch.std_rad,
+        inclination_std=inclination.std_rad,
+        alpha_std=inclination.std_rad,
+        beta_std=beta.std_rad,
     )
 
 
-def _shown(angle: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the angle and its standard deviation; NaN and inf where it is not shown."""
-    shows = variance < UNOBSERVABLE_RAD2
-    return (
-        np.where(shows, angle, np.nan),
-        np.where(shows, np.sqrt(np.maximum(variance, 0)), np.inf),
+class _ShownAngle(NamedTuple):
+    """An angle with its standard deviation; NaN and inf where the force does not show it."""
+
+    angle_rad: np.ndarray
+    std_rad: np.ndarray
+
+
+def _shown(estimate: AngleEstimate) -> _ShownAngle:
+    shows = estimate.variance_rad2 < UNOBSERVABLE_RAD2
+    std_rad = np.sqrt(np.maximum(estimate.variance_rad2, 0))
+    return _ShownAngle(
+        np.where(shows, estimate.angle_rad, np.nan), np.where(shows, std_rad, np.inf)
     )
+
+
+class AngleEstimate(NamedTuple):
+    """An angle by the force, with its variance: floats or arrays (n,)."""
+
+    angle_rad: Value
+    variance_rad2: Value  # To first order; inf where the angle can be anything
 
 
 def angles(
     force: Components, covariance: tuple[Value, ...], maths: Maths
-) -> tuple[tuple[Value, Value], ...]:
+) -> tuple[AngleEstimate, AngleEstimate, AngleEstimate, AngleEstimate]:
     """
-    Return roll, pitch, inclination and beta with first-order variances.
+    Return roll, pitch, inclination and beta, in this order.
 
     Where noise exceeds the part of the force that shows roll or beta, the angle can be anything:
     its variance is infinite. Pitch and inclination are then the length of a small vector of any
@@ -183,37 +197,54 @@ def angles(
     """
     x, y, z = force
     xx, xy, xz, yy, yz, zz = covariance
-    plane2, side2 = x * x + y * y + _FORCE2_FLOOR, y * y + z * z + _FORCE2_FLOOR
-    total2 = plane2 + z * z
-    total4 = total2 * total2
-    in_plane, in_side = xx + yy, yy + zz
-    along = y * y * yy + 2 * y * z * yz + z * z * zz
-    roll = maths.where(
-        side2 > in_side + _FORCE2_FLOOR,
-        (z * z * yy - 2 * y * z * yz + y * y * zz) / (side2 * side2),
-        INFINITE,
-    )
-    pitch = maths.where(
-        side2 > in_side,
-        (side2 * xx - 2 * x * (y * xy + z * xz) + x * x * along / side2) / total4,
-        in_side / total2,
-    )
-    along = x * x * xx + 2 * x * y * xy + y * y * yy
-    inclination = maths.where(
-        plane2 > in_plane,
-        (z * z * along / plane2 - 2 * z * (x * xz + y * yz) + plane2 * zz) / total4,
-        in_plane / total2,
-    )
-    beta = maths.where(
-        plane2 > in_plane + _FORCE2_FLOOR,
-        (y * y * xx - 2 * x * y * xy + x * x * yy) / (plane2 * plane2),
-        INFINITE,
-    )
+    # Squares of the force in the planes xy and yz
+    plane2 = x * x + y * y + _FORCE2_FLOOR
+    side2 = y * y + z * z + _FORCE2_FLOOR
     return (
-        (maths.atan2(y, z), roll),
-        (maths.atan2(-x, maths.sqrt(side2)), pitch),
-        (maths.atan2(maths.sqrt(plane2), z), inclination),
-        (maths.atan2(0.0 - y, x), beta),
+        AngleEstimate(maths.atan2(y, z), _turn_variance(y, z, yy, yz, zz, maths)),
+        AngleEstimate(
+            maths.atan2(-x, maths.sqrt(side2)),
+            _tilt_variance(x, xx, y, z, yy, yz, zz, y * xy + z * xz, maths),
+        ),
+        AngleEstimate(
+            maths.atan2(maths.sqrt(plane2), z),
+            _tilt_variance(z, zz, x, y, xx, xy, yy, x * xz + y * yz, maths),
+        ),
+        AngleEstimate(maths.atan2(0.0 - y, x), _turn_variance(x, y, xx, xy, yy, maths)),
+    )
+
+
+def _turn_variance(a: Value, b: Value, aa: Value, ab: Value, bb: Value, maths: Maths) -> Value:
+    """Return the variance of the angle of a vector a, b in its plane by its covariance, rad²."""
+    square = a * a + b * b + _FORCE2_FLOOR
+    across = b * b * aa - 2 * a * b * ab + a * a * bb
+    return maths.where(square > aa + bb + _FORCE2_FLOOR, across / (square * square), INFINITE)
+
+
+def _tilt_variance(
+    c: Value,
+    cc: Value,
+    a: Value,
+    b: Value,
+    aa: Value,
+    ab: Value,
+    bb: Value,
+    with_c: Value,
+    maths: Maths,
+) -> Value:
+    """
+    Return the variance of the angle between a force a, b, c and the plane of a and b, rad².
+
+    aa, ab, bb, cc: its covariance; with_c: a·ac + b·bc.
+    """
+    square = a * a + b * b + _FORCE2_FLOOR
+    total2 = square + c * c
+    noise = aa + bb
+    along = a * a * aa + 2 * a * b * ab + b * b * bb
+    return maths.where(
+        square > noise,
+        (square * cc - 2 * c * with_c + c * c * along / square) / (total2 * total2),
+        noise / total2,
     )
 
 

@@ -21,7 +21,7 @@ _HARMONICS = 50  # Harmonics of rounding that are summed. Chosen: the others hol
 
 
 class Electronics(NamedTuple):
-    """RC filter, white noise and steps of a unit at its sample rate, by axis, (m,)."""
+    """RC filter, white noise and steps of a sensor at its sample rate, by axis, (m,)."""
 
     rc_s: np.ndarray  # Time constant of the RC filter, s
     noise_ratio: np.ndarray  # Noise density divided by the nominal one
@@ -29,7 +29,7 @@ class Electronics(NamedTuple):
 
 
 def electronics(sensor: Sensor) -> Electronics:
-    """Return filter, white noise and steps of a unit by all its effects, of any package."""
+    """Return filter, white noise and steps of a sensor by all its effects, of any package."""
     names = [name for name in sensor.effects if effect_named(name).place is Place.ELECTRONICS]
     chain, count = Chain(sensor, names), len(sensor.axes)
     # Arrays of one sample: effects with a memory take no floats.
@@ -68,9 +68,9 @@ def filtered_bandwidth_hz(rc_s: np.ndarray, rate_hz: float) -> np.ndarray:
 
 def analog_std_v(sensor: Sensor) -> np.ndarray:
     """Return the standard deviation of the noise behind the filter by axis, V, (m,)."""
-    unit = electronics(sensor)
-    density = unit.noise_ratio * sensor.noise_density_g_per_rthz * sensor.nominal_scale_v_per_g
-    return density * np.sqrt(filtered_bandwidth_hz(unit.rc_s, sensor.rate_hz))
+    circuit = electronics(sensor)
+    density = circuit.noise_ratio * sensor.noise_density_g_per_rthz * sensor.nominal_scale_v_per_g
+    return density * np.sqrt(filtered_bandwidth_hz(circuit.rc_s, sensor.rate_hz))
 
 
 def sample_std_v(sensor: Sensor) -> np.ndarray:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The population of units that a unit is from, as a prior of its zero-g and scale factor.
+The population of sensors that a sensor is from, as a prior of its zero-g and scale factor.
 
-A fleet determines the mean of each coefficient and its standard deviation over units. A unit of
+A fleet determines the mean of each coefficient and its std over sensors. A sensor of
 the same population has both as a normal prior. The estimate of a calibration and its covariance
 then have a normal posterior in closed form, because the chain is nearly linear in them.
 """
@@ -27,15 +27,17 @@ _EFFECTS = ('bias', 'scale_factor')  # Effects of the coefficients that a popula
 class PooledCoefficient:
     """A coefficient over the units of a fleet, in the unit of its column."""
 
-    # mean, mean_std: Mean over the units and its standard deviation
+    # mean, mean_std: Mean over the sensors and its standard deviation
     mean: float
     mean_std: float
-    spread: float  # Standard deviation of the units about the mean, without their own errors
+    spread: float  # Standard deviation of the sensors about the mean, without their own errors
     # spread_low, spread_high: 90 % interval of the spread
     spread_low: float
     spread_high: float
-    prediction_std: float  # Standard deviation of the coefficient of a further unit about the mean
-    units: int  # Number of units
+    prediction_std: (
+        float  # Standard deviation of the coefficient of a further sensor about the mean
+    )
+    units: int  # Number of sensors
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class Population:
     coefficients: Mapping[str, PooledCoefficient]
 
     def prior(self, sensor: Sensor) -> Prior:
-        """Return the prior of a unit's departures from its nominal values."""
+        """Return the prior of a sensor's departures from its nominal values."""
         zero_g_v, scale_v_per_g = sensor.nominal_zero_g_v, sensor.nominal_scale_v_per_g
         names, departures = [], []
         for effect, parameter, column, nominal in (
@@ -73,18 +75,18 @@ class Prior(NamedTuple):
 
 
 class Posterior(NamedTuple):
-    """A unit as one of a population."""
+    """A sensor as one of a population."""
 
-    sensor: Sensor  # The unit; unchanged if it is a stranger
+    sensor: Sensor  # The sensor; unchanged if it is a stranger
     line: str  # How the population is used, or why it is not, for people
-    is_stranger: bool = False  # Whether the unit is not of the population
+    is_stranger: bool = False  # Whether the sensor is not of the population
 
 
 def posterior(sensor: Sensor, population: Population) -> Posterior:
     """
-    Combine the coefficients of a unit with its population, unless they contradict each other.
+    Combine the coefficients of a sensor with its population, unless they contradict each other.
 
-    A unit without zero-g and scale factor of its own takes those of the population.
+    A sensor without zero-g and scale factor of its own takes those of the population.
     """
     names, mean, std = population.prior(sensor)
     if not names:
@@ -94,13 +96,13 @@ def posterior(sensor: Sensor, population: Population) -> Posterior:
             f'{sensor.axes}; it is not used',
         )
     if not set(_EFFECTS) & set(sensor.effects):
-        unit = replace(
+        combined = replace(
             put(with_neutral(sensor, _EFFECTS), names, mean),
             covariance=np.diag(std**2),
             covariance_names=names,
         )
         return Posterior(
-            unit,
+            combined,
             f'zero-g and scale factor are those of '
             f'{population.name}: the unit has none of its own',
         )
@@ -128,11 +130,11 @@ def posterior(sensor: Sensor, population: Population) -> Posterior:
     gain = np.linalg.solve(total, sensor.covariance[places]).T
     covariance = sensor.covariance - gain @ sensor.covariance[places]
     values = get(sensor, sensor.covariance_names) + gain @ departure
-    unit = replace(
+    combined = replace(
         put(sensor, sensor.covariance_names, values), covariance=(covariance + covariance.T) / 2
     )
     return Posterior(
-        unit,
+        combined,
         (
             f'{population.name} is the prior of {len(places)} coefficients: χ² {square:.3g}, '
             f'probability {chance:.2g}'

@@ -44,7 +44,7 @@ class Envelope:
     the variance (g·k_zero·ΔT)² + (f·k_scale·ΔT)², with the typical slopes k of zero-g and scale
     factor, one standard deviation each. A model that follows temperature has slopes of its own,
     whose covariance grows by itself. What it lacks is of the next degree of the polynomial. Fitted
-    to a unit that has this term c·T^n, the model agrees with it at n temperatures T_i, and departs
+    to a sensor that has this term c·T^n, the model agrees with it at n temperatures T_i, departing
     elsewhere by p(T) = c·(T − T_1)···(T − T_n), less p at the temperature of the zero-g. The size
     of c, one standard deviation, is what the poses leave open, and what they show of it.
 
@@ -159,10 +159,10 @@ def _nominal(
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Sensor:
     """
-    One unit: the nominal chain by its nominal values, and the effects that depart from it.
+    One sensor: the nominal chain by its nominal values, and the effects that depart from it.
 
     The metadata of the fields are the only description of the nominal values. Parameter files,
     the nodes' parameters and error messages use them. Arrays have one entry for each measured
@@ -281,7 +281,7 @@ class Sensor:
     # Typical and largest departure by parameter, as the datasheet states them, each in the unit of
     # the parameter; 0 where it does not
     datasheet: dict[Coefficient, tuple[float, float]] = field(default_factory=dict)
-    # How the driver reaches the unit: values of `link.*` by name. Its file carries them.
+    # How the driver reaches the sensor: values of `link.*` by name. Its file carries them.
     link: dict[str, Any] = field(default_factory=dict)
     # How the case sits on the robot: values of `mounting.*` by name, which its file carries, too
     mounting: dict[str, Any] = field(default_factory=dict)
@@ -294,12 +294,12 @@ class Sensor:
 
     @property
     def zero_g_v(self) -> np.ndarray:
-        """Zero-g output of this unit, V, (m,)."""
+        """Zero-g output of this sensor, V, (m,)."""
         return self.nominal_zero_g_v + self._value('bias', 'offset_v')
 
     @property
     def scale_v_per_g(self) -> np.ndarray:
-        """Scale factor of this unit, V/g, (m,)."""
+        """Scale factor of this sensor, V/g, (m,)."""
         return self.nominal_scale_v_per_g + self._value('scale_factor', 'offset_v_per_g')
 
     @property
@@ -322,6 +322,10 @@ class Sensor:
         """
         stated_s = self.rc_resistance_ohm * self.rc_capacitance_f
         return stated_s * self.filter_rate_hz / self.rate_hz if self.filter_rate_hz else stated_s
+
+    def __repr__(self) -> str:
+        effects = ', '.join(self.effects) or 'none'
+        return f'<Sensor {self.serial}: axes {" ".join(self.axes)}, effects: {effects}>'
 
     @property
     def lsb_v(self) -> float:

@@ -145,21 +145,18 @@ class Chain:
 
     def put_units(self, names: Sequence[Coefficient], values: np.ndarray) -> None:
         """Give each of n sensors coefficients of its own, (n, k); the others are shared."""
-        for effect in self._running():
-            for parameter in {name.parameter for name in names if name.effect == effect.name}:
-                by_axis = {
-                    name.axis: values[:, k].copy()
-                    for k, name in enumerate(names)
-                    if (name.effect, name.parameter) == (effect.name, parameter)
-                }
-                shared = effect.parameters[parameter]
-                effect.parameters[parameter] = (
-                    by_axis.get('', shared)
-                    if not isinstance(shared, tuple)
-                    else tuple(
-                        by_axis.get(axis, value) for axis, value in zip(self.sensor.axes, shared)
-                    )
-                )
+        effects = {effect.name: effect for effect in self._running()}
+        for name, of_sensors in zip(names, values.T):
+            effect = effects.get(name.effect)
+            if effect is None:
+                continue
+            own = of_sensors.copy()
+            if name.axis:
+                by_axis = list(effect.parameters[name.parameter])
+                by_axis[self.sensor.axes.index(name.axis)] = own
+                effect.parameters[name.parameter] = tuple(by_axis)
+            else:
+                effect.parameters[name.parameter] = own
 
     def anew(self) -> Chain:
         """Return the chain as after power-on; random generators are shared."""

@@ -138,7 +138,8 @@ class ChangeTest:
     def _compare(self, j: int, length: int) -> list[int]:
         """Compare one length, and learn; return the channels that have changed."""
         begin = self._count - (1 + _BEFORE) * length
-        now, middle, first = (k % self._size for k in (self._count, self._count - length, begin))
+        now, middle = self._count % self._size, (self._count - length) % self._size
+        first = begin % self._size
         difference = (self._sums[now] - self._sums[middle]) / length - (
             self._sums[middle] - self._sums[first]
         ) / (_BEFORE * length)

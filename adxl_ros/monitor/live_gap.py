@@ -93,7 +93,7 @@ class LiveGap:
     """
     Compares a stream with the prediction of its parameters, second by second.
 
-    sensor: the unit at the rate of the stream.
+    sensor: the sensor at the rate of the stream.
     """
 
     def __init__(self, sensor: Sensor, kind: ReferenceKind, settings: GapSettings) -> None:
@@ -109,7 +109,7 @@ class LiveGap:
             maxlen=max(round(settings.window_s * 1e9 / BLOCK_NS), _FEWEST_BLOCKS)
         )
         self._ends_ns: deque[int] = deque(maxlen=LONGEST_BLOCKS + 1)
-        # Random walk of a healthy unit, or of its file if that is larger: that of a file goes on.
+        # Random walk of a healthy sensor, or of its file if larger: that of a file goes on.
         healthy_g = effect_named('bias_walk').diagnosis.healthy_density
         walk_g = float(
             np.max(
@@ -321,7 +321,12 @@ class LiveGap:
                 np.clip((datasheet**2 - gap.value**2) / (datasheet**2 - floor.value**2), 0.0, 1.0)
             )
         return AxisGap(
-            axis, gap, floor, source, float(of_blocks('mean_mps2').mean()) / _MG, explained
+            axis=axis,
+            gap=gap,
+            floor=floor,
+            floor_source=source,
+            offset_mg=float(of_blocks('mean_mps2').mean()) / _MG,
+            explained=explained,
         )
 
 

@@ -54,7 +54,9 @@ _PARTS = 10
 a step is in one part."""
 _FEWEST_OF_PART = 8
 """Fewest samples of a part; chosen: its variance is then known within a factor of two."""
-_ROBOT_NS = 1_000_000_000  # Time whose forces of a robot are computed at once, ns; chosen
+_ROBOT_NS = 1_000_000_000
+"""Time whose forces of a robot are computed at once, ns: that of a block, so that each is computed
+once."""
 _MARGIN_NS = 500_000_000
 """Time of further readings on both sides, ns. Chosen: the ends of the splines then add less than a
 tenth to the error."""
@@ -157,12 +159,12 @@ class ReferenceStream:
         self._origin_ns = origin_ns
         alpha, beta, shift = (partial(self._joint, number) for number in range(len(JOINTS)))
         motion = Motion(
-            np.inf,
-            alpha,
-            beta,
-            shift,
-            partial(self._surrounding, 'temperature_c'),
-            partial(self._surrounding, 'supply_v'),
+            duration_s=np.inf,
+            alpha=alpha,
+            beta=beta,
+            shift=shift,
+            temperature_c=partial(self._surrounding, 'temperature_c'),
+            supply_v=partial(self._surrounding, 'supply_v'),
         )
         if self.kind is ReferenceKind.STAGE:
             return motion
@@ -191,7 +193,7 @@ class ReferenceStream:
         ]
         largest = max(_STILL_STEPS * step_rad, _STILL_RAD)
         time_s = (np.linspace(begin_ns, end_ns, 3) - self._origin_ns) * 1e-9
-        alpha, beta = (path(time_s) for path in self._paths[:2])
+        alpha, beta = self._paths[0](time_s), self._paths[1](time_s)
         stds = [
             errors.std
             if isinstance(path, SmoothedPath) and (errors := path.errors(time_s))
@@ -348,20 +350,21 @@ class Prediction:
         )
         if is_first:
             return None
-        mean_mps2, (moves, error_mps2) = scipy.stats.trim_mean(modelled, _TRIMMED, axis=0), motion
+        mean_mps2 = scipy.stats.trim_mean(modelled, _TRIMMED, axis=0)
+        moves, error_mps2 = motion
         independent = float(
             noise.effective_samples(len(stamp_ns), 1 / self._sensor.rate_hz, self._sensor.rc_s)
         )
         freedom = max(1 - 1 / max(independent, 1.0), 0.5)
         return Block(
-            end_ns,
-            mean_mps2,
-            (modelled**2).mean(axis=0),
-            modelled.var(axis=0) / freedom + _SMALLEST_MPS2**2,
-            _log_noise(modelled),
-            (datasheet**2).mean(axis=0),
-            error_mps2[: len(mean_mps2)] ** 2,
-            moves,
+            end_ns=end_ns,
+            mean_mps2=mean_mps2,
+            square=(modelled**2).mean(axis=0),
+            noise_square=modelled.var(axis=0) / freedom + _SMALLEST_MPS2**2,
+            log_noise=_log_noise(modelled),
+            datasheet_square=(datasheet**2).mean(axis=0),
+            reference_square=error_mps2[: len(mean_mps2)] ** 2,
+            moves=moves,
         )
 
 

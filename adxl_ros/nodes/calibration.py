@@ -26,7 +26,7 @@ from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
 from adxl_ros.files import calibration_store, cdr
 from adxl_ros.files.recording_columns import JOINTS
 from adxl_ros.model.sensor import Sensor, to_volts
-from adxl_ros.nodes import parameters, topics
+from adxl_ros.nodes import parameter_checks, parameters, params_files, sensor_parameters, topics
 from adxl_ros.nodes.jobs import executable, held_output
 from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
@@ -142,7 +142,9 @@ class CalibrationSettings:
     )
 
 
-_SCREEN_END_S = 5.0  # Longest wait for the end of the screen, s; chosen: far above its usual end
+_SCREEN_END_S = 5.0
+"""Longest wait for the end of the screen, s. It ends within one callback, 0.02 s; a process that
+hangs is killed after this, and the node's own end waits as long."""
 _RESET = b'\x1b[?1049l\x1b[?2004l\x1b[?25h\x1b[0m'
 """Leaves alternate screen and bracketed paste and shows the cursor, by the codes of xterm."""
 
@@ -202,7 +204,8 @@ class OwnScreen:
 
 
 _REPEAT_NS = 500_000_000
-"""Time between two commands of the same pose, ns; chosen: a late stage loses little time."""
+"""Time between two commands of the same pose, ns: a stage that starts late, or that has lost the
+first command, loses at most this of a pose of seconds."""
 _COMMAND_QUEUE = 10
 """Commands that are kept for a recorder that stalls: a bag then has every command."""
 
@@ -257,7 +260,8 @@ class Announcer:
 
 
 _PERIOD_S = 0.2
-"""Time between two messages, s; chosen: the eye follows it, and it costs no samples."""
+"""Time between two messages, s: numbers that change more often than 5 times a second are not
+read."""
 
 _ABORT = KeyAction('a', 'abort', 'abort')
 _RUNNING = (
@@ -328,7 +332,7 @@ class DisplayPublisher:
 
     def _publish(self, phase: Phase, text: str) -> None:
         controller, stream = self._controller, self._controller.stream
-        unit, session, newest = stream.unit, controller.session, stream.newest
+        nominal, session, newest = stream.nominal, controller.session, stream.newest
         usual = _BY_HAND if controller.settings.operator_captures else _RUNNING
         keys = () if phase is Phase.FIT else _KEYS.get(controller.state, usual)
         coefficients: list[screen_contents.Row] = []
@@ -341,7 +345,7 @@ class DisplayPublisher:
                 data=screen_contents.ScreenContents(
                     phase=phase.value,
                     text=text,
-                    unit=f'{unit.serial} ({unit.axes})' if unit else '',
+                    unit=f'{nominal.serial} ({nominal.axes})' if nominal else '',
                     output=str(controller.settings.output),
                     keys=keys,
                     rows=tuple(rows),
@@ -353,16 +357,20 @@ class DisplayPublisher:
 
 
 _POLL_S = 0.02
-"""Time between two steps of the controller, s; chosen: short beside a dwell of seconds, also where
-sensor time is many times real time."""
+"""Time between two steps of the controller, s. It ends a dwell late by at most this: by 1 % of 2
+s, and by 0.4 s where sensor time is twenty times real time."""
 _FAREWELL_NS = 2_500_000_000
-"""Time from the end of a calibration to that of the node, ns; chosen: two reports come within."""
-_QUEUE = 100  # Messages that wait while the node fits; chosen: some seconds of slow topics
+"""Time from the end of a calibration to that of the node, ns: two reports of the diagnostics, one
+a second, come within it, so that a screen or recorder has the result."""
+_QUEUE = 100
+"""Messages that wait while the node fits: 100 s of temperature and supply at 1 Hz; a fit takes
+some seconds."""
 _STAGE_TOPICS = ('stage/command', 'stage/joint_states')
 _STAGE_QUEUE = 1000
 """Messages of the stage that wait meanwhile; more, because its angles come faster."""
 _CHECK_POSES = {'full': 16, 'quick': 8}
-"""Check poses by kind of the pose plan; chosen: about a tenth, or a fifth, of the poses."""
+"""Check poses by kind of the pose plan. Their rms is then known within 18 and 25 %. They are about
+a tenth, or a fifth, of the poses; more of them would weaken the fit."""
 _EXAMPLES = {
     'a stage that is turned by hand': '--ros-args -p stage.mode:=manual -p output:=unit.yaml',
     'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml',
@@ -372,8 +380,9 @@ _SAMPLES = 'imu/data_raw'  # Topic of the samples, relative to the namespace of 
 _YAW_VARIANCE = 8
 """Place of the variance of yaw in an orientation's covariance of 9 numbers, from 0."""
 _INFO_NS = 1_000_000_000
-"""Time that samples wait for `sensor_info`, ns; chosen: a latched message comes within it, also
-where the samples of seconds come within a tenth of it."""
+"""Time that samples wait for `sensor_info`, ns. A latched message comes within it, also where
+sensor time is ten times real time; until then nothing is measured, so that more delays the first
+pose."""
 _SAMPLES_QUEUE = 20000  # Samples that are kept: 20 s at 1 kHz, longer than a fit takes
 
 
@@ -405,7 +414,7 @@ class Samples:
         may_come = STEADY.now().nanoseconds - self._begun_ns < _INFO_NS
         return topics.finite_samples([] if may_come else self._raw)
 
-    def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    def take(self, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m), finite."""
         self._receive()
         batch, self._raw = self._raw, []
@@ -415,12 +424,12 @@ class Samples:
         accel, covariance = fields['linear_acceleration'], fields['orientation_covariance']
         # -1 in the first place means that a message has no orientation.
         yaw_rad2 = np.where(covariance[:, 0] >= 0, covariance[:, _YAW_VARIANCE], 0.0)
-        accel = accel[:, : len(unit.axes)]
+        accel = accel[:, : len(sensor.axes)]
         finite = np.isfinite(accel)
         if batch:
-            self.fault = self._fault(bool((yaw_rad2 != UNKNOWN_ANGLE_RAD2).all()), finite, unit)
+            self.fault = self._fault(bool((yaw_rad2 != UNKNOWN_ANGLE_RAD2).all()), finite, sensor)
         complete = finite.all(axis=1)
-        return stamps[complete], to_volts(accel[complete], unit)
+        return stamps[complete], to_volts(accel[complete], sensor)
 
     def _receive(self) -> None:
         """Take the messages that have come since the last call."""
@@ -428,7 +437,7 @@ class Samples:
         if self._raw:
             self._begun_ns = self._begun_ns or STEADY.now().nanoseconds
 
-    def _fault(self, is_raw: bool, finite: np.ndarray, unit: Sensor) -> str:
+    def _fault(self, is_raw: bool, finite: np.ndarray, sensor: Sensor) -> str:
         """Return why samples with these finite values, (n, m), cannot be used, or ''."""
         if not is_raw:
             return (
@@ -439,7 +448,7 @@ class Samples:
         if finite.all(axis=1).any():
             return ''
         dead = ' and '.join(
-            axis for axis, lives in zip(unit.axes, np.asarray(finite.any(axis=0))) if not lives
+            axis for axis, lives in zip(sensor.axes, np.asarray(finite.any(axis=0))) if not lives
         )
         return (
             f'{dead or "one axis or another"} is not a number in all samples; check its '
@@ -456,13 +465,13 @@ class Calibration(Node):
 
     def __init__(self) -> None:
         super().__init__('calibration')
-        parameters.check_given(self)
-        flat = parameters.declare_sensor(self)
+        parameter_checks.check_given(self)
+        flat = sensor_parameters.declare_sensor(self)
         carried: dict[str, Any] = {
             name: parameters.given_below(self, f'{name}.') for name in ('link', 'mounting')
         }
-        sensor = replace(parameters.make_sensor(flat, may_measure=True), **carried)
-        anonymous = replace(parameters.anonymous_sensor(self, flat), **carried)
+        sensor = replace(sensor_parameters.make_sensor(flat, may_measure=True), **carried)
+        anonymous = replace(sensor_parameters.anonymous_sensor(self, flat), **carried)
         self._own = own = parameters.declare_all(self, CalibrationSettings)
         settings = _session_settings(own)
         self._captures: list[object] = []  # Requests that wait for the end of a capture
@@ -471,7 +480,12 @@ class Calibration(Node):
         self.announce, self.withdraw_pose = announcer.announce, announcer.withdraw
         self._samples = Samples(self, own.samples_unit)
         self._controller = controller.Controller(
-            settings, sensor, own.resume, self._samples, self, anonymous
+            settings=settings,
+            sensor=sensor,
+            resume=own.resume,
+            samples=self._samples,
+            outputs=self,
+            anonymous=anonymous,
         )
         if own.autostart:
             self._controller.start()
@@ -605,10 +619,10 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
     output = Path(own.output)
     journal = Path(own.journal or f'{output}.journal')
     if own.mode == 'thermal' and own.report:
-        raise parameters.parameter_error('report', 'mode thermal writes no page; leave it empty')
+        raise params_files.parameter_error('report', 'mode thermal writes no page; leave it empty')
     for name, path in (('output', output), ('journal', journal)):
         if path.is_dir():
-            raise parameters.parameter_error(name, f'{path} is a directory; name a file')
+            raise params_files.parameter_error(name, f'{path} is a directory; name a file')
     planes_rad = tuple(
         np.radians(
             parameters.numbers('sweep.planes_deg', own.planes_deg or [], '[30.0, 60.0, 90.0]')
@@ -616,12 +630,12 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
     )
     step_rad = float(np.radians(own.step_deg))
     capture = screen_contents.CaptureSettings(
-        own.dwell_s,
-        own.tolerance_rad,
-        own.timeout_s,
-        StageMode(own.stage_mode),
-        float(np.radians(own.near_deg)),
-        own.temperature_span_c,
+        dwell_s=own.dwell_s,
+        tolerance_rad=own.tolerance_rad,
+        timeout_s=own.timeout_s,
+        stage_mode=StageMode(own.stage_mode),
+        near_rad=float(np.radians(own.near_deg)),
+        temperature_span_c=own.temperature_span_c,
     )
     kind = own.plan
     if kind == 'auto':

@@ -23,24 +23,29 @@ from adxl_ros.calibrate.result import compare, truth_table
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, sweep_journal
 from adxl_ros.model.effects import effect_named
+from adxl_ros.model.effects.base import Parameter
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import jobs
-from adxl_ros.process import ended_by_closed_output
+from adxl_ros.process import ended_by_closed_output, options_named
 from adxl_ros.report.screen import coloured, program_parser
 import numpy as np
 
-_LONGEST_S = 600.0  # Longest time of a step, s; chosen: far above what sweep and fit take
+_LONGEST_S = 600.0
+"""Longest time of a step, s: twelve times the whole demonstration on two cores."""
 _POLL_S = 0.2  # Time between two looks at the progress, s
 _SPEED = 80.0
-"""Sensor time per real time; chosen: two cores can follow, and a slower machine takes longer."""
+"""Sensor time per real time. Two cores can follow it; a slower machine takes longer, and drops no
+sample. With half of it the demonstration takes twice as long."""
 _RATE_HZ = 125.0
-"""Rate of the simulated sensor, Hz. Chosen: its noise ends at 50 Hz, so that more samples would
-say no more, and many times real time leaves room to catch up."""
+"""Rate of the simulated sensor, Hz. Its noise ends at 50 Hz, so that more samples would say no
+more, and many times real time leaves room to catch up."""
 _DURATION_S = 50  # Real time of the demonstration, s; measured
 _PLANES_DEG = [30.0, 60.0, 90.0, 120.0, 150.0]  # Planes alpha of the sweep, degrees
 _STEP_DEG = 30.0  # Step of beta in each plane, degrees
 _CHECK_POSES = 16  # Number of poses that are kept out of the fit
-_SEED = 203  # Default seed of the demonstrated unit and its stage; chosen
+_SEED = 203
+"""Default seed of the demonstrated unit and its stage: any. It is fixed, so that the README can
+state the figures."""
 _STARTED = ('driver', 'stage', 'calibration')
 """Nodes of the demonstration in the order of their start."""
 _UNIT_EFFECTS = {
@@ -51,15 +56,17 @@ _UNIT_EFFECTS = {
     'cross_axis_z': 1.0,
     'scale_factor_z': 0.7,
 }
-"""Effects of the demonstrated unit, in multiples of their typical values; chosen."""
+"""Effects of the demonstrated unit, in multiples of their typical values: at most one, as a unit
+from the shelf has."""
 _SPREAD = (0.5, 1.5)
-"""Range of the random factor of each coefficient of the demonstrated unit; chosen."""
+"""Range of the random factor of each coefficient of the demonstrated unit: no two are alike, and
+none vanishes."""
 _DELAY_S = 0.2
-"""Time from a command to the motion of the stage, s. Chosen: driver and stage wait for each other
-once in this time, and the samples of a longer time would overflow the shared memory."""
+"""Time from a command to the motion of the stage, s. Driver and stage wait for each other once in
+this time, and the samples of a longer time would overflow the shared memory."""
 _QUEUE = 100_000
-"""Samples that wait for a busy subscriber; chosen: 2.5 s of real time, longer than a busy machine
-lets a process wait."""
+"""Samples that wait for a busy subscriber: 10 s of real time at the speed of the demonstration,
+longer than a busy machine lets a process wait."""
 _KEEPING: dict[str, object] = {'qos_overrides./imu/data_raw.publisher.depth': _QUEUE}
 """Parameters of a driver that keeps its samples until the calibration has them."""
 _UNATTENDED = {
@@ -113,6 +120,7 @@ def _poses(journal: Path) -> tuple[int, list[sweep_journal.PoseRecord]]:
 
 
 @ended_by_closed_output()
+@options_named()
 def main() -> int:
     """Run the demonstration; return the exit status."""
     parser = program_parser(argparse.ArgumentParser, 'demo', __doc__, _EXAMPLES)
@@ -152,13 +160,13 @@ def main() -> int:
 
 def _run_sweep(folder: Path, seed: int) -> None:
     """Sweep a simulated sensor whose coefficients are drawn at datasheet spread."""
-    unit, nominal = folder / 'simulated_unit.yaml', folder / 'nominal.yaml'
+    truth_path, nominal_path = folder / 'simulated_unit.yaml', folder / 'nominal.yaml'
     sensor = replace(
         parameter_file.load(parameter_file.nominal_path()), serial='demo', rate_hz=_RATE_HZ
     )
     truth = _draw_unit(sensor, seed)
-    parameter_file.save(nominal, sensor)
-    parameter_file.save(unit, truth, ['The truth of the simulated unit.'])
+    parameter_file.save(nominal_path, sensor)
+    parameter_file.save(truth_path, truth, ['The truth of the simulated unit.'])
     name = parameter_file.nominal_path().stem
     output, report = folder / f'{name}_demo.yaml', folder / 'sweep'
     _print(
@@ -171,11 +179,11 @@ def _run_sweep(folder: Path, seed: int) -> None:
     for path in (output, journal):
         path.unlink(missing_ok=True)
     commands = [
-        _command('driver', unit, _KEEPING | {'link.type': 'sim', 'link.speed': _SPEED}),
-        _command('stage', nominal, {'delay_s': _DELAY_S, 'seed': seed}),
+        _command('driver', truth_path, _KEEPING | {'link.type': 'sim', 'link.speed': _SPEED}),
+        _command('stage', nominal_path, {'delay_s': _DELAY_S, 'seed': seed}),
         _command(
             'calibration',
-            nominal,
+            nominal_path,
             {
                 **_UNATTENDED,
                 'output': output,
@@ -228,24 +236,18 @@ def _draw_unit(sensor: Sensor, seed: int) -> Sensor:
     The linear cross-axis terms are part of the misalignment, as in the fits.
     """
     rng = np.random.default_rng(seed)
-    values = {
-        name: {
-            p.name: np.array(
-                [
-                    multiple
-                    * p.scale
-                    * rng.choice((-1, 1))
-                    * rng.uniform(*_SPREAD)
-                    * (p.name != 'linear')
-                    if axis in p.axes
-                    else 0.0
-                    for axis in sensor.axes
-                ]
-            )
-            for p in effect_named(name).parameters
-        }
-        for name, multiple in _UNIT_EFFECTS.items()
-    }
+
+    def drawn(parameter: Parameter, multiple: float) -> np.ndarray:
+        size = 0.0 if parameter.name == 'linear' else multiple * parameter.scale
+        values = np.zeros(len(sensor.axes))
+        for place, axis in enumerate(sensor.axes):
+            if axis in parameter.axes:
+                values[place] = size * rng.choice((-1, 1)) * rng.uniform(*_SPREAD)
+        return values
+
+    values = {}
+    for name, multiple in _UNIT_EFFECTS.items():
+        values[name] = {p.name: drawn(p, multiple) for p in effect_named(name).parameters}
     return replace(sensor, effects=tuple(_UNIT_EFFECTS), values=values)
 
 

@@ -10,12 +10,13 @@ import traceback
 from typing import Any
 
 from adxl_ros.errors import one_line, UserError
-from adxl_ros.files.recording_columns import NO_UNIT
+from adxl_ros.files.recording_columns import NO_SERIAL
 from adxl_ros.links.support import base
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes import parameters
+from adxl_ros.nodes import parameter_checks, parameters, sensor_parameters
 from adxl_ros.nodes.link_reader import LinkReader
-from adxl_ros.nodes.parameters import LINK, parameter, parameter_error
+from adxl_ros.nodes.parameters import LINK, parameter
+from adxl_ros.nodes.params_files import parameter_error
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.sample_output import SampleOutput, Tally
 from adxl_ros.nodes.topics import DiagnosticsReporter, Level, Status, STEADY
@@ -68,9 +69,9 @@ def _transition(goal: str, *acts: str) -> Callable[..., TransitionCallbackReturn
     return callback
 
 
-def other_unit(given: Sensor, found: Sensor) -> str:
+def other_sensor(given: Sensor, found: Sensor) -> str:
     """Return that a link has found another unit than the parameters name, or ''."""
-    if NO_UNIT in (given.serial, found.serial) or given.serial == found.serial:
+    if NO_SERIAL in (given.serial, found.serial) or given.serial == found.serial:
         return ''
     return (
         f'the samples are of the unit {found.serial}, but the parameters are those of '
@@ -96,8 +97,8 @@ class Driver(LifecycleNode):
 
     def __init__(self) -> None:
         super().__init__('driver')
-        parameters.check_given(self)
-        self._sensor = parameters.make_sensor(parameters.declare_sensor(self))
+        parameter_checks.check_given(self)
+        self._sensor = sensor_parameters.make_sensor(sensor_parameters.declare_sensor(self))
         self._refuse_silent_simulation()
         own = parameters.declare_all(self, DriverSettings)
         self._delay_ns, self._link = round(1e9 * own.stamp_offset_s), own.link
@@ -137,7 +138,7 @@ class Driver(LifecycleNode):
         given, serial = [*parameters.given_below(self, LINK)], self._sensor.serial
         if given:
             reason = f'{LINK}{given[0]} is given'
-        elif serial != NO_UNIT:
+        elif serial != NO_SERIAL:
             reason = f'the sensor is the unit {serial}'
         else:
             return
@@ -169,13 +170,13 @@ class Driver(LifecycleNode):
         """Create the topics."""
         self._fault = ''
         self._output = SampleOutput(
-            self,
-            self._sensor,
-            self._frame_id,
-            self._delay_ns,
-            self._is_clock,
-            self._stamp_clock,
-            self._tally,
+            node=self,
+            sensor=self._sensor,
+            frame_id=self._frame_id,
+            delay_ns=self._delay_ns,
+            is_clock=self._is_clock,
+            clock=self._stamp_clock,
+            tally=self._tally,
         )
 
     def activate(self) -> None:
@@ -184,7 +185,12 @@ class Driver(LifecycleNode):
         self._fault = ''
         link = self._module.open_link(self._sensor, self._settings)
         self._reader = LinkReader(
-            self, link, self._output, self._settings, self._fail, self._diagnostics.notice
+            node=self,
+            link=link,
+            output=self._output,
+            settings=self._settings,
+            on_error=self._fail,
+            on_level=self._diagnostics.notice,
         )
 
     def close(self) -> None:
@@ -285,7 +291,7 @@ class Driver(LifecycleNode):
             return base.LinkStatus(Level.WARN, 'inactive, no samples are published')
         status = self._reader.status()
         found = self._output.sensor if self._output else self._sensor
-        fault = '' if status.level is Level.ERROR else other_unit(self._sensor, found)
+        fault = '' if status.level is Level.ERROR else other_sensor(self._sensor, found)
         if fault and fault != self._told:
             self.get_logger().error(fault)
             self._told = fault

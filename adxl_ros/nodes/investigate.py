@@ -18,7 +18,7 @@ from adxl_ros.files.bag_writer import LiveBag
 from adxl_ros.investigate import investigation
 from adxl_ros.investigate.investigation import Answer, Investigation, OutputFolder, State
 from adxl_ros.investigate.manoeuvres import CATALOGUE, Pose, StageLimits
-from adxl_ros.nodes import parameters, topics
+from adxl_ros.nodes import parameter_checks, parameters, sensor_parameters, topics
 from adxl_ros.nodes.jobs import LiveLine
 from adxl_ros.nodes.parameters import low_and_high, parameter, SEEDS
 from adxl_ros.nodes.run_node import run
@@ -57,7 +57,8 @@ class InvestigateSettings:
 
 
 _INDENT = 11 * ' '  # Spaces in place of the time at the beginning of a line
-_MOST_NAMED = 3  # Largest number of hypotheses in a line; chosen: a reader keeps them in mind
+_MOST_NAMED = 3
+"""Largest number of hypotheses in a line: more of them fill the line of a terminal."""
 
 
 def answer_lines(minutes: float, answer: Answer) -> list[str]:
@@ -102,10 +103,15 @@ _KINDS = {
 """Type of each recorded topic."""
 _QUEUE = 20000  # Messages of a topic that are kept while the node is busy: 20 s at 1 kHz
 
-_POLL_S = 0.02  # Time between two commands, s; chosen: a tenth of the largest step
+_POLL_S = 0.02
+"""Time between two commands, s: a tenth of `LONGEST_STEP_S`, by which a command is ahead of the
+stage. A command that is late by one turn of the loop is still in time."""
 _FAREWELL_S = 0.5
-"""Time for which the last command is repeated at the end, s; chosen: the stage has it then."""
-_COMMAND_QUEUE = 10  # Commands that are kept for a slow subscriber; chosen
+"""Time for which the last command is repeated at the end, s: 25 times, so that a subscriber that
+loses messages has it. Until then the stage goes on to an older one."""
+_COMMAND_QUEUE = 10
+"""Commands that are kept for a slow subscriber: 0.2 s of them; an older one moves nothing any
+more."""
 _EXAMPLES = {
     'a unit by its parameter file, within limits': (
         '--ros-args --params-file unit.yaml -p limits.rate_deg_s:=10.0 '
@@ -124,8 +130,8 @@ class Investigate(Node):
 
     def __init__(self) -> None:
         super().__init__('investigate')
-        parameters.check_given(self)
-        self._sensor = parameters.make_sensor(parameters.declare_sensor(self))
+        parameter_checks.check_given(self)
+        self._sensor = sensor_parameters.make_sensor(sensor_parameters.declare_sensor(self))
         own = parameters.declare_all(self, InvestigateSettings)
         alpha_deg = low_and_high('limits.alpha_deg', own.alpha_deg, (0.0, 180.0))
         beta_deg = low_and_high('limits.beta_deg', own.beta_deg, (0.0, 360.0))

@@ -15,7 +15,8 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.links.support.base import link_names
 from adxl_ros.nodes import driver, stage
-from adxl_ros.nodes.parameters import given_text, has_section, link_specs, Spec, specs_of
+from adxl_ros.nodes.parameters import link_specs, Spec, specs_of
+from adxl_ros.nodes.params_files import given_text, has_section
 from launch.action import Action
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, Shutdown
 from launch.events.process import ProcessExited
@@ -49,8 +50,7 @@ class Argument(NamedTuple):
             self.name,
             '',
             f'{self.spec.meaning}; not given: as in params_file, or the default',
-            *('',) * bool(self.spec.choices),
-            *self.spec.choices,
+            *(('', *self.spec.choices) if self.spec.choices else ()),
         )
 
     def value(self, text: str) -> Any:
@@ -219,13 +219,16 @@ def make_node(
         options |= {'respawn': respawn, 'respawn_delay': 2.0, 'on_exit': end_with_refusal}
     # The nominal sensor is what a node without a file has; a file would name it for any stream.
     is_named &= path != str(parameter_file.nominal_path())
+    given_files: list[Any] = [path] if is_named else []
+    if given:
+        given_files.append(given)
     # With its name a node gets the parameters in a section of its own, which counts before others.
     return Node(
         package=_PACKAGE,
         executable=executable,
         name=executable,
         namespace=text(context, 'namespace'),
-        parameters=[path] * is_named + [given] * bool(given),
+        parameters=given_files,
         ros_arguments=[*_enclave(context, executable), '--log-level', text(context, 'log_level')],
         **options,
     )

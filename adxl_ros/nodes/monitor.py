@@ -11,13 +11,13 @@ import time
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
-from adxl_ros.files.recording_columns import check_unit, NO_UNIT, StreamInfo, unit_of
+from adxl_ros.files.recording_columns import check_same_sensor, NO_SERIAL, nominal_of, StreamInfo
 from adxl_ros.links.support.base import COLUMNS
 from adxl_ros.monitor import changes
 from adxl_ros.monitor.changes import DiagnosisResult, DiagnosisRun, iso_time
 from adxl_ros.monitor.live_gap import AxisGap, GapSettings, LiveGap
 from adxl_ros.monitor.reference_stream import ReferenceKind, ReferenceStream, RobotForce
-from adxl_ros.nodes import parameters, topics
+from adxl_ros.nodes import parameter_checks, parameters, sensor_parameters, topics
 from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Inbox, Level, Status
@@ -126,15 +126,22 @@ _TOPICS = {
 }
 """Usual topic of each reference."""
 _TURN_S = 0.05
-"""Time between two looks at the topics, s; chosen: a turn costs as much as ten messages."""
+"""Time between two looks at the topics, s. A look costs as much as ten messages, so that at 1 kHz
+it adds a fifth to their work; half of the time would add two fifths, and twice only delays by 0.1
+s."""
 _PERIOD_S = 1.0  # Time between two messages on `gap`, s
-_QUEUE = 10  # Messages that are kept for a slow subscriber; chosen: 10 s
+_QUEUE = 10
+"""Messages that are kept for a slow subscriber: those of the 10 s after which blocks are
+reported."""
 _INFO_S = 3.0
-"""Time that samples wait for `sensor_info`, s; chosen: a latched message comes within 1 s."""
+"""Time that samples wait for `sensor_info`, s. A latched message comes within 1 s of discovery on
+a busy host; with half of that a driver's own values would be replaced by those of any IMU."""
 _SHORTEST_S = 20.0
-"""Shortest time of samples that is diagnosed, s; chosen: `diagnose` needs some rests or moves."""
+"""Shortest time of samples that is diagnosed, s. Four rests of 5 s, or as many moves, fit into it;
+half of them hardly tell one effect from another."""
 _PAUSE_S = 600.0
-"""Shortest time between two automatic diagnoses, s; chosen: each may cost minutes of a core."""
+"""Shortest time between two automatic diagnoses, s: twice `changes._BUDGET_S`, so that the
+diagnoses take at most half of a core."""
 _EXAMPLES = {
     'a sensor on a stage': '--ros-args --params-file unit.yaml',
     'a sensor on a robot': '--ros-args --params-file unit.yaml -p reference:=robot '
@@ -152,8 +159,8 @@ class Monitor(Node):
 
     def __init__(self) -> None:
         super().__init__('monitor')
-        parameters.check_given(self)
-        self._file_sensor = parameters.make_sensor(parameters.declare_sensor(self))
+        parameter_checks.check_given(self)
+        self._file_sensor = sensor_parameters.make_sensor(sensor_parameters.declare_sensor(self))
         self._own = own = parameters.declare_all(self, MonitorSettings)
         self._kind = ReferenceKind(own.reference)
         self._reference_topic = own.reference_topic or _TOPICS[self._kind]
@@ -209,11 +216,11 @@ class Monitor(Node):
             return
         self._info, self._refusal, sensor = info, '', self._file_sensor
         try:
-            if sensor.effects or sensor.serial != NO_UNIT:
-                check_unit(info, info.axes or sensor.axes, sensor)
+            if sensor.effects or sensor.serial != NO_SERIAL:
+                check_same_sensor(info, info.axes or sensor.axes, sensor)
                 sensor = replace(sensor, rate_hz=info.rate_hz or sensor.rate_hz)
             else:
-                sensor = unit_of(sensor, info)
+                sensor = nominal_of(sensor, info)
         except UserError as error:
             self._refusal = str(error)
             self.get_logger().error(self._refusal)

@@ -17,9 +17,9 @@ from typing import Any
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.links.support import base
-from adxl_ros.nodes import parameters
+from adxl_ros.nodes import parameter_checks, parameters, params_files, sensor_parameters
 from adxl_ros.nodes.parameters import Kind, Spec
-from adxl_ros.process import ended_by_closed_output
+from adxl_ros.process import ended_by_closed_output, options_named
 from adxl_ros.report.screen import program_parser
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
@@ -52,7 +52,7 @@ def _parameter_groups(name: str, own: Iterable[Spec]) -> Iterator[tuple[str, lis
             'parameters of the sensor, usually from --params-file',
             sorted(
                 spec
-                for spec in parameters.nominal_specs()
+                for spec in sensor_parameters.nominal_specs()
                 if spec.name.startswith(_LISTED_OF_SENSOR)
             ),
         )
@@ -79,18 +79,19 @@ def _value_text(value: Any) -> str:
 
 
 _SWITCH_S = 0.0005
-"""Time after which a thread of Python gives way to one that waits, s. Chosen: a sample that comes
-while the executor works shall wait for less than its frame; Python's 5 ms are longer."""
+"""Time after which a thread of Python gives way to one that waits, s. A sample that comes while
+the executor works shall wait for less than its frame, 1 ms at 1 kHz; Python's 5 ms are longer."""
 _TIMER_SLACK = Path('/proc/self/timerslack_ns')
 """File that sets by how much the kernel may delay a wake-up of this process (man 5 proc)."""
 _SLACK_NS = '1000'
-"""Largest such delay, ns; chosen: far below the period of samples. The default is 50 µs."""
+"""Largest such delay, ns: a thousandth of a period at 1 kHz. The default is 50 µs, a twentieth."""
 _PLACE = r', at /\S+:\d+'  # Places in rcl within the text of its refusals
 _WITH_COLON = r"rule: '-p ([^:]+):=(.*:.*)'\. Error"
 """An argument in the text of rcl's refusal, whose value has a colon: name and value."""
 _QUOTES = """; a text with a colon needs quotes of its own: -p '{}:="{}"'"""
 
 
+@options_named()
 @ended_by_closed_output()
 def run(
     make_node: Callable[[], Node],
@@ -108,7 +109,7 @@ def run(
     interrupts: list[int] = []
     try:
         # It names a fault of a file by its place; rclpy does not.
-        parameters.check_params_files()
+        params_files.check_params_files()
         parser = program_parser(argparse.ArgumentParser, name, description, examples)
         parser.usage = _USAGE
         # People ask for help behind --ros-args, too.
@@ -132,8 +133,8 @@ def run(
             # The signal came before rclpy's handler.
             rclpy.try_shutdown()
         node = make_node()
-        parameters.warn_of_unused_qos(node)
-        parameters.explain_read_only(node)
+        parameter_checks.warn_of_unused_qos(node)
+        parameter_checks.explain_read_only(node)
     except Exception as error:
         if is_initialised and not rclpy.ok():
             # A signal has ended the context during the start.

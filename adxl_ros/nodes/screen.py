@@ -19,7 +19,8 @@ from typing import Any, TextIO
 from adxl_ros.calibrate.guided.screen_contents import Row, ScreenContents
 from adxl_ros.errors import UserError
 from adxl_ros.nodes.jobs import held_output
-from adxl_ros.nodes.parameters import check_given, declare_all, parameter
+from adxl_ros.nodes.parameter_checks import check_given
+from adxl_ros.nodes.parameters import declare_all, parameter
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import create_subscription
 from rcl_interfaces.msg import Log
@@ -181,10 +182,14 @@ def _terminal() -> tuple[TextIO, TextIO]:
 
 _SERVICES = ('start', 'resume', 'start_over', 'capture', 'redo', 'skip', 'finish', 'abort')
 """Services of the calibration node that keys call."""
-_SPIN_S = 0.02  # Time between two callbacks, s; chosen: far more often than messages come
-_SILENT_S = 2.0  # Age at which a display is reported as missing, s; chosen: ten missing messages
+_SPIN_S = 0.02
+"""Time between two callbacks, s: a tenth of the period of the display, so that keys act at
+once."""
+_SILENT_S = 2.0
+"""Age at which a display is reported as missing, s: ten of its messages at 5 Hz."""
 _QUEUE = 100
-"""Lines of all nodes' logs that wait; chosen: far more than come between two callbacks."""
+"""Lines of all nodes' logs that wait between two callbacks: far more than they write in this time,
+and more than a terminal shows."""
 _STYLES = {Log.WARN: 'ansiyellow', Log.ERROR: 'ansired', Log.FATAL: 'ansired'}
 """Styles of log lines by level."""
 _PLAIN = 'ansibrightblack'  # Style of other log lines

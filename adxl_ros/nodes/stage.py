@@ -12,8 +12,9 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.files.parameter_file import SENSOR_FIELDS
 from adxl_ros.files.recording_columns import JOINTS
-from adxl_ros.nodes import parameters, topics
-from adxl_ros.nodes.parameters import declare_all, parameter, parameter_error
+from adxl_ros.nodes import parameter_checks, parameters, topics
+from adxl_ros.nodes.parameters import declare_all, parameter
+from adxl_ros.nodes.params_files import parameter_error
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.simulate.trajectories import SimulatedStage
@@ -112,9 +113,10 @@ class BridgeSettings:
 
 
 _STEP_NS = 10_000_000
-"""Step of the simulation, ns; chosen: 100 poses a second, as a controller of a stage sends."""
+"""Step of the simulation, ns: 100 poses a second, as the controller of a stage sends."""
 _JUMP_NS = 1_000_000_000
-"""Smallest jump of ROS time after which the motion goes on from there, ns; chosen."""
+"""Smallest jump of ROS time after which the motion goes on from there, ns: a hundred steps. Less
+is a process that was held up, and its steps are made up."""
 _QUEUE = 1000  # Poses that are kept for a slow subscriber: 10 s of ROS time
 _ANGLES = ('alpha', 'beta')  # Joints of a real stage
 
@@ -191,7 +193,7 @@ class SimulatedStageNode:
         if not len(stamps_ns):
             return
         self._simulated_ns = int(stamps_ns[-1])
-        position, velocity, encoder = (np.empty((len(stamps_ns), len(JOINTS))) for _ in range(3))
+        position, velocity, encoder = np.empty((3, len(stamps_ns), len(JOINTS)))
         for i in range(len(stamps_ns)):
             self._stage.step(_STEP_NS * 1e-9)
             position[i], velocity[i] = self._stage.position, self._stage.velocity
@@ -213,14 +215,23 @@ class SimulatedStageNode:
         return Status(level, text, 'simulated', {**values, 'refused': self._refusal_count})
 
 
-_SILENT_NS = 2_000_000_000  # Time without joint states after which diagnostics warn, ns; chosen
+_SILENT_NS = 2_000_000_000
+"""Time without joint states after which diagnostics warn, ns: controllers send at 10 Hz or more,
+so that twenty are missing."""
 _GRACE_NS = 2_000_000_000
-"""Time that a motion may take beyond its duration before its command is sent again, ns; chosen."""
-_ARRIVED_RAD = 0.01  # Largest distance from the goal of a joint that has arrived, rad; chosen
-_SHORTEST_S = 0.2  # Shortest duration of a trajectory, s; chosen
+"""Time that a motion may take beyond its duration before its command is sent again, ns: a
+controller that settles needs less, and a lost command delays a pose by no more."""
+_ARRIVED_RAD = 0.01
+"""Largest distance from the goal of a joint that has arrived, rad: 0.6°. Stages without feedback
+err by tenths of a degree; the angle that counts is the one that is read."""
+_SHORTEST_S = 0.2
+"""Shortest duration of a trajectory, s: controllers refuse one in the past, and a command is on
+its way for up to 0.1 s."""
 _BRIDGE_QUEUE = 100
-"""Positions that are kept for a slow subscriber; chosen: 1 s of a usual controller."""
-_COMMAND_QUEUE = 10  # Commands that are kept, of the calibration and for the controller; chosen
+"""Positions that are kept for a slow subscriber: 1 s of a controller at 100 Hz."""
+_COMMAND_QUEUE = 10
+"""Commands that are kept, of the calibration and for the controller: only the newest moves the
+stage, and the others are those of seconds before."""
 _STATES_QUEUE = 1000
 """Joint states of the controller that are kept: 1 s of the fastest controllers."""
 _DEFAULT_COMMANDS = {
@@ -399,7 +410,7 @@ class Stage(Node):
 
     def __init__(self) -> None:
         super().__init__('stage')
-        parameters.check_given(self)
+        parameter_checks.check_given(self)
         kind = declare_all(self, StageSettings).kind
         self._stage = SimulatedStageNode(self) if kind == 'simulated' else StageBridge(self, kind)
 

@@ -23,7 +23,8 @@ from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import cdr, imu_message
 from adxl_ros.files.recording_columns import StreamInfo
 from adxl_ros.links.support.base import Level
-from adxl_ros.nodes.parameters import QOS_POLICIES, SI
+from adxl_ros.nodes.parameter_checks import QOS_POLICIES
+from adxl_ros.nodes.parameters import SI
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
@@ -47,15 +48,18 @@ sys.modules.setdefault('rosidl_generator_py.generate_py_impl', None)  # type: ig
 _OVERRIDING = QoSOverridingOptions([QoSPolicyKind[name.upper()] for name in QOS_POLICIES])
 """What parameters can override."""
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)  # The clock of intervals
-_SILENT_S = 3.0  # Time without messages after which a topic is silent, s; chosen
+_SILENT_S = 3.0
+"""Time without messages after which a topic is silent, s: three of the slowest usual periods, 1 s.
+With half, one late message would warn; twice hides a broken cable for longer."""
 _LONGEST_LOOK_S = 1.0
-"""Longest time between two looks that counts as silence, s; chosen: above the period of each node,
-and a process that was held up as a whole looks before its middleware has received."""
+"""Longest time between two looks that counts as silence, s. It is above the period of each node; a
+process that was held up as a whole looks before its middleware has received."""
 _LONGEST_WAIT_NS = 100_000_000
-"""Longest wait for a message, ns; chosen: a thread that waits sees within it that it shall end."""
+"""Longest wait for a message, ns: a thread sees within it that it shall end, and wakes 10 times a
+s."""
 _MIXED_S = 3.0
-"""Time within which sequence numbers step back twice where two publishers mix, s; chosen: longer
-than the period of slow samples, shorter than two starts of a driver."""
+"""Time within which sequence numbers step back twice where two publishers mix, s: longer than the
+period of slow samples, 1 s, and shorter than two starts of a driver."""
 
 
 def create_publisher(
@@ -468,12 +472,12 @@ def joint_readings(messages: Sequence[bytes]) -> list[JointReading]:
     """Return the readings of serialized sensor_msgs/JointState, in their order."""
     readings: dict[int, JointReading] = {}
     for table in cdr.tables(messages, cdr.joint_state):
-        positions, velocities = (
-            table.numbers(field).tolist()
-            if field in table.layout.fields
-            else [[]] * len(table.rows)
-            for field in ('position', 'velocity')
-        )
+
+        def numbers(field: str, table: cdr.Table = table) -> list[list[float]]:
+            has_field = field in table.layout.fields
+            return table.numbers(field).tolist() if has_field else [[]] * len(table.rows)
+
+        positions, velocities = numbers('position'), numbers('velocity')
         for row, stamp_ns, position, velocity in zip(
             table.rows.tolist(), table.stamp_ns().tolist(), positions, velocities
         ):

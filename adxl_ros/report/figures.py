@@ -160,7 +160,7 @@ def axes_for(ax: Any) -> Any:
         return ax
     with _matplotlib():
         from matplotlib import pyplot
-    return pyplot.subplots()[1]
+    return pyplot.subplots(layout='constrained')[1]
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import unquote_plus
 
 from adxl_ros.errors import install_hint, UserError
-from adxl_ros.process import command, package_version
+from adxl_ros.process import command, names_options, package_version
 from adxl_ros.report import templates
 from adxl_ros.report.figures import png
 
@@ -47,7 +47,7 @@ def render(package: str, template: str, values: Mapping[str, Any]) -> str:
     plotly_js = gzip.compress(get_plotlyjs().encode(), _GZIP_LEVEL, mtime=0)
     made = f'made {datetime.now().astimezone():%Y-%m-%d %H:%M} by adxl_ros {package_version()}'
     return layouts.get_template(template).render(
-        {'made': made, 'command': command_of_this_process(), **values},
+        {'made': made, 'command': command_of_this_process() if names_options() else '', **values},
         plotly_js=b64encode(plotly_js).decode(),
     )
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 import os
 import tempfile
-from typing import IO
+from typing import IO, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import GYRO, Recording
@@ -20,9 +20,12 @@ from adxl_ros.signals.rest_detection import Rest
 import numpy as np
 
 _MOST_CELLS = 1 << 17
-"""A stream has fewer cells. Chosen: 24 h at 1 kHz are cells of 1 s."""
-_AT_ONCE = 1 << 14  # Samples that are read at a time. Chosen: they stay in the cache of a core
-_FEWEST_AVERAGES = 3  # Averages side by side at the longest time. Chosen: two differences
+"""A stream has fewer cells. 24 h at 1 kHz then have cells of 1 s, in which white noise shows; each
+halving of the number hides an octave of it, and each doubling takes twice the time."""
+_AT_ONCE = 1 << 14
+"""Samples that are read at a time: with three axes 400 kB, which stay in the cache of a core."""
+_FEWEST_AVERAGES = 3
+"""Averages side by side at the longest time: with two there is one difference and no scatter."""
 
 
 @dataclass(frozen=True)
@@ -83,34 +86,50 @@ class Phase:
             number = self.count + 1 - 2 * size
             for begin in range(0, number, _AT_ONCE):
                 stop = min(begin + _AT_ONCE, number)
-                early, middle, late = (
-                    self._sums(begin + lag, stop + lag) for lag in (0, size, 2 * size)
-                )
+                early = self._sums(begin, stop)
+                middle = self._sums(begin + size, stop + size)
+                late = self._sums(begin + 2 * size, stop + 2 * size)
+                # The sum of `size` samples minus that of the `size` samples before
                 difference = late - middle - (middle - early)
                 squares[octave] += np.einsum('ij,ij->j', difference, difference) / number
         return AllanDeviation(
-            sizes / rate_hz, np.sqrt(squares / 2) / sizes[:, None], self.count / sizes
+            tau_s=sizes / rate_hz,
+            deviation=np.sqrt(squares / 2) / sizes[:, None],
+            averages=self.count / sizes,
         )
 
-    def cells(self) -> tuple[int, np.ndarray]:
-        """Return the samples of a cell, a power of two, and the means of all cells, (k, m)."""
+    def cells(self) -> Cells:
+        """Return the means of cells whose length is a power of two."""
         size = 1
         while self.count // size >= _MOST_CELLS:
             size *= 2
+        # Each part that is read begins at an edge of a cell.
         step = max(_AT_ONCE // size, 1) * size
-        edges = np.concatenate(
-            [
-                self._sums(i, min(i + step - size + 1, self.count + 1))[::size].copy()
-                for i in range(0, self.count + 1, step)
-            ]
-        )
-        return size, self._offset + np.diff(edges, axis=0) / size
+        parts = []
+        for begin in range(0, self.count + 1, step):
+            stop = min(begin + step - size + 1, self.count + 1)
+            parts.append(self._sums(begin, stop)[::size].copy())
+        sums = np.concatenate(parts)
+        return Cells(size, self._offset + np.diff(sums, axis=0) / size)
 
 
-_WINDOW_S = 2.0  # Shortest window of the std of a sample, s. Chosen: slow noise is slower
-_LARGEST_END_S = 0.2  # Longest end without a rest that is no motion, s. Chosen: some blocks
-_FEWEST_SAMPLES = 512  # Fewest samples at rest. Chosen: fewer do not show white noise within 10 %
-SHORTEST_S = 10.0  # Shortest rest, s. Chosen: fewer seconds hold no average of one second
+class Cells(NamedTuple):
+    """Means of cells of equally many neighbouring samples."""
+
+    size: int  # Samples of a cell
+    means: np.ndarray  # Mean of each cell by axis, (k, m)
+
+
+_WINDOW_S = 2.0
+"""Shortest window of the standard deviation of a sample, s. It holds the slowest usual filters,
+0.3 s, several times; drift of longer windows would count as noise of a sample."""
+_LARGEST_END_S = 0.2
+"""Longest time beside a rest that is no motion, s: four blocks, which a rest may lose there."""
+_FEWEST_SAMPLES = 512
+"""Fewest samples at rest: white noise is then known within 10 % at 90 %, with half within 15 %."""
+SHORTEST_S = 10.0
+"""Shortest rest, s. Bias instability shows from averages of one second on, of which ten are few;
+half of it would leave no octave above one second with three averages."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +184,7 @@ class StillSensors:
 
 
 def longest_rest(
-    read: Callable[[], Iterable[Recording]], unit: Sensor, first: Recording, look: RecordingLook
+    read: Callable[[], Iterable[Recording]], nominal: Sensor, first: Recording, look: RecordingLook
 ) -> StillSensors:
     """
     Find the longest rest of a recording, which is read twice; `look` is fed meanwhile.
@@ -177,7 +196,7 @@ def longest_rest(
     first_s, beyond = float(first.time_s[0]), BeyondRange()
     for block in read():
         look.feed(block)
-        beyond.add(block.volts(unit), unit)
+        beyond.add(block.volts(nominal), nominal)
         last_s = float(block.time_s[-1])
     look.rests.take()
     rests = [found.rest for found in look.rests.detected]
@@ -188,43 +207,43 @@ def longest_rest(
             f'{first.path}: rests for {rest.span_s:.4g} s at most, expected '
             f'{shortest_s:.3g} s at least; record longer, and do not touch the sensor'
         )
-    edges_s = np.array(
-        [
-            first_s,
-            *(time_s for each in rests for time_s in (each.time_start_s, each.time_stop_s)),
-            last_s,
-        ]
-    )
-    motion_s = [
-        (start_s, stop_s)
-        for start_s, stop_s in edges_s.reshape(-1, 2).tolist()
-        if stop_s - start_s > _LARGEST_END_S
-    ]
+    motion_s = _between(rests, first_s, last_s)
     if not motion_s:
         rest = replace(rest, time_start_s=first_s, time_stop_s=last_s)
+    span_s = last_s - first_s
     with tempfile.TemporaryFile() as file, tempfile.TemporaryFile() as gyro_file:
         samples = _Samples(first, first.sensor_columns, file)
-        turns = _Samples(first, GYRO, gyro_file) if first.gyro_radps is not None else None
+        turns = _Samples(first, GYRO, gyro_file)
         for block in read():
-            samples.feed(block.time_s, block.accel_mps2(unit), rest)
+            samples.feed(block.time_s, block.accel_mps2(nominal), rest)
             gyro_radps = block.gyro_radps
-            if turns is not None and gyro_radps is not None:
+            if gyro_radps is not None:
                 is_taken = np.isfinite(gyro_radps).all(axis=1)
                 turns.feed(block.time_s[is_taken], gyro_radps[is_taken], rest)
-        accelerometer = samples.stretch(last_s - first_s, motion_s, beyond.describe(unit))
-        if turns is None or not turns.count:
-            return StillSensors(accelerometer, None)
-        if turns.count < accelerometer.count:
-            return StillSensors(
-                accelerometer,
-                None,
+        accelerometer = samples.stretch(span_s, motion_s, beyond.describe(nominal))
+        gyroscope, doubt = None, ''
+        if 0 < turns.count < accelerometer.count:
+            doubt = (
                 f'the gyroscope has {turns.count} readings at rest, and the accelerometer '
-                f'{accelerometer.count}: it is left out',
+                f'{accelerometer.count}: it is left out'
             )
-        try:
-            return StillSensors(accelerometer, turns.stretch(last_s - first_s, motion_s, ''))
-        except UserError as error:
-            return StillSensors(accelerometer, None, f'the gyroscope is left out: {error}')
+        elif turns.count:
+            try:
+                gyroscope = turns.stretch(span_s, motion_s, '')
+            except UserError as error:
+                doubt = f'the gyroscope is left out: {error}'
+        return StillSensors(accelerometer, gyroscope, doubt)
+
+
+def _between(rests: Sequence[Rest], first_s: float, last_s: float) -> list[tuple[float, float]]:
+    """Return begin and end of the times between rests that are long enough to be motion, s."""
+    starts_s = [first_s, *(rest.time_stop_s for rest in rests)]
+    stops_s = [*(rest.time_start_s for rest in rests), last_s]
+    return [
+        (start_s, stop_s)
+        for start_s, stop_s in zip(starts_s, stops_s)
+        if stop_s - start_s > _LARGEST_END_S
+    ]
 
 
 class _Samples:
@@ -275,21 +294,21 @@ class _Samples:
         count = self._phase.count
         steps_s = self._stop_s - self._start_s - self._gaps_s
         rate_hz = (count - 1 - self._gaps) / steps_s
-        allan, (size, means) = self._phase.allan_deviation(rate_hz), self._phase.cells()
+        allan, cells = self._phase.allan_deviation(rate_hz), self._phase.cells()
         # The variance within 2^k samples is that of the octaves of Haar's wavelets in it.
         octaves = _window_octaves(rate_hz)
         variance = (allan.deviation[:octaves] ** 2).sum(axis=0) / 2 / (1 - 0.5**octaves)
         return StillStretch(
-            self._start_s,
-            self._stop_s,
-            rate_hz,
-            count,
-            allan,
-            size / rate_hz,
-            means,
-            np.sqrt(variance),
-            self._resolution,
-            recorded_s,
-            motion_s,
-            beyond_range,
+            start_s=self._start_s,
+            stop_s=self._stop_s,
+            rate_hz=rate_hz,
+            count=count,
+            allan=allan,
+            step_s=cells.size / rate_hz,
+            means=cells.means,
+            sample_std=np.sqrt(variance),
+            resolution=self._resolution,
+            recorded_s=recorded_s,
+            motion_s=motion_s,
+            beyond_range=beyond_range,
         )

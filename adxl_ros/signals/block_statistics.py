@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
+from math import ceil
 
 from adxl_ros.model.constants import MAD_TO_STD
 import numpy as np
@@ -78,14 +79,14 @@ class BlockCutter:
         self, time_s: np.ndarray, samples: np.ndarray, angles_rad: np.ndarray | None = None
     ) -> Blocks:
         """Add finite samples, (n, m), and encoder angles, (n, a), NaN where not sampled."""
-        columns = [time_s[:, None], samples] + ([] if angles_rad is None else [angles_rad])
-        return Blocks.join(
-            [self.none()]
-            + [
-                self._cut(np.concatenate([part[i : i + _CHUNK].T for part in columns]))
-                for i in range(0, len(time_s), _CHUNK)
-            ]
-        )
+        columns = [time_s[:, None], samples]
+        if angles_rad is not None:
+            columns.append(angles_rad)
+        parts = [self.none()]
+        for begin in range(0, len(time_s), _CHUNK):
+            rows = slice(begin, begin + _CHUNK)
+            parts.append(self._cut(np.concatenate([column[rows].T for column in columns])))
+        return Blocks.join(parts)
 
     def none(self) -> Blocks:
         """Return an empty sequence of blocks, of the right shape."""
@@ -98,12 +99,13 @@ class BlockCutter:
         step_s = np.diff(columns[0], prepend=self._last_time_s)
         begins = np.flatnonzero(~((step_s >= 0) & (step_s <= self._gap_s)))
         edges = np.unique(np.concatenate([[0], begins, [count]]))
+        # Between two edges are as many whole blocks as fit, from the first row on.
         complete = np.diff(edges) // self.size
-        start = np.repeat(edges[:-1] + self.size * (complete - np.cumsum(complete)), complete)
-        start += self.size * np.arange(len(start))
-        blocks = self._summed(
-            columns, start, self._run + np.searchsorted(begins, start, side='right')
-        )
+        first_row = np.repeat(edges[:-1], complete)
+        blocks_before = np.repeat(np.cumsum(complete) - complete, complete)
+        start = first_row + self.size * (np.arange(len(first_row)) - blocks_before)
+        run = self._run + np.searchsorted(begins, start, side='right')
+        blocks = self._summed(columns, start, run)
         # The next call counts a gap within the leftover rows.
         used = int(edges[-2] + self.size * complete[-1])
         self._run += int(np.searchsorted(begins, used))
@@ -122,13 +124,13 @@ class BlockCutter:
         squares = ((samples - mean[..., None]) ** 2).sum(axis=2)
         bounds = np.stack([np.fmin.reduce(angles, axis=2), np.fmax.reduce(angles, axis=2)])
         return Blocks(
-            self._row + start,
-            block[0][:, [0, -1]],
-            run,
-            mean.T,
-            squares.T,
-            step.T,
-            bounds.transpose(2, 0, 1),
+            start=self._row + start,
+            time_s=block[0][:, [0, -1]],
+            run=run,
+            mean=mean.T,
+            squares=squares.T,
+            step=step.T,
+            angle=bounds.transpose(2, 0, 1),
         )
 
 
@@ -143,14 +145,12 @@ def angle_bounds(blocks: Blocks) -> np.ndarray:
     bounds = blocks.angle * np.array([[-1.0], [1.0]])
     has_angle = np.isfinite(bounds).all(axis=(1, 2))
     place, last = np.arange(len(has_angle)), len(has_angle) - 1
-    before = np.maximum.accumulate(np.where(has_angle, place, 0))
-    after = np.minimum.accumulate(np.where(has_angle, place, last)[::-1])[::-1]
-    return np.fmax(
-        bounds,
-        np.fmax(
-            bounds[before[np.maximum(place - 1, 0)]], bounds[after[np.minimum(place + 1, last)]]
-        ),
-    )
+    # The newest block with an angle up to each place, and the next one from it on
+    newest = np.maximum.accumulate(np.where(has_angle, place, 0))
+    following = np.minimum.accumulate(np.where(has_angle, place, last)[::-1])[::-1]
+    before = bounds[newest[np.maximum(place - 1, 0)]]
+    after = bounds[following[np.minimum(place + 1, last)]]
+    return np.fmax(bounds, np.fmax(before, after))
 
 
 def rms(values: np.ndarray | Sequence[float]) -> float:
@@ -193,9 +193,9 @@ class Spans:
         self.size = max(1, round(BLOCK_S * rate_hz))  # Samples of a block
         self.block_s = self.size / rate_hz  # Length of a block, s
         # Blocks of the window of a variance; odd, so that one is in the middle
-        self.window = (
-            max(round(_WINDOW_S / self.block_s), -(-_WINDOW_SAMPLES // self.size)) // 2 * 2 + 1
-        )
+        by_samples = ceil(_WINDOW_SAMPLES / self.size)
+        fewest = max(round(_WINDOW_S / self.block_s), by_samples)
+        self.window = fewest if fewest % 2 else fewest + 1
         # Blocks of the shortest halves whose means are compared, and of both longest halves
         self.half = max(round(_HALF_S / self.block_s), 4)
         self.longest = self.half << DRIFT_OCTAVES
@@ -212,9 +212,8 @@ def quiet_variance(
     """
     middle = np.median(np.abs(blocks.mean), axis=0)
     smallest = step**2 / 4 + (_ROUNDING * middle) ** 2 + _TINY_VARIANCE
-    variance, ratio = np.array(
-        [_quietest(variances, limit) for variances, limit in zip(windows.T, smallest)]
-    ).T
+    of_axes = [_quietest(variances, least) for variances, least in zip(windows.T, smallest)]
+    variance, ratio = np.array(of_axes).T
     return variance, ratio * variance
 
 

@@ -27,6 +27,7 @@ from adxl_ros.files.recording_columns import (
 from adxl_ros.files.stamps import burst_samples, lacks_samples, period_s
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
+from adxl_ros.process import option
 from adxl_ros.report.quantities import counted, duration
 from adxl_ros.signals.allan_deviation import shortest_rest_s
 from adxl_ros.signals.block_statistics import true_runs
@@ -108,27 +109,26 @@ def examine(
         raise UserError('the recording holds no samples')
     sensor, stamps = sensor_of(first), _Stamps(first)
     look = RecordingLook(sensor, first)
-    unit = look.unit
     axes = [_Axis(name, stamps.period_s) for name in first.sensor_columns]
     gyro = _Gyro(first, stamps.period_s) if first.gyro_radps is not None else None
-    # Lowest and highest value, sum and count of each reference by block
-    references: dict[str, list[tuple[float, float, float, int]]] = {}
+    references: dict[str, _Reference] = {}
     for block in chain([first], blocks):
         if not len(block):
             continue
         stamps.feed(block.time_s)
-        for axis, values in zip(axes, block.accel_mps2(unit).T):
+        for axis, values in zip(axes, block.accel_mps2(look.nominal).T):
             axis.feed(values)
         look.feed(block)
         if gyro is not None:
             gyro.feed(block)
-        _add_references(block, references)
+        for name, values in block.columns.items():
+            read = values[np.isfinite(values)]
+            if name in REFERENCES and len(read):
+                references.setdefault(name, _Reference()).feed(read)
     gravity = look.gravity()
-    # By reference: lowest and highest values, sums, counts
-    parts = {name: list(zip(*rows)) for name, rows in references.items()}
     rests = look.rests.detected
     spans_s = [found.rest.span_s for found in rests]
-    means_mps2 = [to_nominal_mps2(found.mean_v, unit) for found in rests]
+    means_mps2 = [to_nominal_mps2(found.mean_v, look.nominal) for found in rests]
     span_s = stamps.last_s - stamps.first_s
     return RecordingContents(
         path=block.path,
@@ -148,10 +148,8 @@ def examine(
         poses=_count_poses(means_mps2),
         gravity=gravity,
         neighbour_faults=tuple(look.neighbour_faults()),
-        reference_ranges={name: (min(low), max(high)) for name, (low, high, *_) in parts.items()},
-        reference_means={
-            name: sum(total) / sum(count) for name, (_, _, total, count) in parts.items()
-        },
+        reference_ranges={name: (each.lowest, each.highest) for name, each in references.items()},
+        reference_means={name: each.total / each.count for name, each in references.items()},
         log_delay_s=log_delay_s,
         remarks=block.remarks,
         cut=block.cut,
@@ -159,15 +157,19 @@ def examine(
     )
 
 
-def _add_references(
-    block: Recording, references: dict[str, list[tuple[float, float, float, int]]]
-) -> None:
-    for name, values in block.columns.items():
-        read = values[np.isfinite(values)]
-        if name in REFERENCES and len(read):
-            references.setdefault(name, []).append(
-                (float(read.min()), float(read.max()), float(read.sum()), len(read))
-            )
+class _Reference:
+    """Range and mean of a reference."""
+
+    def __init__(self) -> None:
+        self.lowest, self.highest = np.inf, -np.inf
+        self.total, self.count = 0.0, 0  # Sum and number of its values
+
+    def feed(self, values: np.ndarray) -> None:
+        """Add finite values, (n,)."""
+        self.lowest = min(self.lowest, float(values.min()))
+        self.highest = max(self.highest, float(values.max()))
+        self.total += float(values.sum())
+        self.count += len(values)
 
 
 def log_delay_s(times_ns: Iterable[np.ndarray]) -> float | None:
@@ -184,7 +186,7 @@ class _Stamps:
         if len(first) < 2:
             raise UserError(
                 f'{first.path}: {len(first)} sample with a usable stamp; at least 2 '
-                'are needed; --rate HZ stamps by index'
+                f'are needed; {option(rate="HZ")} stamps by index'
             )
         self.burst = burst_samples(first.time_s)
         self.period_s = period_s(first.time_s)
@@ -268,12 +270,12 @@ class _Axis:
             and self._changes > _CHANGING * (self._count - self._most_equal)
         )
         return AxisRange(
-            self.name,
-            low,
-            high,
-            sum(self._clipped),
-            low == high,
-            stuck_s * (is_reported or low == high),
+            name=self.name,
+            lowest_mps2=low,
+            highest_mps2=high,
+            clipped=sum(self._clipped),
+            is_stuck=low == high,
+            stuck_s=stuck_s if is_reported or low == high else 0.0,
         )
 
 
@@ -384,7 +386,7 @@ def _has_wide_gaps(contents: RecordingContents) -> bool:
 def _stamp_faults(contents: RecordingContents) -> list[str]:
     which = 'with the stamp of the one before', 'whose stamp steps back'
     faults = [
-        f'samples {text}: {count}; --drop-bad-stamps leaves them out'
+        f'samples {text}: {count}; {option(drop_bad_stamps=True)} leaves them out'
         for text, count in zip(which, contents.bad_stamps)
         if count
     ]
@@ -394,8 +396,8 @@ def _stamp_faults(contents: RecordingContents) -> list[str]:
     if contents.jitter_s > _LARGEST_JITTER * period_s and contents.burst == 1:
         faults.append(
             f'stamps scatter by {1e3 * contents.jitter_s:.3g} ms rms, expected '
-            f'{1e3 * _LARGEST_JITTER * period_s:.3g} ms at most; --rate HZ stamps by '
-            'index'
+            f'{1e3 * _LARGEST_JITTER * period_s:.3g} ms at most; {option(rate="HZ")} stamps '
+            'by index'
         )
     if contents.cut:
         faults.append(contents.cut)
@@ -435,8 +437,8 @@ def _remarks(contents: RecordingContents) -> list[str]:
         remarks.append(_missing(contents))
     if contents.burst > 1:
         remarks.append(
-            f'stamps come in bursts of {contents.burst} samples; --rate '
-            f'{contents.rate_hz:.4g} stamps by index'
+            f'stamps come in bursts of {contents.burst} samples; '
+            f'{option(rate=f"{contents.rate_hz:.4g}")} stamps by index'
         )
     delay_s = contents.log_delay_s or 0.0
     if abs(delay_s) > _LARGEST_DELAY_S:
@@ -493,7 +495,8 @@ def _diagnose(contents: RecordingContents) -> Ability:
         return Ability(
             'diagnose',
             False,
-            'has no stage angles; give --sim with the specific force of the same motion',
+            f'has no stage angles; give {option("sim")} with the specific force of the '
+            'same motion',
         )
     if range_rad < _MOVED_RAD:
         return Ability('diagnose', False, 'has stage angles that do not change; move the stage')

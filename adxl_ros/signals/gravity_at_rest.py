@@ -12,7 +12,8 @@ than g in most poses, so that they have an upper limit only.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 from itertools import product
 from typing import Any
@@ -22,6 +23,7 @@ from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, TINY
 from adxl_ros.model.effects.base import Coefficient, NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import get, Sensor, to_nominal_mps2
+from adxl_ros.process import option
 from adxl_ros.report.quantities import counted, number
 import numpy as np
 
@@ -46,7 +48,10 @@ its datasheet has a large error, and its rests still do not contradict each othe
 _LEAST_MPS2 = 1e-6  # Least zero-g error and length, m/s², so that they can be divisors
 _STEPS = 20  # Most steps of that search. Chosen: it has converged after some
 _PRIOR = 1.0  # Information about each share of a tolerance: its standard deviation is all of it
-_LARGEST_ERROR = 0.2  # Error of a length, by gravity, with which it tells no unit. Chosen
+_LARGEST_ERROR = 0.2
+"""Error of a length, by gravity, with which it tells no unit: counts of 1 g differ by factors of
+two, so that errors of up to 0.41 would still tell them apart; half of it leaves room for the
+scatter of the rests."""
 _MOST_RESTS = 300  # Rests that are compared at most, evenly spread. Chosen: some milliseconds
 TURNED_COS = 0.9  # Cosine between the directions of two rests of different poses: 26°
 _ALIKE = 0.04  # Logarithm of the ratio of two units that a usual zero-g makes alike: 40 mg
@@ -68,25 +73,32 @@ class ReadingUnit:
 
     name: str  # For people
     gravity: float  # Number of this unit that gravity has
-    remedy: str  # What states or converts it
+    conversion: str = ''  # What converts it
+    # Options that state it, in place of a conversion
+    options: Mapping[str, Any] = field(default_factory=dict, compare=False)
     symbol: str = ''  # Its name in options and parameters; empty where they do not have it
+
+    @property
+    def remedy(self) -> str:
+        """Return what states or converts it."""
+        return self.conversion or f'state it by {option(**self.options)}'
 
 
 _COUNTS_PER_G = [2**k for k in range(6, 19)]
 """Counts of 1 g of digital sensors: from 6 bits of ±2 g to 20 bits of ±2 g, by powers of two."""
 
 UNITS = (
-    ReadingUnit('g', 1.0, 'state it by --unit g', 'g'),
-    ReadingUnit('mg', 1e3, 'state it by --unit mg', 'mg'),
-    ReadingUnit('mm/s²', 1e3 * G0_MPS2, 'state it by --unit mmps2', 'mmps2'),
+    ReadingUnit('g', 1.0, options={'unit': 'g'}, symbol='g'),
+    ReadingUnit('mg', 1e3, options={'unit': 'mg'}, symbol='mg'),
+    ReadingUnit('mm/s²', 1e3 * G0_MPS2, options={'unit': 'mmps2'}, symbol='mmps2'),
     ReadingUnit('cm/s²', 1e2 * G0_MPS2, 'divide the readings by 100'),
     ReadingUnit('ft/s²', G0_MPS2 / 0.3048, 'multiply the readings by 0.3048'),
     ReadingUnit('m/s² divided by 1000', 1e-3 * G0_MPS2, 'multiply the readings by 1000'),
     ReadingUnit('g divided by 1000', 1e-3, f'multiply the readings by {1e3 * G0_MPS2:g}'),
-    ReadingUnit('m/s² that were stated as g', G0_MPS2**2, 'state it by --unit mps2', 'mps2'),
+    ReadingUnit('m/s² that were stated as g', G0_MPS2**2, options={'unit': 'mps2'}, symbol='mps2'),
     *(
         ReadingUnit(
-            f'counts of {count} per g', float(count), f'state it by --unit lsb --lsb-per-g {count}'
+            f'counts of {count} per g', float(count), options={'unit': 'lsb', 'lsb_per_g': count}
         )
         for count in _COUNTS_PER_G
     ),
@@ -213,11 +225,11 @@ class GravityFault:
     @property
     def live_text(self) -> str:
         """Return figure, explanation and remedy for a stream as one line."""
-        return self.stated_by('samples.unit:=')
+        return self.stated_by(f'samples.unit:={self.symbol}')
 
-    def stated_by(self, option: str) -> str:
-        """Return figure, explanation and remedy as one line, where an option states the unit."""
-        remedy = f'state it by {option}{self.symbol}' if self.symbol else self.conversion
+    def stated_by(self, statement: str) -> str:
+        """Return figure, explanation and remedy as one line, where a statement has the unit."""
+        remedy = f'state it by {statement}' if self.symbol else self.conversion
         return f'{self.reason}; {remedy}'
 
     @property
@@ -297,20 +309,32 @@ def look(
     readings = RestReadings(readings.mean_mps2[::every], readings.std_mps2[::every])
     count, axes = readings.mean_mps2.shape
     if not count:
-        return GravityAtRest(0, axes, gravity_mps2, np.nan, np.nan, np.nan, (np.nan, np.nan), None)
+        return GravityAtRest(
+            rests=0,
+            axes=axes,
+            gravity_mps2=gravity_mps2,
+            length_mps2=np.nan,
+            spread_mps2=np.nan,
+            std_mps2=np.nan,
+            allowed_mps2=(np.nan, np.nan),
+            fault=None,
+        )
     length, case = readings.length_mps2, _Case(readings, tolerance, gravity_mps2)
     # A reading of the length g in these poses is that of a force between these lengths.
     upright = readings.divided(np.maximum(length, _LEAST_MPS2)[:, None] / gravity_mps2)
     low, high = (np.median(limits) for limits in replace(case, readings=upright).force_limits())
     return GravityAtRest(
-        count * every,
-        axes,
-        gravity_mps2,
-        float(np.median(length)),
-        float(np.subtract(*np.quantile(length, [0.75, 0.25]))),
-        float(np.median(np.linalg.norm(readings.std_mps2, axis=1))),
-        (float(gravity_mps2**2 / high), float(gravity_mps2**2 / low) if low > 0 else np.inf),
-        case.fault(),
+        rests=count * every,
+        axes=axes,
+        gravity_mps2=gravity_mps2,
+        length_mps2=float(np.median(length)),
+        spread_mps2=float(np.subtract(*np.quantile(length, [0.75, 0.25]))),
+        std_mps2=float(np.median(np.linalg.norm(readings.std_mps2, axis=1))),
+        allowed_mps2=(
+            float(gravity_mps2**2 / high),
+            float(gravity_mps2**2 / low) if low > 0 else np.inf,
+        ),
+        fault=case.fault(),
     )
 
 
@@ -475,12 +499,12 @@ class _Case:
         names = ' or '.join(unit.name for unit in likely)
         remedies = ', or '.join(unit.remedy for unit in likely)
         return GravityFault(
-            GravityFaultKind.UNIT,
-            f'at rest {self._read()}, as values in {names} are',
-            remedies,
-            names,
-            likely[0].symbol,
-            self.gravity_mps2 / likely[0].gravity,
+            kind=GravityFaultKind.UNIT,
+            reason=f'at rest {self._read()}, as values in {names} are',
+            remedy=remedies,
+            unit=names,
+            symbol=likely[0].symbol,
+            factor=self.gravity_mps2 / likely[0].gravity,
         )
 
     def _fits(self, unit: ReadingUnit) -> bool:
@@ -528,7 +552,7 @@ class _Case:
         return GravityFault(
             GravityFaultKind.MIXED_UNITS,
             f'{self._read_over_poses()}: the axes are in different units ({stated})',
-            'state the unit of each axis by --columns',
+            f'state the unit of each axis by {option("columns")}',
             stated,
         )
 

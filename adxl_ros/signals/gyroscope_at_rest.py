@@ -40,7 +40,7 @@ class RestTurns(NamedTuple):
     temperature_c: np.ndarray  # Temperature of each, °C, (n,); NaN where it is not known
 
 
-def rest_turns(read: Recording, unit: Sensor, are_rows: bool = False) -> list[RestTurns]:
+def rest_turns(read: Recording, sensor: Sensor, are_rows: bool = False) -> list[RestTurns]:
     """Return the gyroscope in each rest of a recording, or in each row; none without one."""
     gyro_radps = read.gyro_radps
     if gyro_radps is None:
@@ -50,7 +50,7 @@ def rest_turns(read: Recording, unit: Sensor, are_rows: bool = False) -> list[Re
     if are_rows:
         places = [np.arange(len(read)) == row for row in range(len(read))]
     else:
-        rests = RecordedRests(unit, read)
+        rests = RecordedRests(sensor, read)
         rests.feed(read)
         rests.take()
         places = [found.rest.includes(read.time_s) for found in rests.detected]
@@ -79,7 +79,9 @@ def with_bias(gyro: Gyroscope, rests: Sequence[RestTurns]) -> Gyroscope:
     middle_c = float(np.average(temperature_c, weights=weight)) if is_known else np.nan
     departure_k = temperature_c - middle_c
     has_slope = is_known and bool(np.ptp(temperature_c) >= _TEMPERATURES_K)
-    design = np.column_stack([np.ones(len(parts)), *[departure_k] * has_slope])
+    design = np.ones((len(parts), 1))
+    if has_slope:
+        design = np.column_stack([design, departure_k])
     root = np.sqrt(weight / weight.mean())[:, None]
     values = np.linalg.lstsq(design * root, means * root, rcond=None)[0]
     freedom = len(parts) - design.shape[1]

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import AXES
+from adxl_ros.process import option
 from adxl_ros.signals.rest_detection import Rest
 import numpy as np
 
@@ -53,17 +54,19 @@ class _Way(NamedTuple):
         axes = []
         for axis, weights in zip(AXES, self.matrix):
             column = int(np.abs(weights).argmax())
-            axes.append(f'{axis} is {"-" * bool(weights[column] < 0)}g{AXES[column]}')
+            sign = '-' if weights[column] < 0 else ''
+            axes.append(f'{axis} is {sign}g{AXES[column]}')
         return ', '.join(axes)
 
 
 def _ways() -> list[_Way]:
     """Return all ways, those with fewer changes first."""
-    ways = [
-        _Way(np.eye(3)[list(order)] * np.array(signs)[:, None] * factor, is_degrees)
-        for is_degrees, factor in ((False, 1.0), (True, np.pi / 180))
-        for order, signs in product(permutations(range(3)), product((1, -1), repeat=3))
-    ]
+    ways = []
+    for is_degrees in (False, True):
+        factor = np.pi / 180 if is_degrees else 1.0
+        for order, signs in product(permutations(range(3)), product((1, -1), repeat=3)):
+            matrix = np.eye(3)[list(order)] * np.array(signs)[:, None] * factor
+            ways.append(_Way(matrix, is_degrees))
     return sorted(ways, key=lambda way: way.changes)
 
 
@@ -107,8 +110,10 @@ class GyroLook:
     def feed(self, block: Recording) -> None:
         """Add a block of the recording."""
         gyro_radps = block.gyro_radps
-        is_taken = np.zeros(0, bool) if gyro_radps is None else np.isfinite(gyro_radps).all(axis=1)
-        if gyro_radps is None or not is_taken.any():
+        if gyro_radps is None:
+            return
+        is_taken = np.isfinite(gyro_radps).all(axis=1)
+        if not is_taken.any():
             return
         gyro_radps, time_s = gyro_radps[is_taken], block.time_s[is_taken]
         self._largest_radps = max(self._largest_radps, float(np.abs(gyro_radps).max()))
@@ -138,7 +143,8 @@ class GyroLook:
             rows = (time_s >= begin_s) & (time_s < end_s)
             has_gap = spans_s[rows].max(initial=0.0) > _CELL_S + 2 * self._period_s * self._rows
             if len(mean) == len(AXES) and end_s - begin_s < _LONGEST_TURN_S and not has_gap:
-                before, after = (each / np.linalg.norm(each) for each in (mean, later_mean))
+                before = mean / np.linalg.norm(mean)
+                after = later_mean / np.linalg.norm(later_mean)
                 turns.append(_Turn(before, after, left[rows]))
         turns = sorted(turns, key=lambda turn: -turn.size)[:_MOST_TURNS]
         turns = [turn for turn in turns if turn.size > _SMALLEST_TURN]
@@ -159,7 +165,8 @@ class GyroLook:
         if self._largest_radps > _ROUNDED * _LARGEST_RADPS:
             faults.append(
                 f'the gyroscope reads up to {self._largest_radps:.3g} rad/s, and none measures '
-                f'more than {_LARGEST_RADPS:.3g} rad/s; if it is in °/s, state dps by --columns, '
+                f'more than {_LARGEST_RADPS:.3g} rad/s; if it is in °/s, state dps '
+                f'by {option("columns")}, '
                 'or convert it to rad/s'
             )
         worst = int(np.abs(bias).argmax())
@@ -182,19 +189,17 @@ def _disagreement(turns: Sequence[_Turn]) -> tuple[float, list[str]]:
         predicted = _turned(turn, np.stack([way.matrix for way in ways]))
         squares += np.sum((predicted - turn.after) ** 2, axis=1) / len(turns)
     errors, size = np.sqrt(squares), float(np.sqrt(np.mean([turn.size**2 for turn in turns])))
-    stated = next(
-        number for number, way in enumerate(ways) if not way.changes and not way.is_degrees
-    )
-    error = float(2 * np.arcsin(min(errors[stated] / 2, 1.0)))
-    if errors[stated] < _WRONG * size:
+    # The ways with the fewest changes come first, and of them those in rad/s: as it should be.
+    as_stated = errors[0]
+    error = float(2 * np.arcsin(min(as_stated / 2, 1.0)))
+    if as_stated < _WRONG * size:
         return error, []
-    # The ways with the fewest changes come first.
     best = ways[int((errors <= _EQUAL * errors.min()).argmax())]
     compared = (
         f'over {len(turns)} turns between rests it misses the direction of gravity by '
         f'{np.degrees(error):.0f}° rms'
     )
-    if errors.min() > _BETTER * errors[stated]:
+    if errors.min() > _BETTER * as_stated:
         return error, [
             f'the gyroscope does not follow the accelerometer: {compared}; check its scale '
             'factor and range, and that both are of one sensor, at one time'
@@ -202,10 +207,11 @@ def _disagreement(turns: Sequence[_Turn]) -> tuple[float, list[str]]:
     if best.is_degrees and not best.changes:
         return error, [
             f'the gyroscope is in °/s: {compared}, and as °/s by '
-            f'{np.degrees(2 * np.arcsin(errors.min() / 2)):.0f}°; state dps by --columns, or '
+            f'{np.degrees(2 * np.arcsin(errors.min() / 2)):.0f}°; state '
+            f'dps by {option("columns")}, or '
             'convert it to rad/s'
         ]
-    unit = ' in °/s' * best.is_degrees
+    unit = ' in °/s' if best.is_degrees else ''
     return error, [
         f'the gyroscope has its axes or signs against those of the accelerometer: {compared}, '
         f'and by {np.degrees(2 * np.arcsin(errors.min() / 2)):.0f}° if the rotation about '

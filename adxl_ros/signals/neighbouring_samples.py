@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from adxl_ros.model.constants import G0_MPS2, TINY
+from adxl_ros.process import usage
 import numpy as np
 
 _FEWEST_RUNS = 20
@@ -118,8 +119,8 @@ class NeighbouringSamples:
         if self.are_means:
             return [
                 f'{self._like_means} of {self._rows} rows are as long as gravity and turned by '
-                'more than 10° from the row before: each is the mean of a rest; fit --means '
-                'reads them'
+                'more than 10° from the row before: each is the mean of a rest; '
+                f'{usage("fit", means=True)} reads them'
             ]
         # A value that wraps for one sample stands alone as well.
         found = (

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.exports import kalibr_settings
-from adxl_ros.files.recording_columns import Recording, unit_of
+from adxl_ros.files.recording_columns import nominal_of, Recording
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.model.noise import (
@@ -38,7 +38,9 @@ import numpy as np
 import scipy
 
 _DROP = 2.705543454095404  # Twice log likelihood at the ends of a 90 % interval: χ², 1 degree
-_SINGLE = 64  # Lowest coefficients that are fitted one by one; further terms change little. Chosen
+_SINGLE = 64
+"""Lowest coefficients that are fitted one by one: from there on a group of `_WIDTH` has two or
+more."""
 _WIDTH = 1.03  # Ratio of frequencies of further groups. Chosen: a term changes by 6 %
 _ROUNDS = 60  # Largest number of rounds of a fit. Chosen: usual are ten
 _HALVINGS = 20  # Largest number of halvings of a step that does not raise the likelihood
@@ -60,6 +62,8 @@ _FEWEST = 32  # Fewest coefficients of a fit. Chosen: white noise is then known 
 _MOST = 0.5  # Share of white noise from which a slope is not that of a filter: most of the power
 _SEEN = 2.0  # Standard deviations of a square that is seen. Chosen: as 90 % intervals exclude 0
 
+_FLICKER_OF_INSTABILITY = 1 / float(np.sqrt(np.pi))
+"""Density of `flicker` at 1 Hz divided by B: over positive frequencies it is B²/(π·f)."""
 FLOOR = float(np.sqrt(2 * np.log(2) / np.pi))  # Allan deviation of B / B (IEEE Std 952, C.15)
 
 
@@ -219,7 +223,14 @@ def fit_noise(
     models = _filters(walks, np.pi * highest / (2 * len(means)), np.pi / (2 * len(means)))
     theta, likelihood = _best(models)
     white, instability, walk = (_interval(models, theta, likelihood, term) for term in range(3))
-    return NoiseFit(white, instability, walk, bound_s, highest, highest / (2 * span_s))
+    return NoiseFit(
+        white=white,
+        instability=instability,
+        walk=walk,
+        bound_s=bound_s,
+        highest=highest,
+        highest_hz=highest / (2 * span_s),
+    )
 
 
 def _walks(groups: _Groups, span_s: float, highest: int) -> tuple[list[_Groups], float]:
@@ -238,11 +249,10 @@ def _walks(groups: _Groups, span_s: float, highest: int) -> tuple[list[_Groups],
 
 def _filters(models: list[_Groups], end_rad: float, step_rad: float) -> list[_Groups]:
     """Return the models behind each filter that is likely; angles are half a turn a sample."""
-    filtered = [
-        model.filtered(loss / np.sin(end_rad) ** 2, step_rad)
-        for loss in _FILTER_LOSSES
-        for model in models
-    ]
+    filtered = []
+    for loss in _FILTER_LOSSES:
+        strength = loss / np.sin(end_rad) ** 2
+        filtered += [model.filtered(strength, step_rad) for model in models]
     likelihoods = np.array([_fit(model)[1] for model in filtered])
     return [filtered[i] for i in np.flatnonzero(2 * (likelihoods.max() - likelihoods) < _DROP)]
 
@@ -345,7 +355,8 @@ def _highest(groups: _Groups, count: int, span_s: float, rounding: float) -> int
     while stop > 2 * _FEWEST:
         lower = groups.below(max(stop // 2, _FEWEST))
         bound_s = _walks(lower, span_s, stop // 2)[1]
-        used, lower = (part.bounded(bound_s, span_s) for part in (groups.below(stop), lower))
+        used = groups.below(stop).bounded(bound_s, span_s)
+        lower = lower.bounded(bound_s, span_s)
         theta = _fit(lower)[0]
         chances = scipy.stats.chi2.sf(used.count * used.power / (used.shapes @ theta), used.count)
         octave = used.where(used.first >= stop // 2)
@@ -373,14 +384,17 @@ def _is_expected(octave: _Groups, lower: _Groups, theta: np.ndarray) -> bool:
     """Whether an octave has the power that a fit of the lower groups predicts."""
     if not len(octave.count):
         return False
-    parts, design = (
-        (g.shapes * theta)[:, theta > 0] / (g.shapes @ theta)[:, None] for g in (octave, lower)
-    )
+    parts, design = _shares(octave, theta), _shares(lower, theta)
     share = octave.count / octave.count.sum()
     predicted = share @ parts @ np.linalg.pinv(design * np.sqrt(lower.count / 2)[:, None])
     excess = float(share @ (octave.power / (octave.shapes @ theta))) - 1
     variance = 2 / octave.count.sum() + float(predicted @ predicted)
     return bool(scipy.stats.chi2.sf(excess**2 / variance, 1) > _OCTAVE_PROBABILITY)
+
+
+def _shares(groups: _Groups, theta: np.ndarray) -> np.ndarray:
+    """Return the share of each term that a fit has in the power, (g, terms)."""
+    return (groups.shapes * theta)[:, theta > 0] / (groups.shapes @ theta)[:, None]
 
 
 _CERTAIN_STDS = 2.576  # Standard deviations that refute a filter: 1 of 100 healthy logs is beyond
@@ -454,7 +468,7 @@ class RecordingNoise:
 
     path: str  # The recording
     sensor: Sensor  # Its parameter file
-    unit: Sensor  # The nominal sensor that it comes from
+    nominal: Sensor  # The nominal sensor that it comes from
     rest: StillStretch  # Its samples at rest
     axes: list[AxisNoise]  # The noise by axis
     # What is wrong with the length of gravity and between neighbouring samples, one line each
@@ -473,18 +487,29 @@ def recording_noise(
     if first is None:
         raise UserError('the recording holds no samples')
     sensor = load_sensor(params, first)
-    unit = unit_of(sensor, first.stream_info, first.axes)
+    nominal = nominal_of(sensor, first.stream_info, first.axes)
     look = RecordingLook(sensor, first)
-    still = longest_rest(read, unit, first, look)
+    still = longest_rest(read, nominal, first, look)
     rest, gyro_rest = still.accelerometer, still.gyroscope
     doubts = require_unit(look.gravity(), first.path)
     share = 1.0 if gyro_rest is None else 0.5
-    noises = _axis_noises(rest, unit.axes, lambda done: show(share * done))
+    noises = _axis_noises(rest, nominal.axes, lambda done: show(share * done))
     gyro = (
         _axis_noises(gyro_rest, AXES, lambda done: show(share * (1 + done))) if gyro_rest else []
     )
-    doubts = [*doubts, *[still.gyro_doubt] * bool(still.gyro_doubt), *look.neighbour_faults()]
-    return RecordingNoise(first.path, sensor, unit, rest, noises, tuple(doubts), gyro_rest, gyro)
+    if still.gyro_doubt:
+        doubts.append(still.gyro_doubt)
+    doubts += look.neighbour_faults()
+    return RecordingNoise(
+        path=first.path,
+        sensor=sensor,
+        nominal=nominal,
+        rest=rest,
+        axes=noises,
+        doubts=tuple(doubts),
+        gyro_rest=gyro_rest,
+        gyro=gyro,
+    )
 
 
 def _axis_noises(rest: StillStretch, axes: str, show: Callable[[float], None]) -> list[AxisNoise]:
@@ -497,21 +522,24 @@ def _axis_noises(rest: StillStretch, axes: str, show: Callable[[float], None]) -
         fit = fit_noise(rest.means[:, i], rest.step_s, variances, rounding)
         rounding_variance = rounding**2 * rest.rate_hz
         tau_s = rest.allan.tau_s[: rest.window_octaves]
-        slow_lines = [
-            line
-            for line, term in zip(fit.lines(tau_s)[1:], (fit.instability, fit.walk))
-            if term.is_seen
-        ]
+        _, instability, walk = fit.lines(tau_s)
+        slow_lines = []
+        if fit.instability.is_seen:
+            slow_lines.append(instability)
+        if fit.walk.is_seen:
+            slow_lines.append(walk)
         slow = float(np.sum(np.square(slow_lines)) / 2 / (1 - 0.5 ** len(tau_s)))
         noises.append(
             AxisNoise(
-                axis,
-                without_rounding(fit, std, resolution, rounding),
-                std,
-                resolution,
-                rounding,
-                max(std**2 - slow - rounding_variance, 0.0),
-                max(float(rest.allan.deviation[0, i]) ** 2 - rounding_variance, 0.0),
+                axis=axis,
+                fit=without_rounding(fit, std, resolution, rounding),
+                sample_std=std,
+                resolution=resolution,
+                rounding=rounding,
+                white_variance=max(std**2 - slow - rounding_variance, 0.0),
+                change_variance=max(
+                    float(rest.allan.deviation[0, i]) ** 2 - rounding_variance, 0.0
+                ),
             )
         )
         show((i + 1) / len(axes))
@@ -560,7 +588,7 @@ def with_noise(sensor: Sensor, noises: list[AxisNoise], rest: StillStretch) -> S
     and round nothing.
     """
     values = {name: value for name, value in sensor.values.items() if name != 'noise_excess'}
-    to_g = np.array([ONE_SIDED, 1 / np.sqrt(np.pi), 1.0])[:, None] / G0_MPS2
+    to_g = np.array([ONE_SIDED, _FLICKER_OF_INSTABILITY, 1.0])[:, None] / G0_MPS2
     # By field of an estimate, term and axis.
     value, low, high = (np.array([noise.estimates for noise in noises]) * to_g).T
     for term, (effect, name) in enumerate(
@@ -593,23 +621,25 @@ def with_gyro_noise(gyro: Gyroscope, noises: Sequence[AxisNoise]) -> Gyroscope:
     """
     if not noises:
         return gyro
-    densities = [
-        tuple(
-            factor * (estimate.value if estimate.is_seen else unseen * estimate.high)
-            for noise in noises
-            for estimate in [noise.estimates[term]]
-        )
-        for term, (factor, unseen) in enumerate(
-            ((ONE_SIDED, 1.0), (1 / float(np.sqrt(np.pi)), 0.0), (1.0, 0.0))
-        )
-    ]
-    white, flicker, walk = (each if any(each) else () for each in densities)
+
+    def scaled(factor: float, values: Iterable[float]) -> tuple[float, ...]:
+        densities = tuple(factor * value for value in values)
+        return densities if any(densities) else ()
+
+    fits = [noise.fit for noise in noises]
+    whites = [fit.white.value if fit.white.is_seen else fit.white.high for fit in fits]
     return replace(
         gyro,
-        noise_density_radps_per_rthz=white,
-        flicker_radps_per_rthz=flicker,
-        walk_radps_per_rts=walk,
+        noise_density_radps_per_rthz=scaled(ONE_SIDED, whites),
+        flicker_radps_per_rthz=scaled(
+            _FLICKER_OF_INSTABILITY, (_seen(fit.instability) for fit in fits)
+        ),
+        walk_radps_per_rts=scaled(1.0, (_seen(fit.walk) for fit in fits)),
     )
+
+
+def _seen(estimate: Estimate) -> float:
+    return estimate.value if estimate.is_seen else 0.0
 
 
 def _density(sensor: Sensor, noises: list[AxisNoise], is_repeated: bool) -> np.ndarray:
@@ -618,22 +648,22 @@ def _density(sensor: Sensor, noises: list[AxisNoise], is_repeated: bool) -> np.n
 
     is_repeated: whether the variance of a sample is that of white noise behind the filter.
     """
-    unit, rate_hz = electronics(sensor), sensor.rate_hz
-    share = white_share(unit.rc_s, rate_hz)
+    circuit, rate_hz = electronics(sensor), sensor.rate_hz
+    share = white_share(circuit.rc_s, rate_hz)
     variances = []
     for noise, axis_share in zip(noises, share):
         white = noise.fit.white
-        largest = white.value if white.is_seen else white.high
-        variance = (
-            noise.white_variance
-            if is_repeated and white.is_seen
-            else largest**2 * rate_hz * axis_share
-        )
+        if not white.is_seen:
+            variance = white.high**2 * rate_hz * axis_share
+        elif is_repeated:
+            variance = noise.white_variance
+        else:
+            variance = white.value**2 * rate_hz * axis_share
         if not sensor.adc_bits and white.is_seen:
             variance += noise.rounding**2 * rate_hz
         variances.append(variance / G0_MPS2**2)
-    measured = np.sqrt(density_for_variance(np.array(variances), unit.rc_s, rate_hz))
-    measured /= unit.noise_ratio
+    measured = np.sqrt(density_for_variance(np.array(variances), circuit.rc_s, rate_hz))
+    measured /= circuit.noise_ratio
     before = sensor.noise_density_g_per_rthz
     stated = np.where(before > 0, before, np.inf)
     is_seen = [noise.fit.white.is_seen for noise in noises]
@@ -650,7 +680,7 @@ def _with_filter(
     refutes the stated filter. So does more, but only if the differences of neighbouring samples
     have the form of a filter: vibration and mains add to the variance, too.
     """
-    seen = [each for noise in noises if (each := noise.filter_evidence(rest))]
+    seen = list(filter(None, (noise.filter_evidence(rest) for noise in noises)))
     if not seen:
         return sensor, False
     weights = np.array([each.std**-2 for each in seen])
@@ -695,9 +725,9 @@ def _one_for_all(noises: Sequence[AxisNoise]) -> _OneForAll:
     loudest = max(noises, key=lambda noise: noise.sample_white)
     walk = max((noise.fit.walk for noise in noises), key=lambda walk: walk.value)
     k = walk.value if walk.is_seen else max(noise.fit.walk.high for noise in noises)
-    white_note, note = (
-        '' if term.is_seen else ', an upper limit' for term in (loudest.fit.white, walk)
-    )
+    limit = ', an upper limit'
+    white_note = '' if loudest.fit.white.is_seen else limit
+    note = '' if walk.is_seen else limit
     variances = [noise.sample_std**2 for noise in noises]
     matrix = np.diag((variances + [1e6] * 3)[:3]).ravel().tolist()
     return _OneForAll(loudest.sample_white, k, white_note, note, matrix)

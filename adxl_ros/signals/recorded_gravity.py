@@ -20,14 +20,14 @@ class RecordingLook:
         """Prepare for a recording of a sensor, calibrated or not, by its first block."""
         self._sensor = sensor
         # The same without coefficients, as the recording states it
-        self.unit = uncalibrated(sensor, first.stream_info, first.axes, first.rate_hz)
-        self.rests = RecordedRests(self.unit, first)
-        self._neighbours = NeighbouringSamples(self.unit.axes, first.rate_hz)
+        self.nominal = uncalibrated(sensor, first.stream_info, first.axes, first.rate_hz)
+        self.rests = RecordedRests(self.nominal, first)
+        self._neighbours = NeighbouringSamples(self.nominal.axes, first.rate_hz)
 
     def feed(self, block: Recording) -> None:
         """Add a block of the recording."""
         self.rests.feed(block)
-        self._neighbours.feed(block.time_s, block.accel_mps2(self.unit))
+        self._neighbours.feed(block.time_s, block.accel_mps2(self.nominal))
 
     def gravity(self) -> GravityAtRest:
         """
@@ -47,8 +47,8 @@ class RecordingLook:
         return gravity
 
     def _look(self, rests: list[RestMean]) -> GravityAtRest:
-        is_calibrated = self._sensor.effects and self._sensor.axes == self.unit.axes
-        return _of_rests(rests, self._sensor if is_calibrated else self.unit)
+        is_calibrated = self._sensor.effects and self._sensor.axes == self.nominal.axes
+        return _of_rests(rests, self._sensor if is_calibrated else self.nominal)
 
     def neighbour_faults(self) -> list[str]:
         """Return what is wrong between neighbouring samples, one line each."""

@@ -16,6 +16,7 @@ from adxl_ros.files.stamps import halves, late_by, stamped_rate_hz
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import names_of, put, Sensor, to_volts, with_axes, with_neutral
+from adxl_ros.process import usage
 from adxl_ros.signals import block_statistics as stats
 from adxl_ros.signals.block_statistics import Spans
 import numpy as np
@@ -43,10 +44,11 @@ def measure_unstated(sensor: Sensor, read: Recording) -> tuple[Sensor, list[str]
         )
     if not sensor.unstated:
         return sensor, []
-    unit = sensor if sensor.effects else with_axes(sensor, read.axes)
+    if not sensor.effects:
+        sensor = with_axes(sensor, read.axes)
     if 'noise_density_g_per_rthz' in sensor.unstated:
-        unit = replace(unit, provenance={**unit.provenance, 'noise_from': name})
-    return _measured(unit, read.time_s, read.volts(unit), f'{read.path}: ')
+        sensor = replace(sensor, provenance={**sensor.provenance, 'noise_from': name})
+    return _measured(sensor, read.time_s, read.volts(sensor), f'{read.path}: ')
 
 
 def listed(measured: list[str]) -> list[str]:
@@ -89,74 +91,74 @@ _STEADY = 0.05  # Largest difference of the rate of half of the samples. Chosen:
 _SMALLEST_RANGE_G = 2.0  # Smallest range that is taken, g: of common digital sensors
 _FILTER_START_SAMPLES = 2.0  # First RC of the search, periods. Chosen: slower ones are reached
 _MAX_NOISE_G_PER_RTHZ = 0.1  # Largest density of a parameter file, g/√Hz
+_NO_FILTER = 'filter: the noise at rest shows none'
 RESISTANCE_OHM = 1.0e4  # Resistor of a measured filter, Ω: only R·C has a meaning
 
 
 def _measured(
-    unit: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = ''
+    sensor: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str = ''
 ) -> tuple[Sensor, list[str]]:
     """
-    Fill in what a parameter file leaves out; return the unit, and what is measured, for people.
+    Fill in what a parameter file leaves out; return the sensor, and what is measured, for people.
 
     The noise is that of the quietest quarter seconds, so that the samples may hold motion.
     """
-    scale_v_per_g, spans = unit.nominal_scale_v_per_g, Spans(unit.rate_hz)
-    blocks = stats.BlockCutter(unit.rate_hz, len(unit.axes)).feed(time_s, volts)
+    scale_v_per_g, spans = sensor.nominal_scale_v_per_g, Spans(sensor.rate_hz)
+    blocks = stats.BlockCutter(sensor.rate_hz, len(sensor.axes)).feed(time_s, volts)
     windows = stats.window_variance(blocks, spans)
     if len(time_s) < FEWEST_SAMPLES or not np.isfinite(windows).any():
-        raise UserError(f'{where}{_noise_is_hidden(unit, time_s)}')
+        raise UserError(f'{where}{_noise_is_hidden(sensor, time_s)}')
     step_v = stats.adc_step(blocks)
     variance_v2, limit_v2 = stats.quiet_variance(blocks, windows, step_v)
-    rc_s = unit.rc_s
-    if 'rc_capacitance_f' in unit.unstated:
+    rc_s = sensor.rc_s
+    if 'rc_capacitance_f' in sensor.unstated:
         quiet = stats.quiet_blocks(blocks, windows, limit_v2, spans.window)
         rests = [
             volts[blocks.start[begin] : blocks.start[end - 1] + spans.size]
             for begin, end in stats.true_runs(quiet, blocks.run)
         ]
-        rc_s = _filter_s(rests, unit.rate_hz, float(np.max(step_v)))
+        rc_s = _filter_s(rests, sensor.rate_hz, float(np.max(step_v)))
     noise_g = np.sqrt(variance_v2) / scale_v_per_g
-    largest_g = float(np.max(np.abs(volts - unit.nominal_zero_g_v) / scale_v_per_g))
+    largest_g = float(np.max(np.abs(volts - sensor.nominal_zero_g_v) / scale_v_per_g))
     # A common range: a power of two
     range_g = 2.0 ** ceil(log2(max(largest_g, _SMALLEST_RANGE_G)))
-    bandwidth_hz = 0.25 / rc_s if rc_s else unit.rate_hz / 2
+    # Noise bandwidth of the filter, or that of samples without one
+    bandwidth_hz = 0.25 / rc_s if rc_s else sensor.rate_hz / 2
+    density_g_per_rthz = noise_g / np.sqrt(bandwidth_hz)
     values = {
-        'noise_density_g_per_rthz': np.minimum(
-            noise_g / np.sqrt(bandwidth_hz), _MAX_NOISE_G_PER_RTHZ
-        ),
+        'noise_density_g_per_rthz': np.minimum(density_g_per_rthz, _MAX_NOISE_G_PER_RTHZ),
         'range_g': range_g,
         'rc_resistance_ohm': RESISTANCE_OHM,
         'rc_capacitance_f': rc_s / RESISTANCE_OHM,
-        'filter_rate_hz': unit.rate_hz,
+        'filter_rate_hz': sensor.rate_hz,
     }
     texts = {
-        'noise_density_g_per_rthz': 'noise of a sample: ' + _by_axis(unit, noise_g),
-        'adc_bits': 'resolution: ' + _by_axis(unit, step_v / scale_v_per_g),
-        'rc_capacitance_f': f'filter: {rc_s * 1e3:.3g} ms'
-        if rc_s
-        else 'filter: the noise at rest shows none',
+        'noise_density_g_per_rthz': 'noise of a sample: ' + _by_axis(sensor, noise_g),
+        'adc_bits': 'resolution: ' + _by_axis(sensor, step_v / scale_v_per_g),
+        'rc_capacitance_f': f'filter: {rc_s * 1e3:.3g} ms' if rc_s else _NO_FILTER,
         'range_g': f'range: ±{range_g:g} g (largest reading {largest_g:.3g} g)',
     }
-    lines = [text for name, text in texts.items() if name in unit.unstated]
-    unknown = {*unit.unstated}
+    lines = [text for name, text in texts.items() if name in sensor.unstated]
+    unknown = {*sensor.unstated}
     if 'rc_capacitance_f' in unknown:
         unknown.add('filter_rate_hz')  # The measured filter is that at this rate.
     used = {name: value for name, value in values.items() if name in unknown}
-    return replace(unit, unstated=(), measured=unit.unstated, **used), lines
+    return replace(sensor, unstated=(), measured=sensor.unstated, **used), lines
 
 
-def _noise_is_hidden(unit: Sensor, time_s: np.ndarray) -> str:
+def _noise_is_hidden(sensor: Sensor, time_s: np.ndarray) -> str:
     """Return that samples do not show the noise of a sensor, why, and what does."""
-    needed_s = max(SHORTEST_S, FEWEST_SAMPLES / unit.rate_hz)
-    longest_s = np.diff(time_s).max()
-    has_gaps = longest_s > stats.gap_s(unit.rate_hz)
+    needed_s = max(SHORTEST_S, FEWEST_SAMPLES / sensor.rate_hz)
+    longest_s = np.diff(time_s).max(initial=0.0)
+    has_gaps = longest_s > stats.gap_s(sensor.rate_hz)
     why = f'; they come with gaps of up to {longest_s:.2g} s' if has_gaps else ''
     fields = parameter_file.SENSOR_FIELDS.items()
-    keys = [key for key, field in fields if field.name in unit.unstated]
+    keys = [key for key, field in fields if field.name in sensor.unstated]
     return (
-        f'{len(time_s)} samples at {unit.rate_hz:g} Hz do not show the noise of the sensor{why}; '
-        f'record at least {needed_s:.3g} s without gaps, or state {", ".join(keys)} in the '
-        'parameter file; fit --means takes a table of which each row is the mean of a rest'
+        f'{len(time_s)} samples at {sensor.rate_hz:g} Hz do not show the noise of the '
+        f'sensor{why}; record at least {needed_s:.3g} s without gaps, or state '
+        f'{", ".join(keys)} in the parameter file; {usage("fit", means=True)} takes a table of '
+        'which each row is the mean of a rest'
     )
 
 
@@ -173,7 +175,7 @@ def _filter_s(rests: list[np.ndarray], rate_hz: float, step_v: float) -> float:
     return float(np.mean(time_constants)) if time_constants else 0.0
 
 
-def unit_of_stream(
+def sensor_of_stream(
     sensor: Sensor, stamps_ns: np.ndarray, accel_mps2: np.ndarray
 ) -> tuple[Sensor, list[str]]:
     """
@@ -210,14 +212,15 @@ def unit_of_stream(
         )
     present = ''.join(axis for axis, values in zip(AXES, accel_mps2.T) if values.any())
     axes = present if present in MEASURED_AXES else AXES
-    unit = sensor if sensor.effects else with_axes(sensor, axes)
-    unit = replace(unit, rate_hz=round(rate_hz, 3))
-    volts = to_volts(accel_mps2[:, : len(unit.axes)], unit)
-    unit, lines = _measured(unit, time_s, volts)
+    if not sensor.effects:
+        sensor = with_axes(sensor, axes)
+    sensor = replace(sensor, rate_hz=round(rate_hz, 3))
+    volts = to_volts(accel_mps2[:, : len(sensor.axes)], sensor)
+    sensor, lines = _measured(sensor, time_s, volts)
     return (
-        replace(unit, measured=(*unit.measured, 'rate_hz')),
+        replace(sensor, measured=(*sensor.measured, 'rate_hz')),
         [
-            f'rate: {unit.rate_hz:.4g} Hz, axes: {unit.axes}',
+            f'rate: {sensor.rate_hz:.4g} Hz, axes: {sensor.axes}',
             *lines,
             *([f'left out: {backward}'] if late_ns.any() else []),
         ],
@@ -338,7 +341,7 @@ def _expected(x: np.ndarray, lags: np.ndarray) -> np.ndarray:
 def with_filter(
     fitted: Sensor, estimates: Sequence[Sequence[FilterNoise | None]]
 ) -> tuple[Sensor, list[str]]:
-    """Add the effect `bandwidth` with its variance to a fitted unit."""
+    """Add the effect `bandwidth` with its variance to a fitted sensor."""
     if not fitted.rc_s or not estimates:
         return fitted, []
     ratios, variances = [], []
@@ -356,9 +359,9 @@ def with_filter(
         ratios.append(rc_s / fitted.rc_s - 1)
         variances.append((rc_s / fitted.rc_s) ** 2 / weights.sum())
     names = names_of(effect_named('bandwidth'), fitted.axes)
-    unit = put(with_neutral(fitted, ['bandwidth']), names, ratios)
+    filtered = put(with_neutral(fitted, ['bandwidth']), names, ratios)
     return replace(
-        unit,
+        filtered,
         covariance=scipy.linalg.block_diag(fitted.covariance, np.diag(variances)),
         covariance_names=(*fitted.covariance_names, *names),
     ), []

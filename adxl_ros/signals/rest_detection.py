@@ -21,17 +21,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from adxl_ros.files.recording_columns import JOINTS, Recording
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import G0_MPS2, SAME_ANGLE_RAD
 from adxl_ros.model.noise import effective_samples, sample_std_v
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import block_statistics as stats
 from adxl_ros.signals.block_statistics import Blocks, Spans
 import numpy as np
 import scipy
-
-SAME_ANGLE_RAD = 1e-5
-"""Angles that differ by less are equal, rad. Chosen: above the rounding of angles in a file, and
-far below the step of an encoder."""
 
 _HAND_HELD_S = 1.4  # Shortest rest by hand, s, without 0.3 s of margins. Chosen: beyond pauses
 _STAGE_S = 0.6  # Shortest rest on a stage, s, without these margins. Chosen: dwells are longer
@@ -452,11 +448,11 @@ class RestFinder:
         return not (bounds.sum(axis=0) > allowed).any()
 
 
-def recording_finder(unit: Sensor, has_angles: bool) -> RestFinder:
+def recording_finder(sensor: Sensor, has_angles: bool) -> RestFinder:
     """Return the finder of rests in a recording that all tools use."""
-    noise = None if 'noise_density_g_per_rthz' in unit.unstated else datasheet_noise(unit)
-    tolerance_rad = max(unit.stage_resolution_rad, SAME_ANGLE_RAD) if has_angles else None
-    return RestFinder(unit.rate_hz, len(unit.axes), noise, True, tolerance_rad)
+    noise = None if 'noise_density_g_per_rthz' in sensor.unstated else datasheet_noise(sensor)
+    tolerance_rad = max(sensor.stage_resolution_rad, SAME_ANGLE_RAD) if has_angles else None
+    return RestFinder(sensor.rate_hz, len(sensor.axes), noise, True, tolerance_rad)
 
 
 class RestMean(NamedTuple):
@@ -470,10 +466,10 @@ class RestMean(NamedTuple):
 class RecordedRests:
     """Finds the rests of a recording of any length; the memory is that of an hour."""
 
-    def __init__(self, unit: Sensor, first: Recording) -> None:
-        self._unit = replace(unit, rate_hz=first.rate_hz)
+    def __init__(self, sensor: Sensor, first: Recording) -> None:
+        self._sensor = replace(sensor, rate_hz=first.rate_hz)
         self._has_angles = set(_ANGLES) <= set(first.columns)
-        self._finder = recording_finder(self._unit, self._has_angles)
+        self._finder = recording_finder(self._sensor, self._has_angles)
         self._taken_s = float(first.time_s[0])
         self.detected: list[RestMean] = []  # Rests of all blocks up to the last `take`
 
@@ -484,7 +480,7 @@ class RecordedRests:
             if self._has_angles
             else None
         )
-        self._finder.feed(block.time_s, block.volts(self._unit), angles_rad)
+        self._finder.feed(block.time_s, block.volts(self._sensor), angles_rad)
         if block.time_s[-1] - self._taken_s > _PART_S:
             self.take()
             self._finder.forget()

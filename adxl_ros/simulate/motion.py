@@ -17,6 +17,7 @@ from adxl_ros.files.stamps import stamped_rate_hz
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Components, Need
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import option
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 import scipy
@@ -131,7 +132,7 @@ def check_needs(sensor: Sensor, motion: Motion) -> None:
     missing = {
         Need.STAGE: (has_stage, 'this manoeuvre has none, only specific force'),
         Need.ROTATION: (has_stage or is_robot, 'it is not known beside a specific force'),
-        Need.ROBOT: (is_robot, 'the motion is not that of a robot; give --urdf'),
+        Need.ROBOT: (is_robot, f'the motion is not that of a robot; give {option("urdf")}'),
         Need.ADC: (sensor.adc_bits > 0, 'the sensor has none: sensor.adc_bits is 0'),
         Need.NOISE: (
             np.any(sensor.noise_density_g_per_rthz),
@@ -484,11 +485,15 @@ def _moving(reading: np.ndarray) -> np.ndarray:
 class ForcePath:
     """Specific force of a recording or of another simulator, as cubic splines."""
 
-    name = '--sim'  # What it is, for people
     is_robot = False  # Whether what follows is known
     wanders = False  # Whether it may drift slowly, as the estimated pose of a base
     modes: Mapping[str, np.ndarray] = MappingProxyType({})
     """Force at `time_s` per unit of each error of a robot, (n, 3)."""
+
+    @property
+    def name(self) -> str:
+        """Return what it is, for people."""
+        return option('sim').removesuffix('=')
 
     def __init__(self, time_s: np.ndarray, columns: np.ndarray) -> None:
         """Interpolate columns, (n, k), the first three of them specific force of the case."""

@@ -384,6 +384,6 @@ def change_mg(
         other = replace(
             other, rc_resistance_ohm=_SHORT_RC_S / other.rc_capacitance_f, filter_rate_hz=0.0
         )
-    volts = [Response(unit, motion, _SEED).whole(stamps_s, memo) for unit in (sensor, other)]
+    volts = [Response(variant, motion, _SEED).whole(stamps_s, memo) for variant in (sensor, other)]
     change_g = (volts[0] - volts[1]) / sensor.nominal_scale_v_per_g
     return float(1e3 * np.sqrt(np.mean(change_g**2)))

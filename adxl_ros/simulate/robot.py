@@ -23,6 +23,7 @@ from adxl_ros.files.robot_readings import Readings
 from adxl_ros.files.stamps import period_s, stamped_rate_hz
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Components
+from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
 from adxl_ros.simulate.motion import (
     ForcePath,
@@ -62,7 +63,7 @@ class Robot:
             import pinocchio
         except ImportError:
             raise UserError(
-                '--urdf needs pinocchio: apt install ros-jazzy-pinocchio, or '
+                f'{option("urdf")} needs pinocchio: apt install ros-jazzy-pinocchio, or '
                 f'{install_hint("pin")}'
             ) from None
         self._pin: Any = pinocchio
@@ -107,7 +108,8 @@ class Robot:
         angular acceleration, and the unit vector upward, (4, n, 3).
         """
         pin, model, data = self._pin, self._model, self._data
-        q, v, a = (np.zeros((joints.shape[1], size)) for size in (model.nq, model.nv, model.nv))
+        count = joints.shape[1]
+        q, v, a = np.zeros((count, model.nq)), *np.zeros((2, count, model.nv))
         if base is not None:
             q[:, :7], v[:, :6], a[:, :6] = _free_flyer(base)
         for number, name in enumerate(self.joints):
@@ -133,13 +135,19 @@ class Robot:
 
 def _free_flyer(base: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return position, rate and acceleration of a free joint as pinocchio has them."""
-    (x, q), (dx, dq), (ddx, ddq) = ((b[:, :3], b[:, 3:]) for b in base)
-    norm = np.linalg.norm(q, axis=1, keepdims=True)
-    q, dq, ddq = q / norm, dq / norm, ddq / norm
+    x, dx, ddx = base[:, :, :3]
+    norm = np.linalg.norm(base[0, :, 3:], axis=1, keepdims=True)
+    q, dq, ddq = base[:, :, 3:] / norm
     v, w = q[:, :3], q[:, 3:]
-    # Twice the vector part of the products of the inverse quaternion and the derivatives
-    omega, alpha = (2 * (w * d[:, :3] - v * d[:, 3:] - np.cross(v, d[:, :3])) for d in (dq, ddq))
-    velocity, acceleration = (Rotation.from_quat(q).apply(d, inverse=True) for d in (dx, ddx))
+
+    def turning(derivative: np.ndarray) -> np.ndarray:
+        """Return twice the vector part of the inverse quaternion times a derivative, (n, 3)."""
+        vector, scalar = derivative[:, :3], derivative[:, 3:]
+        return 2 * (w * vector - v * scalar - np.cross(v, vector))
+
+    omega, alpha = turning(dq), turning(ddq)
+    to_body = Rotation.from_quat(q).inv()
+    velocity, acceleration = to_body.apply(dx), to_body.apply(ddx)
     return (
         np.hstack([x, q]),
         np.hstack([velocity, omega]),
@@ -275,10 +283,11 @@ class RobotPath(ForcePath):
         """
         error = self.error_mps2[:, component]
         around = max(round(_AROUND_S / (self.time_s[1] - self.time_s[0])), 3)
-        size, rate = (
-            np.sqrt(np.maximum(uniform_filter1d(v**2, around), 0.0))
-            for v in (error, np.gradient(error, self.time_s))
-        )
+
+        def rms_around(values: np.ndarray) -> np.ndarray:
+            return np.sqrt(np.maximum(uniform_filter1d(values**2, around), 0.0))
+
+        size, rate = rms_around(error), rms_around(np.gradient(error, self.time_s))
         return PathErrors(
             np.interp(time_s, self.time_s, size),
             np.interp(time_s, self.time_s, rate / np.maximum(size, _SMALLEST_STEP)),

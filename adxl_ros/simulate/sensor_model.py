@@ -68,16 +68,16 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
     """
     limit: float | np.ndarray = np.inf
     if units == 'datasheet':
-        rows = [
-            (name, typical or maximum / _STDS_OF_MAXIMUM, maximum or np.inf)
-            for parameter, (typical, maximum) in sensor.datasheet.items()
-            for name in names_of(effect_named(parameter.effect), sensor.axes)
-            if name.without_axis == parameter
-        ]
-        names = [name for name, *_ in rows]
-        std, largest = np.array([row[1:] for row in rows], float).reshape(-1, 2).T
+        names, stds, limits = [], [], []
+        for parameter, (typical, maximum) in sensor.datasheet.items():
+            std = typical or maximum / _STDS_OF_MAXIMUM
+            for name in names_of(effect_named(parameter.effect), sensor.axes):
+                if name.without_axis == parameter:
+                    names.append(name)
+                    stds.append(std)
+                    limits.append((maximum or np.inf) / std)
         mean = np.array([parameter_of(name).neutral for name in names])
-        root, limit = np.diag(std), largest / std
+        root, limit = np.diag(np.array(stds)), np.array(limits)
     elif units == 'calibration':
         names = list(sensor.covariance_names)
         size, vectors = np.linalg.eigh(sensor.covariance)
@@ -172,6 +172,9 @@ class SensorModel:
         self._shape: tuple[int, ...] = ()
         self._dt_s, self._std_v = 0.0, np.zeros(0)
         self._switch_on(0)
+
+    def __repr__(self) -> str:
+        return f'<SensorModel of {self.sensor!r}>'
 
     def _switch_on(self, count: int) -> None:
         """Forget all that sensors remember: steps since power-on, filters, noise, past forces."""

@@ -17,6 +17,7 @@ from adxl_ros.files.stamps import stamped_rate_hz
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import usage
 from adxl_ros.simulate.motion import (
     BAND_LIMITED_DEGREE,
     encoder_reading,
@@ -299,7 +300,7 @@ def motion_from_references(read: Recording, sensor: Sensor) -> Motion:
         if name not in read.columns or np.isnan(read.columns[name]).all():
             raise UserError(
                 f'{read.path}: no stage angle {name} to follow; for specific force '
-                f'say simulate imu --force {read.path}'
+                f'say {usage("simulate", "imu", force=read.path)}'
             )
     paths: dict[str, Any] = environment_paths(read)
     for joint, name in JOINTS.items():

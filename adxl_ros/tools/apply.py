@@ -30,7 +30,6 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--params',
         metavar='FILE',
-        default=None,
         help='the calibrated sensor (default: the nominal sensor)',
     )
     parse.add_argument(
@@ -66,7 +65,9 @@ def apply(options: argparse.Namespace) -> int:
     first = next(blocks, None)
     if first is None:
         raise UserError(f'{options.recording}: has no samples to correct')
-    correction = Correction(first, options.params, options.inverse, options.undo_filter)
+    correction = Correction(
+        first, options.params, inverse=options.inverse, undo_filter=options.undo_filter
+    )
     block = first
     with writer(options.output, correction.sensor) as write, cli.progress('apply') as show:
         for block, estimates in correction.blocks(itertools.chain([first], blocks)):

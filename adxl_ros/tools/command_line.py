@@ -21,7 +21,7 @@ from adxl_ros.files.atomic_write import AnyPath, require_own
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects.base import Effect
-from adxl_ros.process import ended_by_closed_output
+from adxl_ros.process import ended_by_closed_output, option, options_named
 from adxl_ros.report.screen import bar, end_lines, entry_list, NextStep, program_parser, wrapped
 
 if TYPE_CHECKING:
@@ -106,7 +106,6 @@ def add_recording_options(parse: argparse.ArgumentParser) -> None:
         '--rate',
         metavar='HZ',
         type=float,
-        default=None,
         help='stamp the samples by their index at this rate',
     )
     group.add_argument(
@@ -147,30 +146,32 @@ def add_robot_options(parse: argparse.ArgumentParser) -> None:
     )
 
 
+_READING = (
+    'topic',
+    'columns',
+    'unit',
+    'lsb_per_g',
+    'lsb_at_0g',
+    'rate',
+    'axes',
+    'drop_bad_stamps',
+    'drop_bad_samples',
+)
+"""Arguments of `read` that are options of tools."""
+
+
 def reading_options(options: argparse.Namespace) -> ReadingOptions:
     """Return how recordings are to be read."""
-    return recordings.reading_options(
-        options.topic,
-        options.columns,
-        options.unit,
-        options.rate,
-        options.axes,
-        options.lsb_per_g,
-        options.lsb_at_0g,
-        options.drop_bad_stamps,
-        options.drop_bad_samples,
-    )
+    return recordings.reading_options(**{name: getattr(options, name) for name in _READING})
 
 
 def reading_text(options: argparse.Namespace) -> str:
     """Return the given options for a command line that reads the same recording."""
-    words = []
-    for name in ('topic', 'columns', 'unit', 'lsb_per_g', 'lsb_at_0g', 'rate', 'axes'):
+    text = ''
+    for name in _READING:
         if value := getattr(options, name):
-            words += [f'--{name.replace("_", "-")}', str(value)]
-    for name in ('drop_bad_stamps', 'drop_bad_samples'):
-        words += [f'--{name.replace("_", "-")}'] * getattr(options, name)
-    return f' {shlex.join(words)}' if words else ''
+            text += f' {option(**{name: value if value is True else shlex.quote(str(value))})}'
+    return text
 
 
 SYNTAX = (
@@ -214,6 +215,7 @@ def quoted(*words: AnyPath) -> str:
     return shlex.join(str(word) for word in words)
 
 
+@options_named()
 @ended_by_closed_output()
 def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace], int]) -> int:
     """Parse the command line and run a tool."""
@@ -232,15 +234,15 @@ def run(parser: argparse.ArgumentParser, command: Callable[[argparse.Namespace],
 def note(text: str, paste: str = '') -> None:
     """Print a message on stderr: one line, which a terminal gets wrapped between words."""
     if sys.stderr.isatty():
-        text = '\n'.join(wrapped(text.removesuffix(paste), 2))
-        text += f'\n{paste}' * bool(paste)
+        lines = wrapped(text.removesuffix(paste), 2)
+        text = '\n'.join([*lines, paste] if paste else lines)
     print(text, file=sys.stderr)
 
 
 def check_least(options: argparse.Namespace, **least: float) -> None:
     """Refuse numbers of options that are too small; an option that is not given has none."""
     for name, lowest in least.items():
-        require_least(name.replace('_', '-'), getattr(options, name), lowest)
+        require_least(name, getattr(options, name), lowest)
 
 
 def add_overwrite_option(parse: argparse.ArgumentParser, name: str = '--force') -> None:
@@ -257,7 +259,7 @@ def check_outputs(options: argparse.Namespace, *paths: AnyPath | None) -> None:
     """Refuse to replace a file or folder of others; a path that is not given is None or ''."""
     for path in paths:
         if path:
-            require_own(path, options.overwrite, '--overwrite')
+            require_own(path, options.overwrite)
 
 
 def refuse_same_file(output: str, source: str) -> None:

@@ -31,7 +31,6 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--params',
         metavar='FILE',
-        default=None,
         help='what the simulator models (default: the nominal sensor)',
     )
     parse.add_argument(

@@ -64,7 +64,8 @@ def export(options: argparse.Namespace) -> int:
     held = [name for name in exported.sizes_mg if name in exported.holds]
     lost = [name for name in exported.sizes_mg if name not in exported.holds]
     lines = [f'Sensor {sensor.serial} for {options.format}. The file holds: {", ".join(held)}.']
-    lines += [f'It lacks: {", ".join(lost)}; its head has their sizes.'] * bool(lost)
+    if lost:
+        lines.append(f'It lacks: {", ".join(lost)}; its head has their sizes.')
     cli.print_end(
         lines,
         [options.output],
@@ -83,8 +84,9 @@ def _sized(
     motion = TRAJECTORIES['rich'](np.random.default_rng(0))
     change = partial(change_mg, sensor, motion, ChainMemo())
     stage = exports.stage_effects(sensor)
+    own = [name for name in sensor.effects if name not in stage]
     sizes_mg = {}
-    for number, name in enumerate(own := [name for name in sensor.effects if name not in stage]):
+    for number, name in enumerate(own):
         show(number / len(own))
         sizes_mg[name] = change([name])
     axes = exports.axes(sensor)

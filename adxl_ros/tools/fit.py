@@ -9,8 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from adxl_ros.api.calibration import fit as fit_unit
-from adxl_ros.api.updating import PAGE as UPDATE_PAGE, update
+from adxl_ros.api.updating import update
 from adxl_ros.calibrate.calibration import STAGE_FITS
+from adxl_ros.calibrate.keep.update_report import PAGE as UPDATE_PAGE
 from adxl_ros.calibrate.report import certificate_data
 from adxl_ros.calibrate.report.gum import SCHEMA_VERSION
 from adxl_ros.calibrate.report.page import PAGE
@@ -42,7 +43,6 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--params',
         metavar='FILE',
-        default=None,
         help='values that are not fitted (default: the nominal sensor; what '
         'a file leaves out is measured)',
     )

@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from time import monotonic
@@ -14,7 +15,7 @@ from time import monotonic
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import make_folder
-from adxl_ros.files.recording_columns import NO_UNIT
+from adxl_ros.files.recording_columns import NO_SERIAL
 from adxl_ros.fleet.inputs import find_sources, stated_by
 from adxl_ros.fleet.row import (
     as_date,
@@ -73,7 +74,6 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--params',
         metavar='FILE',
-        default=None,
         help='parameter file of all recordings (default: the calibration of each '
         'unit at the date of the recording, else the nominal sensor)',
     )
@@ -137,11 +137,18 @@ def fleet(options: argparse.Namespace) -> int:
     )
     folder = Path(options.output)
     cli.check_outputs(options, folder / TABLE, folder / PAGE)
-    selection = (options.only_failed, since, options.limit)
+    plan_after = partial(
+        plan,
+        sources,
+        recipe,
+        only_failed=options.only_failed,
+        since=since,
+        limit=options.limit,
+    )
     if options.dry_run:
         results = Results(folder)
         cli.print_end(
-            _plan_lines(plan(sources, recipe, results, *selection), results),
+            _plan_lines(plan_after(results), results),
             [],
             command_of_this_process().replace(' --dry-run', ''),
         )
@@ -149,7 +156,7 @@ def fleet(options: argparse.Namespace) -> int:
     make_folder(folder)
     with only_client(folder):
         results = Results(folder)
-        to_do, rows = plan(sources, recipe, results, *selection), []
+        to_do, rows = plan_after(results), []
         try:
             if to_do.todo:
                 shared = (recipe, frozenset(results.known))
@@ -163,8 +170,11 @@ def fleet(options: argparse.Namespace) -> int:
             # Ctrl-C leaves table and page of what is done.
             files, findings = _written(folder, results)
     is_repeated = any(row['outcome'] == 'crashed' or row['refused_by'] == 'stage' for row in rows)
+    lines = [*_result_lines(rows, to_do), '']
+    if findings:
+        lines += [*findings, '']
     cli.print_end(
-        [*_result_lines(rows, to_do), '', *findings, *[''] * bool(findings)],
+        lines,
         files,
         f'{command_of_this_process()} --only-failed' if is_repeated else '',
         monotonic() - begin_s,
@@ -188,10 +198,10 @@ def _written(folder: Path, results: Results) -> tuple[list[Path], list[str]]:
 def _plan_lines(to_do: Plan, results: Results) -> list[str]:
     known = {url: entry.row['serial'] for url, entry in results.newest.items()}
     units = Counter(
-        source.serial or stated or known.get(source.url) or NO_UNIT
+        source.serial or stated or known.get(source.url) or NO_SERIAL
         for source, (stated, _) in zip(to_do.todo, stated_by(to_do.todo))
     )
-    unknown = units.pop(NO_UNIT, 0)
+    unknown = units.pop(NO_SERIAL, 0)
     largest = ', '.join(f'{serial} ({count})' for serial, count in units.most_common(_UNITS))
     rows = {
         'done already': str(to_do.done),
@@ -216,10 +226,8 @@ def _left_out(to_do: Plan) -> str:
 
 def _result_lines(rows: Sequence[Row], to_do: Plan) -> list[str]:
     if not rows:
-        return [
-            f'Nothing to do: {counted(to_do.done, "recording")} had a row before',
-            f' left out  {_left_out(to_do)}' * bool(to_do.outside),
-        ]
+        left_out = f' left out  {_left_out(to_do)}' if to_do.outside else ''
+        return [f'Nothing to do: {counted(to_do.done, "recording")} had a row before', left_out]
     outcomes = Counter(row['outcome'] for row in rows)
     parts = [f'{outcomes[name]} {name}' for name in OUTCOMES if outcomes[name] or name == 'done']
 

@@ -36,7 +36,6 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         '--params',
         metavar='FILE',
-        default=None,
         help='the other values of the sensor (default: the nominal sensor; for a '
         'recording in m/s² that names no sensor, any IMU)',
     )

@@ -42,9 +42,7 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument(
         'trajectory', metavar='TRAJECTORY', help=f'{", ".join(TRAJECTORIES)}, imu, or a recording'
     )
-    parse.add_argument(
-        '--params', metavar='FILE', default=None, help='the sensor (default: the nominal sensor)'
-    )
+    parse.add_argument('--params', metavar='FILE', help='the sensor (default: the nominal sensor)')
     parse.add_argument(
         '--effect',
         action='append',
@@ -99,10 +97,10 @@ def simulate(options: argparse.Namespace) -> int:
     made = prepare(
         options.trajectory if is_named else cli.read('simulate', options.trajectory),
         options.params,
-        cli.effect_inputs(options.effect),
-        options.force,
-        options.rate,
-        options.seed,
+        effects=cli.effect_inputs(options.effect),
+        force=options.force,
+        rate=options.rate,
+        seed=options.seed,
     )
     cli.report_notes('simulate', made.left_out)
     with ExitStack() as stack:

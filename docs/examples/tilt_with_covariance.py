@@ -10,7 +10,7 @@
 import adxl_ros as adxl
 import numpy as np
 
-recording = adxl.simulate('tilt_beta', 'adxl355', rate=50, seed=2)
+recording = adxl.simulate('tumble', 'adxl355', rate=50, seed=2)
 corrected = adxl.apply(recording, 'adxl355')
 roll_deg = np.degrees(corrected.columns['roll_rad'])
 std_deg = np.degrees(corrected.columns['roll_std_rad'])

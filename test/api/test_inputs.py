@@ -105,7 +105,7 @@ def test_no_array_is_refused_in_words_of_a_shell(call, named: str) -> None:
 
 @pytest.mark.parametrize('verb', VERBS)
 def test_a_verb_refuses_what_is_no_recording_and_no_sensor(verb) -> None:
-    for given in (ACCEL, np.zeros((5, 3)), 5, None):
+    for given in (np.zeros((5, 3)), 5, None):
         refused(lambda given=given: verb(given), type(given).__name__, 'expected a Recording')
     refused(lambda: verb(RECORDING, {'sensor': 1}), 'dict', 'expected a Sensor')
 
@@ -153,3 +153,29 @@ def test_results_are_valid_json_with_none_for_what_is_not_known() -> None:
         json.dumps(result.to_dict(), allow_nan=False)
     values = adxl.apply(one_axis).to_dict()
     assert values['time_s'] == TIME_S.tolist() and values['roll_rad'][0] is None
+
+
+def test_dates_are_the_time_of_a_recording() -> None:
+    dates = pd.date_range('2026-01-01 00:00:00.25', periods=len(TIME_S), freq='10ms')
+    for recording in (
+        adxl.from_arrays(time_s=dates, **ACCEL),
+        adxl.from_arrays(pd.DataFrame(ACCEL, index=dates)),
+        adxl.read(pd.DataFrame(ACCEL, index=dates.rename('stamp'))),
+    ):
+        np.testing.assert_array_equal(recording.stamp_ns, dates.astype('M8[ns]').astype('int64'))
+
+
+@pytest.mark.parametrize('verb', VERBS)
+def test_arrays_by_name_are_a_recording(verb) -> None:
+    table = {'time_s': TIME_S, **ACCEL}
+    said = []
+    for given in (table, pd.DataFrame(table)):
+        try:
+            said.append(str(verb(given)))
+        except adxl.UserError as error:
+            said.append(str(error))
+    assert said[0].replace('arrays', 'DataFrame').split() == said[1].split()
+
+
+def test_a_single_sample_is_refused_in_one_line() -> None:
+    refused(lambda: adxl.apply(RECORDING.rows(0, 1)), 'do not show the noise')

@@ -2,7 +2,6 @@
 
 """Recordings of `import adxl_ros`: arrays, tables and what they refuse."""
 
-from importlib import import_module
 import subprocess
 import sys
 
@@ -33,12 +32,6 @@ def test_every_name_is_there() -> None:
     assert adxl.__version__ and set(adxl.__all__) < set(dir(adxl))
     with pytest.raises(AttributeError, match='no_such_verb'):
         _ = adxl.no_such_verb
-
-
-def test_a_verb_is_not_hidden_by_the_package_of_its_name() -> None:
-    import_module('adxl_ros.diagnose.verdict')
-    import_module('adxl_ros.simulate.motion')
-    assert adxl.diagnose.__name__ == 'diagnose'
 
 
 def test_arrays_tables_and_files_hold_the_same(tmp_path) -> None:

@@ -40,6 +40,11 @@ def test_a_file_of_others_is_kept_until_its_user_permits(kind: str, tmp_path: Pa
     assert users.read_bytes() != b'precious'
 
 
+def test_a_page_of_python_shows_no_command(tmp_path: Path) -> None:
+    page = adxl.check(RECORDING).save(tmp_path).read_text()
+    assert 'Check of recordings' in page and 'class="command"' not in page
+
+
 @pytest.mark.parametrize('may_overwrite', [False, True])
 @pytest.mark.parametrize('kind', ['recording', 'corrected'])
 def test_a_folder_of_others_stays_with_all_that_is_in_it(

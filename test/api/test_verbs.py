@@ -2,7 +2,9 @@
 
 """The verbs of `import adxl_ros` on a simulated unit: what results hold, show and write."""
 
+import copy
 import json
+import pickle
 
 import adxl_ros as adxl
 from matplotlib.figure import Figure
@@ -102,6 +104,22 @@ def test_results_print_their_screen_and_show_in_a_notebook(fit, gap, recording) 
         assert result.plot(axes) is axes
 
 
+def test_results_are_copied_compared_and_sent_to_other_processes(recording, fit, gap) -> None:
+    no_gap = adxl.diagnose(adxl.from_arrays(time_s=[0.0, 0.1], x_v=[2.5, 2.5]), 'adxl203')
+    for result in (
+        recording,
+        fit,
+        fit.sensor,
+        gap,
+        no_gap,
+        adxl.apply(recording, fit),
+        adxl.check(recording),
+    ):
+        assert result == result and result != copy.deepcopy(result)
+        assert len({result, result}) == 1
+        assert str(pickle.loads(pickle.dumps(result))) == str(result)
+
+
 def test_a_verb_prints_nothing_and_leaves_the_global_seed(recording, fit, capsys) -> None:
     np.random.seed(3)  # noqa: NPY002 a verb must not change it
     before = np.random.get_state()[1].tolist()  # noqa: NPY002
@@ -168,7 +186,7 @@ def test_a_fit_is_a_sensor_of_a_simulator(fit) -> None:
         (lambda: adxl.simulate('no_such_motion'), 'no_such_motion'),
         (lambda: adxl.simulate('motion', effects=['no_such_effect']), 'no_such_effect'),
         (lambda: adxl.simulate('motion', effects={'bias': {'offset_v': 99}}), '99'),
-        (lambda: adxl.simulate('imu'), '--force'),
+        (lambda: adxl.simulate('imu'), 'force=RECORDING'),
         (lambda: adxl.load('no_such_sensor'), 'no_such_sensor'),
         (lambda: adxl.fit([]), 'no recording'),
         (lambda: adxl.read('no_such_file.csv'), 'no_such_file.csv'),

@@ -2,7 +2,7 @@
 
 """Settings of a joint: the rule, and equal numbers from sweep, journal, bag and CSV."""
 
-from adxl_ros.calibrate.poses import recorded_settings, SettingTracker
+from adxl_ros.calibrate.joint_settings import recorded_settings, SettingTracker
 import numpy as np
 import pytest
 

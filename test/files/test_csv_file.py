@@ -8,7 +8,7 @@ import sys
 from adxl_ros.errors import UserError
 from adxl_ros.files import csv_file, recording
 from adxl_ros.files.csv_file import csv_writer
-from adxl_ros.files.recording_columns import ACCEL, check_unit, Recording, sensor_info
+from adxl_ros.files.recording_columns import ACCEL, check_same_sensor, Recording, sensor_info
 import numpy as np
 from pace import within
 import pytest
@@ -67,12 +67,12 @@ def test_round_trip_to_the_bit(tmp_path: Path) -> None:
 def test_another_unit_is_refused() -> None:
     carried = recorded(np.random.default_rng(5), 5)
     carried.info['serial'] = 'A17'
-    check_unit(carried.stream_info, carried.axes, nominal('xyz'))
-    check_unit(carried.stream_info, carried.axes, nominal('xyz', serial='A17'))
+    check_same_sensor(carried.stream_info, carried.axes, nominal('xyz'))
+    check_same_sensor(carried.stream_info, carried.axes, nominal('xyz', serial='A17'))
     with pytest.raises(UserError, match=r'A17.*B4'):
-        check_unit(carried.stream_info, carried.axes, nominal('xyz', serial='B4'))
+        check_same_sensor(carried.stream_info, carried.axes, nominal('xyz', serial='B4'))
     with pytest.raises(UserError, match=r'axes xyz, .*for xy'):
-        check_unit(carried.stream_info, carried.axes, nominal('xy'))
+        check_same_sensor(carried.stream_info, carried.axes, nominal('xy'))
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 from adxl_ros.errors import UserError
 from adxl_ros.files import recording
 from adxl_ros.files.column_mapping import parse_mapping, parse_mounting, ReadingOptions
-from adxl_ros.files.mapped_recording import propose
+from adxl_ros.files.mapping_proposal import propose
 from adxl_ros.files.tables import open_table
 from adxl_ros.model.constants import G0_MPS2
 from bags import bag_of, EPOCH_NS, imu

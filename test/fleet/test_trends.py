@@ -102,7 +102,7 @@ def test_a_recalibration_is_no_drift():
     # A line through all recordings of a unit would call most steps a drift.
     lines = [
         linregress(recordings.time[part], recordings.value[part]).pvalue
-        for part in (recordings.unit == unit for unit in range(60))
+        for part in (recordings.sensor == unit for unit in range(60))
     ]
     assert (false_discovery_control(lines) < 0.05).sum() > 30
 

@@ -3,9 +3,9 @@
 from dataclasses import replace
 from itertools import count
 
-from adxl_ros.calibrate.poses import extract_poses
+from adxl_ros.calibrate.recorded_poses import extract_poses
 from adxl_ros.files import parameter_file, recording, sweep_journal
-from adxl_ros.files.recording_columns import recorded_unit
+from adxl_ros.files.recording_columns import recorded_nominal
 from adxl_ros.model.sensor import with_neutral
 from adxl_ros.simulate.motion import Held, Knots, Motion
 from adxl_ros.simulate.response import simulate
@@ -193,7 +193,7 @@ def test_a_sweep_ends_with_a_file_and_fit_agrees_on_its_bag(start, run_tool, tmp
     for path in (bag, tmp_path / 'bag.csv'):
         read = recording.read(path)
         check_settings(
-            read, recorded_unit(nominal(serial='T1', rate_hz=200.0), read), entries[-1].rests
+            read, recorded_nominal(nominal(serial='T1', rate_hz=200.0), read), entries[-1].rests
         )
     counts = [
         len({getattr(entry, f'{joint}_setting') for entry in entries[-1].rests})

@@ -7,7 +7,7 @@ import time
 from adxl_ros.files.recording_columns import sensor_info
 from adxl_ros.model import noise
 from adxl_ros.model.sensor import to_nominal_mps2, to_volts
-from adxl_ros.nodes.driver import other_unit
+from adxl_ros.nodes.driver import other_sensor
 from adxl_ros.nodes.sample_output import imu_message, imu_writer
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -53,7 +53,7 @@ def written(path, rows=400, columns=('ax_mps2', 'ay_mps2', 'az_mps2'), dt_s=0.00
     ],
 )
 def test_a_unit_that_is_not_that_of_the_parameters_is_named(given, found, is_named):
-    text = other_unit(nominal(serial=given), nominal(serial=found))
+    text = other_sensor(nominal(serial=given), nominal(serial=found))
     assert (given in text and found in text) == bool(text) == is_named
 
 

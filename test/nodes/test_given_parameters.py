@@ -7,12 +7,9 @@ from pathlib import Path
 import sys
 
 from adxl_ros.files import parameter_file
-from adxl_ros.nodes.parameters import (
-    has_section,
-    node_specs,
-    sensor_specs,
-    write_into,
-)
+from adxl_ros.nodes.parameters import node_specs
+from adxl_ros.nodes.params_files import has_section, write_into
+from adxl_ros.nodes.sensor_parameters import sensor_specs
 from adxl_ros.process import NODES
 from diagnostic_msgs.msg import DiagnosticStatus
 from graph import Graph

@@ -4,7 +4,7 @@
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
-from adxl_ros.signals.recorded_sensor import unit_of_stream
+from adxl_ros.signals.recorded_sensor import sensor_of_stream
 import numpy as np
 import pytest
 
@@ -31,7 +31,7 @@ def even(seconds: float = 3.0) -> np.ndarray:
     ids=['polled', 'lossy', 'jitter'],
 )
 def test_the_rate_is_that_of_the_samples(time_s: np.ndarray) -> None:
-    unit, lines = unit_of_stream(SENSOR, *resting(time_s))
+    unit, lines = sensor_of_stream(SENSOR, *resting(time_s))
     assert unit.rate_hz == pytest.approx(RATE_HZ, rel=0.01)
     assert not unit.unstated and not any('left out' in line for line in lines)
 
@@ -39,7 +39,7 @@ def test_the_rate_is_that_of_the_samples(time_s: np.ndarray) -> None:
 def test_a_few_stamps_that_step_back_are_left_out_and_named() -> None:
     time_s = even()
     time_s[100::60] -= 0.012
-    unit, lines = unit_of_stream(SENSOR, *resting(time_s))
+    unit, lines = sensor_of_stream(SENSOR, *resting(time_s))
     assert unit.rate_hz == pytest.approx(RATE_HZ, rel=0.02)
     assert '9 of 600 samples, whose stamp steps back by up to 7 ms' in lines[-1]
 
@@ -54,4 +54,4 @@ def test_a_few_stamps_that_step_back_are_left_out_and_named() -> None:
 )
 def test_what_is_wrong_with_the_stamps_is_named(time_s: np.ndarray, words: str) -> None:
     with pytest.raises(UserError, match=words):
-        unit_of_stream(SENSOR, *resting(time_s))
+        sensor_of_stream(SENSOR, *resting(time_s))

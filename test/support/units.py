@@ -6,7 +6,8 @@ from dataclasses import replace
 
 from adxl_ros.api import simulation
 from adxl_ros.calibrate.fits.linear import EFFECTS
-from adxl_ros.calibrate.poses import Poses, stage_force
+from adxl_ros.calibrate.pose_model import stage_force
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.files import parameter_file
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model import noise, signal_chain

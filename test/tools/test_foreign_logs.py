@@ -19,7 +19,7 @@ pytestmark = pytest.mark.long
 XYZ_G = 'time=t:s,x=x:g,y=y:g,z=z:g'
 LOG = turned()
 SHORT = 't,x,y,z\n' + ''.join(f'{i / 100},0.01,-0.02,{1 + i % 3 / 1e3}\n' for i in range(500))
-NO_UNIT = 'time=t:s,x=x,y=y,z=z'
+NO_SERIAL = 'time=t:s,x=x,y=y,z=z'
 
 
 def written(folder: Path, name: str, text: str | bytes) -> str:
@@ -395,7 +395,7 @@ def test_numbered_columns_and_a_mapping_file(run_tool, tmp_path) -> None:
         ),
         (
             SHORT,
-            ['--columns', NO_UNIT],
+            ['--columns', NO_SERIAL],
             '--columns: nothing states the unit of x; write for example x=x:mps2',
         ),
         (SHORT, ['--columns', 'gone.txt'], '--columns gone.txt: is neither a mapping nor a file'),

@@ -21,7 +21,7 @@ import numpy as np
 
 _DEGREE = 2  # Degree of the zero-g over temperature: slope and curvature
 _TYPICAL_K2 = parameter_of(Coefficient('temperature_bias', 'per_k2', 'x')).scale
-"""Typical curvature, g/K²: a unit with a smaller one may still have the next degree."""
+"""Typical curvature, g/K²: a sensor with a smaller one may still have the next degree."""
 _LARGEST_CORRELATION = 0.95
 """Largest correlation of neighbouring residuals. Chosen: beyond it the drift is a random walk."""
 
@@ -54,10 +54,9 @@ def next_degree(
     # The whole span counts as one more sample, so that few temperatures determine all degrees.
     even = np.linspace(warmer.min(), warmer.max(), _DEGREE + 2)
     weight = np.sqrt(np.concatenate([np.ones(len(warmer)), np.full(len(even), 1 / len(even))]))
-    last, following = (
-        _orthogonal(np.concatenate([warmer, even]), weight, degree)
-        for degree in (_DEGREE, _DEGREE + 1)
-    )
+    values = np.concatenate([warmer, even])
+    last = _orthogonal(values, weight, _DEGREE)
+    following = _orthogonal(values, weight, _DEGREE + 1)
     nodes_c = middle_c + span_k * np.sort(np.roots(following).real)
     shape = departure_k(temperature_c, nodes_c)
     last_k2 = span_k**_DEGREE * np.polyval(last, warmer)
@@ -67,9 +66,8 @@ def next_degree(
     estimate = shape @ residual_g / squares
     rest_g = residual_g - np.outer(shape, estimate)
     variance_g2 = (rest_g**2).sum(axis=0) / max(len(rest_g) - _DEGREE - 2, 1)
-    neighbours = np.sum(rest_g[1:] * rest_g[:-1], axis=0) / np.maximum(
-        (rest_g**2).sum(axis=0), TINY
-    )
+    rest_squares = np.maximum((rest_g**2).sum(axis=0), TINY)
+    neighbours = np.sum(rest_g[1:] * rest_g[:-1], axis=0) / rest_squares
     correlation = np.clip(neighbours, 0.0, _LARGEST_CORRELATION)
     # Correlated residuals count as fewer independent ones.
     variance_g2 *= (1 + correlation) / (1 - correlation)

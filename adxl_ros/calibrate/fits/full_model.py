@@ -19,9 +19,9 @@ x² + y² + z² is g², so that a square of the own axis equals those of the oth
 not fitted. The case's x is where beta = 0 points, so that an offset of beta is part of the
 misalignment.
 
-A three-axis unit has the same kinds of terms on each axis: squares of both other axes
+A three-axis sensor has the same kinds of terms on each axis: squares of both other axes
 (`cross_axis`, `cross_axis_z`), a scale factor that depends on either (`scale_factor_cross`,
-`scale_factor_z`), and a cube. A two-axis unit has those of the paper and a cube.
+`scale_factor_z`), and a cube. A two-axis sensor has those of the paper and a cube.
 
 Terms are selected by Bayes factors: the ratio of the marginal likelihoods of the poses with a term
 and without it. Coefficients are integrated over their priors, and both models have the stage error
@@ -38,13 +38,15 @@ from itertools import chain
 
 from adxl_ros.calibrate.fits import linear, linearisation
 from adxl_ros.calibrate.fits.linearisation import Linearised, linearised, StageError
-from adxl_ros.calibrate.poses import angle_jacobian, Poses, predicted_volts
+from adxl_ros.calibrate.pose_model import angle_jacobian, predicted_volts
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Place, Role
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import coefficients_of, get, parameter_of, put, Sensor, with_neutral
+from adxl_ros.process import usage
 from adxl_ros.report.quantities import with_half_width
 import numpy as np
 import scipy
@@ -58,10 +60,10 @@ TERMS = (
     'scale_factor_z',
     'nonlinearity',
 )
-"""Terms of a two-axis unit: those of the paper, and a cube."""
-_THREE_AXES = ('scale_factor_cross',)  # Terms that only a three-axis unit has
+"""Terms of a two-axis sensor: those of the paper, and a cube."""
+_THREE_AXES = ('scale_factor_cross',)  # Terms that only a three-axis sensor has
 _PRIOR_SUFFICES = ('nonlinearity',)
-"""Terms that the poses need not determine: most units hardly have them."""
+"""Terms that the poses need not determine: most sensors hardly have them."""
 GAUGE = ('cross_axis.linear', 'cross_axis_z.linear')
 """Terms that are 0 unless the poses distinguish them from the misalignment."""
 _BASE_TILT = (Coefficient('base_tilt', 'x_rad'), Coefficient('base_tilt', 'y_rad'))
@@ -71,7 +73,7 @@ LEVEL_STD_RAD = np.radians(0.1)
 """Prior standard deviation of the level of the base, rad: the paper's 0.1°."""
 _SENSOR_PRIOR_SIZES = 5.0
 """Prior standard deviation of a coefficient of the sensor, in typical sizes. Chosen: wider than
-any healthy unit, so that the prior matters only where the poses determine nothing."""
+any healthy sensor, so that the prior matters only where the poses determine nothing."""
 _STAGE_PRIOR_SIZES = 3.0
 """Prior standard deviation of a coefficient of the stage, in typical sizes. Chosen: wider than any
 stage that is in order."""
@@ -109,8 +111,8 @@ _FINE_SHAPES = 15  # Number of trial values between the neighbours of the likeli
 class FullFit:
     """Result of the fit of k poses."""
 
-    fitted: Sensor  # The unit with its covariance, without effects of the stage
-    unit: Sensor  # The unit with the fitted effects of the stage
+    fitted: Sensor  # The sensor with its covariance, without effects of the stage
+    with_stage: Sensor  # The sensor with the fitted effects of the stage
     names: tuple[Coefficient, ...]  # Fitted coefficients, (p,)
     stage: StageError
     stated_std_rad: float  # Stated standard deviation of a joint's error: step/√12
@@ -128,7 +130,7 @@ class FullFit:
 
 
 def default_terms(axes: str) -> tuple[str, ...]:
-    """Return the terms of the full model for a unit with these axes."""
+    """Return the terms of the full model for a sensor with these axes."""
     return TERMS + (_THREE_AXES if axes == AXES else ())
 
 
@@ -141,9 +143,9 @@ def fit_full(
     Parameters
     ----------
     sensor
-        Nominal values of the unit. Its stage resolution states the error of the stage.
+        Nominal values of the sensor. Its stage resolution states the error of the stage.
     poses
-        k poses of one unit on one stage.
+        k poses of one sensor on one stage.
     terms
         Effects to fit, of the sensor or of the stage, and names of `GAUGE`. By default
         `default_terms` of the sensor's axes.
@@ -170,15 +172,16 @@ def fit_full(
         if not max_open:
             raise
         start = sensor
-    unit = with_neutral(with_neutral(start, effects), ['base_tilt'])
-    names, stated = fitted_coefficients(unit.axes, terms), StageError(sensor.stage_std_rad)
-    start = _likeliest_shapes(unit, poses, names, stated, effects)
+    start = with_neutral(with_neutral(start, effects), ['base_tilt'])
+    names = fitted_coefficients(start.axes, terms)
+    stated = StageError(sensor.stage_std_rad)
+    start = _likeliest_shapes(start, poses, names, stated, effects)
     require_determined(start, poses, names, stated, max_open)
     return _Search(start, poses, names, stated).run()
 
 
 def _likeliest_shapes(
-    unit: Sensor,
+    sensor: Sensor,
     poses: Poses,
     names: tuple[Coefficient, ...],
     stated: StageError,
@@ -190,69 +193,65 @@ def _likeliest_shapes(
     The volts are nearly linear in all other coefficients. The likelihood by a shape parameter has
     several maxima, so that its whole range is searched, and then the interval of the best value.
     """
-    shapes = []
-    for name in effects:
-        for parameter in effect_named(name).parameters:
-            is_fitted = parameter.role is Role.SHAPE and not parameter.held
-            if is_fitted and effect_named(name).invertible:
-                shapes.append((name, parameter))
-    for effect, parameter in shapes:
-        of_effect = unit.values[effect]
-        shape, value = np.shape(of_effect[parameter.name]), parameter.scale
-        for steps in (
-            np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1),
-            np.linspace(-1, 1, _FINE_SHAPES),
-        ):
-            values = value * _SHAPE_STEP**steps
-            units = [
-                replace(
-                    unit,
-                    values={
-                        **unit.values,
-                        effect: {**of_effect, parameter.name: np.full(shape, trial)},
-                    },
-                )
-                for trial in values
-                if parameter.lower <= trial <= parameter.upper
-            ]
-            unit = min(
-                units,
-                key=lambda trial: linearised(trial, poses, names, prior_precision(names)).misfit(
-                    stated
-                ),
-            )
-            value = float(np.ravel(unit.values[effect][parameter.name])[0])
-    return unit
+    precision = prior_precision(names)
+
+    def misfit(trial: Sensor) -> float:
+        return linearised(trial, poses, names, precision).misfit(stated)
+
+    coarse = np.arange(-_SHAPE_STEPS, _SHAPE_STEPS + 1)
+    fine = np.linspace(-1, 1, _FINE_SHAPES)
+    for effect in map(effect_named, effects):
+        for parameter in effect.parameters if effect.invertible else ():
+            if parameter.role is not Role.SHAPE or parameter.held:
+                continue
+            value = parameter.scale
+            for steps in (coarse, fine):
+                values = value * _SHAPE_STEP**steps
+                trials = [
+                    _with_shape(sensor, effect.name, parameter.name, trial)
+                    for trial in values
+                    if parameter.lower <= trial <= parameter.upper
+                ]
+                sensor = min(trials, key=misfit)
+                value = float(np.ravel(sensor.values[effect.name][parameter.name])[0])
+    return sensor
+
+
+def _with_shape(sensor: Sensor, effect: str, name: str, value: float) -> Sensor:
+    """Give a shape parameter of a sensor the same value on each axis."""
+    of_effect = sensor.values[effect]
+    shape = np.full(np.shape(of_effect[name]), value)
+    return replace(sensor, values={**sensor.values, effect: {**of_effect, name: shape}})
 
 
 class _Search:
     """The fit from one start: stage error, coefficients and angles in turn until all converge."""
 
     def __init__(
-        self, unit: Sensor, poses: Poses, names: tuple[Coefficient, ...], stated: StageError
+        self, sensor: Sensor, poses: Poses, names: tuple[Coefficient, ...], stated: StageError
     ) -> None:
         self._measured, self._names, self._stated = poses, names, stated
         self._precision = prior_precision(names)  # Inverse prior variances, (p,)
-        self._unit, self._stage = unit, stated  # Unit with coefficients, and stage error
+        self._sensor, self._stage = sensor, stated  # Sensor with coefficients, and stage error
         # Predicted errors of the angles, and the poses turned by them; see `_turned_linearly`
         none_rad = np.zeros((len(poses), 2))
         self._errors = linearisation.AngleErrors(none_rad, none_rad, none_rad[:, 0], 0.0)
         self._poses = poses
         self._kept = np.ones(len(poses), bool)  # Poses that are no outliers
         # Volts by which the model departs from its linearisation, (m,)
-        self._curvature_v = np.zeros(len(unit.axes))
+        self._curvature_v = np.zeros(len(sensor.axes))
 
     def run(self) -> FullFit:
         """Iterate until all converge."""
         start = self._solved(self._measured, _START_STEPS)
-        self._unit = put(self._unit, self._names, start.values)
+        self._sensor = put(self._sensor, self._names, start.values)
         converged, deviance, noise_v = False, np.inf, self._measured.std_v.mean(axis=0)
         for number in range(_MAX_ROUNDS):
             self._estimate_stage(number)
             step_std = self._step()
             if np.any(self._curvature_v > _MAX_CURVATURE * noise_v):
                 continue
-            about = self._about(self._unit, self._poses)
+            about = self._about(self._sensor, self._poses)
             kept_before, deviance_before = self._kept, deviance
             deviance = about.deviance(self._stage)
             self._kept = _inliers(about, self._stage)
@@ -265,8 +264,8 @@ class _Search:
                 break
         return self._result(converged)
 
-    def _about(self, unit: Sensor, poses: Poses) -> Linearised:
-        return linearised(unit, poses, self._names, self._precision, self._kept)
+    def _about(self, sensor: Sensor, poses: Poses) -> Linearised:
+        return linearised(sensor, poses, self._names, self._precision, self._kept)
 
     def _weighted(self) -> Poses:
         """Return the turned poses with the curvature as further noise."""
@@ -275,11 +274,11 @@ class _Search:
     def _estimate_stage(self, number: int) -> None:
         """Estimate the stage error of a round."""
         for _ in range(1 if number else _FIRST_ROUND_LEVELS):
-            about = self._about(self._unit, self._weighted())
+            about = self._about(self._sensor, self._weighted())
             self._stage = about.stage_error(self._stated.total_rad, self._stage)
             # Angle errors δ that are not predicted yet change the force by δ²/2 of g.
             self._curvature_v = (
-                self._unit.nominal_scale_v_per_g
+                self._sensor.nominal_scale_v_per_g
                 * self._stage.total_rad**2
                 * _CURVATURE_SHRINK**number
             )
@@ -289,29 +288,27 @@ class _Search:
         sizes = _sizes(self._names)
 
         def linearise(values: np.ndarray) -> _Iterate:
-            about = self._about(put(self._unit, self._names, values), poses)
+            about = self._about(put(self._sensor, self._names, values), poses)
             covariance = about.covariance(self._stage)
             step, information = about.solve(covariance)
             step *= min(1.0, _MAX_STEP_SIZES / np.abs(step / sizes).max())
             return _Iterate(values, step, 0.0, about, covariance, information)
 
-        return gauss_newton(
-            linearise,
-            get(self._unit, self._names),
-            lambda _, previous, __: previous is not None and previous.step_std < _LAST_STEP_STD,
-            steps + 1,
-        )
+        def is_last(_: _Iterate, previous: _Iterate | None, __: _Iterate) -> bool:
+            return previous is not None and previous.step_std < _LAST_STEP_STD
+
+        return gauss_newton(linearise, get(self._sensor, self._names), is_last, steps + 1)
 
     def _step(self) -> float:
         """Move coefficients and angles to likelier ones; return the longest step, in stds."""
         weighted = self._weighted()
         solved = self._solved(weighted, _ROUND_STEPS)
         errors = solved.covariance.predicted_errors(solved.about.residual)
-        start = get(self._unit, self._names)
+        start = get(self._sensor, self._names)
 
         def cost(values: np.ndarray, angles: linearisation.AngleErrors) -> float:
             residual = self._measured.volts - predicted_volts(
-                put(self._unit, self._names, values), _turned(self._measured, angles.total_rad)
+                put(self._sensor, self._names, values), _turned(self._measured, angles.total_rad)
             )
             return float(
                 np.sum((residual / weighted.std_v)[self._kept] ** 2)
@@ -319,38 +316,40 @@ class _Search:
                 + solved.covariance.penalty(angles)
             )
 
-        highest, before = cost(start, self._errors), self._errors
+        # The step is halved until it does not raise the cost.
+        before = self._errors
+        cost_before = cost(start, before)
         for share in 0.5 ** np.arange(_MAX_HALVINGS + 1):
             values = start + share * (solved.values - start)
             self._errors = before.interpolated(errors, share)
-            if cost(values, self._errors) <= highest:
+            if cost(values, self._errors) <= cost_before:
                 break
-        self._unit = put(self._unit, self._names, values)
-        self._poses = _turned_linearly(self._unit, self._measured, self._errors.total_rad)
+        self._sensor = put(self._sensor, self._names, values)
+        self._poses = _turned_linearly(self._sensor, self._measured, self._errors.total_rad)
         return float(np.abs((values - start) * np.sqrt(np.diag(solved.information))).max())
 
     def _result(self, converged: bool) -> FullFit:
         """Return the fit, with the covariance of the sensor's coefficients."""
-        about = self._about(self._unit, self._poses)
+        about = self._about(self._sensor, self._poses)
         over_levels = about.covariance_over_levels(self._stage, self._stated.total_rad)
         of_sensor = [i for i, name in enumerate(self._names) if not belongs_to_stage(name)]
         effects = tuple(
             effect
-            for effect in self._unit.effects
+            for effect in self._sensor.effects
             if effect_named(effect).place is not Place.STAGE
         )
         fitted = replace(
-            self._unit,
+            self._sensor,
             model='full',
             effects=effects,
-            values={name: self._unit.values[name] for name in effects},
+            values={name: self._sensor.values[name] for name in effects},
             covariance=over_levels[np.ix_(of_sensor, of_sensor)],
             covariance_names=tuple(self._names[i] for i in of_sensor),
         )
         errors = about.covariance(self._stage).predicted_errors(about.residual)
         return FullFit(
             fitted=fitted,
-            unit=self._unit,
+            with_stage=self._sensor,
             names=self._names,
             stage=self._stage,
             stated_std_rad=self._stated.total_rad,
@@ -425,10 +424,10 @@ def _prior_std(name: Coefficient) -> float:
 
 
 def fisher_information(
-    unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
+    sensor: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
 ) -> np.ndarray:
     """Return the Fisher information, priors included, (p, p); the Cramér-Rao bound inverted."""
-    about = linearised(unit, poses, names, prior_precision(names))
+    about = linearised(sensor, poses, names, prior_precision(names))
     return about.information(about.covariance(stage))
 
 
@@ -446,10 +445,10 @@ def _turned(poses: Poses, errors_rad: np.ndarray) -> Poses:
     )
 
 
-def _turned_linearly(unit: Sensor, poses: Poses, errors_rad: np.ndarray) -> Poses:
+def _turned_linearly(sensor: Sensor, poses: Poses, errors_rad: np.ndarray) -> Poses:
     """Turn poses by errors, (k, 2), and add their linear effect to the volts: a linear model."""
     turned = _turned(poses, errors_rad)
-    effect_v = (angle_jacobian(unit, turned) @ errors_rad[:, :, None])[:, :, 0]
+    effect_v = (angle_jacobian(sensor, turned) @ errors_rad[:, :, None])[:, :, 0]
     return replace(turned, volts=poses.volts + effect_v)
 
 
@@ -459,58 +458,58 @@ def belongs_to_stage(name: Coefficient) -> bool:
 
 
 def open_coefficients(
-    unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
+    sensor: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
 ) -> list[Coefficient]:
     """Return the sensor's coefficients that poses leave as uncertain as their typical size."""
     scale = _sizes(names)
-    required = [
-        not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_PRIOR_SUFFICES)
-        for name in names
-    ]
+    is_required = np.array(
+        [
+            not belongs_to_stage(name) and term_of(name) not in (*GAUGE, *_PRIOR_SUFFICES)
+            for name in names
+        ]
+    )
     # The poses must determine a required coefficient without its prior.
-    information = fisher_information(unit, poses, names, stage) - np.diag(
-        prior_precision(names) * required
-    )
-    variances = np.diag(
-        np.linalg.inv(information * np.outer(scale, scale) + _REGULARISATION * np.eye(len(names)))
-    )
-    return [
-        name
-        for name, variance, is_required in zip(names, variances, required)
-        if is_required and variance > 1.0
-    ]
+    of_priors = np.where(is_required, prior_precision(names), 0.0)
+    information = fisher_information(sensor, poses, names, stage) - np.diag(of_priors)
+    # In typical sizes, of which 1 is the size of the coefficient itself
+    scaled = information * np.outer(scale, scale) + _REGULARISATION * np.eye(len(names))
+    is_open = is_required & (np.diag(np.linalg.inv(scaled)) > 1.0)
+    return [name for name, leaves_open in zip(names, is_open) if leaves_open]
 
 
 def require_determined(
-    unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError, max_open: int = 0
+    sensor: Sensor,
+    poses: Poses,
+    names: Sequence[Coefficient],
+    stage: StageError,
+    max_open: int = 0,
 ) -> None:
     """Refuse poses that leave more coefficients open; the message names poses that help."""
-    undetermined = open_coefficients(unit, poses, names, stage)
+    undetermined = open_coefficients(sensor, poses, names, stage)
     if len(undetermined) <= max_open and poses.volts.size > len(names) - max_open:
         return
-    reason = (
-        f'they do not determine {", ".join(map(str, undetermined))}'
-        if undetermined
-        else f'they have {poses.volts.size} values for {len(names)} coefficients'
-    )
+    reason = f'they have {poses.volts.size} values for {len(names)} coefficients'
+    if undetermined:
+        reason = f'they do not determine {", ".join(map(str, undetermined))}'
     follows = set(chain.from_iterable(effect_named(name.effect).follows for name in undetermined))
-    advice = (
-        f'poses with other values of {" and ".join(sorted(follows))}'
-        if follows
-        else f'poses (alpha, beta) = {next_poses(unit, poses, names, stage)} deg'
-    )
+    if follows:
+        advice = f'poses with other values of {" and ".join(sorted(follows))}'
+    else:
+        advice = f'poses (alpha, beta) = {next_poses(sensor, poses, names, stage)} deg'
     raise UserError(
         f'the full model is not determined by {len(poses)} poses: {reason}; add '
-        f'{advice}, or fit --model physical or linear'
+        f'{advice}, or {usage("fit", model="physical")} or linear'
     )
 
 
-def next_poses(unit: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError) -> str:
+def next_poses(
+    sensor: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
+) -> str:
     """Name the poses of a 15° grid that would help most (D-optimality; Fedorov 1972), in deg."""
     grid = linearisation.candidate_poses(np.median(poses.std_v, axis=0))
     scale = _sizes(names)
-    rows = linearisation.whitened_jacobian(unit, grid, tuple(names), stage) * scale
-    information = fisher_information(unit, poses, names, stage) * np.outer(scale, scale)
+    rows = linearisation.whitened_jacobian(sensor, grid, tuple(names), stage) * scale
+    information = fisher_information(sensor, poses, names, stage) * np.outer(scale, scale)
     chosen = linearisation.choose_poses(
         rows, information + _REGULARISATION * np.eye(len(names)), _NAMED_POSES
     )
@@ -624,11 +623,11 @@ def gauge_is_identifiable(full: FullFit) -> bool:
 
 def _linearised(full: FullFit, added: Sequence[str]) -> tuple[Linearised, np.ndarray]:
     """Linearise the fit with further terms; also return the term of each coefficient, (p,)."""
-    unit = with_neutral(full.unit, map(effect_of, added))
-    further = chain.from_iterable(fitted_coefficients(unit.axes, (term,)) for term in added)
+    sensor = with_neutral(full.with_stage, map(effect_of, added))
+    further = chain.from_iterable(fitted_coefficients(sensor.axes, (term,)) for term in added)
     names = (*full.names, *(name for name in further if name not in full.names))
     return (
-        linearised(unit, full.linear_poses, names, prior_precision(names), full.kept),
+        linearised(sensor, full.linear_poses, names, prior_precision(names), full.kept),
         np.array([term_of(name) for name in names]),
     )
 
@@ -650,31 +649,29 @@ _MIN_PART = 0.2  # Smallest component of the weakest direction, a unit vector, i
 
 def report_lines(full: FullFit, poses: Poses, terms: Sequence[Term]) -> list[str]:
     """Report the stage, the weakest direction and the terms of a fit of poses."""
-    helpful = next_poses(full.unit, poses, full.names, full.stage)
-    setting_deg, pose_deg = (
-        np.degrees(rad * full.stage.joints)
-        for rad in (full.stage.setting_rad, full.stage.pose_rad)
-    )
+    helpful = next_poses(full.with_stage, poses, full.names, full.stage)
+    setting_deg = np.degrees(full.stage.setting_rad * full.stage.joints)
+    pose_deg = np.degrees(full.stage.pose_rad * full.stage.joints)
     std = np.sqrt(np.diag(np.linalg.inv(full.information)))
     values = [
         f'{name} {with_half_width(float(value), Z_90 * value_std)} {parameter_of(name).unit}'
-        for name, value, value_std in zip(full.names, get(full.unit, full.names), std)
+        for name, value, value_std in zip(full.names, get(full.with_stage, full.names), std)
         if belongs_to_stage(name)
     ]
-    return [
+    lines = [
         f'stage error: alpha {setting_deg[0]:.2g}, beta {setting_deg[1]:.2g} deg rms by setting, '
         f'{pose_deg[0]:.2g} and {pose_deg[1]:.2g} deg by pose (stated '
         f'{np.degrees(full.stated_std_rad):.2g} deg)',
         f'stage: {", ".join(values)} (90 % intervals)',
         _weakest_direction(full.fitted),
         f'next poses that would help most, (alpha, beta) in deg: {helpful}',
-        *(['log Bayes factor of each term, nats; above 0 the poses support it:'] if terms else []),
-        *(
-            f'  {term.name:20} {term.log_bayes_factor:10.1f}'
-            f'{"" if term.is_supported else "   not supported by these poses"}'
-            for term in terms
-        ),
     ]
+    if terms:
+        lines.append('log Bayes factor of each term, nats; above 0 the poses support it:')
+    for term in terms:
+        note = '' if term.is_supported else '   not supported by these poses'
+        lines.append(f'  {term.name:20} {term.log_bayes_factor:10.1f}{note}')
+    return lines
 
 
 def _weakest_direction(fitted: Sensor) -> str:
@@ -713,6 +710,6 @@ def warnings(full: FullFit, poses: Poses) -> list[str]:
     if change_k > _MAX_WARMING_K and 'temperature_bias' not in full.fitted.effects:
         lines.append(
             f'temperature moved by {change_k:.1f} degC, which the model ignores; keep it '
-            'steady, or fit --effect temperature_bias'
+            f'steady, or {usage("fit", effects=["temperature_bias"])}'
         )
     return lines

@@ -24,6 +24,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import parameter_of, Sensor
+from adxl_ros.process import option, usage
 import numpy as np
 import scipy
 
@@ -536,8 +537,10 @@ def _require_determined(
     )
     scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
     raise _UndeterminedError(
-        f'gravity: without their angles (fit --poses), the {count} rests {reason}{scatter}; '
-        f'{_advice(rests, parameters)}; if they have them, --params needs the file of this sensor'
+        f'gravity: without their angles ({usage("fit", poses=None)}), the {count} rests '
+        f'{reason}{scatter}; '
+        f'{_advice(rests, parameters)}; if they have them, {option("sensor")} '
+        'needs the file of this sensor'
     )
 
 
@@ -545,7 +548,7 @@ def _advice(rests: NominalRests, parameters: np.ndarray) -> str:
     """Return which directions are missing among rests, for people: faces first, then others."""
     force = force_g(rests.mean, parameters)
     has = covered(force / np.linalg.norm(force, axis=1, keepdims=True))
-    faces, edges = (np.flatnonzero(~has & (axes == AXES_UP)) for axes in (1, 2))
+    faces, edges = np.flatnonzero(~has & (AXES_UP == 1)), np.flatnonzero(~has & (AXES_UP == 2))
     if len(faces):
         return f'add rests in which {", or ".join(map(points_up, faces.tolist()))}'
     if len(edges):

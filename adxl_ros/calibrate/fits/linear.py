@@ -6,22 +6,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from adxl_ros.calibrate.poses import angle_jacobian, planes, Poses, reference_force
+from adxl_ros.calibrate.pose_model import angle_jacobian, reference_force
+from adxl_ros.calibrate.poses import planes, Poses
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import coefficients_of, get, Sensor
+from adxl_ros.process import usage
 import numpy as np
 
 AFFINE = ('bias', 'scale_factor', 'misalignment')
-"""Terms of the twelve coefficients of a three-axis unit that six known faces determine."""
+"""Terms of the twelve coefficients of a three-axis sensor that six known faces determine."""
 
 _UPRIGHT_COS = np.cos(np.radians(0.5))
 """Smallest cosine of an axis at ±1 g: it is within 0.5° of the vertical, an error of 40 µg."""
 _MIN_SPAN_G = 0.2
-"""Smallest span of the reference that determines a scale factor, g. Chosen: over a smaller span
-cross-axis terms dominate the slope."""
+"""Smallest span of the reference that determines a scale factor, g. Over a smaller one, cross-axis
+terms of 1 % of the other axes change the slope by more than a typical error of it, 4 %."""
 
 
 def fit(sensor: Sensor, poses: Poses) -> Sensor:
@@ -39,8 +40,10 @@ def fit(sensor: Sensor, poses: Poses) -> Sensor:
     lines, covariance = np.zeros((count, 2)), np.zeros((2 * count, 2 * count))
     for d, axis in enumerate(sensor.axes):
         reference_g = force[:, AXES.index(axis)]
-        used = np.abs(reference_g) >= sensor.local_gravity_mps2 / G0_MPS2 * _UPRIGHT_COS
-        if not ((reference_g[used] > 0).any() and (reference_g[used] < 0).any()):
+        upright_g = sensor.local_gravity_mps2 / G0_MPS2 * _UPRIGHT_COS
+        is_up, is_down = reference_g >= upright_g, reference_g <= -upright_g
+        used = is_up | is_down
+        if not (is_up.any() and is_down.any()):
             used = np.ones(len(poses), bool)
         span_g = np.ptp(reference_g[used])
         if used.sum() < 2 or span_g < _MIN_SPAN_G:
@@ -114,7 +117,8 @@ def regress_axes(sensor: Sensor, poses: Poses) -> list[AxisRegression]:
     """Fit the regressions of the x and y axes (equations 8 to 17)."""
     if not sensor.axes.startswith('xy'):
         raise UserError(
-            f'the physical model needs the axes x and y, not {sensor.axes}; fit --model linear'
+            f'the physical model needs the axes x and y, not {sensor.axes}; '
+            + usage('fit', model='linear')
         )
     start = fit(sensor, poses)
     return [_regress_axis(d, start, poses) for d in range(2)]
@@ -135,24 +139,33 @@ def _regress_axis(d: int, start: Sensor, poses: Poses) -> AxisRegression:
         'poses at steps of 30 deg in beta there',
     )  # (11)
     corrected = volts - np.polynomial.polynomial.polyval(across, p)
+    # Mean reference of z, offset and slope of each plane: (12), (15)
     rows = []
     for plane in planes(poses.alpha_rad):
-        inclined = np.abs(np.sin(poses.alpha_rad[plane]).mean()) >= _MIN_PLANE_SIN
-        line = (
-            np.polyfit(along[plane], corrected[plane], 1)
-            if inclined and np.ptp(along[plane]) > _MIN_PLANE_SPAN_G
-            else (np.nan, np.mean(corrected[plane] - scale * along[plane]))
-        )
-        rows.append([az[plane].mean(), line[1], line[0]])
-    plane_az, plane_bias, plane_scale = np.array(rows).T  # (12), (15)
-    plane_bias -= zero
+        is_inclined = np.abs(np.sin(poses.alpha_rad[plane]).mean()) >= _MIN_PLANE_SIN
+        if is_inclined and np.ptp(along[plane]) > _MIN_PLANE_SPAN_G:
+            slope, offset = np.polyfit(along[plane], corrected[plane], 1)
+        else:
+            slope, offset = np.nan, np.mean(corrected[plane] - scale * along[plane])
+        rows.append([az[plane].mean(), offset, slope])
+    plane_az, plane_offset, plane_scale = np.array(rows).T
+    plane_bias = plane_offset - zero
     missing = 'planes alpha = 30, 60, 120 and 150 deg beside 90'
     has_scale = np.isfinite(plane_scale)
     r = _quadratic(plane_az[has_scale], plane_scale[has_scale], 'the inclined planes', missing)
     # q1 is the misalignment's A_z, which the scale factor multiplies like any other force.
     growth = np.polynomial.polynomial.polyval(plane_az, r / r[0])
     q = _quadratic(plane_az, plane_bias, 'the planes', missing, growth)  # (13)
-    return AxisRegression(zero, scale, p, q, r, plane_az, plane_bias, plane_scale)
+    return AxisRegression(
+        zero_g_v=zero,
+        scale_v_per_g=scale,
+        p=p,
+        q=q,
+        r=r,
+        plane_az_g=plane_az,
+        plane_bias_v=plane_bias,
+        plane_scale_v_per_g=plane_scale,
+    )
 
 
 def _quadratic(
@@ -174,7 +187,7 @@ def _assemble(sensor: Sensor, poses: Poses, regressions: list[AxisRegression]) -
     """Fix the gauge and convert the regressions into parameters of effects."""
     count = len(sensor.axes)
     zero, scale = sensor.nominal_zero_g_v.copy(), sensor.nominal_scale_v_per_g.copy()
-    alpha, beta, p2, q2, r1, r2 = (np.zeros(count) for _ in range(6))
+    alpha, beta, p2, q2, r1, r2 = np.zeros((6, count))
     for d, axis in enumerate(regressions):
         slope = axis.r[0]
         if max(abs(axis.p[1]), abs(axis.q[1])) >= abs(slope):
@@ -237,26 +250,21 @@ def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:
     chi2 = np.sum((poses.volts - predicted) ** 2 / variance)
     widening = np.sqrt(max(chi2 / max(poses.volts.size - len(fitted.covariance_names), 1), 1.0))
     rng = np.random.default_rng(0)
+
+    def encoder_error_rad(setting: np.ndarray) -> np.ndarray:
+        by_setting = rng.uniform(-0.5, 0.5, int(setting.max()) + 1)
+        return widening * fitted.stage_resolution_rad * by_setting[setting]
+
     drawn = []
     for _ in range(_REPLICAS):
-        errors_rad = [
-            widening
-            * fitted.stage_resolution_rad
-            * rng.uniform(-0.5, 0.5, int(setting.max()) + 1)[setting]
-            for setting in (poses.alpha_setting, poses.beta_setting)
-        ]
-        volts = np.column_stack(
-            respond(
-                specific_force(
-                    poses.alpha_rad + errors_rad[0],
-                    poses.beta_rad + errors_rad[1],
-                    fitted.local_gravity_mps2,
-                )
-            )
+        turned = replace(
+            poses,
+            alpha_rad=poses.alpha_rad + encoder_error_rad(poses.alpha_setting),
+            beta_rad=poses.beta_rad + encoder_error_rad(poses.beta_setting),
         )
+        volts = np.column_stack(respond(reference_force(turned, fitted.local_gravity_mps2)))
         volts += widening * poses.std_v * rng.standard_normal(volts.shape)
         replica = replace(poses, volts=volts)
-        drawn.append(
-            get(_assemble(sensor, replica, regress_axes(sensor, replica)), fitted.covariance_names)
-        )
+        refitted = _assemble(sensor, replica, regress_axes(sensor, replica))
+        drawn.append(get(refitted, fitted.covariance_names))
     return np.cov(np.array(drawn).T)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The covariance of poses about a unit, a fit linearised at its coefficients, and D-optimal poses.
+The covariance of poses about a sensor, a fit linearised at its coefficients, and D-optimal poses.
 
 About coefficients θ₀ the volts are V = h(θ₀) + X·(θ − θ₀) + error with a covariance S(σ_s, σ_p),
 and θ has a normal prior. The angles of the stage have an error with one part for each setting of a
@@ -18,14 +18,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from adxl_ros.calibrate.poses import angle_jacobian, coefficient_jacobian, Poses, predicted_volts
+from adxl_ros.calibrate.pose_model import angle_jacobian, coefficient_jacobian, predicted_volts
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import get, Sensor
 import numpy as np
 import scipy
 
 _MIN_VARIANCE_RAD2 = 1e-24
-"""Smallest variance of an angle as a divisor, rad². Chosen: avoids 0/0 on a perfect stage."""
+"""Smallest variance of an angle as a divisor, rad²: it avoids 0/0 on a stage without errors."""
 
 
 @dataclass(frozen=True)
@@ -126,9 +127,8 @@ class PoseCovariance:
 
     def penalty(self, errors: AngleErrors) -> float:
         """Return the sum of the squared angle errors over their variances."""
-        pose_rad, setting_rad = (
-            part / self._error.joints for part in (errors.pose_rad, errors.setting_rad)
-        )
+        pose_rad = errors.pose_rad / self._error.joints
+        setting_rad = errors.setting_rad / self._error.joints
         total = np.sum((pose_rad**2 / np.maximum(self._pose_rad2, _MIN_VARIANCE_RAD2))[self._kept])
         for joint in range(2):
             _, first = np.unique(self._number[:, joint], return_index=True)
@@ -152,10 +152,10 @@ class PoseCovariance:
         pose = self._pose_rad2 * (np.swapaxes(self._jacobian, 1, 2) @ weighted)[:, :, 0]
         joints = self._error.joints
         return AngleErrors(
-            np.where(self._number >= 0, setting, 0.0) * joints,
-            pose * joints,
-            np.sum(white**2, axis=1),
-            float(factor @ factor),
+            setting_rad=np.where(self._number >= 0, setting, 0.0) * joints,
+            pose_rad=pose * joints,
+            squared_distances=np.sum(white**2, axis=1),
+            setting_penalty=float(factor @ factor),
         )
 
 
@@ -194,9 +194,9 @@ def shared_settings(poses: Poses) -> tuple[np.ndarray, int]:
     return numbers, count
 
 
-def volts_covariance(unit: Sensor, poses: Poses, error: StageError) -> PoseCovariance:
+def volts_covariance(sensor: Sensor, poses: Poses, error: StageError) -> PoseCovariance:
     """Return the covariance of the volts of poses about the model."""
-    return PoseCovariance(angle_jacobian(unit, poses), poses, shared_settings(poses), error)
+    return PoseCovariance(angle_jacobian(sensor, poses), poses, shared_settings(poses), error)
 
 
 _MIN_TOTAL_RAD = 1e-7
@@ -210,9 +210,9 @@ _RATIO_PRIOR_STD = 0.35
 two."""
 _MAX_LOG_RATIO = 1.5
 """Largest |ln(ratio)|. Chosen: a joint is at most twenty times as good as the other."""
-_SEARCH_UNIT = 0.05
-"""Unit of a step of the search, in ln(total), share and ln(ratio): the accuracy with which some
-hundred poses determine them."""
+_SEARCH_STEP = 0.05
+"""Step of the search that counts as 1, in ln(total), share and ln(ratio): the accuracy with which
+some hundred poses determine them."""
 _SEARCH_OPTIONS = {'eps': 1e-3, 'ftol': 1e-8, 'gtol': 0.5, 'maxiter': 20, 'maxls': 5}
 """Options of L-BFGS-B. Chosen: the deviance is found to 0.1, where χ² has the unit 1."""
 _HUBER_CHANCE = 1e-3
@@ -227,7 +227,7 @@ _LEAST_WEIGHT = 1e-3  # Least posterior probability of a level that counts
 
 @dataclass(frozen=True)
 class Linearised:
-    """Poses of a unit about its coefficients: k poses, m axes, p coefficients."""
+    """Poses of a sensor about its coefficients: k poses, m axes, p coefficients."""
 
     poses: Poses  # Poses with their noise, angles and settings
     angle_jacobian: np.ndarray  # Derivatives of the volts by alpha and beta, V/rad, (k, m, 2)
@@ -308,23 +308,20 @@ class Linearised:
     def stage_error(self, stated_rad: float, start: StageError | None = None) -> StageError:
         """Estimate the stage error by restricted maximum likelihood."""
         start = start or StageError(stated_rad)
-        total = float(np.log(np.clip(start.total_rad, 10 * _MIN_TOTAL_RAD, _MAX_TOTAL_RAD)))
+        # Searched are ln(total), the poses' share of its square, and ln(ratio).
+        log_total = np.log(np.clip(start.total_rad, 10 * _MIN_TOTAL_RAD, _MAX_TOTAL_RAD))
         share = (start.pose_rad / max(start.total_rad, _MIN_TOTAL_RAD)) ** 2
-        bounds = np.array(
-            [
-                np.log((_MIN_TOTAL_RAD, _MAX_TOTAL_RAD)),
-                (0.0, 1.0),
-                (-_MAX_LOG_RATIO, _MAX_LOG_RATIO),
-            ]
-        )
+        of_start = np.array([log_total, share, np.log(start.ratio)])
+        lowest = np.array([np.log(_MIN_TOTAL_RAD), 0.0, -_MAX_LOG_RATIO])
+        highest = np.array([np.log(_MAX_TOTAL_RAD), 1.0, _MAX_LOG_RATIO])
         search = scipy.optimize.minimize(
-            lambda x: self._level_deviance(_from_search(x * _SEARCH_UNIT), stated_rad),
-            np.array([total, share, np.log(start.ratio)]) / _SEARCH_UNIT,
+            lambda x: self._level_deviance(_from_search(x * _SEARCH_STEP), stated_rad),
+            of_start / _SEARCH_STEP,
             method='L-BFGS-B',
             options=_SEARCH_OPTIONS,
-            bounds=bounds / _SEARCH_UNIT,
+            bounds=np.column_stack([lowest, highest]) / _SEARCH_STEP,
         )
-        return _from_search(search.x * _SEARCH_UNIT)
+        return _from_search(search.x * _SEARCH_STEP)
 
     def _level_deviance(self, error: StageError, stated_rad: float) -> float:
         """Return −2 times the log posterior of a stage error, up to a constant."""
@@ -369,28 +366,31 @@ class Linearised:
 
 def _from_search(x: np.ndarray) -> StageError:
     """Return the stage error from ln(total), the poses' share of its square, and ln(ratio)."""
-    total = np.exp(x[0])
+    log_total, pose_share, log_ratio = x
+    total_rad = np.exp(log_total)
     return StageError(
-        float(total * np.sqrt(1 - x[1])), float(total * np.sqrt(x[1])), float(np.exp(x[2]))
+        setting_rad=float(total_rad * np.sqrt(1 - pose_share)),
+        pose_rad=float(total_rad * np.sqrt(pose_share)),
+        ratio=float(np.exp(log_ratio)),
     )
 
 
 def linearised(
-    unit: Sensor,
+    sensor: Sensor,
     poses: Poses,
     names: Sequence[Coefficient],
     precision: np.ndarray,
     kept: np.ndarray | None = None,
 ) -> Linearised:
-    """Linearise the volts of poses about the coefficients of a unit; see `Linearised`."""
+    """Linearise the volts of poses about the coefficients of a sensor; see `Linearised`."""
     return Linearised(
-        poses,
-        angle_jacobian(unit, poses),
-        coefficient_jacobian(unit, poses, names),
-        poses.volts - predicted_volts(unit, poses),
-        get(unit, names),
-        precision,
-        np.ones(len(poses), bool) if kept is None else kept,
+        poses=poses,
+        angle_jacobian=angle_jacobian(sensor, poses),
+        design=coefficient_jacobian(sensor, poses, names),
+        residual=poses.volts - predicted_volts(sensor, poses),
+        values=get(sensor, names),
+        precision=precision,
+        kept=np.ones(len(poses), bool) if kept is None else kept,
     )
 
 
@@ -431,8 +431,8 @@ def candidate_poses(std_v: np.ndarray) -> Poses:
 
 
 def whitened_jacobian(
-    unit: Sensor, poses: Poses, names: tuple[Coefficient, ...], stage: StageError
+    sensor: Sensor, poses: Poses, names: tuple[Coefficient, ...], stage: StageError
 ) -> np.ndarray:
     """Return the Jacobian, (k, m, p), whitened by noise and stage error, without settings."""
-    design = coefficient_jacobian(unit, poses, names)
-    return volts_covariance(unit, poses, stage).whiten_by_pose(design).reshape(design.shape)
+    design = coefficient_jacobian(sensor, poses, names)
+    return volts_covariance(sensor, poses, stage).whiten_by_pose(design).reshape(design.shape)

@@ -108,23 +108,27 @@ def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
     orientation = np.concatenate([[0], np.cumsum(turned)])
     span_k = float(np.ptp(temperature_c))
     solver = _Solver(sensor.axes, blocks, outputs_g, orientation)
-    best = ('', 0.0)
+    history, shape = '', 0.0
+    # Above and below in turn: the temperature has reversed.
     branch = stop(temperature_c, span_k * _REACHES[1], {})
     if with_history and branch.max() > 0.5 and branch.min() < -0.5:
-        best = solver.likeliest({'thermal_lag': _LAGS_S, 'thermal_hysteresis': _REACHES * span_k})
-    solved = solver(*best)
+        history, shape = solver.likeliest(
+            {'thermal_lag': _LAGS_S, 'thermal_hysteresis': _REACHES * span_k}
+        )
+    solved = solver(history, shape)
     residual_g = np.column_stack([axis.residual_g for axis in solved])
     names = tuple(chain.from_iterable(axis.names for axis in solved))
     values = np.concatenate([axis.values for axis in solved])
     curvature_k2 = values[[name.parameter == 'per_k2' for name in names]]
     return ThermalFit(
-        names,
-        values,
-        scipy.linalg.block_diag(*(axis.covariance for axis in solved)),
-        *best,
-        residual_g,
-        next_degree(temperature_c, residual_g, curvature_k2),
-        (float(temperature_c.min()), float(temperature_c.max())),
+        names=names,
+        values=values,
+        covariance=scipy.linalg.block_diag(*(axis.covariance for axis in solved)),
+        history=history,
+        shape=shape,
+        residual_g=residual_g,
+        further=next_degree(temperature_c, residual_g, curvature_k2),
+        span_c=(float(temperature_c.min()), float(temperature_c.max())),
     )
 
 
@@ -139,26 +143,9 @@ class _Solver:
 
     def __call__(self, history: str, shape: float) -> list[_Axis]:
         """Return the fit of each axis."""
-        # The output of a history, and its derivative by the shape.
-        low, output, high = (
-            (
-                _history_output(self.blocks, history, shape * (1 + step))
-                for step in (-_STEP, 0.0, _STEP)
-            )
-            if history
-            else np.zeros((3, 1))
-        )
-        by_shape = (high - low) / (2 * _STEP * shape) if history else output
+        of_history = _History(self.blocks, history, shape) if history else None
         return [
-            _fit_axis(
-                axis,
-                self.blocks.temperature_c,
-                output_g,
-                self.orientation,
-                history,
-                output,
-                by_shape,
-            )
+            _fit_axis(axis, self.blocks.temperature_c, output_g, self.orientation, of_history)
             for axis, output_g in zip(self.axes, self.outputs_g.T)
         ]
 
@@ -183,6 +170,17 @@ class _Solver:
             if -search.fun > highest:
                 best, highest = (history, float(np.exp(search.x))), -search.fun
         return best
+
+
+class _History:
+    """The output of an effect of the history of size 1, and its derivative by the shape."""
+
+    def __init__(self, blocks: Poses, effect: str, shape: float) -> None:
+        self.effect = effect
+        low = _history_output(blocks, effect, shape * (1 - _STEP))
+        high = _history_output(blocks, effect, shape * (1 + _STEP))
+        self.output_g = _history_output(blocks, effect, shape)  # (k,)
+        self.by_shape = (high - low) / (2 * _STEP * shape)  # (k,)
 
 
 def _history_output(blocks: Poses, effect: str, shape: float) -> np.ndarray:
@@ -215,20 +213,19 @@ def _fit_axis(
     temperature_c: np.ndarray,
     output_g: np.ndarray,
     orientation: np.ndarray,
-    history: str,
-    history_g: np.ndarray,
-    by_shape: np.ndarray,
+    history: _History | None,
 ) -> _Axis:
     """Fit one axis, the correlation of neighbouring blocks included."""
     columns = _columns(temperature_c - NOMINAL_TEMPERATURE_C, output_g, orientation)
-    if history:
-        columns[history, _SIZES[history]] = history_g
+    if history is not None:
+        columns[history.effect, _SIZES[history.effect]] = history.output_g
     names = [Coefficient(*name, axis) for name in columns]
     # The zero-g of each orientation has the last columns.
     design = np.column_stack([*columns.values(), _are_of(orientation)])
     begins, correlation = np.diff(orientation, prepend=-1) > 0, 0.0
     for _ in range(_ITERATIONS):
-        white, target = (_whitened(each, correlation, begins) for each in (design, output_g))
+        white = _whitened(design, correlation, begins)
+        target = _whitened(output_g, correlation, begins)
         size = np.sqrt((white**2).sum(axis=0))
         values = np.linalg.lstsq(white / size, target, rcond=None)[0] / size
         residual_g = output_g - design @ values
@@ -237,9 +234,10 @@ def _fit_axis(
         correlation = float(np.clip(neighbours, 0.0, _LARGEST_CORRELATION))
     degrees = max(len(output_g) - design.shape[1], 1)
     variance_g2 = max(float(rest @ rest) / degrees, TINY)
-    if history:
+    if history is not None:
         # The shape is uncertain, too.
-        design = np.column_stack([design, values[len(names) - 1] * by_shape])
+        size_of_history = values[len(names) - 1]
+        design = np.column_stack([design, size_of_history * history.by_shape])
     white, white_free = np.hsplit(_whitened(design, correlation, begins), [len(names)])
     white = white - white_free @ np.linalg.lstsq(white_free, white, rcond=None)[0]
     precision = white.T @ white / variance_g2 + np.diag(
@@ -285,7 +283,7 @@ _SHAPES = {'thermal_lag': 'tau_s', 'thermal_hysteresis': 'reach_k'}
 
 
 def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
-    """Put a fit into a calibrated unit, whose zero-g stays right at `calibrated_c`."""
+    """Put a fit into a calibrated sensor, whose zero-g stays right at `calibrated_c`."""
     names, effects = fitted.names, dict.fromkeys(name.effect for name in fitted.names)
     kept = [i for i, name in enumerate(base.covariance_names) if name.effect not in EFFECTS]
     kept_names = tuple(base.covariance_names[i] for i in kept)
@@ -403,32 +401,29 @@ _SAME_ORIENTATION_G = 0.1
 zero-g over temperature."""
 
 
-def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
+def rest_blocks(recording: Recording, sensor: Sensor) -> Poses | None:
     """Cut a recording of a resting sensor into blocks with a temperature."""
     temperature_c = recording.columns.get('temperature_c')
     if temperature_c is None or not np.isfinite(temperature_c).any():
         return None
-    volts, time_s, span_s = recording.volts(unit), recording.time_s, recording.span_s
+    volts, time_s, span_s = recording.volts(sensor), recording.time_s, recording.span_s
     block_s = max(BLOCK_S, span_s / _MOST_BLOCKS, _FEWEST_SAMPLES * period_s(time_s))
-    edges = np.unique(
-        np.searchsorted(time_s, time_s[0] + block_s * np.arange(int(span_s / block_s) + 1))
-    )
-    parts = [
-        slice(a, b)
-        for a, b in pairwise(edges)
-        if b - a >= _FEWEST_SAMPLES
-        and np.isfinite(temperature_c[a:b]).any()
-        and np.isfinite(volts[a:b]).all()
-    ]
+    starts_s = time_s[0] + block_s * np.arange(int(span_s / block_s) + 1)
+    parts = []
+    for begin, end in pairwise(np.unique(np.searchsorted(time_s, starts_s))):
+        part = slice(begin, end)
+        has_temperature = np.isfinite(temperature_c[part]).any()
+        is_whole = end - begin >= _FEWEST_SAMPLES and np.isfinite(volts[part]).all()
+        if has_temperature and is_whole:
+            parts.append(part)
     if not parts:
         return None
-    mean_v = np.array([volts[p].mean(axis=0) for p in parts])
     scatter_v = np.array([volts[p].std(axis=0) for p in parts])
-    at_rest = (scatter_v <= _MOVING * np.median(scatter_v, axis=0) + unit.lsb_v).all(axis=1)
+    at_rest = (scatter_v <= _MOVING * np.median(scatter_v, axis=0) + sensor.lsb_v).all(axis=1)
     counts = np.array([p.stop - p.start for p in parts])[:, None]
     missing = np.full(len(parts), np.nan)
     poses = Poses(
-        volts=mean_v,
+        volts=np.array([volts[p].mean(axis=0) for p in parts]),
         std_v=scatter_v / np.sqrt(counts),
         alpha_rad=missing,
         beta_rad=missing,
@@ -436,11 +431,13 @@ def rest_blocks(recording: Recording, unit: Sensor) -> Poses | None:
         check=np.zeros(len(parts), bool),
         temperature_c=np.array([np.nanmean(temperature_c[p]) for p in parts]),
     ).subset(at_rest)
-    range_g = np.ptp(poses.volts, axis=0) / unit.nominal_scale_v_per_g if len(poses) else 0.0
-    return poses if len(poses) and np.max(range_g) < _SAME_ORIENTATION_G else None
+    if not len(poses):
+        return None
+    range_g = np.ptp(poses.volts, axis=0) / sensor.nominal_scale_v_per_g
+    return poses if np.max(range_g) < _SAME_ORIENTATION_G else None
 
 
 def calibrated_temperature_c(base: Sensor) -> float:
-    """Return the temperature at which a unit was calibrated, °C; else that of the datasheet."""
+    """Return the temperature at which a sensor was calibrated, °C; else that of the datasheet."""
     range_c = base.envelope.temperature_c
     return float(np.mean(range_c)) if range_c else NOMINAL_TEMPERATURE_C

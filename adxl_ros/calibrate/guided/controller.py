@@ -14,7 +14,7 @@ from adxl_ros.calibrate.guided.screen_contents import Phase, Status
 from adxl_ros.calibrate.guided.session import GravityError, Session, SessionSettings
 from adxl_ros.calibrate.guided.stage_guide import MountingError
 from adxl_ros.errors import UserError
-from adxl_ros.files.recording_columns import StreamInfo, unit_of
+from adxl_ros.files.recording_columns import nominal_of, StreamInfo
 from adxl_ros.files.sweep_journal import differences
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals import recorded_sensor
@@ -69,7 +69,7 @@ class SampleSource(Protocol):
 
     fault: str  # Why the newest samples are of no use, or ''
 
-    def take(self, unit: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    def take(self, nominal: Sensor) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m)."""
 
     def restart_silence(self) -> None:
@@ -93,36 +93,36 @@ class StreamSensor:
     ) -> None:
         self._settings, self._sensor, self._anonymous = settings, sensor, anonymous
         self._samples = samples
-        self.unit: Sensor | None = None  # The nominal sensor; None while it is unknown
+        self.nominal: Sensor | None = None  # The nominal sensor; None while it is unknown
         self.newest: NewestSamples | None = None  # Its newest samples
         self.fault = ''  # Why the stated sensor is not the one of the parameters, or ''
         self.outlook = ''  # What is ahead of a calibration, for people
 
-    def take(self, unit: Sensor) -> None:
+    def take(self, nominal: Sensor) -> None:
         """Take a sensor as that of the stream."""
-        self.unit, self.newest, self.fault = unit, NewestSamples(unit), ''
-        self.outlook = self._settings.outlook(unit)
+        self.nominal, self.newest, self.fault = nominal, NewestSamples(nominal), ''
+        self.outlook = self._settings.outlook(nominal)
 
     def stated(self, info: StreamInfo) -> Sensor | None:
         """Return the sensor that the stream states, if it states one; refuse another one."""
         try:
-            unit = unit_of(self._sensor, info)
+            nominal = nominal_of(self._sensor, info)
         except UserError as error:
-            self.unit, self.newest, self.fault = None, None, f'{error}'
+            self.nominal, self.newest, self.fault = None, None, f'{error}'
             raise
-        if unit.unstated:
-            self._anonymous = unit
+        if nominal.unstated:
+            self._anonymous = nominal
             return None
-        return unit
+        return nominal
 
     def watch(self, shows: bool, waits: bool) -> tuple[Severity, str] | None:
         """Look at the samples of no calibration, if shown or waited for; return a line to log."""
-        if self.unit is None and (waits or shows):
+        if self.nominal is None and (waits or shows):
             # A driver that has just begun states its sensor on another topic.
             self._samples.keep_newest()
             return None if self.fault else self._measure()
-        if self.unit is not None and self.newest is not None and shows:
-            self.newest.feed(*self._samples.take(self.unit))
+        if self.nominal is not None and self.newest is not None and shows:
+            self.newest.feed(*self._samples.take(self.nominal))
         else:
             self._samples.keep_newest(0)
         return None
@@ -136,11 +136,13 @@ class StreamSensor:
         ):
             return None
         try:
-            unit, lines = recorded_sensor.unit_of_stream(self._anonymous, stamps_ns, accel_mps2)
+            nominal, lines = recorded_sensor.sensor_of_stream(
+                self._anonymous, stamps_ns, accel_mps2
+            )
         except UserError as error:
             self._samples.keep_newest(0)
             return 'WARNING', f'imu/data_raw: {error}'
-        self.take(unit)
+        self.take(nominal)
         return 'INFO', f'no sensor_info: measured from the stream: {"; ".join(lines)}'
 
 
@@ -266,19 +268,19 @@ class Controller:
         """Take what the stream states about its sensor; a running session needs the same one."""
         session = self.session
         try:
-            unit = self.stream.stated(info)
+            nominal = self.stream.stated(info)
         except UserError as error:
             if session is not None:
                 self._stop('ERROR', f'{error}; the poses are kept')
             self._say('ERROR', f'{error}')
             return
-        if unit is None:
+        if nominal is None:
             return
         if session is not None:
-            changes = differences(self.settings.head(session.unit), self.settings.head(unit))
-            if changes and session.unit.measured and not session.accepted_count:
+            changes = differences(self.settings.head(session.nominal), self.settings.head(nominal))
+            if changes and session.nominal.measured and not session.accepted_count:
                 self._stop('INFO', 'sensor_info has come: the calibration begins again with it')
-                self.stream.take(unit)
+                self.stream.take(nominal)
                 self.start(start_over=True)
                 return
             if changes:
@@ -294,7 +296,7 @@ class Controller:
                 self._outputs.answer_captures(
                     Answer(False, 'the driver started again; capture again')
                 )
-        self.stream.take(unit)
+        self.stream.take(nominal)
 
     def read_quantity(self, quantity: str, stamp_ns: int, value: float) -> None:
         """Take a temperature or a supply; a stamp of another clock gives way to the newest one."""
@@ -363,7 +365,7 @@ class Controller:
 
     def report(self) -> tuple[Status, str, dict[str, str | float]]:
         """Return status, serial number and values by key; log an obstacle once for each pose."""
-        status, unit, session = self.status(), self.stream.unit, self.session
+        status, nominal, session = self.status(), self.stream.nominal, self.session
         values: dict[str, str | float] = {
             'accepted': str(self._accepted),
             'output': str(self.settings.output),
@@ -386,21 +388,21 @@ class Controller:
             if obstacle != self._warned and status.text != self._last:
                 self._outputs.log('WARNING', status.text)
             self._warned = obstacle
-        return status, unit.serial if unit else '', values
+        return status, nominal.serial if nominal else '', values
 
     def _try_to_start(self) -> None:
         """Begin a session if the sensor is known and the operator has nothing to answer."""
-        unit = self.stream.unit
-        if unit is None:
+        nominal = self.stream.nominal
+        if nominal is None:
             return
         try:
             if self.may_ask and self._starts_over is None:
-                self.question = self.settings.question(unit)
+                self.question = self.settings.question(nominal)
             if self.question:
                 self.state = ControllerState.ASKING
                 return
             self.session = session = Session(
-                unit, self.settings, bool(self._starts_over), self._sensor
+                nominal, self.settings, bool(self._starts_over), self._sensor
             )
         except UserError as error:
             self._stop('ERROR', f'{error}')
@@ -422,11 +424,11 @@ class Controller:
             if session.resumed
             else ''
         )
-        self._say('INFO', f'calibrating {unit.serial}: {task}{resumed}')
+        self._say('INFO', f'calibrating {nominal.serial}: {task}{resumed}')
 
     def _take_samples(self, session: Session) -> None:
         """Give the session the samples that have come, and log what is wrong with them."""
-        stamps_ns, volts = self._samples.take(self.stream.unit or session.unit)
+        stamps_ns, volts = self._samples.take(self.stream.nominal or session.nominal)
         if fault := session.feed(stamps_ns, volts, self._samples.fault):
             self._say('ERROR', fault)
 

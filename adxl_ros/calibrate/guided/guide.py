@@ -21,7 +21,7 @@ from adxl_ros.signals.rest_detection import datasheet_noise, Rest, Stillness
 import numpy as np
 
 _REST_WINDOW_S = 1.2
-"""Newest samples that stay in memory, s; chosen: more than the rest detection looks at."""
+"""Newest samples that stay in memory, s: the rest detection looks at both halves of 1 s."""
 _RATE_WINDOW_S = 4.0
 """Newest stamps that stay in memory, s; chosen: halves of it are long against a host's stalls."""
 _RATE_ERROR = 0.05
@@ -60,7 +60,7 @@ class NewestSamples:
     def stillness(self) -> Stillness | None:
         """Return whether the samples are at rest, by the datasheet's noise; None if too few."""
         stamps_ns = self.stamps_ns[len(self.stamps_ns) - len(self.volts) :]
-        dwell = Dwell(self._sensor, int(stamps_ns[:1].sum()))
+        dwell = Dwell(self._sensor, int(stamps_ns[0]) if len(stamps_ns) else 0)
         dwell.feed(stamps_ns, self.volts)
         return dwell.stillness()
 
@@ -150,9 +150,14 @@ class Readings:
     def mean(self, first_ns: int, last_ns: int) -> float:
         """Average the readings between two stamps, or return the last reading before."""
         begin, end = bisect(self._kept, (first_ns,)), bisect(self._kept, (last_ns, math.inf))
-        if begin == end and end and first_ns - self._kept[end - 1][0] < STALE_NS:
-            begin = end - 1
-        return float(np.mean([self._kept[i][1] for i in range(begin, end)] or math.nan))
+        between = [self._kept[i][1] for i in range(begin, end)]
+        if between:
+            return float(np.mean(between))
+        if end:
+            stamp_ns, value = self._kept[end - 1]
+            if first_ns - stamp_ns < STALE_NS:
+                return value
+        return math.nan
 
 
 class Dwell:
@@ -323,8 +328,8 @@ class Guide:
             self.newest = NewestSamples(self.sensor)
             self.begin_stream(((self.newest_ns or 0) - int(stamps_ns[0])) * 1e-9)
             self.newest_ns, self._late = None, LateStamps()
-        before_ns = stamps_ns[:1] if self.newest_ns is None else [self.newest_ns]
-        late_ns = late_by(np.concatenate([before_ns, stamps_ns]))[1:]
+        before_ns = stamps_ns[0] if self.newest_ns is None else self.newest_ns
+        late_ns = late_by(np.append(before_ns, stamps_ns))[1:]
         self._late.count(stamps_ns, late_ns)
         # As steps of the time they would end each rest.
         stamps_ns, volts = stamps_ns[late_ns == 0], volts[late_ns == 0]
@@ -384,10 +389,12 @@ class Guide:
 
 def with_ambient(record: PoseRecord, readings: Mapping[str, Readings]) -> PoseRecord:
     """Add temperature and supply to a record."""
-    temperature_c, supply_v = (
-        quantity.mean(record.start_ns, record.stop_ns) for quantity in readings.values()
+    span_ns = record.start_ns, record.stop_ns
+    return replace(
+        record,
+        temperature_c=readings['temperature'].mean(*span_ns),
+        supply_v=readings['supply'].mean(*span_ns),
     )
-    return replace(record, temperature_c=temperature_c, supply_v=supply_v)
 
 
 def temperature_fault(accepted: Mapping[int, PoseRecord], now_c: float, span_c: float) -> str:

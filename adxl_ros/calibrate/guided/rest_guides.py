@@ -149,10 +149,8 @@ class HandRests(Guide):
     def _update_estimate(self) -> None:
         """Fit the gravity model to the rests so far, with the priors of the datasheet."""
         records = [self.accepted[number] for number in sorted(self.accepted)]
-        mean_v, std_v = (
-            np.array([getattr(record, name) for record in records]).reshape(-1, 3)
-            for name in ('mean_v', 'std_v')
-        )
+        mean_v = np.array([record.mean_v for record in records]).reshape(-1, 3)
+        std_v = np.array([record.std_v for record in records]).reshape(-1, 3)
         rests = nominal_rests(mean_v, std_v, self.sensor)
         self._parameters = np.zeros(len(NAMES))
         if records:

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The estimate of a unit after each pose, and the quick plan: the fewest poses for an error."""
+"""The estimate of a sensor after each pose, and the quick plan: the fewest poses for an error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from adxl_ros.calibrate.fits.linearisation import linearised, StageError
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.guided.pose_plan import Target
 from adxl_ros.calibrate.guided.screen_contents import Row
-from adxl_ros.calibrate.poses import coefficient_jacobian, Poses, predicted_volts
+from adxl_ros.calibrate.pose_model import coefficient_jacobian, predicted_volts
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import held_out
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model import noise
@@ -38,9 +39,9 @@ _MODEL_STD_G = 5e-3  # Std of further model errors; chosen: it accepts twice the
 
 @dataclass(frozen=True)
 class RunningEstimate:
-    """The unit by the poses so far and the datasheet."""
+    """The sensor by the poses so far and the datasheet."""
 
-    unit: Sensor  # With the most likely coefficients, those of the stage's base among them
+    sensor: Sensor  # With the most likely coefficients, those of the stage's base among them
     names: tuple[Coefficient, ...]  # Names of those coefficients, (p,)
     covariance: np.ndarray  # Inverse of the Fisher information of poses and datasheet, (p, p)
     prior: np.ndarray  # Standard deviation of each coefficient by the datasheet alone, (p,)
@@ -50,7 +51,7 @@ class RunningEstimate:
     def reading_fault(self, target: Target, volts: np.ndarray, tolerance_rad: float) -> str:
         """Refuse a pose whose mean, V, (m,), is an outlier to the prediction by earlier poses."""
         sensor, pose = (
-            self.unit,
+            self.sensor,
             Poses.without_volts(
                 np.array([target.alpha_rad]), np.array([target.beta_rad]), self.pose_std_v
             ),
@@ -66,9 +67,8 @@ class RunningEstimate:
         if residual_stds.max() <= _OUTLIER_STDS:
             return ''
         axis = int(residual_stds.argmax())
-        measured_g, expected_g = (
-            (v - sensor.zero_g_v) / sensor.scale_v_per_g for v in (volts, expected_v)
-        )
+        measured_g = (volts - sensor.zero_g_v) / sensor.scale_v_per_g
+        expected_g = (expected_v - sensor.zero_g_v) / sensor.scale_v_per_g
         return (
             f'{sensor.axes[axis]} reads {signed(measured_g[axis])} g where '
             f'{signed(expected_g[axis])} g was expected: axis inverted or '
@@ -81,7 +81,7 @@ class RunningEstimate:
             return self
         angles_rad = np.array([(target.alpha_rad, target.beta_rad) for target in targets])
         poses = Poses.without_volts(angles_rad[:, 0], angles_rad[:, 1], self.pose_std_v)
-        model = linearised(self.unit, poses, self.names, np.zeros(len(self.names)))
+        model = linearised(self.sensor, poses, self.names, np.zeros(len(self.names)))
         return replace(
             self,
             covariance=np.linalg.inv(
@@ -91,14 +91,14 @@ class RunningEstimate:
 
     def tilt_error_rad(self) -> float:
         """Return the expected rms error of alpha and beta over the sphere, rad."""
-        unit = replace(self.unit, covariance=self.covariance, covariance_names=self.names)
+        sensor = replace(self.sensor, covariance=self.covariance, covariance_names=self.names)
         of_unit = [not full_model.belongs_to_stage(name) for name in self.names]
-        return tilt_error_rad(unit.with_covariance_of(of_unit), self.pose_std_v)
+        return tilt_error_rad(sensor.with_covariance_of(of_unit), self.pose_std_v)
 
     def rows(self) -> list[Row]:
         """Return the coefficients for the screen."""
         std = np.sqrt(np.diag(self.covariance))
-        return coefficient_rows(self.names, get(self.unit, self.names), std, self.prior)
+        return coefficient_rows(self.names, get(self.sensor, self.names), std, self.prior)
 
 
 def from_records(
@@ -107,7 +107,7 @@ def from_records(
     dwell_s: float,
     previous: RunningEstimate | None = None,
 ) -> RunningEstimate:
-    """Estimate a unit from the poses of a journal, check poses left out; see `from_poses`."""
+    """Estimate a sensor from the poses of a journal, check poses left out; see `from_poses`."""
     fitted = [record for record in records if not record.check]
     poses = (
         Poses.from_records(fitted)
@@ -124,10 +124,10 @@ def from_poses(
     stage_rad: float,
     previous: RunningEstimate | None = None,
 ) -> RunningEstimate:
-    """Estimate a unit by a linearised fit of the full model with the priors of the datasheet."""
+    """Estimate a sensor by a linearised fit of the full model with the priors of the datasheet."""
     terms = full_model.default_terms(sensor.axes)
     names = full_model.fitted_coefficients(sensor.axes, terms)
-    unit = previous.unit if previous else with_neutral(sensor, (*terms, 'base_tilt'))
+    estimated = previous.sensor if previous else with_neutral(sensor, (*terms, 'base_tilt'))
     stage = previous.stage if previous else StageError(stage_rad)
     prior = np.array(
         [
@@ -140,15 +140,22 @@ def from_poses(
     information = np.diag(1 / prior**2)
     poses = replace(poses, std_v=np.maximum(poses.std_v, _LEAST_STD_V))
     for _ in range(_ROUNDS if len(poses) else 0):
-        model = linearised(unit, poses, names, 1 / prior**2)
+        model = linearised(estimated, poses, names, 1 / prior**2)
         stage = model.stage_error(stage_rad, stage)
         step, information = model.solve(model.covariance(stage))
-        unit = put(unit, names, get(unit, names) + step)
+        estimated = put(estimated, names, get(estimated, names) + step)
     samples = noise.effective_samples(
         round(dwell_s * sensor.rate_hz), 1 / sensor.rate_hz, sensor.rc_s
     )
     pose_std_v = np.maximum(noise.sample_std_v(sensor) / np.sqrt(samples), _LEAST_STD_V)
-    return RunningEstimate(unit, names, np.linalg.inv(information), prior, stage, pose_std_v)
+    return RunningEstimate(
+        sensor=estimated,
+        names=names,
+        covariance=np.linalg.inv(information),
+        prior=prior,
+        stage=stage,
+        pose_std_v=pose_std_v,
+    )
 
 
 def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
@@ -157,10 +164,8 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
         [(target.alpha_rad, target.beta_rad) for target in pose_plan.spread(_EVALUATION_POSES)]
     ).T
     force = specific_force(alpha_rad, beta_rad, sensor.local_gravity_mps2)
-    by_noise, by_all = (
-        force_covariance(unit, force, pose_std_v**2)
-        for unit in (sensor.without_covariance(), sensor)
-    )
+    by_noise = force_covariance(sensor.without_covariance(), force, pose_std_v**2)
+    by_all = force_covariance(sensor, force, pose_std_v**2)
     used = tilt(force, by_noise, 'z' in sensor.axes).alpha_std < _VISIBLE_RAD
     if not used.any():
         return float('nan')
@@ -171,7 +176,7 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
 def coefficient_rows(
     names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray, prior: np.ndarray
 ) -> list[Row]:
-    """Lay out the parameters of the unit: how far the prior has shrunk, and 90 % intervals."""
+    """Lay out the parameters of the sensor: how far the prior has shrunk, and 90 % intervals."""
     places: dict[Coefficient, list[int]] = {}
     for i, name in enumerate(names):
         if not full_model.belongs_to_stage(name):
@@ -200,7 +205,7 @@ def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: in
     start = from_records(sensor, [], dwell_s)
     fewest = math.ceil((len(start.names) + _SPARE_READINGS) / len(sensor.axes))
     grid = linearisation.candidate_poses(start.pose_std_v)
-    rows = linearisation.whitened_jacobian(start.unit, grid, start.names, start.stage)
+    rows = linearisation.whitened_jacobian(start.sensor, grid, start.names, start.stage)
     chosen = [
         Target(float(grid.alpha_rad[i]), float(grid.beta_rad[i]))
         for i in linearisation.choose_poses(

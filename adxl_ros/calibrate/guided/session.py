@@ -26,7 +26,7 @@ from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.signals.gravity_at_rest import of_volts
 import numpy as np
 
-_UNIT_FIELDS = (
+_SENSOR_FIELDS = (
     'serial',
     'axes',
     'rate_hz',
@@ -47,11 +47,11 @@ _UNIT_FIELDS = (
 
 @dataclass(frozen=True)
 class SessionSettings:
-    """What a guided calibration is to do, whatever the unit."""
+    """What a guided calibration is to do, whatever the sensor."""
 
     mode: str  # 'stage', 'gravity' or 'thermal'
     plan_kind: str  # Kind of the pose plan: 'full' or 'quick'
-    # Planes alpha of the plan `full`, rad; empty for those that the axes of the unit need
+    # Planes alpha of the plan `full`, rad; empty for those that the axes of the sensor need
     planes_rad: tuple[float, ...]
     step_rad: float  # Step of beta of the plan `full`
     tilt_error_rad: float  # That the plan `quick` is to reach, rms
@@ -68,18 +68,18 @@ class SessionSettings:
         """Return whether an operator turns a stage and captures."""
         return self.mode == 'stage' and self.capture.stage_mode is not StageMode.COMMANDED
 
-    def targets(self, unit: Sensor) -> list[pose_plan.Target]:
+    def targets(self, nominal: Sensor) -> list[pose_plan.Target]:
         """Return the poses in the order of the visit; none without a stage."""
         if self.mode != 'stage':
             return []
         if self.plan_kind == 'quick':
             return running_estimate.quick(
-                unit, self.capture.dwell_s, self.tilt_error_rad, self.check_poses
+                nominal, self.capture.dwell_s, self.tilt_error_rad, self.check_poses
             )
-        planes_rad = self.planes_rad or pose_plan.default_planes_rad(unit.axes)
+        planes_rad = self.planes_rad or pose_plan.default_planes_rad(nominal.axes)
         return pose_plan.guided(planes_rad, self.step_rad, self.check_poses)
 
-    def outlook(self, unit: Sensor) -> str:
+    def outlook(self, nominal: Sensor) -> str:
         """Return what is ahead, for people: the poses of a stage, or a range of temperature."""
         if self.mode == 'thermal':
             low_c, high_c = self.thermal.range_c
@@ -87,29 +87,28 @@ class SessionSettings:
                 f'leave it at rest from {low_c:g} to {high_c:g} °C and back; call ~/finish to '
                 'end early'
             )
-        targets = self.targets(unit)
+        targets = self.targets(nominal)
         if not targets:
             return ''
         seconds = len(targets) * (self.capture.dwell_s + pose_plan.MOVE_S)
         text = (
             f'plan {self.plan_kind}: {len(targets)} poses, about {max(round(seconds / 60), 1)} min'
         )
-        error_rad = running_estimate.expected_tilt_error_rad(unit, self.capture.dwell_s, targets)
+        error_rad = running_estimate.expected_tilt_error_rad(
+            nominal, self.capture.dwell_s, targets
+        )
         if not np.isfinite(error_rad):
             return text
         return f'{text}, expected tilt error {np.degrees(error_rad):.2g}°'
 
-    def head(self, unit: Sensor) -> dict[str, Any]:
+    def head(self, nominal: Sensor) -> dict[str, Any]:
         """Return the settings and values, by key, that an interrupted calibration must share."""
-        unit_fields = {
-            name: 'measured' if name in unit.measured else np.asarray(getattr(unit, name)).tolist()
-            for name in _UNIT_FIELDS
-        }
-        head = {
-            'mode': self.mode,
-            **unit_fields,
-            'sweep.temperature_span_c': self.capture.temperature_span_c,
-        }
+        head: dict[str, Any] = {'mode': self.mode}
+        for name in _SENSOR_FIELDS:
+            is_measured = name in nominal.measured
+            value = getattr(nominal, name)
+            head[name] = 'measured' if is_measured else np.asarray(value).tolist()
+        head['sweep.temperature_span_c'] = self.capture.temperature_span_c
         if self.mode == 'gravity':
             return head
         if self.mode == 'thermal':
@@ -132,9 +131,9 @@ class SessionSettings:
             'order': pose_plan.ORDER,
         }
 
-    def question(self, unit: Sensor) -> str:
+    def question(self, nominal: Sensor) -> str:
         """Return the question what to do with an interrupted calibration; '' without one."""
-        interrupted = sweep_journal.unfinished(self.journal, self.head(unit))
+        interrupted = sweep_journal.unfinished(self.journal, self.head(nominal))
         if interrupted is None:
             return ''
         choices = (
@@ -157,33 +156,37 @@ class GravityError(UserError):
 
 
 class Session:
-    """One calibration of one unit: a guide, its journal, and the fit."""
+    """One calibration of one sensor: a guide, its journal, and the fit."""
 
     def __init__(
-        self, unit: Sensor, settings: SessionSettings, start_over: bool, base: Sensor | None = None
+        self,
+        nominal: Sensor,
+        settings: SessionSettings,
+        start_over: bool,
+        base: Sensor | None = None,
     ) -> None:
         if not os.access(settings.output.parent, os.W_OK):
             raise UserError(
                 f'output: {settings.output}: {settings.output.parent} is not a '
                 'directory that can be written; choose another'
             )
-        if settings.mode == 'gravity' and unit.axes != AXES:
+        if settings.mode == 'gravity' and nominal.axes != AXES:
             raise UserError(
                 f'mode: gravity needs the axes x, y and z, but the sensor has '
-                f'{unit.axes}; use mode:=stage'
+                f'{nominal.axes}; use mode:=stage'
             )
-        targets = settings.targets(unit)
-        self._base = unit
+        targets = settings.targets(nominal)
+        self._base = nominal
         if settings.mode == 'thermal' and base is not None and base.effects:
-            # The calibrated unit, with the nominal values of its stream.
+            # The calibrated sensor, with the nominal values of its stream.
             self._base = replace(
-                with_axes(base, unit.axes), serial=unit.serial, rate_hz=unit.rate_hz
+                with_axes(base, nominal.axes), serial=nominal.serial, rate_hz=nominal.rate_hz
             )
-        self.unit, self.settings = unit, settings
+        self.nominal, self.settings = nominal, settings
         self.fault = ''  # What is wrong with the samples, or ''
         self.doubt = ''  # What is wrong with the length of gravity, but by less than a unit
         # The accepted poses on disk
-        self.journal = sweep_journal.Journal(settings.journal, settings.head(unit), start_over)
+        self.journal = sweep_journal.Journal(settings.journal, settings.head(nominal), start_over)
         # A process that was killed while it wrote has left unfinished files.
         places = [
             *([Path(settings.report, page.PAGE)] if settings.report else []),
@@ -193,7 +196,7 @@ class Session:
         for place in places:
             remove_unfinished(place.parent, place.name)
         if settings.store:
-            remove_unfinished(calibration_store.unit_folder(settings.store, unit.serial), '')
+            remove_unfinished(calibration_store.sensor_folder(settings.store, nominal.serial), '')
         self._fitted: list[PoseRecord] = []
         self._estimated: tuple[list[int], tuple[list[Row], list[Row]]] | None = None
         entries = self.journal.entries
@@ -202,12 +205,12 @@ class Session:
         self.stage: StageGuide | None = None
         self.guide: StageGuide | HandGuide | ThermalGuide
         if settings.mode == 'gravity':
-            self.guide = HandGuide(unit, settings.capture.temperature_span_c, accepted)
+            self.guide = HandGuide(nominal, settings.capture.temperature_span_c, accepted)
         elif settings.mode == 'thermal':
-            self.guide = ThermalGuide(unit, self._base, settings.thermal, accepted)
+            self.guide = ThermalGuide(nominal, self._base, settings.thermal, accepted)
         else:
             self.guide = self.stage = StageGuide(
-                unit, targets, settings.capture, accepted, sweep_journal.skipped_poses(entries)
+                nominal, targets, settings.capture, accepted, sweep_journal.skipped_poses(entries)
             )
 
     @property
@@ -265,13 +268,12 @@ class Session:
                 'only check poses are taken, which the fit does not use; take other poses, too'
             )
         poses = Poses.from_records(records)
-        result = (
-            calibration.calibrate_thermal(
-                self._base, poses, source, range_c=self.settings.thermal.range_c
-            )
-            if self.settings.mode == 'thermal'
-            else calibration.calibrate(self.unit, [calibration.RecordedPoses(source, poses)])
-        )
+        if self.settings.mode == 'thermal':
+            range_c = self.settings.thermal.range_c
+            result = calibration.calibrate_thermal(self._base, poses, source, range_c=range_c)
+        else:
+            recorded = calibration.RecordedPoses(source, poses)
+            result = calibration.calibrate(self.nominal, [recorded])
         entries = sweep_journal.read(self.journal.path).entries
         if any(isinstance(entry, MountingUnchecked) for entry in entries):
             provenance = {

@@ -11,7 +11,7 @@ from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate, screen
 from adxl_ros.calibrate.guided.guide import Dwell, EncoderTrack, Guide, NextPose, temperature_fault
 from adxl_ros.calibrate.guided.pose_plan import Course, MOVE_S, Target
 from adxl_ros.calibrate.guided.screen_contents import Phase, Row, StageMode, Status
-from adxl_ros.calibrate.poses import angle_tolerance_rad, SettingTracker
+from adxl_ros.calibrate.joint_settings import angle_tolerance_rad, SettingTracker
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord, PoseSkipped
 from adxl_ros.model.sensor import Sensor
@@ -21,7 +21,9 @@ import numpy as np
 _LONGEST_DWELL_S = 60.0
 """Time beyond two dwells after which a moving sensor's samples are dropped, s; chosen: it bounds
 the memory and the time of the rest detection."""
-_FEWEST_INTERVALS = 2  # Times between poses whose median predicts those of the open ones; chosen
+_FEWEST_INTERVALS = 2
+"""Times between poses whose median predicts those of the open ones: the first alone has the time
+in it in which an operator learns what to do."""
 
 
 class MountingError(UserError):

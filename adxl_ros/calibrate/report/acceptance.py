@@ -34,7 +34,7 @@ _ANY_TOLERANCE = {_ZERO_G: 0.25, _SCALE: 0.1}
 """Tolerances of any accelerometer: of the zero-g, g, and of the scale factor, as a share. Chosen:
 the widest ones of the datasheets of consumer parts."""
 _FAR = 2.0
-"""Multiple of a tolerance that is far outside. Chosen: solder, housing and age shift a sound unit
+"""Multiple of a tolerance that is far outside. Chosen: solder, housing and age shift a sound one
 beyond its datasheet, but by less than the datasheet's width."""
 _OPEN = 0.9
 """Share of the variance of a prior above which it alone says what a coefficient is. Chosen: the
@@ -104,7 +104,7 @@ def with_open(assessment: Assessment, determined: ErrorBudgets, sensor: Sensor) 
 
 
 def judged(assessment: Assessment, fitted: Sensor) -> Assessment:
-    """Return an assessment that fails if the fitted unit is implausible, however well it fits."""
+    """Return an assessment that fails for an implausible sensor, however well it fits."""
     return replace(assessment, accel_outcome=FAIL) if implausible(fitted) else assessment
 
 
@@ -132,14 +132,21 @@ def gravity_error_budgets(
     spread = held_out.coefficient_spread(fitted, list(force[kept].T))
     # Each of three axes has the error of a magnitude; two of the three turn the vertical.
     return ErrorBudgets(
-        ErrorBudget(measured, by_noise, 0.0, accel, excess, spread * accel + upper),
         ErrorBudget(
-            3 * measured / gravity**2,
-            2 * by_noise / gravity**2,
-            0.0,
-            tilt,
-            2 * excess / gravity**2,
-            spread * tilt + 2 * upper / gravity**2,
+            measured=measured,
+            noise=by_noise,
+            stage=0.0,
+            coefficients=accel,
+            model=excess,
+            calibration_high=spread * accel + upper,
+        ),
+        ErrorBudget(
+            measured=3 * measured / gravity**2,
+            noise=2 * by_noise / gravity**2,
+            stage=0.0,
+            coefficients=tilt,
+            model=2 * excess / gravity**2,
+            calibration_high=spread * tilt + 2 * upper / gravity**2,
             tilt_per_axis=2 / gravity**2,
         ),
     )
@@ -246,10 +253,9 @@ def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
 def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:
     """State the errors against gravity of rests that begin at times, (k,), and the outliers."""
     kept = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-    before, after, unseen = (
-        held_out.statistic(mg(values[kept]))
-        for values in (fit.before_mps2, fit.residual_mps2, fit.held_out_mps2)
-    )
+    before = held_out.statistic(mg(fit.before_mps2[kept]))
+    after = held_out.statistic(mg(fit.residual_mps2[kept]))
+    unseen = held_out.statistic(mg(fit.held_out_mps2[kept]))
     low, high = unseen.interval
     lines = [
         f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before.rms:.2f}, '
@@ -335,7 +341,7 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
 
 
 def implausible(fitted: Sensor) -> str:
-    """Return a fitted zero-g or scale factor that no sound unit has, for people; '' if none."""
+    """Return a fitted zero-g or scale factor that no sound sensor has, for people; '' if none."""
     for name, unit in (_ZERO_G, 'V'), (_SCALE, 'V/g'):
         typical, largest = fitted.datasheet.get(name, (0.0, 0.0))
         shifts = fitted.values.get(name.effect, {}).get(name.parameter, np.zeros(0))

@@ -14,14 +14,16 @@ import yaml
 
 _NOT_STATED = 'not stated'
 _NO_COUNTRY = 'ZZ'  # Code of no country (ISO 3166-1, user-assigned)
-_PARTIES = ('laboratory', 'customer')
 
 DEFAULTS: Mapping[str, str] = {
-    **{
-        f'{party}_{field}': _NO_COUNTRY if field == 'country' else _NOT_STATED
-        for party in _PARTIES
-        for field in ('name', 'email', 'city', 'country')
-    },
+    'laboratory_name': _NOT_STATED,
+    'laboratory_email': _NOT_STATED,
+    'laboratory_city': _NOT_STATED,
+    'laboratory_country': _NO_COUNTRY,
+    'customer_name': _NOT_STATED,
+    'customer_email': _NOT_STATED,
+    'customer_city': _NOT_STATED,
+    'customer_country': _NO_COUNTRY,
     'person': _NOT_STATED,
     'manufacturer': _NOT_STATED,
     'model': '',

@@ -13,7 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from adxl_ros.calibrate.poses import Poses, reference_force
+from adxl_ros.calibrate.pose_model import reference_force
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, certificate_data, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.report.held_out import ErrorBudget
@@ -23,6 +24,7 @@ from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.sensor import MARGIN_K, Sensor
+from adxl_ros.process import option
 from adxl_ros.report import templates
 from adxl_ros.report.quantities import mg, number
 from adxl_ros.signals.rest_detection import MOST_BATCHES
@@ -129,45 +131,56 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
     poses = result.poses.subset(result.inliers)
     held, used = poses.subset(errors.pose_index), held_out.determining_alpha(errors.errors)
     force = np.column_stack(reference_force(held, gravity))
-    by_noise, by_coefficients, by_stage, _ = (
-        np.sqrt(np.maximum([covariance[d, d][used] for d in axes], 0.0)).T
-        for covariance in held_out.covariances(errors, held, force)
-    )
+
+    def stds_mps2(covariance: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.maximum([covariance[d, d][used] for d in axes], 0.0)).T
+
+    covariances = held_out.covariances(errors, held, force)
+    by_noise = stds_mps2(covariances.by_noise)
+    by_coefficients = stds_mps2(covariances.by_coefficients)
+    by_stage = stds_mps2(covariances.by_stage)
     held, reference = held.subset(used), force[used][:, axes]
     error = errors.errors.accel_mps2[used]
     model = np.full(error.shape, np.sqrt(assessment.accel.model))
     inputs = (
         Input(
-            'noise of the mean',
-            'A, normal',
-            1e3 * np.mean(held.std_v, axis=0),
-            'mV',
-            by_noise,
-            MOST_BATCHES - 1,
+            name='noise of the mean',
+            kind='A, normal',
+            std=1e3 * np.mean(held.std_v, axis=0),
+            unit='mV',
+            contribution_mps2=by_noise,
+            freedom=MOST_BATCHES - 1,
         ),
         Input(
-            'coefficients',
-            'A, covariance of the fit',
-            mg(by_coefficients),
-            'mg',
-            by_coefficients,
-            max(int((~poses.check).sum()) * len(axes) - len(fitted.covariance_names), 1),
+            name='coefficients',
+            kind='A, covariance of the fit',
+            std=mg(by_coefficients),
+            unit='mg',
+            contribution_mps2=by_coefficients,
+            freedom=max(int((~poses.check).sum()) * len(axes) - len(fitted.covariance_names), 1),
         ),
         _stage_angles(by_stage, assessment.accel.stage, fitted),
-        Input('model', 'A, held-out errors', mg(model), 'mg', model, error.size),
+        Input(
+            name='model',
+            kind='A, held-out errors',
+            std=mg(model),
+            unit='mg',
+            contribution_mps2=model,
+            freedom=error.size,
+        ),
         _local_gravity(gravity, reference),
         *(_surroundings(name, fitted, held, reference) for name in _SURROUNDINGS),
         *_next_degree(fitted, held),
     )
     return Uncertainty(
-        fitted.axes,
-        held.alpha_rad,
-        held.beta_rad,
-        reference,
-        error,
-        inputs,
-        acceptance.limit(fitted)[1],
-        _decisions(fitted, assessment),
+        axes=fitted.axes,
+        alpha_rad=held.alpha_rad,
+        beta_rad=held.beta_rad,
+        reference_mps2=reference,
+        error_mps2=error,
+        inputs=inputs,
+        limit_name=acceptance.limit(fitted)[1],
+        decisions=_decisions(fitted, assessment),
     )
 
 
@@ -186,7 +199,12 @@ def _stage_angles(by_step_mps2: np.ndarray, scatter: float, fitted: Sensor) -> I
     std_rad = step_rad * excess or scatter**0.5 / fitted.local_gravity_mps2
     part_mps2 = by_step_mps2 * excess if step_rad else scatter_mps2
     return Input(
-        name, 'A, scatter of the poses', np.degrees(std_rad), '°', part_mps2, part_mps2.size
+        name=name,
+        kind='A, scatter of the poses',
+        std=np.degrees(std_rad),
+        unit='°',
+        contribution_mps2=part_mps2,
+        freedom=part_mps2.size,
     )
 
 
@@ -209,7 +227,12 @@ def _decisions(fitted: Sensor, assessment: Assessment) -> tuple[Decision, ...]:
         """Return a comparison; `scale` turns the SI unit of error and limit into `unit`."""
         error, high = budget.calibration**0.5, budget.calibration_high**0.5
         return Decision(
-            quantity, unit, scale * error, scale * (high - error), scale * limit, outcome
+            quantity=quantity,
+            unit=unit,
+            error=scale * error,
+            guard_band=scale * (high - error),
+            limit=scale * limit,
+            outcome=outcome,
         )
 
     accel, tilt = assessment.accel, assessment.tilt
@@ -339,9 +362,8 @@ def _quantity(
 ) -> dict[str, Any]:
     """Describe a quantity of one value, or of a list, with the expanded uncertainty of each."""
     expanded: Any = [] if std is None else K * np.asarray(std)
-    numbers, expanded = (
-        ' '.join(f'{value:.7g}' for value in np.ravel(each)) for each in (values, expanded)
-    )
+    numbers = ' '.join(f'{value:.7g}' for value in np.ravel(values))
+    half_widths = ' '.join(f'{value:.7g}' for value in np.ravel(expanded))
     return {
         'name': name,
         'about': about,
@@ -349,7 +371,7 @@ def _quantity(
         'unit': unit,
         'numbers': numbers,
         'is_list': np.ndim(values) > 0,
-        'expanded': expanded,
+        'expanded': half_widths,
     }
 
 
@@ -365,7 +387,7 @@ def write(
     if found is None:
         raise UserError(
             f'{path}: a certificate states errors at stage angles, and no pose with '
-            'angles was kept out of the fit; leave --dcc out'
+            f'angles was kept out of the fit; leave {option("certificate")} out'
         )
     elements = templates.environment('a certificate', ('adxl_ros.calibrate.report', ''))
     fitted = result.fitted

@@ -27,7 +27,8 @@ from dataclasses import dataclass, fields, replace
 from math import sqrt
 from typing import NamedTuple
 
-from adxl_ros.calibrate.poses import Poses, reference_force, stage_force
+from adxl_ros.calibrate.pose_model import reference_force, stage_force
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -40,7 +41,7 @@ import numpy as np
 import scipy
 
 Fit = Callable[[Sensor, Poses], Sensor]
-"""A function that fits a nominal sensor to poses and returns the fitted unit."""
+"""A function that fits a nominal sensor to poses and returns the fitted sensor."""
 
 _FOLDS = 5  # Number of folds where no pose is marked as a check pose; chosen: the usual number
 _MAX_ALPHA_STD_RAD = np.radians(1.0)
@@ -131,13 +132,13 @@ def summarise(
     count = len(errors.accel_mps2)
     accel_mg = mg(errors.accel_mps2[determining_alpha(errors)])
     return HeldOutErrors(
-        model,
-        statistic(np.degrees(errors.tilt_rad)),
-        statistic(accel_mg),
-        errors,
-        np.arange(count) if pose_index is None else pose_index,
-        tuple(fitted),
-        np.zeros(count, int) if fold is None else fold,
+        model=model,
+        tilt_deg=statistic(np.degrees(errors.tilt_rad)),
+        accel_mg=statistic(accel_mg),
+        errors=errors,
+        pose_index=np.arange(count) if pose_index is None else pose_index,
+        fitted=tuple(fitted),
+        fold=np.zeros(count, int) if fold is None else fold,
     )
 
 
@@ -235,11 +236,16 @@ def cross_validate(
 
 
 _SAME_POSE_RAD = np.radians(0.5)
-"""Largest distance of the joint angles of two visits of the same pose, rad; chosen."""
-_MIN_PAIRS = 6  # Smallest number of pairs of visits that show the scatter between visits; chosen
+"""Largest distance of the joint angles of two visits of the same pose, rad: above the step of any
+encoder, and a tenth of the smallest usual distance of two poses, 5°."""
+_MIN_PAIRS = 6
+"""Smallest number of pairs of visits that show the scatter between visits: its standard deviation
+is then known within 30 %."""
 _PROBE_MPS2 = 1e-3 * G0_MPS2
 """Error of each axis, m/s², for which the resulting tilt error is computed: 1 mg."""
-_CHANCE = 0.01  # Probability of a model part by chance, if the errors have none; chosen
+_CHANCE = 0.01
+"""Probability of a model part by chance, if the errors have none: one of 100 good calibrations is
+said to lack a term."""
 _UPPER_QUANTILE = 0.95  # Probability of the upper end of a 90 % interval
 
 
@@ -376,43 +382,45 @@ def _budget(
     model = mean_square - explained if lower > explained else 0.0
     stage = min(max(mean_square - by_noise - by_coefficients, 0.0), largest_stage)
     return ErrorBudget(
-        measured,
-        by_noise,
-        max(measured - mean_square, 0.0) + stage,
-        by_coefficients,
-        model,
-        spread * by_coefficients + max(upper - explained, 0.0),
-        bool(np.isfinite(unexplainable)),
+        measured=measured,
+        noise=by_noise,
+        stage=max(measured - mean_square, 0.0) + stage,
+        coefficients=by_coefficients,
+        model=model,
+        calibration_high=spread * by_coefficients + max(upper - explained, 0.0),
+        separable=bool(np.isfinite(unexplainable)),
     )
 
 
-def covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> list[np.ndarray]:
-    """
-    Return covariances of the specific force in the held-out poses, (m/s²)², each (3, 3, k).
+class Covariances(NamedTuple):
+    """Covariances of the specific force in k held-out poses, (m/s²)², (3, 3, k) each."""
 
-    They are those by the noise of the mean, by the coefficients, by the stated stage error, and by
-    an independent error `_PROBE_MPS2` on each measured axis.
-    """
+    by_noise: np.ndarray  # By the noise of the mean
+    by_coefficients: np.ndarray
+    by_stage: np.ndarray  # By the stated stage error
+    by_probe: np.ndarray  # By an independent error `_PROBE_MPS2` on each measured axis
+
+
+def covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> Covariances:
+    """Return the covariances of the specific force in the held-out poses, by their causes."""
     shape = (3, 3, len(held))
     by_noise, by_coefficients, by_probe = np.zeros(shape), np.zeros(shape), np.zeros(shape)
     for number, sensor in enumerate(errors.fitted):
         fold = errors.fold == number
         force, environment = list(reference[fold].T), held.subset(fold).environment
         exact, none_v2 = sensor.without_covariance(), np.zeros(len(sensor.axes))
+        noise_v2 = np.mean(held.std_v[fold], axis=0) ** 2
+        probe_v2 = (sensor.scale_v_per_g / G0_MPS2 * _PROBE_MPS2) ** 2
+        total = force_covariance(sensor, force, noise_v2, environment)
+        without_noise = force_covariance(sensor, force, none_v2, environment)
         # Without both the doubt is left on which side of 90° alpha is, but the stage knows it.
-        total, without_noise, by_side, probed = (
-            force_covariance(unit, force, variance_v2, environment)
-            for unit, variance_v2 in (
-                (sensor, np.mean(held.std_v[fold], axis=0) ** 2),
-                (sensor, none_v2),
-                (exact, none_v2),
-                (exact, (sensor.scale_v_per_g / G0_MPS2 * _PROBE_MPS2) ** 2),
-            )
-        )
+        by_side = force_covariance(exact, force, none_v2, environment)
+        probed = force_covariance(exact, force, probe_v2, environment)
         by_noise[:, :, fold] = total - without_noise
         by_coefficients[:, :, fold] = without_noise - by_side
         by_probe[:, :, fold] = probed - by_side
-    return [by_noise, by_coefficients, _stage_covariance(errors.fitted[0], held), by_probe]
+    by_stage = _stage_covariance(errors.fitted[0], held)
+    return Covariances(by_noise, by_coefficients, by_stage, by_probe)
 
 
 def _stage_covariance(sensor: Sensor, held: Poses) -> np.ndarray:

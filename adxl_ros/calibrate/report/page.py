@@ -10,7 +10,8 @@ import re
 from typing import Any
 
 from adxl_ros.calibrate.fits import linear
-from adxl_ros.calibrate.poses import planes, Poses, reference_force
+from adxl_ros.calibrate.pose_model import reference_force
+from adxl_ros.calibrate.poses import planes, Poses
 from adxl_ros.calibrate.report import acceptance, gum, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.result import CalibrationResult, compare, history, rounded
@@ -51,15 +52,15 @@ def write(folder: AnyPath, result: CalibrationResult, store: AnyPath = '') -> No
 
 
 def paper_figure(result: CalibrationResult) -> Any:
-    """Draw figures 2 to 8 of the paper for a unit, by its model or at least the physical one."""
+    """Draw figures 2 to 8 of the paper for a sensor, by its model or at least the physical one."""
     if result.gravity_fit is not None:
         raise UserError('they need the angles of a stage')
-    unit = (
+    sensor = (
         result.fitted
         if result.fitted.model in ('physical', 'full')
         else linear.fit_physical(result.nominal, result.poses.subset(~result.poses.check))
     )
-    return draw_sweep(result.nominal, unit, result.poses)
+    return draw_sweep(result.nominal, sensor, result.poses)
 
 
 def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
@@ -156,10 +157,8 @@ def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict
     tiles = []
     if (fit := result.gravity_fit) is not None:
         used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-        before, after = (
-            three_digits(held_out.rms_mg(float(np.mean(v[used] ** 2))))
-            for v in (fit.before_mps2, fit.held_out_mps2)
-        )
+        before = three_digits(held_out.rms_mg(float(np.mean(fit.before_mps2[used] ** 2))))
+        after = three_digits(held_out.rms_mg(float(np.mean(fit.held_out_mps2[used] ** 2))))
         tiles = [
             {
                 'label': 'error of the magnitude of gravity',
@@ -173,7 +172,8 @@ def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict
     ):
         statistics = [getattr(errors, name) for errors in result.held_out]
         if statistics and not np.isnan(statistics[-1].rms):
-            before, after = (three_digits(statistics[i].rms) for i in (0, -1))
+            before = three_digits(statistics[0].rms)
+            after = three_digits(statistics[-1].rms)
             low, high = map(three_digits, statistics[-1].interval)
             tiles.append(
                 {
@@ -209,10 +209,10 @@ def _sphere(result: CalibrationResult) -> dict[str, Any]:
         labels = [f'rest {i + 1}' for i in range(len(poses))]
     else:
         force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
-        units = {row.model: row.fitted[0] for row in result.held_out} | {fitted.model: fitted}
+        sensors = {row.model: row.fitted[0] for row in result.held_out} | {fitted.model: fitted}
         errors = {}
-        for model, unit in units.items():
-            of_unit = held_out.pose_errors(unit, poses)
+        for model, sensor in sensors.items():
+            of_unit = held_out.pose_errors(sensor, poses)
             errors[model] = np.column_stack([np.degrees(of_unit.tilt_rad), mg(of_unit.accel_mps2)])
         quantities = [['tilt error', '°'], *([f'error of {a}', 'mg'] for a in fitted.axes)]
         labels = [
@@ -330,9 +330,8 @@ def draw_sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:
     vertical = np.abs(np.sin(swept.alpha_rad)) > _VERTICAL
     for d, (row, regression) in enumerate(zip(grid, regressions)):
         linear_v = line.zero_g_v[d] + line.scale_v_per_g[d] * force_g[:, d]
-        deviation_mv, model_mv = (
-            1e3 * (volts[:, d] - linear_v) for volts in (swept.volts, predicted)
-        )
+        deviation_mv = 1e3 * (swept.volts[:, d] - linear_v)
+        model_mv = 1e3 * (predicted[:, d] - linear_v)
         name, other = ('x', 'y') if d == 0 else ('y', 'x')
         row[0].set(
             title='figs. 2, 3, 5, 7: forth ●, back ◁, model ─',

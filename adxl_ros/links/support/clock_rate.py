@@ -75,9 +75,8 @@ class ClockRate:
     def _take(self, newest_hz: float) -> bool:
         """Take the rate of some samples, Hz; return whether it changes the rate to use."""
         self._newest_hz.append(newest_hz)
-        clock_hz, low_hz, high_hz = (
-            float(f(self._newest_hz)) for f in (np.median, np.min, np.max)
-        )
+        clock_hz = float(np.median(self._newest_hz))
+        low_hz, high_hz = min(self._newest_hz), max(self._newest_hz)
         if len(self._newest_hz) < _RATES or high_hz > (1 + _RATE_SCATTER) * low_hz:
             return False
         if abs(clock_hz / self._stated_hz - 1) <= _MAX_RATE_ERROR:

@@ -211,8 +211,10 @@ class ClockMap:
 
         A window above the line counts less, and a drift of 0 is the prior.
         """
+        # Device times and lags of the windows about those of the newest one
         windows = np.array(self._windows or [self._open])
-        time_s, lag_ns = ((windows - windows[-1]) * (1e-9, 1)).T
+        device_ns, lag_ns = (windows - windows[-1]).T
+        time_s = device_ns * 1e-9
         weight = np.ones(len(windows))
         for _ in range(_FIT_ITERATIONS):
             mean_s, mean_ns = np.average([time_s, lag_ns], axis=1, weights=weight)
@@ -227,12 +229,12 @@ class ClockMap:
         """Begin a new clock if the late samples were late by the same time: it stepped back."""
         late, self._late = self._late, []
         taken_ns, half = late[-1].device_ns - late[0].device_ns, len(late) // 2
-        first_ns, second_ns = (
-            min(arrival.lag_ns for arrival in part) for part in (late[:half], late[half:])
-        )
-        if abs(second_ns - first_ns) < _SAME_NS and taken_ns < _CATCH_UP_RATIO * (
-            late[-1].host_ns - late[0].host_ns
-        ):
+        first_ns = min(arrival.lag_ns for arrival in late[:half])
+        second_ns = min(arrival.lag_ns for arrival in late[half:])
+        is_same_lag = abs(second_ns - first_ns) < _SAME_NS
+        arriving_ns = late[-1].host_ns - late[0].host_ns
+        is_backlog = taken_ns >= _CATCH_UP_RATIO * arriving_ns
+        if is_same_lag and not is_backlog:
             former_ns = self._former_lag_ns
             if former_ns is None:
                 former_ns = late[0].lag_ns - self._lateness_ns(late[0])
@@ -360,15 +362,15 @@ class Stamper:
         parts, self._stamped = self._stamped, []
         marks = np.concatenate([part.in_self_test for part in parts])
         return Samples(
-            np.concatenate([part.stamp_ns for part in parts]),
-            np.concatenate([part.volts for part in parts]),
-            time.time_ns(),
-            sum(part.missing for part in parts),
-            {
+            stamp_ns=np.concatenate([part.stamp_ns for part in parts]),
+            volts=np.concatenate([part.volts for part in parts]),
+            until_ns=time.time_ns(),
+            missing=sum(part.missing for part in parts),
+            references={
                 name: np.concatenate([part.references[name] for part in parts])
                 for name in parts[0].references
             },
-            sum(part.estimated for part in parts),
+            estimated=sum(part.estimated for part in parts),
             in_self_test=marks if marks.any() else None,
         )
 
@@ -408,12 +410,12 @@ class Stamper:
             self._last_ns = int(host_ns[-1])
             self._stamped.append(
                 Samples(
-                    host_ns + self._ros_offset_ns,
-                    block.volts,
-                    time.time_ns(),
-                    self._counted + self._estimated,
-                    self._thin(host_ns, block.references),
-                    self._estimated,
+                    stamp_ns=host_ns + self._ros_offset_ns,
+                    volts=block.volts,
+                    until_ns=time.time_ns(),
+                    missing=self._counted + self._estimated,
+                    references=self._thin(host_ns, block.references),
+                    estimated=self._estimated,
                     in_self_test=np.full(len(host_ns), block.in_self_test),
                 )
             )

@@ -232,7 +232,14 @@ def _decode_info(payload: bytes) -> BoardInfo:
         and all(32 <= byte < 127 for byte in name)
     ):
         raise WireError('an info frame beyond the bounds of the format')
-    return BoardInfo(rate_hz, bits, channels, vref_v, name.decode('ascii').strip(), flags)
+    return BoardInfo(
+        rate_hz=rate_hz,
+        bits=bits,
+        channels=channels,
+        vref_v=vref_v,
+        serial=name.decode('ascii').strip(),
+        flags=flags,
+    )
 
 
 def _decode_samples(payload: bytes) -> SampleFrame:
@@ -249,7 +256,14 @@ def _decode_samples(payload: bytes) -> SampleFrame:
     ):
         raise WireError('a frame of samples beyond the bounds of the format')
     codes = np.frombuffer(payload, '<u2', offset=_SAMPLES.size).reshape(count, channels)
-    return SampleFrame(flags, sequence, time_us, index, overruns, codes)
+    return SampleFrame(
+        flags=flags,
+        sequence=sequence,
+        time_us=time_us,
+        index=index,
+        overruns=overruns,
+        codes=codes,
+    )
 
 
 class Splitter:

@@ -15,8 +15,13 @@ from absl import logging
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import parameter_of
 from adxl_ros_validation.benchmark.case import Case, Finding
-from mujoco.sysid import calculate_intervals, optimize, Parameter, ParameterDict
 import numpy as np
+
+try:
+    from mujoco.sysid import calculate_intervals, optimize, Parameter, ParameterDict
+except ImportError as error:
+    # Without one of its own libraries it is empty, and does not say which.
+    raise ImportError("mujoco[sysid]: run `pip install 'mujoco[sysid]'`") from error
 
 logging.set_verbosity(logging.ERROR)
 _EFFECTS = ('bias', 'scale_factor', 'misalignment', 'time_offset', 'bandwidth')

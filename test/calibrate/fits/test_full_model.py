@@ -72,7 +72,7 @@ def test_a_term_that_is_not_convex_is_fitted_from_several_starts():
     values = {**truth.values['adc_inl'], 'amplitude_v': np.array(1e-3), 'cycles': np.array(17.3)}
     truth = replace(truth, values={**truth.values, 'adc_inl': values})
     poses = swept(np.random.default_rng(1), truth, check_poses=0)
-    fit = full_model.fit_full(sensor, poses, (*TERMS, 'adc_inl')).unit.values['adc_inl']
+    fit = full_model.fit_full(sensor, poses, (*TERMS, 'adc_inl')).with_stage.values['adc_inl']
     assert fit['cycles'] == pytest.approx(17.3, rel=0.01)
     assert fit['amplitude_v'] == pytest.approx(1e-3, rel=0.15)
 

@@ -263,9 +263,9 @@ def test_a_sensor_info_that_comes_late_begins_the_calibration_again(rig):
     bench.unstated = stamps_ns, noise_mps2 + [9.8, 0, 0]
     bench.controller.start()
     bench.turn_until(lambda: bench.controller.session is not None)
-    assert bench.controller.session.unit.measured
+    assert bench.controller.session.nominal.measured
     bench.say_info()
-    assert not bench.controller.session.unit.measured and not bench.lines('ERROR')
+    assert not bench.controller.session.nominal.measured and not bench.lines('ERROR')
     bench.turn_until(lambda: bench.controller.session.accepted_count == 1)
 
 
@@ -284,7 +284,7 @@ def test_another_sensor_ends_the_session_and_a_restarted_driver_checks_the_mount
     assert bench.controller.state is ControllerState.IDLE
     assert 'rate_hz was 200.0, is 100.0: changed during the calibration' in bench.lines()[-1]
     bench.say_info(serial='C2')
-    assert bench.controller.stream.unit is None and bench.lines('ERROR')[-1].startswith(
+    assert bench.controller.stream.nominal is None and bench.lines('ERROR')[-1].startswith(
         'sensor_info: is of the sensor C2'
     )
     bench.controller.start()

@@ -9,21 +9,18 @@ level that all of them together call chance worse in one of a hundred comparison
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 import os
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
-from adxl_ros.api import result
-from adxl_ros.api.sensors import as_input, SensorInput
 from adxl_ros.errors import UserError
-from adxl_ros.files import recording as recording_files
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
-from adxl_ros.files.recording_columns import recorded_unit
+from adxl_ros.files.recording_columns import recorded_nominal, Recording
 from adxl_ros.model.constants import AXES
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
 from adxl_ros.signals.findings import Findings, RecordingContents
 from adxl_ros.signals.recorded_sensor import load_sensor
@@ -39,19 +36,49 @@ _FEWEST_PARTS = 10  # Parts of the rests whose scatter is known within a quarter
 _FEWEST_POSES = 3  # Orientations that show a change of the zero-g. Chosen: one for each axis
 _SAME_RATE = 0.99  # Ratio of two rates of one setting: oscillators of sensors differ by 1 %
 MINIMA = ('samples', 'span_s', 'rate_hz', 'rest_share', 'longest_rest_s', 'rests', 'poses')
-"""Numbers of a recording that may have a minimum, as `check --json` names them."""
+"""Numbers of a recording that may have a minimum, as the JSON of a check names them."""
+_MINIMUM = 'min '  # Begin of the name of an outcome that is a limit
 
 
 @dataclass(frozen=True)
 class Outcome:
     """One comparison, or one limit."""
 
-    name: str  # One of `KINDS`, or 'min' with the number that has a minimum
-    is_worse: bool
+    name: str  # sound, gaps, rate, noise, zero-g, rests, or 'min' with what has a minimum
+    is_worse: bool  # Whether it became worse, or the limit is missed
     text: str  # Figures, for people
     # Interval of the ratio to the other recording, or of the change for the zero-g, m/s²; none
     # where nothing was compared
     interval: tuple[float, float] | None = None
+
+    def fails(self, fail_on: Collection[str]) -> bool:
+        """Return whether it is one of the kinds that fail, or a limit, and worse."""
+        return self.is_worse and (self.name in fail_on or self.name.startswith(_MINIMUM))
+
+
+def require_kinds(fail_on: Collection[str]) -> None:
+    """Refuse names that are no kinds of outcomes."""
+    for name in fail_on:
+        if name not in KINDS:
+            raise UserError(f'{option(fail_on=name)}: expected some of {", ".join(KINDS)}')
+
+
+def outcomes_of(
+    found: Findings,
+    minima: Mapping[str, float],
+    earlier: Earlier | None,
+    read: Callable[[], Recording],
+) -> tuple[Outcome, ...]:
+    """
+    Return whether a recording is sound, what became worse, and its limits.
+
+    read: reads the recording, which is only needed for an earlier one.
+    """
+    sound = Outcome('sound', not found.is_sound, 'sound' if found.is_sound else found.faults[0])
+    if found.contents is None:
+        return (sound,)
+    compared = earlier.compare(found.contents, read()) if earlier is not None else []
+    return (sound, *compared, *limits(found.contents, minima))
 
 
 @dataclass(frozen=True)
@@ -68,7 +95,7 @@ def limits(contents: RecordingContents, minima: Mapping[str, float]) -> list[Out
     for name, smallest in minima.items():
         value = float(getattr(contents, name))
         text = f'{value:.4g}, expected {smallest:.4g} at least'
-        outcomes.append(Outcome(f'min {name}', value < smallest, text))
+        outcomes.append(Outcome(f'{_MINIMUM}{name}', value < smallest, text))
     return outcomes
 
 
@@ -79,11 +106,11 @@ class Earlier:
     Parameters
     ----------
     found
-        What `check` found of it, a file.
+        What a check found of it.
+    read
+        Its samples.
     sensor
-        The sensor, as for `check`.
-    reading
-        How the files are read.
+        The sensor, or the path of its parameter file; None for the nominal one.
 
     Raises
     ------
@@ -95,26 +122,23 @@ class Earlier:
     def __init__(
         self,
         found: Findings,
-        sensor: SensorInput | None = None,
-        reading: ReadingOptions = AS_IT_IS,
+        read: Recording,
+        sensor: Sensor | str | None = None,
     ) -> None:
         if found.contents is None:
             raise UserError(f'{found.path}: {found.faults[0]}')
-        self.found = found
-        self._contents, self._sensor, self._reading = found.contents, sensor, reading
-        self._at_rest = _at_rest(found.path, sensor, reading)
+        self._contents, self._sensor = found.contents, sensor
+        self._at_rest = _at_rest(read, sensor)
 
-    def compare(self, new: Findings) -> list[Outcome]:
-        """Return one outcome for each of `KINDS` but the first; none of one that is unreadable."""
-        if new.contents is None:
-            return []
-        now = _at_rest(new.path, self._sensor, self._reading)
+    def compare(self, contents: RecordingContents, read: Recording) -> list[Outcome]:
+        """Return one outcome of another recording for each of `KINDS` but the first."""
+        now = _at_rest(read, self._sensor)
         return [
-            _events('gaps', new.contents, self._contents, 'gaps'),
-            _rate(new.contents, self._contents),
+            _events('gaps', contents, self._contents, 'gaps'),
+            _rate(contents, self._contents),
             _noise(now, self._at_rest),
             _zero_g(now, self._at_rest),
-            _events('rests', new.contents, self._contents, 'rests'),
+            _events('rests', contents, self._contents, 'rests'),
         ]
 
 
@@ -187,10 +211,9 @@ def _ratio(low: float, high: float) -> str:
     return f'{low:.3g} to {high:.3g} times'
 
 
-def _at_rest(path: str, sensor: SensorInput | None, reading: ReadingOptions) -> _AtRest:
+def _at_rest(read: Recording, sensor: Sensor | str | None) -> _AtRest:
     """Return noise and lengths over the rests of a recording."""
-    read = recording_files.read(path, reading)
-    unit = recorded_unit(load_sensor(as_input(sensor), read), read)
+    unit = recorded_nominal(load_sensor(sensor, read), read)
     rests = RecordedRests(unit, read)
     rests.feed(read)
     rests.take()
@@ -207,27 +230,15 @@ def _at_rest(path: str, sensor: SensorInput | None, reading: ReadingOptions) -> 
     )
 
 
-def as_json(outcome: Outcome) -> Any:
-    """Return an outcome as JSON; an end that is not finite is null."""
-    return result.as_json(
-        {
-            'name': outcome.name,
-            'worse': outcome.is_worse,
-            'text': outcome.text,
-            'interval': outcome.interval,
-        }
-    )
-
-
 def write_junit(
     path: str | os.PathLike,
     results: Sequence[tuple[Findings, Sequence[Outcome]]],
-    fail_on: Sequence[str],
+    fail_on: Collection[str],
 ) -> None:
     """
     Write the outcomes as a report of JUnit: a suite for each recording, a case for each outcome.
 
-    fail_on: names of outcomes that fail; of others a case is skipped where it is worse.
+    fail_on: kinds that fail; a case of another one is skipped where it is worse.
     """
     root = ElementTree.Element('testsuites', name='adxl_ros check')
     for findings, outcomes in results:
@@ -238,7 +249,7 @@ def write_junit(
                 suite, 'testcase', name=outcome.name, classname=findings.path
             )
             if outcome.is_worse:
-                is_failure = outcome.name in fail_on
+                is_failure = outcome.fails(fail_on)
                 failures += is_failure
                 kind = 'failure' if is_failure else 'skipped'
                 ElementTree.SubElement(case, kind, message=outcome.text)

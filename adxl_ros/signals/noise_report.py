@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""The noise of a sensor for people: tables, settings of other programs, warnings, curves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.noise import ONE_SIDED
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.process import option
+from adxl_ros.report.figures import AXIS_COLOURS, new_figure
+from adxl_ros.report.quantities import duration
+from adxl_ros.report.screen import row
+from adxl_ros.signals.allan_deviation import StillStretch
+from adxl_ros.signals.noise_parameters import AxisNoise, RecordingNoise, settings
+import numpy as np
+import yaml
+
+_MICRO_G = 1e6 / G0_MPS2  # 1 m/s² in µg
+_NAMES = ('white noise N', 'bias instability B', 'random walk K')  # Names of the terms
+TERMS = ('white', 'instability', 'walk')  # Their fields in `NoiseFit`
+
+
+class _Unit(NamedTuple):
+    """The units of a sensor's readings."""
+
+    symbol: str  # Unit of the files, as the samples have it
+    small: str  # Unit for people
+    factor: float  # How many of the latter are one of the former
+    column: str  # Unit at the end of a column's name
+    letter: str  # Begin of that name
+
+
+_ACCEL = _Unit('m/s²', 'µg', _MICRO_G, 'mps2', 'a')
+_GYRO = _Unit('rad/s', 'm°/s', float(np.degrees(1e3)), 'radps', 'g')
+
+
+class SensorNoise(NamedTuple):
+    """One sensor at rest."""
+
+    name: str
+    rest: StillStretch
+    axes: Sequence[AxisNoise]
+    unit: _Unit
+
+
+def sensors_at_rest(result: RecordingNoise) -> list[SensorNoise]:
+    """Return the accelerometer, and the gyroscope if there is one."""
+    shown = [SensorNoise('accelerometer', result.rest, result.axes, _ACCEL)]
+    if result.gyro_rest is not None:
+        shown.append(SensorNoise('gyroscope', result.gyro_rest, result.gyro, _GYRO))
+    return shown
+
+
+_YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
+
+
+def head(result: RecordingNoise) -> list[str]:
+    """Return the recording, and how long it rests."""
+    rest, axes = result.rest, ' '.join(noise.axis for noise in result.axes)
+    return [result.path, f'{duration(rest.span_s)} at rest, {rest.rate_hz:.5g} Hz, axes {axes}']
+
+
+def tables(result: RecordingNoise) -> list[str]:
+    """Return the tables of each sensor."""
+    rows: list[str] = []
+    for shown in sensors_at_rest(result):
+        if result.gyro:
+            rows += ['', shown.name] if rows else [shown.name]
+        rows += _table(shown)
+    return rows
+
+
+def _table(shown: SensorNoise) -> list[str]:
+    """Return the terms with intervals, then in SI units and by sample, 79 columns at most."""
+    wide, narrow = (6, 25, 25, 25), (6, 12, 12, 12, 13, 13, 9)
+    si, small = shown.unit.symbol, shown.unit.small
+    rows = [
+        row((' axis', *_NAMES), wide),
+        row(('', f'{small}/√Hz (90 %)', f'{small} (90 %)', f'{small}/√s (90 %)'), wide),
+        *(row((f' {noise.axis}', *intervals(noise, shown.unit)), wide) for noise in shown.axes),
+        *_walk_lines(shown),
+        '',
+        row(('', 'N', 'B', 'K', 'N by sample', 'K by sample', 'datasheet'), narrow),
+        row((' axis', f'{si}/√Hz', si, f'{si}/√s', si, si, f'{small}/√Hz'), narrow),
+    ]
+    rate = np.sqrt(shown.rest.rate_hz)
+    for noise in shown.axes:
+        white, _, walk = noise.estimates
+        estimates = (
+            *noise.estimates,
+            white.scaled(rate),
+            walk.scaled(1 / rate),
+            white.scaled(ONE_SIDED * shown.unit.factor),
+        )
+        rows.append(
+            row(
+                (
+                    f' {noise.axis}',
+                    *(f'{e.value:.3g}' if e.is_seen else f'< {e.high:.3g}' for e in estimates),
+                ),
+                narrow,
+            )
+        )
+    return rows
+
+
+def _walk_lines(shown: SensorNoise) -> list[str]:
+    """Return the bounds of the walks."""
+    rows = []
+    for noise in shown.axes:
+        time_s, k = noise.fit.bound_s, shown.unit.factor * noise.fit.walk.value
+        if np.isfinite(time_s):
+            rows.append(
+                f' {noise.axis}: the walk has bounds, {k * np.sqrt(time_s / 2):.3g} '
+                f'{shown.unit.small} rms; correlation time {time_s:.3g} s'
+            )
+    return rows
+
+
+def intervals(noise: AxisNoise, unit: _Unit) -> list[str]:
+    """Return the estimates with their intervals, or their upper limits."""
+    return [
+        f'{e.value:.3g} ({e.low:.3g} to {e.high:.3g})' if e.is_seen else f'below {e.high:.3g}'
+        for e in (estimate.scaled(unit.factor) for estimate in noise.estimates)
+    ]
+
+
+def paste_lines(result: RecordingNoise) -> list[str]:
+    """Return the settings of other programs in YAML, ready to paste."""
+    lines = []
+    for program, entries in settings(result.axes, result.rest.rate_hz, result.gyro).items():
+        lines.append(f'# {program}')
+        for name, values, unit in entries:
+            if isinstance(values, str):
+                lines += [f'# {unit}', f'{name}: {values}']
+                continue
+            rounded = [float(f'{value:.{6 if value >= 1 else 3}g}') for value in values]
+            is_one = len(rounded) == 1
+            lines += [
+                f'# {unit}',
+                *yaml.safe_dump(
+                    {name: rounded[0] if is_one else rounded},
+                    width=_YAML_COLUMNS,
+                    default_flow_style=False if is_one else None,
+                ).splitlines(),
+            ]
+    return lines
+
+
+def warnings(result: RecordingNoise) -> list[str]:
+    """Return what is wrong with the rest, what it does not show, and how long to record."""
+    rest, texts = result.rest, [*result.doubts]
+    if rest.beyond_range:
+        texts.append(f'{rest.beyond_range}.')
+    if rest.motion_s:
+        begin_s, end_s = rest.motion_s[0][:2]
+        texts.append(
+            f'not still or interrupted {len(rest.motion_s)} times, first from '
+            f'{begin_s:.5g} s to {end_s:.5g} s. Used is the longest rest, '
+            f'{duration(rest.span_s)} of {duration(rest.recorded_s)}. Record again '
+            'without touching the sensor.'
+        )
+    for shown in sensors_at_rest(result):
+        # The accelerometer is meant where no sensor is named.
+        begin = f'{shown.name} ' if shown.unit is _GYRO else ''
+        texts += [
+            f'{begin}{noise.axis}: {text}'
+            for noise in shown.axes
+            for text in _axis_warnings(rest.span_s, noise, shown.unit)
+        ]
+    return texts
+
+
+def filter_warning(stated: Sensor, fresh: Sensor) -> list[str]:
+    """Say that the noise refutes the stated filter, and what the file states in its place."""
+    if 'rc_capacitance_f' in stated.unstated or fresh.rc_s == stated.rc_s:
+        return []
+    found = f'a filter of {fresh.rc_s * 1e3:.3g} ms' if fresh.rc_s else 'no filter'
+    return [
+        f'the noise at {fresh.rate_hz:.5g} Hz shows {found}, not the stated one of '
+        f'{stated.rc_s * 1e3:.3g} ms. The new file states what the noise shows.'
+    ]
+
+
+def _axis_warnings(span_s: float, noise: AxisNoise, unit: _Unit) -> list[str]:
+    texts = []
+    for term, name in enumerate(_NAMES):
+        if not (noise.estimates[term].is_seen or noise.is_coarse):
+            needed_s = noise.fit.needed_s(term)
+            texts.append(
+                f'{duration(span_s)} is too short to see the {name}. '
+                + (
+                    'The other terms hide it, in longer recordings, too.'
+                    if np.isinf(needed_s)
+                    else f'To see half of the limit above, record about {duration(needed_s)}.'
+                )
+            )
+    if noise.is_coarse:
+        texts.append(
+            f'samples change in steps of {noise.resolution * unit.factor:.3g} {unit.small}, '
+            'which hide the noise. N, B and K are upper limits. Choose a smaller range.'
+        )
+    if not noise.fit.white.is_seen:
+        texts.append(
+            f'N is not determined. A parameter file keeps the figure of {option("sensor")}, or '
+            'states no white noise.'
+        )
+    return texts
+
+
+_INCHES = (5.0, 4.4)
+"""Width and height of the plot of an axis, inches. Chosen: three fit beside each other."""
+
+
+def curves(result: RecordingNoise) -> Any:
+    """Draw the axes of each sensor beside each other."""
+    sensors = sensors_at_rest(result)
+    most = max(len(shown.axes) for shown in sensors)
+    figure = new_figure(figsize=(_INCHES[0] * most, _INCHES[1] * len(sensors)))
+    rows = figure.subplots(len(sensors), most, squeeze=False, sharey='row')
+    for shown, plots in zip(sensors, rows):
+        name = shown.name if result.gyro else 'axis'
+        for number, (noise, plot) in enumerate(zip(shown.axes, plots)):
+            draw(plot, shown, number, 'measured')
+            _draw_terms(plot, shown, number)
+            plot.legend(fontsize=8)
+            plot.set_title(f'{name} {noise.axis}')
+        for unused in plots[len(shown.axes) :]:
+            unused.set_visible(False)
+        plots[0].set_ylabel(f'Allan deviation, {shown.unit.small}')
+    return figure
+
+
+def _draw_terms(plot: Any, shown: SensorNoise, number: int) -> None:
+    """Draw the terms of an axis that are seen, and their sum."""
+    tau_s, noise, factor = shown.rest.allan.tau_s, shown.axes[number], shown.unit.factor
+    for name, line, estimate in zip(_NAMES, noise.fit.lines(tau_s), noise.estimates):
+        if estimate.is_seen:
+            plot.plot(tau_s, line * factor, '--', lw=1, label=name)
+    draw_sum(plot, shown, number, color='#222', label='all three')
+
+
+def draw_sum(plot: Any, shown: SensorNoise, number: int, **looks: str) -> None:
+    """Draw the Allan deviation that the terms of an axis have together."""
+    tau_s, noise = shown.rest.allan.tau_s, shown.axes[number]
+    plot.plot(tau_s, noise.fit.allan_deviation(tau_s) * shown.unit.factor, lw=1, **looks)
+
+
+def draw(plot: Any, shown: SensorNoise, number: int, label: str) -> None:
+    """Draw the Allan deviation of an axis; the plot has room for those of all axes."""
+    allan = shown.rest.allan
+    measured = allan.deviation * shown.unit.factor
+    of_axis = measured[:, number]
+    plot.errorbar(
+        allan.tau_s,
+        of_axis,
+        yerr=of_axis * allan.relative_error.clip(max=0.9),
+        fmt='o',
+        ms=4,
+        color=AXIS_COLOURS[shown.axes[number].axis],
+        label=label,
+    )
+    plot.set(
+        xscale='log',
+        yscale='log',
+        xlabel='averaging time τ, s',
+        ylim=(measured.min() / 3, measured.max() * 2),
+    )
+    plot.grid(True, which='both', alpha=0.3)
