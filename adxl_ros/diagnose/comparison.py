@@ -25,7 +25,14 @@ from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.quantities import acceleration_text
 from adxl_ros.signals.block_statistics import held_values, rms, true_runs
-from adxl_ros.simulate.motion import BAND_LIMITED_DEGREE, ForcePath, INTERNAL_RATE_HZ, Motion, Path
+from adxl_ros.simulate.motion import (
+    BAND_LIMITED_DEGREE,
+    ForcePath,
+    INTERNAL_RATE_HZ,
+    Motion,
+    Path,
+    visible_step,
+)
 from adxl_ros.simulate.response import ChainMemo, Response
 from adxl_ros.simulate.trajectories import environment_paths, motion_from_references
 import numpy as np
@@ -533,7 +540,7 @@ def stated_poses(
     Fill the gaps of the stage's joints; return samples that are not known there, and reasons.
 
     A pose that is stated before and after a gap, while the output rests, holds in between. Other
-    gaps are left out.
+    gaps are left out; exact readings go on in a line, so that their spline stays even.
     """
     time_s, output_g = recording.time_s, recording.volts(sensor) / sensor.scale_v_per_g
     columns, left_out = dict(recording.columns), []
@@ -545,6 +552,7 @@ def stated_poses(
             continue
         step = 0.0 if joint == 'shift' else sensor.stage_resolution_rad
         filled = np.interp(time_s, time_s[read], values[read])
+        is_exact = not step or visible_step(values[read], step) < step
         limit_s = max(
             _LONGEST_BRIDGE_S,
             min(USUAL_GAPS * float(np.median(np.diff(time_s[read]))), _SLOWEST_S),
@@ -558,7 +566,7 @@ def stated_poses(
                 and _rests(output_g[begin:end], lag)
                 and abs(filled[end] - filled[begin - 1]) <= _SAME_STEPS * step + _SAME_POSE
             )
-            if inner and (holds or gap_s > limit_s):
+            if inner and (holds or (is_exact and gap_s > limit_s)):
                 columns[name][begin:end] = filled[begin:end]
             if not holds and gap_s > limit_s:
                 unknown |= (time_s > time_s[begin] - _BEFORE_S) & (

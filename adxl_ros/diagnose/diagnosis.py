@@ -156,7 +156,9 @@ def diagnose(
     floor = estimate_floor([c.comparison for c in checked])
     smallest_mps2 = material_mps2(model, floor, material_mg)
     evidence = _evidence(search, floor, smallest_mps2, seed)
-    detections = _detections(checked, search.best, model.baseline, smallest_mps2)
+    detections = _detections(
+        checked, _with_likely_drift(search.best, evidence), model.baseline, smallest_mps2
+    )
     bases = list(chain(*map(flexible_bases, compared, model.baseline_v)))
     verdict = rule.decide(
         evidence,
@@ -347,19 +349,38 @@ def _as_printed(hypothesis: Hypothesis, sensor: Sensor) -> Sensor:
     return put(replace(sensor, values={**sensor.values, **fitted}), hidden, get(sensor, hidden))
 
 
+def _with_likely_drift(best: Hypothesis, evidence: rule.Evidence) -> Sensor:
+    """Return the sensor of a set, with the drift that its noise needs most, if any."""
+    effects, sensor = frozenset(best.effects), best.sensor
+    fits = evidence.candidates[effects]
+    nats = {d: evidence.figure(evidence.drift_nats(effects, d)) for d in fits if d != HEALTHY}
+    likely = max(nats, key=lambda drift: nats[drift].value, default=HEALTHY)
+    if likely == HEALTHY or not nats[likely].predicts:
+        return sensor
+    return _with_drift(sensor, likely, fits[likely])
+
+
+def _with_drift(sensor: Sensor, drift: str, fits: HeldOutFits) -> Sensor:
+    """Return a sensor with the drift that the noise of fits has."""
+    densities = fits.drift_densities()[: len(sensor.axes)]
+    name = effect_named(drift).parameters[0].name
+    return with_values(with_neutral(sensor, [drift]), drift, {name: densities})
+
+
 def _detections(
-    checked: Sequence[CheckedRecording], best: Hypothesis, baseline: Sensor, smallest_mps2: float
+    checked: Sequence[CheckedRecording], best: Sensor, baseline: Sensor, smallest_mps2: float
 ) -> list[Detection]:
     """
     Return the material noise-like effects of recordings and residual, the strongest of each.
 
     Spikes count only where the residual of the best set shows them, too, and excess noise only
-    where it exceeds that of the baseline, too: a filter also changes the noise.
+    where it exceeds that of the baseline, too: a filter also changes the noise. `best` is the
+    sensor of the best set, whose drift is no excess noise.
     """
     detections: list[Detection] = []
     for c in checked:
         comparison, used = c.comparison, c.comparison.used
-        residual_v = comparison.residual_v(best.sensor)
+        residual_v = comparison.residual_v(best)
         # In motion, a smooth reference lacks knocks that look like spikes.
         regular = used if comparison.fading_hz is None else used | ~comparison.at_rest
         spikes = [
@@ -367,7 +388,7 @@ def _detections(
             for d in c.possible_spikes
             if noise_effects.residual_shows_spikes(d, residual_v, regular, comparison.sensor)
         ]
-        found = noise_effects.residual_detections(comparison, residual_v, best.sensor)
+        found = noise_effects.residual_detections(comparison, residual_v, best)
         of_baseline = noise_effects.residual_detections(comparison, residual_v, baseline)
         usual = {d.effect for d in of_baseline}
         detections += [*c.detections, *spikes, *(d for d in found if d.effect in usual)]
@@ -412,12 +433,12 @@ def _named_sensor(
             best,
             replace(sensor, values={**sensor.values, **{e: fitted.values[e] for e in straight}}),
         )
-    in_noise = {d.effect: d.values for d in detections}
+    for detection in detections:
+        sensor = with_values(
+            with_neutral(sensor, [detection.effect]), detection.effect, detection.values
+        )
     for drift in [e for e in drifts_among(library()) if e in verdict.named][:1]:
-        densities = fits[drift].drift_densities()[: len(sensor.axes)]
-        in_noise[drift] = {effect_named(drift).parameters[0].name: densities}
-    for effect, values in in_noise.items():
-        sensor = with_values(with_neutral(sensor, [effect]), effect, values)
+        sensor = _with_drift(sensor, drift, fits[drift])
     kept = [i for i, name in enumerate(baseline.covariance_names) if name.effect in sensor.effects]
     return replace(
         sensor,

@@ -279,6 +279,8 @@ class Whitener:
     sections: np.ndarray  # Second-order sections, (s, 6)
     effect: str  # Name of the drift effect that the filter is for
     density: float  # Density of the drift, in the unit of the effect's parameter
+    # The same that the noise has whose innovations have a standard deviation of 1 V
+    density_per_v: float = 0.0
     # Filter for the errors of angles and rounding; None where there are none, or where the drift
     # exceeds them: they would take up a part of it
     errors: AngleErrorFilter | None = None
@@ -356,13 +358,23 @@ def whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
         step_v2=sensor.lsb_v**2 / 12,
     )
     by_spectrum = {effect_named(e).diagnosis.drift: e for e in drifts_among(library())}
-    filters = [
-        Whitener(usual.without_walk(d * scale), by_spectrum[DriftSpectrum.RANDOM_WALK], d)
-        for d in RANDOM_WALKS_G_PER_RTS
-    ]
+    filters = []
+    for density in RANDOM_WALKS_G_PER_RTS:
+        sections, innovation_v = usual.without_walk(density * scale)
+        filters.append(
+            Whitener(
+                sections,
+                by_spectrum[DriftSpectrum.RANDOM_WALK],
+                density,
+                density / innovation_v,
+            )
+        )
     for density in FLICKERS_G_PER_RTHZ:
-        sections = usual.without_flicker(density * scale, comparison.span_s)
-        filters.append(Whitener(sections, by_spectrum[DriftSpectrum.FLICKER], density))
+        sections, innovation_v = usual.without_flicker(density * scale, comparison.span_s)
+        shown = min(density, usual.largest_flicker_v / scale)
+        filters.append(
+            Whitener(sections, by_spectrum[DriftSpectrum.FLICKER], density, shown / innovation_v)
+        )
         if usual.corner_hz(density * scale) > usual.highest_corner_hz:
             break
     errors = _angle_error_filter(comparison, axis, usual.pole, usual.std_v)
@@ -384,13 +396,23 @@ class _UsualNoise:
         """Return the highest corner of 1/f noise that a filter has, Hz."""
         return _TOP_OF_RATE / self.dt_s
 
+    @property
+    def _density_v2_per_hz(self) -> float:
+        """Return the density at low frequencies, V²/Hz."""
+        analog_v2 = self.std_v**2 * (1 + self.pole) / (1 - self.pole)
+        return 2 * self.dt_s * (analog_v2 + self.step_v2)
+
+    @property
+    def largest_flicker_v(self) -> float:
+        """Return the density of the 1/f noise that has the highest corner, V/√Hz at 1 Hz."""
+        return sqrt(self.highest_corner_hz * self._density_v2_per_hz)
+
     def corner_hz(self, density_v: float) -> float:
         """Return the frequency at which 1/f noise, V/√Hz at 1 Hz, is as dense as this one, Hz."""
-        analog_v2 = self.std_v**2 * (1 + self.pole) / (1 - self.pole)
-        return density_v**2 / (2 * self.dt_s * (analog_v2 + self.step_v2))
+        return density_v**2 / self._density_v2_per_hz
 
-    def without_walk(self, density_v: float) -> np.ndarray:
-        """Return the filter that makes noise with a random walk, V/√s, white."""
+    def without_walk(self, density_v: float) -> tuple[np.ndarray, float]:
+        """Return the filter that makes noise with a random walk, V/√s, white; and its std, V."""
         pole, difference = np.array([1, -self.pole]), np.array([1, -1.0])
         both = np.convolve(pole, difference)
         spectrum = (
@@ -398,21 +420,23 @@ class _UsualNoise:
             + self.step_v2 * _power(both, 2)
             + density_v**2 * self.dt_s * _power(pole, 2)
         )
-        return scipy.signal.tf2sos(both, _spectral_factor(spectrum, 2))
+        factor = _spectral_factor(spectrum, 2)
+        return scipy.signal.tf2sos(both, factor), sqrt(spectrum[2] / np.sum(factor**2))
 
-    def without_flicker(self, density_v: float, span_s: float) -> np.ndarray:
-        """Return the filter that makes noise with 1/f noise, V/√Hz at 1 Hz, white."""
+    def without_flicker(self, density_v: float, span_s: float) -> tuple[np.ndarray, float]:
+        """Return the filter that makes noise with 1/f noise, V/√Hz at 1 Hz, white; and its std."""
         # Noise and steps without drift are an ARMA(1, 1) sequence; this is the zero of its MA.
         spectrum = self.std_v**2 * (1 - self.pole**2) * _power(np.ones(1), 1)
         spectrum += self.step_v2 * _power(np.array([1, -self.pole]), 1)
-        zero = -_spectral_factor(spectrum, 1)[1]
+        factor = _spectral_factor(spectrum, 1)
+        zero, innovation_v = -factor[1], sqrt(spectrum[1] / np.sum(factor**2))
         # Zeros and poles, one pair a decade from the corner down: the gain of the filter rises
         # with the root of the frequency.
         top_hz = min(self.corner_hz(density_v), self.highest_corner_hz)
         decades = np.arange(int(np.ceil(max(np.log10(top_hz * span_s), 0.0))))
         corners = 2 * np.pi * self.dt_s * top_hz * 10.0**-decades
         poles, zeros = [self.pole, *np.exp(-corners * 10**-0.5)], [zero, *np.exp(-corners)]
-        return scipy.signal.zpk2sos(poles, zeros, 1.0)
+        return scipy.signal.zpk2sos(poles, zeros, 1.0), innovation_v
 
 
 def expected_drift_g(effect: str, density: float, comparison: BaselineComparison) -> float:

@@ -122,16 +122,27 @@ def _detection(
 
 
 def repeated_samples(
-    volts: np.ndarray, time_s: np.ndarray, used: np.ndarray, sensor: Sensor
+    volts: np.ndarray,
+    time_s: np.ndarray,
+    used: np.ndarray,
+    sensor: Sensor,
+    isolated: np.ndarray | None = None,
 ) -> tuple[np.ndarray, list[Detection]]:
-    """Find samples that repeat the one before in all axes, in runs too long for chance."""
+    """
+    Find samples that repeat the one before in all axes, in runs too long for chance.
+
+    In fast motion a short run counts, too: one of its samples is isolated, (n,) bool, and the one
+    that it repeats is not.
+    """
     same = np.concatenate([[False], (np.diff(volts, axis=0) == 0).all(axis=1)])
     # At their rails all axes repeat, too.
     same &= ~sensor.saturated(volts).all(axis=1)
     shortest = shortest_repeat(volts, len(sensor.axes))
     repeated = np.zeros(len(volts), bool)
+    alone = np.zeros(len(volts), bool) if isolated is None else isolated
     for begin, end in true_runs(same):
-        repeated[begin:end] = end - begin >= shortest
+        is_held = alone[begin:end].any() and not alone[begin - 1]
+        repeated[begin:end] = end - begin >= shortest or is_held
     repeats = true_runs(repeated & used)
     if not repeats:
         return used, []
@@ -169,7 +180,7 @@ def isolated_samples(
     spikes &= 2 * _deviation_v(volts) > _deviation_v(residual_v)
     if not spikes.any():
         return used, []
-    rate_hz = spikes.sum() / len(sensor.axes) / float(time_s[-1] - time_s[0])
+    rate_hz = spikes.sum() / len(sensor.axes) / float(np.mean(used) * np.ptp(time_s))
     return used & ~spikes.any(axis=1), [
         _detection(
             Detector.ISOLATED_SAMPLES,
@@ -192,7 +203,7 @@ def residual_shows_spikes(
     isolated, _ = _spikes(
         residual_v, code_step_v(residual_v), np.isfinite(residual_v).all(axis=1), sensor
     )
-    expected = float(spikes.values['rate_hz']) * len(sensor.axes) * len(used) / sensor.rate_hz
+    expected = float(spikes.values['rate_hz']) * len(sensor.axes) * used.sum() / sensor.rate_hz
     return bool(isolated[~used].sum() > expected / 2)
 
 
@@ -282,9 +293,13 @@ class SampleFaults(NamedTuple):
 
 
 def sample_faults(comparison: BaselineComparison) -> SampleFaults:
-    """Find coarse codes, else repeated samples, and isolated samples of a recording."""
+    """
+    Find coarse codes, else repeated samples, and isolated samples of a recording.
+
+    Where the reference is not known, a jerk of the motion would look like an isolated sample.
+    """
     volts, time_s, sensor = comparison.volts, comparison.time_s, comparison.sensor
-    finite = np.isfinite(volts).all(axis=1)
+    finite, known = np.isfinite(volts).all(axis=1), comparison.used | comparison.disturbed
     coarse = coarse_codes(volts, sensor)
     # Coarse codes repeat by themselves.
     changing, detections = (
@@ -292,10 +307,17 @@ def sample_faults(comparison: BaselineComparison) -> SampleFaults:
     )
     if coarse:
         sensor = with_bits(sensor, coarse)
-    regular, spikes = isolated_samples(
-        volts, comparison.residual_v(comparison.sensor), time_s, changing, sensor
-    )
-    return SampleFaults(finite & ~changing, changing & ~regular, detections, spikes)
+    residual_v = comparison.residual_v(comparison.sensor)
+
+    def among(compared: np.ndarray) -> tuple[np.ndarray, list[Detection]]:
+        regular, spikes = isolated_samples(volts, residual_v, time_s, compared, sensor)
+        return compared & ~regular, spikes
+
+    isolated, spikes = among(changing & known)
+    if spikes and not coarse:
+        changing, detections = repeated_samples(volts, time_s, finite, sensor, isolated)
+        isolated, spikes = among(changing & known)
+    return SampleFaults(finite & ~changing, isolated, detections, spikes)
 
 
 def with_bits(sensor: Sensor, coarse: Detection) -> Sensor:
@@ -600,7 +622,7 @@ def _statistics(
     volts, residual_v, noise_v = series
     sensor, time_s, scale = comparison.sensor, comparison.time_s, comparison.scale_v_per_mps2
     detector = effect_named(detection.effect).diagnosis.detector
-    finite = np.isfinite(volts).all(axis=1)
+    finite = np.isfinite(volts).all(axis=1) & (comparison.used | comparison.disturbed)
     if detector is Detector.MAINS_LINE:
         hz = float(detection.values['frequency_hz'])
         yield f'line at {hz:.4g} Hz', 'm/s^2', line_amplitude_v(noise_v, time_s, hz) / scale
@@ -617,7 +639,7 @@ def _statistics(
         yield 'size of a spike', 'm/s^2', values['amplitude_v'] / scale
     elif detector is Detector.REPEATED_SAMPLES:
         used = repeated_samples(volts, time_s, finite, sensor)[0]
-        yield 'share of repeated samples', '1', np.array([float(np.mean(finite & ~used))])
+        yield 'share of repeated samples', '1', np.array([float(np.mean(~used[finite]))])
     else:
         lost = coarse_codes(volts, sensor)
         bits = sum(lost.values.values()) if lost else np.zeros(len(scale))

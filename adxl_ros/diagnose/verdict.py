@@ -21,6 +21,7 @@ from typing import NamedTuple
 import warnings
 
 from adxl_ros.diagnose import evidence as linear
+from adxl_ros.diagnose.comparison import bridged
 from adxl_ros.diagnose.evidence import (
     BLOCKS,
     ChannelColumns,
@@ -83,6 +84,7 @@ _FIRST_MEAN_S = 0.1
 """Shortest mean in which a drift is looked for, s. Chosen: noise of sensors is white below it."""
 _FEWEST_MEANS = 16  # Fewest means of the longest length. Chosen: their increments show a form
 _FEWEST_STEPS = 12  # Fewest increments that show a form. Chosen: a kurtosis scatters by 1.4
+_LOCAL_ORDINATES = 101  # Ordinates of the level around a line. Chosen: much wider than a line
 _ROUNDS = 12
 """Rounds of the fit of the levels of flexible functions. Chosen: the levels hardly change then."""
 _FIRST_LEVEL_G = 1e-3  # First level, g rms. Chosen: any other start ends at the same levels
@@ -204,7 +206,8 @@ class HeldOutFits:
 
     def drift_densities(self) -> np.ndarray:
         """Return the densities of the drift by channel; 0 for that of a healthy unit."""
-        return np.array([0.0 if w.healthy else w.density for w in self._whiteners])
+        per_v = [0.0 if w.healthy else w.density_per_v for w in self._whiteners]
+        return np.array(per_v) * np.sqrt(self.full.innovation_variance_v2)
 
     @cached_property
     def drift_mps2(self) -> float:
@@ -322,42 +325,87 @@ def _drift_p(fits: HeldOutFits) -> float:
     smallest = 1.0
     for columns, (comparison, _) in zip(fits.linearised.columns, fits.model.places):
         residual_v = columns.values @ columns.combination(fits.full_departures)
-        p = increments_p(residual_v, comparison.used, comparison.sensor.rate_hz)
+        p = increments_p(
+            residual_v, comparison.used, comparison.sensor.rate_hz, comparison.at_rest
+        )
         smallest = min(smallest, len(fits.model.places) * p)
     return smallest
 
 
-def increments_p(values: np.ndarray, used: np.ndarray, rate_hz: float) -> float:
+def increments_p(
+    values: np.ndarray, used: np.ndarray, rate_hz: float, at_rest: np.ndarray
+) -> float:
     """
     Return how probable the increments of a residual are if they are those of a random drift.
 
     The means are those over the time from which the drift exceeds the noise: twice that of the
-    smallest Allan deviation. A drift has Gaussian increments (test of Anscombe and Glynn 1983)
-    without a line (test of Fisher 1929); jumps between levels and slow oscillations have not.
+    smallest Allan deviation. A drift has Gaussian increments (test of Anscombe and Glynn 1983), as
+    large at rest as in motion (test of Mann and Whitney 1947), and no line. Jumps between levels,
+    what a motor does, and slow oscillations have not.
     """
     longest = int(used.sum()) // _FEWEST_MEANS
-    if not longest:
+    lengths = np.unique(
+        np.geomspace(max(1.0, _FIRST_MEAN_S * rate_hz), max(longest, 1), 12).astype(int)
+    )
+    if not longest or len(lengths) < 2:
         return 1.0
-    lengths = np.unique(np.geomspace(max(1.0, _FIRST_MEAN_S * rate_hz), longest, 12).astype(int))
 
-    def increments(length: int) -> np.ndarray:
+    def increments(length: int) -> _Increments:
         whole = len(values) // length * length
-        count, total = (
-            v[:whole].reshape(-1, length).sum(axis=1) for v in (used, np.where(used, values, 0.0))
+        count, total, resting = (
+            v[:whole].reshape(-1, length).sum(axis=1)
+            for v in (used, np.where(used, values, 0.0), used & at_rest)
         )
         means = np.where(count > length / 2, total / np.maximum(count, 1), np.nan)
-        return np.diff(means)[np.isfinite(np.diff(means))]
+        steps, still = np.diff(means), resting > count / 2
+        known = np.isfinite(steps)
+        return _Increments(
+            steps[known], (still[1:] & still[:-1])[known], ~(still[1:] | still[:-1])[known]
+        )
 
-    quietest = min(lengths.tolist(), key=lambda n: np.mean(increments(n) ** 2))
-    steps = increments(min(2 * quietest, longest)) if len(lengths) > 1 else np.zeros(0)
+    by_length = [increments(length) for length in lengths.tolist()]
+    quietest = min(range(len(lengths)), key=lambda i: np.mean(by_length[i].values ** 2))
+    steps = increments(min(2 * lengths[quietest], longest)).values
     if len(steps) < _FEWEST_STEPS or not np.ptp(steps):
         return 1.0
-    power = np.abs(np.fft.rfft(steps - steps.mean())[1 : (len(steps) + 1) // 2]) ** 2
-    line = len(power) * (1 - power.max() / power.sum()) ** (len(power) - 1)
     with warnings.catch_warnings():
         # Older versions warn below 20 increments, where the test is rougher.
         warnings.simplefilter('ignore')
-        return float(min(1.0, 2 * min(line, scipy.stats.kurtosistest(steps).pvalue)))
+        gaussian = scipy.stats.kurtosistest(steps).pvalue
+    # The longest means that are often at rest show the drift best.
+    often = [each for each in by_length if each.fewest >= _FEWEST_STEPS]
+    alike = often[-1].alike_p if often else 1.0
+    line = _line_p(values, used, lengths[0])
+    return float(min(1.0, 3 * min(line, gaussian, alike)))
+
+
+def _line_p(values: np.ndarray, used: np.ndarray, length: int) -> float:
+    """Return how probable the strongest line of a residual without lines is, in slow means."""
+    changes = np.diff(bridged(values[:, None], used)[:, 0])
+    power = scipy.signal.periodogram(changes, window='hann')[1][1:-1]
+    # A spectrum that is smooth over frequency has exponential ordinates about its local level.
+    level = scipy.ndimage.median_filter(power, _LOCAL_ORDINATES, mode='reflect') / np.log(2)
+    ratios = (power / np.maximum(level, np.finfo(float).tiny))[: max(len(power) // length, 1)]
+    return float(min(1.0, len(ratios) * np.exp(-ratios.max())))
+
+
+class _Increments(NamedTuple):
+    """Increments between neighbouring means of a residual."""
+
+    values: np.ndarray  # (k,)
+    resting: np.ndarray  # Those between means at rest, (k,) bool
+    moving: np.ndarray  # Those between means in motion, (k,) bool
+
+    @property
+    def fewest(self) -> int:
+        """Return the smaller number of those at rest and those in motion."""
+        return int(min(self.resting.sum(), self.moving.sum()))
+
+    @property
+    def alike_p(self) -> float:
+        """Return how probable they are if they are as large at rest as in motion."""
+        sizes = np.abs(self.values)
+        return float(scipy.stats.mannwhitneyu(sizes[self.resting], sizes[self.moving]).pvalue)
 
 
 class FunctionProducts(NamedTuple):
@@ -488,6 +536,7 @@ class Evidence:
     # The sets that could be the answer, simulated again, not linearised
     again: Mapping[frozenset[str], SimulatedAgain] = field(default_factory=dict)
     is_draw: bool = False  # Whether it is one draw, whose figures have no interval
+    noise: str = HEALTHY  # The drift in whose noise sets are compared
 
     def draw(self, number: int) -> Evidence:
         """Return one draw of the blocks."""
@@ -543,13 +592,22 @@ class Evidence:
 
     def gain(self, more: frozenset[str], less: frozenset[str]) -> np.ndarray:
         """Return by how much one set explains more power than another, by draw."""
-        a, b = (self.candidates[e][HEALTHY].figures for e in (more, less))
-        return self.mean(b.squares - a.squares)
+        return self.mean(self._figures(less).squares - self._figures(more).squares)
 
-    def nats(self, more: frozenset[str], less: frozenset[str], drift: str = HEALTHY) -> np.ndarray:
-        """Return by how much a set and its noise make held-out samples more probable, by draw."""
-        a, b = self.candidates[more][drift].figures, self.candidates[less][HEALTHY].figures
+    def nats(self, more: frozenset[str], less: frozenset[str]) -> np.ndarray:
+        """Return by how much a set makes held-out samples more probable, by draw."""
+        a, b = self._figures(more), self._figures(less)
         return self.weights @ (a.log_likelihood - b.log_likelihood)
+
+    def drift_nats(self, effects: frozenset[str], drift: str) -> np.ndarray:
+        """Return by how much a drift makes held-out samples more probable beside a set."""
+        a, b = (self.candidates[effects][d].figures for d in (drift, HEALTHY))
+        return self.weights @ (a.log_likelihood - b.log_likelihood)
+
+    def _figures(self, effects: frozenset[str]) -> HeldOut:
+        """Return the figures of a set in the present noise, or in healthy noise without it."""
+        fits = self.candidates[effects]
+        return fits[self.noise if self.noise in fits else HEALTHY].figures
 
     def interval(self, draws: np.ndarray) -> Interval:
         """Return the value of all blocks with the interval of the draws."""
@@ -614,7 +672,7 @@ def drifts_beside(evidence: Evidence, effects: frozenset[str], rest: Rest) -> li
     that a smooth reference lacks.
     """
     candidate = evidence.candidates[effects]
-    nats = {d: evidence.nats(effects, effects, d) for d in candidate if d != HEALTHY}
+    nats = {d: evidence.drift_nats(effects, d) for d in candidate if d != HEALTHY}
     drifts = sorted(nats, key=lambda d: -nats[d][0])
     if not drifts or evidence.fades:
         return []
@@ -760,6 +818,41 @@ def _answer(
     return _Answer('partly' if is_partly else 'explained', certain)
 
 
+class _BestSet(NamedTuple):
+    """The most probable set, and what it and the noise leave."""
+
+    evidence: Evidence  # The figures, in the noise beside the set
+    effects: frozenset[str]
+    rest: Rest
+    drifts: Sequence[str]  # The drifts of the noise, the best first
+
+
+def _best_set(
+    evidence: Evidence,
+    rest_of: Callable[[frozenset[str], str], Rest],
+    simulate_again: Callable[[frozenset[str]], SimulatedAgain] | None,
+) -> _BestSet:
+    """Find the most probable set, and compare sets in noise that drifts where it is needed."""
+
+    def simulated(weighed: Evidence) -> Evidence:
+        if simulate_again is None:
+            return weighed
+        sets = filter(None, minimal_sets(weighed))
+        return replace(weighed, again={effects: simulate_again(effects) for effects in sets})
+
+    evidence = simulated(evidence)
+    best = minimal_sets(evidence)[0]
+    rest = rest_of(best, HEALTHY)
+    drifts = drifts_beside(evidence, best, rest)
+    if drifts:
+        # In noise that drifts, sets explain less than they seem to beside white noise.
+        evidence = simulated(replace(evidence, noise=drifts[0]))
+        best = minimal_sets(evidence)[0]
+        drifts = [d for d in drifts if d in evidence.candidates[best]]
+        rest = rest_of(best, drifts[0] if drifts else HEALTHY)
+    return _BestSet(evidence, best, rest, drifts)
+
+
 def decide(
     evidence: Evidence,
     rest_of: Callable[[frozenset[str], str], Rest],
@@ -772,18 +865,7 @@ def decide(
     in_noise: the effects that show in the noise.
     simulate_again: simulates a set that could be the answer.
     """
-    if simulate_again is not None:
-        evidence = replace(
-            evidence,
-            again={
-                effects: simulate_again(effects) for effects in minimal_sets(evidence) if effects
-            },
-        )
-    best = minimal_sets(evidence)[0]
-    rest = rest_of(best, HEALTHY)
-    drifts = drifts_beside(evidence, best, rest)
-    if drifts:
-        rest = rest_of(best, drifts[0])
+    evidence, best, rest, drifts = _best_set(evidence, rest_of, simulate_again)
     power = {d: float(evidence.mean(b)[0]) for d, b in rest.by_dimension.items()}
     repeats = evidence.interval(evidence.mean(rest.squares))
     # What follows the pose may be of the reference.
@@ -794,9 +876,12 @@ def decide(
     def answer_of(weighed: Evidence) -> _Answer:
         return _answer(weighed, rest, rest_material, drifts, in_noise)
 
-    answer = answer_of(evidence)
     drawn = [answer_of(evidence.draw(number)) for number in range(1, len(evidence.weights))]
-    probability, hypotheses = _probabilities(answer, drawn)
+    votes = _votes(drawn)
+    # What fewer draws support than that nothing is named is not stated (Breiman 1996).
+    possible = (answer_of(evidence), _Answer('unknown'), _Answer('no_gap'))
+    answer = max(possible, key=lambda a: _support(a, votes))
+    probability, hypotheses = _probabilities(answer, votes)
     highest = max(evidence.interval(evidence.gain(e, _NOTHING)).high for e in evidence.candidates)
     strongest = sorted(power, key=lambda d: -power[d])
     return Verdict(
@@ -826,19 +911,29 @@ def _sets(answer: _Answer) -> list[frozenset[str]]:
     return [answer.effects | set(choice) for choice in product(*answer.groups)]
 
 
-def _probabilities(
-    answer: _Answer, drawn: Sequence[_Answer]
-) -> tuple[float, tuple[WeightedHypothesis, ...]]:
-    """Return the probability of the answer, and of all sets, none above the answer's."""
-    named, votes = set(_sets(answer)), dict[frozenset[str], float]()
+def _votes(drawn: Sequence[_Answer]) -> dict[frozenset[str], float]:
+    """Return the share of draws that name a set, by set."""
+    votes = dict[frozenset[str], float]()
     for sets in map(_sets, drawn):
         for effects in sets:
-            votes[effects] = votes.get(effects, 0.0) + 1 / len(sets)
-    agreed = sum(count for effects, count in votes.items() if effects in named)
-    probability = float(np.interp(agreed / len(drawn), _REPEATED, _RIGHT))
+            votes[effects] = votes.get(effects, 0.0) + 1 / len(sets) / len(drawn)
+    return votes
+
+
+def _support(answer: _Answer, votes: Mapping[frozenset[str], float]) -> float:
+    """Return the share of draws that name what an answer stands for."""
+    return sum(votes.get(effects, 0.0) for effects in {*_sets(answer)})
+
+
+def _probabilities(
+    answer: _Answer, votes: Mapping[frozenset[str], float]
+) -> tuple[float, tuple[WeightedHypothesis, ...]]:
+    """Return the probability of the answer, and of all sets, none above the answer's."""
+    named, agreed = set(_sets(answer)), _support(answer, votes)
+    probability = float(np.interp(agreed, _REPEATED, _RIGHT))
     weights = {
-        e: min(count / (len(drawn) - agreed) * (1 - probability), probability)
-        for e, count in votes.items()
+        e: min(share / (1 - agreed) * (1 - probability), probability)
+        for e, share in votes.items()
         if e not in named
     }
     weights |= {effects: probability / len(named) for effects in named}

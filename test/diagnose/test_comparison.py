@@ -144,6 +144,25 @@ def test_samples_in_a_gap_of_a_simulator_are_left_out():
     assert kept.left_out[0].effect is None
 
 
+def test_a_pose_that_is_stated_at_rests_alone_holds_there():
+    """Poses of 4 s with 3 s between them, in which no angle is stated and the sensor turns."""
+    sensor, time_s = replace(nominal(), rate_hz=RATE_HZ), np.arange(8100) / RATE_HZ
+    poses_rad = np.random.default_rng(1).uniform(-1.5, 1.5, (2, 12))
+    place, resting = (time_s // 7.0).astype(int), time_s % 7.0 < 4.0
+    stated_rad = np.where(resting, poses_rad[:, place], np.nan)
+    force = np.array(specific_force(*poses_rad[:, place], 1.0))[:2].T
+    moving_g = np.sin(20.0 * time_s)[:, None] * ~resting[:, None]
+    volts = (force + moving_g) * sensor.scale_v_per_g + sensor.zero_g_v
+    columns = dict(zip(('x_v', 'y_v', 'alpha_rad', 'beta_rad'), [*volts.T, *stated_rad]))
+    read, left_out = beside.stated_poses(Recording('made', time_s, columns), sensor)
+    unknown = left_out[0][0] | left_out[1][0]
+    assert unknown[~resting].all() and unknown[resting].mean() < 0.15
+    comparison = beside.compare(read, sensor)
+    residual_g = comparison.residual_v(sensor)[~unknown] / sensor.scale_v_per_g
+    # The step of the encoder is 1.5 mrad.
+    assert np.abs(residual_g).max() < 1e-3
+
+
 def low_passed(values, corner_hz):
     return sosfiltfilt(butter(4, corner_hz, fs=RATE_HZ, output='sos'), values, axis=0)
 

@@ -8,6 +8,7 @@ import pytest
 
 RATE_HZ = 50.0
 COUNT = 20_000
+RESTING = np.arange(COUNT) // 1000 % 4 == 0  # 20 s of 80 s
 
 
 def levels(products, dimensions, variance=1.0):
@@ -53,7 +54,7 @@ def walk(seed):
 def test_the_increments_of_a_walk_are_gaussian():
     """At most about one of ten walks has a probability below 0.1."""
     used = np.ones(COUNT, bool)
-    p = [increments_p(walk(seed), used, RATE_HZ) for seed in range(20)]
+    p = [increments_p(walk(seed), used, RATE_HZ, RESTING) for seed in range(20)]
     assert np.mean(np.array(p) < 0.1) <= 0.25
     assert min(p) > 0.001
 
@@ -63,9 +64,15 @@ def test_jumps_and_lines_are_no_walk():
     noise = np.random.default_rng(1).normal(size=COUNT)
     jumps = 4.0 * (np.arange(COUNT) // 5000 % 2)
     line = 4.0 * np.sin(2 * np.pi * np.arange(COUNT) / 2000)
-    assert increments_p(noise + jumps, used, RATE_HZ) < 0.001
-    assert increments_p(noise + line, used, RATE_HZ) < 0.001
+    assert increments_p(noise + jumps, used, RATE_HZ, RESTING) < 0.001
+    assert increments_p(noise + line, used, RATE_HZ, RESTING) < 0.001
+
+
+def test_what_drifts_in_motion_alone_is_no_drift():
+    noise = np.random.default_rng(1).normal(size=COUNT)
+    moved = np.where(RESTING, 0.0, walk(1) - walk(1).mean())
+    assert increments_p(noise + moved, np.ones(COUNT, bool), RATE_HZ, RESTING) < 0.001
 
 
 def test_too_few_increments_say_nothing():
-    assert increments_p(np.arange(10.0), np.ones(10, bool), RATE_HZ) == 1.0
+    assert increments_p(np.arange(10.0), np.ones(10, bool), RATE_HZ, np.zeros(10, bool)) == 1.0

@@ -79,6 +79,22 @@ def test_long_runs_of_equal_samples_are_repeats():
     assert repeats.values['duration_s'] == pytest.approx(20 / RATE_HZ)
 
 
+def test_a_short_hold_in_fast_motion_is_no_spike():
+    """Three equal samples may be chance, but not where the motion goes on."""
+    volts, motion_v = white_v(), np.sin(2 * np.pi * 2 * TIME_S)[:, None]
+    volts += motion_v
+    starts = np.flatnonzero(np.diff(motion_v[:, 0], prepend=0) > 0.9 * 4 * np.pi / RATE_HZ)[::400]
+    for start in starts:
+        volts[start : start + 4] = volts[start]
+    alone = np.zeros(COUNT, bool)
+    alone[starts + 3] = True
+    _, (found,) = noise_effects.repeated_samples(
+        volts[:, :1], TIME_S, np.ones(COUNT, bool), sensor(axes='x'), alone
+    )
+    assert found.effect == 'stuck'
+    assert found.values['duration_s'] == pytest.approx(3 / RATE_HZ)
+
+
 def test_a_run_of_equal_codes_may_be_chance():
     """One axis that repeats in half of its samples repeats 30 times in 10⁵ samples."""
     coarse_v = np.random.default_rng(1).integers(0, 2, (100_000, 1)).astype(float)

@@ -79,6 +79,26 @@ def test_a_fit_takes_the_drift_that_the_noise_has(resting):
     assert free.log_evidence > healthy.log_evidence + 10
 
 
+@pytest.mark.parametrize('density, excess', [(1e-3, 1.0), (1e-2, 1.0), (2e-3, 3.0)])
+def test_the_size_of_flicker_is_that_of_the_fitted_noise(resting, density, excess):
+    """Noise above the stated one has a corner of its own, and the grid has no such density."""
+    scale, rng = float(resting.sensor.scale_v_per_g[0]), np.random.default_rng(1)
+    factor = np.linalg.cholesky(covariance_v2(resting, 0.0))
+    shape = np.maximum(np.fft.rfftfreq(COUNT, 1 / RATE_HZ), 1 / TIME_S[-1]) ** -0.5
+    flicker = np.fft.irfft(np.fft.rfft(rng.normal(size=COUNT)) * shape, COUNT)
+    volts = excess * factor @ rng.normal(size=COUNT)
+    volts += density * scale * np.sqrt(RATE_HZ / 2) * flicker
+    filters = [f for f in evidence.whiteners(resting, 0) if f.effect == 'flicker']
+    channel = evidence.whiten_channel(
+        volts[:, None], np.zeros(0, int), np.ones(COUNT, bool), filters
+    )
+    squares_v2 = channel.total_grams[:, 0, 0]
+    best = int(np.argmin(squares_v2))
+    fitted = filters[best].density_per_v * np.sqrt(squares_v2[best] / COUNT)
+    # The grid has steps of three.
+    assert abs(np.log(fitted / density)) < np.log(3) / 2
+
+
 def test_the_expected_drift_is_that_of_random_walks(resting):
     """A walk about its mean has a mean square of its variance at the end, divided by 6."""
     steps = np.random.default_rng(1).normal(size=(2000, COUNT)) / np.sqrt(RATE_HZ)

@@ -2,6 +2,7 @@
 
 """The rule of the verdict on figures that are made by hand: 48 blocks of 100 samples."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 from adxl_ros.diagnose.evidence import BLOCKS
@@ -43,7 +44,7 @@ def rest(power=0.0, dimension='force'):
     return Rest(squares, squares, squares / FLOOR / 2, {dimension: squares})
 
 
-def decided(candidates, left_over=0.0, in_noise=(), material=0.1, dimension='force'):
+def decided(candidates, left_over=0.0, in_noise=(), material=0.1, dimension='force', only=()):
     evidence = Evidence(
         candidates=candidates,
         counts=np.full(BLOCKS, SAMPLES),
@@ -55,7 +56,11 @@ def decided(candidates, left_over=0.0, in_noise=(), material=0.1, dimension='for
         wanders=False,
         floor_mps2=FLOOR**0.5,
     )
-    return decide(evidence, lambda effects, drift: rest(left_over, dimension), in_noise)
+    left = rest(left_over, dimension)
+    if only:
+        shares = np.isin(np.arange(BLOCKS), only) * BLOCKS / len(only)
+        left = replace(left, squares=left.squares * shares, steady_squares=left.squares * shares)
+    return decide(evidence, lambda effects, drift: left, in_noise)
 
 
 def test_nothing_above_the_noise_is_no_gap():
@@ -91,6 +96,13 @@ def test_what_repeats_beside_an_effect_is_said():
 def test_what_repeats_and_no_effect_explains_is_unknown():
     verdict = decided({NOTHING: fits(5.0), BIAS: fits(4.5)}, left_over=4.0)
     assert (verdict.status, verdict.effects) == ('unknown', ())
+
+
+def test_a_name_that_most_draws_do_not_support_is_not_stated():
+    """What is left is in two blocks: beyond its interval it is nothing, in most draws it is."""
+    candidates = {NOTHING: fits(2.0), BIAS: fits(0.0)}
+    assert decided(candidates, left_over=3.0, only=(3, 30)).status == 'unknown'
+    assert decided(candidates, left_over=1.0, only=(3, 30)).effects == ('bias',)
 
 
 def test_effects_that_explain_less_than_they_leave_are_no_cause():
