@@ -206,7 +206,7 @@ def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> N
                 f'{sim.force.name}: {fault.stated_by(option(sim_unit=fault.symbol))}',
             )
         # A simulator may have the errors of a sensor, but none beyond its tolerance.
-        tolerance = gravity_at_rest.nominal_tolerance(sensor)
+        tolerance = gravity_at_rest.nominal_tolerance(sensor).widest(force_mps2.shape[1])
         fault = gravity_at_rest.look(readings, tolerance, gravity_mps2).fault
         if fault is not None and fault.kind is GravityFaultKind.SCALE:
             raise DataFault(

@@ -117,6 +117,12 @@ class Tolerance:
     scale: np.ndarray  # Relative error of the scale factor, (m,)
     across: float  # Share of the force across an axis that it reads
 
+    def widest(self, axes: int) -> Tolerance:
+        """Return the tolerance of its worst axis for a number of axes."""
+        return Tolerance(
+            np.full(axes, self.zero_g_mps2.max()), np.full(axes, self.scale.max()), self.across
+        )
+
 
 def nominal_tolerance(sensor: Sensor) -> Tolerance:
     """Return the tolerance of a sensor that is read by its nominal values."""
