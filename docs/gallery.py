@@ -111,12 +111,24 @@ class Arm(ForcePath):
         self.modes = {
             'joint1': (self.force(q + 1e-4) - force) / 1e-4,
             'flexible': (self.force(self.turn(1e-5)) - force) / 1e-5,
+            'late_acceleration': -self.acceleration_rate(),
         }
 
     def turn(self, compliance_s2: float) -> np.ndarray:
         """Return the angle of the joint, rad, with links that yield."""
         q = 0.8 * np.sin(6 * CARRIED_S) + 0.1 * np.sin(25 * CARRIED_S)
         return q - compliance_s2 * np.gradient(np.gradient(q, CARRIED_S), CARRIED_S)
+
+    def acceleration_rate(self) -> np.ndarray:
+        """Return how fast the acceleration changes in the world, in the frame, m/s³, (n, 3)."""
+        q = self.turn(0.0)
+        x, _, z = self.force(q).T
+        # Gravity is constant in the world.
+        dx = np.gradient(x * np.cos(q) + z * np.sin(q), CARRIED_S)
+        dz = np.gradient(z * np.cos(q) - x * np.sin(q), CARRIED_S)
+        return np.column_stack(
+            [dx * np.cos(q) - dz * np.sin(q), 0 * q, dx * np.sin(q) + dz * np.cos(q)]
+        )
 
     def force(self, q: np.ndarray) -> np.ndarray:
         """Return the specific force, m/s², (n, 3)."""
@@ -161,6 +173,7 @@ SCENES = {
     'reference_filter': Scene(CARRIED),
     'joint_offset': Scene(SWUNG),
     'flexible_link': Scene(SWUNG),
+    'late_acceleration': Scene(SWUNG),
     'reference_delay': Scene(CARRIED),
     'reference_frame': Scene(CARRIED),
     'bias_walk': Scene(replace(REST, duration_s=1200.0)),

@@ -257,7 +257,8 @@ class RobotPath(ForcePath):
         Force per unit of each error of the robot, at `time_s`, (n, 3).
 
         `joint1` ... per rad, or m, of an offset of a joint. `flexible` per s²: all joints follow
-        their encoders by q − c·d²q/dt², as links that yield to their inertia.
+        their encoders by q − c·d²q/dt², as links that yield to their inertia. `late_acceleration`
+        per s of the time by which the acceleration is later than the attitude.
         """
         smoothed, modes = self._smoothed, {}
         for number in range(len(self._robot.joints)):
@@ -271,7 +272,15 @@ class RobotPath(ForcePath):
             [lag(self.time_s, order)[:, :count] for order in range(3)]
         )
         modes['flexible'] = (self._moved(yielded)[0] - self.motion[0]) / _COMPLIANCE_S2
+        modes['late_acceleration'] = -self._acceleration_rate()
         return modes
+
+    def _acceleration_rate(self) -> np.ndarray:
+        """Return how fast the acceleration changes in the world, in the frame, m/s³, (n, 3)."""
+        force_mps2, rate_radps, _, up = self.motion
+        acceleration_mps2 = force_mps2 - self._gravity_mps2 * up
+        in_frame = CubicSpline(self.time_s, acceleration_mps2)(self.time_s, 1)
+        return np.asarray(in_frame + np.cross(rate_radps, acceleration_mps2))
 
     def errors(self, time_s: np.ndarray, component: int) -> PathErrors:
         """

@@ -43,7 +43,9 @@ class RobotForce(ForcePath):
         super().__init__(time_s, force_mps2)
         self.modes = {
             name: np.roll(force_mps2, k + 1, axis=1)
-            for k, name in enumerate((*(f'joint{n}' for n in range(1, 9)), 'flexible'))
+            for k, name in enumerate(
+                (*(f'joint{n}' for n in range(1, 9)), 'flexible', 'late_acceleration')
+            )
         }
 
 

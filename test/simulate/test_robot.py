@@ -107,6 +107,23 @@ def test_errors_of_the_robot_change_the_force_as_they_say(pendulum):
     )
 
 
+def test_an_acceleration_that_is_later_than_its_attitude(pendulum):
+    """The acceleration of a time before, in the world, is turned into the frame of now."""
+    path, late_s = path_of(pendulum, 250, 0.0), 1e-3
+    time_s, inner = path.time_s, slice(500, -500)
+    q, q_before = swing(time_s)[0], swing(time_s - late_s)[0]
+    gravity = G0_MPS2 * np.column_stack([-np.sin(q_before), 0 * q, np.cos(q_before)])
+    x, _, z = (pendulum_force(*swing(time_s - late_s)) - gravity).T
+    cos, sin = np.cos(q - q_before), np.sin(q - q_before)
+    late = np.column_stack([x * cos - z * sin, 0 * q, x * sin + z * cos])
+    late += G0_MPS2 * np.column_stack([-np.sin(q), 0 * q, np.cos(q)])
+    change = late - pendulum_force(*swing(time_s))
+    assert np.abs(change[inner]).max() > 5e-3
+    assert path.modes['late_acceleration'][inner] * late_s == pytest.approx(
+        change[inner], abs=1e-3
+    )
+
+
 def test_rotation_and_angles_of_a_stage(pendulum):
     path, time_s = path_of(pendulum, 250, 0.0), np.arange(2, 38, 0.01)
     q, rate, acceleration = swing(time_s)

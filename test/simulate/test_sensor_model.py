@@ -31,6 +31,7 @@ STAGE = {
     'stage_offset',
     'joint_offset',
     'flexible_link',
+    'late_acceleration',
 }
 CLOCK = {'clock_skew', 'time_offset'}
 NOISE = {'bias_walk', 'flicker', 'noise_excess', 'spikes', 'stuck'}

@@ -491,6 +491,30 @@ def flexible_link(signals: Signals, p: Parameters) -> None:
     _add_mode(signals, 'flexible', p['compliance_s2'])
 
 
+@effect(
+    Place.REFERENCE,
+    Parameter(
+        'offset_s',
+        's',
+        -0.05,
+        0.05,
+        2e-3,
+        'practice: one step of a simulator',
+        'time by which the acceleration of the readings is later than their attitude',
+        '',
+    ),
+    needs=(Need.ROBOT,),
+    cause='The readings join the acceleration of one time to the attitude of another, as a '
+    'simulator does that differentiates a velocity, or a filter of the acceleration alone.',
+    diagnosis=DiagnosisHints(
+        revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,), proof=(ProofVariable.FORCE_RATE,)
+    ),
+)
+def late_acceleration(signals: Signals, p: Parameters) -> None:
+    """Late acceleration: R(t)·(a(t − offset) + g), to first order."""
+    _add_mode(signals, 'late_acceleration', p['offset_s'])
+
+
 def _add_mode(signals: Signals, name: str, size: float) -> None:
     """Add a multiple of what an error of a robot adds to the force."""
     if size and name in signals.modes:
