@@ -224,28 +224,29 @@ def _align_force(
     """
     force, notes = sim.force, []
     assert isinstance(force, ForcePath)
-    late_s = _find_shift(recording, sensor, force)
-    _check_step(recording, sensor, force, late_s or 0.0)
-    _check_one_shift(recording, sensor, force)
+    align, late_s = option(align=True), 0.0
+    motions = _motions(recording, sensor, force)
+    if motions is not None:
+        late_s = _find_shift(motions, recording, sensor, force)
+        _check_step(motions, recording, force, late_s)
+        _check_one_shift(motions, recording, force)
     shift = f'{abs(late_s):.4f} s {"late" if late_s > 0 else "early"}' if late_s else ''
     if late_s and may_shift:
         force = force.shifted(-late_s)
         notes = [
-            f'{option(align=True)}: {force.name} was {shift}, and is shifted by '
-            f'{-late_s:+.6g} s; a '
-            'latency of the sensor is a part of that and cannot show'
+            f'{align}: {force.name} was {shift}, and is shifted by '
+            f'{-late_s:+.6g} s; a latency of the sensor is a part of that and cannot show'
         ]
     elif may_shift:
         notes = [
-            f'{option(align=True)}: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may '
-            'be an '
-            'effect of the sensor (time_offset), and nothing is shifted'
+            f'{align}: no shift beyond {LARGEST_LATENCY_S:g} s was found; less may '
+            'be an effect of the sensor (time_offset), and nothing is shifted'
         ]
     covered, begin_s, end_s = _covered(recording, force)
     span = f'it is from {begin_s:.6g} to {end_s:.6g} s'
     if not len(covered):
         advice = (
-            f'its motion fits, but is {shift}; use {option(align=True)}'
+            f'its motion fits, but is {shift}; use {align}'
             if shift
             else 'no shift makes its motion fit; give that of this recording'
         )
@@ -258,8 +259,7 @@ def _align_force(
     if late_s and not may_shift:
         raise DataFault(
             'time_misaligned',
-            f'{force.name} is {shift}; use {option(align=True)}, or shift its stamps by '
-            f'{-late_s:+.6g} s',
+            f'{force.name} is {shift}; use {align}, or shift its stamps by {-late_s:+.6g} s',
         )
     if len(covered) < len(recording):
         outside_s = (1 - len(covered) / len(recording)) * float(np.ptp(recording.time_s))
@@ -475,11 +475,8 @@ def _drift_fault(drift: _Drift, recording: Recording, force: ForcePath) -> DataF
     )
 
 
-def _check_one_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> None:
+def _check_one_shift(motions: _Motions, recording: Recording, force: ForcePath) -> None:
     """Refuse motions whose parts fit at different shifts only: a clock drifts or steps."""
-    motions = _motions(recording, sensor, force)
-    if motions is None:
-        return
     parts = motions.fitting_parts()
     drift = _find_drift(motions, parts)
     if drift is not None:
@@ -496,28 +493,27 @@ def _check_one_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> 
     before_s, after_s = (
         max(level, key=lambda part: float(part.correlation.max())).late_s for level in levels[:2]
     )
-    raise _step_fault(force, after_s - before_s, _time_of_step(motions, before_s, after_s))
+    raise _step_fault(force, motions, before_s, after_s)
 
 
-def _step_fault(force: ForcePath, step_s: float, at_s: float) -> DataFault:
+def _step_fault(force: ForcePath, motions: _Motions, before_s: float, after_s: float) -> DataFault:
+    """Return the fault of a clock that steps from one shift to another, with size and time."""
     return DataFault(
         'clock_jump',
-        f'the clock of {force.name} or that of the recording steps by {abs(step_s):.2g} s at '
-        f'about {at_s:.4g} s; cut the recording there, and diagnose each part with '
-        f'{option(align=True)}',
+        f'the clock of {force.name} or that of the recording steps by '
+        f'{abs(after_s - before_s):.2g} s at about '
+        f'{_time_of_step(motions, before_s, after_s):.4g} s; cut the recording there, '
+        f'and diagnose each part with {option(align=True)}',
     )
 
 
-def _check_step(recording: Recording, sensor: Sensor, force: ForcePath, about_s: float) -> None:
+def _check_step(motions: _Motions, recording: Recording, force: ForcePath, about_s: float) -> None:
     """
     Refuse motions whose shift steps by some seconds at most, wherever it does.
 
     A step shows if two shifts leave far less than one, and than shifts that drift. It needs no
     whole parts on both sides: a recording may move for some seconds only before its step.
     """
-    motions = _motions(recording, sensor, force)
-    if motions is None:
-        return
     # What all shifts can be compared in, without gaps
     begin_s, end_s = motions.stated_s[[0, -1]] - about_s + np.array([1, -1]) * _LARGEST_STEP_S
     inside = (motions.measured_s > begin_s) & (motions.measured_s < end_s)
@@ -545,8 +541,7 @@ def _check_step(recording: Recording, sensor: Sensor, force: ForcePath, about_s:
     left_g2 = motions.left_g2(np.where(rows < first, before_s, after_s))
     explains = left_g2 < _LARGEST_ERROR_RATIO * min(motions.left_g2(one_s), drift_g2)
     if explains and abs(after_s - before_s) > _SMALLEST_STEP_S:
-        at_s = _time_of_step(motions, before_s, after_s)
-        raise _step_fault(force, after_s - before_s, at_s)
+        raise _step_fault(force, motions, before_s, after_s)
 
 
 def _first_row_behind(motions: _Motions, one_s: float, near_s: np.ndarray) -> int:
@@ -585,15 +580,14 @@ def _unexplained(measured: np.ndarray, stated: np.ndarray) -> float:
     return left
 
 
-def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> float | None:
+def _find_shift(
+    motions: _Motions, recording: Recording, sensor: Sensor, force: ForcePath
+) -> float:
     """
     Return how much later a simulator is stamped, s, by the cross-correlation of both motions.
 
-    None where it may be a latency, or does not show.
+    0 where it may be a latency, or does not show.
     """
-    motions = _motions(recording, sensor, force)
-    if motions is None:
-        return None
     shortest_s = min(SHORTEST_S, np.ptp(recording.time_s) / 2, np.ptp(force.time_s) / 2)
     every = np.arange(len(motions.measured_s))
     shifts = motions.shifts(every, max(round(shortest_s / motions.step_s), 2))
@@ -605,9 +599,9 @@ def _find_shift(recording: Recording, sensor: Sensor, force: ForcePath) -> float
     overlaps_unshifted = abs(lags_s[unshifted]) < motions.step_s
     gains_little = 1 - correlation[best] > _LARGEST_ERROR_RATIO * (1 - correlation[unshifted])
     if correlation[best] < _CORRELATED or (overlaps_unshifted and gains_little):
-        return None
+        return 0.0
     late_s = _fine_shift(recording, sensor, force, float(lags_s[best]))
-    return late_s if abs(late_s) > LARGEST_LATENCY_S else None
+    return late_s if abs(late_s) > LARGEST_LATENCY_S else 0.0
 
 
 def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: float) -> float:
