@@ -359,10 +359,8 @@ class _FlatReader:
         if kind == 'np.ndarray':
             value = self._numbers(key, value, axes)
         elif kind.startswith('tuple'):
-            # A node has an empty list where nothing is given, and the list of its file where other
-            # axes are given than those of the file: then nothing is stated.
-            values = self._numbers(key, value).tolist()
-            value = tuple(values) if len(values) == len(axes) else ()
+            # A node has an empty list where nothing is given.
+            value = tuple(self._numbers(key, value, axes if value else '').tolist())
         elif kind == 'float':
             value = self._numbers(key, [value])[0].item()
         else:

@@ -374,6 +374,11 @@ class Sensor:
         return self.values.get(effect, {}).get(parameter, np.zeros(len(self.axes)))
 
 
+def without_self_test(sensor: Sensor) -> Sensor:
+    """Return a sensor of which nothing states the self-test, as that of a part with other axes."""
+    return replace(sensor, self_test_g=(), self_test_lower_g=(), self_test_upper_g=())
+
+
 def with_axes(sensor: Sensor, axes: str) -> Sensor:
     """
     Give a nominal sensor the axes of a stream.
@@ -397,12 +402,10 @@ def with_axes(sensor: Sensor, axes: str) -> Sensor:
                 f'file for {axes}'
             )
         changed[name] = np.array([*values, *[values[0]] * 3])[: len(axes)]
-    # Another part has another self-test.
-    changed |= dict.fromkeys(('self_test_g', 'self_test_lower_g', 'self_test_upper_g'), ())
     if len(axes) > len(sensor.axes):
         # A part with more axes has another datasheet.
         changed |= {'datasheet_name': '', 'datasheet': {}}
-    return replace(sensor, axes=axes, **changed)
+    return replace(without_self_test(sensor), axes=axes, **changed)
 
 
 def to_volts(accel_mps2: np.ndarray, sensor: Sensor) -> np.ndarray:

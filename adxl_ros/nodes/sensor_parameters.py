@@ -10,7 +10,7 @@ from typing import Any
 from adxl_ros.files import parameter_file
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import Sensor, without_self_test
 from adxl_ros.nodes.parameters import declare, given_parameters, Kind, show, Spec
 from adxl_ros.nodes.params_files import parameter_error
 from rclpy.node import Node
@@ -34,15 +34,24 @@ def declare_sensor(node: Node) -> dict[str, Any]:
     Where `format` is given the parameters come from a parameter file, and `make_sensor` refuses
     what the file lacks. Otherwise the installed nominal sensor gives the default values.
     """
-    specs = sensor_specs() if is_from_file(node) else nominal_specs()
+    axes = given_parameters(node).get('sensor.axes', '')
+    specs = sensor_specs() if is_from_file(node) else nominal_specs(axes)
     flat = {spec.name: declare(node, spec) for spec in specs}
     return {name: value for name, value in flat.items() if value is not None}
 
 
-def nominal_specs() -> list[Spec]:
-    """Return the parameters of a sensor, with the values of the nominal one as defaults."""
-    nominal = parameter_file.to_flat(parameter_file.load(parameter_file.nominal_path()))
-    return [spec._replace(default=nominal.get(spec.name, spec.default)) for spec in sensor_specs()]
+def nominal_specs(axes: str = '') -> list[Spec]:
+    """
+    Return the parameters of a sensor, with the values of the nominal one as defaults.
+
+    axes: those that are given, '' for those of the nominal sensor; others have no default of a
+    self-test.
+    """
+    nominal = parameter_file.load(parameter_file.nominal_path())
+    if axes not in ('', nominal.axes):
+        nominal = without_self_test(nominal)
+    flat = parameter_file.to_flat(nominal)
+    return [spec._replace(default=flat.get(spec.name, spec.default)) for spec in sensor_specs()]
 
 
 def is_from_file(node: Node) -> bool:
