@@ -287,11 +287,11 @@ def fit(
         several = list(several)
         at_rest = _Unit(sensor, robot, means)
         blocks = at_rest.thermal_blocks(several)
-        if blocks is not None and prior:
-            raise UserError(
-                f'{option(prior=prior)}: a fit over temperature takes none; leave it out'
-            )
         if blocks is not None:
+            if prior:
+                raise UserError(
+                    f'{option(prior=prior)}: a fit over temperature takes none; leave it out'
+                )
             progress(_READING, 'fit')
             return _fit_over_temperature(at_rest, blocks, data_sha256)
     recorded = []

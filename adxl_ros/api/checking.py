@@ -129,7 +129,7 @@ class Check(Result):
         """
         require_own(Path(folder) / words.PAGE, overwrite)
         path = make_folder(folder) / words.PAGE
-        write_text(path, words.page(self.recordings))
+        write_text(path, words.page(self.recordings, self.first_screen._asdict()))
         return path
 
 
@@ -191,11 +191,16 @@ def check(
     if against is not None:
         before = _stored(against)
         found = check_recording(before, stated, reading)
+        samples = _samples(before, reading)
+        earlier, faults = Earlier(found, samples, stated), found.faults
         if robot:
-            found = _with_what_shows(found, before, sensor, robot, reading)
-        earlier = Earlier(found, _samples(before, reading), stated)
-        doubt = '' if found.is_sound else f', not sound: {found.faults[0]}'
-        compared_with = f'{_path(before)}{doubt}'
+            try:
+                robot.path(samples, sensor_of(sensor, samples).sensor)
+            except UserError as error:
+                faults = (*faults, one_line(error))
+        compared_with = _path(before)
+        if faults:
+            compared_with += f', not sound: {faults[0]}'
     results = []
     for number, each in enumerate(several):
         name = Path(_path(each)).name

@@ -105,9 +105,8 @@ class Update(Result):
         """Write the page report.html into a folder, and return its path."""
         require_own(Path(folder) / words.PAGE, overwrite)
         path, top = make_folder(folder) / words.PAGE, self.first_screen
-        badge = {'colour': top.colour, 'word': top.word, 'sentence': top.sentence}
         tiles = [dict(zip(('label', 'text', 'note'), tile)) for tile in top.tiles]
-        write_text(path, words.page(self.sensor, self.days, self.state, badge, tiles))
+        write_text(path, words.page(self.sensor, self.days, self.state, top._asdict(), tiles))
         return path
 
     def to_dict(self) -> dict[str, Any]:

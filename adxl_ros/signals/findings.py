@@ -122,8 +122,10 @@ def examine(
         if gyro is not None:
             gyro.feed(block)
         for name, values in block.columns.items():
+            if name not in REFERENCES:
+                continue
             read = values[np.isfinite(values)]
-            if name in REFERENCES and len(read):
+            if len(read):
                 references.setdefault(name, _Reference()).feed(read)
     gravity = look.gravity()
     rests = look.rests.detected

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 import textwrap
@@ -152,14 +152,8 @@ def _gyro_text(gyro: GyroFindings) -> str:
     return f'gyroscope at rest {bias} °/s; {turns}'
 
 
-def page(results: Sequence[Findings]) -> str:
-    """Return the page of a check."""
-    is_sound = all(result.is_sound for result in results)
-    badge = {
-        'colour': 'green' if is_sound else 'red',
-        'sentence': sentence(results),
-        'word': 'Sound.' if is_sound else 'Not sound.',
-    }
+def page(results: Sequence[Findings], badge: Mapping[str, Any]) -> str:
+    """Return the page of a check; badge is its top."""
     recordings = [
         {'path': result.path, 'entries': _entries(result), 'shows': result.shows}
         for result in results

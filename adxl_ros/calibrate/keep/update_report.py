@@ -46,7 +46,7 @@ def page(
     sensor: Sensor,
     days: Sequence[UpdatedDay],
     state: KeptState,
-    badge: Mapping[str, str],
+    badge: Mapping[str, Any],
     tiles: Sequence[Mapping[str, str]],
 ) -> str:
     """Return the page; badge and tiles are its top."""
