@@ -408,16 +408,12 @@ def _at_rest(
             rows = (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
             output = output_mps2[rows & finite]
             stated = np.array(motion.force(time_s[rows & finite])[: output.shape[1]]).T
+            scatter, left = output.var(axis=0).mean(), (output - stated).var(axis=0).mean()
             # A sensor that always moves has no quiet part that would show what moves.
-            at_rest |= rows & (_scatter(output - stated) > _MOVED * _scatter(output))
+            at_rest |= rows & (left > _MOVED * scatter)
         return at_rest
     rates = [motion.alpha(time_s, 1), motion.beta(time_s, 1), motion.shift(time_s, 2)]
     return time_since_move_s(time_s, rates) > SETTLING_S
-
-
-def _scatter(values: np.ndarray) -> float:
-    """Return the mean square of values, (n, m), about their means."""
-    return float(np.mean(np.var(values, axis=0)))
 
 
 def direction_of_last_move(rate: np.ndarray, smallest: float = _REST_RATE) -> np.ndarray:

@@ -255,7 +255,8 @@ def _plots(
         drifts = [drift for drift in sensor.drifts if drift.result.quantity.is_noise == is_noise]
         measured = [result for result in kind if result.place_of(sensor.number) is not None]
         shown = [drift.result for drift in drifts] or measured
-        plots += [_Plot(sensor, result, drifts) for result in shown[:1]]
+        if shown:
+            plots.append(_Plot(sensor, shown[0], drifts))
     return sorted(plots, key=lambda plot: not plot.drifts)[:_SHOWN]
 
 

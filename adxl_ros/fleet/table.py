@@ -51,9 +51,8 @@ _TEXTS = [
 _OTHERS = ['date', 'effects', 'calibration_age_days', 'gap_floor_mps2']
 """Columns that the page uses, beside those of the quantities."""
 _YEAR = np.timedelta64(31_557_600_000_000, 'us')  # A year of 365.25 days
-TOLERANCE_MG = (
-    3.5  # Largest gap of a sensor that is in order, mg. Chosen: an error of 0.2° in tilt
-)
+TOLERANCE_MG = 3.5
+"""Largest gap of a sensor that is in order, mg. Chosen: an error of 0.2° in tilt."""
 MG = mg(1.0)  # Milli-g in 1 m/s²
 
 
@@ -63,7 +62,7 @@ class Quantity:
 
     column: str  # Column of its value; the quantity is named by it
     label: str  # Its name for people
-    shown_unit: str  # Sensor on the page
+    shown_unit: str  # Unit on the page
     factor: float  # Factor from the column's unit to that of the page
     # Column of its standard deviation, or columns of both ends of its 90 % interval
     error_columns: tuple[str, ...]
@@ -380,9 +379,9 @@ def _state_of(sensor: int, table: FleetTable, results: Sequence[QuantityResult])
         reason = f'{drift.text}: out of tolerance ' + (
             f'in {number(drift.days, digits=2)} days.' if drift.days else 'now.'
         )
-    elif any(drift.is_rising_noise for drift in drifts):
+    elif rising := [drift.text for drift in drifts if drift.is_rising_noise]:
         state, urgency = State.DRIFTS, _FARTHEST_DAYS
-        reason = f'{next(drift.text for drift in drifts if drift.is_rising_noise)}.'
+        reason = f'{rising[0]}.'
     elif series:
         state, urgency = State.NOT_JUDGED, -series
         reason = (

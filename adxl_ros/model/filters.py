@@ -158,7 +158,9 @@ def _weights(z: complex, order: int) -> np.ndarray:
     return np.array([np.dot(c[::-1], moments) for c in lagrange])
 
 
-_MOST_TURNS = 0.5  # Largest share of the inputs at which one turns, for a play by them; chosen
+_MOST_TURNS = 0.5
+"""Largest share of the inputs at which one turns, for a play by these alone. Chosen: with more,
+all inputs cost no more."""
 _THRESHOLDS = (0.25, 0.5, 0.75, 1.0)  # Of stop operators, by the reach; chosen: four equal
 
 

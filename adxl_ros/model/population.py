@@ -34,9 +34,8 @@ class PooledCoefficient:
     # spread_low, spread_high: 90 % interval of the spread
     spread_low: float
     spread_high: float
-    prediction_std: (
-        float  # Standard deviation of the coefficient of a further sensor about the mean
-    )
+    # Standard deviation of the coefficient of a further sensor about the mean
+    prediction_std: float
     units: int  # Number of sensors
 
 

@@ -76,7 +76,11 @@ class ReadingUnit:
     conversion: str = ''  # What converts it
     # Options that state it, in place of a conversion
     options: Mapping[str, Any] = field(default_factory=dict, compare=False)
-    symbol: str = ''  # Its name in options and parameters; empty where they do not have it
+
+    @property
+    def symbol(self) -> str:
+        """Name of the unit in options and parameters; '' where it alone does not state it."""
+        return self.options.get('unit', '') if len(self.options) == 1 else ''
 
     @property
     def remedy(self) -> str:
@@ -88,14 +92,14 @@ _COUNTS_PER_G = [2**k for k in range(6, 19)]
 """Counts of 1 g of digital sensors: from 6 bits of ±2 g to 20 bits of ±2 g, by powers of two."""
 
 UNITS = (
-    ReadingUnit('g', 1.0, options={'unit': 'g'}, symbol='g'),
-    ReadingUnit('mg', 1e3, options={'unit': 'mg'}, symbol='mg'),
-    ReadingUnit('mm/s²', 1e3 * G0_MPS2, options={'unit': 'mmps2'}, symbol='mmps2'),
+    ReadingUnit('g', 1.0, options={'unit': 'g'}),
+    ReadingUnit('mg', 1e3, options={'unit': 'mg'}),
+    ReadingUnit('mm/s²', 1e3 * G0_MPS2, options={'unit': 'mmps2'}),
     ReadingUnit('cm/s²', 1e2 * G0_MPS2, 'divide the readings by 100'),
     ReadingUnit('ft/s²', G0_MPS2 / 0.3048, 'multiply the readings by 0.3048'),
     ReadingUnit('m/s² divided by 1000', 1e-3 * G0_MPS2, 'multiply the readings by 1000'),
     ReadingUnit('g divided by 1000', 1e-3, f'multiply the readings by {1e3 * G0_MPS2:g}'),
-    ReadingUnit('m/s² that were stated as g', G0_MPS2**2, options={'unit': 'mps2'}, symbol='mps2'),
+    ReadingUnit('m/s² that were stated as g', G0_MPS2**2, options={'unit': 'mps2'}),
     *(
         ReadingUnit(
             f'counts of {count} per g', float(count), options={'unit': 'lsb', 'lsb_per_g': count}
@@ -574,7 +578,7 @@ class _Case:
         zero_g_mps2 = self._sphere_middle_mps2(prior=0.0)
         about_mps2 = np.linalg.norm(self.readings.mean_mps2 - zero_g_mps2, axis=1)
         is_sphere = len(about_mps2) > len(zero_g_mps2) + 1 and np.allclose(
-            about_mps2, self.gravity_mps2, rtol=float(self.tolerance.scale.max())
+            about_mps2, self.gravity_mps2, rtol=self.tolerance.scale.max()
         )
         if not is_sphere:
             return ''

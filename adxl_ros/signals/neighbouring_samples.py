@@ -242,15 +242,15 @@ class NeighbouringSamples:
         if not 0 < len(self._jumps) <= _MOST_TURNS:
             return ''
         jump = self._jumps[0]
-        text = f'the readings jump by {jump.size_mps2 / G0_MPS2:.3g} g at {jump.time_s:.6g} s'
+        what = (
+            'one steady value to another, faster than a sensor turns: it was turned over, '
+            'exchanged or read in another way'
+        )
         if jump.is_held:
-            return (
-                f'{text} from or to a reading that is repeated: the driver or the bus stood '
-                'still; use the parts'
-            )
+            what = 'or to a reading that is repeated: the driver or the bus stood still'
         return (
-            f'{text} from one steady value to another, faster than a sensor turns: it was '
-            'turned over, exchanged or read in another way; use the parts'
+            f'the readings jump by {jump.size_mps2 / G0_MPS2:.3g} g at {jump.time_s:.6g} s from '
+            f'{what}; use the parts'
         )
 
     def _find_spikes(self, time_s: np.ndarray, samples: np.ndarray) -> None:

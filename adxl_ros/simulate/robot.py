@@ -280,7 +280,7 @@ class RobotPath(ForcePath):
         force_mps2, rate_radps, _, up = self.motion
         acceleration_mps2 = force_mps2 - self._gravity_mps2 * up
         in_frame = CubicSpline(self.time_s, acceleration_mps2)(self.time_s, 1)
-        return np.asarray(in_frame + np.cross(rate_radps, acceleration_mps2))
+        return in_frame + np.cross(rate_radps, acceleration_mps2)
 
     def errors(self, time_s: np.ndarray, component: int) -> PathErrors:
         """

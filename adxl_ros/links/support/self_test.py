@@ -176,10 +176,9 @@ class EmulatedLine:
     """The self-test of a simulated sensor, which ends by itself."""
 
     def __init__(self, sensor: Sensor) -> None:
-        typical_g = sensor.self_test_g
-        step_g = np.mean(
-            [typical_g or sensor.self_test_lower_g, typical_g or sensor.self_test_upper_g], axis=0
-        )
+        step_g = np.array(sensor.self_test_g)
+        if not len(step_g):
+            step_g = np.mean([sensor.self_test_lower_g, sensor.self_test_upper_g], axis=0)
         self.has_step = len(step_g) > 0  # Whether the parameters state what it does
         self._step_v = step_g * sensor.scale_v_per_g if self.has_step else np.zeros(1)
         self._rc_s = max(sensor.rc_s, _SHORTEST_RC_S)
@@ -193,9 +192,11 @@ class EmulatedLine:
 
     def add(self, time_s: np.ndarray, volts: np.ndarray) -> np.ndarray:
         """Add the step to samples at times, s, in place, (n, m); return which are marked, (n,)."""
+        settling_s = max(SETTLING_S, 2 * _TIME_CONSTANTS * self._rc_s)
+        if not len(time_s) or time_s[0] >= self._off_s + settling_s:
+            return np.zeros(len(time_s), bool)
         on_s = np.clip(time_s, self._on_s, self._off_s) - self._on_s
         off_s = np.maximum(time_s - self._off_s, 0.0)
         level = (1 - np.exp(-on_s / self._rc_s)) * np.exp(-off_s / self._rc_s)
         volts += np.outer(level, self._step_v)
-        settling_s = max(SETTLING_S, 2 * _TIME_CONSTANTS * self._rc_s)
         return (time_s >= self._on_s) & (off_s < settling_s)

@@ -434,6 +434,10 @@ def reference_filter(signals: Signals, p: Parameters) -> None:
         )
 
 
+_OF_FAST_MOTION = DiagnosisHints(
+    revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,), proof=(ProofVariable.FORCE_RATE,)
+)
+"""Hints of the errors of a robot that grow with its speed."""
 ROBOT_JOINTS = 8
 """Joints of a robot whose offsets are errors of their own; chosen: an arm has six or seven."""
 
@@ -482,9 +486,7 @@ def joint_offset(signals: Signals, p: Parameters) -> None:
     needs=(Need.ROBOT,),
     cause='The links or gears of the robot yield to their own inertia; move more slowly, or '
     'model them.',
-    diagnosis=DiagnosisHints(
-        revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,), proof=(ProofVariable.FORCE_RATE,)
-    ),
+    diagnosis=_OF_FAST_MOTION,
 )
 def flexible_link(signals: Signals, p: Parameters) -> None:
     """Flexible links of a robot: its joints follow their encoders by q − c·d²q/dt²."""
@@ -506,9 +508,7 @@ def flexible_link(signals: Signals, p: Parameters) -> None:
     needs=(Need.ROBOT,),
     cause='The readings join the acceleration of one time to the attitude of another, as a '
     'simulator does that differentiates a velocity, or a filter of the acceleration alone.',
-    diagnosis=DiagnosisHints(
-        revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,), proof=(ProofVariable.FORCE_RATE,)
-    ),
+    diagnosis=_OF_FAST_MOTION,
 )
 def late_acceleration(signals: Signals, p: Parameters) -> None:
     """Late acceleration: R(t)·(a(t − offset) + g), to first order."""
