@@ -21,7 +21,7 @@ from adxl_ros_validation.blind.report import markdown_table
 from adxl_ros_validation.kept_robots import kept_row, KINDS, knock_row, KNOCKED, KNOCKS_MG, run
 
 KEPT_HEAD = ('robots', 'tilt error (rms)', 'inside, % x y z', 'worse', 'false')
-KNOCK_HEAD = ('knock', 'size', 'within a day', 'ever', 'adopted after')
+KNOCK_HEAD = ('knock', 'size', 'within a day', 'ever', 'learnt')
 
 
 def main() -> int:
