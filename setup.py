@@ -81,6 +81,7 @@ setup(
             'calibrate/report/*.xml',
             'diagnose/*.html',
             'files/export_templates/*',
+            'fleet/*.csv',
             'fleet/*.html',
             'report/page_templates/*',
             'signals/*.html',
