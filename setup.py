@@ -83,6 +83,7 @@ setup(
             'files/export_templates/*',
             'fleet/*.csv',
             'fleet/*.html',
+            'investigate/*.yaml',
             'report/page_templates/*',
             'signals/*.html',
         ],
