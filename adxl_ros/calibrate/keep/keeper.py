@@ -250,7 +250,9 @@ class Keeper:
             # Less axes do not show which side is up: the one that departs most.
             largest = int(np.abs(departure_g).argmax())
             axis, along_g = self._kept.sensor.axes[largest], float(departure_g[largest])
-        if self._is_rejected(axis, along_g, found.plausibility, rest.start_ns):
+        is_rejected = self._is_rejected(axis, along_g, found.plausibility, rest.start_ns)
+        if is_rejected or self._knocked:
+            # After a knock, rests in other directions would show it as a drift.
             self._stay = None
             return
         low, high = self._temperatures_c
@@ -433,13 +435,18 @@ class Keeper:
     @property
     def changed(self) -> str:
         """Return what has changed beyond age and temperature, '' if nothing has."""
-        for axis, rejection in self._rejections.items():
-            if rejection.is_change:
-                return (
-                    f'changed: {1e3 * rejection.size_g:+.2g} mg on {axis} since '
-                    f'{utc(rejection.since_ns):%A %Y-%m-%dT%H:%MZ}: knocked, or broken?'
-                )
+        for axis in self._knocked:
+            rejection = self._rejections[axis]
+            return (
+                f'changed: {1e3 * rejection.size_g:+.2g} mg on {axis} since '
+                f'{utc(rejection.since_ns):%A %Y-%m-%dT%H:%MZ}: knocked, or broken?'
+            )
         return self._unexplained
+
+    @property
+    def _knocked(self) -> list[str]:
+        """Return the axes with a change of the sensor."""
+        return [axis for axis, found in self._rejections.items() if found.is_change]
 
     def state(self, now_ns: int, temperature_c: float | None = None) -> KeptState:
         """Return what is known at a time and a temperature; by default, that of the last rest."""
