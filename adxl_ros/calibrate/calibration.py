@@ -420,8 +420,8 @@ def _against_gravity(
     force = np.column_stack(signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment))
     budgets = acceptance.gravity_error_budgets(fit, fitted, force, kept)
     assessment = acceptance.assess('gravity', budgets, fitted, fit.converged and not doubts)
-    if fit.step.left_out:
-        determined = [name not in fit.step.left_out for name in fitted.covariance_names]
+    if fit.rung.left_out:
+        determined = [name not in fit.rung.left_out for name in fitted.covariance_names]
         assessment = acceptance.with_open(
             assessment,
             acceptance.gravity_error_budgets(

@@ -260,7 +260,7 @@ def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:
     low, high = unseen.interval
     lines = [
         f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before.rms:.2f}, '
-        f'{fit.step.text} {after.rms:.3f}, held-out stretches of time {unseen.rms:.3f} '
+        f'{fit.rung.text} {after.rms:.3f}, held-out stretches of time {unseen.rms:.3f} '
         f'({low:.3f} to {high:.3f}), {unseen.largest:.3f} max'
     ]
     if fit.outliers:
