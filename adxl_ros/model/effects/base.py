@@ -280,8 +280,8 @@ class Signals:
 class Coefficient:
     """A parameter of an effect, for one axis; as text it is `effect.parameter.axis`."""
 
-    effect: str
-    parameter: str
+    effect: str  # Name of the effect
+    parameter: str  # Name of its parameter, whose unit it has
     axis: str = ''  # Empty for a parameter without axes, and for all axes of a parameter
 
     @classmethod
