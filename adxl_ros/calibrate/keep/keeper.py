@@ -10,7 +10,9 @@ the temperature. A robot that also rests on its sides shows more.
 
 A calibration is adopted when stays that were held out of the estimate fit it better than the one
 in use, and if age and temperature explain the change. A rest that neither explains is not learnt.
-Several of them with the same side up are a change of the sensor, which is reported.
+Several of them with the same side up, or one that is as improbable, are a change of the sensor.
+It is reported, and nothing is learnt any more. Of an axis that no rest has up or down, which would
+not show it, the slope over temperature alone is adopted.
 """
 
 from __future__ import annotations
