@@ -33,6 +33,7 @@ _JERK_S = 0.3  # Time in which an acceleration begins or ends
 _SLOPE_RAD = np.radians(3.0)  # Of the ground, rms
 _VIBRATION_MPS2 = np.array([0.2, 0.2, 0.6])  # Rms at 1 m/s and faster
 _VIBRATION_HZ = (5.0, 40.0)
+_STANDS_MPS = 0.05
 _GYRO_NOISE_RADPS_PER_RTHZ = np.radians(5e-3)
 _GYRO_BIAS_RADPS = np.radians(0.03)  # What the subtraction of the bias leaves, standard deviation
 
@@ -67,50 +68,42 @@ class Drive:
 def drive(kind: Kind, rng: np.random.Generator) -> Drive:
     """Draw a drive."""
     time_s = np.arange(round(_DURATION_S / _STEP_S)) * _STEP_S
-    forward, sideways = np.zeros((2, len(time_s)))
-    begin_s = 5.0
-
-    def hold(values: np.ndarray, value: float, duration_s: float) -> None:
-        nonlocal begin_s
-        values[(begin_s <= time_s) & (time_s < begin_s + duration_s)] = value
-        begin_s += duration_s
-
-    while begin_s < _DURATION_S - 25:
-        speed_mps = rng.uniform(1.0, 3.0)
-        for sign in (1.0, -1.0):
-            accel = rng.uniform(kind.slowest_mps2, kind.fastest_mps2)
-            hold(forward, sign * accel, speed_mps / accel)
-            if sign > 0:
-                begin_s += rng.uniform(1.0, 3.0)
-                side = rng.choice([-1.0, 1.0])
-                turn = side * rng.uniform(kind.slowest_mps2, kind.fastest_mps2)
-                hold(sideways, turn, rng.uniform(1.0, 4.0))
-                begin_s += rng.uniform(1.0, 3.0)
-        begin_s += rng.uniform(2.0, 6.0)
-    ramp = np.full(round(_JERK_S / _STEP_S), _STEP_S / _JERK_S)
-    forward, sideways = (np.convolve(v, ramp, 'same') for v in (forward, sideways))
+    forward, sideways = _accelerations(kind, time_s, rng)
     speed = np.maximum(np.cumsum(forward) * _STEP_S, 0.0)
     way_m = np.cumsum(speed) * _STEP_S
-    tilt = np.array([_slope(way_m, rng), _slope(way_m, rng)])
-    roll, pitch = tilt
-    roll_rate, pitch_rate = np.gradient(tilt, _STEP_S, axis=1)
-    is_driving = speed > 0.01
+    is_driving = speed > _STANDS_MPS
     yaw_rate = np.where(is_driving, sideways / np.maximum(speed, 0.1), 0.0)
-    rate = np.array(
-        [
-            roll_rate - yaw_rate * np.sin(pitch),
-            pitch_rate * np.cos(roll) + yaw_rate * np.sin(roll) * np.cos(pitch),
-            yaw_rate * np.cos(roll) * np.cos(pitch) - pitch_rate * np.sin(roll),
-        ]
+    yaw_pitch_roll = np.column_stack(
+        [np.cumsum(yaw_rate) * _STEP_S, _slope(way_m, rng), _slope(way_m, rng)]
     )
-    # The velocity is along x of the robot, so that it accelerates by its change and by ω × v.
-    accel = np.array([np.gradient(speed, _STEP_S), speed * rate[2], -speed * rate[1]])
-    up = np.array([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
+    attitude = scipy.spatial.transform.Rotation.from_euler('ZYX', yaw_pitch_roll)
+    turns = (attitude[:-1].inv() * attitude[1:]).as_rotvec()
+    rate = np.vstack([turns, turns[-1:]]) / _STEP_S
+    # The velocity is along x of the robot, which turns with it.
+    velocity = np.outer(speed, [1.0, 0.0, 0.0])
+    accel = np.gradient(velocity, _STEP_S, axis=0) + np.cross(rate, velocity)
     band = scipy.signal.butter(2, _VIBRATION_HZ, 'bandpass', fs=1 / _STEP_S, output='sos')
-    shaken = scipy.signal.sosfilt(band, rng.standard_normal((3, len(time_s))))
-    shaken *= (_VIBRATION_MPS2 / shaken.std(axis=1))[:, None] * np.minimum(speed, 1.0)
-    force = accel + G0_MPS2 * up + shaken
-    return Drive(time_s, force.T, rate.T, tilt.T, is_driving)
+    shaken = scipy.signal.sosfilt(band, rng.standard_normal(rate.shape), axis=0)
+    shaken *= _VIBRATION_MPS2 / shaken.std(axis=0) * np.minimum(speed, 1.0)[:, None]
+    force = accel + attitude.inv().apply([0.0, 0.0, G0_MPS2]) + shaken
+    return Drive(time_s, force, rate, yaw_pitch_roll[:, :0:-1], is_driving)
+
+
+def _accelerations(kind: Kind, time_s: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw the acceleration of the wheels forward, and to the left, m/s², (2, n)."""
+    accel, begin_s = np.zeros((2, len(time_s))), 5.0
+    while begin_s < _DURATION_S - 25:
+        speed_mps = rng.uniform(1.0, 3.0)
+        speeds_up, turns, brakes = rng.uniform(kind.slowest_mps2, kind.fastest_mps2, 3)
+        for row, value, duration_s, pause_s in (
+            (0, speeds_up, speed_mps / speeds_up, rng.uniform(1.0, 3.0)),
+            (1, turns * rng.choice([-1.0, 1.0]), rng.uniform(1.0, 4.0), rng.uniform(1.0, 3.0)),
+            (0, -brakes, speed_mps / brakes, rng.uniform(2.0, 6.0)),
+        ):
+            accel[row, (begin_s <= time_s) & (time_s < begin_s + duration_s)] = value
+            begin_s += duration_s + pause_s
+    ramp = np.full((1, round(_JERK_S / _STEP_S)), _STEP_S / _JERK_S)
+    return np.asarray(scipy.signal.convolve(accel, ramp, 'same'))
 
 
 def _slope(way_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
