@@ -58,7 +58,8 @@ class MotionMeasure:
     The force in the plane of x and y shows a vibration by its variance within 0.2 s, and a
     manoeuvre by how much its mean has changed in the last seconds of motion; each as far as it
     exceeds twice the variance of the noise. A constant acceleration across gravity is shown by the
-    length of the force alone, √(g² + a²), which exceeds its errors from some 0.8 m/s² on.
+    length of the force alone, √(g² + a²), which exceeds its errors from √(6·g·σ) on: 0.6 m/s² for
+    an axis with a standard deviation σ of 0.7 mg.
     """
 
     def __init__(self, noise_variance: Sequence[float], gravity_mps2: float) -> None:
