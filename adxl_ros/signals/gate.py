@@ -134,17 +134,17 @@ class Earlier:
         """Return one outcome of another recording for each of `KINDS` but the first."""
         now = _at_rest(read, self._sensor)
         return [
-            _events('gaps', contents, self._contents, 'gaps'),
+            _events('gaps', contents, self._contents),
             _rate(contents, self._contents),
             _noise(now, self._at_rest),
             _zero_g(now, self._at_rest),
-            _events('rests', contents, self._contents, 'rests'),
+            _events('rests', contents, self._contents),
         ]
 
 
-def _events(name: str, new: RecordingContents, old: RecordingContents, field: str) -> Outcome:
+def _events(name: str, new: RecordingContents, old: RecordingContents) -> Outcome:
     """Compare how often something happens, as events of chance; fewer rests are worse."""
-    counts = [int(getattr(each, field)) for each in (new, old)]
+    counts = [int(getattr(each, name)) for each in (new, old)]
     text = ', before '.join(
         f'{count} in {each.span_s:.4g} s' for count, each in zip(counts, (new, old))
     )
@@ -157,7 +157,7 @@ def _events(name: str, new: RecordingContents, old: RecordingContents, field: st
         exposure * value / (1 - value) if value < 1 else np.inf
         for value in (share.low, share.high)
     )
-    is_worse = high < 1 if field == 'rests' else low > 1
+    is_worse = high < 1 if name == 'rests' else low > 1
     return Outcome(name, is_worse, f'{text}: {_ratio(low, high)}', (low, high))
 
 
