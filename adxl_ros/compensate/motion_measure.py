@@ -25,7 +25,7 @@ _MANOEUVRE_S = 2.0
 
 _REST_S = 1.0
 """Time without motion after which a sensor rests, s; chosen: the variance takes as long to forget
-what was before, so that a brake without vibration counts for some 2 s."""
+what was before, so that a brake without vibration counts for 2 to 3 s."""
 
 _PAUSE_S = 1.0
 """Time without a sample after which the variance begins again, s; chosen: some time constants."""

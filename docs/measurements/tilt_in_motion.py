@@ -178,21 +178,21 @@ def main() -> int:
         ]
         parts.append(f'## {name}\n\n{markdown_table(HEAD, rows)}')
         print(parts[-1], flush=True)
-    separator = '\n'
+    tables = '\n\n'.join(parts)
     write_text(
         options.output,
         f"""# Tilt of simulated robots that drive
 
-{date.today()}, version {package_version()}, `docs/measurements/tilt_in_motion.py`, seeds
-{seeds.start} to {seeds.stop - 1}: {options.drives} drives of two minutes, samples at 100 Hz. Error
-of roll and pitch while the robot drives: mean rms of the drives with its 90 % interval, and the
-worst sample. Share of the samples in their 90 % interval.
+{date.today()}, version {package_version()}, `docs/measurements/tilt_in_motion.py`:
+{options.drives} drives of two minutes, seeds {seeds.start} to {seeds.stop - 1}, samples at 100 Hz.
+Error of roll and pitch while the robot drives: mean rms of the drives with its 90 % interval, and the worst sample.
+Then the share of the samples in their 90 % interval.
 
 The robots are those of `driving_robots.py` of the validation. The filter is the class Ekf of
 robot_localization with `launch/ekf.yaml`. *Not raised*: the covariance by noise and calibration
 alone. *Its default noise*: the process noise that robot_localization has where none is given.
 
-{separator.join(parts)}
+{tables}
 """,
     )
     return 0
