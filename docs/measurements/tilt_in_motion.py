@@ -185,8 +185,8 @@ def main() -> int:
 
 {date.today()}, version {package_version()}, `docs/measurements/tilt_in_motion.py`:
 {options.drives} drives of two minutes, seeds {seeds.start} to {seeds.stop - 1}, samples at 100 Hz.
-Error of roll and pitch while the robot drives: mean rms of the drives with its 90 % interval, and the worst sample.
-Then the share of the samples in their 90 % interval.
+Error of roll and pitch while the robot drives: mean rms of the drives with its 90 % interval, and
+the worst sample. Then the share of the samples in their 90 % interval.
 
 The robots are those of `driving_robots.py` of the validation. The filter is the class Ekf of
 robot_localization with `launch/ekf.yaml`. *Not raised*: the covariance by noise and calibration

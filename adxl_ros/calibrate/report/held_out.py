@@ -61,20 +61,20 @@ class PoseErrors:
 
 @dataclass(frozen=True)
 class ErrorStatistic:
-    """Size of one kind of error over all poses; NaN where no pose shows it."""
+    """Size of one kind of error over all poses, in the unit of its field, as `tilt_deg`."""
 
-    rms: float
-    largest: float  # Magnitude
-    interval: tuple[float, float]  # 90 % interval of the rms
+    rms: float  # Root mean square; NaN where no pose shows the error
+    largest: float  # Largest magnitude
+    interval: tuple[float, float]  # Low and high end of the 90 % interval of the rms
 
 
 @dataclass(frozen=True)
 class HeldOutErrors:
     """Errors of one model over held-out poses."""
 
-    model: str
-    tilt_deg: ErrorStatistic
-    accel_mg: ErrorStatistic  # Over the measured axes
+    model: str  # Name of the model
+    tilt_deg: ErrorStatistic  # Tilt, degrees
+    accel_mg: ErrorStatistic  # Acceleration over the measured axes, mg
     errors: PoseErrors  # The errors of all held-out poses
     pose_index: np.ndarray  # Index of each held-out pose among all poses, (k,)
     fitted: tuple[Sensor, ...]  # The fitted sensor of each fold
