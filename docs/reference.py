@@ -210,16 +210,15 @@ READ_FIRST = (
     (
         '`read`, `from_arrays`, `simulate`',
         'Recording',
-        'recording',
         '`time_s`, `columns`, `notes`',
     ),
-    ('`load`', 'Sensor', 'sensor', '`nominal_zero_g_v`, `nominal_scale_v_per_g`, `values`'),
-    ('`fit`', 'Fit', 'fit-1', '`outcome`, `coefficients`, `sensor`, `save`'),
-    ('`update`', 'Update', 'update-1', '`outcome`, `sensor`, `save`'),
-    ('`apply`', 'Corrected', 'corrected', '`force_mps2`, `force_std_mps2`, `columns`, `save`'),
-    ('`diagnose`', 'Gap', 'gap', '`verdict`, `effects`, `figures`, `sensor`, `save`'),
-    ('`check`', 'Check', 'check-1', '`is_sound`, `faults`, `failures`'),
-    ('`noise`', 'Noise', 'noise-1', '`axes`, `tau_s`, `allan_deviation_mps2`, `save`'),
+    ('`load`', 'Sensor', '`nominal_zero_g_v`, `nominal_scale_v_per_g`, `values`'),
+    ('`fit`', 'Fit', '`outcome`, `coefficients`, `sensor`, `save`'),
+    ('`update`', 'Update', '`outcome`, `sensor`, `save`'),
+    ('`apply`', 'Corrected', '`force_mps2`, `force_std_mps2`, `columns`, `save`'),
+    ('`diagnose`', 'Gap', '`verdict`, `effects`, `figures`, `sensor`, `save`'),
+    ('`check`', 'Check', '`is_sound`, `faults`, `failures`'),
+    ('`noise`', 'Noise', '`axes`, `tau_s`, `allan_deviation_mps2`, `save`'),
 )
 """What each verb returns, and what people read of it first."""
 STEPS = ('result', 'diagnosis', 'parts')
@@ -616,7 +615,7 @@ def documented_classes() -> Iterator[str]:
         *block(USAGE, 'python'),
         *table(
             'verb | returns | read first',
-            ((verb, f'[{name}](#{anchor})', what) for verb, name, anchor, what in READ_FIRST),
+            ((verb, f'`{name}`', what) for verb, name, what in READ_FIRST),
         ),
     ]
     for name in VERBS:
