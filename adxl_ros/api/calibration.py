@@ -34,7 +34,7 @@ from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.files.tables import read_pose_table
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.process import option
-from adxl_ros.report.figures import axes_for, AXIS_COLOURS
+from adxl_ros.report.figures import axes_for, AXIS_COLOURS, QUIET_COLOUR
 from adxl_ros.report.quantities import mg
 from adxl_ros.report.screen import Tile
 from adxl_ros.signals.gravity_at_rest import require_unit
@@ -98,7 +98,8 @@ class Fit(Result):
     @property
     def screen(self) -> list[str]:
         """Return the lines of the tool's screen."""
-        fitted, lines = self.sensor, []
+        fitted = self.sensor
+        lines = []
         if not self.is_over_temperature:
             lines = [
                 errors_in_words(fitted),
@@ -203,14 +204,15 @@ class Fit(Result):
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the errors on held-out poses, mg, into axes of matplotlib."""
-        ax, gravity = axes_for(ax), self.result.gravity_fit
+        ax = axes_for(ax)
+        gravity = self.result.gravity_fit
         if gravity is not None:
             ax.plot(mg(gravity.held_out_mps2), 'o', label='magnitude minus gravity')
         elif self.held_out:
             for axis, errors in zip(self.sensor.axes, self.held_out[-1].errors.accel_mps2.T):
                 ax.plot(mg(errors), 'o', label=axis, color=AXIS_COLOURS[axis])
         ax.set(xlabel='held-out pose', ylabel='error of acceleration, mg')
-        ax.axhline(0.0, lw=0.8, color='#7b8794')
+        ax.axhline(0.0, lw=0.8, color=QUIET_COLOUR)
         ax.legend()
         return ax
 
@@ -341,7 +343,9 @@ class _Unit:
     def __init__(
         self, sensor: SensorInput | None, robot: RobotInput | None, has_means: bool
     ) -> None:
-        self._stated, self._robot, self._has_means = sensor, robot, has_means
+        self._stated = sensor
+        self._robot = robot
+        self._has_means = has_means
         self._given: GivenSensor | None = None
         self._paths: list[str] = []
         self.notes: list[str] = []  # Readings beyond the stated range, and what means lack
@@ -430,7 +434,8 @@ class _Rests:
         if sum(ways) > 1:
             raise _one_recording_only()
         self._table = read_pose_table(table) if table else None
-        self._are_rows, self._is_one = are_rows, any(ways)
+        self._are_rows = are_rows
+        self._is_one = any(ways)
         self._records = (
             sweep_journal.poses_to_fit(sweep_journal.read(journal).entries) if journal else None
         )

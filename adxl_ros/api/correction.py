@@ -82,7 +82,8 @@ class Correction:
         self._estimator = RecordingEstimator(self.sensor, first, inverse == 'paper', undo_filter)
         self._counts: Counter[str] = Counter()
         self._beyond = BeyondRange()
-        self._look, self._path = RecordingLook(self.sensor, first), first.path
+        self._look = RecordingLook(self.sensor, first)
+        self._path = first.path
         self._has_gyro = first.gyro_radps is not None
         self._doubts: list[str] = []  # What is wrong with gravity, or between samples
 

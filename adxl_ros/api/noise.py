@@ -64,7 +64,8 @@ class Noise(Result):
     @cached_property
     def sensor(self) -> Sensor:
         """Return the sensor of the parameter file with the measured noise."""
-        stated, name = _sensor(self.result), Path(self.result.path).name
+        stated = _sensor(self.result)
+        name = Path(self.result.path).name
         fresh = noise_parameters.with_noise(stated, self.result.axes, self.result.rest)
         return replace(
             fresh,
@@ -264,7 +265,8 @@ def _terms(axes: Iterable[AxisNoise]) -> dict[str, dict[str, Any]]:
 
 def _sensor(result: RecordingNoise) -> Sensor:
     """Return the sensor of the parameter file, with the axes and rate of the recording."""
-    sensor, unit = result.sensor, result.nominal
+    sensor = result.sensor
+    unit = result.nominal
     if sensor.effects and sensor.axes != unit.axes:
         raise UserError(
             f'{result.path}: has the axes {unit.axes}, but the parameters of '

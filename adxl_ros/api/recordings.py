@@ -269,7 +269,8 @@ def _are_dates(given: Any) -> bool:
 def _since_first(dates: Any) -> tuple[np.ndarray, int]:
     """Return dates as seconds, NaN where missing, since a whole second, and that second in ns."""
     stamps = np.asarray(dates, 'M8[ns]')
-    stamps_ns, is_date = stamps.astype(np.int64), ~np.isnat(stamps)
+    stamps_ns = stamps.astype(np.int64)
+    is_date = ~np.isnat(stamps)
     epoch_ns = int(stamps_ns[is_date][0]) // 10**9 * 10**9 if is_date.any() else 0
     return np.where(is_date, (stamps_ns - epoch_ns) * 1e-9, np.nan), epoch_ns
 

@@ -185,11 +185,13 @@ def write_messages(writer: Any, batches: Sequence[Batch]) -> None:
 
 def _write_chunk(writer: Any, batches: list[Batch]) -> None:
     """Append a chunk with its message indices, which rosbags would write message by message."""
-    storage, chunk = writer.storage, writer.storage.chunk
+    storage = writer.storage
+    chunk = writer.storage.chunk
     indices: dict[int, bytes] = {}
     for connection, stamp_ns, data in batches:
         head = np.zeros(len(data), _MESSAGE_HEAD)
-        head['code'], head['channel'] = _MESSAGE, connection.id
+        head['code'] = _MESSAGE
+        head['channel'] = connection.id
         head['size'] = head.itemsize + data.shape[1] - _RECORD_HEAD.size
         head['log_ns'] = head['publish_ns'] = stamp_ns
         records = np.hstack([head.view(np.uint8).reshape(len(data), -1), data])
@@ -206,7 +208,8 @@ def _write_chunk(writer: Any, batches: list[Batch]) -> None:
     writer.min_timestamp = min(writer.min_timestamp, storage.message_start_time)
     writer.max_timestamp = max(writer.max_timestamp, storage.message_end_time)
     storage.close_chunk()
-    begin, offsets = storage.bio.tell(), b''
+    begin = storage.bio.tell()
+    offsets = b''
     for channel, index in indices.items():
         offsets += _INDEX_OFFSET.pack(channel, storage.bio.tell())
         storage.bio.write(
@@ -271,7 +274,8 @@ class Bag:
             if connection.msgcount
         }
         self.done = 0.0  # Fraction of the recording that has been read
-        self._storages, self._is_packed = storages, is_packed
+        self._storages = storages
+        self._is_packed = is_packed
 
     def pieces(self, topics: Collection[str]) -> Iterator[Piece]:
         """Yield the messages of some topics in pieces, in the order of recording."""
@@ -336,14 +340,16 @@ def import_rosbags() -> Any:
 @contextmanager
 def open_bag(path: AnyPath) -> Iterator[Bag]:
     """Open a rosbag2 directory, or one .mcap or .db3 file."""
-    rosbag2, bag_path = import_rosbags(), Path(path)
+    rosbag2 = import_rosbags()
+    bag_path = Path(path)
     with ExitStack() as stack:
         if (bag_path / 'metadata.yaml').exists():
             with _readable(bag_path):
                 reader = stack.enter_context(rosbag2.Reader(bag_path))
             yield Bag(str(path), reader.storage.storages, reader.compression_mode == 'message', '')
             return
-        storages, cuts = [], []
+        storages = []
+        cuts = []
         for file in _files(bag_path):
             with _readable(file):
                 if file.suffix == '.mcap' and _is_unfinished(file):

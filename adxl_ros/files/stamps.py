@@ -92,7 +92,8 @@ def period_s(time_s: np.ndarray) -> float:
         if not period > 0:
             break
         complete = ~lacks_samples(time_s, period)
-        before, period = period, float(steps_s[complete].mean()) if complete.any() else period
+        before = period
+        period = float(steps_s[complete].mean()) if complete.any() else period
         if period == before:
             break
     return max(period, 0.0)

@@ -38,7 +38,8 @@ class _Quantity:
         self.unknown += int(is_unknown.sum())
         self.missing += int((~is_known & ~is_unknown).sum())
         self.longest_s = float(np.nanmax(held_since_s, initial=self.longest_s))
-        self._last, self._last_s = float(held[-1]), float(time_s[-1] - held_since_s[-1])
+        self._last = float(held[-1])
+        self._last_s = float(time_s[-1] - held_since_s[-1])
         return np.where(is_unknown, self.nominal, held)
 
 

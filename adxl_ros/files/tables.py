@@ -173,7 +173,8 @@ def _open_parquet(path: str) -> Table:
     with _library(path, 'Parquet', 'pyarrow'):
         import pyarrow.parquet
 
-        schema, kinds = pyarrow.parquet.read_schema(path), pyarrow.types
+        schema = pyarrow.parquet.read_schema(path)
+        kinds = pyarrow.types
     units = {
         each.name: each.type.unit
         for each in schema

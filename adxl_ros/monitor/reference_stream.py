@@ -72,7 +72,8 @@ class StreamBuffer:
     """Keeps the newest rows of a stream, in the pieces in which they came; stamps ascend."""
 
     def __init__(self, columns: int, span_ns: int) -> None:
-        self._span_ns, self._rows = span_ns, 0
+        self._span_ns = span_ns
+        self._rows = 0
         # It gives parts without rows their shape.
         self._nothing = np.zeros(0, np.int64), np.zeros((0, columns))
         self._pieces: deque[tuple[np.ndarray, np.ndarray]] = deque()
@@ -131,7 +132,8 @@ class ReferenceStream:
         self.readings = StreamBuffer(3, span_ns)
         self.surroundings = {name: StreamBuffer(1, span_ns) for name in _USUAL}
         self.error_mps2 = np.zeros(3)  # Standard deviation of the newest forces by their source
-        self._held, self._origin_ns = [0.0, 0.0, 0.0], 0
+        self._held = [0.0, 0.0, 0.0]
+        self._origin_ns = 0
         self._paths: list[Path] = [Held(), Held(), Held()]
         self._force: ForcePath
 
@@ -227,7 +229,8 @@ class RobotForce:
     """Turns the joint readings of a robot with a base at rest into the force in one frame."""
 
     def __init__(self, robot: Robot, gravity_mps2: float) -> None:
-        self._robot, self._gravity_mps2 = robot, gravity_mps2
+        self._robot = robot
+        self._gravity_mps2 = gravity_mps2
         self._joints = StreamBuffer(len(robot.joints), _HISTORY_NS)
         self._given_ns = 0  # Newest stamp whose force was returned
 
@@ -277,7 +280,8 @@ def _add_finite(
 ) -> None:
     """Add the finite rows; stamps that jump back by more than a time begin a new stream."""
     finite = np.isfinite(rows).all(axis=1)
-    stamp_ns, newest_ns = stamp_ns[finite], buffer.newest_ns
+    stamp_ns = stamp_ns[finite]
+    newest_ns = buffer.newest_ns
     if len(stamp_ns) and newest_ns is not None and stamp_ns[-1] < newest_ns - longest_ns:
         buffer.clear()
     buffer.add(stamp_ns, rows[finite])
@@ -315,7 +319,9 @@ class Prediction:
             )
         )
         effects = tuple(name for name in sensor.effects if name not in self.left_out)
-        self._sensor, self._reference, self._origin_ns = sensor, reference, 0
+        self._sensor = sensor
+        self._reference = reference
+        self._origin_ns = 0
         self._sensors = [
             noiseless(replace(sensor, effects=effects)),
             noiseless(replace(sensor, effects=(), values={})),

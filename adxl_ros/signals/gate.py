@@ -128,7 +128,8 @@ class Earlier:
     ) -> None:
         if found.contents is None:
             raise UserError(f'{found.path}: {found.faults[0]}')
-        self._contents, self._sensor = found.contents, sensor
+        self._contents = found.contents
+        self._sensor = sensor
         self._at_rest = _at_rest(read, sensor)
 
     def compare(self, contents: RecordingContents, read: Recording) -> list[Outcome]:
@@ -218,7 +219,8 @@ def _at_rest(read: Recording, sensor: Sensor | str | None) -> _AtRest:
     rests = RecordedRests(unit, read)
     rests.feed(read)
     rests.take()
-    accel_mps2, found = read.accel_mps2(unit), rests.detected
+    accel_mps2 = read.accel_mps2(unit)
+    found = rests.detected
     samples = [accel_mps2[each.rest.includes(read.time_s)] for each in found]
     count = -(-_FEWEST_PARTS // max(len(samples), 1))
     parts = [part for each in samples for part in np.array_split(each, count) if len(part) > 1]

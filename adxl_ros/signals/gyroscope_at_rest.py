@@ -91,7 +91,8 @@ def with_bias(gyro: Gyroscope, rests: Sequence[RestTurns]) -> Gyroscope:
     student = float(scipy.stats.t.ppf(_COVERED, freedom)) / Z_90
     std = student * np.sqrt(np.outer(widths, scatter))
     std[0] = np.hypot(std[0], _rounding(parts))
-    low_c, high_c = float(temperature_c.min()), float(temperature_c.max())
+    low_c = float(temperature_c.min())
+    high_c = float(temperature_c.max())
     slopes = [tuple(each[1].tolist()) if has_slope else () for each in (values, std)]
     return replace(
         gyro,

@@ -77,7 +77,8 @@ class NeighbouringSamples:
     """Looks at neighbouring samples of a stream, in blocks of any length."""
 
     def __init__(self, axes: str, rate_hz: float) -> None:
-        self._axes, self._rate_hz = axes, rate_hz
+        self._axes = axes
+        self._rate_hz = rate_hz
         self._left = np.zeros((0, len(axes)))  # Newest samples, which later ones are compared with
         self._left_s = np.zeros(0)
         self._run = 1  # Length of the newest run of equal samples
@@ -161,7 +162,8 @@ class NeighbouringSamples:
 
     def _repeats(self) -> str:
         """Return how often each reading stands, where that is no chance."""
-        count, lengths = int(self._runs.sum()), np.arange(len(self._runs))
+        count = int(self._runs.sum())
+        lengths = np.arange(len(self._runs))
         if count < _FEWEST_RUNS:
             return ''
         mean = float((lengths * self._runs).sum() / count)
@@ -227,7 +229,8 @@ class NeighbouringSamples:
         both = size[_SIDE - 1 : len(size) - _SIDE + 1]
         places = _SIDE - 1 + np.flatnonzero(both > _SMALLEST_JUMP_G * G0_MPS2)
         for i in places.tolist():
-            left, right = size[i - _SIDE + 1 : i].max(), size[i + 1 : i + _SIDE].max()
+            left = size[i - _SIDE + 1 : i].max()
+            right = size[i + 1 : i + _SIDE].max()
             if max(left, right) > _STEADY * size[i]:
                 continue
             before = samples[i - _NEAREST + 1 : i + 1].mean(axis=0)
@@ -315,7 +318,8 @@ class _Ends:
 
     def __init__(self) -> None:
         # Largest value of minus the samples and of the samples, m/s², and number of samples there
-        self._largest_mps2, self._at_end = [-np.inf, -np.inf], [0, 0]
+        self._largest_mps2 = [-np.inf, -np.inf]
+        self._at_end = [0, 0]
         self.step_mps2 = np.inf  # Smallest change
         self._sizes = np.zeros(int(_LARGEST_STEP_G / _BIN_G) + 1, int)  # Number of steps by size
 
@@ -328,7 +332,8 @@ class _Ends:
         for side, signed in enumerate((-values, values)):
             largest = float(signed.max())
             if largest > self._largest_mps2[side]:
-                self._largest_mps2[side], self._at_end[side] = largest, 0
+                self._largest_mps2[side] = largest
+                self._at_end[side] = 0
             self._at_end[side] += int((signed == self._largest_mps2[side]).sum())
 
     def wraps(self) -> str:
@@ -339,10 +344,12 @@ class _Ends:
         frequent, because a small step across the end reads as one of nearly the whole range. In
         rough motion only the ends show it: a sensor that reaches both of them clips there.
         """
-        low_g, high_g = -self._largest_mps2[0] / G0_MPS2, self._largest_mps2[1] / G0_MPS2
+        low_g = -self._largest_mps2[0] / G0_MPS2
+        high_g = self._largest_mps2[1] / G0_MPS2
         if max(self._at_end) > _CLIPPED or not high_g > low_g:
             return ''
-        step_g, sizes_g = self.step_mps2 / G0_MPS2, _BIN_G * np.arange(len(self._sizes))
+        step_g = self.step_mps2 / G0_MPS2
+        sizes_g = _BIN_G * np.arange(len(self._sizes))
         by_counts_g = step_g * 2.0 ** np.ceil(np.log2((high_g - low_g) / step_g))
         for range_g in (by_counts_g, *_RANGES_G):
             is_full, is_half = sizes_g > 0.75 * range_g, sizes_g > 0.5 * range_g

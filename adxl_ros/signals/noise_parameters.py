@@ -314,7 +314,8 @@ def _fit(
                 break
         else:
             break
-        theta, likelihood = trial, likelihood + gained
+        theta = trial
+        likelihood = likelihood + gained
         if 2 * gained < _CONVERGED:
             break
     return theta, likelihood
@@ -340,7 +341,8 @@ def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term:
         return float(np.exp(scipy.optimize.brentq(excess, beyond - step, beyond, xtol=1e-6)))
 
     is_seen = best > 0 and 2 * (likelihood - _best(models, term, 0.0)[1]) > _DROP
-    low, high = end(-1.0) if is_seen else 0.0, end(1.0)
+    low = end(-1.0) if is_seen else 0.0
+    high = end(1.0)
     return Estimate(*(float(np.sqrt(square)) for square in (best, low, high)))
 
 
@@ -490,7 +492,8 @@ def recording_noise(
     nominal = nominal_of(sensor, first.stream_info, first.axes)
     look = RecordingLook(sensor, first)
     still = longest_rest(read, nominal, first, look)
-    rest, gyro_rest = still.accelerometer, still.gyroscope
+    rest = still.accelerometer
+    gyro_rest = still.gyroscope
     doubts = require_unit(look.gravity(), first.path)
     share = 1.0 if gyro_rest is None else 0.5
     noises = _axis_noises(rest, nominal.axes, lambda done: show(share * done))
@@ -517,7 +520,8 @@ def _axis_noises(rest: StillStretch, axes: str, show: Callable[[float], None]) -
     variances = coefficient_variances(len(rest.means), rest.step_s)
     noises = []
     for i, axis in enumerate(axes):
-        std, resolution = float(rest.sample_std[i]), float(rest.resolution[i])
+        std = float(rest.sample_std[i])
+        resolution = float(rest.resolution[i])
         rounding = resolution / float(np.sqrt(12 * rest.rate_hz))
         fit = fit_noise(rest.means[:, i], rest.step_s, variances, rounding)
         rounding_variance = rounding**2 * rest.rate_hz
@@ -648,7 +652,8 @@ def _density(sensor: Sensor, noises: list[AxisNoise], is_repeated: bool) -> np.n
 
     is_repeated: whether the variance of a sample is that of white noise behind the filter.
     """
-    circuit, rate_hz = electronics(sensor), sensor.rate_hz
+    circuit = electronics(sensor)
+    rate_hz = sensor.rate_hz
     share = white_share(circuit.rc_s, rate_hz)
     variances = []
     for noise, axis_share in zip(noises, share):

@@ -64,7 +64,8 @@ class BeyondRange:
     """Counts the readings of a recording that are beyond the stated range of its sensor."""
 
     def __init__(self) -> None:
-        self._samples, self._largest_g = 0, 0.0
+        self._samples = 0
+        self._largest_g = 0.0
 
     def add(self, volts: np.ndarray, sensor: Sensor) -> None:
         """Count further samples, V, (n, m)."""
@@ -103,7 +104,8 @@ def _measured(
 
     The noise is that of the quietest quarter seconds, so that the samples may hold motion.
     """
-    scale_v_per_g, spans = sensor.nominal_scale_v_per_g, Spans(sensor.rate_hz)
+    scale_v_per_g = sensor.nominal_scale_v_per_g
+    spans = Spans(sensor.rate_hz)
     blocks = stats.BlockCutter(sensor.rate_hz, len(sensor.axes)).feed(time_s, volts)
     windows = stats.window_variance(blocks, spans)
     if len(time_s) < FEWEST_SAMPLES or not np.isfinite(windows).any():
@@ -344,7 +346,8 @@ def with_filter(
     """Add the effect `bandwidth` with its variance to a fitted sensor."""
     if not fitted.rc_s or not estimates:
         return fitted, []
-    ratios, variances = [], []
+    ratios = []
+    variances = []
     for axis, axis_estimates in zip(fitted.axes, zip(*estimates)):
         credible = [
             estimate for estimate in axis_estimates if estimate is not None and estimate.credible

@@ -156,7 +156,8 @@ def fleet(options: argparse.Namespace) -> int:
     make_folder(folder)
     with only_client(folder):
         results = Results(folder)
-        to_do, rows = plan_after(results), []
+        to_do = plan_after(results)
+        rows = []
         try:
             if to_do.todo:
                 shared = (recipe, frozenset(results.known))
@@ -186,10 +187,12 @@ def _written(folder: Path, results: Results) -> tuple[list[Path], list[str]]:
     """Write table and page; return files and findings, or report that a page is not possible."""
     from adxl_ros.fleet import page  # only the end of a run needs it
 
-    files, findings = [results.write_table()], list[str]()
+    files = [results.write_table()]
+    findings = list[str]()
     try:
         written = page.write(folder)
-        files, findings = [*written.files, *files], written.findings
+        files = [*written.files, *files]
+        findings = written.findings
     except UserError as error:
         cli.note(f'{PROG}: no page: {error}')
     return [*files, folder / 'reports'], findings

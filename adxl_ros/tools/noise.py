@@ -71,7 +71,8 @@ def noise(options: argparse.Namespace) -> int:
     cli.report_notes('noise', newest[-1].notes)
     if options.report:
         found.report(options.report, overwrite=options.overwrite)
-    lines, files = found.screen, curves
+    lines = found.screen
+    files = curves
     if options.output:
         found.save(options.output, overwrite=options.overwrite)
         files = [Path(options.output), *curves]
