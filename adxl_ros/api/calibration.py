@@ -40,7 +40,7 @@ from adxl_ros.report.screen import Tile
 from adxl_ros.signals.gravity_at_rest import require_unit
 from adxl_ros.signals.gyroscope_at_rest import rest_turns, RestTurns, with_bias
 from adxl_ros.signals.recorded_gravity import RecordingLook
-from adxl_ros.signals.recorded_sensor import BeyondRange, FilterNoise, listed
+from adxl_ros.signals.recorded_sensor import BeyondRange, listed
 
 _READING = 0.3  # Share of the work until the fit begins (chosen: a sweep of minutes)
 
@@ -301,7 +301,7 @@ def fit(
     for number, read in enumerate(several):
         read = unit.add(read)
         progress(_READING * (number + 1) / (number + 2), 'reading')
-        recorded.append(calibration.RecordedPoses(unit.names[-1], *rests.of(read, unit, number)))
+        recorded.append(rests.of(read, unit, number))
     if not recorded:
         raise UserError('no recording is given')
     progress(_READING, 'fit')
@@ -440,14 +440,13 @@ class _Rests:
             sweep_journal.poses_to_fit(sweep_journal.read(journal).entries) if journal else None
         )
 
-    def of(
-        self, read: Recording, unit: _Unit, number: int
-    ) -> tuple[Poses, Sequence[FilterNoise | None], list[str]]:
-        """Return the poses of a recording, their filters, and faults between its samples."""
+    def of(self, read: Recording, unit: _Unit, number: int) -> calibration.RecordedPoses:
+        """Return what a recording shows, which is one of several by its number."""
+        name = unit.names[-1]
         if number and self._is_one:
             raise _one_recording_only()
         if self._are_rows:
-            return poses_of_means(read, unit.sensor), (), []
+            return calibration.RecordedPoses(name, poses_of_means(read, unit.sensor))
         look = RecordingLook(unit.sensor, read)
         look.feed(read)
         # Rests by the noise of the sensor may not tell the unit; of other faults, the poses tell.
@@ -455,7 +454,8 @@ class _Rests:
         poses = extract_poses(read, unit.sensor, self._records, self._table)
         if self._table:
             poses = with_table_angles(poses, self._table)
-        return poses, estimate_filters(read, unit.sensor, poses), look.neighbour_faults()
+        filters = estimate_filters(read, unit.sensor, poses)
+        return calibration.RecordedPoses(name, poses, filters, look.neighbour_faults())
 
 
 def _one_recording_only() -> UserError:

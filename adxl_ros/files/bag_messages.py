@@ -186,28 +186,41 @@ def write_messages(writer: Any, batches: Sequence[Batch]) -> None:
 def _write_chunk(writer: Any, batches: list[Batch]) -> None:
     """Append a chunk with its message indices, which rosbags would write message by message."""
     storage = writer.storage
-    chunk = writer.storage.chunk
     indices: dict[int, bytes] = {}
-    for connection, stamp_ns, data in batches:
-        head = np.zeros(len(data), _MESSAGE_HEAD)
-        head['code'] = _MESSAGE
-        head['channel'] = connection.id
-        head['size'] = head.itemsize + data.shape[1] - _RECORD_HEAD.size
-        head['log_ns'] = head['publish_ns'] = stamp_ns
-        records = np.hstack([head.view(np.uint8).reshape(len(data), -1), data])
-        entries = np.empty(len(data), _INDEX_ENTRY)
-        entries['log_ns'] = stamp_ns
-        entries['offset'] = chunk.bio.tell() + np.arange(len(data)) * records.shape[1]
-        indices[connection.id] = indices.get(connection.id, b'') + entries.tobytes()
-        chunk.bio.write(records)
-        storage.channel_stats[connection.id] += len(data)
-        writer.counts[connection.id] += len(data)
-        for counter in (chunk, storage):
-            counter.message_start_time = min(counter.message_start_time, int(stamp_ns[0]))
-            counter.message_end_time = max(counter.message_end_time, int(stamp_ns[-1]))
+    for batch in batches:
+        channel = batch.connection.id
+        indices[channel] = indices.get(channel, b'') + _append_batch(writer, batch)
     writer.min_timestamp = min(writer.min_timestamp, storage.message_start_time)
     writer.max_timestamp = max(writer.max_timestamp, storage.message_end_time)
     storage.close_chunk()
+    _write_indices(storage, indices)
+
+
+def _append_batch(writer: Any, batch: Batch) -> bytes:
+    """Append messages of one size to the chunk; return their entries in the index."""
+    storage = writer.storage
+    chunk = storage.chunk
+    connection, stamp_ns, data = batch
+    head = np.zeros(len(data), _MESSAGE_HEAD)
+    head['code'] = _MESSAGE
+    head['channel'] = connection.id
+    head['size'] = head.itemsize + data.shape[1] - _RECORD_HEAD.size
+    head['log_ns'] = head['publish_ns'] = stamp_ns
+    records = np.hstack([head.view(np.uint8).reshape(len(data), -1), data])
+    entries = np.empty(len(data), _INDEX_ENTRY)
+    entries['log_ns'] = stamp_ns
+    entries['offset'] = chunk.bio.tell() + np.arange(len(data)) * records.shape[1]
+    chunk.bio.write(records)
+    storage.channel_stats[connection.id] += len(data)
+    writer.counts[connection.id] += len(data)
+    for counter in (chunk, storage):
+        counter.message_start_time = min(counter.message_start_time, int(stamp_ns[0]))
+        counter.message_end_time = max(counter.message_end_time, int(stamp_ns[-1]))
+    return entries.tobytes()
+
+
+def _write_indices(storage: Any, indices: Mapping[int, bytes]) -> None:
+    """Write the message index of each channel behind the chunk, and state where they are."""
     begin = storage.bio.tell()
     offsets = b''
     for channel, index in indices.items():

@@ -208,22 +208,30 @@ def _json(export: Export) -> str:
     )
 
 
+class KalibrSetting(NamedTuple):
+    """A setting of Kalibr."""
+
+    name: str
+    density: float
+    unit: str
+
+
 def kalibr_settings(
     accel: tuple[float, float], gyro: tuple[float, float] | None
-) -> list[tuple[str, float, str]]:
+) -> list[KalibrSetting]:
     """
     Return the settings of Kalibr, which are densities over both signs of the frequency.
 
     accel, gyro: white noise and random walk; None without a gyroscope.
     """
     settings = [
-        ('accelerometer_noise_density', accel[0], 'm/s^2/sqrt(Hz)'),
-        ('accelerometer_random_walk', accel[1], 'm/s^3/sqrt(Hz)'),
+        KalibrSetting('accelerometer_noise_density', accel[0], 'm/s^2/sqrt(Hz)'),
+        KalibrSetting('accelerometer_random_walk', accel[1], 'm/s^3/sqrt(Hz)'),
     ]
     if gyro is not None:
         settings += [
-            ('gyroscope_noise_density', gyro[0], 'rad/s/sqrt(Hz)'),
-            ('gyroscope_random_walk', gyro[1], 'rad/s^2/sqrt(Hz)'),
+            KalibrSetting('gyroscope_noise_density', gyro[0], 'rad/s/sqrt(Hz)'),
+            KalibrSetting('gyroscope_random_walk', gyro[1], 'rad/s^2/sqrt(Hz)'),
         ]
     return settings
 

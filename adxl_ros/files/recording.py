@@ -20,9 +20,9 @@ from adxl_ros.files import mapped_recording, mapping_proposal
 from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.column_mapping import (
     AS_IT_IS,
-    Mounting,
     parse_mapping,
     ReadingOptions,
+    SignedAxes,
     Table,
 )
 from adxl_ros.files.csv_file import csv_writer
@@ -112,7 +112,7 @@ def _table_blocks(
 
 
 def _mounted(
-    blocks: Iterator[Recording], mounting: Mounting | None
+    blocks: Iterator[Recording], mounting: SignedAxes | None
 ) -> Generator[Recording, None, None]:
     """Turn the blocks of a recording; they stay as they are without a mounting."""
     if mounting is None:

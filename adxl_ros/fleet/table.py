@@ -57,7 +57,7 @@ MG = mg(1.0)  # Milli-g in 1 m/s²
 
 
 @dataclass(frozen=True)
-class Quantity:
+class FleetQuantity:
     """A quantity of the table."""
 
     column: str  # Column of its value; the quantity is named by it
@@ -98,7 +98,7 @@ class FleetTable:
         begin, end = np.searchsorted(self.sensor, [sensor, sensor + 1])
         return np.arange(begin, end)
 
-    def recordings(self, quantity: Quantity) -> tuple[np.ndarray, Recordings]:
+    def recordings(self, quantity: FleetQuantity) -> tuple[np.ndarray, Recordings]:
         """Return a quantity in the recordings that have it."""
         value = self[quantity.column]
         low, *high = (self[name] for name in quantity.error_columns)
@@ -147,10 +147,10 @@ def read(path: AnyPath) -> FleetTable:
     )
 
 
-def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
+def quantities(table: FleetTable | None) -> tuple[FleetQuantity, ...]:
     """Return all quantities of a table."""
     listed = [
-        Quantity(
+        FleetQuantity(
             'gap_before_mps2',
             'gap',
             'mg',
@@ -164,10 +164,10 @@ def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
         scales = scales[scales > 0]
         mg_per_v = 1e3 / float(np.median(scales)) if len(scales) else 1e3
         listed += [
-            Quantity(
+            FleetQuantity(
                 f'zero_g_{axis}_v', f'zero-g {axis}', 'mg', mg_per_v, (f'zero_g_std_{axis}_v',)
             ),
-            Quantity(
+            FleetQuantity(
                 f'scale_{axis}_v_per_g',
                 f'scale factor {axis}',
                 'mg/g',
@@ -179,7 +179,7 @@ def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
         column, *ends = (f'noise_{letter}{end}_{axis}_{unit}' for end in ('', '_low', '_high'))
         # The unit of the files begins with that of an acceleration.
         listed.append(
-            Quantity(
+            FleetQuantity(
                 column,
                 f'{label}, {axis}',
                 shown.replace('m/s²', 'µg', 1),
@@ -196,7 +196,7 @@ def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
 class QuantityResult:
     """A quantity over the k sensors that have it, in n recordings."""
 
-    quantity: Quantity  # The quantity
+    quantity: FleetQuantity  # The quantity
     rows: np.ndarray  # Rows of the recordings in the table, (n,)
     recordings: Recordings  # Its values in the unit of its column
     # Distance of each recording from those of its sensor, robust standard deviations, (n,)

@@ -325,7 +325,7 @@ def look(
     case = _Case(readings, tolerance, gravity_mps2)
     # A reading of the length g in these poses is that of a force between these lengths.
     upright = readings.divided(np.maximum(length, _LEAST_MPS2)[:, None] / gravity_mps2)
-    low, high = (np.median(limits) for limits in replace(case, readings=upright).force_limits())
+    low, high = np.median(replace(case, readings=upright).force_limits(), axis=1)
     return GravityAtRest(
         rests=count * every,
         axes=axes,

@@ -67,7 +67,7 @@ _FLICKER_OF_INSTABILITY = 1 / float(np.sqrt(np.pi))
 FLOOR = float(np.sqrt(2 * np.log(2) / np.pi))  # Allan deviation of B / B (IEEE Std 952, C.15)
 
 
-class Estimate(NamedTuple):
+class NoiseTerm(NamedTuple):
     """A value with its interval."""
 
     value: float  # The most likely value
@@ -79,9 +79,9 @@ class Estimate(NamedTuple):
         """Whether the interval excludes 0."""
         return self.low > 0
 
-    def scaled(self, factor: float) -> Estimate:
+    def scaled(self, factor: float) -> NoiseTerm:
         """Return the estimate in another unit."""
-        return Estimate(self.value * factor, self.low * factor, self.high * factor)
+        return NoiseTerm(self.value * factor, self.low * factor, self.high * factor)
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,10 @@ class NoiseFit:
     """The noise of one axis; u is the unit of the signal."""
 
     # White noise N, u/√Hz: the density over positive and negative frequencies is N²
-    white: Estimate
-    instability: Estimate  # Bias instability B, u: the density is B²/(2π·f)
+    white: NoiseTerm
+    instability: NoiseTerm  # Bias instability B, u: the density is B²/(2π·f)
     # Random walk K, u/√s: the density is K²/(2π·f)², or K²/((2π·f)² + 1/T²) with bounds
-    walk: Estimate
+    walk: NoiseTerm
     # Correlation time T of a bounded walk (first-order Gauss-Markov), s, whose standard deviation
     # is K·√(T/2); inf where no bounds show
     bound_s: float
@@ -222,11 +222,10 @@ def fit_noise(
     walks, bound_s = _walks(groups.below(highest), span_s, highest)
     models = _filters(walks, np.pi * highest / (2 * len(means)), np.pi / (2 * len(means)))
     theta, likelihood = _best(models)
-    white, instability, walk = (_interval(models, theta, likelihood, term) for term in range(3))
     return NoiseFit(
-        white=white,
-        instability=instability,
-        walk=walk,
+        white=_interval(models, theta, likelihood, 0),
+        instability=_interval(models, theta, likelihood, 1),
+        walk=_interval(models, theta, likelihood, 2),
         bound_s=bound_s,
         highest=highest,
         highest_hz=highest / (2 * span_s),
@@ -321,7 +320,7 @@ def _fit(
     return theta, likelihood
 
 
-def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term: int) -> Estimate:
+def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term: int) -> NoiseTerm:
     """Return a term with the ends of its interval by the profile likelihood."""
 
     def excess(logarithm: float) -> float:
@@ -343,7 +342,7 @@ def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term:
     is_seen = best > 0 and 2 * (likelihood - _best(models, term, 0.0)[1]) > _DROP
     low = end(-1.0) if is_seen else 0.0
     high = end(1.0)
-    return Estimate(*(float(np.sqrt(square)) for square in (best, low, high)))
+    return NoiseTerm(*(float(np.sqrt(square)) for square in (best, low, high)))
 
 
 def _highest(groups: _Groups, count: int, span_s: float, rounding: float) -> int:
@@ -431,7 +430,7 @@ class AxisNoise:
     change_variance: float
 
     @property
-    def estimates(self) -> tuple[Estimate, Estimate, Estimate]:
+    def estimates(self) -> tuple[NoiseTerm, ...]:
         """N in u/√Hz, B in u, and K in u/√s."""
         return self.fit.white, self.fit.instability, self.fit.walk
 
@@ -560,16 +559,21 @@ def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: flo
     if not _is_coarse(std, resolution):
         return replace(
             fit,
-            white=Estimate(
+            white=NoiseTerm(
                 *(float(np.sqrt(max(value**2 - rounding**2, 0.0))) for value in fit.white)
             ),
         )
     widest = max(_DITHERED_STEPS * resolution / std, 1.0)
-    white, instability, walk = (
-        Estimate(term.value, 0.0, term.high * widest)
-        for term in (fit.white, fit.instability, fit.walk)
+
+    def widened(term: NoiseTerm) -> NoiseTerm:
+        return NoiseTerm(term.value, 0.0, term.high * widest)
+
+    return replace(
+        fit,
+        white=widened(fit.white),
+        instability=widened(fit.instability),
+        walk=widened(fit.walk),
     )
-    return replace(fit, white=white, instability=instability, walk=walk)
 
 
 def _is_coarse(std: float, resolution: float) -> bool:
@@ -642,7 +646,7 @@ def with_gyro_noise(gyro: Gyroscope, noises: Sequence[AxisNoise]) -> Gyroscope:
     )
 
 
-def _seen(estimate: Estimate) -> float:
+def _seen(estimate: NoiseTerm) -> float:
     return estimate.value if estimate.is_seen else 0.0
 
 
@@ -760,9 +764,9 @@ def settings(
         root = float(np.sqrt(filter_hz))
         rows: list[Setting] = []
         for sensor, unit, walk_unit, of in sensors:
-            white_name, walk_name = (
+            white_name, walk_name = [
                 name.format(small=sensor, large=sensor.upper()) for name in names
-            )
+            ]
             rows += [
                 (white_name, [of.white * root], f'{unit}{of.white_note}'),
                 (walk_name, [of.walk * root], f'{walk_unit}{of.note}'),

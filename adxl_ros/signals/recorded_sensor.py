@@ -296,20 +296,25 @@ def estimate_filter(
     best = scipy.optimize.minimize(
         cost, start, method='Nelder-Mead', options={'xatol': 1e-5, 'fatol': 1e-6, 'maxiter': 2000}
     ).x
-    scatter = float(np.mean((power / _expected(best, lags) - 1) ** 2) * weight)
-    slopes = np.array(
-        [
-            np.log(_expected(best + step, lags) / _expected(best - step, lags))
-            for step in _LOG_STEP * np.eye(3)
-        ]
-    ) / (2 * _LOG_STEP)
-    information = slopes @ slopes.T * weight / _CORRELATED_ORDINATES
-    information += np.diag([0.0, 0.0, _ADC_NOISE_PRIOR_STD**-2])
+    information = _information(best, lags, weight)
     # White noise does not show a filter.
     if np.linalg.cond(information) > _MAX_CONDITION:
         return None
+    scatter = float(np.mean((power / _expected(best, lags) - 1) ** 2) * weight)
     ratio_std = float(np.sqrt(np.linalg.inv(information)[1, 1] * max(scatter, 1.0)))
     return FilterNoise(float(np.exp(best[1]) / rate_hz), ratio_std, scatter)
+
+
+def _information(x: np.ndarray, lags: np.ndarray, weight: float) -> np.ndarray:
+    """Return the information on the parameters of `_expected`, (3, 3), the prior included."""
+    ratios = [
+        np.log(_expected(x + step, lags) / _expected(x - step, lags))
+        for step in _LOG_STEP * np.eye(3)
+    ]
+    slopes = np.array(ratios) / (2 * _LOG_STEP)
+    information = slopes @ slopes.T * weight / _CORRELATED_ORDINATES
+    information += np.diag([0.0, 0.0, _ADC_NOISE_PRIOR_STD**-2])
+    return information
 
 
 def _mean_periodogram(rests: Iterable[np.ndarray], window: np.ndarray) -> tuple[np.ndarray, int]:
