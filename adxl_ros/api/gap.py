@@ -112,7 +112,7 @@ class Gap(Result):
     """no_gap, explained, partly, inseparable or unknown; without a verdict insufficient or
     bad_data."""
     probability: float
-    """How often such verdicts were right in the working cases, 0 to 1."""
+    """How often such verdicts were right in the working cases, 0 to 1; a `fault` is certain, 1."""
     effects: tuple[FoundEffect, ...]
     """Effects of the verdict, those with the largest share of the gap first."""
     figures: GapFigures | None

@@ -149,6 +149,11 @@ def _of_arrays(path: str, arrays: Mapping[str, Any], advice: str) -> Table:
 
 def _open_parquet(path: str) -> Table:
     """Open a Parquet file with the library pyarrow: its columns of numbers and of times."""
+    with _library(path, 'Parquet', 'pyarrow'):
+        import pyarrow.parquet
+
+        schema = pyarrow.parquet.read_schema(path)
+        kinds = pyarrow.types
 
     def blocks(names: Collection[str], _: Collection[str]) -> Iterator[TableBlock]:
         first = 0
@@ -170,11 +175,6 @@ def _open_parquet(path: str) -> Table:
             column.cast(pyarrow.float64(), safe=False).to_numpy(zero_copy_only=False), float
         )
 
-    with _library(path, 'Parquet', 'pyarrow'):
-        import pyarrow.parquet
-
-        schema = pyarrow.parquet.read_schema(path)
-        kinds = pyarrow.types
     units = {
         each.name: each.type.unit
         for each in schema

@@ -350,10 +350,10 @@ class Prediction:
         if is_first:
             self._responses = [Response(sensor, self._motion, 0) for sensor in self._sensors]
         time_s = (stamp_ns - self._origin_ns) * 1e-9
-        modelled, datasheet = (
+        modelled, datasheet = [
             accel_mps2 - to_nominal_mps2(respond(time_s), self._sensor)
             for respond in self._responses
-        )
+        ]
         if is_first:
             return None
         mean_mps2 = scipy.stats.trim_mean(modelled, _TRIMMED, axis=0)

@@ -172,11 +172,9 @@ def warnings(result: RecordingNoise) -> list[str]:
     for shown in sensors_at_rest(result):
         # The accelerometer is meant where no sensor is named.
         begin = f'{shown.name} ' if shown.unit is _GYRO else ''
-        texts += [
-            f'{begin}{noise.axis}: {text}'
-            for noise in shown.axes
-            for text in _axis_warnings(rest.span_s, noise, shown.unit)
-        ]
+        for noise in shown.axes:
+            warnings = _axis_warnings(rest.span_s, noise, shown.unit)
+            texts += [f'{begin}{noise.axis}: {text}' for text in warnings]
     return texts
 
 
