@@ -7,7 +7,7 @@ Plain objects serve every version of plotly. Its Python classes would cost a sec
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from math import ceil
