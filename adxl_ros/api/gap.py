@@ -46,7 +46,7 @@ from adxl_ros.report.figures import AFTER_COLOUR, axes_for, BEFORE_COLOUR, QUIET
 from adxl_ros.report.quantities import Interval, mg
 from adxl_ros.report.screen import NextStep, Tile
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.trajectories import motion_from_force
+from adxl_ros.simulate.recorded_motion import motion_from_force
 
 PAGE = 'report.html'  # File of the page of a diagnosis
 PARAMETERS = 'params.yaml'  # File of the sensor with the effects that were found
@@ -503,7 +503,7 @@ def _motion(read: Recording, sim: RecordingInput | Motion | None, unit: str) -> 
     """Return the motion of another simulator; None for that of the stage."""
     if sim is None or isinstance(sim, Motion):
         return sim
-    return motion_from_force(read_ideal(sim, read.epoch_ns, unit), False)[0]
+    return motion_from_force(read_ideal(sim, read.epoch_ns, unit), False)
 
 
 def _subject(recordings: Sequence[Recording], sensor: Sensor, sim: str) -> str:
