@@ -40,7 +40,7 @@ from adxl_ros.report.screen import Tile
 from adxl_ros.signals.gravity_at_rest import require_unit
 from adxl_ros.signals.gyroscope_at_rest import rest_turns, RestTurns, with_bias
 from adxl_ros.signals.recorded_gravity import RecordingLook
-from adxl_ros.signals.recorded_sensor import BeyondRange, listed
+from adxl_ros.signals.recorded_sensor import BeyondRange, measured_lines
 
 _READING = 0.3  # Share of the work until the fit begins (chosen: a sweep of minutes)
 
@@ -111,7 +111,7 @@ class Fit(Result):
         lines += [*self.result.summary, *self.warnings]
         if gyro := gyro_lines(fitted.gyro):
             lines += ['', *gyro]
-        return [*lines, *listed([*self.measured])]
+        return [*lines, *measured_lines([*self.measured])]
 
     @property
     def first_screen(self) -> FirstScreen:
@@ -468,7 +468,7 @@ def _one_recording_only() -> UserError:
 
 def _fit(result: CalibrationResult, unit: _Unit, is_over_temperature: bool = False) -> Fit:
     """Collect what a user reads of a calibration."""
-    measured = listed([*unit.measured])
+    measured = measured_lines([*unit.measured])
     fitted = result.fitted
     result = replace(
         result,

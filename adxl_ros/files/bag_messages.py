@@ -421,7 +421,8 @@ def find_topics(bag: Bag, topic: str = '', has_stage: bool = True) -> Topics:
         """Return a topic in the namespace of the sensor; other nodes use these names, too."""
         return space + name if (space + name, kind) in bag.types else None
 
-    temperature, supply = beside('temperature', TEMPERATURE), beside('supply', BATTERY_STATE)
+    temperature = beside('temperature', TEMPERATURE)
+    supply = beside('supply', BATTERY_STATE)
     if not has_stage:
         return Topics(imu, temperature=temperature, supply=supply)
     joints = beside('stage/joint_states', JOINT_STATE) or _only(

@@ -65,7 +65,8 @@ def blocks(
             )
         topics = find_topics(bag, reading.topic, has_stage=not ideal)
         info = read_info(bag, topics.info)
-        tracks, commands = _tracks(bag, topics), _commands(bag, topics)
+        tracks = _tracks(bag, topics)
+        commands = _commands(bag, topics)
         samples = _Samples(
             f'{bag.path}: topic {topics.imu}', AXES if ideal else info.get('axes'), reading
         )

@@ -413,7 +413,7 @@ _SHORTEST_STEP_S = 2.5e-5  # Shortest step of stamps, s. Chosen: an IIS3DWB has 
 _LONGEST_STEP_S = 1.05  # Longest step of stamps, s. Chosen: 1 Hz, the slowest, with jitter
 
 
-def listed(names: Sequence[str]) -> str:
+def first_names(names: Sequence[str]) -> str:
     """Return the first names of columns for a message."""
     more = len(names) - _LISTED_NAMES
     return ', '.join(names[:_LISTED_NAMES]) + (f' and {more} more' if more > 0 else '')

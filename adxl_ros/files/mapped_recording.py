@@ -15,9 +15,9 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import (
     ColumnMapping,
     drop_samples,
+    first_names,
     GYRO_ROLES,
     is_sensor_step,
-    listed,
     Quantity,
     ReadingOptions,
     ROLES,
@@ -97,7 +97,7 @@ def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
             )
     missing = [column for column in (TIME, *output) if column not in names]
     if missing:
-        present = f'; the columns are {listed(names)}' if output else ''
+        present = f'; the columns are {first_names(names)}' if output else ''
         raise NotNativeError(f'{table.header}: no column {missing[0]}{present}')
     try:
         outputs = output or sensor_columns(names, table.header)
@@ -185,7 +185,7 @@ class _Converter:
             if not name.isdecimal() or not 1 <= int(name) <= len(names):
                 raise UserError(
                     f'{self._where}: {table.path} has no column {name!r} for {role}; '
-                    f'the columns are {listed(names)}'
+                    f'the columns are {first_names(names)}'
                 )
             name = names[int(name) - 1]
         unit = source.unit or table.units.get(name) or unit_in_name(name, ROLES[role])

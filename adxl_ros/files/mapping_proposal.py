@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 from adxl_ros.files.column_mapping import (
     ColumnMapping,
     Columns,
+    first_names,
     GRAVITY,
     is_sensor_step,
     likely_unit,
-    listed,
     LSB,
     Quantity,
     ROLES,
@@ -125,7 +125,7 @@ _SIGN_GAP = (24576, 40960)
 
 def propose(table: Table) -> tuple[str, str]:
     """Describe the columns of a table, and the options that most likely read it."""
-    seen = f'the columns are {listed(table.names)}'
+    seen = f'the columns are {first_names(table.names)}'
     sample = next((block.columns for block in table.blocks(table.names, ())), {})
     values = {
         name: np.where(np.abs(column) < _LARGEST, column, np.nan)

@@ -489,7 +489,8 @@ class Track:
         stamp_ns: stamps, ns, (k,). Of messages with the same stamp the last one counts; value:
         values, (k,); NaN where it was not sampled; longest_ns: gap that is bridged, ns.
         """
-        stamps, values = stamp_ns[~np.isnan(value)], value[~np.isnan(value)]
+        stamps = stamp_ns[~np.isnan(value)]
+        values = value[~np.isnan(value)]
         step = np.diff(stamps)
         if (step < 0).any():
             i = int((step < 0).argmax())
@@ -498,7 +499,8 @@ class Track:
                 f'after {seconds(stamps[i])}'
             )
         is_last = np.append(step > 0, True)[: len(stamps)]
-        self._stamp_ns, self._value = stamps[is_last], values[is_last]
+        self._stamp_ns = stamps[is_last]
+        self._value = values[is_last]
         step = step[step > 0]
         self._usual_ns = float(np.median(step)) if len(step) else 0.0
         self._longest_ns = max(longest_ns, USUAL_GAPS * self._usual_ns)

@@ -372,7 +372,8 @@ def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np
 
 def _common_variance(variance: np.ndarray, freedom: np.ndarray) -> tuple[float, float]:
     """Return the scale of the inverse χ² distribution and its degrees of freedom."""
-    freedom, variance = freedom[variance > 0], variance[variance > 0]
+    freedom = freedom[variance > 0]
+    variance = variance[variance > 0]
     if len(variance) < 2:
         return (float(variance[0]), _NO_FREEDOM) if len(variance) else (1.0, _EQUAL_VARIANCES)
     log_variance = np.log(variance) - scipy.special.digamma(freedom / 2) + np.log(freedom / 2)

@@ -27,6 +27,7 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.calibration_store import sha256
 from adxl_ros.files.recording_columns import NO_SERIAL, Recording
 from adxl_ros.files.surroundings import assumed
+from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.fleet import inputs
 from adxl_ros.fleet.inputs import begin_of, Source
 from adxl_ros.fleet.row import (
@@ -41,7 +42,7 @@ from adxl_ros.fleet.row import (
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import code_version, options_named, package_version
-from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
+from adxl_ros.signals.findings import check_recording, Findings
 import numpy as np
 
 _SPARE_MB = 64  # Space that stays free, MB. Chosen: a task writes some MB

@@ -101,7 +101,8 @@ class ChangeTest:
     ) -> None:
         self._channels = channels
         self._block_s = block_s
-        self._walks, self._drifts = np.array(walks), np.array(drifts)
+        self._walks = np.array(walks)
+        self._drifts = np.array(drifts)
         comparisons = sum(_DAY_S / block_s / _stride(2**j) for j in range(_LENGTHS))
         # Permitted probability of a false alarm in one comparison
         self._p = min(_RESERVE * false_alarms_per_day / (comparisons * channels), 0.5)

@@ -144,7 +144,8 @@ class LiveGap:
         finite = np.isfinite(accel_mps2).all(axis=1)
         self.counts['samples'] += len(stamp_ns)
         self.counts['dropped'] += int((~finite).sum())
-        stamp_ns, accel_mps2 = stamp_ns[finite], accel_mps2[finite]
+        stamp_ns = stamp_ns[finite]
+        accel_mps2 = accel_mps2[finite]
         steps_ns = _steps_ns(self._samples.newest_ns, stamp_ns)
         jumps = np.flatnonzero((steps_ns < -_JUMP_NS) | (steps_ns > _BREAK_NS))
         for i, part in enumerate(np.split(np.arange(len(stamp_ns)), jumps)):

@@ -87,7 +87,8 @@ class StreamBuffer:
         """Append rows, (n, k), whose stamps, ns, (n,), increase; return these stamps."""
         newest_ns = np.iinfo(np.int64).min if self.newest_ns is None else self.newest_ns
         later = stamp_ns > np.maximum.accumulate(np.append(newest_ns, stamp_ns))[:-1]
-        stamp_ns, rows = stamp_ns[later], rows[later]
+        stamp_ns = stamp_ns[later]
+        rows = rows[later]
         if len(stamp_ns):
             self._pieces.append((stamp_ns, rows))
             self._rows += len(stamp_ns)
@@ -195,7 +196,8 @@ class ReferenceStream:
         ]
         largest = max(_STILL_STEPS * step_rad, _STILL_RAD)
         time_s = (np.linspace(begin_ns, end_ns, 3) - self._origin_ns) * 1e-9
-        alpha, beta = self._paths[0](time_s), self._paths[1](time_s)
+        alpha = self._paths[0](time_s)
+        beta = self._paths[1](time_s)
         stds = [
             errors.std
             if isinstance(path, SmoothedPath) and (errors := path.errors(time_s))

@@ -270,7 +270,8 @@ class _Samples:
         inside = rest.includes(time_s)
         if not inside.any():
             return
-        rows, time_s = samples[inside], time_s[inside]
+        rows = samples[inside]
+        time_s = time_s[inside]
         if not self._phase.count:
             self._start_s = self._stop_s = float(time_s[0])
         steps_s = np.diff(time_s, prepend=self._stop_s)

@@ -27,6 +27,7 @@ from adxl_ros.files.recording_columns import (
     REFERENCES,
 )
 from adxl_ros.files.stamps import burst_samples, lacks_samples, period_s
+from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.process import option, usage
@@ -109,7 +110,8 @@ def examine(
     first = next((block for block in blocks if len(block)), None)
     if first is None:
         raise UserError('the recording holds no samples')
-    sensor, stamps = sensor_of(first), _Stamps(first)
+    sensor = sensor_of(first)
+    stamps = _Stamps(first)
     look = RecordingLook(sensor, first)
     axes = [_Axis(name, stamps.period_s) for name in first.sensor_columns]
     gyro = _Gyro(first, stamps.period_s) if first.gyro_radps is not None else None
@@ -545,9 +547,6 @@ def _noise(contents: RecordingContents) -> Ability:
         if longest_s >= shortest_s
         else f'rests for {longest_s:.4g} s, needs {shortest_s:.3g} s',
     )
-
-
-BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 
 
 def check_recording(

@@ -99,7 +99,8 @@ class NeighbouringSamples:
     def feed(self, time_s: np.ndarray, samples: np.ndarray) -> None:
         """Add samples, m/s², (n, m), with their stamps, s, (n,)."""
         finite = np.isfinite(samples).all(axis=1)
-        time_s, samples = time_s[finite], samples[finite]
+        time_s = time_s[finite]
+        samples = samples[finite]
         if not len(samples):
             return
         joined = np.concatenate([self._left, samples])
@@ -113,7 +114,8 @@ class NeighbouringSamples:
         # The sides of the last samples come with the next block.
         self._find_jumps(joined_s, joined)
         self._find_spikes(joined_s, joined)
-        self._left, self._left_s = joined[1 - 2 * _SIDE :], joined_s[1 - 2 * _SIDE :]
+        self._left = joined[1 - 2 * _SIDE :]
+        self._left_s = joined_s[1 - 2 * _SIDE :]
 
     def faults(self) -> list[str]:
         """Return what is wrong, one line each."""
@@ -352,7 +354,8 @@ class _Ends:
         sizes_g = _BIN_G * np.arange(len(self._sizes))
         by_counts_g = step_g * 2.0 ** np.ceil(np.log2((high_g - low_g) / step_g))
         for range_g in (by_counts_g, *_RANGES_G):
-            is_full, is_half = sizes_g > 0.75 * range_g, sizes_g > 0.5 * range_g
+            is_full = sizes_g > 0.75 * range_g
+            is_half = sizes_g > 0.5 * range_g
             full = int(self._sizes[is_full].sum())
             half = int(self._sizes[is_half & ~is_full].sum())
             fills = max(abs(low_g + range_g / 2), abs(high_g - range_g / 2)) < _FILLED * range_g

@@ -385,7 +385,8 @@ def _is_expected(octave: _Groups, lower: _Groups, theta: np.ndarray) -> bool:
     """Whether an octave has the power that a fit of the lower groups predicts."""
     if not len(octave.count):
         return False
-    parts, design = _shares(octave, theta), _shares(lower, theta)
+    parts = _shares(octave, theta)
+    design = _shares(lower, theta)
     share = octave.count / octave.count.sum()
     predicted = share @ parts @ np.linalg.pinv(design * np.sqrt(lower.count / 2)[:, None])
     excess = float(share @ (octave.power / (octave.shapes @ theta))) - 1

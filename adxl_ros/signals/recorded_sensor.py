@@ -51,7 +51,7 @@ def measure_unstated(sensor: Sensor, read: Recording) -> tuple[Sensor, list[str]
     return _measured(sensor, read.time_s, read.volts(sensor), f'{read.path}: ')
 
 
-def listed(measured: list[str]) -> list[str]:
+def measured_lines(measured: list[str]) -> list[str]:
     """Return the lines of `measure_unstated` below a heading; none where nothing is measured."""
     return (
         ['', 'Measured, as no parameter file states it:', *(f'  {line}' for line in measured)]
@@ -192,7 +192,8 @@ def sensor_of_stream(
     )
     if np.count_nonzero(late_ns) > _MOST_BACKWARD * len(stamps_ns):
         raise UserError(f'{backward}; one driver must stamp them, in their order')
-    stamps_ns, accel_mps2 = stamps_ns[late_ns == 0], accel_mps2[late_ns == 0]
+    stamps_ns = stamps_ns[late_ns == 0]
+    accel_mps2 = accel_mps2[late_ns == 0]
     time_s = (stamps_ns - stamps_ns[:1]) * 1e-9
     if len(time_s) < 3 or time_s[-1] < SHORTEST_S:
         raise UserError(

@@ -9,9 +9,10 @@ from collections.abc import Iterator
 import json
 from pathlib import Path
 
-from adxl_ros.api.noise import BLOCK_ROWS, noise as find_noise, PLOT, TABLE
+from adxl_ros.api.noise import noise as find_noise, PLOT, TABLE
 from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.process import command
 from adxl_ros.tools import command_line as cli
 
