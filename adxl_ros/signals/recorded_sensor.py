@@ -115,10 +115,7 @@ def _measured(
     rc_s = sensor.rc_s
     if 'rc_capacitance_f' in sensor.unstated:
         quiet = stats.quiet_blocks(blocks, windows, limit_v2, spans.window)
-        rests = [
-            volts[blocks.start[begin] : blocks.start[end - 1] + spans.size]
-            for begin, end in stats.true_runs(quiet, blocks.run)
-        ]
+        rests = _runs_of(volts, blocks, quiet, spans.size)
         rc_s = _filter_s(rests, sensor.rate_hz, float(np.max(step_v)))
     noise_g = np.sqrt(variance_v2) / scale_v_per_g
     largest_g = float(np.max(np.abs(volts - sensor.nominal_zero_g_v) / scale_v_per_g))
@@ -146,6 +143,16 @@ def _measured(
         unknown.add('filter_rate_hz')  # The measured filter is that at this rate.
     used = {name: value for name, value in values.items() if name in unknown}
     return replace(sensor, unstated=(), measured=sensor.unstated, **used), lines
+
+
+def _runs_of(
+    volts: np.ndarray, blocks: stats.Blocks, quiet: np.ndarray, size: int
+) -> list[np.ndarray]:
+    """Return the samples of each run of quiet blocks, V, (k, m)."""
+    return [
+        volts[blocks.start[begin] : blocks.start[end - 1] + size]
+        for begin, end in stats.true_runs(quiet, blocks.run)
+    ]
 
 
 def _noise_is_hidden(sensor: Sensor, time_s: np.ndarray) -> str:

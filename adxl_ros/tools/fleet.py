@@ -16,12 +16,13 @@ from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import make_folder
 from adxl_ros.files.recording_columns import NO_SERIAL
-from adxl_ros.fleet.inputs import find_sources, stated_by
+from adxl_ros.fleet.inputs import find_sources, Source, stated_by
 from adxl_ros.fleet.row import (
     as_date,
     make_recipe,
     OUTCOMES,
     PAGE,
+    Recipe,
     Row,
     TABLE,
     task_names,
@@ -157,16 +158,8 @@ def fleet(options: argparse.Namespace) -> int:
     with only_client(folder):
         results = Results(folder)
         to_do = plan_after(results)
-        rows = []
         try:
-            if to_do.todo:
-                shared = (recipe, frozenset(results.known))
-                with (
-                    open_pool(options.scheduler, options.jobs, shared) as pool,
-                    cli.progress(PROG) as show,
-                ):
-                    for row in work(pool, to_do.todo, recipe, results, options.retries, show):
-                        rows.append({name: row[name] for name in _SHOWN})
+            rows = _worked(options, recipe, to_do.todo, results) if to_do.todo else []
         finally:
             # Ctrl-C leaves table and page of what is done.
             files, findings = _written(folder, results)
@@ -181,6 +174,21 @@ def fleet(options: argparse.Namespace) -> int:
         monotonic() - begin_s,
     )
     return 1 if rows and not any(row['outcome'] == 'done' for row in rows) else 0
+
+
+def _worked(
+    options: argparse.Namespace, recipe: Recipe, todo: Sequence[Source], results: Results
+) -> list[Row]:
+    """Work on recordings; return what the screen shows of each."""
+    shared = (recipe, frozenset(results.known))
+    rows = []
+    with (
+        open_pool(options.scheduler, options.jobs, shared) as pool,
+        cli.progress(PROG) as show,
+    ):
+        for row in work(pool, todo, recipe, results, options.retries, show):
+            rows.append({name: row[name] for name in _SHOWN})
+    return rows
 
 
 def _written(folder: Path, results: Results) -> tuple[list[Path], list[str]]:
