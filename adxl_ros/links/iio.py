@@ -14,8 +14,9 @@ from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.links.support import base, stamping
+from adxl_ros.links.support.clock_map import ClockMap, IdentityMap
 from adxl_ros.links.support.clock_rate import ClockRate
-from adxl_ros.links.support.stamping import ClockMap, IdentityMap, Stamper
+from adxl_ros.links.support.stamping import Stamper
 from adxl_ros.links.support.wire_format import RATES_HZ
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -180,7 +181,7 @@ class IioLink(base.Link):
             self._adc = adc
             self.sensor = replace(self._declared, **adc)  # type: ignore[arg-type]
             if stream.by_host_clock:
-                self._stamper.clock = IdentityMap(0.0)
+                self._stamper.clock = IdentityMap()
             self._stamper.restart(1e9 / stream.rate_hz)
             self._newest_ns = -1
 

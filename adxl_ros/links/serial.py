@@ -20,8 +20,9 @@ from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.links.support import base, stamping, wire_format
+from adxl_ros.links.support.clock_map import ClockMap
 from adxl_ros.links.support.clock_rate import ClockRate
-from adxl_ros.links.support.stamping import ClockMap, Stamper
+from adxl_ros.links.support.stamping import Stamper
 from adxl_ros.links.support.wire_format import BoardInfo, SampleFrame
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
