@@ -10,7 +10,7 @@ from itertools import product
 from math import exp
 from typing import NamedTuple
 
-from adxl_ros.compensate.inversions import noise_variance_v2, paper_inverse, undo_filter_blocks
+from adxl_ros.compensate.inversions import noise_variance_v2, PaperInverse, undo_filter_blocks
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.surroundings import Surroundings
@@ -74,7 +74,7 @@ class RecordingEstimator:
         self._surroundings = Surroundings()
         self._begin_s = float(first.time_s[0])
         self._gravity_mps2 = signal_chain.gravity_mps2(sensor)
-        self._inverse = (paper_inverse if paper else signal_chain.inverse)(sensor)
+        self._inverse = (PaperInverse if paper else signal_chain.inverse)(sensor)
         self._measured_covariance = force_errors.measured_covariance(
             sensor, noise_variance_v2(sensor) if undo_filter else None, bool(sensor.z_sign)
         )
@@ -258,7 +258,7 @@ class LiveEstimator:
             if sensor.provenance.get('reference') == 'stage'
             else alignment_std_rad(sensor) ** 2
         )
-        self._paper_inverse = paper_inverse(sensor, FLOATS) if paper else None
+        self._paper_inverse = PaperInverse(sensor, FLOATS) if paper else None
         self._variance_v2 = (
             noise_variance_v2(sensor) if undo_filter else noise.sample_std_v(sensor) ** 2
         )

@@ -343,7 +343,7 @@ class DisplayPublisher:
         self._publisher.publish(
             String(
                 data=screen_contents.ScreenContents(
-                    phase=phase.value,
+                    phase=phase,
                     text=text,
                     unit=f'{nominal.serial} ({nominal.axes})' if nominal else '',
                     output=str(controller.settings.output),
