@@ -278,7 +278,7 @@ def _judged(sensor: Sensor, inliers: Poses, fit: _StageFit, is_sound: bool) -> _
         and (fit.full is None or fit.full.converged)
         and not acceptance.open_coefficients(fit.fitted)
     )
-    *simpler_ones, of_fit = [
+    assessments = [
         acceptance.assess(
             row.model,
             error_budgets(row, inliers, stage),
@@ -288,7 +288,8 @@ def _judged(sensor: Sensor, inliers: Poses, fit: _StageFit, is_sound: bool) -> _
         for row in errors
         if row.model != 'nominal'
     ]
-    return _Judgement(tuple(errors), (*simpler_ones, acceptance.judged(of_fit, fit.fitted)))
+    assessments[-1] = acceptance.judged(assessments[-1], fit.fitted)
+    return _Judgement(tuple(errors), tuple(assessments))
 
 
 def _richest_fit(
@@ -303,10 +304,12 @@ def _richest_fit(
     def fitted(name: str) -> _StageFit:
         if name != 'full':
             return _StageFit(STAGE_FITS[name](sensor, poses), STAGE_FITS[name])
-        full, terms = full_model.fit_selected(sensor, poses, effects)
+        selected = full_model.fit_selected(sensor, poses, effects)
+        full = selected.fit
         if len(recordings) > 1:
             _require_one_mounting(full, recordings)
-        return _StageFit(full.fitted, partial(full_model.fit, effects=effects), full, terms)
+        refit = partial(full_model.fit, effects=effects)
+        return _StageFit(full.fitted, refit, full, selected.terms)
 
     if model:
         return fitted(model)

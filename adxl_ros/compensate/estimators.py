@@ -94,7 +94,8 @@ class RecordingEstimator:
     @property
     def assumed(self) -> list[str]:
         """Return what was assumed of the surroundings so far, one line each, for people."""
-        sensor, lines = self._sensor, self._surroundings.assumed(self._sensor.effects)
+        sensor = self._sensor
+        lines = self._surroundings.assumed(self._sensor.effects)
         if sensor.axes == 'xy' and sensor.effects and not sensor.z_sign:
             lines = [
                 *lines,
@@ -283,7 +284,9 @@ class LiveEstimator:
         self._environment = NOMINAL_ENVIRONMENT
         self._last_volts = self._respond(self._force)
         # Time of the last sample, and weighted mean and variance of the in-plane force
-        self._time_s, self._mean, self._variance = float('-inf'), [0.0, 0.0], [0.0, 0.0]
+        self._time_s = float('-inf')
+        self._mean = [0.0, 0.0]
+        self._variance = [0.0, 0.0]
 
     def volts(self, accel_mps2: Sequence[float]) -> Components:
         """Undo the nominal conversion; an empty list if a value exceeds that of any sensor."""
@@ -354,7 +357,8 @@ class LiveEstimator:
             return self._force if abs(sum(self._force)) < float('inf') else None
         tangent = self._cell(self._force).tangent
         force, change = self._force, 0.0
-        response, input_v = self._last_volts, self._undo_adc(volts)
+        response = self._last_volts
+        input_v = self._undo_adc(volts)
         for _ in range(_MAX_STEPS):
             previous, previous_change = force, change
             force = self._newton_step(

@@ -92,7 +92,8 @@ def undo_filter_blocks(
     ):
         near_s = np.concatenate([before_s, time_s, after_s[:HALF]])
         near_v = np.concatenate([before_v, volts, after_v[:HALF]])
-        begin, end = len(before_s), len(before_s) + len(time_s)
+        begin = len(before_s)
+        end = len(before_s) + len(time_s)
         yield token, undo_filter(near_v, near_s, rc_s, rate_hz)[begin:end]
         before_s, before_v = near_s[:end][-HALF:], near_v[:end][-HALF:]
 

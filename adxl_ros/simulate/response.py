@@ -332,7 +332,8 @@ class Response:
 
         Noise of missing samples is drawn, too, as far back as the filter remembers.
         """
-        rc_s, rate_hz = np.array(signals.rc_s), self.sensor.rate_hz
+        rc_s = np.array(signals.rc_s)
+        rate_hz = self.sensor.rate_hz
         std_v = noise.analog_std_v(self.sensor)
         if not std_v.any():
             return np.zeros((len(stamps_s), len(std_v)))
