@@ -159,10 +159,14 @@ def diagnose(
     detections = _detections(
         checked, _with_likely_drift(search.best, evidence), model.baseline, smallest_mps2
     )
-    bases = list(chain(*map(flexible_bases, compared, model.baseline_v)))
+
+    def rest_of(effects: frozenset[str], drift: str) -> rule.Rest:
+        bases = chain(*map(flexible_bases, compared, model.baseline_v))
+        return rule.reproducible_rest(evidence.candidates[effects][drift], bases)
+
     verdict = rule.decide(
         evidence,
-        lambda effects, drift: rule.reproducible_rest(evidence.candidates[effects][drift], bases),
+        rest_of,
         [rule.NoiseCause(d.effect, d.power_mps2, d.is_left_out) for d in detections],
         lambda effects: _simulate_again(search, effects),
     )
@@ -392,11 +396,11 @@ def _detections(
             if noise_effects.residual_shows_spikes(d, residual_v, regular, comparison.sensor)
         ]
         found = noise_effects.residual_detections(comparison, residual_v, best)
-        of_baseline = (
-            noise_effects.residual_detections(comparison, residual_v, baseline) if found else ()
-        )
-        usual = {d.effect for d in of_baseline}
-        detections += [*c.detections, *spikes, *(d for d in found if d.effect in usual)]
+        if found:
+            of_baseline = noise_effects.residual_detections(comparison, residual_v, baseline)
+            usual = {d.effect for d in of_baseline}
+            found = [d for d in found if d.effect in usual]
+        detections += [*c.detections, *spikes, *found]
     material = [d for d in detections if d.power_mps2 > smallest_mps2**2]
     return list({d.effect: d for d in sorted(material, key=lambda d: d.power_mps2)}.values())
 

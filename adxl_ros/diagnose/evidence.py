@@ -500,17 +500,17 @@ def whiten_channel(
     numbers of the columns, (k,); used: samples that are used, (n,) bool; the others are bridged by
     straight lines; also: further columns of each filter that are white already, (k − c, n).
     """
-    block_grams, total_grams, log_scales = [], [], []
+    grams, total_grams, log_scales = [], [], []
     for whitener, rows, known in zip(filters, white_rows(design, used, filters), also):
         white = rows if known is None else np.concatenate([rows, known])
-        block_grams.append(_grams(white) if by_block else np.zeros((0, 0, 0)))
-        total_grams.append(block_grams[-1].sum(axis=0) if by_block else white @ white.T)
+        grams.append(block_grams(white) if by_block else np.zeros((0, 0, 0)))
+        total_grams.append(grams[-1].sum(axis=0) if by_block else white @ white.T)
         # The log determinant of the filter for errors, sample by sample.
         scale = np.ones(len(used)) if whitener.errors is None else whitener.errors.scale
         log_scales.append(sum_by_block(np.where(used, np.log(scale), 0.0)))
     return WhitenedChannel(
         column_ids,
-        np.array(block_grams),
+        np.array(grams),
         np.array(total_grams),
         sum_by_block(used),
         np.array(log_scales),
@@ -548,7 +548,7 @@ def plain_grams(columns: np.ndarray, used: np.ndarray) -> np.ndarray:
     return np.array([part @ part.T for part in parts])
 
 
-def _grams(rows: np.ndarray) -> np.ndarray:
+def block_grams(rows: np.ndarray) -> np.ndarray:
     """Return the products of k rows, (k, n), by block, (blocks, k, k)."""
     edges = pairwise(block_edges(rows.shape[1]).tolist())
     return np.array([rows[:, a:b] @ rows[:, a:b].T for a, b in edges])

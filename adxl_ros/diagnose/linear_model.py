@@ -297,9 +297,7 @@ class LinearModel:
     # By channel: sensitivities by number of the column, V per unit, (n,)
     columns: list[dict[int, np.ndarray]]
     # Whitened nuisance columns by number of the channel and identity of the filter
-    _white: dict[tuple[int, int], np.ndarray] = field(
-        default_factory=dict, compare=False, repr=False
-    )
+    _white: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
 
     @property
     def baseline(self) -> Sensor:
@@ -363,13 +361,13 @@ class LinearModel:
     ) -> Iterator[np.ndarray]:
         """Yield nuisance columns of a channel whitened by each filter, (k, n); each once."""
         own, used = self.nuisance_columns[number], self.places[number].comparison.used
-        missing = [f for f in filters if (number, id(f)) not in self._white]
-        design = np.reshape([*own.values()], (len(own), len(used))).T
-        for whitener, rows in zip(missing, evidence.white_rows(design, used, missing)):
-            self._white[number, id(whitener)] = rows
         places = [[*own].index(name) for name in shown]
         for whitener in filters:
-            yield self._white[number, id(whitener)][places]
+            key = number, id(whitener)
+            if key not in self._white:
+                design = np.reshape([*own.values()], (len(own), len(used))).T
+                self._white[key] = next(evidence.white_rows(design, used, [whitener]))
+            yield self._white[key][places]
 
     @cached_property
     def parts_at_rest(self) -> dict[Coefficient, np.ndarray]:

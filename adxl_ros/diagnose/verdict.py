@@ -13,7 +13,7 @@ user would act on. The same rule, applied to blocks drawn with replacement, says
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -259,11 +259,14 @@ class _FlexibleFunctions:
         columns, channel = fits.linearised.columns[number], fits.model.places[number]
         sensor, used = channel.comparison.sensor, channel.comparison.used
         unit_v = _FIRST_LEVEL_G * float(sensor.scale_v_per_g[channel.axis])
-        design = np.concatenate([columns.values.T, *(unit_v * b.T for b in basis.values())]).T
+        rows = np.concatenate([columns.values.T, *(b.T for b in basis.values())])
+        rows[1 + len(columns.places) :] *= unit_v
+        plain_mps2 = linear.plain_grams(rows.T, used) / channel.v_per_mean_mps2**2
         whitener = fits.linearised.filters[number][fits.full.filter_indices[number]]
-        ids = np.arange(design.shape[1] - 1)
-        white_v2 = linear.whiten_channel(design, ids, used, [whitener]).block_grams[0]
-        plain_mps2 = linear.plain_grams(design, used) / channel.v_per_mean_mps2**2
+        # One by one and in place they take little memory.
+        for row in rows:
+            row[:] = next(linear.white_rows(row[:, None], used, [whitener]))[0]
+        white_v2 = linear.block_grams(rows)
         return cls(
             dimensions=np.repeat(
                 [d.value for d in basis], [functions.shape[1] for functions in basis.values()]
@@ -315,7 +318,7 @@ class _FlexibleFunctions:
         return _Decrease(squares, log_likelihood)
 
 
-def reproducible_rest(fits: HeldOutFits, bases: Sequence[Basis]) -> Rest:
+def reproducible_rest(fits: HeldOutFits, bases: Iterable[Basis]) -> Rest:
     """
     Predict held-out blocks by flexible functions of everything that a residual may follow.
 
