@@ -34,7 +34,7 @@ _LYING = 0.3  # Share of the places at which a robot that lies down lies on a si
 
 
 def calibrated(axes: str = AXES) -> Sensor:
-    """Return a sensor with the covariance of a good calibration."""
+    """Return an upright sensor with the covariance of a good calibration."""
     nominal = with_axes(parameter_file.load(parameter_file.nominal_path()), axes)
     names = []
     for effect, parameter in (('bias', 'offset_v'), ('scale_factor', 'offset_v_per_g')):
@@ -45,6 +45,7 @@ def calibrated(axes: str = AXES) -> Sensor:
         model='gravity',
         covariance=np.eye(len(names)) * _CALIBRATION_STD**2,
         covariance_names=tuple(names),
+        z_sign=1,
         provenance={'date': '2026-01-01T00:00:00+00:00'},
     )
 
