@@ -302,8 +302,6 @@ def fit(
         read = unit.add(read)
         progress(_READING * (number + 1) / (number + 2), 'reading')
         recorded.append(rests.of(read, unit, number))
-    if not recorded:
-        raise UserError('no recording is given')
     progress(_READING, 'fit')
     result = calibration.calibrate(
         unit.with_gyro(unit.sensor),

@@ -214,7 +214,7 @@ def update(
             if lost
             else 'no rest of 5 s by the noise of the sensor'
         )
-        raise UserError(f'{name or "no recording"}: {reason}; nothing can be updated')
+        raise UserError(f'{name}: {reason}; nothing can be updated')
     state = keeper.state(keeper.newest_ns)
     outcome = 'ADOPTED' if keeper.adoptions else 'KEPT'
     if state.changed:
