@@ -16,7 +16,8 @@ from adxl_ros.calibrate.pose_model import predicted_volts, reference_force, resi
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment
-from adxl_ros.calibrate.report.error_budget import error_budgets, rms_mg
+from adxl_ros.calibrate.report.error_budget import rms_mg
+from adxl_ros.calibrate.report.error_causes import error_budgets
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.calibrate.result import CalibrationResult, envelope, with_provenance
 from adxl_ros.errors import UserError

@@ -81,14 +81,16 @@ class HandRests(Guide):
                 fault = self._fault(record)
                 if not fault:
                     return record
-                self._announced_ns, self._next_search_ns = record.stop_ns, 0
+                self._announced_ns = record.stop_ns
+                self._next_search_ns = 0
                 self._new_refusal = fault
                 return None
         return None
 
     def take(self, record: PoseRecord) -> None:
         """Count a rest that is on disk."""
-        self._announced_ns, self._next_search_ns = record.stop_ns, 0
+        self._announced_ns = record.stop_ns
+        self._next_search_ns = 0
         self.accepted[record.pose] = record
         self._update_estimate()
 
@@ -319,7 +321,8 @@ class ThermalGuide(Guide):
         accepted: Sequence[PoseRecord] = (),
     ) -> None:
         super().__init__(sensor, accepted)
-        self._base, self._settings = base, settings
+        self._base = base
+        self._settings = settings
         self._dwell: Dwell | None = None
         self._update()
 

@@ -17,7 +17,8 @@ from adxl_ros.calibrate.pose_model import reference_force
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, certificate_data, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
-from adxl_ros.calibrate.report.error_budget import covariances, ErrorBudget
+from adxl_ros.calibrate.report.error_budget import ErrorBudget
+from adxl_ros.calibrate.report.error_causes import covariances
 from adxl_ros.calibrate.result import CalibrationResult, compare
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import AnyPath, write_text
