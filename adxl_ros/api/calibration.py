@@ -449,7 +449,7 @@ class _Rests:
         poses = extract_poses(read, unit.sensor, self._records, self._table)
         if self._table:
             poses = with_table_angles(poses, self._table)
-        return poses, estimate_filters(read, unit.sensor, poses), look.neighbour_faults()
+        return poses, estimate_filters(read, unit.sensor, poses), look.faults()
 
 
 def _one_recording_only() -> UserError:

@@ -182,6 +182,9 @@ _QUIET_RATIO = 3.0  # Largest variance of a quiet window, relative to that of th
 _QUIET_STEPS = 50  # Largest number of steps of that search
 _QUIET_DEVIATIONS = 5.0  # Distance of the limit from the noise, stds of ln(variance)
 _ROUNDING = 1e-9  # Relative rounding error of samples without noise
+_CONSTANT_SHARE = 0.5
+"""Share of the windows in which only the others rest, from which an axis is constant by its steps.
+Chosen: most of them."""
 _TINY_VARIANCE = 1e-300  # Lower bound of a variance, for its logarithm
 
 
@@ -208,12 +211,20 @@ def quiet_variance(
     Learn the variance that the quietest windows have in common, and its limit, (m,) each.
 
     Noise below the ADC's step, (m,), makes at most two codes equally frequent: a variance of
-    step²/4. Samples without any noise still have a rounding error.
+    step²/4. Samples without any noise still have a rounding error. An axis that changes while the
+    others rest is no such one: where it does not, it is stuck, or at the end of its range.
     """
     middle = np.median(np.abs(blocks.mean), axis=0)
-    smallest = step**2 / 4 + (_ROUNDING * middle) ** 2 + _TINY_VARIANCE
-    of_axes = [_quietest(variances, least) for variances, least in zip(windows.T, smallest)]
-    variance, ratio = np.array(of_axes).T
+    rounding = (_ROUNDING * middle) ** 2 + _TINY_VARIANCE
+    smallest = step**2 / 4 + rounding
+    found = list(map(_quietest, windows.T, smallest))
+    is_quiet = windows <= np.prod(found, axis=1)
+    constant = windows <= rounding
+    for axis in np.flatnonzero(constant.any(axis=0)) if len(step) > 1 else ():
+        others_rest = np.delete(is_quiet, axis, axis=1).all(axis=1)
+        if others_rest.any() and constant[others_rest, axis].mean() < _CONSTANT_SHARE:
+            found[axis] = _quietest(windows[~constant[:, axis], axis], smallest[axis])
+    variance, ratio = np.array(found).T
     return variance, ratio * variance
 
 
