@@ -104,8 +104,8 @@ def axis_faults(axes: Iterable[AxisRange]) -> list[str]:
         if axis.clipped >= _FEWEST_CLIPPED:
             low_g, high_g = axis.lowest_mps2 / G0_MPS2, axis.highest_mps2 / G0_MPS2
             faults.append(
-                f'{axis.name} stays at its extreme value {axis.clipped} times in motion; its range '
-                f'ends at {low_g:.3g} or {high_g:.3g} g'
+                f'{axis.name} stays at its extreme value {axis.clipped} times in motion; its '
+                f'range ends at {low_g:.3g} or {high_g:.3g} g'
             )
         elif axis.is_stuck:
             faults.append(f'{axis.name} never changes; the axis is stuck, or not connected')

@@ -29,7 +29,7 @@ from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.process import option
 from adxl_ros.report.quantities import counted, duration
-from adxl_ros.signals.allan_deviation import shortest_rest_s
+from adxl_ros.signals.allan_deviation import longest_of, shortest_rest_s
 from adxl_ros.signals.axis_ranges import axis_faults, AxisLook, AxisRange
 from adxl_ros.signals.gravity_at_rest import GravityAtRest
 from adxl_ros.signals.gyroscope_turns import GyroFindings, GyroLook
@@ -103,6 +103,7 @@ def examine(
     gravity = look.gravity()
     rests = look.rests.detected
     spans_s = [found.rest.span_s for found in rests]
+    longest, _ = longest_of([found.rest for found in rests], stamps.first_s, stamps.last_s)
     means_mps2 = [to_nominal_mps2(found.mean_v, look.nominal) for found in rests]
     span_s = stamps.last_s - stamps.first_s
     return RecordingContents(
@@ -118,7 +119,7 @@ def examine(
         bad_stamps=block.bad_stamps,
         axes=look.axes(),
         rest_share=min(sum(spans_s) / span_s, 1.0),
-        longest_rest_s=max(spans_s, default=0.0),
+        longest_rest_s=longest.span_s,
         rests=len(spans_s),
         poses=_count_poses(means_mps2),
         gravity=gravity,
