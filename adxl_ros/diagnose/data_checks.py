@@ -22,7 +22,7 @@ from adxl_ros.diagnose import comparison as baseline, noise_effects, reference_c
 from adxl_ros.diagnose.comparison import BaselineComparison, compare, SMALLEST_MOTION_G
 from adxl_ros.files.recording_columns import JOINTS, Recording, stamped_rate_hz
 from adxl_ros.model import noise
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import G0_MPS2, TINY
 from adxl_ros.model.effects.base import Detector
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
@@ -1084,7 +1084,7 @@ def _check_axes(comparison: BaselineComparison) -> None:
         (v - v[finite].mean(axis=0)) / sensor.scale_v_per_g
         for v in (comparison.simulated_v(sensor), comparison.volts)
     )
-    _check_units(sensor, simulated_g[finite], measured_g[finite], bool(comparison.simulated_force))
+    _check_units(comparison, measured_g, finite)
     moving = np.flatnonzero(simulated_g.std(axis=0) > SMALLEST_MOTION_G)
     if not len(moving):
         return
@@ -1110,16 +1110,22 @@ def _check_axes(comparison: BaselineComparison) -> None:
 
 
 def _check_units(
-    sensor: Sensor, simulated_g: np.ndarray, measured_g: np.ndarray, has_options: bool
+    comparison: BaselineComparison, measured_g: np.ndarray, finite: np.ndarray
 ) -> None:
-    """Compare the size of motion, g, (n, m), on each axis with the ratios of two units."""
+    """Compare the size of motion on each axis, g, (n, m), with the ratios of two units."""
+    sensor = comparison.sensor
+    # In another unit the simulated output may be beyond the rails of the ADC.
+    simulated_v = comparison.simulated_v(replace(sensor, adc_bits=0))
     gains: dict[str, float] = {}
-    for axis, simulated, measured in zip(sensor.axes, simulated_g.T, measured_g.T):
-        spreads_g = simulated.std(), measured.std()
-        if min(spreads_g) > 0 and max(spreads_g) > SMALLEST_MOTION_G:
-            slope = float(np.mean(simulated * measured)) / spreads_g[0] ** 2
-            if slope * spreads_g[0] > _CORRELATED * spreads_g[1]:
-                gains[axis] = slope
+    for axis, simulated, measured in zip(
+        sensor.axes, (simulated_v / sensor.scale_v_per_g)[finite].T, measured_g[finite].T
+    ):
+        stds_g = float(simulated.std()), float(measured.std())
+        covariance_g2 = float(np.mean((simulated - simulated.mean()) * measured))
+        # Only another simulator can be in such a unit that it seems not to move.
+        moves_g = max(stds_g) if comparison.simulated_force else stds_g[0]
+        if moves_g > SMALLEST_MOTION_G and covariance_g2 > _CORRELATED * stds_g[0] * stds_g[1]:
+            gains[axis] = covariance_g2 / max(stds_g[0] ** 2, TINY)
     for ratio, units in _UNIT_RATIOS.items():
         wrong = [axis for axis in gains if abs(np.log(gains[axis] / ratio)) < _UNIT_TOLERANCE]
         if not wrong:
@@ -1132,5 +1138,5 @@ def _check_units(
             f'{which} is {np.median([gains[axis] for axis in wrong]):.4g} times the simulated '
             f'output, as values in {units} are; correct the unit of the columns'
             + by_option
-            * (are_all and has_options),
+            * bool(are_all and comparison.simulated_force),
         )

@@ -118,6 +118,21 @@ def test_live_equals_offline(seed, axes, rate_hz, known_noise, with_stage):
             assert (got == wanted).all()
 
 
+@pytest.mark.parametrize('fault', ['stuck', 'clipped'])
+def test_an_axis_without_noise_in_motion_hides_no_rest(fault):
+    """Where it does not change it is stuck or at its limit: that is not its noise."""
+    rng = np.random.default_rng(4)
+    time_s, samples, bounds, _ = handled_stream(rng, 100.0, [4.0] * 12, turn_s=4.0)
+    moves = np.ones(len(time_s), bool)
+    for start, stop in bounds:
+        moves[start - 50 : stop + 50] = False
+    if fault == 'stuck':
+        samples[moves, 1] = 3.0
+    else:
+        samples[moves, 1] = np.minimum(samples[moves, 1], -15.0)
+    assert len(find_rests(time_s, samples, 100.0)) == len(bounds)
+
+
 def test_a_knock_neither_ends_nor_moves_a_rest():
     rng = np.random.default_rng(9)
     samples = np.tile([0.0, 0.0, G0_MPS2], (1000, 1)) + SIGMA * rng.normal(size=(1000, 3))
