@@ -302,14 +302,19 @@ def fit(
     if not recorded:
         raise UserError('no recording is given')
     progress(_READING, 'fit')
-    result = calibration.calibrate(
-        unit.with_gyro(unit.sensor),
-        recorded,
-        model,
-        effects,
-        data_sha256 or unit.sha256,
-        population,
-    )
+    try:
+        result = calibration.calibrate(
+            unit.with_gyro(unit.sensor),
+            recorded,
+            model,
+            effects,
+            data_sha256 or unit.sha256,
+            population,
+        )
+    except UserError as error:
+        # Rests that were not found are no fault of the poses where the samples are wrong.
+        reasons = chain.from_iterable(each.faults for each in recorded)
+        raise UserError('; '.join([*reasons, str(error)])) from None
     return _fit(result, unit)
 
 

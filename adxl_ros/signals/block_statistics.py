@@ -183,8 +183,8 @@ _QUIET_STEPS = 50  # Largest number of steps of that search
 _QUIET_DEVIATIONS = 5.0  # Distance of the limit from the noise, stds of ln(variance)
 _ROUNDING = 1e-9  # Relative rounding error of samples without noise
 _CONSTANT_SHARE = 0.5
-"""Share of the windows in which only the others rest, from which an axis is constant by its steps.
-Chosen: most of them."""
+"""Share of the windows in which the others rest, above which an axis is constant by its steps.
+Chosen: most of them. Where the others never rest, several axes are stuck or clipped in turn."""
 _TINY_VARIANCE = 1e-300  # Lower bound of a variance, for its logarithm
 
 
@@ -222,7 +222,7 @@ def quiet_variance(
     constant = windows <= rounding
     for axis in np.flatnonzero(constant.any(axis=0)) if len(step) > 1 else ():
         others_rest = np.delete(is_quiet, axis, axis=1).all(axis=1)
-        if others_rest.any() and constant[others_rest, axis].mean() < _CONSTANT_SHARE:
+        if constant[others_rest, axis].sum() <= _CONSTANT_SHARE * others_rest.sum():
             found[axis] = _quietest(windows[~constant[:, axis], axis], smallest[axis])
     variance, ratio = np.array(found).T
     return variance, ratio * variance
