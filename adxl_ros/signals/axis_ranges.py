@@ -110,8 +110,9 @@ def axis_faults(axes: Iterable[AxisRange]) -> list[str]:
         elif axis.is_stuck:
             faults.append(f'{axis.name} never changes; the axis is stuck, or not connected')
         elif axis.stuck_s:
+            at_end = 'at the end of its range, ' * bool(axis.clipped)
             faults.append(
-                f'{axis.name} does not change for {axis.stuck_s:.3g} s; the axis is stuck, or '
-                'the driver repeats a sample'
+                f'{axis.name} does not change for {axis.stuck_s:.3g} s; the axis is {at_end}'
+                'stuck, or the driver repeats a sample'
             )
     return faults

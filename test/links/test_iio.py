@@ -54,7 +54,7 @@ def read_samples(link, count, timeout_s=60.0):
 
 
 def read_until(condition, link, count=0):
-    """Read some samples and on until a condition holds: a busy machine loses samples, or a link."""
+    """Read samples until a condition holds: a busy machine loses samples, or the link."""
     read_samples(link, count)
     end_s = time.monotonic() + PATIENCE * 10
     while not condition():

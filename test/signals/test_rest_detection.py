@@ -125,7 +125,7 @@ def test_an_axis_without_noise_in_motion_hides_no_rest(fault):
     time_s, samples, bounds, _ = handled_stream(rng, 100.0, [4.0] * 12, turn_s=4.0)
     moves = np.ones(len(time_s), bool)
     for start, stop in bounds:
-        moves[start - 50 : stop + 50] = False
+        moves[max(start - 50, 0) : stop + 50] = False
     if fault == 'stuck':
         samples[moves, 1] = 3.0
     else:
