@@ -20,6 +20,7 @@ from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.population import Population
 from adxl_ros.report import figures as plotly, page as html_page
 from adxl_ros.report.quantities import number
+from adxl_ros.report.screen import Tile
 import numpy as np
 import pandas as pd
 
@@ -59,10 +60,12 @@ def _trend_figure(
     table: fleet.FleetTable, result: fleet.QuantityResult, sensor: int
 ) -> plotly.Figure:
     """Plot a quantity of a sensor over time, about its mean where sensors differ by far more."""
-    quantity, place = result.quantity, result.place_of(sensor)
+    quantity = result.quantity
+    place = result.place_of(sensor)
     origin = result.trends.level[place] if quantity.is_coefficient and place is not None else 0.0
     part = table.sensor[result.rows] == sensor
-    years, is_outlier = result.recordings.time[part], result.is_outlier[part]
+    years = result.recordings.time[part]
+    is_outlier = result.is_outlier[part]
     value = quantity.factor * (result.recordings.value[part] - origin)
     half = Z_90 * quantity.factor * result.recordings.std[part]
     traces = []
@@ -72,7 +75,8 @@ def _trend_figure(
         colour = plotly.BEFORE_COLOUR if is_claimed else plotly.QUIET_COLOUR
         periods = np.where(is_outlier, -1, result.recordings.period[part])
         for period in set(periods.tolist()) - {-1}:
-            within, level = years[periods == period], value[periods == period].mean()
+            within = years[periods == period]
+            level = value[periods == period].mean()
             ends = np.array([within.min(), within.max()])
             traces.append(
                 plotly.line([], level + slope * (ends - within.mean()), 'line', colour)
@@ -288,18 +292,15 @@ def _badge(
     }
 
 
-def _tiles(table: fleet.FleetTable, counts: Counter[fleet.State]) -> list[dict[str, str]]:
+def _tiles(table: fleet.FleetTable, counts: Counter[fleet.State]) -> list[Tile]:
     outcomes = Counter(table['outcome'].tolist())
     return [
-        {
-            'label': 'recordings',
-            'text': str(len(table)),
-            'note': f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed',
-        },
-        *(
-            {'label': f'units: {state.words}', 'text': str(counts[state]), 'note': ''}
-            for state in fleet.State
+        Tile(
+            'recordings',
+            str(len(table)),
+            f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed',
         ),
+        *(Tile(f'units: {state.words}', str(counts[state])) for state in fleet.State),
     ]
 
 

@@ -22,11 +22,11 @@ _UNIT_SUFFIXES = ('m', 's', 'rad', 'v', 'hz', 'f', 'g')
 
 @dataclass(frozen=True)
 class Interval:
-    """A value with its 90 % interval."""
+    """A value with its 90 % interval, in the unit of the field that has it, as `before_mps2`."""
 
-    value: float
-    low: float
-    high: float
+    value: float  # The estimate
+    low: float  # Low end of the interval
+    high: float  # High end of the interval
 
 
 def utc(stamp_ns: int) -> datetime:
@@ -194,9 +194,11 @@ def _for_people(values: np.ndarray, unit: str, scale_v_per_g: float) -> tuple[np
     if unit == 'rad':
         return np.degrees(values), 'deg'
     if unit in ('V', 'V/g'):
-        values, unit = values / scale_v_per_g, 'g' if unit == 'V' else '1'
+        values = values / scale_v_per_g
+        unit = 'g' if unit == 'V' else '1'
     if unit == 'm/s^2':
-        values, unit = values / G0_MPS2, 'g'
+        values = values / G0_MPS2
+        unit = 'g'
     base, slash, per = unit.replace('s/s', '1').partition('/')
     per = per.replace('^2', '²').replace('sqrt(', '√').replace(')', '')
     largest = float(np.abs(values).max())

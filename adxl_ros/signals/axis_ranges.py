@@ -42,10 +42,14 @@ class AxisLook:
     """Extreme values of an axis, and the longest time in which it does not change."""
 
     def __init__(self, name: str, period_s: float) -> None:
-        self.name, self._period_s = name, period_s
+        self.name = name
+        self._period_s = period_s
         # Largest value of minus the samples and of the samples, and how often they stay there
-        self._largest, self._clipped = [-np.inf, -np.inf], [0, 0]
-        self._last, self._count, self._changes = np.nan, 0, 0
+        self._largest = [-np.inf, -np.inf]
+        self._clipped = [0, 0]
+        self._last = np.nan
+        self._count = 0
+        self._changes = 0
         self._equal = self._most_equal = 0  # Samples since the last change, and most between two
 
     def feed(self, values: np.ndarray) -> None:
@@ -55,8 +59,10 @@ class AxisLook:
             return
         changes = np.flatnonzero(np.diff(values, prepend=self._last))
         equal = np.diff(changes, prepend=-1 - self._equal, append=len(values)) - 1
-        self._equal, self._most_equal = int(equal[-1]), max(self._most_equal, int(equal.max()))
-        self._count, self._changes = self._count + len(values), self._changes + len(changes)
+        self._equal = int(equal[-1])
+        self._most_equal = max(self._most_equal, int(equal.max()))
+        self._count += len(values)
+        self._changes += len(changes)
         self._last = values[-1]
         steps = np.abs(np.diff(values))
         smallest = float(steps[steps > 0].min(initial=np.inf))
@@ -64,7 +70,8 @@ class AxisLook:
         for side, signed in enumerate((-values, values)):
             largest = float(signed.max())
             if largest > self._largest[side]:
-                self._largest[side], self._clipped[side] = largest, 0
+                self._largest[side] = largest
+                self._clipped[side] = 0
             if largest == self._largest[side]:
                 self._clipped[side] += sum(
                     self._moves(signed, largest - drop, first, stop)
@@ -80,7 +87,8 @@ class AxisLook:
 
     def result(self) -> AxisRange:
         """Return the range of the axis."""
-        low, high = -self._largest[0], self._largest[1]
+        low = -self._largest[0]
+        high = self._largest[1]
         stuck_s = self._most_equal * self._period_s
         is_reported = (
             stuck_s >= _STUCK_S

@@ -117,7 +117,8 @@ class BlockCutter:
 
     def _summed(self, columns: np.ndarray, start: np.ndarray, run: np.ndarray) -> Blocks:
         block = columns[:, start[:, None] + np.arange(self.size)]
-        samples, angles = block[1 : 1 + self._axes], block[1 + self._axes :]
+        samples = block[1 : 1 + self._axes]
+        angles = block[1 + self._axes :]
         change = np.abs(np.diff(samples, axis=2))
         step = np.where(change > 0, change, np.inf).min(axis=2, initial=np.inf)
         mean = samples.mean(axis=2)
@@ -144,7 +145,8 @@ def angle_bounds(blocks: Blocks) -> np.ndarray:
     """
     bounds = blocks.angle * np.array([[-1.0], [1.0]])
     has_angle = np.isfinite(bounds).all(axis=(1, 2))
-    place, last = np.arange(len(has_angle)), len(has_angle) - 1
+    place = np.arange(len(has_angle))
+    last = len(has_angle) - 1
     # The newest block with an angle up to each place, and the next one from it on
     newest = np.maximum.accumulate(np.where(has_angle, place, 0))
     following = np.minimum.accumulate(np.where(has_angle, place, last)[::-1])[::-1]
@@ -266,12 +268,17 @@ def _quietest(variances: np.ndarray, smallest: float) -> tuple[float, float]:
     )
 
 
+def smallest_change(changes: np.ndarray) -> np.ndarray:
+    """Return the smallest change that is not 0 by axis, (n, m) to (m,); inf where none is."""
+    return np.asarray(np.where(changes > 0, changes, np.inf).min(axis=0, initial=np.inf))
+
+
 def adc_step(blocks: Blocks) -> np.ndarray:
     """Return the smallest change of the samples, (m,); 0 where they never change."""
     changes = blocks.step
     if not np.isfinite(changes).any():  # also where a block is one sample
         changes = np.abs(np.diff(blocks.mean, axis=0))
-    smallest = np.where(changes > 0, changes, np.inf).min(axis=0, initial=np.inf)
+    smallest = smallest_change(changes)
     return np.where(np.isfinite(smallest), smallest, 0.0)
 
 

@@ -8,10 +8,12 @@ These are faults of stamps and samples, remarks, and what other tools can do wit
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 import os
+from typing import NamedTuple
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
@@ -25,9 +27,10 @@ from adxl_ros.files.recording_columns import (
     REFERENCES,
 )
 from adxl_ros.files.stamps import burst_samples, lacks_samples, period_s
+from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.process import option
+from adxl_ros.process import option, usage
 from adxl_ros.report.quantities import counted, duration
 from adxl_ros.signals.allan_deviation import longest_of, shortest_rest_s
 from adxl_ros.signals.axis_ranges import axis_faults, AxisLook, AxisRange
@@ -83,10 +86,11 @@ def examine(
     first = next((block for block in blocks if len(block)), None)
     if first is None:
         raise UserError('the recording holds no samples')
-    sensor, stamps = sensor_of(first), _Stamps(first)
+    sensor = sensor_of(first)
+    stamps = _Stamps(first)
     look = RecordingLook(sensor, first)
     gyro = _Gyro(first, stamps.period_s) if first.gyro_radps is not None else None
-    references: dict[str, _Reference] = {}
+    references = _References()
     for block in chain([first], blocks):
         if not len(block):
             continue
@@ -94,12 +98,7 @@ def examine(
         look.feed(block)
         if gyro is not None:
             gyro.feed(block)
-        for name, values in block.columns.items():
-            if name not in REFERENCES:
-                continue
-            read = values[np.isfinite(values)]
-            if len(read):
-                references.setdefault(name, _Reference()).feed(read)
+        references.feed(block)
     gravity = look.gravity()
     rests = look.rests.detected
     spans_s = [found.rest.span_s for found in rests]
@@ -124,8 +123,8 @@ def examine(
         poses=_count_poses(means_mps2),
         gravity=gravity,
         neighbour_faults=tuple(look.faults()),
-        reference_ranges={name: (each.lowest, each.highest) for name, each in references.items()},
-        reference_means={name: each.total / each.count for name, each in references.items()},
+        reference_ranges=references.ranges,
+        reference_means=references.means,
         log_delay_s=log_delay_s,
         remarks=block.remarks,
         cut=block.cut,
@@ -133,19 +132,29 @@ def examine(
     )
 
 
-class _Reference:
-    """Range and mean of a reference."""
+class _References:
+    """Range and mean of each reference, by column."""
 
     def __init__(self) -> None:
-        self.lowest, self.highest = np.inf, -np.inf
-        self.total, self.count = 0.0, 0  # Sum and number of its values
+        self.ranges: dict[str, tuple[float, float]] = {}  # Lowest and highest value
+        self._sums: defaultdict[str, float] = defaultdict(float)
+        self._counts: Counter[str] = Counter()
 
-    def feed(self, values: np.ndarray) -> None:
-        """Add finite values, (n,)."""
-        self.lowest = min(self.lowest, float(values.min()))
-        self.highest = max(self.highest, float(values.max()))
-        self.total += float(values.sum())
-        self.count += len(values)
+    def feed(self, block: Recording) -> None:
+        """Add the samples of a block, where they are known."""
+        for name, values in block.columns.items():
+            known = values[np.isfinite(values)]
+            if name not in REFERENCES or not len(known):
+                continue
+            low, high = self.ranges.get(name, (np.inf, -np.inf))
+            self.ranges[name] = min(low, float(known.min())), max(high, float(known.max()))
+            self._sums[name] += float(known.sum())
+            self._counts[name] += len(known)
+
+    @property
+    def means(self) -> dict[str, float]:
+        """Return the mean of each."""
+        return {name: self._sums[name] / self._counts[name] for name in self.ranges}
 
 
 def log_delay_s(times_ns: Iterable[np.ndarray]) -> float | None:
@@ -171,12 +180,15 @@ class _Stamps:
         self.count = self.missing = self.gaps = 0
         self.longest_gap_s = 0.0
         # Sums over the steps that are no gaps
-        self._squares, self._usual_s, self._usual = 0.0, 0.0, 0
+        self._squares = 0.0
+        self._usual_s = 0.0
+        self._usual = 0
 
     def feed(self, time_s: np.ndarray) -> None:
         """Add further stamps."""
         stamps_s = np.concatenate([[self.last_s], time_s]) if self.count else time_s
-        steps_s, is_gap = np.diff(stamps_s), lacks_samples(stamps_s, self.period_s)
+        steps_s = np.diff(stamps_s)
+        is_gap = lacks_samples(stamps_s, self.period_s)
         self.count += len(time_s)
         self.last_s = float(time_s[-1])
         lacking = np.rint(steps_s[is_gap] / self.period_s) - self.burst
@@ -246,6 +258,15 @@ SHORTEST_MOTION_S = 30.0  # Shortest recording on a moving stage that `diagnose`
 _FEWEST_STAGE_POSES = 4  # Orientations of a linear fit. Chosen: both ends of two axes
 
 
+class Shown(NamedTuple):
+    """What a recording shows of an effect, sizes with their units, for people."""
+
+    effect: str  # Name of the effect
+    smallest: str  # Smallest size that would show, or that none would
+    typical: str  # Typical size
+    missing: str  # What is missing to show it; '' for nothing
+
+
 @dataclass(frozen=True)
 class Ability:
     """What a tool can do with a recording."""
@@ -264,8 +285,7 @@ class Findings:
     faults: tuple[str, ...]  # Why it is not sound, one line each
     remarks: tuple[str, ...] = ()  # What else is noteworthy, one line each
     abilities: tuple[Ability, ...] = ()  # What the tools can do with it
-    # By effect what `diagnose` could show: effect, smallest and typical size, what is missing
-    shows: tuple[tuple[str, str, str, str], ...] = ()
+    shows: tuple[Shown, ...] = ()  # By effect what `diagnose` could show
     paste: str = ''  # End of the last fault that is for a command line; empty for none
 
     @property
@@ -388,8 +408,8 @@ def _diagnose(contents: RecordingContents) -> Ability:
         return Ability(
             'diagnose',
             False,
-            f'has no stage angles; give {option("sim")} with the specific force of the '
-            'same motion',
+            f'has no stage angles; give {usage("diagnose", sim=None)} with the specific force '
+            'of the same motion',
         )
     if range_rad < _MOVED_RAD:
         return Ability('diagnose', False, 'has stage angles that do not change; move the stage')
@@ -401,7 +421,8 @@ def _diagnose(contents: RecordingContents) -> Ability:
 
 
 def _noise(contents: RecordingContents) -> Ability:
-    longest_s, shortest_s = contents.longest_rest_s, shortest_rest_s(contents.rate_hz)
+    longest_s = contents.longest_rest_s
+    shortest_s = shortest_rest_s(contents.rate_hz)
     return Ability(
         'noise',
         longest_s >= shortest_s,
@@ -409,9 +430,6 @@ def _noise(contents: RecordingContents) -> Ability:
         if longest_s >= shortest_s
         else f'rests for {longest_s:.4g} s, needs {shortest_s:.3g} s',
     )
-
-
-BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 
 
 def check_recording(

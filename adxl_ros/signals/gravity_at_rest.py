@@ -201,7 +201,7 @@ class RestReadings:
 class GravityFault:
     """Why the rests do not read gravity."""
 
-    kind: GravityFaultKind
+    kind: GravityFaultKind  # What is wrong
     reason: str  # The figure, and what explains it
     remedy: str  # What to do
     unit: str = ''  # The likely unit, for people; '' where none explains the readings
@@ -255,12 +255,13 @@ class GravityAtRest:
     rests: int  # Number of rests
     axes: int  # Number of measured axes; with less than three, lengths are lower limits
     gravity_mps2: float  # Local gravity, m/s²
-    length_mps2: float  # Median length of the readings, m/s²; NaN without rests
-    spread_mps2: float  # Range of the lengths that holds half of the rests, m/s²
-    std_mps2: float  # Standard deviation of a length by noise, m/s²
+    # Median length of the readings, m/s². This and the next ones are NaN without rests
+    length_mps2: float = np.nan
+    spread_mps2: float = np.nan  # Range of the lengths that holds half of the rests, m/s²
+    std_mps2: float = np.nan  # Standard deviation of a length by noise, m/s²
     # Lowest and highest median of the lengths that the tolerance allows a sound sensor, m/s²
-    allowed_mps2: tuple[float, float]
-    fault: GravityFault | None  # Why the rests do not read gravity; None where they may
+    allowed_mps2: tuple[float, float] = (np.nan, np.nan)
+    fault: GravityFault | None = None  # Why the rests do not read gravity; None where they may
 
     def as_json(self) -> dict[str, Any]:
         """Return the figures by name, in SI units, without what is not known."""
@@ -319,20 +320,12 @@ def look(
     readings = RestReadings(readings.mean_mps2[::every], readings.std_mps2[::every])
     count, axes = readings.mean_mps2.shape
     if not count:
-        return GravityAtRest(
-            rests=0,
-            axes=axes,
-            gravity_mps2=gravity_mps2,
-            length_mps2=np.nan,
-            spread_mps2=np.nan,
-            std_mps2=np.nan,
-            allowed_mps2=(np.nan, np.nan),
-            fault=None,
-        )
-    length, case = readings.length_mps2, _Case(readings, tolerance, gravity_mps2)
+        return GravityAtRest(0, axes, gravity_mps2)
+    length = readings.length_mps2
+    case = _Case(readings, tolerance, gravity_mps2)
     # A reading of the length g in these poses is that of a force between these lengths.
     upright = readings.divided(np.maximum(length, _LEAST_MPS2)[:, None] / gravity_mps2)
-    low, high = (np.median(limits) for limits in replace(case, readings=upright).force_limits())
+    low, high = np.median(replace(case, readings=upright).force_limits(), axis=1)
     return GravityAtRest(
         rests=count * every,
         axes=axes,
@@ -367,7 +360,8 @@ class _Case:
     def force_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the smallest and largest length of the force of each rest, m/s², (k,) each."""
         size = np.abs(self.readings.mean_mps2)
-        zero_g, scale = self.tolerance.zero_g_mps2, self.tolerance.scale
+        zero_g = self.tolerance.zero_g_mps2
+        scale = self.tolerance.scale
         low = np.linalg.norm(np.maximum(size - zero_g, 0) / (1 + scale), axis=1)
         high = np.linalg.norm((size + zero_g) / (1 - scale), axis=1)
         return low - self.error_mps2, high + self.error_mps2
@@ -402,7 +396,8 @@ class _Case:
 
     def _sphere_middle_mps2(self, prior: float) -> np.ndarray:
         """Return the middle of the sphere nearest to the readings, near 0 by a prior, (m,)."""
-        mean, axes = self.readings.mean_mps2, self.readings.mean_mps2.shape[1]
+        mean = self.readings.mean_mps2
+        axes = self.readings.mean_mps2.shape[1]
         # |r|² = 2·r·b + (|f|² − |b|²) is linear in b and in the bracket.
         near_0 = np.diag(
             prior
@@ -422,7 +417,9 @@ class _Case:
 
     def _unexplained(self, zero_g_mps2: np.ndarray) -> np.ndarray:
         """Return which rests no zero-g near a first guess, m/s², (m,), and scale explain, (k,)."""
-        mean, axes, error_mps2 = self.readings.mean_mps2, len(zero_g_mps2), self.error_mps2
+        mean = self.readings.mean_mps2
+        axes = len(zero_g_mps2)
+        error_mps2 = self.error_mps2
         allowed = _CORRECTABLE * np.concatenate([self.tolerance.zero_g_mps2, self.tolerance.scale])
         shares = np.append(zero_g_mps2, np.zeros(axes)) / allowed.clip(min=TINY)
         shares = shares.clip(-1.0, 1.0)
@@ -452,7 +449,8 @@ class _Case:
     def fault(self) -> GravityFault | None:
         """Return what is wrong; None where a sound sensor may read all this."""
         wrong = self.contradicting()
-        longer, shorter = self.too_long().mean(), self.too_short().mean()
+        longer = self.too_long().mean()
+        shorter = self.too_short().mean()
         is_off = max(longer, shorter) > 0.5
         is_spread = wrong.sum() > 1 and wrong.mean() > _LARGEST_FALSE_SHARE
         if is_off and (unit_fault := self._unit()):
@@ -546,7 +544,8 @@ class _Case:
         factors = {'m/s²': 1.0} | {
             unit.name: unit.gravity / self.gravity_mps2 for unit in _AXIS_UNITS
         }
-        best, least = None, np.inf
+        best = None
+        least = np.inf
         for names in product(factors, repeat=axes):
             if len(set(names)) == 1:
                 continue
@@ -555,7 +554,8 @@ class _Case:
                 continue
             departure = float(np.abs(case.readings.length_mps2 - self.gravity_mps2).max())
             if departure < least:
-                best, least = names, departure
+                best = names
+                least = departure
         if best is None:
             return None
         stated = ', '.join(f'{axis} in {name}' for axis, name in zip(AXES, best))

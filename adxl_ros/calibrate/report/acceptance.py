@@ -6,11 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.fits.linear import AFFINE
-from adxl_ros.calibrate.report import held_out
-from adxl_ros.calibrate.report.held_out import ErrorBudget, ErrorBudgets, HeldOutErrors, rms_mg
+from adxl_ros.calibrate.report import error_budget, held_out
+from adxl_ros.calibrate.report.error_budget import ErrorBudget, ErrorBudgets, rms_mg
+from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
@@ -84,7 +86,9 @@ def assess(
         passes = is_certain and budget.calibration_high <= limit_square
         return PASS if passes else NOT_SHOWN
 
-    (accel, tilt), square = budgets, limit(sensor)[0] ** 2
+    accel = budgets.accel
+    tilt = budgets.tilt
+    square = limit(sensor).mps2 ** 2
     return Assessment(
         model, accel, tilt, outcome(accel, square), outcome(tilt, square * tilt.tilt_per_axis)
     )
@@ -123,13 +127,15 @@ def gravity_error_budgets(
     excess = fit.excess_mps2**2
     by_noise = float(np.mean(fit.expected_mps2[kept] ** 2)) - excess
     covariance = force_covariance(fitted, list(force[kept].T), np.zeros(len(fitted.axes)))
-    gravity, used = fitted.local_gravity_mps2, np.ones(len(kept), bool)
-    measured, nu = float(np.mean(errors**2)), held_out.degrees_of_freedom(errors)
+    gravity = fitted.local_gravity_mps2
+    used = np.ones(len(kept), bool)
+    measured = float(np.mean(errors**2))
+    nu = held_out.degrees_of_freedom(errors)
     quantile = float(scipy.special.chdtri(nu, _UPPER_QUANTILE))
     upper = max(measured * nu / quantile - by_noise, excess)
-    accel = held_out.axis_variance(covariance, [0, 1, 2], used)
-    tilt = held_out.tilt_variance(covariance, force[kept], gravity, used)
-    spread = held_out.coefficient_spread(fitted, list(force[kept].T))
+    accel = error_budget.axis_variance(covariance, [0, 1, 2], used)
+    tilt = error_budget.tilt_variance(covariance, force[kept], gravity, used)
+    spread = error_budget.coefficient_spread(fitted, list(force[kept].T))
     # Each of three axes has the error of a magnitude; two of the three turn the vertical.
     return ErrorBudgets(
         ErrorBudget(
@@ -152,18 +158,25 @@ def gravity_error_budgets(
     )
 
 
-def limit(sensor: Sensor) -> tuple[float, str]:
+class Limit(NamedTuple):
+    """Limit of the error of acceleration."""
+
+    mps2: float
+    origin: str  # Where it comes from, for people
+
+
+def limit(sensor: Sensor) -> Limit:
     """
-    Return the limit of the error of acceleration, m/s², and where it comes from.
+    Return the limit of the error of acceleration.
 
     It is the typical nonlinearity at full scale by the datasheet, the only error that the
     manufacturer's own calibration leaves; where none is stated, the noise of one sample.
     """
     typical, _ = sensor.datasheet.get(_NONLINEARITY, (0.0, 0.0))
     if typical:
-        return typical * sensor.range_g**3 * G0_MPS2, 'datasheet'
+        return Limit(typical * sensor.range_g**3 * G0_MPS2, 'datasheet')
     noise_g = sample_std_v(sensor) / sensor.scale_v_per_g
-    return G0_MPS2 * float(np.sqrt(np.mean(noise_g**2))), 'noise of one sample'
+    return Limit(G0_MPS2 * float(np.sqrt(np.mean(noise_g**2))), 'noise of one sample')
 
 
 LIMITS = {
@@ -185,7 +198,7 @@ def summary_lines(
     if assessment is not None:
         if open_coefficients(fitted):
             cause = 'open'
-        elif limit(fitted)[0]:
+        elif limit(fitted).mps2:
             cause = assessment.accel.limited_by
         else:
             cause = 'noise or model'
@@ -232,7 +245,7 @@ _MODELS = {
 
 def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
     """Lay out the error of the calibration above its limit, with one outcome for each figure."""
-    limit_mps2, _ = limit(sensor)
+    limit_mps2 = limit(sensor).mps2
     rows = (
         ('calibration error', assessment.error_mg, assessment.error_deg, '', ''),
         (
@@ -259,7 +272,7 @@ def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:
     low, high = unseen.interval
     lines = [
         f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before.rms:.2f}, '
-        f'{fit.step.text} {after.rms:.3f}, held-out stretches of time {unseen.rms:.3f} '
+        f'{fit.rung.text} {after.rms:.3f}, held-out stretches of time {unseen.rms:.3f} '
         f'({low:.3f} to {high:.3f}), {unseen.largest:.3f} max'
     ]
     if fit.outliers:
@@ -315,7 +328,8 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
     accel = provenance.get('verdict', '')
     outcomes = accel, provenance.get('verdict_tilt', '')
     outcome = next((word for word in (FAIL, NOT_SHOWN) if word in outcomes), PASS)
-    error, verb = float(provenance['own_accel_mg']), 'allows' if origin == 'datasheet' else 'is'
+    error = float(provenance['own_accel_mg'])
+    verb = 'allows' if origin == 'datasheet' else 'is'
     lines = [f'calibration error {two_digits(error)} mg; the {origin} {verb} {limit_text}']
     if outcome == FAIL:
         if accel != FAIL:

@@ -4,7 +4,7 @@
 The uncertainty of the acceleration at a stated pose (GUM, JCGM 100), and a certificate of it.
 
 Squares of contributions add. Those of noise, coefficients, stage and model are the parts of
-`held_out.ErrorBudget`, here pose by pose.
+`error_budget.ErrorBudget`, here pose by pose.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from adxl_ros.calibrate.pose_model import reference_force
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, certificate_data, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
-from adxl_ros.calibrate.report.held_out import ErrorBudget
+from adxl_ros.calibrate.report.error_budget import covariances, ErrorBudget
 from adxl_ros.calibrate.result import CalibrationResult, compare
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import AnyPath, write_text
@@ -127,20 +127,23 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
     if not result.held_out or not np.isfinite(result.assessments[-1].accel.measured):
         return None
     errors, assessment = result.held_out[-1], result.assessments[-1]
-    gravity, axes = fitted.local_gravity_mps2, [AXES.index(axis) for axis in fitted.axes]
+    gravity = fitted.local_gravity_mps2
+    axes = [AXES.index(axis) for axis in fitted.axes]
     poses = result.poses.subset(result.inliers)
-    held, used = poses.subset(errors.pose_index), held_out.determining_alpha(errors.errors)
+    held = poses.subset(errors.pose_index)
+    used = held_out.determining_alpha(errors.pose_errors)
     force = np.column_stack(reference_force(held, gravity))
 
     def stds_mps2(covariance: np.ndarray) -> np.ndarray:
         return np.sqrt(np.maximum([covariance[d, d][used] for d in axes], 0.0)).T
 
-    covariances = held_out.covariances(errors, held, force)
-    by_noise = stds_mps2(covariances.by_noise)
-    by_coefficients = stds_mps2(covariances.by_coefficients)
-    by_stage = stds_mps2(covariances.by_stage)
-    held, reference = held.subset(used), force[used][:, axes]
-    error = errors.errors.accel_mps2[used]
+    by_cause = covariances(errors, held, force)
+    by_noise = stds_mps2(by_cause.by_noise)
+    by_coefficients = stds_mps2(by_cause.by_coefficients)
+    by_stage = stds_mps2(by_cause.by_stage)
+    held = held.subset(used)
+    reference = force[used][:, axes]
+    error = errors.pose_errors.accel_mps2[used]
     model = np.full(error.shape, np.sqrt(assessment.accel.model))
     inputs = (
         Input(
@@ -179,7 +182,7 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
         reference_mps2=reference,
         error_mps2=error,
         inputs=inputs,
-        limit_name=acceptance.limit(fitted)[1],
+        limit_name=acceptance.limit(fitted).origin,
         decisions=_decisions(fitted, assessment),
     )
 
@@ -190,7 +193,8 @@ def _stage_angles(by_step_mps2: np.ndarray, scatter: float, fitted: Sensor) -> I
 
     The poses may scatter more than the step permits; scatter: their mean square, (m/s²)².
     """
-    name, step_rad = 'stage angles', fitted.stage_std_rad
+    name = 'stage angles'
+    step_rad = fitted.stage_std_rad
     excess = (scatter / max(np.mean(by_step_mps2**2), 1e-30)) ** 0.5
     if excess <= 1:
         kind = 'B, uniform within a step'
@@ -210,16 +214,18 @@ def _stage_angles(by_step_mps2: np.ndarray, scatter: float, fitted: Sensor) -> I
 
 def _local_gravity(gravity_mps2: float, reference_mps2: np.ndarray) -> Input:
     """Return the contribution of local gravity to accelerations, m/s², (k, m)."""
-    std_mps2, kind = _LOCAL_STD_MPS2, 'B, anomalies of gravity'
+    std_mps2 = _LOCAL_STD_MPS2
+    kind = 'B, anomalies of gravity'
     if gravity_mps2 in _NOT_LOCAL_MPS2:
-        std_mps2, kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, not local: anywhere'
+        std_mps2 = _EARTH_HALF_RANGE_MPS2 / _UNIFORM
+        kind = 'B, not local: anywhere'
     part_mps2 = np.abs(reference_mps2) / gravity_mps2 * std_mps2
     return Input('local gravity', kind, std_mps2, 'm/s²', part_mps2)
 
 
 def _decisions(fitted: Sensor, assessment: Assessment) -> tuple[Decision, ...]:
     """Return the comparisons with limits; none of a quantity without a limit."""
-    limit_mps2, _ = acceptance.limit(fitted)
+    limit_mps2 = acceptance.limit(fitted).mps2
 
     def decision(
         quantity: str, unit: str, scale: float, budget: ErrorBudget, limit: float, outcome: str
@@ -248,7 +254,8 @@ def _decisions(fitted: Sensor, assessment: Assessment) -> tuple[Decision, ...]:
 def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray) -> Input:
     """Return the contribution of temperature or supply, uniform over those of the poses."""
     field, unit, margin, step = _SURROUNDINGS[name]
-    values, environment = getattr(held, field), held.environment
+    values = getattr(held, field)
+    environment = held.environment
     seen = values[np.isfinite(values)]
     half_range = margin + (np.ptp(seen) / 2 if seen.size else 0.0)
     if seen.size:
@@ -348,31 +355,11 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
 
 
 SCHEMA_VERSION = '3.2.0'
-_UNITS = {
-    'V': (r'\volt', 1.0),
-    '°': (r'\degree', 1.0),
-    'V/g': (r'\volt\metre\tothe{-1}\second\tothe{2}', 1 / G0_MPS2),
-}
-"""Units in D-SI, where g is none, and factors of the coefficients that a certificate states."""
-_ACCELERATION = r'\metre\second\tothe{-2}'
 
 
-def _quantity(
-    name: str, values: Any, unit: str, std: Any = None, about: str = '', kind: str = ''
-) -> dict[str, Any]:
-    """Describe a quantity of one value, or of a list, with the expanded uncertainty of each."""
-    expanded: Any = [] if std is None else K * np.asarray(std)
-    numbers = ' '.join(f'{value:.7g}' for value in np.ravel(values))
-    half_widths = ' '.join(f'{value:.7g}' for value in np.ravel(expanded))
-    return {
-        'name': name,
-        'about': about,
-        'kind': kind,
-        'unit': unit,
-        'numbers': numbers,
-        'is_list': np.ndim(values) > 0,
-        'expanded': half_widths,
-    }
+def _digits(values: Any) -> str:
+    """Return a number, or several ones, (n,), as a certificate has them."""
+    return ' '.join(f'{value:.7g}' for value in np.ravel(values))
 
 
 def write(
@@ -390,91 +377,20 @@ def write(
             f'angles was kept out of the fit; leave {option("certificate")} out'
         )
     elements = templates.environment('a certificate', ('adxl_ros.calibrate.report', ''))
-    fitted = result.fitted
+    elements.filters |= {'degrees': np.degrees, 'digits': _digits}
     write_text(
         path,
         elements.get_template('certificate.xml').render(
             schema_version=SCHEMA_VERSION,
             k=K,
+            z_90=Z_90,
+            g0_mps2=G0_MPS2,
             rule=RULE,
             method=f'{MEANING} {MODEL}',
-            fitted=fitted,
             data=data,
-            provenance=fitted.provenance,
-            step_deg=np.degrees(fitted.stage_resolution_rad),
-            **_results(fitted, found),
+            found=found,
+            fitted=result.fitted,
+            provenance=result.fitted.provenance,
+            coefficients=compare(result.fitted, result.fitted),
         ),
     )
-
-
-def _decision(row: Decision, limit_name: str) -> dict[str, Any]:
-    """Return a comparison of an error with its limit."""
-    unit, factor = (_ACCELERATION, 1e-3 * G0_MPS2) if row.unit == 'mg' else (r'\degree', 1.0)
-    conditional = 'conditionalPass' if row.error <= row.limit else 'conditionalFail'
-    return {
-        'quantity': row.quantity,
-        'outcome': row.outcome,
-        'conformity': {PASS: 'pass', FAIL: 'fail'}.get(row.outcome, conditional),
-        'figures': [
-            _quantity(name, factor * value, unit, kind=kind)
-            for name, value, kind in (
-                ('error of the calibration', row.error, 'basic_measuredValue'),
-                ('guard band', row.guard_band, ''),
-                (f'limit by the {limit_name}', row.limit, 'basic_acceptanceLimitUpper'),
-            )
-        ],
-    }
-
-
-def _results(fitted: Sensor, found: Uncertainty) -> dict[str, list[Any]]:
-    """Return decisions, errors, coefficients and conditions as quantities."""
-    errors = [
-        [
-            _quantity('alpha', np.degrees(found.alpha_rad), r'\degree'),
-            _quantity('beta', np.degrees(found.beta_rad), r'\degree'),
-            _quantity(
-                f'reference acceleration along {name}',
-                found.reference_mps2[:, d],
-                _ACCELERATION,
-                kind='basic_referenceValue',
-            ),
-            _quantity(
-                f'measured acceleration along {name}',
-                (found.reference_mps2 + found.error_mps2)[:, d],
-                _ACCELERATION,
-                kind='basic_measuredValue',
-            ),
-            _quantity(
-                f'error along {name}',
-                found.error_mps2[:, d],
-                _ACCELERATION,
-                found.combined_mps2[:, d],
-                kind='basic_measurementError',
-            ),
-        ]
-        for d, name in enumerate(fitted.axes)
-    ]
-    coefficients = []
-    for row in compare(fitted, fitted):
-        if row.unit in _UNITS:
-            unit, factor = _UNITS[row.unit]
-            coefficients.append(
-                _quantity(
-                    f'{row.label} {row.axis}',
-                    factor * row.fitted,
-                    unit,
-                    factor * row.half_width / Z_90,
-                    row.name,
-                )
-            )
-    conditions = [_quantity('local gravity', fitted.local_gravity_mps2, _ACCELERATION)]
-    conditions += [
-        _quantity(f'{name} temperature', value + 273.15, r'\kelvin')
-        for name, value in zip(('lowest', 'highest'), fitted.envelope.temperature_c or ())
-    ]
-    return {
-        'decisions': [_decision(row, found.limit_name) for row in found.decisions],
-        'errors': errors,
-        'coefficients': coefficients,
-        'conditions': conditions,
-    }

@@ -18,13 +18,13 @@ from adxl_ros.model.effects.base import (
     FormDimension,
     Manoeuvre,
     Need,
-    optional,
+    OptionalSize,
     Parameter,
     Parameters,
     Place,
     ProofVariable,
     Role,
-    shape,
+    Shape,
     Signals,
     StraightLine,
     Value,
@@ -56,14 +56,20 @@ def _bias_by(others: tuple[int, int, int], signals: Signals, p: Parameters) -> N
     Place.ELEMENT,
     Parameter(
         'linear',
-        'g/g',
-        -0.3,
-        0.3,
-        0.015,
-        'ADXL203 datasheet: cross-axis 1.5 %',
-        'p1 of equation 11; to first order the same as a misalignment',
+        unit='g/g',
+        upper=0.3,
+        scale=0.015,
+        source='ADXL203 datasheet: cross-axis 1.5 %',
+        doc='p1 of equation 11; to first order the same as a misalignment',
     ),
-    Parameter('quadratic_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 4', 'p2 of equation 11'),
+    Parameter(
+        'quadratic_per_g',
+        unit='1/g',
+        upper=0.3,
+        scale=0.01,
+        source='paper, figure 4',
+        doc='p2 of equation 11',
+    ),
     invertible=True,
     cause='The other in-plane axis shifts the bias; calibrate with the plane alpha = 90 deg.',
     diagnosis=DiagnosisHints(
@@ -81,14 +87,20 @@ def cross_axis(signals: Signals, p: Parameters) -> None:
     Place.ELEMENT,
     Parameter(
         'linear',
-        'g/g',
-        -0.3,
-        0.3,
-        0.015,
-        'ADXL203 datasheet: cross-axis 1.5 %',
-        'q1 of equation 13; to first order the same as a misalignment',
+        unit='g/g',
+        upper=0.3,
+        scale=0.015,
+        source='ADXL203 datasheet: cross-axis 1.5 %',
+        doc='q1 of equation 13; to first order the same as a misalignment',
     ),
-    Parameter('quadratic_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 6', 'q2 of equation 13'),
+    Parameter(
+        'quadratic_per_g',
+        unit='1/g',
+        upper=0.3,
+        scale=0.01,
+        source='paper, figure 6',
+        doc='q2 of equation 13',
+    ),
     invertible=True,
     cause='The out-of-plane axis shifts the bias; calibrate with several planes alpha.',
     diagnosis=DiagnosisHints(
@@ -106,12 +118,11 @@ def cross_axis_z(signals: Signals, p: Parameters) -> None:
     Place.ELEMENT,
     Parameter(
         'linear_per_g',
-        '1/g',
-        -0.3,
-        0.3,
-        0.01,
-        'as scale_factor_z: paper, figure 8',
-        'relative change of the scale factor for 1 g on the other axis',
+        unit='1/g',
+        upper=0.3,
+        scale=0.01,
+        source='as scale_factor_z: paper, figure 8',
+        doc='relative change of the scale factor for 1 g on the other axis',
     ),
     invertible=True,
     cause='The other in-plane axis changes the scale factor; calibrate with several planes alpha.',
@@ -140,16 +151,20 @@ def scale_factor_cross(signals: Signals, p: Parameters) -> None:
 @effect(
     Place.ELEMENT,
     Parameter(
-        'linear_per_g', '1/g', -0.3, 0.3, 0.01, 'paper, figure 8', 'r1 over r0 of equation 15'
+        'linear_per_g',
+        unit='1/g',
+        upper=0.3,
+        scale=0.01,
+        source='paper, figure 8',
+        doc='r1 over r0 of equation 15',
     ),
     Parameter(
         'quadratic_per_g2',
-        '1/g^2',
-        -0.3,
-        0.3,
-        0.01,
-        'paper, figure 8',
-        'r2 over r0 of equation 15',
+        unit='1/g^2',
+        upper=0.3,
+        scale=0.01,
+        source='paper, figure 8',
+        doc='r2 over r0 of equation 15',
     ),
     invertible=True,
     cause='The out-of-plane axis changes the scale factor; calibrate with several planes alpha.',
@@ -177,12 +192,11 @@ def scale_factor_z(signals: Signals, p: Parameters) -> None:
     Place.ELEMENT,
     Parameter(
         'cubic_per_g2',
-        '1/g^2',
-        -0.1,
-        0.1,
-        7e-4,
-        'ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
-        'coefficient of the cube of the acceleration along the axis',
+        unit='1/g^2',
+        upper=0.1,
+        scale=7e-4,
+        source='ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
+        doc='coefficient of the cube of the acceleration along the axis',
     ),
     invertible=True,
     cause='The scale factor changes with the input; calibrate with poses between 0 and 1 g.',
@@ -203,12 +217,11 @@ def nonlinearity(signals: Signals, p: Parameters) -> None:
     Place.ELEMENT,
     Parameter(
         'quadratic_per_g',
-        '1/g',
-        -0.1,
-        0.1,
-        1.2e-3,
-        'ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
-        'coefficient of the square of the acceleration along the axis',
+        unit='1/g',
+        upper=0.1,
+        scale=1.2e-3,
+        source='ADXL203 datasheet: nonlinearity 0.2 % of 1.7 g full scale',
+        doc='coefficient of the square of the acceleration along the axis',
     ),
     invertible=True,
     cause='Scale factors up and down differ; calibrate, and let no supply clip one side.',
@@ -229,21 +242,20 @@ def quadratic(signals: Signals, p: Parameters) -> None:
     Place.ELEMENT,
     Parameter(
         'half_width_g',
-        'g',
-        -0.1,
-        0.1,
-        2e-3,
-        'physics: friction in die and package',
-        'largest lag behind the input: half of the width of the loop',
+        unit='g',
+        upper=0.1,
+        scale=2e-3,
+        source='physics: friction in die and package',
+        doc='largest lag behind the input: half of the width of the loop',
     ),
-    shape(
+    Shape(
         'reach_g',
-        'g',
-        1e-3,
-        2.0,
-        0.2,
-        'physics: part of the range',
-        'change of the input after a reversal that builds up half of the lag',
+        unit='g',
+        lower=1e-3,
+        upper=2.0,
+        scale=0.2,
+        source='physics: part of the range',
+        doc='change of the input after a reversal that builds up half of the lag',
         starts=(0.04, 0.2, 1.0),
     ),
     smooth=False,
@@ -274,21 +286,20 @@ def hysteresis(signals: Signals, p: Parameters) -> None:
     Place.ELEMENT,
     Parameter(
         'coefficient_per_g',
-        'g/g^2',
-        -1.0,
-        1.0,
-        0.05,
-        'physics: asymmetry of the element, clipping of fast peaks',
-        'shift of the zero-g divided by the mean square of the vibration',
+        unit='g/g^2',
+        upper=1.0,
+        scale=0.05,
+        source='physics: asymmetry of the element, clipping of fast peaks',
+        doc='shift of the zero-g divided by the mean square of the vibration',
     ),
-    shape(
+    Shape(
         'tau_s',
-        's',
-        0.01,
-        60.0,
-        0.5,
-        'physics: slower than any vibration',
-        'time over which the mean square is taken',
+        unit='s',
+        lower=0.01,
+        upper=60.0,
+        scale=0.5,
+        source='physics: slower than any vibration',
+        doc='time over which the mean square is taken',
         starts=(0.1, 0.5, 2.5),
     ),
     cause='Vibration shifts the zero-g; damp the mount, or stay away from its resonance.',
@@ -307,11 +318,12 @@ def vibration_rectification(signals: Signals, p: Parameters) -> None:
         if not k:
             continue
         sensed = signals.sensed[d]
-        mean, square = (signals.memory.setdefault((d, i), {}) for i in range(2))
-        vibration = sensed - low_pass(sensed, tau_s, signals.dt_s, mean)
-        signals.output[d] = signals.output[d] + k * low_pass(
-            vibration * vibration, tau_s, signals.dt_s, square
-        )
+        of_mean = signals.memory.setdefault((d, 'mean'), {})
+        of_square = signals.memory.setdefault((d, 'square'), {})
+        mean = low_pass(sensed, tau_s, signals.dt_s, of_mean)
+        vibration = sensed - mean
+        mean_square = low_pass(vibration * vibration, tau_s, signals.dt_s, of_square)
+        signals.output[d] = signals.output[d] + k * mean_square
 
 
 def direction(axis: int, alpha_rad: Value, beta_rad: Value) -> Components:
@@ -331,21 +343,19 @@ def direction(axis: int, alpha_rad: Value, beta_rad: Value) -> Components:
     Place.MOUNTING,
     Parameter(
         'alpha_rad',
-        'rad',
-        -0.5,
-        0.5,
-        0.0175,
-        'ADXL203 datasheet: package alignment 1 deg',
-        'tilt of the sensing axis out of the plane (z: about x), equations 18 and 19',
+        unit='rad',
+        upper=0.5,
+        scale=0.0175,
+        source='ADXL203 datasheet: package alignment 1 deg',
+        doc='tilt of the sensing axis out of the plane (z: about x), equations 18 and 19',
     ),
     Parameter(
         'beta_rad',
-        'rad',
-        -0.5,
-        0.5,
-        0.0175,
-        'ADXL203 datasheet: package alignment 1 deg, x to y 0.1 deg',
-        'turn of the sensing axis in the plane (z: about y), equations 18 and 19',
+        unit='rad',
+        upper=0.5,
+        scale=0.0175,
+        source='ADXL203 datasheet: package alignment 1 deg, x to y 0.1 deg',
+        doc='turn of the sensing axis in the plane (z: about y), equations 18 and 19',
     ),
     exact=True,
     invertible=True,
@@ -356,7 +366,10 @@ def direction(axis: int, alpha_rad: Value, beta_rad: Value) -> Components:
 )
 def misalignment(signals: Signals, p: Parameters) -> None:
     """Directions of the sensing axes in the case: equations 18 and 19, and the same for z."""
-    alpha_rad, beta_rad, memory = p['alpha_rad'], p['beta_rad'], signals.memory
+    alpha_rad = p['alpha_rad']
+    beta_rad = p['beta_rad']
+    memory = signals.memory
+    # Live samples share their values, so that the directions are computed once.
     if memory.get('alpha_rad') is not alpha_rad or memory.get('beta_rad') is not beta_rad:
         memory.update(
             alpha_rad=alpha_rad,
@@ -374,31 +387,30 @@ def misalignment(signals: Signals, p: Parameters) -> None:
     Place.MOUNTING,
     Parameter(
         'gain',
-        '1',
-        -2.0,
-        2.0,
-        1.0,
-        'physics: 0 is rigid, 1 all through the mount',
-        'part of the force that comes through the mount',
+        unit='1',
+        upper=2.0,
+        scale=1.0,
+        source='physics: 0 is rigid, 1 all through the mount',
+        doc='part of the force that comes through the mount',
     ),
-    shape(
+    Shape(
         'frequency_hz',
-        'Hz',
-        2.0,
-        450.0,
-        120.0,
-        'physics: a board on standoffs',
-        'natural frequency, undamped',
+        unit='Hz',
+        lower=2.0,
+        upper=450.0,  # Below half of the 1000 Hz at which a motion is computed
+        scale=120.0,
+        source='physics: a board on standoffs',
+        doc='natural frequency, undamped',
         starts=(8.0, 14.0, 24.0, 40.0, 70.0, 120.0, 250.0),
     ),
-    shape(
+    Shape(
         'damping_ratio',
-        '1',
-        0.001,
-        0.95,
-        0.05,
-        'physics: metal and FR4',
-        'damping divided by the critical one',
+        unit='1',
+        lower=0.001,
+        upper=0.95,  # At 1 and above it is no resonator
+        scale=0.05,
+        source='physics: metal and FR4',
+        doc='damping divided by the critical one',
     ),
     cause='The mount is a spring; stiffen it, or keep the motion away from its resonance.',
     diagnosis=DiagnosisHints(
@@ -428,12 +440,11 @@ def mount_resonance(signals: Signals, p: Parameters) -> None:
     Place.ELECTRONICS,
     Parameter(
         'offset_v',
-        'V',
-        -2.0,
-        2.0,
-        0.1,
-        'ADXL203 datasheet: zero-g 2.4 to 2.6 V',
-        'zero-g output minus the nominal one',
+        unit='V',
+        upper=2.0,
+        scale=0.1,
+        source='ADXL203 datasheet: zero-g 2.4 to 2.6 V',
+        doc='zero-g output minus the nominal one',
     ),
     exact=True,
     invertible=True,
@@ -456,12 +467,12 @@ def bias(signals: Signals, p: Parameters) -> None:
     Place.ELECTRONICS,
     Parameter(
         'offset_v_per_g',
-        'V/g',
-        -0.9,
-        9.0,
-        0.04,
-        'ADXL203 datasheet: 960 to 1040 mV/g',
-        'scale factor minus the nominal one',
+        unit='V/g',
+        lower=-0.9,  # A scale factor of 1 V/g stays above 0
+        upper=9.0,
+        scale=0.04,
+        source='ADXL203 datasheet: 960 to 1040 mV/g',
+        doc='scale factor minus the nominal one',
     ),
     exact=True,
     invertible=True,
@@ -489,30 +500,28 @@ _SCALE_EXPONENT = 1.135
     Place.ELECTRONICS,
     Parameter(
         'zero_g_exponent',
-        '1',
-        -3.0,
-        3.0,
-        1.0,
-        'ADXL203 datasheet: ratiometric',
-        'exponent of the supply voltage in the zero-g; 0 is independent of it',
+        unit='1',
+        upper=3.0,
+        scale=1.0,
+        source='ADXL203 datasheet: ratiometric',
+        doc='exponent of the supply voltage in the zero-g; 0 is independent of it',
     ),
     Parameter(
         'scale_exponent',
-        '1',
-        -3.0,
-        3.0,
-        _SCALE_EXPONENT,
-        'ADXL203 datasheet: 560 mV/g at 3 V, not 600',
-        'exponent of the supply voltage in the scale factor; 0 is independent of it',
+        unit='1',
+        upper=3.0,
+        scale=_SCALE_EXPONENT,
+        source='ADXL203 datasheet: 560 mV/g at 3 V, not 600',
+        doc='exponent of the supply voltage in the scale factor; 0 is independent of it',
     ),
-    shape(
+    Shape(
         'nominal_v',
-        'V of the supply',
-        1.0,
-        30.0,
-        NOMINAL_SUPPLY_V,
-        'ADXL203 datasheet: values at 5 V',
-        'supply voltage of the datasheet values',
+        unit='V of the supply',
+        lower=1.0,
+        upper=30.0,
+        scale=NOMINAL_SUPPLY_V,
+        source='ADXL203 datasheet: values at 5 V',
+        doc='supply voltage of the datasheet values',
         held=True,
     ),
     invertible=True,
@@ -534,33 +543,32 @@ def supply(signals: Signals, p: Parameters) -> None:
     Place.ELECTRONICS,
     Parameter(
         'limit_g',
-        'g',
-        0.1,
-        1000.0,
-        1.0,
-        'ADXL203 datasheet: range 1.7 g at least; lower with a low supply',
-        'largest output of either sign; 1000 does not clip',
+        unit='g',
+        lower=0.1,
+        upper=1000.0,  # Does not clip
+        scale=1.0,
+        source='ADXL203 datasheet: range 1.7 g at least; lower with a low supply',
+        doc='largest output of either sign; 1000 does not clip',
         neutral=1000.0,
         role=Role.LIMIT,
     ),
-    optional(
+    OptionalSize(
         'knee_g',
-        'g',
-        0.0,
-        0.5,
-        0.02,
-        'physics: an amplifier near its rail',
-        'width of a soft clip; 0 is hard',
+        unit='g',
+        lower=0.0,
+        upper=0.5,
+        scale=0.02,
+        source='physics: an amplifier near its rail',
+        doc='width of a soft clip; 0 is hard',
         axes='',
     ),
-    optional(
+    OptionalSize(
         'offset_g',
-        'g',
-        -0.5,
-        0.5,
-        0.02,
-        'ADXL203 datasheet: zero-g 2.4 to 2.6 V between rails of 0 and 5 V',
-        'middle of the two limits',
+        unit='g',
+        upper=0.5,
+        scale=0.02,
+        source='ADXL203 datasheet: zero-g 2.4 to 2.6 V between rails of 0 and 5 V',
+        doc='middle of the two limits',
     ),
     smooth=False,
     cause='The output clips; raise the supply, lower the gain, or choose a wider range.',
@@ -582,11 +590,9 @@ def saturation(signals: Signals, p: Parameters) -> None:
         if not knee_g:
             signals.output[d] = np.clip(x, -lower, upper)
         else:
-            beyond = [
-                np.logaddexp(0.0, (sign * x - rail) / knee_g)
-                for sign, rail in ((1, upper), (-1, lower))
-            ]
-            signals.output[d] = x - knee_g * (beyond[0] - beyond[1])
+            above = np.logaddexp(0.0, (x - upper) / knee_g)
+            below = np.logaddexp(0.0, (-x - lower) / knee_g)
+            signals.output[d] = x - knee_g * (above - below)
 
 
 _WITHOUT_FILTER_S = 1e-3
@@ -597,12 +603,12 @@ _WITHOUT_FILTER_S = 1e-3
     Place.ELECTRONICS,
     Parameter(
         'resistance_ratio',
-        '1',
-        -0.95,
-        1000.0,
-        1.0,
-        'ADXL203 datasheet: 32 kOhm +-25 %; ADXL355: settings from 1 to 1000 Hz',
-        "filter's resistance divided by the stated one, minus 1; ms without a filter",
+        unit='1',
+        lower=-0.95,  # A resistance stays above 0
+        upper=1000.0,  # Registers set the ADXL355 from 1 to 1000 Hz
+        scale=1.0,
+        source='ADXL203 datasheet: 32 kOhm +-25 %; ADXL355: settings from 1 to 1000 Hz',
+        doc="filter's resistance divided by the stated one, minus 1; ms without a filter",
         typical=0.15,
         starts=(0.03, *(2.0**n for n in range(7))),
     ),
@@ -632,21 +638,19 @@ def bandwidth(signals: Signals, p: Parameters) -> None:
     Place.ELECTRONICS,
     Parameter(
         'per_k',
-        'g/K',
-        -0.1,
-        0.1,
-        1e-4,
-        'ADXL203 datasheet: 0.1 mg/degC',
-        'slope of the zero-g over temperature at 25 degC',
+        unit='g/K',
+        upper=0.1,
+        scale=1e-4,
+        source='ADXL203 datasheet: 0.1 mg/degC',
+        doc='slope of the zero-g over temperature at 25 degC',
     ),
-    optional(
+    OptionalSize(
         'per_k2',
-        'g/K^2',
-        -0.01,
-        0.01,
-        1e-6,
-        'physics: a slope that changes by 1 % a degree',
-        'curvature of the zero-g over temperature',
+        unit='g/K^2',
+        upper=0.01,
+        scale=1e-6,
+        source='physics: a slope that changes by 1 % a degree',
+        doc='curvature of the zero-g over temperature',
     ),
     invertible=True,
     follows=('temperature_c',),
@@ -674,21 +678,19 @@ def temperature_bias(signals: Signals, p: Parameters) -> None:
     Place.ELECTRONICS,
     Parameter(
         'per_k',
-        '1/K',
-        -0.01,
-        0.01,
-        1e-4,
-        'ADXL203 datasheet: sensitivity +-0.3 % over temperature',
-        'relative slope of the scale factor over temperature, from 25 degC on',
+        unit='1/K',
+        upper=0.01,
+        scale=1e-4,
+        source='ADXL203 datasheet: sensitivity +-0.3 % over temperature',
+        doc='relative slope of the scale factor over temperature, from 25 degC on',
     ),
-    optional(
+    OptionalSize(
         'per_k2',
-        '1/K^2',
-        -0.001,
-        0.001,
-        1e-6,
-        'physics: a slope that changes by 1 % a degree',
-        'relative curvature of the scale factor over temperature',
+        unit='1/K^2',
+        upper=0.001,
+        scale=1e-6,
+        source='physics: a slope that changes by 1 % a degree',
+        doc='relative curvature of the scale factor over temperature',
     ),
     invertible=True,
     follows=('temperature_c',),
@@ -716,21 +718,20 @@ def temperature_scale(signals: Signals, p: Parameters) -> None:
     Place.ELECTRONICS,
     Parameter(
         'per_k',
-        'g/K',
-        -0.1,
-        0.1,
-        1e-4,
-        'ADXL203 datasheet: 0.1 mg/degC',
-        'slope of the zero-g over the temperature that lags the thermometer',
+        unit='g/K',
+        upper=0.1,
+        scale=1e-4,
+        source='ADXL203 datasheet: 0.1 mg/degC',
+        doc='slope of the zero-g over the temperature that lags the thermometer',
     ),
-    shape(
+    Shape(
         'tau_s',
-        's',
-        1.0,
-        1e4,
-        60.0,
-        'physics: a small board in moving air',
-        'time constant between thermometer and sensor',
+        unit='s',
+        lower=1.0,
+        upper=1e4,
+        scale=60.0,
+        source='physics: a small board in moving air',
+        doc='time constant between thermometer and sensor',
         starts=(8.0, 25.0, 80.0, 250.0),
     ),
     follows=('temperature_c',),
@@ -754,7 +755,7 @@ def thermal_lag(signals: Signals, p: Parameters) -> None:
     """
     temperature_c = signals.environment.temperature_c
     if not any(p['per_k']) or not np.ndim(temperature_c):
-        return
+        return  # At a single, steady temperature nothing lags
     lag_k = low_pass(temperature_c, p['tau_s'], signals.dt_s, signals.memory) - temperature_c
     add(signals.output, (per_k * lag_k for per_k in p['per_k']))
 
@@ -763,21 +764,20 @@ def thermal_lag(signals: Signals, p: Parameters) -> None:
     Place.ELECTRONICS,
     Parameter(
         'half_width_g',
-        'g',
-        -0.1,
-        0.1,
-        2e-3,
-        'physics: friction and creep in solder and die attach',
-        'zero-g while cooling minus that while warming, divided by 2',
+        unit='g',
+        upper=0.1,
+        scale=2e-3,
+        source='physics: friction and creep in solder and die attach',
+        doc='zero-g while cooling minus that while warming, divided by 2',
     ),
-    shape(
+    Shape(
         'reach_k',
-        'K',
-        0.1,
-        200.0,
-        10.0,
-        'physics: part of the range',
-        'half of the change after a reversal that opens the loop',
+        unit='K',
+        lower=0.1,
+        upper=200.0,
+        scale=10.0,
+        source='physics: part of the range',
+        doc='half of the change after a reversal that opens the loop',
         starts=(2.0, 10.0, 50.0),
     ),
     smooth=False,
@@ -801,7 +801,7 @@ def thermal_hysteresis(signals: Signals, p: Parameters) -> None:
     """
     temperature_c = signals.environment.temperature_c
     if not any(p['half_width_g']) or not np.ndim(temperature_c):
-        return
+        return  # A single temperature has no branch
     branch = loop(temperature_c, p['reach_k'], signals.memory)
     add(signals.output, (-half_width * branch for half_width in p['half_width_g']))
 
@@ -810,21 +810,20 @@ def thermal_hysteresis(signals: Signals, p: Parameters) -> None:
     Place.ELECTRONICS,
     Parameter(
         'amplitude_g',
-        'g',
-        -0.5,
-        0.5,
-        2e-3,
-        'physics: self-heating by 20 K, 0.1 mg/K',
-        'zero-g at power-on minus the settled one',
+        unit='g',
+        upper=0.5,
+        scale=2e-3,
+        source='physics: self-heating by 20 K, 0.1 mg/K',
+        doc='zero-g at power-on minus the settled one',
     ),
-    shape(
+    Shape(
         'tau_s',
-        's',
-        1.0,
-        1e5,
-        300.0,
-        'physics: a board in still air',
-        'time constant of settling',
+        unit='s',
+        lower=1.0,
+        upper=1e5,
+        scale=300.0,
+        source='physics: a board in still air',
+        doc='time constant of settling',
         starts=(15.0, 60.0, 300.0, 1500.0),
     ),
     invertible=True,
