@@ -90,7 +90,7 @@ def test_a_shifted_simulator_is_late(run_tool, tmp_path, late_s):
 def test_one_axis_of_a_simulator_in_another_unit_is_no_scale_factor(tmp_path, axis, factor, words):
     stated = recording.read_ideal(tmp_path / ideal(tmp_path, 0.0))
     stated.columns[f'a{axis}_mps2'] *= factor
-    force = motion_from_force(stated, False)[0]
+    force = motion_from_force(stated, False)
     with pytest.raises(DataFault) as refused:
         check_recording(compare_checked(made(unit()), unit(), force, False))
     assert refused.value.name == 'unit'
