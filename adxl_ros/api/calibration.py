@@ -303,14 +303,19 @@ def fit(
         progress(_READING * (number + 1) / (number + 2), 'reading')
         recorded.append(rests.of(read, unit, number))
     progress(_READING, 'fit')
-    result = calibration.calibrate(
-        unit.with_gyro(unit.sensor),
-        recorded,
-        model,
-        effects,
-        data_sha256 or unit.sha256,
-        population,
-    )
+    try:
+        result = calibration.calibrate(
+            unit.with_gyro(unit.sensor),
+            recorded,
+            model,
+            effects,
+            data_sha256 or unit.sha256,
+            population,
+        )
+    except UserError as error:
+        # Rests that were not found are no fault of the poses where the samples are wrong.
+        reasons = chain.from_iterable(each.faults for each in recorded)
+        raise UserError('; '.join([*reasons, str(error)])) from None
     return _fit(result, unit)
 
 
@@ -453,7 +458,7 @@ class _Rests:
         if self._table:
             poses = with_table_angles(poses, self._table)
         filters = estimate_filters(read, unit.sensor, poses)
-        return calibration.RecordedPoses(name, poses, filters, look.neighbour_faults())
+        return calibration.RecordedPoses(name, poses, filters, look.faults())
 
 
 def _one_recording_only() -> UserError:

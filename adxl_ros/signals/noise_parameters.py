@@ -502,7 +502,7 @@ def recording_noise(
     )
     if still.gyro_doubt:
         doubts.append(still.gyro_doubt)
-    doubts += look.neighbour_faults()
+    doubts += look.faults()
     return RecordingNoise(
         path=first.path,
         sensor=sensor,
