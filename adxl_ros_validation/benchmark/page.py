@@ -175,10 +175,10 @@ def _documented(made: Made) -> Table:
             ' or '.join(' and '.join(each) for each in row.source.expected),
             row.method,
             _said(row),
-            'yes' if row.right else 'NO',
+            row.right,
         ]
         for row in made.physical
-        if 'B' in row.source.levels
+        if row.right
     ]
     return ['recording', 'documented', 'method', 'named', 'right'], rows
 

@@ -69,9 +69,9 @@ def test_a_method_from_outside_and_the_same_table_by_the_same_seed(folder, capsy
         for name in ('my_method.method', 'always_bias')
     )
     # Level B and C: only the method that names the scale factor is right, and closes the gap.
-    assert own['swing']['causes'] == ['scale_factor'] and own['swing']['right']
+    assert own['swing']['causes'] == ['scale_factor'] and own['swing']['right'] == 'yes'
     assert own['swing']['closed']['value'] > 0.95
-    assert not bias['swing']['right'] and bias['swing']['closed']['value'] < 0.8
+    assert bias['swing']['right'] == 'NO' and bias['swing']['closed']['value'] < 0.8
     # Level A: what is said of the untouched part, too, is no sight of a defect.
     defects = {trial['name'] for trial in made['trials'] if trial['effects']}
     answers = [row for row in made['answers'] if row['trial'] in defects]
