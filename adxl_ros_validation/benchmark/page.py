@@ -76,8 +76,13 @@ def report(made: Made) -> Report:
             'Level A: what else counts': _further(made),
             'Level A: one defect, by its strength': _single(made, _strength),
             'Level A: one defect, by recording': _single(made, lambda row: row.fact.recording),
-            'Level B: a documented defect': _documented(made),
-            'Level C: share of the squared gap that is closed on a later part': _closed(made),
+            'Level B: a documented defect': _physical(
+                made, 'B', lambda row: f'{row.right}: {_said(row)}'
+            ),
+            'Level C: share of the squared gap that is closed on a later part': _physical(
+                made, 'C', lambda row: _percent(row.closed)
+            ),
+            'Level C: what is named': _physical(made, 'C', _said),
             'Answers without a verdict': _failed(made),
             'Recordings': _card(made),
             'Left out': (['what, and why'], [[text] for text in made.left_out]),
@@ -167,36 +172,23 @@ def _strength(row: Row) -> str:
     return f'{low:g} to {high:g} times the noise'
 
 
-def _documented(made: Made) -> Table:
-    """Return the answers to level B."""
-    rows = [
-        [
-            row.source.name,
-            ' or '.join(' and '.join(each) for each in row.source.expected),
-            row.method,
-            _said(row),
-            row.right,
-        ]
-        for row in made.physical
-        if row.right
-    ]
-    return ['recording', 'documented', 'method', 'named', 'right'], rows
+def _physical(made: Made, level: str, cell_of: Callable[[Physical], str]) -> Table:
+    """Return a cell of each answer to a level, by recording and method."""
+    chosen = [row for row in made.physical if level in row.source.levels]
+    cells = {(row.source.name, row.method): cell_of(row) for row in chosen}
+    expected = {row.source.name: row.source.expected for row in chosen}
+    rows = []
+    for name, sets in expected.items():
+        documented = ' or '.join(' and '.join(each) for each in sets) if level == 'B' else ''
+        about = f'{name}: {documented}' if documented else name
+        rows.append([about, *(cells.get((name, method), '-') for method in made.methods)])
+    return ['recording', *made.methods], rows
 
 
 def _said(row: Physical) -> str:
     """Return what an answer names."""
     groups = [f'({" or ".join(sorted(group))})' for group in row.answered.one_of]
     return ', '.join([*sorted(row.answered.causes), *groups]) or row.answered.status
-
-
-def _closed(made: Made) -> Table:
-    """Return the answers to level C."""
-    rows = [
-        [row.source.name, row.method, _said(row), _percent(row.closed)]
-        for row in made.physical
-        if 'C' in row.source.levels
-    ]
-    return ['recording', 'method', 'named', 'closed; n blocks'], rows
 
 
 def _failed(made: Made) -> Table:
