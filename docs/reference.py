@@ -840,7 +840,8 @@ def benchmark(title: str) -> list[str]:
     command = next(line for line in text.splitlines() if line.startswith('`./run benchmark'))
     rows = text.split(f'### {title}\n\n')[1].split('\n\n')[0].splitlines()
     # The page has room for the first four methods.
-    return [command, '', *('|'.join(row.split('|')[:6]) + '|' for row in rows)]
+    cells = [row.strip('|').split('|')[:5] for row in rows]
+    return [command, '', *(f'|{"|".join(row)}|' for row in cells)]
 
 
 def simulators() -> list[str]:
