@@ -36,6 +36,7 @@ from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.process import option
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
 from adxl_ros.report.quantities import mg
+from adxl_ros.report.screen import Tile
 from adxl_ros.signals.gravity_at_rest import require_unit
 from adxl_ros.signals.gyroscope_at_rest import rest_turns, RestTurns, with_bias
 from adxl_ros.signals.recorded_gravity import RecordingLook
@@ -118,7 +119,7 @@ class Fit(Result):
         tiles = page.tiles(self.result, assessments[-1] if assessments else None)
         return FirstScreen(
             **page.badge(self.sensor),
-            tiles=[(tile['label'], tile['text'], tile['note']) for tile in tiles],
+            tiles=[Tile(**tile) for tile in tiles],
         )
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
@@ -206,7 +207,7 @@ class Fit(Result):
         if gravity is not None:
             ax.plot(mg(gravity.held_out_mps2), 'o', label='magnitude minus gravity')
         elif self.held_out:
-            for axis, errors in zip(self.sensor.axes, self.held_out[-1].errors.accel_mps2.T):
+            for axis, errors in zip(self.sensor.axes, self.held_out[-1].pose_errors.accel_mps2.T):
                 ax.plot(mg(errors), 'o', label=axis, color=AXIS_COLOURS[axis])
         ax.set(xlabel='held-out pose', ylabel='error of acceleration, mg')
         ax.axhline(0.0, lw=0.8, color='#7b8794')

@@ -24,6 +24,7 @@ from adxl_ros.files.recording_columns import check_same_sensor, Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
 from adxl_ros.report.quantities import counted, number, utc
+from adxl_ros.report.screen import Tile
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -86,9 +87,9 @@ class Update(Result):
             self.outcome,
             self._sentence,
             [
-                ('rests', str(self.counts['rests']), counted(len(self.days), 'day')),
-                ('adoptions', str(self.adoptions), ''),
-                ('tilt error now, 90 %', f'{number(self.state.tilt_90_deg)}°', ''),
+                Tile('rests', str(self.counts['rests']), counted(len(self.days), 'day')),
+                Tile('adoptions', str(self.adoptions)),
+                Tile('tilt error now, 90 %', f'{number(self.state.tilt_90_deg)}°'),
             ],
         )
 
@@ -105,8 +106,7 @@ class Update(Result):
         """Write the page report.html into a folder, and return its path."""
         require_own(Path(folder) / words.PAGE, overwrite)
         path, top = make_folder(folder) / words.PAGE, self.first_screen
-        tiles = [dict(zip(('label', 'text', 'note'), tile)) for tile in top.tiles]
-        write_text(path, words.page(self.sensor, self.days, self.state, top._asdict(), tiles))
+        write_text(path, words.page(self.sensor, self.days, self.state, top._asdict(), top.tiles))
         return path
 
     def to_dict(self) -> dict[str, Any]:

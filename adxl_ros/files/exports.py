@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 import json
+from pathlib import Path
 import re
-from textwrap import indent, wrap
-from typing import NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
@@ -29,11 +29,15 @@ from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.process import command, package_version
 from adxl_ros.report import templates
 import numpy as np
+import yaml
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 WHITE_NOISE = 'white noise'  # Name of a part: noise of a sample before the ADC
 FILTER = 'RC filter'  # Name of a part: low-pass of the output
 STEPS = 'ADC steps'  # Name of a part: rounding
-_COLUMNS = 75  # Columns of the head without the signs of a comment; chosen: 79 with them
+_TEMPLATES = Path(__file__).with_name('export_templates')  # What the files are made of
 _NOT_HELD = 'not held'  # In place of the place of a part that a file lacks
 _SMALLEST_MG = 5e-4  # Size below which a part counts as 0, mg; chosen: half of the last digit
 _ABSENT = np.diag([-1.0, 0.0, 0.0])
@@ -126,49 +130,20 @@ def places(form: Format, sensor: Sensor) -> dict[str, str]:
     }
 
 
-def _head(export: Export, software: str, prefix: str = '# ') -> str:
-    """Return the head of a file: what it holds of the sensor, and what it cannot hold."""
+def _head(formats: Environment, export: Export, software: str, prefix: str = '# ') -> str:
+    """Return the head of a file as a comment whose lines begin with a prefix."""
     sensor = export.sensor
     width = max(map(len, export.sizes_mg)) + 2
-    lines = [
-        f'Sensor {sensor.serial}, axes {" ".join(sensor.axes)}, {sensor.rate_hz:.5g} Hz.',
-        *wrap(
-            f'Written by adxl_ros {package_version()} for {software}, from {export.source}.',
-            _COLUMNS,
-        ),
-        '',
-        f'{"part":{width}}{"size, mg rms":14}in this file',
-    ]
-    for part, size_mg in sorted(export.sizes_mg.items(), key=lambda part: -part[1]):
-        lines.append(f'{part:{width}}{size_text(size_mg):14}{export.holds.get(part, _NOT_HELD)}')
-    missing = [axis for axis in AXES if axis not in sensor.axes]
-    if missing:
-        lines += ['', f'The sensor has no {" and no ".join(missing)}: do not use that output.']
-    if stage := stage_effects(sensor):
-        lines += [
-            '',
-            *wrap(
-                f'Left out, as errors of the stage or of another reference: {", ".join(stage)}.',
-                _COLUMNS,
-            ),
-        ]
-    noise_from = sensor.provenance.get('noise_from')
-    stated = sensor.datasheet_name or 'the parameter file'
-    origin = (
-        f'measured in {noise_from}'
-        if noise_from
-        else f'the figure of {stated}; nobody measured it'
+    formats.filters |= {'size': size_text, 'column': lambda part: part.ljust(width)}
+    text = formats.get_template('head.jinja').render(
+        export=export,
+        software=software,
+        version=package_version(),
+        missing=[axis for axis in AXES if axis not in sensor.axes],
+        of_stage=stage_effects(sensor),
     )
-    lines += [
-        '',
-        *wrap(f'White noise: {origin}. All figures hold at {sensor.rate_hz:.5g} Hz.', _COLUMNS),
-        '',
-        'Sizes: change of the output in the manoeuvre rich (7 minutes of turns,',
-        'shaking, warming and a step of the supply), by simulation.',
-        f'All that is not held, but for noise and steps: {size_text(export.remaining_mg)} mg rms.',
-    ]
-    text = indent('\n'.join(lines), prefix, lambda line: True)
-    text = '\n'.join(map(str.rstrip, text.split('\n')))
+    lines = [f'{prefix}{line}'.rstrip() for line in text.splitlines()]
+    text = '\n'.join(lines)
     return text if prefix.startswith('#') else _without_double_dashes(text)
 
 
@@ -330,7 +305,7 @@ def text(name: str, export: Export) -> str:
     )
     formats.filters |= {'yaml': _yaml, 'single_dashes': _without_double_dashes}
     return formats.get_template(f'{name}.jinja').render(
-        head=partial(_head, export),
+        head=partial(_head, formats, export),
         white=partial(_white_density, export),
         walk=walk,
         walk_remark=f'# {remark}',
@@ -351,88 +326,17 @@ def text(name: str, export: Export) -> str:
     )
 
 
-def _at(place: str, *parts: str) -> dict[str, str]:
-    return dict.fromkeys(parts, place)
+def _formats() -> dict[str, Format]:
+    """Read the formats by their name."""
+    stated = yaml.safe_load((_TEMPLATES / 'formats.yaml').read_text(encoding='utf-8'))
+    formats = {}
+    for name, about in stated.items():
+        if not name.startswith('.'):
+            holds: dict[str, str] = {}
+            for place, parts in about['holds'].items():
+                holds |= dict.fromkeys(parts, place)
+            formats[name] = Format(about['meaning'], holds)
+    return formats
 
 
-_NOISE = (WHITE_NOISE, 'noise_excess')
-_ROUNDING = (STEPS, 'quantisation')
-_SAMPLE = (*_NOISE, *_ROUNDING)  # Parts in the variance of one sample
-_GAUSSIAN = {**_at('std', *_NOISE), 'bias': 'mean'}  # Places of the parts in Gaussian noise
-
-FORMATS = {
-    'broadcaster': Format(
-        'parameters of imu_sensor_broadcaster (ros2_controllers)', _at('covariance', *_SAMPLE)
-    ),
-    'fusioncore': Format(
-        'parameters of FusionCore 0.3',
-        {
-            **_at('imu.accel_noise', *_SAMPLE),
-            'bias_walk': 'ukf.q_accel_bias',
-            'lever_arm': 'imu.lever_arm_x, _y, _z',
-        },
-    ),
-    'json': Format(
-        'all values, for any program',
-        {
-            **_at('axes.noise_std_mps2', *_NOISE),
-            'bias': 'axes.zero_g_mps2',
-            **_at('gain', 'scale_factor', 'misalignment'),
-            'bias_walk': 'axes.walk_density',
-            'lever_arm': 'position_m',
-            **_at('axes.step_mps2', *_ROUNDING),
-            **_at('filter_s', FILTER, 'bandwidth'),
-        },
-    ),
-    'kalibr': Format(
-        'imu.yaml of Kalibr; without a gyroscope its part of the accelerometer',
-        {**_at('accelerometer_noise_density', *_SAMPLE), 'bias_walk': 'accelerometer_random_walk'},
-    ),
-    'okvis2': Format(
-        'noise of the sensors in the configuration of OKVIS2',
-        {
-            **_at('sigma_a_c', *_SAMPLE),
-            'bias': 'a0',
-            'bias_walk': 'sigma_aw_c',
-            'saturation': 'a_max',
-        },
-    ),
-    'point_lio': Format(
-        'noise of the sensors in the configuration of Point-LIO',
-        {**_at('imu_meas_acc_cov', *_SAMPLE), 'bias_walk': 'b_acc_cov', 'saturation': 'satu_acc'},
-    ),
-    'genesis': Format(
-        'Python module with options of an IMU of Genesis 0.4 to 1.4',
-        {
-            **_at('acc_noise', *_NOISE),
-            'bias': 'acc_bias',
-            'bias_walk': 'acc_random_walk',
-            **_at('CROSS_AXIS_COUPLING', 'scale_factor', 'misalignment'),
-            'lever_arm': 'pos_offset',
-            **_at('acc_resolution', *_ROUNDING),
-            'time_offset': 'delay',
-        },
-    ),
-    'isaaclab': Format(
-        'Python module with configurations of Isaac Lab, 2.x and 3.0',
-        {**_GAUSSIAN, 'lever_arm': 'pos'},
-    ),
-    'mjlab': Format(
-        'Python module with configurations of mjlab 1.x', {**_GAUSSIAN, 'lever_arm': 'POS'}
-    ),
-    'mujoco': Format(
-        'site and accelerometer of MuJoCo (MJCF)',
-        {'lever_arm': 'pos of the site', **_at('noise (MuJoCo does not add it)', *_NOISE)},
-    ),
-    'sdf': Format(
-        'imu of gz-sensors, Gazebo (SDFormat)',
-        {
-            **_at('<stddev>', *_NOISE),
-            'bias': '<mean>',
-            'bias_walk': '<dynamic_bias_stddev>',
-            'lever_arm': '<pose>',
-            **_at('<precision>', *_ROUNDING),
-        },
-    ),
-}
-"""Formats by name."""
+FORMATS = _formats()  # Formats by name

@@ -20,6 +20,7 @@ from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.population import Population
 from adxl_ros.report import figures as plotly, page as html_page
 from adxl_ros.report.quantities import number
+from adxl_ros.report.screen import Tile
 import numpy as np
 import pandas as pd
 
@@ -288,18 +289,15 @@ def _badge(
     }
 
 
-def _tiles(table: fleet.FleetTable, counts: Counter[fleet.State]) -> list[dict[str, str]]:
+def _tiles(table: fleet.FleetTable, counts: Counter[fleet.State]) -> list[Tile]:
     outcomes = Counter(table['outcome'].tolist())
     return [
-        {
-            'label': 'recordings',
-            'text': str(len(table)),
-            'note': f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed',
-        },
-        *(
-            {'label': f'units: {state.words}', 'text': str(counts[state]), 'note': ''}
-            for state in fleet.State
+        Tile(
+            'recordings',
+            str(len(table)),
+            f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed',
         ),
+        *(Tile(f'units: {state.words}', str(counts[state])) for state in fleet.State),
     ]
 
 

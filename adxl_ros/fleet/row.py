@@ -10,13 +10,13 @@ each worker once, with the texts of all parameter files: a worker needs no acces
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
+import csv
 from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
 import hashlib
-from itertools import product
 import json
 import math
 from pathlib import Path
@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
-from adxl_ros.model.constants import AXES
 from adxl_ros.process import code_version
 import yaml
 
@@ -41,17 +40,14 @@ OUTCOMES = ('done', 'refused', 'crashed')
 reason; the worker ended or failed at each attempt."""
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """One column of the table."""
 
     name: str  # Its name, which ends in the unit where there is one
     # `text`, `float`, `integer`, `flag`, `time` (UTC), `texts` or `groups` (lists of texts)
     kind: str
+    unit: str  # Its unit; empty for none
     meaning: str  # What it holds, for people
-    unit: str = ''  # Its unit; empty for none
-    # Whether it depends on where and when the task ran, and not on the recording
-    is_timing: bool = False
 
 
 NOISE = (
@@ -60,93 +56,16 @@ NOISE = (
     ('k', 'random walk K', 'mps2_per_rts', 'm/s²/√s'),
 )
 """Terms of the noise: letter, name, unit in the names of columns, and unit."""
-_ENDS = (
-    ('', ''),
-    ('_low', ': lower end of the 90 % interval'),
-    ('_high', ': upper end of the 90 % interval'),
-)
-_FITTED = (
-    ('zero_g', 'v', 'fitted zero-g', 'V'),
-    ('zero_g_std', 'v', 'standard deviation of the zero-g', 'V'),
-    ('scale', 'v_per_g', 'fitted scale factor', 'V/g'),
-    ('scale_std', 'v_per_g', 'standard deviation of the scale factor', 'V/g'),
-)
-_GAP = (
-    ('before', 'rms of recording minus simulation', 'm/s²'),
-    ('after', 'rms with the named effects, on held-out blocks', 'm/s²'),
-    ('floor', 'noise floor; without an interval if assumed', 'm/s²'),
-    ('closed', 'closed share of the squared gap above the floor', ''),
-)
 
 
-COLUMNS: tuple[Column, ...] = (
-    Column('url', 'text', 'the recording, as it was found'),
-    Column('hash', 'text', 'SHA-256 of its content; as sha256sum for a single file'),
-    Column('key', 'text', 'SHA-256 of content, parameters, options and code version'),
-    Column('size_bytes', 'integer', 'size of the recording', 'byte'),
-    Column('serial', 'text', 'serial number of the unit'),
-    Column('date', 'time', 'begin of the recording'),
-    Column('date_source', 'text', 'where the date is from: manifest, stamps, header or file'),
-    Column('tasks', 'texts', 'the tasks that were asked for: check, noise, fit, diagnose'),
-    Column('outcome', 'text', f'one of {", ".join(OUTCOMES)}'),
-    Column('refusal', 'text', 'why there is no result, in one line'),
-    Column('refused_by', 'text', 'the task that refused; stage or read before the first one'),
-    Column('assumed', 'texts', 'what is assumed of temperature, supply and power-on'),
-    Column('skipped', 'texts', 'tasks that do not fit the recording, with the reason'),
-    Column('axes', 'text', 'measured axes: x, xy or xyz'),
-    Column('duration_s', 'float', 'time from the first to the last sample', 's'),
-    Column('samples', 'integer', 'samples in the recording'),
-    Column('rate_hz', 'float', 'usual sample rate', 'Hz'),
-    Column('jitter_s', 'float', 'rms deviation of the steps of the stamps, without gaps', 's'),
-    Column('missing', 'integer', 'missing samples'),
-    Column('longest_gap_s', 'float', 'longest gap; 0 for none', 's'),
-    Column('temperature_c', 'float', 'mean temperature', '°C'),
-    Column('temperature_low_c', 'float', 'lowest temperature', '°C'),
-    Column('temperature_high_c', 'float', 'highest temperature', '°C'),
-    Column('is_sound', 'flag', 'whether check finds no fault'),
-    Column('faults', 'texts', 'what check finds wrong, one line each'),
-    Column('calibration_id', 'text', 'calibration that was valid at the date'),
-    Column('calibration_age_days', 'float', 'its age at the date', 'day'),
-    Column('validity', 'text', 'valid, or why the calibration is not known to be valid'),
-    *(
-        Column(
-            f'noise_{letter}{end}_{axis}_{unit_name}',
-            'float',
-            f'{meaning}{note}, axis {axis}',
-            unit,
-        )
-        for (letter, meaning, unit_name, unit), (end, note), axis in product(NOISE, _ENDS, AXES)
-    ),
-    *(
-        Column(f'{name}_{axis}_{unit_name}', 'float', f'{meaning}, axis {axis}', unit)
-        for (name, unit_name, meaning, unit), axis in product(_FITTED, AXES)
-    ),
-    Column('fit_model', 'text', 'model that was fitted'),
-    Column('fit_poses', 'integer', 'poses that were fitted'),
-    *(
-        Column(f'gap_{name}{end}{"_mps2" if unit else ""}', 'float', f'{meaning}{note}', unit)
-        for (name, meaning, unit), (end, note) in product(_GAP, _ENDS)
-    ),
-    Column('gap_floor_source', 'text', 'where the floor is from: still, repeats or assumed'),
-    Column(
-        'status',
-        'text',
-        'no_gap, explained, partly, inseparable, unknown, insufficient or bad_data',
-    ),
-    Column('effects', 'texts', 'effects that are named for certain'),
-    Column('groups', 'groups', 'sets of inseparable effects, one of each acts'),
-    Column('probability', 'float', 'probability of the verdict'),
-    Column('data_fault', 'text', 'name of the fault of the data, with the status bad_data'),
-    Column('report', 'text', "folder of the recording's single reports, relative to the table"),
-    Column('version', 'text', 'version of the package'),
-    Column('code', 'text', 'SHA-256 of the code that made the row'),
-    Column('seconds', 'float', 'run time of the tasks', 's', is_timing=True),
-    Column('memory_mb', 'float', 'largest memory of the worker until then', 'MB', is_timing=True),
-    Column('worker', 'text', 'host and process of the worker', is_timing=True),
-    Column('attempts', 'integer', 'attempts until the row was made', is_timing=True),
-    Column('written', 'time', 'when the row was made', is_timing=True),
-)
-"""All columns, in the order of the table."""
+def _columns() -> Iterator[Column]:
+    """Read the columns, whose table has the fields of `Column`."""
+    text = Path(__file__).with_name('columns.csv').read_text(encoding='utf-8')
+    for row in csv.DictReader(text.splitlines()):
+        yield Column(**row)
+
+
+COLUMNS = tuple(_columns())  # All columns, in the order of the table
 
 
 def empty_row() -> Row:

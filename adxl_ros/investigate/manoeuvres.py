@@ -15,20 +15,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
+import pathlib
 from typing import NamedTuple
 
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.trajectories import RUN_UP_S, Script
 import numpy as np
+import yaml
 
 _REST_S = 4.0
 """Time at rest in a pose, s. Chosen: the mean of its samples is then a tenth of their noise."""
-_LONG_REST_S = 30.0
-"""Time at rest in a pose where drifts are to show, s. Chosen: two of them are one minute."""
-_SLOW_SHARE = 1 / 3
-"""Rate of a slow turn, as a share of the limit. Chosen: an effect of the rate's square is then
-nine times smaller."""
 _SWING_RAD = np.radians(15.0)
 """Amplitude of swings and of reversals, rad. Chosen: far beyond every backlash."""
 _SWINGS = 4  # Number of swings forth and back. Chosen: their reversals are averaged
@@ -132,101 +128,14 @@ class Manoeuvre(NamedTuple):
 
     kind: str  # What it varies
     text: str  # What it does, for people
-    moves: Sequence[tuple]  # Name of a method of `Path` and its arguments, for each move
-
-
-_APPROACH_DEG = 20.0
-"""Distance from which a pose is approached, degrees. Chosen: beyond every backlash."""
-
-
-def _approaches(beta_deg: float) -> list[tuple]:
-    """Return the moves that approach a pose from both sides of each joint."""
-    moves = []
-    for d_alpha, d_beta in ((0, -1), (0, 1), (-1, 0), (1, 0)):
-        beside = 60 + d_alpha * _APPROACH_DEG, beta_deg + d_beta * _APPROACH_DEG
-        moves += [('rest', *beside, 0.5), ('rest', 60, beta_deg, 3.0)]
-    return moves
+    moves: Sequence[Sequence]  # Name of a method of `Path` and its arguments, for each move
 
 
 CATALOGUE = {
-    'rests_upright': Manoeuvre(
-        'rests',
-        'rest in steps of 60° of beta, with x and y upright',
-        [('rest', 90, beta_deg) for beta_deg in range(0, 360, 60)],
-    ),
-    'rests_on_sphere': Manoeuvre(
-        'rests',
-        'rest in poses that spread gravity over the sphere',
-        [
-            ('rest', *pose)
-            for pose in (
-                (0, 0),
-                (45, 0),
-                (45, 120),
-                (45, 240),
-                (135, 240),
-                (135, 120),
-                (135, 0),
-                (180, 0),
-            )
-        ],
-    ),
-    'rests_on_axes': Manoeuvre(
-        'rests',
-        'rest with each axis up and down',
-        [('rest', 90, beta_deg, 2.0) for beta_deg in (0, 90, 180, 270)],
-    ),
-    'slow_turn_of_beta': Manoeuvre(
-        'turns of beta',
-        'turn beta once, forth and back, slowly',
-        [('full_turn', 'beta', 90.0, _SLOW_SHARE)],
-    ),
-    'fast_turn_of_beta': Manoeuvre(
-        'turns of beta',
-        'turn beta once, forth and back, at the limit of rate',
-        [('full_turn', 'beta', 90.0)],
-    ),
-    'slow_turn_of_alpha': Manoeuvre(
-        'turns of alpha',
-        'turn alpha over its range, forth and back, slowly',
-        [('full_turn', 'alpha', 45.0, _SLOW_SHARE)],
-    ),
-    'fast_turns_of_alpha': Manoeuvre(
-        'turns of alpha',
-        'turn alpha over its range at two angles beta, at the limit of rate',
-        [('full_turn', 'alpha', 0.0), ('full_turn', 'alpha', 90.0)],
-    ),
-    'two_rates_of_beta': Manoeuvre(
-        'rates',
-        'turn beta over half a turn at three rates, forth and back',
-        [
-            ('rest', 90, 0, 1.0),
-            *(
-                ('turn', 'beta', to_rad, share)
-                for share, to_rad in product((1.0, 0.5, 0.25), (np.pi, 0.0))
-            ),
-        ],
-    ),
-    'swings_of_beta': Manoeuvre(
-        'reversals',
-        'swing beta about a pose, with reversals',
-        [('rest', 90, 45, 1.0), ('swing', 'beta'), ('swing', 'beta', 0.5)],
-    ),
-    'swings_of_alpha': Manoeuvre(
-        'reversals',
-        'swing alpha about a pose, with reversals',
-        [('rest', 45, 45, 1.0), ('swing', 'alpha'), ('swing', 'alpha', 0.5)],
-    ),
-    'poses_from_both_sides': Manoeuvre(
-        'reversals',
-        'approach the same poses from both sides of each joint',
-        [*_approaches(45), *_approaches(225)],
-    ),
-    'long_rests': Manoeuvre(
-        'long rests',
-        'rest for a minute in two opposite poses',
-        [('rest', 90, 45, _LONG_REST_S), ('rest', 90, 225, _LONG_REST_S)],
-    ),
+    name: Manoeuvre(**stated)
+    for name, stated in yaml.safe_load(
+        pathlib.Path(__file__).with_suffix('.yaml').read_text(encoding='utf-8')
+    ).items()
 }
 """Manoeuvres by name."""
 

@@ -13,7 +13,7 @@ from typing import IO, NamedTuple
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import GYRO, Recording
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.block_statistics import gap_s
+from adxl_ros.signals.block_statistics import gap_s, smallest_change
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import BeyondRange
 from adxl_ros.signals.rest_detection import Rest
@@ -275,9 +275,7 @@ class _Samples:
         self._gaps_s += float(gaps_s.sum())
         self._stop_s = float(time_s[-1])
         changes = np.abs(np.diff(rows, axis=0))
-        self._resolution = np.minimum(
-            self._resolution, np.where(changes > 0, changes, np.inf).min(axis=0, initial=np.inf)
-        )
+        self._resolution = np.minimum(self._resolution, smallest_change(changes))
         self._phase.feed(rows)
 
     def stretch(

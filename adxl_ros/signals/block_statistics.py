@@ -240,12 +240,17 @@ def _quietest(variances: np.ndarray, smallest: float) -> tuple[float, float]:
     )
 
 
+def smallest_change(changes: np.ndarray) -> np.ndarray:
+    """Return the smallest change that is not 0 by axis, (n, m) to (m,); inf where none is."""
+    return np.asarray(np.where(changes > 0, changes, np.inf).min(axis=0, initial=np.inf))
+
+
 def adc_step(blocks: Blocks) -> np.ndarray:
     """Return the smallest change of the samples, (m,); 0 where they never change."""
     changes = blocks.step
     if not np.isfinite(changes).any():  # also where a block is one sample
         changes = np.abs(np.diff(blocks.mean, axis=0))
-    smallest = np.where(changes > 0, changes, np.inf).min(axis=0, initial=np.inf)
+    smallest = smallest_change(changes)
     return np.where(np.isfinite(smallest), smallest, 0.0)
 
 

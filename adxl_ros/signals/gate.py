@@ -47,9 +47,10 @@ class Outcome:
     name: str  # sound, gaps, rate, noise, zero-g, rests, or 'min' with what has a minimum
     is_worse: bool  # Whether it became worse, or the limit is missed
     text: str  # Figures, for people
-    # Interval of the ratio to the other recording, or of the change for the zero-g, m/s²; none
-    # where nothing was compared
+    # Low and high end of the interval of the ratio to the other recording, or of the change, in
+    # `unit`; None where nothing was compared
     interval: tuple[float, float] | None = None
+    unit: str = ''  # Unit of the interval: m/s^2 for the zero-g; '' for a ratio
 
     def fails(self, fail_on: Collection[str]) -> bool:
         """Return whether it is one of the kinds that fail, or a limit, and worse."""
@@ -134,17 +135,17 @@ class Earlier:
         """Return one outcome of another recording for each of `KINDS` but the first."""
         now = _at_rest(read, self._sensor)
         return [
-            _events('gaps', contents, self._contents, 'gaps'),
+            _events('gaps', contents, self._contents),
             _rate(contents, self._contents),
             _noise(now, self._at_rest),
             _zero_g(now, self._at_rest),
-            _events('rests', contents, self._contents, 'rests'),
+            _events('rests', contents, self._contents),
         ]
 
 
-def _events(name: str, new: RecordingContents, old: RecordingContents, field: str) -> Outcome:
+def _events(name: str, new: RecordingContents, old: RecordingContents) -> Outcome:
     """Compare how often something happens, as events of chance; fewer rests are worse."""
-    counts = [int(getattr(each, field)) for each in (new, old)]
+    counts = [int(getattr(each, name)) for each in (new, old)]
     text = ', before '.join(
         f'{count} in {each.span_s:.4g} s' for count, each in zip(counts, (new, old))
     )
@@ -157,7 +158,7 @@ def _events(name: str, new: RecordingContents, old: RecordingContents, field: st
         exposure * value / (1 - value) if value < 1 else np.inf
         for value in (share.low, share.high)
     )
-    is_worse = high < 1 if field == 'rests' else low > 1
+    is_worse = high < 1 if name == 'rests' else low > 1
     return Outcome(name, is_worse, f'{text}: {_ratio(low, high)}', (low, high))
 
 
@@ -196,7 +197,7 @@ def _zero_g(new: _AtRest, old: _AtRest) -> Outcome:
         f'length of gravity off by {now_mg:.3g} mg, before {before_mg:.3g} mg: change '
         f'{float(mg(low)):.3g} to {float(mg(high)):.3g} mg'
     )
-    return Outcome('zero-g', low > 0, text, (low, high))
+    return Outcome('zero-g', low > 0, text, (low, high), 'm/s^2')
 
 
 def _change(new: np.ndarray, old: np.ndarray) -> tuple[float, float]:

@@ -201,7 +201,7 @@ class RestReadings:
 class GravityFault:
     """Why the rests do not read gravity."""
 
-    kind: GravityFaultKind
+    kind: GravityFaultKind  # What is wrong
     reason: str  # The figure, and what explains it
     remedy: str  # What to do
     unit: str = ''  # The likely unit, for people; '' where none explains the readings
@@ -255,12 +255,13 @@ class GravityAtRest:
     rests: int  # Number of rests
     axes: int  # Number of measured axes; with less than three, lengths are lower limits
     gravity_mps2: float  # Local gravity, m/s²
-    length_mps2: float  # Median length of the readings, m/s²; NaN without rests
-    spread_mps2: float  # Range of the lengths that holds half of the rests, m/s²
-    std_mps2: float  # Standard deviation of a length by noise, m/s²
+    # Median length of the readings, m/s². This and the next ones are NaN without rests
+    length_mps2: float = np.nan
+    spread_mps2: float = np.nan  # Range of the lengths that holds half of the rests, m/s²
+    std_mps2: float = np.nan  # Standard deviation of a length by noise, m/s²
     # Lowest and highest median of the lengths that the tolerance allows a sound sensor, m/s²
-    allowed_mps2: tuple[float, float]
-    fault: GravityFault | None  # Why the rests do not read gravity; None where they may
+    allowed_mps2: tuple[float, float] = (np.nan, np.nan)
+    fault: GravityFault | None = None  # Why the rests do not read gravity; None where they may
 
     def as_json(self) -> dict[str, Any]:
         """Return the figures by name, in SI units, without what is not known."""
@@ -319,16 +320,7 @@ def look(
     readings = RestReadings(readings.mean_mps2[::every], readings.std_mps2[::every])
     count, axes = readings.mean_mps2.shape
     if not count:
-        return GravityAtRest(
-            rests=0,
-            axes=axes,
-            gravity_mps2=gravity_mps2,
-            length_mps2=np.nan,
-            spread_mps2=np.nan,
-            std_mps2=np.nan,
-            allowed_mps2=(np.nan, np.nan),
-            fault=None,
-        )
+        return GravityAtRest(0, axes, gravity_mps2)
     length, case = readings.length_mps2, _Case(readings, tolerance, gravity_mps2)
     # A reading of the length g in these poses is that of a force between these lengths.
     upright = readings.divided(np.maximum(length, _LEAST_MPS2)[:, None] / gravity_mps2)

@@ -20,6 +20,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.signals.block_statistics import smallest_change
 from adxl_ros.signals.rest_detection import RecordedRests
 import numpy as np
 import scipy
@@ -118,9 +119,7 @@ def _divided(rests: Sequence[RestTurns]) -> list[RestTurns]:
 def _rounding(parts: Sequence[RestTurns]) -> np.ndarray:
     """Return the standard deviation of a mean by rounding that no noise spreads, rad/s, (3,)."""
     changes = np.concatenate([np.abs(np.diff(part.gyro_radps, axis=0)) for part in parts])
-    if not len(changes):
-        return np.zeros(3)
-    step = np.where(changes > 0, changes, np.inf).min(axis=0)
+    step = smallest_change(changes)
     std = np.sqrt(np.mean([part.gyro_radps.var(axis=0) for part in parts], axis=0))
-    is_coarse = np.isfinite(step) & (std < _DITHERED_STEPS * step)
-    return np.where(is_coarse, np.where(np.isfinite(step), step, 0.0) / np.sqrt(12), 0.0)
+    step[np.isinf(step)] = 0.0
+    return np.where(std < _DITHERED_STEPS * step, step / np.sqrt(12), 0.0)

@@ -21,6 +21,7 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.process import option
 from adxl_ros.signals.rest_detection import Rest
 import numpy as np
+import scipy
 
 _CELL_S = 0.05  # Time over which angles are summed, s. Chosen: a hand turns its axis more slowly
 _LONGEST_S = 3600.0  # Time from the begin that is looked at, s; it bounds the memory
@@ -223,15 +224,6 @@ def _turned(turn: _Turn, matrices: np.ndarray) -> np.ndarray:
     """Return the direction of gravity after a turn by readings in k ways, (k, 3)."""
     direction = np.tile(turn.before, (len(matrices), 1))
     # By cell and way, (c, k, 3).
-    rotations = -np.einsum('kij,cj->cki', matrices, turn.angles)
-    sizes = np.linalg.norm(rotations, axis=2, keepdims=True)
-    about = rotations / np.maximum(sizes, np.finfo(float).tiny)
-    for axis, size in zip(about, sizes):
-        # Rodrigues' formula
-        along = np.sum(axis * direction, axis=1, keepdims=True)
-        direction = (
-            direction * np.cos(size)
-            + np.cross(axis, direction) * np.sin(size)
-            + axis * along * (1 - np.cos(size))
-        )
+    for rotation in -np.einsum('kij,cj->cki', matrices, turn.angles):
+        direction = scipy.spatial.transform.Rotation.from_rotvec(rotation).apply(direction)
     return direction

@@ -18,10 +18,71 @@ import sys
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.process import package_version
 from adxl_ros_validation.blind.report import markdown_table
-from adxl_ros_validation.kept_robots import kept_row, KINDS, knock_row, KNOCKED, KNOCKS_MG, run
+from adxl_ros_validation.kept_robots import Kind, Outcome, run
+import numpy as np
 
 KEPT_HEAD = ('robots', 'tilt error (rms)', 'inside, % x y z', 'worse', 'false')
 KNOCK_HEAD = ('knock', 'size', 'within a day', 'ever', 'adopted after')
+
+KINDS = {
+    f'{name}, {text}': replace(kind, drift=factor, slope=factor)
+    for name, kind in {
+        'level': Kind(),
+        'lies down': Kind(lies_down=True),
+        'slope of 4° for 3 weeks': Kind(place_deg=1.0, weeks_deg=4.0),
+        'turned by hand': Kind(is_turned=True),
+    }.items()
+    for text, factor in {'usual drift': 1.0, 'five times': 5.0}.items()
+} | {
+    'level, five times by temperature': Kind(slope=5.0),
+    'level, ten times by temperature': Kind(slope=10.0),
+    'lies down, five times by temperature': Kind(lies_down=True, slope=5.0),
+}
+"""Robots without a knock."""
+KNOCKED = {
+    'level, on z': Kind(knock_axis=2),
+    'level, on x': Kind(knock_axis=0),
+    'lies down, on x': Kind(lies_down=True, knock_axis=0),
+    'lies down, on z': Kind(lies_down=True, knock_axis=2),
+    'lies down, on x, five times the drift': Kind(
+        lies_down=True, knock_axis=0, drift=5.0, slope=5.0
+    ),
+}
+"""Robots with a knock on the 31st day."""
+KNOCKS_MG = (3.0, 8.0, 20.0)
+
+
+def kept_row(name: str, outcomes: list[Outcome]) -> list[str]:
+    """Return the row of a kind of robot."""
+    days = sum(outcome.days for outcome in outcomes)
+    inside = np.sum([outcome.inside for outcome in outcomes], axis=0) / days
+    tilt_deg = [
+        np.sqrt(np.mean([value**2 for value in values]))
+        for values in (
+            [outcome.tilt_without_deg for outcome in outcomes],
+            [outcome.tilt_with_deg for outcome in outcomes],
+        )
+    ]
+    return [
+        name,
+        f'{tilt_deg[0]:.3f}° → {tilt_deg[1]:.3f}°',
+        ' '.join(f'{100 * share:.0f}' for share in inside),
+        f'{sum(outcome.worse for outcome in outcomes)} of '
+        f'{sum(outcome.adoptions for outcome in outcomes)}',
+        str(sum(outcome.false_changes > 0 for outcome in outcomes)),
+    ]
+
+
+def knock_row(name: str, size_mg: float, outcomes: list[Outcome]) -> list[str]:
+    """Return the row of a knock."""
+    reported = [outcome.reported_days for outcome in outcomes]
+    return [
+        name,
+        f'{size_mg:g} mg',
+        f'{sum(days <= 1 for days in reported)} of {len(reported)}',
+        f'{sum(bool(np.isfinite(days)) for days in reported)} of {len(reported)}',
+        str(sum(outcome.adoptions_after > 0 for outcome in outcomes)),
+    ]
 
 
 def main() -> int:

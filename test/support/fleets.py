@@ -4,12 +4,11 @@
 
 from pathlib import Path
 
-from adxl_ros.fleet.row import COLUMNS
 import numpy as np
 
 RATE_HZ = 50.0
 SPAN_S = 16.0
-TIMING = [column.name for column in COLUMNS if column.is_timing]
+TIMING = ['seconds', 'memory_mb', 'worker', 'attempts', 'written']
 """Columns that differ from run to run."""
 
 

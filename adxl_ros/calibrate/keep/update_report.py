@@ -12,6 +12,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import page as html_page
 from adxl_ros.report.figures import AXIS_COLOURS, figure, line, points, QUIET_COLOUR
 from adxl_ros.report.quantities import counted, utc, with_half_width
+from adxl_ros.report.screen import Tile
 import numpy as np
 
 PAGE = 'report.html'
@@ -47,7 +48,7 @@ def page(
     days: Sequence[UpdatedDay],
     state: KeptState,
     badge: Mapping[str, Any],
-    tiles: Sequence[Mapping[str, str]],
+    tiles: Sequence[Tile],
 ) -> str:
     """Return the page; badge and tiles are its top."""
     values = {

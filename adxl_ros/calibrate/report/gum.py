@@ -4,7 +4,7 @@
 The uncertainty of the acceleration at a stated pose (GUM, JCGM 100), and a certificate of it.
 
 Squares of contributions add. Those of noise, coefficients, stage and model are the parts of
-`held_out.ErrorBudget`, here pose by pose.
+`error_budget.ErrorBudget`, here pose by pose.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from adxl_ros.calibrate.pose_model import reference_force
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, certificate_data, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
-from adxl_ros.calibrate.report.held_out import ErrorBudget
+from adxl_ros.calibrate.report.error_budget import covariances, ErrorBudget
 from adxl_ros.calibrate.result import CalibrationResult, compare
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import AnyPath, write_text
@@ -129,18 +129,19 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
     errors, assessment = result.held_out[-1], result.assessments[-1]
     gravity, axes = fitted.local_gravity_mps2, [AXES.index(axis) for axis in fitted.axes]
     poses = result.poses.subset(result.inliers)
-    held, used = poses.subset(errors.pose_index), held_out.determining_alpha(errors.errors)
+    held = poses.subset(errors.pose_index)
+    used = held_out.determining_alpha(errors.pose_errors)
     force = np.column_stack(reference_force(held, gravity))
 
     def stds_mps2(covariance: np.ndarray) -> np.ndarray:
         return np.sqrt(np.maximum([covariance[d, d][used] for d in axes], 0.0)).T
 
-    covariances = held_out.covariances(errors, held, force)
-    by_noise = stds_mps2(covariances.by_noise)
-    by_coefficients = stds_mps2(covariances.by_coefficients)
-    by_stage = stds_mps2(covariances.by_stage)
+    by_cause = covariances(errors, held, force)
+    by_noise = stds_mps2(by_cause.by_noise)
+    by_coefficients = stds_mps2(by_cause.by_coefficients)
+    by_stage = stds_mps2(by_cause.by_stage)
     held, reference = held.subset(used), force[used][:, axes]
-    error = errors.errors.accel_mps2[used]
+    error = errors.pose_errors.accel_mps2[used]
     model = np.full(error.shape, np.sqrt(assessment.accel.model))
     inputs = (
         Input(
@@ -348,31 +349,11 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
 
 
 SCHEMA_VERSION = '3.2.0'
-_UNITS = {
-    'V': (r'\volt', 1.0),
-    '°': (r'\degree', 1.0),
-    'V/g': (r'\volt\metre\tothe{-1}\second\tothe{2}', 1 / G0_MPS2),
-}
-"""Units in D-SI, where g is none, and factors of the coefficients that a certificate states."""
-_ACCELERATION = r'\metre\second\tothe{-2}'
 
 
-def _quantity(
-    name: str, values: Any, unit: str, std: Any = None, about: str = '', kind: str = ''
-) -> dict[str, Any]:
-    """Describe a quantity of one value, or of a list, with the expanded uncertainty of each."""
-    expanded: Any = [] if std is None else K * np.asarray(std)
-    numbers = ' '.join(f'{value:.7g}' for value in np.ravel(values))
-    half_widths = ' '.join(f'{value:.7g}' for value in np.ravel(expanded))
-    return {
-        'name': name,
-        'about': about,
-        'kind': kind,
-        'unit': unit,
-        'numbers': numbers,
-        'is_list': np.ndim(values) > 0,
-        'expanded': half_widths,
-    }
+def _digits(values: Any) -> str:
+    """Return a number, or several ones, (n,), as a certificate has them."""
+    return ' '.join(f'{value:.7g}' for value in np.ravel(values))
 
 
 def write(
@@ -390,91 +371,20 @@ def write(
             f'angles was kept out of the fit; leave {option("certificate")} out'
         )
     elements = templates.environment('a certificate', ('adxl_ros.calibrate.report', ''))
-    fitted = result.fitted
+    elements.filters |= {'degrees': np.degrees, 'digits': _digits}
     write_text(
         path,
         elements.get_template('certificate.xml').render(
             schema_version=SCHEMA_VERSION,
             k=K,
+            z_90=Z_90,
+            g0_mps2=G0_MPS2,
             rule=RULE,
             method=f'{MEANING} {MODEL}',
-            fitted=fitted,
             data=data,
-            provenance=fitted.provenance,
-            step_deg=np.degrees(fitted.stage_resolution_rad),
-            **_results(fitted, found),
+            found=found,
+            fitted=result.fitted,
+            provenance=result.fitted.provenance,
+            coefficients=compare(result.fitted, result.fitted),
         ),
     )
-
-
-def _decision(row: Decision, limit_name: str) -> dict[str, Any]:
-    """Return a comparison of an error with its limit."""
-    unit, factor = (_ACCELERATION, 1e-3 * G0_MPS2) if row.unit == 'mg' else (r'\degree', 1.0)
-    conditional = 'conditionalPass' if row.error <= row.limit else 'conditionalFail'
-    return {
-        'quantity': row.quantity,
-        'outcome': row.outcome,
-        'conformity': {PASS: 'pass', FAIL: 'fail'}.get(row.outcome, conditional),
-        'figures': [
-            _quantity(name, factor * value, unit, kind=kind)
-            for name, value, kind in (
-                ('error of the calibration', row.error, 'basic_measuredValue'),
-                ('guard band', row.guard_band, ''),
-                (f'limit by the {limit_name}', row.limit, 'basic_acceptanceLimitUpper'),
-            )
-        ],
-    }
-
-
-def _results(fitted: Sensor, found: Uncertainty) -> dict[str, list[Any]]:
-    """Return decisions, errors, coefficients and conditions as quantities."""
-    errors = [
-        [
-            _quantity('alpha', np.degrees(found.alpha_rad), r'\degree'),
-            _quantity('beta', np.degrees(found.beta_rad), r'\degree'),
-            _quantity(
-                f'reference acceleration along {name}',
-                found.reference_mps2[:, d],
-                _ACCELERATION,
-                kind='basic_referenceValue',
-            ),
-            _quantity(
-                f'measured acceleration along {name}',
-                (found.reference_mps2 + found.error_mps2)[:, d],
-                _ACCELERATION,
-                kind='basic_measuredValue',
-            ),
-            _quantity(
-                f'error along {name}',
-                found.error_mps2[:, d],
-                _ACCELERATION,
-                found.combined_mps2[:, d],
-                kind='basic_measurementError',
-            ),
-        ]
-        for d, name in enumerate(fitted.axes)
-    ]
-    coefficients = []
-    for row in compare(fitted, fitted):
-        if row.unit in _UNITS:
-            unit, factor = _UNITS[row.unit]
-            coefficients.append(
-                _quantity(
-                    f'{row.label} {row.axis}',
-                    factor * row.fitted,
-                    unit,
-                    factor * row.half_width / Z_90,
-                    row.name,
-                )
-            )
-    conditions = [_quantity('local gravity', fitted.local_gravity_mps2, _ACCELERATION)]
-    conditions += [
-        _quantity(f'{name} temperature', value + 273.15, r'\kelvin')
-        for name, value in zip(('lowest', 'highest'), fitted.envelope.temperature_c or ())
-    ]
-    return {
-        'decisions': [_decision(row, found.limit_name) for row in found.decisions],
-        'errors': errors,
-        'coefficients': coefficients,
-        'conditions': conditions,
-    }

@@ -14,6 +14,7 @@ from adxl_ros.calibrate.pose_model import reference_force
 from adxl_ros.calibrate.poses import planes, Poses
 from adxl_ros.calibrate.report import acceptance, gum, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.report.error_budget import rms_mg
 from adxl_ros.calibrate.result import CalibrationResult, compare, history, rounded
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
@@ -84,8 +85,8 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     elif errors is not None and assessment is not None:
         half_mg = np.full(errors.pose_count, Z_90 * mg(assessment.accel.expected**0.5))
         drawn['errors'] = _error_figure(
-            held_out.determining_alpha(errors.errors),
-            mg(errors.errors.accel_mps2),
+            held_out.determining_alpha(errors.pose_errors),
+            mg(errors.pose_errors.accel_mps2),
             half_mg,
             fitted.axes,
             'held-out pose',
@@ -125,7 +126,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
             'row_of': row_of,
             'poses': len(result.poses),
             'digits': three_digits,
-            'mg': held_out.rms_mg,
+            'mg': rms_mg,
             'limit': f'{origin} ({mg(limit_mps2):.2g} mg)',
             'budget': assessment.accel if assessment and errors else None,
             'part_colours': _PART_COLOURS,
@@ -157,8 +158,8 @@ def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict
     tiles = []
     if (fit := result.gravity_fit) is not None:
         used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-        before = three_digits(held_out.rms_mg(float(np.mean(fit.before_mps2[used] ** 2))))
-        after = three_digits(held_out.rms_mg(float(np.mean(fit.held_out_mps2[used] ** 2))))
+        before = three_digits(rms_mg(float(np.mean(fit.before_mps2[used] ** 2))))
+        after = three_digits(rms_mg(float(np.mean(fit.held_out_mps2[used] ** 2))))
         tiles = [
             {
                 'label': 'error of the magnitude of gravity',
