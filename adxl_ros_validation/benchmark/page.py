@@ -50,6 +50,11 @@ class Made:
         names = [row.method for row in self.rows] + [row.method for row in self.physical]
         return list(dict.fromkeys(names))
 
+    @property
+    def graded(self) -> list[str]:
+        """Return the methods that answered some of level A."""
+        return [method for method in self.methods if self.of(method)]
+
     def of(self, method: str) -> list[Row]:
         """Return the answers of a method to level A."""
         return [row for row in self.rows if row.method == method]
@@ -95,7 +100,7 @@ def screen(made: Made) -> list[str]:
     groups = {row.group for row in made.rows}
     shown = {group: words for group, words in GROUPS.items() if group in groups}
     rows = []
-    for method in made.methods:
+    for method in made.graded:
         scores = [group_score(made.of(method), group, 'exact') for group in shown]
         cells = [f'{s["value"]:.2f} of {s["count"]}' if s['count'] else '-' for s in scores]
         rows.append([method, *cells])
@@ -106,7 +111,7 @@ def screen(made: Made) -> list[str]:
 def _naming(made: Made) -> Table:
     """Return how often each method is exactly right."""
     rows = []
-    for method in made.methods:
+    for method in made.graded:
         own = made.of(method)
         rows.append([method, *(in_words(group_score(own, group, 'exact')) for group in GROUPS)])
     bounds = ['ideal observer', '-']
@@ -119,7 +124,7 @@ def _naming(made: Made) -> Table:
 def _further(made: Made) -> Table:
     """Return what a user of the answers gains and loses."""
     rows = []
-    for method in made.methods:
+    for method in made.graded:
         own = made.of(method)
         defect = [row for row in own if row.group != 'none']
         rows.append(
@@ -156,7 +161,7 @@ def _single(made: Made, name_of: Callable[[Row], str]) -> Table:
     single = [row for row in made.rows if row.group == 'single']
     names = sorted({name_of(row) for row in single})
     rows = []
-    for method in made.methods:
+    for method in made.graded:
         own = [(name_of(row), row.exact) for row in single if row.method == method]
         rows.append(
             [method, *(in_words(share([hit for part, hit in own if part == n])) for n in names)]
@@ -221,7 +226,7 @@ def picture(made: Made) -> Any:
     from matplotlib.figure import Figure
 
     kinds = sorted({name for fact in made.facts for name in fact.label.effects}) + ['no defect']
-    methods = made.methods
+    methods = made.graded
     shares = np.full((len(methods), len(kinds)), np.nan)
     texts: dict[tuple[int, int], str] = {}
     for i, method in enumerate(methods):
