@@ -48,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
     )
     parse.add_argument(
         '--real',
-        metavar='FOLDER_OR_MANIFEST',
+        metavar='FOLDER',
         help='put defects into recordings of real sensors: CSV files, each with '
         'NAME_sim.csv where another simulator knows its force',
     )

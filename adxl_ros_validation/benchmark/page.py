@@ -50,6 +50,11 @@ class Made:
         names = [row.method for row in self.rows] + [row.method for row in self.physical]
         return list(dict.fromkeys(names))
 
+    @property
+    def graded(self) -> list[str]:
+        """Return the methods that answered some of level A."""
+        return [method for method in self.methods if self.of(method)]
+
     def of(self, method: str) -> list[Row]:
         """Return the answers of a method to level A."""
         return [row for row in self.rows if row.method == method]
@@ -76,8 +81,13 @@ def report(made: Made) -> Report:
             'Level A: what else counts': _further(made),
             'Level A: one defect, by its strength': _single(made, _strength),
             'Level A: one defect, by recording': _single(made, lambda row: row.fact.recording),
-            'Level B: a documented defect': _documented(made),
-            'Level C: share of the squared gap that is closed on a later part': _closed(made),
+            'Level B: a documented defect': _physical(
+                made, 'B', lambda row: f'{row.right}: {_said(row)}'
+            ),
+            'Level C: share of the squared gap that is closed on a later part': _physical(
+                made, 'C', lambda row: _percent(row.closed)
+            ),
+            'Level C: what is named': _physical(made, 'C', _said),
             'Answers without a verdict': _failed(made),
             'Recordings': _card(made),
             'Left out': (['what, and why'], [[text] for text in made.left_out]),
@@ -90,7 +100,7 @@ def screen(made: Made) -> list[str]:
     groups = {row.group for row in made.rows}
     shown = {group: words for group, words in GROUPS.items() if group in groups}
     rows = []
-    for method in made.methods:
+    for method in made.graded:
         scores = [group_score(made.of(method), group, 'exact') for group in shown]
         cells = [f'{s["value"]:.2f} of {s["count"]}' if s['count'] else '-' for s in scores]
         rows.append([method, *cells])
@@ -101,7 +111,7 @@ def screen(made: Made) -> list[str]:
 def _naming(made: Made) -> Table:
     """Return how often each method is exactly right."""
     rows = []
-    for method in made.methods:
+    for method in made.graded:
         own = made.of(method)
         rows.append([method, *(in_words(group_score(own, group, 'exact')) for group in GROUPS)])
     bounds = ['ideal observer', '-']
@@ -114,7 +124,7 @@ def _naming(made: Made) -> Table:
 def _further(made: Made) -> Table:
     """Return what a user of the answers gains and loses."""
     rows = []
-    for method in made.methods:
+    for method in made.graded:
         own = made.of(method)
         defect = [row for row in own if row.group != 'none']
         rows.append(
@@ -151,7 +161,7 @@ def _single(made: Made, name_of: Callable[[Row], str]) -> Table:
     single = [row for row in made.rows if row.group == 'single']
     names = sorted({name_of(row) for row in single})
     rows = []
-    for method in made.methods:
+    for method in made.graded:
         own = [(name_of(row), row.exact) for row in single if row.method == method]
         rows.append(
             [method, *(in_words(share([hit for part, hit in own if part == n])) for n in names)]
@@ -167,36 +177,23 @@ def _strength(row: Row) -> str:
     return f'{low:g} to {high:g} times the noise'
 
 
-def _documented(made: Made) -> Table:
-    """Return the answers to level B."""
-    rows = [
-        [
-            row.source.name,
-            ' or '.join(' and '.join(each) for each in row.source.expected),
-            row.method,
-            _said(row),
-            'yes' if row.right else 'NO',
-        ]
-        for row in made.physical
-        if 'B' in row.source.levels
-    ]
-    return ['recording', 'documented', 'method', 'named', 'right'], rows
+def _physical(made: Made, level: str, cell_of: Callable[[Physical], str]) -> Table:
+    """Return a cell of each answer to a level, by recording and method."""
+    chosen = [row for row in made.physical if level in row.source.levels]
+    cells = {(row.source.name, row.method): cell_of(row) for row in chosen}
+    expected = {row.source.name: row.source.expected for row in chosen}
+    rows = []
+    for name, sets in expected.items():
+        documented = ' or '.join(' and '.join(each) for each in sets) if level == 'B' else ''
+        about = f'{name}: {documented}' if documented else name
+        rows.append([about, *(cells.get((name, method), '-') for method in made.methods)])
+    return ['recording', *made.methods], rows
 
 
 def _said(row: Physical) -> str:
     """Return what an answer names."""
     groups = [f'({" or ".join(sorted(group))})' for group in row.answered.one_of]
     return ', '.join([*sorted(row.answered.causes), *groups]) or row.answered.status
-
-
-def _closed(made: Made) -> Table:
-    """Return the answers to level C."""
-    rows = [
-        [row.source.name, row.method, _said(row), _percent(row.closed)]
-        for row in made.physical
-        if 'C' in row.source.levels
-    ]
-    return ['recording', 'method', 'named', 'closed; n blocks'], rows
 
 
 def _failed(made: Made) -> Table:
@@ -229,7 +226,7 @@ def picture(made: Made) -> Any:
     from matplotlib.figure import Figure
 
     kinds = sorted({name for fact in made.facts for name in fact.label.effects}) + ['no defect']
-    methods = made.methods
+    methods = made.graded
     shares = np.full((len(methods), len(kinds)), np.nan)
     texts: dict[tuple[int, int], str] = {}
     for i, method in enumerate(methods):
