@@ -21,7 +21,7 @@ from math import factorial
 from typing import Any, TypeVar
 
 from adxl_ros.model import noise
-from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import (
     ARRAYS,
     Components,
@@ -172,7 +172,7 @@ def paper_inverse(sensor: Sensor, maths: Maths = ARRAYS) -> Callable[..., Compon
     inputs (14, 16). Finally the misalignment is removed, one axis after the other (20, 21). The
     result maps the volts of each axis, and an `Environment`, to specific force, m/s².
     """
-    measured = [AXES.index(axis) for axis in sensor.axes]
+    measured = sensor.axis_indices
     gravity_g = gravity_mps2(sensor) / G0_MPS2
     chain = static_chain(sensor)
     mounted = chain.signals(NOMINAL_ENVIRONMENT, force=list(G0_MPS2 * np.eye(3)))

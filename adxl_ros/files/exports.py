@@ -294,7 +294,7 @@ def text(name: str, export: Export) -> str:
         for axis, v in zip(AXES, values['sample_variance'])
     ]
     coupling = np.eye(3)
-    coupling[[AXES.index(axis) for axis in sensor.axes]] = gain(sensor)
+    coupling[sensor.axis_indices] = gain(sensor)
     walk, remark = max(values['walk_density']), 'Values are those of the noisiest axis.'
     if not walk:
         walk = effect_named('bias_walk').diagnosis.healthy_density * G0_MPS2

@@ -22,7 +22,7 @@ from adxl_ros.calibrate.result import CalibrationResult, compare
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model import signal_chain
-from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
+from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import MARGIN_K, Sensor
 from adxl_ros.process import option
 from adxl_ros.report import templates
@@ -127,7 +127,7 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
     if not result.held_out or not np.isfinite(result.assessments[-1].accel.measured):
         return None
     errors, assessment = result.held_out[-1], result.assessments[-1]
-    gravity, axes = fitted.local_gravity_mps2, [AXES.index(axis) for axis in fitted.axes]
+    gravity, axes = fitted.local_gravity_mps2, fitted.axis_indices
     poses = result.poses.subset(result.inliers)
     held, used = poses.subset(errors.pose_index), held_out.determining_alpha(errors.errors)
     force = np.column_stack(reference_force(held, gravity))
@@ -268,7 +268,7 @@ def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray)
         )
         for sign in (1, -1)
     ]
-    slope = (shifted[0] - shifted[1])[:, [AXES.index(axis) for axis in fitted.axes]] / (2 * step)
+    slope = (shifted[0] - shifted[1])[:, fitted.axis_indices] / (2 * step)
     if name == 'temperature':
         # What the model does not follow drifts as the datasheet states.
         slope = np.sqrt(

@@ -99,7 +99,7 @@ def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Po
         sensor, force, np.mean(poses.std_v, axis=0) ** 2, poses.environment
     )
     shows_tilt = tilt(force, covariance, 'z' in sensor.axes).alpha_std < _MAX_ALPHA_STD_RAD
-    measured = [AXES.index(axis) for axis in sensor.axes]
+    measured = sensor.axis_indices
     tilt_error = angle_between(np.column_stack(force), np.column_stack(reference))
     return PoseErrors(
         np.column_stack([force[d] - reference[d] for d in measured]),
@@ -305,7 +305,7 @@ def error_budgets(
     reference = np.column_stack(reference_force(held, gravity))
     corrected = np.column_stack(_reference(held, sensor, stage))
     has_tilt, used = np.isfinite(measured.tilt_rad), determining_alpha(measured)
-    axes = [AXES.index(axis) for axis in sensor.axes]
+    axes = sensor.axis_indices
     *by_cause, probe = covariances(errors, held, reference)
     accel_scatter, tilt_scatter, has_noise = _scatter(sensor, poses.subset(~poses.check))
     spread = coefficient_spread(sensor, list(reference.T), held.environment)
