@@ -70,7 +70,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     row_of = {row.model: row for row in result.assessments}
     errors = result.held_out[-1] if result.held_out else None
     assessment = result.assessments[-1] if result.assessments else None
-    rows, (limit_mps2, origin) = _coefficients(fitted), acceptance.limit(fitted)
+    limit_mps2, origin = acceptance.limit(fitted)
     drawn: dict[str, Figure] = {}
     if (fit := result.gravity_fit) is not None:
         drawn['errors'] = _error_figure(
@@ -101,39 +101,29 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
         'adxl_ros.calibrate.report',
         'calibration.html',
         {
-            'title': f'Calibration of {fitted.serial}, {fitted.provenance["date"][:10]}',
-            'about': [
-                f'{fitted.model} model',
-                f'{len(result.poses)} poses',
-                f'axes {fitted.axes}',
-            ],
+            'result': result,
+            'fitted': fitted,
             'badge': badge(fitted),
             'tiles': tiles(result, assessment),
-            'advice': f'Limited by {acceptance.LIMITS[assessment.accel.limited_by]}.'
-            if assessment
-            else 'Take more poses: too few were held out to assess this calibration.',
+            'assessment': assessment,
+            'limits': acceptance.LIMITS,
             'file_name': file_name,
             'apply_command': command('apply', f'RECORDING --params {file_name} -o tilt.csv'),
             'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
             'figures': drawn,
             'sphere': _sphere(result),
-            'coefficients': rows,
-            'beyond': [row for row in rows if row['outcome'] == _BEYOND],
-            'datasheet': fitted.datasheet_name,
-            'models': list(errors_of or row_of),
+            'coefficients': _coefficients(fitted),
+            'beyond_maximum': _BEYOND,
             'errors_of': errors_of,
             'row_of': row_of,
-            'poses': len(result.poses),
             'digits': three_digits,
             'mg': held_out.rms_mg,
             'limit': f'{origin} ({mg(limit_mps2):.2g} mg)',
-            'budget': assessment.accel if assessment and errors else None,
             'part_colours': _PART_COLOURS,
             'gum': gum.section(gum.uncertainty(result)),
             'history': history(fitted, past),
             'picture': picture,
             'picture_fault': fault,
-            'report_lines': result.report_lines,
             'provenance': [
                 [key.replace('_', ' '), value] for key, value in fitted.provenance.items()
             ],
