@@ -114,12 +114,7 @@ class Fit(Result):
     @property
     def first_screen(self) -> FirstScreen:
         """Return the top of the page."""
-        assessments = self.result.assessments
-        tiles = page.tiles(self.result, assessments[-1] if assessments else None)
-        return FirstScreen(
-            **page.badge(self.sensor),
-            tiles=[(tile['label'], tile['text'], tile['note']) for tile in tiles],
-        )
+        return FirstScreen(**page.badge(self.sensor), tiles=page.tiles(self.result))
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
         """

@@ -23,6 +23,7 @@ from adxl_ros.files.atomic_write import make_folder, require_own, write_text
 from adxl_ros.files.recording_columns import check_same_sensor, Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
+from adxl_ros.report.page import Tile
 from adxl_ros.report.quantities import counted, number, utc
 
 
@@ -86,9 +87,9 @@ class Update(Result):
             self.outcome,
             self._sentence,
             [
-                ('rests', str(self.counts['rests']), counted(len(self.days), 'day')),
-                ('adoptions', str(self.adoptions), ''),
-                ('tilt error now, 90 %', f'{number(self.state.tilt_90_deg)}°', ''),
+                Tile('rests', str(self.counts['rests']), counted(len(self.days), 'day')),
+                Tile('adoptions', str(self.adoptions)),
+                Tile('tilt error now, 90 %', f'{number(self.state.tilt_90_deg)}°'),
             ],
         )
 
@@ -104,9 +105,9 @@ class Update(Result):
     def report(self, folder: str | os.PathLike, *, overwrite: bool = False) -> Path:
         """Write the page report.html into a folder, and return its path."""
         require_own(Path(folder) / words.PAGE, overwrite)
-        path, top = make_folder(folder) / words.PAGE, self.first_screen
-        tiles = [dict(zip(('label', 'text', 'note'), tile)) for tile in top.tiles]
-        write_text(path, words.page(self.sensor, self.days, self.state, top._asdict(), tiles))
+        path = make_folder(folder) / words.PAGE
+        top = self.first_screen._asdict()
+        write_text(path, words.page(self.sensor, self.days, self.state, top))
         return path
 
     def to_dict(self) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.population import Population
 from adxl_ros.report import figures as plotly, page as html_page
+from adxl_ros.report.page import Tile
 from adxl_ros.report.quantities import number
 import numpy as np
 import pandas as pd
@@ -288,19 +289,11 @@ def _badge(
     }
 
 
-def _tiles(table: fleet.FleetTable, counts: Counter[fleet.State]) -> list[dict[str, str]]:
+def _tiles(table: fleet.FleetTable, counts: Counter[fleet.State]) -> list[Tile]:
     outcomes = Counter(table['outcome'].tolist())
-    return [
-        {
-            'label': 'recordings',
-            'text': str(len(table)),
-            'note': f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed',
-        },
-        *(
-            {'label': f'units: {state.words}', 'text': str(counts[state]), 'note': ''}
-            for state in fleet.State
-        ),
-    ]
+    failed = f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed'
+    tiles = [Tile('recordings', str(len(table)), failed)]
+    return tiles + [Tile(f'units: {state.words}', str(counts[state])) for state in fleet.State]
 
 
 def _link(folder: Path, report: str) -> str:

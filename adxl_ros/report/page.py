@@ -16,7 +16,7 @@ from pathlib import Path
 import re
 import shlex
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import unquote_plus
 
 from adxl_ros.errors import install_hint, UserError
@@ -27,6 +27,14 @@ from adxl_ros.report.figures import png
 _DPI = 100  # Resolution of pictures, dots per inch (chosen: sharp at the page's width)
 _GZIP_LEVEL = 6
 """Level of compression (chosen: 0.3 s for plotly.js; level 9 takes three times as long)."""
+
+
+class Tile(NamedTuple):
+    """A figure at the top of a page."""
+
+    label: str
+    text: str  # The figure with its unit
+    note: str = ''
 
 
 def check_libraries() -> None:
@@ -47,7 +55,14 @@ def render(package: str, template: str, values: Mapping[str, Any]) -> str:
     plotly_js = gzip.compress(get_plotlyjs().encode(), _GZIP_LEVEL, mtime=0)
     made = f'made {datetime.now().astimezone():%Y-%m-%d %H:%M} by adxl_ros {package_version()}'
     return layouts.get_template(template).render(
-        {'made': made, 'command': command_of_this_process() if names_options() else '', **values},
+        {
+            'made': made,
+            'command': command_of_this_process() if names_options() else '',
+            'about': [],
+            'badge': None,
+            'figures': {},
+            **values,
+        },
         plotly_js=b64encode(plotly_js).decode(),
     )
 

@@ -87,13 +87,7 @@ class Report(NamedTuple):
         return page.render(
             'adxl_ros_validation',
             'pages/tables.html',
-            {
-                **self._asdict(),
-                'about': [],
-                'badge': None,
-                'figures': {},
-                'picture': page.picture_url(picture) if picture is not None else '',
-            },
+            {**self._asdict(), 'picture': page.picture_url(picture) if picture else ''},
         )
 
 

@@ -43,18 +43,13 @@ class UpdatedDay(NamedTuple):
 
 
 def page(
-    sensor: Sensor,
-    days: Sequence[UpdatedDay],
-    state: KeptState,
-    badge: Mapping[str, Any],
-    tiles: Sequence[Mapping[str, str]],
+    sensor: Sensor, days: Sequence[UpdatedDay], state: KeptState, top: Mapping[str, Any]
 ) -> str:
-    """Return the page; badge and tiles are its top."""
+    """Return the page; `top` has badge and tiles."""
     values = {
         'title': f'Calibration of {sensor.serial} over {counted(len(days), "day")}',
-        'about': [],
-        'badge': badge,
-        'tiles': tiles,
+        'badge': top,
+        'tiles': top['tiles'],
         'figures': {
             'days': _by_day(sensor, days),
             'temperature': _by_temperature(sensor, days),

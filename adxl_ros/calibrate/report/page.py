@@ -13,7 +13,7 @@ from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.pose_model import reference_force
 from adxl_ros.calibrate.poses import planes, Poses
 from adxl_ros.calibrate.report import acceptance, gum, held_out
-from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.report.acceptance import FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.result import CalibrationResult, compare, history, rounded
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
@@ -24,6 +24,7 @@ from adxl_ros.model.sensor import get, Sensor
 from adxl_ros.process import command
 from adxl_ros.report import figures, page as html_page
 from adxl_ros.report.figures import AXIS_COLOURS, Figure
+from adxl_ros.report.page import Tile
 from adxl_ros.report.quantities import mg, three_digits
 import numpy as np
 
@@ -104,7 +105,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
             'result': result,
             'fitted': fitted,
             'badge': badge(fitted),
-            'tiles': tiles(result, assessment),
+            'tiles': tiles(result),
             'assessment': assessment,
             'limits': acceptance.LIMITS,
             'file_name': file_name,
@@ -142,7 +143,7 @@ def badge(fitted: Sensor) -> dict[str, str]:
     }
 
 
-def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict[str, str]]:
+def tiles(result: CalibrationResult) -> list[Tile]:
     """Return tilt and acceleration error before and after, and what limits them."""
     tiles = []
     if (fit := result.gravity_fit) is not None:
@@ -150,11 +151,11 @@ def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict
         before = three_digits(held_out.rms_mg(float(np.mean(fit.before_mps2[used] ** 2))))
         after = three_digits(held_out.rms_mg(float(np.mean(fit.held_out_mps2[used] ** 2))))
         tiles = [
-            {
-                'label': 'error of the magnitude of gravity',
-                'text': f'{before} → {after} mg',
-                'note': f'rms over {len(used)} rests, held out',
-            }
+            Tile(
+                'error of the magnitude of gravity',
+                f'{before} → {after} mg',
+                f'rms over {len(used)} rests, held out',
+            )
         ]
     for label, unit, name in (
         ('tilt error', '°', 'tilt_deg'),
@@ -166,20 +167,20 @@ def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict
             after = three_digits(statistics[-1].rms)
             low, high = map(three_digits, statistics[-1].interval)
             tiles.append(
-                {
-                    'label': label,
-                    'text': f'{before} → {after} {unit}',
-                    'note': f'rms on held-out poses, 90 %: {low} to {high} {unit}',
-                }
+                Tile(
+                    label,
+                    f'{before} → {after} {unit}',
+                    f'rms on held-out poses, 90 %: {low} to {high} {unit}',
+                )
             )
-    if assessment is not None:
+    for assessment in result.assessments[-1:]:
         tiles.append(
-            {
-                'label': 'limited by',
-                'text': assessment.accel.limited_by,
-                'note': f'calibration error {three_digits(assessment.error_mg)} mg, without '
+            Tile(
+                'limited by',
+                assessment.accel.limited_by,
+                f'calibration error {three_digits(assessment.error_mg)} mg, without '
                 'noise and stage error of the check',
-            }
+            )
         )
     return tiles
 
