@@ -14,7 +14,7 @@ The verbs of the package load when they are used, and need no ROS:
 
 from collections.abc import Callable
 from importlib import import_module
-from types import ModuleType
+import sys
 from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -80,37 +80,45 @@ __all__ = [
 ]
 
 
-class _VerbPackage(ModuleType):
+class _Verb:
     """
-    A package that has the name of a verb, and is called as that verb.
+    A verb that has a package of the same name, and stands for it in `sys.modules`.
 
     Both stay what they are in any order of imports: `adxl_ros.diagnose(...)` as well as
-    `import adxl_ros.diagnose.verdict`.
+    `import adxl_ros.diagnose.verdict`. It is no module, so that `help` shows the verb.
     """
+
+    def __init__(self, verb: str) -> None:
+        # Spec and path, by which the modules of the package are found
+        vars(self).update(vars(import_module(f'{__name__}.{verb}')))
+        self._verb = self.__qualname__ = verb
 
     @property
     def __wrapped__(self) -> Callable[..., Any]:
         """Return the verb, for its signature."""
-        return getattr(import_module(f'adxl_ros.{_MODULES[self._verb]}'), self._verb)
-
-    @property
-    def _verb(self) -> str:
-        return self.__name__.rpartition('.')[2]
+        return getattr(import_module(f'{__name__}.{_MODULES[self._verb]}'), self._verb)
 
     @property
     def __doc__(self) -> str | None:  # type: ignore[override]
         return self.__wrapped__.__doc__
 
+    def __get__(self, instance: object, owner: object = None) -> Callable[..., Any]:
+        """Return the verb; by this method `inspect` and `help` know it as a routine."""
+        return self.__wrapped__
+
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         return self.__wrapped__(*arguments, **named)
+
+    def __repr__(self) -> str:
+        return repr(self.__wrapped__)
 
     def __reduce__(self) -> str:
         """Pickle it by its name, as functions are."""
         return self._verb
 
 
-for _package in ('diagnose', 'simulate'):
-    import_module(f'{__name__}.{_package}').__class__ = _VerbPackage
+for _name in ('diagnose', 'simulate'):
+    globals()[_name] = sys.modules[f'{__name__}.{_name}'] = _Verb(_name)  # type: ignore[assignment]
 
 
 def __getattr__(name: str) -> Any:

@@ -2,7 +2,7 @@
 
 """What the processes of all executables share; it must load before numpy, and quickly."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 import hashlib
@@ -88,6 +88,18 @@ _OPTIONS = {
 _UNQUOTED = re.compile(r'[-+]?\d[\d.]*(e[-+]?\d+)?|[A-Z]{2,}')
 """What has no quotes in Python: numbers, and words in capitals, which stand for values."""
 _METHODS = ('certificate', 'report')  # Options of `fit` that are methods of its result in Python
+READING = (
+    'topic',
+    'columns',
+    'unit',
+    'lsb_per_g',
+    'lsb_at_0g',
+    'rate',
+    'axes',
+    'drop_bad_stamps',
+    'drop_bad_samples',
+)
+"""Arguments of `read`, which are options of the tools that read recordings."""
 
 
 @contextmanager
@@ -118,14 +130,16 @@ def option(*names: str, **values: Any) -> str:
     given = {**dict.fromkeys(names), **values}
     if names_options():
         return ' '.join(_of_tool(name, value) for name, value in given.items())
-    return ', '.join(_of_verb(name, value) for name, value in given.items())
+    arguments = _arguments(given)
+    # Other verbs take recordings as they were read.
+    return f'read(..., {arguments})' if given.keys() <= {*READING} else arguments
 
 
 def usage(verb: str, *inputs: str, **values: Any) -> str:
     """Return how a verb is used with an option: `fit --means` as a tool, `fit(means=True)`."""
     if names_options():
         return ' '.join((verb, *inputs, option(**values)))
-    return f'{verb}({", ".join((*map(repr, inputs), option(**values)))})'
+    return f'{verb}({", ".join((*map(repr, inputs), _arguments(values)))})'
 
 
 def pasted(columns: str, **values: Any) -> str:
@@ -142,6 +156,11 @@ def _of_tool(name: str, value: Any) -> str:
     if isinstance(value, list):
         return ' '.join(f'{flag} {each}' for each in value)
     return flag if value is None or value is True else f'{flag} {value}'
+
+
+def _arguments(given: Mapping[str, Any]) -> str:
+    """Return arguments of a verb."""
+    return ', '.join(_of_verb(name, value) for name, value in given.items())
 
 
 def _of_verb(name: str, value: Any) -> str:

@@ -194,7 +194,6 @@ VERBS = (
 """The verbs of the front door, in the order of the page."""
 RESULTS = (
     'adxl_ros.files.recording_columns:Recording',
-    'adxl_ros.files.column_mapping:ReadingOptions',
     'adxl_ros.model.sensor:Sensor',
     'adxl_ros.api.calibration:Fit',
     'adxl_ros.api.updating:Update',
@@ -204,8 +203,8 @@ RESULTS = (
     'adxl_ros.api.noise:Noise',
 )
 """What the verbs take and return; the types of their fields follow each."""
-STEPS = ('result', 'diagnosis', 'parts', 'mapping', 'mounting')
-"""Fields whose types are no part of the interface: steps of the work, and what is parsed."""
+STEPS = ('result', 'diagnosis', 'parts')
+"""Fields whose types are no part of the interface: steps of the work."""
 INPUTS = (
     'adxl_ros.api.recordings:RecordingInput',
     'adxl_ros.api.sensors:SensorInput',

@@ -13,7 +13,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from adxl_ros.api.recordings import as_series, one_recording, RecordingInput, RobotInput
+from adxl_ros.api.recordings import (
+    as_series,
+    one_recording,
+    reading_options,
+    RecordingInput,
+    RobotInput,
+)
 from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Result
 from adxl_ros.api.sensors import as_input, sensor_of, SensorInput
 from adxl_ros.diagnose.data_checks import DataFault
@@ -22,7 +28,7 @@ from adxl_ros.diagnose.report import shows_row
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording as recording_files
 from adxl_ros.files.atomic_write import make_folder, require_own, write_text
-from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
+from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.signals import findings_report as words
 from adxl_ros.signals.findings import Ability, check_recording, Findings
@@ -146,8 +152,8 @@ def check(
     urdf: str | os.PathLike | None = None,
     frame: str = 'imu_link',
     joints: str = '',
-    reading: ReadingOptions = AS_IT_IS,
     progress: Progress = no_progress,
+    **reading: Any,
 ) -> Check:
     """
     Check whether recordings are sound, and what the verbs can do with them.
@@ -166,10 +172,11 @@ def check(
         poses.
     urdf, frame, joints
         Path of a robot as the stage, its frame that carries the sensor, topic of its joints.
-    reading
-        How the recordings of paths are read; samples whose stamp does not increase are counted.
     progress
         Called with the share of the work that is done, 0 to 1, and the name of the recording.
+    **reading
+        Arguments of `read` for recordings that are named by their path, such as `unit='g'`;
+        samples whose stamp does not increase are counted in any case.
 
     Returns
     -------
@@ -185,13 +192,13 @@ def check(
     if unknown := sorted(set(minima) - set(MINIMA)):
         raise UserError(f'minima: {unknown[0]!r} is none of {", ".join(MINIMA)}')
     several = list(map(_stored, as_series(recordings)))
-    reading = replace(reading, drop_bad_stamps=True)
+    options = reading_options(**{**reading, 'drop_bad_stamps': True})
     stated, earlier, compared_with = as_input(sensor), None, ''
     robot = RobotInput(urdf, frame, joints) if urdf else None
     if against is not None:
         before = _stored(against)
-        found = check_recording(before, stated, reading)
-        samples = _samples(before, reading)
+        found = check_recording(before, stated, options)
+        samples = _samples(before, options)
         earlier, faults = Earlier(found, samples, stated), found.faults
         if robot:
             try:
@@ -208,11 +215,11 @@ def check(
         def step(done: float, number: int = number, name: str = name) -> None:
             progress((number + done) / len(several), name)
 
-        results.append(check_recording(each, stated, reading, step))
+        results.append(check_recording(each, stated, options, step))
     if len(results) == 1:
-        results = [_with_what_shows(results[0], several[0], sensor, robot, reading)]
+        results = [_with_what_shows(results[0], several[0], sensor, robot, options)]
     outcomes = [
-        outcomes_of(result, minima, earlier, partial(_samples, each, reading))
+        outcomes_of(result, minima, earlier, partial(_samples, each, options))
         for result, each in zip(results, several)
     ]
     return Check(tuple(results), tuple(outcomes), compared_with)

@@ -174,11 +174,16 @@ def from_arrays(
     /,
     *,
     rate: float | None = None,
+    unit: str = '',
+    columns: str | Mapping[str, str | tuple[str, str]] | None = None,
+    axes: str | None = None,
+    lsb_per_g: Counts = (),
+    lsb_at_0g: Counts = (),
     serial: str = '',
     name: str = 'arrays',
     drop_bad_stamps: bool = False,
     drop_bad_samples: bool = False,
-    **columns: Any,
+    **arrays: Any,
 ) -> Recording:
     """
     Make a recording of arrays.
@@ -190,15 +195,15 @@ def from_arrays(
         too. An index that has a name is a column, and one of dates is the time.
     rate
         Sample rate, Hz, in place of `time_s`; a row without a reading is a gap.
+    unit
+        Unit of the output where it is another one than its names say: `ax_mps2=ax, unit='g'`.
+    columns, axes, lsb_per_g, lsb_at_0g, drop_bad_stamps, drop_bad_samples
+        As in `read`. With `columns`, arrays may have any names.
     serial
         Serial number of the sensor; '' for an unnamed one.
     name
         What messages call it.
-    drop_bad_stamps
-        Whether samples are left out whose stamp does not increase; else they are refused.
-    drop_bad_samples
-        Whether samples are left out that have no number as their stamp or on an axis.
-    **columns
+    **arrays
         Arrays (n,): `time_s`, s or dates, rising; the output `ax_mps2, ay_mps2, az_mps2`, m/s², or
         `x_v, y_v, z_v`, V, of one, two or three axes; the references `alpha_rad, beta_rad` of a
         stage, rad, `shift_m`, m, `temperature_c`, °C, `supply_v`, V; a gyroscope's `gx_radps,
@@ -215,16 +220,25 @@ def from_arrays(
         There is no time or no output, lengths differ, or values are no readings of a sensor.
 
     """
-    arrays = {} if table is None else _columns_of(table, 'from_arrays')
-    for key in columns:
-        if key not in _KNOWN:
-            raise UserError(f'{name}: no array {key!r} is known, but {", ".join(_KNOWN)}')
+    given = arrays if table is None else {**_columns_of(table, 'from_arrays'), **arrays}
+    unknown = arrays.keys() - _KNOWN
+    # Without an output that is known, the reader proposes what the others may be.
+    if unknown and not columns and not _OUTPUTS.isdisjoint(given):
+        raise UserError(f'{name}: no array {min(unknown)!r} is known, but {", ".join(_KNOWN)}')
     options = reading_options(
-        rate=rate, drop_bad_stamps=drop_bad_stamps, drop_bad_samples=drop_bad_samples
+        columns=columns,
+        unit=unit,
+        rate=rate,
+        axes=axes,
+        lsb_per_g=lsb_per_g,
+        lsb_at_0g=lsb_at_0g,
+        drop_bad_stamps=drop_bad_stamps,
+        drop_bad_samples=drop_bad_samples,
     )
-    return _of_memory({**arrays, **columns}, name, options, serial)
+    return _of_memory(given, name, options, serial)
 
 
+_OUTPUTS = {*ACCEL, *VOLTS}  # Columns of the sensor's output
 _KNOWN = (TIME, *ACCEL, *VOLTS, *GYRO, *REFERENCES)  # Columns of the package
 
 
@@ -279,7 +293,7 @@ def _of_memory(
             f'{name}: arrays must have one dimension and the same length, but have '
             + ', '.join(f'{key} {shape}' for key, shape in shapes.items())
         )
-    if options.mapping is None and not {*ACCEL, *VOLTS}.isdisjoint(columns):
+    if options.mapping is None and not _OUTPUTS.isdisjoint(columns):
         if options.rate_hz is not None:
             (rows,) = next(iter(shapes.values()))
             columns[TIME] = np.arange(rows) / options.rate_hz

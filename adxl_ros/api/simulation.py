@@ -89,7 +89,8 @@ def prepare(
     bounds = parameter_file.SENSOR_FIELDS['sensor.rate_hz'].metadata
     if rate is not None and not bounds['lower'] <= rate <= bounds['upper']:
         raise UserError(
-            f'{option(rate=f"{rate:g}")}: outside {bounds["lower"]:g} to {bounds["upper"]:g} Hz'
+            f'{usage("simulate", rate=f"{rate:g}")}: outside {bounds["lower"]:g} to '
+            f'{bounds["upper"]:g} Hz'
         )
     name = trajectory if isinstance(trajectory, str) else ''
     if (name == IMU) != (force is not None):

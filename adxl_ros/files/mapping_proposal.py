@@ -150,7 +150,7 @@ def propose(table: Table) -> tuple[str, str]:
         sources = {'time': source, **sources}
         stamps, note = _stamp_options(values[time], source), ''
         if guess.unit in ('v', 'mv'):
-            note = f' (add {option("sensor")} with the parameter file of the sensor)'
+            note = f' (then {option("sensor")} takes the parameter file of the sensor)'
     if table.has_names:
         sources |= _references(values, {*outputs, time})
     options = {'columns': str(ColumnMapping(sources)), **stamps, **guess.count_options}

@@ -27,7 +27,7 @@ from adxl_ros.files.recording_columns import (
 from adxl_ros.files.stamps import burst_samples, lacks_samples, period_s
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.process import option
+from adxl_ros.process import option, usage
 from adxl_ros.report.quantities import counted, duration
 from adxl_ros.signals.allan_deviation import shortest_rest_s
 from adxl_ros.signals.block_statistics import true_runs
@@ -497,8 +497,8 @@ def _diagnose(contents: RecordingContents) -> Ability:
         return Ability(
             'diagnose',
             False,
-            f'has no stage angles; give {option("sim")} with the specific force of the '
-            'same motion',
+            f'has no stage angles; give {usage("diagnose", sim=None)} with the specific force '
+            'of the same motion',
         )
     if range_rad < _MOVED_RAD:
         return Ability('diagnose', False, 'has stage angles that do not change; move the stage')

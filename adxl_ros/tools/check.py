@@ -83,8 +83,8 @@ def check(options: argparse.Namespace) -> int:
             urdf=options.urdf,
             frame=options.frame,
             joints=options.joints,
-            reading=cli.reading_options(options),
             progress=show,
+            **cli.reading_arguments(options),
         )
     if options.junit:
         checked.junit(options.junit, fail_on, overwrite=options.overwrite)

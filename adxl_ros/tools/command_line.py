@@ -11,7 +11,7 @@ from pathlib import Path
 import shlex
 import signal
 import sys
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 from adxl_ros.api import recordings
 from adxl_ros.api.result import require_least
@@ -21,7 +21,7 @@ from adxl_ros.files.atomic_write import AnyPath, require_own
 from adxl_ros.files.column_mapping import AS_IT_IS, ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects.base import Effect
-from adxl_ros.process import ended_by_closed_output, option, options_named
+from adxl_ros.process import ended_by_closed_output, option, options_named, READING
 from adxl_ros.report.screen import bar, end_lines, entry_list, NextStep, program_parser, wrapped
 
 if TYPE_CHECKING:
@@ -146,30 +146,21 @@ def add_robot_options(parse: argparse.ArgumentParser) -> None:
     )
 
 
-_READING = (
-    'topic',
-    'columns',
-    'unit',
-    'lsb_per_g',
-    'lsb_at_0g',
-    'rate',
-    'axes',
-    'drop_bad_stamps',
-    'drop_bad_samples',
-)
-"""Arguments of `read` that are options of tools."""
+def reading_arguments(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the arguments of `read` that are given."""
+    return {name: getattr(options, name) for name in READING}
 
 
 def reading_options(options: argparse.Namespace) -> ReadingOptions:
     """Return how recordings are to be read."""
-    return recordings.reading_options(**{name: getattr(options, name) for name in _READING})
+    return recordings.reading_options(**reading_arguments(options))
 
 
 def reading_text(options: argparse.Namespace) -> str:
     """Return the given options for a command line that reads the same recording."""
     text = ''
-    for name in _READING:
-        if value := getattr(options, name):
+    for name, value in reading_arguments(options).items():
+        if value:
             text += f' {option(**{name: value if value is True else shlex.quote(str(value))})}'
     return text
 

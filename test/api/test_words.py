@@ -5,9 +5,11 @@
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from functools import partial
+import inspect
 from multiprocessing import get_context
 import pickle
 from pkgutil import iter_modules
+import re
 import subprocess
 import sys
 
@@ -38,7 +40,7 @@ OF_VERBS: dict[str, tuple[Callable[[], object], str]] = {
     'apply, inverse': (lambda: adxl.apply(X_ONLY, inverse='paper'), "inverse='paper'"),
     'apply, no inverse': (lambda: adxl.apply(STILL, inverse='no'), "inverse='no'"),
     'check, unit': (lambda: adxl.check(IN_G), "unit='g'"),
-    'check, angles': (lambda: adxl.check(STILL), 'give sim='),
+    'check, angles': (lambda: adxl.check(STILL), 'give diagnose(sim=)'),
     'check, bursts': (lambda: adxl.check(BURSTS), 'rate='),
     'check, effects': (lambda: adxl.check(adxl.simulate('tilt_both', rate=25)), 'needs sim='),
     'diagnose, angles': (lambda: adxl.diagnose(SIM), 'or sim= with the specific force'),
@@ -76,6 +78,12 @@ OF_VERBS: dict[str, tuple[Callable[[], object], str]] = {
 }
 """Calls whose error or result advises, and a word of the advice."""
 
+CALL = re.compile(rf'\b({"|".join(filter(str.islower, adxl.__all__))})\(([^()]*)\)')
+"""A call of a verb: its name and its arguments."""
+
+ARGUMENT = re.compile(r"(?<!needs)(?:^|[\s,])([a-z_]+)=(?=$|[A-Z\d'\s;:,]|True)")
+"""An argument by its name: no role of a mapping, and not what an effect needs of `diagnose`."""
+
 
 def texts(value: object) -> Iterator[str]:
     """Yield all texts of an object of JSON but command lines."""
@@ -104,6 +112,27 @@ def test_a_verb_advises_arguments_and_no_options(name: str) -> None:
     call, word = OF_VERBS[name]
     said = words_of(call)
     assert word in said and ' --' not in said and not said.startswith('--'), said
+    # Arguments stand in a call of a verb that takes them, or are of this one.
+    alone = CALL.sub('', said)
+    calls = [(name.partition(',')[0], alone), *CALL.findall(said)]
+    for verb, arguments in calls:
+        taken = set(inspect.signature(getattr(adxl, verb)).parameters) | {'overwrite'}
+        assert set(ARGUMENT.findall(arguments)) <= taken, said
+
+
+@pytest.mark.parametrize('name', ['ax_mps2', 'ax_g', 'ax', 'accX'])
+def test_arrays_in_g_are_read_as_the_message_says(name: str) -> None:
+    arrays = {'time_s': TIME_S} | {
+        name.replace('x', axis, 1).replace('X', axis.upper()): each / 9.80665
+        for axis, each in zip('xyz', LEVEL.values())
+    }
+    with pytest.raises(adxl.UserError) as error:
+        adxl.noise(adxl.from_arrays(**arrays))
+    options = dict(re.findall(r"read\(\.\.\., (\w+)='(.*?)'\)", str(error.value)))
+    assert len(options) == 1
+    for recording in (adxl.from_arrays(**arrays, **options), adxl.read(arrays, **options)):
+        for column, values in LEVEL.items():
+            np.testing.assert_allclose(recording.columns[column], values, rtol=1e-12)
 
 
 def test_every_verb_is_asked() -> None:
@@ -114,14 +143,22 @@ def test_every_verb_is_asked() -> None:
 @pytest.mark.parametrize(
     'make, of_tool, of_verb',
     [
-        (partial(option, 'drop_bad_stamps'), '--drop-bad-stamps', 'drop_bad_stamps='),
+        (partial(option, 'drop_bad_stamps'), '--drop-bad-stamps', 'read(..., drop_bad_stamps=)'),
         (partial(option, align=True), '--align', 'align=True'),
         (partial(option, sensor='a.yaml'), '--params a.yaml', "sensor='a.yaml'"),
-        (partial(option, rate='HZ'), '--rate HZ', 'rate=HZ'),
-        (partial(option, unit='lsb', lsb_per_g=64), '--unit lsb --lsb-per-g 64', None),
+        (partial(option, rate='HZ'), '--rate HZ', 'read(..., rate=HZ)'),
+        (
+            partial(option, unit='lsb', lsb_per_g=64),
+            '--unit lsb --lsb-per-g 64',
+            "read(..., unit='lsb', lsb_per_g=64)",
+        ),
         (partial(option, quantity='tilt'), '--in tilt', "quantity='tilt'"),
         (partial(option, 'certificate'), '--dcc', 'certificate()'),
-        (partial(pasted, columns='x=a b:g'), "--columns 'x=a b:g'", "columns='x=a b:g'"),
+        (
+            partial(pasted, columns='x=a b:g'),
+            "--columns 'x=a b:g'",
+            "read(..., columns='x=a b:g')",
+        ),
         (partial(usage, 'fit', effects=['bias']), 'fit --effect bias', "fit(effects=['bias'])"),
         (
             partial(usage, 'simulate', 'imu', force='a.csv'),
@@ -131,9 +168,9 @@ def test_every_verb_is_asked() -> None:
     ],
 )
 def test_options_are_those_of_tools_while_one_runs(
-    make: Callable[[], str], of_tool: str, of_verb: str | None
+    make: Callable[[], str], of_tool: str, of_verb: str
 ) -> None:
-    assert make() == of_verb or "unit='lsb', lsb_per_g=64"
+    assert make() == of_verb
     with options_named():
         assert make() == of_tool
         with options_named():
@@ -168,7 +205,9 @@ def test_a_verb_and_the_package_of_its_name_are_both_there(is_verb_first: bool) 
     verb = 'import adxl_ros as adxl; adxl.simulate.__doc__; from adxl_ros import diagnose'
     imports = 'import adxl_ros.diagnose.verdict as v, adxl_ros.simulate.motion as m'
     check = """
-import adxl_ros.diagnose, inspect
+import adxl_ros.diagnose, inspect, pydoc
+assert pydoc.plaintext.document(diagnose).startswith('adxl_ros.diagnose(recordings')
+assert str(diagnose).startswith('<function diagnose')
 assert v is adxl_ros.diagnose.verdict is adxl.diagnose.verdict and m.Motion
 assert 'recordings' in inspect.signature(diagnose).parameters
 assert diagnose.__doc__.split()[0] == 'Find'
