@@ -24,20 +24,29 @@ import numpy as np
 KEPT_HEAD = ('robots', 'tilt error (rms)', 'inside, % x y z', 'worse', 'false')
 KNOCK_HEAD = ('knock', 'size', 'within a day', 'ever', 'adopted after')
 
-KINDS = {
-    f'{name}, {text}': replace(kind, drift=factor, slope=factor)
-    for name, kind in {
-        'level': Kind(),
-        'lies down': Kind(lies_down=True),
-        'slope of 4° for 3 weeks': Kind(place_deg=1.0, weeks_deg=4.0),
-        'turned by hand': Kind(is_turned=True),
-    }.items()
-    for text, factor in {'usual drift': 1.0, 'five times': 5.0}.items()
-} | {
-    'level, five times by temperature': Kind(slope=5.0),
-    'level, ten times by temperature': Kind(slope=10.0),
-    'lies down, five times by temperature': Kind(lies_down=True, slope=5.0),
+_BY_DRIFT = {
+    'level': Kind(),
+    'lies down': Kind(lies_down=True),
+    'slope of 4° for 3 weeks': Kind(place_deg=1.0, weeks_deg=4.0),
+    'turned by hand': Kind(is_turned=True),
 }
+"""Robots that are simulated with the usual drift and with five times of it."""
+
+
+def _kinds() -> dict[str, Kind]:
+    """Return the robots without a knock."""
+    kinds = {}
+    for name, kind in _BY_DRIFT.items():
+        kinds[f'{name}, usual drift'] = kind
+        kinds[f'{name}, five times'] = replace(kind, drift=5.0, slope=5.0)
+    return kinds | {
+        'level, five times by temperature': Kind(slope=5.0),
+        'level, ten times by temperature': Kind(slope=10.0),
+        'lies down, five times by temperature': Kind(lies_down=True, slope=5.0),
+    }
+
+
+KINDS = _kinds()
 """Robots without a knock."""
 KNOCKED = {
     'level, on z': Kind(knock_axis=2),
