@@ -207,26 +207,6 @@ def _json(export: Export) -> str:
     )
 
 
-def kalibr_settings(
-    accel: tuple[float, float], gyro: tuple[float, float] | None
-) -> list[tuple[str, float, str]]:
-    """
-    Return the settings of Kalibr, which are densities over both signs of the frequency.
-
-    accel, gyro: white noise and random walk; None without a gyroscope.
-    """
-    settings = [
-        ('accelerometer_noise_density', accel[0], 'm/s^2/sqrt(Hz)'),
-        ('accelerometer_random_walk', accel[1], 'm/s^3/sqrt(Hz)'),
-    ]
-    if gyro is not None:
-        settings += [
-            ('gyroscope_noise_density', gyro[0], 'rad/s/sqrt(Hz)'),
-            ('gyroscope_random_walk', gyro[1], 'rad/s^2/sqrt(Hz)'),
-        ]
-    return settings
-
-
 _HIDDEN_S = 3600.0  # Rest that does not show an unstated walk, s. Chosen: an hour
 
 
@@ -309,7 +289,6 @@ def text(name: str, export: Export) -> str:
         white=partial(_white_density, export),
         walk=walk,
         walk_remark=f'# {remark}',
-        kalibr_settings=kalibr_settings,
         gyro=gyro,
         gyro_covariance=np.diag(gyro.variances).ravel().tolist() if gyro else [],
         sensor=sensor,
