@@ -9,6 +9,7 @@ Write docs/reference from the package: tools, nodes, effects, files and the libr
 
 from collections.abc import Iterable, Iterator
 import dataclasses
+import enum
 from functools import cache
 import html
 import importlib
@@ -201,8 +202,26 @@ RESULTS = (
     'adxl_ros.api.gap:Gap',
     'adxl_ros.api.checking:Check',
     'adxl_ros.api.noise:Noise',
+    'adxl_ros.api.result:FirstScreen',
+    'adxl_ros.report.screen:NextStep',
 )
 """What the verbs take and return; the types of their fields follow each."""
+READ_FIRST = (
+    (
+        '`read`, `from_arrays`, `simulate`',
+        'Recording',
+        'recording',
+        '`time_s`, `columns`, `notes`',
+    ),
+    ('`load`', 'Sensor', '`nominal_zero_g_v`, `nominal_scale_v_per_g`, `values`'),
+    ('`fit`', 'Fit', '`outcome`, `coefficients`, `sensor`, `save`'),
+    ('`update`', 'Update', '`outcome`, `sensor`, `save`'),
+    ('`apply`', 'Corrected', '`force_mps2`, `force_std_mps2`, `columns`, `save`'),
+    ('`diagnose`', 'Gap', '`verdict`, `effects`, `figures`, `sensor`, `save`'),
+    ('`check`', 'Check', '`is_sound`, `faults`, `failures`'),
+    ('`noise`', 'Noise', '`axes`, `tau_s`, `allan_deviation_mps2`, `save`'),
+)
+"""What each verb returns, and what people read of it first."""
 STEPS = ('result', 'diagnosis', 'parts')
 """Fields whose types are no part of the interface: steps of the work."""
 INPUTS = (
@@ -595,6 +614,10 @@ def documented_classes() -> Iterator[str]:
         'notebook. Errors are `adxl.UserError`. [calibrate_arrays.py]'
         '(../examples/calibrate_arrays.py) and the files beside it run as they are.',
         *block(USAGE, 'python'),
+        *table(
+            'verb | returns | read first',
+            ((verb, f'`{name}`', what) for verb, name, what in READ_FIRST),
+        ),
     ]
     for name in VERBS:
         yield from verb(name)
@@ -640,10 +663,19 @@ def with_fields(paths: Iterable[str]) -> list[str]:
         todo[:0] = [
             f'{each.__module__}:{each.__name__}'
             for each in types
-            if getattr(each, '__module__', '').startswith('adxl_ros')
-            and (dataclasses.is_dataclass(each) or hasattr(each, '_fields'))
+            if getattr(each, '__module__', '').startswith('adxl_ros') and has_fields(each)
         ]
     return found
+
+
+def has_fields(item: Any) -> bool:
+    """Return whether a type is described by its fields, or by the words of an enumeration."""
+    return (
+        dataclasses.is_dataclass(item)
+        or hasattr(item, '_fields')
+        or isinstance(item, enum.EnumMeta)
+        or getattr(item, '_is_protocol', False)
+    )
 
 
 def input_types() -> Iterator[tuple[str, ...]]:
@@ -677,11 +709,7 @@ def described(path: str, level: int) -> Iterator[str]:
     module, name = path.split(':')
     item = getattr(importlib.import_module(module), name)
     lines = [f'from {module} import {name}', '']
-    if (
-        dataclasses.is_dataclass(item)
-        or getattr(item, '_is_protocol', False)
-        or hasattr(item, '_fields')
-    ):
+    if has_fields(item):
         # The fields have their meaning beside them; the functions follow.
         source = inspect.getsource(item).split('\n    def ')[0].rstrip()
         lines += re.sub(r'(\n    @\w+)+$', '', source).rstrip().splitlines()

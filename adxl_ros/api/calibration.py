@@ -201,7 +201,7 @@ class Fit(Result):
         if gravity is not None:
             ax.plot(mg(gravity.held_out_mps2), 'o', label='magnitude minus gravity')
         elif self.held_out:
-            for axis, errors in zip(self.sensor.axes, self.held_out[-1].errors.accel_mps2.T):
+            for axis, errors in zip(self.sensor.axes, self.held_out[-1].pose_errors.accel_mps2.T):
                 ax.plot(mg(errors), 'o', label=axis, color=AXIS_COLOURS[axis])
         ax.set(xlabel='held-out pose', ylabel='error of acceleration, mg')
         ax.axhline(0.0, lw=0.8, color='#7b8794')

@@ -30,8 +30,9 @@ from adxl_ros.files import recording as recording_files
 from adxl_ros.files.atomic_write import make_folder, require_own, write_text
 from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import Recording
+from adxl_ros.report.screen import Tile
 from adxl_ros.signals import findings_report as words
-from adxl_ros.signals.findings import Ability, check_recording, Findings
+from adxl_ros.signals.findings import Ability, check_recording, Findings, Shown
 from adxl_ros.signals.gate import (
     Earlier,
     KINDS,
@@ -84,7 +85,10 @@ class Check(Result):
     @property
     def first_screen(self) -> FirstScreen:
         """Return the top of the page."""
-        tiles = [tuple(words.table_row(result)) for result in self.recordings]
+        tiles = []
+        for result in self.recordings:
+            name, *figures, verdict = words.table_row(result)
+            tiles.append(Tile(name, ', '.join(figures), verdict))
         colour, word = ('green', 'Sound.') if self.is_sound else ('red', 'Not sound.')
         return FirstScreen(colour, word, words.sentence(self.recordings), tiles)
 
@@ -273,7 +277,7 @@ def _with_what_shows(
         else:
             scale_v_per_g = float(unit.scale_v_per_g.mean())
             shown_first = sorted(shown, key=lambda effect: not effect.shows)
-            rows = tuple(shows_row(effect, scale_v_per_g) for effect in shown_first)
+            rows = tuple(Shown(*shows_row(effect, scale_v_per_g)) for effect in shown_first)
             result = replace(result, shows=rows)
     except UserError as error:
         reason = one_line(error)

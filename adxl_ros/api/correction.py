@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.api.recordings import one_recording, RecordingInput
 from adxl_ros.api.result import as_json, FirstScreen, Result
@@ -30,6 +30,7 @@ from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.process import option
 from adxl_ros.report.figures import axes_for
 from adxl_ros.report.quantities import mg
+from adxl_ros.report.screen import Tile
 from adxl_ros.signals.gravity_at_rest import require_unit
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import BeyondRange, listed
@@ -45,6 +46,13 @@ _COUNTED = {
     f'their variances {UNMEASURED_VARIANCE:g}',
 }
 """What is said of counted samples, by the field of `Estimates`."""
+
+
+class CorrectedPart(NamedTuple):
+    """Some samples, and what follows from them."""
+
+    samples: Recording
+    estimates: Estimates
 
 
 class Correction:
@@ -78,10 +86,10 @@ class Correction:
         self._has_gyro = first.gyro_radps is not None
         self._doubts: list[str] = []  # What is wrong with gravity, or between samples
 
-    def blocks(self, recording: Iterable[Recording]) -> Iterator[tuple[Recording, Estimates]]:
+    def blocks(self, recording: Iterable[Recording]) -> Iterator[CorrectedPart]:
         """Yield each block with its estimates; refuse readings in another unit at the end."""
         for block, estimates in self._estimator.blocks(recording):
-            yield block, estimates
+            yield CorrectedPart(block, estimates)
             explained = ~(estimates.unsolved | estimates.at_rail)
             self._beyond.add(estimates.volts[explained], self.sensor)
             self._look.feed(block)
@@ -252,7 +260,7 @@ class Corrected(Result):
     """Effects that stay, and how many samples are at a rail, outside or without a solution."""
     screen_lines: tuple[str, ...]
     """What the tool shows."""
-    parts: tuple[tuple[Recording, Estimates], ...]
+    parts: tuple[CorrectedPart, ...]
     """Samples and estimates, block by block."""
 
     @property
@@ -265,7 +273,7 @@ class Corrected(Result):
         """Return what a notebook shows."""
         std_mg = mg(np.median(self.force_std_mps2, axis=0))
         tiles = [
-            (f'{axis}, standard deviation', f'{value:.2g} mg')
+            Tile(f'{axis}, standard deviation', f'{value:.2g} mg')
             for axis, value in zip(AXES, std_mg)
             if np.isfinite(value)
         ]
@@ -308,8 +316,8 @@ class Corrected(Result):
         """
         require_own(path, overwrite)
         with writer(path, self.sensor) as append:
-            for block, estimates in self.parts:
-                append(block, estimates)
+            for part in self.parts:
+                append(part.samples, part.estimates)
 
 
 def apply(
@@ -355,11 +363,12 @@ def apply(
 
     def joined(name: str) -> np.ndarray:
         """Return a field of the estimates of all blocks; its last axis becomes the first."""
-        return np.moveaxis(np.concatenate([getattr(each, name) for _, each in parts], -1), -1, 0)
+        arrays = [getattr(part.estimates, name) for part in parts]
+        return np.moveaxis(np.concatenate(arrays, -1), -1, 0)
 
     tables = [
-        {**_columns(estimates), **_gyro_columns(block, correction.sensor.gyro)}
-        for block, estimates in parts
+        {**_columns(part.estimates), **_gyro_columns(part.samples, correction.sensor.gyro)}
+        for part in parts
     ]
     columns = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     return Corrected(

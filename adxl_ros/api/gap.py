@@ -44,9 +44,9 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import command, option
 from adxl_ros.report.figures import axes_for
 from adxl_ros.report.quantities import Interval, mg
-from adxl_ros.report.screen import NextStep
+from adxl_ros.report.screen import NextStep, Tile
 from adxl_ros.simulate.motion import Motion
-from adxl_ros.simulate.trajectories import motion_from_force
+from adxl_ros.simulate.recorded_motion import motion_from_force
 
 PAGE = 'report.html'  # File of the page of a diagnosis
 PARAMETERS = 'params.yaml'  # File of the sensor with the effects that were found
@@ -81,7 +81,7 @@ class GapFigures(NamedTuple):
     before_mps2: Interval  # Recording minus simulation, rms, m/s²
     after_mps2: Interval  # The same with the effects, on parts that were not fitted, m/s²
     floor_mps2: Interval  # Noise, which no simulation predicts, rms, m/s²
-    closed: Interval  # (before² − after²) / (before² − floor²); NaN without a gap
+    closed: Interval  # (before² − after²) / (before² − floor²), a share; NaN without a gap
     upper_limit_mps2: float  # A gap of any kind above it would have shown, m/s²
     material_mps2: float  # Smaller amplitudes are no gap, rms, m/s²
     reference_mps2: float  # Error of the reference that returns with each pose, rms, m/s²
@@ -163,11 +163,12 @@ class Gap(Result):
         from adxl_ros.diagnose.page import COLOURS, TILES
 
         rows = [] if self.fault else words.figure_rows(self.diagnosis)[:TILES]
+        tiles = [Tile(*row) for row in rows]
         return FirstScreen(
             COLOURS[self.verdict],
             words.badge(self.diagnosis),
             words.headline(self.diagnosis),
-            rows,
+            tiles,
         )
 
     @cached_property
@@ -486,7 +487,7 @@ def _motion(read: Recording, sim: RecordingInput | Motion | None, unit: str) -> 
     """Return the motion of another simulator; None for that of the stage."""
     if sim is None or isinstance(sim, Motion):
         return sim
-    return motion_from_force(read_ideal(sim, read.epoch_ns, unit), False)[0]
+    return motion_from_force(read_ideal(sim, read.epoch_ns, unit), False)
 
 
 def _subject(recordings: Sequence[Recording], sensor: Sensor, sim: str) -> str:

@@ -22,6 +22,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS, png
 from adxl_ros.report.quantities import duration
+from adxl_ros.report.screen import Tile
 from adxl_ros.signals import noise_parameters, noise_report as words
 from adxl_ros.signals.noise_parameters import AxisNoise, RecordingNoise
 import numpy as np
@@ -99,7 +100,7 @@ class Noise(Result):
             for noise in shown.axes:
                 white = words.intervals(noise, shown.unit)[0]
                 label = f'white noise, {shown.name} {noise.axis}'
-                tiles.append((label, f'{white} {shown.unit.small}/√Hz'))
+                tiles.append(Tile(label, f'{white} {shown.unit.small}/√Hz'))
         colour = 'amber' if self.warnings else 'green'
         return FirstScreen(colour, 'Noise', words.head(self.result)[1], tiles)
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.process import option
-from adxl_ros.report.screen import end_lines
+from adxl_ros.report.screen import end_lines, Tile
 import numpy as np
 
 Progress = Callable[[float, str], None]
@@ -30,8 +30,8 @@ class FirstScreen(NamedTuple):
 
     colour: str  # green, grey, amber or red
     word: str  # The outcome
-    sentence: str
-    tiles: Sequence[tuple[str, ...]] = ()  # Label, value with unit, and perhaps a note
+    sentence: str  # The outcome with its figures
+    tiles: Sequence[Tile] = ()  # Its figures
 
 
 def as_json(value: Any) -> Any:
@@ -72,7 +72,7 @@ class Result:
         """Return the top of the page for a notebook."""
         top = self.first_screen
         tiles = ''.join(
-            '<td style="text-align:left">' + '<br>'.join(map(escape, tile)) + '</td>'
+            '<td style="text-align:left">' + '<br>'.join(map(escape, filter(None, tile))) + '</td>'
             for tile in top.tiles
         )
         return (

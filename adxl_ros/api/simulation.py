@@ -28,12 +28,9 @@ from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option, usage
 from adxl_ros.simulate.motion import INTERNAL_RATE_HZ, Motion
+from adxl_ros.simulate.recorded_motion import motion_from_force, motion_from_references
 from adxl_ros.simulate.response import simulate_blocks
-from adxl_ros.simulate.trajectories import (
-    motion_from_force,
-    motion_from_references,
-    TRAJECTORIES,
-)
+from adxl_ros.simulate.trajectories import TRAJECTORIES
 import numpy as np
 
 IMU = 'imu'  # Trajectory of the specific force of another simulator
@@ -152,7 +149,7 @@ def _existing(trajectory: RecordingInput) -> RecordingInput:
 
 def _by_force(ideal: Recording, sensor: Sensor, rate_hz: float | None) -> Simulation:
     """Follow the specific force of another simulator, at its rate or another."""
-    motion, begin_s = motion_from_force(ideal, rate_hz is None)
+    motion = motion_from_force(ideal, rate_hz is None)
     if rate_hz is None:
         sensor = replace(sensor, rate_hz=motion.internal_rate_hz)
         motion = replace(motion, internal_rate_hz=max(sensor.rate_hz, INTERNAL_RATE_HZ))
@@ -160,7 +157,7 @@ def _by_force(ideal: Recording, sensor: Sensor, rate_hz: float | None) -> Simula
         name=IMU,
         sensor=sensor,
         motion=motion,
-        begin_s=begin_s,
+        begin_s=float(ideal.time_s[0]),
         assumed=assumed(ideal, sensor.effects),
     )
 

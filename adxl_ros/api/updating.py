@@ -23,8 +23,8 @@ from adxl_ros.files.atomic_write import make_folder, require_own, write_text
 from adxl_ros.files.recording_columns import check_same_sensor, Recording
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
-from adxl_ros.report.page import Tile
 from adxl_ros.report.quantities import counted, number, utc
+from adxl_ros.report.screen import Tile
 
 
 @dataclass(frozen=True, repr=False, eq=False)

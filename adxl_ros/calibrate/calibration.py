@@ -15,7 +15,8 @@ from adxl_ros.calibrate.pose_model import predicted_volts, reference_force, resi
 from adxl_ros.calibrate.poses import at_a_rail, Poses
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment
-from adxl_ros.calibrate.report.held_out import HeldOutErrors, rms_mg
+from adxl_ros.calibrate.report.error_budget import error_budgets, rms_mg
+from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.calibrate.result import CalibrationResult, envelope, with_provenance
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
@@ -265,7 +266,7 @@ def _assessed(
     return tuple(errors), tuple(
         acceptance.assess(
             row.model,
-            held_out.error_budgets(row, inliers, stage),
+            error_budgets(row, inliers, stage),
             sensor,
             is_certain or (is_sound and row.model != fit.fitted.model),
         )
@@ -419,8 +420,8 @@ def _against_gravity(
     force = np.column_stack(signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment))
     budgets = acceptance.gravity_error_budgets(fit, fitted, force, kept)
     assessment = acceptance.assess('gravity', budgets, fitted, fit.converged and not doubts)
-    if fit.step.left_out:
-        determined = [name not in fit.step.left_out for name in fitted.covariance_names]
+    if fit.rung.left_out:
+        determined = [name not in fit.rung.left_out for name in fitted.covariance_names]
         assessment = acceptance.with_open(
             assessment,
             acceptance.gravity_error_budgets(

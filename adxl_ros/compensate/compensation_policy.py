@@ -4,12 +4,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store
@@ -17,6 +17,7 @@ from adxl_ros.files.recording_columns import check_same_sensor, NO_SERIAL, Strea
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import NOMINAL_ENVIRONMENT
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.level import Level
 
 _STALE_S = 60.0
 """Age from which a temperature or supply counts as unknown, s; chosen: a room warms by less than
@@ -24,6 +25,22 @@ _STALE_S = 60.0
 _SHORTEST_SILENCE_S = 0.5
 """Shortest interval in which samples are missed, s; chosen. A report on a change of level may
 follow the last one by less than a sample period."""
+
+
+@dataclass
+class StreamFaults:
+    """What is wrong with a stream, one line each; '' for what is not."""
+
+    mixture: str = ''  # Several nodes publish the samples, so that none counts
+    no_gravity: str = ''  # The rests are in another unit, or without gravity
+    wrong_gravity: str = ''  # They are off by less
+
+
+class Status(NamedTuple):
+    """The state of a compensation."""
+
+    level: Level
+    text: str  # One line for people
 
 
 @dataclass(frozen=True)
@@ -58,23 +75,20 @@ class CompensationPolicy:
 
     A calibration that is named stands. Otherwise the sensor's newest one in the store applies,
     as soon as the stream states its serial number.
-
-    mixture: that several nodes publish the samples, so that none counts, or ''; no_gravity: that
-    the rests of the stream are in another unit or without gravity, or ''; wrong_gravity: that they
-    are off by less, or ''; refusal: why the sensor cannot correct the stream, or ''.
     """
 
-    sensor: Sensor  # The sensor whose coefficients are used
-    source: str  # Where the coefficients come from
+    sensor: Sensor  # The sensor whose coefficients are used, since `use`
+    source: str  # Where the coefficients come from, since `use`
 
     def __init__(self, paper: bool, store: str, full_name: Callable[[str], str]) -> None:
         """Prepare; `full_name` gives the full name of a topic, for messages."""
         self._paper, self._store, self._full_name = paper, store, full_name
-        self._warnings: set[str] = set()
+        self._given: set[str] = set()  # Warnings that were given
         self.stored_path = ''  # File that was taken from the store, '' if none was
         # What the stream states of itself (`sensor_info`), None before it does
         self.info: StreamInfo | None = None
-        self.refusal = self.mixture = self.no_gravity = self.wrong_gravity = ''
+        self.faults = StreamFaults()
+        self.refusal = ''  # Why the sensor cannot correct the stream, or ''
 
     @property
     def rate_hz(self) -> float:
@@ -106,7 +120,8 @@ class CompensationPolicy:
 
     def assess(self) -> bool:
         """Update `refusal` by the sensor and the stream; return whether it has changed."""
-        before, self.refusal = self.refusal, self.mixture or self.no_gravity
+        before = self.refusal
+        self.refusal = self.faults.mixture or self.faults.no_gravity
         try:
             self.check(self.sensor)
         except UserError as error:
@@ -131,8 +146,8 @@ class CompensationPolicy:
 
     def new_warnings(self, warnings: list[str]) -> list[str]:
         """Return the warnings that were not given before."""
-        new = [text for text in dict.fromkeys(warnings) if text not in self._warnings]
-        self._warnings.update(new)
+        new = [text for text in dict.fromkeys(warnings) if text not in self._given]
+        self._given.update(new)
         return new
 
     def newer(self) -> Path | None:
@@ -142,51 +157,53 @@ class CompensationPolicy:
             return None
         return calibration_store.newer(self._store, sensor)
 
-    def status(self, interval: Interval, newer: Path | None, calibration: str) -> tuple[str, str]:
-        """Return level (OK, WARN, ERROR) and text of the state: the first one that holds."""
+    def status(self, interval: Interval, newer: Path | None, calibration: str) -> Status:
+        """Return the state: the first fault or warning that holds."""
         if self.refusal:
-            return 'ERROR', f'publishing nothing: {self.refusal}'
-        if self.wrong_gravity:
-            return 'ERROR', f'the tilt is uncertain: {self.wrong_gravity}'
-        counts, samples = interval.counts, self._full_name('imu/data_raw')
+            return Status(Level.ERROR, f'publishing nothing: {self.refusal}')
+        if self.faults.wrong_gravity:
+            return Status(Level.ERROR, f'the tilt is uncertain: {self.faults.wrong_gravity}')
+        for warning in self._warnings(interval, newer, calibration):
+            return Status(Level.WARN, warning)
+        return Status(Level.OK, 'compensating')
+
+    def _warnings(self, interval: Interval, newer: Path | None, calibration: str) -> Iterator[str]:
+        """Yield what is not as it should be, the gravest first."""
+        samples = self._full_name('imu/data_raw')
         no_info = f'nothing on {self._full_name("sensor_info")}'
-        is_silent = not counts.get('received') and interval.duration_s > _SHORTEST_SILENCE_S
-        unknown = self._unknown_surroundings(interval)
-        warnings = (
-            (is_silent, f'no samples on {samples}'),
-            (
-                interval.obstacle,
+        counts = interval.counts
+        if not counts.get('received') and interval.duration_s > _SHORTEST_SILENCE_S:
+            yield f'no samples on {samples}'
+        if interval.obstacle:
+            yield (
                 f'publishing nothing yet: {no_info}, and {samples} does not show '
-                f'its sensor: {interval.obstacle}',
-            ),
-            (
-                counts.get('dropped'),
-                f'{counts.get("dropped")} samples dropped that no force explains',
-            ),
-            (
-                counts.get('saturated'),
-                f'{counts.get("saturated")} samples with the ADC at its rail',
-            ),
-            (
-                counts.get('backward'),
-                f'{counts.get("backward")} samples whose stamp steps back; '
-                f'one driver must stamp {samples} in order',
-            ),
-            (self.info is None, f'unit not confirmed: {no_info}'),
-            (unknown, unknown),
-            (not self.sensor.effects, 'not calibrated: the datasheet values apply'),
-            (
-                counts.get('outside'),
-                f'{counts.get("outside")} samples outside of what was '
-                f'calibrated, their covariance raised: {"; ".join(interval.outside)}',
-            ),
-            (
-                newer is not None and not self.is_named(calibration),
+                f'its sensor: {interval.obstacle}'
+            )
+        if dropped := counts.get('dropped'):
+            yield f'{dropped} samples dropped that no force explains'
+        if saturated := counts.get('saturated'):
+            yield f'{saturated} samples with the ADC at its rail'
+        if backward := counts.get('backward'):
+            yield (
+                f'{backward} samples whose stamp steps back; '
+                f'one driver must stamp {samples} in order'
+            )
+        if self.info is None:
+            yield f'unit not confirmed: {no_info}'
+        if unknown := self._unknown_surroundings(interval):
+            yield unknown
+        if not self.sensor.effects:
+            yield 'not calibrated: the datasheet values apply'
+        if outside := counts.get('outside'):
+            yield (
+                f'{outside} samples outside of what was '
+                f'calibrated, their covariance raised: {"; ".join(interval.outside)}'
+            )
+        if newer is not None and not self.is_named(calibration):
+            yield (
                 f'a newer calibration is in the store: {newer}; set calibration to it, or start '
-                'again',
-            ),
-        )
-        return next((('WARN', text) for holds, text in warnings if holds), ('OK', 'compensating'))
+                'again'
+            )
 
     def _unknown_surroundings(self, interval: Interval) -> str:
         """Name an effect whose temperature or supply nobody publishes, or return ''."""

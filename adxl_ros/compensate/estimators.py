@@ -27,7 +27,7 @@ from adxl_ros.model.effects.base import (
     NOMINAL_ENVIRONMENT,
     Value,
 )
-from adxl_ros.model.kinematics import angles, Mounting, Tilt, tilt
+from adxl_ros.model.kinematics import AngleEstimate, angles, Covariance3, Mounting, Tilt, tilt
 from adxl_ros.model.sensor import parameter_of, Sensor
 from adxl_ros.process import option
 import numpy as np
@@ -200,12 +200,12 @@ class Estimate(NamedTuple):
     # Specific force in the frame of the case, or of the robot where there is a mounting, m/s²,
     # three floats
     force: Components
-    covariance: tuple[float, ...]  # Covariance of the force: xx, xy, xz, yy, yz, zz, (m/s²)²
-    # roll, pitch, inclination: Angle, rad, and its variance, rad². The variance of an angle that
-    # is not shown exceeds `tilt.UNOBSERVABLE_RAD2`.
-    roll: tuple[float, float]
-    pitch: tuple[float, float]
-    inclination: tuple[float, float]
+    covariance: Covariance3  # Covariance of the force, (m/s²)²
+    # roll, pitch, inclination: The variance of an angle that is not shown exceeds
+    # `kinematics.UNOBSERVABLE_RAD2`.
+    roll: AngleEstimate
+    pitch: AngleEstimate
+    inclination: AngleEstimate
     # Whether the ADC is at a rail; the variances are then those of an unmeasured axis
     saturated: bool
     # Texts on how the sample lies outside of the validity range; the variances include it
@@ -223,8 +223,7 @@ class _Cell(NamedTuple):
     """What the forces of one cell of the grid share."""
 
     tangent: signal_chain.Tangent  # Tangent of the inverse at the middle of the cell
-    # Covariance by noise and coefficients: xx, xy, xz, yy, yz, zz, (m/s²)²
-    covariance: tuple[float, ...]
+    covariance: Covariance3  # By noise and coefficients, (m/s²)²
     outside: tuple[str, ...]  # Texts on how the cell lies outside of the validity range
 
 
@@ -310,21 +309,22 @@ class LiveEstimator:
         # The angles are those of gravity, so that motion adds to the variance of each axis.
         if self.sensor.axes == AXES:
             motion += self._excess_variance(force, covariance)
-        moved: tuple[float, ...] = (
-            covariance[0] + motion,
-            covariance[1],
-            covariance[2],
-            covariance[3] + motion,
-            covariance[4],
-            covariance[5] if self._derives_z else covariance[5] + motion,
-        )
+        moved = covariance.widened(motion, motion, 0.0 if self._derives_z else motion)
         if self.mounting is not None:
             force = self.mounting.rotate(force)
             turned = self.mounting.rotate_covariance
             covariance = self._with_yaw(force, turned(covariance))
             moved = self._with_yaw(force, turned(moved))
-        roll, pitch, inclination, _ = angles(force, moved, FLOATS)
-        return Estimate(force, covariance, roll, pitch, inclination, saturated, cell.outside)
+        shown = angles(force, moved, FLOATS)
+        return Estimate(
+            force=force,
+            covariance=covariance,
+            roll=shown.roll,
+            pitch=shown.pitch,
+            inclination=shown.inclination,
+            saturated=saturated,
+            outside=cell.outside,
+        )
 
     def set_environment(
         self, temperature_c: float | None = None, supply_v: float | None = None
@@ -384,36 +384,39 @@ class LiveEstimator:
             excess = max(excess, self._variance[d] - _NOISE_FACTOR * noise_variance)
         return excess
 
-    def _with_yaw(self, force: Components, covariance: tuple[float, ...]) -> tuple[float, ...]:
+    def _with_yaw(self, force: Components, covariance: Covariance3) -> Covariance3:
         """Add the error of a turn ψ about the robot's vertical, ψ·(−y, x, 0), to a covariance."""
-        xx, xy, xz, yy, yz, zz = covariance
         x, y, _ = force
+        xx, xy, xz, yy, yz, zz = covariance
         variance = self._yaw_rad2
-        return xx + variance * y * y, xy - variance * x * y, xz, yy + variance * x * x, yz, zz
+        return Covariance3(
+            xx + variance * y * y, xy - variance * x * y, xz, yy + variance * x * x, yz, zz
+        )
 
-    def _excess_variance(self, force: Components, covariance: tuple[float, ...]) -> float:
+    def _excess_variance(self, force: Components, covariance: Covariance3) -> float:
         """Return the square of what a force is beyond gravity and its error, (m/s²)²."""
         x, y, z = force
-        error2 = max(covariance[0], covariance[3], covariance[5])
+        error2 = max(covariance.xx, covariance.yy, covariance.zz)
         excess = length_excess((x * x + y * y + z * z) ** 0.5, error2, self._gravity_mps2, FLOATS)
         return float(excess) ** 2
 
     def _covariance(
         self, force: Components, cell: _Cell, unknown: float, motion: float
-    ) -> tuple[float, ...]:
+    ) -> Covariance3:
         """
-        Return the covariance of a force: xx, xy, xz, yy, yz, zz, (m/s²)².
+        Return the covariance of a force, (m/s²)².
 
         Each axis gets the variance `unknown`; a derived z also gets that of noise and motion.
         """
-        xx, xy, xz, yy, yz, zz = cell.covariance
+        covariance = cell.covariance
         further = unknown
         if self._derives_z:
-            xx, xy, xz, yy, yz, zz = force_errors.derived_z_covariance(
-                force, (xx, xy, yy), cell.tangent.slope, FLOATS
+            in_plane = covariance.xx, covariance.xy, covariance.yy
+            covariance = force_errors.derived_z_covariance(
+                force, in_plane, cell.tangent.slope, FLOATS
             )
             further = self._noise_variance[0] + motion
-        return xx + unknown, xy, xz, yy + unknown, yz, zz + further
+        return covariance.widened(unknown, unknown, further)
 
     def _cell(self, force: Components) -> _Cell:
         around = self._environment
@@ -435,6 +438,6 @@ class LiveEstimator:
             axes = self.sensor.axis_indices
             covariance[np.ix_(axes, axes)] = measured[:, :, 0]
             cell = self._cells[key] = _Cell(
-                tangent, tuple(covariance[np.triu_indices(3)].tolist()), outside
+                tangent, Covariance3(*covariance[np.triu_indices(3)].tolist()), outside
             )
         return cell

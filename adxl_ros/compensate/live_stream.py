@@ -174,7 +174,6 @@ class LiveStream:
         if estimate.outside:
             self.counts['outside'] += 1
             self.outside = estimate.outside
-        xx, xy, xz, yy, yz, zz = estimate.covariance
         # Read once: `collected` may take the list away at any time.
         forces = self._forces
         if forces is not None:
@@ -207,7 +206,7 @@ class LiveStream:
                 )
         self._publish_imu(
             imu_message.corrected(
-                raw, orientation, (*estimate.force, xx, xy, xz, xy, yy, yz, xz, yz, zz)
+                raw, orientation, (*estimate.force, *estimate.covariance.row_by_row)
             )
         )
         self._publish_tilt(imu_message.vector3_stamped(raw, self._angles_rad))

@@ -33,8 +33,8 @@ from adxl_ros.simulate.motion import (
     Path,
     visible_step,
 )
+from adxl_ros.simulate.recorded_motion import environment_paths, motion_from_references
 from adxl_ros.simulate.response import ChainMemo, Response
-from adxl_ros.simulate.trajectories import environment_paths, motion_from_references
 import numpy as np
 import scipy
 

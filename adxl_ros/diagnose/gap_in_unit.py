@@ -35,11 +35,11 @@ class Quantity(NamedTuple):
 class GapInUnit(NamedTuple):
     """The gap in the unit of a quantity, root mean square over recordings."""
 
-    quantity: str
-    unit: str
-    before: float  # Recording and simulation by the sensor that was given
-    after: float  # Recording and simulation by params.yaml
-    floor: float  # Two simulations, one with noise
+    quantity: str  # Its name
+    unit: str  # Its unit
+    before: float  # Recording and simulation by the sensor that was given, in `unit`
+    after: float  # Recording and simulation by params.yaml, in `unit`
+    floor: float  # Two simulations, one with noise, in `unit`
 
     @property
     def text(self) -> str:

@@ -56,9 +56,14 @@ class CouldShow(NamedTuple):
     """Smallest size of one parameter of an effect that recordings would have shown."""
 
     name: Coefficient  # The coefficient
-    smallest: float  # The size; infinite where nothing of the effect reaches the output
+    smallest: float  # The size, in `unit`; infinite where nothing of it reaches the output
     # Share of the effect's signal that zero-g, scale factor and latency cannot imitate
     share: float = 1.0
+
+    @property
+    def unit(self) -> str:
+        """Unit of the size: that of the parameter."""
+        return parameter_of(self.name).unit
 
     @property
     def shows(self) -> bool:

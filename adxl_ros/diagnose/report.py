@@ -122,7 +122,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
                     'effect': r.name.effect,
                     'parameter': r.name.parameter,
                     'axis': r.name.axis or None,
-                    'unit': parameter_of(r.name).unit,
+                    'unit': r.unit,
                     'smallest': r.smallest,
                     'could_show': r.shows,
                 }

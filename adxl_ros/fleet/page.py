@@ -19,8 +19,8 @@ from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.population import Population
 from adxl_ros.report import figures as plotly, page as html_page
-from adxl_ros.report.page import Tile
 from adxl_ros.report.quantities import number
+from adxl_ros.report.screen import Tile
 import numpy as np
 import pandas as pd
 
@@ -291,9 +291,14 @@ def _badge(
 
 def _tiles(table: fleet.FleetTable, counts: Counter[fleet.State]) -> list[Tile]:
     outcomes = Counter(table['outcome'].tolist())
-    failed = f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed'
-    tiles = [Tile('recordings', str(len(table)), failed)]
-    return tiles + [Tile(f'units: {state.words}', str(counts[state])) for state in fleet.State]
+    return [
+        Tile(
+            'recordings',
+            str(len(table)),
+            f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed',
+        ),
+        *(Tile(f'units: {state.words}', str(counts[state])) for state in fleet.State),
+    ]
 
 
 def _link(folder: Path, report: str) -> str:

@@ -22,6 +22,7 @@ from adxl_ros.model.effects.base import (
     NOMINAL_ENVIRONMENT,
     Value,
 )
+from adxl_ros.model.kinematics import Covariance3
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor
 from adxl_ros.model.signal_chain import analog_response, static_response
 import numpy as np
@@ -67,8 +68,7 @@ def of_three_axes(
     """Complete the result of `measured_covariance` to `force_covariance`."""
     if sensor.axes == 'xy':
         in_plane = measured[0, 0], measured[0, 1], measured[1, 1]
-        xx, xy, xz, yy, yz, zz = derived_z_covariance(force, in_plane, tangent.slope, ARRAYS)
-        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        return derived_z_covariance(force, in_plane, tangent.slope, ARRAYS).matrix
     covariance = np.zeros((3, 3, len(force[0])))
     covariance[1, 1] = covariance[2, 2] = UNMEASURED_VARIANCE
     axes = sensor.axis_indices
@@ -135,7 +135,7 @@ def _propagated(slope: Any, covariance: np.ndarray) -> np.ndarray:
 
 def derived_z_covariance(
     force: Components, measured: tuple[Value, Value, Value], slope: Components, maths: Maths
-) -> tuple[Value, ...]:
+) -> Covariance3:
     """
     Propagate the in-plane covariance to z = √(g² − x² − y²), equation 5.
 
@@ -146,7 +146,7 @@ def derived_z_covariance(
     square of their distance is added.
 
     measured: variances xx, xy and yy of the force given z; slope: derivative s of the estimates
-    of x and y by z; returns: xx, xy, xz, yy, yz and zz, (m/s²)².
+    of x and y by z; returns: (m/s²)².
     """
     x, y, z = force
     xx, xy, yy = measured
@@ -163,7 +163,7 @@ def derived_z_covariance(
     zz = by_x * xz + by_y * yz + independent
     # The error of z goes on to x and y.
     by_zz = [by_z * zz for by_z in slope]
-    return (
+    return Covariance3(
         xx + slope[0] * (2 * xz + by_zz[0]),
         xy + slope[0] * yz + slope[1] * (xz + by_zz[0]),
         xz + by_zz[0],

@@ -143,9 +143,10 @@ class Tilt:
 def tilt(force: Components, covariance: np.ndarray, measures_z: bool = True) -> Tilt:
     """Return the angles of forces at rest, (n,), with a covariance, (m/s²)², (3, 3, n)."""
     force = [np.asarray(f, float) for f in force]
-    components = tuple(covariance[np.triu_indices(3)])
     with np.errstate(over='ignore', invalid='ignore'):
-        roll, pitch, inclination, beta = map(_shown, angles(force, components, ARRAYS))
+        components = Covariance3.of(covariance)
+        roll, pitch, inclination = map(_shown, angles(force, components, ARRAYS))
+        beta = _shown(turn_of_stage(force, components, ARRAYS))
     alpha = inclination.angle_rad
     if not measures_z:
         alpha = np.minimum(alpha, np.pi - alpha)
@@ -185,67 +186,116 @@ class AngleEstimate(NamedTuple):
     variance_rad2: Value  # To first order; inf where the angle can be anything
 
 
-def angles(
-    force: Components, covariance: tuple[Value, ...], maths: Maths
-) -> tuple[AngleEstimate, AngleEstimate, AngleEstimate, AngleEstimate]:
-    """
-    Return roll, pitch, inclination and beta, in this order.
+class Angles(NamedTuple):
+    """The tilt by the force of one sample at rest, or of many; see `Tilt`."""
 
-    Where noise exceeds the part of the force that shows roll or beta, the angle can be anything:
-    its variance is infinite. Pitch and inclination are then the length of a small vector of any
-    direction. The force is that at rest, its covariance xx, xy, xz, yy, yz, zz.
+    roll: AngleEstimate
+    pitch: AngleEstimate
+    inclination: AngleEstimate
+
+
+_UPPER = np.triu_indices(3)  # Rows and columns of xx, xy, xz, yy, yz, zz in a matrix
+
+
+class Covariance3(NamedTuple):
+    """Covariance of a vector x, y, z: floats or arrays (n,)."""
+
+    xx: Value
+    xy: Value
+    xz: Value
+    yy: Value
+    yz: Value
+    zz: Value
+
+    @classmethod
+    def of(cls, matrix: np.ndarray) -> Covariance3:
+        """Return that of a symmetric matrix, (3, 3) or (3, 3, n)."""
+        return cls(*matrix[_UPPER])
+
+    @property
+    def row_by_row(self) -> tuple[Value, ...]:
+        """Return the nine elements of the matrix."""
+        xx, xy, xz, yy, yz, zz = self
+        return xx, xy, xz, xy, yy, yz, xz, yz, zz
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """Return the matrix, (3, 3) or (3, 3, n)."""
+        return np.reshape(self.row_by_row, (3, 3, *np.shape(self.xx)))
+
+    def along(self, x: Value, y: Value, z: Value) -> Value:
+        """Return uᵀ·C·u with u = x, y, z: the variance of a quantity whose gradient is u."""
+        xx, xy, xz, yy, yz, zz = self
+        return x * (xx * x + 2 * (xy * y + xz * z)) + y * (yy * y + 2 * yz * z) + z * zz * z
+
+    def widened(self, x: Value, y: Value, z: Value) -> Covariance3:
+        """Return the covariance with further variances of the components."""
+        xx, xy, xz, yy, yz, zz = self
+        return Covariance3(xx + x, xy, xz, yy + y, yz, zz + z)
+
+
+def angles(force: Components, covariance: Covariance3, maths: Maths) -> Angles:
+    """
+    Return the angles of a force at rest, whose variances follow from their gradients by it.
+
+    Where noise exceeds the part of the force that shows roll, the angle can be anything: its
+    variance is infinite. Pitch and inclination are then the length of a small vector of any
+    direction.
     """
     x, y, z = force
-    xx, xy, xz, yy, yz, zz = covariance
-    # Squares of the force in the planes xy and yz
+    xx, _, _, yy, _, zz = covariance
+    # Squares of the force in the planes xy and yz, and of all of it
     plane2 = x * x + y * y + _FORCE2_FLOOR
     side2 = y * y + z * z + _FORCE2_FLOOR
-    return (
-        AngleEstimate(maths.atan2(y, z), _turn_variance(y, z, yy, yz, zz, maths)),
+    total2 = side2 + x * x
+    plane = maths.sqrt(plane2)
+    side = maths.sqrt(side2)
+    pitch2 = covariance.along(side, -x * y / side, -x * z / side)
+    inclination2 = covariance.along(-z * x / plane, -z * y / plane, plane)
+    return Angles(
         AngleEstimate(
-            maths.atan2(-x, maths.sqrt(side2)),
-            _tilt_variance(x, xx, y, z, yy, yz, zz, y * xy + z * xz, maths),
+            maths.atan2(y, z),
+            _turn_variance(side2, yy + zz, covariance.along(0.0, z, -y), maths),
         ),
         AngleEstimate(
-            maths.atan2(maths.sqrt(plane2), z),
-            _tilt_variance(z, zz, x, y, xx, xy, yy, x * xz + y * yz, maths),
+            maths.atan2(-x, side), _tilt_variance(side2, yy + zz, pitch2, total2, maths)
         ),
-        AngleEstimate(maths.atan2(0.0 - y, x), _turn_variance(x, y, xx, xy, yy, maths)),
+        AngleEstimate(
+            maths.atan2(plane, z), _tilt_variance(plane2, xx + yy, inclination2, total2, maths)
+        ),
     )
 
 
-def _turn_variance(a: Value, b: Value, aa: Value, ab: Value, bb: Value, maths: Maths) -> Value:
-    """Return the variance of the angle of a vector a, b in its plane by its covariance, rad²."""
-    square = a * a + b * b + _FORCE2_FLOOR
-    across = b * b * aa - 2 * a * b * ab + a * a * bb
-    return maths.where(square > aa + bb + _FORCE2_FLOOR, across / (square * square), INFINITE)
+def turn_of_stage(force: Components, covariance: Covariance3, maths: Maths) -> AngleEstimate:
+    """Return beta, the angle of the stage about its z axis, by a force at rest; see `angles`."""
+    x, y, _ = force
+    plane2 = x * x + y * y + _FORCE2_FLOOR
+    noise2 = covariance.xx + covariance.yy
+    return AngleEstimate(
+        maths.atan2(0.0 - y, x),
+        _turn_variance(plane2, noise2, covariance.along(y, -x, 0.0), maths),
+    )
+
+
+def _turn_variance(square: Value, noise2: Value, across: Value, maths: Maths) -> Value:
+    """
+    Return the variance of the angle of a vector in its plane, rad².
+
+    square: its square, whose variance is noise2; across: variance across it times the square.
+    """
+    return maths.where(square > noise2 + _FORCE2_FLOOR, across / (square * square), INFINITE)
 
 
 def _tilt_variance(
-    c: Value,
-    cc: Value,
-    a: Value,
-    b: Value,
-    aa: Value,
-    ab: Value,
-    bb: Value,
-    with_c: Value,
-    maths: Maths,
+    square: Value, noise2: Value, across: Value, total2: Value, maths: Maths
 ) -> Value:
     """
-    Return the variance of the angle between a force a, b, c and the plane of a and b, rad².
+    Return the variance of the angle between a force and a plane, rad².
 
-    aa, ab, bb, cc: its covariance; with_c: a·ac + b·bc.
+    square: that of the part in the plane, whose variance is noise2; across: variance of the force
+    across itself, towards the plane, times its square total2.
     """
-    square = a * a + b * b + _FORCE2_FLOOR
-    total2 = square + c * c
-    noise = aa + bb
-    along = a * a * aa + 2 * a * b * ab + b * b * bb
-    return maths.where(
-        square > noise,
-        (square * cc - 2 * c * with_c + c * c * along / square) / (total2 * total2),
-        noise / total2,
-    )
+    return maths.where(square > noise2, across / (total2 * total2), noise2 / total2)
 
 
 def quaternion(roll_rad: Value, pitch_rad: Value, maths: Maths) -> tuple[Value, ...]:
@@ -288,11 +338,10 @@ class Mounting:
         """Return a vector of the case in the frame of the robot."""
         return (self.rows @ vector).tolist()
 
-    def rotate_covariance(self, covariance: Sequence[float]) -> tuple[float, ...]:
-        """Return the covariance R·C·Rᵀ; both are xx, xy, xz, yy, yz, zz."""
-        xx, xy, xz, yy, yz, zz = covariance
-        turned = self.rotate_matrix((xx, xy, xz, xy, yy, yz, xz, yz, zz))
-        return *turned[:3], *turned[4:6], turned[8]
+    def rotate_covariance(self, covariance: Covariance3) -> Covariance3:
+        """Return the covariance R·C·Rᵀ."""
+        xx, xy, xz, _, yy, yz, _, _, zz = self.rotate_matrix(covariance.row_by_row)
+        return Covariance3(xx, xy, xz, yy, yz, zz)
 
     def rotate_matrix(self, covariance: Sequence[float]) -> tuple[float, ...]:
         """Return the covariance R·C·Rᵀ; both have 9 numbers, row by row."""

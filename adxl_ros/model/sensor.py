@@ -68,10 +68,9 @@ class Envelope:
     zero_g_at_c: float = 0.0  # Temperature at which the zero-g is known, °C
     # Misfit of held-out poses beyond noise and stage error, by axis, m/s²
     misfit_mps2: float = 0.0
-    # force_low_mps2, force_high_mps2: Lowest and highest specific force of the poses by component,
-    # m/s²; empty if unknown
+    # Lowest specific force of the poses by component, m/s²; empty if unknown
     force_low_mps2: tuple[float, ...] = ()
-    force_high_mps2: tuple[float, ...] = ()
+    force_high_mps2: tuple[float, ...] = ()  # Highest one
 
     def beyond_k(self, temperature_c: Any) -> Any:
         """Return the distance of temperatures, °C, outside of range and margin, K; 0 inside."""

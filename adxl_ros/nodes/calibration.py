@@ -497,15 +497,15 @@ class Calibration(Node):
         if not own.autostart and not self._controller.may_ask:
             # Nobody sees a screen, so that the log says what the node waits for.
             self.log(
-                'INFO',
+                Level.OK,
                 f'waits for a call of {self.resolve_service_name("~/start")}, or '
                 f'start it with autostart:=true; it takes samples of '
                 f'{self.resolve_topic_name(_SAMPLES)}',
             )
 
-    def log(self, severity: controller.Severity, text: str) -> None:
+    def log(self, level: Level, text: str) -> None:
         """Log a line."""
-        topics.log(self, severity, text)
+        topics.log(self, level, text)
 
     def answer_captures(self, answer: Answer) -> None:
         """Answer all calls of ~/capture that wait."""
@@ -595,7 +595,7 @@ class Calibration(Node):
                 elif not reading.position.keys() & JOINTS.keys() and not self._names_joints:
                     self._names_joints = True
                     self.log(
-                        'WARNING',
+                        Level.WARN,
                         f'{self.resolve_topic_name(topic)} has the joints '
                         f'{", ".join(reading.position)}, but calibration needs alpha and '
                         'beta; the node stage gives them, by bridge.alpha.joint and '

@@ -364,7 +364,7 @@ class Compensation(Node):
 
     def _look(self) -> None:
         """Refuse samples of several nodes; measure the sensor of a stream that states none."""
-        self._policy.mixture = self._samples.fault()
+        self._policy.faults.mixture = self._samples.fault()
         self._check_gravity()
         self._assess()
         samples = self._stream.unknown
@@ -396,8 +396,10 @@ class Compensation(Node):
             if fault is None
             else f'{self.resolve_topic_name("imu/data_raw")}: {fault.live_text}'
         )
-        self._policy.no_gravity = text if fault is not None and fault.is_clear else ''
-        self._policy.wrong_gravity = '' if self._policy.no_gravity else text
+        is_clear = fault is not None and fault.is_clear
+        faults = self._policy.faults
+        faults.no_gravity = text if is_clear else ''
+        faults.wrong_gravity = '' if is_clear else text
 
     def _on_info(self, message: DiagnosticStatus) -> None:
         self._policy.info = topics.stream_info(message, self.resolve_topic_name('sensor_info'))
@@ -425,13 +427,14 @@ class Compensation(Node):
 
     def _assess(self) -> None:
         """Publish only if the coefficients are those of the stream's unit; log a change."""
-        changed, refusal = self._policy.assess(), self._policy.refusal
+        changed = self._policy.assess()
+        refusal = self._policy.refusal
         self._stream.refused = bool(refusal)
         if not changed:
             return
         topics.log(
             self,
-            'ERROR' if refusal else 'INFO',
+            Level.ERROR if refusal else Level.OK,
             f'publishing nothing: {refusal}' if refusal else 'publishing again',
         )
 
@@ -447,21 +450,23 @@ class Compensation(Node):
             self._stream(sample)
 
     def _status(self) -> Status:
-        steady_ns, ros_ns = STEADY.now().nanoseconds, self.get_clock().now().nanoseconds
+        steady_ns = STEADY.now().nanoseconds
+        ros_ns = self.get_clock().now().nanoseconds
         totals = {name: self._stream.counts[name] for name in COUNTS}
         duration_s = (steady_ns - self._reported_ns) * 1e-9
         counts = {name: total - self._reported[name] for name, total in totals.items()}
-        self._reported, self._reported_ns = Counter(totals), steady_ns
+        self._reported = Counter(totals)
+        self._reported_ns = steady_ns
         interval = Interval(
-            duration_s,
-            counts,
-            self._stream.outside,
-            self._stream.surroundings.copy(),
-            {name: (ros_ns - ns) * 1e-9 for name, ns in self._heard_ns.items()},
-            self._obstacle if self._stream.unknown is not None else '',
+            duration_s=duration_s,
+            counts=counts,
+            outside=self._stream.outside,
+            surroundings=self._stream.surroundings.copy(),
+            ages_s={name: (ros_ns - ns) * 1e-9 for name, ns in self._heard_ns.items()},
+            obstacle=self._obstacle if self._stream.unknown is not None else '',
         )
         newer = self._policy.newer()
-        level, text = self._policy.status(interval, newer, self._calibration())
+        state = self._policy.status(interval, newer, self._calibration())
         late = HALF if self._settings.undo_filter else 0
         values = {
             'rate_in_hz': round(counts['received'] / duration_s, 1),
@@ -471,7 +476,7 @@ class Compensation(Node):
             **age_report(self._ages_s),
             **self._policy.values(interval, newer),
         }
-        return Status(Level[level], text, self._policy.sensor.serial, values)
+        return Status(state.level, state.text, self._policy.sensor.serial, values)
 
 
 def main() -> int:

@@ -173,11 +173,11 @@ class LinkReader:
             return
         for event in status.events:
             if event.count > self._counts.get(event.message, 0):
-                topics.log(self._node, 'WARN', event.message)
+                topics.log(self._node, Level.WARN, event.message)
                 self._counts[event.message], self._logged_s = event.count, now_s
         if status.text != self._text:
             self._text, self._logged_s = status.text, now_s
-            topics.log(self._node, status.level.name, status.text)
+            topics.log(self._node, status.level, status.text)
 
     def _live_turn(self) -> None:
         """Publish what a device sends; the link waits for it."""
@@ -220,7 +220,7 @@ class LinkReader:
     def _answer(self, answer: Answer | None) -> None:
         """Answer all who have asked for a self-test once it has ended."""
         if answer is not None:
-            topics.log(self._node, 'INFO' if answer.is_passed else 'WARN', answer.text)
+            topics.log(self._node, Level.OK if answer.is_passed else Level.WARN, answer.text)
             self._service.answer(self._requests, *answer)
             self._requests = []
 

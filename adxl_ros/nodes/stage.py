@@ -17,7 +17,7 @@ from adxl_ros.nodes.parameters import declare_all, parameter
 from adxl_ros.nodes.params_files import parameter_error
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Level, Status, STEADY
-from adxl_ros.simulate.trajectories import SimulatedStage
+from adxl_ros.simulate.simulated_stage import SimulatedStage
 from builtin_interfaces.msg import Duration
 import numpy as np
 from rclpy.node import Node

@@ -22,9 +22,9 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import cdr, imu_message
 from adxl_ros.files.recording_columns import StreamInfo
-from adxl_ros.links.support.base import Level
 from adxl_ros.nodes.parameter_checks import QOS_POLICIES
 from adxl_ros.nodes.parameters import SI
+from adxl_ros.report.level import Level
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
@@ -128,11 +128,11 @@ def stream_info(message: DiagnosticStatus, topic: str) -> StreamInfo:
     return StreamInfo({pair.key: pair.value for pair in message.values}, topic)
 
 
-def log(node: Node, severity: str, text: str) -> None:
+def log(node: Node, level: Level, text: str) -> None:
     """Log a line; rclpy permits one severity for each place in the code."""
-    if severity in ('OK', 'INFO'):
+    if level is Level.OK:
         node.get_logger().info(text)
-    elif severity in ('WARN', 'WARNING'):
+    elif level is Level.WARN:
         node.get_logger().warning(text)
     else:
         node.get_logger().error(text)

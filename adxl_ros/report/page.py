@@ -16,7 +16,7 @@ from pathlib import Path
 import re
 import shlex
 import sys
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import unquote_plus
 
 from adxl_ros.errors import install_hint, UserError
@@ -27,14 +27,6 @@ from adxl_ros.report.figures import png
 _DPI = 100  # Resolution of pictures, dots per inch (chosen: sharp at the page's width)
 _GZIP_LEVEL = 6
 """Level of compression (chosen: 0.3 s for plotly.js; level 9 takes three times as long)."""
-
-
-class Tile(NamedTuple):
-    """A figure at the top of a page."""
-
-    label: str
-    text: str  # The figure with its unit
-    note: str = ''
 
 
 def check_libraries() -> None:

@@ -22,11 +22,11 @@ _UNIT_SUFFIXES = ('m', 's', 'rad', 'v', 'hz', 'f', 'g')
 
 @dataclass(frozen=True)
 class Interval:
-    """A value with its 90 % interval."""
+    """A value with its 90 % interval, in the unit of the field that has it, as `before_mps2`."""
 
-    value: float
-    low: float
-    high: float
+    value: float  # The estimate
+    low: float  # Low end of the interval
+    high: float  # High end of the interval
 
 
 def utc(stamp_ns: int) -> datetime:

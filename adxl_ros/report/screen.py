@@ -43,6 +43,14 @@ _NO_COLOUR = '\x1b[0m'
 _OUTCOME = re.compile(rf'\b({"|".join(_COLOURS)})\b')
 
 
+class Tile(NamedTuple):
+    """One figure at the top of a page."""
+
+    label: str  # What it is
+    text: str  # Its value with the unit
+    note: str = ''  # A remark
+
+
 class NextStep(NamedTuple):
     """Something that a user does next."""
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 import os
+from typing import NamedTuple
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording
@@ -332,6 +333,15 @@ SHORTEST_MOTION_S = 30.0  # Shortest recording on a moving stage that `diagnose`
 _FEWEST_STAGE_POSES = 4  # Orientations of a linear fit. Chosen: both ends of two axes
 
 
+class Shown(NamedTuple):
+    """What a recording shows of an effect, sizes with their units, for people."""
+
+    effect: str  # Name of the effect
+    smallest: str  # Smallest size that would show, or that none would
+    typical: str  # Typical size
+    missing: str  # What is missing to show it; '' for nothing
+
+
 @dataclass(frozen=True)
 class Ability:
     """What a tool can do with a recording."""
@@ -350,8 +360,7 @@ class Findings:
     faults: tuple[str, ...]  # Why it is not sound, one line each
     remarks: tuple[str, ...] = ()  # What else is noteworthy, one line each
     abilities: tuple[Ability, ...] = ()  # What the tools can do with it
-    # By effect what `diagnose` could show: effect, smallest and typical size, what is missing
-    shows: tuple[tuple[str, str, str, str], ...] = ()
+    shows: tuple[Shown, ...] = ()  # By effect what `diagnose` could show
     paste: str = ''  # End of the last fault that is for a command line; empty for none
 
     @property

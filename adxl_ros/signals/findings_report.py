@@ -91,7 +91,7 @@ def _details(result: Findings) -> list[str]:
         if paste:
             rows.append(_LABEL_COLUMNS * ' ' + paste)
     if result.shows:
-        shown = [cells for cells in result.shows if not cells[3]]
+        shown = [effect for effect in result.shows if not effect.missing]
         rows += [
             '',
             f'  {len(shown)} of {len(result.shows)} effects could show to diagnose',
@@ -99,8 +99,8 @@ def _details(result: Findings) -> list[str]:
             '',
             '  the others cannot show',
         ]
-    for missing in dict.fromkeys(cells[3] for cells in result.shows if cells[3]):
-        effects = ', '.join(cells[0] for cells in result.shows if cells[3] == missing)
+    for missing in dict.fromkeys(each.missing for each in result.shows if each.missing):
+        effects = ', '.join(each.effect for each in result.shows if each.missing == missing)
         rows += wrapped(f'  {missing}: {effects}', 4)
     return rows
 

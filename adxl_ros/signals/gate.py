@@ -47,9 +47,10 @@ class Outcome:
     name: str  # sound, gaps, rate, noise, zero-g, rests, or 'min' with what has a minimum
     is_worse: bool  # Whether it became worse, or the limit is missed
     text: str  # Figures, for people
-    # Interval of the ratio to the other recording, or of the change for the zero-g, m/s²; none
-    # where nothing was compared
+    # Low and high end of the interval of the ratio to the other recording, or of the change, in
+    # `unit`; None where nothing was compared
     interval: tuple[float, float] | None = None
+    unit: str = ''  # Unit of the interval: m/s^2 for the zero-g; '' for a ratio
 
     def fails(self, fail_on: Collection[str]) -> bool:
         """Return whether it is one of the kinds that fail, or a limit, and worse."""
@@ -196,7 +197,7 @@ def _zero_g(new: _AtRest, old: _AtRest) -> Outcome:
         f'length of gravity off by {now_mg:.3g} mg, before {before_mg:.3g} mg: change '
         f'{float(mg(low)):.3g} to {float(mg(high)):.3g} mg'
     )
-    return Outcome('zero-g', low > 0, text, (low, high))
+    return Outcome('zero-g', low > 0, text, (low, high), 'm/s^2')
 
 
 def _change(new: np.ndarray, old: np.ndarray) -> tuple[float, float]:

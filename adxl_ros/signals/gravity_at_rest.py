@@ -201,7 +201,7 @@ class RestReadings:
 class GravityFault:
     """Why the rests do not read gravity."""
 
-    kind: GravityFaultKind
+    kind: GravityFaultKind  # What is wrong
     reason: str  # The figure, and what explains it
     remedy: str  # What to do
     unit: str = ''  # The likely unit, for people; '' where none explains the readings

@@ -31,8 +31,8 @@ from adxl_ros.model.sensor import (
     with_neutral,
 )
 from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.recorded_motion import motion_from_force, motion_from_references
 from adxl_ros.simulate.response import Response
-from adxl_ros.simulate.trajectories import motion_from_force, motion_from_references
 import numpy as np
 
 UNKNOWN = 'unknown'
@@ -106,7 +106,7 @@ class Case:
             motion = motion_from_references(self.recording, self.parameters)
         else:
             ideal = read_ideal(self.reference, self.recording.epoch_ns)
-            motion = motion_from_force(ideal, False)[0]
+            motion = motion_from_force(ideal, False)
         return replace(motion, internal_rate_hz=max(self.recording.rate_hz, _GRID_HZ))
 
     @property

@@ -11,6 +11,7 @@ from adxl_ros.files import calibration_store
 from adxl_ros.files.recording_columns import sensor_info, StreamInfo
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.level import Level
 import numpy as np
 import pytest
 from units import drawn, nominal
@@ -96,12 +97,12 @@ def test_a_stream_is_refused_until_it_belongs_to_the_unit(
     assert policy.refusal.startswith('/sensor_info: ')
     assert not policy.assess(), 'the refusal is as before'
     status = policy.status(QUIET, None, '')
-    assert status == ('ERROR', f'publishing nothing: {policy.refusal}')
+    assert status == (Level.ERROR, f'publishing nothing: {policy.refusal}')
     assert policy.values(QUIET, None)['unit'] == 'other'
     assert policy.values(QUIET, None)['validity'] == policy.refusal
     policy.info = StreamInfo(sensor_info(unit()), '/sensor_info')
     assert policy.assess()
-    assert policy.status(QUIET, None, '') == ('OK', 'compensating')
+    assert policy.status(QUIET, None, '') == (Level.OK, 'compensating')
 
 
 def test_the_newest_calibration_of_the_unit_is_chosen(tmp_path: Path) -> None:
@@ -130,8 +131,8 @@ def test_a_newer_calibration_is_announced_unless_one_was_named(tmp_path: Path) -
     assert policy.newer() == fresh
     policy.stored_path = str(old)
     level, text = policy.status(QUIET, fresh, str(old))
-    assert level == 'WARN' and f'a newer calibration is in the store: {fresh}' in text
-    assert policy.status(QUIET, fresh, '/named.yaml') == ('OK', 'compensating')
+    assert level is Level.WARN and f'a newer calibration is in the store: {fresh}' in text
+    assert policy.status(QUIET, fresh, '/named.yaml') == (Level.OK, 'compensating')
     assert policy.values(QUIET, fresh)['newer'] == str(fresh)
     assert policy.values(QUIET, fresh)['age_days'] == pytest.approx(3.0, abs=0.01)
 
@@ -149,7 +150,7 @@ def test_a_newer_calibration_is_announced_unless_one_was_named(tmp_path: Path) -
 def test_states_of_the_samples(counts: dict[str, int], expected: str) -> None:
     interval = replace(QUIET, counts=counts, outside=('temperature 40.0 degC',))
     level, text = policy_for(unit()).status(interval, None, '')
-    assert level == 'WARN' and expected in text
+    assert level is Level.WARN and expected in text
 
 
 def test_validity() -> None:

@@ -12,8 +12,9 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.simulate import trajectories
 from adxl_ros.simulate.motion import Motion
+from adxl_ros.simulate.recorded_motion import motion_from_force
 from adxl_ros.simulate.response import simulate
-from adxl_ros.simulate.trajectories import motion_from_force, shaker
+from adxl_ros.simulate.trajectories import shaker
 import numpy as np
 import pytest
 from units import nominal
@@ -89,7 +90,7 @@ def test_a_simulator_of_another_time_does_not_overlap(run_tool, tmp_path):
 
 @pytest.mark.parametrize('late_s', [1000.0, 0.7, 0.02])
 def test_align_shifts_the_simulator(tmp_path, late_s):
-    force = motion_from_force(recording.read_ideal(tmp_path / ideal(tmp_path, late_s)), False)[0]
+    force = motion_from_force(recording.read_ideal(tmp_path / ideal(tmp_path, late_s)), False)
     comparison = compare_checked(made(unit()), unit(), force, True)
     residual_g = comparison.residual_v(comparison.sensor)[comparison.used]
     assert np.sqrt(np.mean(residual_g**2)) < (1e-3 if late_s > 0.1 else 1e-2)

@@ -12,7 +12,7 @@ from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import to_volts
 from adxl_ros.simulate.motion import ForcePath, Motion
-from adxl_ros.simulate.trajectories import motion_from_force
+from adxl_ros.simulate.recorded_motion import motion_from_force
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -70,7 +70,7 @@ class Carried:
             comments='',
             header='time_s,ax_mps2,ay_mps2,az_mps2',
         )
-        return motion_from_force(read_ideal(folder / 'sim.csv', 0, unit), False)[0]
+        return motion_from_force(read_ideal(folder / 'sim.csv', 0, unit), False)
 
     def beside(self, folder, recorded, force=None, time_s=None, may_shift=False):
         """Put a recording beside a simulator."""

@@ -3,7 +3,7 @@
 """The mounting against scipy's rotations."""
 
 from adxl_ros.files import imu_message
-from adxl_ros.model.kinematics import Mounting
+from adxl_ros.model.kinematics import Covariance3, Mounting
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
@@ -22,7 +22,7 @@ def test_rotation_covariance_and_orientation_agree_with_scipy():
     np.testing.assert_allclose(MOUNTING.rotate(vector), TURN.apply(vector))
     expected = TURN.as_matrix() @ covariance @ TURN.as_matrix().T
     np.testing.assert_allclose(
-        MOUNTING.rotate_covariance(covariance[np.triu_indices(3)]), expected[np.triu_indices(3)]
+        MOUNTING.rotate_covariance(Covariance3.of(covariance)).matrix, expected
     )
     np.testing.assert_allclose(MOUNTING.rotate_matrix(covariance.ravel()), expected.ravel())
     case = Rotation.random(random_state=3)

@@ -10,7 +10,8 @@ from adxl_ros.investigate.manoeuvres import (
     Pose,
     StageLimits,
 )
-from adxl_ros.simulate.trajectories import RUN_UP_S, SimulatedStage
+from adxl_ros.simulate.simulated_stage import SimulatedStage
+from adxl_ros.simulate.trajectories import RUN_UP_S
 import numpy as np
 import pytest
 

@@ -14,7 +14,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.effects.base import Joint
 from adxl_ros.model.kinematics import specific_force, specific_force_in_motion
 from adxl_ros.model.sensor import to_nominal_mps2
-from adxl_ros.simulate.trajectories import SimulatedStage
+from adxl_ros.simulate.simulated_stage import SimulatedStage
 import numpy as np
 from processes import REPO
 import pytest

@@ -3,7 +3,9 @@
 """What the documentation shows is so: commands, links, figures, and the reference."""
 
 from collections.abc import Callable
+from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
+import inspect
 from pathlib import Path
 import re
 import shlex
@@ -227,6 +229,17 @@ def test_reference_is_that_of_the_package(tmp_path: Path) -> None:
         assert (DOCS / 'reference' / page.name).read_text('utf-8') == page.read_text('utf-8'), (
             f'{page.name}: run make reference'
         )
+
+
+def test_every_field_of_a_result_has_a_meaning() -> None:
+    made = reference()
+    for path in made.with_fields(made.RESULTS):
+        module, name = path.split(':')
+        lines = inspect.getsource(getattr(import_module(module), name)).splitlines()
+        for before, line, after in zip(lines, lines[1:], [*lines[2:], '']):
+            is_said = before.strip().startswith('#') or after.strip().startswith('"""')
+            is_said |= any(mark in line for mark in ('#', '_nominal(', '_by_axis('))
+            assert is_said or not re.match(r'    [a-z]\w*: ', line), f'{path}: {line}'
 
 
 def test_every_effect_has_a_picture() -> None:

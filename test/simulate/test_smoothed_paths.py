@@ -4,7 +4,8 @@
 
 import adxl_ros as adxl
 from adxl_ros.simulate.motion import SmoothedPath, visible_step
-from adxl_ros.simulate.trajectories import motion_from_references, tumble
+from adxl_ros.simulate.recorded_motion import motion_from_references
+from adxl_ros.simulate.trajectories import tumble
 import numpy as np
 import pytest
 

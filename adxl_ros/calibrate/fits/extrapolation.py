@@ -49,31 +49,54 @@ def next_degree(
     temperature_c: in the order of time, (k,); residual_g: by axis, (k, m); curvature_k2: that of
     the fit, g/K², (m,).
     """
-    middle_c, span_k = float(np.mean(temperature_c)), float(np.ptp(temperature_c))
-    warmer = (temperature_c - middle_c) / span_k
+    polynomials = _orthogonal_polynomials(temperature_c)
+    shape = departure_k(temperature_c, polynomials.nodes_c)
+    squares = float(shape @ shape)
+    size = shape @ residual_g / squares
+    variance_g2 = _residual_variance_g2(residual_g - np.outer(shape, size))
+    # A further degree contributes no more to what was seen than the last one.
+    curvature = np.maximum(np.abs(curvature_k2), _TYPICAL_K2)
+    prior_std = curvature * np.linalg.norm(polynomials.last_k2) / np.linalg.norm(shape)
+    information = squares / np.maximum(variance_g2, TINY)
+    variance = 1 / (information + prior_std**-2)
+    posterior_mean = variance * information * size
+    return NextDegree(polynomials.nodes_c, np.sqrt(posterior_mean**2 + variance))
+
+
+class _OrthogonalPolynomials(NamedTuple):
+    """The last degree of a fit over temperature, and the next one, over what was seen."""
+
+    last_k2: np.ndarray  # The last one at the temperatures of the fit, K², (k,)
+    nodes_c: np.ndarray  # Temperatures at which the next one is 0, °C
+
+
+def _orthogonal_polynomials(temperature_c: np.ndarray) -> _OrthogonalPolynomials:
+    middle_c = float(np.mean(temperature_c))
+    span_k = float(np.ptp(temperature_c))
+    place = (temperature_c - middle_c) / span_k
     # The whole span counts as one more sample, so that few temperatures determine all degrees.
-    even = np.linspace(warmer.min(), warmer.max(), _DEGREE + 2)
-    weight = np.sqrt(np.concatenate([np.ones(len(warmer)), np.full(len(even), 1 / len(even))]))
-    values = np.concatenate([warmer, even])
+    even = np.linspace(place.min(), place.max(), _DEGREE + 2)
+    values = np.concatenate([place, even])
+    weight = np.sqrt(np.concatenate([np.ones(len(place)), np.full(len(even), 1 / len(even))]))
     last = _orthogonal(values, weight, _DEGREE)
     following = _orthogonal(values, weight, _DEGREE + 1)
-    nodes_c = middle_c + span_k * np.sort(np.roots(following).real)
-    shape = departure_k(temperature_c, nodes_c)
-    last_k2 = span_k**_DEGREE * np.polyval(last, warmer)
-    prior = np.maximum(np.abs(curvature_k2), _TYPICAL_K2)
-    prior = prior * np.linalg.norm(last_k2) / np.linalg.norm(shape)
-    squares = float(shape @ shape)
-    estimate = shape @ residual_g / squares
-    rest_g = residual_g - np.outer(shape, estimate)
-    variance_g2 = (rest_g**2).sum(axis=0) / max(len(rest_g) - _DEGREE - 2, 1)
-    rest_squares = np.maximum((rest_g**2).sum(axis=0), TINY)
-    neighbours = np.sum(rest_g[1:] * rest_g[:-1], axis=0) / rest_squares
-    correlation = np.clip(neighbours, 0.0, _LARGEST_CORRELATION)
-    # Correlated residuals count as fewer independent ones.
-    variance_g2 *= (1 + correlation) / (1 - correlation)
-    information = squares / np.maximum(variance_g2, TINY)
-    variance = 1 / (information + prior**-2)
-    return NextDegree(nodes_c, np.sqrt((variance * information * estimate) ** 2 + variance))
+    return _OrthogonalPolynomials(
+        last_k2=span_k**_DEGREE * np.polyval(last, place),
+        nodes_c=middle_c + span_k * np.sort(np.roots(following).real),
+    )
+
+
+def _residual_variance_g2(rest_g: np.ndarray) -> np.ndarray:
+    """
+    Return the variance of residuals, (k, m), as if they were independent, by axis, (m,).
+
+    Correlated residuals count as fewer independent ones.
+    """
+    squares_g2 = (rest_g**2).sum(axis=0)
+    neighbours_g2 = np.sum(rest_g[1:] * rest_g[:-1], axis=0)
+    correlation = np.clip(neighbours_g2 / np.maximum(squares_g2, TINY), 0.0, _LARGEST_CORRELATION)
+    freedom = max(len(rest_g) - _DEGREE - 2, 1)
+    return squares_g2 / freedom * (1 + correlation) / (1 - correlation)
 
 
 def _orthogonal(values: np.ndarray, weight: np.ndarray, degree: int) -> np.ndarray:

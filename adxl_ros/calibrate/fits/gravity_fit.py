@@ -10,16 +10,14 @@ magnitude. The gauge therefore holds Θx on the case's x and Θy in its x-y plan
 
 Rests that determine zero-g and scale factor, but not the angles, give a fit of these six. The
 angles then stay as their prior says, and their uncertainty is that of the prior.
-
-Somebody who turns a sensor by hand is asked for the faces, edges and corners of a cube.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 from typing import NamedTuple
 
+from adxl_ros.calibrate.fits.cube_directions import AXES_UP, covered, points_up
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
@@ -49,8 +47,26 @@ _PRIOR_INFORMATION = np.eye(len(NAMES)) / PRIOR_STD**2
 """Inverse covariance of the prior about 0, (9, 9)."""
 
 
-class Step(NamedTuple):
-    """A step of the ladder of fits: which parameters the rests determine."""
+class GravityParameters(NamedTuple):
+    """The parts of the parameters."""
+
+    zero_g_g: np.ndarray  # Zero-g minus the nominal one, g, (3,)
+    scale: np.ndarray  # Relative change of the scale factor, (3,)
+    angles_rad: np.ndarray  # beta of y, alpha of z and beta of z, rad, (3,)
+
+    @classmethod
+    def of(cls, parameters: np.ndarray) -> GravityParameters:
+        """Return the parts of a vector, (9,)."""
+        return cls(parameters[:3], parameters[3:6], parameters[6:])
+
+    @property
+    def vector(self) -> np.ndarray:
+        """Return all of them, (9,)."""
+        return np.concatenate(self)
+
+
+class Rung(NamedTuple):
+    """A rung of the ladder of fits: which parameters the rests determine."""
 
     text: str  # The parameters, for people
     determined: int  # The first ones of `NAMES`, as many as the rests determine
@@ -66,9 +82,14 @@ class Step(NamedTuple):
         """Coefficients that are known by their prior alone."""
         return NAMES[self.determined :]
 
+    @property
+    def left_out_std_rad(self) -> float:
+        """Standard deviation of the prior of an angle that is left out, rad."""
+        return float(self.precision[-1] ** -0.5)
 
-NINE = Step('nine parameters', len(NAMES), np.zeros(len(NAMES)))
-SIX = Step(
+
+NINE = Rung('nine parameters', len(NAMES), np.zeros(len(NAMES)))
+SIX = Rung(
     'zero-g and scale factor',
     6,
     np.array([0.0] * 6 + [parameter_of(name).scale ** -2.0 for name in NAMES[6:]]),
@@ -105,27 +126,30 @@ def effect_values(
     """Return the values of the effects, and the factor from each parameter to its coefficient."""
     scale = sensor.nominal_scale_v_per_g
     units = np.concatenate([scale, scale, np.ones(3)])
-    values = parameters * units
+    values = GravityParameters.of(parameters * units)
+    beta_y, alpha_z, beta_z = values.angles_rad
     return {
-        'bias': {'offset_v': values[:3]},
-        'scale_factor': {'offset_v_per_g': values[3:6]},
+        'bias': {'offset_v': values.zero_g_g},
+        'scale_factor': {'offset_v_per_g': values.scale},
         'misalignment': {
-            'alpha_rad': np.array([0.0, 0.0, values[7]]),
-            'beta_rad': np.array([0.0, values[6], values[8]]),
+            'alpha_rad': np.array([0.0, 0.0, alpha_z]),
+            'beta_rad': np.array([0.0, beta_y, beta_z]),
         },
     }, units
 
 
-def _sensing_axes(parameters: np.ndarray) -> np.ndarray:
+def _sensing_axes(angles_rad: np.ndarray) -> np.ndarray:
     """Return the directions of the sensing axes in the gauge, rows Θx, Θy, Θz, (3, 3)."""
-    (sy, sa, sb), (cy, ca, cb) = np.sin(parameters[6:]), np.cos(parameters[6:])
+    sy, sa, sb = np.sin(angles_rad)
+    cy, ca, cb = np.cos(angles_rad)
     return np.array([[1.0, 0.0, 0.0], [-sy, cy, 0.0], [sb, -sa * cb, ca * cb]])
 
 
 def force_g(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
     """Return the specific force of rests in the case, g, (k, 3), by their means, g, (k, 3)."""
-    sensed = (mean - parameters[:3]) / (1 + parameters[3:6])
-    return np.asarray(sensed @ np.linalg.inv(_sensing_axes(parameters)).T)
+    part = GravityParameters.of(parameters)
+    sensed = (mean - part.zero_g_g) / (1 + part.scale)
+    return np.asarray(sensed @ np.linalg.inv(_sensing_axes(part.angles_rad)).T)
 
 
 def magnitude(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
@@ -143,15 +167,17 @@ class Linearised(NamedTuple):
 
 def linearised(mean: np.ndarray, parameters: np.ndarray) -> Linearised:
     """Return the magnitudes with their derivatives; `mean` by nominal values, g, (k, 3)."""
-    scale = 1 + parameters[3:6]
-    sensed = (mean - parameters[:3]) / scale
-    inverse = np.linalg.inv(_sensing_axes(parameters))
+    part = GravityParameters.of(parameters)
+    scale = 1 + part.scale
+    sensed = (mean - part.zero_g_g) / scale
+    inverse = np.linalg.inv(_sensing_axes(part.angles_rad))
     force = sensed @ inverse.T
     length = np.linalg.norm(force, axis=1)
     by_sensed = force / length[:, None] @ inverse
     by_output = by_sensed / scale
     # ∂Θ/∂angle: of Θy by its angle, of Θz by both of its angles.
-    (sy, sa, sb), (cy, ca, cb) = np.sin(parameters[6:]), np.cos(parameters[6:])
+    sy, sa, sb = np.sin(part.angles_rad)
+    cy, ca, cb = np.cos(part.angles_rad)
     turned = np.array([[-cy, -sy, 0.0], [0.0, -ca * cb, -sa * cb], [cb, sa * sb, -ca * sb]])
     by_angle = -by_sensed[:, [1, 2, 2]] * (force @ turned.T)
     return Linearised(length, by_output, np.hstack([-by_output, -by_output * sensed, by_angle]))
@@ -166,10 +192,11 @@ def regularised_fit(rests: NominalRests, steps: int) -> np.ndarray:
     """Fit rests with the prior by Gauss-Newton steps from 0; return the parameters."""
     parameters = np.zeros(len(NAMES))
     for _ in range(steps):
-        length, _, rows = linearised(rests.mean, parameters)
-        weighted = rows.T / (magnitude_variance(rests, parameters).mean() + TRIAL_STD_G**2)
-        gradient = weighted @ (rests.gravity_g - length) - parameters / PRIOR_STD**2
-        step = np.linalg.solve(weighted @ rows + _PRIOR_INFORMATION, gradient)
+        at = linearised(rests.mean, parameters)
+        variance = magnitude_variance(rests, parameters).mean() + TRIAL_STD_G**2
+        weighted = at.jacobian.T / variance
+        gradient = weighted @ (rests.gravity_g - at.magnitude) - parameters / PRIOR_STD**2
+        step = np.linalg.solve(weighted @ at.jacobian + _PRIOR_INFORMATION, gradient)
         parameters = np.clip(parameters + step, -_MAX_VALUE, _MAX_VALUE)
     return parameters
 
@@ -187,38 +214,6 @@ def posterior_information(
 ) -> np.ndarray:
     """Return the information of prior and rests about the parameters, (9, 9)."""
     return _PRIOR_INFORMATION + fisher_information(rests, parameters, excess_g2)
-
-
-CANDIDATES = np.array([signs for signs in product((0, 1, -1), repeat=3) if any(signs)])
-"""Faces, edges and corners of a cube, one of which points up, (26, 3)."""
-UP = CANDIDATES / np.linalg.norm(CANDIDATES, axis=1, keepdims=True)
-"""The candidates as unit vectors, (26, 3)."""
-_COVERED_COS = np.cos(np.radians(22.0))
-"""Cosine of the angle up to which a rest covers a direction: half of the 45° to the next one."""
-AXES_UP = np.count_nonzero(CANDIDATES, axis=1)
-"""Number of axes that are not horizontal, (26,): 1 for a face, 2 for an edge, 3 for a corner."""
-
-
-def covered(up: np.ndarray) -> np.ndarray:
-    """Mark the candidates that rests in the directions `up`, (k, 3), cover, (26,) bool."""
-    return np.any(up @ UP.T > _COVERED_COS, axis=0) if len(up) else np.zeros(len(UP), bool)
-
-
-def next_up(available: np.ndarray, now: np.ndarray | None) -> int | None:
-    """Choose the nearest available face, edge or corner by what points up now, (3,)."""
-    nearness = UP @ (np.zeros(3) if now is None else now)
-    cost = np.where(available, AXES_UP - 0.4 * nearness, np.inf)
-    return int(cost.argmin()) if available.any() else None
-
-
-def points_up(candidate: int) -> str:
-    """Return a sentence: '+x points up', '+x and −y point up equally'."""
-    axes = [
-        ('+' if sign > 0 else '−') + axis
-        for axis, sign in zip(AXES, CANDIDATES[candidate])
-        if sign
-    ]
-    return f'{axes[0]} points up' if len(axes) == 1 else f'{" and ".join(axes)} point up equally'
 
 
 _TOLERANCE = 1e-12  # Relative tolerance of `leastsq` in cost, parameters and gradient
@@ -255,13 +250,17 @@ class GravityFit:
     expected_mps2: np.ndarray  # Standard deviation of a magnitude: noise of the mean and excess
     excess_mps2: float  # Part of it that the noise of the means does not explain
     outliers: tuple[int, ...]  # Indices of the outliers, which the fit leaves out
-    step: Step  # Which parameters the rests determine
+    rung: Rung  # Which parameters the rests determine
     note: str  # What is left out and what would determine it, for people; '' if nothing is
     converged: bool = True  # Whether parameters and excess variance have converged
 
 
-_Estimate = tuple[np.ndarray, float, bool]
-"""Parameters, (9,), variance beyond the noise of the means, g², and whether they converged."""
+class _Estimate(NamedTuple):
+    """A fit of parameters and excess variance."""
+
+    parameters: np.ndarray  # (9,)
+    excess_g2: float  # Variance beyond the noise of the means, g²
+    converged: bool
 
 
 def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> GravityFit:
@@ -293,32 +292,36 @@ def fit_gravity(mean_v: np.ndarray, std_v: np.ndarray, sensor: Sensor) -> Gravit
     """
     rests = nominal_rests(mean_v, std_v, sensor)
     _require_gravity(rests, np.zeros(len(NAMES)))
-    for step in LADDER:
+    for rung in LADDER:
         try:
-            return _fitted(rests, sensor, step)
+            return _fitted(rests, sensor, rung)
         except _UndeterminedError as error:
             refusal = error
     raise refusal
 
 
 class _UndeterminedError(UserError):
-    """The rests do not determine the parameters of a step."""
+    """The rests do not determine the parameters of a rung."""
 
 
-def _fitted(rests: NominalRests, sensor: Sensor, step: Step) -> GravityFit:
-    """Fit the parameters of one step."""
-    _require_determined(rests, np.zeros(len(NAMES)), 0.0, step)
-    kept = _inliers(rests, step)
-    parameters, excess_g2, converged = _fit(rests[kept], step)
-    _require_gravity(rests[kept], parameters)
-    _require_determined(rests[kept], parameters, excess_g2, step)
+def _fitted(rests: NominalRests, sensor: Sensor, rung: Rung) -> GravityFit:
+    """Fit the parameters of one rung."""
+    _require_determined(rests, np.zeros(len(NAMES)), 0.0, rung)
+    kept = _inliers(rests, rung)
+    used = rests[kept]
+    estimate = _fit(used, rung)
+    parameters = estimate.parameters
+    excess_g2 = estimate.excess_g2
+    _require_gravity(used, parameters)
+    _require_determined(used, parameters, excess_g2, rung)
     variance = magnitude_variance(rests, parameters) + excess_g2
-    information = fisher_information(rests[kept], parameters, excess_g2)
+    information = fisher_information(used, parameters, excess_g2)
     # An excess that ν rests determine widens its share of the variance by ν/(ν − 2).
-    widened = 1 + excess_g2 / variance[kept].mean() * 2 / max(kept.sum() - step.determined - 2, 1)
-    covariance = np.linalg.inv(information / widened + np.diag(step.precision)) + _second_order(
-        step
-    )
+    share = excess_g2 / variance[kept].mean()
+    freedom = kept.sum() - rung.determined
+    widened = 1 + share * 2 / max(freedom - 2, 1)
+    covariance = np.linalg.inv(information / widened + np.diag(rung.precision))
+    covariance += _second_order(rung)
     values, units = effect_values(parameters, sensor)
     residual = _residual(rests, parameters)
     return GravityFit(
@@ -326,36 +329,39 @@ def _fitted(rests: NominalRests, sensor: Sensor, step: Step) -> GravityFit:
         covariance=covariance * np.outer(units, units),
         before_mps2=G0_MPS2 * (np.linalg.norm(rests.mean, axis=1) - rests.gravity_g),
         residual_mps2=G0_MPS2 * residual,
-        held_out_mps2=G0_MPS2 * _held_out(rests, kept, parameters, variance, residual, step),
+        held_out_mps2=G0_MPS2 * _held_out(rests, kept, parameters, variance, residual, rung),
         expected_mps2=G0_MPS2 * np.sqrt(variance),
         excess_mps2=G0_MPS2 * float(np.sqrt(excess_g2)),
         outliers=tuple(int(i) for i in np.flatnonzero(~kept)),
-        step=step,
-        note=_note(rests[kept], parameters, step),
-        converged=converged,
+        rung=rung,
+        note=_note(used, parameters, rung),
+        converged=estimate.converged,
     )
 
 
-def _second_order(step: Step) -> np.ndarray:
+def _second_order(rung: Rung) -> np.ndarray:
     """
     Return the covariance by the squares of angles that the rests do not determine, (9, 9).
 
     Turned by β a sensing axis reads gravity along it by cos β = 1 − β²/2 too small, as by its
     scale factor. The mean square of β²/2 is 3σ⁴/4, that of two such angles 2σ⁴.
     """
-    squares = np.zeros(len(NAMES))
-    if step.left_out:
-        variance = 1 / step.precision[-1]
-        squares[4:6] = 0.75 * variance**2, 2 * variance**2
-    return np.diag(squares)
+    by_y, by_z = 0.0, 0.0
+    if rung.left_out:
+        fourth_power = rung.left_out_std_rad**4
+        by_y = 0.75 * fourth_power
+        by_z = 2 * fourth_power
+    none = np.zeros(3)
+    return np.diag(GravityParameters(none, np.array([0.0, by_y, by_z]), none).vector)
 
 
-def _note(rests: NominalRests, parameters: np.ndarray, step: Step) -> str:
-    if not step.left_out:
+def _note(rests: NominalRests, parameters: np.ndarray, rung: Rung) -> str:
+    if not rung.left_out:
         return ''
-    names, std_deg = ', '.join(map(str, step.left_out)), np.degrees(step.precision[-1] ** -0.5)
+    names = ', '.join(map(str, rung.left_out))
+    std_deg = np.degrees(rung.left_out_std_rad)
     return (
-        f'the rests determine {step.text} only; left out, by their prior of 0 ± '
+        f'the rests determine {rung.text} only; left out, by their prior of 0 ± '
         f'{std_deg:.2g}° (standard deviation): {names}; {_advice(rests, parameters)}'
     )
 
@@ -366,10 +372,11 @@ def _residual(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
 
 
 def _solve(
-    rests: NominalRests, start: np.ndarray, variance: np.ndarray, step: Step
+    rests: NominalRests, start: np.ndarray, variance: np.ndarray, rung: Rung
 ) -> tuple[np.ndarray, bool]:
     """Fit with given variances of the magnitudes, g², (k,); also return whether it converged."""
-    std, prior = np.sqrt(variance), np.diag(np.sqrt(step.precision))
+    std = np.sqrt(variance)
+    prior = np.diag(np.sqrt(rung.precision))
     # `least_squares` calls the same routine of MINPACK, and takes twice the time around it.
     parameters, _, _, _, status = scipy.optimize.leastsq(
         lambda p: np.concatenate([_residual(rests, p) / std, prior @ p]),
@@ -384,18 +391,20 @@ def _solve(
     return parameters, status in _CONVERGED
 
 
-def _fit(rests: NominalRests, step: Step) -> _Estimate:
+def _fit(rests: NominalRests, rung: Rung) -> _Estimate:
     """Fit the parameters, and the excess variance that makes χ² equal its degrees of freedom."""
-    parameters, excess_g2 = np.zeros(len(NAMES)), 0.0
-    freedom = len(rests.mean) - step.determined
+    parameters = np.zeros(len(NAMES))
+    excess_g2 = 0.0
+    freedom = len(rests.mean) - rung.determined
     for _ in range(_MAX_ROUNDS):
         variance = magnitude_variance(rests, parameters)
-        parameters, converged = _solve(rests, parameters, variance + excess_g2, step)
+        parameters, converged = _solve(rests, parameters, variance + excess_g2, rung)
         squares = _residual(rests, parameters) ** 2
-        before_g2, excess_g2 = excess_g2, _excess(squares, variance, freedom)
+        before_g2 = excess_g2
+        excess_g2 = _excess(squares, variance, freedom)
         if abs(excess_g2 - before_g2) <= _EXCESS_TOLERANCE * (excess_g2 + variance.min()):
-            return parameters, excess_g2, converged
-    return parameters, excess_g2, False
+            return _Estimate(parameters, excess_g2, converged)
+    return _Estimate(parameters, excess_g2, converged=False)
 
 
 def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
@@ -411,7 +420,7 @@ def _excess(squares: np.ndarray, variance: np.ndarray, freedom: int) -> float:
     )
 
 
-def _inliers(rests: NominalRests, step: Step) -> np.ndarray:
+def _inliers(rests: NominalRests, rung: Rung) -> np.ndarray:
     """
     Mark the rests that fit the others, (k,) bool.
 
@@ -421,10 +430,10 @@ def _inliers(rests: NominalRests, step: Step) -> np.ndarray:
     not.
     """
     count = len(rests.mean)
-    max_outliers = min(int(_MAX_OUTLIERS * count), count - step.min_rests)
+    max_outliers = min(int(_MAX_OUTLIERS * count), count - rung.min_rests)
     if max_outliers < 1:
         return np.ones(count, bool)
-    prior = TRIAL_STD_G * np.diag(np.sqrt(step.precision))
+    prior = TRIAL_STD_G * np.diag(np.sqrt(rung.precision))
     robust = scipy.optimize.least_squares(
         lambda p: np.concatenate([_residual(rests, p), prior @ p]),
         np.zeros(len(NAMES)),
@@ -433,15 +442,16 @@ def _inliers(rests: NominalRests, step: Step) -> np.ndarray:
         f_scale=TRIAL_STD_G,
     )
     size = np.abs(robust.fun[:count])
-    freedom = max(count - max_outliers - step.determined, 1)
+    freedom = max(count - max_outliers - rung.determined, 1)
     variance = np.sum(np.sort(size)[: count - max_outliers] ** 2) / freedom
     kept = size <= _MAX_DEVIATIONS * np.sqrt(variance + magnitude_variance(rests, robust.x).mean())
     for _ in range(2 * max_outliers):
-        distance = _studentised(rests, kept, _fit(rests[kept], step), step)
+        distance = _studentised(rests, kept, _fit(rests[kept], rung), rung)
         limit = -scipy.special.stdtrit(
-            max(kept.sum() - step.min_rests, 1), _OUTLIER_CHANCE / (2 * count)
+            max(kept.sum() - rung.min_rests, 1), _OUTLIER_CHANCE / (2 * count)
         )
-        excluded, included = np.where(kept, np.inf, distance), np.where(kept, distance, 0)
+        excluded = np.where(kept, np.inf, distance)
+        included = np.where(kept, distance, 0)
         if excluded.min() <= limit:
             kept[excluded.argmin()] = True
         elif included.max() > limit and (~kept).sum() < max_outliers:
@@ -452,20 +462,21 @@ def _inliers(rests: NominalRests, step: Step) -> np.ndarray:
 
 
 def _studentised(
-    rests: NominalRests, kept: np.ndarray, estimate: _Estimate, step: Step
+    rests: NominalRests, kept: np.ndarray, estimate: _Estimate, rung: Rung
 ) -> np.ndarray:
     """Return the distance of each rest from the fit to the others by its std, (k,)."""
-    parameters, excess_g2, _ = estimate
+    parameters = estimate.parameters
+    excess_g2 = estimate.excess_g2
     variance = magnitude_variance(rests, parameters) + excess_g2
     covariance = np.linalg.inv(
-        posterior_information(rests[kept], parameters, excess_g2) + np.diag(step.precision)
+        posterior_information(rests[kept], parameters, excess_g2) + np.diag(rung.precision)
     )
     jacobian = linearised(rests.mean, parameters).jacobian
     leverage = np.einsum('ki,ij,kj->k', jacobian, covariance, jacobian) / variance
     distance = np.abs(_residual(rests, parameters)) / np.sqrt(variance)
     inside = distance / np.sqrt(np.maximum(1 - leverage, _MIN_REMAINDER))
     # χ² per degree of freedom of the other rests, at least that of the noise of the means.
-    freedom = kept.sum() - step.determined
+    freedom = kept.sum() - rung.determined
     others = (max((distance[kept] ** 2).sum(), freedom) - inside**2) / max(freedom - 1, 1)
     inside = inside / np.sqrt(np.maximum(others, np.median(1 - excess_g2 / variance)))
     return np.where(kept, inside, distance / np.sqrt(1 + leverage))
@@ -477,20 +488,21 @@ def _held_out(
     parameters: np.ndarray,
     variance: np.ndarray,
     residual: np.ndarray,
-    step: Step,
+    rung: Rung,
 ) -> np.ndarray:
     """Return magnitude minus gravity by the fit to the other stretches of rests, g, (k,)."""
-    errors, used = residual.copy(), rests[kept]
+    errors = residual.copy()
+    used = rests[kept]
     count = len(used.mean)
     stretch = np.arange(count) * _STRETCHES // count
     for number in np.unique(stretch):
         others = stretch != number
         # A stretch may hold the only rests that determine a parameter.
-        is_open = _undetermined(used[others], parameters, 0.0, step)
+        is_open = _undetermined(used[others], parameters, 0.0, rung)
         without = (
             parameters
-            if is_open or others.sum() < step.determined
-            else _solve(used[others], parameters, variance[kept][others], step)[0]
+            if is_open or others.sum() < rung.determined
+            else _solve(used[others], parameters, variance[kept][others], rung)[0]
         )
         errors[np.flatnonzero(kept)[~others]] = _residual(used[~others], without)
     return errors
@@ -510,30 +522,31 @@ def _require_gravity(rests: NominalRests, parameters: np.ndarray) -> None:
 
 
 def _undetermined(
-    rests: NominalRests, parameters: np.ndarray, excess_g2: float, step: Step
+    rests: NominalRests, parameters: np.ndarray, excess_g2: float, rung: Rung
 ) -> list[Coefficient]:
-    """Return the coefficients of a step that rests do not determine."""
+    """Return the coefficients of a rung that rests do not determine."""
     covariance = np.linalg.inv(
-        posterior_information(rests, parameters, excess_g2) + np.diag(step.precision)
+        posterior_information(rests, parameters, excess_g2) + np.diag(rung.precision)
     )
     return [
         name
-        for name, variance in zip(NAMES[: step.determined], np.diag(covariance))
+        for name, variance in zip(NAMES[: rung.determined], np.diag(covariance))
         if variance > DETERMINED_STD**2
     ]
 
 
 def _require_determined(
-    rests: NominalRests, parameters: np.ndarray, excess_g2: float, step: Step
+    rests: NominalRests, parameters: np.ndarray, excess_g2: float, rung: Rung
 ) -> None:
-    """Refuse rests that do not determine a coefficient of a step; say what is missing."""
-    count, missing = len(rests.mean), _undetermined(rests, parameters, excess_g2, step)
-    if count >= step.min_rests and not missing:
+    """Refuse rests that do not determine a coefficient of a rung; say what is missing."""
+    count = len(rests.mean)
+    missing = _undetermined(rests, parameters, excess_g2, rung)
+    if count >= rung.min_rests and not missing:
         return
     reason = (
         f'do not determine {", ".join(map(str, missing))}'
         if missing
-        else f'are too few, at least {step.min_rests} in different directions are needed'
+        else f'are too few, at least {rung.min_rests} in different directions are needed'
     )
     scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
     raise _UndeterminedError(
@@ -548,7 +561,8 @@ def _advice(rests: NominalRests, parameters: np.ndarray) -> str:
     """Return which directions are missing among rests, for people: faces first, then others."""
     force = force_g(rests.mean, parameters)
     has = covered(force / np.linalg.norm(force, axis=1, keepdims=True))
-    faces, edges = np.flatnonzero(~has & (AXES_UP == 1)), np.flatnonzero(~has & (AXES_UP == 2))
+    faces = np.flatnonzero(~has & (AXES_UP == 1))
+    edges = np.flatnonzero(~has & (AXES_UP == 2))
     if len(faces):
         return f'add rests in which {", or ".join(map(points_up, faces.tolist()))}'
     if len(edges):

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from enum import auto, Enum
-from typing import Literal, NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, Protocol
 
 from adxl_ros.calibrate.fits.gravity_fit import NINE
 from adxl_ros.calibrate.guided.guide import NewestSamples, NextPose, STALE_NS
@@ -17,6 +17,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import nominal_of, StreamInfo
 from adxl_ros.files.sweep_journal import differences
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.level import Level
 from adxl_ros.signals import recorded_sensor
 import numpy as np
 
@@ -32,9 +33,6 @@ class ControllerState(Enum):
     RUNNING = auto()
 
 
-Severity: TypeAlias = Literal['INFO', 'WARNING', 'ERROR']
-
-
 class Answer(NamedTuple):
     """The answer to a request."""
 
@@ -48,7 +46,7 @@ _NOT_RUNNING = Answer(False, 'no calibration is running')
 class Outputs(Protocol):
     """Where a controller's lines, answers and announcements go."""
 
-    def log(self, severity: Severity, text: str) -> None:
+    def log(self, level: Level, text: str) -> None:
         """Log a line."""
 
     def answer_captures(self, answer: Answer) -> None:
@@ -115,7 +113,7 @@ class StreamSensor:
             return None
         return nominal
 
-    def watch(self, shows: bool, waits: bool) -> tuple[Severity, str] | None:
+    def watch(self, shows: bool, waits: bool) -> tuple[Level, str] | None:
         """Look at the samples of no calibration, if shown or waited for; return a line to log."""
         if self.nominal is None and (waits or shows):
             # A driver that has just begun states its sensor on another topic.
@@ -127,7 +125,7 @@ class StreamSensor:
             self._samples.keep_newest(0)
         return None
 
-    def _measure(self) -> tuple[Severity, str] | None:
+    def _measure(self) -> tuple[Level, str] | None:
         """Measure the sensor of a stream that states nothing of itself."""
         stamps_ns, accel_mps2 = self._samples.waiting()
         if (
@@ -141,9 +139,9 @@ class StreamSensor:
             )
         except UserError as error:
             self._samples.keep_newest(0)
-            return 'WARNING', f'imu/data_raw: {error}'
+            return Level.WARN, f'imu/data_raw: {error}'
         self.take(nominal)
-        return 'INFO', f'no sensor_info: measured from the stream: {"; ".join(lines)}'
+        return Level.OK, f'no sensor_info: measured from the stream: {"; ".join(lines)}'
 
 
 class Controller:
@@ -204,7 +202,7 @@ class Controller:
         self._take_samples(self.session)
         obstacle = guide.capture()
         if obstacle:
-            self._say('WARNING', obstacle)
+            self._say(Level.WARN, obstacle)
         return Answer(not obstacle, obstacle or 'averaging')
 
     def change_pose(self, request: str) -> Answer:
@@ -220,7 +218,7 @@ class Controller:
             return Answer(False, f'no pose to {what}')
         self.fit_fault = ''
         self._outputs.answer_captures(Answer(False, text))
-        self._say('INFO', text)
+        self._say(Level.OK, text)
         return Answer(True, text)
 
     def finish(self) -> Answer:
@@ -229,31 +227,31 @@ class Controller:
         if session is None:
             return _NOT_RUNNING
         self._take_samples(session)
-        self._say('INFO', f'fitting {session.accepted_count} poses')
+        self._say(Level.OK, f'fitting {session.accepted_count} poses')
         self._outputs.show_fit(self._last)
         self.fit_fault = ''
         try:
             result = session.finish()
-            self._outputs.log('INFO', result.keep(self.settings.store))
+            self._outputs.log(Level.OK, result.keep(self.settings.store))
             try:
                 session.write_report(result)
             except (UserError, OSError) as error:
-                self._say('ERROR', f'no report: {error}')
+                self._say(Level.ERROR, f'no report: {error}')
             session.end()
         except (UserError, OSError) as error:
             # The poses stay: further poses, or room on the disk, can still lead to a fit.
             text = f'cannot finish: {error}'
             if session.guide.next_pose() is None:
                 self.fit_fault = text = f'{text}; finish again, redo or abort'
-            self._say('ERROR', text)
+            self._say(Level.ERROR, text)
             return Answer(False, text)
         for line in result.comments():
-            self._outputs.log('INFO', line)
+            self._outputs.log(Level.OK, line)
         self.outcome = (result.summary[0].strip(), *result.summary[1:], *result.warnings)
-        self._outputs.log('INFO', self.outcome[0])
+        self._outputs.log(Level.OK, self.outcome[0])
         open_poses = session.guide.open_poses
         advice = f'; {open_poses} poses are open: start again to go on' if open_poses else ''
-        self._stop('INFO', f'wrote {self.settings.output}{advice}')
+        self._stop(Level.OK, f'wrote {self.settings.output}{advice}')
         return Answer(True, self._last)
 
     def abort(self) -> Answer:
@@ -261,7 +259,7 @@ class Controller:
         if self.state is ControllerState.IDLE:
             return _NOT_RUNNING
         kept = f'; its poses stay in {self.session.journal.path}' if self.session else ''
-        self._stop('INFO', f'aborted{kept}')
+        self._stop(Level.OK, f'aborted{kept}')
         return Answer(True, self._last)
 
     def read_sensor_info(self, info: StreamInfo) -> None:
@@ -271,21 +269,21 @@ class Controller:
             nominal = self.stream.stated(info)
         except UserError as error:
             if session is not None:
-                self._stop('ERROR', f'{error}; the poses are kept')
-            self._say('ERROR', f'{error}')
+                self._stop(Level.ERROR, f'{error}; the poses are kept')
+            self._say(Level.ERROR, f'{error}')
             return
         if nominal is None:
             return
         if session is not None:
             changes = differences(self.settings.head(session.nominal), self.settings.head(nominal))
             if changes and session.nominal.measured and not session.accepted_count:
-                self._stop('INFO', 'sensor_info has come: the calibration begins again with it')
+                self._stop(Level.OK, 'sensor_info has come: the calibration begins again with it')
                 self.stream.take(nominal)
                 self.start(start_over=True)
                 return
             if changes:
                 self._stop(
-                    'ERROR',
+                    Level.ERROR,
                     f'sensor_info: {changes}: changed during the '
                     'calibration; put it back and start again, the poses are kept',
                 )
@@ -319,19 +317,19 @@ class Controller:
         self._take_samples(session)
         try:
             for text in session.take_poses():
-                self._say('INFO', text)
+                self._say(Level.OK, text)
                 self._outputs.answer_captures(Answer(True, text))
         except (MountingError, GravityError) as error:
-            self._stop('ERROR', f'{error}')
+            self._stop(Level.ERROR, f'{error}')
             return
         except UserError as error:
-            self._say('ERROR', f'{error}')
+            self._say(Level.ERROR, f'{error}')
             self._outputs.answer_captures(Answer(False, f'{error}'))
         if session.doubt and not self._has_doubt:
-            self._say('WARNING', f'imu/data_raw: {session.doubt}')
+            self._say(Level.WARN, f'imu/data_raw: {session.doubt}')
         self._has_doubt = bool(session.doubt)
         if refusal := session.guide.new_refusal():
-            self._say('WARNING', refusal)
+            self._say(Level.WARN, refusal)
             self._outputs.answer_captures(Answer(False, refusal))
         pose = session.guide.next_pose()
         if pose is not None:
@@ -386,7 +384,7 @@ class Controller:
             # The times in its text change.
             obstacle = f'{status.phase.value} {session.accepted_count if session else ""}'
             if obstacle != self._warned and status.text != self._last:
-                self._outputs.log('WARNING', status.text)
+                self._outputs.log(Level.WARN, status.text)
             self._warned = obstacle
         return status, nominal.serial if nominal else '', values
 
@@ -405,7 +403,7 @@ class Controller:
                 nominal, self.settings, bool(self._starts_over), self._sensor
             )
         except UserError as error:
-            self._stop('ERROR', f'{error}')
+            self._stop(Level.ERROR, f'{error}')
             return
         self.state, self.outcome = ControllerState.RUNNING, ()
         self._samples.restart_silence()
@@ -424,15 +422,15 @@ class Controller:
             if session.resumed
             else ''
         )
-        self._say('INFO', f'calibrating {nominal.serial}: {task}{resumed}')
+        self._say(Level.OK, f'calibrating {nominal.serial}: {task}{resumed}')
 
     def _take_samples(self, session: Session) -> None:
         """Give the session the samples that have come, and log what is wrong with them."""
         stamps_ns, volts = self._samples.take(self.stream.nominal or session.nominal)
         if fault := session.feed(stamps_ns, volts, self._samples.fault):
-            self._say('ERROR', fault)
+            self._say(Level.ERROR, fault)
 
-    def _stop(self, severity: Severity, text: str) -> None:
+    def _stop(self, level: Level, text: str) -> None:
         """End the session, or the wait for one, with a line for people."""
         if self.session is not None:
             self._accepted = self.session.accepted_count
@@ -441,10 +439,10 @@ class Controller:
         self.question = self.fit_fault = ''
         self._outputs.answer_captures(Answer(False, text))
         self._outputs.withdraw_pose(text)
-        self._say(severity, text)
+        self._say(level, text)
 
-    def _say(self, severity: Severity, text: str) -> None:
+    def _say(self, level: Level, text: str) -> None:
         """Log a line unless it was the last one."""
         if text != self._last:
-            self._outputs.log(severity, text)
+            self._outputs.log(level, text)
         self._last = text

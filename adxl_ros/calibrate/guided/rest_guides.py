@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 import math
 
-from adxl_ros.calibrate.fits import gravity_fit, thermal_fit
+from adxl_ros.calibrate.fits import cube_directions, gravity_fit, thermal_fit
 from adxl_ros.calibrate.fits.gravity_fit import force_g, NAMES, NINE, nominal_rests, SIX
 from adxl_ros.calibrate.fits.thermal_fit import PARTS
 from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate
@@ -49,7 +49,7 @@ class HandRests(Guide):
     ) -> None:
         super().__init__(sensor, accepted)
         self._span_c = temperature_span_c
-        self._skipped = np.zeros(len(gravity_fit.UP), bool)
+        self._skipped = np.zeros(len(cube_directions.UP), bool)
         self.begin_stream()
         self._update_estimate()
 
@@ -100,8 +100,8 @@ class HandRests(Guide):
         if self.next_up is None:
             return 'there is no direction left to skip'
         self._skipped[self.next_up] = True
-        skipped = gravity_fit.points_up(self.next_up)
-        self.next_up = gravity_fit.next_up(~self.covered & ~self._skipped, self.up())
+        skipped = cube_directions.points_up(self.next_up)
+        self.next_up = cube_directions.next_up(~self.covered & ~self._skipped, self.up())
         return f'the direction in which {skipped} is left out'
 
     def forget(self, number: int) -> str:
@@ -174,8 +174,10 @@ class HandRests(Guide):
             covariance_names=NAMES,
         )
         force = force_g(rests.mean, self._parameters)
-        self.covered = gravity_fit.covered(force / np.linalg.norm(force, axis=1, keepdims=True))
-        self.next_up = gravity_fit.next_up(~self.covered & ~self._skipped, self.up())
+        self.covered = cube_directions.covered(
+            force / np.linalg.norm(force, axis=1, keepdims=True)
+        )
+        self.next_up = cube_directions.next_up(~self.covered & ~self._skipped, self.up())
 
     def _fault(self, record: PoseRecord) -> str:
         """Return why a rest is refused, or ''."""
@@ -212,13 +214,13 @@ class HandGuide(HandRests):
         """Name the direction to turn to, for people."""
         if self.next_up is None:
             return 'turn it to any direction not yet covered, and hold it still'
-        return f'turn it so that {gravity_fit.points_up(self.next_up)}, and hold it still'
+        return f'turn it so that {cube_directions.points_up(self.next_up)}, and hold it still'
 
     def next_pose(self) -> NextPose:
         """Return the direction to announce."""
         values: dict[str, str | float] = {'pose': str(self.pose_number)}
         if self.next_up is not None:
-            values |= zip(('up_x', 'up_y', 'up_z'), gravity_fit.UP[self.next_up].tolist())
+            values |= zip(('up_x', 'up_y', 'up_z'), cube_directions.UP[self.next_up].tolist())
         return NextPose(self.destination(), values, None)
 
     def status(self) -> Status:
@@ -253,7 +255,12 @@ class HandGuide(HandRests):
         now = (
             []
             if up is None
-            else [Row('now', gravity_fit.points_up(int(np.argmax(gravity_fit.UP @ up))) + ' now')]
+            else [
+                Row(
+                    'now',
+                    cube_directions.points_up(int(np.argmax(cube_directions.UP @ up))) + ' now',
+                )
+            ]
         )
         return [
             Row('pose', f'{self.pose_number}: {self.destination()}'),
@@ -269,7 +276,7 @@ class HandGuide(HandRests):
     def estimated(self) -> tuple[list[Row], list[Row]]:
         """Return coverage and error, and the coefficients by the rests so far, for the screen."""
         groups = {
-            name: self.covered[axes == gravity_fit.AXES_UP]
+            name: self.covered[axes == cube_directions.AXES_UP]
             for name, axes in (('faces', 1), ('edges', 2), ('corners', 3))
         }
         return [

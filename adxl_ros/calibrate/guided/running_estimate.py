@@ -15,7 +15,7 @@ from adxl_ros.calibrate.guided.pose_plan import Target
 from adxl_ros.calibrate.guided.screen_contents import Row
 from adxl_ros.calibrate.pose_model import coefficient_jacobian, predicted_volts
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.report import held_out
+from adxl_ros.calibrate.report import error_budget
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model import noise
 from adxl_ros.model.constants import Z_90
@@ -169,7 +169,9 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
     used = tilt(force, by_noise, 'z' in sensor.axes).alpha_std < _VISIBLE_RAD
     if not used.any():
         return float('nan')
-    variance = held_out.tilt_variance(by_all, np.array(force).T, sensor.local_gravity_mps2, used)
+    variance = error_budget.tilt_variance(
+        by_all, np.array(force).T, sensor.local_gravity_mps2, used
+    )
     return min(math.sqrt(variance), np.pi / 2)
 
 

@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.fits.linear import AFFINE
-from adxl_ros.calibrate.report import held_out
-from adxl_ros.calibrate.report.held_out import ErrorBudget, ErrorBudgets, HeldOutErrors, rms_mg
+from adxl_ros.calibrate.report import error_budget, held_out
+from adxl_ros.calibrate.report.error_budget import ErrorBudget, ErrorBudgets, rms_mg
+from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
@@ -127,9 +128,9 @@ def gravity_error_budgets(
     measured, nu = float(np.mean(errors**2)), held_out.degrees_of_freedom(errors)
     quantile = float(scipy.special.chdtri(nu, _UPPER_QUANTILE))
     upper = max(measured * nu / quantile - by_noise, excess)
-    accel = held_out.axis_variance(covariance, [0, 1, 2], used)
-    tilt = held_out.tilt_variance(covariance, force[kept], gravity, used)
-    spread = held_out.coefficient_spread(fitted, list(force[kept].T))
+    accel = error_budget.axis_variance(covariance, [0, 1, 2], used)
+    tilt = error_budget.tilt_variance(covariance, force[kept], gravity, used)
+    spread = error_budget.coefficient_spread(fitted, list(force[kept].T))
     # Each of three axes has the error of a magnitude; two of the three turn the vertical.
     return ErrorBudgets(
         ErrorBudget(
@@ -259,7 +260,7 @@ def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:
     low, high = unseen.interval
     lines = [
         f'magnitude of gravity over {len(kept)} rests, rms in mg: nominal {before.rms:.2f}, '
-        f'{fit.step.text} {after.rms:.3f}, held-out stretches of time {unseen.rms:.3f} '
+        f'{fit.rung.text} {after.rms:.3f}, held-out stretches of time {unseen.rms:.3f} '
         f'({low:.3f} to {high:.3f}), {unseen.largest:.3f} max'
     ]
     if fit.outliers:

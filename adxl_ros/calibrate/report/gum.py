@@ -4,7 +4,7 @@
 The uncertainty of the acceleration at a stated pose (GUM, JCGM 100), and a certificate of it.
 
 Squares of contributions add. Those of noise, coefficients, stage and model are the parts of
-`held_out.ErrorBudget`, here pose by pose.
+`error_budget.ErrorBudget`, here pose by pose.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from adxl_ros.calibrate.pose_model import reference_force
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, certificate_data, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
-from adxl_ros.calibrate.report.held_out import ErrorBudget
+from adxl_ros.calibrate.report.error_budget import covariances, ErrorBudget
 from adxl_ros.calibrate.result import CalibrationResult, compare
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import AnyPath, write_text
@@ -129,18 +129,19 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
     errors, assessment = result.held_out[-1], result.assessments[-1]
     gravity, axes = fitted.local_gravity_mps2, fitted.axis_indices
     poses = result.poses.subset(result.inliers)
-    held, used = poses.subset(errors.pose_index), held_out.determining_alpha(errors.errors)
+    held = poses.subset(errors.pose_index)
+    used = held_out.determining_alpha(errors.pose_errors)
     force = np.column_stack(reference_force(held, gravity))
 
     def stds_mps2(covariance: np.ndarray) -> np.ndarray:
         return np.sqrt(np.maximum([covariance[d, d][used] for d in axes], 0.0)).T
 
-    covariances = held_out.covariances(errors, held, force)
-    by_noise = stds_mps2(covariances.by_noise)
-    by_coefficients = stds_mps2(covariances.by_coefficients)
-    by_stage = stds_mps2(covariances.by_stage)
+    by_cause = covariances(errors, held, force)
+    by_noise = stds_mps2(by_cause.by_noise)
+    by_coefficients = stds_mps2(by_cause.by_coefficients)
+    by_stage = stds_mps2(by_cause.by_stage)
     held, reference = held.subset(used), force[used][:, axes]
-    error = errors.errors.accel_mps2[used]
+    error = errors.pose_errors.accel_mps2[used]
     model = np.full(error.shape, np.sqrt(assessment.accel.model))
     inputs = (
         Input(

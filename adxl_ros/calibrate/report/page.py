@@ -14,6 +14,7 @@ from adxl_ros.calibrate.pose_model import reference_force
 from adxl_ros.calibrate.poses import planes, Poses
 from adxl_ros.calibrate.report import acceptance, gum, held_out
 from adxl_ros.calibrate.report.acceptance import FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.report.error_budget import rms_mg
 from adxl_ros.calibrate.result import CalibrationResult, compare, history, rounded
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
@@ -24,8 +25,8 @@ from adxl_ros.model.sensor import get, Sensor
 from adxl_ros.process import command
 from adxl_ros.report import figures, page as html_page
 from adxl_ros.report.figures import AXIS_COLOURS, Figure
-from adxl_ros.report.page import Tile
 from adxl_ros.report.quantities import mg, three_digits
+from adxl_ros.report.screen import Tile
 import numpy as np
 
 PAGE = 'report.html'  # The file of a report
@@ -85,8 +86,8 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     elif errors is not None and assessment is not None:
         half_mg = np.full(errors.pose_count, Z_90 * mg(assessment.accel.expected**0.5))
         drawn['errors'] = _error_figure(
-            held_out.determining_alpha(errors.errors),
-            mg(errors.errors.accel_mps2),
+            held_out.determining_alpha(errors.pose_errors),
+            mg(errors.pose_errors.accel_mps2),
             half_mg,
             fitted.axes,
             'held-out pose',
@@ -118,7 +119,7 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
             'errors_of': errors_of,
             'row_of': row_of,
             'digits': three_digits,
-            'mg': held_out.rms_mg,
+            'mg': rms_mg,
             'limit': f'{origin} ({mg(limit_mps2):.2g} mg)',
             'part_colours': _PART_COLOURS,
             'gum': gum.section(gum.uncertainty(result)),
@@ -148,8 +149,8 @@ def tiles(result: CalibrationResult) -> list[Tile]:
     tiles = []
     if (fit := result.gravity_fit) is not None:
         used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-        before = three_digits(held_out.rms_mg(float(np.mean(fit.before_mps2[used] ** 2))))
-        after = three_digits(held_out.rms_mg(float(np.mean(fit.held_out_mps2[used] ** 2))))
+        before = three_digits(rms_mg(float(np.mean(fit.before_mps2[used] ** 2))))
+        after = three_digits(rms_mg(float(np.mean(fit.held_out_mps2[used] ** 2))))
         tiles = [
             Tile(
                 'error of the magnitude of gravity',

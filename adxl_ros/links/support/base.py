@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from importlib import import_module
 import os
 import pkgutil
@@ -21,6 +20,7 @@ from typing import Any, cast, Protocol, runtime_checkable
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files.column_mapping import Columns
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.level import Level
 import numpy as np
 
 DEFAULT_LINK = 'sim'
@@ -99,14 +99,6 @@ class SimulatorSettings:
 def samples_within(latency_s: float, rate_hz: float) -> int:
     """Return how many samples at a rate, Hz, are collected within a time, s: at least one."""
     return max(int(latency_s * rate_hz + _MAX_SHARE), 1)
-
-
-class Level(Enum):
-    """How well a link works."""
-
-    OK = 'ok'
-    WARN = 'warn'
-    ERROR = 'error'
 
 
 @dataclass(frozen=True)

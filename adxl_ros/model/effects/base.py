@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, KW_ONLY
 from enum import auto, Enum, IntEnum
 import math
 from typing import Any, NamedTuple
@@ -280,8 +280,8 @@ class Signals:
 class Coefficient:
     """A parameter of an effect, for one axis; as text it is `effect.parameter.axis`."""
 
-    effect: str
-    parameter: str
+    effect: str  # Name of the effect
+    parameter: str  # Name of its parameter, whose unit it has
     axis: str = ''  # Empty for a parameter without axes, and for all axes of a parameter
 
     @classmethod
@@ -338,12 +338,16 @@ class Parameter:
     """One parameter of an effect, a departure from the nominal chain."""
 
     name: str  # It ends in its unit where it has one
+    _: KW_ONLY
     unit: str  # As messages show it
-    lower: float
-    upper: float
     scale: float  # Typical magnitude
     source: str  # Source of the typical magnitude: datasheet, paper or physics
     doc: str  # Meaning, in words that continue "it is the ..."
+    # Bounds of a value, which files and fits keep to. Most are ten to a hundred times the typical
+    # magnitude: what is beyond them is no departure but another sensor, or a wrong unit. A lower
+    # bound of 0 is that of a quantity without a sign.
+    upper: float
+    lower: float = math.nan  # −upper unless given
     # Axes that it applies to, with one value for each measured axis; values of other axes are
     # neutral. Empty for one value without axes. At ELEMENT and ELECTRONICS, the value of an axis
     # changes the output of that axis only.
@@ -361,21 +365,36 @@ class Parameter:
     # Only for a size: whether the shape parameters of its effect change what it does
     shaped: bool = True
 
+    def __post_init__(self) -> None:
+        """Fill in the lower bound."""
+        if math.isnan(self.lower):
+            object.__setattr__(self, 'lower', -self.upper)
+
     @property
     def is_size(self) -> bool:
         """Whether it is a strength of the effect, and not a shape or a limit."""
         return self.role in (Role.SIZE, Role.OPTIONAL)
 
 
-def shape(*about: Any, **further: Any) -> Parameter:
-    """Return a parameter of shape: it has no axes, and its neutral value is the typical one."""
-    parameter = Parameter(*about, **further)
-    return replace(parameter, axes='', neutral=parameter.scale, role=Role.SHAPE)
+@dataclass(frozen=True)
+class Shape(Parameter):
+    """A parameter of shape: it has no axes, and its neutral value is the typical one."""
+
+    axes: str = ''
+    role: Role = Role.SHAPE
+
+    def __post_init__(self) -> None:
+        """Fill in the neutral value."""
+        super().__post_init__()
+        object.__setattr__(self, 'neutral', self.scale)
 
 
-def optional(*about: Any, **further: Any) -> Parameter:
-    """Return a size that is usually neutral."""
-    return replace(Parameter(*about, **further), typical=0.0, role=Role.OPTIONAL)
+@dataclass(frozen=True)
+class OptionalSize(Parameter):
+    """A size that is usually neutral."""
+
+    typical: float | None = 0.0
+    role: Role = Role.OPTIONAL
 
 
 @dataclass(frozen=True)
@@ -426,7 +445,29 @@ def add(components: Components, values: Iterable[Value]) -> None:
 
 
 def effect(
-    place: Place, *parameters: Parameter, cause: str, **properties: Any
+    place: Place,
+    *parameters: Parameter,
+    cause: str,
+    smooth: bool = True,
+    exact: bool = False,
+    acts_on: ActsOn = ActsOn.MEAN,
+    invertible: bool = False,
+    needs: tuple[Need, ...] = (),
+    follows: tuple[str, ...] = (),
+    diagnosis: DiagnosisHints = DiagnosisHints(),
 ) -> Callable[[Apply], Effect]:
     """Turn a function into the effect of its name, with the properties of `Effect`."""
-    return lambda apply: Effect(apply.__name__, place, parameters, apply, cause, **properties)
+    return lambda apply: Effect(
+        name=apply.__name__,
+        place=place,
+        parameters=parameters,
+        apply=apply,
+        cause=cause,
+        smooth=smooth,
+        exact=exact,
+        acts_on=acts_on,
+        invertible=invertible,
+        needs=needs,
+        follows=follows,
+        diagnosis=diagnosis,
+    )

@@ -187,7 +187,7 @@ def test_faces_alone_determine_six_parameters(poses):
         sensor, truth = unit(rng)
         means, errors = rested(rng, sensor, np.concatenate([poses, SIX[:1]]))
         fit = fit_gravity(means, errors, bare(sensor))
-        assert fit.step is gravity_fit.SIX
+        assert fit.rung is gravity_fit.SIX
         deviation = np.abs(parameters(fit) - truth) / np.sqrt(np.diag(fit.covariance))
         inside.append(deviation < 1.645)
     assert np.mean(inside) > 0.85

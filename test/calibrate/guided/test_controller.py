@@ -11,6 +11,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, sweep_journal
 from adxl_ros.files.recording_columns import sensor_info, StreamInfo
 from adxl_ros.model.kinematics import specific_force
+from adxl_ros.report.level import Level
 import numpy as np
 import pytest
 from units import drawn, Fed, nominal
@@ -44,8 +45,8 @@ class Rig:
         )
         self.controller = Controller(replace(settings, **changes), UNIT, resume, self, self)
 
-    def log(self, severity, text):
-        self.log_lines.append((severity, text))
+    def log(self, level, text):
+        self.log_lines.append((level, text))
 
     def answer_captures(self, answer):
         self.answers.append(answer)
@@ -115,8 +116,8 @@ class Rig:
             self.turn()
         pytest.fail(f'{condition} has not come: {self.controller.status()}')
 
-    def lines(self, severity=None):
-        return [text for kind, text in self.log_lines if severity in (None, kind)]
+    def lines(self, level=None):
+        return [text for kind, text in self.log_lines if level in (None, kind)]
 
 
 @pytest.fixture
@@ -220,7 +221,7 @@ def test_a_fit_that_fails_at_the_end_waits_for_a_decision(rig, tmp_path, monkeyp
     assert status.phase is Phase.REFUSED and status.late
     assert status.text == 'cannot finish: unit.yaml: the disk is full; finish again, redo or abort'
     bench.turn(0.5)
-    assert bench.lines('ERROR') == [status.text], 'one attempt has one report'
+    assert bench.lines(Level.ERROR) == [status.text], 'one attempt has one report'
     assert bench.controller.change_pose('redo') == (True, 'pose 10 will be taken again')
     assert not bench.controller.fit_fault
     bench.turn_until(lambda: bench.controller.fit_fault)
@@ -238,7 +239,7 @@ def test_a_capture_has_its_answer_when_its_pose_is_on_disk_or_refused(rig):
     assert bench.controller.status().phase is Phase.OPERATOR
     answer = bench.controller.capture()
     assert not answer.success and answer.message.startswith('alpha is 45.0° from the target 45°')
-    assert bench.lines('WARNING')[-1] == answer.message
+    assert bench.lines(Level.WARN)[-1] == answer.message
     bench.angles_rad = (np.pi / 4, 0.0)
     bench.turn(0.5)
     assert bench.controller.capture() == (True, 'averaging')
@@ -265,7 +266,7 @@ def test_a_sensor_info_that_comes_late_begins_the_calibration_again(rig):
     bench.turn_until(lambda: bench.controller.session is not None)
     assert bench.controller.session.nominal.measured
     bench.say_info()
-    assert not bench.controller.session.nominal.measured and not bench.lines('ERROR')
+    assert not bench.controller.session.nominal.measured and not bench.lines(Level.ERROR)
     bench.turn_until(lambda: bench.controller.session.accepted_count == 1)
 
 
@@ -284,7 +285,7 @@ def test_another_sensor_ends_the_session_and_a_restarted_driver_checks_the_mount
     assert bench.controller.state is ControllerState.IDLE
     assert 'rate_hz was 200.0, is 100.0: changed during the calibration' in bench.lines()[-1]
     bench.say_info(serial='C2')
-    assert bench.controller.stream.nominal is None and bench.lines('ERROR')[-1].startswith(
+    assert bench.controller.stream.nominal is None and bench.lines(Level.ERROR)[-1].startswith(
         'sensor_info: is of the sensor C2'
     )
     bench.controller.start()

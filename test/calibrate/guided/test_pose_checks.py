@@ -228,7 +228,7 @@ def test_by_hand_directions_are_requested_until_all_are_covered():
 
 
 def _direction(guide):
-    from adxl_ros.calibrate.fits.gravity_fit import UP as EACH
+    from adxl_ros.calibrate.fits.cube_directions import UP as EACH
 
     return EACH[guide.next_up]
 

@@ -9,7 +9,7 @@ from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits.full_model import TERMS
 from adxl_ros.calibrate.guided.pose_plan import Target
 from adxl_ros.calibrate.report import acceptance, held_out
-from adxl_ros.calibrate.report.held_out import ErrorBudget, ErrorBudgets
+from adxl_ros.calibrate.report.error_budget import ErrorBudget, ErrorBudgets
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2
@@ -45,7 +45,7 @@ def true_errors(truth, result):
         in_fold = unseen.fold == number
         up = np.where(force[in_fold, 2] < 0, -1, 1)
         got[in_fold] = np.column_stack(signal_chain.inverse(unit, up)(list(volts[in_fold].T)))
-    finite = np.isfinite(unseen.errors.tilt_rad)
+    finite = np.isfinite(unseen.pose_errors.tilt_rad)
     mg = (got - force)[finite, : len(truth.axes)] / G0_MPS2 * 1e3
     return (
         np.sqrt(np.mean(mg**2)),

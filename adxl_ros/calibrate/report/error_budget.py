@@ -1,0 +1,330 @@
+# SPDX-License-Identifier: Apache-2.0
+
+"""
+Budget of the errors on poses that a fit has not seen: their mean square, split by cause.
+
+The mean runs over axes and over the poses that determine alpha. Squares add:
+
+    measured = noise + stage + coefficients + model
+
+- noise: the noise of the pose's mean, propagated through the linearised inverse.
+- stage: the random error of each joint. It is at most the stated σ = step/√12, or the scatter
+  between visits of the same pose if that is larger. The level of the base and the eccentricity
+  that the full model fits are corrected in the reference.
+- coefficients: the covariance of the calibration, which noise and stage error cause.
+- model: the remainder. It counts if chance explains it less than once in a hundred, by the degrees
+  of freedom of correlated poses. The scatter between visits of the same pose is no part of it.
+  Where no pose was visited twice, a sensor with z separates stage and model by |f|, which no
+  stage can change.
+
+The error of the calibration itself is √(coefficients + model).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import nan, sqrt
+from typing import NamedTuple
+
+from adxl_ros.calibrate.pose_model import reference_force
+from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.report.held_out import (
+    angle_between,
+    corrected_reference,
+    degrees_of_freedom,
+    determining_alpha,
+    HeldOutErrors,
+    pose_errors,
+)
+from adxl_ros.model import signal_chain
+from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.covariance import coefficient_tangent, force_covariance
+from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT
+from adxl_ros.model.sensor import Sensor
+from adxl_ros.report.quantities import mg
+import numpy as np
+import scipy
+
+_SAME_POSE_RAD = np.radians(0.5)
+"""Largest distance of the joint angles of two visits of the same pose, rad: above the step of any
+encoder, and a tenth of the smallest usual distance of two poses, 5°."""
+_MIN_PAIRS = 6
+"""Smallest number of pairs of visits that show the scatter between visits: its standard deviation
+is then known within 30 %."""
+_PROBE_MPS2 = 1e-3 * G0_MPS2
+"""Error of each axis, m/s², for which the resulting tilt error is computed: 1 mg."""
+_CHANCE = 0.01
+"""Probability of a model part by chance, if the errors have none: one of 100 good calibrations is
+said to lack a term."""
+_UPPER_QUANTILE = 0.95  # Probability of the upper end of a 90 % interval
+
+
+@dataclass(frozen=True)
+class ErrorBudget:
+    """Parts of a mean square of errors: (m/s²)² per axis for acceleration, rad² for tilt."""
+
+    measured: float  # By chance it differs from the sum of the parts
+    noise: float
+    stage: float
+    coefficients: float
+    model: float
+    # Upper end of the 90 % interval of the error of this calibration, of which
+    # `coefficients + model` is the mean over many calibrations
+    calibration_high: float
+    separable: bool = True  # Whether the poses separate stage and model
+    # Mean square of tilt that a mean square of 1 (m/s²)² on each measured axis causes; NaN for
+    # acceleration
+    tilt_per_axis: float = nan
+
+    @property
+    def calibration(self) -> float:
+        """Return the mean square of the error of the calibration itself."""
+        return self.coefficients + self.model
+
+    @property
+    def expected(self) -> float:
+        """Return the sum of all parts."""
+        return self.noise + self.stage + self.coefficients + self.model
+
+    @property
+    def limited_by(self) -> str:
+        """Return the cause of the largest part: noise, stage, model, or 'stage or model'."""
+        if not self.separable and max(self.model, self.coefficients) > max(self.noise, self.stage):
+            return 'stage or model'
+        # Noise and stage cause the error of the coefficients, which is no limit of its own.
+        parts = {'noise': self.noise, 'stage': self.stage, 'model': self.model}
+        return max(parts, key=lambda part: parts[part])
+
+
+_NO_BUDGET = ErrorBudget(
+    measured=nan, noise=nan, stage=nan, coefficients=nan, model=nan, calibration_high=nan
+)
+"""Budget of a quantity that no pose shows."""
+
+
+class ErrorBudgets(NamedTuple):
+    """The error budgets of one model."""
+
+    accel: ErrorBudget  # (m/s²)² per axis
+    tilt: ErrorBudget  # rad²
+
+
+def error_budgets(
+    errors: HeldOutErrors, poses: Poses, stage: Sensor | None = None
+) -> ErrorBudgets:
+    """Split the held-out errors of one model by cause."""
+    held = poses.subset(errors.pose_index)
+    sensor = errors.fitted[0]
+    measured = errors.pose_errors
+    gravity = sensor.local_gravity_mps2
+    reference = np.column_stack(reference_force(held, gravity))
+    corrected = np.column_stack(corrected_reference(held, sensor, stage))
+    has_tilt = np.isfinite(measured.tilt_rad)
+    used = determining_alpha(measured)
+    axes = sensor.axis_indices
+    by_cause = covariances(errors, held, reference)
+    scatter = _scatter(sensor, poses.subset(~poses.check))
+    spread = coefficient_spread(sensor, list(reference.T), held.environment)
+    accel = tilt = _NO_BUDGET
+    if used.any():
+        predicted = by_cause.mean_squares(lambda part: axis_variance(part, axes, used))
+        accel = _budget(
+            (measured.force_mps2 - corrected)[used][:, axes],
+            float(np.mean(measured.accel_mps2[used] ** 2)),
+            predicted,
+            scatter.accel - predicted.noise if scatter.has_noise else scatter.accel,
+            spread,
+        )
+    if has_tilt.any():
+
+        def mean_tilt2(covariance: np.ndarray) -> float:
+            return tilt_variance(covariance, reference, gravity, has_tilt)
+
+        predicted = by_cause.mean_squares(mean_tilt2)
+        tilt = _budget(
+            angle_between(measured.force_mps2, corrected)[has_tilt],
+            float(np.mean(measured.tilt_rad[has_tilt] ** 2)),
+            predicted,
+            scatter.tilt - predicted.noise if scatter.has_noise else scatter.tilt,
+            spread,
+        )
+        tilt = replace(tilt, tilt_per_axis=mean_tilt2(by_cause.by_probe) / _PROBE_MPS2**2)
+    return ErrorBudgets(accel, tilt)
+
+
+def coefficient_spread(
+    sensor: Sensor, force: Components, environment: Environment = NOMINAL_ENVIRONMENT
+) -> float:
+    """
+    Return how far the mean square by the coefficients may exceed its mean: the 95 % quantile.
+
+    The error by the coefficients of one fit is drawn once, and few of its directions matter. Its
+    mean square over the poses has the mean Σλ and the degrees of freedom (Σλ)²/Σλ² (Satterthwaite
+    1946), with the eigenvalues λ of its covariance.
+    """
+    if not sensor.covariance_names:
+        return 1.0
+    tangent = signal_chain.tangent(
+        signal_chain.analog_response(sensor), sensor.axes, force, environment
+    )
+    slope = np.einsum(
+        'iak,apk->ipk', np.array(tangent.back), coefficient_tangent(sensor)(force, environment)
+    )
+    product = np.einsum('ipk,iqk->pq', slope, slope) @ sensor.covariance
+    nu = float(np.trace(product) ** 2 / np.trace(product @ product))
+    return float(scipy.special.chdtri(nu, 1 - _UPPER_QUANTILE)) / nu
+
+
+def _budget(
+    errors: np.ndarray,
+    measured: float,
+    predicted: PredictedParts,
+    unexplainable: float,
+    spread: float,
+) -> ErrorBudget:
+    """
+    Split a mean square of errors against the corrected reference.
+
+    errors: the errors, (k,) or (k, m), in the order of the visit; unexplainable: mean square that
+    no model explains, without noise; NaN where it is unknown; spread: see `coefficient_spread`.
+    """
+    mean_square = float(np.mean(errors**2))
+    nu = degrees_of_freedom(errors)
+    lower = mean_square * nu / float(scipy.special.chdtri(nu, _CHANCE))
+    upper = mean_square * nu / float(scipy.special.chdtri(nu, _UPPER_QUANTILE))
+    largest_stage = float(np.fmax(predicted.stage, unexplainable))
+    explained = predicted.noise + predicted.coefficients + largest_stage
+    model = mean_square - explained if lower > explained else 0.0
+    left = mean_square - predicted.noise - predicted.coefficients
+    stage = min(max(left, 0.0), largest_stage)
+    return ErrorBudget(
+        measured=measured,
+        noise=predicted.noise,
+        stage=max(measured - mean_square, 0.0) + stage,
+        coefficients=predicted.coefficients,
+        model=model,
+        calibration_high=spread * predicted.coefficients + max(upper - explained, 0.0),
+        separable=bool(np.isfinite(unexplainable)),
+    )
+
+
+class PredictedParts(NamedTuple):
+    """Mean squares that are known before any error is measured, in the units of a budget."""
+
+    noise: float  # By the noise of the means
+    coefficients: float
+    stage: float  # By the stated stage error
+
+
+class Covariances(NamedTuple):
+    """Covariances of the specific force in k held-out poses, (m/s²)², (3, 3, k) each."""
+
+    by_noise: np.ndarray  # By the noise of the mean
+    by_coefficients: np.ndarray
+    by_stage: np.ndarray  # By the stated stage error
+    by_probe: np.ndarray  # By an independent error `_PROBE_MPS2` on each measured axis
+
+    def mean_squares(self, mean_square: Callable[[np.ndarray], float]) -> PredictedParts:
+        """Return the parts of a mean square, which a function gives for one covariance."""
+        return PredictedParts(
+            noise=mean_square(self.by_noise),
+            coefficients=mean_square(self.by_coefficients),
+            stage=mean_square(self.by_stage),
+        )
+
+
+def covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> Covariances:
+    """Return the covariances of the specific force in the held-out poses, by their causes."""
+    shape = (3, 3, len(held))
+    by_noise = np.zeros(shape)
+    by_coefficients = np.zeros(shape)
+    by_probe = np.zeros(shape)
+    for number, sensor in enumerate(errors.fitted):
+        fold = errors.fold == number
+        force = list(reference[fold].T)
+        environment = held.subset(fold).environment
+        exact = sensor.without_covariance()
+        none_v2 = np.zeros(len(sensor.axes))
+        noise_v2 = np.mean(held.std_v[fold], axis=0) ** 2
+        probe_v2 = (sensor.scale_v_per_g / G0_MPS2 * _PROBE_MPS2) ** 2
+        total = force_covariance(sensor, force, noise_v2, environment)
+        without_noise = force_covariance(sensor, force, none_v2, environment)
+        # Without both the doubt is left on which side of 90° alpha is, but the stage knows it.
+        by_side = force_covariance(exact, force, none_v2, environment)
+        probed = force_covariance(exact, force, probe_v2, environment)
+        by_noise[:, :, fold] = total - without_noise
+        by_coefficients[:, :, fold] = without_noise - by_side
+        by_probe[:, :, fold] = probed - by_side
+    by_stage = _stage_covariance(errors.fitted[0], held)
+    return Covariances(by_noise, by_coefficients, by_stage, by_probe)
+
+
+def _stage_covariance(sensor: Sensor, held: Poses) -> np.ndarray:
+    """Return the covariance of the reference by the stated stage error, (m/s²)², (3, 3, k)."""
+    variance = (sensor.stage_std_rad * sensor.local_gravity_mps2) ** 2
+    a, b, zero = held.alpha_rad, held.beta_rad, np.zeros(len(held))
+    by_alpha = np.array([np.cos(a) * np.cos(b), -np.cos(a) * np.sin(b), -np.sin(a)])
+    by_beta = np.array([-np.sin(a) * np.sin(b), -np.sin(a) * np.cos(b), zero])
+    return variance * (
+        np.einsum('ik,jk->ijk', by_alpha, by_alpha) + np.einsum('ik,jk->ijk', by_beta, by_beta)
+    )
+
+
+def axis_variance(covariance: np.ndarray, axes: list[int], used: np.ndarray) -> float:
+    """Return the mean variance of the measured axes over the poses used, (m/s²)²."""
+    return float(np.mean([covariance[d, d][used] for d in axes]))
+
+
+def tilt_variance(
+    covariance: np.ndarray, force: np.ndarray, gravity: float, used: np.ndarray
+) -> float:
+    """Return the mean square of tilt over the poses used, rad², by the part across the force."""
+    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    trace = np.einsum('iik->k', covariance)
+    radial = np.einsum('ki,ijk,kj->k', up, covariance, up)
+    return float(np.mean((trace - radial)[used])) / gravity**2
+
+
+class _Scatter(NamedTuple):
+    """Mean squares that no model can explain; NaN where the poses do not show them."""
+
+    accel: float  # (m/s²)² per axis
+    tilt: float  # rad²
+    has_noise: bool  # Whether they include the noise of the means
+
+
+def _scatter(sensor: Sensor, poses: Poses) -> _Scatter:
+    """Return the mean squares of acceleration and tilt that no model can explain."""
+    joints = np.column_stack(
+        [
+            np.cos(poses.alpha_rad),
+            np.sin(poses.alpha_rad),
+            np.cos(poses.beta_rad),
+            np.sin(poses.beta_rad),
+        ]
+    )
+    near = scipy.spatial.cKDTree(joints).query_pairs(_SAME_POSE_RAD)
+    pairs = np.array(sorted(near), int).reshape(-1, 2)
+    gravity = sensor.local_gravity_mps2
+    errors = pose_errors(sensor, poses)
+    reference = np.column_stack(reference_force(poses, gravity))
+    if len(pairs) >= _MIN_PAIRS:
+        # The difference of two visits has twice the mean square of one visit.
+        accel = np.diff(errors.accel_mps2[pairs], axis=1)[:, 0]
+        force = np.diff((errors.force_mps2 - reference)[pairs], axis=1)[:, 0]
+        has_tilt = np.isfinite(errors.tilt_rad[pairs]).all(axis=1)
+        across = np.cross(force, reference[pairs[:, 0]])[has_tilt] / gravity**2
+        tilt = np.sum(across**2) / max(len(across), 1) / 2
+        return _Scatter(float(np.mean(accel**2) / 2), float(tilt), has_noise=True)
+    if sensor.axes != AXES:
+        return _Scatter(nan, nan, has_noise=False)
+    # No stage error changes |f|. A model error is as large in |f| as in any other direction.
+    magnitude = np.linalg.norm(errors.force_mps2, axis=1) - gravity
+    excess = max(float(np.mean(errors.accel_mps2**2) - np.mean(magnitude**2)), 0.0)
+    return _Scatter(excess, 3 * excess / gravity**2, has_noise=False)
+
+
+def rms_mg(mean_square: float) -> float:
+    """Return the rms in mg of a mean square in (m/s²)²; 0 for a negative one."""
+    return float(mg(sqrt(max(mean_square, 0.0))))
