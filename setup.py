@@ -94,7 +94,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
-        (f'share/{PACKAGE}/launch', glob('launch/*.launch.py')),
+        (f'share/{PACKAGE}/launch', glob('launch/*.launch.py') + ['launch/ekf.yaml']),
         (f'share/{PACKAGE}/params', glob('params/*.yaml')),
         (f'share/{PACKAGE}/security', glob('security/*.xml')),
         *(

@@ -38,15 +38,17 @@ _CHARGING = 5  # Rests in the stay at the charger, one in 12 minutes
 _LYING = 0.3  # Share of the places at which a robot that lies down lies on a side
 
 
-def calibrated() -> Sensor:
-    """Return a three-axis sensor with the covariance of a good calibration."""
-    nominal = with_axes(parameter_file.load(parameter_file.nominal_path()), AXES)
+def calibrated(axes: str = AXES) -> Sensor:
+    """Return an upright sensor with the covariance of a good calibration."""
+    nominal = with_axes(parameter_file.load(parameter_file.nominal_path()), axes)
+    names = tuple(name for name in _NAMES if name.axis in axes)
     return replace(
         with_neutral(nominal, ('bias', 'scale_factor')),
         serial='K1',
         model='gravity',
-        covariance=np.eye(len(_NAMES)) * _CALIBRATION_STD**2,
-        covariance_names=_NAMES,
+        covariance=np.eye(len(names)) * _CALIBRATION_STD**2,
+        covariance_names=names,
+        z_sign=1,
         provenance={'date': '2026-01-01T00:00:00+00:00'},
     )
 

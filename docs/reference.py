@@ -210,7 +210,6 @@ READ_FIRST = (
     (
         '`read`, `from_arrays`, `simulate`',
         'Recording',
-        'recording',
         '`time_s`, `columns`, `notes`',
     ),
     ('`load`', 'Sensor', '`nominal_zero_g_v`, `nominal_scale_v_per_g`, `values`'),
@@ -741,6 +740,7 @@ def figures() -> dict[Path, str]:
         ),
         'simulators': simulators(),
         'hand held': hand_held(),
+        'tilt in motion': tilt_in_motion(),
         'units': units(),
     }
     pages = {}
@@ -875,6 +875,14 @@ def simulators() -> list[str]:
     rows = text.split('### Verdicts\n\n')[1].split('\n\n')[0].splitlines()
     # What would have shown stands in the last column, for which this page has no room.
     return [command, '', *(row.rstrip('|').rpartition('|')[0] + '|' for row in rows)]
+
+
+def tilt_in_motion() -> list[str]:
+    """Return the error of the tilt of robots that drive firmly, under the command."""
+    text = (DOCS / 'measurements' / 'tilt_in_motion.md').read_text('utf-8')
+    _, command, rest = text.split('\n\n', 2)
+    rows = rest.split('## firm, 1 to 4 m/s²\n\n')[1].split('\n\n')[0].splitlines()
+    return [*command.splitlines(), '', *rows]
 
 
 def units() -> list[str]:

@@ -7,10 +7,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from math import exp
 from typing import NamedTuple
 
-from adxl_ros.compensate.inversions import noise_variance_v2, paper_inverse, undo_filter_blocks
+from adxl_ros.compensate.inversions import noise_variance_v2, PaperInverse, undo_filter_blocks
+from adxl_ros.compensate.motion_measure import length_excess, MotionMeasure
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.surroundings import Surroundings
@@ -23,9 +23,7 @@ from adxl_ros.model.effects.base import (
     Components,
     Environment,
     FLOATS,
-    Maths,
     NOMINAL_ENVIRONMENT,
-    Value,
 )
 from adxl_ros.model.kinematics import AngleEstimate, angles, Covariance3, Mounting, Tilt, tilt
 from adxl_ros.model.sensor import parameter_of, Sensor
@@ -74,7 +72,7 @@ class RecordingEstimator:
         self._surroundings = Surroundings()
         self._begin_s = float(first.time_s[0])
         self._gravity_mps2 = signal_chain.gravity_mps2(sensor)
-        self._inverse = (paper_inverse if paper else signal_chain.inverse)(sensor)
+        self._inverse = (PaperInverse if paper else signal_chain.inverse)(sensor)
         self._measured_covariance = force_errors.measured_covariance(
             sensor, noise_variance_v2(sensor) if undo_filter else None, bool(sensor.z_sign)
         )
@@ -94,7 +92,8 @@ class RecordingEstimator:
     @property
     def assumed(self) -> list[str]:
         """Return what was assumed of the surroundings so far, one line each, for people."""
-        sensor, lines = self._sensor, self._surroundings.assumed(self._sensor.effects)
+        sensor = self._sensor
+        lines = self._surroundings.assumed(self._sensor.effects)
         if sensor.axes == 'xy' and sensor.effects and not sensor.z_sign:
             lines = [
                 *lines,
@@ -151,21 +150,6 @@ class RecordingEstimator:
         )
 
 
-def length_excess(length_mps2: Value, error2: Value, gravity_mps2: float, maths: Maths) -> Value:
-    """
-    Return how much the length of a force departs from gravity beyond its error, m/s².
-
-    The tilt is that of gravity. A force whose length is not gravity's is in motion, in another
-    sensor, or has lost gravity, and at least this much of it is no gravity. error2: the largest
-    variance of an axis, (m/s²)².
-    """
-    departure = length_mps2 - gravity_mps2
-    beyond = maths.maximum(departure, -departure) - _LENGTH_STDS * maths.sqrt(error2)
-    return maths.maximum(beyond, 0.0)
-
-
-_LENGTH_STDS = 3.0  # Error of a length that is usual, in standard deviations of an axis
-
 _CELL_MPS2 = 0.5
 """Width of a cell of the grid of forces, m/s²; chosen: tangent and covariance hardly vary within
 it, so that its samples share them."""
@@ -181,17 +165,6 @@ _TOLERANCE_MPS2 = 1e-8  # Largest next step of a converged inverse; chosen: far 
 
 _MAX_STEPS = 8
 """Newton steps after which the inverse starts from zero; chosen: one or two suffice usually."""
-
-_MOTION_S = 0.2
-"""Time constant of the variance that separates motion from noise, s; chosen: the RC filter leaves
-some 20 independent samples in twice of it, and a strong vibration is forgotten after 2 s."""
-
-_PAUSE_S = 1.0
-"""Time without a sample after which the variance begins again, s; chosen: some time constants."""
-
-_NOISE_FACTOR = 2
-"""Multiple of the noise variance that does not count as motion; chosen: the variance of some 20
-samples hardly exceeds it by chance."""
 
 
 class Estimate(NamedTuple):
@@ -235,9 +208,8 @@ class LiveEstimator:
     force is that of `signal_chain.inverse` to 1e-8 m/s². Near alpha = ±90°, where |f| = g may
     have no solution, it differs by a few hundredths of its standard deviation.
 
-    Angles, and the z of equation 5, hold at rest only. Motion adds to their variances: the
-    exponentially weighted variance of the in-plane force, as far as it exceeds twice that of the
-    noise. A derived z also gets the noise variance of a measured axis.
+    Angles, and the z of equation 5, hold at rest only: `MotionMeasure` adds to their variances.
+    A derived z also gets the noise variance of a measured axis.
     """
 
     def __init__(
@@ -258,7 +230,7 @@ class LiveEstimator:
             if sensor.provenance.get('reference') == 'stage'
             else alignment_std_rad(sensor) ** 2
         )
-        self._paper_inverse = paper_inverse(sensor, FLOATS) if paper else None
+        self._paper_inverse = PaperInverse(sensor, FLOATS) if paper else None
         self._variance_v2 = (
             noise_variance_v2(sensor) if undo_filter else noise.sample_std_v(sensor) ** 2
         )
@@ -277,13 +249,11 @@ class LiveEstimator:
         noise_mps2 = np.sqrt(self._variance_v2) / sensor.scale_v_per_g * G0_MPS2
         self._noise_variance = (noise_mps2[:2] ** 2).tolist()
         self._derives_z = sensor.axes == 'xy'
-        self._gravity_mps2 = signal_chain.gravity_mps2(sensor)
+        self._motion = MotionMeasure(self._noise_variance, signal_chain.gravity_mps2(sensor))
         # The last force, and the volts at the ADC's input that respond to it.
         self._force: Components = [0.0, 0.0, 0.0]
         self._environment = NOMINAL_ENVIRONMENT
         self._last_volts = self._respond(self._force)
-        # Time of the last sample, and weighted mean and variance of the in-plane force
-        self._time_s, self._mean, self._variance = float('-inf'), [0.0, 0.0], [0.0, 0.0]
 
     def volts(self, accel_mps2: Sequence[float]) -> Components:
         """Undo the nominal conversion; an empty list if a value exceeds that of any sensor."""
@@ -303,12 +273,13 @@ class LiveEstimator:
             abs(v - rail) < self._half_lsb_v for v, rail in product(volts, self._rails_v)
         )
         unknown = UNMEASURED_VARIANCE if saturated else 0.0
-        motion = self._motion_variance(force, time_s) + unknown
+        motion = self._motion.changes(force, time_s) + unknown
         cell = self._cell(force)
         covariance = self._covariance(force, cell, unknown, motion)
         # The angles are those of gravity, so that motion adds to the variance of each axis.
         if self.sensor.axes == AXES:
-            motion += self._excess_variance(force, covariance)
+            error2 = max(covariance.xx, covariance.yy, covariance.zz)
+            motion = max(motion, self._motion.of_length(force, error2))
         moved = covariance.widened(motion, motion, 0.0 if self._derives_z else motion)
         if self.mounting is not None:
             force = self.mounting.rotate(force)
@@ -354,7 +325,8 @@ class LiveEstimator:
             return self._force if abs(sum(self._force)) < float('inf') else None
         tangent = self._cell(self._force).tangent
         force, change = self._force, 0.0
-        response, input_v = self._last_volts, self._undo_adc(volts)
+        response = self._last_volts
+        input_v = self._undo_adc(volts)
         for _ in range(_MAX_STEPS):
             previous, previous_change = force, change
             force = self._newton_step(
@@ -372,18 +344,6 @@ class LiveEstimator:
         self._force, self._last_volts = force, input_v
         return force
 
-    def _motion_variance(self, force: Components, time_s: float) -> float:
-        """Return the variance of the recent in-plane force beyond its noise, (m/s²)²."""
-        elapsed_s, self._time_s = time_s - self._time_s, time_s
-        kept = exp(-elapsed_s / _MOTION_S) if 0 <= elapsed_s < _PAUSE_S else 0.0
-        excess = 0.0
-        for d, noise_variance in enumerate(self._noise_variance):
-            deviation = force[d] - self._mean[d]
-            self._mean[d] += (1 - kept) * deviation
-            self._variance[d] = kept * (self._variance[d] + (1 - kept) * deviation * deviation)
-            excess = max(excess, self._variance[d] - _NOISE_FACTOR * noise_variance)
-        return excess
-
     def _with_yaw(self, force: Components, covariance: Covariance3) -> Covariance3:
         """Add the error of a turn ψ about the robot's vertical, ψ·(−y, x, 0), to a covariance."""
         x, y, _ = force
@@ -392,13 +352,6 @@ class LiveEstimator:
         return Covariance3(
             xx + variance * y * y, xy - variance * x * y, xz, yy + variance * x * x, yz, zz
         )
-
-    def _excess_variance(self, force: Components, covariance: Covariance3) -> float:
-        """Return the square of what a force is beyond gravity and its error, (m/s²)²."""
-        x, y, z = force
-        error2 = max(covariance.xx, covariance.yy, covariance.zz)
-        excess = length_excess((x * x + y * y + z * z) ** 0.5, error2, self._gravity_mps2, FLOATS)
-        return float(excess) ** 2
 
     def _covariance(
         self, force: Components, cell: _Cell, unknown: float, motion: float

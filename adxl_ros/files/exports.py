@@ -90,7 +90,8 @@ def axes(sensor: Sensor) -> list[Axis]:
     step = noise.electronics(sensor).lsb_v * mps2_per_v
     std = noise.analog_std_v(sensor) * mps2_per_v
     density = np.sqrt(noise.density_v2_per_hz(sensor, np.zeros(1)))[0] * mps2_per_v
-    of_walk, count = sensor.values.get('bias_walk', {}), len(sensor.axes)
+    of_walk = sensor.values.get('bias_walk', {})
+    count = len(sensor.axes)
     walk = np.broadcast_to(of_walk.get('density_g_per_rts', 0.0), count) * G0_MPS2
     returns = np.broadcast_to(of_walk.get('return_per_s', 0.0), count)
     # The columns are the fields of `Axis` behind its name.
@@ -226,7 +227,8 @@ def gyro_figures(sensor: Sensor) -> GyroFigures | None:
     if not gyro.noise_density_radps_per_rthz:
         return None
     white = np.array(gyro.noise_density_radps_per_rthz) / ONE_SIDED
-    remark, walk = 'Gyroscope: noise as it was measured.', max(gyro.walk_radps_per_rts, default=0)
+    remark = 'Gyroscope: noise as it was measured.'
+    walk = max(gyro.walk_radps_per_rts, default=0)
     if not walk:
         # Its Allan deviation K·√(τ/3) is that of white noise, N/√τ, after this time.
         walk = float(np.sqrt(3) * white.max() / _HIDDEN_S)
@@ -249,7 +251,8 @@ def _white_density(export: Export, software: str) -> float:
 
 def _largest_mps2(sensor: Sensor) -> float:
     """Return the reading at which the first axis may clip, m/s²: by range, rails or saturation."""
-    zero_g_v, scale = sensor.nominal_zero_g_v, sensor.nominal_scale_v_per_g
+    zero_g_v = sensor.nominal_zero_g_v
+    scale = sensor.nominal_scale_v_per_g
     limits_g = [sensor.range_g, *np.ravel(sensor.values.get('saturation', {}).get('limit_g', ()))]
     if sensor.adc_bits:
         limits_g += [*(zero_g_v / scale), *((sensor.adc_vref_v - sensor.lsb_v - zero_g_v) / scale)]
@@ -275,7 +278,8 @@ def text(name: str, export: Export) -> str:
     ]
     coupling = np.eye(3)
     coupling[sensor.axis_indices] = gain(sensor)
-    walk, remark = max(values['walk_density']), 'Values are those of the noisiest axis.'
+    walk = max(values['walk_density'])
+    remark = 'Values are those of the noisiest axis.'
     if not walk:
         walk = effect_named('bias_walk').diagnosis.healthy_density * G0_MPS2
         remark += '\n# The random walk is that of a healthy unit: the file states none.'

@@ -3,6 +3,7 @@
 """The launch files under `ros2 launch`: refusals, failed starts, a killed driver, the end."""
 
 from collections.abc import Callable
+import os
 import re
 import shutil
 import signal
@@ -51,6 +52,7 @@ def launch(start: Callable[..., Started]) -> Callable[..., Started]:
         ('robot', 'link_type:=seral', '"seral" is not valid'),
         ('robot', 'link_baud:=fast', 'link_baud:=fast: expected a number'),
         ('robot', 'log_level:=loud', '"loud" is not valid'),
+        ('robot', 'filter:=true', 'apt install ros-$ROS_DISTRO-robot-localization, or leave'),
         ('calibrate', 'screen:=maybe', '"maybe" is not valid'),
         ('robot', 'output_rate_hz:=slow', 'output_rate_hz:=slow: expected a number'),
         ('robot', 'mounting_xyz_m:=0.1', 'mounting_xyz_m:=0.1: expected three numbers'),
@@ -158,6 +160,22 @@ def test_a_robot_takes_the_imu_of_another_driver(launch):
             GetParameters.Request(names=['output_rate_hz', 'use_sim_time']),
         ).values
         assert (values[0].double_value, values[1].bool_value) == (25.0, True)
+
+
+def test_a_robot_joins_tilt_and_gyroscope(launch, ros_env, tmp_path):
+    """A program that shows what it is given stands for the node of robot_localization."""
+    packages = tmp_path / 'share' / 'ament_index' / 'resource_index' / 'packages'
+    node = tmp_path / 'lib' / 'robot_localization' / 'ekf_node'
+    for folder in (packages, node.parent):
+        folder.mkdir(parents=True)
+    (packages / 'robot_localization').touch()
+    node.write_text('#!/bin/sh\nfor a; do echo "given $a"; [ ! -f "$a" ] || cat "$a"; done\n')
+    node.chmod(0o755)
+    ros_env['AMENT_PREFIX_PATH'] += f'{os.pathsep}{tmp_path}'
+    launched = launch('robot', 'filter:=true', 'namespace:=arm', 'use_sim_time:=true')
+    launched.wait_for('active: link sim')
+    for given in ('ekf.yaml', '__ns:=/arm', 'use_sim_time: true', 'imu0: imu/data'):
+        launched.wait_for(given)
 
 
 def test_a_launch_puts_a_sensor_behind_a_simulator(launch, tmp_path):

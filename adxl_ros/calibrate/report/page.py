@@ -313,7 +313,8 @@ _VERTICAL = np.sin(np.radians(89))
 def draw_sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:
     """Draw figures 2 to 8 of the paper for the x and y axes, one row per axis."""
     swept = poses.subset(~poses.check)
-    line, regressions = linear.fit(sensor, swept), linear.regress_axes(sensor, swept)
+    line = linear.fit(sensor, swept)
+    regressions = linear.regress_axes(sensor, swept)
     reference = reference_force(swept, sensor.local_gravity_mps2)
     force_g = np.column_stack(reference) / G0_MPS2
     predicted = np.column_stack(signal_chain.static_response(fitted)(reference, swept.environment))
