@@ -143,6 +143,11 @@ class Gap(Result):
         return replace(self, compared=self.compared._replace(params=path, params_name=name))
 
     @property
+    def fault_name(self) -> str:
+        """Return the name of the fault, one of docs/reference/report_json.md; '' for none."""
+        return self._report['verdict']['data_fault'] or ''
+
+    @property
     def has_verdict(self) -> bool:
         """Return whether the recordings allow a verdict."""
         return self.verdict not in _NO_VERDICT
@@ -389,12 +394,13 @@ def diagnose(
     Returns
     -------
     Gap
-        Verdict, effects with sizes and intervals, figures, and the sensor to simulate with.
+        Verdict, effects with sizes and intervals, figures, and the sensor to simulate with. What
+        makes a recording useless is its `fault`, with the verdict bad_data or insufficient.
 
     Raises
     ------
     UserError
-        A recording is of another unit, or its reference cannot be followed.
+        An argument is wrong, a file cannot be read, or recordings are of several units.
 
     """
     require_least('seed', seed, 0)
