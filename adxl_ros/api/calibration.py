@@ -36,7 +36,6 @@ from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.process import option
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS, QUIET_COLOUR
 from adxl_ros.report.quantities import mg
-from adxl_ros.report.screen import Tile
 from adxl_ros.signals.gravity_at_rest import require_unit
 from adxl_ros.signals.gyroscope_at_rest import rest_turns, RestTurns, with_bias
 from adxl_ros.signals.recorded_gravity import RecordingLook
@@ -116,12 +115,7 @@ class Fit(Result):
     @property
     def first_screen(self) -> FirstScreen:
         """Return the top of the page."""
-        assessments = self.result.assessments
-        tiles = page.tiles(self.result, assessments[-1] if assessments else None)
-        return FirstScreen(
-            **page.badge(self.sensor),
-            tiles=[Tile(**tile) for tile in tiles],
-        )
+        return FirstScreen(**page.badge(self.sensor), tiles=page.tiles(self.result))
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
         """

@@ -106,8 +106,8 @@ class Update(Result):
         """Write the page report.html into a folder, and return its path."""
         require_own(Path(folder) / words.PAGE, overwrite)
         path = make_folder(folder) / words.PAGE
-        top = self.first_screen
-        write_text(path, words.page(self.sensor, self.days, self.state, top._asdict(), top.tiles))
+        top = self.first_screen._asdict()
+        write_text(path, words.page(self.sensor, self.days, self.state, top))
         return path
 
     def to_dict(self) -> dict[str, Any]:

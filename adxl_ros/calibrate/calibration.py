@@ -224,7 +224,7 @@ def _check_polarity(sensor: Sensor, poses: Poses) -> None:
             [[np.corrcoef(volts, force)[0, 1] for force in reference] for volts in poses.volts.T]
         )
     fault = recorded_sensor.find_polarity_fault(
-        correlation, [AXES.index(a) for a in sensor.axes], recorded_sensor.CERTAIN_CORRELATION
+        correlation, sensor.axis_indices, recorded_sensor.CERTAIN_CORRELATION
     )
     if fault is not None:
         raise UserError(fault.describe(sensor.axes[fault.axis], AXES[fault.follows]))

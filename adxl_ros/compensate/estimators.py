@@ -391,7 +391,7 @@ class LiveEstimator:
             measured, tangent = self._measured_covariance(middle, around)
             outside = self._envelope.describe_outside(around.temperature_c, middle)
             covariance = np.diag([0.0, UNMEASURED_VARIANCE, UNMEASURED_VARIANCE])
-            axes = [AXES.index(axis) for axis in self.sensor.axes]
+            axes = self.sensor.axis_indices
             covariance[np.ix_(axes, axes)] = measured[:, :, 0]
             cell = self._cells[key] = _Cell(
                 tangent, Covariance3(*covariance[np.triu_indices(3)].tolist()), outside

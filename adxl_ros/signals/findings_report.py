@@ -164,9 +164,7 @@ def page(results: Sequence[Findings], badge: Mapping[str, Any]) -> str:
         PAGE,
         {
             'title': 'Check of recordings',
-            'about': [],
             'badge': badge,
-            'figures': {},
             'columns': HEAD,
             'rows': list(map(table_row, results)),
             'recordings': recordings,

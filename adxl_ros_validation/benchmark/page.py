@@ -11,20 +11,19 @@ import math
 from typing import Any
 
 from adxl_ros.process import code_version, package_version
-from adxl_ros.report import page
-from adxl_ros.report.figures import axes_for
+from adxl_ros.report.figures import new_figure
 from adxl_ros_validation.benchmark.defects import GROUPS
 from adxl_ros_validation.benchmark.manifest import Loaded
 from adxl_ros_validation.benchmark.results import (
     Drawn,
-    group_score,
+    exact_share,
     limit_of,
     median_closed,
     Physical,
     Row,
 )
 from adxl_ros_validation.blind.report import Report, Table, terminal_table
-from adxl_ros_validation.blind.scores import in_words, Score, share
+from adxl_ros_validation.blind.scores import in_words, share
 import numpy as np
 
 _STRENGTHS = (0.0, 3.0, 8.0, math.inf)
@@ -85,7 +84,7 @@ def report(made: Made) -> Report:
                 made, 'B', lambda row: f'{row.right}: {_said(row)}'
             ),
             'Level C: share of the squared gap that is closed on a later part': _physical(
-                made, 'C', lambda row: _percent(row.closed)
+                made, 'C', lambda row: in_words(row.closed)
             ),
             'Level C: what is named': _physical(made, 'C', _said),
             'Answers without a verdict': _failed(made),
@@ -101,7 +100,7 @@ def screen(made: Made) -> list[str]:
     shown = {group: words for group, words in GROUPS.items() if group in groups}
     rows = []
     for method in made.graded:
-        scores = [group_score(made.of(method), group, 'exact') for group in shown]
+        scores = [exact_share(made.of(method), group) for group in shown]
         cells = [f'{s["value"]:.2f} of {s["count"]}' if s['count'] else '-' for s in scores]
         rows.append([method, *cells])
     first = ['Level A, exactly right:', '']
@@ -113,7 +112,7 @@ def _naming(made: Made) -> Table:
     rows = []
     for method in made.graded:
         own = made.of(method)
-        rows.append([method, *(in_words(group_score(own, group, 'exact')) for group in GROUPS)])
+        rows.append([method, *(in_words(exact_share(own, group)) for group in GROUPS)])
     bounds = ['ideal observer', '-']
     for group in list(GROUPS)[1:]:
         limit = limit_of(made.facts, group)
@@ -131,7 +130,7 @@ def _further(made: Made) -> Table:
             [
                 method,
                 in_words(share([row.in_set for row in defect])),
-                _percent(median_closed(own)),
+                in_words(median_closed(own)),
                 in_words(share([row.harm for row in own])),
                 f'{np.mean([row.by_chance for row in own]):.2f}',
                 f'{np.median([row.answered.cpu_s for row in own]):.1f}',
@@ -146,14 +145,6 @@ def _further(made: Made) -> Table:
         'processor time, s',
     ]
     return head, rows if made.rows else []
-
-
-def _percent(score: Score) -> str:
-    """Return a share with its interval in percent; it may be negative."""
-    if score['value'] is None:
-        return '-'
-    value, low, high = (100 * part for part in (score['value'], *score['ci']))
-    return f'{value:.0f} % ({low:.0f} to {high:.0f}), n = {score["count"]}'
 
 
 def _single(made: Made, name_of: Callable[[Row], str]) -> Table:
@@ -223,8 +214,6 @@ def _card(made: Made) -> Table:
 
 def picture(made: Made) -> Any:
     """Draw where each method fails: the share of right answers by defect."""
-    from matplotlib.figure import Figure
-
     kinds = sorted({name for fact in made.facts for name in fact.label.effects}) + ['no defect']
     methods = made.graded
     shares = np.full((len(methods), len(kinds)), np.nan)
@@ -239,8 +228,9 @@ def picture(made: Made) -> Any:
             if hits:
                 shares[i, j] = np.mean(hits)
                 texts[i, j] = f'{sum(hits)}/{len(hits)}'
-    figure = Figure((3.0 + 0.42 * len(kinds), 2.6 + 0.4 * len(methods)), layout='constrained')
-    ax = axes_for(figure.add_subplot())
+    size = 3.0 + 0.42 * len(kinds), 2.6 + 0.4 * len(methods)
+    figure = new_figure(figsize=size)
+    ax = figure.add_subplot()
     ax.imshow(shares, cmap='RdYlGn', vmin=0, vmax=1, aspect='auto')
     ax.set_xticks(range(len(kinds)), kinds, rotation=90)
     ax.set_yticks(range(len(methods)), methods)
@@ -248,18 +238,3 @@ def picture(made: Made) -> Any:
         ax.text(j, i, text, ha='center', va='center', fontsize=7)
     ax.set_title('Right answers of all trials in which the defect acts')
     return figure
-
-
-def html(made: Made, said: Report) -> str:
-    """Return the whole page."""
-    return page.render(
-        'adxl_ros_validation',
-        'pages/tables.html',
-        {
-            **said._asdict(),
-            'about': [],
-            'badge': None,
-            'figures': {},
-            'picture': page.picture_url(picture(made)) if made.rows else '',
-        },
-    )

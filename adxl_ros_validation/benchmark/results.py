@@ -127,9 +127,9 @@ def _right(answer: Answer, base: Answer, label: Label) -> tuple[bool, bool]:
     return real_sensors.right(answer, base, label)
 
 
-def group_score(rows: Sequence[Row], group: str, key: str) -> Score:
-    """Return the share of the trials of a group for which a key of the rows holds."""
-    return share([getattr(row, key) for row in rows if row.group == group])
+def exact_share(rows: Sequence[Row], group: str) -> Score:
+    """Return the share of the trials of a group that are exactly right."""
+    return share([row.exact for row in rows if row.group == group])
 
 
 def limit_of(facts: Sequence[Drawn], group: str) -> Bracket | None:

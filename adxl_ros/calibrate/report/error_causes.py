@@ -87,7 +87,7 @@ def error_budgets(
     corrected = np.column_stack(corrected_reference(held, sensor, stage))
     has_tilt = np.isfinite(measured.tilt_rad)
     used = determining_alpha(measured)
-    axes = [AXES.index(axis) for axis in sensor.axes]
+    axes = sensor.axis_indices
     by_cause = covariances(errors, held, reference)
     scatter = _scatter(sensor, poses.subset(~poses.check))
     spread = coefficient_spread(sensor, list(reference.T), held.environment)
