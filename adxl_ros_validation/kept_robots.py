@@ -22,11 +22,6 @@ import numpy as np
 
 BEGIN_NS = 1_767_225_600 * 10**9  # 2026-01-01, the date of the calibration
 _REST_NS = 30 * 10**9
-_NAMES = tuple(
-    Coefficient(effect, parameter, axis)
-    for effect, parameter in (('bias', 'offset_v'), ('scale_factor', 'offset_v_per_g'))
-    for axis in AXES
-)
 _CALIBRATION_STD = 3e-4  # Error of zero-g, g, and of the scale factor, of the calibration
 _SLOPE_PER_K = 1e-4  # Typical slope of the zero-g over temperature, g/K: the datasheet's
 _CURVATURE_PER_K2 = 1e-6
@@ -41,13 +36,15 @@ _LYING = 0.3  # Share of the places at which a robot that lies down lies on a si
 def calibrated(axes: str = AXES) -> Sensor:
     """Return an upright sensor with the covariance of a good calibration."""
     nominal = with_axes(parameter_file.load(parameter_file.nominal_path()), axes)
-    names = tuple(name for name in _NAMES if name.axis in axes)
+    names = []
+    for effect, parameter in (('bias', 'offset_v'), ('scale_factor', 'offset_v_per_g')):
+        names += [Coefficient(effect, parameter, axis) for axis in axes]
     return replace(
         with_neutral(nominal, ('bias', 'scale_factor')),
         serial='K1',
         model='gravity',
         covariance=np.eye(len(names)) * _CALIBRATION_STD**2,
-        covariance_names=names,
+        covariance_names=tuple(names),
         z_sign=1,
         provenance={'date': '2026-01-01T00:00:00+00:00'},
     )
@@ -64,6 +61,7 @@ class Kind:
     weeks_deg: float = 0.0
     drift: float = 1.0  # Multiple of the usual drift with time
     slope: float = 1.0  # Multiple of the datasheet's drift with temperature
+    axes: str = AXES  # Of its sensor: all, or the first two
     knock_axis: int = 0
     knock_mg: float = 0.0  # Size of a knock on the 31st day
 
@@ -131,13 +129,14 @@ class Robot:
             up = self.up(day) if moved else up
             temperature_c = self.temperature_c(when) - 1.5 * max(number - _PLACES, 0)
             noise = self.rng.normal(size=3) * np.hypot(_SCATTER_G, _NOISE_G)
+            volts = (2.5 + self.reading_g(up, temperature_c) + noise)[: len(self.kind.axes)]
             stamp_ns = BEGIN_NS + int(when * DAY_NS)
             rest = NaturalRest(
                 stay=day * 100 + place,
                 start_ns=stamp_ns,
                 stop_ns=stamp_ns + _REST_NS,
-                mean_v=tuple((2.5 + self.reading_g(up, temperature_c) + noise).tolist()),
-                std_v=(_NOISE_G,) * 3,
+                mean_v=tuple(volts.tolist()),
+                std_v=(_NOISE_G,) * len(volts),
                 temperature_c=temperature_c,
             )
             found.append((rest, up))
@@ -150,49 +149,80 @@ class Outcome:
 
     tilt_without_deg: float  # rms tilt error at level over the days, by the calibration
     tilt_with_deg: float  # The same by the calibration that is kept
-    inside: tuple[int, int, int]  # Days on which the 90 % interval has the zero-g, by axis
+    inside: tuple[int, ...]  # Days on which the 90 % interval has the zero-g, by axis
     days: int
     adoptions: int
     worse: int  # Adoptions after which the next day's rests err more than without it
     false_changes: int  # Days with a reported change and without a knock
+    could_show: bool  # Whether the robot rests on the knocked side within a day of the knock
     reported_days: float  # Days from a knock to its report; NaN where it was not reported
     adoptions_after: int  # Adoptions after a knock
+    is_learnt: bool  # Whether they hold more than half of it
+
+
+@dataclass
+class _Knock:
+    """A knock, and what becomes of it."""
+
+    axis: int
+    size_g: float
+    could_show: bool = False
+    reported_days: float = np.nan
+    adoptions: int = 0  # Before it
+    zero_g: float = 0.0  # Of the calibration in use before it, g
+
+    def hit(self, robot: Robot, keeper: Keeper) -> None:
+        """Knock a sensor."""
+        self.adoptions, self.zero_g = len(keeper.adoptions), self._zero_g(keeper)
+        robot.error[self.axis] += self.size_g
+
+    def look(self, days: float, up: np.ndarray, keeper: Keeper) -> None:
+        """Note what a rest has shown, days after the knock."""
+        self.could_show |= bool(days < 1 and abs(up[self.axis]) > 0.5)
+        if np.isnan(self.reported_days) and keeper.changed:
+            self.reported_days = days
+
+    def is_learnt(self, keeper: Keeper) -> bool:
+        """Return whether the calibration in use has more than half of it."""
+        return bool(self.size_g and (self._zero_g(keeper) - self.zero_g) / self.size_g > 0.5)
+
+    def _zero_g(self, keeper: Keeper) -> float:
+        return float(_zero_g(keeper.sensor, 25.0)[self.axis])
 
 
 def run(kind: Kind, seed: int, days: int = 60) -> Outcome:
     """Simulate a robot."""
-    robot, original = Robot(kind, np.random.default_rng(seed)), calibrated()
-    keeper = Keeper(original)
-    inside, without, kept = np.zeros(3, int), [], []
+    robot, keeper = Robot(kind, np.random.default_rng(seed)), Keeper(calibrated(kind.axes))
+    count = len(kind.axes)
+    inside, without, kept = np.zeros(count, int), [], []
     worse = false_changes = 0
     knock_day = 30 if kind.knock_mg else days
-    reported = np.nan
-    before_knock = 0
+    knock = _Knock(kind.knock_axis, kind.knock_mg * 1e-3)
     pending: Sensor | None = None
     for day in range(days):
         if day == knock_day:
-            before_knock = len(keeper.adoptions)
-            robot.error[kind.knock_axis] += kind.knock_mg * 1e-3
+            knock.hit(robot, keeper)
         squares = np.zeros(2)  # Of the errors before and after an adoption
         for rest, up in robot.rests(day):
             if pending is not None:
-                reading = robot.reading_g(up, rest.temperature_c)
+                reading = robot.reading_g(up, rest.temperature_c)[:count]
                 for number, sensor in enumerate((pending, keeper.sensor)):
-                    squares[number] += _error2(sensor, reading, up, rest.temperature_c)
+                    squares[number] += _error2(sensor, reading, up[:count], rest.temperature_c)
             if keeper.add(rest) is not None:
                 pending, squares = keeper.before[-1], np.zeros(2)
-            if kind.knock_mg and np.isnan(reported) and day >= knock_day and keeper.changed:
-                reported = (rest.stop_ns - BEGIN_NS) / DAY_NS - knock_day - 0.3
+            if day >= knock_day:
+                knock.look((rest.stop_ns - BEGIN_NS) / DAY_NS - knock_day - 0.3, up, keeper)
         if pending is not None and squares[0] > 0:
             worse += bool(squares[1] > squares[0])
             pending = None
         false_changes += bool(keeper.changed) and day < knock_day
         state = keeper.state(rest.stop_ns)
-        true = robot.zero_g(rest.temperature_c) - _zero_g(keeper.sensor, rest.temperature_c)
+        zero_g = robot.zero_g(rest.temperature_c)[:count]
+        true = zero_g - _zero_g(keeper.sensor, rest.temperature_c)
         departure = np.abs(true * 1e3 - state.zero_g_mg)
         if day < knock_day:
             inside += departure <= state.zero_g_90_mg
-            without.append(robot.zero_g(rest.temperature_c)[:2])
+            without.append(zero_g[:2])
             kept.append(true[:2])
     return Outcome(
         tilt_without_deg=_rms_deg(without),
@@ -202,8 +232,10 @@ def run(kind: Kind, seed: int, days: int = 60) -> Outcome:
         adoptions=len(keeper.adoptions),
         worse=worse,
         false_changes=false_changes,
-        reported_days=reported,
-        adoptions_after=len(keeper.adoptions) - before_knock if kind.knock_mg else 0,
+        could_show=knock.could_show,
+        reported_days=knock.reported_days,
+        adoptions_after=len(keeper.adoptions) - knock.adoptions if kind.knock_mg else 0,
+        is_learnt=knock.is_learnt(keeper),
     )
 
 

@@ -210,7 +210,6 @@ READ_FIRST = (
     (
         '`read`, `from_arrays`, `simulate`',
         'Recording',
-        'recording',
         '`time_s`, `columns`, `notes`',
     ),
     ('`load`', 'Sensor', '`nominal_zero_g_v`, `nominal_scale_v_per_g`, `values`'),

@@ -34,13 +34,13 @@ from adxl_ros.files.surroundings import Surroundings
 from adxl_ros.files.tables import read_pose_table
 from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.process import option
-from adxl_ros.report.figures import axes_for, AXIS_COLOURS
+from adxl_ros.report.figures import axes_for, AXIS_COLOURS, QUIET_COLOUR
 from adxl_ros.report.quantities import mg
 from adxl_ros.report.screen import Tile
 from adxl_ros.signals.gravity_at_rest import require_unit
 from adxl_ros.signals.gyroscope_at_rest import rest_turns, RestTurns, with_bias
 from adxl_ros.signals.recorded_gravity import RecordingLook
-from adxl_ros.signals.recorded_sensor import BeyondRange, FilterNoise, listed
+from adxl_ros.signals.recorded_sensor import BeyondRange, measured_lines
 
 _READING = 0.3  # Share of the work until the fit begins (chosen: a sweep of minutes)
 
@@ -98,7 +98,8 @@ class Fit(Result):
     @property
     def screen(self) -> list[str]:
         """Return the lines of the tool's screen."""
-        fitted, lines = self.sensor, []
+        fitted = self.sensor
+        lines = []
         if not self.is_over_temperature:
             lines = [
                 errors_in_words(fitted),
@@ -110,7 +111,7 @@ class Fit(Result):
         lines += [*self.result.summary, *self.warnings]
         if gyro := gyro_lines(fitted.gyro):
             lines += ['', *gyro]
-        return [*lines, *listed([*self.measured])]
+        return [*lines, *measured_lines([*self.measured])]
 
     @property
     def first_screen(self) -> FirstScreen:
@@ -203,14 +204,15 @@ class Fit(Result):
 
     def plot(self, ax: Any = None) -> Any:
         """Draw the errors on held-out poses, mg, into axes of matplotlib."""
-        ax, gravity = axes_for(ax), self.result.gravity_fit
+        ax = axes_for(ax)
+        gravity = self.result.gravity_fit
         if gravity is not None:
             ax.plot(mg(gravity.held_out_mps2), 'o', label='magnitude minus gravity')
         elif self.held_out:
             for axis, errors in zip(self.sensor.axes, self.held_out[-1].pose_errors.accel_mps2.T):
                 ax.plot(mg(errors), 'o', label=axis, color=AXIS_COLOURS[axis])
         ax.set(xlabel='held-out pose', ylabel='error of acceleration, mg')
-        ax.axhline(0.0, lw=0.8, color='#7b8794')
+        ax.axhline(0.0, lw=0.8, color=QUIET_COLOUR)
         ax.legend()
         return ax
 
@@ -299,7 +301,7 @@ def fit(
     for number, read in enumerate(several):
         read = unit.add(read)
         progress(_READING * (number + 1) / (number + 2), 'reading')
-        recorded.append(calibration.RecordedPoses(unit.names[-1], *rests.of(read, unit, number)))
+        recorded.append(rests.of(read, unit, number))
     if not recorded:
         raise UserError('no recording is given')
     progress(_READING, 'fit')
@@ -341,7 +343,9 @@ class _Unit:
     def __init__(
         self, sensor: SensorInput | None, robot: RobotInput | None, has_means: bool
     ) -> None:
-        self._stated, self._robot, self._has_means = sensor, robot, has_means
+        self._stated = sensor
+        self._robot = robot
+        self._has_means = has_means
         self._given: GivenSensor | None = None
         self._paths: list[str] = []
         self.notes: list[str] = []  # Readings beyond the stated range, and what means lack
@@ -430,19 +434,19 @@ class _Rests:
         if sum(ways) > 1:
             raise _one_recording_only()
         self._table = read_pose_table(table) if table else None
-        self._are_rows, self._is_one = are_rows, any(ways)
+        self._are_rows = are_rows
+        self._is_one = any(ways)
         self._records = (
             sweep_journal.poses_to_fit(sweep_journal.read(journal).entries) if journal else None
         )
 
-    def of(
-        self, read: Recording, unit: _Unit, number: int
-    ) -> tuple[Poses, Sequence[FilterNoise | None], list[str]]:
-        """Return the poses of a recording, their filters, and faults between its samples."""
+    def of(self, read: Recording, unit: _Unit, number: int) -> calibration.RecordedPoses:
+        """Return what a recording shows, which is one of several by its number."""
+        name = unit.names[-1]
         if number and self._is_one:
             raise _one_recording_only()
         if self._are_rows:
-            return poses_of_means(read, unit.sensor), (), []
+            return calibration.RecordedPoses(name, poses_of_means(read, unit.sensor))
         look = RecordingLook(unit.sensor, read)
         look.feed(read)
         # Rests by the noise of the sensor may not tell the unit; of other faults, the poses tell.
@@ -450,7 +454,8 @@ class _Rests:
         poses = extract_poses(read, unit.sensor, self._records, self._table)
         if self._table:
             poses = with_table_angles(poses, self._table)
-        return poses, estimate_filters(read, unit.sensor, poses), look.neighbour_faults()
+        filters = estimate_filters(read, unit.sensor, poses)
+        return calibration.RecordedPoses(name, poses, filters, look.neighbour_faults())
 
 
 def _one_recording_only() -> UserError:
@@ -463,7 +468,7 @@ def _one_recording_only() -> UserError:
 
 def _fit(result: CalibrationResult, unit: _Unit, is_over_temperature: bool = False) -> Fit:
     """Collect what a user reads of a calibration."""
-    measured = listed([*unit.measured])
+    measured = measured_lines([*unit.measured])
     fitted = result.fitted
     result = replace(
         result,

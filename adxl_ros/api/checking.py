@@ -197,13 +197,16 @@ def check(
         raise UserError(f'minima: {unknown[0]!r} is none of {", ".join(MINIMA)}')
     several = list(map(_stored, as_series(recordings)))
     options = reading_options(**{**reading, 'drop_bad_stamps': True})
-    stated, earlier, compared_with = as_input(sensor), None, ''
+    stated = as_input(sensor)
+    earlier = None
+    compared_with = ''
     robot = RobotInput(urdf, frame, joints) if urdf else None
     if against is not None:
         before = _stored(against)
         found = check_recording(before, stated, options)
         samples = _samples(before, options)
-        earlier, faults = Earlier(found, samples, stated), found.faults
+        earlier = Earlier(found, samples, stated)
+        faults = found.faults
         if robot:
             try:
                 robot.path(samples, sensor_of(sensor, samples).sensor)
@@ -263,7 +266,8 @@ def _with_what_shows(
             f'{_MOST_SHOWN} samples at most; check a part'
         )
         return replace(result, remarks=(*result.remarks, remark))
-    reason, sim = 'against the joints of the robot', None
+    reason = 'against the joints of the robot'
+    sim = None
     try:
         read = _samples(given, reading)
         unit = sensor_of(sensor, read).sensor

@@ -33,7 +33,7 @@ from adxl_ros.report.quantities import mg
 from adxl_ros.report.screen import Tile
 from adxl_ros.signals.gravity_at_rest import require_unit
 from adxl_ros.signals.recorded_gravity import RecordingLook
-from adxl_ros.signals.recorded_sensor import BeyondRange, listed
+from adxl_ros.signals.recorded_sensor import BeyondRange, measured_lines
 import numpy as np
 
 BLOCK_ROWS = 8192  # Samples that are corrected at a time (chosen: their arrays stay in the cache)
@@ -82,7 +82,8 @@ class Correction:
         self._estimator = RecordingEstimator(self.sensor, first, inverse == 'paper', undo_filter)
         self._counts: Counter[str] = Counter()
         self._beyond = BeyondRange()
-        self._look, self._path = RecordingLook(self.sensor, first), first.path
+        self._look = RecordingLook(self.sensor, first)
+        self._path = first.path
         self._has_gyro = first.gyro_radps is not None
         self._doubts: list[str] = []  # What is wrong with gravity, or between samples
 
@@ -127,7 +128,7 @@ class Correction:
         ]
         if self._has_gyro:
             lines.append(_gyro_text(self.sensor.gyro))
-        return [*lines, *listed([*self.measured])]
+        return [*lines, *measured_lines([*self.measured])]
 
 
 def _gyro_text(gyro: Gyroscope) -> str:

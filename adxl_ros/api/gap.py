@@ -42,7 +42,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import command, option
-from adxl_ros.report.figures import axes_for
+from adxl_ros.report.figures import AFTER_COLOUR, axes_for, BEFORE_COLOUR, QUIET_COLOUR
 from adxl_ros.report.quantities import Interval, mg
 from adxl_ros.report.screen import NextStep, Tile
 from adxl_ros.simulate.motion import Motion
@@ -112,7 +112,7 @@ class Gap(Result):
     """no_gap, explained, partly, inseparable or unknown; without a verdict insufficient or
     bad_data."""
     probability: float
-    """How often such verdicts were right in the working cases, 0 to 1."""
+    """How often such verdicts were right in the working cases, 0 to 1; a `fault` is certain, 1."""
     effects: tuple[FoundEffect, ...]
     """Effects of the verdict, those with the largest share of the gap first."""
     figures: GapFigures | None
@@ -141,6 +141,11 @@ class Gap(Result):
         """Name the parameter file of a sensor that was given as such; '' is the usual one."""
         name = Path(path).name or self.compared.params_name
         return replace(self, compared=self.compared._replace(params=path, params_name=name))
+
+    @property
+    def fault_name(self) -> str:
+        """Return the name of the fault, one of docs/reference/report_json.md; '' for none."""
+        return self._report['verdict']['data_fault'] or ''
 
     @property
     def has_verdict(self) -> bool:
@@ -199,7 +204,8 @@ class Gap(Result):
         """Draw gap, gap with the effects, and noise floor, mg, into axes of matplotlib."""
         if self.figures is None:
             raise UserError(f'no figures to draw: {self.fault}')
-        ax, figures = axes_for(ax), self.figures
+        ax = axes_for(ax)
+        figures = self.figures
         bars = {
             'gap': figures.before_mps2,
             'with the effects': figures.after_mps2,
@@ -208,7 +214,7 @@ class Gap(Result):
         ax.barh(
             list(bars),
             [mg(bar.value) for bar in bars.values()],
-            color=['#c0392b', '#2a8a43', '#7b8794'],
+            color=[BEFORE_COLOUR, AFTER_COLOUR, QUIET_COLOUR],
         )
         ax.invert_yaxis()
         ax.set(xlabel='rms, mg', title=words.badge(self.diagnosis))
@@ -266,10 +272,12 @@ class Gap(Result):
 
     def next_steps(self, folder: str | os.PathLike) -> list[NextStep]:
         """Return what to record, how to diagnose that, and how to simulate what was found."""
-        report, compared = self.diagnosis.report, self.compared
+        report = self.diagnosis.report
+        compared = self.compared
         if report is None:
             return []
-        params, proposal = str(Path(folder) / PARAMETERS), report.next_experiment
+        params = str(Path(folder) / PARAMETERS)
+        proposal = report.next_experiment
         steps = []
         if proposal is not None:
             both = f', and {proposal.stem}_simulated.csv in the simulator' if compared.sim else ''
@@ -386,33 +394,27 @@ def diagnose(
     Returns
     -------
     Gap
-        Verdict, effects with sizes and intervals, figures, and the sensor to simulate with.
+        Verdict, effects with sizes and intervals, figures, and the sensor to simulate with. What
+        makes a recording useless is its `fault`, with the verdict bad_data or insufficient.
 
     Raises
     ------
     UserError
-        A recording is of another unit, or its reference cannot be followed.
+        An argument is wrong, a file cannot be read, or recordings are of several units.
 
     """
     require_least('seed', seed, 0)
     require_least('self_check', self_check, 0)
     require_least('material', material, 1e-6)
-    if align and sim is None and not urdf:
-        raise UserError(
-            f'{option(align=True)}: shifts {option("sim")} or a robot, and neither is given'
-        )
-    if sim_unit and not isinstance(sim, (str, os.PathLike)):
-        raise UserError(
-            f'{option(sim_unit=sim_unit)}: states the unit of a file that {option("sim")} names, '
-            'and none is named; samples in memory are given by read(..., unit=...)'
-        )
+    _require_simulator(sim, sim_unit, urdf, align)
     unit = quantity_named(quantity) if quantity else None
     if not (sim is None or isinstance(sim, (Motion, str, os.PathLike))):
         sim = one_recording(sim)
     read = as_recordings(recordings)
     _require_one_reference(sim, urdf, len(read))
     given = sensor_of(sensor, read[0])
-    baseline, remarks = given.sensor, []
+    baseline = given.sensor
+    remarks = []
     motion = (
         RobotInput(urdf, frame, joints).path(read[0], baseline).as_motion()
         if urdf
@@ -426,7 +428,8 @@ def diagnose(
     diagnosis = core.diagnose(
         read, baseline, motion, seed, lambda stage, done: progress(done, stage), align, material
     )
-    in_unit, found = None, diagnosis.report
+    in_unit = None
+    found = diagnosis.report
     if self_check and found:
         remarks.append(
             core.self_check(
@@ -440,7 +443,8 @@ def diagnose(
         )
     if unit and found:
         in_unit = gap_in(unit, diagnosis.full_rate, found.baseline, found.sensor, seed)
-    simulator, robot = _name_of(sim), os.fspath(urdf or '')
+    simulator = _name_of(sim)
+    robot = os.fspath(urdf or '')
     compared = Compared(
         recordings=tuple(each.path for each in read),
         params=given.file,
@@ -452,6 +456,24 @@ def diagnose(
         subject=_subject(read, baseline, simulator or robot),
     )
     return _gap(diagnosis, baseline, compared, in_unit, remarks)
+
+
+def _require_simulator(
+    sim: RecordingInput | Motion | None,
+    sim_unit: str,
+    urdf: str | os.PathLike | None,
+    align: bool,
+) -> None:
+    """Refuse arguments that are about a simulator or a robot, where none is given."""
+    if align and sim is None and not urdf:
+        raise UserError(
+            f'{option(align=True)}: shifts {option("sim")} or a robot, and neither is given'
+        )
+    if sim_unit and not isinstance(sim, (str, os.PathLike)):
+        raise UserError(
+            f'{option(sim_unit=sim_unit)}: states the unit of a file that {option("sim")} names, '
+            'and none is named; samples in memory are given by read(..., unit=...)'
+        )
 
 
 def _require_one_reference(
@@ -492,7 +514,8 @@ def _motion(read: Recording, sim: RecordingInput | Motion | None, unit: str) -> 
 
 def _subject(recordings: Sequence[Recording], sensor: Sensor, sim: str) -> str:
     """Return what is compared with what."""
-    first, count = recordings[0], len(recordings)
+    first = recordings[0]
+    count = len(recordings)
     name = Path(first.path).name if count == 1 else f'{count} recordings'
     span_s = sum(read.span_s for read in recordings)
     unit = 'the nominal sensor' if sensor.serial == NO_SERIAL else f'unit {sensor.serial}'
@@ -511,7 +534,8 @@ def _gap(
     remarks: Sequence[str],
 ) -> Gap:
     """Collect what a user reads of a diagnosis."""
-    objects, report = words.as_json(diagnosis), diagnosis.report
+    objects = words.as_json(diagnosis)
+    report = diagnosis.report
     effects: tuple[FoundEffect, ...] = ()
     figures = None
     if report is not None:

@@ -19,6 +19,7 @@ from adxl_ros.files import parameter_file, recording as recording_files
 from adxl_ros.files.atomic_write import make_folder, require_own, write_bytes
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS, png
 from adxl_ros.report.quantities import duration
@@ -29,7 +30,6 @@ import numpy as np
 
 PLOT = 'allan.png'  # Name of the curve in the folder of a report
 TABLE = 'allan.csv'  # Name of its table
-BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -64,7 +64,8 @@ class Noise(Result):
     @cached_property
     def sensor(self) -> Sensor:
         """Return the sensor of the parameter file with the measured noise."""
-        stated, name = _sensor(self.result), Path(self.result.path).name
+        stated = _sensor(self.result)
+        name = Path(self.result.path).name
         fresh = noise_parameters.with_noise(stated, self.result.axes, self.result.rest)
         return replace(
             fresh,
@@ -264,7 +265,8 @@ def _terms(axes: Iterable[AxisNoise]) -> dict[str, dict[str, Any]]:
 
 def _sensor(result: RecordingNoise) -> Sensor:
     """Return the sensor of the parameter file, with the axes and rate of the recording."""
-    sensor, unit = result.sensor, result.nominal
+    sensor = result.sensor
+    unit = result.nominal
     if sensor.effects and sensor.axes != unit.axes:
         raise UserError(
             f'{result.path}: has the axes {unit.axes}, but the parameters of '

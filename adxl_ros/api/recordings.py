@@ -154,19 +154,20 @@ def _mapping_text(columns: str | Mapping[str, str | tuple[str, str]]) -> str:
     )
 
 
-def _counts(argument: str, given: Counts, above: float) -> tuple[float, ...]:
+def _counts(argument: str, stated: Counts, above: float) -> tuple[float, ...]:
     """Return counts by axis; none where none are given."""
-    words = given.split(',') if isinstance(given, str) and given else given or ()
+    given: Any = stated
+    if isinstance(stated, str):
+        given = stated.split(',') if stated else ()
     try:
-        values = tuple(float(word) for word in np.atleast_1d(words))
+        values = tuple(float(count) for count in np.atleast_1d(given))
+        if all(above < value < math.inf for value in values):
+            return values
     except ValueError:
-        values = (math.nan,)
-    if not all(above < value < math.inf for value in values):
-        raise UserError(
-            f'{option(**{argument: given})}: expected counts, for example 16384 or '
-            '16384,16384,16500'
-        )
-    return values
+        pass
+    raise UserError(
+        f'{option(**{argument: stated})}: expected counts, for example 16384 or 16384,16384,16500'
+    )
 
 
 def from_arrays(
@@ -269,7 +270,8 @@ def _are_dates(given: Any) -> bool:
 def _since_first(dates: Any) -> tuple[np.ndarray, int]:
     """Return dates as seconds, NaN where missing, since a whole second, and that second in ns."""
     stamps = np.asarray(dates, 'M8[ns]')
-    stamps_ns, is_date = stamps.astype(np.int64), ~np.isnat(stamps)
+    stamps_ns = stamps.astype(np.int64)
+    is_date = ~np.isnat(stamps)
     epoch_ns = int(stamps_ns[is_date][0]) // 10**9 * 10**9 if is_date.any() else 0
     return np.where(is_date, (stamps_ns - epoch_ns) * 1e-9, np.nan), epoch_ns
 
@@ -287,22 +289,16 @@ def _of_memory(
         )
     if not columns:
         raise UserError(f'{name}: holds no array of numbers')
-    shapes = {key: values.shape for key, values in columns.items()}
-    if len(set(shapes.values())) > 1 or any(len(shape) != 1 for shape in shapes.values()):
-        raise UserError(
-            f'{name}: arrays must have one dimension and the same length, but have '
-            + ', '.join(f'{key} {shape}' for key, shape in shapes.items())
-        )
-    if options.mapping is None and not _OUTPUTS.isdisjoint(columns):
-        if options.rate_hz is not None:
-            (rows,) = next(iter(shapes.values()))
-            columns[TIME] = np.arange(rows) / options.rate_hz
-        elif TIME not in columns:
-            raise UserError(f'{name}: has no time; give time_s or rate')
+    rows = _rows_of(columns, name)
     info = {'serial': serial} if serial else {}
+    is_native = options.mapping is None and not _OUTPUTS.isdisjoint(columns)
     if options.rate_hz is None and _are_dates(given.get(TIME)):
         columns[TIME], epoch_ns = _since_first(given[TIME])
         info['epoch_ns'] = str(epoch_ns)
+    elif is_native and options.rate_hz is not None:
+        columns[TIME] = np.arange(rows) / options.rate_hz
+    elif is_native and TIME not in columns:
+        raise UserError(f'{name}: has no time; give time_s or rate')
     table = in_memory(name, columns, info=info, is_every_row_a_step=True)
     recording = recording_files.of_table(table, options)
     if not others:
@@ -311,21 +307,36 @@ def _of_memory(
     return replace(recording, remarks=(*recording.remarks, left_out))
 
 
+def _rows_of(columns: Mapping[str, np.ndarray], name: str) -> int:
+    """Return the common length of arrays; refuse those of other shapes."""
+    shapes = {key: values.shape for key, values in columns.items()}
+    shape = next(iter(shapes.values()))
+    if len(shape) != 1 or set(shapes.values()) != {shape}:
+        raise UserError(
+            f'{name}: arrays must have one dimension and the same length, but have '
+            + ', '.join(f'{key} {shape}' for key, shape in shapes.items())
+        )
+    return shape[0]
+
+
+_TIMES = 'mM'  # Kinds of numpy's types that are times or dates
+_NUMBERS = 'iufb'  # Kinds that are numbers: int, unsigned, float, bool
+_OBJECTS = 'O'  # Kind of arrays of any objects
+
+
 def _floats(given: Any) -> np.ndarray | None:
     """Return numbers as floats and times as ns, NaN where masked or missing; None for others."""
     try:
         values: Any = np.ma.asarray(given)
         if hasattr(given, 'isna'):
             values = np.ma.array(values, mask=given.isna())
-        if values.dtype.kind in 'mM':
+        if values.dtype.kind in _TIMES:
             values = values.astype(f'{values.dtype.kind}8[ns]').astype(np.int64)
-        is_text = values.dtype.kind == 'O' and any(
-            isinstance(each, (str, bytes)) for each in values.flat
-        )
-        if values.dtype.kind not in 'iufbO' or is_text:
+        if values.dtype.kind in _NUMBERS:
+            return np.asarray(values.astype(float).filled(np.nan))
+        is_text = any(isinstance(each, (str, bytes)) for each in values.flat)
+        if values.dtype.kind != _OBJECTS or is_text:
             return None
-        if values.dtype.kind != 'O':
-            values = values.astype(float)
         return np.asarray(values.filled(np.nan), float)
     except (TypeError, ValueError):
         return None
@@ -333,9 +344,18 @@ def _floats(given: Any) -> np.ndarray | None:
 
 def as_series(given: RecordingInput | Iterable[RecordingInput]) -> Iterable[RecordingInput]:
     """Return recordings that are given in a series; one that is given alone is a series, too."""
-    if isinstance(given, (str, os.PathLike, Mapping, np.ndarray)) or _is_frame(given):
-        return [given]  # type: ignore[list-item]  # an array is refused by name
+    if isinstance(given, (str, os.PathLike, Mapping)) or _is_frame(given):
+        return [given]
+    if isinstance(given, np.ndarray):
+        raise _no_recording(given)
     return given if isinstance(given, Iterable) else [given]
+
+
+def _no_recording(given: Any) -> UserError:
+    return UserError(
+        f'{type(given).__name__} is no recording; expected a Recording, a pandas '
+        'DataFrame, arrays by name, or the path of a file'
+    )
 
 
 def one_recording(given: RecordingInput) -> Recording:
@@ -343,10 +363,7 @@ def one_recording(given: RecordingInput) -> Recording:
     if isinstance(given, (str, os.PathLike, Mapping)) or _is_frame(given):
         return read(given)
     if not isinstance(given, Recording):
-        raise UserError(
-            f'{type(given).__name__} is no recording; expected a Recording, a pandas '
-            'DataFrame, arrays by name, or the path of a file'
-        )
+        raise _no_recording(given)
     for name, values in _samples(given).items():
         numbers = _floats(values)
         if numbers is None or numbers.shape != (len(given),) or not np.isfinite(numbers).all():

@@ -114,7 +114,8 @@ def _put(effect: Effect, values: dict[str, np.ndarray], axes: str, key: str, num
     parameters = {parameter.name: parameter for parameter in effect.parameters}
     if name not in parameters:
         raise UserError(f'{effect.name} has no parameter {name!r}, but {", ".join(parameters)}')
-    parameter, value = parameters[name], math.nan
+    parameter = parameters[name]
+    value = math.nan
     with suppress(ValueError, TypeError):
         value = float(number)
     if not parameter.lower <= value <= parameter.upper:

@@ -164,9 +164,11 @@ def _by_force(ideal: Recording, sensor: Sensor, rate_hz: float | None) -> Simula
 
 def _by_references(read: Recording, sensor: Sensor, rate_hz: float | None) -> Simulation:
     """Follow the references of a recording, at its stamps or at another rate."""
-    motion, like = motion_from_references(read, sensor), None
+    motion = motion_from_references(read, sensor)
+    like = None
     if rate_hz is None:
-        sensor, like = replace(sensor, rate_hz=read.rate_hz), read
+        sensor = replace(sensor, rate_hz=read.rate_hz)
+        like = read
     return Simulation(
         name=read.path,
         sensor=sensor,

@@ -105,7 +105,8 @@ class Update(Result):
     def report(self, folder: str | os.PathLike, *, overwrite: bool = False) -> Path:
         """Write the page report.html into a folder, and return its path."""
         require_own(Path(folder) / words.PAGE, overwrite)
-        path, top = make_folder(folder) / words.PAGE, self.first_screen
+        path = make_folder(folder) / words.PAGE
+        top = self.first_screen
         write_text(path, words.page(self.sensor, self.days, self.state, top._asdict(), top.tiles))
         return path
 
@@ -194,14 +195,16 @@ def update(
     keeper = Keeper(before, KeepSettings(drift_mg_per_year))
     stream = RestStream(before)
     days: dict[str, UpdatedDay] = {}
-    newest_ns, name = 0, ''
+    newest_ns = 0
+    name = ''
     for place, read in enumerate(each_recording(recordings)):
         check_same_sensor(read.stream_info, read.axes, before)
         if read.stamp_ns[0] < newest_ns:
             raise UserError(
                 f'{read.path}: begins before {name} ends; give recordings in the order of time'
             )
-        newest_ns, name = int(read.stamp_ns[-1]), read.path
+        newest_ns = int(read.stamp_ns[-1])
+        name = read.path
         progress((place + 1) / (place + 2), 'rests')
         _take(read, before, stream, keeper, days)
     if not days:

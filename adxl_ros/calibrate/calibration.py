@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, thermal_fit
 from adxl_ros.calibrate.fits.linearisation import volts_covariance
@@ -167,46 +168,43 @@ def _against_stage(
     fit = _richest_fit(sensor, poses.subset(~poses.check), recordings, model, effects)
     if population is not None:
         fit = _with_population(fit, population)
-    full, fitted, fitting = fit.full, fit.fitted, np.flatnonzero(~poses.check)
-    outliers = tuple(fitting[list(full.outliers)].tolist()) if full else ()
+    fitting = np.flatnonzero(~poses.check)
+    outliers = tuple(fitting[list(fit.full.outliers)].tolist()) if fit.full else ()
     inliers = poses.subset(~np.isin(np.arange(len(poses)), outliers))
-    errors, assessments = _assessed(sensor, inliers, fit, not doubts)
-    assessment, error_mps2 = None, 0.0
-    if assessments:
-        assessment = acceptance.judged(assessments[-1], fitted)
-        assessments = (*assessments[:-1], assessment)
-        error_mps2 = float(np.nan_to_num(np.sqrt(assessment.accel.calibration)))
-    force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
-    residual_mg = 1e3 * residual_g(fitted, poses)[fitting]
+    judgement = _judged(sensor, inliers, fit, not doubts)
+    fitted = fit.fitted
+    residual_mps2 = G0_MPS2 * residual_g(fitted, poses)[fitting]
     details: list[str] = []
     warnings = list(doubts)
-    if full:
-        details += full_model.report_lines(full, poses.subset(fitting), fit.terms)
-        warnings += full_model.warnings(full, poses.subset(fitting))
+    if fit.full:
+        details += full_model.report_lines(fit.full, poses.subset(fitting), fit.terms)
+        warnings += full_model.warnings(fit.full, poses.subset(fitting))
     if fitted.model == 'full':
         fitted, filter_lines = recorded_sensor.with_filter(
             fitted, [recording.filters for recording in recordings if recording.filters]
         )
         details += filter_lines
-    fitted = replace(fitted, envelope=envelope(fitted, force, poses, error_mps2))
+    force = np.column_stack(reference_force(poses, fitted.local_gravity_mps2))
+    fitted = replace(fitted, envelope=envelope(fitted, force, poses, judgement.error_mps2))
     entries = {'reference': 'stage'}
     if population:
         entries['prior'] = population.name
-    entries['residual_mg'] = f'{np.sqrt(np.mean(residual_mg**2)):.4f}'
-    if full:
-        entries['converged'] = 'yes' if full.converged else 'no'
-    entries |= acceptance.provenance_entries(assessment, errors, doubts)
+    entries['residual_mg'] = f'{rms_mg(float(np.mean(residual_mps2**2))):.4f}'
+    if fit.full:
+        entries['converged'] = 'yes' if fit.full.converged else 'no'
+    entries |= acceptance.provenance_entries(judgement.of_fit, judgement.held_out, doubts)
     fitted = with_provenance(fitted, source, poses, data_sha256, entries)
-    summary = acceptance.summary_lines(
-        fitted, assessment, acceptance.held_out_lines(errors, len(inliers))
-    )
     return CalibrationResult(
         nominal=sensor,
         fitted=fitted,
-        summary=summary,
+        summary=acceptance.summary_lines(
+            fitted,
+            judgement.of_fit,
+            acceptance.held_out_lines(judgement.held_out, len(inliers)),
+        ),
         poses=poses,
-        assessments=assessments,
-        held_out=errors,
+        assessments=judgement.assessments,
+        held_out=judgement.held_out,
         outliers=outliers,
         warnings=[*warnings, *fit.notes],
         details=details,
@@ -242,37 +240,56 @@ def _with_population(fit: _StageFit, population: Population) -> _StageFit:
     )
 
 
-def _assessed(
-    sensor: Sensor, inliers: Poses, fit: _StageFit, is_sound: bool
-) -> tuple[tuple[HeldOutErrors, ...], tuple[Assessment, ...]]:
-    """Return held-out errors and acceptance of the fit and of all simpler models."""
+class _Judgement(NamedTuple):
+    """Held-out errors and acceptance of a fit and of all simpler models, the fit the last."""
+
+    held_out: tuple[HeldOutErrors, ...] = ()
+    assessments: tuple[Assessment, ...] = ()
+
+    @property
+    def of_fit(self) -> Assessment | None:
+        """Return the acceptance of the fit itself."""
+        return self.assessments[-1] if self.assessments else None
+
+    @property
+    def error_mps2(self) -> float:
+        """Return the error of the calibration, m/s²; 0 where it is not known."""
+        calibration = self.of_fit.accel.calibration if self.of_fit else 0.0
+        return float(np.nan_to_num(np.sqrt(calibration)))
+
+
+def _judged(sensor: Sensor, inliers: Poses, fit: _StageFit, is_sound: bool) -> _Judgement:
+    """Judge the fit and all simpler models by poses that they have not seen."""
     # The reference of all models is the stage with its fitted errors.
     stage = fit.full.with_stage if fit.full else None
+    model = fit.fitted.model
     models = list(STAGE_FITS)
-    simpler = {name: STAGE_FITS[name] for name in models[: models.index(fit.fitted.model)]}
+    simpler = {name: STAGE_FITS[name] for name in models[: models.index(model)]}
     errors = held_out.cross_validate(
-        {'nominal': lambda sensor, _: sensor, **simpler, fit.fitted.model: fit.refit},
+        {'nominal': lambda sensor, _: sensor, **simpler, model: fit.refit},
         sensor,
         inliers,
         stage,
     )
+    if not errors or errors[-1].model != model:
+        return _Judgement()
     is_certain = (
         is_sound
         and (fit.full is None or fit.full.converged)
         and not acceptance.open_coefficients(fit.fitted)
     )
-    if not errors or errors[-1].model != fit.fitted.model:
-        return (), ()
-    return tuple(errors), tuple(
+    assessments = [
         acceptance.assess(
             row.model,
             error_budgets(row, inliers, stage),
             sensor,
-            is_certain or (is_sound and row.model != fit.fitted.model),
+            is_certain or (is_sound and row.model != model),
         )
         for row in errors
         if row.model != 'nominal'
-    )
+    ]
+    assessments[-1] = acceptance.judged(assessments[-1], fit.fitted)
+    return _Judgement(tuple(errors), tuple(assessments))
 
 
 def _richest_fit(
@@ -287,10 +304,12 @@ def _richest_fit(
     def fitted(name: str) -> _StageFit:
         if name != 'full':
             return _StageFit(STAGE_FITS[name](sensor, poses), STAGE_FITS[name])
-        full, terms = full_model.fit_selected(sensor, poses, effects)
+        selected = full_model.fit_selected(sensor, poses, effects)
+        full = selected.fit
         if len(recordings) > 1:
             _require_one_mounting(full, recordings)
-        return _StageFit(full.fitted, partial(full_model.fit, effects=effects), full, terms)
+        refit = partial(full_model.fit, effects=effects)
+        return _StageFit(full.fitted, refit, full, selected.terms)
 
     if model:
         return fitted(model)
@@ -360,7 +379,9 @@ def _require_one_mounting(full: full_model.FullFit, recordings: Sequence[Recorde
         if worst < 3:
             change = f'case is turned by {np.degrees(changes[worst]):.2f} deg about {AXES[worst]}'
         else:
-            change = f'zero-g of {axes[worst - 3]} is shifted by {1e3 * changes[worst]:.2f} mg'
+            change = (
+                f'zero-g of {axes[worst - 3]} is shifted by {mg(changes[worst] * G0_MPS2):.2f} mg'
+            )
         raise _ContradictionError(
             f'{recording.source}: {change} from the fit of all recordings '
             f'({deviations[worst]:.0f} standard deviations): another unit or another '
@@ -467,7 +488,7 @@ def _turn_on_lines(fitted: Sensor, recordings: Sequence[Poses]) -> list[str]:
     on_stage = [poses.subset(poses.has_angles) for poses in recordings if poses.has_angles.any()]
     if len(on_stage) < 2:
         return []
-    changes_mg = [1e3 * np.mean(residual_g(fitted, poses), axis=0) for poses in on_stage]
+    changes_mg = [mg(G0_MPS2 * np.mean(residual_g(fitted, poses), axis=0)) for poses in on_stage]
     by_axis = ', '.join(
         f'{axis} {value:.2g}'
         for axis, value in zip(fitted.axes, np.std(changes_mg, axis=0, ddof=1))

@@ -80,7 +80,8 @@ def coefficient_jacobian(sensor: Sensor, poses: Poses, names: Sequence[Coefficie
     force = stage_force(sensor, poses.alpha_rad, poses.beta_rad)
 
     def slope(name: Coefficient) -> np.ndarray:
-        value, step = get(sensor, [name]), _COEFFICIENT_STEP * parameter_of(name).scale
+        value = get(sensor, [name])
+        step = _COEFFICIENT_STEP * parameter_of(name).scale
         shared = None if _is_of_stage(name.effect) else force
         above = predicted_volts(put(sensor, [name], value + step), poses, force=shared)
         below = predicted_volts(put(sensor, [name], value - step), poses, force=shared)

@@ -104,7 +104,8 @@ class Poses:
             for field in fields(Poses)
         }
         for name in ('alpha_setting', 'beta_setting'):
-            renumbered, begin = [], 0
+            renumbered = []
+            begin = 0
             for part in parts:
                 settings = getattr(part, name)
                 renumbered.append(begin + settings)

@@ -37,7 +37,8 @@ quarter. Half of them would show it within a third."""
 
 def _named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Rest]:
     """Find the rows of the rests that a journal names by their first and last stamp."""
-    rests, stamps_ns = [], recording.stamp_ns
+    rests = []
+    stamps_ns = recording.stamp_ns
     for number, record in enumerate(records, 1):
         start = int(np.searchsorted(stamps_ns, record.start_ns, 'left'))
         stop = int(np.searchsorted(stamps_ns, record.stop_ns, 'right'))
@@ -55,7 +56,8 @@ def _named_rests(recording: Recording, records: Sequence[PoseRecord]) -> list[Re
 
 def _rests_of_table(recording: Recording, path: str, spans_s: np.ndarray) -> list[Rest]:
     """Return the rests between stamps of a recording, s, (k, 2), that a table names."""
-    rests, fewest = [], _SHORTEST_SPAN_S * recording.rate_hz
+    rests = []
+    fewest = _SHORTEST_SPAN_S * recording.rate_hz
     # The stamps as the recording states them
     time_s = recording.time_s + recording.epoch_ns * 1e-9
     for number, (start_s, stop_s) in enumerate(spans_s.tolist(), 1):
@@ -150,7 +152,8 @@ def _surroundings(recording: Recording, name: str, rests: Sequence[Rest]) -> np.
     if values is None:
         return np.full(len(rests), np.nan)
     at_rest = _means(values, rests)
-    is_missing, is_known = np.isnan(at_rest), np.isfinite(values)
+    is_missing = np.isnan(at_rest)
+    is_known = np.isfinite(values)
     if is_known.any():
         middle_s = np.array([(rest.time_start_s + rest.time_stop_s) / 2 for rest in rests])
         at_rest[is_missing] = np.interp(
@@ -166,8 +169,10 @@ def poses_of_means(recording: Recording, sensor: Sensor) -> Poses:
     The noise of the means is not known. Against gravity, 0 stands for it, and the residuals show
     it; against a stage, it is at most that of a sample.
     """
-    volts, columns = recording.volts(sensor), recording.columns
-    missing, std_v = np.full(len(recording), np.nan), np.zeros_like(volts)
+    volts = recording.volts(sensor)
+    columns = recording.columns
+    missing = np.full(len(recording), np.nan)
+    std_v = np.zeros_like(volts)
     alpha_rad = beta_rad = missing
     angles = recording.stage_angles
     if angles is not None:
@@ -215,7 +220,8 @@ def estimate_filters(
     recording: Recording, sensor: Sensor, poses: Poses
 ) -> list[recorded_sensor.FilterNoise | None]:
     """Estimate the output filter of each axis from the noise of the poses."""
-    volts, gapless = recording.volts(sensor), []
+    volts = recording.volts(sensor)
+    gapless = []
     for begin, end in zip(*np.searchsorted(recording.time_s, poses.time_s.T)):
         steps_s = np.diff(recording.time_s[begin : end + 1])
         if steps_s.size and steps_s.max() * sensor.rate_hz < _MAX_PERIODS:

@@ -271,16 +271,20 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
     A misalignment and a linear cross-axis term are the same to first order: the true sensor
     must have the gauge of the fits: no linear cross-axis terms.
     """
-    names, rows = fitted.covariance_names, []
+    names = fitted.covariance_names
+    rows = []
     truth = with_neutral(truth, [name.effect for name in names])
     half_widths = Z_90 * np.sqrt(np.diag(fitted.covariance))
     for name, *values in zip(names, get(fitted, names), half_widths, get(truth, names)):
-        key, unit, scale = str(name.without_axis), parameter_of(name).unit, 1.0
+        key = str(name.without_axis)
+        unit = parameter_of(name).unit
+        scale = 1.0
         if key in _ABSOLUTE:
             nominal = getattr(fitted, _ABSOLUTE[key])[fitted.axes.index(name.axis)]
             values[0], values[2] = values[0] + nominal, values[2] + nominal
         if unit == 'rad':
-            unit, scale = '°', float(np.degrees(1.0))
+            unit = '°'
+            scale = float(np.degrees(1.0))
         acts = name.axis and name.effect in OTHER_AXIS
         other = AXES[OTHER_AXIS[name.effect][AXES.index(name.axis)]] if acts else ''
         rows.append(

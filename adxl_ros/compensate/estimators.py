@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
 
-from adxl_ros.compensate.inversions import noise_variance_v2, paper_inverse, undo_filter_blocks
+from adxl_ros.compensate.inversions import noise_variance_v2, PaperInverse, undo_filter_blocks
 from adxl_ros.compensate.motion_measure import length_excess, MotionMeasure
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
@@ -72,7 +72,7 @@ class RecordingEstimator:
         self._surroundings = Surroundings()
         self._begin_s = float(first.time_s[0])
         self._gravity_mps2 = signal_chain.gravity_mps2(sensor)
-        self._inverse = (paper_inverse if paper else signal_chain.inverse)(sensor)
+        self._inverse = (PaperInverse if paper else signal_chain.inverse)(sensor)
         self._measured_covariance = force_errors.measured_covariance(
             sensor, noise_variance_v2(sensor) if undo_filter else None, bool(sensor.z_sign)
         )
@@ -92,7 +92,8 @@ class RecordingEstimator:
     @property
     def assumed(self) -> list[str]:
         """Return what was assumed of the surroundings so far, one line each, for people."""
-        sensor, lines = self._sensor, self._surroundings.assumed(self._sensor.effects)
+        sensor = self._sensor
+        lines = self._surroundings.assumed(self._sensor.effects)
         if sensor.axes == 'xy' and sensor.effects and not sensor.z_sign:
             lines = [
                 *lines,
@@ -229,7 +230,7 @@ class LiveEstimator:
             if sensor.provenance.get('reference') == 'stage'
             else alignment_std_rad(sensor) ** 2
         )
-        self._paper_inverse = paper_inverse(sensor, FLOATS) if paper else None
+        self._paper_inverse = PaperInverse(sensor, FLOATS) if paper else None
         self._variance_v2 = (
             noise_variance_v2(sensor) if undo_filter else noise.sample_std_v(sensor) ** 2
         )
@@ -324,7 +325,8 @@ class LiveEstimator:
             return self._force if abs(sum(self._force)) < float('inf') else None
         tangent = self._cell(self._force).tangent
         force, change = self._force, 0.0
-        response, input_v = self._last_volts, self._undo_adc(volts)
+        response = self._last_volts
+        input_v = self._undo_adc(volts)
         for _ in range(_MAX_STEPS):
             previous, previous_change = force, change
             force = self._newton_step(

@@ -15,7 +15,7 @@ The paper's inverse serves comparisons. The default is `signal_chain.inverse`, w
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 import itertools
 from math import factorial
 from typing import Any, TypeVar
@@ -29,6 +29,7 @@ from adxl_ros.model.effects.base import (
     Maths,
     NOMINAL_ENVIRONMENT,
     Place,
+    Value,
 )
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.signal_chain import gravity_mps2, static_chain
@@ -91,7 +92,8 @@ def undo_filter_blocks(
     ):
         near_s = np.concatenate([before_s, time_s, after_s[:HALF]])
         near_v = np.concatenate([before_v, volts, after_v[:HALF]])
-        begin, end = len(before_s), len(before_s) + len(time_s)
+        begin = len(before_s)
+        end = len(before_s) + len(time_s)
         yield token, undo_filter(near_v, near_s, rc_s, rate_hz)[begin:end]
         before_s, before_v = near_s[:end][-HALF:], near_v[:end][-HALF:]
 
@@ -163,52 +165,70 @@ _NEAR_ZERO_G = 1e-6
 differs there by 1e-8 of itself."""
 
 
-def paper_inverse(sensor: Sensor, maths: Maths = ARRAYS) -> Callable[..., Components]:
+class PaperInverse:
     """
-    Prepare the paper's inverse, equations 14 to 21, which ignores the errors of the other axes.
+    The paper's inverse, equations 14 to 21, which ignores the errors of the other axes.
 
     First each axis is linear (3), and z follows from equation 5 if it is not measured. Then the
     bias by the other axes is subtracted, and the result is divided by the scale factor at those
-    inputs (14, 16). Finally the misalignment is removed, one axis after the other (20, 21). The
-    result maps the volts of each axis, and an `Environment`, to specific force, m/s².
+    inputs (14, 16). Finally the misalignment is removed, one axis after the other (20, 21).
     """
-    measured = [AXES.index(axis) for axis in sensor.axes]
-    gravity_g = gravity_mps2(sensor) / G0_MPS2
-    chain = static_chain(sensor)
-    mounted = chain.signals(NOMINAL_ENVIRONMENT, force=list(G0_MPS2 * np.eye(3)))
-    chain(Place.MOUNTING, mounted)
-    directions = [np.asarray(row).tolist() for row in mounted.sensed]  # Θ of (18) and (19)
 
-    def respond(inputs: Components) -> Components:
-        signals = chain.signals(NOMINAL_ENVIRONMENT, sensed=inputs)
-        chain(Place.ELEMENT, signals)
-        return signals.output
+    def __init__(self, sensor: Sensor, maths: Maths = ARRAYS) -> None:
+        """Prepare for a sensor."""
+        self._maths = maths
+        self._up = sensor.up
+        self._measured = [AXES.index(axis) for axis in sensor.axes]
+        self._gravity_g = gravity_mps2(sensor) / G0_MPS2
+        self._chain = static_chain(sensor)
+        mounted = self._chain.signals(NOMINAL_ENVIRONMENT, force=list(G0_MPS2 * np.eye(3)))
+        self._chain(Place.MOUNTING, mounted)
+        # Θ of (18) and (19)
+        self._directions = [np.asarray(row).tolist() for row in mounted.sensed]
 
-    def converted(output: Components, environment: Environment) -> Components:
-        return chain.volts(chain.signals(environment, output=output), Place.ELECTRONICS)
-
-    def invert(volts: Components, environment: Environment = NOMINAL_ENVIRONMENT) -> Components:
-        at_0_g = converted([0.0 * volts[0]] * 3, environment)
-        at_1_g = converted([0.0 * volts[0] + 1.0] * 3, environment)
-        linear = [0.0 * volts[0]] * 3
-        for d, v, v0, v1 in zip(measured, volts, at_0_g, at_1_g):
-            linear[d] = (v - v0) / (v1 - v0)  # (3)
-        if 2 not in measured:
-            z2 = gravity_g**2 - linear[0] ** 2 - linear[1] ** 2
-            linear[2] = sensor.up * maths.sqrt(maths.maximum(z2, 0.0))  # (5)
-        sensed = list(linear)
-        for d in measured:
-            inputs = list(linear)
-            inputs[d] = 0.0 * linear[d]
-            bias = respond(inputs)[d]
-            is_near_zero = abs(linear[d]) < _NEAR_ZERO_G
-            inputs[d] = maths.where(is_near_zero, linear[d] + 2 * _NEAR_ZERO_G, linear[d])
-            scale = (respond(inputs)[d] - bias) / inputs[d]
-            sensed[d] = (linear[d] - bias) / scale  # (14), (16)
-        force = list(sensed)
-        for d in measured:  # (20), (21)
-            others = sum(directions[d][c] * force[c] for c in range(3) if c != d)
-            force[d] = (sensed[d] - others) / directions[d][d]
+    def __call__(
+        self, volts: Components, environment: Environment = NOMINAL_ENVIRONMENT
+    ) -> Components:
+        """Map the volts of each axis to specific force, m/s²."""
+        linear = self._linear(volts, environment)
+        force = list(linear)
+        for d in self._measured:
+            force[d] = self._sensed(d, linear)
+        for d, direction in enumerate(self._directions):  # (20), (21)
+            if d in self._measured:
+                others = sum(direction[c] * force[c] for c in range(3) if c != d)
+                force[d] = (force[d] - others) / direction[d]
         return [f * G0_MPS2 for f in force]
 
-    return invert
+    def _linear(self, volts: Components, environment: Environment) -> Components:
+        """Return the inputs of linear axes, g (3), and z by the others if it is not measured."""
+        zero = 0.0 * volts[0]
+        at_0_g = self._converted([zero] * 3, environment)
+        at_1_g = self._converted([zero + 1.0] * 3, environment)
+        linear = [zero] * 3
+        for d, v, v0, v1 in zip(self._measured, volts, at_0_g, at_1_g):
+            linear[d] = (v - v0) / (v1 - v0)
+        if 2 not in self._measured:
+            z2 = self._gravity_g**2 - linear[0] ** 2 - linear[1] ** 2
+            linear[2] = self._up * self._maths.sqrt(self._maths.maximum(z2, 0.0))  # (5)
+        return linear
+
+    def _sensed(self, axis: int, linear: Components) -> Value:
+        """Return the input of an axis, g, by its bias and scale factor at the others (14, 16)."""
+        own = linear[axis]
+        inputs = list(linear)
+        inputs[axis] = 0.0 * own
+        bias = self._respond(inputs)[axis]
+        is_near_zero = abs(own) < _NEAR_ZERO_G
+        inputs[axis] = self._maths.where(is_near_zero, own + 2 * _NEAR_ZERO_G, own)
+        scale = (self._respond(inputs)[axis] - bias) / inputs[axis]
+        return (own - bias) / scale
+
+    def _respond(self, inputs: Components) -> Components:
+        signals = self._chain.signals(NOMINAL_ENVIRONMENT, sensed=inputs)
+        self._chain(Place.ELEMENT, signals)
+        return signals.output
+
+    def _converted(self, output: Components, environment: Environment) -> Components:
+        signals = self._chain.signals(environment, output=output)
+        return self._chain.volts(signals, Place.ELECTRONICS)

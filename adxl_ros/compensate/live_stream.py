@@ -66,7 +66,8 @@ class LiveStream:
         self._paper, self._undo_filter = paper, undo_filter
         self._keep_orientation, self._publish_free = keep_orientation, publish_free
         self._output_rate_hz, self._corrected = output_rate_hz, 0
-        self._mounting, self._frame_id = Mounting(), ''
+        self._mounting = Mounting()
+        self._frame_id = ''
         self._sensor: tuple[Sensor, float]
         self._forces: list[Components] | None = None
         self._publish_imu, self._publish_tilt = publish_imu, publish_tilt
@@ -92,7 +93,8 @@ class LiveStream:
 
     def release(self) -> None:
         """Correct and publish the samples that follow."""
-        self.unknown, self.may_be_foreign = None, False
+        self.unknown = None
+        self.may_be_foreign = False
 
     def use(self, sensor: Sensor, rate_hz: float) -> None:
         """Correct by a sensor, at the rate of the stream, from the next sample on."""
@@ -126,7 +128,8 @@ class LiveStream:
 
     def collected(self) -> np.ndarray:
         """Return the forces since `collect` in the frame of the case, (n, 3), and forget them."""
-        forces, self._forces = self._forces or [], None
+        forces = self._forces or []
+        self._forces = None
         return np.reshape(forces, (-1, 3)) @ self._mounting.rows
 
     def surround(self, name: str, value: float) -> None:

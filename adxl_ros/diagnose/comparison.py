@@ -34,7 +34,7 @@ from adxl_ros.simulate.motion import (
     visible_step,
 )
 from adxl_ros.simulate.recorded_motion import environment_paths, motion_from_references
-from adxl_ros.simulate.response import ChainMemo, Response
+from adxl_ros.simulate.response import ChainMemo, Response, whole_response
 import numpy as np
 import scipy
 
@@ -246,8 +246,7 @@ class BaselineComparison:
 
     def simulated_v(self, sensor: Sensor) -> np.ndarray:
         """Return the mean output of a sensor in this recording, V, (n, m)."""
-        respond = Response(noiseless(sensor), self.motion, 0, float(self.time_s[0]))
-        return respond.whole(self.time_s, self.memo)
+        return whole_response(noiseless(sensor), self.motion, 0, self.time_s, self.memo)
 
     def residual_v(self, sensor: Sensor) -> np.ndarray:
         """

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -25,11 +25,11 @@ from adxl_ros.diagnose.evidence import (
     sum_by_block,
 )
 from adxl_ros.diagnose.flexible_functions import flexible_bases
-from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
+from adxl_ros.diagnose.linear_model import build_linear_model, filters_for, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
 from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemainder
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
-from adxl_ros.diagnose.search import Hypothesis, linearise, Search
+from adxl_ros.diagnose.search import Hypothesis, Search, with_filters
 from adxl_ros.diagnose.verdict import HEALTHY, HeldOutFits, MATERIAL_MG, Verdict
 from adxl_ros.files.recording_columns import check_same_sensor, Recording
 from adxl_ros.model import noise
@@ -159,10 +159,14 @@ def diagnose(
     detections = _detections(
         checked, _with_likely_drift(search.best, evidence), model.baseline, smallest_mps2
     )
-    bases = list(chain(*map(flexible_bases, compared, model.baseline_v)))
+
+    def rest_of(effects: frozenset[str], drift: str) -> rule.Rest:
+        bases = chain(*map(flexible_bases, compared, model.baseline_v))
+        return rule.reproducible_rest(evidence.candidates[effects][drift], bases)
+
     verdict = rule.decide(
         evidence,
-        lambda effects, drift: rule.reproducible_rest(evidence.candidates[effects][drift], bases),
+        rest_of,
         [rule.NoiseCause(d.effect, d.power_mps2, d.is_left_out) for d in detections],
         lambda effects: _simulate_again(search, effects),
     )
@@ -268,22 +272,27 @@ class _FitsByDrift(Mapping[str, HeldOutFits]):
     """Held-out fits of a set by the drift of its noise; those with a drift once they are asked."""
 
     def __init__(
-        self, healthy: HeldOutFits, fits_with_drifts: Callable[[], dict[str, HeldOutFits]]
+        self,
+        healthy: HeldOutFits,
+        drifts: Sequence[str],
+        with_drift: Callable[[str], HeldOutFits | None],
     ) -> None:
-        self._healthy, self._fits_with_drifts = healthy, fits_with_drifts
-
-    @cached_property
-    def _every(self) -> dict[str, HeldOutFits]:
-        return {HEALTHY: self._healthy, **self._fits_with_drifts()}
+        self._drifts, self._with_drift = drifts, with_drift
+        self._known: dict[str, HeldOutFits | None] = {HEALTHY: healthy}
 
     def __getitem__(self, drift: str) -> HeldOutFits:
-        return self._healthy if drift == HEALTHY else self._every[drift]
+        if drift not in self._known:
+            self._known[drift] = self._with_drift(drift) if drift in self._drifts else None
+        fits = self._known[drift]
+        if fits is None:
+            raise KeyError(drift)
+        return fits
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._every)
+        return (drift for drift in (HEALTHY, *self._drifts) if drift in self)
 
     def __len__(self) -> int:
-        return len(self._every)
+        return sum(1 for _ in self)
 
 
 def _held_out(
@@ -291,26 +300,24 @@ def _held_out(
 ) -> dict[frozenset[str], Mapping[str, HeldOutFits]]:
     """Return held-out fits of all sets by the drift of their noise."""
     best, model = search.best, search.model
-    beside = linearise(model, best.effects, best.sensor, model.filters)
+    beside = with_filters(model, best.linearised, model.filters)
     drifts = (
         drifts_among(library())
         if beside.fit(drifts=drifts_among(library())).log_evidence > beside.fit().log_evidence
         else ()
     )
 
-    def with_drifts(hypothesis: Hypothesis, healthy: HeldOutFits) -> dict[str, HeldOutFits]:
-        if not drifts:
-            return {}
+    def with_drift(healthy: HeldOutFits, drift: str) -> HeldOutFits | None:
         left = healthy.figures.squares.sum() / count - floor.rms_mps2**2
-        linearised = linearise(model, hypothesis.effects, hypothesis.sensor, model.filters)
-        fits = {d: HeldOutFits(linearised, model, (d,)) for d in drifts}
+        filters = filters_for(model.filters, (*model.baseline.effects, drift))
+        fits = HeldOutFits(with_filters(model, healthy.linearised, filters), model, (drift,))
         # A drift that should be far larger than what is left is none.
-        return {d: f for d, f in fits.items() if f.drift_mps2**2 <= _DRIFT_LIMIT * max(left, 0.0)}
+        return fits if fits.drift_mps2**2 <= _DRIFT_LIMIT * max(left, 0.0) else None
 
     out: dict[frozenset[str], Mapping[str, HeldOutFits]] = {}
     for effects, hypothesis in search.found.items():
         healthy = HeldOutFits(hypothesis.linearised, model)
-        out[effects] = _FitsByDrift(healthy, partial(with_drifts, hypothesis, healthy))
+        out[effects] = _FitsByDrift(healthy, drifts, partial(with_drift, healthy))
     return out
 
 
@@ -389,9 +396,11 @@ def _detections(
             if noise_effects.residual_shows_spikes(d, residual_v, regular, comparison.sensor)
         ]
         found = noise_effects.residual_detections(comparison, residual_v, best)
-        of_baseline = noise_effects.residual_detections(comparison, residual_v, baseline)
-        usual = {d.effect for d in of_baseline}
-        detections += [*c.detections, *spikes, *(d for d in found if d.effect in usual)]
+        if found:
+            of_baseline = noise_effects.residual_detections(comparison, residual_v, baseline)
+            usual = {d.effect for d in of_baseline}
+            found = [d for d in found if d.effect in usual]
+        detections += [*c.detections, *spikes, *found]
     material = [d for d in detections if d.power_mps2 > smallest_mps2**2]
     return list({d.effect: d for d in sorted(material, key=lambda d: d.power_mps2)}.values())
 

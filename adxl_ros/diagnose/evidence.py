@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, repeat
 from math import sqrt
 from typing import NamedTuple
 
@@ -257,19 +257,22 @@ class AngleErrorFilter:
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Filter k series, (k, n)."""
-        lower = np.ones((2, len(self.gain)))
+        lower = np.ones((2, len(self.gain)), order='F')
         lower[1, :-1] = -self.transition[1:]
-        changes = values.copy()
-        changes[:, 0] = 0.0
-        changes[:, 1:] -= self.pole * values[:, :-1]
-        estimates = scipy.linalg.lapack.dtbtrs(
-            lower, (changes * self.gain).T, uplo='L', diag='U', overwrite_b=True
-        )[0].T
-        estimates[:, :-1] *= self.weight[1:]
-        changes[:, 1:] -= estimates[:, :-1]
-        changes *= self.scale
-        changes[:, 0] = values[:, 0]
-        return scipy.signal.lfilter([1.0], [1.0, -self.pole], changes)
+        out = np.empty(values.shape)
+        # One by one they stay in the cache.
+        for series, filtered in zip(values, out):
+            changes = series.copy()
+            changes[0] = 0.0
+            changes[1:] -= self.pole * series[:-1]
+            estimates = scipy.linalg.lapack.dtbtrs(
+                lower, changes * self.gain, uplo='L', diag='U', overwrite_b=True
+            )[0]
+            changes[1:] -= estimates[:-1] * self.weight[1:]
+            changes *= self.scale
+            changes[0] = series[0]
+            filtered[:] = scipy.signal.lfilter([1.0], [1.0, -self.pole], changes)
+        return out
 
 
 @dataclass(frozen=True)
@@ -488,14 +491,38 @@ def whiten_channel(
     used: np.ndarray,
     filters: Sequence[Whitener],
     by_block: bool = True,
+    also: Iterable[np.ndarray | None] = repeat(None),
 ) -> WhitenedChannel:
     """
     Whiten one axis of one recording.
 
-    design: residual, V, and columns, V per unit of their coefficients, (n, k + 1); column_ids:
+    design: residual, V, and columns, V per unit of their coefficients, (n, c + 1); column_ids:
     numbers of the columns, (k,); used: samples that are used, (n,) bool; the others are bridged by
-    straight lines.
+    straight lines; also: further columns of each filter that are white already, (k − c, n).
     """
+    grams, total_grams, log_scales = [], [], []
+    for whitener, rows, known in zip(filters, white_rows(design, used, filters), also):
+        white = rows if known is None else np.concatenate([rows, known])
+        grams.append(block_grams(white) if by_block else np.zeros((0, 0, 0)))
+        total_grams.append(grams[-1].sum(axis=0) if by_block else white @ white.T)
+        # The log determinant of the filter for errors, sample by sample.
+        scale = np.ones(len(used)) if whitener.errors is None else whitener.errors.scale
+        log_scales.append(sum_by_block(np.where(used, np.log(scale), 0.0)))
+    return WhitenedChannel(
+        column_ids,
+        np.array(grams),
+        np.array(total_grams),
+        sum_by_block(used),
+        np.array(log_scales),
+        np.array([f.log_prior for f in filters]),
+        np.array(['' if f.healthy else f.effect for f in filters]),
+    )
+
+
+def white_rows(
+    design: np.ndarray, used: np.ndarray, filters: Sequence[Whitener]
+) -> Iterator[np.ndarray]:
+    """Yield k columns, (n, k), whitened by each filter, (k, n); 0 where they are not used."""
     data = np.ascontiguousarray(bridged(design, used).T, float)
     # Filters share that for errors of angles, which is applied once.
     shared = {id(f.errors): f.errors for f in filters}
@@ -503,24 +530,10 @@ def whiten_channel(
     # The first sample is a step from zero.
     counted = used.copy()
     counted[0] = False
-    block_grams, total_grams, log_scales = [], [], []
     for whitener in filters:
         white = scipy.signal.sosfilt(whitener.sections, before[id(whitener.errors)])
         white *= counted
-        block_grams.append(_grams(white) if by_block else np.zeros((0, 0, 0)))
-        total_grams.append(block_grams[-1].sum(axis=0) if by_block else white @ white.T)
-        # The log determinant of the filter for errors, sample by sample.
-        scale = np.ones(len(used)) if whitener.errors is None else whitener.errors.scale
-        log_scales.append(sum_by_block(np.where(used, np.log(scale), 0.0)))
-    return WhitenedChannel(
-        column_ids,
-        np.array(block_grams),
-        np.array(total_grams),
-        sum_by_block(used),
-        np.array(log_scales),
-        np.array([f.log_prior for f in filters]),
-        np.array(['' if f.healthy else f.effect for f in filters]),
-    )
+        yield white
 
 
 def sum_by_block(values: np.ndarray) -> np.ndarray:
@@ -530,10 +543,12 @@ def sum_by_block(values: np.ndarray) -> np.ndarray:
 
 def plain_grams(columns: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Return the products of k columns, (n, k), over used samples, by block, (blocks, k, k)."""
-    return _grams(columns.T * used)
+    edges = pairwise(block_edges(len(used)).tolist())
+    parts = (columns[a:b].T * used[a:b] for a, b in edges)
+    return np.array([part @ part.T for part in parts])
 
 
-def _grams(rows: np.ndarray) -> np.ndarray:
+def block_grams(rows: np.ndarray) -> np.ndarray:
     """Return the products of k rows, (k, n), by block, (blocks, k, k)."""
     edges = pairwise(block_edges(rows.shape[1]).tolist())
     return np.array([rows[:, a:b] @ rows[:, a:b].T for a, b in edges])
@@ -718,10 +733,14 @@ class ChannelColumns(NamedTuple):
     """The linear model of a hypothesis in one channel."""
 
     places: np.ndarray  # Places of the k coefficients among all, (k,)
-    values: np.ndarray  # Residual at the prior mean, V, and sensitivities, V per unit, (n, k + 1)
-    # Products of the same divided by the scale factor and the root of the number of axes, by
-    # block, (m/s²)², (blocks, k + 1, k + 1)
-    plain: np.ndarray
+    # Residual at the prior mean, V, and sensitivities to the effects, V per unit, (n, c + 1)
+    own: np.ndarray
+    nuisances: dict[Coefficient, np.ndarray]  # The same to nuisance parameters, (n,) each
+
+    @property
+    def values(self) -> np.ndarray:
+        """Residual and all sensitivities, (n, k + 1)."""
+        return np.vstack([self.own.T, *self.nuisances.values()]).T
 
     def combination(self, departures: np.ndarray) -> np.ndarray:
         """Return the factors of the columns, (k + 1,), that leave the residual at departures."""

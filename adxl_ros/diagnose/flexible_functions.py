@@ -10,7 +10,7 @@ has functions of its own, by dimension.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from math import prod
 
@@ -58,9 +58,9 @@ Basis = dict[Form, np.ndarray]
 combination with coefficients of standard deviation 1 has an rms of 1."""
 
 
-def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> list[Basis]:
+def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> Iterator[Basis]:
     """
-    Compute the flexible functions of a recording, one basis for each axis.
+    Yield the flexible functions of a recording, one basis for each axis.
 
     Those of temperature and supply also multiply the force, because they change the scale factor,
     and those of the angles its slope over the angle, because they are errors of the angle.
@@ -72,7 +72,6 @@ def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> li
     slopes = np.zeros((2, len(AXES), 0))
     if comparison.joints:
         slopes = beside.gravity_slopes(*comparison.joint_values())
-    bases = []
     for axis, along_g in enumerate(force_g):
         factors = {
             Form.TEMPERATURE: along_g,
@@ -87,8 +86,7 @@ def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> li
                 functions[dimension] = np.concatenate([plain, plain * factor])
         functions |= _of_axis(comparison, force_g, axis, baseline_v[:, axis])
         basis = {d: _normalised(values, comparison.used) for d, values in functions.items()}
-        bases.append({d: values for d, values in basis.items() if values.shape[1]})
-    return bases
+        yield {d: values for d, values in basis.items() if values.shape[1]}
 
 
 def _normalised(functions: np.ndarray, used: np.ndarray) -> np.ndarray:

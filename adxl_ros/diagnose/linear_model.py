@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import chain, product
 from typing import NamedTuple
 
@@ -28,7 +28,6 @@ from adxl_ros.model.effects import base, effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Concern, Effect, Parameter, Role
 from adxl_ros.model.sensor import names_of, parameter_of, put, Sensor, with_neutral
 from adxl_ros.signals.block_statistics import rms
-from adxl_ros.simulate.response import ChainMemo
 import numpy as np
 
 PRIOR_WIDTH = 5.0
@@ -297,8 +296,8 @@ class LinearModel:
     filters: list[list[Whitener]]  # Whitening filters of each channel
     # By channel: sensitivities by number of the column, V per unit, (n,)
     columns: list[dict[int, np.ndarray]]
-    # Responses of the newest hypotheses
-    memo: ChainMemo = field(default_factory=partial(ChainMemo, 2), compare=False, repr=False)
+    # Whitened nuisance columns by number of the channel and identity of the filter
+    _white: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
 
     @property
     def baseline(self) -> Sensor:
@@ -356,6 +355,19 @@ class LinearModel:
     def nuisances(self) -> list[Coefficient]:
         """Return the nuisance parameters that show in any channel."""
         return list(dict.fromkeys(chain(*self.nuisance_columns)))
+
+    def white_nuisances(
+        self, number: int, shown: Iterable[Coefficient], filters: Sequence[Whitener]
+    ) -> Iterator[np.ndarray]:
+        """Yield nuisance columns of a channel whitened by each filter, (k, n); each once."""
+        own, used = self.nuisance_columns[number], self.places[number].comparison.used
+        places = [[*own].index(name) for name in shown]
+        for whitener in filters:
+            key = number, id(whitener)
+            if key not in self._white:
+                design = np.reshape([*own.values()], (len(own), len(used))).T
+                self._white[key] = next(evidence.white_rows(design, used, [whitener]))
+            yield self._white[key][places]
 
     @cached_property
     def parts_at_rest(self) -> dict[Coefficient, np.ndarray]:

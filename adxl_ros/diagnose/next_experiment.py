@@ -62,7 +62,7 @@ class CouldShow(NamedTuple):
 
     @property
     def unit(self) -> str:
-        """Unit of the size: that of the parameter."""
+        """Return the unit of the size, that of the parameter."""
         return parameter_of(self.name).unit
 
     @property

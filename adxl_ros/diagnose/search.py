@@ -107,7 +107,7 @@ class Hypothesis:
         squares, varying = 0.0, 0.0
         for channel in self.linearised.columns:
             shown = [(k, i) for k, i in enumerate(channel.places) if i in own]
-            change_v = sum(self.values[i] * channel.values[:, 1 + k] for k, i in shown)
+            change_v = sum(self.values[i] * channel.own[:, 1 + k] for k, i in shown)
             squares += float(np.mean(np.square(change_v)))
             varying += float(np.var(change_v))
         return varying < linear.SMALLEST_BENT_SHARE**2 * squares
@@ -140,33 +140,23 @@ def linearise(
     nuisances = [n for n in linear_model.nuisances if n.effect not in effects]
     start = with_neutral(linear_model.baseline, [*effects, *(n.effect for n in nuisances)])
     point = _Point.of(start, effects, names, get(sensor, names))
-    # The last iterate of a fit is linearised again, for more filters.
-    responses = linear_model.memo(
-        'responses',
-        (tuple(effects), point.values.tobytes()),
-        lambda: list(chain.from_iterable(map(point.responses, linear_model.comparisons))),
-    )
-    channels: list[evidence.WhitenedChannel] = []
+    responses = chain.from_iterable(map(point.responses, linear_model.comparisons))
     columns: list[evidence.ChannelColumns] = []
     changes: list[dict[int, np.ndarray]] = []
-    for response, own, channel, of_channel in zip(
-        responses, linear_model.nuisance_columns, linear_model.places, filters
-    ):
+    for response, own in zip(responses, linear_model.nuisance_columns):
         shown = [n for n in nuisances if n in own]
         nuisance_places = [len(names) + nuisances.index(name) for name in shown]
         ids = np.array([*response.places, *nuisance_places], int)
-        design = np.vstack([response.columns.T, *(own[name] for name in shown)]).T
-        used = channel.comparison.used
-        plain = evidence.plain_grams(design / channel.v_per_mean_mps2, used)
-        columns.append(evidence.ChannelColumns(ids, design.astype(np.float32), plain))
-        channels.append(evidence.whiten_channel(design, ids, used, of_channel))
+        columns.append(
+            evidence.ChannelColumns(ids, response.columns, {name: own[name] for name in shown})
+        )
         changes.append({0: response.change_v})
     # The square of each deviation is that of a healthy unit's tolerance plus that of what a
     # calibration can take up of the effects.
     parts = linear_model.taken_up(changes, 1)
     taken_up = np.array([float(parts[n][0]) if n in parts else 0.0 for n in nuisances])
     tolerance = np.array([linear_model.tolerance(name) for name in nuisances])
-    return LinearisedHypothesis(
+    linearised = LinearisedHypothesis(
         effects=tuple(effects),
         sensor=point.sensor,
         names=(*names, *nuisances),
@@ -174,10 +164,27 @@ def linearise(
         prior_std=np.concatenate([_prior_std(names), np.hypot(tolerance, taken_up)]),
         reach=np.hypot(_HEALTHY_STDS * tolerance, taken_up),
         values=point.values,
-        channels=channels,
+        channels=[],
         columns=columns,
-        filters=filters,
+        filters=[],
     )
+    return with_filters(linear_model, linearised, filters)
+
+
+def with_filters(
+    linear_model: LinearModel,
+    linearised: LinearisedHypothesis,
+    filters: Sequence[Sequence[Whitener]],
+) -> LinearisedHypothesis:
+    """Return a linearised hypothesis, whitened by the filters of each channel."""
+    channels = []
+    for number, (columns, of_channel) in enumerate(zip(linearised.columns, filters)):
+        known = linear_model.white_nuisances(number, columns.nuisances, of_channel)
+        used = linear_model.places[number].comparison.used
+        channels.append(
+            evidence.whiten_channel(columns.own, columns.places, used, of_channel, also=known)
+        )
+    return replace(linearised, channels=channels, filters=filters)
 
 
 class _Response(NamedTuple):
@@ -322,7 +329,7 @@ def fit_hypothesis(
 
     last = gauss_newton(iterate_at, first, has_ended, _EVALUATIONS, _HALVINGS, _EVIDENCE_TOLERANCE)
     return _fitted_hypothesis(
-        linear_model, linearise(linear_model, effects, last.linearised.sensor)
+        linear_model, with_filters(linear_model, last.linearised, linear_model.usual_filters)
     )
 
 

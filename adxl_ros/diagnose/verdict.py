@@ -13,7 +13,7 @@ user would act on. The same rule, applied to blocks drawn with replacement, says
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
@@ -182,15 +182,21 @@ class HeldOutFits:
         """Squares and log likelihood of the held-out blocks."""
         squares, log_likelihood = np.zeros(BLOCKS), np.zeros(BLOCKS)
         linearised = self.linearised
+        # Products of the columns, mean over axes, by block, (m/s²)²
+        plain = [
+            linear.plain_grams(columns.values, place.comparison.used) / place.v_per_mean_mps2**2
+            for columns, place in zip(linearised.columns, self.model.places)
+        ]
         for held_out, _, fit, departures in self.folds:
-            for columns, channel, f, variance in zip(
+            for columns, plain_mps2, channel, f, variance in zip(
                 linearised.columns,
+                plain,
                 linearised.channels,
                 fit.filter_indices,
                 fit.innovation_variance_v2,
             ):
                 v = columns.combination(departures)
-                squares[held_out] += np.einsum('i,bij,j->b', v, columns.plain[held_out], v)
+                squares[held_out] += np.einsum('i,bij,j->b', v, plain_mps2[held_out], v)
                 white = np.einsum('i,bij,j->b', v, channel.block_grams[f][held_out], v)
                 log_likelihood[held_out] += channel.log_scales[f][held_out] - 0.5 * (
                     white / variance + channel.counts[held_out] * np.log(variance)
@@ -228,15 +234,23 @@ class _Decrease(NamedTuple):
     log_likelihood: np.ndarray  # Increase of the log likelihood
 
 
+class _FoldProducts(NamedTuple):
+    """The products of a fold."""
+
+    fitted_v2: np.ndarray  # Whitened, over the fitted blocks, V²
+    white_v2: np.ndarray  # Whitened, by held-out block, V²
+    plain_mps2: np.ndarray  # Mean over axes, by held-out block, (m/s²)²
+
+
 @dataclass(frozen=True)
 class _FlexibleFunctions:
     """The k flexible functions of one channel, beside the columns of a set of effects."""
 
     dimensions: np.ndarray  # What each function follows, (k,)
     columns: ChannelColumns  # The columns of the set
-    # Products of the columns, then the functions, in both directions, by block
+    # Products of the columns, then the functions, in both directions
     white_v2: np.ndarray  # Whitened, V²
-    plain_mps2: np.ndarray  # Mean over axes, (m/s²)²
+    by_fold: list[_FoldProducts]
     variance_v2: float  # Variance of the whitened noise, V²
 
     @classmethod
@@ -245,17 +259,28 @@ class _FlexibleFunctions:
         columns, channel = fits.linearised.columns[number], fits.model.places[number]
         sensor, used = channel.comparison.sensor, channel.comparison.used
         unit_v = _FIRST_LEVEL_G * float(sensor.scale_v_per_g[channel.axis])
-        design = np.concatenate([columns.values, *(unit_v * b for b in basis.values())], axis=1)
+        rows = np.concatenate([columns.values.T, *(b.T for b in basis.values())])
+        rows[1 + len(columns.places) :] *= unit_v
+        plain_mps2 = linear.plain_grams(rows.T, used) / channel.v_per_mean_mps2**2
         whitener = fits.linearised.filters[number][fits.full.filter_indices[number]]
-        ids = np.arange(design.shape[1] - 1)
-        white = linear.whiten_channel(design, ids, used, [whitener])
+        # One by one and in place they take little memory.
+        for row in rows:
+            row[:] = next(linear.white_rows(row[:, None], used, [whitener]))[0]
+        white_v2 = linear.block_grams(rows)
         return cls(
             dimensions=np.repeat(
                 [d.value for d in basis], [functions.shape[1] for functions in basis.values()]
             ),
             columns=columns,
-            white_v2=white.block_grams[0],
-            plain_mps2=linear.plain_grams(design / channel.v_per_mean_mps2, used),
+            white_v2=white_v2.sum(axis=0),
+            by_fold=[
+                _FoldProducts(
+                    white_v2[fold.fitted].sum(axis=0),
+                    white_v2[fold.held_out],
+                    plain_mps2[fold.held_out],
+                )
+                for fold in fits.folds
+            ],
             variance_v2=float(fits.full.innovation_variance_v2[number]),
         )
 
@@ -263,7 +288,7 @@ class _FlexibleFunctions:
         self, grams: np.ndarray, departures: np.ndarray, chosen: np.ndarray
     ) -> FunctionProducts:
         """Return the products of chosen functions, where effects have some departures."""
-        effects = self.columns.values.shape[1]
+        effects = 1 + len(self.columns.places)
         functions = grams[..., effects:, effects:]
         residual = grams[..., effects:, :effects] @ self.columns.combination(departures)
         return FunctionProducts(functions[..., chosen, :][..., chosen], residual[..., chosen])
@@ -271,9 +296,8 @@ class _FlexibleFunctions:
     def predict(self, fits: HeldOutFits, chosen: np.ndarray) -> _Decrease:
         """Fit functions, (k,) bool, to the other blocks, and predict those held out."""
         number = np.flatnonzero(chosen)
-        together = self.white_v2.sum(axis=0)
         level = largest_evidence_levels(
-            self.products(together, fits.full_departures, number),
+            self.products(self.white_v2, fits.full_departures, number),
             self.dimensions[number],
             self.variance_v2,
         )
@@ -281,20 +305,20 @@ class _FlexibleFunctions:
         squares, log_likelihood = np.zeros(BLOCKS), np.zeros(BLOCKS)
         if not len(active):
             return _Decrease(squares, log_likelihood)
-        for held_out, fitted, _, departures in fits.folds:
-            known = self.products(self.white_v2[fitted].sum(axis=0), departures, active)
+        for (held_out, _, _, departures), fold in zip(fits.folds, self.by_fold):
+            known = self.products(fold.fitted_v2, departures, active)
             values = np.linalg.solve(
                 known.functions / self.variance_v2 + np.diag(1 / level),
                 known.residual / self.variance_v2,
             )
-            plain = self.products(self.plain_mps2[held_out], departures, active)
-            white = self.products(self.white_v2[held_out], departures, active)
+            plain = self.products(fold.plain_mps2, departures, active)
+            white = self.products(fold.white_v2, departures, active)
             squares[held_out] = plain.decrease(values)
             log_likelihood[held_out] = 0.5 * white.decrease(values) / self.variance_v2
         return _Decrease(squares, log_likelihood)
 
 
-def reproducible_rest(fits: HeldOutFits, bases: Sequence[Basis]) -> Rest:
+def reproducible_rest(fits: HeldOutFits, bases: Iterable[Basis]) -> Rest:
     """
     Predict held-out blocks by flexible functions of everything that a residual may follow.
 

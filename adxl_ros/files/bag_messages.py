@@ -185,28 +185,44 @@ def write_messages(writer: Any, batches: Sequence[Batch]) -> None:
 
 def _write_chunk(writer: Any, batches: list[Batch]) -> None:
     """Append a chunk with its message indices, which rosbags would write message by message."""
-    storage, chunk = writer.storage, writer.storage.chunk
+    storage = writer.storage
     indices: dict[int, bytes] = {}
-    for connection, stamp_ns, data in batches:
-        head = np.zeros(len(data), _MESSAGE_HEAD)
-        head['code'], head['channel'] = _MESSAGE, connection.id
-        head['size'] = head.itemsize + data.shape[1] - _RECORD_HEAD.size
-        head['log_ns'] = head['publish_ns'] = stamp_ns
-        records = np.hstack([head.view(np.uint8).reshape(len(data), -1), data])
-        entries = np.empty(len(data), _INDEX_ENTRY)
-        entries['log_ns'] = stamp_ns
-        entries['offset'] = chunk.bio.tell() + np.arange(len(data)) * records.shape[1]
-        indices[connection.id] = indices.get(connection.id, b'') + entries.tobytes()
-        chunk.bio.write(records)
-        storage.channel_stats[connection.id] += len(data)
-        writer.counts[connection.id] += len(data)
-        for counter in (chunk, storage):
-            counter.message_start_time = min(counter.message_start_time, int(stamp_ns[0]))
-            counter.message_end_time = max(counter.message_end_time, int(stamp_ns[-1]))
+    for batch in batches:
+        channel = batch.connection.id
+        indices[channel] = indices.get(channel, b'') + _append_batch(writer, batch)
     writer.min_timestamp = min(writer.min_timestamp, storage.message_start_time)
     writer.max_timestamp = max(writer.max_timestamp, storage.message_end_time)
     storage.close_chunk()
-    begin, offsets = storage.bio.tell(), b''
+    _write_indices(storage, indices)
+
+
+def _append_batch(writer: Any, batch: Batch) -> bytes:
+    """Append messages of one size to the chunk; return their entries in the index."""
+    storage = writer.storage
+    chunk = storage.chunk
+    connection, stamp_ns, data = batch
+    head = np.zeros(len(data), _MESSAGE_HEAD)
+    head['code'] = _MESSAGE
+    head['channel'] = connection.id
+    head['size'] = head.itemsize + data.shape[1] - _RECORD_HEAD.size
+    head['log_ns'] = head['publish_ns'] = stamp_ns
+    records = np.hstack([head.view(np.uint8).reshape(len(data), -1), data])
+    entries = np.empty(len(data), _INDEX_ENTRY)
+    entries['log_ns'] = stamp_ns
+    entries['offset'] = chunk.bio.tell() + np.arange(len(data)) * records.shape[1]
+    chunk.bio.write(records)
+    storage.channel_stats[connection.id] += len(data)
+    writer.counts[connection.id] += len(data)
+    for counter in (chunk, storage):
+        counter.message_start_time = min(counter.message_start_time, int(stamp_ns[0]))
+        counter.message_end_time = max(counter.message_end_time, int(stamp_ns[-1]))
+    return entries.tobytes()
+
+
+def _write_indices(storage: Any, indices: Mapping[int, bytes]) -> None:
+    """Write the message index of each channel behind the chunk, and state where they are."""
+    begin = storage.bio.tell()
+    offsets = b''
     for channel, index in indices.items():
         offsets += _INDEX_OFFSET.pack(channel, storage.bio.tell())
         storage.bio.write(
@@ -271,7 +287,8 @@ class Bag:
             if connection.msgcount
         }
         self.done = 0.0  # Fraction of the recording that has been read
-        self._storages, self._is_packed = storages, is_packed
+        self._storages = storages
+        self._is_packed = is_packed
 
     def pieces(self, topics: Collection[str]) -> Iterator[Piece]:
         """Yield the messages of some topics in pieces, in the order of recording."""
@@ -336,14 +353,16 @@ def import_rosbags() -> Any:
 @contextmanager
 def open_bag(path: AnyPath) -> Iterator[Bag]:
     """Open a rosbag2 directory, or one .mcap or .db3 file."""
-    rosbag2, bag_path = import_rosbags(), Path(path)
+    rosbag2 = import_rosbags()
+    bag_path = Path(path)
     with ExitStack() as stack:
         if (bag_path / 'metadata.yaml').exists():
             with _readable(bag_path):
                 reader = stack.enter_context(rosbag2.Reader(bag_path))
             yield Bag(str(path), reader.storage.storages, reader.compression_mode == 'message', '')
             return
-        storages, cuts = [], []
+        storages = []
+        cuts = []
         for file in _files(bag_path):
             with _readable(file):
                 if file.suffix == '.mcap' and _is_unfinished(file):
@@ -402,7 +421,8 @@ def find_topics(bag: Bag, topic: str = '', has_stage: bool = True) -> Topics:
         """Return a topic in the namespace of the sensor; other nodes use these names, too."""
         return space + name if (space + name, kind) in bag.types else None
 
-    temperature, supply = beside('temperature', TEMPERATURE), beside('supply', BATTERY_STATE)
+    temperature = beside('temperature', TEMPERATURE)
+    supply = beside('supply', BATTERY_STATE)
     if not has_stage:
         return Topics(imu, temperature=temperature, supply=supply)
     joints = beside('stage/joint_states', JOINT_STATE) or _only(

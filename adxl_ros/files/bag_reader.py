@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterator, Mapping
 from functools import partial
 from itertools import chain
+from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
@@ -64,17 +65,34 @@ def blocks(
             )
         topics = find_topics(bag, reading.topic, has_stage=not ideal)
         info = read_info(bag, topics.info)
-        tracks, commands = _tracks(bag, topics), _commands(bag, topics)
+        tracks = _tracks(bag, topics)
+        commands = _commands(bag, topics)
         samples = _Samples(
             f'{bag.path}: topic {topics.imu}', AXES if ideal else info.get('axes'), reading
         )
         for piece in bag.pieces([topics.imu]):
             samples.add(piece.messages[topics.imu])
-            while len(samples.stamp_ns) > rows:
+            while len(samples.waiting.stamp_ns) > rows:
                 yield _block(bag, samples, tracks, commands, info, rows)
         if not samples.count:
             raise UserError(f'{samples.where}: holds no message')
         yield _block(bag, samples, tracks, commands, info, rows)
+
+
+class _Rows(NamedTuple):
+    """Some samples of the sensor."""
+
+    stamp_ns: np.ndarray  # Stamps, ns, (n,)
+    force_mps2: np.ndarray  # Specific force, m/s², (n, 3)
+    gyro_radps: np.ndarray  # Angular velocity, rad/s, (n, 3)
+
+    def part(self, rows: slice | np.ndarray) -> _Rows:
+        """Return some of them."""
+        return _Rows(self.stamp_ns[rows], self.force_mps2[rows], self.gyro_radps[rows])
+
+    def followed_by(self, later: _Rows) -> _Rows:
+        """Return these samples and later ones."""
+        return _Rows(*map(np.concatenate, zip(self, later)))
 
 
 class _Samples:
@@ -88,9 +106,7 @@ class _Samples:
         self.epoch_ns = 0  # Origin of the times, ns
         self.count = 0  # Messages so far
         self.incomplete = 0  # Those of them that were left out, because an axis has no number
-        self.stamp_ns = np.zeros(0, np.int64)  # Stamps of the waiting samples, ns, (n,)
-        self.force = np.zeros((0, 3))  # Their specific force, m/s², (n, 3)
-        self.gyro_radps = np.zeros((0, 3))  # Their angular velocity, rad/s, (n, 3)
+        self.waiting = _Rows(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
         self.has_gyro = False  # Whether the messages state an angular velocity
         self._reading = reading
         self._unit = reading.unit or 'mps2'  # Unit of the accelerations of the topic
@@ -114,8 +130,8 @@ class _Samples:
             },
         )
         readings = np.column_stack([columns[name] for name in ACCEL])
+        force_mps2 = self._reading.outputs(readings, 3 * [self._unit])
         gyro_radps = np.column_stack([columns[name] for name in GYRO])
-        force = self._reading.outputs(readings, 3 * [self._unit])
         # A value beyond every gyroscope is no reading.
         gyro_radps[~(np.abs(gyro_radps) <= LIMIT)] = np.nan
         if not self.count:
@@ -125,6 +141,14 @@ class _Samples:
             number = self.count + np.arange(len(stamp_ns))
             since_first_ns = np.rint(number * 1e9 / self._reading.rate_hz)
             stamp_ns = self._first_ns + since_first_ns.astype(np.int64)
+        rows = _Rows(stamp_ns, force_mps2, gyro_radps)
+        is_kept = self._checked(rows)
+        self.count += len(stamp_ns)
+        self.waiting = self.waiting.followed_by(rows.part(is_kept))
+
+    def _checked(self, rows: _Rows) -> np.ndarray:
+        """Return which messages are samples, (n,); refuse those with values of no sensor."""
+        stamp_ns, force_mps2, _ = rows
 
         def place(row: int) -> str:
             number = self.count + row + 1
@@ -132,22 +156,25 @@ class _Samples:
 
         is_sample = np.ones(len(stamp_ns), bool)
         if self._reading.drop_bad_samples:
-            is_sample = np.isfinite(force).all(axis=1)
+            is_sample = np.isfinite(force_mps2).all(axis=1)
             self.incomplete += int((~is_sample).sum())
         is_kept = self.stamps.increasing((stamp_ns - self.epoch_ns) / 1e9, is_sample, place)
-        wrong = is_kept[:, None] & ~(np.abs(force) <= LIMIT)
+        wrong = is_kept[:, None] & ~(np.abs(force_mps2) <= LIMIT)
         if wrong.any():
             row, axis = np.argwhere(wrong)[0]
-            advice = '' if np.isfinite(force[row, axis]) else f'; {drop_samples()}'
+            value = force_mps2[row, axis]
+            advice = '' if np.isfinite(value) else f'; {drop_samples()}'
             raise UserError(
-                f'{place(row)}: linear_acceleration.{AXES[axis]} is '
-                f'{force[row, axis]:g} m/s², expected a number within ±{LIMIT:g}'
-                f'{advice}'
+                f'{place(row)}: linear_acceleration.{AXES[axis]} is {value:g} m/s², expected a '
+                f'number within ±{LIMIT:g}{advice}'
             )
-        self.count += len(stamp_ns)
-        self.stamp_ns = np.concatenate([self.stamp_ns, stamp_ns[is_kept]])
-        self.force = np.concatenate([self.force, force[is_kept]])
-        self.gyro_radps = np.concatenate([self.gyro_radps, gyro_radps[is_kept]])
+        return is_kept
+
+    def take(self, rows: int) -> _Rows:
+        """Take the first ones that wait."""
+        taken = self.waiting.part(slice(rows))
+        self.waiting = self.waiting.part(slice(rows, None))
+        return taken
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -197,31 +224,32 @@ def _columns(
     return stamp_ns, columns
 
 
-def series(
-    bag: Bag, topic: str, find: Callable[[bytes], cdr.Layout], values: Values
-) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Return stamps and log times, ns, (k,), and columns, (k,), of all messages of a topic."""
-    logs, stamps, columns = zip(
-        *(
-            (
-                piece.log_ns[topic],
-                *_columns(f'{bag.path}: topic {topic}', piece.messages[topic], find, values),
-            )
-            for piece in bag.pieces([topic])
-        )
-    )
+class Series(NamedTuple):
+    """All k messages of a topic, by the time of their records."""
+
+    stamp_ns: np.ndarray  # Stamps, ns, (k,)
+    log_ns: np.ndarray  # Times of their records, ns, (k,), rising
+    columns: dict[str, np.ndarray]  # Values by name, (k,); NaN where a message has none
+
+
+def series(bag: Bag, topic: str, find: Callable[[bytes], cdr.Layout], values: Values) -> Series:
+    """Return all messages of a topic."""
+    where = f'{bag.path}: topic {topic}'
+    logs = []
+    stamps = []
+    parts = []
+    for piece in bag.pieces([topic]):
+        stamp_ns, columns = _columns(where, piece.messages[topic], find, values)
+        logs.append(piece.log_ns[topic])
+        stamps.append(stamp_ns)
+        parts.append(columns)
     log_ns = np.concatenate(logs)
     order = np.argsort(log_ns, kind='stable')  # A file that was cut off has no index by time
-    return (
-        np.concatenate(stamps)[order],
-        log_ns[order],
-        {
-            name: np.concatenate(
-                [part.get(name, np.full(len(log), np.nan)) for part, log in zip(columns, logs)]
-            )[order]
-            for name in dict.fromkeys(chain.from_iterable(columns))
-        },
-    )
+    joined = {}
+    for name in dict.fromkeys(chain.from_iterable(parts)):
+        known = [part.get(name, np.full(len(log), np.nan)) for part, log in zip(parts, logs)]
+        joined[name] = np.concatenate(known)[order]
+    return Series(np.concatenate(stamps)[order], log_ns[order], joined)
 
 
 def positions(table: cdr.Table, names: Mapping[str, str] | None = None) -> dict[str, np.ndarray]:
@@ -238,41 +266,53 @@ def positions(table: cdr.Table, names: Mapping[str, str] | None = None) -> dict[
 
 def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
     """Return the references by column; none of a joint without a position."""
-    tracks = {}
-    for topic, find, longest_ns, values in (
-        (topics.joints, cdr.joint_state, LONGEST_MOVE_NS, partial(positions, names=JOINTS)),
-        (
-            topics.temperature,
-            cdr.temperature,
-            np.inf,
-            lambda table: {'temperature_c': table.numbers('temperature')[:, 0]},
-        ),
-        (
-            topics.supply,
-            cdr.battery_state,
-            np.inf,
-            lambda table: {'supply_v': table.numbers('voltage')[:, 0]},
-        ),
-    ):
-        if not topic:
-            continue
-        where = f'{bag.path}: topic {topic}'
-        stamp_ns, _, columns = series(bag, topic, find, values)
-        for name, value in columns.items():
-            lowest, highest = limits(name)
-            wrong = (value < lowest) | (value > highest)
-            if wrong.any():
-                raise UserError(
-                    f'{where}: {name} is {value[wrong.argmax()]:g} at '
-                    f'{seconds(stamp_ns[wrong.argmax()])}, expected {lowest:g} to {highest:g}'
-                )
-            tracks[name] = Track(where, stamp_ns, value, longest_ns)
+    tracks: dict[str, Track] = {}
+    if topics.joints:
+        values = partial(positions, names=JOINTS)
+        found = series(bag, topics.joints, cdr.joint_state, values)
+        tracks |= _tracks_of(f'{bag.path}: topic {topics.joints}', found, LONGEST_MOVE_NS)
+    if topics.temperature:
+        values = partial(_first, column='temperature_c', field='temperature')
+        found = series(bag, topics.temperature, cdr.temperature, values)
+        tracks |= _tracks_of(f'{bag.path}: topic {topics.temperature}', found)
+    if topics.supply:
+        values = partial(_first, column='supply_v', field='voltage')
+        found = series(bag, topics.supply, cdr.battery_state, values)
+        tracks |= _tracks_of(f'{bag.path}: topic {topics.supply}', found)
     return tracks
 
 
-def _commands(bag: Bag, topics: Topics) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _first(table: cdr.Table, column: str, field: str) -> dict[str, np.ndarray]:
+    """Return the first number of a field as a column."""
+    return {column: table.numbers(field)[:, 0]}
+
+
+def _tracks_of(where: str, found: Series, longest_ns: float = np.inf) -> dict[str, Track]:
+    """Return the references of a topic by column; refuse values that none has."""
+    tracks = {}
+    for name, value in found.columns.items():
+        lowest, highest = limits(name)
+        wrong = (value < lowest) | (value > highest)
+        if wrong.any():
+            row = wrong.argmax()
+            raise UserError(
+                f'{where}: {name} is {value[row]:g} at {seconds(found.stamp_ns[row])}, '
+                f'expected {lowest:g} to {highest:g}'
+            )
+        tracks[name] = Track(where, found.stamp_ns, value, longest_ns)
+    return tracks
+
+
+class _Commands(NamedTuple):
+    """The k commands of a joint."""
+
+    stamp_ns: np.ndarray  # Stamps, ns, (k,), rising
+    position_rad: np.ndarray  # Positions, rad, (k,)
+
+
+def _commands(bag: Bag, topics: Topics) -> dict[str, _Commands]:
     """
-    Return the commands of joints by column: stamps, ns, rising, and positions, rad, (k,) each.
+    Return the commands of joints by column.
 
     One without a stamp counts from the time of its record. A value that is no angle is left out,
     because the stage refuses it.
@@ -287,7 +327,7 @@ def _commands(bag: Bag, topics: Topics) -> dict[str, tuple[np.ndarray, np.ndarra
     for name, value in columns.items():
         is_given = np.abs(value) <= LIMIT
         order = np.argsort(stamp_ns[is_given], kind='stable')
-        commands[name] = stamp_ns[is_given][order], value[is_given][order]
+        commands[name] = _Commands(stamp_ns[is_given][order], value[is_given][order])
     return commands
 
 
@@ -295,22 +335,21 @@ def _block(
     bag: Bag,
     samples: _Samples,
     tracks: Mapping[str, Track],
-    commands: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    commands: Mapping[str, _Commands],
     info: Mapping[str, str],
     rows: int,
 ) -> Recording:
     """Take a block of waiting samples, with references and commands at their stamps."""
-    stamp_ns, samples.stamp_ns = samples.stamp_ns[:rows], samples.stamp_ns[rows:]
-    force, samples.force = samples.force[:rows], samples.force[rows:]
-    gyro_radps, samples.gyro_radps = samples.gyro_radps[:rows], samples.gyro_radps[rows:]
-    columns = dict(zip(ACCEL[: len(samples.axes or '')], force.T.copy()))
+    stamp_ns, force_mps2, gyro_radps = samples.take(rows)
+    columns = dict(zip(ACCEL[: len(samples.axes or '')], force_mps2.T.copy()))
     if samples.has_gyro:
         columns |= dict(zip(GYRO, gyro_radps.T.copy()))
     columns |= {name: track.interpolate(stamp_ns) for name, track in tracks.items()}
     alignments = {name: track.alignment for name, track in tracks.items()}
-    for name, (begin_ns, value) in commands.items():
+    for name, given in commands.items():
         # Each is in force until the next one; before the first it is NaN.
-        columns[name] = np.append(value, np.nan)[np.searchsorted(begin_ns, stamp_ns, 'right') - 1]
+        latest = np.searchsorted(given.stamp_ns, stamp_ns, 'right') - 1
+        columns[name] = np.append(given.position_rad, np.nan)[latest]
     # A division gives the float64 nearest to the decimal number, a product with 1e-9 does not.
     time_s = (stamp_ns - samples.epoch_ns) / 1e9
     cut = f'{bag.cut}; the last sample read is at {seconds(stamp_ns[-1])}' if bag.cut else ''

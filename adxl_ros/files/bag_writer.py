@@ -52,7 +52,8 @@ class _NewBag:
     """Writes the messages of a new bag by topic."""
 
     def __init__(self, path: Path, writer: Any) -> None:
-        self.path, self.writer = path, writer
+        self.path = path
+        self.writer = writer
         self.types = typestore()
         self.connections: dict[str, Any] = {}
 

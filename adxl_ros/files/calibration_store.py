@@ -127,7 +127,8 @@ def put(folder: AnyPath, sensor: Sensor, comments: Iterable[str] = ()) -> Path |
 
 def history(folder: AnyPath, serial: str) -> SensorHistory:
     """Return the calibrations of a sensor by date."""
-    calibrations, refused = [], []
+    calibrations = []
+    refused = []
     for path in sorted(sensor_folder(folder, serial).glob('*.yaml')):
         try:
             sensor = parameter_file.load(path)
@@ -162,7 +163,8 @@ def newer(folder: AnyPath, sensor: Sensor) -> Path | None:
         for path in sensor_folder(folder, sensor.serial).glob('*.yaml')
         if re.match(r'\d{8}T\d{6}Z', path.name.removeprefix(begin))
     ]
-    last, date = max(files, default=None), date_of(sensor)
+    last = max(files, default=None)
+    date = date_of(sensor)
     is_newer = last and (
         not date or last.name.removeprefix(begin)[:_DATE_LETTERS] > f'{date:{_DATE}}'
     )

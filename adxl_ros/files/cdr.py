@@ -183,7 +183,8 @@ def tables(raws: Sequence[bytes] | np.ndarray, find: Callable[[bytes], Layout]) 
                 yield Table(rows, data, layout)
                 break
             yield Table(rows[~differs], data[~differs], layout)
-            rows, data = rows[differs], data[differs]
+            rows = rows[differs]
+            data = data[differs]
 
 
 def fill(

@@ -159,11 +159,11 @@ def parse_mapping(text: str) -> ColumnMapping:
     return ColumnMapping(sources, where)
 
 
-Mounting = tuple[tuple[int, int], ...]
+SignedAxes = tuple[tuple[int, int], ...]
 """For each axis of the sensor frame, the index of an axis of the file, and its sign, 1 or −1."""
 
 
-def parse_mounting(text: str) -> Mounting:
+def parse_mounting(text: str) -> SignedAxes:
     """Parse a documented mounting, as in `x=-y,y=x,z=z`: x of the frame is −y of the file."""
     entries = re.findall(r'(?:^|,)\s*([xyz])\s*=\s*([-+]?)\s*([xyz])\s*(?=,|$)', text)
     axes = AXES[: text.count(',') + 1]
@@ -183,7 +183,7 @@ def parse_mounting(text: str) -> Mounting:
     return signed_axes
 
 
-def _is_mirror(mounting: Mounting) -> bool:
+def _is_mirror(mounting: SignedAxes) -> bool:
     """Return whether a map of three axes has the determinant -1."""
     matrix = np.zeros((len(AXES), len(AXES)))
     for row, (column, sign) in enumerate(mounting):
@@ -352,7 +352,7 @@ class ReadingOptions:
     drop_bad_stamps: bool = False  # Whether samples are left out whose stamp does not increase
     # Whether samples are left out that have no number as their stamp or on an axis
     drop_bad_samples: bool = False
-    mounting: Mounting | None = None  # How the axes of the file are those of the sensor frame
+    mounting: SignedAxes | None = None  # How the axes of the file are those of the sensor frame
 
     def __post_init__(self) -> None:
         """Refuse two statements of the unit."""
@@ -413,7 +413,7 @@ _SHORTEST_STEP_S = 2.5e-5  # Shortest step of stamps, s. Chosen: an IIS3DWB has 
 _LONGEST_STEP_S = 1.05  # Longest step of stamps, s. Chosen: 1 Hz, the slowest, with jitter
 
 
-def listed(names: Sequence[str]) -> str:
+def first_names(names: Sequence[str]) -> str:
     """Return the first names of columns for a message."""
     more = len(names) - _LISTED_NAMES
     return ', '.join(names[:_LISTED_NAMES]) + (f' and {more} more' if more > 0 else '')

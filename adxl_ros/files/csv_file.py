@@ -251,7 +251,8 @@ def find_form(path: str) -> Form:
     if not written:
         raise UserError(f'{path}: is empty')
     plain = [_plain(line.encode()).decode() for line in lines]
-    best, form = (0, 0), None
+    best = (0, 0)
+    form = None
     for delimiter in _DELIMITERS:
         numbers: Counter[int] = Counter()
         first: dict[int, int] = {}
@@ -264,7 +265,8 @@ def find_form(path: str) -> Form:
                 first.setdefault(len(fields), index)
         size, most = max(numbers.items(), key=lambda item: item[1], default=(0, 0))
         if (most, -size) > best:
-            best, form = (most, -size), _form(lines, plain, first[size], delimiter)
+            best = (most, -size)
+            form = _form(lines, plain, first[size], delimiter)
     if 'time_s' in _fields(written[0], ',') and not (form and form.header_line):
         number = lines.index(written[0]) + 1  # a recording of the package without good samples
         return _named(_fields(written[0], ','), number, number + 1, ',', False)
@@ -282,7 +284,8 @@ def _form(lines: Sequence[str], plain: Sequence[str], index: int, delimiter: str
     header_line, header = _header(lines[:index], delimiter, count)
     labels = _LABEL.findall(_DATE.sub(b'0', lines[index].encode()))
     if not header and len(labels) == count:
-        header_line, header = index + 1, [label.decode().strip('":= ') for label in labels]
+        header_line = index + 1
+        header = [label.decode().strip('":= ') for label in labels]
     is_worded = any(
         line != bare and not _COMMENT.match(line)
         for line, bare in zip(lines[index:], plain[index:])

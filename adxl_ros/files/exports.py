@@ -90,7 +90,8 @@ def axes(sensor: Sensor) -> list[Axis]:
     step = noise.electronics(sensor).lsb_v * mps2_per_v
     std = noise.analog_std_v(sensor) * mps2_per_v
     density = np.sqrt(noise.density_v2_per_hz(sensor, np.zeros(1)))[0] * mps2_per_v
-    of_walk, count = sensor.values.get('bias_walk', {}), len(sensor.axes)
+    of_walk = sensor.values.get('bias_walk', {})
+    count = len(sensor.axes)
     walk = np.broadcast_to(of_walk.get('density_g_per_rts', 0.0), count) * G0_MPS2
     returns = np.broadcast_to(of_walk.get('return_per_s', 0.0), count)
     # The columns are the fields of `Axis` behind its name.
@@ -207,22 +208,30 @@ def _json(export: Export) -> str:
     )
 
 
+class KalibrSetting(NamedTuple):
+    """A setting of Kalibr."""
+
+    name: str
+    density: float
+    unit: str
+
+
 def kalibr_settings(
     accel: tuple[float, float], gyro: tuple[float, float] | None
-) -> list[tuple[str, float, str]]:
+) -> list[KalibrSetting]:
     """
     Return the settings of Kalibr, which are densities over both signs of the frequency.
 
     accel, gyro: white noise and random walk; None without a gyroscope.
     """
     settings = [
-        ('accelerometer_noise_density', accel[0], 'm/s^2/sqrt(Hz)'),
-        ('accelerometer_random_walk', accel[1], 'm/s^3/sqrt(Hz)'),
+        KalibrSetting('accelerometer_noise_density', accel[0], 'm/s^2/sqrt(Hz)'),
+        KalibrSetting('accelerometer_random_walk', accel[1], 'm/s^3/sqrt(Hz)'),
     ]
     if gyro is not None:
         settings += [
-            ('gyroscope_noise_density', gyro[0], 'rad/s/sqrt(Hz)'),
-            ('gyroscope_random_walk', gyro[1], 'rad/s^2/sqrt(Hz)'),
+            KalibrSetting('gyroscope_noise_density', gyro[0], 'rad/s/sqrt(Hz)'),
+            KalibrSetting('gyroscope_random_walk', gyro[1], 'rad/s^2/sqrt(Hz)'),
         ]
     return settings
 
@@ -246,7 +255,8 @@ def gyro_figures(sensor: Sensor) -> GyroFigures | None:
     if not gyro.noise_density_radps_per_rthz:
         return None
     white = np.array(gyro.noise_density_radps_per_rthz) / ONE_SIDED
-    remark, walk = 'Gyroscope: noise as it was measured.', max(gyro.walk_radps_per_rts, default=0)
+    remark = 'Gyroscope: noise as it was measured.'
+    walk = max(gyro.walk_radps_per_rts, default=0)
     if not walk:
         # Its Allan deviation K·√(τ/3) is that of white noise, N/√τ, after this time.
         walk = float(np.sqrt(3) * white.max() / _HIDDEN_S)
@@ -269,7 +279,8 @@ def _white_density(export: Export, software: str) -> float:
 
 def _largest_mps2(sensor: Sensor) -> float:
     """Return the reading at which the first axis may clip, m/s²: by range, rails or saturation."""
-    zero_g_v, scale = sensor.nominal_zero_g_v, sensor.nominal_scale_v_per_g
+    zero_g_v = sensor.nominal_zero_g_v
+    scale = sensor.nominal_scale_v_per_g
     limits_g = [sensor.range_g, *np.ravel(sensor.values.get('saturation', {}).get('limit_g', ()))]
     if sensor.adc_bits:
         limits_g += [*(zero_g_v / scale), *((sensor.adc_vref_v - sensor.lsb_v - zero_g_v) / scale)]
@@ -295,7 +306,8 @@ def text(name: str, export: Export) -> str:
     ]
     coupling = np.eye(3)
     coupling[[AXES.index(axis) for axis in sensor.axes]] = gain(sensor)
-    walk, remark = max(values['walk_density']), 'Values are those of the noisiest axis.'
+    walk = max(values['walk_density'])
+    remark = 'Values are those of the noisiest axis.'
     if not walk:
         walk = effect_named('bias_walk').diagnosis.healthy_density * G0_MPS2
         remark += '\n# The random walk is that of a healthy unit: the file states none.'

@@ -53,7 +53,8 @@ def read(raw: bytes) -> tuple[float, Sequence[float]]:
 def in_mps2(raw: bytes, unit: str) -> bytes:
     """Return an Imu with the acceleration in m/s² that has it in a unit, a key of `GRAVITY`."""
     order, begin = _numbers_begin(raw)
-    message, place = bytearray(raw), begin + _ACCELERATION
+    message = bytearray(raw)
+    place = begin + _ACCELERATION
     values = struct.unpack_from(order + '3d', message, place)
     factor = G0_MPS2 / GRAVITY[unit]
     struct.pack_into(order + '3d', message, place, *(factor * value for value in values))

@@ -15,9 +15,9 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import (
     ColumnMapping,
     drop_samples,
+    first_names,
     GYRO_ROLES,
     is_sensor_step,
-    listed,
     Quantity,
     ReadingOptions,
     ROLES,
@@ -97,7 +97,7 @@ def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
             )
     missing = [column for column in (TIME, *output) if column not in names]
     if missing:
-        present = f'; the columns are {listed(names)}' if output else ''
+        present = f'; the columns are {first_names(names)}' if output else ''
         raise NotNativeError(f'{table.header}: no column {missing[0]}{present}')
     try:
         outputs = output or sensor_columns(names, table.header)
@@ -152,7 +152,9 @@ class _Converter:
         self, table: Table, mapping: ColumnMapping, reading: ReadingOptions, is_native: bool
     ) -> None:
         self.count = 0  # Samples so far
-        self._path, self._where, self._reading = table.path, mapping.where, reading
+        self._path = table.path
+        self._where = mapping.where
+        self._reading = reading
         self._is_native = is_native  # Whether the columns are those of the package
         if 'time' not in mapping.sources and reading.rate_hz is None:
             raise UserError(
@@ -177,12 +179,13 @@ class _Converter:
 
     def _source(self, table: Table, role: str, source: Source) -> Source:
         """Return the column of a role, by its name or number, and its unit."""
-        name, names = source.column, table.names
+        name = source.column
+        names = table.names
         if name not in names:
             if not name.isdecimal() or not 1 <= int(name) <= len(names):
                 raise UserError(
                     f'{self._where}: {table.path} has no column {name!r} for {role}; '
-                    f'the columns are {listed(names)}'
+                    f'the columns are {first_names(names)}'
                 )
             name = names[int(name) - 1]
         unit = source.unit or table.units.get(name) or unit_in_name(name, ROLES[role])
@@ -307,7 +310,8 @@ class _Converter:
             number = self._rows + np.cumsum(is_step) - 1
             self._rows += int(is_step.sum())
             return number / self._reading.rate_hz, is_sample
-        source, unit = self.sources['time'], self._unit('time')
+        source = self.sources['time']
+        unit = self._unit('time')
         stamps = block.columns[source.column]
         _refuse(
             block,
@@ -347,9 +351,11 @@ class _Converter:
 
     def _check_step(self, time_s: np.ndarray) -> None:
         """Refuse stamps whose steps no sensor has."""
-        source, divisor = self.sources['time'], self._unit('time').divisor
+        source = self.sources['time']
+        divisor = self._unit('time').divisor
         rate_hz = stamped_rate_hz(time_s)
-        stamps, step = time_s * divisor, divisor / rate_hz
+        stamps = time_s * divisor
+        step = divisor / rate_hz
         is_whole = bool((np.abs(stamps - np.rint(stamps)) < _WHOLE).all())
         if not is_sensor_step(1 / rate_hz, is_whole):
             unit = time_unit_of_step(step, is_whole)

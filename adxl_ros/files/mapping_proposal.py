@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 from adxl_ros.files.column_mapping import (
     ColumnMapping,
     Columns,
+    first_names,
     GRAVITY,
     is_sensor_step,
     likely_unit,
-    listed,
     LSB,
     Quantity,
     ROLES,
@@ -125,7 +125,7 @@ _SIGN_GAP = (24576, 40960)
 
 def propose(table: Table) -> tuple[str, str]:
     """Describe the columns of a table, and the options that most likely read it."""
-    seen = f'the columns are {listed(table.names)}'
+    seen = f'the columns are {first_names(table.names)}'
     sample = next((block.columns for block in table.blocks(table.names, ())), {})
     values = {
         name: np.where(np.abs(column) < _LARGEST, column, np.nan)
@@ -148,7 +148,8 @@ def propose(table: Table) -> tuple[str, str]:
     if time:
         source = _time_source(table, time, values[time])
         sources = {'time': source, **sources}
-        stamps, note = _stamp_options(values[time], source), ''
+        stamps = _stamp_options(values[time], source)
+        note = ''
         if guess.unit in ('v', 'mv'):
             note = f' (then {option("sensor")} takes the parameter file of the sensor)'
     if table.has_names:
@@ -179,9 +180,11 @@ def _guess_output(table: Table, outputs: Sequence[str], readings: np.ndarray) ->
     unit = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
     is_whole = bool((readings == np.rint(readings)).all())
     if unit in (None, LSB) and is_whole and _have_lost_sign(readings):
-        unit, readings = UNSIGNED, signed(readings)
+        unit = UNSIGNED
+        readings = signed(readings)
     # A sensor that was turned and never reads below 0 has its 0 g in the middle.
-    low, spread = readings.min(axis=0), np.ptp(readings, axis=0)
+    low = readings.min(axis=0)
+    spread = np.ptp(readings, axis=0)
     zero = 0.0
     is_turned = spread.min() > max(_TURNED * spread.max(), _AT_REST * readings.max())
     if low.min() > 0 and is_turned:

@@ -352,7 +352,8 @@ class _FlatReader:
 
     def _field(self, field: Field[Any], axes: str = '') -> Any:
         """Return the value of a field of `Sensor`."""
-        about, kind = field.metadata, str(field.type)
+        about = field.metadata
+        kind = str(field.type)
         key = about['key']
         self._require(key in self.flat, key, f'missing; it is the {about["doc"]}')
         value = self.flat[key]
@@ -468,7 +469,8 @@ class _FlatReader:
         self, effects: Sequence[str], axes: str
     ) -> tuple[np.ndarray, tuple[Coefficient, ...]]:
         """Return the covariance, (k, k), symmetric and positive, and its k coefficients."""
-        key, names = 'covariance', self._names('covariance_names')
+        key = 'covariance'
+        names = self._names('covariance_names')
         coefficients = {str(name): name for name in coefficients_of(effects, axes)}
         for name in names:
             self._require(

@@ -20,20 +20,18 @@ from adxl_ros.files import mapped_recording, mapping_proposal
 from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.column_mapping import (
     AS_IT_IS,
-    Mounting,
     parse_mapping,
     ReadingOptions,
+    SignedAxes,
     Table,
 )
 from adxl_ros.files.csv_file import csv_writer
 from adxl_ros.files.recording_columns import ACCEL, concatenate, GYRO, Recording, TIME, VOLTS
-from adxl_ros.files.tables import open_table
+from adxl_ros.files.tables import BLOCK_ROWS, open_table
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
 import numpy as np
-
-_BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 
 _MAGIC_BYTES = 16  # Bytes at the beginning of a file that show its format
 
@@ -68,7 +66,7 @@ def read(path: AnyPath, reading: ReadingOptions = AS_IT_IS) -> Recording:
         The recording cannot be read, or holds values that no sensor gives.
 
     """
-    return concatenate(blocks(path, _BLOCK_ROWS, reading))
+    return concatenate(blocks(path, BLOCK_ROWS, reading))
 
 
 def blocks(
@@ -87,7 +85,7 @@ def blocks(
 
 def of_table(table: Table, reading: ReadingOptions = AS_IT_IS) -> Recording:
     """Return the whole recording that a table in memory holds."""
-    return concatenate(_table_blocks(table, _BLOCK_ROWS, reading))
+    return concatenate(_table_blocks(table, BLOCK_ROWS, reading))
 
 
 def _bag_blocks(path: AnyPath, rows: int, **options: Any) -> Generator[Recording, None, None]:
@@ -112,7 +110,7 @@ def _table_blocks(
 
 
 def _mounted(
-    blocks: Iterator[Recording], mounting: Mounting | None
+    blocks: Iterator[Recording], mounting: SignedAxes | None
 ) -> Generator[Recording, None, None]:
     """Turn the blocks of a recording; they stay as they are without a mounting."""
     if mounting is None:
@@ -174,9 +172,9 @@ def read_ideal(path: AnyPath, epoch_ns: int = 0, unit: str = '') -> Recording:
     """
     reading = ReadingOptions(unit=unit)
     parts = (
-        _bag_blocks(path, _BLOCK_ROWS, ideal=True, reading=reading)
+        _bag_blocks(path, BLOCK_ROWS, ideal=True, reading=reading)
         if is_bag(path)
-        else mapped_recording.blocks(open_table(path), None, reading, _BLOCK_ROWS, ACCEL)
+        else mapped_recording.blocks(open_table(path), None, reading, BLOCK_ROWS, ACCEL)
     )
     return at_epoch(concatenate(parts), epoch_ns)
 

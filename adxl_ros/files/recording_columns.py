@@ -194,7 +194,8 @@ class Recording:
         """Draw the sensor's output over time into axes of matplotlib, new ones for None."""
         from adxl_ros.report.figures import axes_for, AXIS_COLOURS
 
-        ax, unit = axes_for(ax), 'V' if self.sensor_columns[0] in VOLTS else 'm/s²'
+        ax = axes_for(ax)
+        unit = 'V' if self.sensor_columns[0] in VOLTS else 'm/s²'
         for axis, name in zip(self.axes, self.sensor_columns):
             ax.plot(self.time_s, self.columns[name], lw=0.8, label=axis, color=AXIS_COLOURS[axis])
         ax.set(xlabel='time, s', ylabel=f'output, {unit}')
@@ -347,7 +348,8 @@ class StampCheck:
 
     def __init__(self, path: str, may_drop: bool) -> None:
         self.bad = BadStamps(0, 0)  # What was left out so far
-        self._path, self._may_drop = path, may_drop
+        self._path = path
+        self._may_drop = may_drop
         self._last_s = -np.inf
 
     def increasing(
@@ -357,7 +359,8 @@ class StampCheck:
         latest = np.maximum.accumulate(
             np.concatenate([[self._last_s], np.where(is_sample, time_s, -np.inf)])
         )
-        self._last_s, latest = latest[-1], latest[:-1]
+        self._last_s = latest[-1]
+        latest = latest[:-1]
         wrong = is_sample & ~(time_s > latest)
         stands = wrong & (time_s == latest)
         if wrong.any() and not self._may_drop:
@@ -486,7 +489,8 @@ class Track:
         stamp_ns: stamps, ns, (k,). Of messages with the same stamp the last one counts; value:
         values, (k,); NaN where it was not sampled; longest_ns: gap that is bridged, ns.
         """
-        stamps, values = stamp_ns[~np.isnan(value)], value[~np.isnan(value)]
+        stamps = stamp_ns[~np.isnan(value)]
+        values = value[~np.isnan(value)]
         step = np.diff(stamps)
         if (step < 0).any():
             i = int((step < 0).argmax())
@@ -495,7 +499,8 @@ class Track:
                 f'after {seconds(stamps[i])}'
             )
         is_last = np.append(step > 0, True)[: len(stamps)]
-        self._stamp_ns, self._value = stamps[is_last], values[is_last]
+        self._stamp_ns = stamps[is_last]
+        self._value = values[is_last]
         step = step[step > 0]
         self._usual_ns = float(np.median(step)) if len(step) else 0.0
         self._longest_ns = max(longest_ns, USUAL_GAPS * self._usual_ns)
@@ -507,8 +512,10 @@ class Track:
             return np.full(len(stamp_ns), np.nan)
         first, last = np.searchsorted(self._stamp_ns, stamp_ns[[0, -1]])
         part = slice(max(first - 1, 0), last + 1)  # The messages around the samples
-        values, begin_ns = self._value[part], self._stamp_ns[part][0]
-        sample_ns, message_ns = stamp_ns - begin_ns, self._stamp_ns[part] - begin_ns
+        values = self._value[part]
+        begin_ns = self._stamp_ns[part][0]
+        sample_ns = stamp_ns - begin_ns
+        message_ns = self._stamp_ns[part] - begin_ns
         result = np.interp(sample_ns, message_ns, values)
         is_known = (sample_ns >= -self._usual_ns) & (sample_ns <= message_ns[-1] + self._usual_ns)
         after = np.searchsorted(message_ns, sample_ns).clip(max=len(message_ns) - 1)
@@ -531,7 +538,8 @@ class Track:
         """
         if self._is_exact or len(self._value) < 3:
             return 0.0
-        time_ns, value = self._stamp_ns - self._stamp_ns[0], self._value
+        time_ns = self._stamp_ns - self._stamp_ns[0]
+        value = self._value
         share = (time_ns[1:-1] - time_ns[:-2]) / (time_ns[2:] - time_ns[:-2])
         residual = value[1:-1] - (value[:-2] + share * (value[2:] - value[:-2]))
         return float(np.sqrt(np.mean(residual**2)))

@@ -128,7 +128,8 @@ def _poses_in(message: Any, kind: str, root: str) -> list[tuple]:
 
 def _base(bag: Bag, root: str, epoch_ns: int) -> Track | None:
     """Return the pose of the base by odometry, or else by tf; None where neither moves it."""
-    store, kinds = typestore(), dict(sorted(bag.types))
+    store = typestore()
+    kinds = dict(sorted(bag.types))
     odometry = [topic for topic, kind in kinds.items() if kind == _ODOMETRY]
     topics = odometry or [
         topic for topic, kind in kinds.items() if kind == _TRANSFORMS and topic.endswith('tf')

@@ -16,20 +16,23 @@ from typing import NamedTuple
 from adxl_ros.model.constants import TINY
 import numpy as np
 
-_LONG_QUANTILE = 0.985
+_BETWEEN_BURSTS_QUANTILE = 0.985
 """Quantile of the steps that is one between bursts (chosen: a burst has at most 64 samples)."""
-_SHORT = 0.1
+_WITHIN_BURST = 0.1
 """Longest step within a burst, as a share of one between bursts (chosen: beyond jitter)."""
-_SHORT_SHARE = 0.45
+_LEAST_WITHIN_BURSTS = 0.45
 """Smallest share of such steps among all (chosen: bursts of two samples have 0.5)."""
-_EVEN = 0.25  # A median step from this share of the mean step shows stamps without bursts
-_EVEN_STEPS = 0.02
+_MEDIAN_OF_BURSTS = 0.25
+"""Share of the mean step that the median step is below where stamps come in bursts (chosen: most
+steps are within one)."""
+_EVEN_DEVIATION = 0.02
 """Largest deviation of even steps, as a share of them (chosen: rate right to 0.5 %)."""
-_EVEN_SHARE = 0.9  # Share of the steps that are even (chosen: a few losses or delays are common)
+_EVEN_QUANTILE = 0.9
+"""Share of the steps that are even (chosen: a few losses or delays are common)."""
 _LAG = 64
 """Most samples, or bursts, over which the first estimate of a period is taken (chosen: delays
 hardly change their time, and most such spans hold no pause)."""
-_LONG_STEP = 1.5
+_LACKING_STEP = 1.5
 """Step from which a sample may be missing, periods (between one period and two)."""
 _NEARBY = (0.75, 1.5, 3.0, 6.0)
 """Samples on both sides of a long step in which its time may be made up, as multiples of the
@@ -44,9 +47,9 @@ _ROUNDS = 8  # Most rounds of period and missing samples (chosen: two or three s
 def burst_ends(time_s: np.ndarray) -> np.ndarray:
     """Return the samples, (k,), that end a burst of stamps, s, (n,): all where none is seen."""
     steps_s = np.diff(time_s)
-    if len(steps_s) >= 8 and np.median(steps_s) < _EVEN * steps_s.mean():
-        is_short = steps_s < _SHORT * np.quantile(steps_s, _LONG_QUANTILE)
-        if is_short.mean() >= _SHORT_SHARE:
+    if len(steps_s) >= 8 and np.median(steps_s) < _MEDIAN_OF_BURSTS * steps_s.mean():
+        is_short = steps_s < _WITHIN_BURST * np.quantile(steps_s, _BETWEEN_BURSTS_QUANTILE)
+        if is_short.mean() >= _LEAST_WITHIN_BURSTS:
             return np.flatnonzero(~is_short)
     return np.arange(len(time_s))
 
@@ -63,7 +66,7 @@ def lacks_samples(time_s: np.ndarray, period: float) -> np.ndarray:
     They are longer than a period, s, and the stamps nearby do not make up for it. A host that
     stalls takes the samples that have waited at once, so that nothing is missing.
     """
-    lacks = np.diff(time_s) > _LONG_STEP * period
+    lacks = np.diff(time_s) > _LACKING_STEP * period
     long = np.flatnonzero(lacks)
     excess_s = time_s[long + 1] - time_s[long] - period
     lacking = np.maximum(np.rint(excess_s / period), 1)
@@ -86,13 +89,16 @@ def period_s(time_s: np.ndarray) -> float:
         np.median((time_s[ends[lag:]] - time_s[ends[:-lag]]) / (ends[lag:] - ends[:-lag]))
     )
     # From the end of a burst to the end of another one, so that all of them are whole.
-    time_s = time_s[ends[0] : ends[-1] + 1]
-    steps_s = np.diff(time_s)
+    whole_s = time_s[ends[0] : ends[-1] + 1]
+    steps_s = np.diff(whole_s)
     for _ in range(_ROUNDS):
         if not period > 0:
             break
-        complete = ~lacks_samples(time_s, period)
-        before, period = period, float(steps_s[complete].mean()) if complete.any() else period
+        complete = ~lacks_samples(whole_s, period)
+        if not complete.any():
+            break
+        before = period
+        period = float(steps_s[complete].mean())
         if period == before:
             break
     return max(period, 0.0)
@@ -107,8 +113,8 @@ def stamped_rate_hz(time_s: np.ndarray) -> float:
 def is_even(time_s: np.ndarray) -> bool:
     """Return whether nearly all steps of stamps, s, (n,), are one period."""
     step_s = period_s(time_s)
-    deviation_s = np.quantile(np.abs(np.diff(time_s) - step_s), _EVEN_SHARE)
-    return bool(deviation_s <= _EVEN_STEPS * step_s)
+    deviation_s = np.quantile(np.abs(np.diff(time_s) - step_s), _EVEN_QUANTILE)
+    return bool(deviation_s <= _EVEN_DEVIATION * step_s)
 
 
 class Halves(NamedTuple):

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.effects import effect_named
@@ -38,8 +39,17 @@ class _Quantity:
         self.unknown += int(is_unknown.sum())
         self.missing += int((~is_known & ~is_unknown).sum())
         self.longest_s = float(np.nanmax(held_since_s, initial=self.longest_s))
-        self._last, self._last_s = float(held[-1]), float(time_s[-1] - held_since_s[-1])
+        self._last = float(held[-1])
+        self._last_s = float(time_s[-1] - held_since_s[-1])
         return np.where(is_unknown, self.nominal, held)
+
+
+class _Followed(NamedTuple):
+    """A surrounding that effects follow."""
+
+    column: str  # Its column
+    quantity: _Quantity  # What was read of it
+    effects: str  # The effects, as text
 
 
 @dataclass
@@ -101,11 +111,11 @@ class Surroundings:
             ),
         ]
 
-    def _followed(self, effects: Iterable[str]) -> list[tuple[str, _Quantity, str]]:
-        """Return what has values: its column, its state, and the effects that follow it."""
+    def _followed(self, effects: Iterable[str]) -> list[_Followed]:
+        """Return what has values."""
         names = _followers(effects)
         return [
-            (name, quantity, names[name])
+            _Followed(name, quantity, names[name])
             for name, quantity in self._quantities.items()
             if name in names and quantity.unknown < quantity.samples
         ]

@@ -272,7 +272,8 @@ def unfinished(path: AnyPath, head: Mapping[str, Any]) -> Unfinished | None:
     """Look for an interrupted calibration, without a lock."""
     if not Path(path).exists():
         return None
-    found, new_head = _parse(Path(path)), _as_read(head)
+    found = _parse(Path(path))
+    new_head = _as_read(head)
     poses = len(accepted_poses(found.entries))
     if found.damage:
         return Unfinished(poses, found.damage)

@@ -22,7 +22,7 @@ from adxl_ros.model.kinematics import stage_angles
 from adxl_ros.process import option
 import numpy as np
 
-_BLOCK_ROWS = 65536  # Rows that are read at a time (chosen: some MB)
+BLOCK_ROWS = 65536  # Rows that are read at a time (chosen: some MB)
 
 _MAPPINGS = {
     'sensor_accel': 'time={time}:us,x=x:mps2,y=y:mps2,z=z:mps2,temperature=temperature:c',
@@ -69,8 +69,8 @@ def in_memory(
 
     def blocks(names: Collection[str], _: Collection[str]) -> Iterator[TableBlock]:
         rows = len(next(iter(columns.values())))
-        for start in range(0, rows, _BLOCK_ROWS):
-            stop = min(start + _BLOCK_ROWS, rows)
+        for start in range(0, rows, BLOCK_ROWS):
+            stop = min(start + BLOCK_ROWS, rows)
             yield TableBlock(
                 {name: np.asarray(columns[name][start:stop], float) for name in names},
                 _row_places(path, start),
@@ -149,11 +149,16 @@ def _of_arrays(path: str, arrays: Mapping[str, Any], advice: str) -> Table:
 
 def _open_parquet(path: str) -> Table:
     """Open a Parquet file with the library pyarrow: its columns of numbers and of times."""
+    with _library(path, 'Parquet', 'pyarrow'):
+        import pyarrow.parquet
+
+        schema = pyarrow.parquet.read_schema(path)
+        kinds = pyarrow.types
 
     def blocks(names: Collection[str], _: Collection[str]) -> Iterator[TableBlock]:
         first = 0
         with _library(path, 'Parquet', 'pyarrow'), pyarrow.parquet.ParquetFile(path) as file:
-            for batch in file.iter_batches(_BLOCK_ROWS, columns=list(names)):
+            for batch in file.iter_batches(BLOCK_ROWS, columns=list(names)):
                 last = first + batch.num_rows
                 yield TableBlock(
                     {name: numbers(batch.column(name)) for name in names},
@@ -170,10 +175,6 @@ def _open_parquet(path: str) -> Table:
             column.cast(pyarrow.float64(), safe=False).to_numpy(zero_copy_only=False), float
         )
 
-    with _library(path, 'Parquet', 'pyarrow'):
-        import pyarrow.parquet
-
-        schema, kinds = pyarrow.parquet.read_schema(path), pyarrow.types
     units = {
         each.name: each.type.unit
         for each in schema

@@ -210,8 +210,10 @@ def _source(fs: Any, path: str, **known: Any) -> Source:
     # A name that is not UTF-8 has no place in a table.
     address = as_utf_8(str(fs.unstrip_protocol(path)))
     options = fs.storage_options
-    host, port = options.get('host'), options.get('port')
-    user, password = options.get('username'), options.get('password')
+    host = options.get('host')
+    port = options.get('port')
+    user = options.get('username')
+    password = options.get('password')
     if host:
         # The path in a server does not name the server.
         server = f'{host}:{port}' if port else host
@@ -316,7 +318,9 @@ def _of_manifest(text: str, rows: list[dict[str, str]]) -> Iterable[Source]:
             )
 
     def source(row: dict[str, str]) -> Source:
-        url, params, serial = row.get('url', ''), row.get('params', ''), row.get('serial', '')
+        url = row.get('url', '')
+        params = row.get('params', '')
+        serial = row.get('serial', '')
         try:
             recorded = look_up(*file_system(_beside(folder, url)))
         except UserError as error:

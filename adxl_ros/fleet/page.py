@@ -60,10 +60,12 @@ def _trend_figure(
     table: fleet.FleetTable, result: fleet.QuantityResult, sensor: int
 ) -> plotly.Figure:
     """Plot a quantity of a sensor over time, about its mean where sensors differ by far more."""
-    quantity, place = result.quantity, result.place_of(sensor)
+    quantity = result.quantity
+    place = result.place_of(sensor)
     origin = result.trends.level[place] if quantity.is_coefficient and place is not None else 0.0
     part = table.sensor[result.rows] == sensor
-    years, is_outlier = result.recordings.time[part], result.is_outlier[part]
+    years = result.recordings.time[part]
+    is_outlier = result.is_outlier[part]
     value = quantity.factor * (result.recordings.value[part] - origin)
     half = Z_90 * quantity.factor * result.recordings.std[part]
     traces = []
@@ -73,7 +75,8 @@ def _trend_figure(
         colour = plotly.BEFORE_COLOUR if is_claimed else plotly.QUIET_COLOUR
         periods = np.where(is_outlier, -1, result.recordings.period[part])
         for period in set(periods.tolist()) - {-1}:
-            within, level = years[periods == period], value[periods == period].mean()
+            within = years[periods == period]
+            level = value[periods == period].mean()
             ends = np.array([within.min(), within.max()])
             traces.append(
                 plotly.line([], level + slope * (ends - within.mean()), 'line', colour)

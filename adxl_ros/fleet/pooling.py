@@ -139,6 +139,18 @@ def fit_trends(recordings: Recordings) -> Trends:
     )
 
 
+class _Lines(NamedTuple):
+    """The line of each of m sensors, about the centre of its recordings."""
+
+    mean: np.ndarray  # Weighted mean, (m,)
+    mean_std: np.ndarray  # Its standard deviation, (m,)
+    intercept: np.ndarray  # Value at the centre in time, (m,)
+    slope: np.ndarray  # Slope, (m,); 0 where there is none
+    slope_std: np.ndarray  # Its standard deviation, (m,)
+    squares: np.ndarray  # Weighted squares of the residuals, (m,)
+    log_det: float  # Logarithm of the determinant of the normal equations
+
+
 class _Sums:
     """Recordings about the centre of their sensor, with where sensors and periods begin."""
 
@@ -155,43 +167,62 @@ class _Sums:
 
     def fit(self, scatter: Scatter) -> Trends:
         """Fit the lines of all sensors for given variances, by generalised least squares."""
-        step2, sensor = scatter.calibration**2, self.recordings.sensor
+        step2 = scatter.calibration**2
         weight = 1 / (self.recordings.std**2 + scatter.recording**2)
-        t, y = self.time, self.value
+        t = self.time
+        y = self.value
         # Weighted sums over each period of the products of 1, t and y
-        one = np.ones_like(t)
-        products = self._by_period(weight * [one, t, t * t, y, t * y, y * y])
-        w, wt, _, wy, _, _ = products
+        products = self._by_period(weight * [np.ones_like(t), t, t * t, y, t * y, y * y])
         # The step of a period has one common part in all of its recordings (Woodbury).
-        shared = step2 / (1 + step2 * w)
-        first, second = np.array([w, w, wt, w, wt, wy]), np.array([w, wt, wt, wy, wy, wy])
-        # The normal equations are a·intercept + b·slope = p and b·intercept + c·slope = q.
+        shared = step2 / (1 + step2 * products[0])
+        lines = self._lines(products, shared)
+        log_det = self._by_sensor(np.log1p(step2 * products[0])).sum() - np.log(weight).sum()
+        nan = np.where(self.has_slope, 1.0, np.nan)
+        return Trends(
+            scatter=scatter,
+            level=self.centre_value + lines.mean,
+            level_std=lines.mean_std,
+            slope=nan * lines.slope,
+            slope_std=nan * lines.slope_std,
+            freedom=np.full(len(nan), np.inf),
+            squares=lines.squares,
+            residual=self._residual(lines, shared, weight),
+            log_likelihood=float(-0.5 * (log_det + lines.log_det + lines.squares.sum())),
+        )
+
+    def _lines(self, products: np.ndarray, shared: np.ndarray) -> _Lines:
+        """
+        Solve the normal equations of all sensors.
+
+        products: sums over each period of the products of 1, t and y, (6, k); shared: weight of
+        the product of two sums, by which the step of a period lowers them, (k,).
+        """
+        w, wt, _, wy, _, _ = products
+        first = np.array([w, w, wt, w, wt, wy])
+        second = np.array([w, wt, wt, wy, wy, wy])
+        # They are a·intercept + b·slope = p and b·intercept + c·slope = q.
         a, b, c, p, q, r = self._by_sensor(products - shared * first * second)
         det = np.where(self.has_slope, np.maximum(a * c - b * b, TINY), 1.0)
         slope = np.where(self.has_slope, (a * q - b * p) / det, 0.0)
         intercept = (p - b * slope) / a
-        squares = np.maximum(r - intercept * p - slope * q, 0.0)
-        log_det = self._by_sensor(np.log1p(step2 * w)).sum() - np.log(weight).sum()
-        log_likelihood = -0.5 * (
-            log_det + np.log(np.where(self.has_slope, det, a)).sum() + squares.sum()
-        )
-        residual = y - intercept[sensor] - slope[sensor] * t
-        step = shared * self._by_period(weight * residual)
-        residual = (residual - step[self.recordings.period]) * np.sqrt(weight)
-        nan = np.where(self.has_slope, 1.0, np.nan)
         with np.errstate(invalid='ignore'):
-            slope_std = nan * np.sqrt(a / det)
-        return Trends(
-            scatter=scatter,
-            level=self.centre_value + p / a,
-            level_std=a**-0.5,
-            slope=nan * slope,
+            slope_std = np.sqrt(a / det)
+        return _Lines(
+            mean=p / a,
+            mean_std=a**-0.5,
+            intercept=intercept,
+            slope=slope,
             slope_std=slope_std,
-            freedom=np.full(len(a), np.inf),
-            squares=squares,
-            residual=residual,
-            log_likelihood=float(log_likelihood),
+            squares=np.maximum(r - intercept * p - slope * q, 0.0),
+            log_det=float(np.log(np.where(self.has_slope, det, a)).sum()),
         )
+
+    def _residual(self, lines: _Lines, shared: np.ndarray, weight: np.ndarray) -> np.ndarray:
+        """Return what lines and steps leave, in standard deviations, (n,)."""
+        sensor = self.recordings.sensor
+        residual = self.value - lines.intercept[sensor] - lines.slope[sensor] * self.time
+        step = shared * self._by_period(weight * residual)
+        return (residual - step[self.recordings.period]) * np.sqrt(weight)
 
     def _by_period(self, values: np.ndarray) -> np.ndarray:
         """Sum values of recordings, (..., n), within each period."""
@@ -227,7 +258,8 @@ def _shared_scatter(sums: _Sums) -> Scatter:
 
 def _widening(sums: _Sums, fit: Trends) -> float:
     """Estimate the factor of the variances of levels and slopes by correlation in time."""
-    sensor, residual = sums.recordings.sensor, fit.residual
+    sensor = sums.recordings.sensor
+    residual = fit.residual
     used = sums.has_slope & (sums.counts > 2 * _MIN_RECORDINGS)
     same = (sensor[1:] == sensor[:-1]) & used[sensor[1:]]
     if not same.any() or fit.scatter.recording == 0:
@@ -235,8 +267,10 @@ def _widening(sums: _Sums, fit: Trends) -> float:
     variance = fit.scatter.recording**2
     share = float(np.mean((variance / (variance + sums.recordings.std**2))[used[sensor]]))
     products = float((residual[1:] * residual[:-1])[same].sum())
-    squares, count = float((residual**2)[used[sensor]].sum()), int(sums.counts[used].sum())
-    lines, widening = 2 * int(used.sum()), 1.0
+    squares = float((residual**2)[used[sensor]].sum())
+    count = int(sums.counts[used].sum())
+    lines = 2 * int(used.sum())
+    widening = 1.0
     for _ in range(_ROUNDS):
         # A line removes as much from squares and products of its residuals.
         removed = lines * widening
@@ -271,7 +305,8 @@ def outliers(recordings: Recordings, tests: int) -> tuple[np.ndarray, np.ndarray
     each recording in robust standard deviations, (n,), which is 0 where a period has too few
     recordings, and whether it is an outlier, (n,) bool.
     """
-    period, value = recordings.period, recordings.value
+    period = recordings.period
+    value = recordings.value
     counts = np.bincount(period)
     deviation = np.abs(value - _medians(period, value)[period])
     enough = counts >= _MIN_OF_OUTLIERS
@@ -337,7 +372,8 @@ def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np
 
 def _common_variance(variance: np.ndarray, freedom: np.ndarray) -> tuple[float, float]:
     """Return the scale of the inverse χ² distribution and its degrees of freedom."""
-    freedom, variance = freedom[variance > 0], variance[variance > 0]
+    freedom = freedom[variance > 0]
+    variance = variance[variance > 0]
     if len(variance) < 2:
         return (float(variance[0]), _NO_FREEDOM) if len(variance) else (1.0, _EQUAL_VARIANCES)
     log_variance = np.log(variance) - scipy.special.digamma(freedom / 2) + np.log(freedom / 2)
@@ -394,7 +430,8 @@ def _largest_dropped(distance: np.ndarray, limit: float) -> np.ndarray:
 def _of_sensors(estimates: np.ndarray, std: np.ndarray) -> PooledCoefficient:
     """Return the population of the units that count."""
     scale = max(float(np.ptp(estimates)), float(std.max()), TINY)
-    y, variance = (estimates - estimates.mean()) / scale, (std / scale) ** 2
+    y = (estimates - estimates.mean()) / scale
+    variance = (std / scale) ** 2
     spread2, low, high = _spreads2(y, variance)
     mean, _ = weighted_mean(y, variance, spread2)
     mean_variance, prediction_variance = _variances(y, variance, mean)
@@ -442,7 +479,9 @@ def _spreads2(y: np.ndarray, variance: np.ndarray) -> list[float]:
         mean, _ = weighted_mean(y, variance, spread2)
         return float(np.sum((y - mean) ** 2 / (variance + spread2)))
 
-    floor, freedom, spreads2 = 1e-12 * float(np.var(y) + variance.mean()), len(y) - 1, []
+    floor = 1e-12 * float(np.var(y) + variance.mean())
+    freedom = len(y) - 1
+    spreads2 = []
     for target in (freedom, *scipy.special.chdtri(freedom, [0.05, 0.95])):
         # No weight is above 1/spread2, so that the squares are below the target at the high end.
         high = floor + len(y) * float(np.var(y)) / target
@@ -485,7 +524,8 @@ def bad_batch(
         if _MIN_BATCH <= counts[prefix] <= len(serials) / 2:
             members = np.array([name.startswith(prefix) for name in serials])
             batches.setdefault(members.tobytes(), (prefix, members))
-    best, lowest = None, _CHANCE / (max(len(batches), 1) * tests)
+    best = None
+    lowest = _CHANCE / (max(len(batches), 1) * tests)
     for prefix, members in batches.values():
         test = scipy.stats.ttest_ind(level[members], level[~members], equal_var=False)
         difference = float(level[members].mean() - level[~members].mean())

@@ -177,14 +177,12 @@ def plan(
     chosen = _since(sources, since, results) if since else sources
     newest = results.newest
     if only_failed:
-        todo, done = (
-            [
-                source
-                for source in chosen
-                if source.url in newest and newest[source.url].row['outcome'] != 'done'
-            ],
-            0,
-        )
+        todo = [
+            source
+            for source in chosen
+            if source.url in newest and newest[source.url].row['outcome'] != 'done'
+        ]
+        done = 0
     else:
         todo = [source for source in chosen if not is_done(source, newest.get(source.url), recipe)]
         done = len(chosen) - len(todo)

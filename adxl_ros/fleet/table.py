@@ -57,7 +57,7 @@ MG = mg(1.0)  # Milli-g in 1 m/s²
 
 
 @dataclass(frozen=True)
-class Quantity:
+class FleetQuantity:
     """A quantity of the table."""
 
     column: str  # Column of its value; the quantity is named by it
@@ -98,7 +98,7 @@ class FleetTable:
         begin, end = np.searchsorted(self.sensor, [sensor, sensor + 1])
         return np.arange(begin, end)
 
-    def recordings(self, quantity: Quantity) -> tuple[np.ndarray, Recordings]:
+    def recordings(self, quantity: FleetQuantity) -> tuple[np.ndarray, Recordings]:
         """Return a quantity in the recordings that have it."""
         value = self[quantity.column]
         low, *high = (self[name] for name in quantity.error_columns)
@@ -126,7 +126,8 @@ def read(path: AnyPath) -> FleetTable:
     frame = frame.sort_values(['serial', 'date'], kind='stable', ignore_index=True)
     serials, sensor = np.unique(frame['serial'].to_numpy(str), return_inverse=True)
     if len(serials) and not serials[0]:
-        serials, sensor = serials[1:], sensor - 1
+        serials = serials[1:]
+        sensor = sensor - 1
     date = frame['date'].dt.tz_localize(None).to_numpy('datetime64[us]')
     # A period ends where the sensor is calibrated again, and lasts where none is stated.
     named = frame['calibration_id'].mask(frame['calibration_id'] == '').groupby(sensor).ffill()
@@ -146,10 +147,10 @@ def read(path: AnyPath) -> FleetTable:
     )
 
 
-def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
+def quantities(table: FleetTable | None) -> tuple[FleetQuantity, ...]:
     """Return all quantities of a table."""
     listed = [
-        Quantity(
+        FleetQuantity(
             'gap_before_mps2',
             'gap',
             'mg',
@@ -163,10 +164,10 @@ def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
         scales = scales[scales > 0]
         mg_per_v = 1e3 / float(np.median(scales)) if len(scales) else 1e3
         listed += [
-            Quantity(
+            FleetQuantity(
                 f'zero_g_{axis}_v', f'zero-g {axis}', 'mg', mg_per_v, (f'zero_g_std_{axis}_v',)
             ),
-            Quantity(
+            FleetQuantity(
                 f'scale_{axis}_v_per_g',
                 f'scale factor {axis}',
                 'mg/g',
@@ -178,7 +179,7 @@ def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
         column, *ends = (f'noise_{letter}{end}_{axis}_{unit}' for end in ('', '_low', '_high'))
         # The unit of the files begins with that of an acceleration.
         listed.append(
-            Quantity(
+            FleetQuantity(
                 column,
                 f'{label}, {axis}',
                 shown.replace('m/s²', 'µg', 1),
@@ -195,7 +196,7 @@ def quantities(table: FleetTable | None) -> tuple[Quantity, ...]:
 class QuantityResult:
     """A quantity over the k sensors that have it, in n recordings."""
 
-    quantity: Quantity  # The quantity
+    quantity: FleetQuantity  # The quantity
     rows: np.ndarray  # Rows of the recordings in the table, (n,)
     recordings: Recordings  # Its values in the unit of its column
     # Distance of each recording from those of its sensor, robust standard deviations, (n,)
@@ -231,7 +232,8 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
         distance, is_outlier = pooling.outliers(recordings, values)
         trends = pooling.fit_trends(recordings[~is_outlier])
         sensors = np.unique(table.sensor[rows[~is_outlier]])
-        population, batch = None, None
+        population = None
+        batch = None
         if quantity.is_coefficient and len(sensors) >= pooling.MIN_SENSORS:
             batch = pooling.bad_batch(
                 [table.serials[sensor] for sensor in sensors],
@@ -292,7 +294,8 @@ def effect_matrix(table: FleetTable) -> pd.DataFrame:
     frequent first.
     """
     used = np.isin(table['status'].astype(str), _VERDICTS) & (table.sensor >= 0) & table.first
-    frame, sensor = table.frame[used], table.sensor[used]
+    frame = table.frame[used]
+    sensor = table.sensor[used]
     counts = Counter(chain.from_iterable(frame['effects']))
     effects = sorted(counts, key=lambda name: (-counts[name], name))
     has = pd.DataFrame(
@@ -359,43 +362,20 @@ def rank(table: FleetTable, results: Sequence[QuantityResult]) -> list[SensorSta
 def _state_of(sensor: int, table: FleetTable, results: Sequence[QuantityResult]) -> SensorState:
     """Return a sensor with the first state that fits."""
     rows = table.rows_of(sensor)
-    gap_mg, floor_mg, over_mg = _gap_now(table, rows)
+    gap = _gap_now(table, rows)
     ages = table['calibration_age_days'][rows]
     age_days = float(next((age for age in ages[::-1] if np.isfinite(age)), np.nan))
-    drifts = _drifts(sensor, results, over_mg, age_days)
+    drifts = _drifts(sensor, results, gap.over_mg, age_days)
     refused = table['outcome'][rows] != 'done'
-    series = len(refused) if refused.all() else int(np.argmin(refused[::-1]))
-    drift = drifts[0] if drifts and drifts[0].days < _FARTHEST_DAYS else None
-    state, urgency, reason = State.IN_ORDER, 0.0, ''
-    if over_mg > TOLERANCE_MG:
-        state, urgency = State.OUT_OF_TOLERANCE, -over_mg
-        reason = (
-            f'Gap {number(gap_mg)} mg, noise {number(floor_mg)} mg; the tolerance is '
-            f'{number(TOLERANCE_MG)} mg.'
-        )
-    elif drift is not None:
-        state = State.DRIFTS if drift.days else State.OUT_OF_TOLERANCE
-        urgency = drift.days or -drift.reached_mg
-        reason = f'{drift.text}: out of tolerance ' + (
-            f'in {number(drift.days, digits=2)} days.' if drift.days else 'now.'
-        )
-    elif rising := [drift.text for drift in drifts if drift.is_rising_noise]:
-        state, urgency = State.DRIFTS, _FARTHEST_DAYS
-        reason = f'{rising[0]}.'
-    elif series:
-        state, urgency = State.NOT_JUDGED, -series
-        reason = (
-            f'Refused, {counted(series, "recording")} in a row: '
-            f'{table["refusal"][rows[-1]] or table["outcome"][rows[-1]]}'
-        )
+    judged = _by_gap(gap) or _by_drifts(drifts) or _by_refusals(table, rows, refused)
     return SensorState(
-        urgency=urgency,
+        urgency=judged.urgency,
         number=sensor,
         serial=table.serials[sensor],
-        state=state,
-        reason=reason[:1].upper() + reason[1:],
+        state=judged.state,
+        reason=judged.reason[:1].upper() + judged.reason[1:],
         drifts=drifts,
-        gap=f'{number(gap_mg)} / {number(floor_mg)}' if np.isfinite(gap_mg) else '-',
+        gap=f'{number(gap.gap_mg)} / {number(gap.floor_mg)}' if np.isfinite(gap.gap_mg) else '-',
         recordings=f'{len(rows)} ({refused.sum()})',
         age=f'{age_days:.0f}' if np.isfinite(age_days) else '-',
         last_year=float(table.years[rows[-1]]),
@@ -403,16 +383,66 @@ def _state_of(sensor: int, table: FleetTable, results: Sequence[QuantityResult])
     )
 
 
-def _gap_now(table: FleetTable, rows: np.ndarray) -> tuple[float, float, float]:
-    """Return the last gap, its noise floor and the gap beyond the floor, mg; NaN without any."""
+class _Judged(NamedTuple):
+    """The state of a sensor, and why."""
+
+    state: State
+    urgency: float  # Sensors of a state with smaller ones come first
+    reason: str
+
+
+def _by_gap(gap: _GapNow) -> _Judged | None:
+    """Judge a sensor by its last gap; None where that is within the tolerance."""
+    if not gap.over_mg > TOLERANCE_MG:
+        return None
+    return _Judged(
+        State.OUT_OF_TOLERANCE,
+        -gap.over_mg,
+        f'Gap {number(gap.gap_mg)} mg, noise {number(gap.floor_mg)} mg; the tolerance is '
+        f'{number(TOLERANCE_MG)} mg.',
+    )
+
+
+def _by_drifts(drifts: Sequence[Drift]) -> _Judged | None:
+    """Judge a sensor by its drifts, the most urgent first; None where none matters."""
+    if drifts and drifts[0].days < _FARTHEST_DAYS:
+        days = drifts[0].days
+        text = f'{drifts[0].text}: out of tolerance '
+        if days:
+            return _Judged(State.DRIFTS, days, f'{text}in {number(days, digits=2)} days.')
+        return _Judged(State.OUT_OF_TOLERANCE, -drifts[0].reached_mg, f'{text}now.')
+    rising = [drift.text for drift in drifts if drift.is_rising_noise]
+    return _Judged(State.DRIFTS, _FARTHEST_DAYS, f'{rising[0]}.') if rising else None
+
+
+def _by_refusals(table: FleetTable, rows: np.ndarray, refused: np.ndarray) -> _Judged:
+    """Judge a sensor whose recordings show nothing wrong by those that were refused, (n,) bool."""
+    series = len(refused) if refused.all() else int(np.argmin(refused[::-1]))
+    if not series:
+        return _Judged(State.IN_ORDER, 0.0, '')
+    why = table['refusal'][rows[-1]] or table['outcome'][rows[-1]]
+    reason = f'Refused, {counted(series, "recording")} in a row: {why}'
+    return _Judged(State.NOT_JUDGED, -series, reason)
+
+
+class _GapNow(NamedTuple):
+    """The last gap of a sensor, mg; NaN without any."""
+
+    gap_mg: float  # The gap
+    floor_mg: float  # Its noise floor
+    over_mg: float  # The gap beyond the floor
+
+
+def _gap_now(table: FleetTable, rows: np.ndarray) -> _GapNow:
+    """Return the gap over the last recordings since a calibration."""
     rows = rows[table.period[rows] == table.period[rows[-1]]]
     rows = rows[np.isfinite(table['gap_before_mps2'][rows])][-RECENT:]
     if not len(rows):
-        return np.nan, np.nan, np.nan
+        return _GapNow(np.nan, np.nan, np.nan)
     gap = float(np.median(table['gap_before_mps2'][rows])) * MG
     floors = table['gap_floor_mps2'][rows]
     floor = float(np.nanmedian(floors)) * MG if np.isfinite(floors).any() else 0.0
-    return gap, floor, float(np.sqrt(max(gap**2 - floor**2, 0.0)))
+    return _GapNow(gap, floor, float(np.sqrt(max(gap**2 - floor**2, 0.0))))
 
 
 def _drifts(
@@ -421,12 +451,15 @@ def _drifts(
     """Return the claimed slopes of a sensor, the most urgent first."""
     drifts = []
     for result in results:
-        place, quantity = result.place_of(sensor), result.quantity
+        place = result.place_of(sensor)
+        quantity = result.quantity
         if place is None or not result.is_claimed[place]:
             continue
-        slope, half = float(result.trends.slope[place]), float(result.half_width[place])
+        slope = float(result.trends.slope[place])
+        half = float(result.half_width[place])
         text = f'{quantity.label} {quantity.text(slope, slope - half, slope + half)} per year'
-        days, reached_mg = np.inf, np.nan
+        days = np.inf
+        reached_mg = np.nan
         if quantity.is_coefficient or (slope > 0 and not quantity.is_noise):
             # A coefficient is right at its calibration, and the gap shows what it is now.
             mg_per_day = abs(quantity.factor * slope) / DAYS_PER_YEAR

@@ -27,6 +27,7 @@ from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.calibration_store import sha256
 from adxl_ros.files.recording_columns import NO_SERIAL, Recording
 from adxl_ros.files.surroundings import assumed
+from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.fleet import inputs
 from adxl_ros.fleet.inputs import begin_of, Source
 from adxl_ros.fleet.row import (
@@ -41,7 +42,7 @@ from adxl_ros.fleet.row import (
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import code_version, options_named, package_version
-from adxl_ros.signals.findings import BLOCK_ROWS, check_recording, Findings
+from adxl_ros.signals.findings import check_recording, Findings
 import numpy as np
 
 _SPARE_MB = 64  # Space that stays free, MB. Chosen: a task writes some MB
@@ -88,7 +89,8 @@ def stage(source: Source, folder: Path) -> Staged:
     if before.fault:
         error = UserError if before.fault == inputs.NO_FILE else StagingError
         raise error(f'{url}: {before.fault}')
-    size_mb, free_mb = (before.size_bytes or 0) / 1e6, shutil.disk_usage(folder).free / 1e6
+    size_mb = (before.size_bytes or 0) / 1e6
+    free_mb = shutil.disk_usage(folder).free / 1e6
     if size_mb + _SPARE_MB > free_mb:
         raise StagingError(
             f'{url}: needs {size_mb:.3g} MB beside {_SPARE_MB} MB that stay free, '
@@ -189,7 +191,8 @@ def refused(recipe: Recipe, source: Source, reason: str, outcome: str = 'refused
 
 def _of_staged(recipe: Recipe, source: Source, earlier: frozenset[str], staged: Staged) -> Result:
     """Run the tasks on a copy, unless there is a row of this content by this recipe."""
-    first, fault = None, ''
+    first = None
+    fault = ''
     try:
         first = next(
             recording.blocks(staged.path, 1, replace(recipe.reading, drop_bad_stamps=True)), None
@@ -257,7 +260,9 @@ class _Job:
     def __init__(
         self, recipe: Recipe, source: Source, staged: Staged, parameters: ParameterText, row: Row
     ) -> None:
-        self._recipe, self._source, self._staged = recipe, source, staged
+        self._recipe = recipe
+        self._source = source
+        self._staged = staged
         self._parameters = parameters
         self._params: str | None = None  # Path of the parameter file; None: the nominal sensor
         if parameters.text:
@@ -333,7 +338,8 @@ class _Job:
 
     def _put_check(self, findings: Findings) -> None:
         """Put the check of a recording into its row, and whether its calibration is valid."""
-        row, contents = self.row, findings.contents
+        row = self.row
+        contents = findings.contents
         row |= {'is_sound': findings.is_sound, 'faults': [*map(self.plain, findings.faults)]}
         if contents is None:
             return

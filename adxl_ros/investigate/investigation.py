@@ -210,7 +210,7 @@ def decide(
         outcome = Outcome.TIME_OVER
     else:
         return Answer(hypotheses, Outcome.GO_ON, manoeuvre=following[0].name, verdict=verdict)
-    names = listed([hypothesis_text(h.effects) for h in named])
+    names = first_or_others([hypothesis_text(h.effects) for h in named])
     sentence = {
         Outcome.CERTAIN: f'The recording shows {names}: ',
         Outcome.NO_VISIBLE_GAP: 'There is no gap that this stage can show: ',
@@ -236,9 +236,10 @@ def hypothesis_text(effects: Sequence[str]) -> str:
     return ' with '.join(named)
 
 
-def listed(names: Sequence[str]) -> str:
+def first_or_others(names: Sequence[str]) -> str:
     """Return the first names in a sentence, and how many others there are."""
-    shown, others = list(names[:_LARGEST_NAMED]), len(names) - _LARGEST_NAMED
+    shown = list(names[:_LARGEST_NAMED])
+    others = len(names) - _LARGEST_NAMED
     if others > 0:
         shown.append(f'{others} others')
     return quantities.listed(shown, 'or')
@@ -287,7 +288,9 @@ class BackgroundDiagnoser:
     """Diagnoses the bag of a folder in a process of its own."""
 
     def __init__(self, folder: OutputFolder, limits: StageLimits, seed: int) -> None:
-        self._folder, self._limits, self._seed = folder, limits, seed
+        self._folder = folder
+        self._limits = limits
+        self._seed = seed
         self._answer: Future | None = None
         self.cancel: Callable[[], object] = lambda: None  # Ends the process
 
@@ -301,7 +304,8 @@ class BackgroundDiagnoser:
         """Return the answer, or None while the process runs."""
         if self._answer is None or not self._answer.done():
             return None
-        ended, self._answer = self._answer, None
+        ended = self._answer
+        self._answer = None
         try:
             return ended.result()
         except Exception as error:
@@ -362,8 +366,11 @@ class Investigation:
         # Answers so far, each with the minutes at which its question was asked
         self.answers: list[tuple[float, Answer]] = []
         self.reason = ''  # Why it was stopped; '' otherwise
-        self._limits, self._longest_s = limits, 60 * longest_minutes
-        self._diagnoser, self._show, self._flush = diagnoser, show, flush
+        self._limits = limits
+        self._longest_s = 60 * longest_minutes
+        self._diagnoser = diagnoser
+        self._show = show
+        self._flush = flush
         self._begin_s: float | None = None
         self.moved_s = 0.0  # Time of the manoeuvres so far, s
         self._now_s = self._since_s = self._asked_minutes = 0.0
@@ -414,7 +421,9 @@ class Investigation:
 
     def step(self, now_s: float, pose: Pose | None) -> Pose | None:
         """Go on."""
-        elapsed_s, self._now_s, self._pose = now_s - self._now_s, now_s, pose
+        elapsed_s = now_s - self._now_s
+        self._now_s = now_s
+        self._pose = pose
         if pose is None or self.has_ended:
             self._since_s = now_s
             return self._command
@@ -429,7 +438,8 @@ class Investigation:
     def stop(self, reason: str) -> Pose | None:
         """Stop, and hold the present pose."""
         if not self.has_ended:
-            self.state, self.reason = State.STOPPED, reason
+            self.state = State.STOPPED
+            self.reason = reason
             self._diagnoser.cancel()
             self._hold()
         return self._command
@@ -456,7 +466,8 @@ class Investigation:
     def _ask(self, pose: Pose) -> None:
         """Ask for a diagnosis of the samples so far."""
         assert self._begin_s is not None
-        self.state, self._stream = State.DIAGNOSING, None
+        self.state = State.DIAGNOSING
+        self._stream = None
         self._asked_minutes = self.minutes
         self._flush()
         self._diagnoser.ask(

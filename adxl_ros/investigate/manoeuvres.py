@@ -176,7 +176,8 @@ class CommandStream:
         self.command = self._expected = limits.nearest(*pose)
         self.speed = Pose(0.0, 0.0)  # Speed of each joint on the way to it, rad/s
         self.waited_s = 0.0  # Time for which the command has waited for the stage, s
-        self._limits, self._manoeuvre = limits, manoeuvre
+        self._limits = limits
+        self._manoeuvre = manoeuvre
         self._elapsed_s = 0.0
 
     @property

@@ -14,8 +14,9 @@ from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.links.support import base, stamping
+from adxl_ros.links.support.clock_map import ClockMap, IdentityMap
 from adxl_ros.links.support.clock_rate import ClockRate
-from adxl_ros.links.support.stamping import ClockMap, IdentityMap, Stamper
+from adxl_ros.links.support.stamping import Stamper
 from adxl_ros.links.support.wire_format import RATES_HZ
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -145,7 +146,8 @@ class IioLink(base.Link):
 
     def _condition(self) -> tuple[base.Level, str]:
         # The URI of this machine is only a kind and a colon.
-        uri, stream = self._settings.uri.removesuffix(':'), self._stream
+        uri = self._settings.uri.removesuffix(':')
+        stream = self._stream
         if self._error:
             return base.Level.ERROR, f'{uri}: {self._error}'
         if stream is None:
@@ -171,16 +173,18 @@ class IioLink(base.Link):
             # To look for a USB device, libiio asks all that are on the bus.
             self._backoff.fail(slow=uri.startswith('usb:') or isinstance(error, UserError))
             return
-        self._stream, self._error = stream, ''
+        self._stream = stream
+        self._error = ''
         self._connections += 1
         self._last_buffer_s = time.monotonic()
         is_other_rate = self._rate.used_hz != stream.rate_hz
-        self._rate, adc = ClockRate(stream.rate_hz), stream.adc
+        self._rate = ClockRate(stream.rate_hz)
+        adc = stream.adc
         if adc != self._adc or is_other_rate:
             self._adc = adc
             self.sensor = replace(self._declared, **adc)  # type: ignore[arg-type]
             if stream.by_host_clock:
-                self._stamper.clock = IdentityMap(0.0)
+                self._stamper.clock = IdentityMap()
             self._stamper.restart(1e9 / stream.rate_hz)
             self._newest_ns = -1
 
@@ -346,7 +350,8 @@ def _open_stream(settings: Settings, entries: Sequence[str], sensor: Sensor) -> 
 @contextmanager
 def _quiet_stderr() -> Iterator[None]:
     """Drop what libiio itself writes to stderr: each attempt would write the same line."""
-    original, nothing = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    original = os.dup(2)
+    nothing = os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nothing, 2)
         yield
@@ -384,7 +389,8 @@ def _inputs(device: Any) -> list[Any]:
 
 def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, Any]:
     """Return the channels of a device by role."""
-    inputs, order = _inputs(device), [*axes, base.SUPPLY, base.TEMPERATURE]
+    inputs = _inputs(device)
+    order = [*axes, base.SUPPLY, base.TEMPERATURE]
     named: dict[str, Any] = {}
     for channel in reversed(inputs):
         names = channel.name, _label(channel), channel.id

@@ -20,8 +20,9 @@ from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
 from adxl_ros.links.support import base, stamping, wire_format
+from adxl_ros.links.support.clock_map import ClockMap
 from adxl_ros.links.support.clock_rate import ClockRate
-from adxl_ros.links.support.stamping import ClockMap, Stamper
+from adxl_ros.links.support.stamping import Stamper
 from adxl_ros.links.support.wire_format import BoardInfo, SampleFrame
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
@@ -278,7 +279,8 @@ class SerialLink(base.Link):
         Only a device that has sent a frame gets bytes: another one could take them for its own
         commands. A board answers with its info frame, so that the first samples need not wait.
         """
-        now_s, info = time.monotonic(), self._info
+        now_s = time.monotonic()
+        info = self._info
         count, self._unjudged = self._unjudged, 0
         if not count or now_s < self._command_due_s:
             return
@@ -331,12 +333,14 @@ class SerialLink(base.Link):
         if not changed and not info.flags & wire_format.AFTER_RESET:
             return
         is_other_rate = self._rate.used_hz != info.rate_hz
-        self._info, self._rate = info, ClockRate(info.rate_hz)
+        self._info = info
+        self._rate = ClockRate(info.rate_hz)
         self._use(info, changed or is_other_rate)
 
     def _use(self, info: BoardInfo, changed: bool = True) -> None:
         """Read further samples by a description of the board; its sensor may have changed."""
-        self._conversion, self._misfit = None, ''
+        self._conversion = None
+        self._misfit = ''
         self._counter.restart(info.rate_hz)
         axes = self._declared.axes
         roles = self._stated_roles or [
@@ -359,7 +363,9 @@ class SerialLink(base.Link):
 
     def _on_samples(self, frame: SampleFrame, arrived_ns: int) -> None:
         """Check, count and stamp the samples of a frame."""
-        info, conversion, count = self._info, self._conversion, len(frame.codes)
+        info = self._info
+        conversion = self._conversion
+        count = len(frame.codes)
         self._unjudged = count
         self._frame_s = count / (info.rate_hz if info else _UNSTATED_RATE_HZ)
         if info is None or conversion is None:
@@ -437,7 +443,9 @@ class _Port:
 
     def close(self) -> None:
         """Close the port."""
-        port, self._port, self._poll = self._port, None, None
+        port = self._port
+        self._port = None
+        self._poll = None
         if port is not None:
             with suppress(OSError):  # an unplugged port may not close
                 port.close()

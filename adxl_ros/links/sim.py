@@ -189,9 +189,14 @@ class SimulatedSensor(base.Link):
 
     def _settled_response(self) -> Response:
         """Return the response of a sensor at rest in the stage's pose, with new noise."""
-        alpha, beta, shift = (partial(self._joint, joint) for joint in range(len(JOINTS)))
         self._seed += 1
-        return Response(self.sensor, Motion(inf, alpha, beta, shift), self._seed - 1)
+        motion = Motion(
+            inf,
+            alpha=partial(self._joint, 0),
+            beta=partial(self._joint, 1),
+            shift=partial(self._joint, 2),
+        )
+        return Response(self.sensor, motion, self._seed - 1)
 
     def _joint(self, joint: int, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         """Interpolate one joint by cubic Hermite splines, exactly at the stage's stamps."""

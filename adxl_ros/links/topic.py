@@ -180,7 +180,8 @@ class EmulatedSensor(base.Link):
 
     def read(self, now_ns: int) -> base.Samples:
         """Return the samples since the last call."""
-        made, self._made = self._made, []
+        made = self._made
+        self._made = []
         missing, self._missing = self._missing, 0
         if not made:
             empty = base.no_samples(self._sensor, self._newest_ns or 0)
@@ -264,7 +265,8 @@ class EmulatedSensor(base.Link):
         """Return whether there is a chain; it is made once the held samples show the rate."""
         if self._chain is None and self._held:
             stamps_ns = np.array([stamp_ns for stamp_ns, _ in self._held])
-            count, time_s = len(stamps_ns), (stamps_ns - stamps_ns[0]) * 1e-9
+            count = len(stamps_ns)
+            time_s = (stamps_ns - stamps_ns[0]) * 1e-9
             is_long = time_s[-1] >= _FIRST_S and count >= _MIN_FIRST
             if is_long or (count >= _FIRST and is_even(time_s)):
                 rate_hz = stamped_rate_hz(time_s)

@@ -172,7 +172,8 @@ def stop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:
     (Prandtl-Ishlinskii; Brokate and Sprekels, "Hysteresis and Phase Transitions", 1996). The
     input is (n,), or (n, k) for k independent operators, as in `play`.
     """
-    lag, turns = np.zeros(x.shape), _turns(x)
+    lag = np.zeros(x.shape)
+    turns = _turns(x)
     for i, fraction in enumerate(_THRESHOLDS):
         threshold = fraction * reach
         lag += (x - play(x, threshold, memory.setdefault(i, {}), turns)) / threshold

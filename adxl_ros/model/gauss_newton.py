@@ -43,7 +43,8 @@ def gauss_newton(
     `cost_tolerance`. Halved steps count as evaluations, too.
     """
     first = present = linearise(start)
-    previous, evaluations = None, 1
+    previous = None
+    evaluations = 1
     while not has_converged(first, previous, present):
         for halvings in range(max_halvings + 1):
             if evaluations >= max_evaluations:

@@ -35,7 +35,10 @@ def specific_force(
     its second derivative. Angles are arrays or floats; `up` is the vertical in the frame of the
     stage's base, whose y is the axis of alpha.
     """
-    x, y, z = (gravity_mps2 * u for u in up)
+    up_x, up_y, up_z = up
+    x = gravity_mps2 * up_x
+    y = gravity_mps2 * up_y
+    z = gravity_mps2 * up_z
     sin_alpha, cos_alpha = np.sin(alpha_rad), np.cos(alpha_rad)
     sin_beta, cos_beta = np.sin(beta_rad), np.cos(beta_rad)
     along = x * cos_alpha + z * sin_alpha

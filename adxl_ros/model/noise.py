@@ -31,7 +31,8 @@ class Electronics(NamedTuple):
 def electronics(sensor: Sensor) -> Electronics:
     """Return filter, white noise and steps of a sensor by all its effects, of any package."""
     names = [name for name in sensor.effects if effect_named(name).place is Place.ELECTRONICS]
-    chain, count = Chain(sensor, names), len(sensor.axes)
+    chain = Chain(sensor, names)
+    count = len(sensor.axes)
     # Arrays of one sample: effects with a memory take no floats.
     around = Environment(*(np.full(1, value) for value in NOMINAL_ENVIRONMENT))
     signals = chain.signals(

@@ -248,7 +248,8 @@ def adc_inverse(sensor: Sensor) -> Callable[[Components], Components]:
                 changes = [v - c for v, c in zip(volts, chain.through_adc(current))]
                 # A converged sample stays, so that it does not depend on its neighbours.
                 changes = [change * (abs(change) >= _SETTLED_V) for change in changes]
-                previous, current = current, [v + change for v, change in zip(current, changes)]
+                previous = current
+                current = [v + change for v, change in zip(current, changes)]
                 if not any(np.any(change) for change in changes):
                     break
         return [(a + b) / 2 for a, b in zip(current, previous)]
@@ -396,7 +397,8 @@ class _Search:
     """Newton's method on many samples, each until it has converged."""
 
     def __init__(self, sensor: Sensor) -> None:
-        self._axes, self._gravity = sensor.axes, gravity_mps2(sensor)
+        self._axes = sensor.axes
+        self._gravity = gravity_mps2(sensor)
         self._respond = analog_response(sensor)
         self._step = newton_step(sensor.axes, self._gravity, ARRAYS)
 
@@ -433,12 +435,14 @@ class _Search:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Take steps from no force; return the last forces, (3, n), and steps, (n,)."""
         count = input_v.shape[1]
-        force, last_change = np.zeros((3, count)), np.full(count, np.inf)
+        force = np.zeros((3, count))
+        last_change = np.full(count, np.inf)
         active = np.arange(count)
         for _ in range(limit):
             # Most samples need equally many steps, and a slice costs less than their numbers.
             samples = slice(None) if len(active) == count else active
-            current, around = list(force[:, samples]), _select(environment, samples)
+            current = list(force[:, samples])
+            around = _select(environment, samples)
             residual_v = [
                 v - r for v, r in zip(input_v[:, samples], self._respond(current, around))
             ]

@@ -99,8 +99,10 @@ class ChangeTest:
         walks: Sequence[float] = (np.inf,),
         drifts: Sequence[float] = (np.inf,),
     ) -> None:
-        self._channels, self._block_s = channels, block_s
-        self._walks, self._drifts = np.array(walks), np.array(drifts)
+        self._channels = channels
+        self._block_s = block_s
+        self._walks = np.array(walks)
+        self._drifts = np.array(drifts)
         comparisons = sum(_DAY_S / block_s / _stride(2**j) for j in range(_LENGTHS))
         # Permitted probability of a false alarm in one comparison
         self._p = min(_RESERVE * false_alarms_per_day / (comparisons * channels), 0.5)
@@ -138,7 +140,8 @@ class ChangeTest:
     def _compare(self, j: int, length: int) -> list[int]:
         """Compare one length, and learn; return the channels that have changed."""
         begin = self._count - (1 + _BEFORE) * length
-        now, middle = self._count % self._size, (self._count - length) % self._size
+        now = self._count % self._size
+        middle = (self._count - length) % self._size
         first = begin % self._size
         difference = (self._sums[now] - self._sums[middle]) / length - (
             self._sums[middle] - self._sums[first]

@@ -97,7 +97,8 @@ class LiveGap:
     """
 
     def __init__(self, sensor: Sensor, kind: ReferenceKind, settings: GapSettings) -> None:
-        self.sensor, self._settings = sensor, settings
+        self.sensor = sensor
+        self._settings = settings
         span_ns = round(settings.history_s * 1e9)
         # The reference, which takes its messages itself
         self.reference = reference_stream.ReferenceStream(kind, sensor, span_ns)
@@ -143,7 +144,8 @@ class LiveGap:
         finite = np.isfinite(accel_mps2).all(axis=1)
         self.counts['samples'] += len(stamp_ns)
         self.counts['dropped'] += int((~finite).sum())
-        stamp_ns, accel_mps2 = stamp_ns[finite], accel_mps2[finite]
+        stamp_ns = stamp_ns[finite]
+        accel_mps2 = accel_mps2[finite]
         steps_ns = _steps_ns(self._samples.newest_ns, stamp_ns)
         jumps = np.flatnonzero((steps_ns < -_JUMP_NS) | (steps_ns > _BREAK_NS))
         for i, part in enumerate(np.split(np.arange(len(stamp_ns)), jumps)):
@@ -185,14 +187,16 @@ class LiveGap:
         stamps_ns, accel_mps2 = self._samples.between(begin_ns, newest_ns + 1)
         origin_ns = int(stamps_ns[0]) if len(stamps_ns) else 0
         columns = dict(zip(ACCEL, accel_mps2.T))
-        around, force = (begin_ns - BLOCK_NS, newest_ns + BLOCK_NS), None
+        around = (begin_ns - BLOCK_NS, newest_ns + BLOCK_NS)
+        force = None
         at_ns, readings = self.reference.readings.between(*around)
         tracks = {
             name: (at_ns, values, LONGEST_MOVE_NS)
             for name, values in zip(JOINTS.values(), readings.T)
         }
         if self.reference.kind is not ReferenceKind.STAGE:
-            tracks, force = {}, ((at_ns - origin_ns) * 1e-9, readings)
+            tracks = {}
+            force = ((at_ns - origin_ns) * 1e-9, readings)
         for name, buffer in self.reference.surroundings.items():
             at_ns, readings = buffer.between(*around)
             if len(at_ns) > 1:
@@ -269,7 +273,8 @@ class LiveGap:
             elif motion is not None:
                 self.obstacle = 'no samples'
             return None
-        self._compared_ns, self.obstacle = end_ns, ''
+        self._compared_ns = end_ns
+        self.obstacle = ''
         return self._prediction.block(stamps_ns, accel_mps2, motion, end_ns)
 
     def _take(self, block: Block) -> list[GapChange]:
@@ -305,7 +310,8 @@ class LiveGap:
         def of_blocks(name: str) -> np.ndarray:
             return np.array([getattr(block, name)[d] for block in blocks])
 
-        gap, encoder = _rms_interval(of_blocks('square')), of_blocks('reference_square').mean()
+        gap = _rms_interval(of_blocks('square'))
+        encoder = of_blocks('reference_square').mean()
         still = [not block.moves for block in blocks]
         if sum(still) >= _FEWEST_BLOCKS:
             floor = _rms_interval(of_blocks('noise_square')[still] + encoder)
@@ -313,7 +319,8 @@ class LiveGap:
         else:
             noise_g = noise.sample_std_v(self.sensor)[d] / self.sensor.nominal_scale_v_per_g[d]
             std_mg = float(np.sqrt((noise_g * G0_MPS2) ** 2 + encoder)) / _MG
-            floor, source = Interval(std_mg, std_mg, std_mg), 'parameters'
+            floor = Interval(std_mg, std_mg, std_mg)
+            source = 'parameters'
         datasheet = _rms_interval(of_blocks('datasheet_square')).value
         explained = None
         if datasheet > _EXPLAINED_LEAST * floor.value:

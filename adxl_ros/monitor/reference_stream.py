@@ -72,7 +72,8 @@ class StreamBuffer:
     """Keeps the newest rows of a stream, in the pieces in which they came; stamps ascend."""
 
     def __init__(self, columns: int, span_ns: int) -> None:
-        self._span_ns, self._rows = span_ns, 0
+        self._span_ns = span_ns
+        self._rows = 0
         # It gives parts without rows their shape.
         self._nothing = np.zeros(0, np.int64), np.zeros((0, columns))
         self._pieces: deque[tuple[np.ndarray, np.ndarray]] = deque()
@@ -86,7 +87,8 @@ class StreamBuffer:
         """Append rows, (n, k), whose stamps, ns, (n,), increase; return these stamps."""
         newest_ns = np.iinfo(np.int64).min if self.newest_ns is None else self.newest_ns
         later = stamp_ns > np.maximum.accumulate(np.append(newest_ns, stamp_ns))[:-1]
-        stamp_ns, rows = stamp_ns[later], rows[later]
+        stamp_ns = stamp_ns[later]
+        rows = rows[later]
         if len(stamp_ns):
             self._pieces.append((stamp_ns, rows))
             self._rows += len(stamp_ns)
@@ -131,7 +133,8 @@ class ReferenceStream:
         self.readings = StreamBuffer(3, span_ns)
         self.surroundings = {name: StreamBuffer(1, span_ns) for name in _USUAL}
         self.error_mps2 = np.zeros(3)  # Standard deviation of the newest forces by their source
-        self._held, self._origin_ns = [0.0, 0.0, 0.0], 0
+        self._held = [0.0, 0.0, 0.0]
+        self._origin_ns = 0
         self._paths: list[Path] = [Held(), Held(), Held()]
         self._force: ForcePath
 
@@ -193,7 +196,8 @@ class ReferenceStream:
         ]
         largest = max(_STILL_STEPS * step_rad, _STILL_RAD)
         time_s = (np.linspace(begin_ns, end_ns, 3) - self._origin_ns) * 1e-9
-        alpha, beta = self._paths[0](time_s), self._paths[1](time_s)
+        alpha = self._paths[0](time_s)
+        beta = self._paths[1](time_s)
         stds = [
             errors.std
             if isinstance(path, SmoothedPath) and (errors := path.errors(time_s))
@@ -227,7 +231,8 @@ class RobotForce:
     """Turns the joint readings of a robot with a base at rest into the force in one frame."""
 
     def __init__(self, robot: Robot, gravity_mps2: float) -> None:
-        self._robot, self._gravity_mps2 = robot, gravity_mps2
+        self._robot = robot
+        self._gravity_mps2 = gravity_mps2
         self._joints = StreamBuffer(len(robot.joints), _HISTORY_NS)
         self._given_ns = 0  # Newest stamp whose force was returned
 
@@ -277,7 +282,8 @@ def _add_finite(
 ) -> None:
     """Add the finite rows; stamps that jump back by more than a time begin a new stream."""
     finite = np.isfinite(rows).all(axis=1)
-    stamp_ns, newest_ns = stamp_ns[finite], buffer.newest_ns
+    stamp_ns = stamp_ns[finite]
+    newest_ns = buffer.newest_ns
     if len(stamp_ns) and newest_ns is not None and stamp_ns[-1] < newest_ns - longest_ns:
         buffer.clear()
     buffer.add(stamp_ns, rows[finite])
@@ -315,7 +321,9 @@ class Prediction:
             )
         )
         effects = tuple(name for name in sensor.effects if name not in self.left_out)
-        self._sensor, self._reference, self._origin_ns = sensor, reference, 0
+        self._sensor = sensor
+        self._reference = reference
+        self._origin_ns = 0
         self._sensors = [
             noiseless(replace(sensor, effects=effects)),
             noiseless(replace(sensor, effects=(), values={})),
@@ -344,10 +352,10 @@ class Prediction:
         if is_first:
             self._responses = [Response(sensor, self._motion, 0) for sensor in self._sensors]
         time_s = (stamp_ns - self._origin_ns) * 1e-9
-        modelled, datasheet = (
+        modelled, datasheet = [
             accel_mps2 - to_nominal_mps2(respond(time_s), self._sensor)
             for respond in self._responses
-        )
+        ]
         if is_first:
             return None
         mean_mps2 = scipy.stats.trim_mean(modelled, _TRIMMED, axis=0)

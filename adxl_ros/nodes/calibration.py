@@ -227,7 +227,8 @@ class Announcer:
             else None
         )
         self._next = create_publisher(node, DiagnosticStatus, '~/next_pose', 1, latched=True)
-        self._announced, self._commanded_ns = '', 0
+        self._announced = ''
+        self._commanded_ns = 0
 
     def announce(self, pose: NextPose) -> None:
         """Announce a pose if it is new, and command the stage if it turns itself."""
@@ -343,7 +344,7 @@ class DisplayPublisher:
         self._publisher.publish(
             String(
                 data=screen_contents.ScreenContents(
-                    phase=phase.value,
+                    phase=phase,
                     text=text,
                     unit=f'{nominal.serial} ({nominal.axes})' if nominal else '',
                     output=str(controller.settings.output),
@@ -417,7 +418,8 @@ class Samples:
     def take(self, sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
         """Return the samples since the last call: stamps, ns, (n,), and volts, (n, m), finite."""
         self._receive()
-        batch, self._raw = self._raw, []
+        batch = self._raw
+        self._raw = []
         stamps, fields = topics.decoded(
             batch, cdr.imu, linear_acceleration=3, orientation_covariance=9
         )
@@ -490,7 +492,8 @@ class Calibration(Node):
         if own.autostart:
             self._controller.start()
         self._connect()
-        self._has_run, self._busy_ns = False, 0
+        self._has_run = False
+        self._busy_ns = 0
         self._names_joints = False  # Whether a line has named joints that no stage has
         self._display = DisplayPublisher(self, self._controller, own.screen)
         self.show_fit = self._display.show_fit

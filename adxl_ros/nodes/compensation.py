@@ -115,7 +115,8 @@ class MountingParameters:
 
     def __init__(self, node: Node, stream: LiveStream, mounting: Mounting, frame_id: str) -> None:
         self._node, self._stream = node, stream
-        self._frame_id, self._path = frame_id, ''
+        self._frame_id = frame_id
+        self._path = ''
         # What was given counts before the file of a calibration.
         self._is_given = _RPY in parameters.given_parameters(node)
         self._mount(mounting)
@@ -263,7 +264,8 @@ class Compensation(Node):
         super().__init__('compensation')
         parameter_checks.check_given(self)
         self._settings = settings = parameters.declare_all(self, CompensationSettings)
-        paper, mounting = settings.inverse == 'paper', _mounting(settings.rpy_rad)
+        paper = settings.inverse == 'paper'
+        mounting = _mounting(settings.rpy_rad)
         self._heard_ns: dict[str, int] = {}
         self._named: tuple[Sensor, str]
         self._obstacle = self._told = ''  # Why the sensor is unknown; the newest line on it

@@ -13,6 +13,7 @@ from pathlib import Path
 import subprocess
 import sys
 import time
+from typing import NamedTuple
 
 from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.guided import pose_plan
@@ -107,16 +108,23 @@ def _wait(finished: Callable[[], bool], processes: Sequence[subprocess.Popen], l
             raise UserError(f'{what}; see {log}')
 
 
-def _poses(journal: Path) -> tuple[int, list[sweep_journal.PoseRecord]]:
-    """Return how many poses are accepted, and those of the fit, once everything is written."""
+class _Poses(NamedTuple):
+    """The poses of a journal."""
+
+    accepted: int  # How many are accepted
+    fitted: list[sweep_journal.PoseRecord]  # Those of the fit, once everything is written
+
+
+def _poses(journal: Path) -> _Poses:
+    """Return the poses so far."""
     with suppress(UserError):
         entries = sweep_journal.read(journal).entries
         fitted: list = []
         for entry in entries:
             if isinstance(entry, sweep_journal.Fitted):
                 fitted += entry.rests or ()
-        return len(sweep_journal.accepted_poses(entries)), fitted
-    return 0, []
+        return _Poses(len(sweep_journal.accepted_poses(entries)), fitted)
+    return _Poses(0, [])
 
 
 @ended_by_closed_output()
@@ -174,7 +182,8 @@ def _run_sweep(folder: Path, seed: int) -> None:
         f'({_DURATION_S} s)',
         '',
     )
-    log, journal = output.with_suffix('.log'), output.with_name(f'{output.name}.journal')
+    log = output.with_suffix('.log')
+    journal = output.with_name(f'{output.name}.journal')
     # Results of an earlier demonstration would pass for those of this one.
     for path in (output, journal):
         path.unlink(missing_ok=True)
@@ -204,7 +213,7 @@ def _run_sweep(folder: Path, seed: int) -> None:
         with jobs.Step('1/3 sweep', 'starting', total) as step:
 
             def swept() -> bool:
-                count, _ = _poses(journal)
+                count = _poses(journal).accepted
                 step.show(f'{count} of {total} poses', count)
                 return count == total
 
@@ -214,8 +223,8 @@ def _run_sweep(folder: Path, seed: int) -> None:
             _wait(output.exists, nodes, log)
             step.show(f'{fitting}, {parameter_file.load(output).model} model')
         with jobs.Step('3/3 check', f'{_CHECK_POSES} poses that the fit has not seen'):
-            _wait(lambda: bool(_poses(journal)[1]), nodes, log)
-    poses = Poses.from_records(_poses(journal)[1])
+            _wait(lambda: bool(_poses(journal).fitted), nodes, log)
+    poses = Poses.from_records(_poses(journal).fitted)
     fitted = parameter_file.load(output)
     _print(
         '',

@@ -101,7 +101,8 @@ class Driver(LifecycleNode):
         self._sensor = sensor_parameters.make_sensor(sensor_parameters.declare_sensor(self))
         self._refuse_silent_simulation()
         own = parameters.declare_all(self, DriverSettings)
-        self._delay_ns, self._link = round(1e9 * own.stamp_offset_s), own.link
+        self._delay_ns = round(1e9 * own.stamp_offset_s)
+        self._link = own.link
         self._module = base.link_module(own.link)
         self._settings = settings = self._declare_link()
         has_frame = isinstance(settings, base.SimulatorSettings)
@@ -135,7 +136,8 @@ class Driver(LifecycleNode):
 
     def _refuse_silent_simulation(self) -> None:
         """Refuse a driver of a real unit without a link: no real unit gets simulated data."""
-        given, serial = [*parameters.given_below(self, LINK)], self._sensor.serial
+        given = [*parameters.given_below(self, LINK)]
+        serial = self._sensor.serial
         if given:
             reason = f'{LINK}{given[0]} is given'
         elif serial != NO_SERIAL:
@@ -195,13 +197,15 @@ class Driver(LifecycleNode):
 
     def close(self) -> None:
         """End the thread and close the link."""
-        reader, self._reader = self._reader, None
+        reader = self._reader
+        self._reader = None
         if reader is not None:
             reader.close()
 
     def clean_up(self) -> None:
         """Remove the topics."""
-        output, self._output = self._output, None
+        output = self._output
+        self._output = None
         if output is not None:
             output.destroy()
 

@@ -251,7 +251,8 @@ class Investigate(Node):
 
     def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._request = '~/abort was called'
-        response.success, response.message = True, 'stopped; the stage holds its pose'
+        response.success = True
+        response.message = 'stopped; the stage holds its pose'
         return response
 
     def _status(self) -> Status:

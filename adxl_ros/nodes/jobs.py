@@ -129,7 +129,8 @@ class Step(LiveLine):
     def __init__(self, name: str, text: str, total: int = 0) -> None:
         columns = (_BAR_WIDTH, '{task.percentage:3.0f} %') if total else ()
         super().__init__(*columns, '{task.elapsed:4.0f} s', total=total)
-        self._name, self._begin_s = name, time.monotonic()
+        self._name = name
+        self._begin_s = time.monotonic()
         self._width = _TEXT_WIDTH if total else _LINE_WIDTH - _NAME_WIDTH - 2
         self.show(text)
 

@@ -242,7 +242,8 @@ def _enclave(context: LaunchContext, executable: str) -> list[str]:
 
 def static_transform(context: LaunchContext) -> list[Action]:
     """Publish where the case is on the robot, if the launch names the frame of the robot."""
-    base_frame, executable = text(context, 'base_frame'), 'static_transform_publisher'
+    base_frame = text(context, 'base_frame')
+    executable = 'static_transform_publisher'
     if not base_frame:
         return []
     frame_id = given_anywhere(context, 'frame_id', 'driver') or driver.DEFAULT_FRAME

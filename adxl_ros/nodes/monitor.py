@@ -68,7 +68,8 @@ class MonitorSettings:
 
 def gap_status(live: LiveGap, likely: DiagnosisResult | None, window_s: float) -> Status:
     """Return text, level and values of the gap, its newest change, and the newest diagnosis."""
-    gaps, changed = live.report(), live.changes[-1:]
+    gaps = live.report()
+    changed = live.changes[-1:]
     text = 'comparing; the first result takes some seconds'
     values: dict[str, object] = {'window_s': window_s, 'changes': len(live.changes)}
     if gaps:
@@ -214,7 +215,9 @@ class Monitor(Node):
         """Begin a comparison with the parameters, as far as they fit what a stream states."""
         if self._info is not None and self._info.texts == info.texts:
             return
-        self._info, self._refusal, sensor = info, '', self._file_sensor
+        self._info = info
+        self._refusal = ''
+        sensor = self._file_sensor
         try:
             if sensor.effects or sensor.serial != NO_SERIAL:
                 check_same_sensor(info, info.axes or sensor.axes, sensor)
@@ -226,7 +229,8 @@ class Monitor(Node):
             self.get_logger().error(self._refusal)
             return
         self._live = LiveGap(sensor, self._kind, self._settings)
-        self._changed_ns, self._result = 0, None
+        self._changed_ns = 0
+        self._result = None
         self.get_logger().info(
             f'comparing {self.resolve_topic_name("imu/data_raw")} of {sensor.serial} with '
             f'{self.resolve_topic_name(self._reference_topic)}'
@@ -294,7 +298,8 @@ class Monitor(Node):
             or (self._result is None and any(gap.is_open for gap in self._live.report()))
         ):
             self._begin_diagnosis(self._changed_ns)
-            self._changed_ns, self._diagnosed_s = 0, time.monotonic()
+            self._changed_ns = 0
+            self._diagnosed_s = time.monotonic()
 
     def _begin_diagnosis(self, begin_ns: int) -> None:
         """Begin a diagnosis of the samples since a stamp, ns."""

@@ -226,7 +226,8 @@ class SampleOutput:
 
     def _destroy_left(self) -> None:
         """Destroy the publisher of the clock; an executor that waits for it would fail."""
-        left, self._left = self._left, None
+        left = self._left
+        self._left = None
         if left is not None:
             self._node.destroy_publisher(left)
 
@@ -243,7 +244,9 @@ class SampleOutput:
         ):
             return
         # The thread of the link calls this: the executor destroys the publisher in its own.
-        self._left, self._clock, self.is_clock = self._clock, None, False
+        self._left = self._clock
+        self._clock = None
+        self.is_clock = False
         self._leave.trigger()
         self._node.set_parameters([Parameter('use_sim_time', value=True)])
         self._node.get_logger().warning(

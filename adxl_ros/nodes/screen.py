@@ -16,7 +16,7 @@ from textwrap import wrap
 import time
 from typing import Any, TextIO
 
-from adxl_ros.calibrate.guided.screen_contents import Row, ScreenContents
+from adxl_ros.calibrate.guided.screen_contents import Phase, Row, ScreenContents
 from adxl_ros.errors import UserError
 from adxl_ros.nodes.jobs import held_output
 from adxl_ros.nodes.parameter_checks import check_given
@@ -43,14 +43,14 @@ Styled = tuple[str, str]  # A style of prompt_toolkit and its text
 Line = list[Styled]  # A line of the screen
 
 _COLOURS = {
-    'dwell': 'ansigreen',
-    'refused': 'ansired',
-    'silent': 'ansired',
-    'question': 'ansiyellow',
-    'rest': 'ansiyellow',
-    'stage': 'ansiyellow',
-    'operator': 'bold ansicyan',
-    'fit': 'ansigreen',
+    Phase.DWELL: 'ansigreen',
+    Phase.REFUSED: 'ansired',
+    Phase.SILENT: 'ansired',
+    Phase.QUESTION: 'ansiyellow',
+    Phase.REST: 'ansiyellow',
+    Phase.STAGE: 'ansiyellow',
+    Phase.OPERATOR: 'bold ansicyan',
+    Phase.FIT: 'ansigreen',
 }
 """Styles by phase."""
 _LEAST_WIDTH = 20  # A narrower terminal is drawn as if it had this width, columns
@@ -141,11 +141,12 @@ def full_screen(
     except ImportError:
         raise UserError('the screen needs prompt_toolkit; pip install prompt_toolkit') from None
     stdin, stdout = _terminal()
-    output, keys = create_output(stdout), KeyBindings()
+    output = create_output(stdout)
+    keys = KeyBindings()
 
     def fragments() -> Any:
         rows, columns = output.get_size()
-        drawn: Line = []
+        drawn: list[Styled] = []
         for line in lines(columns, rows):
             drawn += [*line, ('', '\n')]
         return drawn[:-1]
@@ -204,9 +205,11 @@ class Screen(Node):
         super().__init__('screen')
         check_given(self)
         own = declare_all(self, ScreenSettings)
-        name, self._node_pid = own.node, own.node_pid
+        name = own.node
+        self._node_pid = own.node_pid
         self._target = self.resolve_topic_name(name)
-        self._contents, self._received_s = ScreenContents('info', ''), 0.0
+        self._contents = ScreenContents(Phase.INFO, '')
+        self._received_s = 0.0
         self._log: deque[tuple[str, str]] = deque(maxlen=_FEW_LINES)  # Styles and messages
         self._application = full_screen(
             lambda columns, rows: draw(self._shown(), self._log, columns, rows),
@@ -250,7 +253,9 @@ class Screen(Node):
 
     def _shown(self) -> ScreenContents:
         """Return the newest contents, or what the screen waits for; a node that fits is silent."""
-        is_new = time.monotonic() - self._received_s < _SILENT_S or self._contents.phase == 'fit'
+        is_new = (
+            time.monotonic() - self._received_s < _SILENT_S or self._contents.phase is Phase.FIT
+        )
         if (
             self._received_s
             and is_new
@@ -260,7 +265,7 @@ class Screen(Node):
             return self._contents
         return replace(
             self._contents,
-            phase='silent',
+            phase=Phase.SILENT,
             keys=(),
             text=f'waiting for {self._target}; is it running in this ROS domain?',
         )
@@ -284,9 +289,9 @@ class Screen(Node):
             self._contents = ScreenContents.from_json(message.data)
         except (LookupError, TypeError, ValueError):
             self._contents = ScreenContents(
-                'refused', f'{self._target} is of another version of adxl_ros; update both'
+                Phase.REFUSED, f'{self._target} is of another version of adxl_ros; update both'
             )
-        if self._contents.phase != before:
+        if self._contents.phase is not before:
             # A launch prints lines of its own into this terminal: draw all, not what is new.
             self._application.renderer.clear()
         self._received_s = time.monotonic()

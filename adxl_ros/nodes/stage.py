@@ -208,9 +208,12 @@ class SimulatedStageNode:
         )
 
     def _status(self) -> Status:
-        level, text = Level.OK, 'moving' if self._stage.moving() else 'at rest'
+        level = Level.OK
+        text = 'moving' if self._stage.moving() else 'at rest'
         if self._refusal:
-            level, text, self._refusal = Level.WARN, f'refused {self._refusal}', ''
+            level = Level.WARN
+            text = f'refused {self._refusal}'
+            self._refusal = ''
         values = {name: float(p) for name, p in zip(JOINTS, self._stage.encoder())}
         return Status(level, text, 'simulated', {**values, 'refused': self._refusal_count})
 
@@ -320,7 +323,8 @@ class StageBridge:
             np.abs(goal_rad - self._angles_rad).max() / self._speed_rad_s, _SHORTEST_S
         )
         self._resend_ns = now_ns + round(duration_s * 1e9) + _GRACE_NS
-        self._goal_rad, self._refusal = goal_rad, ''
+        self._goal_rad = goal_rad
+        self._refusal = ''
         self._send(duration_s)
 
     def _send(self, duration_s: float) -> None:

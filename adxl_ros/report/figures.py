@@ -7,10 +7,11 @@ Plain objects serve every version of plotly. Its Python classes would cost a sec
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
-from typing import Any
+from math import ceil
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import install_hint, UserError
 import numpy as np
@@ -114,10 +115,30 @@ def extremes(values: np.ndarray, count: int) -> np.ndarray:
     """
     if len(values) <= count:
         return np.arange(len(values))
-    size = -(-len(values) // (count // 2))
-    blocks = np.pad(np.nan_to_num(values), (0, -len(values) % size), 'edge').reshape(-1, size)
+    size = ceil(len(values) / (count // 2))
+    number = ceil(len(values) / size)
+    padded = np.pad(np.nan_to_num(values), (0, number * size - len(values)), 'edge')
+    blocks = padded.reshape(number, size)
     begins = np.arange(0, len(values), size)
     return np.unique([begins + blocks.argmin(axis=1), begins + blocks.argmax(axis=1)])
+
+
+class Span(NamedTuple):
+    """A part of a line, in percent of its length."""
+
+    begin: float
+    width: float
+
+
+class Whisker(NamedTuple):
+    """A value with its interval on a line, in percent of its length."""
+
+    text: str
+    zero: float  # Place of 0
+    dot: float  # Place of the value
+    typical: Span | None  # Typical values; None where none are stated
+    line: Span  # The interval
+    beyond: bool  # Whether the value is beyond its limit
 
 
 def whisker(
@@ -128,7 +149,7 @@ def whisker(
     text: str,
     typical: float = 0.0,
     beyond: bool = False,
-) -> Mapping[str, Any]:
+) -> Whisker:
     """Place a value with its interval between bounds, in percent of their distance."""
     begin, end = bounds
 
@@ -136,15 +157,17 @@ def whisker(
         share = (position - begin) / (end - begin) if end > begin else 0.5
         return round(100 * float(np.clip(share, 0.0, 1.0)), 2)
 
-    shaded = (place(-typical), place(typical) - place(-typical)) if typical else None
-    return {
-        'text': text,
-        'zero': place(0.0),
-        'dot': place(value),
-        'typical': shaded,
-        'line': (place(low), place(high) - place(low)),
-        'beyond': beyond,
-    }
+    def span(first: float, last: float) -> Span:
+        return Span(place(first), place(last) - place(first))
+
+    return Whisker(
+        text=text,
+        zero=place(0.0),
+        dot=place(value),
+        typical=span(-typical, typical) if typical else None,
+        line=span(low, high),
+        beyond=beyond,
+    )
 
 
 def new_figure(**options: Any) -> Any:

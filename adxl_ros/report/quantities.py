@@ -194,9 +194,11 @@ def _for_people(values: np.ndarray, unit: str, scale_v_per_g: float) -> tuple[np
     if unit == 'rad':
         return np.degrees(values), 'deg'
     if unit in ('V', 'V/g'):
-        values, unit = values / scale_v_per_g, 'g' if unit == 'V' else '1'
+        values = values / scale_v_per_g
+        unit = 'g' if unit == 'V' else '1'
     if unit == 'm/s^2':
-        values, unit = values / G0_MPS2, 'g'
+        values = values / G0_MPS2
+        unit = 'g'
     base, slash, per = unit.replace('s/s', '1').partition('/')
     per = per.replace('^2', '²').replace('sqrt(', '√').replace(')', '')
     largest = float(np.abs(values).max())

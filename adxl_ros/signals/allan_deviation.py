@@ -193,7 +193,8 @@ def longest_rest(
     """
     if len(first) < 2:
         raise UserError(f'{first.path}: {len(first)} samples; record longer')
-    first_s, beyond = float(first.time_s[0]), BeyondRange()
+    first_s = float(first.time_s[0])
+    beyond = BeyondRange()
     for block in read():
         look.feed(block)
         beyond.add(block.volts(nominal), nominal)
@@ -221,7 +222,8 @@ def longest_rest(
                 is_taken = np.isfinite(gyro_radps).all(axis=1)
                 turns.feed(block.time_s[is_taken], gyro_radps[is_taken], rest)
         accelerometer = samples.stretch(span_s, motion_s, beyond.describe(nominal))
-        gyroscope, doubt = None, ''
+        gyroscope = None
+        doubt = ''
         if 0 < turns.count < accelerometer.count:
             doubt = (
                 f'the gyroscope has {turns.count} readings at rest, and the accelerometer '
@@ -250,7 +252,9 @@ class _Samples:
     """The undisturbed samples of a rest; those after a gap follow those before it."""
 
     def __init__(self, first: Recording, names: Sequence[str], file: IO[bytes]) -> None:
-        self._path, self._rate_hz, self._names = first.path, first.rate_hz, names
+        self._path = first.path
+        self._rate_hz = first.rate_hz
+        self._names = names
         self._phase = Phase(len(names), file)
         self._resolution = np.full(len(names), np.inf)
         self._start_s = self._stop_s = 0.0  # Stamps of the first and the newest sample
@@ -266,7 +270,8 @@ class _Samples:
         inside = rest.includes(time_s)
         if not inside.any():
             return
-        rows, time_s = samples[inside], time_s[inside]
+        rows = samples[inside]
+        time_s = time_s[inside]
         if not self._phase.count:
             self._start_s = self._stop_s = float(time_s[0])
         steps_s = np.diff(time_s, prepend=self._stop_s)
@@ -292,7 +297,8 @@ class _Samples:
         count = self._phase.count
         steps_s = self._stop_s - self._start_s - self._gaps_s
         rate_hz = (count - 1 - self._gaps) / steps_s
-        allan, cells = self._phase.allan_deviation(rate_hz), self._phase.cells()
+        allan = self._phase.allan_deviation(rate_hz)
+        cells = self._phase.cells()
         # The variance within 2^k samples is that of the octaves of Haar's wavelets in it.
         octaves = _window_octaves(rate_hz)
         variance = (allan.deviation[:octaves] ** 2).sum(axis=0) / 2 / (1 - 0.5**octaves)

@@ -117,7 +117,8 @@ class BlockCutter:
 
     def _summed(self, columns: np.ndarray, start: np.ndarray, run: np.ndarray) -> Blocks:
         block = columns[:, start[:, None] + np.arange(self.size)]
-        samples, angles = block[1 : 1 + self._axes], block[1 + self._axes :]
+        samples = block[1 : 1 + self._axes]
+        angles = block[1 + self._axes :]
         change = np.abs(np.diff(samples, axis=2))
         step = np.where(change > 0, change, np.inf).min(axis=2, initial=np.inf)
         mean = samples.mean(axis=2)
@@ -144,7 +145,8 @@ def angle_bounds(blocks: Blocks) -> np.ndarray:
     """
     bounds = blocks.angle * np.array([[-1.0], [1.0]])
     has_angle = np.isfinite(bounds).all(axis=(1, 2))
-    place, last = np.arange(len(has_angle)), len(has_angle) - 1
+    place = np.arange(len(has_angle))
+    last = len(has_angle) - 1
     # The newest block with an angle up to each place, and the next one from it on
     newest = np.maximum.accumulate(np.where(has_angle, place, 0))
     following = np.minimum.accumulate(np.where(has_angle, place, last)[::-1])[::-1]

@@ -8,6 +8,7 @@ These are faults of stamps and samples, remarks, and what other tools can do wit
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -26,6 +27,7 @@ from adxl_ros.files.recording_columns import (
     REFERENCES,
 )
 from adxl_ros.files.stamps import burst_samples, lacks_samples, period_s
+from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.process import option, usage
@@ -108,11 +110,12 @@ def examine(
     first = next((block for block in blocks if len(block)), None)
     if first is None:
         raise UserError('the recording holds no samples')
-    sensor, stamps = sensor_of(first), _Stamps(first)
+    sensor = sensor_of(first)
+    stamps = _Stamps(first)
     look = RecordingLook(sensor, first)
     axes = [_Axis(name, stamps.period_s) for name in first.sensor_columns]
     gyro = _Gyro(first, stamps.period_s) if first.gyro_radps is not None else None
-    references: dict[str, _Reference] = {}
+    references = _References()
     for block in chain([first], blocks):
         if not len(block):
             continue
@@ -122,12 +125,7 @@ def examine(
         look.feed(block)
         if gyro is not None:
             gyro.feed(block)
-        for name, values in block.columns.items():
-            if name not in REFERENCES:
-                continue
-            read = values[np.isfinite(values)]
-            if len(read):
-                references.setdefault(name, _Reference()).feed(read)
+        references.feed(block)
     gravity = look.gravity()
     rests = look.rests.detected
     spans_s = [found.rest.span_s for found in rests]
@@ -151,8 +149,8 @@ def examine(
         poses=_count_poses(means_mps2),
         gravity=gravity,
         neighbour_faults=tuple(look.neighbour_faults()),
-        reference_ranges={name: (each.lowest, each.highest) for name, each in references.items()},
-        reference_means={name: each.total / each.count for name, each in references.items()},
+        reference_ranges=references.ranges,
+        reference_means=references.means,
         log_delay_s=log_delay_s,
         remarks=block.remarks,
         cut=block.cut,
@@ -160,19 +158,29 @@ def examine(
     )
 
 
-class _Reference:
-    """Range and mean of a reference."""
+class _References:
+    """Range and mean of each reference, by column."""
 
     def __init__(self) -> None:
-        self.lowest, self.highest = np.inf, -np.inf
-        self.total, self.count = 0.0, 0  # Sum and number of its values
+        self.ranges: dict[str, tuple[float, float]] = {}  # Lowest and highest value
+        self._sums: defaultdict[str, float] = defaultdict(float)
+        self._counts: Counter[str] = Counter()
 
-    def feed(self, values: np.ndarray) -> None:
-        """Add finite values, (n,)."""
-        self.lowest = min(self.lowest, float(values.min()))
-        self.highest = max(self.highest, float(values.max()))
-        self.total += float(values.sum())
-        self.count += len(values)
+    def feed(self, block: Recording) -> None:
+        """Add the samples of a block, where they are known."""
+        for name, values in block.columns.items():
+            known = values[np.isfinite(values)]
+            if name not in REFERENCES or not len(known):
+                continue
+            low, high = self.ranges.get(name, (np.inf, -np.inf))
+            self.ranges[name] = min(low, float(known.min())), max(high, float(known.max()))
+            self._sums[name] += float(known.sum())
+            self._counts[name] += len(known)
+
+    @property
+    def means(self) -> dict[str, float]:
+        """Return the mean of each."""
+        return {name: self._sums[name] / self._counts[name] for name in self.ranges}
 
 
 def log_delay_s(times_ns: Iterable[np.ndarray]) -> float | None:
@@ -198,12 +206,15 @@ class _Stamps:
         self.count = self.missing = self.gaps = 0
         self.longest_gap_s = 0.0
         # Sums over the steps that are no gaps
-        self._squares, self._usual_s, self._usual = 0.0, 0.0, 0
+        self._squares = 0.0
+        self._usual_s = 0.0
+        self._usual = 0
 
     def feed(self, time_s: np.ndarray) -> None:
         """Add further stamps."""
         stamps_s = np.concatenate([[self.last_s], time_s]) if self.count else time_s
-        steps_s, is_gap = np.diff(stamps_s), lacks_samples(stamps_s, self.period_s)
+        steps_s = np.diff(stamps_s)
+        is_gap = lacks_samples(stamps_s, self.period_s)
         self.count += len(time_s)
         self.last_s = float(time_s[-1])
         lacking = np.rint(steps_s[is_gap] / self.period_s) - self.burst
@@ -230,18 +241,24 @@ class _Axis:
     """Extreme values of an axis, and the longest time in which it does not change."""
 
     def __init__(self, name: str, period_s: float) -> None:
-        self.name, self._period_s = name, period_s
+        self.name = name
+        self._period_s = period_s
         # Largest value of minus the samples and of the samples, and how often they stay there
-        self._largest, self._clipped = [-np.inf, -np.inf], [0, 0]
-        self._last, self._count, self._changes = np.nan, 0, 0
+        self._largest = [-np.inf, -np.inf]
+        self._clipped = [0, 0]
+        self._last = np.nan
+        self._count = 0
+        self._changes = 0
         self._equal = self._most_equal = 0  # Samples since the last change, and most between two
 
     def feed(self, values: np.ndarray) -> None:
         """Add further samples, m/s², (n,)."""
         changes = np.flatnonzero(np.diff(values, prepend=self._last))
         equal = np.diff(changes, prepend=-1 - self._equal, append=len(values)) - 1
-        self._equal, self._most_equal = int(equal[-1]), max(self._most_equal, int(equal.max()))
-        self._count, self._changes = self._count + len(values), self._changes + len(changes)
+        self._equal = int(equal[-1])
+        self._most_equal = max(self._most_equal, int(equal.max()))
+        self._count += len(values)
+        self._changes += len(changes)
         self._last = values[-1]
         steps = np.abs(np.diff(values))
         smallest = float(steps[steps > 0].min(initial=np.inf))
@@ -249,7 +266,8 @@ class _Axis:
         for side, signed in enumerate((-values, values)):
             largest = float(signed.max())
             if largest > self._largest[side]:
-                self._largest[side], self._clipped[side] = largest, 0
+                self._largest[side] = largest
+                self._clipped[side] = 0
             if largest == self._largest[side]:
                 self._clipped[side] += sum(
                     self._moves(signed, largest - drop, first, stop)
@@ -265,7 +283,8 @@ class _Axis:
 
     def result(self) -> AxisRange:
         """Return the range of the axis."""
-        low, high = -self._largest[0], self._largest[1]
+        low = -self._largest[0]
+        high = self._largest[1]
         stuck_s = self._most_equal * self._period_s
         is_reported = (
             stuck_s >= _STUCK_S
@@ -519,7 +538,8 @@ def _diagnose(contents: RecordingContents) -> Ability:
 
 
 def _noise(contents: RecordingContents) -> Ability:
-    longest_s, shortest_s = contents.longest_rest_s, shortest_rest_s(contents.rate_hz)
+    longest_s = contents.longest_rest_s
+    shortest_s = shortest_rest_s(contents.rate_hz)
     return Ability(
         'noise',
         longest_s >= shortest_s,
@@ -527,9 +547,6 @@ def _noise(contents: RecordingContents) -> Ability:
         if longest_s >= shortest_s
         else f'rests for {longest_s:.4g} s, needs {shortest_s:.3g} s',
     )
-
-
-BLOCK_ROWS = 65536  # Samples that are read at a time (chosen: some MB)
 
 
 def check_recording(

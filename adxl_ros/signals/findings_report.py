@@ -49,7 +49,8 @@ def sentence(results: Sequence[Findings]) -> str:
 
 def table_row(result: Findings) -> list[str]:
     """Return name, figures and outcome of a recording, as `HEAD` names them."""
-    name, contents = Path(result.path).name, result.contents
+    name = Path(result.path).name
+    contents = result.contents
     if contents is None:
         return [name, *['–'] * 5, 'unreadable']
     return [

@@ -128,7 +128,8 @@ class Earlier:
     ) -> None:
         if found.contents is None:
             raise UserError(f'{found.path}: {found.faults[0]}')
-        self._contents, self._sensor = found.contents, sensor
+        self._contents = found.contents
+        self._sensor = sensor
         self._at_rest = _at_rest(read, sensor)
 
     def compare(self, contents: RecordingContents, read: Recording) -> list[Outcome]:
@@ -153,11 +154,13 @@ def _events(name: str, new: RecordingContents, old: RecordingContents) -> Outcom
         return Outcome(name, False, text)
     # Of all events, the share of the new recording is binomial (Clopper and Pearson 1934).
     share = scipy.stats.binomtest(counts[0], sum(counts)).proportion_ci(1 - _CHANCE / _INTERVALS)
-    exposure = old.span_s / new.span_s
-    low, high = (
-        exposure * value / (1 - value) if value < 1 else np.inf
-        for value in (share.low, share.high)
-    )
+
+    def rates(value: float) -> float:
+        """Return the ratio of the rates for a share."""
+        return old.span_s / new.span_s * value / (1 - value) if value < 1 else np.inf
+
+    low = rates(share.low)
+    high = rates(share.high)
     is_worse = high < 1 if name == 'rests' else low > 1
     return Outcome(name, is_worse, f'{text}: {_ratio(low, high)}', (low, high))
 
@@ -192,10 +195,11 @@ def _zero_g(new: _AtRest, old: _AtRest) -> Outcome:
             'zero-g', False, f'not compared: needs three axes and {_FEWEST_POSES} rests in both'
         )
     low, high = _change(np.abs(new.departure_mps2), np.abs(old.departure_mps2))
-    now_mg, before_mg = (float(mg(np.mean(np.abs(each.departure_mps2)))) for each in (new, old))
+    now = np.mean(np.abs(new.departure_mps2))
+    before = np.mean(np.abs(old.departure_mps2))
     text = (
-        f'length of gravity off by {now_mg:.3g} mg, before {before_mg:.3g} mg: change '
-        f'{float(mg(low)):.3g} to {float(mg(high)):.3g} mg'
+        f'length of gravity off by {mg(now):.3g} mg, before {mg(before):.3g} mg: change '
+        f'{mg(low):.3g} to {mg(high):.3g} mg'
     )
     return Outcome('zero-g', low > 0, text, (low, high), 'm/s^2')
 
@@ -218,10 +222,13 @@ def _at_rest(read: Recording, sensor: Sensor | str | None) -> _AtRest:
     rests = RecordedRests(unit, read)
     rests.feed(read)
     rests.take()
-    accel_mps2, found = read.accel_mps2(unit), rests.detected
+    accel_mps2 = read.accel_mps2(unit)
+    found = rests.detected
     samples = [accel_mps2[each.rest.includes(read.time_s)] for each in found]
     count = -(-_FEWEST_PARTS // max(len(samples), 1))
-    parts = [part for each in samples for part in np.array_split(each, count) if len(part) > 1]
+    parts = []
+    for each in samples:
+        parts += [part for part in np.array_split(each, count) if len(part) > 1]
     std = np.reshape([part.std(axis=0) for part in parts], (len(parts), len(read.axes)))
     lengths = [float(np.linalg.norm(each.mean(axis=0))) for each in samples]
     has_length = len(read.axes) == len(AXES)

@@ -321,10 +321,11 @@ def look(
     count, axes = readings.mean_mps2.shape
     if not count:
         return GravityAtRest(0, axes, gravity_mps2)
-    length, case = readings.length_mps2, _Case(readings, tolerance, gravity_mps2)
+    length = readings.length_mps2
+    case = _Case(readings, tolerance, gravity_mps2)
     # A reading of the length g in these poses is that of a force between these lengths.
     upright = readings.divided(np.maximum(length, _LEAST_MPS2)[:, None] / gravity_mps2)
-    low, high = (np.median(limits) for limits in replace(case, readings=upright).force_limits())
+    low, high = np.median(replace(case, readings=upright).force_limits(), axis=1)
     return GravityAtRest(
         rests=count * every,
         axes=axes,
@@ -359,7 +360,8 @@ class _Case:
     def force_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the smallest and largest length of the force of each rest, m/s², (k,) each."""
         size = np.abs(self.readings.mean_mps2)
-        zero_g, scale = self.tolerance.zero_g_mps2, self.tolerance.scale
+        zero_g = self.tolerance.zero_g_mps2
+        scale = self.tolerance.scale
         low = np.linalg.norm(np.maximum(size - zero_g, 0) / (1 + scale), axis=1)
         high = np.linalg.norm((size + zero_g) / (1 - scale), axis=1)
         return low - self.error_mps2, high + self.error_mps2
@@ -394,7 +396,8 @@ class _Case:
 
     def _sphere_middle_mps2(self, prior: float) -> np.ndarray:
         """Return the middle of the sphere nearest to the readings, near 0 by a prior, (m,)."""
-        mean, axes = self.readings.mean_mps2, self.readings.mean_mps2.shape[1]
+        mean = self.readings.mean_mps2
+        axes = self.readings.mean_mps2.shape[1]
         # |r|² = 2·r·b + (|f|² − |b|²) is linear in b and in the bracket.
         near_0 = np.diag(
             prior
@@ -414,7 +417,9 @@ class _Case:
 
     def _unexplained(self, zero_g_mps2: np.ndarray) -> np.ndarray:
         """Return which rests no zero-g near a first guess, m/s², (m,), and scale explain, (k,)."""
-        mean, axes, error_mps2 = self.readings.mean_mps2, len(zero_g_mps2), self.error_mps2
+        mean = self.readings.mean_mps2
+        axes = len(zero_g_mps2)
+        error_mps2 = self.error_mps2
         allowed = _CORRECTABLE * np.concatenate([self.tolerance.zero_g_mps2, self.tolerance.scale])
         shares = np.append(zero_g_mps2, np.zeros(axes)) / allowed.clip(min=TINY)
         shares = shares.clip(-1.0, 1.0)
@@ -444,7 +449,8 @@ class _Case:
     def fault(self) -> GravityFault | None:
         """Return what is wrong; None where a sound sensor may read all this."""
         wrong = self.contradicting()
-        longer, shorter = self.too_long().mean(), self.too_short().mean()
+        longer = self.too_long().mean()
+        shorter = self.too_short().mean()
         is_off = max(longer, shorter) > 0.5
         is_spread = wrong.sum() > 1 and wrong.mean() > _LARGEST_FALSE_SHARE
         if is_off and (unit_fault := self._unit()):
@@ -538,7 +544,8 @@ class _Case:
         factors = {'m/s²': 1.0} | {
             unit.name: unit.gravity / self.gravity_mps2 for unit in _AXIS_UNITS
         }
-        best, least = None, np.inf
+        best = None
+        least = np.inf
         for names in product(factors, repeat=axes):
             if len(set(names)) == 1:
                 continue
@@ -547,7 +554,8 @@ class _Case:
                 continue
             departure = float(np.abs(case.readings.length_mps2 - self.gravity_mps2).max())
             if departure < least:
-                best, least = names, departure
+                best = names
+                least = departure
         if best is None:
             return None
         stated = ', '.join(f'{axis} in {name}' for axis, name in zip(AXES, best))

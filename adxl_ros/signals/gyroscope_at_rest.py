@@ -83,24 +83,35 @@ def with_bias(gyro: Gyroscope, rests: Sequence[RestTurns]) -> Gyroscope:
     design = np.ones((len(parts), 1))
     if has_slope:
         design = np.column_stack([design, departure_k])
-    root = np.sqrt(weight / weight.mean())[:, None]
-    values = np.linalg.lstsq(design * root, means * root, rcond=None)[0]
-    freedom = len(parts) - design.shape[1]
-    scatter = np.sum(((means - design @ values) * root) ** 2, axis=0) / freedom
-    widths = np.diag(np.linalg.inv((design * root).T @ (design * root)))
-    student = float(scipy.stats.t.ppf(_COVERED, freedom)) / Z_90
-    std = student * np.sqrt(np.outer(widths, scatter))
-    std[0] = np.hypot(std[0], _rounding(parts))
-    low_c, high_c = float(temperature_c.min()), float(temperature_c.max())
-    slopes = [tuple(each[1].tolist()) if has_slope else () for each in (values, std)]
+    fit = _weighted_fit(design, means, weight)
+    low_c = float(temperature_c.min())
+    high_c = float(temperature_c.max())
     return replace(
         gyro,
-        bias_radps=tuple(values[0].tolist()),
-        bias_std_radps=tuple(std[0].tolist()),
-        bias_per_k_radps=slopes[0],
-        bias_per_k_std_radps=slopes[1],
+        bias_radps=tuple(fit.value[0].tolist()),
+        bias_std_radps=tuple(np.hypot(fit.std[0], _rounding(parts)).tolist()),
+        bias_per_k_radps=tuple(fit.value[1].tolist()) if has_slope else (),
+        bias_per_k_std_radps=tuple(fit.std[1].tolist()) if has_slope else (),
         temperature_c=(low_c, middle_c, high_c) if is_known else (),
     )
+
+
+class _Fitted(NamedTuple):
+    """Coefficients by axis."""
+
+    value: np.ndarray  # (p, 3)
+    std: np.ndarray  # Standard deviations, those of Student's t as of a normal one, (p, 3)
+
+
+def _weighted_fit(design: np.ndarray, means: np.ndarray, weight: np.ndarray) -> _Fitted:
+    """Fit means, (k, 3), by a design, (k, p), weighted by the numbers of their samples, (k,)."""
+    root = np.sqrt(weight / weight.mean())[:, None]
+    value = np.linalg.lstsq(design * root, means * root, rcond=None)[0]
+    freedom = len(means) - design.shape[1]
+    scatter = np.sum(((means - design @ value) * root) ** 2, axis=0) / freedom
+    widths = np.diag(np.linalg.inv((design * root).T @ (design * root)))
+    student = float(scipy.stats.t.ppf(_COVERED, freedom)) / Z_90
+    return _Fitted(value, student * np.sqrt(np.outer(widths, scatter)))
 
 
 def _divided(rests: Sequence[RestTurns]) -> list[RestTurns]:

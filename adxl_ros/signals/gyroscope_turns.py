@@ -116,7 +116,8 @@ class GyroLook:
         is_taken = np.isfinite(gyro_radps).all(axis=1)
         if not is_taken.any():
             return
-        gyro_radps, time_s = gyro_radps[is_taken], block.time_s[is_taken]
+        gyro_radps = gyro_radps[is_taken]
+        time_s = block.time_s[is_taken]
         self._largest_radps = max(self._largest_radps, float(np.abs(gyro_radps).max()))
         if time_s[0] - self._first_s > _LONGEST_S:
             return
@@ -140,7 +141,8 @@ class GyroLook:
         left = angles - bias * spans_s[:, None]
         turns = []
         for (rest, mean), (later, later_mean) in pairwise(zip(rests, means_mps2)):
-            begin_s, end_s = rest.time_stop_s, later.time_start_s
+            begin_s = rest.time_stop_s
+            end_s = later.time_start_s
             rows = (time_s >= begin_s) & (time_s < end_s)
             has_gap = spans_s[rows].max(initial=0.0) > _CELL_S + 2 * self._period_s * self._rows
             if len(mean) == len(AXES) and end_s - begin_s < _LONGEST_TURN_S and not has_gap:
@@ -189,7 +191,8 @@ def _disagreement(turns: Sequence[_Turn]) -> tuple[float, list[str]]:
     for turn in turns:
         predicted = _turned(turn, np.stack([way.matrix for way in ways]))
         squares += np.sum((predicted - turn.after) ** 2, axis=1) / len(turns)
-    errors, size = np.sqrt(squares), float(np.sqrt(np.mean([turn.size**2 for turn in turns])))
+    errors = np.sqrt(squares)
+    size = float(np.sqrt(np.mean([turn.size**2 for turn in turns])))
     # The ways with the fewest changes come first, and of them those in rad/s: as it should be.
     as_stated = errors[0]
     error = float(2 * np.arcsin(min(as_stated / 2, 1.0)))

@@ -77,7 +77,8 @@ class NeighbouringSamples:
     """Looks at neighbouring samples of a stream, in blocks of any length."""
 
     def __init__(self, axes: str, rate_hz: float) -> None:
-        self._axes, self._rate_hz = axes, rate_hz
+        self._axes = axes
+        self._rate_hz = rate_hz
         self._left = np.zeros((0, len(axes)))  # Newest samples, which later ones are compared with
         self._left_s = np.zeros(0)
         self._run = 1  # Length of the newest run of equal samples
@@ -98,7 +99,8 @@ class NeighbouringSamples:
     def feed(self, time_s: np.ndarray, samples: np.ndarray) -> None:
         """Add samples, m/s², (n, m), with their stamps, s, (n,)."""
         finite = np.isfinite(samples).all(axis=1)
-        time_s, samples = time_s[finite], samples[finite]
+        time_s = time_s[finite]
+        samples = samples[finite]
         if not len(samples):
             return
         joined = np.concatenate([self._left, samples])
@@ -112,7 +114,8 @@ class NeighbouringSamples:
         # The sides of the last samples come with the next block.
         self._find_jumps(joined_s, joined)
         self._find_spikes(joined_s, joined)
-        self._left, self._left_s = joined[1 - 2 * _SIDE :], joined_s[1 - 2 * _SIDE :]
+        self._left = joined[1 - 2 * _SIDE :]
+        self._left_s = joined_s[1 - 2 * _SIDE :]
 
     def faults(self) -> list[str]:
         """Return what is wrong, one line each."""
@@ -161,7 +164,8 @@ class NeighbouringSamples:
 
     def _repeats(self) -> str:
         """Return how often each reading stands, where that is no chance."""
-        count, lengths = int(self._runs.sum()), np.arange(len(self._runs))
+        count = int(self._runs.sum())
+        lengths = np.arange(len(self._runs))
         if count < _FEWEST_RUNS:
             return ''
         mean = float((lengths * self._runs).sum() / count)
@@ -227,7 +231,8 @@ class NeighbouringSamples:
         both = size[_SIDE - 1 : len(size) - _SIDE + 1]
         places = _SIDE - 1 + np.flatnonzero(both > _SMALLEST_JUMP_G * G0_MPS2)
         for i in places.tolist():
-            left, right = size[i - _SIDE + 1 : i].max(), size[i + 1 : i + _SIDE].max()
+            left = size[i - _SIDE + 1 : i].max()
+            right = size[i + 1 : i + _SIDE].max()
             if max(left, right) > _STEADY * size[i]:
                 continue
             before = samples[i - _NEAREST + 1 : i + 1].mean(axis=0)
@@ -315,7 +320,8 @@ class _Ends:
 
     def __init__(self) -> None:
         # Largest value of minus the samples and of the samples, m/s², and number of samples there
-        self._largest_mps2, self._at_end = [-np.inf, -np.inf], [0, 0]
+        self._largest_mps2 = [-np.inf, -np.inf]
+        self._at_end = [0, 0]
         self.step_mps2 = np.inf  # Smallest change
         self._sizes = np.zeros(int(_LARGEST_STEP_G / _BIN_G) + 1, int)  # Number of steps by size
 
@@ -328,7 +334,8 @@ class _Ends:
         for side, signed in enumerate((-values, values)):
             largest = float(signed.max())
             if largest > self._largest_mps2[side]:
-                self._largest_mps2[side], self._at_end[side] = largest, 0
+                self._largest_mps2[side] = largest
+                self._at_end[side] = 0
             self._at_end[side] += int((signed == self._largest_mps2[side]).sum())
 
     def wraps(self) -> str:
@@ -339,13 +346,16 @@ class _Ends:
         frequent, because a small step across the end reads as one of nearly the whole range. In
         rough motion only the ends show it: a sensor that reaches both of them clips there.
         """
-        low_g, high_g = -self._largest_mps2[0] / G0_MPS2, self._largest_mps2[1] / G0_MPS2
+        low_g = -self._largest_mps2[0] / G0_MPS2
+        high_g = self._largest_mps2[1] / G0_MPS2
         if max(self._at_end) > _CLIPPED or not high_g > low_g:
             return ''
-        step_g, sizes_g = self.step_mps2 / G0_MPS2, _BIN_G * np.arange(len(self._sizes))
+        step_g = self.step_mps2 / G0_MPS2
+        sizes_g = _BIN_G * np.arange(len(self._sizes))
         by_counts_g = step_g * 2.0 ** np.ceil(np.log2((high_g - low_g) / step_g))
         for range_g in (by_counts_g, *_RANGES_G):
-            is_full, is_half = sizes_g > 0.75 * range_g, sizes_g > 0.5 * range_g
+            is_full = sizes_g > 0.75 * range_g
+            is_half = sizes_g > 0.5 * range_g
             full = int(self._sizes[is_full].sum())
             half = int(self._sizes[is_half & ~is_full].sum())
             fills = max(abs(low_g + range_g / 2), abs(high_g - range_g / 2)) < _FILLED * range_g

@@ -67,7 +67,7 @@ _FLICKER_OF_INSTABILITY = 1 / float(np.sqrt(np.pi))
 FLOOR = float(np.sqrt(2 * np.log(2) / np.pi))  # Allan deviation of B / B (IEEE Std 952, C.15)
 
 
-class Estimate(NamedTuple):
+class NoiseTerm(NamedTuple):
     """A value with its interval."""
 
     value: float  # The most likely value
@@ -79,9 +79,9 @@ class Estimate(NamedTuple):
         """Whether the interval excludes 0."""
         return self.low > 0
 
-    def scaled(self, factor: float) -> Estimate:
+    def scaled(self, factor: float) -> NoiseTerm:
         """Return the estimate in another unit."""
-        return Estimate(self.value * factor, self.low * factor, self.high * factor)
+        return NoiseTerm(self.value * factor, self.low * factor, self.high * factor)
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,10 @@ class NoiseFit:
     """The noise of one axis; u is the unit of the signal."""
 
     # White noise N, u/√Hz: the density over positive and negative frequencies is N²
-    white: Estimate
-    instability: Estimate  # Bias instability B, u: the density is B²/(2π·f)
+    white: NoiseTerm
+    instability: NoiseTerm  # Bias instability B, u: the density is B²/(2π·f)
     # Random walk K, u/√s: the density is K²/(2π·f)², or K²/((2π·f)² + 1/T²) with bounds
-    walk: Estimate
+    walk: NoiseTerm
     # Correlation time T of a bounded walk (first-order Gauss-Markov), s, whose standard deviation
     # is K·√(T/2); inf where no bounds show
     bound_s: float
@@ -222,11 +222,10 @@ def fit_noise(
     walks, bound_s = _walks(groups.below(highest), span_s, highest)
     models = _filters(walks, np.pi * highest / (2 * len(means)), np.pi / (2 * len(means)))
     theta, likelihood = _best(models)
-    white, instability, walk = (_interval(models, theta, likelihood, term) for term in range(3))
     return NoiseFit(
-        white=white,
-        instability=instability,
-        walk=walk,
+        white=_interval(models, theta, likelihood, 0),
+        instability=_interval(models, theta, likelihood, 1),
+        walk=_interval(models, theta, likelihood, 2),
         bound_s=bound_s,
         highest=highest,
         highest_hz=highest / (2 * span_s),
@@ -314,13 +313,14 @@ def _fit(
                 break
         else:
             break
-        theta, likelihood = trial, likelihood + gained
+        theta = trial
+        likelihood = likelihood + gained
         if 2 * gained < _CONVERGED:
             break
     return theta, likelihood
 
 
-def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term: int) -> Estimate:
+def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term: int) -> NoiseTerm:
     """Return a term with the ends of its interval by the profile likelihood."""
 
     def excess(logarithm: float) -> float:
@@ -340,8 +340,9 @@ def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term:
         return float(np.exp(scipy.optimize.brentq(excess, beyond - step, beyond, xtol=1e-6)))
 
     is_seen = best > 0 and 2 * (likelihood - _best(models, term, 0.0)[1]) > _DROP
-    low, high = end(-1.0) if is_seen else 0.0, end(1.0)
-    return Estimate(*(float(np.sqrt(square)) for square in (best, low, high)))
+    low = end(-1.0) if is_seen else 0.0
+    high = end(1.0)
+    return NoiseTerm(*(float(np.sqrt(square)) for square in (best, low, high)))
 
 
 def _highest(groups: _Groups, count: int, span_s: float, rounding: float) -> int:
@@ -384,7 +385,8 @@ def _is_expected(octave: _Groups, lower: _Groups, theta: np.ndarray) -> bool:
     """Whether an octave has the power that a fit of the lower groups predicts."""
     if not len(octave.count):
         return False
-    parts, design = _shares(octave, theta), _shares(lower, theta)
+    parts = _shares(octave, theta)
+    design = _shares(lower, theta)
     share = octave.count / octave.count.sum()
     predicted = share @ parts @ np.linalg.pinv(design * np.sqrt(lower.count / 2)[:, None])
     excess = float(share @ (octave.power / (octave.shapes @ theta))) - 1
@@ -429,7 +431,7 @@ class AxisNoise:
     change_variance: float
 
     @property
-    def estimates(self) -> tuple[Estimate, Estimate, Estimate]:
+    def estimates(self) -> tuple[NoiseTerm, ...]:
         """N in u/√Hz, B in u, and K in u/√s."""
         return self.fit.white, self.fit.instability, self.fit.walk
 
@@ -490,7 +492,8 @@ def recording_noise(
     nominal = nominal_of(sensor, first.stream_info, first.axes)
     look = RecordingLook(sensor, first)
     still = longest_rest(read, nominal, first, look)
-    rest, gyro_rest = still.accelerometer, still.gyroscope
+    rest = still.accelerometer
+    gyro_rest = still.gyroscope
     doubts = require_unit(look.gravity(), first.path)
     share = 1.0 if gyro_rest is None else 0.5
     noises = _axis_noises(rest, nominal.axes, lambda done: show(share * done))
@@ -517,7 +520,8 @@ def _axis_noises(rest: StillStretch, axes: str, show: Callable[[float], None]) -
     variances = coefficient_variances(len(rest.means), rest.step_s)
     noises = []
     for i, axis in enumerate(axes):
-        std, resolution = float(rest.sample_std[i]), float(rest.resolution[i])
+        std = float(rest.sample_std[i])
+        resolution = float(rest.resolution[i])
         rounding = resolution / float(np.sqrt(12 * rest.rate_hz))
         fit = fit_noise(rest.means[:, i], rest.step_s, variances, rounding)
         rounding_variance = rounding**2 * rest.rate_hz
@@ -556,16 +560,21 @@ def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: flo
     if not _is_coarse(std, resolution):
         return replace(
             fit,
-            white=Estimate(
+            white=NoiseTerm(
                 *(float(np.sqrt(max(value**2 - rounding**2, 0.0))) for value in fit.white)
             ),
         )
     widest = max(_DITHERED_STEPS * resolution / std, 1.0)
-    white, instability, walk = (
-        Estimate(term.value, 0.0, term.high * widest)
-        for term in (fit.white, fit.instability, fit.walk)
+
+    def widened(term: NoiseTerm) -> NoiseTerm:
+        return NoiseTerm(term.value, 0.0, term.high * widest)
+
+    return replace(
+        fit,
+        white=widened(fit.white),
+        instability=widened(fit.instability),
+        walk=widened(fit.walk),
     )
-    return replace(fit, white=white, instability=instability, walk=walk)
 
 
 def _is_coarse(std: float, resolution: float) -> bool:
@@ -638,7 +647,7 @@ def with_gyro_noise(gyro: Gyroscope, noises: Sequence[AxisNoise]) -> Gyroscope:
     )
 
 
-def _seen(estimate: Estimate) -> float:
+def _seen(estimate: NoiseTerm) -> float:
     return estimate.value if estimate.is_seen else 0.0
 
 
@@ -648,7 +657,8 @@ def _density(sensor: Sensor, noises: list[AxisNoise], is_repeated: bool) -> np.n
 
     is_repeated: whether the variance of a sample is that of white noise behind the filter.
     """
-    circuit, rate_hz = electronics(sensor), sensor.rate_hz
+    circuit = electronics(sensor)
+    rate_hz = sensor.rate_hz
     share = white_share(circuit.rc_s, rate_hz)
     variances = []
     for noise, axis_share in zip(noises, share):
@@ -755,9 +765,9 @@ def settings(
         root = float(np.sqrt(filter_hz))
         rows: list[Setting] = []
         for sensor, unit, walk_unit, of in sensors:
-            white_name, walk_name = (
+            white_name, walk_name = [
                 name.format(small=sensor, large=sensor.upper()) for name in names
-            )
+            ]
             rows += [
                 (white_name, [of.white * root], f'{unit}{of.white_note}'),
                 (walk_name, [of.walk * root], f'{walk_unit}{of.note}'),

@@ -60,7 +60,8 @@ _YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may
 
 def head(result: RecordingNoise) -> list[str]:
     """Return the recording, and how long it rests."""
-    rest, axes = result.rest, ' '.join(noise.axis for noise in result.axes)
+    rest = result.rest
+    axes = ' '.join(noise.axis for noise in result.axes)
     return [result.path, f'{duration(rest.span_s)} at rest, {rest.rate_hz:.5g} Hz, axes {axes}']
 
 
@@ -76,8 +77,10 @@ def tables(result: RecordingNoise) -> list[str]:
 
 def _table(shown: SensorNoise) -> list[str]:
     """Return the terms with intervals, then in SI units and by sample, 79 columns at most."""
-    wide, narrow = (6, 25, 25, 25), (6, 12, 12, 12, 13, 13, 9)
-    si, small = shown.unit.symbol, shown.unit.small
+    wide = (6, 25, 25, 25)
+    narrow = (6, 12, 12, 12, 13, 13, 9)
+    si = shown.unit.symbol
+    small = shown.unit.small
     rows = [
         row((' axis', *_NAMES), wide),
         row(('', f'{small}/√Hz (90 %)', f'{small} (90 %)', f'{small}/√s (90 %)'), wide),
@@ -112,7 +115,8 @@ def _walk_lines(shown: SensorNoise) -> list[str]:
     """Return the bounds of the walks."""
     rows = []
     for noise in shown.axes:
-        time_s, k = noise.fit.bound_s, shown.unit.factor * noise.fit.walk.value
+        time_s = noise.fit.bound_s
+        k = shown.unit.factor * noise.fit.walk.value
         if np.isfinite(time_s):
             rows.append(
                 f' {noise.axis}: the walk has bounds, {k * np.sqrt(time_s / 2):.3g} '
@@ -153,7 +157,8 @@ def paste_lines(result: RecordingNoise) -> list[str]:
 
 def warnings(result: RecordingNoise) -> list[str]:
     """Return what is wrong with the rest, what it does not show, and how long to record."""
-    rest, texts = result.rest, [*result.doubts]
+    rest = result.rest
+    texts = [*result.doubts]
     if rest.beyond_range:
         texts.append(f'{rest.beyond_range}.')
     if rest.motion_s:
@@ -167,11 +172,9 @@ def warnings(result: RecordingNoise) -> list[str]:
     for shown in sensors_at_rest(result):
         # The accelerometer is meant where no sensor is named.
         begin = f'{shown.name} ' if shown.unit is _GYRO else ''
-        texts += [
-            f'{begin}{noise.axis}: {text}'
-            for noise in shown.axes
-            for text in _axis_warnings(rest.span_s, noise, shown.unit)
-        ]
+        for noise in shown.axes:
+            warnings = _axis_warnings(rest.span_s, noise, shown.unit)
+            texts += [f'{begin}{noise.axis}: {text}' for text in warnings]
     return texts
 
 
@@ -237,7 +240,9 @@ def curves(result: RecordingNoise) -> Any:
 
 def _draw_terms(plot: Any, shown: SensorNoise, number: int) -> None:
     """Draw the terms of an axis that are seen, and their sum."""
-    tau_s, noise, factor = shown.rest.allan.tau_s, shown.axes[number], shown.unit.factor
+    tau_s = shown.rest.allan.tau_s
+    noise = shown.axes[number]
+    factor = shown.unit.factor
     for name, line, estimate in zip(_NAMES, noise.fit.lines(tau_s), noise.estimates):
         if estimate.is_seen:
             plot.plot(tau_s, line * factor, '--', lw=1, label=name)
@@ -246,7 +251,8 @@ def _draw_terms(plot: Any, shown: SensorNoise, number: int) -> None:
 
 def draw_sum(plot: Any, shown: SensorNoise, number: int, **looks: str) -> None:
     """Draw the Allan deviation that the terms of an axis have together."""
-    tau_s, noise = shown.rest.allan.tau_s, shown.axes[number]
+    tau_s = shown.rest.allan.tau_s
+    noise = shown.axes[number]
     plot.plot(tau_s, noise.fit.allan_deviation(tau_s) * shown.unit.factor, lw=1, **looks)
 
 

@@ -84,7 +84,8 @@ class LiveLook:
         newest `LIVE_WINDOW_S` of the stream, ns, (n,), and m/s², (n, 3).
         """
         if sensor is not self._sensor:
-            self._sensor, self._rests = sensor, {True: [], False: []}
+            self._sensor = sensor
+            self._rests = {True: [], False: []}
         time_s = (stamps_ns - stamps_ns[:1].sum()) * 1e-9
         volts = to_volts(accel_mps2[:, : len(sensor.axes)], sensor)
         by_stream = self._look(

@@ -51,7 +51,7 @@ def measure_unstated(sensor: Sensor, read: Recording) -> tuple[Sensor, list[str]
     return _measured(sensor, read.time_s, read.volts(sensor), f'{read.path}: ')
 
 
-def listed(measured: list[str]) -> list[str]:
+def measured_lines(measured: list[str]) -> list[str]:
     """Return the lines of `measure_unstated` below a heading; none where nothing is measured."""
     return (
         ['', 'Measured, as no parameter file states it:', *(f'  {line}' for line in measured)]
@@ -64,7 +64,8 @@ class BeyondRange:
     """Counts the readings of a recording that are beyond the stated range of its sensor."""
 
     def __init__(self) -> None:
-        self._samples, self._largest_g = 0, 0.0
+        self._samples = 0
+        self._largest_g = 0.0
 
     def add(self, volts: np.ndarray, sensor: Sensor) -> None:
         """Count further samples, V, (n, m)."""
@@ -103,7 +104,8 @@ def _measured(
 
     The noise is that of the quietest quarter seconds, so that the samples may hold motion.
     """
-    scale_v_per_g, spans = sensor.nominal_scale_v_per_g, Spans(sensor.rate_hz)
+    scale_v_per_g = sensor.nominal_scale_v_per_g
+    spans = Spans(sensor.rate_hz)
     blocks = stats.BlockCutter(sensor.rate_hz, len(sensor.axes)).feed(time_s, volts)
     windows = stats.window_variance(blocks, spans)
     if len(time_s) < FEWEST_SAMPLES or not np.isfinite(windows).any():
@@ -113,10 +115,7 @@ def _measured(
     rc_s = sensor.rc_s
     if 'rc_capacitance_f' in sensor.unstated:
         quiet = stats.quiet_blocks(blocks, windows, limit_v2, spans.window)
-        rests = [
-            volts[blocks.start[begin] : blocks.start[end - 1] + spans.size]
-            for begin, end in stats.true_runs(quiet, blocks.run)
-        ]
+        rests = _runs_of(volts, blocks, quiet, spans.size)
         rc_s = _filter_s(rests, sensor.rate_hz, float(np.max(step_v)))
     noise_g = np.sqrt(variance_v2) / scale_v_per_g
     largest_g = float(np.max(np.abs(volts - sensor.nominal_zero_g_v) / scale_v_per_g))
@@ -144,6 +143,16 @@ def _measured(
         unknown.add('filter_rate_hz')  # The measured filter is that at this rate.
     used = {name: value for name, value in values.items() if name in unknown}
     return replace(sensor, unstated=(), measured=sensor.unstated, **used), lines
+
+
+def _runs_of(
+    volts: np.ndarray, blocks: stats.Blocks, quiet: np.ndarray, size: int
+) -> list[np.ndarray]:
+    """Return the samples of each run of quiet blocks, V, (k, m)."""
+    return [
+        volts[blocks.start[begin] : blocks.start[end - 1] + size]
+        for begin, end in stats.true_runs(quiet, blocks.run)
+    ]
 
 
 def _noise_is_hidden(sensor: Sensor, time_s: np.ndarray) -> str:
@@ -190,7 +199,8 @@ def sensor_of_stream(
     )
     if np.count_nonzero(late_ns) > _MOST_BACKWARD * len(stamps_ns):
         raise UserError(f'{backward}; one driver must stamp them, in their order')
-    stamps_ns, accel_mps2 = stamps_ns[late_ns == 0], accel_mps2[late_ns == 0]
+    stamps_ns = stamps_ns[late_ns == 0]
+    accel_mps2 = accel_mps2[late_ns == 0]
     time_s = (stamps_ns - stamps_ns[:1]) * 1e-9
     if len(time_s) < 3 or time_s[-1] < SHORTEST_S:
         raise UserError(
@@ -294,20 +304,25 @@ def estimate_filter(
     best = scipy.optimize.minimize(
         cost, start, method='Nelder-Mead', options={'xatol': 1e-5, 'fatol': 1e-6, 'maxiter': 2000}
     ).x
-    scatter = float(np.mean((power / _expected(best, lags) - 1) ** 2) * weight)
-    slopes = np.array(
-        [
-            np.log(_expected(best + step, lags) / _expected(best - step, lags))
-            for step in _LOG_STEP * np.eye(3)
-        ]
-    ) / (2 * _LOG_STEP)
-    information = slopes @ slopes.T * weight / _CORRELATED_ORDINATES
-    information += np.diag([0.0, 0.0, _ADC_NOISE_PRIOR_STD**-2])
+    information = _information(best, lags, weight)
     # White noise does not show a filter.
     if np.linalg.cond(information) > _MAX_CONDITION:
         return None
+    scatter = float(np.mean((power / _expected(best, lags) - 1) ** 2) * weight)
     ratio_std = float(np.sqrt(np.linalg.inv(information)[1, 1] * max(scatter, 1.0)))
     return FilterNoise(float(np.exp(best[1]) / rate_hz), ratio_std, scatter)
+
+
+def _information(x: np.ndarray, lags: np.ndarray, weight: float) -> np.ndarray:
+    """Return the information on the parameters of `_expected`, (3, 3), the prior included."""
+    ratios = [
+        np.log(_expected(x + step, lags) / _expected(x - step, lags))
+        for step in _LOG_STEP * np.eye(3)
+    ]
+    slopes = np.array(ratios) / (2 * _LOG_STEP)
+    information = slopes @ slopes.T * weight / _CORRELATED_ORDINATES
+    information += np.diag([0.0, 0.0, _ADC_NOISE_PRIOR_STD**-2])
+    return information
 
 
 def _mean_periodogram(rests: Iterable[np.ndarray], window: np.ndarray) -> tuple[np.ndarray, int]:
@@ -344,7 +359,8 @@ def with_filter(
     """Add the effect `bandwidth` with its variance to a fitted sensor."""
     if not fitted.rc_s or not estimates:
         return fitted, []
-    ratios, variances = [], []
+    ratios = []
+    variances = []
     for axis, axis_estimates in zip(fitted.axes, zip(*estimates)):
         credible = [
             estimate for estimate in axis_estimates if estimate is not None and estimate.credible

@@ -270,12 +270,15 @@ class RestFinder:
     def by_own_noise(self) -> RestFinder:
         """Return a finder of the same samples that only uses the noise that they show."""
         other = copy(self)
-        other.noise, other.learn, other._result = None, True, None
+        other.noise = None
+        other.learn = True
+        other._result = None
         return other
 
     def forget(self) -> None:
         """Keep the newest blocks only, in which a drift may begin."""
-        self._parts, self._result = [self.blocks()[-self._spans.longest :]], None
+        self._parts = [self.blocks()[-self._spans.longest :]]
+        self._result = None
 
     def means(self, rests: list[Rest]) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean of each rest and its standard deviation, (k, m) each."""
@@ -311,7 +314,8 @@ class RestFinder:
         """Find limits and rests of the stream so far; search again only after a new block."""
         blocks = self.blocks()
         if self._result is None or self._result[0] != len(blocks):
-            windows, step = stats.window_variance(blocks, self._spans), stats.adc_step(blocks)
+            windows = stats.window_variance(blocks, self._spans)
+            step = stats.adc_step(blocks)
             found = [
                 stated_limits(self.noise, step, self._spans) if self.noise else None,
                 learned_limits(blocks, windows, step, self._spans) if self.learn else None,
@@ -391,13 +395,16 @@ class RestFinder:
         """Split blocks `first` to `stop` where an encoder angle leaves its tolerance."""
         if bounds is None:
             return [(first, stop)]
-        parts, begin, widest = [], first, bounds[first]
+        parts = []
+        begin = first
+        widest = bounds[first]
         changed = (bounds[first + 1 : stop] != bounds[first : stop - 1]).any(axis=(1, 2))
         for i in (first + 1 + np.flatnonzero(changed)).tolist():
             widest = np.fmax(widest, bounds[i])
             if not self._is_one_pose(widest):
                 parts.append((begin, i))
-                begin, widest = i, bounds[i]
+                begin = i
+                widest = bounds[i]
         return [*parts, (begin, stop)]
 
     def _join_across_knocks(
@@ -413,13 +420,15 @@ class RestFinder:
 
         A drift without motion that returns to the same mean is noise, and part of the rest.
         """
-        spans, means = self._spans, blocks.mean
+        spans = self._spans
+        means = blocks.mean
         longest_s = (max(_KNOCK_S / spans.block_s, spans.window) + 1) * spans.block_s
         reach = spans.longest // 2
         groups: list[list[tuple[int, int]]] = []
         for first, stop in parts:
             if groups:
-                begin, end = groups[-1][0][0], groups[-1][-1][1]
+                begin = groups[-1][0][0]
+                end = groups[-1][-1][1]
                 has_drifted = (
                     first - end <= spans.longest
                     and quiet[end:first].all()

@@ -129,7 +129,8 @@ def lagrange_weights(position: np.ndarray) -> np.ndarray:
 
 def check_needs(sensor: Sensor, motion: Motion) -> None:
     """Refuse an effect that has nothing to act on."""
-    has_stage, is_robot = motion.force is None, getattr(motion.force, 'is_robot', False)
+    has_stage = motion.force is None
+    is_robot = getattr(motion.force, 'is_robot', False)
     missing = {
         Need.STAGE: (has_stage, 'this manoeuvre has none, only specific force'),
         Need.ROTATION: (has_stage or is_robot, 'it is not known beside a specific force'),
@@ -346,7 +347,8 @@ def _pieces(spline: scipy.interpolate.BSpline) -> scipy.interpolate.PPoly:
 
     `PPoly.from_spline` overruns its memory above degree 5.
     """
-    knots, derivative = np.unique(spline.t), spline
+    knots = np.unique(spline.t)
+    derivative = spline
     coefficients = [spline(knots[:-1])]
     for order in range(1, spline.k + 1):
         derivative = derivative.derivative()
@@ -474,7 +476,8 @@ class _Window:
         normal[-1] += _RIDGE * normal[-1].max()
         factor = scipy.linalg.cholesky_banded(normal + _BOUNDED_SHARE * strength * self._penalty)
         low, high, pulled = self._values - bound, self._values + bound, weights * self._values
-        within, excess = self._values, np.zeros(len(self._values))
+        within = self._values
+        excess = np.zeros(len(self._values))
         for _ in range(_BOUND_ROUNDS):
             coefficients = scipy.linalg.cho_solve_banded(
                 (factor, False), transposed @ (pulled + within - excess)

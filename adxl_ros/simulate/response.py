@@ -4,15 +4,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Hashable, Iterator
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import chain
 from math import ceil
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.files.recording_columns import Recording, REFERENCES
 from adxl_ros.model import noise
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import (
     Components,
@@ -27,6 +28,7 @@ from adxl_ros.model.filters import first_order_recursion, low_pass
 from adxl_ros.model.kinematics import specific_force_in_motion
 from adxl_ros.model.sensor import neutral, Sensor
 from adxl_ros.model.signal_chain import Chain
+from adxl_ros.report.quantities import mg
 from adxl_ros.simulate.motion import (
     check_needs,
     encoder_reading,
@@ -34,6 +36,7 @@ from adxl_ros.simulate.motion import (
     Held,
     lagrange_weights,
     Motion,
+    Path,
     POINTS,
 )
 import numpy as np
@@ -45,7 +48,57 @@ _WHOLE_STEPS = 300_000
 """Most steps whose signals are kept. Chosen: 20 min at 250 Hz, 200 MB."""
 _ALIGNED_STEPS = 1e-4  # Distance of an aligned sample, steps; chosen: above rounding
 _ROUNDING = 1e-9  # Rounding error of a ratio of two rates
+_ANALOG = tuple(place for place in Place if place not in (Place.ADC, Place.CODE))
+"""Places of the chain up to the filter, with the clock."""
 _NOISE_MEMORY = 50  # RC over which missing noise is drawn; chosen: e⁻⁵⁰ is left
+
+
+class _Grid:
+    """The newest volts behind the filter, on the uniform grid on which the chain runs."""
+
+    def __init__(self, axes: int) -> None:
+        self._rows = np.zeros((0, axes))
+        self.end = 0  # Step behind the last row: so many the chain has run over
+
+    @property
+    def begin(self) -> int:
+        """Return the step of the first row."""
+        return self.end - len(self._rows)
+
+    def extend(self, volts: np.ndarray, most_rows: int) -> None:
+        """Append the next steps, (n, m), and forget all but the newest rows."""
+        rows = np.concatenate([self._rows, volts]) if len(self._rows) else volts
+        self._rows = rows[-most_rows:]
+        self.end += len(volts)
+
+    def forget(self) -> None:
+        """Forget all but what samples between the last step and the next one need."""
+        self._rows = self._rows[-(2 * POINTS) :]
+
+    def at(self, steps: np.ndarray) -> np.ndarray:
+        """Return the volts at steps, (n,) int: (n, m)."""
+        return self._rows[steps - self.begin]
+
+    def between(self, steps: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Interpolate from steps and their weights, (n, points): (n, m)."""
+        index = np.clip(steps - self.begin, 0, None)
+        return np.column_stack([np.einsum('ij,ij->i', weights, v[index]) for v in self._rows.T])
+
+
+class _Neighbours(NamedTuple):
+    """The steps that samples lie between, and their weights, (n, points) each."""
+
+    steps: np.ndarray
+    weights: np.ndarray
+
+
+class _Stage(NamedTuple):
+    """A part of the chain up to the sensing element."""
+
+    name: str
+    # Place whose effects act in it: its result depends on them, and on those of earlier stages
+    place: Place
+    run: Callable[[Signals], None]  # Changes the signals, of which it has copies
 
 
 class Response:
@@ -58,23 +111,31 @@ class Response:
     are taken at their instants, and noise is never resampled.
     """
 
-    def __init__(self, sensor: Sensor, motion: Motion, seed: int, begin_s: float = 0.0) -> None:
-        """Put the sensor, settled, at the beginning of a manoeuvre."""
+    def __init__(
+        self,
+        sensor: Sensor,
+        motion: Motion,
+        seed: int,
+        begin_s: float = 0.0,
+        memo: ChainMemo | None = None,
+        block_steps: int = _BLOCK_STEPS,
+    ) -> None:
+        """Put the sensor, settled, at the beginning of a manoeuvre; keep results in a memo."""
         check_needs(sensor, motion)
-        self.sensor, self._motion, self._begin_s = sensor, motion, begin_s
+        self.sensor = sensor
+        self._motion = motion
+        self._begin_s = begin_s
         self._seed = seed
-        self._force_path: Callable[[np.ndarray], Components] | None = None
+        self._memo = memo or ChainMemo(0)
+        self._block_steps = block_steps
         self._chain = Chain(sensor, seed=seed)
-        self._kept = ChainMemo(0)
-        self._block_steps = _BLOCK_STEPS
-        steps_per_sample = ceil(motion.internal_rate_hz / sensor.rate_hz - _ROUNDING)
-        self._step_s = 1 / (sensor.rate_hz * steps_per_sample)
+        self._step_s = step_s(sensor, motion)
         # Rate of the instants by stamps; rounding evens out the steps of float64 times.
         instants_s = self._instants(np.array([0.0, 1.0]))
         self._dt_s = self._step_s * round(float(instants_s[1] - instants_s[0]), 12)
+        self._force_path: Callable[[np.ndarray], Components] | None = None
         self._filters: list[dict[str, Any]] = [{} for _ in sensor.axes]
-        self._done_steps = 0
-        self._tail = np.zeros((0, len(sensor.axes)))
+        self._grid = _Grid(len(sensor.axes))
         self._white = np.random.default_rng([seed, 0])
         self._noise = np.zeros(0)
         self._last_s = begin_s
@@ -84,34 +145,45 @@ class Response:
         if not len(stamps_s):
             return np.zeros((0, len(self.sensor.axes)))
         steps = (stamps_s - self._begin_s) / self._step_s
-        exceeds_block = ceil(steps[-1]) - self._done_steps > self._block_steps
-        if exceeds_block and len(stamps_s) > 1:
+        if ceil(steps[-1]) - self._grid.end > self._block_steps and len(stamps_s) > 1:
+            # Memory holds the steps of a block: samples of a longer time come in two halves.
             half = len(stamps_s) // 2
             return np.concatenate([self(stamps_s[:half]), self(stamps_s[half:])])
-        instants_s = self._instants(stamps_s)
-        key = (self._analog_key(), stamps_s.tobytes())
-        analog_v, signals = self._kept('analog', key, partial(self._sampled, steps))
+        stamps = stamps_s.tobytes()
+        analog_v, signals = self._once(
+            'analog', _ANALOG, partial(self._sampled, steps), *self._electronics, stamps
+        )
         signals = replace(signals, dt_s=1 / self.sensor.rate_hz)
         if self._chain.effects[Place.ADC] or self._chain.effects[Place.CODE]:
-            signals.environment = self._kept(
-                'surroundings',
-                (*self._key(Place.CLOCK), stamps_s.tobytes()),
-                partial(self._environment, instants_s),
+            instants_s = self._instants(stamps_s)
+            signals.environment = self._once(
+                'surroundings', (Place.CLOCK,), partial(self._environment, instants_s), stamps
             )
         signals.input_v = list((analog_v + self._draw_noise(stamps_s, signals)).T)
         return self._chain.convert(signals)
 
-    def whole(self, stamps_s: np.ndarray, memo: ChainMemo) -> np.ndarray:
-        """Simulate all samples of a recording as `__call__` does; nothing can follow."""
-        steps = ceil((float(stamps_s[-1]) - self._begin_s) / self._step_s) + POINTS
-        if steps <= _WHOLE_STEPS:
-            self._kept, self._block_steps = memo, steps
+    def key(self, stamps_s: np.ndarray) -> tuple[Hashable, ...]:
+        """Return what the volts of all samples of a recording depend on."""
         noise_density = self.sensor.noise_density_g_per_rthz.tolist()
-        key = (self._analog_key(), self._key(*Place), *noise_density, stamps_s.tobytes())
-        return memo('volts', key, lambda: self(stamps_s)).copy()
+        return self._key(Place, *self._electronics, *noise_density, stamps_s.tobytes())
 
-    def _key(self, *places: Place) -> tuple:
-        """Return what the chain up to the element depends on, with effects of some places."""
+    def _once(
+        self,
+        part: str,
+        places: Collection[Place],
+        compute: Callable[[], Any],
+        *further: Hashable,
+    ) -> Any:
+        """Return a result, and compute it only where the memo does not have it; see `_key`."""
+        return self._memo(part, self._key(places, *further), compute)
+
+    def _key(self, places: Iterable[Place], *further: Hashable) -> tuple[Hashable, ...]:
+        """
+        Return what a result depends on.
+
+        These are the motion, what the chain takes from the sensor up to the element, the effects
+        of some places, and what is named further.
+        """
         sensor = self.sensor
         effects = chain.from_iterable(self._chain.effects[place] for place in places)
         return (
@@ -122,14 +194,14 @@ class Response:
             sensor.adc_vref_v,
             *sensor.nominal_scale_v_per_g.tolist(),
             *(effect.key for effect in effects),
+            *further,
         )
 
-    def _analog_key(self) -> tuple:
-        """Return what the chain up to the filter depends on."""
+    @property
+    def _electronics(self) -> tuple[Hashable, ...]:
+        """Return what the chain behind the element takes from the sensor, and its seed."""
         sensor = self.sensor
-        digital = (Place.ADC, Place.CODE)
         return (
-            *self._key(*(place for place in Place if place not in digital)),
             self._seed,
             sensor.rate_hz,
             sensor.rc_s,
@@ -153,96 +225,85 @@ class Response:
         """Return filtered volts, (n, m), at samples in steps of the grid, and its signals."""
         nearest = np.rint(steps)
         aligned = bool(np.abs(steps - nearest).max() < _ALIGNED_STEPS)
-        ahead = 0 if aligned else POINTS // 2
-        first = self._done_steps - len(self._tail)
-        until = int(nearest[-1]) + 1 + ahead
-        kept, signals = [self._tail], None
-        while self._done_steps < until or signals is None:
-            volts, signals = self._advance(min(until - self._done_steps, self._block_steps))
-            kept.append(volts)
-            if sum(map(len, kept)) > 2 * self._block_steps:  # a gap, without samples
-                first += sum(map(len, kept[:-1]))
-                kept = kept[-1:]
-        grid = np.concatenate(kept) if len(kept[0]) else kept[-1]
-        self._tail = grid[-(2 * POINTS) :]
+        until = int(nearest[-1]) + 1 + (0 if aligned else POINTS // 2)
+        signals = self._advance(until)
+        while self._grid.end < until:  # a gap, without samples
+            signals = self._advance(until)
         if aligned:
-            index = nearest.astype(np.intp) - first
-            return grid[index], signals
-        key = (first, steps.tobytes())
+            volts = self._grid.at(nearest.astype(np.intp))
+        else:
+            near = self._once('weights', (), partial(_neighbours, steps), steps.tobytes())
+            volts = self._grid.between(near.steps, near.weights)
+        self._grid.forget()
+        return volts, signals
 
-        def between() -> tuple[np.ndarray, np.ndarray]:
-            """Return the steps that samples lie between, (n, points), and their weights."""
-            start = np.floor(steps).astype(np.intp) - (POINTS // 2 - 1)
-            return (
-                np.clip(start[:, None] + np.arange(POINTS) - first, 0, None),
-                lagrange_weights(steps - start),
-            )
-
-        index, weights = self._kept('weights', key, between)
-        return np.column_stack([np.einsum('ij,ij->i', weights, v[index]) for v in grid.T]), signals
-
-    def _advance(self, count: int) -> tuple[np.ndarray, Signals]:
-        """Run the chain up to the filter over the next steps of the grid: volts, (n, m)."""
-        count = max(count, 0)
+    def _advance(self, until: int) -> Signals:
+        """Run the chain up to the filter over the next steps of the grid, a block at most."""
+        count = max(min(until - self._grid.end, self._block_steps), 0)
         signals = self._output_of_element(count)
-        self._done_steps += count
         volts = np.empty((count, len(self.sensor.axes)))
         for d, v in enumerate(self._chain.volts(signals, Place.ELECTRONICS)):
             volts[:, d] = low_pass(
                 np.broadcast_to(v, count), signals.rc_s[d], self._dt_s, self._filters[d]
             )
-        return volts, signals
+        self._grid.extend(volts, 2 * self._block_steps)
+        return signals
+
+    @property
+    def _stages(self) -> tuple[_Stage, ...]:
+        """Return the parts of the chain up to the sensing element, in order."""
+        return (
+            _Stage('clock', Place.CLOCK, self._follow_clock),
+            _Stage('motion', Place.REFERENCE, self._follow_motion),
+            _Stage('stage', Place.STAGE, self._turn_stage),
+            _Stage('force', Place.FORCE, partial(self._chain, Place.FORCE)),
+            _Stage('mounting', Place.MOUNTING, partial(self._chain, Place.MOUNTING)),
+            _Stage('element', Place.ELEMENT, partial(self._chain, Place.ELEMENT)),
+        )
 
     def _output_of_element(self, count: int) -> Signals:
         """Run the chain up to the sensing element over the next steps of the grid."""
-        stamps_s = self._begin_s + (self._done_steps + np.arange(count)) * self._step_s
+        first = self._grid.end
+        stamps_s = self._begin_s + (first + np.arange(count)) * self._step_s
         signals = self._chain.signals(NOMINAL_ENVIRONMENT, time_s=stamps_s, dt_s=self._dt_s)
-        places = [Place.REFERENCE]
-        # Without an effect that follows it, the rotation of a robot is not computed.
-        rotates = bool(self._motion.force and self._chain.effects[Place.FORCE])
-        for place in (Place.CLOCK, Place.STAGE, Place.FORCE, Place.MOUNTING, Place.ELEMENT):
-            places.append(place)
-            signals = self._kept(
-                place.name,
-                (*self._key(*places), rotates, self._done_steps, count),
-                partial(self._through, place, signals),
+        places: tuple[Place, ...] = ()
+        for stage in self._stages:
+            places = *places, stage.place
+            signals = self._once(
+                stage.name, places, partial(_after, stage, signals), self._rotates, first, count
             )
         return replace(signals)
 
-    def _through(self, place: Place, before: Signals) -> Signals:
-        """Return signals behind a place of the chain; those before it stay, for the memo."""
-        signals = replace(before, up=list(before.up), force=list(before.force))
-        motion, instants_s = self._motion, before.time_s
-        if place is Place.STAGE and motion.force:
-            if self._force_path is None:
-                self._force_path = self._kept(
-                    'reference', self._key(Place.REFERENCE), self._acting_force
-                )
-            signals.force = list(self._force_path(instants_s))
-            if self._chain.effects[Place.FORCE] and isinstance(motion.force, ForcePath):
-                signals.rotation = motion.force.rotation(instants_s)
-            return signals
-        if place is Place.STAGE:
-            signals.alpha, signals.beta, signals.shift = self._kept(
-                'joints',
-                (*self._key(Place.REFERENCE, Place.CLOCK), self._done_steps, len(instants_s)),
-                lambda: self._joints(instants_s),
-            )
-        self._chain(place, signals)
-        if place is Place.CLOCK:
-            signals.environment = self._environment(signals.time_s)
-        elif place is Place.STAGE:
-            signals.force = specific_force_in_motion(
-                signals.alpha, signals.beta, signals.shift, signals.gravity_mps2, signals.up
-            )
-        return signals
+    @property
+    def _rotates(self) -> bool:
+        """Whether the rotation of a robot is computed: an effect of the force follows it."""
+        return isinstance(self._motion.force, ForcePath) and bool(self._chain.effects[Place.FORCE])
 
-    def _joints(self, instants_s: np.ndarray) -> tuple[Joint, ...]:
-        """Return positions, rates and accelerations of the joints, before the stage's effects."""
+    def _follow_clock(self, signals: Signals) -> None:
+        self._chain(Place.CLOCK, signals)
+        signals.environment = self._environment(signals.time_s)
+
+    def _follow_motion(self, signals: Signals) -> None:
+        """Set the force of a robot, or the joints of a stage, before the effects of either."""
         motion = self._motion
-        return tuple(
-            Joint(*(joint(instants_s, order) for order in range(3)))
-            for joint in (motion.alpha, motion.beta, motion.shift)
+        instants_s = signals.time_s
+        if not motion.force:
+            signals.alpha = _joint(motion.alpha, instants_s)
+            signals.beta = _joint(motion.beta, instants_s)
+            signals.shift = _joint(motion.shift, instants_s)
+            return
+        if self._force_path is None:
+            self._force_path = self._once('reference', (Place.REFERENCE,), self._acting_force)
+        signals.force = list(self._force_path(instants_s))
+        if self._rotates and isinstance(motion.force, ForcePath):
+            signals.rotation = motion.force.rotation(instants_s)
+
+    def _turn_stage(self, signals: Signals) -> None:
+        if self._motion.force:
+            return
+        self._chain(Place.STAGE, signals)
+        signals.force = specific_force_in_motion(
+            signals.alpha, signals.beta, signals.shift, signals.gravity_mps2, signals.up
         )
 
     def _acting_force(self) -> Callable[[np.ndarray], Components]:
@@ -271,7 +332,8 @@ class Response:
 
         Noise of missing samples is drawn, too, as far back as the filter remembers.
         """
-        rc_s, rate_hz = np.array(signals.rc_s), self.sensor.rate_hz
+        rc_s = np.array(signals.rc_s)
+        rate_hz = self.sensor.rate_hz
         std_v = noise.analog_std_v(self.sensor)
         if not std_v.any():
             return np.zeros((len(stamps_s), len(std_v)))
@@ -293,6 +355,23 @@ class Response:
         return drawn[np.cumsum(passed) - 1] * std_v
 
 
+def _after(stage: _Stage, before: Signals) -> Signals:
+    """Return the signals behind a stage; those before it stay, for the memo."""
+    signals = replace(before, up=list(before.up), force=list(before.force))
+    stage.run(signals)
+    return signals
+
+
+def _joint(path: Path, instants_s: np.ndarray) -> Joint:
+    return Joint(*(path(instants_s, order) for order in range(3)))
+
+
+def _neighbours(steps: np.ndarray) -> _Neighbours:
+    """Return the steps that samples lie between."""
+    first = np.floor(steps).astype(np.intp) - (POINTS // 2 - 1)
+    return _Neighbours(first[:, None] + np.arange(POINTS), lagrange_weights(steps - first))
+
+
 class ChainMemo:
     """Results of parts of the chain by what they depend on, the newest of each part."""
 
@@ -309,6 +388,27 @@ class ChainMemo:
         if len(kept) > self._most:
             del kept[next(iter(kept))]
         return result
+
+
+def step_s(sensor: Sensor, motion: Motion) -> float:
+    """Return the step of the grid, s: a part of the sample period."""
+    steps_per_sample = ceil(motion.internal_rate_hz / sensor.rate_hz - _ROUNDING)
+    return 1 / (sensor.rate_hz * steps_per_sample)
+
+
+def whole_response(
+    sensor: Sensor, motion: Motion, seed: int, stamps_s: np.ndarray, memo: ChainMemo
+) -> np.ndarray:
+    """Simulate all samples of a recording: volts, (n, m); a memo keeps them for other sensors."""
+    begin_s = float(stamps_s[0])
+    span_s = float(stamps_s[-1]) - begin_s
+    steps = ceil(span_s / step_s(sensor, motion)) + POINTS
+    respond = (
+        Response(sensor, motion, seed, begin_s, memo, steps)
+        if steps <= _WHOLE_STEPS
+        else Response(sensor, motion, seed, begin_s)
+    )
+    return memo('volts', respond.key(stamps_s), partial(respond, stamps_s)).copy()
 
 
 def simulate(
@@ -393,6 +493,8 @@ def change_mg(
         other = replace(
             other, rc_resistance_ohm=_SHORT_RC_S / other.rc_capacitance_f, filter_rate_hz=0.0
         )
-    volts = [Response(variant, motion, _SEED).whole(stamps_s, memo) for variant in (sensor, other)]
-    change_g = (volts[0] - volts[1]) / sensor.nominal_scale_v_per_g
-    return float(1e3 * np.sqrt(np.mean(change_g**2)))
+    changed_v = whole_response(sensor, motion, _SEED, stamps_s, memo) - whole_response(
+        other, motion, _SEED, stamps_s, memo
+    )
+    change_mps2 = changed_v / sensor.nominal_scale_v_per_g * G0_MPS2
+    return float(mg(np.sqrt(np.mean(change_mps2**2))))

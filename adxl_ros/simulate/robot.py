@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 import os
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import robot_readings
@@ -52,6 +52,15 @@ _USUAL_GAPS = 5.0  # The same in usual gaps. Chosen: a message may be late
 _AROUND_S = 0.3  # Time around which the error of the force is taken, s. Chosen: a part of a move
 _OFFSET_RAD = 1e-4  # Offset of a joint whose effect is taken, rad. Chosen: linear to 1e-4
 _COMPLIANCE_S2 = 1e-5  # Compliance whose effect is taken, s². Chosen: a resonance of 50 Hz
+
+
+class FrameMotion(NamedTuple):
+    """Motion of a frame over time, in the frame, (n, 3) each."""
+
+    force_mps2: np.ndarray  # Specific force
+    rate_radps: np.ndarray  # Angular rate
+    acceleration_radps2: np.ndarray  # Angular acceleration
+    up: np.ndarray  # Unit vector
 
 
 class Robot:
@@ -93,19 +102,19 @@ class Robot:
         self._model = pinocchio.buildReducedModel(model, fixed, pinocchio.neutral(model))
         self._data = self._model.createData()
         self._frame = self._model.getFrameId(frame)
-        self.frame, self.urdf = frame, str(urdf)
+        self.frame = frame
+        self.urdf = str(urdf)
         # Name of the link that the base is
         self.root = model.frames[1 + moves].name if model.nframes > 1 else ''
 
     def motion(
         self, joints: np.ndarray, base: np.ndarray | None, gravity_mps2: float
-    ) -> np.ndarray:
+    ) -> FrameMotion:
         """
         Return the motion of the frame.
 
         joints: position, rate and acceleration, (3, n, j); base: the same of its x, y, z and
-        quaternion x, y, z, w, (3, n, 7); returns: in the frame: specific force, angular rate,
-        angular acceleration, and the unit vector upward, (4, n, 3).
+        quaternion x, y, z, w, (3, n, 7).
         """
         pin, model, data = self._pin, self._model, self._data
         count = joints.shape[1]
@@ -119,7 +128,7 @@ class Robot:
             q[:, joint.idx_q : joint.idx_q + joint.nq] = np.column_stack(
                 [angle] if joint.nq == 1 else [np.cos(angle), np.sin(angle)]
             )
-        result = np.empty((4, len(q), 3))
+        moved = FrameMotion(*np.empty((4, len(q), 3)))
         up = np.array([0.0, 0.0, 1.0])
         for i in range(len(q)):
             pin.forwardKinematics(model, data, q[i], v[i], a[i])
@@ -127,10 +136,11 @@ class Robot:
             vertical = turn @ up
             acceleration = pin.getFrameClassicalAcceleration(model, data, self._frame, pin.LOCAL)
             rate = pin.getFrameVelocity(model, data, self._frame, pin.LOCAL)
-            result[0, i] = acceleration.linear + gravity_mps2 * vertical
-            result[1, i], result[2, i] = rate.angular, acceleration.angular
-            result[3, i] = vertical
-        return result
+            moved.force_mps2[i] = acceleration.linear + gravity_mps2 * vertical
+            moved.rate_radps[i] = rate.angular
+            moved.acceleration_radps2[i] = acceleration.angular
+            moved.up[i] = vertical
+        return moved
 
 
 def _free_flyer(base: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -158,7 +168,8 @@ def _free_flyer(base: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 class RobotPath(ForcePath):
     """Specific force in a frame of a robot, and what errors of the robot would add to it."""
 
-    name, is_robot = 'the robot', True
+    name = 'the robot'
+    is_robot = True
 
     def __init__(
         self,
@@ -186,7 +197,8 @@ class RobotPath(ForcePath):
         self._smoothed = _derivatives(self._splines, grid_s)
         self.motion = self._moved(self._smoothed)
         super().__init__(grid_s, np.hstack(list(self.motion)))
-        self.joints, self.wanders = robot.joints, readings.base is not None
+        self.joints = robot.joints
+        self.wanders = readings.base is not None
 
     def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Path]:
         """Smooth the tracks."""
@@ -203,7 +215,7 @@ class RobotPath(ForcePath):
             for (times, values), step in zip(tracks, self._steps)
         ]
 
-    def _moved(self, tracks: np.ndarray) -> np.ndarray:
+    def _moved(self, tracks: np.ndarray) -> FrameMotion:
         count = len(self._robot.joints)
         base = tracks[:, :, count:] if tracks.shape[2] > count else None
         return self._robot.motion(tracks[:, :, :count], base, self._gravity_mps2)
@@ -260,18 +272,21 @@ class RobotPath(ForcePath):
         their encoders by q − c·d²q/dt², as links that yield to their inertia. `late_acceleration`
         per s of the time by which the acceleration is later than the attitude.
         """
-        smoothed, modes = self._smoothed, {}
+        smoothed = self._smoothed
+        force_mps2 = self.motion.force_mps2
+        modes = {}
         for number in range(len(self._robot.joints)):
             moved = smoothed.copy()
             moved[0, :, number] += _OFFSET_RAD
-            modes[f'joint{number + 1}'] = (self._moved(moved)[0] - self.motion[0]) / _OFFSET_RAD
+            change_mps2 = self._moved(moved).force_mps2 - force_mps2
+            modes[f'joint{number + 1}'] = change_mps2 / _OFFSET_RAD
         lag = CubicSpline(self.time_s, smoothed[2])
         yielded = smoothed.copy()
         count = len(self._robot.joints)
         yielded[:, :, :count] -= _COMPLIANCE_S2 * np.array(
             [lag(self.time_s, order)[:, :count] for order in range(3)]
         )
-        modes['flexible'] = (self._moved(yielded)[0] - self.motion[0]) / _COMPLIANCE_S2
+        modes['flexible'] = (self._moved(yielded).force_mps2 - force_mps2) / _COMPLIANCE_S2
         modes['late_acceleration'] = -self._acceleration_rate()
         return modes
 
@@ -323,14 +338,16 @@ class RobotPath(ForcePath):
 
     def _read_again(self, every: int) -> np.ndarray:
         """Return the change by reading the smoothed motion: by its encoders, or exactly some."""
-        rng, tracks = np.random.default_rng(0), []
+        rng = np.random.default_rng(0)
+        tracks = []
         for (times, values), step, path in zip(self._tracks, self._steps, self._splines):
             read = path(times)
             offset = step * rng.random()
             if every == 1 and step and np.ptp(values):
                 read = np.rint((read + offset) / step) * step - offset
             tracks.append((times[::every], read[::every]))
-        return self._moved(_derivatives(self._paths(tracks), self.time_s))[0] - self.motion[0]
+        moved = self._moved(_derivatives(self._paths(tracks), self.time_s))
+        return moved.force_mps2 - self.motion.force_mps2
 
 
 def _derivatives(paths: Sequence[Path], time_s: np.ndarray) -> np.ndarray:

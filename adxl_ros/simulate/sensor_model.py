@@ -77,17 +77,21 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
                     stds.append(std)
                     limits.append((maximum or np.inf) / std)
         mean = np.array([parameter_of(name).neutral for name in names])
-        root, limit = np.diag(np.array(stds)), np.array(limits)
+        root = np.diag(np.array(stds))
+        limit = np.array(limits)
     elif units == 'calibration':
         names = list(sensor.covariance_names)
         size, vectors = np.linalg.eigh(sensor.covariance)
-        mean, root = get(sensor, names), vectors * np.sqrt(np.maximum(size, 0.0))
+        mean = get(sensor, names)
+        root = vectors * np.sqrt(np.maximum(size, 0.0))
     else:
         population = (
             units if isinstance(units, Population) else calibration_store.read_population(units)
         )
         prior = population.prior(sensor)
-        names, mean, root = list(prior.names), prior.mean, np.diag(prior.std)
+        names = list(prior.names)
+        mean = prior.mean
+        root = np.diag(prior.std)
     if not names:
         raise UserError(
             f'units {str(units)!r}: {sensor.serial} has no coefficients to draw from '
@@ -170,7 +174,8 @@ class SensorModel:
         self.gyro = GyroscopeModel(self.sensor.gyro, seed)
         self._past_weights = np.zeros(0)
         self._shape: tuple[int, ...] = ()
-        self._dt_s, self._std_v = 0.0, np.zeros(0)
+        self._dt_s = 0.0
+        self._std_v = np.zeros(0)
         self._switch_on(0)
 
     def __repr__(self) -> str:
@@ -302,7 +307,8 @@ class SensorModel:
         if not np.isfinite(force).all():
             raise UserError('the specific force is not finite; check the simulation')
         if not len(self._memory['steps']):
-            self._shape, self._dt_s = force.shape, float(dt_s)
+            self._shape = force.shape
+            self._dt_s = float(dt_s)
             # A digital filter follows the rate, which here is that of the time steps.
             self._std_v = noise.analog_std_v(replace(self.sensor, rate_hz=1 / self._dt_s))
             self._chain.sensor = replace(self._chain.sensor, rate_hz=1 / self._dt_s)
@@ -388,7 +394,8 @@ def _generators(seed: int) -> list[np.random.Generator]:
 def _put_rows(whole: Any, part: Any, rows: np.ndarray) -> None:
     """Put the memory of some sensors into that of all; sensors are the axis of other length."""
     for key in part if isinstance(part, dict) else range(len(part)):
-        old, new = whole.get(key) if isinstance(whole, dict) else whole[key], part[key]
+        old = whole.get(key) if isinstance(whole, dict) else whole[key]
+        new = part[key]
         if isinstance(new, dict | list) and old is not None:
             _put_rows(old, new, rows)
         elif isinstance(new, np.ndarray) and old is not None and old.shape != new.shape:

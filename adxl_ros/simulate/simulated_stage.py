@@ -38,7 +38,8 @@ class SimulatedStage:
         seed: int,
     ) -> None:
         """Rest at a pose; `slew` is the largest velocity, and a resolution of 0 is exact."""
-        self._slew, self._speed = slew, np.array(slew, float)
+        self._slew = slew
+        self._speed = np.array(slew, float)
         self._omega, self._resolution = _SETTLED / settling_s, resolution
         self._rng = np.random.default_rng(seed)
         self._commanded = np.array(pose, float)

@@ -61,7 +61,8 @@ class Steps:
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         """Return the value; see `motion.Path`. It has no derivatives."""
-        values, previous = np.full(len(time_s), self.begin), self.begin
+        values = np.full(len(time_s), self.begin)
+        previous = self.begin
         for step_s, level in self.steps:
             elapsed_s = np.maximum(time_s - step_s, 0.0)
             values += (level - previous) * -np.expm1(-elapsed_s / self.tau_s)

@@ -114,18 +114,12 @@ def _minima(texts: Sequence[str]) -> dict[str, float]:
 
 
 def _next_command(results: Sequence[Findings], options: argparse.Namespace) -> str:
-    able = [
-        (result.path, ability.tool)
-        for result in results
-        if result.is_sound
-        for ability in result.abilities
-        if ability.is_able and ability.tool != 'diagnose'
-    ]
-    return (
-        command(able[0][1], f'{cli.quoted(able[0][0])}{cli.reading_text(options)} -o unit.yaml')
-        if able
-        else ''
-    )
+    for result in results:
+        for ability in result.abilities:
+            if result.is_sound and ability.is_able and ability.tool != 'diagnose':
+                reading = cli.reading_text(options)
+                return command(ability.tool, f'{cli.quoted(result.path)}{reading} -o unit.yaml')
+    return ''
 
 
 def main() -> int:

@@ -38,7 +38,8 @@ class _Parser(argparse.ArgumentParser):
 
     def format_help(self) -> str:
         if self.details is not None:
-            self.epilog, self.details = f'{self.epilog}\n\n{self.details()}', None
+            self.epilog = f'{self.epilog}\n\n{self.details()}'
+            self.details = None
         return super().format_help()
 
 

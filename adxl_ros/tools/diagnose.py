@@ -136,7 +136,7 @@ def diagnose(options: argparse.Namespace) -> int:
         )
     if gap.has_verdict:
         return 0
-    reason = gap.to_dict()['verdict']['data_fault'] or gap.verdict
+    reason = gap.fault_name or gap.verdict
     cli.note(
         f'diagnose: {", ".join(options.recording)}: no verdict ({reason}); the reason is in '
         f'{Path(options.output, REPORT)}'

@@ -16,12 +16,13 @@ from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import make_folder
 from adxl_ros.files.recording_columns import NO_SERIAL
-from adxl_ros.fleet.inputs import find_sources, stated_by
+from adxl_ros.fleet.inputs import find_sources, Source, stated_by
 from adxl_ros.fleet.row import (
     as_date,
     make_recipe,
     OUTCOMES,
     PAGE,
+    Recipe,
     Row,
     TABLE,
     task_names,
@@ -156,16 +157,9 @@ def fleet(options: argparse.Namespace) -> int:
     make_folder(folder)
     with only_client(folder):
         results = Results(folder)
-        to_do, rows = plan_after(results), []
+        to_do = plan_after(results)
         try:
-            if to_do.todo:
-                shared = (recipe, frozenset(results.known))
-                with (
-                    open_pool(options.scheduler, options.jobs, shared) as pool,
-                    cli.progress(PROG) as show,
-                ):
-                    for row in work(pool, to_do.todo, recipe, results, options.retries, show):
-                        rows.append({name: row[name] for name in _SHOWN})
+            rows = _worked(options, recipe, to_do.todo, results) if to_do.todo else []
         finally:
             # Ctrl-C leaves table and page of what is done.
             files, findings = _written(folder, results)
@@ -182,14 +176,31 @@ def fleet(options: argparse.Namespace) -> int:
     return 1 if rows and not any(row['outcome'] == 'done' for row in rows) else 0
 
 
+def _worked(
+    options: argparse.Namespace, recipe: Recipe, todo: Sequence[Source], results: Results
+) -> list[Row]:
+    """Work on recordings; return what the screen shows of each."""
+    shared = (recipe, frozenset(results.known))
+    rows = []
+    with (
+        open_pool(options.scheduler, options.jobs, shared) as pool,
+        cli.progress(PROG) as show,
+    ):
+        for row in work(pool, todo, recipe, results, options.retries, show):
+            rows.append({name: row[name] for name in _SHOWN})
+    return rows
+
+
 def _written(folder: Path, results: Results) -> tuple[list[Path], list[str]]:
     """Write table and page; return files and findings, or report that a page is not possible."""
     from adxl_ros.fleet import page  # only the end of a run needs it
 
-    files, findings = [results.write_table()], list[str]()
+    files = [results.write_table()]
+    findings = list[str]()
     try:
         written = page.write(folder)
-        files, findings = [*written.files, *files], written.findings
+        files = [*written.files, *files]
+        findings = written.findings
     except UserError as error:
         cli.note(f'{PROG}: no page: {error}')
     return [*files, folder / 'reports'], findings

@@ -9,9 +9,10 @@ from collections.abc import Iterator
 import json
 from pathlib import Path
 
-from adxl_ros.api.noise import BLOCK_ROWS, noise as find_noise, PLOT, TABLE
+from adxl_ros.api.noise import noise as find_noise, PLOT, TABLE
 from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.process import command
 from adxl_ros.tools import command_line as cli
 
@@ -71,7 +72,8 @@ def noise(options: argparse.Namespace) -> int:
     cli.report_notes('noise', newest[-1].notes)
     if options.report:
         found.report(options.report, overwrite=options.overwrite)
-    lines, files = found.screen, curves
+    lines = found.screen
+    files = curves
     if options.output:
         found.save(options.output, overwrite=options.overwrite)
         files = [Path(options.output), *curves]

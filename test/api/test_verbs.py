@@ -17,7 +17,7 @@ BIAS_V = 0.01  # Largest departure of the zero-g that is simulated, 10 mg
 
 
 @pytest.fixture(scope='module')
-def recording() -> object:
+def recording() -> adxl.Recording:
     """Make a recording of arrays, as a stranger has them."""
     made = adxl.simulate(
         'tilt_both',
@@ -31,12 +31,12 @@ def recording() -> object:
 
 
 @pytest.fixture(scope='module')
-def fit(recording: object) -> object:
+def fit(recording: adxl.Recording) -> adxl.Fit:
     return adxl.fit(recording, 'adxl203', model='linear')
 
 
 @pytest.fixture(scope='module')
-def gap(recording: object) -> object:
+def gap(recording: adxl.Recording) -> adxl.Gap:
     return adxl.diagnose(recording, 'adxl203')
 
 
@@ -115,7 +115,7 @@ def test_results_are_copied_compared_and_sent_to_other_processes(recording, fit,
         adxl.apply(recording, fit),
         adxl.check(recording),
     ):
-        assert result == result and result != copy.deepcopy(result)
+        assert result == result and str(copy.deepcopy(result)) == str(result)
         assert len({result, result}) == 1
         assert str(pickle.loads(pickle.dumps(result))) == str(result)
 
@@ -144,7 +144,7 @@ def test_noise_of_white_samples_is_within_its_interval() -> None:
     )
     for axis in noise.axes:
         white = axis.fit.white
-        assert white.low * 0.95 < std_mps2 / np.sqrt(rate_hz) < white.high * 1.05
+        assert white.low < std_mps2 / np.sqrt(rate_hz) < white.high
     assert noise.sensor.noise_density_g_per_rthz.shape == (3,)
     assert len(noise.to_pandas()) == 9
 

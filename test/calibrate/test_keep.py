@@ -11,7 +11,6 @@ from adxl_ros.calibrate.keep.keeper import Keeper
 from adxl_ros.calibrate.keep.stays import RestStream
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import Adopted, Journal, read
-from adxl_ros.model.sensor import with_axes
 from adxl_ros_validation import kept_robots
 from adxl_ros_validation.kept_robots import BEGIN_NS, calibrated, Kind, Robot
 import numpy as np
@@ -43,24 +42,26 @@ def test_a_knock_is_reported_and_never_learnt(kind):
     assert outcome.false_changes == 0
 
 
+def test_one_rest_reports_a_large_knock():
+    outcome = kept_robots.run(Kind(lies_down=True, knock_mg=20), 5, 31)
+    assert outcome.could_show and outcome.reported_days < 0.1
+
+
+def test_a_knock_that_no_rest_can_show_is_never_adopted():
+    """Slopes of the ground show a knock on x in the length of gravity, as a drift of weeks."""
+    outcome = kept_robots.run(Kind(knock_mg=20), 4, 45)
+    assert outcome.adoptions_after > 0 and not outcome.is_learnt
+
+
 def test_the_interval_of_a_sensor_of_two_axes_holds():
     """Two axes do not show the length of gravity: it learns from the changes within stays."""
-    whole = calibrated()
-    names = tuple(name for name in whole.covariance_names if name.axis != 'z')
-    unit = replace(with_axes(replace(whole, effects=()), 'xy'), effects=whole.effects)
-    values = {
-        effect: {name: value[:2] for name, value in parameters.items()}
-        for effect, parameters in whole.values.items()
-    }
-    unit = replace(
-        unit, values=values, covariance=whole.covariance[:4, :4], covariance_names=names
-    )
     inside = []
     for seed in (0, 1):
-        robot, keeper = Robot(Kind(True, slope=5), np.random.default_rng(seed)), Keeper(unit)
+        robot = Robot(Kind(True, slope=5, axes='xy'), np.random.default_rng(seed))
+        keeper = Keeper(calibrated('xy'))
         for day in range(20):
             for rest, _ in robot.rests(day):
-                keeper.add(replace(rest, mean_v=rest.mean_v[:2], std_v=rest.std_v[:2]))
+                keeper.add(rest)
             state = keeper.state(rest.stop_ns)
             true_mg = 1e3 * robot.zero_g(rest.temperature_c)[:2]
             inside += [*(np.abs(true_mg - state.total_mg) <= state.zero_g_90_mg)]

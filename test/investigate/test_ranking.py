@@ -19,8 +19,6 @@ import numpy as np
 import pytest
 from units import nominal
 
-pytestmark = pytest.mark.long
-
 LIMITS = StageLimits((0.0, np.pi), (0.0, 2 * np.pi), 0.5)
 SENSOR = nominal(rate_hz=62.5)
 FIRST = Question(Pose(0.0, 0.0), 0.0, 10.0, False)
@@ -48,6 +46,7 @@ def first_round():
     return run_round(FIRST, [], SENSOR, LIMITS)
 
 
+@pytest.mark.long
 def test_fast_turns_show_an_arm_better_than_rests_and_slow_turns():
     names = ('rests_on_axes', 'fast_turn_of_beta', 'slow_turn_of_beta')
     _, worth = rank(between(BEYOND, ('lever_arm',)), None, SENSOR, planned(*names))
@@ -56,6 +55,7 @@ def test_fast_turns_show_an_arm_better_than_rests_and_slow_turns():
     assert information['fast_turn_of_beta'] > information['slow_turn_of_beta']
 
 
+@pytest.mark.long
 @pytest.mark.xdist_group('first_round')
 def test_a_manoeuvre_that_does_not_fit_in_the_time_is_not_chosen():
     pose = Pose(0.0, 0.0)
@@ -67,10 +67,11 @@ def test_a_manoeuvre_that_does_not_fit_in_the_time_is_not_chosen():
     )
     assert fits.manoeuvre == shortest
     assert (none_fits.manoeuvre, none_fits.outcome) == ('', Outcome.TIME_OVER)
-    assert (
-        decide(between((), ('hysteresis',)), (told_nothing(1.0),), FIRST, False).outcome
-        is Outcome.TIME_OVER
-    )
+
+
+def test_a_round_without_time_left_ends():
+    decision = decide(between((), ('hysteresis',)), (told_nothing(1.0),), FIRST, False)
+    assert decision.outcome is Outcome.TIME_OVER
 
 
 @pytest.mark.parametrize('probability, outcome', [(0.96, Outcome.CERTAIN), (0.85, Outcome.GO_ON)])
@@ -101,6 +102,7 @@ def test_a_verdict_that_stays_after_every_kind_of_manoeuvre_ends_it():
     assert changed.outcome is Outcome.GO_ON
 
 
+@pytest.mark.long
 @pytest.mark.xdist_group('first_round')
 def test_the_first_round_needs_no_samples():
     answer, diagnosis = first_round()

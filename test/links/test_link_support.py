@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from adxl_ros.errors import UserError
 from adxl_ros.links.support import emulated_board, stamping
+from adxl_ros.links.support.clock_map import ClockMap
 from adxl_ros.links.support.clock_rate import ClockRate
-from adxl_ros.links.support.stamping import ClockMap
 from adxl_ros.links.support.wire_format import AFTER_RESET, FrameCounter, SampleFrame
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -46,7 +46,7 @@ class DelayedFrames:
 
     def stamp(self):
         """Stamp the frames that wait, when the map is ready."""
-        if self.map.ready(self.arrived):
+        if self.map.advance(self.arrived):
             for device, true in self.held:
                 self.stamps.append(self.map.host_ns(device))
                 self.truth.append(true)

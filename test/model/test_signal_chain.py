@@ -7,8 +7,22 @@ from dataclasses import replace
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.covariance import coefficient_tangent, force_covariance
 from adxl_ros.model.effects import library
-from adxl_ros.model.effects.base import ARRAYS, Coefficient, Environment, FLOATS, Need, Role
-from adxl_ros.model.kinematics import angles, specific_force, tilt
+from adxl_ros.model.effects.base import (
+    ARRAYS,
+    Coefficient,
+    Environment,
+    FLOATS,
+    Maths,
+    Need,
+    Role,
+)
+from adxl_ros.model.kinematics import (
+    angles,
+    Covariance3,
+    specific_force,
+    tilt,
+    turn_of_stage,
+)
 from adxl_ros.model.sensor import get, names_of, parameter_of, put, Sensor, with_neutral
 from hypothesis import given, strategies as st
 import numpy as np
@@ -192,7 +206,12 @@ def test_floats_and_arrays_agree() -> None:
     force = rng.normal(size=(3, 200)) * 6
     mixed = rng.normal(size=(200, 3, 3)) * 0.1
     spread = np.array([(m @ m.T)[np.triu_indices(3)] for m in mixed]).T
-    arrays = np.array(angles(list(force), tuple(spread), ARRAYS)).reshape(8, -1)
+    by_array = every_angle(list(force), Covariance3(*spread), ARRAYS)
     for i in range(200):
-        f, s = force[:, i].tolist(), tuple(spread[:, i].tolist())
-        np.testing.assert_allclose(np.ravel(angles(f, s, FLOATS)), arrays[:, i], rtol=1e-12)
+        one = every_angle(force[:, i].tolist(), Covariance3(*spread[:, i].tolist()), FLOATS)
+        np.testing.assert_allclose(one, by_array[:, i], rtol=1e-12)
+
+
+def every_angle(force: list, covariance: Covariance3, maths: Maths) -> np.ndarray:
+    estimates = (*angles(force, covariance, maths), turn_of_stage(force, covariance, maths))
+    return np.array([number for estimate in estimates for number in estimate])

@@ -122,7 +122,7 @@ def test_a_robot_is_a_reference(tmp_path: Path) -> None:
     robot, joints = Robot(tmp_path / 'robot.urdf', 'imu_link'), (Swing(0.8, 0.9), Swing(0.6, 1.3))
     time_s = np.arange(0, 46, 0.002)
     swung = np.array([[joint(time_s, order) for joint in joints] for order in range(3)])
-    force = ForcePath(time_s, robot.motion(swung.transpose(0, 2, 1), None, 9.80665)[0])
+    force = ForcePath(time_s, robot.motion(swung.transpose(0, 2, 1), None, 9.80665).force_mps2)
     sensor = Response(UNIT, Motion(np.inf, force=force), 3)
     live = LiveGap(UNIT, ReferenceKind.ROBOT, GapSettings(window_s=20.0))
     stream = RobotForce(robot, 9.80665)

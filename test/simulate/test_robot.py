@@ -6,7 +6,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.robot_readings import Readings
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.simulate.motion import ForcePath, Motion
-from adxl_ros.simulate.response import ChainMemo, Response
+from adxl_ros.simulate.response import ChainMemo, whole_response
 from adxl_ros.simulate.robot import Robot, robot_path, RobotPath
 import numpy as np
 import pytest
@@ -205,6 +205,6 @@ def test_an_effect_of_the_rotation_shows_after_a_simulation_without_it():
     motion = Motion(2.0, force=Turning(time_s, np.tile([0.0, 0.0, G0_MPS2], (200, 1))))
     sensor, memo = nominal('xyz', rate_hz=100.0), ChainMemo()
     arm = with_effects(sensor, ['lever_arm:x_m=0.1'])
-    without, beside = (Response(s, motion, 0).whole(time_s, memo) for s in (sensor, arm))
+    without, beside = (whole_response(s, motion, 0, time_s, memo) for s in (sensor, arm))
     change_mps2 = (beside - without)[-1, 0] / sensor.scale_v_per_g[0] * G0_MPS2
     assert change_mps2 == pytest.approx(-0.1 * 2**2, rel=0.05)

@@ -49,7 +49,8 @@ def robot(tmp_path_factory):
     (folder / 'robot.urdf').write_text(urdf(WRIST, 0.1, '0.3 0.2 -0.4'))
     parameter_file.save(folder / 'unit.yaml', nominal('xyz', **FILE), [])
     fine_s = np.arange(0, SPAN_S, 1e-3)
-    force = Robot(folder / 'robot.urdf', 'imu_link').motion(poses(fine_s), None, 9.80665)[0]
+    arm = Robot(folder / 'robot.urdf', 'imu_link')
+    force = arm.motion(poses(fine_s), None, 9.80665).force_mps2
 
     def record(name, *effects, joint_offset_rad=0.0):
         sensor = with_effects(nominal('xyz', **FILE), effects)

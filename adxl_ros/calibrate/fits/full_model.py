@@ -35,6 +35,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
+from typing import NamedTuple
 
 from adxl_ros.calibrate.fits import linear, linearisation
 from adxl_ros.calibrate.fits.linearisation import Linearised, linearised, StageError
@@ -245,7 +246,9 @@ class _Search:
         """Iterate until all converge."""
         start = self._solved(self._measured, _START_STEPS)
         self._sensor = put(self._sensor, self._names, start.values)
-        converged, deviance, noise_v = False, np.inf, self._measured.std_v.mean(axis=0)
+        converged = False
+        deviance = np.inf
+        noise_v = self._measured.std_v.mean(axis=0)
         for number in range(_MAX_ROUNDS):
             self._estimate_stage(number)
             step_std = self._step()
@@ -562,12 +565,17 @@ def candidates(poses: Poses) -> tuple[str, ...]:
 
 def fit(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> Sensor:
     """Fit the full model with selected terms, and with some effects in any case."""
-    return fit_selected(sensor, poses, effects)[0].fitted
+    return fit_selected(sensor, poses, effects).fit.fitted
 
 
-def fit_selected(
-    sensor: Sensor, poses: Poses, effects: Sequence[str] = ()
-) -> tuple[FullFit, list[Term]]:
+class SelectedFit(NamedTuple):
+    """A full fit, and the evidence for its terms and for those that it does not have."""
+
+    fit: FullFit
+    terms: list[Term]
+
+
+def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> SelectedFit:
     """Fit the full model and effects as `fit_full` does, and add terms that the poses support."""
     terms = tuple(dict.fromkeys((*default_terms(sensor.axes), *effects)))
     full = fit_full(sensor, poses, terms)
@@ -583,7 +591,7 @@ def fit_selected(
         terms = (*terms, max(supported, key=lambda term: term.log_bayes_factor).name)
         full = fit_full(sensor, poses, terms)
         compared = compare_terms(full)
-    return full, compared
+    return SelectedFit(full, compared)
 
 
 def compare_terms(full: FullFit) -> list[Term]:
@@ -676,7 +684,8 @@ def report_lines(full: FullFit, poses: Poses, terms: Sequence[Term]) -> list[str
 
 def _weakest_direction(fitted: Sensor) -> str:
     """Name the direction that the poses determine least, in typical sizes, and the condition."""
-    names, scale = fitted.covariance_names, _sizes(fitted.covariance_names)
+    names = fitted.covariance_names
+    scale = _sizes(fitted.covariance_names)
     values, vectors = np.linalg.eigh(fitted.covariance / np.outer(scale, scale))
     weakest = vectors[:, -1]
     parts = ' '.join(

@@ -23,6 +23,7 @@ from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import parameter_of, Sensor
 from adxl_ros.process import option, usage
+from adxl_ros.report.quantities import mg
 import numpy as np
 import scipy
 
@@ -371,10 +372,15 @@ def _residual(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:
     return magnitude(rests.mean, parameters) - rests.gravity_g
 
 
-def _solve(
-    rests: NominalRests, start: np.ndarray, variance: np.ndarray, rung: Rung
-) -> tuple[np.ndarray, bool]:
-    """Fit with given variances of the magnitudes, g², (k,); also return whether it converged."""
+class _Solution(NamedTuple):
+    """The best parameters for given variances."""
+
+    parameters: np.ndarray  # (9,)
+    converged: bool
+
+
+def _solve(rests: NominalRests, start: np.ndarray, variance: np.ndarray, rung: Rung) -> _Solution:
+    """Fit with given variances of the magnitudes, g², (k,)."""
     std = np.sqrt(variance)
     prior = np.diag(np.sqrt(rung.precision))
     # `least_squares` calls the same routine of MINPACK, and takes twice the time around it.
@@ -388,7 +394,7 @@ def _solve(
         gtol=_TOLERANCE,
         diag=_UNSCALED,
     )
-    return parameters, status in _CONVERGED
+    return _Solution(parameters, status in _CONVERGED)
 
 
 def _fit(rests: NominalRests, rung: Rung) -> _Estimate:
@@ -502,7 +508,7 @@ def _held_out(
         without = (
             parameters
             if is_open or others.sum() < rung.determined
-            else _solve(used[others], parameters, variance[kept][others], rung)[0]
+            else _solve(used[others], parameters, variance[kept][others], rung).parameters
         )
         errors[np.flatnonzero(kept)[~others]] = _residual(used[~others], without)
     return errors
@@ -548,7 +554,7 @@ def _require_determined(
         if missing
         else f'are too few, at least {rung.min_rests} in different directions are needed'
     )
-    scatter = f' and scatter by {1e3 * np.sqrt(excess_g2):.2g} mg' if excess_g2 else ''
+    scatter = f' and scatter by {mg(G0_MPS2 * np.sqrt(excess_g2)):.2g} mg' if excess_g2 else ''
     raise _UndeterminedError(
         f'gravity: without their angles ({usage("fit", poses=None)}), the {count} rests '
         f'{reason}{scatter}; '

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from adxl_ros.calibrate.pose_model import angle_jacobian, reference_force
 from adxl_ros.calibrate.poses import planes, Poses
@@ -186,7 +187,8 @@ def _quadratic(
 def _assemble(sensor: Sensor, poses: Poses, regressions: list[AxisRegression]) -> Sensor:
     """Fix the gauge and convert the regressions into parameters of effects."""
     count = len(sensor.axes)
-    zero, scale = sensor.nominal_zero_g_v.copy(), sensor.nominal_scale_v_per_g.copy()
+    zero = sensor.nominal_zero_g_v.copy()
+    scale = sensor.nominal_scale_v_per_g.copy()
     alpha, beta, p2, q2, r1, r2 = np.zeros((6, count))
     for d, axis in enumerate(regressions):
         slope = axis.r[0]
@@ -202,7 +204,11 @@ def _assemble(sensor: Sensor, poses: Poses, regressions: list[AxisRegression]) -
         p2[d], q2[d] = axis.p[2] / scale[d], axis.q[2] / scale[d]
         r1[d], r2[d] = axis.r[1:] / slope
     if count == 3:
-        zero[2], scale[2], alpha[2], beta[2] = _fit_z_axis(sensor, poses)
+        fitted = _fit_z_axis(sensor, poses)
+        zero[2] = fitted.zero_g_v
+        scale[2] = fitted.scale_v_per_g
+        alpha[2] = fitted.alpha_rad
+        beta[2] = fitted.beta_rad
     values = {
         'bias': {'offset_v': zero - sensor.nominal_zero_g_v},
         'scale_factor': {'offset_v_per_g': scale - sensor.nominal_scale_v_per_g},
@@ -222,14 +228,24 @@ def _assemble(sensor: Sensor, poses: Poses, regressions: list[AxisRegression]) -
     )
 
 
-def _fit_z_axis(sensor: Sensor, poses: Poses) -> tuple[float, float, float, float]:
-    """Fit zero-g, V, scale factor, V/g, and misalignment alpha and beta, rad, of a z axis."""
+class _ZAxis(NamedTuple):
+    """Coefficients of a z axis."""
+
+    zero_g_v: float
+    scale_v_per_g: float
+    # Misalignment
+    alpha_rad: float
+    beta_rad: float
+
+
+def _fit_z_axis(sensor: Sensor, poses: Poses) -> _ZAxis:
+    """Fit zero-g, scale factor and direction of a z axis."""
     force = np.column_stack(reference_force(poses, sensor.local_gravity_mps2)) / G0_MPS2
     design = np.column_stack([np.ones(len(poses)), force])
-    (zero, tx, ty, tz), *_ = np.linalg.lstsq(design, poses.volts[:, 2], rcond=None)
+    zero, tx, ty, tz = np.linalg.lstsq(design, poses.volts[:, 2], rcond=None)[0]
     scale = np.sqrt(tx * tx + ty * ty + tz * tz)
     beta = np.arcsin(tx / scale)
-    return zero, scale, np.arcsin(-ty / scale / np.cos(beta)), beta
+    return _ZAxis(zero, scale, np.arcsin(-ty / scale / np.cos(beta)), beta)
 
 
 def _covariance(sensor: Sensor, fitted: Sensor, poses: Poses) -> np.ndarray:

@@ -185,7 +185,8 @@ class AngleErrors:
 
 def shared_settings(poses: Poses) -> tuple[np.ndarray, int]:
     """Return the numbers of settings that poses share, (k, 2), −1 for others, and their count."""
-    numbers, count = np.full((len(poses), 2), -1), 0
+    numbers = np.full((len(poses), 2), -1)
+    count = 0
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
         _, index, size = np.unique(setting, return_inverse=True, return_counts=True)
         column = np.cumsum(size > 1) - 1 + count

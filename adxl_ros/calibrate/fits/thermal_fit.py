@@ -14,10 +14,11 @@ from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stamps import period_s
-from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C, TINY
+from adxl_ros.model.constants import G0_MPS2, NOMINAL_TEMPERATURE_C, TINY
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.filters import loop, play, stop
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
+from adxl_ros.report.quantities import mg
 import numpy as np
 import scipy
 
@@ -70,7 +71,8 @@ class ThermalFit:
         warmer_k = temperatures_c - NOMINAL_TEMPERATURE_C
         base_k = calibrated_c - NOMINAL_TEMPERATURE_C
         slopes = np.column_stack([warmer_k - base_k, warmer_k**2 - base_k**2])
-        variances, axes = [], dict.fromkeys(name.axis for name in self.names if name.axis)
+        variances = []
+        axes = dict.fromkeys(name.axis for name in self.names if name.axis)
         for axis, residual_g in zip(axes, self.rms_g):
             places = [
                 self.names.index(Coefficient('temperature_bias', parameter, axis))
@@ -108,7 +110,8 @@ def fit(sensor: Sensor, blocks: Poses, with_history: bool = True) -> ThermalFit:
     orientation = np.concatenate([[0], np.cumsum(turned)])
     span_k = float(np.ptp(temperature_c))
     solver = _Solver(sensor.axes, blocks, outputs_g, orientation)
-    history, shape = '', 0.0
+    history = ''
+    shape = 0.0
     # Above and below in turn: the temperature has reversed.
     branch = stop(temperature_c, span_k * _REACHES[1], {})
     if with_history and branch.max() > 0.5 and branch.min() < -0.5:
@@ -157,7 +160,8 @@ class _Solver:
 
     def likeliest(self, shapes_of: Mapping[str, np.ndarray]) -> tuple[str, float]:
         """Return the effect that gains enough, and its shape; the shapes are those to try."""
-        best, highest = ('', 0.0), self.score('', 0.0) + _SMALLEST_GAIN
+        best = ('', 0.0)
+        highest = self.score('', 0.0) + _SMALLEST_GAIN
         for history, shapes in shapes_of.items():
             place = int(np.argmax([self.score(history, shape) for shape in shapes]))
             bounds = np.log(shapes[[max(place - 1, 0), min(place + 1, len(shapes) - 1)]])
@@ -168,7 +172,8 @@ class _Solver:
                 options={'xatol': 0.01},
             )
             if -search.fun > highest:
-                best, highest = (history, float(np.exp(search.x))), -search.fun
+                best = (history, float(np.exp(search.x)))
+                highest = -search.fun
         return best
 
 
@@ -222,7 +227,8 @@ def _fit_axis(
     names = [Coefficient(*name, axis) for name in columns]
     # The zero-g of each orientation has the last columns.
     design = np.column_stack([*columns.values(), _are_of(orientation)])
-    begins, correlation = np.diff(orientation, prepend=-1) > 0, 0.0
+    begins = np.diff(orientation, prepend=-1) > 0
+    correlation = 0.0
     for _ in range(_ITERATIONS):
         white = _whitened(design, correlation, begins)
         target = _whitened(output_g, correlation, begins)
@@ -284,7 +290,8 @@ _SHAPES = {'thermal_lag': 'tau_s', 'thermal_hysteresis': 'reach_k'}
 
 def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
     """Put a fit into a calibrated sensor, whose zero-g stays right at `calibrated_c`."""
-    names, effects = fitted.names, dict.fromkeys(name.effect for name in fitted.names)
+    names = fitted.names
+    effects = dict.fromkeys(name.effect for name in fitted.names)
     kept = [i for i, name in enumerate(base.covariance_names) if name.effect not in EFFECTS]
     kept_names = tuple(base.covariance_names[i] for i in kept)
     dropped = set(EFFECTS) - set(effects)
@@ -386,7 +393,8 @@ def expected_error_mg(fit: ThermalFit, covered: Passed, calibrated_c: float) -> 
     """
     typical_g = parameter_of(Coefficient('thermal_hysteresis', 'half_width_g', 'x')).scale
     unseen_g = np.where(covered.warming & covered.cooling, 0.0, typical_g)
-    return 1e3 * float(np.hypot(fit.error_g(covered.middles_c, calibrated_c), unseen_g).max())
+    error_g = np.hypot(fit.error_g(covered.middles_c, calibrated_c), unseen_g)
+    return float(mg(G0_MPS2 * error_g.max()))
 
 
 BLOCK_S = 10.0  # Length of a block, s. Chosen: short beside the lag of a thermometer
@@ -406,7 +414,9 @@ def rest_blocks(recording: Recording, sensor: Sensor) -> Poses | None:
     temperature_c = recording.columns.get('temperature_c')
     if temperature_c is None or not np.isfinite(temperature_c).any():
         return None
-    volts, time_s, span_s = recording.volts(sensor), recording.time_s, recording.span_s
+    volts = recording.volts(sensor)
+    time_s = recording.time_s
+    span_s = recording.span_s
     block_s = max(BLOCK_S, span_s / _MOST_BLOCKS, _FEWEST_SAMPLES * period_s(time_s))
     starts_s = time_s[0] + block_s * np.arange(int(span_s / block_s) + 1)
     parts = []

@@ -98,7 +98,9 @@ class StreamSensor:
 
     def take(self, nominal: Sensor) -> None:
         """Take a sensor as that of the stream."""
-        self.nominal, self.newest, self.fault = nominal, NewestSamples(nominal), ''
+        self.nominal = nominal
+        self.newest = NewestSamples(nominal)
+        self.fault = ''
         self.outlook = self._settings.outlook(nominal)
 
     def stated(self, info: StreamInfo) -> Sensor | None:
@@ -106,7 +108,9 @@ class StreamSensor:
         try:
             nominal = nominal_of(self._sensor, info)
         except UserError as error:
-            self.nominal, self.newest, self.fault = None, None, f'{error}'
+            self.nominal = None
+            self.newest = None
+            self.fault = f'{error}'
             raise
         if nominal.unstated:
             self._anonymous = nominal
@@ -170,14 +174,16 @@ class Controller:
         self._starts_over = self._by_default
         self._sensor, self._samples, self._outputs = sensor, samples, outputs
         self._last = self._warned = ''  # The newest line, and the newest obstacle
-        self._accepted, self._has_doubt = 0, False
+        self._accepted = 0
+        self._has_doubt = False
 
     def start(self, start_over: bool | None = None) -> Answer:
         """Begin a calibration, or resume an interrupted one, as soon as the sensor is known."""
         if self.session is not None:
             return Answer(False, 'a calibration is running; finish or abort it first')
         if self.state is not ControllerState.ASKING or start_over is not None:
-            self.state, self.question = ControllerState.WAITING_FOR_SENSOR, ''
+            self.state = ControllerState.WAITING_FOR_SENSOR
+            self.question = ''
             self._starts_over = self._by_default if start_over is None else start_over
             self._try_to_start()
         if self.state is ControllerState.ASKING:
@@ -363,7 +369,9 @@ class Controller:
 
     def report(self) -> tuple[Status, str, dict[str, str | float]]:
         """Return status, serial number and values by key; log an obstacle once for each pose."""
-        status, nominal, session = self.status(), self.stream.nominal, self.session
+        status = self.status()
+        nominal = self.stream.nominal
+        session = self.session
         values: dict[str, str | float] = {
             'accepted': str(self._accepted),
             'output': str(self.settings.output),
@@ -405,7 +413,8 @@ class Controller:
         except UserError as error:
             self._stop(Level.ERROR, f'{error}')
             return
-        self.state, self.outcome = ControllerState.RUNNING, ()
+        self.state = ControllerState.RUNNING
+        self.outcome = ()
         self._samples.restart_silence()
         task = (
             self.stream.outlook
@@ -435,7 +444,8 @@ class Controller:
         if self.session is not None:
             self._accepted = self.session.accepted_count
             self.session.journal.close()
-        self.state, self.session = ControllerState.IDLE, None
+        self.state = ControllerState.IDLE
+        self.session = None
         self.question = self.fit_fault = ''
         self._outputs.answer_captures(Answer(False, text))
         self._outputs.withdraw_pose(text)

@@ -212,7 +212,9 @@ class Dwell:
 
     def record(self, pose: int, rest: Rest, samples: int) -> PoseRecord:
         """Average the first samples of a rest."""
-        stamps, start, stop = np.concatenate(self._stamps), rest.start, rest.start + samples
+        stamps = np.concatenate(self._stamps)
+        start = rest.start
+        stop = rest.start + samples
         times = (stamps - self.arrived_ns) * 1e-9
         mean, std = rest_detection.rest_means(
             times,
@@ -257,7 +259,8 @@ class EncoderTrack:
         if sample_ns is not None:
             self.offsets_s.append((stamp_ns - sample_ns) * 1e-9)
         restarted = went_back(self.newest_ns, stamp_ns)
-        self.newest_ns, self.angles_rad = stamp_ns, (alpha_rad, beta_rad)
+        self.newest_ns = stamp_ns
+        self.angles_rad = (alpha_rad, beta_rad)
         return restarted
 
     def clock_fault(self) -> str:
@@ -327,7 +330,8 @@ class Guide:
         if went_back(self.newest_ns, stamps_ns[0]):
             self.newest = NewestSamples(self.sensor)
             self.begin_stream(((self.newest_ns or 0) - int(stamps_ns[0])) * 1e-9)
-            self.newest_ns, self._late = None, LateStamps()
+            self.newest_ns = None
+            self._late = LateStamps()
         before_ns = stamps_ns[0] if self.newest_ns is None else self.newest_ns
         late_ns = late_by(np.append(before_ns, stamps_ns))[1:]
         self._late.count(stamps_ns, late_ns)
@@ -379,7 +383,8 @@ class Guide:
 
     def new_refusal(self) -> str:
         """Return why a pose was refused since the last call, or ''."""
-        text, self._new_refusal = self._new_refusal, ''
+        text = self._new_refusal
+        self._new_refusal = ''
         return text
 
     def tilt_error_rad(self) -> float:

@@ -107,7 +107,8 @@ def _turn(planes_rad: Sequence[float], step_rad: float) -> np.ndarray:
 
 def nearest(start: Target, targets: list[Target]) -> list[Target]:
     """Order poses so that each one is the nearest to the pose before."""
-    remaining, path = list(targets), [start]
+    remaining = list(targets)
+    path = [start]
     while remaining:
         path.append(
             min(
@@ -136,7 +137,9 @@ def spread(count: int) -> list[Target]:
 def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> str:
     """Count the poses of a plan by plane and by direction of travel, and the check poses."""
     alpha_rad, beta_rad, check = np.array([(t.alpha_rad, t.beta_rad, t.check) for t in targets]).T
-    planes, grid, turn = np.round(np.degrees(alpha_rad)), check == 0, np.diff(beta_rad, prepend=0)
+    planes = np.round(np.degrees(alpha_rad))
+    grid = check == 0
+    turn = np.diff(beta_rad, prepend=0)
     turn[:1] = 0
     groups = {f'{plane:.0f}°': grid & (planes == plane) for plane in dict.fromkeys(planes[grid])}
     groups |= {

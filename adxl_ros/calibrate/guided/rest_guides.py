@@ -225,23 +225,9 @@ class HandGuide(HandRests):
 
     def status(self) -> Status:
         """Return what the guide waits for, with the values that matter."""
-        count, stillness = len(self.accepted), self._finder.stillness()
-        advice = next(
-            (
-                text
-                for needed, text in (
-                    (SIX.min_rests, f'{SIX.min_rests - count} more at least'),
-                    (
-                        NINE.min_rests,
-                        f'{SIX.text} only; {NINE.min_rests - count} more for the angles',
-                    ),
-                    (ENOUGH_RESTS, 'more make it better'),
-                )
-                if count < needed
-            ),
-            'call finish when done',
-        )
-        rests = f'{count} rests ({advice})'
+        count = len(self.accepted)
+        stillness = self._finder.stillness()
+        rests = f'{count} rests ({_advice(count)})'
         if stillness is None:
             return Status(Phase.REST, f'{rests}; waiting for samples', False)
         phase = Phase.DWELL if stillness.at_rest else Phase.REST
@@ -251,7 +237,8 @@ class HandGuide(HandRests):
 
     def progress(self) -> list[Row]:
         """Return direction, readings and progress, for the screen."""
-        up, count = self.up(), len(self.accepted)
+        up = self.up()
+        count = len(self.accepted)
         now = (
             []
             if up is None
@@ -309,6 +296,15 @@ class ThermalSettings:
 
     range_c: tuple[float, float] = (0.0, 50.0)  # Lowest and highest wanted temperature, °C
     block_s: float = thermal_fit.BLOCK_S  # Length of a block, s
+
+
+def _advice(count: int) -> str:
+    """Return what so many rests determine, and how many more are needed, for people."""
+    if count < SIX.min_rests:
+        return f'{SIX.min_rests - count} more at least'
+    if count < NINE.min_rests:
+        return f'{SIX.text} only; {NINE.min_rests - count} more for the angles'
+    return 'more make it better' if count < ENOUGH_RESTS else 'call finish when done'
 
 
 class ThermalGuide(Guide):
@@ -426,7 +422,9 @@ class ThermalGuide(Guide):
 
     def estimated(self) -> tuple[list[Row], list[Row]]:
         """Return coverage and error, and the coefficients by the blocks so far, for the screen."""
-        fit, (low_c, high_c), rows = self._fit, self._settings.range_c, []
+        fit = self._fit
+        (low_c, high_c) = self._settings.range_c
+        rows = []
         if fit is not None:
             prior = [thermal_fit.PRIOR_WIDTH * parameter_of(name).scale for name in fit.names]
             rows = running_estimate.coefficient_rows(

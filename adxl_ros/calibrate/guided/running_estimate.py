@@ -50,11 +50,9 @@ class RunningEstimate:
 
     def reading_fault(self, target: Target, volts: np.ndarray, tolerance_rad: float) -> str:
         """Refuse a pose whose mean, V, (m,), is an outlier to the prediction by earlier poses."""
-        sensor, pose = (
-            self.sensor,
-            Poses.without_volts(
-                np.array([target.alpha_rad]), np.array([target.beta_rad]), self.pose_std_v
-            ),
+        sensor = self.sensor
+        pose = Poses.without_volts(
+            np.array([target.alpha_rad]), np.array([target.beta_rad]), self.pose_std_v
         )
         slope = coefficient_jacobian(sensor, pose, self.names)[0]
         variance = np.diag(

@@ -100,7 +100,7 @@ class KeyAction:
 class ScreenContents:
     """Everything that the screen shows, except the log."""
 
-    phase: str  # Value of the `Phase` of the calibration, which chooses the colour
+    phase: Phase  # It chooses the colour
     text: str  # What the calibration waits for, for people
     unit: str = ''  # Serial number and axes of the sensor; '' before they are known
     output: str = ''  # The parameter file that is to be written
@@ -111,12 +111,23 @@ class ScreenContents:
 
     def to_json(self) -> str:
         """Return the contents as text."""
-        return json.dumps(asdict(self))
+        return json.dumps({**asdict(self), 'phase': self.phase.value})
 
     @staticmethod
     def from_json(text: str) -> ScreenContents:
-        """Return the contents of a text of this version; of others LookupError or TypeError."""
+        """
+        Return the contents of a text of this version.
+
+        That of another version raises LookupError, TypeError or ValueError.
+        """
         values = json.loads(text)
-        for name, kind in (('keys', KeyAction), ('rows', Row), ('coefficients', Row)):
-            values[name] = tuple(kind(**each) for each in values[name])
-        return ScreenContents(**{**values, 'outcome': tuple(values['outcome'])})
+        return ScreenContents(
+            **{
+                **values,
+                'phase': Phase(values['phase']),
+                'keys': tuple(KeyAction(**key) for key in values['keys']),
+                'rows': tuple(Row(**row) for row in values['rows']),
+                'coefficients': tuple(Row(**row) for row in values['coefficients']),
+                'outcome': tuple(values['outcome']),
+            }
+        )

@@ -260,7 +260,8 @@ class Session:
 
     def finish(self) -> calibration.CalibrationResult:
         """Fit the poses so far and write the parameter file; `end` follows all other files."""
-        records, source = self.guide.poses_to_fit(), self.journal.path.name
+        records = self.guide.poses_to_fit()
+        source = self.journal.path.name
         if not records:
             raise UserError('no pose is taken yet')
         if all(record.check for record in records):

@@ -232,7 +232,8 @@ class StageSweep(Guide):
 
 def _fault(sweep: StageSweep, record: PoseRecord, dwell: Dwell, rest: Rest) -> str:
     """Return why a pose is refused, or ''."""
-    settings, fault = sweep.settings, ''
+    settings = sweep.settings
+    fault = ''
     if settings.stage_mode is StageMode.ENCODER:
         now_rad = sweep.encoder.angles_rad or (record.alpha_rad, record.beta_rad)
         fault = pose_plan.angle_fault(
@@ -306,7 +307,8 @@ class StageGuide(StageSweep):
 
     def next_pose(self) -> NextPose | None:
         """Return the pose to announce; None where no pose is open."""
-        target, count = self.course.target, len(self.course.targets)
+        target = self.course.target
+        count = len(self.course.targets)
         if target is None:
             return None
         values: dict[str, str | float] = {
@@ -317,16 +319,19 @@ class StageGuide(StageSweep):
             'beta_rad': target.beta_rad,
             'check': 'true' if target.check else 'false',
         }
-        task, command_rad = f'turn the stage to {self.destination()}, then capture', None
+        task = f'turn the stage to {self.destination()}, then capture'
+        command_rad = None
         if self.moves_itself:
-            task, command_rad = self.destination(), (target.alpha_rad, target.beta_rad)
+            task = self.destination()
+            command_rad = (target.alpha_rad, target.beta_rad)
         return NextPose(
             f'pose {self.pose_number} of {count}: {task}', values, command_rad, self.newest_ns or 0
         )
 
     def status(self) -> Status:
         """Return what the guide waits for, with the values that matter."""
-        target, by_encoder = self.course.target, self.settings.stage_mode is StageMode.ENCODER
+        target = self.course.target
+        by_encoder = self.settings.stage_mode is StageMode.ENCODER
         if target is None:
             return Status(Phase.DONE, 'all poses are taken', False)
         waited_s = ((self.newest_ns or 0) - (self.since_ns or 0)) * 1e-9
@@ -338,7 +343,8 @@ class StageGuide(StageSweep):
         if self.refusal:
             return Status(Phase.REFUSED, self.refusal, True)
         late = waited_s > self.settings.timeout_s
-        since, place = f' for {waited_s:.0f} s' if late else '', self.destination()
+        since = f' for {waited_s:.0f} s' if late else ''
+        place = self.destination()
         if self.dwell is not None:
             if self.dwell.at_rest():
                 return Status(Phase.DWELL, f'at {place}: averaging', late)
@@ -359,11 +365,9 @@ class StageGuide(StageSweep):
 
     def progress(self) -> list[Row]:
         """Return pose, readings and progress of the sweep, for the screen."""
-        target, angles_rad, total = (
-            self.course.target,
-            self.encoder.angles_rad,
-            len(self.course.targets),
-        )
+        target = self.course.target
+        angles_rad = self.encoder.angles_rad
+        total = len(self.course.targets)
         rows = [Row('pose', f'{self.pose_number} of {total}: {self.destination()}')]
         if target is not None and angles_rad is not None:
             rows.append(
@@ -378,7 +382,8 @@ class StageGuide(StageSweep):
                 )
             )
         rests = [] if self.dwell is None else self.dwell.rests()
-        samples, dwell_s = rests[-1].stop - rests[-1].start if rests else 0, self.settings.dwell_s
+        samples = rests[-1].stop - rests[-1].start if rests else 0
+        dwell_s = self.settings.dwell_s
         at_rest_s = min(samples / self.sensor.rate_hz, dwell_s)
         intervals_ns = np.abs(np.diff([record.stop_ns for record in self.accepted.values()]))
         pose_s = (

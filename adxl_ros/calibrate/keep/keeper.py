@@ -10,7 +10,9 @@ the temperature. A robot that also rests on its sides shows more.
 
 A calibration is adopted when stays that were held out of the estimate fit it better than the one
 in use, and if age and temperature explain the change. A rest that neither explains is not learnt.
-Several of them with the same side up are a change of the sensor, which is reported.
+Several of them with the same side up, or one that is as improbable, are a change of the sensor.
+It is reported, and nothing is learnt any more. Of an axis that no rest has up or down, which would
+not show it, the slope over temperature alone is adopted.
 """
 
 from __future__ import annotations
@@ -40,7 +42,9 @@ _MOST_HELD_OUT = 400  # Most stays that are kept for that; chosen: some weeks
 _SURE = 0.99  # Confidence with which held-out stays must improve
 _IMPLAUSIBLE = 3e-4
 """Probability below which a rest is not learnt; chosen: one false rest in months."""
-_REJECTED = 2  # Rests in succession along one axis that are a change; chosen: no single accident
+_REJECTED = 2
+"""Rests in succession along one axis that are a change, or one that is as improbable as so many.
+Chosen: no single accident."""
 _UNEXPLAINED = 1e-3  # Probability below which age and temperature do not explain a change
 KEPT = 'kept'
 """Key of the provenance that says how a calibration was adopted."""
@@ -59,12 +63,13 @@ class _Rejection:
 
     since_ns: int  # Stamp of the first
     departures_g: list[float] = field(default_factory=list)  # Along the axis
+    chance: float = 1.0  # Product of their probabilities
     returned: int = 0  # Rests in succession that read again as before a change
 
     @property
     def is_change(self) -> bool:
         """Return whether no single accident explains them."""
-        return len(self.departures_g) >= _REJECTED
+        return self.chance < _IMPLAUSIBLE**_REJECTED
 
     @property
     def size_g(self) -> float:
@@ -176,6 +181,7 @@ class Keeper:
         self._belief = Belief.prior(prior.known, prior.drifting, directions)
         self._original = self._kept.values
         self._allowed = prior.known + LARGEST_DRIFT**2 * prior.drifting
+        self._calibrated_at_c = self._kept.calibrated_at_c
         self._unlearnt = self._belief.moments[1]
         date = date_of(sensor)
         self._time_ns = 0 if date is None else int(date.timestamp() * 1e9)
@@ -246,13 +252,13 @@ class Keeper:
             # Less axes do not show which side is up: the one that departs most.
             largest = int(np.abs(departure_g).argmax())
             axis, along_g = self._kept.sensor.axes[largest], float(departure_g[largest])
-        if self._is_rejected(axis, along_g, found.plausibility, rest.start_ns):
+        is_rejected = self._is_rejected(axis, along_g, found.plausibility, rest.start_ns)
+        if is_rejected or self._knocked:
+            # After a knock, rests in other directions would show it as a drift.
             self._stay = None
             return
-        self._temperatures_c = [
-            min(self._temperatures_c[0], temperature_c),
-            max(self._temperatures_c[1], temperature_c),
-        ]
+        low, high = self._temperatures_c
+        self._temperatures_c = [min(low, temperature_c), max(high, temperature_c)]
         self._stay.rests.append(seen)
         self._stay.belief = self._stay.belief.learnt(found)
         if not self._stay.is_held_out:
@@ -271,6 +277,7 @@ class Keeper:
             if earlier is None or earlier.departures_g[-1] * along_g < 0:
                 earlier = self._rejections[axis] = _Rejection(stamp_ns)
             earlier.departures_g.append(along_g)
+            earlier.chance *= plausibility
             return True
         self._rejections.pop(axis, None)
         return False
@@ -282,9 +289,9 @@ class Keeper:
         self._belief = self._belief.aged(self._per_day, days)
         if self._stay is not None:
             self._stay.belief = self._stay.belief.aged(self._per_day, days)
-        diagonal = np.arange(len(self._per_day))
-        self._allowed[diagonal, diagonal] += LARGEST_DRIFT**2 * self._per_day * days
-        self._unlearnt[diagonal, diagonal] += self._per_day * days
+        growth = np.diag(self._per_day * days)
+        self._allowed += LARGEST_DRIFT**2 * growth
+        self._unlearnt += growth
         while self._newest and self._newest[0][0] < stamp_ns - DAY_NS:
             self._newest.popleft()
 
@@ -355,15 +362,27 @@ class Keeper:
         Return the change of the coefficients of those axes that it surely improves, (p,).
 
         With δ ~ N(m, P), a change c takes 2·cᵀHᵀHδ − |Hc|² from the squared error of the rests H.
-        That is positive with the confidence `_SURE`, or the axis stays as it is.
+        That is positive with the confidence `_SURE`, or the axis stays as it is. Of an axis that
+        no rest has had up or down, a knock would not be noticed. So its zero-g stays as calibrated
+        at the temperature of the calibration, and changes with temperature alone.
         """
         mean, covariance = self._belief.moments
         designs = np.array([rest.design for stay in self._held for rest in stay.rests])
+        upright = set()
+        if self._kept.sensor.axes == AXES:
+            upright = {int(np.abs(stay.up_g).argmax()) for stay in self._held}
+        zero_g = self._kept.rows('bias', 'offset_v')
+        scale = self._kept.rows('scale_factor', 'offset_v_per_g')
+        at_calibration = self._linear.zero_g(self._calibrated_at_c)
         sure = np.zeros_like(mean)
         for number, axis in enumerate(self._kept.sensor.axes):
             rows = [row for row, name in enumerate(self._kept.names) if _is_kept(name, axis)]
             change = np.zeros_like(mean)
             change[rows] = mean[rows]
+            if number not in upright:
+                change[[zero_g[number], scale[number]]] = 0.0
+                left_g = at_calibration[number] @ change
+                change[zero_g[number]] = -left_g / at_calibration[number, zero_g[number]]
             design = designs[:, number]
             errors_g = design @ change
             slope = 2 * errors_g @ design
@@ -418,13 +437,18 @@ class Keeper:
     @property
     def changed(self) -> str:
         """Return what has changed beyond age and temperature, '' if nothing has."""
-        for axis, rejection in self._rejections.items():
-            if rejection.is_change:
-                return (
-                    f'changed: {1e3 * rejection.size_g:+.2g} mg on {axis} since '
-                    f'{utc(rejection.since_ns):%A %Y-%m-%dT%H:%MZ}: knocked, or broken?'
-                )
+        for axis in self._knocked:
+            rejection = self._rejections[axis]
+            return (
+                f'changed: {1e3 * rejection.size_g:+.2g} mg on {axis} since '
+                f'{utc(rejection.since_ns):%A %Y-%m-%dT%H:%MZ}: knocked, or broken?'
+            )
         return self._unexplained
+
+    @property
+    def _knocked(self) -> list[str]:
+        """Return the axes with a change of the sensor."""
+        return [axis for axis, found in self._rejections.items() if found.is_change]
 
     def state(self, now_ns: int, temperature_c: float | None = None) -> KeptState:
         """Return what is known at a time and a temperature; by default, that of the last rest."""

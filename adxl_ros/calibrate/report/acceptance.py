@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
 from adxl_ros.calibrate.fits.linear import AFFINE
@@ -85,7 +86,9 @@ def assess(
         passes = is_certain and budget.calibration_high <= limit_square
         return PASS if passes else NOT_SHOWN
 
-    (accel, tilt), square = budgets, limit(sensor)[0] ** 2
+    accel = budgets.accel
+    tilt = budgets.tilt
+    square = limit(sensor).mps2 ** 2
     return Assessment(
         model, accel, tilt, outcome(accel, square), outcome(tilt, square * tilt.tilt_per_axis)
     )
@@ -124,8 +127,10 @@ def gravity_error_budgets(
     excess = fit.excess_mps2**2
     by_noise = float(np.mean(fit.expected_mps2[kept] ** 2)) - excess
     covariance = force_covariance(fitted, list(force[kept].T), np.zeros(len(fitted.axes)))
-    gravity, used = fitted.local_gravity_mps2, np.ones(len(kept), bool)
-    measured, nu = float(np.mean(errors**2)), held_out.degrees_of_freedom(errors)
+    gravity = fitted.local_gravity_mps2
+    used = np.ones(len(kept), bool)
+    measured = float(np.mean(errors**2))
+    nu = held_out.degrees_of_freedom(errors)
     quantile = float(scipy.special.chdtri(nu, _UPPER_QUANTILE))
     upper = max(measured * nu / quantile - by_noise, excess)
     accel = error_budget.axis_variance(covariance, [0, 1, 2], used)
@@ -153,18 +158,25 @@ def gravity_error_budgets(
     )
 
 
-def limit(sensor: Sensor) -> tuple[float, str]:
+class Limit(NamedTuple):
+    """Limit of the error of acceleration."""
+
+    mps2: float
+    origin: str  # Where it comes from, for people
+
+
+def limit(sensor: Sensor) -> Limit:
     """
-    Return the limit of the error of acceleration, m/s², and where it comes from.
+    Return the limit of the error of acceleration.
 
     It is the typical nonlinearity at full scale by the datasheet, the only error that the
     manufacturer's own calibration leaves; where none is stated, the noise of one sample.
     """
     typical, _ = sensor.datasheet.get(_NONLINEARITY, (0.0, 0.0))
     if typical:
-        return typical * sensor.range_g**3 * G0_MPS2, 'datasheet'
+        return Limit(typical * sensor.range_g**3 * G0_MPS2, 'datasheet')
     noise_g = sample_std_v(sensor) / sensor.scale_v_per_g
-    return G0_MPS2 * float(np.sqrt(np.mean(noise_g**2))), 'noise of one sample'
+    return Limit(G0_MPS2 * float(np.sqrt(np.mean(noise_g**2))), 'noise of one sample')
 
 
 LIMITS = {
@@ -186,7 +198,7 @@ def summary_lines(
     if assessment is not None:
         if open_coefficients(fitted):
             cause = 'open'
-        elif limit(fitted)[0]:
+        elif limit(fitted).mps2:
             cause = assessment.accel.limited_by
         else:
             cause = 'noise or model'
@@ -233,7 +245,7 @@ _MODELS = {
 
 def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
     """Lay out the error of the calibration above its limit, with one outcome for each figure."""
-    limit_mps2, _ = limit(sensor)
+    limit_mps2 = limit(sensor).mps2
     rows = (
         ('calibration error', assessment.error_mg, assessment.error_deg, '', ''),
         (
@@ -316,7 +328,8 @@ def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
     accel = provenance.get('verdict', '')
     outcomes = accel, provenance.get('verdict_tilt', '')
     outcome = next((word for word in (FAIL, NOT_SHOWN) if word in outcomes), PASS)
-    error, verb = float(provenance['own_accel_mg']), 'allows' if origin == 'datasheet' else 'is'
+    error = float(provenance['own_accel_mg'])
+    verb = 'allows' if origin == 'datasheet' else 'is'
     lines = [f'calibration error {two_digits(error)} mg; the {origin} {verb} {limit_text}']
     if outcome == FAIL:
         if accel != FAIL:

@@ -263,7 +263,9 @@ def covariances(errors: HeldOutErrors, held: Poses, reference: np.ndarray) -> Co
 def _stage_covariance(sensor: Sensor, held: Poses) -> np.ndarray:
     """Return the covariance of the reference by the stated stage error, (m/s²)², (3, 3, k)."""
     variance = (sensor.stage_std_rad * sensor.local_gravity_mps2) ** 2
-    a, b, zero = held.alpha_rad, held.beta_rad, np.zeros(len(held))
+    a = held.alpha_rad
+    b = held.beta_rad
+    zero = np.zeros(len(held))
     by_alpha = np.array([np.cos(a) * np.cos(b), -np.cos(a) * np.sin(b), -np.sin(a)])
     by_beta = np.array([-np.sin(a) * np.sin(b), -np.sin(a) * np.cos(b), zero])
     return variance * (

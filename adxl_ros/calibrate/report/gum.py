@@ -127,7 +127,8 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
     if not result.held_out or not np.isfinite(result.assessments[-1].accel.measured):
         return None
     errors, assessment = result.held_out[-1], result.assessments[-1]
-    gravity, axes = fitted.local_gravity_mps2, [AXES.index(axis) for axis in fitted.axes]
+    gravity = fitted.local_gravity_mps2
+    axes = [AXES.index(axis) for axis in fitted.axes]
     poses = result.poses.subset(result.inliers)
     held = poses.subset(errors.pose_index)
     used = held_out.determining_alpha(errors.pose_errors)
@@ -140,7 +141,8 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
     by_noise = stds_mps2(by_cause.by_noise)
     by_coefficients = stds_mps2(by_cause.by_coefficients)
     by_stage = stds_mps2(by_cause.by_stage)
-    held, reference = held.subset(used), force[used][:, axes]
+    held = held.subset(used)
+    reference = force[used][:, axes]
     error = errors.pose_errors.accel_mps2[used]
     model = np.full(error.shape, np.sqrt(assessment.accel.model))
     inputs = (
@@ -180,7 +182,7 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
         reference_mps2=reference,
         error_mps2=error,
         inputs=inputs,
-        limit_name=acceptance.limit(fitted)[1],
+        limit_name=acceptance.limit(fitted).origin,
         decisions=_decisions(fitted, assessment),
     )
 
@@ -191,7 +193,8 @@ def _stage_angles(by_step_mps2: np.ndarray, scatter: float, fitted: Sensor) -> I
 
     The poses may scatter more than the step permits; scatter: their mean square, (m/s²)².
     """
-    name, step_rad = 'stage angles', fitted.stage_std_rad
+    name = 'stage angles'
+    step_rad = fitted.stage_std_rad
     excess = (scatter / max(np.mean(by_step_mps2**2), 1e-30)) ** 0.5
     if excess <= 1:
         kind = 'B, uniform within a step'
@@ -211,16 +214,18 @@ def _stage_angles(by_step_mps2: np.ndarray, scatter: float, fitted: Sensor) -> I
 
 def _local_gravity(gravity_mps2: float, reference_mps2: np.ndarray) -> Input:
     """Return the contribution of local gravity to accelerations, m/s², (k, m)."""
-    std_mps2, kind = _LOCAL_STD_MPS2, 'B, anomalies of gravity'
+    std_mps2 = _LOCAL_STD_MPS2
+    kind = 'B, anomalies of gravity'
     if gravity_mps2 in _NOT_LOCAL_MPS2:
-        std_mps2, kind = _EARTH_HALF_RANGE_MPS2 / _UNIFORM, 'B, not local: anywhere'
+        std_mps2 = _EARTH_HALF_RANGE_MPS2 / _UNIFORM
+        kind = 'B, not local: anywhere'
     part_mps2 = np.abs(reference_mps2) / gravity_mps2 * std_mps2
     return Input('local gravity', kind, std_mps2, 'm/s²', part_mps2)
 
 
 def _decisions(fitted: Sensor, assessment: Assessment) -> tuple[Decision, ...]:
     """Return the comparisons with limits; none of a quantity without a limit."""
-    limit_mps2, _ = acceptance.limit(fitted)
+    limit_mps2 = acceptance.limit(fitted).mps2
 
     def decision(
         quantity: str, unit: str, scale: float, budget: ErrorBudget, limit: float, outcome: str
@@ -249,7 +254,8 @@ def _decisions(fitted: Sensor, assessment: Assessment) -> tuple[Decision, ...]:
 def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray) -> Input:
     """Return the contribution of temperature or supply, uniform over those of the poses."""
     field, unit, margin, step = _SURROUNDINGS[name]
-    values, environment = getattr(held, field), held.environment
+    values = getattr(held, field)
+    environment = held.environment
     seen = values[np.isfinite(values)]
     half_range = margin + (np.ptp(seen) / 2 if seen.size else 0.0)
     if seen.size:

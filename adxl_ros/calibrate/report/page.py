@@ -71,7 +71,8 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     row_of = {row.model: row for row in result.assessments}
     errors = result.held_out[-1] if result.held_out else None
     assessment = result.assessments[-1] if result.assessments else None
-    rows, (limit_mps2, origin) = _coefficients(fitted), acceptance.limit(fitted)
+    rows = _coefficients(fitted)
+    limit_mps2, origin = acceptance.limit(fitted)
     drawn: dict[str, Figure] = {}
     if (fit := result.gravity_fit) is not None:
         drawn['errors'] = _error_figure(
@@ -322,7 +323,8 @@ _VERTICAL = np.sin(np.radians(89))
 def draw_sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:
     """Draw figures 2 to 8 of the paper for the x and y axes, one row per axis."""
     swept = poses.subset(~poses.check)
-    line, regressions = linear.fit(sensor, swept), linear.regress_axes(sensor, swept)
+    line = linear.fit(sensor, swept)
+    regressions = linear.regress_axes(sensor, swept)
     reference = reference_force(swept, sensor.local_gravity_mps2)
     force_g = np.column_stack(reference) / G0_MPS2
     predicted = np.column_stack(signal_chain.static_response(fitted)(reference, swept.environment))

@@ -40,7 +40,8 @@ class Board:
 
     def __init__(self, sensor: Sensor, roles: list[str], fd: int) -> None:
         self._sensor, self._roles, self._fd = sensor, roles, fd
-        self._line, self._received = EmulatedLine(sensor), wire_format.Splitter()
+        self._line = EmulatedLine(sensor)
+        self._received = wire_format.Splitter()
         flags = wire_format.HAS_SELF_TEST if self._line.has_step else 0
         self._encoder = wire_format.Encoder(
             wire_format.BoardInfo(
@@ -153,7 +154,8 @@ def check_sensor(sensor: Sensor) -> None:
 @contextmanager
 def open_terminal(port: str) -> Iterator[int]:
     """Open the end of a new terminal that a board writes to; the other end gets a name."""
-    path, (board_fd, driver_fd) = Path(port), pty.openpty()
+    path = Path(port)
+    (board_fd, driver_fd) = pty.openpty()
     name = os.ttyname(driver_fd)
     try:
         tty.setraw(driver_fd)

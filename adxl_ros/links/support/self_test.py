@@ -85,7 +85,8 @@ class SelfTest:
         # The stamps of a clock that was set back say nothing about the line.
         is_settled = (since_ns < 0) | (since_ns >= settling_ns)
         if len(stamps_ns):
-            self._was_on, self._changed_ns = bool(is_on[-1]), int(changed_ns[-1])
+            self._was_on = bool(is_on[-1])
+            self._changed_ns = int(changed_ns[-1])
         answer = self._step(_Batch(samples, sensor, is_on, is_settled, settling_ns))
         return samples.where(is_settled & ~is_on), answer
 
@@ -140,7 +141,9 @@ def judge(sensor: Sensor, off_v: np.ndarray, on_v: np.ndarray) -> Answer:
     errors_g = (np.ptp(off_v, axis=0) + np.ptp(on_v, axis=0)) / scale_v_per_g
     is_at_end = np.any(sensor.saturated(np.concatenate([off_v, on_v])), axis=0)
     limits_g = list(zip(sensor.self_test_lower_g, sensor.self_test_upper_g))
-    wrong, unsure, texts = '', '', []
+    wrong = ''
+    unsure = ''
+    texts = []
     for i, axis in enumerate(sensor.axes):
         step_g, error_g = steps_g[i], errors_g[i]
         lower_g, upper_g = limits_g[i] if limits_g else (-np.inf, np.inf)

@@ -184,11 +184,11 @@ def _stuff(raw: bytes) -> bytes:
     """
     stuffed = bytearray()
     for run in raw.split(b'\0'):
-        *full, rest = (run[i : i + _BLOCK] for i in range(0, len(run) + 1, _BLOCK))
-        for block in (*full, rest):
+        blocks = [run[i : i + _BLOCK] for i in range(0, len(run) + 1, _BLOCK)]
+        for block in blocks:
             stuffed.append(len(block) + 1)
             stuffed += block
-    if full and not rest:
+    if len(blocks) > 1 and not blocks[-1]:
         del stuffed[-1]  # nothing follows the last full block
     return bytes(stuffed)
 
@@ -196,7 +196,8 @@ def _stuff(raw: bytes) -> bytes:
 def _unstuff(raw: bytes) -> bytes:
     if 0 in raw:
         raise WireError('zero byte found in input')
-    parts, at = [], 0
+    parts = []
+    at = 0
     while at < len(raw):
         length = raw[at]
         parts.append(raw[at + 1 : at + length])
@@ -279,7 +280,8 @@ class Splitter:
         *ended, rest = chunk.split(b'\0')
         frames = []
         for part in ended:
-            raw, self._incomplete = self._incomplete + part, b''
+            raw = self._incomplete + part
+            self._incomplete = b''
             if self._skipping or len(raw) > MAX_FRAME_BYTES:
                 self.skipped += len(raw)
                 self._skipping = False
@@ -288,12 +290,14 @@ class Splitter:
         self._incomplete += rest
         if self._skipping or len(self._incomplete) > MAX_FRAME_BYTES:
             self.skipped += len(self._incomplete)
-            self._incomplete, self._skipping = b'', True
+            self._incomplete = b''
+            self._skipping = True
         return frames
 
     def restart(self) -> None:
         """Drop the incomplete frame: the next byte does not belong to it."""
-        self._incomplete, self._skipping = b'', False
+        self._incomplete = b''
+        self._skipping = False
 
 
 _TOLERANCE_US = 1000.0  # Absolute tolerance between the device's clock and its count, µs
@@ -346,7 +350,8 @@ class FrameCounter:
     def accept(self, frame: SampleFrame, arrived_ns: int) -> list[AcceptedFrame]:
         """Take the next frame of the stream; return the frames whose samples are published."""
         arrived_us = arrived_ns * 1e-3
-        pending, self._pending = self._pending, None
+        pending = self._pending
+        self._pending = None
         following = self._follow(frame, arrived_us)
         accepted = [] if following is None else [following]
         if pending is not None:
@@ -363,7 +368,9 @@ class FrameCounter:
                 self._first = part.frame
             elif self._previous is not None:
                 self.overruns += (part.frame.overruns - self._previous.overruns) % 2**16
-            self._previous, self._closed_us, self._arrived_us = part.frame, None, arrived_us
+            self._previous = part.frame
+            self._closed_us = None
+            self._arrived_us = arrived_us
         return accepted
 
     def _follow(self, frame: SampleFrame, arrived_us: float) -> AcceptedFrame | None:

@@ -318,11 +318,12 @@ def vibration_rectification(signals: Signals, p: Parameters) -> None:
         if not k:
             continue
         sensed = signals.sensed[d]
-        mean, square = (signals.memory.setdefault((d, i), {}) for i in range(2))
-        vibration = sensed - low_pass(sensed, tau_s, signals.dt_s, mean)
-        signals.output[d] = signals.output[d] + k * low_pass(
-            vibration * vibration, tau_s, signals.dt_s, square
-        )
+        of_mean = signals.memory.setdefault((d, 'mean'), {})
+        of_square = signals.memory.setdefault((d, 'square'), {})
+        mean = low_pass(sensed, tau_s, signals.dt_s, of_mean)
+        vibration = sensed - mean
+        mean_square = low_pass(vibration * vibration, tau_s, signals.dt_s, of_square)
+        signals.output[d] = signals.output[d] + k * mean_square
 
 
 def direction(axis: int, alpha_rad: Value, beta_rad: Value) -> Components:
@@ -365,7 +366,10 @@ def direction(axis: int, alpha_rad: Value, beta_rad: Value) -> Components:
 )
 def misalignment(signals: Signals, p: Parameters) -> None:
     """Directions of the sensing axes in the case: equations 18 and 19, and the same for z."""
-    alpha_rad, beta_rad, memory = p['alpha_rad'], p['beta_rad'], signals.memory
+    alpha_rad = p['alpha_rad']
+    beta_rad = p['beta_rad']
+    memory = signals.memory
+    # Live samples share their values, so that the directions are computed once.
     if memory.get('alpha_rad') is not alpha_rad or memory.get('beta_rad') is not beta_rad:
         memory.update(
             alpha_rad=alpha_rad,
@@ -586,11 +590,9 @@ def saturation(signals: Signals, p: Parameters) -> None:
         if not knee_g:
             signals.output[d] = np.clip(x, -lower, upper)
         else:
-            beyond = [
-                np.logaddexp(0.0, (sign * x - rail) / knee_g)
-                for sign, rail in ((1, upper), (-1, lower))
-            ]
-            signals.output[d] = x - knee_g * (beyond[0] - beyond[1])
+            above = np.logaddexp(0.0, (x - upper) / knee_g)
+            below = np.logaddexp(0.0, (-x - lower) / knee_g)
+            signals.output[d] = x - knee_g * (above - below)
 
 
 _WITHOUT_FILTER_S = 1e-3
@@ -753,7 +755,7 @@ def thermal_lag(signals: Signals, p: Parameters) -> None:
     """
     temperature_c = signals.environment.temperature_c
     if not any(p['per_k']) or not np.ndim(temperature_c):
-        return
+        return  # At a single, steady temperature nothing lags
     lag_k = low_pass(temperature_c, p['tau_s'], signals.dt_s, signals.memory) - temperature_c
     add(signals.output, (per_k * lag_k for per_k in p['per_k']))
 
@@ -799,7 +801,7 @@ def thermal_hysteresis(signals: Signals, p: Parameters) -> None:
     """
     temperature_c = signals.environment.temperature_c
     if not any(p['half_width_g']) or not np.ndim(temperature_c):
-        return
+        return  # A single temperature has no branch
     branch = loop(temperature_c, p['reach_k'], signals.memory)
     add(signals.output, (-half_width * branch for half_width in p['half_width_g']))
 
