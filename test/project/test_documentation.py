@@ -25,7 +25,7 @@ BY_HAND = [
     if 'measurements' not in page.parts
     and 'Made by `make reference`' not in page.read_text('utf-8')
 ]
-MOST_WORDS = 24_370
+MOST_WORDS = 24_310
 """Words of the pages by hand: what they have more, somebody has to read and to keep true."""
 EXECUTABLES = (
     *TOOLS,
