@@ -85,6 +85,7 @@ setup(
             'fleet/*.html',
             'investigate/*.yaml',
             'report/page_templates/*',
+            'signals/*.csv',
             'signals/*.html',
         ],
         f'{PACKAGE}_validation': ['*.yaml', 'blind/*.yaml', 'pages/*'],

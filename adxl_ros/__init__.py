@@ -118,7 +118,8 @@ class _Verb:
 
 
 for _name in ('diagnose', 'simulate'):
-    globals()[_name] = sys.modules[f'{__name__}.{_name}'] = _Verb(_name)  # type: ignore[assignment]
+    globals()[_name] = _Verb(_name)
+    sys.modules[f'{__name__}.{_name}'] = globals()[_name]
 
 
 def __getattr__(name: str) -> Any:

@@ -195,7 +195,8 @@ class Cluster(Pool):
         ):
             logging.getLogger(name).setLevel(logging.CRITICAL)
         warnings.filterwarnings('ignore', 'Sending large graph')
-        self._address, self._slots = address, _FEWEST_TASKS
+        self._address = address
+        self._slots = _FEWEST_TASKS
         try:
             self._client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, ValueError) as error:

@@ -139,9 +139,10 @@ def _write(folder: Path, made: page.Made) -> int:
     figures = results.as_json(made.facts, made.rows, made.physical)
     write_text(folder / 'benchmark.json', json.dumps(figures, indent=1) + '\n')
     write_text(folder / 'benchmark.md', said.markdown())
-    write_text(folder / 'benchmark.html', page.html(made, said))
-    if made.rows:
-        (folder / 'benchmark.png').write_bytes(png(page.picture(made)))
+    picture = page.picture(made) if made.rows else None
+    write_text(folder / 'benchmark.html', said.html(picture))
+    if picture is not None:
+        (folder / 'benchmark.png').write_bytes(png(picture))
     cli.print_end(
         [said.said[0], '', *page.screen(made), ''],
         [folder / f'benchmark.{end}' for end in ('html', 'md', 'json', 'png')],

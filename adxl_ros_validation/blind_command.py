@@ -48,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
     )
     parse.add_argument(
         '--real',
-        metavar='FOLDER_OR_MANIFEST',
+        metavar='FOLDER',
         help='put defects into recordings of real sensors: CSV files, each with '
         'NAME_sim.csv where another simulator knows its force',
     )
@@ -103,14 +103,7 @@ def _check(options: argparse.Namespace, folder: Path) -> int:
     said = (real_sensors.report if is_real else report.of_simulated)(made)
     write_text(folder / 'blind.json', json.dumps(made, indent=1, allow_nan=False) + '\n')
     write_text(folder / 'blind.md', said.markdown())
-    write_text(
-        folder / 'blind.html',
-        page.render(
-            'adxl_ros_validation',
-            'pages/tables.html',
-            {**said._asdict(), 'about': [], 'badge': None, 'figures': {}, 'picture': ''},
-        ),
-    )
+    write_text(folder / 'blind.html', said.html())
     cli.print_end(
         [*said.screen(), ''], [folder / f'blind.{suffix}' for suffix in ('html', 'md', 'json')]
     )

@@ -36,7 +36,6 @@ from adxl_ros.model.sensor import Sensor, with_axes
 from adxl_ros.process import option
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS, QUIET_COLOUR
 from adxl_ros.report.quantities import mg
-from adxl_ros.report.screen import Tile
 from adxl_ros.signals.gravity_at_rest import require_unit
 from adxl_ros.signals.gyroscope_at_rest import rest_turns, RestTurns, with_bias
 from adxl_ros.signals.recorded_gravity import RecordingLook
@@ -116,12 +115,7 @@ class Fit(Result):
     @property
     def first_screen(self) -> FirstScreen:
         """Return the top of the page."""
-        assessments = self.result.assessments
-        tiles = page.tiles(self.result, assessments[-1] if assessments else None)
-        return FirstScreen(
-            **page.badge(self.sensor),
-            tiles=[Tile(**tile) for tile in tiles],
-        )
+        return FirstScreen(**page.badge(self.sensor), tiles=page.tiles(self.result))
 
     def save(self, path: str | os.PathLike, *, overwrite: bool = False) -> None:
         """
@@ -302,17 +296,20 @@ def fit(
         read = unit.add(read)
         progress(_READING * (number + 1) / (number + 2), 'reading')
         recorded.append(rests.of(read, unit, number))
-    if not recorded:
-        raise UserError('no recording is given')
     progress(_READING, 'fit')
-    result = calibration.calibrate(
-        unit.with_gyro(unit.sensor),
-        recorded,
-        model,
-        effects,
-        data_sha256 or unit.sha256,
-        population,
-    )
+    try:
+        result = calibration.calibrate(
+            unit.with_gyro(unit.sensor),
+            recorded,
+            model,
+            effects,
+            data_sha256 or unit.sha256,
+            population,
+        )
+    except UserError as error:
+        # Rests that were not found are no fault of the poses where the samples are wrong.
+        reasons = chain.from_iterable(each.faults for each in recorded)
+        raise UserError('; '.join([*reasons, str(error)])) from None
     return _fit(result, unit)
 
 
@@ -455,7 +452,7 @@ class _Rests:
         if self._table:
             poses = with_table_angles(poses, self._table)
         filters = estimate_filters(read, unit.sensor, poses)
-        return calibration.RecordedPoses(name, poses, filters, look.neighbour_faults())
+        return calibration.RecordedPoses(name, poses, filters, look.faults())
 
 
 def _one_recording_only() -> UserError:

@@ -99,7 +99,7 @@ class Correction:
                 self._counts[name] += int(getattr(estimates, name).sum())
         self._doubts = [
             *require_unit(self._look.gravity(), self._path),
-            *self._look.neighbour_faults(),
+            *self._look.faults(),
         ]
 
     @property

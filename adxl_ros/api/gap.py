@@ -14,7 +14,7 @@ import shlex
 from typing import Any, NamedTuple
 
 from adxl_ros.api.recordings import (
-    as_recordings,
+    each_recording,
     one_recording,
     read_ideal,
     RecordingInput,
@@ -410,7 +410,7 @@ def diagnose(
     unit = quantity_named(quantity) if quantity else None
     if not (sim is None or isinstance(sim, (Motion, str, os.PathLike))):
         sim = one_recording(sim)
-    read = as_recordings(recordings)
+    read = list(each_recording(recordings))
     _require_one_reference(sim, urdf, len(read))
     given = sensor_of(sensor, read[0])
     baseline = given.sensor

@@ -381,7 +381,7 @@ def _samples(recording: Recording) -> dict[str, np.ndarray]:
 
 
 def each_recording(given: RecordingInput | Iterable[RecordingInput]) -> Iterator[Recording]:
-    """Yield recordings, those that are named by their path read as they are; each only once."""
+    """Yield one or more recordings, each only once; those of paths are read as they are."""
     known: dict[bytes, str] = {}  # Number and name of each recording by the hash of its samples
     for number, each in enumerate(as_series(given), 1):
         recording = one_recording(each)
@@ -396,14 +396,8 @@ def each_recording(given: RecordingInput | Iterable[RecordingInput]) -> Iterator
             )
         known[key] = f'{number} ({recording.path})'
         yield recording
-
-
-def as_recordings(given: RecordingInput | Iterable[RecordingInput]) -> list[Recording]:
-    """Return one or more recordings."""
-    several = list(each_recording(given))
-    if not several:
+    if not known:
         raise UserError('no recording is given')
-    return several
 
 
 class RobotInput(NamedTuple):

@@ -106,8 +106,8 @@ class Update(Result):
         """Write the page report.html into a folder, and return its path."""
         require_own(Path(folder) / words.PAGE, overwrite)
         path = make_folder(folder) / words.PAGE
-        top = self.first_screen
-        write_text(path, words.page(self.sensor, self.days, self.state, top._asdict(), top.tiles))
+        top = self.first_screen._asdict()
+        write_text(path, words.page(self.sensor, self.days, self.state, top))
         return path
 
     def to_dict(self) -> dict[str, Any]:
@@ -214,7 +214,7 @@ def update(
             if lost
             else 'no rest of 5 s by the noise of the sensor'
         )
-        raise UserError(f'{name or "no recording"}: {reason}; nothing can be updated')
+        raise UserError(f'{name}: {reason}; nothing can be updated')
     state = keeper.state(keeper.newest_ns)
     outcome = 'ADOPTED' if keeper.adoptions else 'KEPT'
     if state.changed:

@@ -13,16 +13,18 @@ from typing import NamedTuple
 from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, thermal_fit
 from adxl_ros.calibrate.fits.linearisation import volts_covariance
 from adxl_ros.calibrate.pose_model import predicted_volts, reference_force, residual_g
-from adxl_ros.calibrate.poses import at_a_rail, Poses
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment
-from adxl_ros.calibrate.report.error_budget import error_budgets, rms_mg
+from adxl_ros.calibrate.report.error_budget import rms_mg
+from adxl_ros.calibrate.report.error_causes import error_budgets
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.calibrate.result import CalibrationResult, envelope, with_provenance
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.noise import means_at_a_rail
 from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
@@ -86,15 +88,16 @@ def calibrate(
     source = ', '.join(recording.source for recording in recordings)
     poses = Poses.joined([recording.poses for recording in recordings])
     lines: list[str] = []
-    if (at_rail := at_a_rail(sensor, poses)).any():
+    at_rail = means_at_a_rail(sensor, poses.volts)
+    if at_rail.any():
         starts_s = poses.time_s[at_rail, 0]
         text = f'ADC at a rail in {len(starts_s)} poses (the first one from {starts_s[0]:.1f} s)'
         if at_rail.all():
             raise UserError(f'{source}: {text}: no other is left; check supply and wiring')
         lines = [f'{text}, left out: check supply and wiring']
         recordings = [
-            replace(recording, poses=recording.poses.subset(~at_a_rail(sensor, recording.poses)))
-            for recording in recordings
+            replace(each, poses=each.poses.subset(~means_at_a_rail(sensor, each.poses.volts)))
+            for each in recordings
         ]
         poses = poses.subset(~at_rail)
     doubts = require_unit(of_volts(poses.volts, poses.std_v, sensor), source, True)
@@ -221,7 +224,7 @@ def _check_polarity(sensor: Sensor, poses: Poses) -> None:
             [[np.corrcoef(volts, force)[0, 1] for force in reference] for volts in poses.volts.T]
         )
     fault = recorded_sensor.find_polarity_fault(
-        correlation, [AXES.index(a) for a in sensor.axes], recorded_sensor.CERTAIN_CORRELATION
+        correlation, sensor.axis_indices, recorded_sensor.CERTAIN_CORRELATION
     )
     if fault is not None:
         raise UserError(fault.describe(sensor.axes[fault.axis], AXES[fault.follows]))

@@ -15,8 +15,6 @@ from dataclasses import dataclass, fields
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.constants import SAME_ANGLE_RAD
 from adxl_ros.model.effects.base import Environment, NOMINAL_ENVIRONMENT
-from adxl_ros.model.noise import sample_std_v
-from adxl_ros.model.sensor import Sensor
 import numpy as np
 
 _SAME_PLANE_RAD = np.radians(1.0)  # Largest difference of neighbouring angles alpha in one plane
@@ -151,19 +149,3 @@ def planes(alpha_rad: np.ndarray) -> list[np.ndarray]:
     order = np.argsort(alpha_rad, kind='stable')
     cuts = np.flatnonzero(np.diff(alpha_rad[order]) > _SAME_PLANE_RAD) + 1
     return np.split(order, cuts) if len(order) else []
-
-
-_RAIL_STDS = 3.0
-"""Distance of a mean from a rail of the ADC, in standard deviations of a sample, up to which its
-samples were cut off there. Beyond it one sample of 700 is, which moves the mean by less than a
-thousandth of that deviation; half of it would hide a shift of 3 %."""
-
-
-def at_a_rail(sensor: Sensor, poses: Poses) -> np.ndarray:
-    """Return the poses, (k,) bool, whose mean is false as samples are at a rail of the ADC."""
-    if not sensor.adc_bits:
-        return np.zeros(len(poses), bool)
-    reach_v = _RAIL_STDS * sample_std_v(sensor) + sensor.lsb_v
-    highest_v = sensor.adc_vref_v - sensor.lsb_v
-    is_cut_off = (np.abs(poses.volts) < reach_v) | (np.abs(poses.volts - highest_v) < reach_v)
-    return is_cut_off.any(axis=1)

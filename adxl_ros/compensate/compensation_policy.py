@@ -82,7 +82,9 @@ class CompensationPolicy:
 
     def __init__(self, paper: bool, store: str, full_name: Callable[[str], str]) -> None:
         """Prepare; `full_name` gives the full name of a topic, for messages."""
-        self._paper, self._store, self._full_name = paper, store, full_name
+        self._paper = paper
+        self._store = store
+        self._full_name = full_name
         self._given: set[str] = set()  # Warnings that were given
         self.stored_path = ''  # File that was taken from the store, '' if none was
         # What the stream states of itself (`sensor_info`), None before it does
@@ -110,7 +112,8 @@ class CompensationPolicy:
 
     def use(self, sensor: Sensor, source: str) -> str:
         """Apply a sensor from now on."""
-        self.sensor, self.source = sensor, source
+        self.sensor = sensor
+        self.source = source
         model = (
             f'{sensor.serial}, model {sensor.model}'
             if sensor.effects

@@ -68,7 +68,8 @@ class RecordingEstimator:
             )
         if 'temperature_c' not in first.columns:
             sensor = sensor.without_temperature_range()
-        self._sensor, self._undo_filter = sensor, undo_filter
+        self._sensor = sensor
+        self._undo_filter = undo_filter
         self._surroundings = Surroundings()
         self._begin_s = float(first.time_s[0])
         self._gravity_mps2 = signal_chain.gravity_mps2(sensor)
@@ -223,7 +224,8 @@ class LiveEstimator:
         if mounting is not None and not sensor.z_sign:
             # A robot stands upright, so that its mounting says which way up the case is.
             sensor = replace(sensor, z_sign=-1 if mounting.rows[2, 2] < 0 else 1)
-        self.sensor, self.mounting = sensor, mounting
+        self.sensor = sensor
+        self.mounting = mounting
         # Only a stage shows the yaw of the axes in the case. Gravity and a level robot do not.
         self._yaw_rad2 = (
             0.0
@@ -341,7 +343,8 @@ class LiveEstimator:
             force = self._invert(volts, self._environment)
         if not abs(force[0]) + abs(force[1]) + abs(force[2]) < float('inf'):
             return None
-        self._force, self._last_volts = force, input_v
+        self._force = force
+        self._last_volts = input_v
         return force
 
     def _with_yaw(self, force: Components, covariance: Covariance3) -> Covariance3:
@@ -388,7 +391,7 @@ class LiveEstimator:
             measured, tangent = self._measured_covariance(middle, around)
             outside = self._envelope.describe_outside(around.temperature_c, middle)
             covariance = np.diag([0.0, UNMEASURED_VARIANCE, UNMEASURED_VARIANCE])
-            axes = [AXES.index(axis) for axis in self.sensor.axes]
+            axes = self.sensor.axis_indices
             covariance[np.ix_(axes, axes)] = measured[:, :, 0]
             cell = self._cells[key] = _Cell(
                 tangent, Covariance3(*covariance[np.triu_indices(3)].tolist()), outside

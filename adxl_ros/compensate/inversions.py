@@ -21,7 +21,7 @@ from math import factorial
 from typing import Any, TypeVar
 
 from adxl_ros.model import noise
-from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import (
     ARRAYS,
     Components,
@@ -178,7 +178,7 @@ class PaperInverse:
         """Prepare for a sensor."""
         self._maths = maths
         self._up = sensor.up
-        self._measured = [AXES.index(axis) for axis in sensor.axes]
+        self._measured = sensor.axis_indices
         self._gravity_g = gravity_mps2(sensor) / G0_MPS2
         self._chain = static_chain(sensor)
         mounted = self._chain.signals(NOMINAL_ENVIRONMENT, force=list(G0_MPS2 * np.eye(3)))

@@ -63,14 +63,18 @@ class LiveStream:
         publish_free: Callable[[bytes], None] | None = None,
         output_rate_hz: float = 0.0,
     ) -> None:
-        self._paper, self._undo_filter = paper, undo_filter
-        self._keep_orientation, self._publish_free = keep_orientation, publish_free
-        self._output_rate_hz, self._corrected = output_rate_hz, 0
+        self._paper = paper
+        self._undo_filter = undo_filter
+        self._keep_orientation = keep_orientation
+        self._publish_free = publish_free
+        self._output_rate_hz = output_rate_hz
+        self._corrected = 0
         self._mounting = Mounting()
         self._frame_id = ''
         self._sensor: tuple[Sensor, float]
         self._forces: list[Components] | None = None
-        self._publish_imu, self._publish_tilt = publish_imu, publish_tilt
+        self._publish_imu = publish_imu
+        self._publish_tilt = publish_tilt
         self._chain: _Chain
         self._angles_rad = [0.0, 0.0, 0.0]
         self._newest_s = -inf  # Stamp of the newest sample, s
@@ -119,7 +123,8 @@ class LiveStream:
 
     def mount(self, mounting: Mounting, frame_id: str) -> None:
         """Turn the samples that follow into the frame of the robot."""
-        self._mounting, self._frame_id = mounting, frame_id
+        self._mounting = mounting
+        self._frame_id = frame_id
         self.use(*self._sensor)
 
     def collect(self) -> None:

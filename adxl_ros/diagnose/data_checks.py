@@ -22,11 +22,12 @@ from adxl_ros.diagnose import comparison as baseline, noise_effects, reference_c
 from adxl_ros.diagnose.comparison import BaselineComparison, compare, SMALLEST_MOTION_G
 from adxl_ros.files.recording_columns import JOINTS, Recording, stamped_rate_hz
 from adxl_ros.model import noise
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import G0_MPS2, TINY
 from adxl_ros.model.effects.base import Detector
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
+from adxl_ros.report.quantities import listed
 from adxl_ros.signals import gravity_at_rest
 from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.signals.gravity_at_rest import GravityFaultKind, RestReadings
@@ -133,10 +134,14 @@ _LARGEST_LEVEL_G = 1e3  # Largest median output, g. Chosen: above that of any se
 _UNIT_TOLERANCE = 0.1
 """Relative deviation of a gain from the ratio of two units. Chosen: above any scale error."""
 _UNIT_RATIOS = {
-    9.80665: 'm/s² instead of g',
-    1e3: 'mV instead of V',
-    1e-3: 'kV instead of V',
-    1 / 9.80665: 'g instead of m/s²',
+    G0_MPS2: 'm/s² instead of g',
+    1 / G0_MPS2: 'g instead of m/s²',
+    1e3: 'mm/s² instead of m/s², or mV instead of V',
+    1e-3: 'm/s² instead of mm/s², or V instead of mV',
+    1e3 / G0_MPS2: 'mg instead of m/s²',
+    G0_MPS2 / 1e3: 'm/s² instead of mg',
+    1e3 * G0_MPS2: 'mm/s² instead of g',
+    1e-3 / G0_MPS2: 'g instead of mm/s²',
 }
 """Gain of an output in the wrong unit, and which unit it has instead of which."""
 
@@ -177,15 +182,18 @@ class DataFault(Exception):
         return DataFault, (self.name, self.message, self.status, self.comparisons)
 
 
-def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> None:
+def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> list[str]:
     """
     Refuse a recording, or the force of another simulator, whose rests do not read gravity.
 
-    A wrong zero-g or scale factor is an effect that the diagnosis finds, and no fault.
+    A wrong zero-g or scale factor is an effect that the diagnosis finds, and no fault. Return what
+    else is wrong with the samples of the recording.
     """
+    doubts: list[str] = []
     if len(recording) > 1:
         look = RecordingLook(sensor, recording)
         look.feed(recording)
+        doubts = [f'{basename(recording.path)}: {fault}' for fault in look.faults()]
         fault = look.gravity().fault
         if fault is not None and fault.is_clear:
             raise DataFault(fault.data_fault, f'{basename(recording.path)}: {fault.text}')
@@ -212,6 +220,7 @@ def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> N
             raise DataFault(
                 'reference', f'{sim.force.name}: {fault.reason}; check the gravity of its world'
             )
+    return doubts
 
 
 def _align_force(
@@ -695,7 +704,9 @@ def compare_checked(
 def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
     """Leave out what the sensor did not measure: no numbers, repeated, lone or stuck samples."""
     faults, sensor = noise_effects.sample_faults(comparison), comparison.sensor
-    comparison = replace(comparison, disturbed=faults.repeated | faults.isolated)
+    stuck = _stuck(comparison)
+    disturbed = faults.repeated | faults.isolated | stuck.any(axis=1)
+    comparison = replace(comparison, disturbed=disturbed)
     for rows, reason, detector in (
         (~np.isfinite(comparison.volts).all(axis=1), 'they are no numbers', None),
         (faults.repeated, 'they repeat the one before', Detector.REPEATED_SAMPLES),
@@ -707,7 +718,6 @@ def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
     ):
         effect = noise_effects.effect_of(detector) if detector else None
         comparison = baseline.leave_out(comparison, rows, reason, effect)
-    stuck = _stuck(comparison)
     for axis, rows in zip(sensor.axes, stuck.T):
         comparison = baseline.leave_out(
             comparison, rows, f'{axis} does not change there, though the motion does', ''
@@ -1074,6 +1084,7 @@ def _check_axes(comparison: BaselineComparison) -> None:
         (v - v[finite].mean(axis=0)) / sensor.scale_v_per_g
         for v in (comparison.simulated_v(sensor), comparison.volts)
     )
+    _check_units(comparison, measured_g, finite)
     moving = np.flatnonzero(simulated_g.std(axis=0) > SMALLEST_MOTION_G)
     if not len(moving):
         return
@@ -1088,22 +1099,6 @@ def _check_axes(comparison: BaselineComparison) -> None:
             'axis_inverted' if polarity.axis == polarity.follows else 'axis_swapped',
             polarity.describe(axes[polarity.axis], axes[polarity.follows]),
         )
-    gains = [
-        np.polyfit(simulated_g[:, d], measured_g[:, d], 1)[0]
-        for d in np.flatnonzero(np.diag(correlation) > _CORRELATED)
-    ]
-    for ratio, units in _UNIT_RATIOS.items() if gains else ():
-        if abs(np.log(np.median(gains) / ratio)) < _UNIT_TOLERANCE:
-            raise DataFault(
-                'unit',
-                f'the output is {np.median(gains):.4g} times the simulated '
-                f'output, as values in {units} are; correct the unit of the columns'
-                + (
-                    f', by {option("unit")} or {option("sim_unit")}'
-                    if comparison.simulated_force
-                    else ''
-                ),
-            )
     largest = float(np.max(np.abs(correlation)))
     if largest < _UNCORRELATED:
         raise DataFault(
@@ -1111,4 +1106,37 @@ def _check_axes(comparison: BaselineComparison) -> None:
             f'the output does not follow the reference (correlation {largest:.2f}); '
             'check that both belong to one recording, with clocks that differ by less than '
             f'{_LARGEST_DELAY_S:g} s',
+        )
+
+
+def _check_units(
+    comparison: BaselineComparison, measured_g: np.ndarray, finite: np.ndarray
+) -> None:
+    """Compare the size of motion on each axis, g, (n, m), with the ratios of two units."""
+    sensor = comparison.sensor
+    # In another unit the simulated output may be beyond the rails of the ADC.
+    simulated_v = comparison.simulated_v(replace(sensor, adc_bits=0))
+    gains: dict[str, float] = {}
+    for axis, simulated, measured in zip(
+        sensor.axes, (simulated_v / sensor.scale_v_per_g)[finite].T, measured_g[finite].T
+    ):
+        stds_g = float(simulated.std()), float(measured.std())
+        covariance_g2 = float(np.mean((simulated - simulated.mean()) * measured))
+        # Only another simulator can be in such a unit that it seems not to move.
+        moves_g = max(stds_g) if comparison.simulated_force else stds_g[0]
+        if moves_g > SMALLEST_MOTION_G and covariance_g2 > _CORRELATED * stds_g[0] * stds_g[1]:
+            gains[axis] = covariance_g2 / max(stds_g[0] ** 2, TINY)
+    for ratio, units in _UNIT_RATIOS.items():
+        wrong = [axis for axis in gains if abs(np.log(gains[axis] / ratio)) < _UNIT_TOLERANCE]
+        if not wrong:
+            continue
+        are_all = len(wrong) == len(gains)
+        which = 'the output' if are_all else f'the output of {listed(wrong, "and")}'
+        by_option = f', by {option("unit")} or {option("sim_unit")}'
+        raise DataFault(
+            'unit',
+            f'{which} is {np.median([gains[axis] for axis in wrong]):.4g} times the simulated '
+            f'output, as values in {units} are; correct the unit of the columns'
+            + by_option
+            * bool(are_all and comparison.simulated_force),
         )

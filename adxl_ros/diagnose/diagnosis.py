@@ -238,18 +238,20 @@ def check(
     """Put recordings beside their simulation; raise DataFault for the first fault."""
     if not sensor.effects:
         sensor = with_axes(sensor, recordings[0].axes)
+    doubts: list[list[str]] = []
     for recording in recordings:
         check_same_sensor(recording.stream_info, recording.axes, sensor)
         follows_stage = sim is None and {'alpha_rad', 'beta_rad'} <= {*recording.columns}
         # The angles of a stage show the unit of each axis, its sign, and which axis it is.
-        if not follows_stage:
-            data_checks.check_gravity(recording, sensor, sim)
+        doubts.append([] if follows_stage else data_checks.check_gravity(recording, sensor, sim))
     compared: list[BaselineComparison] = []
     try:
-        for recording in recordings:
-            compared.append(data_checks.compare_checked(recording, sensor, sim, align))
+        for recording, of_samples in zip(recordings, doubts):
+            comparison = data_checks.compare_checked(recording, sensor, sim, align)
+            compared.append(replace(comparison, notes=(*of_samples, *comparison.notes)))
+        checked = [data_checks.check_recording(comparison) for comparison in compared]
         data_checks.check_length(compared)
-        return [data_checks.check_recording(comparison) for comparison in compared]
+        return checked
     except DataFault as fault:
         # The notes of all recordings say what was corrected or left out before.
         of_fault = [c for c in fault.comparisons if not any(c is other for other in compared)]

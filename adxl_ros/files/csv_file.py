@@ -22,7 +22,7 @@ from typing import Any, BinaryIO
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import AnyPath, atomic_path, release_written
-from adxl_ros.files.column_mapping import Columns, TableBlock
+from adxl_ros.files.column_mapping import Columns, Quantity, TableBlock, unit_name
 import numpy as np
 
 _CHUNK_BYTES = 1 << 22
@@ -318,13 +318,20 @@ def _header(lines: Sequence[str], delimiter: str, count: int) -> tuple[int, list
                 break
             continue
         number = index + 1
-        # A row of units below the names has each in brackets, or empty.
-        if units or not all(not name or re.fullmatch(r'[(\[].*[)\]]', name) for name in names):
+        if units or not all(map(_is_unit, names)):
             return number, [
                 f'{name} {unit}'.strip() for name, unit in zip(names, units or [''] * count)
             ]
-        units = names
+        # A row of units below the names
+        units = [f'[{name}]' if name.strip('()[]') == name != '' else name for name in names]
     return number, units
+
+
+def _is_unit(name: str) -> bool:
+    """Return whether a field may be a unit: one that is known, in brackets, or empty."""
+    if not name or re.fullmatch(r'[(\[].*[)\]]', name):
+        return True
+    return any(unit_name(name, quantity) for quantity in Quantity)
 
 
 def _names(line: str, delimiter: str, count: int) -> list[str] | None:

@@ -208,34 +208,6 @@ def _json(export: Export) -> str:
     )
 
 
-class KalibrSetting(NamedTuple):
-    """A setting of Kalibr."""
-
-    name: str
-    density: float
-    unit: str
-
-
-def kalibr_settings(
-    accel: tuple[float, float], gyro: tuple[float, float] | None
-) -> list[KalibrSetting]:
-    """
-    Return the settings of Kalibr, which are densities over both signs of the frequency.
-
-    accel, gyro: white noise and random walk; None without a gyroscope.
-    """
-    settings = [
-        KalibrSetting('accelerometer_noise_density', accel[0], 'm/s^2/sqrt(Hz)'),
-        KalibrSetting('accelerometer_random_walk', accel[1], 'm/s^3/sqrt(Hz)'),
-    ]
-    if gyro is not None:
-        settings += [
-            KalibrSetting('gyroscope_noise_density', gyro[0], 'rad/s/sqrt(Hz)'),
-            KalibrSetting('gyroscope_random_walk', gyro[1], 'rad/s^2/sqrt(Hz)'),
-        ]
-    return settings
-
-
 _HIDDEN_S = 3600.0  # Rest that does not show an unstated walk, s. Chosen: an hour
 
 
@@ -305,7 +277,7 @@ def text(name: str, export: Export) -> str:
         for axis, v in zip(AXES, values['sample_variance'])
     ]
     coupling = np.eye(3)
-    coupling[[AXES.index(axis) for axis in sensor.axes]] = gain(sensor)
+    coupling[sensor.axis_indices] = gain(sensor)
     walk = max(values['walk_density'])
     remark = 'Values are those of the noisiest axis.'
     if not walk:
@@ -321,7 +293,6 @@ def text(name: str, export: Export) -> str:
         white=partial(_white_density, export),
         walk=walk,
         walk_remark=f'# {remark}',
-        kalibr_settings=kalibr_settings,
         gyro=gyro,
         gyro_covariance=np.diag(gyro.variances).ravel().tolist() if gyro else [],
         sensor=sensor,

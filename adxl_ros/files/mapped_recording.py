@@ -360,11 +360,14 @@ class _Converter:
         if not is_sensor_step(1 / rate_hz, is_whole):
             unit = time_unit_of_step(step, is_whole)
             fitting = ColumnMapping({**self.sources, 'time': Source(source.column, unit)})
+            right = f'if that is right, give {option(rate=f"{rate_hz:.6g}")}'
+            if is_whole and step == 1:
+                right = f'if it counts samples, give {option(rate="HZ")}'
+            is_other = unit != source.unit
             raise UserError(
-                f'{self._path}: {source.column} has steps of {step:.4g}, which as '
-                f'{source.unit} are {rate_hz:.3g} Hz; if that is right, give '
-                f'{option(rate=f"{rate_hz:.3g}")}, and if they are {unit}:',
-                pasted(columns=str(fitting)),
+                f'{self._path}: {source.column} has steps of {step:.4g}, which as {source.unit} '
+                f'are {rate_hz:.6g} Hz; {right}' + f', and if they are {unit}:' * is_other,
+                pasted(columns=str(fitting)) if is_other else '',
             )
 
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tables of any format: delimited text, .npz, MATLAB's .mat, Parquet, and logs of PX4 (.ulg)."""
+"""Tables of any format: delimited text, arrays of NumPy and MATLAB, Parquet, logs of PX4."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from functools import partial
 from io import StringIO
 from itertools import chain
@@ -23,6 +23,21 @@ from adxl_ros.process import option
 import numpy as np
 
 BLOCK_ROWS = 65536  # Rows that are read at a time (chosen: some MB)
+
+_SIGNATURES = {
+    b'MATLAB': 'is a MATLAB file; name it .mat',
+    b'\x93NUMPY': 'is an array of NumPy; name it .npy',
+    b'PAR1': 'is a Parquet file; name it .parquet',
+    b'ULog': 'is a log of PX4; name it .ulg',
+    b'\x89MCAP': 'is a bag; name it .mcap',
+    b'SQLite': 'is a database; a bag is named .db3',
+    b'PK\x03\x04': 'is an archive; name arrays of NumPy .npz, and save a sheet as CSV',
+    b'\x89HDF': 'is HDF5; save its columns as CSV or .npz',
+    b'\x1f\x8b': 'is compressed; unpack it',
+    b'\x80': 'is a pickle of Python; save its columns as CSV or .npz',
+}
+"""First bytes of files that are no text, and what to do with them."""
+_SIGNATURE_BYTES = max(map(len, _SIGNATURES))
 
 _MAPPINGS = {
     'sensor_accel': 'time={time}:us,x=x:mps2,y=y:mps2,z=z:mps2,temperature=temperature:c',
@@ -44,6 +59,11 @@ def open_table(path: AnyPath, topic: str = '') -> Table:
         raise UserError(f'{option(topic=topic)}: {path} is no bag; leave {option("topic")} out')
     if ending in _FORMATS:
         return _FORMATS[ending](path)
+    with suppress(OSError), open(path, 'rb') as file:
+        head = file.read(_SIGNATURE_BYTES)
+        for signature, what in _SIGNATURES.items():
+            if head.startswith(signature):
+                raise UserError(f'{path}: {what}')
     form = find_form(path)
     return Table(
         path,
@@ -105,11 +125,11 @@ def _library(path: str, kind: str, package: str) -> Iterator[None]:
         ) from None
 
 
-def _open_npz(path: str) -> Table:
-    with (
-        _library(path, '.npz of plain arrays', 'numpy'),
-        np.load(path, allow_pickle=False) as arrays,
-    ):
+def _open_numpy(path: str) -> Table:
+    with _library(path, 'plain arrays of NumPy', 'numpy'):
+        loaded = np.load(path, allow_pickle=False)
+        names = getattr(loaded, 'files', None) or loaded.dtype.names
+        arrays = {name: loaded[name] for name in names} if names else {'column': loaded}
         return _of_arrays(path, arrays, 'save each column as an array')
 
 
@@ -240,7 +260,8 @@ def _open_ulog(path: str, topic: str) -> Table:
 
 
 _FORMATS: Mapping[str, Callable[[str], Table]] = {
-    '.npz': _open_npz,
+    '.npz': _open_numpy,
+    '.npy': _open_numpy,
     '.mat': _open_mat,
     '.parquet': _open_parquet,
     '.pq': _open_parquet,

@@ -95,7 +95,8 @@ class IioLink(base.Link):
     references = tuple(base.COLUMNS.values())
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        self._declared, self._settings = sensor, settings
+        self._declared = sensor
+        self._settings = settings
         self._entries = base.parse_channels(settings.channels)
         self._stream: _Stream | None = None
         self._stamper = Stamper(ClockMap(settings.delay, _DECISION_S), self.references)
@@ -229,11 +230,13 @@ class _Column:
                 f'{channel.id}: a format of {form.length} bits, {form.repeat} times, '
                 'cannot be read'
             )
-        self.role, self.channel = role, channel
+        self.role = role
+        self.channel = channel
         self._dtype = f'{"i" if form.is_signed else "u"}{form.length // 8}'
         # The kernel omits an offset of 0, but never a scale. IIO scales to mV and m°C.
         self._offset = _number(channel, 'offset') if 'offset' in channel.attrs else 0.0
-        self._scale, self._zero = 1e-3 * _number(channel, 'scale'), 0.0
+        self._scale = 1e-3 * _number(channel, 'scale')
+        self._zero = 0.0
         if kind == 'IIO_ACCEL' and role in sensor.axes:
             # A digital sensor in m/s²: pseudo-volts by the nominal scale factor and zero-g.
             axis = sensor.axes.index(role)
@@ -274,7 +277,8 @@ class _Stream:
         sensor: Sensor,
     ) -> None:
         self.name = _name(device)
-        self._context, self._device = context, device
+        self._context = context
+        self._device = device
         self._timestamp = device.find_channel('timestamp')
         if self._timestamp is None or not self._timestamp.scan_element:
             raise UserError(

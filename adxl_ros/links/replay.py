@@ -53,7 +53,8 @@ class Replay(base.Link):
     _volts: np.ndarray
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        self._path, self._loop = settings.recording, settings.loop
+        self._path = settings.recording
+        self._loop = settings.loop
         self._blocks = self._all_blocks()
         first = next(self._blocks)
         self.sensor = _recorded_sensor(sensor, first)
@@ -111,7 +112,8 @@ class Replay(base.Link):
 
     def _load(self, block: Recording | None) -> None:
         """Make a block the present one; None after the last one."""
-        self._block, self._row = block, 0
+        self._block = block
+        self._row = 0
         if block is not None:
             self._stamps, self._volts = block.stamp_ns, block.volts(self.sensor)
 

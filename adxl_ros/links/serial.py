@@ -150,7 +150,8 @@ class SerialLink(base.Link):
     """
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        self._declared, self._settings = sensor, settings
+        self._declared = sensor
+        self._settings = settings
         self._stated_roles = base.parse_channels(settings.channels)
         if self._stated_roles:
             base.check_roles(self._stated_roles, sensor.axes)
@@ -226,7 +227,8 @@ class SerialLink(base.Link):
             )
         now_s = time.monotonic()
         if hold_s != self._held_s or now_s >= self._self_test_due_s:
-            self._held_s, self._self_test_due_s = hold_s, now_s + _SELF_TEST_S
+            self._held_s = hold_s
+            self._self_test_due_s = now_s + _SELF_TEST_S
             self._command(round(hold_s * 1e6), wire_format.SELF_TEST_TYPE)
 
     def close(self) -> None:
@@ -406,7 +408,8 @@ class _Port:
         self.last_byte_s = self.opened_s = 0.0
         # Bytes that the open port carries per second; infinite where the baud rate has no meaning
         self.uart_bytes_per_s = inf
-        self._name, self._baud = name, baud
+        self._name = name
+        self._baud = baud
         self._pyserial = import_pyserial()
         self._port: Any = None
         self._poll: Any = None

@@ -125,8 +125,11 @@ class SimulatedSensor(base.Link):
         gap_s = (now_ns - self._until_ns) * 1e-9
         skipped = round(gap_s * self.sensor.rate_hz) if self._until_ns and gap_s > 0 else 0
         self._origin_ns = -(-now_ns // _BEAT_NS) * _BEAT_NS
-        self._made, self._until_ns, self._next_ns = 0, now_ns, self._origin_ns
-        self._stamps, self._volts = self._stamps[:0], self._volts[:0]
+        self._made = 0
+        self._until_ns = now_ns
+        self._next_ns = self._origin_ns
+        self._stamps = self._stamps[:0]
+        self._volts = self._volts[:0]
         self._knots = [_resting(self._knots[-1].position)]
         self._respond = self._settled_response()
         return skipped
@@ -140,7 +143,8 @@ class SimulatedSensor(base.Link):
         stamps, volts = self._stamps[:due], self._volts[:due]
         is_in_test = self._line.add(stamps * 1e-9, volts)
         samples = base.Samples(stamps, volts, until_ns, in_self_test=is_in_test)
-        self._stamps, self._volts = self._stamps[due:], self._volts[due:]
+        self._stamps = self._stamps[due:]
+        self._volts = self._volts[due:]
         self._until_ns = until_ns
         return samples
 

@@ -97,7 +97,8 @@ class _Chain:
         self._count += len(force)
         volts = self._respond(index / self._rate_hz)
         surplus = len(self._force) - self._kept
-        self._force, self._first = self._force[surplus:], self._first + surplus
+        self._force = self._force[surplus:]
+        self._first = self._first + surplus
         return volts
 
     def _force_at(self, time_s: np.ndarray) -> list[np.ndarray]:
@@ -130,7 +131,8 @@ class EmulatedSensor(base.Link):
     """
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
-        self.imu_topic, self.temperature_topic = settings.topic, settings.temperature_topic
+        self.imu_topic = settings.topic
+        self.temperature_topic = settings.temperature_topic
         self.imu_unit = unit_name(settings.unit, Quantity.OUTPUT) or ''
         if self.imu_unit not in GRAVITY:
             raise UserError(
@@ -165,7 +167,8 @@ class EmulatedSensor(base.Link):
 
     def sense_publishers(self, count: int, mixture: str = '') -> None:
         """Take who publishes the ideal samples."""
-        self._publishers, self._mixture = count, mixture
+        self._publishers = count
+        self._mixture = mixture
 
     def sense_imu(self, stamp_ns: np.ndarray, fields: Mapping[str, np.ndarray]) -> None:
         """Take ideal samples in the frame of the case; values that are no numbers are absent."""

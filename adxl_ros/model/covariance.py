@@ -71,7 +71,7 @@ def of_three_axes(
         return derived_z_covariance(force, in_plane, tangent.slope, ARRAYS).matrix
     covariance = np.zeros((3, 3, len(force[0])))
     covariance[1, 1] = covariance[2, 2] = UNMEASURED_VARIANCE
-    axes = [AXES.index(axis) for axis in sensor.axes]
+    axes = sensor.axis_indices
     covariance[np.ix_(axes, axes)] = measured
     return covariance
 

@@ -145,3 +145,19 @@ def effective_samples(count: int | np.ndarray, dt_s: float, rc_s: float) -> np.n
     a = np.exp(-dt_s / rc_s)
     correlated = 2 * a / (1 - a) * (1 - (1 - a**n) / (n * (1 - a)))
     return n / (1 + correlated)
+
+
+_RAIL_STDS = 3.0
+"""Distance of a mean from a rail of the ADC, in standard deviations of a sample, up to which its
+samples were cut off there. Beyond it one sample of 700 is, which moves the mean by less than a
+thousandth of that deviation; half of it would hide a shift of 3 %."""
+
+
+def means_at_a_rail(sensor: Sensor, mean_v: np.ndarray) -> np.ndarray:
+    """Return which means of samples, V, (k, m), are false as samples are at a rail, (k,) bool."""
+    if not sensor.adc_bits:
+        return np.zeros(len(mean_v), bool)
+    reach_v = _RAIL_STDS * sample_std_v(sensor) + sensor.lsb_v
+    highest_v = sensor.adc_vref_v - sensor.lsb_v
+    is_cut_off = (np.abs(mean_v) < reach_v) | (np.abs(mean_v - highest_v) < reach_v)
+    return is_cut_off.any(axis=1)

@@ -10,7 +10,7 @@ from itertools import chain, compress
 from typing import Any
 
 from adxl_ros.errors import UserError
-from adxl_ros.model.constants import G0_MPS2, MEASURED_AXES
+from adxl_ros.model.constants import AXES, G0_MPS2, MEASURED_AXES
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Effect, Parameter, Parameters
 from adxl_ros.model.gyroscope import Gyroscope
@@ -290,6 +290,11 @@ class Sensor:
     unstated: tuple[str, ...] = ()
     # Names of the nominal values that were measured from samples in their place
     measured: tuple[str, ...] = ()
+
+    @property
+    def axis_indices(self) -> list[int]:
+        """Places of the measured axes among x, y and z."""
+        return [AXES.index(axis) for axis in self.axes]
 
     @property
     def zero_g_v(self) -> np.ndarray:

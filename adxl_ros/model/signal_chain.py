@@ -60,7 +60,9 @@ class RunningEffect:
             self.parameters.get(p.name) in (None, p.neutral, (p.neutral,) * len(sensor.axes))
             for p in sizes
         )
-        self.name, self.place, self.apply = name, effect.place, effect.apply
+        self.name = name
+        self.place = effect.place
+        self.apply = effect.apply
         self.key = (name, *sorted(self.parameters.items()))
         self.memory: dict[str, Any] = {}
         # An invertible effect is a function of one sample, and draws nothing.
@@ -124,13 +126,17 @@ class Chain:
         elif place is Place.ELECTRONICS:
             sensor = self.sensor
             signals.output = list(signals.output)
-            signals.zero_g_v, signals.scale_v_per_g = self._zero_g_v[:], self._scale_v_per_g[:]
-            signals.rc_s, signals.noise_ratio = [sensor.rc_s] * count, [1.0] * count
-            signals.lsb_v, signals.lsb_ratio = sensor.lsb_v, [1.0] * count
+            signals.zero_g_v = self._zero_g_v[:]
+            signals.scale_v_per_g = self._scale_v_per_g[:]
+            signals.rc_s = [sensor.rc_s] * count
+            signals.noise_ratio = [1.0] * count
+            signals.lsb_v = sensor.lsb_v
+            signals.lsb_ratio = [1.0] * count
         elif place is Place.ADC:
             signals.volts = list(signals.input_v)
         for effect in self.effects[place]:
-            signals.memory, signals.rng = effect.memory, effect.rng
+            signals.memory = effect.memory
+            signals.rng = effect.rng
             effect.apply(signals, effect.parameters)
 
     def volts(self, signals: Signals, first: Place = Place.MOUNTING) -> Components:

@@ -235,7 +235,8 @@ class Announcer:
         if pose.text != self._announced:
             self._node.get_logger().info(pose.text)
             self._publish(pose.text, pose.values)
-            self._announced, self._commanded_ns = pose.text, 0
+            self._announced = pose.text
+            self._commanded_ns = 0
         now_ns = STEADY.now().nanoseconds
         if (
             self._command
@@ -295,7 +296,8 @@ class DisplayPublisher:
     """
 
     def __init__(self, node: Node, controller: Controller, starts_screen: bool) -> None:
-        self._node, self._controller = node, controller
+        self._node = node
+        self._controller = controller
         self._own_screen = (
             open_screen(node.get_fully_qualified_name(), node.get_logger().info)
             if starts_screen
@@ -479,7 +481,8 @@ class Calibration(Node):
         self._captures: list[object] = []  # Requests that wait for the end of a capture
         announcer = Announcer(self, own.mode == 'stage')
         # What the controller asks of a node
-        self.announce, self.withdraw_pose = announcer.announce, announcer.withdraw
+        self.announce = announcer.announce
+        self.withdraw_pose = announcer.withdraw
         self._samples = Samples(self, own.samples_unit)
         self._controller = controller.Controller(
             settings=settings,

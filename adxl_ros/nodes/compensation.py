@@ -114,7 +114,8 @@ class MountingParameters:
     """The parameters `mounting.*` and the service `~/level` of a node."""
 
     def __init__(self, node: Node, stream: LiveStream, mounting: Mounting, frame_id: str) -> None:
-        self._node, self._stream = node, stream
+        self._node = node
+        self._stream = stream
         self._frame_id = frame_id
         self._path = ''
         # What was given counts before the file of a calibration.

@@ -39,7 +39,8 @@ class SimulatorInput:
     """Gives the messages of a simulator to a link."""
 
     def __init__(self, node: Node, link: ImuLink) -> None:
-        self._node, self._link = node, link
+        self._node = node
+        self._link = link
         self.frame_id = ''  # Frame of the newest samples
         self._due_s = self._looked_s = time.monotonic()
         self._inbox = topics.Inbox(node, Imu, link.imu_topic, _SIMULATOR_QUEUE, link.imu_unit)
@@ -111,7 +112,10 @@ class LinkReader:
         on_error: Callable[[UserError], None],
         on_level: Callable[[Level], None],
     ) -> None:
-        self._node, self._link, self._output, self._settings = node, link, output, settings
+        self._node = node
+        self._link = link
+        self._output = output
+        self._settings = settings
         self._on_level = on_level
         self._ros: Any = node.get_clock()
         self._is_real_time = False
@@ -131,7 +135,8 @@ class LinkReader:
             self._references = References(node, output.frame_id, link.references)
             on_close.callback(self._references.destroy)
             status = link.status()
-            self._level, self._text = status.level, status.text
+            self._level = status.level
+            self._text = status.text
             self._logged_s = -_LOG_INTERVAL_S
             self._counts: dict[str, int] = {}
             if link.sensor is not None:
@@ -176,7 +181,8 @@ class LinkReader:
                 topics.log(self._node, Level.WARN, event.message)
                 self._counts[event.message], self._logged_s = event.count, now_s
         if status.text != self._text:
-            self._text, self._logged_s = status.text, now_s
+            self._text = status.text
+            self._logged_s = now_s
             topics.log(self._node, status.level, status.text)
 
     def _live_turn(self) -> None:

@@ -108,7 +108,8 @@ class References:
     """Publishes what was recorded beside the sensor: stage angles, temperature, supply."""
 
     def __init__(self, node: Node, frame_id: str, columns: tuple[str, ...]) -> None:
-        self._node, self._frame_id = node, frame_id
+        self._node = node
+        self._frame_id = frame_id
         of_topics = {
             topic: [name for name in names if name in columns] for topic, names in _COLUMNS.items()
         }
@@ -205,8 +206,13 @@ class SampleOutput:
         clock: StampClock,
         tally: Tally,
     ) -> None:
-        self._node, self._delay_ns, self._stamp_clock = node, delay_ns, clock
-        self.sensor, self.frame_id, self.is_clock, self.tally = sensor, frame_id, is_clock, tally
+        self._node = node
+        self._delay_ns = delay_ns
+        self._stamp_clock = clock
+        self.sensor = sensor
+        self.frame_id = frame_id
+        self.is_clock = is_clock
+        self.tally = tally
         self._follows_frame = not frame_id
         self._writer = imu_writer(sensor, frame_id)
         self._data = topics.create_publisher(node, Imu, 'imu/data_raw', _QUEUE)

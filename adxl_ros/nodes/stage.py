@@ -253,7 +253,8 @@ class StageBridge:
     """
 
     def __init__(self, node: Node, kind: str) -> None:
-        self._node, self._kind = node, kind
+        self._node = node
+        self._kind = kind
         own = declare_all(node, BridgeSettings)
         self._names = [own.alpha_joint, own.beta_joint]
         self._signs = np.array([own.alpha_sign, own.beta_sign])
@@ -267,7 +268,8 @@ class StageBridge:
                 raise parameter_error(f'bridge.{joint}.sign', '0 is not 1 or -1')
         self._states_topic = node.resolve_topic_name(own.joint_states)
         self._speed_rad_s = own.speed_rad_s
-        self._angles_rad, self._goal_rad = np.full(2, np.nan), np.full(2, np.nan)
+        self._angles_rad = np.full(2, np.nan)
+        self._goal_rad = np.full(2, np.nan)
         self._heard_ns = self._resend_ns = 0
         self._begun_ns = STEADY.now().nanoseconds
         self._refusal = self._fault = ''

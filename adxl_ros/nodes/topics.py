@@ -158,7 +158,9 @@ class RepeatingThread:
         name: str,
         on_error: Callable[[UserError], None] | None = None,
     ) -> None:
-        self._turn, self._context, self._on_error = turn, node.context, on_error
+        self._turn = turn
+        self._context = node.context
+        self._on_error = on_error
         self._open = True
         self._failure: Exception | None = None
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -268,11 +270,15 @@ class Inbox:
         unit: that of the accelerations of a sensor_msgs/Imu, which are taken in m/s².
         """
         self._unit = unit
-        self._node, self._kind, self._depth = node, kind, depth
+        self._node = node
+        self._kind = kind
+        self._depth = depth
         self._looked_s = time.monotonic()  # When messages were taken last
         self._silent_s = 0.0  # Time without a message until then
         self._topic = node.resolve_topic_name(topic)
-        self._number, self._back_s, self._mixed_until_s = 0, -_MIXED_S, 0.0
+        self._number = 0
+        self._back_s = -_MIXED_S
+        self._mixed_until_s = 0.0
         self._subscription = create_subscription(
             node, kind, topic, lambda _: None, depth, raw=True, group=NotForExecutors(), **options
         )
@@ -392,7 +398,9 @@ class DiagnosticsReporter:
     """Reports the state of a node once a second, and at once when its level changes."""
 
     def __init__(self, node: Node, task: str, status: Callable[[], Status]) -> None:
-        self._node, self._task, self._status = node, task, status
+        self._node = node
+        self._task = task
+        self._status = status
         self._level: Level | None = None
         self._publisher = create_publisher(node, DiagnosticArray, '/diagnostics', _REPORTS)
         self._timer = node.create_timer(_PERIOD_S, self._report, clock=STEADY)

@@ -47,7 +47,14 @@ def render(package: str, template: str, values: Mapping[str, Any]) -> str:
     plotly_js = gzip.compress(get_plotlyjs().encode(), _GZIP_LEVEL, mtime=0)
     made = f'made {datetime.now().astimezone():%Y-%m-%d %H:%M} by adxl_ros {package_version()}'
     return layouts.get_template(template).render(
-        {'made': made, 'command': command_of_this_process() if names_options() else '', **values},
+        {
+            'made': made,
+            'command': command_of_this_process() if names_options() else '',
+            'about': [],
+            'badge': None,
+            'figures': {},
+            **values,
+        },
         plotly_js=b64encode(plotly_js).decode(),
     )
 

@@ -171,7 +171,8 @@ def _window_octaves(rate_hz: float) -> int:
 
 def shortest_rest_s(rate_hz: float) -> float:
     """Return the shortest rest that shows noise, from its first to its last sample, s."""
-    return max(SHORTEST_S, _FEWEST_SAMPLES / rate_hz) - 1 / rate_hz
+    # Stamps may be rounded by up to half a period.
+    return max(SHORTEST_S, _FEWEST_SAMPLES / rate_hz) - 1.5 / rate_hz
 
 
 @dataclass(frozen=True)
@@ -200,17 +201,13 @@ def longest_rest(
         beyond.add(block.volts(nominal), nominal)
         last_s = float(block.time_s[-1])
     look.rests.take()
-    rests = [found.rest for found in look.rests.detected]
-    rest = max(rests, key=lambda rest: rest.span_s, default=Rest(0, 0, 0.0, 0.0))
+    rest, motion_s = longest_of([found.rest for found in look.rests.detected], first_s, last_s)
     shortest_s = shortest_rest_s(first.rate_hz)
     if rest.span_s < shortest_s:
         raise UserError(
             f'{first.path}: rests for {rest.span_s:.4g} s at most, expected '
             f'{shortest_s:.3g} s at least; record longer, and do not touch the sensor'
         )
-    motion_s = _between(rests, first_s, last_s)
-    if not motion_s:
-        rest = replace(rest, time_start_s=first_s, time_stop_s=last_s)
     span_s = last_s - first_s
     with tempfile.TemporaryFile() as file, tempfile.TemporaryFile() as gyro_file:
         samples = _Samples(first, first.sensor_columns, file)
@@ -237,15 +234,25 @@ def longest_rest(
         return StillSensors(accelerometer, gyroscope, doubt)
 
 
-def _between(rests: Sequence[Rest], first_s: float, last_s: float) -> list[tuple[float, float]]:
-    """Return begin and end of the times between rests that are long enough to be motion, s."""
+def longest_of(
+    rests: Sequence[Rest], first_s: float, last_s: float
+) -> tuple[Rest, list[tuple[float, float]]]:
+    """
+    Return the longest rest, and the times between rests that are long enough to be motion, s.
+
+    Without motion it is as long as the recording, from its first to its last stamp, s.
+    """
+    rest = max(rests, key=lambda rest: rest.span_s, default=Rest(0, 0, 0.0, 0.0))
     starts_s = [first_s, *(rest.time_stop_s for rest in rests)]
     stops_s = [*(rest.time_start_s for rest in rests), last_s]
-    return [
+    motion_s = [
         (start_s, stop_s)
         for start_s, stop_s in zip(starts_s, stops_s)
         if stop_s - start_s > _LARGEST_END_S
     ]
+    if not motion_s and rests:
+        rest = replace(rest, time_start_s=first_s, time_stop_s=last_s)
+    return rest, motion_s
 
 
 class _Samples:

@@ -184,6 +184,9 @@ _QUIET_RATIO = 3.0  # Largest variance of a quiet window, relative to that of th
 _QUIET_STEPS = 50  # Largest number of steps of that search
 _QUIET_DEVIATIONS = 5.0  # Distance of the limit from the noise, stds of ln(variance)
 _ROUNDING = 1e-9  # Relative rounding error of samples without noise
+_CONSTANT_SHARE = 0.25
+"""Share of the windows in which the others rest, above which an axis is constant by its steps.
+Chosen: far below all of them. Where the others never rest, axes are stuck or clipped in turn."""
 _TINY_VARIANCE = 1e-300  # Lower bound of a variance, for its logarithm
 
 
@@ -212,11 +215,34 @@ def quiet_variance(
     Noise below the ADC's step, (m,), makes at most two codes equally frequent: a variance of
     step²/4. Samples without any noise still have a rounding error.
     """
-    middle = np.median(np.abs(blocks.mean), axis=0)
-    smallest = step**2 / 4 + (_ROUNDING * middle) ** 2 + _TINY_VARIANCE
+    smallest = step**2 / 4 + _rounding(blocks)
     of_axes = [_quietest(variances, least) for variances, least in zip(windows.T, smallest)]
     variance, ratio = np.array(of_axes).T
     return variance, ratio * variance
+
+
+def _rounding(blocks: Blocks) -> np.ndarray:
+    """Return the variance of samples that do not change, (m,)."""
+    return (_ROUNDING * np.median(np.abs(blocks.mean), axis=0)) ** 2 + _TINY_VARIANCE
+
+
+def without_stuck(blocks: Blocks, windows: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """
+    Return the variances of windows, which are infinite where an axis is stuck or at its limit.
+
+    There it does not change, although it mostly does while the other axes rest.
+    """
+    if windows.shape[1] == 1 or not len(windows):
+        return windows
+    constant = windows <= _rounding(blocks)
+    if not constant.any():
+        return windows
+    is_quiet, out = windows <= quiet_variance(blocks, windows, step)[1], windows.copy()
+    for axis in np.flatnonzero(constant.any(axis=0)):
+        others_rest = np.delete(is_quiet, axis, axis=1).all(axis=1)
+        if constant[others_rest, axis].sum() <= _CONSTANT_SHARE * others_rest.sum():
+            out[constant[:, axis], axis] = np.inf
+    return out
 
 
 def _quietest(variances: np.ndarray, smallest: float) -> tuple[float, float]:

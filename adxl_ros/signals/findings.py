@@ -32,8 +32,8 @@ from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.process import option, usage
 from adxl_ros.report.quantities import counted, duration
-from adxl_ros.signals.allan_deviation import shortest_rest_s
-from adxl_ros.signals.block_statistics import true_runs
+from adxl_ros.signals.allan_deviation import longest_of, shortest_rest_s
+from adxl_ros.signals.axis_ranges import axis_faults, AxisLook, AxisRange
 from adxl_ros.signals.gravity_at_rest import GravityAtRest
 from adxl_ros.signals.gyroscope_turns import GyroFindings, GyroLook
 from adxl_ros.signals.recorded_gravity import RecordingLook
@@ -43,30 +43,6 @@ import numpy as np
 
 _SAME_POSE_G = 0.1  # Distance of the means of two rests of one orientation, g. Chosen: 6° of tilt
 _MOST_POSES = 200  # Orientations that are counted at most. Chosen: more than a sweep has
-_CLIPPED_SAMPLES = 3  # Equal samples at an extreme that are clipped. Chosen: noise repeats fewer
-_CLIPPED_STEP_G = 0.05  # Change before or after them, g. Chosen: a sensor at rest has none
-_CLIPPED_WINDOW_S = 0.1  # Longest time beside them in which it moves, s. Chosen: a hand is faster
-_CLIPPED_CODES = 20
-"""Change, in steps of the resolution, that a smooth peak does not reach within the time that it
-stays at its top. Chosen: a parabola reaches nine."""
-_STUCK_S = 5.0
-"""Shortest time without change that is reported, s. Chosen: a coarse axis may rest for some
-seconds between two codes."""
-_STUCK_SAMPLES = 20  # Fewest samples of such a time. Chosen: a slow sensor repeats a few
-_CHANGING = 0.5  # Share of the other samples that change. Chosen: fewer of a coarse axis at rest
-
-
-@dataclass(frozen=True)
-class AxisRange:
-    """The samples of one axis."""
-
-    name: str  # Its column
-    lowest_mps2: float  # Its lowest value, m/s²
-    highest_mps2: float  # Its highest value, m/s²
-    clipped: int  # Times at which it stays at an extreme value in motion
-    is_stuck: bool  # Whether it never changes
-    # Longest time in which it does not change although it usually does, s; 0 for none
-    stuck_s: float
 
 
 @dataclass(frozen=True)
@@ -113,15 +89,12 @@ def examine(
     sensor = sensor_of(first)
     stamps = _Stamps(first)
     look = RecordingLook(sensor, first)
-    axes = [_Axis(name, stamps.period_s) for name in first.sensor_columns]
     gyro = _Gyro(first, stamps.period_s) if first.gyro_radps is not None else None
     references = _References()
     for block in chain([first], blocks):
         if not len(block):
             continue
         stamps.feed(block.time_s)
-        for axis, values in zip(axes, block.accel_mps2(look.nominal).T):
-            axis.feed(values)
         look.feed(block)
         if gyro is not None:
             gyro.feed(block)
@@ -129,6 +102,7 @@ def examine(
     gravity = look.gravity()
     rests = look.rests.detected
     spans_s = [found.rest.span_s for found in rests]
+    longest, _ = longest_of([found.rest for found in rests], stamps.first_s, stamps.last_s)
     means_mps2 = [to_nominal_mps2(found.mean_v, look.nominal) for found in rests]
     span_s = stamps.last_s - stamps.first_s
     return RecordingContents(
@@ -142,13 +116,13 @@ def examine(
         gaps=stamps.gaps,
         longest_gap_s=stamps.longest_gap_s,
         bad_stamps=block.bad_stamps,
-        axes=tuple(axis.result() for axis in axes),
+        axes=look.axes(),
         rest_share=min(sum(spans_s) / span_s, 1.0),
-        longest_rest_s=max(spans_s, default=0.0),
+        longest_rest_s=longest.span_s,
         rests=len(spans_s),
         poses=_count_poses(means_mps2),
         gravity=gravity,
-        neighbour_faults=tuple(look.neighbour_faults()),
+        neighbour_faults=tuple(look.faults()),
         reference_ranges=references.ranges,
         reference_means=references.means,
         log_delay_s=log_delay_s,
@@ -237,85 +211,18 @@ class _Stamps:
         return float(np.sqrt(self._squares / max(self._usual, 1)))
 
 
-class _Axis:
-    """Extreme values of an axis, and the longest time in which it does not change."""
-
-    def __init__(self, name: str, period_s: float) -> None:
-        self.name = name
-        self._period_s = period_s
-        # Largest value of minus the samples and of the samples, and how often they stay there
-        self._largest = [-np.inf, -np.inf]
-        self._clipped = [0, 0]
-        self._last = np.nan
-        self._count = 0
-        self._changes = 0
-        self._equal = self._most_equal = 0  # Samples since the last change, and most between two
-
-    def feed(self, values: np.ndarray) -> None:
-        """Add further samples, m/s², (n,)."""
-        changes = np.flatnonzero(np.diff(values, prepend=self._last))
-        equal = np.diff(changes, prepend=-1 - self._equal, append=len(values)) - 1
-        self._equal = int(equal[-1])
-        self._most_equal = max(self._most_equal, int(equal.max()))
-        self._count += len(values)
-        self._changes += len(changes)
-        self._last = values[-1]
-        steps = np.abs(np.diff(values))
-        smallest = float(steps[steps > 0].min(initial=np.inf))
-        drop = max(_CLIPPED_STEP_G * G0_MPS2, _CLIPPED_CODES * smallest)
-        for side, signed in enumerate((-values, values)):
-            largest = float(signed.max())
-            if largest > self._largest[side]:
-                self._largest[side] = largest
-                self._clipped[side] = 0
-            if largest == self._largest[side]:
-                self._clipped[side] += sum(
-                    self._moves(signed, largest - drop, first, stop)
-                    for first, stop in true_runs(signed == largest)
-                    if stop - first >= _CLIPPED_SAMPLES
-                )
-
-    def _moves(self, values: np.ndarray, low: float, first: int, stop: int) -> bool:
-        """Return whether the axis is below a value soon before or after some samples."""
-        window = max(min(stop - first, round(_CLIPPED_WINDOW_S / self._period_s)), 1)
-        beside = np.append(values[max(first - window, 0) : first], values[stop : stop + window])
-        return bool((beside < low).any())
-
-    def result(self) -> AxisRange:
-        """Return the range of the axis."""
-        low = -self._largest[0]
-        high = self._largest[1]
-        stuck_s = self._most_equal * self._period_s
-        is_reported = (
-            stuck_s >= _STUCK_S
-            and self._most_equal >= _STUCK_SAMPLES
-            and self._changes > _CHANGING * (self._count - self._most_equal)
-        )
-        return AxisRange(
-            name=self.name,
-            lowest_mps2=low,
-            highest_mps2=high,
-            clipped=sum(self._clipped),
-            is_stuck=low == high,
-            stuck_s=stuck_s if is_reported or low == high else 0.0,
-        )
-
-
 class _Gyro:
     """What a recording shows of its gyroscope."""
 
     def __init__(self, first: Recording, period_s: float) -> None:
         self._look = GyroLook(first)
-        self._axes = [_Axis(name, period_s) for name in GYRO]
+        self._axes = [AxisLook(name, period_s) for name in GYRO]
 
     def feed(self, block: Recording) -> None:
         """Add a block of the recording."""
         self._look.feed(block)
         for axis in self._axes:
-            values = block.columns[axis.name]
-            taken = values[np.isfinite(values)]
-            if len(taken):
-                axis.feed(taken)
+            axis.feed(block.columns[axis.name])
 
     def result(self, rests: list[Rest], means_mps2: list[np.ndarray]) -> GyroFindings | None:
         """Return the findings; None where it was never sampled."""
@@ -323,7 +230,7 @@ class _Gyro:
         if not np.isfinite([axis.lowest_mps2 for axis in ranges]).all():
             return None
         found = self._look.result(rests, means_mps2)
-        stuck = _stuck_faults(ranges)
+        stuck = axis_faults(ranges)
         # What is stuck follows no turn.
         return replace(found, faults=tuple(stuck or found.faults))
 
@@ -341,7 +248,6 @@ def _count_poses(means_mps2: Sequence[np.ndarray]) -> int:
 _LARGEST_MISSING = 0.01  # Share of missing samples of a sound log. Chosen: a lossy link loses less
 _LONGEST_GAP_S = 1.0  # Longest gap of a sound log, s. Chosen: a longer one may hide a turn
 _LARGEST_JITTER = 0.3  # Jitter of a sound log, periods. Chosen: samples still show
-_FEWEST_CLIPPED = 3  # Clippings from which a log is not sound. Chosen: one may be a knock
 _LARGEST_DELAY_S = 0.1  # Mentioned delay of the log time, s. Chosen: recorders are faster
 _MOVED_RAD = 0.01  # Range from which a stage moves, rad. Chosen: beyond jitter of encoders
 _FOLLOWED = {'temperature_c': ('temperature', 1.0), 'supply_v': ('supply', 0.1)}
@@ -390,7 +296,11 @@ class Findings:
 
 def assess(contents: RecordingContents) -> Findings:
     """Return the findings of a recording that can be read."""
-    faults = [*_stamp_faults(contents), *_sample_faults(contents)]
+    faults = [*_stamp_faults(contents), *contents.neighbour_faults]
+    if contents.gravity.fault:
+        faults.append(contents.gravity.fault.text)
+    if contents.gyro:
+        faults += contents.gyro.faults
     return Findings(
         contents.path,
         contents,
@@ -432,33 +342,6 @@ def _stamp_faults(contents: RecordingContents) -> list[str]:
     if contents.cut:
         faults.append(contents.cut)
     return faults
-
-
-def _sample_faults(contents: RecordingContents) -> list[str]:
-    faults = _stuck_faults(contents.axes)
-    faults += [
-        f'{axis.name} stays at its extreme value {axis.clipped} times in motion; its range '
-        f'ends at {axis.lowest_mps2 / G0_MPS2:.3g} or {axis.highest_mps2 / G0_MPS2:.3g} g'
-        for axis in contents.axes
-        if axis.clipped >= _FEWEST_CLIPPED
-    ]
-    faults += contents.neighbour_faults
-    if contents.gravity.fault:
-        faults.append(contents.gravity.fault.text)
-    if contents.gyro:
-        faults += contents.gyro.faults
-    return faults
-
-
-def _stuck_faults(axes: Iterable[AxisRange]) -> list[str]:
-    return [
-        f'{axis.name} never changes; the axis is stuck, or not connected'
-        if axis.is_stuck
-        else f'{axis.name} does not change for {axis.stuck_s:.3g} s; the axis is stuck, or '
-        'the driver repeats a sample'
-        for axis in axes
-        if axis.stuck_s
-    ]
 
 
 def _remarks(contents: RecordingContents) -> list[str]:

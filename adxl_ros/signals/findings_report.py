@@ -22,7 +22,7 @@ PAGE = 'check.html'  # Name of the page in the folder of the report
 _LABEL_COLUMNS = 12  # Columns of the label of a line below a recording
 _NAME_COLUMNS = 20  # Columns of the name of a recording
 HEAD = ('recording', 'length', 'rate', 'missing', 'rest', 'axes', 'verdict')
-_COLUMNS = (_NAME_COLUMNS, '>13', '>10', '>9', '>8', '>6', 11)
+_COLUMNS = (_NAME_COLUMNS, '>12', '>12', '>8', '>8', '>6', 11)
 _SHOWS_HEAD = ('effect', 'from', 'typical', '')
 _SHOWS_COLUMNS = (24, 16, 14)
 
@@ -164,9 +164,7 @@ def page(results: Sequence[Findings], badge: Mapping[str, Any]) -> str:
         PAGE,
         {
             'title': 'Check of recordings',
-            'about': [],
             'badge': badge,
-            'figures': {},
             'columns': HEAD,
             'rows': list(map(table_row, results)),
             'recordings': recordings,

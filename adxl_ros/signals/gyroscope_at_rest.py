@@ -84,15 +84,14 @@ def with_bias(gyro: Gyroscope, rests: Sequence[RestTurns]) -> Gyroscope:
     if has_slope:
         design = np.column_stack([design, departure_k])
     fit = _weighted_fit(design, means, weight)
-    low_c = float(temperature_c.min())
-    high_c = float(temperature_c.max())
+    range_c = (float(temperature_c.min()), middle_c, float(temperature_c.max()))
     return replace(
         gyro,
         bias_radps=tuple(fit.value[0].tolist()),
         bias_std_radps=tuple(np.hypot(fit.std[0], _rounding(parts)).tolist()),
         bias_per_k_radps=tuple(fit.value[1].tolist()) if has_slope else (),
         bias_per_k_std_radps=tuple(fit.std[1].tolist()) if has_slope else (),
-        temperature_c=(low_c, middle_c, high_c) if is_known else (),
+        temperature_c=range_c if is_known else (),
     )
 
 

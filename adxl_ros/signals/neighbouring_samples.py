@@ -93,6 +93,7 @@ class NeighbouringSamples:
         self._jumps: list[_Jump] = []
         self._spike_s: list[float] = []  # Times of single samples away from steady ones, s
         self._spike_mps2: list[float] = []  # Their largest deviation of an axis, m/s²
+        self._beside_mps2: list[float] = []  # The largest step beside each, m/s²
         # Number of samples by how much they deviate from the mean of their neighbours
         self._deviations = np.zeros(_SIZE_BINS, int)
 
@@ -127,8 +128,8 @@ class NeighbouringSamples:
             ]
         # A value that wraps for one sample stands alone as well.
         found = (
-            self._repeats(),
-            self._alternates(),
+            # Of readings that stand for two samples, every other row is nearer to the one before.
+            self._repeats() or self._alternates(),
             self._wraps() or self._spikes(),
             self._jumped(),
         )
@@ -160,7 +161,7 @@ class NeighbouringSamples:
     def are_means(self) -> bool:
         """Whether each row is the mean of a rest."""
         fewest = max(_FEWEST_MEANS, _SHARE_OF_MEANS * self._rows)
-        return len(self._axes) == 3 and self._like_means >= fewest
+        return len(self._axes) == 3 and self._like_means >= fewest and not self._alternates()
 
     def _repeats(self) -> str:
         """Return how often each reading stands, where that is no chance."""
@@ -190,16 +191,20 @@ class NeighbouringSamples:
         count = len(samples) // _WINDOW
         windows = samples[: count * _WINDOW].reshape(count, _WINDOW, samples.shape[1])
         self._windows += count
+        # Beside the mean of its neighbours a row shows its sensor, and no slow motion.
+        beside = windows - (np.roll(windows, 1, axis=1) + np.roll(windows, -1, axis=1)) / 2
         for phases in _PHASES if count else ():
-            parts = windows.reshape(count, _WINDOW // phases, phases, samples.shape[1])
+            shape = (count, _WINDOW // phases, phases, samples.shape[1])
+            parts = beside.reshape(shape)[:, 1:-1]  # The first row of a window has none before it
             means = parts.mean(axis=1)  # (count, phases, m)
             within = np.sqrt(((parts - means[:, None]) ** 2).mean(axis=(1, 2)))
             distance = np.ptp(means, axis=1)
             smallest = np.maximum(_TWO_VALUES, _MEAN_STDS * np.sqrt(2 * phases / _WINDOW)) * within
             apart = ((distance > smallest) & (distance > 0)).any(axis=1)
             self._alternating[phases] += int(apart.sum())
+            between = np.ptp(windows.reshape(shape).mean(axis=1), axis=1)
             self._distance_mps2[phases] = max(
-                self._distance_mps2[phases], float(distance[apart].max(initial=0.0))
+                self._distance_mps2[phases], float(between[apart].max(initial=0.0))
             )
 
     def _alternates(self) -> str:
@@ -287,9 +292,11 @@ class NeighbouringSamples:
         )
         for i in (_SIDE + np.flatnonzero(stands_out[known])).tolist():
             size_mps2 = float(deviation[i - 1])
-            if steps[i - _SIDE : i + _SIDE - 1].max() < _STEADY * size_mps2:
+            beside_mps2 = float(steps[i - _SIDE : i + _SIDE - 1].max())
+            if beside_mps2 < _STEADY * size_mps2:
                 self._spike_s.append(float(time_s[i]))
                 self._spike_mps2.append(size_mps2)
+                self._beside_mps2.append(beside_mps2)
 
     def _spikes(self) -> str:
         """Return how many single samples are wrong; shocks deviate for more than one sample."""
@@ -300,10 +307,12 @@ class NeighbouringSamples:
         first_bin = _BINS_PER_OCTAVE * np.log2(_ALIKE_SIZE * size_mps2 / _SMALLEST_BIN_MPS2)
         if self._deviations[int(max(first_bin, 0.0)) :].sum() > 2 * count:
             return ''
+        shown_g = float(np.median(self._beside_mps2)) / _STEADY / G0_MPS2
         return (
             f'{count} single samples stand {size_mps2 / G0_MPS2:.3g} g away from those around '
             f'them, the first at {self._spike_s[0]:.6g} s: error values of the bus, a loose '
-            'contact, or shocks shorter than a sample'
+            f'contact, or shocks shorter than a sample; below about {shown_g:.2g} g not all of '
+            'them stand out'
         )
 
 
@@ -361,9 +370,12 @@ class _Ends:
             fills = max(abs(low_g + range_g / 2), abs(high_g - range_g / 2)) < _FILLED * range_g
             is_range = high_g - low_g < (1 + _ROUNDING) * range_g
             if is_range and full >= _FEWEST_WRAPS and (full > half or fills):
+                advice = 'record with a larger range'
+                if low_g > -_FILLED * range_g:
+                    advice = 'read them as signed numbers'
                 return (
                     f'jumps by nearly {range_g:.3g} g between neighbouring samples {full} '
                     f'times: its counts wrap at the end of the range, {low_g:.3g} to '
-                    f'{high_g:.3g} g; record with a larger range'
+                    f'{high_g:.3g} g; {advice}'
                 )
         return ''

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.exports import kalibr_settings
 from adxl_ros.files.recording_columns import nominal_of, Recording
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.gyroscope import Gyroscope
@@ -502,7 +501,7 @@ def recording_noise(
     )
     if still.gyro_doubt:
         doubts.append(still.gyro_doubt)
-    doubts += look.neighbour_faults()
+    doubts += look.faults()
     return RecordingNoise(
         path=first.path,
         sensor=sensor,
@@ -712,86 +711,3 @@ def _with_filter(
         rc_capacitance_f=rc_of_white_share(share, sensor.rate_hz) / RESISTANCE_OHM,
         filter_rate_hz=sensor.rate_hz,
     ), True
-
-
-_PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000
-
-
-Setting = tuple[str, list[float] | str, str]
-"""A line of another program's settings: name, one value or nine of a matrix, or text; its unit."""
-
-
-class _OneForAll(NamedTuple):
-    """The noise of the loudest axis of a sensor, for programs with one value for all axes."""
-
-    white: float  # N of a sample with its rounding, u/√Hz
-    walk: float  # K, u/√s
-    white_note: str  # Whether N is an upper limit, for people
-    note: str  # Whether K is one
-    matrix: list[float]  # Variances of a sample, rows of a matrix, u²
-
-
-def _one_for_all(noises: Sequence[AxisNoise]) -> _OneForAll:
-    loudest = max(noises, key=lambda noise: noise.sample_white)
-    walk = max((noise.fit.walk for noise in noises), key=lambda walk: walk.value)
-    k = walk.value if walk.is_seen else max(noise.fit.walk.high for noise in noises)
-    limit = ', an upper limit'
-    white_note = '' if loudest.fit.white.is_seen else limit
-    note = '' if walk.is_seen else limit
-    variances = [noise.sample_std**2 for noise in noises]
-    matrix = np.diag((variances + [1e6] * 3)[:3]).ravel().tolist()
-    return _OneForAll(loudest.sample_white, k, white_note, note, matrix)
-
-
-def settings(
-    noises: Sequence[AxisNoise], rate_hz: float, gyro_noises: Sequence[AxisNoise] = ()
-) -> dict[str, list[Setting]]:
-    """
-    Return the settings of other programs.
-
-    kalibr takes N and K as they are. VINS-Fusion and PX4 add the variance of a value times the
-    square of the time step, so they take N·√rate and K·√rate, at the rate of their filter.
-    robot_localization takes the variance of a sample from the message. Programs that have one
-    value for all axes get the largest one. A term that is not seen is its upper limit.
-    """
-    accel = _one_for_all(noises)
-    gyro = _one_for_all(gyro_noises) if gyro_noises else None
-    # Each sensor with its name in settings and the units of its readings and their change.
-    sensors = [('acc', 'm/s^2', 'm/s^3', accel)]
-    sensors += [('gyr', 'rad/s', 'rad/s^2', gyro)] if gyro else []
-
-    def both(names: tuple[str, str], filter_hz: float) -> list[Setting]:
-        """Return N and K of each sensor for a filter at a rate."""
-        root = float(np.sqrt(filter_hz))
-        rows: list[Setting] = []
-        for sensor, unit, walk_unit, of in sensors:
-            white_name, walk_name = [
-                name.format(small=sensor, large=sensor.upper()) for name in names
-            ]
-            rows += [
-                (white_name, [of.white * root], f'{unit}{of.white_note}'),
-                (walk_name, [of.walk * root], f'{walk_unit}{of.note}'),
-            ]
-        return rows
-
-    notes = [accel.white_note, accel.note]
-    if gyro:
-        notes += [gyro.white_note, gyro.note]
-    densities = kalibr_settings(
-        (accel.white, accel.walk), (gyro.white, gyro.walk) if gyro else None
-    )
-    return {
-        'kalibr, imu.yaml': [
-            *([('rostopic', '/imu/data_raw', 'write your topic')] if gyro else []),
-            *((name, [value], unit + note) for (name, value, unit), note in zip(densities, notes)),
-            ('update_rate', [rate_hz], 'Hz'),
-        ],
-        f'VINS-Fusion, at {rate_hz:.4g} Hz': both(('{small}_n', '{small}_w'), rate_hz),
-        'robot_localization, in sensor_msgs/Imu of the driver': [
-            ('linear_acceleration_covariance', accel.matrix, '(m/s^2)^2'),
-            *([('angular_velocity_covariance', gyro.matrix, '(rad/s)^2')] if gyro else []),
-        ],
-        'PX4, its filter at 100 Hz; EKF2_ACC_NOISE at least 0.01; vibration needs more': both(
-            ('EKF2_{large}_NOISE', 'EKF2_{large}_B_NOISE'), _PX4_HZ
-        ),
-    }

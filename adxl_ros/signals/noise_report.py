@@ -5,8 +5,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+import csv
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from adxl_ros.files.parameter_file import float_text
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
@@ -15,7 +18,7 @@ from adxl_ros.report.figures import AXIS_COLOURS, new_figure
 from adxl_ros.report.quantities import duration
 from adxl_ros.report.screen import row
 from adxl_ros.signals.allan_deviation import StillStretch
-from adxl_ros.signals.noise_parameters import AxisNoise, RecordingNoise, settings
+from adxl_ros.signals.noise_parameters import AxisNoise, RecordingNoise
 import numpy as np
 import yaml
 
@@ -56,6 +59,8 @@ def sensors_at_rest(result: RecordingNoise) -> list[SensorNoise]:
 
 
 _YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
+_PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000
+_NOT_MEASURED = 1e6  # Variance of a sample of an axis that is not there, u²
 
 
 def head(result: RecordingNoise) -> list[str]:
@@ -133,26 +138,67 @@ def intervals(noise: AxisNoise, unit: _Unit) -> list[str]:
     ]
 
 
+class _Figure(NamedTuple):
+    """A figure of a sensor for programs that have one value for all axes."""
+
+    values: list[float]  # One, or the rows of a matrix
+    note: str = ''  # That it is an upper limit, for people
+
+
+def _figures(noises: Sequence[AxisNoise], rate_hz: float) -> dict[str, _Figure]:
+    """Return N, u/√Hz, and K, u/√s, of the loudest axis, and the variances of a sample, u²."""
+    loudest = max(noises, key=lambda noise: noise.sample_white)
+    walk = max((noise.fit.walk for noise in noises), key=lambda walk: walk.value)
+    k = walk.value if walk.is_seen else max(noise.fit.walk.high for noise in noises)
+    variances = [noise.sample_std**2 for noise in noises]
+    limit = ', an upper limit'
+    return {
+        'white': _Figure([loudest.sample_white], '' if loudest.fit.white.is_seen else limit),
+        'walk': _Figure([k], '' if walk.is_seen else limit),
+        'matrix': _Figure(np.diag((variances + [_NOT_MEASURED] * 3)[:3]).ravel().tolist()),
+        'rate': _Figure([rate_hz]),
+    }
+
+
 def paste_lines(result: RecordingNoise) -> list[str]:
-    """Return the settings of other programs in YAML, ready to paste."""
-    lines = []
-    for program, entries in settings(result.axes, result.rest.rate_hz, result.gyro).items():
-        lines.append(f'# {program}')
-        for name, values, unit in entries:
-            if isinstance(values, str):
-                lines += [f'# {unit}', f'{name}: {values}']
-                continue
-            rounded = [float(f'{value:.{6 if value >= 1 else 3}g}') for value in values]
-            is_one = len(rounded) == 1
-            lines += [
-                f'# {unit}',
-                *yaml.safe_dump(
-                    {name: rounded[0] if is_one else rounded},
-                    width=_YAML_COLUMNS,
-                    default_flow_style=False if is_one else None,
-                ).splitlines(),
-            ]
+    """
+    Return the settings of other programs in YAML, ready to paste.
+
+    program_settings.csv has them. kalibr takes N and K as they are. VINS-Fusion and PX4 add the
+    variance of a value times the square of the time step, so they take N·√rate and K·√rate, at
+    the rate of their filter. robot_localization takes the variance of a sample from the message.
+    Programs that have one value for all axes get the largest one. A term that is not seen is its
+    upper limit.
+    """
+    rate_hz = result.rest.rate_hz
+    sensors = {'acc': _figures(result.axes, rate_hz)}
+    if result.gyro:
+        sensors['gyr'] = _figures(result.gyro, rate_hz)
+    factors = {'': 1.0, 'samples': rate_hz**0.5, 'PX4': _PX4_HZ**0.5}
+    text = Path(__file__).with_name('program_settings.csv').read_text(encoding='utf-8')
+    lines, program = [], ''
+    for stated in csv.DictReader(text.splitlines()):
+        if stated['sensor'] not in sensors:
+            continue
+        if stated['program'] != program:
+            program = stated['program']
+            lines.append(f'# {program.format(rate_hz=rate_hz)}')
+        if not stated['figure']:
+            lines += [f'# {stated["unit"]}', stated['setting']]
+            continue
+        figure = sensors[stated['sensor']][stated['figure']]
+        values = [factors[stated['filter']] * value for value in figure.values]
+        lines += [f'# {stated["unit"]}{figure.note}', *_yaml_lines(stated['setting'], values)]
     return lines
+
+
+def _yaml_lines(name: str, values: Sequence[float]) -> list[str]:
+    """Return a number, or a list of several, as lines of YAML."""
+    rounded = [float(f'{value:.{6 if value >= 1 else 3}g}') for value in values]
+    if len(rounded) == 1:
+        return [f'{name}: {float_text(rounded[0])}']
+    entry = yaml.safe_dump({name: rounded}, width=_YAML_COLUMNS, default_flow_style=None)
+    return entry.splitlines()
 
 
 def warnings(result: RecordingNoise) -> list[str]:

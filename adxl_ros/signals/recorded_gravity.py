@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 
-"""The look at gravity while a recording is read, and while a live stream goes on."""
+"""The look at gravity and samples while a recording is read, and while a live stream goes on."""
 
 from __future__ import annotations
 
 from adxl_ros.files.recording_columns import Recording, uncalibrated
 from adxl_ros.model.constants import TINY
 from adxl_ros.model.sensor import Sensor, to_volts
+from adxl_ros.signals.axis_ranges import axis_faults, AxisLook, AxisRange
 from adxl_ros.signals.gravity_at_rest import GravityAtRest, GravityFaultKind, of_volts, TURNED_COS
 from adxl_ros.signals.neighbouring_samples import NeighbouringSamples
 from adxl_ros.signals.rest_detection import datasheet_noise, RecordedRests, RestFinder, RestMean
@@ -14,7 +15,7 @@ import numpy as np
 
 
 class RecordingLook:
-    """Looks at gravity and at neighbouring samples while a recording is read."""
+    """Looks at gravity, at each axis and at neighbouring samples while a recording is read."""
 
     def __init__(self, sensor: Sensor, first: Recording) -> None:
         """Prepare for a recording of a sensor, calibrated or not, by its first block."""
@@ -23,11 +24,15 @@ class RecordingLook:
         self.nominal = uncalibrated(sensor, first.stream_info, first.axes, first.rate_hz)
         self.rests = RecordedRests(self.nominal, first)
         self._neighbours = NeighbouringSamples(self.nominal.axes, first.rate_hz)
+        self._axes = [AxisLook(name, 1 / first.rate_hz) for name in first.sensor_columns]
 
     def feed(self, block: Recording) -> None:
         """Add a block of the recording."""
         self.rests.feed(block)
-        self._neighbours.feed(block.time_s, block.accel_mps2(self.nominal))
+        accel_mps2 = block.accel_mps2(self.nominal)
+        self._neighbours.feed(block.time_s, accel_mps2)
+        for axis, values in zip(self._axes, accel_mps2.T):
+            axis.feed(values)
 
     def gravity(self) -> GravityAtRest:
         """
@@ -50,9 +55,13 @@ class RecordingLook:
         is_calibrated = self._sensor.effects and self._sensor.axes == self.nominal.axes
         return _of_rests(rests, self._sensor if is_calibrated else self.nominal)
 
-    def neighbour_faults(self) -> list[str]:
-        """Return what is wrong between neighbouring samples, one line each."""
-        return self._neighbours.faults()
+    def axes(self) -> tuple[AxisRange, ...]:
+        """Return the range of each axis."""
+        return tuple(axis.result() for axis in self._axes)
+
+    def faults(self) -> list[str]:
+        """Return what is wrong on an axis and between neighbouring samples, one line each."""
+        return [*axis_faults(self.axes()), *self._neighbours.faults()]
 
 
 LIVE_WINDOW_S = 4.0  # Newest samples in which a live stream may rest, s. Chosen: two short rests

@@ -111,6 +111,7 @@ def _measured(
     if len(time_s) < FEWEST_SAMPLES or not np.isfinite(windows).any():
         raise UserError(f'{where}{_noise_is_hidden(sensor, time_s)}')
     step_v = stats.adc_step(blocks)
+    windows = stats.without_stuck(blocks, windows, step_v)
     variance_v2, limit_v2 = stats.quiet_variance(blocks, windows, step_v)
     rc_s = sensor.rc_s
     if 'rc_capacitance_f' in sensor.unstated:

@@ -314,8 +314,8 @@ class RestFinder:
         """Find limits and rests of the stream so far; search again only after a new block."""
         blocks = self.blocks()
         if self._result is None or self._result[0] != len(blocks):
-            windows = stats.window_variance(blocks, self._spans)
             step = stats.adc_step(blocks)
+            windows = stats.without_stuck(blocks, stats.window_variance(blocks, self._spans), step)
             found = [
                 stated_limits(self.noise, step, self._spans) if self.noise else None,
                 learned_limits(blocks, windows, step, self._spans) if self.learn else None,

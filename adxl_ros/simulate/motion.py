@@ -52,7 +52,8 @@ class Pieces:
     def __init__(self, pieces: scipy.interpolate.PPoly) -> None:
         """Take the polynomials."""
         self._orders = [pieces, pieces.derivative(), pieces.derivative(2)]
-        self._begin_s, self._end_s = float(pieces.x[0]), float(pieces.x[-1])
+        self._begin_s = float(pieces.x[0])
+        self._end_s = float(pieces.x[-1])
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:
         """Return a derivative; see `Path`."""
@@ -224,13 +225,17 @@ class SmoothedPath:
         is_seen: whether the step is that of the readings, and not stated.
         """
         sampled = np.isfinite(reading)
-        self._time_s, self._reading = time_s[sampled], reading[sampled]
+        self._time_s = time_s[sampled]
+        self._reading = reading[sampled]
         self._step = step if is_seen else visible_step(self._reading, step)
         if not is_seen and self._step == step and _is_interpolated(self._reading, step):
             kept = _places_of_readings(self._reading, _SMALLEST_CHANGE * step)
-            self._time_s, self._reading = self._time_s[kept], self._reading[kept]
+            self._time_s = self._time_s[kept]
+            self._reading = self._reading[kept]
         self._windows: dict[int, scipy.interpolate.PPoly] = {}
-        self._knot_s, self._is_seen, self._degree = knot_s, is_seen, degree
+        self._knot_s = knot_s
+        self._is_seen = is_seen
+        self._degree = degree
         self._strength = self._matched_strength()
 
     def __call__(self, time_s: np.ndarray, order: int = 0) -> np.ndarray:

@@ -179,7 +179,8 @@ class RobotPath(ForcePath):
         since_s: float = -np.inf,
     ) -> None:
         """Smooth the readings, and run the kinematics from a time on, s."""
-        self._robot, self._gravity_mps2 = robot, gravity_mps2
+        self._robot = robot
+        self._gravity_mps2 = gravity_mps2
         self._tracks = _tracks(robot, readings)
         self._steps = [noise_step(values, _SMALLEST_STEP, times) for times, values in self._tracks]
         begin_s = max(times[0] for times, _ in self._tracks)

@@ -16,7 +16,7 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.model import noise
-from adxl_ros.model.constants import AXES, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
+from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Concern, Effect, Environment, Place
 from adxl_ros.model.filters import low_pass
@@ -293,9 +293,7 @@ class SensorModel:
         volts = self._volts(now, [delayed[None, :, c] for c in range(3)])
         self._memory['steps'] = self._memory['steps'] + 1
         readings = np.zeros((len(rows), 3))
-        readings[:, [AXES.index(axis) for axis in self.sensor.axes]] = to_nominal_mps2(
-            volts, self.sensor
-        )
+        readings[:, self.sensor.axis_indices] = to_nominal_mps2(volts, self.sensor)
         return readings
 
     def _check(self, force: np.ndarray, dt_s: float) -> None:

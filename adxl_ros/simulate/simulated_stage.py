@@ -40,7 +40,8 @@ class SimulatedStage:
         """Rest at a pose; `slew` is the largest velocity, and a resolution of 0 is exact."""
         self._slew = slew
         self._speed = np.array(slew, float)
-        self._omega, self._resolution = _SETTLED / settling_s, resolution
+        self._omega = _SETTLED / settling_s
+        self._resolution = resolution
         self._rng = np.random.default_rng(seed)
         self._commanded = np.array(pose, float)
         self._goal = self._reachable(self._commanded)

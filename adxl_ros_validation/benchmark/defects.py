@@ -28,7 +28,7 @@ from adxl_ros_validation.blind.ideal_observer import (
     told_apart,
 )
 from adxl_ros_validation.blind.real_sensors import Half
-from adxl_ros_validation.blind.simulator import Fault, G0, SCALE_STD, Unit, ZERO_G_STD_G
+from adxl_ros_validation.blind.simulator import Fault, G0, Unit
 from adxl_ros_validation.blind.trials import Label, Show
 import numpy as np
 
@@ -124,21 +124,7 @@ class RecordedObserver(IdealObserver):
         self.axes, self.count = self.force.shape
         self.weight = 1 / np.sqrt(_smooth_spectrum(untouched, part))
         # Zero-g and scale factor are known as those of the blind check are.
-        stated = [
-            (self.of_axis(d, response), std)
-            for d in range(self.axes)
-            for response, std in (
-                (part.known.astype(float), ZERO_G_STD_G * G0),
-                (self.force[d], SCALE_STD),
-            )
-        ]
-        self._no_prior = np.zeros(len(stated))
-        priors = np.diag([1 / std for _, std in stated])
-        rows = [
-            np.concatenate([self.whiten(change), prior])
-            for (change, _), prior in zip(stated, priors)
-        ]
-        self.stated = np.linalg.qr(np.stack(rows, axis=1))[0]
+        self.state([], part.known.astype(float))
 
 
 def _smooth_spectrum(untouched: np.ndarray, part: Half) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 import hashlib
 import math
 from pathlib import Path
@@ -13,7 +14,11 @@ from typing import Any, NamedTuple
 import adxl_ros as adxl
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import ACCEL, Recording
+from adxl_ros.model.constants import G0_MPS2
 import numpy as np
+import pandas as pd
+from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation, Slerp
 import yaml
 
 SHIPPED = Path(__file__).parents[1] / 'benchmark_sources.yaml'
@@ -26,34 +31,58 @@ _LONGEST_SHIFT_S = 5.0
 """Longest shift between the clocks of a recording and its reference, s; chosen."""
 
 
-@dataclass(frozen=True)
-class Reference:
-    """What knows the force of the same motion better."""
+@dataclass(frozen=True, kw_only=True)
+class Fetched:
+    """A file that a user fetches."""
 
-    file: str  # Name of its file in the folder
+    file: str  # Its name in the folder
+    address: str = ''  # Where it is, or what it is made of
+    convert: str = ''  # Command that makes $FILE of $FETCHED, which is at the address; '' for none
     sha256: str = ''  # Hash of the file; '' where none is stated
     read: Mapping[str, Any] = field(default_factory=dict)  # Arguments of `adxl_ros.read`
+
+    def path_in(self, folder: Path) -> Path:
+        """Return the path of the file, which is the one of the manifest."""
+        path = folder / self.file
+        if not path.exists():
+            raise UserError(f'{path}: no such file; fetch {self.address or "it"}{self._then()}')
+        if self.sha256 and hashlib.sha256(path.read_bytes()).hexdigest() != self.sha256:
+            raise UserError(f'{path}: is not the file whose SHA-256 the manifest has')
+        return path
+
+    def _then(self) -> str:
+        """Return what is to be done with what was fetched."""
+        if not self.convert:
+            return ''
+        fetched = self.address.rpartition('/')[2]
+        command = self.convert.replace('$FETCHED', fetched).replace('$FILE', self.file)
+        return f', then run: {command}'
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference(Fetched):
+    """What knows the force of the same motion better."""
+
+    # Whether it is a table of poses with the columns time_s, qx, qy, qz, qw, which turn the body
+    # into a frame whose z is up, and x_m, y_m, z_m where its position is known
+    poses: bool = False
+    smooth_s: float = 0.12  # Span of the polynomials that smooth poses, and differentiate, s
     # Whether it is a sensor itself, which is calibrated against gravity first
     calibrate: bool = False
     align: bool = False  # Whether its clock is another one, so that it is shifted in time
     turn: bool = False  # Whether its axes are others, so that it is turned by least squares
 
 
-@dataclass(frozen=True)
-class Source:
+@dataclass(frozen=True, kw_only=True)
+class Source(Fetched):
     """One public recording."""
 
     name: str
-    file: str  # Name of its file in the folder
     licence: str
     known: str  # What is known of it
     levels: str  # Some of `LEVELS`, for example AC
-    address: str = ''  # Where the file is
-    commit: str = ''  # Version of it
-    sha256: str = ''  # Hash of the file; '' where none is stated
     not_known: str = ''
     rate_hz: float = math.nan  # Its sample rate, Hz, for readers of the manifest
-    read: Mapping[str, Any] = field(default_factory=dict)  # Arguments of `adxl_ros.read`
     angles_deg: Sequence[float] = ()  # Stage angles alpha and beta of a sensor that rests
     reference: Reference | None = None
     # Sets of effects of which each is a right answer of level B
@@ -120,26 +149,17 @@ def read_all(sources: Sequence[Source], folder: Path) -> tuple[list[Loaded], lis
 
 def _read(source: Source, folder: Path) -> Loaded:
     """Read a source and its reference."""
-    recording = adxl.read(
-        _found(folder, source.file, source.sha256, source.address), **source.read
-    )
+    recording = adxl.read(source.path_in(folder), **source.read)
     if source.angles_deg:
         angles = {
             name: np.full(len(recording), np.deg2rad(angle))
             for name, angle in zip(('alpha_rad', 'beta_rad'), source.angles_deg)
         }
         recording = replace(recording, columns={**recording.columns, **angles})
-    return Loaded(source, recording, _force(source, folder, recording))
-
-
-def _found(folder: Path, name: str, sha256: str, address: str) -> Path:
-    """Return the path of a file that is the one of the manifest."""
-    path = folder / name
-    if not path.exists():
-        raise UserError(f'{path}: no such file; fetch {address or "it"}')
-    if sha256 and hashlib.sha256(path.read_bytes()).hexdigest() != sha256:
-        raise UserError(f'{path}: is not the file whose SHA-256 the manifest has')
-    return path
+    force = _force(source, folder, recording)
+    if force is not None:
+        recording = recording.rows(*np.searchsorted(recording.time_s, force.time_s[[0, -1]]))
+    return Loaded(source, recording, force)
 
 
 def _force(source: Source, folder: Path, recording: Recording) -> Recording | None:
@@ -147,8 +167,11 @@ def _force(source: Source, folder: Path, recording: Recording) -> Recording | No
     reference = source.reference
     if reference is None:
         return None
-    path = _found(folder, reference.file, reference.sha256, source.address)
-    force = adxl.read(path, **reference.read)
+    path = reference.path_in(folder)
+    if reference.poses:
+        force = _force_of_poses(path, reference.smooth_s)
+    else:
+        force = adxl.read(path, **reference.read)
     if reference.calibrate:
         corrected = adxl.apply(force, adxl.fit(force)).to_pandas()
         columns = {name: corrected[name].to_numpy() for name in ACCEL}
@@ -166,6 +189,27 @@ def _force(source: Source, folder: Path, recording: Recording) -> Recording | No
     return force
 
 
+def _force_of_poses(path: Path, smooth_s: float) -> Recording:
+    """Return the specific force of a body by its poses, in its own axes."""
+    table = pd.read_csv(path)
+    try:
+        time_s = table['time_s'].to_numpy()
+        turn = Slerp(time_s, Rotation.from_quat(table[['qx', 'qy', 'qz', 'qw']].to_numpy()))
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f'{path}: is no table of poses: {error}') from None
+    step_s = float(np.median(np.diff(time_s)))
+    grid_s = np.arange(time_s[0], time_s[-1], step_s)
+    width = max(2 * round(smooth_s / step_s / 2) + 1, 5)
+    smooth = partial(savgol_filter, window_length=width, polyorder=3, delta=step_s)
+    turns = Rotation.from_matrix(smooth(turn(grid_s).as_matrix(), axis=0))
+    force = np.tile([0.0, 0.0, G0_MPS2], (len(grid_s), 1))
+    if 'x_m' in table:
+        places = [np.interp(grid_s, time_s, table[name]) for name in ('x_m', 'y_m', 'z_m')]
+        force += smooth(places, deriv=2).T
+    force = turns.inv().apply(force)
+    return adxl.from_arrays(time_s=grid_s, **dict(zip(ACCEL, force.T)), name=path.name)
+
+
 def _samples(recording: Recording, time_s: np.ndarray) -> np.ndarray:
     """Return the output at instants, in its own unit, (m, n)."""
     return np.array(
@@ -181,14 +225,15 @@ def _lag_s(recording: Recording, force: Recording) -> float:
     Return by what the clock of a reference is behind that of a recording, s.
 
     The agreement at a lag is the largest that any rotation of the reference gives: the sum of the
-    singular values of the correlations of all pairs of axes.
+    singular values of the correlations of all pairs of axes. The means are left out: that of
+    gravity agrees at any lag, and best where the two overlap most.
     """
     step_s = 1 / recording.rate_hz
     grid_s = np.arange(0.0, min(recording.span_s, force.span_s), step_s)
     most = min(round(_LONGEST_SHIFT_S / step_s), len(grid_s) // 4)
     first, second = (
-        np.fft.rfft(_samples(each, grid_s + each.time_s[0]), 2 * len(grid_s))
-        for each in (recording, force)
+        np.fft.rfft(samples - samples.mean(axis=1, keepdims=True), 2 * len(grid_s))
+        for samples in (_samples(each, grid_s + each.time_s[0]) for each in (recording, force))
     )
     pairs = np.roll(np.fft.irfft(first[:, None] * np.conj(second)), most)[..., : 2 * most + 1]
     agreement = np.linalg.svd(np.moveaxis(pairs, -1, 0), compute_uv=False).sum(axis=1)

@@ -11,20 +11,19 @@ import math
 from typing import Any
 
 from adxl_ros.process import code_version, package_version
-from adxl_ros.report import page
-from adxl_ros.report.figures import axes_for
+from adxl_ros.report.figures import new_figure
 from adxl_ros_validation.benchmark.defects import GROUPS
 from adxl_ros_validation.benchmark.manifest import Loaded
 from adxl_ros_validation.benchmark.results import (
     Drawn,
-    group_score,
+    exact_share,
     limit_of,
     median_closed,
     Physical,
     Row,
 )
 from adxl_ros_validation.blind.report import Report, Table, terminal_table
-from adxl_ros_validation.blind.scores import in_words, Score, share
+from adxl_ros_validation.blind.scores import in_words, share
 import numpy as np
 
 _STRENGTHS = (0.0, 3.0, 8.0, math.inf)
@@ -49,6 +48,11 @@ class Made:
         """Return the methods in their order."""
         names = [row.method for row in self.rows] + [row.method for row in self.physical]
         return list(dict.fromkeys(names))
+
+    @property
+    def graded(self) -> list[str]:
+        """Return the methods that answered some of level A."""
+        return [method for method in self.methods if self.of(method)]
 
     def of(self, method: str) -> list[Row]:
         """Return the answers of a method to level A."""
@@ -76,8 +80,13 @@ def report(made: Made) -> Report:
             'Level A: what else counts': _further(made),
             'Level A: one defect, by its strength': _single(made, _strength),
             'Level A: one defect, by recording': _single(made, lambda row: row.fact.recording),
-            'Level B: a documented defect': _documented(made),
-            'Level C: share of the squared gap that is closed on a later part': _closed(made),
+            'Level B: a documented defect': _physical(
+                made, 'B', lambda row: f'{row.right}: {_said(row)}'
+            ),
+            'Level C: share of the squared gap that is closed on a later part': _physical(
+                made, 'C', lambda row: in_words(row.closed)
+            ),
+            'Level C: what is named': _physical(made, 'C', _said),
             'Answers without a verdict': _failed(made),
             'Recordings': _card(made),
             'Left out': (['what, and why'], [[text] for text in made.left_out]),
@@ -90,8 +99,8 @@ def screen(made: Made) -> list[str]:
     groups = {row.group for row in made.rows}
     shown = {group: words for group, words in GROUPS.items() if group in groups}
     rows = []
-    for method in made.methods:
-        scores = [group_score(made.of(method), group, 'exact') for group in shown]
+    for method in made.graded:
+        scores = [exact_share(made.of(method), group) for group in shown]
         cells = [f'{s["value"]:.2f} of {s["count"]}' if s['count'] else '-' for s in scores]
         rows.append([method, *cells])
     first = ['Level A, exactly right:', '']
@@ -101,9 +110,9 @@ def screen(made: Made) -> list[str]:
 def _naming(made: Made) -> Table:
     """Return how often each method is exactly right."""
     rows = []
-    for method in made.methods:
+    for method in made.graded:
         own = made.of(method)
-        rows.append([method, *(in_words(group_score(own, group, 'exact')) for group in GROUPS)])
+        rows.append([method, *(in_words(exact_share(own, group)) for group in GROUPS)])
     bounds = ['ideal observer', '-']
     for group in list(GROUPS)[1:]:
         limit = limit_of(made.facts, group)
@@ -114,14 +123,14 @@ def _naming(made: Made) -> Table:
 def _further(made: Made) -> Table:
     """Return what a user of the answers gains and loses."""
     rows = []
-    for method in made.methods:
+    for method in made.graded:
         own = made.of(method)
         defect = [row for row in own if row.group != 'none']
         rows.append(
             [
                 method,
                 in_words(share([row.in_set for row in defect])),
-                _percent(median_closed(own)),
+                in_words(median_closed(own)),
                 in_words(share([row.harm for row in own])),
                 f'{np.mean([row.by_chance for row in own]):.2f}',
                 f'{np.median([row.answered.cpu_s for row in own]):.1f}',
@@ -138,20 +147,12 @@ def _further(made: Made) -> Table:
     return head, rows if made.rows else []
 
 
-def _percent(score: Score) -> str:
-    """Return a share with its interval in percent; it may be negative."""
-    if score['value'] is None:
-        return '-'
-    value, low, high = (100 * part for part in (score['value'], *score['ci']))
-    return f'{value:.0f} % ({low:.0f} to {high:.0f}), n = {score["count"]}'
-
-
 def _single(made: Made, name_of: Callable[[Row], str]) -> Table:
     """Return how often one defect is named, by what a name of each trial says."""
     single = [row for row in made.rows if row.group == 'single']
     names = sorted({name_of(row) for row in single})
     rows = []
-    for method in made.methods:
+    for method in made.graded:
         own = [(name_of(row), row.exact) for row in single if row.method == method]
         rows.append(
             [method, *(in_words(share([hit for part, hit in own if part == n])) for n in names)]
@@ -167,36 +168,23 @@ def _strength(row: Row) -> str:
     return f'{low:g} to {high:g} times the noise'
 
 
-def _documented(made: Made) -> Table:
-    """Return the answers to level B."""
-    rows = [
-        [
-            row.source.name,
-            ' or '.join(' and '.join(each) for each in row.source.expected),
-            row.method,
-            _said(row),
-            'yes' if row.right else 'NO',
-        ]
-        for row in made.physical
-        if 'B' in row.source.levels
-    ]
-    return ['recording', 'documented', 'method', 'named', 'right'], rows
+def _physical(made: Made, level: str, cell_of: Callable[[Physical], str]) -> Table:
+    """Return a cell of each answer to a level, by recording and method."""
+    chosen = [row for row in made.physical if level in row.source.levels]
+    cells = {(row.source.name, row.method): cell_of(row) for row in chosen}
+    expected = {row.source.name: row.source.expected for row in chosen}
+    rows = []
+    for name, sets in expected.items():
+        documented = ' or '.join(' and '.join(each) for each in sets) if level == 'B' else ''
+        about = f'{name}: {documented}' if documented else name
+        rows.append([about, *(cells.get((name, method), '-') for method in made.methods)])
+    return ['recording', *made.methods], rows
 
 
 def _said(row: Physical) -> str:
     """Return what an answer names."""
     groups = [f'({" or ".join(sorted(group))})' for group in row.answered.one_of]
     return ', '.join([*sorted(row.answered.causes), *groups]) or row.answered.status
-
-
-def _closed(made: Made) -> Table:
-    """Return the answers to level C."""
-    rows = [
-        [row.source.name, row.method, _said(row), _percent(row.closed)]
-        for row in made.physical
-        if 'C' in row.source.levels
-    ]
-    return ['recording', 'method', 'named', 'closed; n blocks'], rows
 
 
 def _failed(made: Made) -> Table:
@@ -226,10 +214,8 @@ def _card(made: Made) -> Table:
 
 def picture(made: Made) -> Any:
     """Draw where each method fails: the share of right answers by defect."""
-    from matplotlib.figure import Figure
-
     kinds = sorted({name for fact in made.facts for name in fact.label.effects}) + ['no defect']
-    methods = made.methods
+    methods = made.graded
     shares = np.full((len(methods), len(kinds)), np.nan)
     texts: dict[tuple[int, int], str] = {}
     for i, method in enumerate(methods):
@@ -242,8 +228,9 @@ def picture(made: Made) -> Any:
             if hits:
                 shares[i, j] = np.mean(hits)
                 texts[i, j] = f'{sum(hits)}/{len(hits)}'
-    figure = Figure((3.0 + 0.42 * len(kinds), 2.6 + 0.4 * len(methods)), layout='constrained')
-    ax = axes_for(figure.add_subplot())
+    size = 3.0 + 0.42 * len(kinds), 2.6 + 0.4 * len(methods)
+    figure = new_figure(figsize=size)
+    ax = figure.add_subplot()
     ax.imshow(shares, cmap='RdYlGn', vmin=0, vmax=1, aspect='auto')
     ax.set_xticks(range(len(kinds)), kinds, rotation=90)
     ax.set_yticks(range(len(methods)), methods)
@@ -251,18 +238,3 @@ def picture(made: Made) -> Any:
         ax.text(j, i, text, ha='center', va='center', fontsize=7)
     ax.set_title('Right answers of all trials in which the defect acts')
     return figure
-
-
-def html(made: Made, said: Report) -> str:
-    """Return the whole page."""
-    return page.render(
-        'adxl_ros_validation',
-        'pages/tables.html',
-        {
-            **said._asdict(),
-            'about': [],
-            'badge': None,
-            'figures': {},
-            'picture': page.picture_url(picture(made)) if made.rows else '',
-        },
-    )

@@ -127,9 +127,9 @@ def _right(answer: Answer, base: Answer, label: Label) -> tuple[bool, bool]:
     return real_sensors.right(answer, base, label)
 
 
-def group_score(rows: Sequence[Row], group: str, key: str) -> Score:
-    """Return the share of the trials of a group for which a key of the rows holds."""
-    return share([getattr(row, key) for row in rows if row.group == group])
+def exact_share(rows: Sequence[Row], group: str) -> Score:
+    """Return the share of the trials of a group that are exactly right."""
+    return share([row.exact for row in rows if row.group == group])
 
 
 def limit_of(facts: Sequence[Drawn], group: str) -> Bracket | None:
@@ -149,7 +149,8 @@ class Physical(NamedTuple):
     source: Source
     method: str
     answered: Answered
-    right: bool | None  # Whether it is a documented set; None where none is documented
+    # Whether it names a documented set: yes, among others, or NO; '' where none is documented
+    right: str
     closed: Score  # Share of the squared gap that is closed on the later part, by blocks
 
 
@@ -162,11 +163,16 @@ def grade_physical(chosen: Mapping[str, Loaded], answers: Answers) -> list[Physi
             if name not in by_name:
                 continue  # It was interrupted.
             answered = by_name[name]
-            right = None
-            if 'B' in source.levels:
-                right = answered.causes in expected and not answered.one_of
+            right = _documented(answered, expected) if 'B' in source.levels else ''
             rows.append(Physical(source, method, answered, right, _share_closed(answered)))
     return rows
+
+
+def _documented(answered: Answered, expected: Sequence[frozenset[str]]) -> str:
+    """Return whether an answer names one of the documented sets, in words."""
+    if answered.causes in expected and not answered.one_of:
+        return 'yes'
+    return 'among others' if any(each <= answered.causes for each in expected) else 'NO'
 
 
 def _share_closed(answered: Answered) -> Score:

@@ -100,25 +100,24 @@ class IdealObserver:
             for name, count in (('stage_offset', 2), ('stage_eccentricity', 4))
             for row in np.eye(count)
         ]
-        stated += [
-            (self.of_axis(d, response), std)
-            for d in range(self.axes)
-            for response, std in (
-                (np.ones(self.count), sim.ZERO_G_STD_G * G0),
-                (self.force[d], sim.SCALE_STD),
-            )
-        ]
+        self.state(stated, np.ones(self.count))
+
+    def state(self, stated: list[tuple[np.ndarray, float]], offset: np.ndarray) -> None:
+        """
+        Take as known to a standard deviation only: some changes, m/s², zero-g and scale factor.
+
+        offset: what 1 m/s² of zero-g changes, m/s², (n,).
+        """
+        for d in range(self.axes):
+            stated.append((self.of_axis(d, offset), sim.ZERO_G_STD_G * G0))
+            stated.append((self.of_axis(d, self.force[d]), sim.SCALE_STD))
         self._no_prior = np.zeros(len(stated))
         priors = np.diag([1 / std for _, std in stated])
-        self.stated = np.linalg.qr(
-            np.stack(
-                [
-                    np.concatenate([self.whiten(change), prior])
-                    for (change, _), prior in zip(stated, priors)
-                ],
-                axis=1,
-            )
-        )[0]
+        rows = [
+            np.concatenate([self.whiten(change), prior])
+            for (change, _), prior in zip(stated, priors)
+        ]
+        self.stated = np.linalg.qr(np.stack(rows, axis=1))[0]
 
     def of_axis(self, d: int, row: np.ndarray) -> np.ndarray:
         """Return a change of one axis only, m/s², (m, n)."""

@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-import hashlib
 import json
 import math
 from pathlib import Path
@@ -33,7 +32,6 @@ from adxl_ros_validation.kept_results import write
 import numpy as np
 import pandas as pd
 import scipy
-import yaml
 
 _NOISES = (1.0, 20.0)
 """Weakest and strongest defect, in the recording's own noise; log-uniform."""
@@ -138,34 +136,21 @@ class Half:
         ]
 
 
-def prepare(source: Path) -> tuple[list[Half], list[str]]:
-    """Return the later parts of recordings, and why others are left out."""
+def prepare(folder: Path) -> tuple[list[Half], list[str]]:
+    """Return the later parts of the recordings of a folder, and why others are left out."""
+    if not folder.is_dir():
+        raise UserError(f'{folder}: no such folder')
     halves, left_out = [], []
-    for path, digest in _sources(source).items():
+    for path in sorted(folder.glob('*.csv')):
+        if path.match('*_sim.csv'):
+            continue
         try:
-            if not path.exists():
-                raise UserError('no such file; the manifest has its address')
-            if digest and hashlib.sha256(path.read_bytes()).hexdigest() != digest:
-                raise UserError('is not the file whose SHA-256 the manifest has')
             halves.append(later_part(path))
         except UserError as error:
             left_out.append(f'{path.name}: {error}')
     if not halves:
-        raise UserError(f'{source}: no recording can be used: {"; ".join(left_out) or "no CSV"}')
+        raise UserError(f'{folder}: no recording can be used: {"; ".join(left_out) or "no CSV"}')
     return halves, left_out
-
-
-def _sources(source: Path) -> dict[Path, str]:
-    """List recordings, each with the SHA-256 that a manifest states."""
-    if source.is_dir():
-        return {path: '' for path in sorted(source.glob('*.csv')) if not path.match('*_sim.csv')}
-    try:
-        rows = yaml.safe_load(source.read_text(encoding='utf-8'))['recordings']
-        return {source.parent / row['file']: row.get('sha256', '') for row in rows}
-    except FileNotFoundError:
-        raise UserError(f'{source}: no such file or folder') from None
-    except (OSError, UnicodeError, yaml.YAMLError, KeyError, TypeError) as error:
-        raise UserError(f'{source}: no folder, and no manifest: {error}') from None
 
 
 def _read(path: Path) -> tuple[pd.DataFrame, dict[str, int]]:

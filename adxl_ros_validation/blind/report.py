@@ -10,6 +10,7 @@ import re
 import textwrap
 from typing import Any, NamedTuple
 
+from adxl_ros.report import page
 from adxl_ros.report.screen import COLUMNS
 from adxl_ros_validation.blind.scores import FEWEST_TRIALS, in_words, WITHOUT_BAR
 from adxl_ros_validation.blind.simulator import G0
@@ -79,6 +80,14 @@ class Report(NamedTuple):
                 ]
             )
             + '\n'
+        )
+
+    def html(self, picture: Any = None) -> str:
+        """Return words and tables as a page, below the first table a picture of matplotlib."""
+        return page.render(
+            'adxl_ros_validation',
+            'pages/tables.html',
+            {**self._asdict(), 'picture': page.picture_url(picture) if picture else ''},
         )
 
 

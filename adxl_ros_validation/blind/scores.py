@@ -163,10 +163,10 @@ def resampled(
     return {'value': float(statistic(rows)), 'ci': [float(low), float(high)], 'count': len(rows)}
 
 
-def by_strength(rows: pd.DataFrame, count: int = 8) -> list[dict[str, Any]]:
-    """Return the share detected, and that which the oracle sees, in bins of equal numbers."""
+def by_strength(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """Return the share detected, and that which the oracle sees, in eight bins or fewer."""
     rows = rows.assign(strength=rows.strength_mps2.str[0]).sort_values('strength', kind='stable')
-    parts = np.array_split(np.arange(len(rows)), min(count, max(len(rows) // 3, 1)))
+    parts = np.array_split(np.arange(len(rows)), min(8, max(len(rows) // 3, 1)))
     return [
         {
             'strength': float(part.strength.median()),

@@ -113,25 +113,26 @@ def main() -> int:
         knocked.append(knock_row(name, by_size))
         print(*knocked[-1], sep=' | ', flush=True)
     upper = scipy.stats.binomtest(*worse.tolist()).proportion_ci(0.9).high
+    given = f'--robots {options.robots} --seed {options.seed}'
     write_text(
         options.output,
         f"""# Kept calibrations of simulated robots
 
-{date.today()}, version {package_version()}, `make kept ARGS='--robots {options.robots} --seed
-{options.seed}'`: {options.robots} robots a row, 60 days each. The robots follow the model that is
-learnt; `kept_robots.py` of the validation says how.
+{date.today()}, version {package_version()}, `make kept ARGS='{given}'`.
+{options.robots} robots a row, 60 days each. The robots follow the model that is learnt;
+`kept_robots.py` of the validation says how.
 
 Tilt error of a level robot at the end of each day, by the calibration and by the kept one. Share
 of days on which the 90 % interval has the zero-g, by axis, and of all axes with what the scatter
-of the robots allows (90 %); of all robots it is {100 * np.mean(inside):.1f} %. Adoptions after
-which the rests of the next day err more than without: {worse[0]} of {worse[1]}, at most
-{100 * upper:.1f} % (95 %). Robots with a reported change and no knock.
+of the robots allows (90 %); of all robots it is {100 * np.mean(inside):.1f} %.
+Adoptions after which the rests of the next day err more than without: {worse[0]} of {worse[1]}, at
+most {100 * upper:.1f} % (95 %). Robots with a reported change and no knock.
 
 {markdown_table(KEPT_HEAD, kept)}
 
 The interval is true on average over units that drift 1 to 6 times as strongly as stated. Where
-rests show how strongly, it is true for each of them. Where they do not, as for two axes, it takes
-them for equally likely. So it is wide for the usual drift, and narrow for five times of it:
+rests show how strongly, it is about true for each of them. Where they do not, as for two axes, it
+takes them for equally likely. So it is wide for the usual drift, and narrow for five times of it:
 2·Φ(1.645 · √14.4 / 5) − 1 = 79 % inside.
 
 A knock of 3, 8 and 20 mg on day 31. Robots that rest within a day with that axis up or down; those

@@ -9,6 +9,8 @@ from adxl_ros_validation.benchmark import manifest, methods
 import numpy as np
 from processes import REPO
 import pytest
+from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation
 
 RATE_HZ, SECONDS = 25.0, 80.0
 MANIFEST = """
@@ -69,9 +71,9 @@ def test_a_method_from_outside_and_the_same_table_by_the_same_seed(folder, capsy
         for name in ('my_method.method', 'always_bias')
     )
     # Level B and C: only the method that names the scale factor is right, and closes the gap.
-    assert own['swing']['causes'] == ['scale_factor'] and own['swing']['right']
+    assert own['swing']['causes'] == ['scale_factor'] and own['swing']['right'] == 'yes'
     assert own['swing']['closed']['value'] > 0.95
-    assert not bias['swing']['right'] and bias['swing']['closed']['value'] < 0.8
+    assert bias['swing']['right'] == 'NO' and bias['swing']['closed']['value'] < 0.8
     # Level A: what is said of the untouched part, too, is no sight of a defect.
     defects = {trial['name'] for trial in made['trials'] if trial['effects']}
     answers = [row for row in made['answers'] if row['trial'] in defects]
@@ -93,6 +95,46 @@ def test_a_wrong_manifest_is_answered_in_one_line(entry, words, tmp_path) -> Non
     with pytest.raises(manifest.UserError) as error:
         manifest.load(path)
     assert words in str(error.value) and '\n' not in str(error.value)
+
+
+def test_poses_are_a_reference_on_a_clock_and_axes_of_their_own(tmp_path) -> None:
+    """A walk in the hand: gravity hardly moves, and the clock of the poses is 3 s behind."""
+    time_s = np.arange(0, 60, 0.02)
+    rng = np.random.default_rng(5)
+    steps = np.cumsum(rng.normal(0, 1, (len(time_s), 3)), axis=0)
+    place = 0.01 * np.sin(2 * np.pi * np.array([0.7, 1.1, 1.7]) * time_s[:, None] + 0.02 * steps)
+    place = savgol_filter(place, 51, 3, axis=0)
+    turn = Rotation.from_rotvec(0.1 * np.sin(0.5 * time_s)[:, None] * [1, 0, 0])
+    over = savgol_filter(place, 11, 3, deriv=2, delta=0.02, axis=0) + [0, 0, 9.80665]
+    force = turn.inv().apply(over)
+    mounted = Rotation.from_euler('zyx', [80, 20, -30], degrees=True).apply(force)
+    for name, head, columns in (
+        ('a.csv', 'time_s,ax_mps2,ay_mps2,az_mps2', (time_s + 3, mounted)),
+        ('b.csv', 'time_s,x_m,y_m,z_m,qx,qy,qz,qw', (time_s, place, turn.as_quat())),
+    ):
+        np.savetxt(
+            tmp_path / name, np.column_stack(columns), '%.8f', ',', header=head, comments=''
+        )
+    source = manifest.Source(
+        name='a', file='a.csv', licence='none', known='made for a test', levels='C',
+        reference=manifest.Reference(file='b.csv', poses=True, align=True, turn=True),
+    )  # fmt: skip
+    (read,), left_out = manifest.read_all([source], tmp_path)
+    assert not left_out
+    found = np.array([read.force.columns[name] for name in manifest.ACCEL])
+    there = np.array([read.recording.columns[name] for name in manifest.ACCEL])
+    moved = [np.interp(read.recording.time_s, read.force.time_s, axis) for axis in found]
+    spread = np.std(there, axis=1)
+    assert (np.std(there - moved, axis=1) < 0.15 * spread).all() and (spread > 0.1).all()
+
+
+def test_what_is_made_of_a_fetched_file_is_said(tmp_path) -> None:
+    source = manifest.Source(
+        name='a', file='a.csv', licence='none', known='made for a test', levels='A',
+        address='https://host/b.mat', convert='cut -f 1 $FETCHED > $FILE',
+    )  # fmt: skip
+    _, (text,) = manifest.read_all([source], tmp_path)
+    assert text.endswith('fetch https://host/b.mat, then run: cut -f 1 b.mat > a.csv')
 
 
 def test_the_manifest_of_the_package_is_read() -> None:

@@ -321,7 +321,7 @@ def test_the_command_commits_and_scores(run_tool, tmp_path, monkeypatch):
         (['-o', 'a', '--open', 'b'], 2, 'not allowed'),
         (['--trials', 0, '-o', 'a'], 1, 'at least 1'),
         (['--open', 'none'], 1, '--seal none'),
-        (['-o', 'a', '--real', 'x'], 1, 'x: no such file or folder'),
+        (['-o', 'a', '--real', 'x'], 1, 'x: no such folder'),
     ],
 )
 def test_wrong_usage(run_tool, tmp_path, words, status, says):

@@ -104,6 +104,6 @@ def test_the_papers_inverse_is_approximate_and_the_other_exact(axes):
     force = poses()
     volts = signal_chain.static_response(sensor)(force)
     exact = np.subtract(signal_chain.inverse(sensor)(volts), force)
-    paper = np.subtract(inversions.paper_inverse(sensor)(volts), force)
+    paper = np.subtract(inversions.PaperInverse(sensor)(volts), force)
     assert np.abs(exact).max() < 1e-9
     assert 1e-4 < np.abs(paper[:2]).max() < 0.05

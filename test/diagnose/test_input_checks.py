@@ -5,7 +5,7 @@
 from dataclasses import replace
 import json
 
-from adxl_ros.diagnose.data_checks import compare_checked
+from adxl_ros.diagnose.data_checks import check_recording, compare_checked, DataFault
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.model.constants import G0_MPS2
@@ -76,6 +76,25 @@ def test_a_shifted_simulator_is_late(run_tool, tmp_path, late_s):
     assert words[:2] == ['--sim', 'is'] and 'use --align' in report['summary']
     assert words[4] == ('late;' if late_s > 0 else 'early;')
     assert float(words[2]) == pytest.approx(abs(late_s), abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    'axis, factor, words',
+    [
+        ('x', 1 / G0_MPS2, 'x is 9.8'),
+        ('y', G0_MPS2, 'y is 0.10'),
+        ('y', 1e3, 'y is 0.00'),
+        ('x', 1e3 / G0_MPS2, 'x is 0.00'),
+    ],
+)
+def test_one_axis_of_a_simulator_in_another_unit_is_no_scale_factor(tmp_path, axis, factor, words):
+    stated = recording.read_ideal(tmp_path / ideal(tmp_path, 0.0))
+    stated.columns[f'a{axis}_mps2'] *= factor
+    force = motion_from_force(stated, False)
+    with pytest.raises(DataFault) as refused:
+        check_recording(compare_checked(made(unit()), unit(), force, False))
+    assert refused.value.name == 'unit'
+    assert f'the output of {words}' in refused.value.message
 
 
 def test_a_simulator_of_another_time_does_not_overlap(run_tool, tmp_path):

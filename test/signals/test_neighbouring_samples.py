@@ -58,6 +58,25 @@ def test_rows_of_several_sensors_in_turn(sensors: int, differ: list[float]) -> N
     assert f'{sensors} sensors' in found
 
 
+def test_alternate_rows_show_in_motion_and_are_no_means_of_rests() -> None:
+    moved = turning() + 2 * np.sin(np.arange(4000) / 15)[:, None]
+    assert faults(moved) == []
+    moved[1::2] += [0.3, -0.2, 0.25]
+    (found,) = faults(moved)
+    assert '2 sensors' in found
+    of_two = turning()
+    of_two[1::2] = of_two[1::2, [1, 2, 0]]
+    (found,) = faults(of_two)
+    assert '2 sensors' in found
+
+
+def test_counts_whose_sign_was_lost() -> None:
+    true_g = np.random.default_rng(3).normal(0, 0.4, (6000, 3))
+    counts = np.round(true_g * 16384) % 65536
+    (found,) = [text for text in faults(counts / 16384 * G) if 'wrap' in text]
+    assert 'signed numbers' in found
+
+
 @pytest.mark.parametrize('shake_g', [0.4, 0.9])
 def test_counts_that_wrap(shake_g: float) -> None:
     true_g = np.random.default_rng(3).normal(0, shake_g, (6000, 3)) + [0, 0, 1]
@@ -114,6 +133,14 @@ def test_single_wrong_samples(spikes: int, size_g: float, block: int) -> None:
     stated_g = float(found.split(' g ')[0].split()[-1])
     assert stated_g == pytest.approx(size_g, rel=0.02)
     assert f'{rows[0] / RATE_HZ:g} s' in found
+
+
+def test_it_is_said_from_which_size_on_single_samples_are_counted() -> None:
+    samples, rows = turning(noise_mps2=0.055), 20 + 60 * np.arange(60)
+    samples[rows] += np.linspace(0.05, 1.0, 60)[:, None] * G
+    (found,) = faults(samples)
+    counted, from_g = int(found.split()[0]), float(found.split('below about ')[1].split()[0])
+    assert counted == pytest.approx(np.sum(np.linspace(0.05, 1.0, 60) > from_g), abs=5)
 
 
 @pytest.mark.parametrize('length', [2, 4])

@@ -2,8 +2,11 @@
 
 """Rests in simulated and real streams, and equality of live and offline detection."""
 
+import adxl_ros as adxl
 from adxl_ros.files import recording
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.noise import sample_std_v
+from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
 from adxl_ros.signals.rest_detection import find_rests, Noise, Rest, rest_means, RestFinder
 from hypothesis import given, settings, strategies
 from needs import lack
@@ -116,6 +119,27 @@ def test_live_equals_offline(seed, axes, rate_hz, known_noise, with_stage):
             live.means(offline), rest_means(time_s, samples, offline, rate_hz, noise)
         ):
             assert (got == wanted).all()
+
+
+@pytest.mark.parametrize('fault', ['stuck', 'clipped'])
+def test_an_axis_without_noise_in_motion_hides_no_rest(fault):
+    """Where it does not change it is stuck or at its limit: that is not its noise."""
+    rng = np.random.default_rng(4)
+    time_s, samples, bounds, _ = handled_stream(rng, 100.0, [4.0] * 12, turn_s=4.0)
+    moves = np.ones(len(time_s), bool)
+    for start, stop in bounds:
+        moves[max(start - 50, 0) : stop + 50] = False
+    if fault == 'stuck':
+        samples[moves, 1] = 3.0
+    else:
+        samples[moves, 1] = np.minimum(samples[moves, 1], -15.0)
+    assert len(find_rests(time_s, samples, 100.0)) == len(bounds)
+    # Nor is it the noise that no file states
+    x, y, z = samples.T
+    recorded = adxl.from_arrays(time_s=time_s, ax_mps2=x, ay_mps2=y, az_mps2=z)
+    unit, _ = measure_unstated(load_sensor(None, recorded), recorded)
+    noise_mps2 = sample_std_v(unit) / unit.scale_v_per_g * G0_MPS2
+    assert noise_mps2 == pytest.approx(np.full(3, SIGMA), rel=0.2)
 
 
 def test_a_knock_neither_ends_nor_moves_a_rest():

@@ -9,6 +9,7 @@ from pathlib import Path
 import shlex
 import subprocess
 
+import adxl_ros as adxl
 from adxl_ros.calibrate.fits import gravity_fit
 from adxl_ros.diagnose import data_checks
 from adxl_ros.signals import findings
@@ -140,6 +141,13 @@ def test_each_fault_is_named(
     faults = checked(tmp_path, 'faulty.csv')['faults']
     assert any(fault in text for text in faults), faults
     assert count in (None, len(faults)), faults
+
+
+@pytest.mark.parametrize('rate_hz', [0.0012345, 0.05, 100_000.0])
+def test_the_columns_of_the_table_stay_apart(rate_hz: float) -> None:
+    ax, ay, az = samples()[1].T
+    recorded = adxl.from_arrays(rate=rate_hz, ax_mps2=ax, ay_mps2=ay, az_mps2=az)
+    assert f' {rate_hz:.4g} Hz ' in adxl.check(recorded).screen[1]
 
 
 def test_a_coarse_sensor_at_rest_is_sound(tmp_path: Path) -> None:

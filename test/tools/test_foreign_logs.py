@@ -327,6 +327,36 @@ def test_a_documented_mounting(run_tool, tmp_path) -> None:
     check_errors(tmp_path / 'u.yaml')
 
 
+def test_a_counter_that_is_named_as_a_time_is_asked_for_its_rate(run_tool, tmp_path) -> None:
+    rows = [np.arange(float(len(LOG.time_s))), *G0_MPS2 * LOG.output_g.T]
+    written(tmp_path, 'log.csv', 'n,x,y,z\n' + lines(rows, ['%.0f'] + ['%.4f'] * 3))
+    columns = 'time=n:s,x=x:mps2,y=y:mps2,z=z:mps2'
+    done = run_tool('check', 'log.csv', '--columns', columns)
+    assert 'if it counts samples, give --rate HZ' in ' '.join(done.stdout.split())
+
+
+def test_a_row_of_units_below_the_names(run_tool, tmp_path) -> None:
+    rows = [1e3 * LOG.time_s, *LOG.output_g.T]
+    head = 'Time,X,Y,Z\nms,g,g,g\n'
+    written(tmp_path, 'log.csv', head + lines(rows, ['%.1f'] + ['%.6f'] * 3))
+    text = ' '.join(run_tool('check', 'log.csv').stdout.split())
+    options = shlex.split(text[text.index('--columns') :])[:2]
+    assert options[1] == 'time=Time [ms]:ms,x=X [g]:g,y=Y [g]:g,z=Z [g]:g'
+    assert run_tool('check', 'log.csv', *options).returncode == 0
+
+
+@pytest.mark.parametrize('name', ['log.npy', 'log.csv'])
+def test_an_array_of_numpy_is_read_and_named(run_tool, tmp_path, name) -> None:
+    with open(tmp_path / name, 'wb') as file:
+        np.save(file, np.column_stack([LOG.time_s, G0_MPS2 * LOG.output_g]))
+    columns = 'time=column[0]:s,x=column[1]:mps2,y=column[2]:mps2,z=column[3]:mps2'
+    done = run_tool('check', name, '--columns', columns)
+    if name == 'log.npy':
+        assert done.returncode == 0, done.stdout
+    else:
+        assert 'is an array of NumPy; name it .npy' in ' '.join(done.stdout.split())
+
+
 @pytest.mark.parametrize('counts', [1e3, 1e6])
 @pytest.mark.parametrize('tool', ['check', 'fit', 'noise', 'diagnose'])
 def test_every_tool_refuses_stamps_in_another_unit(run_tool, tmp_path, tool, counts) -> None:

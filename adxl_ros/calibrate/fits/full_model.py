@@ -231,7 +231,9 @@ class _Search:
     def __init__(
         self, sensor: Sensor, poses: Poses, names: tuple[Coefficient, ...], stated: StageError
     ) -> None:
-        self._measured, self._names, self._stated = poses, names, stated
+        self._measured = poses
+        self._names = names
+        self._stated = stated
         self._precision = prior_precision(names)  # Inverse prior variances, (p,)
         self._sensor, self._stage = sensor, stated  # Sensor with coefficients, and stage error
         # Predicted errors of the angles, and the poses turned by them; see `_turned_linearly`

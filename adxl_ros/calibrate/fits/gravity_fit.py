@@ -85,7 +85,7 @@ class Rung(NamedTuple):
 
     @property
     def left_out_std_rad(self) -> float:
-        """Standard deviation of the prior of an angle that is left out, rad."""
+        """Return the standard deviation of the prior of an angle that is left out, rad."""
         return float(self.precision[-1] ** -0.5)
 
 

@@ -65,7 +65,8 @@ class PoseCovariance:
         kept: np.ndarray | None = None,
     ) -> None:
         # Scaled by r and 1/r, so that both joints have the same standard deviations.
-        self._jacobian, self._error = jacobian * error.joints, error
+        self._jacobian = jacobian * error.joints
+        self._error = error
         self._kept = np.ones(len(poses), bool) if kept is None else kept
         self._number, self._shared = shared
         # The error of a setting with only one pose is an error of that pose.

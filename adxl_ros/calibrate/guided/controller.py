@@ -89,7 +89,9 @@ class StreamSensor:
     def __init__(
         self, settings: SessionSettings, sensor: Sensor, anonymous: Sensor, samples: SampleSource
     ) -> None:
-        self._settings, self._sensor, self._anonymous = settings, sensor, anonymous
+        self._settings = settings
+        self._sensor = sensor
+        self._anonymous = anonymous
         self._samples = samples
         self.nominal: Sensor | None = None  # The nominal sensor; None while it is unknown
         self.newest: NewestSamples | None = None  # Its newest samples
@@ -172,7 +174,9 @@ class Controller:
         # Whether to put an interrupted calibration aside; None asks an operator at a screen
         self._by_default = {'ask': None, 'continue': False, 'anew': True}[resume]
         self._starts_over = self._by_default
-        self._sensor, self._samples, self._outputs = sensor, samples, outputs
+        self._sensor = sensor
+        self._samples = samples
+        self._outputs = outputs
         self._last = self._warned = ''  # The newest line, and the newest obstacle
         self._accepted = 0
         self._has_doubt = False

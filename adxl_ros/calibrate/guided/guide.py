@@ -115,7 +115,9 @@ class LateStamps:
     """Samples of a stream that are left out, because their stamp steps back."""
 
     def __init__(self) -> None:
-        self._number, self._newest_ns, self._largest_ns = 0, 0, 0
+        self._number = 0
+        self._newest_ns = 0
+        self._largest_ns = 0
 
     def count(self, stamps_ns: np.ndarray, late_ns: np.ndarray) -> None:
         """Count further stamps, ns, (n,), and by how much they step back, ns, (n,)."""

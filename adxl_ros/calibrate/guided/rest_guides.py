@@ -15,9 +15,10 @@ from adxl_ros.calibrate.fits.thermal_fit import PARTS
 from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate
 from adxl_ros.calibrate.guided.guide import Dwell, Guide, NextPose
 from adxl_ros.calibrate.guided.screen_contents import Phase, Row, Status, tilt_row
-from adxl_ros.calibrate.poses import at_a_rail, Poses
+from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
+from adxl_ros.model.noise import means_at_a_rail
 from adxl_ros.model.sensor import parameter_of, Sensor
 from adxl_ros.signals.rest_detection import datasheet_noise, RestFinder, Stillness
 import numpy as np
@@ -80,14 +81,16 @@ class HandRests(Guide):
                 fault = self._fault(record)
                 if not fault:
                     return record
-                self._announced_ns, self._next_search_ns = record.stop_ns, 0
+                self._announced_ns = record.stop_ns
+                self._next_search_ns = 0
                 self._new_refusal = fault
                 return None
         return None
 
     def take(self, record: PoseRecord) -> None:
         """Count a rest that is on disk."""
-        self._announced_ns, self._next_search_ns = record.stop_ns, 0
+        self._announced_ns = record.stop_ns
+        self._next_search_ns = 0
         self.accepted[record.pose] = record
         self._update_estimate()
 
@@ -181,7 +184,7 @@ class HandRests(Guide):
 
     def _fault(self, record: PoseRecord) -> str:
         """Return why a rest is refused, or ''."""
-        if at_a_rail(self.sensor, Poses.from_records([record])).any():
+        if means_at_a_rail(self.sensor, Poses.from_records([record]).volts).any():
             return 'saturated: the ADC is at its rail in this rest; check supply and wiring'
         return guide.temperature_fault(self.accepted, record.temperature_c, self._span_c)
 
@@ -318,7 +321,8 @@ class ThermalGuide(Guide):
         accepted: Sequence[PoseRecord] = (),
     ) -> None:
         super().__init__(sensor, accepted)
-        self._base, self._settings = base, settings
+        self._base = base
+        self._settings = settings
         self._dwell: Dwell | None = None
         self._update()
 

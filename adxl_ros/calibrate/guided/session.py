@@ -182,7 +182,8 @@ class Session:
             self._base = replace(
                 with_axes(base, nominal.axes), serial=nominal.serial, rate_hz=nominal.rate_hz
             )
-        self.nominal, self.settings = nominal, settings
+        self.nominal = nominal
+        self.settings = settings
         self.fault = ''  # What is wrong with the samples, or ''
         self.doubt = ''  # What is wrong with the length of gravity, but by less than a unit
         # The accepted poses on disk

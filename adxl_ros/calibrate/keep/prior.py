@@ -140,7 +140,7 @@ class Linear:
 
     def __init__(self, kept: KeptSensor) -> None:
         self._axes = kept.sensor.axes
-        self._measured = [AXES.index(axis) for axis in self._axes]
+        self._measured = kept.sensor.axis_indices
         self._respond = signal_chain.analog_response(kept.sensor)
         self._invert = signal_chain.inverse(kept.sensor)
         self._by_coefficient = coefficient_tangent(kept.sensor)

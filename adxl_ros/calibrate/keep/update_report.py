@@ -12,7 +12,6 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import page as html_page
 from adxl_ros.report.figures import AXIS_COLOURS, figure, line, points, QUIET_COLOUR
 from adxl_ros.report.quantities import counted, utc, with_half_width
-from adxl_ros.report.screen import Tile
 import numpy as np
 
 PAGE = 'report.html'
@@ -44,18 +43,13 @@ class UpdatedDay(NamedTuple):
 
 
 def page(
-    sensor: Sensor,
-    days: Sequence[UpdatedDay],
-    state: KeptState,
-    badge: Mapping[str, Any],
-    tiles: Sequence[Tile],
+    sensor: Sensor, days: Sequence[UpdatedDay], state: KeptState, top: Mapping[str, Any]
 ) -> str:
-    """Return the page; badge and tiles are its top."""
+    """Return the page; `top` has badge and tiles."""
     values = {
         'title': f'Calibration of {sensor.serial} over {counted(len(days), "day")}',
-        'about': [],
-        'badge': badge,
-        'tiles': tiles,
+        'badge': top,
+        'tiles': top['tiles'],
         'figures': {
             'days': _by_day(sensor, days),
             'temperature': _by_temperature(sensor, days),

@@ -17,12 +17,13 @@ from adxl_ros.calibrate.pose_model import reference_force
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, certificate_data, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
-from adxl_ros.calibrate.report.error_budget import covariances, ErrorBudget
+from adxl_ros.calibrate.report.error_budget import ErrorBudget
+from adxl_ros.calibrate.report.error_causes import covariances
 from adxl_ros.calibrate.result import CalibrationResult, compare
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model import signal_chain
-from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
+from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.sensor import MARGIN_K, Sensor
 from adxl_ros.process import option
 from adxl_ros.report import templates
@@ -128,7 +129,7 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
         return None
     errors, assessment = result.held_out[-1], result.assessments[-1]
     gravity = fitted.local_gravity_mps2
-    axes = [AXES.index(axis) for axis in fitted.axes]
+    axes = fitted.axis_indices
     poses = result.poses.subset(result.inliers)
     held = poses.subset(errors.pose_index)
     used = held_out.determining_alpha(errors.pose_errors)
@@ -275,7 +276,7 @@ def _surroundings(name: str, fitted: Sensor, held: Poses, reference: np.ndarray)
         )
         for sign in (1, -1)
     ]
-    slope = (shifted[0] - shifted[1])[:, [AXES.index(axis) for axis in fitted.axes]] / (2 * step)
+    slope = (shifted[0] - shifted[1])[:, fitted.axis_indices] / (2 * step)
     if name == 'temperature':
         # What the model does not follow drifts as the datasheet states.
         slope = np.sqrt(

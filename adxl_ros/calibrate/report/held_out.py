@@ -12,7 +12,6 @@ from adxl_ros.calibrate.pose_model import reference_force, stage_force
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
-from adxl_ros.model.constants import AXES
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Components
 from adxl_ros.model.kinematics import tilt
@@ -89,7 +88,7 @@ def pose_errors(sensor: Sensor, poses: Poses, stage: Sensor | None = None) -> Po
         sensor, force, np.mean(poses.std_v, axis=0) ** 2, poses.environment
     )
     shows_tilt = tilt(force, covariance, 'z' in sensor.axes).alpha_std < _MAX_ALPHA_STD_RAD
-    measured = [AXES.index(axis) for axis in sensor.axes]
+    measured = sensor.axis_indices
     tilt_error = angle_between(np.column_stack(force), np.column_stack(reference))
     return PoseErrors(
         np.column_stack([force[d] - reference[d] for d in measured]),

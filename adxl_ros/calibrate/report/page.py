@@ -13,7 +13,7 @@ from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.pose_model import reference_force
 from adxl_ros.calibrate.poses import planes, Poses
 from adxl_ros.calibrate.report import acceptance, gum, held_out
-from adxl_ros.calibrate.report.acceptance import Assessment, FAIL, NOT_SHOWN, PASS
+from adxl_ros.calibrate.report.acceptance import FAIL, NOT_SHOWN, PASS
 from adxl_ros.calibrate.report.error_budget import rms_mg
 from adxl_ros.calibrate.result import CalibrationResult, compare, history, rounded
 from adxl_ros.errors import UserError
@@ -26,6 +26,7 @@ from adxl_ros.process import command
 from adxl_ros.report import figures, page as html_page
 from adxl_ros.report.figures import AXIS_COLOURS, Figure
 from adxl_ros.report.quantities import mg, three_digits
+from adxl_ros.report.screen import Tile
 import numpy as np
 
 PAGE = 'report.html'  # The file of a report
@@ -71,7 +72,6 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     row_of = {row.model: row for row in result.assessments}
     errors = result.held_out[-1] if result.held_out else None
     assessment = result.assessments[-1] if result.assessments else None
-    rows = _coefficients(fitted)
     limit_mps2, origin = acceptance.limit(fitted)
     drawn: dict[str, Figure] = {}
     if (fit := result.gravity_fit) is not None:
@@ -103,39 +103,29 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
         'adxl_ros.calibrate.report',
         'calibration.html',
         {
-            'title': f'Calibration of {fitted.serial}, {fitted.provenance["date"][:10]}',
-            'about': [
-                f'{fitted.model} model',
-                f'{len(result.poses)} poses',
-                f'axes {fitted.axes}',
-            ],
+            'result': result,
+            'fitted': fitted,
             'badge': badge(fitted),
-            'tiles': tiles(result, assessment),
-            'advice': f'Limited by {acceptance.LIMITS[assessment.accel.limited_by]}.'
-            if assessment
-            else 'Take more poses: too few were held out to assess this calibration.',
+            'tiles': tiles(result),
+            'assessment': assessment,
+            'limits': acceptance.LIMITS,
             'file_name': file_name,
             'apply_command': command('apply', f'RECORDING --params {file_name} -o tilt.csv'),
             'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
             'figures': drawn,
             'sphere': _sphere(result),
-            'coefficients': rows,
-            'beyond': [row for row in rows if row['outcome'] == _BEYOND],
-            'datasheet': fitted.datasheet_name,
-            'models': list(errors_of or row_of),
+            'coefficients': _coefficients(fitted),
+            'beyond_maximum': _BEYOND,
             'errors_of': errors_of,
             'row_of': row_of,
-            'poses': len(result.poses),
             'digits': three_digits,
             'mg': rms_mg,
             'limit': f'{origin} ({mg(limit_mps2):.2g} mg)',
-            'budget': assessment.accel if assessment and errors else None,
             'part_colours': _PART_COLOURS,
             'gum': gum.section(gum.uncertainty(result)),
             'history': history(fitted, past),
             'picture': picture,
             'picture_fault': fault,
-            'report_lines': result.report_lines,
             'provenance': [
                 [key.replace('_', ' '), value] for key, value in fitted.provenance.items()
             ],
@@ -154,7 +144,7 @@ def badge(fitted: Sensor) -> dict[str, str]:
     }
 
 
-def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict[str, str]]:
+def tiles(result: CalibrationResult) -> list[Tile]:
     """Return tilt and acceleration error before and after, and what limits them."""
     tiles = []
     if (fit := result.gravity_fit) is not None:
@@ -162,11 +152,11 @@ def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict
         before = three_digits(rms_mg(float(np.mean(fit.before_mps2[used] ** 2))))
         after = three_digits(rms_mg(float(np.mean(fit.held_out_mps2[used] ** 2))))
         tiles = [
-            {
-                'label': 'error of the magnitude of gravity',
-                'text': f'{before} → {after} mg',
-                'note': f'rms over {len(used)} rests, held out',
-            }
+            Tile(
+                'error of the magnitude of gravity',
+                f'{before} → {after} mg',
+                f'rms over {len(used)} rests, held out',
+            )
         ]
     for label, unit, name in (
         ('tilt error', '°', 'tilt_deg'),
@@ -178,20 +168,20 @@ def tiles(result: CalibrationResult, assessment: Assessment | None) -> list[dict
             after = three_digits(statistics[-1].rms)
             low, high = map(three_digits, statistics[-1].interval)
             tiles.append(
-                {
-                    'label': label,
-                    'text': f'{before} → {after} {unit}',
-                    'note': f'rms on held-out poses, 90 %: {low} to {high} {unit}',
-                }
+                Tile(
+                    label,
+                    f'{before} → {after} {unit}',
+                    f'rms on held-out poses, 90 %: {low} to {high} {unit}',
+                )
             )
-    if assessment is not None:
+    for assessment in result.assessments[-1:]:
         tiles.append(
-            {
-                'label': 'limited by',
-                'text': assessment.accel.limited_by,
-                'note': f'calibration error {three_digits(assessment.error_mg)} mg, without '
+            Tile(
+                'limited by',
+                assessment.accel.limited_by,
+                f'calibration error {three_digits(assessment.error_mg)} mg, without '
                 'noise and stage error of the check',
-            }
+            )
         )
     return tiles
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 from enum import auto, Enum
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,58 +77,6 @@ class ClockState(Enum):
     SETTLING = auto()  # It is new: its samples wait for some arrivals
     SETTLED = auto()  # Samples get stamps
     HELD = auto()  # Samples wait until the cause of late arrivals is known
-
-
-class DeviceClock(Protocol):
-    """A map of the clock of a device to the host's monotonic clock."""
-
-    state: ClockState
-    steps: int  # How often the device's clock has stepped, by its arrivals
-
-    @property
-    def drift_ppm(self) -> float:
-        """Drift of the device's clock, ppm; positive where it is slower than the host's."""
-
-    @property
-    def jitter_ns(self) -> float:
-        """Median distance of the windows' earliest arrivals from the fit, ns."""
-
-    def restart(self) -> None:
-        """Begin a new clock; its stamps follow the earlier ones."""
-
-    def observe(self, device_ns: int, arrived_ns: int) -> bool:
-        """Take an arrival; return whether it shows a forward step of the device's clock."""
-
-    def advance(self, now_ns: int) -> bool:
-        """Decide what a host time, ns, decides; return whether samples then get stamps."""
-
-    def host_ns(self, device_ns: np.ndarray) -> np.ndarray:
-        """Map ascending device times, ns, (n,), to host times that ascend from call to call."""
-
-
-class IdentityMap:
-    """Map for a device that stamps by the host's own monotonic clock: it learns nothing."""
-
-    drift_ppm = jitter_ns = 0.0
-
-    def __init__(self) -> None:
-        self.state = ClockState.SETTLED
-        self.steps = 0
-
-    def restart(self) -> None:
-        """Do nothing: all its clocks are one."""
-
-    def observe(self, device_ns: int, arrived_ns: int) -> bool:
-        """Do nothing: this clock does not step."""
-        return False
-
-    def advance(self, now_ns: int) -> bool:
-        """Return True: samples can be stamped at any time."""
-        return True
-
-    def host_ns(self, device_ns: np.ndarray) -> np.ndarray:
-        """Return the same times, ns."""
-        return device_ns
 
 
 class _Windows:
@@ -237,10 +185,10 @@ class _Clock:
 
 
 class ClockMap:
-    """Map of a device's clock by the arrivals of its samples; see `DeviceClock`."""
+    """Map of a device's clock by the arrivals of its samples."""
 
     def __init__(self, delay_s: float, decision_s: float = _LATER_WAIT_S) -> None:
-        self.steps = 0
+        self.steps = 0  # How often the device's clock has stepped, by its arrivals
         self.state = ClockState.SETTLING
         self._delay_ns = round(delay_s * 1e9)
         self._decision_s = decision_s
@@ -250,12 +198,12 @@ class ClockMap:
 
     @property
     def drift_ppm(self) -> float:
-        """Drift of the device's clock, ppm; see `DeviceClock`."""
+        """Drift of the device's clock, ppm; positive where it is slower than the host's."""
         return self._clock.windows.drift_ppm
 
     @property
     def jitter_ns(self) -> float:
-        """Distance of early arrivals from the fit, ns; see `DeviceClock`."""
+        """Median distance of the windows' earliest arrivals from the fit, ns."""
         return self._clock.windows.jitter_ns
 
     def restart(self) -> None:
@@ -371,3 +319,32 @@ class ClockMap:
             self._clock.former_lag_ns = former_ns
             for arrival in late:
                 self._take(arrival)
+
+
+class IdentityMap:
+    """Map for a device that stamps by the host's own monotonic clock: it learns nothing."""
+
+    drift_ppm = jitter_ns = 0.0
+
+    def __init__(self) -> None:
+        self.state = ClockState.SETTLED
+        self.steps = 0
+
+    def restart(self) -> None:
+        """Do nothing: all its clocks are one."""
+
+    def observe(self, device_ns: int, arrived_ns: int) -> bool:
+        """Do nothing: this clock does not step."""
+        return False
+
+    def advance(self, now_ns: int) -> bool:
+        """Return True: samples can be stamped at any time."""
+        return True
+
+    def host_ns(self, device_ns: np.ndarray) -> np.ndarray:
+        """Return the same times, ns."""
+        return device_ns
+
+
+DeviceClock = ClockMap | IdentityMap
+"""A map of the clock of a device to the host's monotonic clock."""

@@ -39,7 +39,9 @@ class Board:
     """
 
     def __init__(self, sensor: Sensor, roles: list[str], fd: int) -> None:
-        self._sensor, self._roles, self._fd = sensor, roles, fd
+        self._sensor = sensor
+        self._roles = roles
+        self._fd = fd
         self._line = EmulatedLine(sensor)
         self._received = wire_format.Splitter()
         flags = wire_format.HAS_SELF_TEST if self._line.has_step else 0

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.fits.full_model import TERMS
-from adxl_ros.calibrate.report import certificate_data, error_budget, gum
+from adxl_ros.calibrate.report import certificate_data, error_causes, gum
 from adxl_ros.errors import UserError
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
@@ -136,7 +136,7 @@ def test_the_stage_knows_on_which_side_of_90_degrees_a_pose_is(found):
     force = np.column_stack(
         specific_force(0 * held.beta_rad + np.radians(87), held.beta_rad, GRAVITY_MPS2)
     )
-    by_coefficients = error_budget.covariances(errors, held, force).by_coefficients
+    by_coefficients = error_causes.covariances(errors, held, force).by_coefficients
     assert np.sqrt(by_coefficients[0, 0].max()) < 2e-3
 
 
