@@ -1132,11 +1132,11 @@ def _check_units(
             continue
         are_all = len(wrong) == len(gains)
         which = 'the output' if are_all else f'the output of {listed(wrong, "and")}'
-        by_option = f', by {option("unit")} or {option("sim_unit")}'
+        by_option = ''
+        if are_all and comparison.simulated_force:
+            by_option = f', by {option("unit")} or {option("sim_unit")}'
         raise DataFault(
             'unit',
             f'{which} is {np.median([gains[axis] for axis in wrong]):.4g} times the simulated '
-            f'output, as values in {units} are; correct the unit of the columns'
-            + by_option
-            * bool(are_all and comparison.simulated_force),
+            f'output, as values in {units} are; correct the unit of the columns{by_option}',
         )
