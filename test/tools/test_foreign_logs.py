@@ -307,7 +307,7 @@ def test_volts_of_another_sensor(run_tool, tmp_path) -> None:
         + lines([LOG.time_s, *volts.T, 0 * LOG.time_s], ['%.3f'] + ['%.5f'] * 3 + ['%.1f']),
     )
     done = run_tool('fit', 'log.csv', '-o', 'unit.yaml')
-    assert 'add --params with the parameter file of the sensor' in done.stderr
+    assert '--params takes the parameter file of the sensor' in done.stderr
     options = proposed(done.stderr)
     assert options == ['--columns', 'time=t:s,x=Vx:v,y=Vy:v,z=Vz:v']
     done = run_tool('fit', 'log.csv', '-o', 'unit.yaml', *options)
