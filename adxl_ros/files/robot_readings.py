@@ -21,7 +21,12 @@ _TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 _BASE = ('x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw')
 """Columns of the pose of the base in a table, behind `base_`."""
 
-Track = tuple[np.ndarray, np.ndarray]  # Time, s, (k,), and values, (k,) or (k, 7)
+
+class Track(NamedTuple):
+    """Readings of a joint, or of the base."""
+
+    time_s: np.ndarray  # (k,), rising
+    values: np.ndarray  # (k,), or (k, 7) of the base
 
 
 class Readings(NamedTuple):
@@ -110,8 +115,8 @@ def _from_table(path: str) -> Readings:
 def _track(time_s: np.ndarray, values: np.ndarray) -> Track:
     """Return the finite readings in the order of their times, each time once."""
     known = np.isfinite(values).reshape(len(values), -1).all(axis=1)
-    time_s, first = np.unique(time_s[known], return_index=True)
-    return time_s, values[known][first]
+    read_s, first = np.unique(time_s[known], return_index=True)
+    return Track(read_s, values[known][first])
 
 
 def _poses_in(message: Any, kind: str, root: str) -> list[tuple]:

@@ -13,7 +13,7 @@ from itertools import takewhile
 
 from adxl_ros.diagnose.comparison import gravity_slopes, noiseless
 from adxl_ros.files.recording_columns import JOINTS
-from adxl_ros.files.robot_readings import Readings
+from adxl_ros.files.robot_readings import Readings, Track
 from adxl_ros.model import noise
 from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
@@ -266,7 +266,7 @@ class RobotForce:
             self._robot,
             Readings(
                 'the robot',
-                {name: (time_s, values) for name, values in zip(self._robot.joints, rows.T)},
+                {name: Track(time_s, values) for name, values in zip(self._robot.joints, rows.T)},
             ),
             self._gravity_mps2,
             since_s=-0.1,
