@@ -43,7 +43,7 @@ _LEAST_LOG_SHARE = np.log(1e-3)
 unit may begin to drift, so that one change after a quiet time is no knock unless it is large."""
 
 
-class Rest(NamedTuple):
+class SeenRest(NamedTuple):
     """A rest to first order."""
 
     residual_g: np.ndarray  # Force by the calibration in use, minus gravity in its direction, (m,)
@@ -128,7 +128,7 @@ class Belief:
         mean[:, : len(change)] -= change
         return replace(self, mean=mean)
 
-    def innovation(self, rest: Rest, freedom: int) -> Innovation:
+    def innovation(self, rest: SeenRest, freedom: int) -> Innovation:
         """Compare a rest with its prediction; freedom: numbers in it that the stay determines."""
         design = np.hstack([rest.design, rest.basis])
         spread = self.covariance @ design.T
