@@ -323,21 +323,29 @@ def _held_out(
     return out
 
 
+def _left_mps2(comparison: BaselineComparison, sensor: Sensor) -> np.ndarray:
+    """Return the squares that a sensor leaves of used samples, mean over axes, (m/s²)², (n,)."""
+    residual_mps2 = comparison.residual_v(sensor) / comparison.scale_v_per_mps2
+    return np.mean(residual_mps2**2, axis=1) * comparison.used
+
+
 def _simulate_again(search: Search, effects: frozenset[str]) -> rule.SimulatedAgain:
     """Simulate a set as it is printed in all recordings, and as it was fitted at their rests."""
     hypothesis, model = search.found[effects], search.model
     printed = _as_printed(hypothesis, with_neutral(model.baseline, hypothesis.effects))
-    squares, more_at_rest, resting = np.zeros(BLOCKS), list[float](), 0
+    squares = np.zeros(BLOCKS)
+    more_at_rest = []
+    resting = 0
     for c in model.comparisons:
-        left, fitted, without = (
-            np.mean((c.residual_v(s) / c.scale_v_per_mps2) ** 2, axis=1) * c.used
-            for s in (printed, hypothesis.sensor, search.found[frozenset()].sensor)
-        )
+        left = _left_mps2(c, printed)
         left[~c.used] = 0.0
         squares += sum_by_block(left)
-        rests = true_runs(c.at_rest & c.used) if c.pose_known else []
-        more_at_rest += [float(np.sum((fitted - without)[a:b])) for a, b in rests]
-        resting += sum(b - a for a, b in rests)
+        if c.pose_known:
+            more = _left_mps2(c, hypothesis.sensor)
+            more -= _left_mps2(c, search.found[frozenset()].sensor)
+            for begin, end in true_runs(c.at_rest & c.used):
+                more_at_rest.append(float(np.sum(more[begin:end])))
+                resting += end - begin
     return rule.SimulatedAgain(
         squares, np.array(more_at_rest), float(resting), hypothesis.at_bound
     )
@@ -473,10 +481,14 @@ def _closure(
     removed_power: mean square, (m/s²)², of samples that the sensor did not measure.
     """
     best = verdict.best if verdict.closes else frozenset[str]()
-    before, after = (
-        evidence.mean(evidence.candidates[e][HEALTHY].figures.squares) + removed_power
-        for e in (frozenset[str](), best)
-    )
+
+    def left(effects: frozenset[str]) -> np.ndarray:
+        """Return the power that a set leaves, (m/s²)², by draw."""
+        squares = evidence.candidates[effects][HEALTHY].figures.squares
+        return evidence.mean(squares) + removed_power
+
+    before = left(frozenset())
+    after = left(best)
     stated = noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2)
     stated_mps2 = rms(stated)
     draws = floor.draws_mps2(seed, len(before) - 1)
@@ -583,7 +595,9 @@ def self_check(
     """
     report = diagnosis.report
     assert report is not None
-    named, same, inside = (report.verdict.effects, report.verdict.groups), 0, []
+    named = report.verdict.effects, report.verdict.groups
+    same = 0
+    inside = []
     for i in range(count):
         drawn = []
         for k, (c, recording) in enumerate(zip(diagnosis.full_rate, recordings)):

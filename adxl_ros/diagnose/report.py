@@ -15,12 +15,13 @@ from adxl_ros.diagnose.search import Hypothesis
 from adxl_ros.diagnose.verdict import Verdict
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern, Need
+from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern, Effect, Need
 from adxl_ros.model.sensor import fitted_of, get, parameter_of, with_neutral
 from adxl_ros.process import option
 from adxl_ros.report import quantities
 from adxl_ros.report.quantities import amplitude_text, Interval, listed, mg_text, percent
 from adxl_ros.report.screen import COLUMNS, wrapped
+from adxl_ros.signals.findings import Shown
 import numpy as np
 
 _DIGITS = 6  # Significant digits of the report. Chosen: more than any of its numbers has
@@ -391,7 +392,8 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
         )
     ]
     if closes(report):
-        low, high = (percent(share) for share in (closure.closed.low, closure.closed.high))
+        low = percent(closure.closed.low)
+        high = percent(closure.closed.high)
         ci = '' if low == high else f', 90 % interval {low} to {high}'
         rows.append(
             Row(
@@ -464,7 +466,9 @@ def beside_rows(report: Report) -> list[Row]:
 
     A calibration may have taken them up of the effects, so that both belong together.
     """
-    verdict, sensor, texts = report.verdict, report.sensor, list[str]()
+    verdict = report.verdict
+    sensor = report.sensor
+    texts = []
     straight = [
         e
         for e in library().values()
@@ -526,25 +530,26 @@ def closes(report: Report) -> bool:
     )
 
 
-def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]:
-    """Return effect, smallest and typical size, and what is missing to show it; '' for nothing."""
-    p, effect = parameter_of(row.name), effect_named(row.name.effect)
-    smallest, typical = (
-        quantities.parameter_text({'value': v, 'unit': p.unit}, scale_v_per_g, 2)
-        for v in (row.smallest, p.scale)
-    )
+def shown(row: CouldShow, scale_v_per_g: float) -> Shown:
+    """Return smallest and typical size of an effect, and what is missing to show it."""
+    effect = effect_named(row.name.effect)
+    parameter = parameter_of(row.name)
+
+    def text(size: float) -> str:
+        return quantities.parameter_text({'value': size, 'unit': parameter.unit}, scale_v_per_g, 2)
+
+    typical = text(parameter.scale)
     if row.shows:
-        return effect.name, smallest, typical, ''
+        return Shown(effect.name, text(row.smallest), typical, '')
+    return Shown(effect.name, 'cannot show', typical, _missing(effect))
+
+
+def _missing(effect: Effect) -> str:
+    """Return what is missing to show an effect."""
+    if effect.concern is Concern.REFERENCE:
+        return f'needs {option("urdf" if Need.ROBOT in effect.needs else "sim")}'
     revealed_by = effect.diagnosis.revealed_by
-    reference = f'needs {option("urdf" if Need.ROBOT in effect.needs else "sim")}'
-    missing = (
-        reference
-        if effect.concern is Concern.REFERENCE
-        else f'needs: {MENU[revealed_by].text}'
-        if revealed_by
-        else 'no manoeuvre shows it'
-    )
-    return effect.name, 'cannot show', typical, missing
+    return f'needs: {MENU[revealed_by].text}' if revealed_by else 'no manoeuvre shows it'
 
 
 _BADGE_COLUMNS = 29  # Columns of the verdict
@@ -556,14 +561,18 @@ _SHARE_COLUMNS = 7  # Columns of the share of the gap there
 
 def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     """Return the diagnosis as lines of at most `COLUMNS` columns; the first one is the subject."""
-    lines, word, report = [*wrapped(subject), ''], badge(diagnosis), diagnosis.report
+    lines = [*wrapped(subject), '']
+    word = badge(diagnosis)
+    report = diagnosis.report
     labelled = [('note', note) for note in notes(diagnosis)]
     if report is None:
         return (
             lines + wrapped(f'{word}  {headline(diagnosis)}', len(word) + 2) + _labelled(labelled)
         )
-    objects, rows = as_json(diagnosis), figure_rows(diagnosis)
-    closure, first = report.closure, {row.label: row.note for row in rows}
+    objects = as_json(diagnosis)
+    rows = figure_rows(diagnosis)
+    closure = report.closure
+    note_of = {row.label: row.note for row in rows}
     # The gap, with the effects, and the floor stand in the first line.
     after = f' -> {mg_text(closure.after.value)}' if closes(report) else ''
     gap = f'{mg_text(closure.before.value)}{after} rms'
@@ -571,16 +580,20 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
         f'{word:{_BADGE_COLUMNS - 1}} {gap:{_GAP_COLUMNS - 1}} noise floor '
         f'{mg_text(closure.floor.value)}'
     )
-    remark = first.get('with the effects', '' if 'sim' in first['gap'] else f'gap {first["gap"]}')
-    for text in (remark, f'noise floor {first["noise floor"]}'):
+    without_effects = '' if 'sim' in note_of['gap'] else f'gap {note_of["gap"]}'
+    remark = note_of.get('with the effects', without_effects)
+    for text in (remark, f'noise floor {note_of["noise floor"]}'):
         beside = wrapped(text, columns=COLUMNS - _BADGE_COLUMNS)
         lines += [' ' * _BADGE_COLUMNS + part for part in beside]
     if report.verdict.status != 'explained' or 'REFERENCE' in word:
         lines += wrapped(headline(diagnosis))
     elif is_only_noise(report):
         lines += wrapped(NOISE_STAYS)
-    shown = report.could_show
-    hidden = ', '.join(row.name.effect for row in shown if not row.shows)
+    could_show = report.could_show
+    shows = f'{sum(row.shows for row in could_show)} of {len(could_show)} effects could show'
+    hidden = ', '.join(row.name.effect for row in could_show if not row.shows)
+    if hidden:
+        shows += f'; could not: {hidden}'
     return [
         *lines,
         *_effect_table(report, objects),
@@ -592,11 +605,7 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
                     '; '.join(f'{row.label} {row.text}' for row in rows[2 + closes(report) :]),
                 ),
                 *(('noise', f'{row.label}: {row.text}') for row in remainder_rows(report)),
-                (
-                    'shows',
-                    f'{sum(row.shows for row in shown)} of {len(shown)} effects could show'
-                    + f'; could not: {hidden}' * bool(hidden),
-                ),
+                ('shows', shows),
                 *(
                     ('cause', f'{name}: {effect_named(name).cause}')
                     for name in named_effects(report, objects)
@@ -621,17 +630,16 @@ def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
     candidates = {c['effect']: c for c in objects['candidates']}
     width = max(map(len, ('effect', *named))) + 2
     size_columns = COLUMNS - 1 - width - _SURE_COLUMNS - _SHARE_COLUMNS
-    lines = (
-        [
+    lines = []
+    if named:
+        lines = [
             '',
             f' {"effect":{width}}{"sure":{_SURE_COLUMNS}}'
             f'{"size (90 % interval)":{size_columns - 6}} share of gap',
         ]
-        if named
-        else []
-    )
     for name in named:
-        share, sure = candidates[name]['share'], percent(candidates[name]['probability'])
+        share = candidates[name]['share']
+        sure = percent(candidates[name]['probability'])
         sizes: list[str] = []
         for size in size_lines(report, candidates[name]):
             sizes += wrap(size, size_columns - 1, subsequent_indent='  ')
@@ -648,9 +656,12 @@ def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
     """Return one line for each parameter; those that may be 0 share the last line."""
     parameters = candidate['parameters']
     is_single = len({key.partition('.')[0] for key in parameters}) == 1
-    lines, zeros, all_v_per_g = [], [], report.baseline.scale_v_per_g
+    lines = []
+    zeros = []
+    all_v_per_g = report.baseline.scale_v_per_g
     for key, parameter in parameters.items():
-        label, ci = quantities.parameter_label(key, is_single), parameter.get('ci')
+        label = quantities.parameter_label(key, is_single)
+        ci = parameter.get('ci')
         if ci and ci[0] <= 0 <= ci[1]:
             zeros.append(label)
         else:
@@ -658,9 +669,9 @@ def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
                 key.partition('.')[2], all_v_per_g.mean()
             )
             lines.append(f'{label} {quantities.parameter_text(parameter, float(scale))}'.strip())
-    return lines + (
-        [f'{", ".join(zeros)}: not different from 0'.removeprefix(': ')] if zeros else []
-    )
+    if zeros:
+        lines.append(f'{", ".join(zeros)}: not different from 0'.removeprefix(': '))
+    return lines
 
 
 def _labelled(rows: Sequence[tuple[str, str]]) -> list[str]:

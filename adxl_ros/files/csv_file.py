@@ -372,9 +372,8 @@ def _plain(data: bytes) -> bytes:
 
 def _since_1970(date: re.Match[bytes]) -> bytes:
     """Return the seconds since 1970 of a date and time, in nanoseconds."""
-    year, month, day, time, hours, minutes = (
-        part.decode() if part else '0' for part in date.groups()
-    )
+    parts = [part.decode() if part else '0' for part in date.groups()]
+    year, month, day, time, hours, minutes = parts
     try:
         stamp = np.datetime64(f'{year}-{month}-{day}T{time.replace(",", ".")}', 'ns')
     except ValueError:

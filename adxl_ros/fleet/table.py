@@ -71,8 +71,11 @@ class FleetQuantity:
 
     def text(self, value: float, low: float, high: float) -> str:
         """Return a difference with its interval, in the unit of the page."""
-        middle, below, above = (number(self.factor * x, True) for x in (value, low, high))
-        return f'{middle} ({below} to {above}) {self.shown_unit}'
+
+        def shown(difference: float) -> str:
+            return number(self.factor * difference, True)
+
+        return f'{shown(value)} ({shown(low)} to {shown(high)}) {self.shown_unit}'
 
 
 @dataclass(frozen=True)
@@ -101,8 +104,11 @@ class FleetTable:
     def recordings(self, quantity: FleetQuantity) -> tuple[np.ndarray, Recordings]:
         """Return a quantity in the recordings that have it."""
         value = self[quantity.column]
-        low, *high = (self[name] for name in quantity.error_columns)
-        std = (high[0] - low) / (2 * Z_90) if high else low
+        errors = [self[name] for name in quantity.error_columns]
+        std = errors[0]
+        if len(errors) == 2:
+            low, high = errors
+            std = (high - low) / (2 * Z_90)
         used = np.isfinite(value) & np.isfinite(self.years) & (self.sensor >= 0) & self.first
         rows = np.flatnonzero(used & np.isfinite(std) & (std >= 0))
         return rows, Recordings(self.sensor, self.period, self.years, value, std)[rows]
@@ -176,15 +182,15 @@ def quantities(table: FleetTable | None) -> tuple[FleetQuantity, ...]:
             ),
         ]
     for (letter, label, unit, shown), axis in product(NOISE, AXES):
-        column, *ends = (f'noise_{letter}{end}_{axis}_{unit}' for end in ('', '_low', '_high'))
+        of_axis = f'{axis}_{unit}'
         # The unit of the files begins with that of an acceleration.
         listed.append(
             FleetQuantity(
-                column,
+                f'noise_{letter}_{of_axis}',
                 f'{label}, {axis}',
                 shown.replace('m/s²', 'µg', 1),
                 1e3 * MG,
-                tuple(ends),
+                (f'noise_{letter}_low_{of_axis}', f'noise_{letter}_high_{of_axis}'),
                 is_coefficient=False,
                 is_noise=True,
             )

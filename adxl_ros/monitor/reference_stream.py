@@ -160,12 +160,10 @@ class ReferenceStream:
     def motion(self, origin_ns: int) -> Motion:
         """Return the motion whose time begins at a stamp, ns; it follows the prepared blocks."""
         self._origin_ns = origin_ns
-        alpha, beta, shift = (partial(self._joint, number) for number in range(len(JOINTS)))
+        joints = {joint: partial(self._joint, number) for number, joint in enumerate(JOINTS)}
         motion = Motion(
             duration_s=np.inf,
-            alpha=alpha,
-            beta=beta,
-            shift=shift,
+            **joints,
             temperature_c=partial(self._surrounding, 'temperature_c'),
             supply_v=partial(self._surrounding, 'supply_v'),
         )
@@ -313,13 +311,11 @@ class Prediction:
 
     def __init__(self, sensor: Sensor, reference: ReferenceStream) -> None:
         # Effects that need the angles of a stage, which the reference has not
-        self.left_out = (
-            ()
-            if reference.kind is ReferenceKind.STAGE
-            else tuple(
+        self.left_out: tuple[str, ...] = ()
+        if reference.kind is not ReferenceKind.STAGE:
+            self.left_out = tuple(
                 name for name in sensor.effects if effect_named(name).concern is Concern.STAGE
             )
-        )
         effects = tuple(name for name in sensor.effects if name not in self.left_out)
         self._sensor = sensor
         self._reference = reference

@@ -86,15 +86,11 @@ class NoiseLimits:
 
 
 def _largest(limits: list[NoiseLimits]) -> NoiseLimits | None:
-    return (
-        NoiseLimits(
-            *(
-                np.maximum.reduce([getattr(each, f.name) for each in limits])
-                for f in fields(NoiseLimits)
-            )
-        )
-        if limits
-        else None
+    if not limits:
+        return None
+    names = [field.name for field in fields(NoiseLimits)]
+    return NoiseLimits(
+        **{name: np.maximum.reduce([getattr(each, name) for each in limits]) for name in names}
     )
 
 

@@ -214,11 +214,13 @@ def _plan_lines(to_do: Plan, results: Results) -> list[str]:
     )
     unknown = units.pop(NO_SERIAL, 0)
     largest = ', '.join(f'{serial} ({count})' for serial, count in units.most_common(_UNITS))
+    if len(units) > _UNITS:
+        largest += ', ...'
     rows = {
         'done already': str(to_do.done),
         'left out': _left_out(to_do),
         'core hours': f'{to_do.core_hours:.3g}',
-        'units': largest and f'{len(units)}: {largest}{", ..." * (len(units) > _UNITS)}',
+        'units': largest and f'{len(units)}: {largest}',
         'unknown unit': counted(unknown, 'recording'),
     }
     size_gb = number(to_do.size_bytes / 1e9, digits=2)

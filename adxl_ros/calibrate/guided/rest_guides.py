@@ -242,16 +242,10 @@ class HandGuide(HandRests):
         """Return direction, readings and progress, for the screen."""
         up = self.up()
         count = len(self.accepted)
-        now = (
-            []
-            if up is None
-            else [
-                Row(
-                    'now',
-                    cube_directions.points_up(int(np.argmax(cube_directions.UP @ up))) + ' now',
-                )
-            ]
-        )
+        now = []
+        if up is not None:
+            nearest = int(np.argmax(cube_directions.UP @ up))
+            now = [Row('now', f'{cube_directions.points_up(nearest)} now')]
         return [
             Row('pose', f'{self.pose_number}: {self.destination()}'),
             *now,
@@ -400,7 +394,8 @@ class ThermalGuide(Guide):
             return Status(Phase.DONE, self.destination(), False)
         at_rest = self._dwell is not None and self._dwell.at_rest()
         motion = '' if at_rest or self._dwell is None else 'the sensor moves; '
-        (coverage, error), _ = self.estimated()
+        expected, _ = self.estimated()
+        coverage, error = expected
         return Status(
             Phase.DWELL if at_rest else Phase.REST,
             f'{len(self.accepted)} blocks; '
@@ -427,21 +422,19 @@ class ThermalGuide(Guide):
     def estimated(self) -> tuple[list[Row], list[Row]]:
         """Return coverage and error, and the coefficients by the blocks so far, for the screen."""
         fit = self._fit
-        (low_c, high_c) = self._settings.range_c
+        low_c, high_c = self._settings.range_c
         rows = []
         if fit is not None:
             prior = [thermal_fit.PRIOR_WIDTH * parameter_of(name).scale for name in fit.names]
             rows = running_estimate.coefficient_rows(
                 fit.names, fit.values, np.sqrt(np.diag(fit.covariance)), np.array(prior)
             )
-        error = (
-            f'not known yet over {low_c:g} to {high_c:g} °C'
-            if self._error_mg is None
-            else (
+        error = f'not known yet over {low_c:g} to {high_c:g} °C'
+        if self._error_mg is not None:
+            error = (
                 f'zero-g {self._error_mg:.2g} mg expected over {low_c:g} to {high_c:g} °C, after '
                 f'{self._blocks_c.min():.1f} to {self._blocks_c.max():.1f} °C'
             )
-        )
         return [
             Row(
                 'coverage',
