@@ -181,7 +181,7 @@ def _noise_could_show(
     return rows
 
 
-class Belief(NamedTuple):
+class KnownCoefficients(NamedTuple):
     """What a hypothesis knows of k coefficients."""
 
     mean: np.ndarray  # Mean, (k,)
@@ -191,7 +191,7 @@ class Belief(NamedTuple):
 def expected_information(
     gram: np.ndarray,
     probabilities: Sequence[float],
-    beliefs: Sequence[Belief],
+    beliefs: Sequence[KnownCoefficients],
     factor: float = 1.0,
 ) -> float:
     """
@@ -324,7 +324,7 @@ def _belief(
     fitted_keys: dict[int, tuple],
     fit: LinearFit | None,
     unseen: Collection[str],
-) -> Belief:
+) -> KnownCoefficients:
     """
     Return what a hypothesis knows of the columns of a manoeuvre.
 
@@ -347,7 +347,7 @@ def _belief(
         mean[at] = fit.values[kept]
         covariance[at] = 0.0
         covariance[np.ix_(at, at)] = fit.covariance[np.ix_(kept, kept)]
-    return Belief(mean, covariance)
+    return KnownCoefficients(mean, covariance)
 
 
 class ManoeuvreDescription(NamedTuple):

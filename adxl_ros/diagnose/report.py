@@ -55,7 +55,7 @@ NOISE_STAYS = 'The effects are noise, which no simulation repeats sample by samp
 """Why effects on the noise close nothing."""
 
 
-class Row(NamedTuple):
+class FigureRow(NamedTuple):
     """One row of figures: what it is, its figures with their units, and a remark."""
 
     label: str
@@ -376,14 +376,14 @@ def summary(diagnosis: Diagnosis) -> str:
     )
 
 
-def figure_rows(diagnosis: Diagnosis) -> list[Row]:
+def figure_rows(diagnosis: Diagnosis) -> list[FigureRow]:
     """Return the figures from which the verdict follows: the same for terminal, page and JSON."""
     report = diagnosis.report
     assert report is not None
     closure, verdict = report.closure, report.verdict
     compared = any(c.pose_known for c in diagnosis.comparisons)
     rows = [
-        Row(
+        FigureRow(
             'gap',
             f'{mg_text(closure.before.value)} rms',
             'recording minus simulation'
@@ -396,14 +396,14 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
         high = percent(closure.closed.high)
         ci = '' if low == high else f', 90 % interval {low} to {high}'
         rows.append(
-            Row(
+            FigureRow(
                 'with the effects',
                 f'{mg_text(closure.after.value)} rms',
                 f'{percent(closure.closed.value)} closed, held out{ci}',
             )
         )
     rows.append(
-        Row(
+        FigureRow(
             'noise floor',
             f'{mg_text(closure.floor.value)} rms',
             _FLOOR_SOURCES[report.noise_floor.source],
@@ -411,11 +411,13 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
     )
     if verdict.status in _WITHOUT_GAP:
         rows.append(
-            Row('upper limit', mg_text(verdict.upper_limit_mps2), 'a larger gap would have shown')
+            FigureRow(
+                'upper limit', mg_text(verdict.upper_limit_mps2), 'a larger gap would have shown'
+            )
         )
     else:
         rows.append(
-            Row(
+            FigureRow(
                 'explained',
                 quantities.power_text(verdict.explained),
                 'by ' + listed(sorted(verdict.best), 'and')
@@ -425,15 +427,15 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
         )
     rows += beside_rows(report)
     rows.append(
-        Row(
+        FigureRow(
             'repeats, not explained',
             quantities.power_text(verdict.rest),
             'by flexible functions, held out',
         )
     )
     rows += [
-        Row('material', f'from {mg_text(verdict.material_mps2)}', 'smaller is no gap'),
-        Row(
+        FigureRow('material', f'from {mg_text(verdict.material_mps2)}', 'smaller is no gap'),
+        FigureRow(
             'errors of the reference',
             mg_text(verdict.reference_mps2),
             'what follows the pose must exceed them, too',
@@ -442,7 +444,7 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
     fading_hz = [c.fading_hz for c in diagnosis.comparisons if c.fading_hz is not None]
     if report.linear_model.lost_motion_mps2:
         rows.append(
-            Row(
+            FigureRow(
                 'not in the reference',
                 f'{mg_text(report.linear_model.lost_motion_mps2)} rms',
                 f'motion above {min(fading_hz) / 2:.2g} Hz',
@@ -450,7 +452,7 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
         )
     if len(verdict.lost_without) > 1 and closes(report):
         rows += [
-            Row(
+            FigureRow(
                 f'lost without {effect}',
                 amplitude_text(power.value),
                 ' to '.join(amplitude_text(p) for p in (power.low, power.high)),
@@ -460,7 +462,7 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
     return rows
 
 
-def beside_rows(report: Report) -> list[Row]:
+def beside_rows(report: Report) -> list[FigureRow]:
     """
     Return how zero-g and scale factor changed beside the effects, where that is material.
 
@@ -486,13 +488,13 @@ def beside_rows(report: Report) -> list[Row]:
                 )
                 texts.append(f'{effect.name} {name.axis} {size}')
     return (
-        [Row('with them', ', '.join(texts), 'a calibration may have taken this up of them')]
+        [FigureRow('with them', ', '.join(texts), 'a calibration may have taken this up of them')]
         if texts
         else []
     )
 
 
-def remainder_rows(report: Report) -> list[Row]:
+def remainder_rows(report: Report) -> list[FigureRow]:
     """Return what remains of each noise-like effect."""
 
     def text(value: float, unit: str) -> str:
@@ -501,7 +503,7 @@ def remainder_rows(report: Report) -> list[Row]:
         return f'{100 * value:.2g} %' if unit == '1' else f'{value:.2g} a second'
 
     return [
-        Row(
+        FigureRow(
             f'{r.effect}, {r.quantity}{f" on {r.axis}" if r.axis else ""}',
             '{} recorded, {} simulated, {} left'.format(
                 *(

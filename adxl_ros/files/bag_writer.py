@@ -40,7 +40,7 @@ _END_OF_TIME_NS = (1 << 31) * 1_000_000_000
 _LONGEST_NS = (1 << 63) - 1  # Largest duration of ROS, ns: a QoS without a deadline
 
 
-class Form(NamedTuple):
+class TopicForm(NamedTuple):
     """How the messages of a topic are written."""
 
     kind: str  # Their type
@@ -65,7 +65,7 @@ class _NewBag:
             )
         return self.connections[topic]
 
-    def batch(self, topic: str, form: Form, stamp_ns: np.ndarray, fields: Columns) -> Batch:
+    def batch(self, topic: str, form: TopicForm, stamp_ns: np.ndarray, fields: Columns) -> Batch:
         """Return the messages of a topic at stamps, ns, (n,), rising."""
         return Batch(
             self.connection(topic, form.kind),
@@ -220,7 +220,7 @@ def _joint_batches(
         if sampled:
             yield bag.batch(
                 topic,
-                Form(JOINT_STATE, cdr.joint_state, template),
+                TopicForm(JOINT_STATE, cdr.joint_state, template),
                 stamp_ns[rows],
                 {'position': values[rows][:, pattern]},
             )
@@ -261,9 +261,9 @@ _ABSENT = np.array([-1.0, *[0.0] * 8])
 """Covariance of a quantity that is not measured (REP-145)."""
 
 
-def _imu_form(covariance: np.ndarray) -> Form:
+def _imu_form(covariance: np.ndarray) -> TopicForm:
     """Return the form of an Imu without orientation and rate, by its covariance, (9,)."""
-    return Form(
+    return TopicForm(
         IMU,
         cdr.imu,
         cdr.message(
@@ -279,12 +279,12 @@ _SCALARS = {
     'temperature_c': (
         '/temperature',
         'temperature',
-        Form(TEMPERATURE, cdr.temperature, cdr.message(FRAME, np.zeros(2))),
+        TopicForm(TEMPERATURE, cdr.temperature, cdr.message(FRAME, np.zeros(2))),
     ),
     'supply_v': (
         '/supply',
         'voltage',
-        Form(
+        TopicForm(
             # Three states, present, no cell voltages and temperatures, location, serial number.
             BATTERY_STATE,
             cdr.battery_state,
@@ -305,7 +305,7 @@ def tilt_bag(path: AnyPath) -> Iterator[Callable[..., None]]:
     """
     forms = {
         '/imu/data': _imu_form(np.zeros(9)),
-        '/tilt': Form(
+        '/tilt': TopicForm(
             'geometry_msgs/msg/Vector3Stamped',
             cdr.vector3_stamped,
             cdr.message(FRAME, np.zeros(3)),

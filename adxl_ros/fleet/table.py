@@ -312,7 +312,7 @@ def effect_matrix(table: FleetTable) -> pd.DataFrame:
     return has.groupby(sensor).mean()
 
 
-class State(IntEnum):
+class Condition(IntEnum):
     """State of a sensor; the most urgent is the least."""
 
     OUT_OF_TOLERANCE = 1
@@ -349,7 +349,7 @@ class SensorState:
     urgency: float  # Its rank among the units of its state; the least is the most urgent
     number: int  # Its number
     serial: str  # Its serial number
-    state: State  # Its state
+    state: Condition  # Its state
     reason: str  # Why it has this state, in one sentence; empty for none
     drifts: tuple[Drift, ...]  # Its claimed slopes, the most urgent first
     gap: str  # Median of its last gaps and of their noise floors, mg
@@ -392,7 +392,7 @@ def _state_of(sensor: int, table: FleetTable, results: Sequence[QuantityResult])
 class _Judged(NamedTuple):
     """The state of a sensor, and why."""
 
-    state: State
+    state: Condition
     urgency: float  # Sensors of a state with smaller ones come first
     reason: str
 
@@ -402,7 +402,7 @@ def _by_gap(gap: _GapNow) -> _Judged | None:
     if not gap.over_mg > TOLERANCE_MG:
         return None
     return _Judged(
-        State.OUT_OF_TOLERANCE,
+        Condition.OUT_OF_TOLERANCE,
         -gap.over_mg,
         f'Gap {number(gap.gap_mg)} mg, noise {number(gap.floor_mg)} mg; the tolerance is '
         f'{number(TOLERANCE_MG)} mg.',
@@ -415,20 +415,20 @@ def _by_drifts(drifts: Sequence[Drift]) -> _Judged | None:
         days = drifts[0].days
         text = f'{drifts[0].text}: out of tolerance '
         if days:
-            return _Judged(State.DRIFTS, days, f'{text}in {number(days, digits=2)} days.')
-        return _Judged(State.OUT_OF_TOLERANCE, -drifts[0].reached_mg, f'{text}now.')
+            return _Judged(Condition.DRIFTS, days, f'{text}in {number(days, digits=2)} days.')
+        return _Judged(Condition.OUT_OF_TOLERANCE, -drifts[0].reached_mg, f'{text}now.')
     rising = [drift.text for drift in drifts if drift.is_rising_noise]
-    return _Judged(State.DRIFTS, _FARTHEST_DAYS, f'{rising[0]}.') if rising else None
+    return _Judged(Condition.DRIFTS, _FARTHEST_DAYS, f'{rising[0]}.') if rising else None
 
 
 def _by_refusals(table: FleetTable, rows: np.ndarray, refused: np.ndarray) -> _Judged:
     """Judge a sensor whose recordings show nothing wrong by those that were refused, (n,) bool."""
     series = len(refused) if refused.all() else int(np.argmin(refused[::-1]))
     if not series:
-        return _Judged(State.IN_ORDER, 0.0, '')
+        return _Judged(Condition.IN_ORDER, 0.0, '')
     why = table['refusal'][rows[-1]] or table['outcome'][rows[-1]]
     reason = f'Refused, {counted(series, "recording")} in a row: {why}'
-    return _Judged(State.NOT_JUDGED, -series, reason)
+    return _Judged(Condition.NOT_JUDGED, -series, reason)
 
 
 class _GapNow(NamedTuple):

@@ -49,7 +49,7 @@ class Settings(base.PacedSettings):
     beta_rad: float = base.option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
 
 
-class _Knot(NamedTuple):
+class _JointKnot(NamedTuple):
     """Motion of the joints at one stamp."""
 
     stamp_ns: int  # ROS time, ns
@@ -110,7 +110,7 @@ class SimulatedSensor(base.Link):
             self._knots.pop()
         previous = self._knots[-1].position
         self._knots.append(
-            _Knot(
+            _JointKnot(
                 stamp_ns,
                 tuple(position.get(joint, previous[i]) for i, joint in enumerate(JOINTS)),
                 tuple(velocity.get(joint, 0.0) for joint in JOINTS),
@@ -217,5 +217,5 @@ class SimulatedSensor(base.Link):
         return np.where((step_ns > 0) & (step_ns <= _GAP_NS), spline(time_s, order), held)
 
 
-def _resting(position: tuple[float, ...]) -> _Knot:
-    return _Knot(0, position, (0.0,) * len(JOINTS))
+def _resting(position: tuple[float, ...]) -> _JointKnot:
+    return _JointKnot(0, position, (0.0,) * len(JOINTS))

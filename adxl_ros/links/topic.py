@@ -64,7 +64,7 @@ class Settings(base.SimulatorSettings):
     seed: int = base.option(0, 'seed of the noise', '', 0, 2**31 - 1)
 
 
-class _Chain:
+class _SimulatedChain:
     """The signal chain at the rate of the samples, as `simulate` runs it."""
 
     def __init__(self, sensor: Sensor, seed: int) -> None:
@@ -151,7 +151,7 @@ class EmulatedSensor(base.Link):
         self._mixture = ''
         self._heard_s = time.monotonic()
         self._newest_ns: int | None = None
-        self._chain: _Chain | None = None
+        self._chain: _SimulatedChain | None = None
         # Period of the samples, and the longest gap through which the chain runs on, ns
         self._period_ns = self._longest_ns = 0.0
         # Samples of the simulator by stamp, ns, and fields, and their volts
@@ -281,7 +281,7 @@ class EmulatedSensor(base.Link):
                 self.sensor = replace(self._sensor, rate_hz=rate_hz)
                 self._period_ns = 1e9 / rate_hz
                 self._longest_ns = max(_MAX_FILLED_NS, _LATE_PERIODS * self._period_ns)
-                self._chain = _Chain(self.sensor, self._seed)
+                self._chain = _SimulatedChain(self.sensor, self._seed)
                 self._seed += 1
         return self._chain is not None
 

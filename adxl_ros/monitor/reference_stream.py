@@ -13,7 +13,7 @@ from itertools import takewhile
 
 from adxl_ros.diagnose.comparison import gravity_slopes, noiseless
 from adxl_ros.files.recording_columns import JOINTS
-from adxl_ros.files.robot_readings import Readings, Track
+from adxl_ros.files.robot_readings import JointTrack, RobotReadings
 from adxl_ros.model import noise
 from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
@@ -262,9 +262,12 @@ class RobotForce:
         time_s = (stamp_ns - begin_ns) * 1e-9
         path = RobotPath(
             self._robot,
-            Readings(
+            RobotReadings(
                 'the robot',
-                {name: Track(time_s, values) for name, values in zip(self._robot.joints, rows.T)},
+                {
+                    name: JointTrack(time_s, values)
+                    for name, values in zip(self._robot.joints, rows.T)
+                },
             ),
             self._gravity_mps2,
             since_s=-0.1,
@@ -288,7 +291,7 @@ def _add_finite(
 
 
 @dataclass(frozen=True)
-class Block:
+class ComparedBlock:
     """The comparison of one block; m axes."""
 
     end_ns: int  # End of the block, ns
@@ -338,7 +341,7 @@ class Prediction:
 
     def block(
         self, stamp_ns: np.ndarray, accel_mps2: np.ndarray, motion: BlockMotion, end_ns: int
-    ) -> Block | None:
+    ) -> ComparedBlock | None:
         """
         Compare the samples of one prepared block; None for the first, in which filters settle.
 
@@ -360,7 +363,7 @@ class Prediction:
             noise.effective_samples(len(stamp_ns), 1 / self._sensor.rate_hz, self._sensor.rc_s)
         )
         freedom = max(1 - 1 / max(independent, 1.0), 0.5)
-        return Block(
+        return ComparedBlock(
             end_ns=end_ns,
             mean_mps2=mean_mps2,
             square=(modelled**2).mean(axis=0),

@@ -154,7 +154,7 @@ class KeepCalibrated(Node):
         self._sent_s = -_SENT_AGAIN_S
         self._obstacle = 'waiting for sensor_info, which names the unit'
         self._samples = Inbox(self, Imu, 'imu/data_raw', _INPUT_QUEUE, own.samples_unit)
-        self._surroundings = topics.Surroundings(self, _INPUT_QUEUE)
+        self._surroundings = topics.SurroundingTopics(self, _INPUT_QUEUE)
         self._info_topic = self.resolve_topic_name('sensor_info')
         given = sensor_parameters.make_sensor(flat, may_measure=True)
         if given.effects:

@@ -19,7 +19,7 @@ from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import robot_readings
 from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.robot_readings import Readings, Track
+from adxl_ros.files.robot_readings import JointTrack, RobotReadings
 from adxl_ros.files.stamps import period_s, stamped_rate_hz
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Components
@@ -186,7 +186,7 @@ class RobotPath(ForcePath):
     def __init__(
         self,
         robot: Robot,
-        readings: Readings,
+        readings: RobotReadings,
         gravity_mps2: float = G0_MPS2,
         since_s: float = -np.inf,
     ) -> None:
@@ -213,7 +213,7 @@ class RobotPath(ForcePath):
         self.joints = robot.joints
         self.wanders = readings.base is not None
 
-    def _smooth(self, tracks: Sequence[Track]) -> list[Path]:
+    def _smooth(self, tracks: Sequence[JointTrack]) -> list[Path]:
         """Return smooth paths through tracks with the steps of the encoders."""
         paths: list[Path] = []
         for (time_s, values), step in zip(tracks, self._steps):
@@ -339,7 +339,7 @@ class RobotPath(ForcePath):
         few readings, as the motion itself does.
         """
         halved = [
-            Track(track.time_s[::2], path(track.time_s[::2]))
+            JointTrack(track.time_s[::2], path(track.time_s[::2]))
             for track, path in zip(self._tracks, self._splines)
         ]
         return self._change_mps2(halved)
@@ -358,10 +358,10 @@ class RobotPath(ForcePath):
             offset = step * rng.random()
             if step and np.ptp(values):
                 read = np.rint((read + offset) / step) * step - offset
-            encoded.append(Track(time_s, read))
+            encoded.append(JointTrack(time_s, read))
         return self._change_mps2(encoded) + self.smoothing_mps2
 
-    def _change_mps2(self, tracks: Sequence[Track]) -> np.ndarray:
+    def _change_mps2(self, tracks: Sequence[JointTrack]) -> np.ndarray:
         """Return by how much the force of other readings differs, m/s², at `time_s`, (n, 3)."""
         moved = self._moved(_derivatives(self._smooth(tracks), self.time_s))
         return moved.force_mps2 - self.motion.force_mps2
@@ -374,7 +374,7 @@ def _derivatives(paths: Sequence[Path], time_s: np.ndarray) -> np.ndarray:
     )
 
 
-def _tracks(robot: Robot, readings: Readings) -> list[Track]:
+def _tracks(robot: Robot, readings: RobotReadings) -> list[JointTrack]:
     """Return the readings of the chain's joints, and then of the base's coordinates."""
     missing = [name for name in robot.joints if name not in readings.joints]
     if missing:
@@ -394,7 +394,7 @@ def _tracks(robot: Robot, readings: Readings) -> list[Track]:
         signs = np.cumprod(np.append(1.0, np.where(is_turned, -1.0, 1.0)))
         steady = np.hstack([pose[:, :3], pose[:, 3:] * signs[:, None]])
         for axis, values in zip(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), steady.T):
-            tracks[f'base {axis}'] = Track(time_s, values)
+            tracks[f'base {axis}'] = JointTrack(time_s, values)
     if not tracks:
         raise UserError(
             f'{robot.urdf}: no joint moves {robot.frame}, and {readings.path} has no '

@@ -178,7 +178,7 @@ def fit_full(
     stated = StageError(sensor.stage_std_rad)
     start = _likeliest_shapes(start, poses, names, stated, effects)
     require_determined(start, poses, names, stated, max_open)
-    return _Search(start, poses, names, stated).run()
+    return _StageSearch(start, poses, names, stated).run()
 
 
 def _likeliest_shapes(
@@ -225,7 +225,7 @@ def _with_shape(sensor: Sensor, effect: str, name: str, value: float) -> Sensor:
     return replace(sensor, values={**sensor.values, effect: {**of_effect, name: shape}})
 
 
-class _Search:
+class _StageSearch:
     """The fit from one start: stage error, coefficients and angles in turn until all converge."""
 
     def __init__(

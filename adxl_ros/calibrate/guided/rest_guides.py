@@ -14,7 +14,7 @@ from adxl_ros.calibrate.fits.gravity_fit import force_g, NAMES, NINE, nominal_re
 from adxl_ros.calibrate.fits.thermal_fit import PARTS
 from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate
 from adxl_ros.calibrate.guided.guide import Dwell, Guide, NextPose
-from adxl_ros.calibrate.guided.screen_contents import Phase, Row, Status, tilt_row
+from adxl_ros.calibrate.guided.screen_contents import GuideStatus, Phase, ScreenRow, tilt_row
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
@@ -226,45 +226,45 @@ class HandGuide(HandRests):
             values |= zip(('up_x', 'up_y', 'up_z'), cube_directions.UP[self.next_up].tolist())
         return NextPose(self.destination(), values, None)
 
-    def status(self) -> Status:
+    def status(self) -> GuideStatus:
         """Return what the guide waits for, with the values that matter."""
         count = len(self.accepted)
         stillness = self._finder.stillness()
         rests = f'{count} rests ({_advice(count)})'
         if stillness is None:
-            return Status(Phase.REST, f'{rests}; waiting for samples', False)
+            return GuideStatus(Phase.REST, f'{rests}; waiting for samples', False)
         phase = Phase.DWELL if stillness.at_rest else Phase.REST
-        return Status(
+        return GuideStatus(
             phase, f'{rests}; {stillness.describe_mps2(self.sensor)}; {self.destination()}', False
         )
 
-    def progress(self) -> list[Row]:
+    def progress(self) -> list[ScreenRow]:
         """Return direction, readings and progress, for the screen."""
         up = self.up()
         count = len(self.accepted)
         now = []
         if up is not None:
             nearest = int(np.argmax(cube_directions.UP @ up))
-            now = [Row('now', f'{cube_directions.points_up(nearest)} now')]
+            now = [ScreenRow('now', f'{cube_directions.points_up(nearest)} now')]
         return [
-            Row('pose', f'{self.pose_number}: {self.destination()}'),
+            ScreenRow('pose', f'{self.pose_number}: {self.destination()}'),
             *now,
             *self.newest.rows(self.stillness()),
-            Row(
+            ScreenRow(
                 'poses',
                 f'{count} done, {max(ENOUGH_RESTS - count, 0)} left for a good fit',
                 count / ENOUGH_RESTS,
             ),
         ]
 
-    def estimated(self) -> tuple[list[Row], list[Row]]:
+    def estimated(self) -> tuple[list[ScreenRow], list[ScreenRow]]:
         """Return coverage and error, and the coefficients by the rests so far, for the screen."""
         groups = {
             name: self.covered[axes == cube_directions.AXES_UP]
             for name, axes in (('faces', 1), ('edges', 2), ('corners', 3))
         }
         return [
-            Row(
+            ScreenRow(
                 'coverage',
                 ', '.join(
                     f'{name} up {group.sum()}/{len(group)}' for name, group in groups.items()
@@ -386,40 +386,40 @@ class ThermalGuide(Guide):
         """Return what to announce; None once the range is covered."""
         return None if self._passed.complete else NextPose(self.destination(), {}, None)
 
-    def status(self) -> Status:
+    def status(self) -> GuideStatus:
         """Return what the guide waits for, with the values that matter."""
         if self.refusal:
-            return Status(Phase.REFUSED, self.refusal, True)
+            return GuideStatus(Phase.REFUSED, self.refusal, True)
         if self._passed.complete:
-            return Status(Phase.DONE, self.destination(), False)
+            return GuideStatus(Phase.DONE, self.destination(), False)
         at_rest = self._dwell is not None and self._dwell.at_rest()
         motion = '' if at_rest or self._dwell is None else 'the sensor moves; '
         expected, _ = self.estimated()
         coverage, error = expected
-        return Status(
+        return GuideStatus(
             Phase.DWELL if at_rest else Phase.REST,
             f'{len(self.accepted)} blocks; '
             f'{coverage.text}; {error.text}; {motion}{self.destination()}',
             False,
         )
 
-    def progress(self) -> list[Row]:
+    def progress(self) -> list[ScreenRow]:
         """Return temperature, readings and progress, for the screen."""
         passed = self._passed
-        rows = [Row('pose', f'{self.pose_number}: {self.destination()}')]
+        rows = [ScreenRow('pose', f'{self.pose_number}: {self.destination()}')]
         if self.accepted:
             change = 'warming' if passed.rises else 'cooling'
-            rows.append(Row('now', f'{self._blocks_c[-1]:.1f} °C, {change}'))
+            rows.append(ScreenRow('now', f'{self._blocks_c[-1]:.1f} °C, {change}'))
         done = int(passed.warming.sum() + passed.cooling.sum())
         return [
             *rows,
             *self.newest.rows(self.stillness()),
-            Row(
+            ScreenRow(
                 'parts', f'{done} done, {2 * PARTS - done} left for a good fit', done / (2 * PARTS)
             ),
         ]
 
-    def estimated(self) -> tuple[list[Row], list[Row]]:
+    def estimated(self) -> tuple[list[ScreenRow], list[ScreenRow]]:
         """Return coverage and error, and the coefficients by the blocks so far, for the screen."""
         fit = self._fit
         low_c, high_c = self._settings.range_c
@@ -436,12 +436,12 @@ class ThermalGuide(Guide):
                 f'{self._blocks_c.min():.1f} to {self._blocks_c.max():.1f} °C'
             )
         return [
-            Row(
+            ScreenRow(
                 'coverage',
                 f'warming {self._passed.warming.sum()}/{PARTS}, '
                 f'cooling {self._passed.cooling.sum()}/{PARTS}',
             ),
-            Row('error', error),
+            ScreenRow('error', error),
         ], rows
 
     def _update(self) -> None:
