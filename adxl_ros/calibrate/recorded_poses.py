@@ -198,7 +198,8 @@ def poses_of_means(recording: Recording, sensor: Sensor) -> Poses:
 
 def with_table_angles(poses: Poses, table: PoseTable) -> Poses:
     """Give rests the angles of a table of poses, in their order."""
-    angles, path = table.angles_rad, table.path
+    angles = table.angles_rad
+    path = table.path
     if len(angles) != len(poses):
         starts = ', '.join(f'{start_s:.1f}' for start_s in poses.time_s[:, 0]) + ' s'
         raise UserError(

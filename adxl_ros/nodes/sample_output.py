@@ -139,7 +139,8 @@ class References:
             rows = np.flatnonzero(np.isfinite(values).any(axis=1))
             if not len(rows):
                 continue
-            values, periods = values[rows], stamps_ns[rows] // _PERIODS_NS[topic]
+            values = values[rows]
+            periods = stamps_ns[rows] // _PERIODS_NS[topic]
             last_period, last = self._published[topic]
             is_new = (np.diff(values, axis=0, prepend=last[None]) != 0).any(axis=1) | (
                 np.diff(periods, prepend=last_period) != 0

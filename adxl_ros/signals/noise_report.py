@@ -176,7 +176,8 @@ def paste_lines(result: RecordingNoise) -> list[str]:
         sensors['gyr'] = _figures(result.gyro, rate_hz)
     factors = {'': 1.0, 'samples': rate_hz**0.5, 'PX4': _PX4_HZ**0.5}
     text = Path(__file__).with_name('program_settings.csv').read_text(encoding='utf-8')
-    lines, program = [], ''
+    lines = []
+    program = ''
     for stated in csv.DictReader(text.splitlines()):
         if stated['sensor'] not in sensors:
             continue

@@ -224,7 +224,8 @@ class Session:
         if not len(stamps_ns) and not fault:
             return ''
         fault = fault or self.guide.feed(stamps_ns, volts)
-        before, self.fault = self.fault, fault
+        before = self.fault
+        self.fault = fault
         return '' if before else fault
 
     def take_poses(self) -> Iterator[str]:

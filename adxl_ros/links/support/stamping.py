@@ -31,7 +31,9 @@ def _system_offset() -> tuple[int, int]:
     """Return uncertainty and offset of the system clock from the monotonic clock, ns."""
     readings = []
     for _ in range(_TRIES):
-        before_ns, system_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        before_ns = time.monotonic_ns()
+        system_ns = time.time_ns()
+        after_ns = time.monotonic_ns()
         readings.append((after_ns - before_ns, system_ns - (before_ns + after_ns) // 2))
     return min(readings)
 
@@ -107,7 +109,8 @@ class Stamper:
             self._stamp()
         if not self._stamped:
             return no_samples(sensor, time.time_ns())
-        parts, self._stamped = self._stamped, []
+        parts = self._stamped
+        self._stamped = []
         marks = np.concatenate([part.in_self_test for part in parts])
         return Samples(
             stamp_ns=np.concatenate([part.stamp_ns for part in parts]),
