@@ -407,8 +407,8 @@ class StageGuide(StageSweep):
             ),
         ]
 
-    def estimated(self) -> tuple[list[ScreenRow], list[ScreenRow]]:
-        """Return coverage and error, and the coefficients by the poses so far, for the screen."""
+    def estimated(self) -> screen_contents.EstimateRows:
+        """Return what the poses so far show, for the screen."""
         targets = self.course.targets
         closed = self.course.closed
         final_rad = self.estimate.with_poses(
@@ -418,7 +418,8 @@ class StageGuide(StageSweep):
                 if number not in closed and not target.check
             ]
         ).tilt_error_rad()
-        return [
+        expected = [
             ScreenRow('coverage', pose_plan.by_plane(targets, self.accepted)),
             screen_contents.tilt_row(self.tilt_error_rad(), final_rad),
-        ], self.estimate.rows()
+        ]
+        return screen_contents.EstimateRows(expected, self.estimate.rows())
