@@ -34,9 +34,9 @@ FAST = (
 )
 RATE_HZ = 50.0
 RATE_RAD_S = np.radians(60)
-LONG = '-p', 'limits.rate_deg_s:=10.0', '-p', 'limits.minutes:=0.9'
-"""Manoeuvres that take long enough to be seen and ended."""
-LONG_RATE_RAD_S = np.radians(10)
+LONG = '-p', 'limits.rate_deg_s:=3.0', '-p', 'limits.minutes:=6.0'
+"""Manoeuvres of a minute of real time: a busy machine, too, sees and ends them."""
+LONG_RATE_RAD_S = np.radians(3)
 BETA_RAD = np.radians(90)
 
 
