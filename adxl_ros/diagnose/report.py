@@ -103,8 +103,8 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
             'hypotheses': [h._asdict() for h in verdict.hypotheses],
             'gap': _gap(report),
             'explained': _power(verdict.explained),
-            'rest': _power(verdict.rest),
-            'rest_follows': verdict.rest_follows,
+            'rest': _power(verdict.remainder),
+            'rest_follows': verdict.remainder_follows,
             'material': verdict.material_mps2,
             'lost_without': {e: _power(p) for e, p in verdict.lost_without.items()},
             'where': [
@@ -328,8 +328,8 @@ def headline(diagnosis: Diagnosis) -> str:
     share = verdict.explained_share
     named = listed([*verdict.effects, *(listed(group, 'or') for group in verdict.groups)], 'and')
     rest = amplitude_text(verdict.remaining)
-    where = [_DIMENSIONS[d] for d in verdict.rest_follows[:_MOST_DIMENSIONS]]
-    follows = f' It follows {listed(where, "and")}.' if where and verdict.rest.low > 0 else ''
+    where = [_DIMENSIONS[d] for d in verdict.remainder_follows[:_MOST_DIMENSIONS]]
+    follows = f' It follows {listed(where, "and")}.' if where and verdict.remainder.low > 0 else ''
     separate = ': the data do not separate them' if verdict.groups else ''
     noise = f' {NOISE_STAYS}' if is_only_noise(diagnosis.report) else ''
     in_reference = [e for e in verdict.effects if effect_named(e).concern is Concern.REFERENCE]
@@ -439,7 +439,7 @@ def figure_rows(diagnosis: Diagnosis) -> list[FigureRow]:
     rows.append(
         FigureRow(
             'repeats, not explained',
-            quantities.power_text(verdict.rest),
+            quantities.power_text(verdict.remainder),
             'by flexible functions, held out',
         )
     )
