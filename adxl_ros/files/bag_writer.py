@@ -28,7 +28,7 @@ from adxl_ros.files.bag_messages import (
 from adxl_ros.files.column_mapping import Columns
 from adxl_ros.files.recording_columns import COMMANDS, converted_info, JOINTS, Recording
 from adxl_ros.files.tables import TABLE_ENDINGS
-from adxl_ros.model.covariance import imu_covariance
+from adxl_ros.model.covariance import imu_covariance, NOT_MEASURED
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -253,12 +253,8 @@ def angular_velocity(
     covariance[:, [0, 4, 8]] = variance
     return {
         'angular_velocity': np.where(is_taken, gyro_radps, 0.0),
-        'angular_velocity_covariance': np.where(is_taken, covariance, _ABSENT),
+        'angular_velocity_covariance': np.where(is_taken, covariance, NOT_MEASURED),
     }
-
-
-_ABSENT = np.array([-1.0, *[0.0] * 8])
-"""Covariance of a quantity that is not measured (REP-145)."""
 
 
 def _imu_form(covariance: np.ndarray) -> TopicForm:
@@ -267,7 +263,13 @@ def _imu_form(covariance: np.ndarray) -> TopicForm:
         IMU,
         cdr.imu,
         cdr.message(
-            FRAME, [0.0, 0.0, 0.0, 1.0], _ABSENT, np.zeros(3), _ABSENT, np.zeros(3), covariance
+            FRAME,
+            [0.0, 0.0, 0.0, 1.0],
+            NOT_MEASURED,
+            np.zeros(3),
+            NOT_MEASURED,
+            np.zeros(3),
+            covariance,
         ),
     )
 

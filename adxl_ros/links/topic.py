@@ -14,6 +14,7 @@ from adxl_ros.files.column_mapping import GRAVITY, Quantity, unit_name
 from adxl_ros.files.stamps import is_even, stamped_rate_hz
 from adxl_ros.links.support import base
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
+from adxl_ros.model.covariance import NOT_MEASURED
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import lagrange_weights, Motion, POINTS
 from adxl_ros.simulate.response import Response
@@ -43,8 +44,6 @@ floats."""
 _LATE_PERIODS = 10
 """Periods by which a sample may be late; chosen: an older stamp is a simulation that was reset."""
 
-_NOT_MEASURED = np.array([-1.0, *[0.0] * 8])
-"""Covariance that says that there is no value (sensor_msgs/Imu)."""
 _ABSENT = {'orientation': np.array([0.0, 0.0, 0.0, 1.0]), 'angular_velocity': np.zeros(3)}
 """Values in place of those that are no numbers."""
 
@@ -177,7 +176,7 @@ class EmulatedSensor(base.Link):
             sample = {name: values[i] for name, values in fields.items()}
             for name, value in _ABSENT.items():
                 if not np.isfinite([*sample[name], *sample[f'{name}_covariance']]).all():
-                    sample |= {name: value, f'{name}_covariance': _NOT_MEASURED}
+                    sample |= {name: value, f'{name}_covariance': NOT_MEASURED}
             self._sense(stamp, sample)
         self._run_chain()
 

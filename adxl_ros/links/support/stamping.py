@@ -24,7 +24,7 @@ _PERIOD_NS = 100_000_000
 _FOLLOW_NS = 10_000_000
 """Time between two readings of the system clock, ns; chosen: a reading takes several microseconds,
 and nobody sees a clock that was set 10 ms later."""
-_FOREVER_NS = 2**63 - 1  # Largest time, ns: any waiting time is over by then
+FOREVER_NS = 2**63 - 1  # Largest time, ns: any waiting time is over by then
 
 
 def _system_offset() -> tuple[int, int]:
@@ -97,7 +97,7 @@ class Stamper:
     def flush(self) -> bool:
         """Stamp all samples now, by what is known of the clock; return whether there are any."""
         if self._unstamped:
-            self.clock.advance(_FOREVER_NS)
+            self.clock.advance(FOREVER_NS)
             self._stamp()
         return bool(self._stamped)
 
