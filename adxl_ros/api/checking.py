@@ -281,7 +281,7 @@ def _with_what_shows(
         else:
             scale_v_per_g = float(unit.scale_v_per_g.mean())
             shown_first = sorted(could_show, key=lambda effect: not effect.shows)
-            rows = [diagnosis_report.shown(effect, scale_v_per_g) for effect in shown_first]
+            rows = [diagnosis_report.as_shown(effect, scale_v_per_g) for effect in shown_first]
             result = replace(result, shows=tuple(rows))
     except UserError as error:
         reason = one_line(error)

@@ -326,7 +326,8 @@ class LiveEstimator:
             self._force = self._paper_inverse(volts, self._environment)
             return self._force if abs(sum(self._force)) < float('inf') else None
         tangent = self._cell(self._force).tangent
-        force, change = self._force, 0.0
+        force = self._force
+        change = 0.0
         response = self._last_volts
         input_v = self._undo_adc(volts)
         for _ in range(_MAX_STEPS):

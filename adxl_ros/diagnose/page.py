@@ -171,7 +171,7 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
         'not_covered': objects['not_covered'],
         'where': [_cell(c) for c in report.residual_cells],
         'menu': menu,
-        'could_show': [(row.shows, *words.shown(row, scale)) for row in report.could_show],
+        'could_show': [(row.shows, *words.as_shown(row, scale)) for row in report.could_show],
     }
 
 

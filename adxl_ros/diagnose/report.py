@@ -65,7 +65,8 @@ class FigureRow(NamedTuple):
 
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the report as the objects of JSON; docs/reference/report_json.md lists its keys."""
-    fault, report = diagnosis.fault, diagnosis.report
+    fault = diagnosis.fault
+    report = diagnosis.report
     if report is None:
         assert fault is not None
         return {
@@ -86,7 +87,8 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
             'next_experiment': None,
             'summary': fault.message,
         }
-    verdict, proposal = report.verdict, report.next_experiment
+    verdict = report.verdict
+    proposal = report.next_experiment
     return _rounded(
         {
             'schema': 1,
@@ -189,7 +191,8 @@ def _power(power: Interval) -> dict[str, Any]:
 
 def _gap(report: Report) -> dict[str, Any]:
     """Return the gap before and after, and the noise recording by recording."""
-    closure, verdict = report.closure, report.verdict
+    closure = report.closure
+    verdict = report.verdict
     figures: dict[str, Any] = {'unit': 'm/s^2'}
     for name, figure in closure._asdict().items():
         figures |= {name: figure.value, f'{name}_ci': (figure.low, figure.high)}
@@ -209,7 +212,8 @@ def _gap(report: Report) -> dict[str, Any]:
 
 def shares_of_gap(report: Report) -> dict[str, float]:
     """Split the closed share of the squared gap among the effects by what is lost without each."""
-    verdict, closure = report.verdict, report.closure
+    verdict = report.verdict
+    closure = report.closure
     if not verdict.best & {*verdict.named}:
         return {}
     lost = {effect: max(power.value, 0.0) for effect, power in verdict.lost_without.items()}
@@ -220,8 +224,10 @@ def shares_of_gap(report: Report) -> dict[str, float]:
 
 def _candidates(report: Report) -> list[dict[str, Any]]:
     """Return the effects of all hypotheses and detections, the most probable first."""
-    verdict, shown = report.verdict, {row.name.effect: row for row in report.could_show}
-    detected, shares = {d.effect: d for d in report.detections}, shares_of_gap(report)
+    verdict = report.verdict
+    shown = {row.name.effect: row for row in report.could_show}
+    detected = {d.effect: d for d in report.detections}
+    shares = shares_of_gap(report)
     out = []
     for name, effect in library().items():
         sets = [h for h in verdict.hypotheses if name in h.effects]
@@ -262,7 +268,8 @@ def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> d
 
     A parameter that the recordings do not determine has no value.
     """
-    names, sensor = fitted_of(effect_named(effect), report.sensor.axes), report.sensor
+    names = fitted_of(effect_named(effect), report.sensor.axes)
+    sensor = report.sensor
     if effect_named(effect).diagnosis.drift and effect in sensor.effects:
         # The density of a drift is chosen with the noise, on a grid.
         return {
@@ -271,7 +278,8 @@ def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> d
         }
     if hypothesis is None:
         return {}
-    parameters, values = dict[str, dict[str, Any]](), get(hypothesis.sensor, hypothesis.names)
+    parameters = dict[str, dict[str, Any]]()
+    values = get(hypothesis.sensor, hypothesis.names)
     for name, value, std, is_open in zip(
         hypothesis.names, values.tolist(), hypothesis.std, hypothesis.undetermined
     ):
@@ -316,7 +324,8 @@ def headline(diagnosis: Diagnosis) -> str:
         assert diagnosis.fault is not None
         return diagnosis.fault.message
     verdict = diagnosis.report.verdict
-    sure, share = f'({percent(verdict.probability)} sure)', verdict.explained_share
+    sure = f'({percent(verdict.probability)} sure)'
+    share = verdict.explained_share
     named = listed([*verdict.effects, *(listed(group, 'or') for group in verdict.groups)], 'and')
     rest = amplitude_text(verdict.remaining)
     where = [_DIMENSIONS[d] for d in verdict.remainder_follows[:_MOST_DIMENSIONS]]
@@ -380,7 +389,8 @@ def figure_rows(diagnosis: Diagnosis) -> list[FigureRow]:
     """Return the figures from which the verdict follows: the same for terminal, page and JSON."""
     report = diagnosis.report
     assert report is not None
-    closure, verdict = report.closure, report.verdict
+    closure = report.closure
+    verdict = report.verdict
     compared = any(c.pose_known for c in diagnosis.comparisons)
     rows = [
         FigureRow(
@@ -532,7 +542,7 @@ def closes(report: Report) -> bool:
     )
 
 
-def shown(row: CouldShow, scale_v_per_g: float) -> Shown:
+def as_shown(row: CouldShow, scale_v_per_g: float) -> Shown:
     """Return smallest and typical size of an effect, and what is missing to show it."""
     effect = effect_named(row.name.effect)
     parameter = parameter_of(row.name)
@@ -678,7 +688,8 @@ def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
 
 def _labelled(rows: Sequence[tuple[str, str]]) -> list[str]:
     """Return texts behind their labels, wrapped between words; equal labels stand once."""
-    lines, last = [], ''
+    lines = []
+    last = ''
     for label, text in rows:
         shown = '' if label == last else label
         lines += wrapped(f' {shown:{_LABEL_COLUMNS - 1}}{text}', _LABEL_COLUMNS)

@@ -14,7 +14,6 @@ from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import JOINTS
 from adxl_ros.links.support import base
 from adxl_ros.links.support.self_test import EmulatedLine
-from adxl_ros.links.support.stamping import FOREVER_NS
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import Response
@@ -167,7 +166,7 @@ class SimulatedSensor(base.Link):
     def _motion_until_ns(self) -> int:
         """Return the time up to which the motion is known; it is unbounded without a stage."""
         if self._watchdog is None:
-            return FOREVER_NS
+            return base.FOREVER_NS
         if self._watchdog.check() < _LOST_S:
             return self._knots[-1].stamp_ns
         self._watchdog = None
@@ -176,7 +175,7 @@ class SimulatedSensor(base.Link):
             f'stage lost: nothing on {self.joint_state_topic} for {_LOST_S:g} '
             's, its last pose is held',
         )
-        return FOREVER_NS
+        return base.FOREVER_NS
 
     def _make(self, until_ns: int) -> None:
         """Make a block of samples, beyond a time as far as the motion is known."""

@@ -184,7 +184,8 @@ class EmulatedSensor(base.Link):
         """Return the samples since the last call."""
         made = self._made
         self._made = []
-        missing, self._missing = self._missing, 0
+        missing = self._missing
+        self._missing = 0
         if not made:
             empty = base.no_samples(self._sensor, self._newest_ns or 0)
             return replace(empty, missing=missing, estimated=missing)
@@ -219,7 +220,8 @@ class EmulatedSensor(base.Link):
         return base.LinkStatus(*self._condition(), counts, events)
 
     def _condition(self) -> tuple[base.Level, str]:
-        topic, sensor = self.imu_topic, self.sensor
+        topic = self.imu_topic
+        sensor = self.sensor
         if self._mixture:
             return base.Level.ERROR, self._mixture
         if self._newest_ns is None or time.monotonic() - self._heard_s > _SILENT_S:

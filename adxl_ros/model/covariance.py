@@ -27,9 +27,9 @@ from adxl_ros.model.sensor import get, parameter_of, put, Sensor
 from adxl_ros.model.signal_chain import analog_response, static_response
 import numpy as np
 
-NOT_MEASURED = np.array([-1.0, *[0.0] * 8])
-"""Covariance that says that there is no value (sensor_msgs/Imu), (9,)."""
 UNMEASURED_VARIANCE = 1e6  # Of an axis that is not there, (m/s²)²; chosen: above any force
+NOT_MEASURED = np.array([-1.0, *[0.0] * 8])
+"""Covariance, row by row, of a quantity that is not measured (sensor_msgs/Imu, REP-145)."""
 _OVERHANG_MPS2 = -0.5  # Lowest z of an upright sensor, m/s²; chosen: 3° over
 _ROOT_MEAN = 1.25
 """Factor of the term that keeps the divisor of derived z from 0 where the in-plane force is g.

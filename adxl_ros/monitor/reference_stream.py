@@ -160,10 +160,11 @@ class ReferenceStream:
     def motion(self, origin_ns: int) -> Motion:
         """Return the motion whose time begins at a stamp, ns; it follows the prepared blocks."""
         self._origin_ns = origin_ns
-        joints = {joint: partial(self._joint, number) for number, joint in enumerate(JOINTS)}
         motion = Motion(
             duration_s=np.inf,
-            **joints,
+            alpha=partial(self._joint, 0),
+            beta=partial(self._joint, 1),
+            shift=partial(self._joint, 2),
             temperature_c=partial(self._surrounding, 'temperature_c'),
             supply_v=partial(self._surrounding, 'supply_v'),
         )
@@ -336,7 +337,8 @@ class Prediction:
     def prepare(self, begin_ns: int, end_ns: int) -> BlockMotion | None:
         """Return what the reference shows of a block; before the first one the sensor rests."""
         if not self._responses:
-            self._origin_ns, self._motion = begin_ns, self._reference.motion(begin_ns)
+            self._origin_ns = begin_ns
+            self._motion = self._reference.motion(begin_ns)
         return self._reference.prepare(begin_ns, end_ns)
 
     def block(

@@ -339,8 +339,11 @@ class DisplayPublisher:
             self._own_screen = None
 
     def _publish(self, phase: Phase, text: str) -> None:
-        controller, stream = self._controller, self._controller.stream
-        nominal, session, newest = stream.nominal, controller.session, stream.newest
+        controller = self._controller
+        stream = self._controller.stream
+        nominal = stream.nominal
+        session = controller.session
+        newest = stream.newest
         usual = _BY_HAND if controller.settings.operator_captures else _RUNNING
         keys = () if phase is Phase.FIT else _KEYS.get(controller.state, usual)
         coefficients: list[screen_contents.ScreenRow] = []
@@ -430,7 +433,8 @@ class WaitingSamples:
         stamps, fields = topics.decoded(
             batch, cdr.imu, linear_acceleration=3, orientation_covariance=9
         )
-        accel, covariance = fields['linear_acceleration'], fields['orientation_covariance']
+        accel = fields['linear_acceleration']
+        covariance = fields['orientation_covariance']
         # -1 in the first place means that a message has no orientation.
         yaw_rad2 = np.where(covariance[:, 0] >= 0, covariance[:, _YAW_VARIANCE], 0.0)
         accel = accel[:, : len(sensor.axes)]

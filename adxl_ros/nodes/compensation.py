@@ -416,7 +416,8 @@ class Compensation(Node):
         """Use the newest calibration of the stream's unit, unless one was named."""
         path, warnings = self._policy.choose(self._calibration())
         if path:
-            before, self._policy.stored_path = self._policy.stored_path, path
+            before = self._policy.stored_path
+            self._policy.stored_path = path
             result = self.set_parameters([Parameter('calibration', value=path)])[0]
             if not result.successful:
                 self._policy.stored_path = before

@@ -262,7 +262,8 @@ class LinkReader:
     def _tick(self) -> None:
         """Publish the samples that are due."""
         steady_ns = time.monotonic_ns()
-        step_ns, self._ticked_ns = steady_ns - self._ticked_ns, steady_ns
+        step_ns = steady_ns - self._ticked_ns
+        self._ticked_ns = steady_ns
         if self._output.is_clock and steady_ns >= self._search_ns:
             self._search_ns = steady_ns + _CLOCK_SEARCH_NS
             self._output.follow_other_clock()

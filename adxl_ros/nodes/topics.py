@@ -291,7 +291,8 @@ class Inbox:
         A turn of an executor builds its wait set from all that the node has. A wait set of one
         subscription makes a relay at 1 kHz two to three times cheaper.
         """
-        handle, context = self._subscription.handle, self._node.context.handle
+        handle = self._subscription.handle
+        context = self._node.context.handle
         assert context is not None, 'a node has a context'
         with handle, context:
             if self._wait_set is None:

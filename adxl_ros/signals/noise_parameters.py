@@ -38,17 +38,16 @@ import numpy as np
 import scipy
 
 _INTERVAL_DROP = 2.705543454095404
-"""Drop of twice the log likelihood at the ends of a 90 % interval: χ² of 1 degree of freedom."""
-_FIRST_GROUPED = 64
+"""Drop of twice the log likelihood at the ends of a 90 % interval: χ², 1 degree of freedom."""
+_SINGLE_COEFFICIENTS = 64
 """Lowest coefficients that are fitted one by one: from there on a group of `_GROUP_WIDTH` has two
 or more."""
 _GROUP_WIDTH = 1.03  # Ratio of frequencies of further groups. Chosen: a term changes by 6 %
 _ROUNDS = 60  # Largest number of rounds of a fit. Chosen: usual are ten
 _HALVINGS = 20  # Largest number of halvings of a step that does not raise the likelihood
-_CONVERGED = 1e-9  # Change of twice the log likelihood at which a fit ends
-_SMALLEST_SQUARE_RATIO = (
-    1e-4  # Square, by a dominant one, from which a limit is searched. Chosen: never seen
-)
+_CONVERGED_GAIN = 1e-9  # Change of twice the log likelihood at which a fit ends
+_SMALLEST_SQUARE = 1e-4
+"""Square, by a dominant one, from which a limit is searched. Chosen: never seen."""
 _LINE_PROBABILITY = 1e-3  # Chance from which a line shows. Chosen: 1 % of logs
 _OCTAVE_PROBABILITY = 0.05
 """Chance from which a filter shows in an octave. Chosen: an octave less costs little, but one that
@@ -61,18 +60,12 @@ _MARGIN_OCTAVES = 1  # Octaves left out below a filter or line. Chosen: a line l
 _FILTER_LOSSES = (0.0, *(4.0**n for n in range(-2, 2)))
 """Power that tried filters take at the end of the fit, by what they leave. Chosen: less than the
 first does not show in a thousand coefficients, more than the last ends the fit earlier."""
-_FEWEST_COEFFICIENTS = (
-    32  # Fewest coefficients of a fit. Chosen: white noise is then known within 20 %
-)
-_FEWEST_WHITE_SHARE = (
-    0.5  # Share of white noise from which a slope is not that of a filter: most of the power
-)
-_SEEN_STDS = (
-    2.0  # Standard deviations of a square that is seen. Chosen: as 90 % intervals exclude 0
-)
-_WHITE = 0  # Place of N among the terms of a fit
-_INSTABILITY = 1  # That of B
-_WALK = 2  # That of K
+_FEWEST_COEFFICIENTS = 32
+"""Fewest coefficients of a fit. Chosen: white noise is then known within 20 %."""
+_LEAST_WHITE = 0.5
+"""Share of white noise from which a slope is not that of a filter: most of the power."""
+_SEEN_STDS = 2.0
+"""Standard deviations of a square that is seen. Chosen: as 90 % intervals exclude 0."""
 
 _FLICKER_OF_INSTABILITY = 1 / float(np.sqrt(np.pi))
 """Density of `flicker` at 1 Hz divided by B: over positive frequencies it is B²/(π·f)."""
@@ -186,6 +179,13 @@ class _Groups:
         return replace(self, shapes=self.shapes * gain[:, None])
 
 
+class _Fit(NamedTuple):
+    """The likeliest terms."""
+
+    squares: np.ndarray  # N², B² and K², (3,)
+    log_likelihood: float  # Up to a constant
+
+
 def coefficients(means: np.ndarray) -> np.ndarray:
     """Return the cosine coefficients 1 to n − 1 of means, (n,); coefficient k is at k/(2·T)."""
     return scipy.fft.dct(means - means.mean(), norm='ortho')[1:]
@@ -231,35 +231,21 @@ def fit_noise(
     groups = _grouped(np.square(coefficients(means)), variances)
     span_s = len(means) * step_s
     highest = _highest(groups, len(means), span_s, rounding)
-    walks = _walks(groups.below(highest), span_s, highest)
-    models = _filters(walks.models, np.pi * highest / (2 * len(means)), np.pi / (2 * len(means)))
+    walks, bound_s = _walks(groups.below(highest), span_s, highest)
+    models = _filters(walks, np.pi * highest / (2 * len(means)), np.pi / (2 * len(means)))
     best = _best(models)
     return NoiseFit(
-        white=_interval(models, best, _WHITE),
-        instability=_interval(models, best, _INSTABILITY),
-        walk=_interval(models, best, _WALK),
-        bound_s=walks.bound_s,
+        white=_interval(models, best, 0),
+        instability=_interval(models, best, 1),
+        walk=_interval(models, best, 2),
+        bound_s=bound_s,
         highest=highest,
         highest_hz=highest / (2 * span_s),
     )
 
 
-class _Fitted(NamedTuple):
-    """The likeliest fit of groups."""
-
-    squares: np.ndarray  # N², B² and K², (3,)
-    log_likelihood: float  # Up to a constant
-
-
-class _Walks(NamedTuple):
-    """The groups with each bound of the walk that is likely."""
-
-    models: list[_Groups]
-    bound_s: float  # The likeliest bound, s; inf without bounds
-
-
-def _walks(groups: _Groups, span_s: float, highest: int) -> _Walks:
-    """Return the groups with each bound of the walk that is likely."""
+def _walks(groups: _Groups, span_s: float, highest: int) -> tuple[list[_Groups], float]:
+    """Return the groups with each bound of the walk that is likely, and the likeliest bound, s."""
     shortest = min(highest / _SHORTEST_BOUND, span_s / _SHORTEST_BOUND_S)
     count = int(np.log(shortest) / np.log(_BOUND_STEP))
     times_s = span_s * _BOUND_STEP ** np.arange(-count, 5.0)
@@ -267,11 +253,9 @@ def _walks(groups: _Groups, span_s: float, highest: int) -> _Walks:
     likelihoods = np.array([_fit(model).log_likelihood for model in models])
     best = likelihoods.max()
     if 2 * (best - _fit(groups).log_likelihood) < scipy.stats.chi2.isf(_BOUND_PROBABILITY, 1):
-        return _Walks([groups], np.inf)
+        return [groups], np.inf
     likely = 2 * (best - likelihoods) < _INTERVAL_DROP
-    return _Walks(
-        [models[i] for i in np.flatnonzero(likely)], float(times_s[likelihoods.argmax()])
-    )
+    return [models[i] for i in np.flatnonzero(likely)], float(times_s[likelihoods.argmax()])
 
 
 def _filters(models: list[_Groups], end_rad: float, step_rad: float) -> list[_Groups]:
@@ -286,15 +270,15 @@ def _filters(models: list[_Groups], end_rad: float, step_rad: float) -> list[_Gr
     ]
 
 
-def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0) -> _Fitted:
+def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0) -> _Fit:
     """Return the most likely fit of several models; see `_fit`."""
     fits = [_fit(model, fixed, value) for model in models]
     return max(fits, key=lambda fit: fit.log_likelihood)
 
 
 def _grouped(power: np.ndarray, variances: np.ndarray) -> _Groups:
-    edges = [*range(min(_FIRST_GROUPED, len(power)))]
-    position = float(_FIRST_GROUPED)
+    edges = [*range(min(_SINGLE_COEFFICIENTS, len(power)))]
+    position = float(_SINGLE_COEFFICIENTS)
     while position < len(power):
         edges.append(int(position))
         position = max(position * _GROUP_WIDTH, position + 1)
@@ -316,8 +300,8 @@ def _log_likelihood(groups: _Groups, theta: np.ndarray) -> float:
     return -0.5 * float(groups.count @ (np.log(variance) + groups.power / variance))
 
 
-def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0) -> _Fitted:
-    """Return the likeliest squares of 0 or more by Fisher scoring; one may be fixed at a value."""
+def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0) -> _Fit:
+    """Return the likeliest terms of 0 or more by Fisher scoring; one may have a fixed square."""
     free = [term for term in range(3) if term != fixed]
     theta = np.zeros(3)
     if fixed is not None:
@@ -342,26 +326,26 @@ def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0) -> _Fitt
             break
         theta = trial
         likelihood = likelihood + gained
-        if 2 * gained < _CONVERGED:
+        if 2 * gained < _CONVERGED_GAIN:
             break
-    return _Fitted(theta, likelihood)
+    return _Fit(theta, likelihood)
 
 
-def _interval(models: list[_Groups], fitted: _Fitted, term: int) -> NoiseTerm:
+def _interval(models: list[_Groups], fit: _Fit, term: int) -> NoiseTerm:
     """Return a term with the ends of its interval by the profile likelihood."""
 
     def drop(square: float) -> float:
-        """Return twice the drop of the log likelihood where the term has this square."""
-        return 2 * (fitted.log_likelihood - _best(models, term, square).log_likelihood)
+        """Return twice the drop of the likelihood where the term has another square."""
+        return 2 * (fit.log_likelihood - _best(models, term, square).log_likelihood)
 
     def excess(logarithm: float) -> float:
-        """Return twice the drop of the profile likelihood, minus its limit."""
+        """Return the drop minus its limit, by the logarithm of the square."""
         return drop(np.exp(logarithm)) - _INTERVAL_DROP
 
     shapes = models[0].shapes
-    scale = float(np.min(shapes @ fitted.squares / shapes[:, term]))
-    best = float(fitted.squares[term])
-    begin = np.log(best if best > 0 else scale * _SMALLEST_SQUARE_RATIO)
+    scale = float(np.min(shapes @ fit.squares / shapes[:, term]))
+    best = float(fit.squares[term])
+    begin = np.log(best if best > 0 else scale * _SMALLEST_SQUARE)
 
     def end(step: float) -> float:
         """Return the end of the interval that lies in the direction of a step."""
@@ -370,8 +354,7 @@ def _interval(models: list[_Groups], fitted: _Fitted, term: int) -> NoiseTerm:
             beyond += step
         return float(np.exp(scipy.optimize.brentq(excess, beyond - step, beyond, xtol=1e-6)))
 
-    is_seen = best > 0 and drop(0.0) > _INTERVAL_DROP
-    low = end(-1.0) if is_seen else 0.0
+    low = end(-1.0) if best > 0 and drop(0.0) > _INTERVAL_DROP else 0.0
     high = end(1.0)
     return NoiseTerm(float(np.sqrt(best)), float(np.sqrt(low)), float(np.sqrt(high)))
 
@@ -386,18 +369,15 @@ def _highest(groups: _Groups, count: int, span_s: float, rounding: float) -> int
     stop = count
     while stop > 2 * _FEWEST_COEFFICIENTS:
         lower = groups.below(max(stop // 2, _FEWEST_COEFFICIENTS))
-        bound_s = _walks(lower, span_s, stop // 2).bound_s
+        _, bound_s = _walks(lower, span_s, stop // 2)
         used = groups.below(stop).bounded(bound_s, span_s)
         lower = lower.bounded(bound_s, span_s)
         theta = _fit(lower).squares
         chances = scipy.stats.chi2.sf(used.count * used.power / (used.shapes @ theta), used.count)
         octave = used.where(used.first >= stop // 2)
         is_without_line = chances.min() * len(chances) > _LINE_PROBABILITY
-        if (
-            _white_share(octave, theta, rounding) > _FEWEST_WHITE_SHARE
-            and is_without_line
-            and _is_expected(octave, lower, theta)
-        ):
+        is_white = _white_share(octave, theta, rounding) > _LEAST_WHITE
+        if is_white and is_without_line and _is_expected(octave, lower, theta):
             break
         stop //= 2
     return max(stop >> _MARGIN_OCTAVES, min(count, _FEWEST_COEFFICIENTS))
@@ -471,7 +451,7 @@ class AxisNoise:
     def filter_evidence(self, rest: StillStretch) -> FilterEvidence | None:
         """Return what the noise shows of a filter; None where slow noise or rounding hides it."""
         white = self.fit.white
-        is_clear = self.white_variance > _FEWEST_WHITE_SHARE * (self.sample_std**2)
+        is_clear = self.white_variance > _LEAST_WHITE * (self.sample_std**2)
         if not white.is_seen or not is_clear:
             return None
         share = self.white_variance / (white.value**2 * rest.rate_hz)
@@ -586,14 +566,8 @@ def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: flo
     is hidden: it may be anything up to that, and codes that do not change show less.
     """
     if not _is_coarse(std, resolution):
-
-        def finer(value: float) -> float:
-            return float(np.sqrt(max(value**2 - rounding**2, 0.0)))
-
-        white = fit.white
-        return replace(
-            fit, white=NoiseTerm(finer(white.value), finer(white.low), finer(white.high))
-        )
+        before = [float(np.sqrt(max(value**2 - rounding**2, 0.0))) for value in fit.white]
+        return replace(fit, white=NoiseTerm(*before))
     widest = max(DITHERED_STEPS * resolution / std, 1.0)
 
     def widened(term: NoiseTerm) -> NoiseTerm:

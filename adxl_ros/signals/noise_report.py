@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.files.parameter_file import float_text
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
@@ -60,7 +61,6 @@ def sensors_at_rest(result: RecordingNoise) -> list[SensorAtRest]:
 
 _YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
 _PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000
-_NOT_MEASURED = 1e6  # Variance of a sample of an axis that is not there, u²
 
 
 def head(result: RecordingNoise) -> list[str]:
@@ -155,7 +155,7 @@ def _figures(noises: Sequence[AxisNoise], rate_hz: float) -> dict[str, _Figure]:
     return {
         'white': _Figure([loudest.sample_white], '' if loudest.fit.white.is_seen else limit),
         'walk': _Figure([k], '' if walk.is_seen else limit),
-        'matrix': _Figure(np.diag((variances + [_NOT_MEASURED] * 3)[:3]).ravel().tolist()),
+        'matrix': _Figure(np.diag((variances + [UNMEASURED_VARIANCE] * 3)[:3]).ravel().tolist()),
         'rate': _Figure([rate_hz]),
     }
 
@@ -176,7 +176,8 @@ def paste_lines(result: RecordingNoise) -> list[str]:
         sensors['gyr'] = _figures(result.gyro, rate_hz)
     factors = {'': 1.0, 'samples': rate_hz**0.5, 'PX4': _PX4_HZ**0.5}
     text = Path(__file__).with_name('program_settings.csv').read_text(encoding='utf-8')
-    lines, program = [], ''
+    lines = []
+    program = ''
     for stated in csv.DictReader(text.splitlines()):
         if stated['sensor'] not in sensors:
             continue

@@ -478,7 +478,9 @@ class _Window:
         normal = _banded(transposed @ weighted)
         normal[-1] += _RIDGE * normal[-1].max()
         factor = scipy.linalg.cholesky_banded(normal + _BOUNDED_SHARE * strength * self._penalty)
-        low, high, pulled = self._values - bound, self._values + bound, weights * self._values
+        low = self._values - bound
+        high = self._values + bound
+        pulled = weights * self._values
         within = self._values
         excess = np.zeros(len(self._values))
         for _ in range(_BOUND_ROUNDS):

@@ -124,7 +124,9 @@ class Robot:
         joints: position, rate and acceleration, (3, n, j); base: the same of its x, y, z and
         quaternion x, y, z, w, (3, n, 7).
         """
-        pin, model, data = self._pin, self._model, self._data
+        pin = self._pin
+        model = self._model
+        data = self._data
         count = joints.shape[1]
         q = np.zeros((count, model.nq))
         v, a = np.zeros((2, count, model.nv))
@@ -324,7 +326,8 @@ class RobotPath(ForcePath):
         def rms_around(values: np.ndarray) -> np.ndarray:
             return np.sqrt(np.maximum(uniform_filter1d(values**2, around), 0.0))
 
-        size, rate = rms_around(error), rms_around(np.gradient(error, self.time_s))
+        size = rms_around(error)
+        rate = rms_around(np.gradient(error, self.time_s))
         return PathErrors(
             np.interp(time_s, self.time_s, size),
             np.interp(time_s, self.time_s, rate / np.maximum(size, _SMALLEST_STEP)),

@@ -10,6 +10,7 @@ import json
 from pathlib import Path
 
 from adxl_ros.api.noise import noise as find_noise, PLOT, TABLE
+from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.process import command
@@ -80,8 +81,8 @@ def noise(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(found.to_dict(), indent=1))
         return 0
-    recording = f'{cli.quoted(options.recording)}{cli.reading_text(options)}'
-    following = command('noise', f'{recording} -o noise.yaml')
+    read = f'{cli.quoted(options.recording)}{cli.reading_text(options)}'
+    following = command('noise', f'{read} -o noise.yaml')
     if options.output:
         params = cli.quoted(options.output)
         following = command('diagnose', f'RECORDING --params {params} -o gap')

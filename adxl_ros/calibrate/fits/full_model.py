@@ -257,7 +257,8 @@ class _StageSearch:
             if np.any(self._curvature_v > _MAX_CURVATURE * noise_v):
                 continue
             about = self._about(self._sensor, self._poses)
-            kept_before, deviance_before = self._kept, deviance
+            kept_before = self._kept
+            deviance_before = deviance
             deviance = about.deviance(self._stage)
             self._kept = _inliers(about, self._stage)
             converged = (

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from enum import Enum
 import json
 import math
+from typing import NamedTuple
 
 
 class StageMode(Enum):
@@ -77,6 +78,13 @@ class ScreenRow:
     text: str
     share: float | None = None  # Of a bar before the text that is full; None without a bar
     style: str = ''  # Of prompt_toolkit
+
+
+class EstimateRows(NamedTuple):
+    """What the poses so far show."""
+
+    expected: list[ScreenRow]  # What is covered, and the expected error
+    coefficients: list[ScreenRow]
 
 
 def tilt_row(now_rad: float, final_rad: float = math.nan) -> ScreenRow:

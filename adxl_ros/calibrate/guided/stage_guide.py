@@ -165,7 +165,9 @@ class StageSweep(Guide):
 
     def accept(self) -> PoseRecord | None:
         """Return the pose for the journal when a full dwell at rest is complete, else None."""
-        target, settings, dwell = self.course.target, self.settings, self.dwell
+        target = self.course.target
+        settings = self.settings
+        dwell = self.dwell
         samples = round(settings.dwell_s * self.sensor.rate_hz)
         if (
             target is None
@@ -259,7 +261,8 @@ def _fault(sweep: StageSweep, record: PoseRecord, dwell: Dwell, rest: Rest) -> s
 
 def _verify_mounting(sweep: StageSweep, record: PoseRecord) -> None:
     """Compare a pose that is taken again with its first record, and go to the next pose."""
-    before, tolerance_rad = sweep.to_verify[0], sweep.sensor.stage_resolution_rad
+    before = sweep.to_verify[0]
+    tolerance_rad = sweep.sensor.stage_resolution_rad
     if sweep.uses_encoder:
         # The encoder shows how far the stage is from the earlier angles.
         tolerance_rad += max(
@@ -404,9 +407,10 @@ class StageGuide(StageSweep):
             ),
         ]
 
-    def estimated(self) -> tuple[list[ScreenRow], list[ScreenRow]]:
-        """Return coverage and error, and the coefficients by the poses so far, for the screen."""
-        targets, closed = self.course.targets, self.course.closed
+    def estimated(self) -> screen_contents.EstimateRows:
+        """Return what the poses so far show, for the screen."""
+        targets = self.course.targets
+        closed = self.course.closed
         final_rad = self.estimate.with_poses(
             [
                 target
@@ -414,7 +418,8 @@ class StageGuide(StageSweep):
                 if number not in closed and not target.check
             ]
         ).tilt_error_rad()
-        return [
+        expected = [
             ScreenRow('coverage', pose_plan.by_plane(targets, self.accepted)),
             screen_contents.tilt_row(self.tilt_error_rad(), final_rad),
-        ], self.estimate.rows()
+        ]
+        return screen_contents.EstimateRows(expected, self.estimate.rows())

@@ -98,7 +98,8 @@ class Belief:
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean, (p,), and covariance, (p, p), of the coefficients over all filters."""
         count = self.mean.shape[1] - self.directions
-        means, weight = self.mean[:, :count], self.weight
+        means = self.mean[:, :count]
+        weight = self.weight
         mean = weight @ means
         spread = np.einsum('l,li,lj->ij', weight, means - mean, means - mean)
         return mean, np.tensordot(weight, self.covariance[:, :count, :count], 1) + spread

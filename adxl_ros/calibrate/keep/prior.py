@@ -92,7 +92,8 @@ class KeptSensor:
 
     def prior(self, drift_g_per_year: float) -> KeptPrior:
         """Return what is known at the date of the calibration."""
-        sensor, known = self.sensor, self.sensor.covariance
+        sensor = self.sensor
+        known = self.sensor.covariance
         count = len(sensor.axes)
         drifting = np.zeros_like(known)
         slopes = self.rows('temperature_bias', 'per_k')

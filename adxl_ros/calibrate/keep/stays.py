@@ -84,7 +84,8 @@ class RestStream:
     def _cut(self) -> Iterator[NaturalRest]:
         """Search a window."""
         stamps_ns, volts = np.concatenate(self._stamps_ns), np.concatenate(self._volts)
-        self._stamps_ns, self._volts = [], []
+        self._stamps_ns = []
+        self._volts = []
         time_s = (stamps_ns - stamps_ns[0]) * 1e-9
         finite = np.isfinite(volts).all(axis=1)
         increases = np.diff(time_s, prepend=-1.0) > 0

@@ -231,7 +231,8 @@ def screen_table(models: Sequence[HeldOutErrors]) -> list[str]:
     """Lay out the errors of the models on held-out poses for people; the last one is saved."""
     lines = [f' {"":24}tilt error     acceleration error     (rms)']
     for errors in models:
-        tilt, accel = _padded(errors.tilt_deg.rms), _padded(errors.accel_mg.rms)
+        tilt = _padded(errors.tilt_deg.rms)
+        accel = _padded(errors.accel_mg.rms)
         lines.append(f' {_MODELS[errors.model]:22} {tilt:>9} ° {accel:>18} mg')
     lines[-1] += '           <- saved'
     return lines

@@ -94,7 +94,8 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
             'error of acceleration, mg',
         )
     file_name = re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml'
-    picture, fault = '', ''
+    picture = ''
+    fault = ''
     try:
         picture = html_page.picture_url(paper_figure(result))
     except UserError as error:
@@ -189,7 +190,9 @@ def tiles(result: CalibrationResult) -> list[Tile]:
 
 def _sphere(result: CalibrationResult) -> dict[str, Any]:
     """Return the data of the sphere's script: errors of each model by pose and quantity."""
-    fitted, poses, fit = result.fitted, result.poses, result.gravity_fit
+    fitted = result.fitted
+    poses = result.poses
+    fit = result.gravity_fit
     if fit is not None:
         force = np.column_stack(
             signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment)

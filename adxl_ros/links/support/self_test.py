@@ -73,7 +73,8 @@ class SelfTest:
 
     def take(self, samples: Samples, sensor: Sensor) -> tuple[Samples, SelfTestAnswer | None]:
         """Take the next samples; return those to publish, and how a test has ended, or None."""
-        stamps_ns, is_on = samples.stamp_ns, samples.in_self_test
+        stamps_ns = samples.stamp_ns
+        is_on = samples.in_self_test
         if is_on is None:
             if self._steps is None and self._changed_ns == _LONG_AGO_NS:
                 return samples, None
