@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.files.recording_columns import JOINTS, LONGEST_MOVE_NS, Recording, USUAL_GAPS
 from adxl_ros.files.stamps import period_s, stamped_rate_hz
@@ -58,32 +58,33 @@ specific force then changes by less than the noise within a second."""
 SETTLING_S = 0.3
 """A sample rests if no joint moves within this time before it, s. Chosen: an RC filter of 15 Hz
 has settled."""
-_MOVED = 0.5
+_MOVED_SHARE = 0.5
 """Share of the scatter within a rest that its reference leaves, below which it is motion. Chosen:
 noise leaves all of it, and a reference that is in phase less than half."""
 _LONGEST_S = 1e3  # Time since the last move where there was none, s. Chosen: beyond any creep
 _LONGEST_BRIDGE_S = LONGEST_MOVE_NS / 1e9
 """Longest time without a reading of a joint that is bridged, s: that of a move."""
 _SLOWEST_S = 1.0
-"""The same of a slow encoder, s: its readings are a move apart at most."""
+"""Longest time without a reading of a slow encoder that is bridged, s: a move at most."""
 _BEFORE_S = 0.1  # Time left out before a gap, s. Chosen: the spline is uncertain there
 _AFTER_S = 0.3  # Time left out after a gap, s. Chosen: an RC filter of 15 Hz has settled
 _FEWEST_CHANGES = 100
 """Fewest changes of a reading that show the step of its encoder. Chosen: two turns by hand."""
 _LARGEST_STEP_RAD = 0.02  # Largest step of an encoder, rad. Chosen: 1°
-_COARSER = 1.05
+_COARSER_STEP_RATIO = 1.05
 """Ratio to the stated step from which one counts. Chosen: 1/12° may be stated as 0.083°."""
-_WHOLE = 0.2
+_WHOLE_STEPS_TOLERANCE = 0.2
 """Deviation of a change from whole steps, in steps, up to which it is one. Chosen: above the
 rounding of written angles, and exact readings stay distinct."""
-_WHOLE_SHARE = 0.9
+_FEWEST_WHOLE_SHARE = 0.9
 """Share of such changes by encoders. Chosen: 40 % of the changes of exact readings are such."""
 _SAME_POSE = 1e-4  # Change of a joint over a gap without a move, rad or m. Chosen: 0.1 mg
 _SAME_STEPS = 2.0
-"""The same in steps of its encoder. Chosen: two readings that scatter by one step."""
+"""Change of a joint over such a gap, steps of its encoder. Chosen: two readings that scatter by
+one step."""
 _LAG_S = 0.02
 """Lag of differences that show the noise, s. Chosen: an RC filter has forgotten it."""
-_SLOW = 3.0
+_STILL_STD_RATIO = 3.0
 """Standard deviation of the output, divided by that noise, up to which it rests. Chosen: motion
 below 2 Hz exceeds it."""
 _WINDOW_S = 1.0  # Length of a window whose spectrum is taken, s. Chosen: shorter than a move
@@ -99,10 +100,10 @@ _NAMED_PARTS = 4  # Parts that a note names. Chosen: it stays one or two lines
 _FEWEST_WINDOWS = 20
 """Fewest windows by which fading is judged. Chosen: noise then has a coherence of 0.05."""
 _BAND_HZ = 2.0  # Width of its bands, Hz. Chosen: a line of the mains is one value
-_MOTION = 10.0
+_MOTION_POWER_RATIO = 10.0
 """Power over that of the noise from which motion shows. Chosen: a single ordinate of noise exceeds
 it once in e¹⁰, 22 000."""
-_FADED = 0.5
+_FADED_POWER_RATIO = 0.5
 """Power of the reference, even without the filter of the sensor, divided by the recorded one,
 below which it has faded. Chosen: −3 dB, the usual corner of a filter."""
 _JERK_S = 0.1
@@ -308,7 +309,8 @@ def with_values(sensor: Sensor, effect: str, values: Mapping[str, Any]) -> Senso
 def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None) -> BaselineComparison:
     """Put a recording beside the simulator, at the full rate of the recording."""
     sensor = replace(sensor, rate_hz=recording.rate_hz)
-    volts, time_s = recording.volts(sensor), recording.time_s
+    volts = recording.volts(sensor)
+    time_s = recording.time_s
     motion, reference = _motion(recording, sensor, volts, sim)
     if reference is not Reference.NONE:
         motion = replace(
@@ -337,7 +339,8 @@ def compare(recording: Recording, sensor: Sensor, sim: Motion | None = None) -> 
 
 def at_search_rate(comparison: BaselineComparison) -> BaselineComparison:
     """Return every k-th sample of a recording, for the search."""
-    span_s, rate_hz = max(comparison.span_s, 1.0), comparison.sensor.rate_hz
+    span_s = max(comparison.span_s, 1.0)
+    rate_hz = comparison.sensor.rate_hz
     motion = comparison.motion
     every = max(1, round(rate_hz / min(SEARCH_RATE_HZ, SEARCH_SAMPLES / span_s)))
     if comparison.pose_known:
@@ -402,14 +405,16 @@ def _at_rest(
 
         assert motion.force is not None, 'the reference states it'
         # The force of another simulator may be noisy, so that the sensor itself shows its rests.
-        finite, at_rest = np.isfinite(output_mps2).all(axis=1), np.zeros(len(time_s), bool)
+        finite = np.isfinite(output_mps2).all(axis=1)
+        at_rest = np.zeros(len(time_s), bool)
         for rest in find_rests(time_s[finite], output_mps2[finite], stamped_rate_hz(time_s)):
             rows = (time_s >= rest.time_start_s) & (time_s <= rest.time_stop_s)
             output = output_mps2[rows & finite]
             stated = np.array(motion.force(time_s[rows & finite])[: output.shape[1]]).T
-            scatter, left = output.var(axis=0).mean(), (output - stated).var(axis=0).mean()
+            scatter = output.var(axis=0).mean()
+            left = (output - stated).var(axis=0).mean()
             # A sensor that always moves has no quiet part that would show what moves.
-            at_rest |= rows & (left > _MOVED * scatter)
+            at_rest |= rows & (left > _MOVED_SHARE * scatter)
         return at_rest
     rates = [motion.alpha(time_s, 1), motion.beta(time_s, 1), motion.shift(time_s, 2)]
     return time_since_move_s(time_s, rates) > SETTLING_S
@@ -475,7 +480,8 @@ def leave_out(
     rows = rows & comparison.used
     if not rows.any():
         return comparison
-    time_s, runs = comparison.time_s, true_runs(rows)
+    time_s = comparison.time_s
+    runs = true_runs(rows)
     residual_v = comparison.residual_v(comparison.sensor)[rows]
     squares = (residual_v / comparison.scale_v_per_mps2)[np.isfinite(residual_v)] ** 2
     left_out = LeftOut(
@@ -486,11 +492,11 @@ def leave_out(
         effect,
     )
     parts = ', '.join(_span_text(time_s[a], time_s[b - 1]) for a, b in runs[:_NAMED_PARTS])
-    size = f'; they differ by {acceleration_text(left_out.rms_mps2)} rms' * bool(len(squares))
-    note = (
-        f'left out: {left_out.samples} samples, {left_out.duration_s:.3g} s '
-        f'({parts}{", ..." * (len(runs) > _NAMED_PARTS)}): {reason}{size}'
-    )
+    if len(runs) > _NAMED_PARTS:
+        parts += ', ...'
+    note = f'left out: {left_out.samples} samples, {left_out.duration_s:.3g} s ({parts}): {reason}'
+    if len(squares):
+        note += f'; they differ by {acceleration_text(left_out.rms_mps2)} rms'
     return replace(
         comparison,
         used=comparison.used & ~rows,
@@ -532,53 +538,77 @@ def stated_poses(
     recording: Recording, sensor: Sensor
 ) -> tuple[Recording, list[tuple[np.ndarray, str]]]:
     """
-    Fill the gaps of the stage's joints; return samples that are not known there, and reasons.
+    Fill the gaps of the stage's joints, and return the samples at which one is not known, and why.
 
     A pose that is stated before and after a gap, while the output rests, holds in between. Other
     gaps are left out; exact readings go on in a line, so that their spline stays even.
     """
-    time_s, output_g = recording.time_s, recording.volts(sensor) / sensor.scale_v_per_g
-    columns, left_out = dict(recording.columns), []
-    lag = max(1, round(_LAG_S * recording.rate_hz))
+    output_g = recording.volts(sensor) / sensor.scale_v_per_g
+    columns = dict(recording.columns)
+    left_out = []
     for joint, name in JOINTS.items():
-        values = columns.get(name, np.zeros(0))
-        read = np.flatnonzero(np.isfinite(values))
-        if len(read) < 2:
+        readings = columns.get(name, np.zeros(0))
+        if np.isfinite(readings).sum() < 2:
             continue
         step = 0.0 if joint == 'shift' else sensor.stage_resolution_rad
-        filled = np.interp(time_s, time_s[read], values[read])
-        is_exact = not step or visible_step(values[read], step) < step
-        limit_s = max(
-            _LONGEST_BRIDGE_S,
-            min(USUAL_GAPS * float(np.median(np.diff(time_s[read]))), _SLOWEST_S),
-        )
-        unknown, columns[name] = np.zeros(len(time_s), bool), values.copy()
-        for begin, end in _in_gaps(time_s, time_s[read], _LONGEST_BRIDGE_S):
-            inner = 0 < begin < end < len(time_s)
-            gap_s = time_s[min(end, len(time_s) - 1)] - time_s[max(begin - 1, 0)]
-            holds = (
-                inner
-                and _rests(output_g[begin:end], lag)
-                and abs(filled[end] - filled[begin - 1]) <= _SAME_STEPS * step + _SAME_POSE
-            )
-            if inner and (holds or (is_exact and gap_s > limit_s)):
-                columns[name][begin:end] = filled[begin:end]
-            if not holds and gap_s > limit_s:
-                unknown |= (time_s > time_s[begin] - _BEFORE_S) & (
-                    time_s < time_s[end - 1] + _AFTER_S
-                )
-        left_out.append((unknown, f'no reading of {name} for more than {limit_s:.3g} s'))
+        bridges = _Bridges.over(recording, output_g, readings, step)
+        columns[name] = bridges.values
+        reason = f'no reading of {name} for more than {bridges.limit_s:.3g} s'
+        left_out.append((bridges.unknown, reason))
     return replace(recording, columns=columns), left_out
 
 
-def _rests(output_g: np.ndarray, lag: int) -> bool:
+class _Bridges(NamedTuple):
+    """The values of one joint over the gaps between its readings."""
+
+    values: np.ndarray  # Readings, and values in the gaps that are bridged, (n,)
+    unknown: np.ndarray  # Samples at which the joint is not known, (n,) bool
+    limit_s: float  # Longest gap without an effect, s
+
+    @classmethod
+    def over(
+        cls, recording: Recording, output_g: np.ndarray, readings: np.ndarray, step: float
+    ) -> _Bridges:
+        """Bridge the gaps of readings, (n,), of an encoder with this step; NaN is none."""
+        time_s = recording.time_s
+        read = np.isfinite(readings)
+        read_s = time_s[read]
+        line = np.interp(time_s, read_s, readings[read])
+        is_exact = not step or visible_step(readings[read], step) < step
+        usual_s = USUAL_GAPS * float(np.median(np.diff(read_s)))
+        limit_s = max(_LONGEST_BRIDGE_S, min(usual_s, _SLOWEST_S))
+        lag = max(1, round(_LAG_S * recording.rate_hz))
+        values = readings.copy()
+        unknown = np.zeros(len(time_s), bool)
+        for begin, end in _in_gaps(time_s, read_s, _LONGEST_BRIDGE_S):
+            is_inner = 0 < begin < end < len(time_s)
+            gap_s = time_s[min(end, len(time_s) - 1)] - time_s[max(begin - 1, 0)]
+            is_long = gap_s > limit_s
+            holds = (
+                is_inner
+                and _is_still(output_g[begin:end], lag)
+                and abs(line[end] - line[begin - 1]) <= _SAME_STEPS * step + _SAME_POSE
+            )
+            if is_inner and (holds or (is_exact and is_long)):
+                values[begin:end] = line[begin:end]
+            if is_long and not holds:
+                unknown |= (time_s > time_s[begin] - _BEFORE_S) & (
+                    time_s < time_s[end - 1] + _AFTER_S
+                )
+        return cls(values, unknown, limit_s)
+
+
+def _is_still(output_g: np.ndarray, lag: int) -> bool:
     """Determine whether an output, g, (n, m), neither moves far nor slowly; with NaN as gaps."""
     output_g = output_g[np.isfinite(output_g).all(axis=1)]
     if len(output_g) <= 2 * lag:
         return True
     noise_g = np.sqrt(np.mean((output_g[lag:] - output_g[:-lag]) ** 2, axis=0) / 2)
     return bool(
-        np.all(output_g.std(axis=0) < np.minimum(SMALLEST_MOTION_G, _SLOW * noise_g) + _SAME_POSE)
+        np.all(
+            output_g.std(axis=0)
+            < np.minimum(SMALLEST_MOTION_G, _STILL_STD_RATIO * noise_g) + _SAME_POSE
+        )
     )
 
 
@@ -594,9 +624,9 @@ def seen_step_rad(recording: Recording, sensor: Sensor) -> float:
         few = changes[changes < 4.5 * step_rad]
         # Readings with decimals differ by one step more or less exactly.
         step_rad = float(few.sum() / np.rint(few / step_rad).sum())
-        whole = np.abs(few / step_rad - np.rint(few / step_rad)) < _WHOLE
-        has_steps = whole.sum() >= _FEWEST_CHANGES and whole.mean() > _WHOLE_SHARE
-        if has_steps and _COARSER * largest_rad < step_rad < _LARGEST_STEP_RAD:
+        whole = np.abs(few / step_rad - np.rint(few / step_rad)) < _WHOLE_STEPS_TOLERANCE
+        has_steps = whole.sum() >= _FEWEST_CHANGES and whole.mean() > _FEWEST_WHOLE_SHARE
+        if has_steps and _COARSER_STEP_RATIO * largest_rad < step_rad < _LARGEST_STEP_RAD:
             largest_rad = step_rad
     return largest_rad
 
@@ -632,13 +662,13 @@ class _Readings:
     def error_g(self, time_s: np.ndarray) -> np.ndarray:
         """Return the difference between the splines, g, (n,), by that between readings."""
         middle_s = (self.time_s[1:] + self.time_s[:-1]) / 2
-        first, second = (
-            scipy.interpolate.make_interp_spline(self.time_s, self.values, degree)(
-                middle_s, self.order
-            )
-            for degree in self.degrees
-        )
-        return np.interp(time_s, middle_s, np.abs(first - second).max(axis=1))
+
+        def force_g(degree: int) -> np.ndarray:
+            spline = scipy.interpolate.make_interp_spline(self.time_s, self.values, degree)
+            return spline(middle_s, self.order)
+
+        low, high = self.degrees
+        return np.interp(time_s, middle_s, np.abs(force_g(low) - force_g(high)).max(axis=1))
 
     def lacks(self, time_s: np.ndarray) -> np.ndarray:
         """Return where readings are missing between their neighbours, (n,) bool."""
@@ -649,23 +679,27 @@ class _Readings:
 
 def _readings(comparison: BaselineComparison, columns: dict[str, np.ndarray]) -> list[_Readings]:
     """Return the readings of another simulator, or of the joints that move."""
-    sensor, time_s, force = comparison.sensor, comparison.time_s, comparison.stated_force
-    axes = len(sensor.axes)
+    sensor = comparison.sensor
+    force = comparison.stated_force
     if force is not None:
-        force_g = np.array(force(force.time_s)) / G0_MPS2
-        return [_Readings(force.name, force.time_s, force_g[:axes].T, (3, 5), 0, 0.0)]
+        force_g = np.array(force(force.time_s))[: len(sensor.axes)].T / G0_MPS2
+        return [_Readings(force.name, force.time_s, force_g, (3, 5), 0, 0.0)]
+    if not comparison.joints:
+        return []
     found = []
-    for joint, name in JOINTS.items() if comparison.joints else ():
+    for joint, name in JOINTS.items():
         values = columns.get(name, np.zeros(0))
         read = np.isfinite(values)
         if read.sum() <= BAND_LIMITED_DEGREE or not np.ptp(values[read]):
             continue
-        unit, degrees, order, step = 1.0, (3, 5), 0, sensor.stage_resolution_rad
+        readings = values[read, None]
+        time_s = comparison.time_s[read]
         if joint == 'shift':
-            unit, degrees = G0_MPS2, (BAND_LIMITED_DEGREE - 2, BAND_LIMITED_DEGREE)
-            order, step = 2, 0.0
-        readings_g = values[read, None] / unit
-        found.append(_Readings(name, time_s[read], readings_g, degrees, order, step))
+            degrees = (BAND_LIMITED_DEGREE - 2, BAND_LIMITED_DEGREE)
+            found.append(_Readings(name, time_s, readings / G0_MPS2, degrees, 2, 0.0))
+        else:
+            step_g = sensor.stage_resolution_rad
+            found.append(_Readings(name, time_s, readings, (3, 5), 0, step_g))
     return found
 
 
@@ -678,7 +712,8 @@ def without_fast_motion(
     Rests that the sensor shows stay; a stage may move at an alias of its readings where it seems
     to rest. Where readings are missing, or the output is beyond the range, that is the reason.
     """
-    sensor, robot = comparison.sensor, comparison.robot_force
+    sensor = comparison.sensor
+    robot = comparison.robot_force
     noise_g = float(np.min(noise.analog_std_v(sensor) / sensor.scale_v_per_g))
     if robot is not None:
         return _without_jerks(comparison, robot, noise_g)
@@ -725,7 +760,8 @@ def _with_aliases(
     comparison: BaselineComparison, coarse: np.ndarray, noise_g: float
 ) -> np.ndarray:
     """Extend samples to the seconds beside them that move otherwise than simulated, (n,) bool."""
-    sensor, measured = comparison.sensor, comparison.measured
+    sensor = comparison.sensor
+    measured = comparison.measured
     length = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
     part = np.minimum(np.arange(len(coarse)) // length, max(len(coarse) // length - 1, 0))
 
@@ -735,7 +771,8 @@ def _with_aliases(
         squares_g2 = [np.bincount(part, c**2) / np.bincount(part) for c in changes_g.T]
         return np.sqrt(noise_g**2 + np.array(squares_g2))
 
-    recorded, simulated = motion_g(comparison.volts), motion_g(comparison.simulated_v(sensor))
+    recorded = motion_g(comparison.volts)
+    simulated = motion_g(comparison.simulated_v(sensor))
     differs = np.any(np.abs(np.log(recorded / simulated)) > np.log(_SAME_MOTION), axis=0)
     touched = np.bincount(part, coarse) > 0
     extended = coarse.copy()
@@ -751,32 +788,30 @@ def fading_frequency_hz(comparison: BaselineComparison) -> float | None:
         return None
     sensor = comparison.sensor
     size = max(round(_WINDOW_S * sensor.rate_hz), _SHORTEST_WINDOW)
-    within = comparison.measured & ~comparison.out_of_range.any(axis=1)
-    recorded_g, simulated_g = (
-        bridged(v, within) / sensor.scale_v_per_g
-        for v in (comparison.volts, comparison.simulated_v(sensor))
-    )
-    if len(recorded_g) < _FEWEST_WINDOWS * size // 2:
+    if len(comparison) < _FEWEST_WINDOWS * size // 2:
         return None
-
+    within = comparison.measured & ~comparison.out_of_range.any(axis=1)
     frequency_hz = np.arange(size // 2 + 1) * sensor.rate_hz / size
-    band = max(round(_BAND_HZ * size / sensor.rate_hz), 1)
-    count = (size // 2) // band * band
-    stated = (noise.density_v2_per_hz(sensor, frequency_hz[1:]) / sensor.scale_v_per_g**2).sum(1)
+    width = max(round(_BAND_HZ * size / sensor.rate_hz), 1)
+
+    def power(volts: np.ndarray) -> np.ndarray:
+        """Return the power density of all axes, g²/Hz, at frequencies above 0."""
+        output_g = bridged(volts, within) / sensor.scale_v_per_g
+        density = scipy.signal.welch(
+            output_g, sensor.rate_hz, nperseg=size, detrend='linear', axis=0
+        )[1]
+        return density[1:].sum(axis=1)
+
+    def by_band(density: np.ndarray) -> np.ndarray:
+        return density[: (size // 2) // width * width].reshape(-1, width).mean(axis=1)
+
     # Without its RC filter the sensor has this gain over its simulation.
     rc_s = float(np.max(noise.electronics(sensor).rc_s))
     unfiltered = 1 + (2 * np.pi * frequency_hz[1:] * rc_s) ** 2
-    recorded, simulated = (
-        scipy.signal.welch(v, sensor.rate_hz, nperseg=size, detrend='linear', axis=0)[1][1:].sum(
-            axis=1
-        )
-        for v in (recorded_g, simulated_g)
-    )
-    recorded, simulated, stated = (
-        v[:count].reshape(-1, band).mean(axis=1)
-        for v in (recorded, simulated * unfiltered, stated)
-    )
-    moves = recorded > _MOTION * stated
-    followed = np.flatnonzero(moves & (simulated >= _FADED * recorded))
+    recorded = by_band(power(comparison.volts))
+    simulated = by_band(power(comparison.simulated_v(sensor)) * unfiltered)
+    noise_g2 = noise.density_v2_per_hz(sensor, frequency_hz[1:]) / sensor.scale_v_per_g**2
+    moves = recorded > _MOTION_POWER_RATIO * by_band(noise_g2.sum(1))
+    followed = np.flatnonzero(moves & (simulated >= _FADED_POWER_RATIO * recorded))
     first = followed[-1] + 1 if len(followed) else 0
-    return float(frequency_hz[1 + first * band]) if moves[first:].any() else None
+    return float(frequency_hz[1 + first * width]) if moves[first:].any() else None

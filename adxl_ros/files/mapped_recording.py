@@ -91,9 +91,10 @@ def native_mapping(table: Table, output: tuple[str, ...] = ()) -> ColumnMapping:
         column = stems.get(stem, name)
         is_wrong = column not in names and roles[column] not in GYRO_ROLES
         if is_wrong and unit_name(unit, ROLES[roles[column]]):
+            # Arrays in memory and the columns of binary files stand in no line.
+            place = f'{table.header}:{number}' if table.header_line else table.path
             raise NotNativeError(
-                f'{table.header}:{number}: column {name} is in another unit; '
-                f'expected the column {column}'
+                f'{place}: column {name} is in another unit; expected the column {column}'
             )
     missing = [column for column in (TIME, *output) if column not in names]
     if missing:

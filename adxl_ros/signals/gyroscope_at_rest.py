@@ -20,7 +20,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.signals.block_statistics import smallest_change
+from adxl_ros.signals.block_statistics import DITHERED_STEPS, smallest_change
 from adxl_ros.signals.rest_detection import RecordedRests
 import numpy as np
 import scipy
@@ -31,7 +31,6 @@ _TEMPERATURES_K = 3.0
 """Range of temperatures from which the bias follows temperature, K. Chosen: a usual slope of
 5 m°/s/K then changes it by more than its noise in a rest."""
 _COVERED = 0.95  # Probability below the upper end of a 90 % interval
-_DITHERED_STEPS = 0.6  # Noise, in steps, below which rounding shifts a mean
 
 
 class RestTurns(NamedTuple):
@@ -132,4 +131,4 @@ def _rounding(parts: Sequence[RestTurns]) -> np.ndarray:
     step = smallest_change(changes)
     std = np.sqrt(np.mean([part.gyro_radps.var(axis=0) for part in parts], axis=0))
     step[np.isinf(step)] = 0.0
-    return np.where(std < _DITHERED_STEPS * step, step / np.sqrt(12), 0.0)
+    return np.where(std < DITHERED_STEPS * step, step / np.sqrt(12), 0.0)

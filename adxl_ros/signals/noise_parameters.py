@@ -30,6 +30,7 @@ from adxl_ros.model.noise import (
 )
 from adxl_ros.model.sensor import Sensor, without_effect
 from adxl_ros.signals.allan_deviation import longest_rest, StillStretch
+from adxl_ros.signals.block_statistics import DITHERED_STEPS
 from adxl_ros.signals.gravity_at_rest import require_unit
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import load_sensor, RESISTANCE_OHM
@@ -411,9 +412,6 @@ def _shares(groups: _Groups, theta: np.ndarray) -> np.ndarray:
 
 _CERTAIN_STDS = 2.576  # Standard deviations that refute a filter: 1 of 100 healthy logs is beyond
 _FORM_TOLERANCE = 0.2  # Logarithm within which noise has the form of an RC filter. Chosen: 20 %
-_DITHERED_STEPS = 0.6
-"""Noise from which rounding adds step²/12, steps. Chosen: exact within 0.4 % by the first harmonic
-of the rounding error (Widrow and Kollár 2008, section 4.4)."""
 _DENSITY = 'noise_density_g_per_rthz'  # Field of a sensor that holds its white noise
 
 
@@ -570,7 +568,7 @@ def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: flo
     if not _is_coarse(std, resolution):
         before = [float(np.sqrt(max(value**2 - rounding**2, 0.0))) for value in fit.white]
         return replace(fit, white=NoiseTerm(*before))
-    widest = max(_DITHERED_STEPS * resolution / std, 1.0)
+    widest = max(DITHERED_STEPS * resolution / std, 1.0)
 
     def widened(term: NoiseTerm) -> NoiseTerm:
         return NoiseTerm(term.value, 0.0, term.high * widest)
@@ -585,7 +583,7 @@ def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: flo
 
 def _is_coarse(std: float, resolution: float) -> bool:
     """Whether samples with rounding have less noise than makes rounding independent of them."""
-    return std**2 < resolution**2 * (_DITHERED_STEPS**2 + 1 / 12)
+    return std**2 < resolution**2 * (DITHERED_STEPS**2 + 1 / 12)
 
 
 def with_noise(sensor: Sensor, noises: list[AxisNoise], rest: StillStretch) -> Sensor:

@@ -181,7 +181,7 @@ class SensorModel:
         self._switch_on(0)
 
     def __repr__(self) -> str:
-        return f'<SensorModel of {self.sensor!r}>'
+        return repr(self.sensor).replace('Sensor', 'SensorModel', 1)
 
     def _switch_on(self, count: int) -> None:
         """Forget all that sensors remember: steps since power-on, filters, noise, past forces."""
