@@ -25,7 +25,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, TINY
 from adxl_ros.model.effects.base import Detector
 from adxl_ros.model.kinematics import specific_force
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.process import option
 from adxl_ros.report.quantities import listed
 from adxl_ros.signals import gravity_at_rest
@@ -124,7 +124,6 @@ buffer of ten samples stays below by a factor of two."""
 _LARGEST_JUMP_SHARE = 0.2
 """Share of the recording that jumps may have. Chosen: gaps of a lossy link are no fault of the
 clock."""
-_SMALLEST_RANGE_V = 0.05  # Range of an output that moves, V. Chosen: 50 mg
 _SMALLEST_STEP_V = 1e-9  # Step of an ADC that stands for none, V. Chosen: rounding errors
 _DEAD_SHARE = 1e-4  # Share of its simulated range that a wired axis covers. Chosen: any wrong unit
 _LONGEST_HOLD_S = 1.0
@@ -718,9 +717,20 @@ def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
     ):
         effect = noise_effects.effect_of(detector) if detector else None
         comparison = baseline.leave_out(comparison, rows, reason, effect)
-    for axis, rows in zip(sensor.axes, stuck.T):
+    readings_mps2 = to_nominal_mps2(comparison.volts, sensor)
+    for d, axis in enumerate(sensor.axes):
         comparison = baseline.leave_out(
-            comparison, rows, f'{axis} does not change there, though the motion does', ''
+            comparison,
+            stuck[:, d],
+            f'{axis} does not change there, though the motion does',
+            '',
+        )
+        ends = [f'{end:.4g}' for end in np.unique(readings_mps2[faults.held[:, d], d])]
+        comparison = baseline.leave_out(
+            comparison,
+            faults.held[:, d],
+            f'{axis} is held at {listed(ends, "and")} m/s², the end of its range',
+            noise_effects.effect_of(Detector.HELD_AT_END),
         )
     beyond = comparison.out_of_range
     for d in np.flatnonzero(beyond.any(axis=0)):
@@ -745,7 +755,10 @@ def _stuck(comparison: BaselineComparison) -> np.ndarray:
         held = np.diff(values, prepend=np.nan) == 0
         held &= (values < np.nanmax(values)) & (values > np.nanmin(values))
         for begin, end in true_runs(held & comparison.used):
-            if end - begin > longest and np.ptp(expected[begin:end]) > _SMALLEST_RANGE_V:
+            if (
+                end - begin > longest
+                and np.ptp(expected[begin:end]) > noise_effects.SMALLEST_RANGE_V
+            ):
                 stuck[begin:end, d] = True
     return stuck
 
@@ -1004,26 +1017,23 @@ def _check_range(comparison: BaselineComparison, finite: np.ndarray) -> None:
     lsb_v, range_v = max(sensor.lsb_v, _SMALLEST_STEP_V), np.ptp(volts, axis=0)
     # Coarse codes repeat in an extreme pose, so that the simulation must differ, too.
     step_v = np.maximum(baseline.code_step_v(volts), lsb_v)
-    railed = max(
-        float(
-            np.mean(
-                (np.abs(volts - rail_v) < lsb_v / 2) & (np.abs(simulated_v - rail_v) > step_v),
-                axis=0,
-            )[range_v > _SMALLEST_RANGE_V].max(initial=0.0)
-        )
-        for rail_v in (volts.max(axis=0), volts.min(axis=0))
-    )
-    if railed > _LARGEST_MISSING_SHARE:
-        raise DataFault(
-            'saturated',
-            f'{100 * railed:.0f} % of the samples are at the end of the '
-            'range; check supply, range and wiring',
-        )
+    for rail_v in (volts.max(axis=0), volts.min(axis=0)):
+        railed = (np.abs(volts - rail_v) < lsb_v / 2) & (np.abs(simulated_v - rail_v) > step_v)
+        share = np.where(range_v > noise_effects.SMALLEST_RANGE_V, railed.mean(axis=0), 0.0)
+        worst = int(np.argmax(share))
+        if share[worst] > _LARGEST_MISSING_SHARE:
+            end_mps2 = to_nominal_mps2(rail_v, sensor)[worst]
+            raise DataFault(
+                'saturated',
+                f'{sensor.axes[worst]} is held at {end_mps2:.4g} m/s², the end of its range, for '
+                f'{railed[:, worst].sum()} samples ({100 * share[worst]:.0f} %); check supply, '
+                'range and wiring',
+            )
     expected_v = np.ptp(simulated_v, axis=0)
     # At rest, codes may all be the same where their step exceeds the noise.
     noisy = noise.analog_std_v(sensor) > sensor.lsb_v
     dead = np.where(
-        expected_v > _SMALLEST_RANGE_V,
+        expected_v > noise_effects.SMALLEST_RANGE_V,
         range_v < _DEAD_SHARE * expected_v,
         (range_v < _SMALLEST_STEP_V) & ((range_v > 0) | noisy),
     )
