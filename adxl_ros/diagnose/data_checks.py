@@ -718,17 +718,16 @@ def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
         effect = noise_effects.effect_of(detector) if detector else None
         comparison = baseline.leave_out(comparison, rows, reason, effect)
     readings_mps2 = to_nominal_mps2(comparison.volts, sensor)
-    for d, axis in enumerate(sensor.axes):
+    for axis, still, held, values_mps2 in zip(
+        sensor.axes, stuck.T, faults.held.T, readings_mps2.T
+    ):
         comparison = baseline.leave_out(
-            comparison,
-            stuck[:, d],
-            f'{axis} does not change there, though the motion does',
-            '',
+            comparison, still, f'{axis} does not change there, though the motion does', ''
         )
-        ends = [f'{end:.4g}' for end in np.unique(readings_mps2[faults.held[:, d], d])]
+        ends = [f'{end:.4g}' for end in np.unique(values_mps2[held])]
         comparison = baseline.leave_out(
             comparison,
-            faults.held[:, d],
+            held,
             f'{axis} is held at {listed(ends, "and")} m/s², the end of its range',
             noise_effects.effect_of(Detector.HELD_AT_END),
         )
