@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 from adxl_ros.diagnose import comparison as baseline, noise_effects, reference_checks
 from adxl_ros.diagnose.comparison import BaselineComparison, compare, SMALLEST_MOTION_G
 from adxl_ros.files.recording_columns import JOINTS, Recording, stamped_rate_hz
+from adxl_ros.files.stamps import without_stalls
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, TINY
 from adxl_ros.model.effects.base import Detector
@@ -124,6 +125,7 @@ buffer of ten samples stays below by a factor of two."""
 _LARGEST_JUMP_SHARE = 0.2
 """Share of the recording that jumps may have. Chosen: gaps of a lossy link are no fault of the
 clock."""
+_SMALLEST_GAP_G = 1e-6  # Largest difference of a recording and itself, g: rounding of files
 _SMALLEST_STEP_V = 1e-9  # Step of an ADC that stands for none, V. Chosen: rounding errors
 _DEAD_SHARE = 1e-4  # Share of its simulated range that a wired axis covers. Chosen: any wrong unit
 _LONGEST_HOLD_S = 1.0
@@ -652,11 +654,21 @@ def compare_checked(
     Raise DataFault where that is meaningless.
     """
     sensor, notes = replace(sensor, rate_hz=recording.rate_hz), list[str]()
+    mended_s = without_stalls(recording.time_s, 1 / recording.rate_hz, LARGEST_LATENCY_S)
+    late_s = recording.time_s - mended_s
+    if late_s.any():
+        recording = replace(recording, time_s=mended_s)
+        notes.append(
+            f'{np.count_nonzero(late_s)} samples are stamped up to {late_s.max():.3g} s late, the '
+            f'first at {recording.time_s[np.flatnonzero(late_s)[0]]:.6g} s, as by a host that '
+            'stalls and reads at once what waited: they are taken at an even rate'
+        )
     _check_clock(recording)
     even_s = even_stamps(recording.time_s)
     left_out: list[tuple[np.ndarray, str]] = []
     if sim is not None:
-        recording, sim, notes = _align_force(recording, sensor, sim, may_shift)
+        recording, sim, of_shift = _align_force(recording, sensor, sim, may_shift)
+        notes += of_shift
     else:
         _check_encoder(recording, sensor)
         step_rad = baseline.seen_step_rad(recording, sensor)
@@ -1004,6 +1016,14 @@ def _check_output(comparison: BaselineComparison) -> None:
 
 def _check_simulator(comparison: BaselineComparison) -> None:
     """Refuse another simulator whose errors no effect of the sensor describes."""
+    residual_g = comparison.residual_v(comparison.sensor) / comparison.sensor.scale_v_per_g
+    if comparison.simulated_force and np.nanmax(np.abs(residual_g)) < _SMALLEST_GAP_G:
+        raise DataFault(
+            'reference',
+            f'{comparison.simulated_force.name} agrees with the recording to '
+            f'{1e6 * _SMALLEST_GAP_G:g} µg in all samples, as no sensor does: it holds the '
+            'recording itself',
+        )
     factor = reference_checks.wrong_dynamic_factor(comparison)
     if factor is not None:
         raise DataFault('reference', factor)

@@ -196,6 +196,32 @@ def test_the_advice_on_a_clock_that_steps_can_be_followed(tmp_path, step_s, at_s
         assert left_mps2(comparison) < LARGEST_LEFT_MPS2
 
 
+@pytest.mark.parametrize('stalled_s', [0.6, 3.0])
+@pytest.mark.parametrize('read_s', [1e-4, 4e-3])
+def test_a_host_that_stalls_is_no_clock_that_steps(tmp_path, stalled_s, read_s):
+    """What waited is read at once, or faster than the sensor makes it."""
+    carried = Carried()
+    stamps_s = carried.time_s + 2e-4 * np.sin(np.arange(len(carried.time_s)))
+    waits = (stamps_s > 20.0) & (stamps_s < 20.0 + stalled_s)
+    earliest_s = np.where(waits, 20.0 + stalled_s, stamps_s)
+    numbers_s = read_s * np.arange(len(stamps_s))
+    stamps_s = np.maximum.accumulate(earliest_s - numbers_s) + numbers_s
+    comparison = carried.beside(tmp_path, replace(carried.recorded(), time_s=stamps_s))
+    assert left_mps2(comparison) < LARGEST_LEFT_MPS2
+    (note,) = [text for text in comparison.notes if 'stalls' in text]
+    assert f'{stalled_s:.2g} s late' in note or f'{stalled_s - 0.01:.3g} s late' in note
+    assert float(re.search(r'first at ([\d.]+) s', note)[1]) == pytest.approx(20.0, abs=0.02)
+
+
+def test_a_recording_beside_itself_is_named(tmp_path):
+    carried = Carried()
+    sim = carried.simulated(tmp_path, carried.force() + carried.noise)
+    unfiltered = replace(nominal('xyz'), rate_hz=RATE_HZ, rc_capacitance_f=0.0)
+    with pytest.raises(DataFault) as raised:
+        compare_checked(carried.recorded(), unfiltered, sim, False)
+    assert raised.value.name == 'reference' and 'the recording itself' in raised.value.message
+
+
 @pytest.mark.parametrize('ratio, seconds', [(1e-2, 40.0), (-5e-3, 120.0), (2e-3, 300.0)])
 @pytest.mark.parametrize('may_shift', [False, True])
 def test_the_advice_on_clocks_that_drift_apart_can_be_followed(
