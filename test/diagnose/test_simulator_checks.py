@@ -174,6 +174,7 @@ def only(recorded: Recording, rows: np.ndarray) -> Recording:
         (0.4, 13.0),
         (-0.25, 15.0),
         (2.0, 48.0),
+        (10.0, 13.0),
     ],
 )
 def test_the_advice_on_a_clock_that_steps_can_be_followed(tmp_path, step_s, at_s):
