@@ -5,13 +5,16 @@
 from pathlib import Path
 import re
 import subprocess
+from typing import Any
 
 import adxl_ros as adxl
+from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.signals.noise_parameters import recording_noise, RecordingNoise
 import numpy as np
 from processes import run_in_process
 import pytest
+from scipy.spatial.transform import Rotation
 from still_noise import still_samples, write_csv
 import yaml
 
@@ -186,3 +189,14 @@ def test_a_level_axis_in_another_unit_is_told_by_its_noise(
         ratio, of_upright = re.search(r', (.*) times that of z \((.*)\)', text).groups()
         assert float(ratio) == pytest.approx(per_mps2, rel=0.1)
         assert float(of_upright) == pytest.approx(1e6 * N / G, rel=0.1)
+
+
+@pytest.mark.parametrize('verb', [adxl.noise, adxl.fit])
+def test_a_refusal_for_want_of_rests_names_why_nothing_rests(tmp_path: Path, verb: Any) -> None:
+    time_s, accel = samples(60.0, terms=(N, 0.0, 0.0))
+    turned = Rotation.from_rotvec(np.floor(time_s / 4.0)[:, None] * [0.7, 0.4, 0.2])
+    accel = turned.apply(accel)
+    accel[1::2] = accel[1::2, [1, 2, 0]]
+    write_csv(tmp_path / 'two.csv', time_s, accel)
+    with pytest.raises(UserError, match='rest.*rows alternate between 2 values'):
+        verb(tmp_path / 'two.csv')
