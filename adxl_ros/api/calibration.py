@@ -448,7 +448,8 @@ class _Rests:
         look.feed(read)
         # Rests by the noise of the sensor may not tell the unit; of other faults, the poses tell.
         require_unit(look.gravity(), read.path)
-        poses = extract_poses(read, unit.sensor, self._records, self._table)
+        with look.named_in_refusals():
+            poses = extract_poses(read, unit.sensor, self._records, self._table)
         if self._table:
             poses = with_table_angles(poses, self._table)
         filters = estimate_filters(read, unit.sensor, poses)

@@ -21,11 +21,12 @@ from typing import Any, NamedTuple
 from adxl_ros.diagnose import comparison as baseline, noise_effects, reference_checks
 from adxl_ros.diagnose.comparison import BaselineComparison, compare, SMALLEST_MOTION_G
 from adxl_ros.files.recording_columns import JOINTS, Recording, stamped_rate_hz
+from adxl_ros.files.stamps import without_stalls
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, TINY
 from adxl_ros.model.effects.base import Detector
 from adxl_ros.model.kinematics import specific_force
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.process import option
 from adxl_ros.report.quantities import listed
 from adxl_ros.signals import gravity_at_rest
@@ -58,15 +59,14 @@ _OVERLAP_OF_PART = 0.5
 """Share of a part that must overlap. Chosen: the ends of both recordings differ, and a clock may
 step by half of a part."""
 _MOST_PARTS = 8  # Most parts. Chosen: a step then shows in all but an eighth at either end
-_NOT_COMPARED = -1.0  # Correlation where too few samples overlap, or nothing moves
 _CORRELATED = 0.9
 """Correlation from which two motions are the same one. Chosen: noise of half the motion."""
 _SAME_CORRELATION = 0.01
 """Correlations that differ by less are equal, and the one of the longest overlap counts. Chosen: a
 motion that repeats fits at several shifts."""
 _LARGEST_STEP_S = 4.0
-"""Largest step of a clock that is looked for anywhere, s; of a larger one, the parts tell. Chosen:
-a quarter of a part."""
+"""Largest step of a clock that is looked for anywhere, s; of a larger one, the parts tell the
+shifts. Chosen: a quarter of a part."""
 _COARSE_S = 0.05  # Step of the search for a step, s. Chosen: below a period of most motion
 _SMALLEST_STEP_S = 5e-3  # Smallest step of a clock, s. Chosen: less is jitter
 _LARGEST_ERROR_RATIO = 0.5
@@ -124,7 +124,7 @@ buffer of ten samples stays below by a factor of two."""
 _LARGEST_JUMP_SHARE = 0.2
 """Share of the recording that jumps may have. Chosen: gaps of a lossy link are no fault of the
 clock."""
-_SMALLEST_RANGE_V = 0.05  # Range of an output that moves, V. Chosen: 50 mg
+_SMALLEST_GAP_G = 1e-6  # Largest difference of a recording and itself, g: rounding of files
 _SMALLEST_STEP_V = 1e-9  # Step of an ADC that stands for none, V. Chosen: rounding errors
 _DEAD_SHARE = 1e-4  # Share of its simulated range that a wired axis covers. Chosen: any wrong unit
 _LONGEST_HOLD_S = 1.0
@@ -237,8 +237,11 @@ def _align_force(
     motions = _motions(recording, sensor, force)
     if motions is not None:
         late_s = _find_shift(motions, recording, sensor, force)
-        _check_step(motions, recording, force, late_s)
-        _check_one_shift(motions, recording, force)
+        parts = motions.fitting_parts()
+        _check_step(motions, recording, force, late_s, parts)
+        drift = _find_drift(motions, parts)
+        if drift is not None:
+            raise _drift_fault(drift, recording, force)
     shift = f'{abs(late_s):.4f} s {"late" if late_s > 0 else "early"}' if late_s else ''
     if late_s and may_shift:
         force = force.shifted(-late_s)
@@ -325,12 +328,18 @@ class _Motions(NamedTuple):
             [np.interp(instants_s, self.stated_s, axis_g) for axis_g in self.stated_g.T]
         )
 
+    def overlap(self, late_s: np.ndarray | float) -> np.ndarray:
+        """Return which instants the simulator has at shifts, s, (n,) or (), (n,) bool."""
+        instants_s = self.measured_s + late_s
+        return (instants_s >= self.stated_s[0]) & (instants_s <= self.stated_s[-1])
+
     def left_g2(self, late_s: np.ndarray | float) -> float:
         """Return the mean square, g², that shifts, s, (n,) or (), leave where both overlap."""
-        instants_s = self.measured_s + late_s
-        overlap = (instants_s >= self.stated_s[0]) & (instants_s <= self.stated_s[-1])
+        overlap = self.overlap(late_s)
+        if overlap.mean() < _OVERLAP_OF_PART:
+            return np.inf
         left = _unexplained(self.measured_g[overlap], self.stated_at(late_s)[overlap])
-        return left / max(int(overlap.sum()), 1)
+        return left / int(overlap.sum())
 
     def part(self, rows: np.ndarray) -> _Motions:
         """Return the part of the recording that has these rows."""
@@ -379,19 +388,6 @@ class _Shifts(NamedTuple):
     def fits(self) -> bool:
         """Return whether the part fits at its best shift."""
         return bool(self.correlation.max() > _CORRELATED)
-
-    def misfits(self, late_s: float) -> bool:
-        """Return whether the part can be compared at a shift, and does not fit there."""
-        there = self.correlation[np.argmin(np.abs(self.lags_s - late_s))]
-        return bool(_NOT_COMPARED < there <= _CORRELATED)
-
-    def contradicts(self, other: _Shifts) -> bool:
-        """Return whether neither part fits at the shift of the other."""
-        return (
-            abs(self.late_s - other.late_s) > LARGEST_LATENCY_S
-            and self.misfits(other.late_s)
-            and other.misfits(self.late_s)
-        )
 
 
 class _Drift(NamedTuple):
@@ -484,27 +480,6 @@ def _drift_fault(drift: _Drift, recording: Recording, force: ForcePath) -> DataF
     )
 
 
-def _check_one_shift(motions: _Motions, recording: Recording, force: ForcePath) -> None:
-    """Refuse motions whose parts fit at different shifts only: a clock drifts or steps."""
-    parts = motions.fitting_parts()
-    drift = _find_drift(motions, parts)
-    if drift is not None:
-        raise _drift_fault(drift, recording, force)
-    levels: list[list[_Shifts]] = []  # Parts in a row of which one shift may be that of all
-    for part in parts:
-        if levels and not part.contradicts(levels[-1][-1]):
-            levels[-1].append(part)
-        else:
-            levels.append([part])
-    if len(levels) < 2:
-        return
-    # The part in which the clock steps fits less well than the others.
-    before_s, after_s = (
-        max(level, key=lambda part: float(part.correlation.max())).late_s for level in levels[:2]
-    )
-    raise _step_fault(force, motions, before_s, after_s)
-
-
 def _step_fault(force: ForcePath, motions: _Motions, before_s: float, after_s: float) -> DataFault:
     """Return the fault of a clock that steps from one shift to another, with size and time."""
     return DataFault(
@@ -516,16 +491,23 @@ def _step_fault(force: ForcePath, motions: _Motions, before_s: float, after_s: f
     )
 
 
-def _check_step(motions: _Motions, recording: Recording, force: ForcePath, about_s: float) -> None:
+def _check_step(
+    motions: _Motions,
+    recording: Recording,
+    force: ForcePath,
+    about_s: float,
+    parts: Sequence[_Shifts],
+) -> None:
     """
-    Refuse motions whose shift steps by some seconds at most, wherever it does.
+    Refuse motions whose shift steps, wherever it does.
 
     A step shows if two shifts leave far less than one, and than shifts that drift. It needs no
-    whole parts on both sides: a recording may move for some seconds only before its step.
+    whole parts on both sides: a recording may move for some seconds only before its step. Shifts
+    are some seconds about one that fits, none, and those of the parts that fit.
     """
-    # What all shifts can be compared in, without gaps
-    begin_s, end_s = motions.stated_s[[0, -1]] - about_s + np.array([1, -1]) * _LARGEST_STEP_S
-    inside = (motions.measured_s > begin_s) & (motions.measured_s < end_s)
+    centers_s = {about_s, 0.0, *(part.late_s for part in parts)}
+    # Instants that have a reference, without gaps
+    inside = np.any([motions.overlap(late_s) for late_s in centers_s], axis=0)
     before = np.searchsorted(recording.time_s, motions.measured_s, 'right') - 1
     inside &= np.diff(recording.time_s, append=np.inf)[before] < _COARSE_S + 2 / recording.rate_hz
     compared = np.flatnonzero(inside)
@@ -533,12 +515,15 @@ def _check_step(motions: _Motions, recording: Recording, force: ForcePath, about
     rows = np.arange(len(motions.measured_s))
     if not len(rows):
         return
-    near_s = about_s + np.union1d(
-        np.arange(-_LARGEST_STEP_S, _LARGEST_STEP_S, _COARSE_S),
-        np.arange(-LARGEST_LATENCY_S, LARGEST_LATENCY_S, motions.step_s),
+    latencies_s = np.arange(-LARGEST_LATENCY_S, LARGEST_LATENCY_S, motions.step_s)
+    near_s = np.concatenate(
+        [
+            about_s + np.arange(-_LARGEST_STEP_S, _LARGEST_STEP_S, _COARSE_S),
+            *(late_s + latencies_s for late_s in centers_s),
+        ]
     )
     one_s = motions.best_shift_s(near_s)
-    zero_g = (motions.measured_g - motions.stated_at(one_s)).mean(axis=0)
+    zero_g = (motions.measured_g - motions.stated_at(one_s))[motions.overlap(one_s)].mean(axis=0)
     motions = motions._replace(measured_g=motions.measured_g - zero_g)
     first = _first_row_behind(motions, one_s, near_s)
     if min(first, len(rows) - first) * motions.step_s < LARGEST_LATENCY_S:
@@ -559,7 +544,8 @@ def _first_row_behind(motions: _Motions, one_s: float, near_s: np.ndarray) -> in
     most_g2, first = 0.0, 0
     for other_s in near_s:
         other_g = motions.stated_at(other_s)
-        gain_g2 = np.cumsum(((own_g - one_g) ** 2 - (own_g - other_g) ** 2).sum(axis=1))
+        gains_g2 = ((own_g - one_g) ** 2 - (own_g - other_g) ** 2).sum(axis=1)
+        gain_g2 = np.cumsum(gains_g2 * motions.overlap(one_s) * motions.overlap(other_s))
         for row, gained_g2 in (
             (gain_g2.argmax(), gain_g2.max()),
             (gain_g2.argmin(), gain_g2[-1] - gain_g2.min()),
@@ -653,11 +639,21 @@ def compare_checked(
     Raise DataFault where that is meaningless.
     """
     sensor, notes = replace(sensor, rate_hz=recording.rate_hz), list[str]()
+    mended_s = without_stalls(recording.time_s, 1 / recording.rate_hz, LARGEST_LATENCY_S)
+    late_s = recording.time_s - mended_s
+    if late_s.any():
+        recording = replace(recording, time_s=mended_s)
+        notes.append(
+            f'{np.count_nonzero(late_s)} samples are stamped up to {late_s.max():.3g} s late, the '
+            f'first at {recording.time_s[np.flatnonzero(late_s)[0]]:.6g} s, as by a host that '
+            'stalls and reads at once what waited: they are taken at an even rate'
+        )
     _check_clock(recording)
     even_s = even_stamps(recording.time_s)
     left_out: list[tuple[np.ndarray, str]] = []
     if sim is not None:
-        recording, sim, notes = _align_force(recording, sensor, sim, may_shift)
+        recording, sim, of_shift = _align_force(recording, sensor, sim, may_shift)
+        notes += of_shift
     else:
         _check_encoder(recording, sensor)
         step_rad = baseline.seen_step_rad(recording, sensor)
@@ -718,9 +714,19 @@ def _without_disturbed(comparison: BaselineComparison) -> BaselineComparison:
     ):
         effect = noise_effects.effect_of(detector) if detector else None
         comparison = baseline.leave_out(comparison, rows, reason, effect)
-    for axis, rows in zip(sensor.axes, stuck.T):
+    readings_mps2 = to_nominal_mps2(comparison.volts, sensor)
+    for axis, still, held, values_mps2 in zip(
+        sensor.axes, stuck.T, faults.held.T, readings_mps2.T
+    ):
         comparison = baseline.leave_out(
-            comparison, rows, f'{axis} does not change there, though the motion does', ''
+            comparison, still, f'{axis} does not change there, though the motion does', ''
+        )
+        ends = [f'{end:.4g}' for end in np.unique(values_mps2[held])]
+        comparison = baseline.leave_out(
+            comparison,
+            held,
+            f'{axis} is held at {listed(ends, "and")} m/s², the end of its range',
+            noise_effects.effect_of(Detector.HELD_AT_END),
         )
     beyond = comparison.out_of_range
     for d in np.flatnonzero(beyond.any(axis=0)):
@@ -745,7 +751,10 @@ def _stuck(comparison: BaselineComparison) -> np.ndarray:
         held = np.diff(values, prepend=np.nan) == 0
         held &= (values < np.nanmax(values)) & (values > np.nanmin(values))
         for begin, end in true_runs(held & comparison.used):
-            if end - begin > longest and np.ptp(expected[begin:end]) > _SMALLEST_RANGE_V:
+            if (
+                end - begin > longest
+                and np.ptp(expected[begin:end]) > noise_effects.SMALLEST_RANGE_V
+            ):
                 stuck[begin:end, d] = True
     return stuck
 
@@ -992,6 +1001,14 @@ def _check_output(comparison: BaselineComparison) -> None:
 
 def _check_simulator(comparison: BaselineComparison) -> None:
     """Refuse another simulator whose errors no effect of the sensor describes."""
+    residual_g = comparison.residual_v(comparison.sensor) / comparison.sensor.scale_v_per_g
+    if comparison.simulated_force and np.nanmax(np.abs(residual_g)) < _SMALLEST_GAP_G:
+        raise DataFault(
+            'reference',
+            f'{comparison.simulated_force.name} agrees with the recording to '
+            f'{1e6 * _SMALLEST_GAP_G:g} µg in all samples, as no sensor does: it holds the '
+            'recording itself',
+        )
     factor = reference_checks.wrong_dynamic_factor(comparison)
     if factor is not None:
         raise DataFault('reference', factor)
@@ -1004,26 +1021,23 @@ def _check_range(comparison: BaselineComparison, finite: np.ndarray) -> None:
     lsb_v, range_v = max(sensor.lsb_v, _SMALLEST_STEP_V), np.ptp(volts, axis=0)
     # Coarse codes repeat in an extreme pose, so that the simulation must differ, too.
     step_v = np.maximum(baseline.code_step_v(volts), lsb_v)
-    railed = max(
-        float(
-            np.mean(
-                (np.abs(volts - rail_v) < lsb_v / 2) & (np.abs(simulated_v - rail_v) > step_v),
-                axis=0,
-            )[range_v > _SMALLEST_RANGE_V].max(initial=0.0)
-        )
-        for rail_v in (volts.max(axis=0), volts.min(axis=0))
-    )
-    if railed > _LARGEST_MISSING_SHARE:
-        raise DataFault(
-            'saturated',
-            f'{100 * railed:.0f} % of the samples are at the end of the '
-            'range; check supply, range and wiring',
-        )
+    for rail_v in (volts.max(axis=0), volts.min(axis=0)):
+        railed = (np.abs(volts - rail_v) < lsb_v / 2) & (np.abs(simulated_v - rail_v) > step_v)
+        share = np.where(range_v > noise_effects.SMALLEST_RANGE_V, railed.mean(axis=0), 0.0)
+        worst = int(np.argmax(share))
+        if share[worst] > _LARGEST_MISSING_SHARE:
+            end_mps2 = to_nominal_mps2(rail_v, sensor)[worst]
+            raise DataFault(
+                'saturated',
+                f'{sensor.axes[worst]} is held at {end_mps2:.4g} m/s², the end of its range, for '
+                f'{railed[:, worst].sum()} samples ({100 * share[worst]:.0f} %); check supply, '
+                'range and wiring',
+            )
     expected_v = np.ptp(simulated_v, axis=0)
     # At rest, codes may all be the same where their step exceeds the noise.
     noisy = noise.analog_std_v(sensor) > sensor.lsb_v
     dead = np.where(
-        expected_v > _SMALLEST_RANGE_V,
+        expected_v > noise_effects.SMALLEST_RANGE_V,
         range_v < _DEAD_SHARE * expected_v,
         (range_v < _SMALLEST_STEP_V) & ((range_v > 0) | noisy),
     )

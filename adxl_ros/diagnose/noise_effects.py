@@ -82,6 +82,10 @@ samples, chance explains runs of 7."""
 _REPEAT_LEAST_OF_SEVERAL = 1e-3
 """The same on all of several axes. Chosen: chance explains runs of 3."""
 _REPEAT_MOST = 0.5  # The largest one. Chosen: chance explains runs of 30
+SMALLEST_RANGE_V = 0.05  # Range of an output that moves, V. Chosen: 50 mg
+_HELD_STEPS = 3.0
+"""The same in steps of its codes, beyond an end at which it is held. Chosen: a peak within one
+code moves by less, whatever its scale factor."""
 _BANDS = 5  # Bands of frequency in which noise is compared. Chosen: half a decade each
 _LOWEST_EDGE_HZ = 0.05  # Smallest edge of a band, Hz. Chosen: a period of 20 s
 _TIMES_S = (0.1, 1.0, 10.0)  # Averaging times of the Allan deviation, s. Chosen: a decade apart
@@ -101,7 +105,11 @@ class Detection:
     def is_left_out(self) -> bool:
         """Whether its samples are left out of the comparison."""
         detector = effect_named(self.effect).diagnosis.detector
-        return detector in (Detector.REPEATED_SAMPLES, Detector.ISOLATED_SAMPLES)
+        return detector in (
+            Detector.REPEATED_SAMPLES,
+            Detector.ISOLATED_SAMPLES,
+            Detector.HELD_AT_END,
+        )
 
 
 def effect_of(detector: Detector) -> str:
@@ -282,19 +290,60 @@ def _spikes(
     return isolated, size_v
 
 
+def _held_at_end(comparison: BaselineComparison, sign: float) -> np.ndarray:
+    """
+    Return where axes are held at an end of their range, (n, m) bool; sign: 1 for the upper one.
+
+    The simulation moves on beyond it. In an extreme pose codes repeat, too, but nothing moves.
+    """
+    outputs_v = sign * comparison.volts
+    beyond_v = sign * comparison.simulated_v(comparison.sensor) - np.nanmax(outputs_v, axis=0)
+    steps_v = np.maximum(code_step_v(outputs_v), comparison.sensor.lsb_v)
+    at_end = outputs_v == np.nanmax(outputs_v, axis=0)
+    for d, smallest_v in enumerate(np.maximum(_HELD_STEPS * steps_v, SMALLEST_RANGE_V)):
+        is_held = any(
+            min(beyond_v[a:b, d].max(), np.ptp(beyond_v[a:b, d])) > smallest_v
+            for a, b in true_runs(at_end[:, d])
+            if b - a >= _REPEAT_SHORTEST
+        )
+        at_end[:, d] &= is_held
+    return at_end
+
+
+def _clipping(comparison: BaselineComparison, low: np.ndarray, high: np.ndarray) -> Detection:
+    """Return the limits of axes that are held at the lower or the upper end, (n, m) bool each."""
+    sensor = comparison.sensor
+    output_g = (comparison.volts - sensor.zero_g_v) / sensor.scale_v_per_g
+    lowest_g, highest_g = np.nanmin(output_g, axis=0), np.nanmax(output_g, axis=0)
+    is_low, is_high = low.any(axis=0), high.any(axis=0)
+    # An end that was not reached is at least as far as the samples, and as the other end.
+    low_g = np.where(is_low, lowest_g, np.minimum(lowest_g, -highest_g))
+    high_g = np.where(is_high, highest_g, np.maximum(highest_g, -lowest_g))
+    neutral = effect_named(effect_of(Detector.HELD_AT_END)).parameters[0].neutral
+    missing_v = np.where(low | high, comparison.residual_v(sensor), 0.0)
+    return _detection(
+        Detector.HELD_AT_END,
+        np.mean(missing_v**2, axis=0),
+        sensor,
+        limit_g=np.where(is_low | is_high, (high_g - low_g) / 2, neutral),
+        offset_g=np.where(is_low | is_high, (high_g + low_g) / 2, 0.0),
+    )
+
+
 class SampleFaults(NamedTuple):
     """What the samples themselves show of a sensor, before any effect on the mean is known."""
 
     repeated: np.ndarray  # Samples that repeat the one before, (n,) bool
     isolated: np.ndarray  # Samples that stand alone, (n,) bool
-    detections: list[Detection]  # Repeated samples or coarse codes
+    held: np.ndarray  # Samples at an end of the range of an axis, (n, m) bool
+    detections: list[Detection]  # Repeated samples, coarse codes, and ends of the range
     # Isolated samples; the residual of the best hypothesis must show them, too
     possible_spikes: list[Detection]
 
 
 def sample_faults(comparison: BaselineComparison) -> SampleFaults:
     """
-    Find coarse codes, else repeated samples, and isolated samples of a recording.
+    Find coarse codes, else repeated samples, samples at an end, and isolated ones of a recording.
 
     Where the reference is not known, a jerk of the motion would look like an isolated sample.
     """
@@ -317,7 +366,10 @@ def sample_faults(comparison: BaselineComparison) -> SampleFaults:
     if spikes and not coarse:
         changing, detections = repeated_samples(volts, time_s, finite, sensor, isolated)
         isolated, spikes = among(changing & known)
-    return SampleFaults(finite & ~changing, isolated, detections, spikes)
+    low, high = (_held_at_end(comparison, sign) for sign in (-1.0, 1.0))
+    if (low | high).any():
+        detections = [*detections, _clipping(comparison, low, high)]
+    return SampleFaults(finite & ~changing, isolated, low | high, detections, spikes)
 
 
 def with_bits(sensor: Sensor, coarse: Detection) -> Sensor:
@@ -640,7 +692,7 @@ def _statistics(
     elif detector is Detector.REPEATED_SAMPLES:
         used = repeated_samples(volts, time_s, finite, sensor)[0]
         yield 'share of repeated samples', '1', np.array([float(np.mean(~used[finite]))])
-    else:
+    elif detector is Detector.COARSE_CODES:
         lost = coarse_codes(volts, sensor)
         bits = sum(lost.values.values()) if lost else np.zeros(len(scale))
         yield 'distance of codes', 'm/s^2', sensor.lsb_v * 2**bits / scale

@@ -52,6 +52,7 @@ _DIMENSIONS = {
 """Dimensions of the reproducible rest, for people."""
 _MOST_DIMENSIONS = 2  # Dimensions that a sentence names. Chosen: the strongest ones
 NOISE_STAYS = 'The effects are noise, which no simulation repeats sample by sample.'
+_NOT_COMPARED = 'The samples that the effects change are left out.'
 """Why effects on the noise close nothing."""
 
 
@@ -331,7 +332,7 @@ def headline(diagnosis: Diagnosis) -> str:
     where = [_DIMENSIONS[d] for d in verdict.remainder_follows[:_MOST_DIMENSIONS]]
     follows = f' It follows {listed(where, "and")}.' if where and verdict.remainder.low > 0 else ''
     separate = ': the data do not separate them' if verdict.groups else ''
-    noise = f' {NOISE_STAYS}' if is_only_noise(diagnosis.report) else ''
+    noise = f' {_noise_text(diagnosis.report)}' if is_only_noise(diagnosis.report) else ''
     in_reference = [e for e in verdict.effects if effect_named(e).concern is Concern.REFERENCE]
     in_words = listed(in_reference, 'and')
     of_reference = f' Error of the reference, not of the sensor: {in_words}.' if in_words else ''
@@ -533,6 +534,12 @@ def is_only_noise(report: Report) -> bool:
     )
 
 
+def _noise_text(report: Report) -> str:
+    """Say why effects that no model of the mean has do not make a gap smaller."""
+    left_out = {detection.effect for detection in report.detections if detection.is_left_out}
+    return _NOT_COMPARED if left_out >= {*report.verdict.named} else NOISE_STAYS
+
+
 def closes(report: Report) -> bool:
     """Determine whether there is a gap, and effects that change the mean."""
     return (
@@ -600,7 +607,7 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     if report.verdict.status != 'explained' or 'REFERENCE' in word:
         lines += wrapped(headline(diagnosis))
     elif is_only_noise(report):
-        lines += wrapped(NOISE_STAYS)
+        lines += wrapped(_noise_text(report))
     could_show = report.could_show
     shows = f'{sum(row.shows for row in could_show)} of {len(could_show)} effects could show'
     hidden = ', '.join(row.name.effect for row in could_show if not row.shows)
@@ -666,7 +673,15 @@ def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
 
 def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
     """Return one line for each parameter; those that may be 0 share the last line."""
-    parameters = candidate['parameters']
+    parameters: dict[str, Any] = {}
+    for key, parameter in candidate['parameters'].items():
+        neutral = parameter_of(Coefficient(candidate['effect'], key.partition('.')[0])).neutral
+        if isinstance(parameter['value'], list):
+            for axis, value in zip(report.baseline.axes, parameter['value']):
+                if value != neutral:
+                    parameters[f'{key}.{axis}'] = {**parameter, 'value': value}
+        else:
+            parameters[key] = parameter
     is_single = len({key.partition('.')[0] for key in parameters}) == 1
     lines = []
     zeros = []

@@ -79,6 +79,22 @@ def lacks_samples(time_s: np.ndarray, period: float) -> np.ndarray:
     return lacks
 
 
+def without_stalls(time_s: np.ndarray, period: float, shortest_s: float) -> np.ndarray:
+    """
+    Return stamps, s, (n,), as they were without stalls of a host of some time, s, or more.
+
+    What waited came at once: it is evenly spaced from the sample before.
+    """
+    mended_s = time_s.copy()
+    is_stall = (np.diff(time_s) > period + shortest_s) & ~lacks_samples(time_s, period)
+    for i in np.flatnonzero(is_stall).tolist():
+        even_s = mended_s[i] + period * np.arange(1, len(time_s) - i)
+        is_late = np.append(time_s[i + 1 :] > even_s + period / 2, False)
+        waited = int(np.argmin(is_late))
+        mended_s[i + 1 : i + 1 + waited] = even_s[:waited]
+    return mended_s
+
+
 def period_s(time_s: np.ndarray) -> float:
     """Return the mean period of two or more stamps, s, (n,); 0 where they stand still."""
     ends = burst_ends(time_s)

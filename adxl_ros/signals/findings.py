@@ -331,7 +331,9 @@ def _stamp_faults(contents: RecordingContents) -> list[str]:
         if count
     ]
     if _has_wide_gaps(contents):
-        faults.append(f'{_missing(contents)}; record again, or use the parts')
+        faults.append(
+            f'{_missing(contents)}, or the clock stepped there; record again, or use the parts'
+        )
     period_s = 1 / contents.rate_hz
     if contents.jitter_s > _LARGEST_JITTER * period_s and contents.burst == 1:
         faults.append(

@@ -109,7 +109,7 @@ UNITS = (
 )
 """Units in which readings may be, those of physics before counts."""
 
-_AXIS_UNITS = [unit for unit in UNITS if unit.name in ('g', 'mg', 'mm/s²', 'm/s² divided by 1000')]
+AXIS_UNITS = [unit for unit in UNITS if unit.name in ('g', 'mg', 'mm/s²', 'm/s² divided by 1000')]
 """Units that single axes are tried in. Counts are left out: one of them fits almost any length."""
 
 
@@ -542,7 +542,7 @@ class _Case:
         if not self.divided(length / self.gravity_mps2).contradicting().any():
             return None  # One factor of all axes explains them.
         factors = {'m/s²': 1.0} | {
-            unit.name: unit.gravity / self.gravity_mps2 for unit in _AXIS_UNITS
+            unit.name: unit.gravity / self.gravity_mps2 for unit in AXIS_UNITS
         }
         best = None
         least = np.inf

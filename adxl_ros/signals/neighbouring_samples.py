@@ -10,11 +10,12 @@ wrong samples, and rows that are means of rests.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from adxl_ros.model.constants import G0_MPS2, TINY
+from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD, TINY
 from adxl_ros.process import usage
 import numpy as np
+from scipy.special import erfc
 
 _FEWEST_RUNS = 20
 """Fewest runs of equal samples that are judged. Chosen: at most half of the runs of a reading that
@@ -35,6 +36,7 @@ values: two normal distributions in equal parts have two maxima from there on.""
 _MEAN_STDS = 6.0  # Distance of two means, in their standard deviations, that is no chance
 
 _RANGES_G = (4.0, 8.0, 16.0, 32.0, 64.0)  # Whole ranges of digital sensors: ±2 g to ±32 g
+_FEWEST_BITS = 6  # Fewest bits of a digital sensor: noise that fills fewer codes is at rest
 _FEWEST_WRAPS = 3  # Fewest jumps across the range. Chosen: a single one may be a shock
 _CLIPPED = 3  # Most samples at the end of a range that does not clip. Chosen: by chance one is
 _FILLED = 0.005  # Largest distance of the samples from both ends of a range that they fill, by it
@@ -60,7 +62,15 @@ _FEWEST_SPIKES = 3  # Fewest single wrong samples. Chosen: as with counts that w
 _ALIKE_SIZE = 0.75
 """Size from which another sample deviates as much as a spike, by the spike. The neighbours of a
 spike deviate by half of it, and it itself by all of it: the middle."""
-_BINS_PER_OCTAVE = 4  # Bins of the sizes of deviations. Chosen: a width of 19 %
+_SPIKE_STDS = 6.0
+"""Deviation of a spike, in standard deviations of the others. Chosen: normal noise exceeds it on
+one of three axes once in 2·10⁸ samples."""
+_NOISE_STDS = 4.0
+"""Largest deviation of steady samples, in the same. Chosen: of 15 samples on three axes one in 400
+is beyond."""
+_CODE_STD = 0.5
+"""The least that noise counts, in codes: a change by one or two codes is then no spike."""
+_BINS_PER_OCTAVE = 8  # Bins of the sizes of deviations. Chosen: a width of 9 %
 _SMALLEST_BIN_MPS2 = 1e-6  # Deviations below this are rounding, m/s²: that of six decimals
 _SIZE_BINS = 40 * _BINS_PER_OCTAVE  # Number of these bins: up to 1e6 m/s²
 
@@ -93,9 +103,9 @@ class NeighbouringSamples:
         self._jumps: list[_Jump] = []
         self._spike_s: list[float] = []  # Times of single samples away from steady ones, s
         self._spike_mps2: list[float] = []  # Their largest deviation of an axis, m/s²
-        self._beside_mps2: list[float] = []  # The largest step beside each, m/s²
-        # Number of samples by how much they deviate from the mean of their neighbours
-        self._deviations = np.zeros(_SIZE_BINS, int)
+        self._beside_mps2: list[float] = []  # What deviates most beside each, m/s²
+        # Number of samples by axis and how much they deviate from the mean of their neighbours
+        self._deviations = np.zeros((len(axes), _SIZE_BINS), int)
 
     def feed(self, time_s: np.ndarray, samples: np.ndarray) -> None:
         """Add samples, m/s², (n, m), with their stamps, s, (n,)."""
@@ -273,30 +283,34 @@ class NeighbouringSamples:
         if len(samples) < 2 * _SIDE:
             return
         between = (samples[:-2] + samples[2:]) / 2
-        deviation = np.abs(samples[1:-1] - between).max(axis=1)
-        codes = np.array([ends.step_mps2 for ends in self._ends])
-        code = float(codes[np.isfinite(codes)].max(initial=0.0))
-        across = np.maximum(np.abs(samples[2:] - samples[:-2]).max(axis=1), code)
-        stands_out = across < _STEADY * deviation
+        deviation = np.abs(samples[1:-1] - between)
+        # Samples whose both sides are known; those before were judged in the block before.
+        known = slice(_SIDE - 1, len(deviation) - _SIDE + 2)
+        for counts, sizes in zip(self._deviations, deviation[known].T):
+            counts += np.bincount(_bin_of(sizes), minlength=_SIZE_BINS)
+        noise_mps2 = self._noise_mps2()
+        size_mps2 = deviation.max(axis=1)
+        across = (np.abs(samples[2:] - samples[:-2]) - _NOISE_STDS * noise_mps2).max(axis=1)
+        is_large = (deviation > _SPIKE_STDS * noise_mps2).any(axis=1)
+        stands_out = is_large & (across < _STEADY * size_mps2)
         # Spikes nearby are no unsteadiness of the samples around one.
         others = samples.copy()
         others[1:-1][stands_out] = between[stands_out]
-        steps = np.abs(np.diff(others, axis=0)).max(axis=1)
-        # Samples whose both sides are known; those before were judged in the block before.
-        known = slice(_SIDE - 1, len(deviation) - _SIDE + 2)
-        bins = _BINS_PER_OCTAVE * np.log2(
-            deviation[known].clip(_SMALLEST_BIN_MPS2) / _SMALLEST_BIN_MPS2
-        )
-        self._deviations += np.bincount(
-            bins.astype(int).clip(max=_SIZE_BINS - 1), minlength=_SIZE_BINS
-        )
+        left = (np.abs(np.diff(others, 2, axis=0)) / 2 - _NOISE_STDS * noise_mps2).max(axis=1)
         for i in (_SIDE + np.flatnonzero(stands_out[known])).tolist():
-            size_mps2 = float(deviation[i - 1])
-            beside_mps2 = float(steps[i - _SIDE : i + _SIDE - 1].max())
-            if beside_mps2 < _STEADY * size_mps2:
+            beside_mps2 = float(left[i - _SIDE : i + _SIDE - 1].max())
+            if beside_mps2 < _STEADY * size_mps2[i - 1]:
                 self._spike_s.append(float(time_s[i]))
-                self._spike_mps2.append(size_mps2)
+                self._spike_mps2.append(float(size_mps2[i - 1]))
                 self._beside_mps2.append(beside_mps2)
+
+    def _noise_mps2(self) -> np.ndarray:
+        """Return the standard deviation of the deviations so far, but for few, m/s², (m,)."""
+        below = self._deviations.cumsum(axis=1)
+        middle = 1 + np.argmax(2 * below >= below[:, -1:], axis=1)
+        noise = MAD_TO_STD * _SMALLEST_BIN_MPS2 * 2 ** (middle / _BINS_PER_OCTAVE)
+        codes = np.array([ends.step_mps2 for ends in self._ends])
+        return np.maximum(noise, _CODE_STD * np.where(np.isfinite(codes), codes, 0.0))
 
     def _spikes(self) -> str:
         """Return how many single samples are wrong; shocks deviate for more than one sample."""
@@ -304,16 +318,26 @@ class NeighbouringSamples:
         if count < _FEWEST_SPIKES:
             return ''
         size_mps2 = float(np.median(self._spike_mps2))
-        first_bin = _BINS_PER_OCTAVE * np.log2(_ALIKE_SIZE * size_mps2 / _SMALLEST_BIN_MPS2)
-        if self._deviations[int(max(first_bin, 0.0)) :].sum() > 2 * count:
+        alike_mps2 = _ALIKE_SIZE * size_mps2
+        noise_mps2 = self._noise_mps2()
+        alike = self._deviations[:, _bin_of(alike_mps2) :].sum(axis=1)
+        by_noise = self._deviations.sum(axis=1) * erfc(alike_mps2 / noise_mps2 / np.sqrt(2))
+        if (alike - by_noise).max() > 2 * count:
             return ''
-        shown_g = float(np.median(self._beside_mps2)) / _STEADY / G0_MPS2
+        beside_mps2 = float(np.median(self._beside_mps2))
+        shown_g = max(_SPIKE_STDS * noise_mps2.max(), beside_mps2 / _STEADY) / G0_MPS2
         return (
             f'{count} single samples stand {size_mps2 / G0_MPS2:.3g} g away from those around '
             f'them, the first at {self._spike_s[0]:.6g} s: error values of the bus, a loose '
             f'contact, or shocks shorter than a sample; below about {shown_g:.2g} g not all of '
             'them stand out'
         )
+
+
+def _bin_of(size_mps2: Any) -> Any:
+    """Return the bins of sizes of deviations, m/s²."""
+    ratio = np.maximum(size_mps2, _SMALLEST_BIN_MPS2) / _SMALLEST_BIN_MPS2
+    return np.minimum(_BINS_PER_OCTAVE * np.log2(ratio), _SIZE_BINS - 1).astype(int)
 
 
 def _turn_rad(first: np.ndarray, second: np.ndarray) -> float:
@@ -361,7 +385,8 @@ class _Ends:
             return ''
         step_g = self.step_mps2 / G0_MPS2
         sizes_g = _BIN_G * np.arange(len(self._sizes))
-        by_counts_g = step_g * 2.0 ** np.ceil(np.log2((high_g - low_g) / step_g))
+        bits = max(np.ceil(np.log2((high_g - low_g) / step_g)), _FEWEST_BITS)
+        by_counts_g = step_g * 2.0**bits
         for range_g in (by_counts_g, *_RANGES_G):
             is_full = sizes_g > 0.75 * range_g
             is_half = sizes_g > 0.5 * range_g

@@ -499,7 +499,8 @@ def recording_noise(
     sensor = load_sensor(params, first)
     nominal = nominal_of(sensor, first.stream_info, first.axes)
     look = RecordingLook(sensor, first)
-    still = longest_rest(read, nominal, first, look)
+    with look.named_in_refusals():
+        still = longest_rest(read, nominal, first, look)
     rest = still.accelerometer
     gyro_rest = still.gyroscope
     doubts = require_unit(look.gravity(), first.path)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adxl_ros.files.parameter_file import float_text
-from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.constants import G0_MPS2, TINY
 from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
@@ -19,6 +19,7 @@ from adxl_ros.report.figures import AXIS_COLOURS, new_figure
 from adxl_ros.report.quantities import duration
 from adxl_ros.report.screen import row
 from adxl_ros.signals.allan_deviation import StillStretch
+from adxl_ros.signals.gravity_at_rest import AXIS_UNITS
 from adxl_ros.signals.noise_parameters import AxisNoise, RecordingNoise
 import numpy as np
 import yaml
@@ -59,6 +60,10 @@ def sensors_at_rest(result: RecordingNoise) -> list[SensorAtRest]:
     return shown
 
 
+_SAME_NOISE = float(np.log(1.6))
+"""Logarithm of the ratio of the noise of two axes in one unit. Chosen: datasheets state up to 1.5
+for z, and the ratio of g and m/s² is far above its square."""
+_LEVEL_G = 0.5  # Largest reading of an axis whose unit gravity does not show, g: 30° of tilt
 _YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
 _PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000
 
@@ -222,6 +227,28 @@ def warnings(result: RecordingNoise) -> list[str]:
         for noise in shown.axes:
             warnings = _axis_warnings(rest.span_s, noise, shown.unit)
             texts += [f'{begin}{noise.axis}: {text}' for text in warnings]
+    return texts + _unit_warnings(result)
+
+
+def _unit_warnings(result: RecordingNoise) -> list[str]:
+    """Say which axes may be in another unit than the one that reads gravity, by their noise."""
+    means_mps2 = result.rest.means.mean(axis=0)
+    upright = result.axes[int(np.argmin(np.abs(np.abs(means_mps2) - G0_MPS2)))]
+    texts = []
+    for noise, mean_mps2 in zip(result.axes, means_mps2):
+        ratio = noise.sample_std / max(upright.sample_std, TINY)
+        for unit in AXIS_UNITS:
+            factor = unit.gravity / G0_MPS2
+            is_near = abs(np.log(max(ratio, TINY) / factor)) < _SAME_NOISE
+            # Gravity along the axis would show its unit.
+            if is_near and abs(mean_mps2) < _LEVEL_G * unit.gravity:
+                n, other_n = (_MICRO_G * each.sample_white for each in (noise, upright))
+                texts.append(
+                    f'{noise.axis}: N is {n:.3g} µg/√Hz, {ratio:.3g} times that of {upright.axis} '
+                    f'({other_n:.3g}), as if it were in {unit.name}; gravity, which is along '
+                    f'{upright.axis}, does not show the unit of {noise.axis}: if it is another, '
+                    f'state it by {option("columns")}'
+                )
     return texts
 
 

@@ -4,6 +4,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from adxl_ros.errors import one_line, UserError
 from adxl_ros.files.recording_columns import Recording, uncalibrated
 from adxl_ros.model.constants import TINY
 from adxl_ros.model.sensor import Sensor, to_volts
@@ -62,6 +66,16 @@ class RecordingLook:
     def faults(self) -> list[str]:
         """Return what is wrong on an axis and between neighbouring samples, one line each."""
         return [*axis_faults(self.axes()), *self._neighbours.faults()]
+
+    @contextmanager
+    def named_in_refusals(self) -> Iterator[None]:
+        """Add what is wrong with the samples to a refusal, as it may be why nothing rests."""
+        try:
+            yield
+        except UserError as error:
+            if not self.faults():
+                raise
+            raise UserError('; '.join([one_line(error), *self.faults()])) from None
 
 
 LIVE_WINDOW_S = 4.0  # Newest samples in which a live stream may rest, s. Chosen: two short rests

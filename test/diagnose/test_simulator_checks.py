@@ -8,6 +8,7 @@ import re
 from adxl_ros.api.recordings import read_ideal
 from adxl_ros.diagnose.comparison import compare
 from adxl_ros.diagnose.data_checks import check_gravity, compare_checked, DataFault
+from adxl_ros.diagnose.noise_effects import sample_faults
 from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import to_volts
@@ -173,6 +174,7 @@ def only(recorded: Recording, rows: np.ndarray) -> Recording:
         (0.4, 13.0),
         (-0.25, 15.0),
         (2.0, 48.0),
+        (10.0, 13.0),
     ],
 )
 def test_the_advice_on_a_clock_that_steps_can_be_followed(tmp_path, step_s, at_s):
@@ -193,6 +195,32 @@ def test_the_advice_on_a_clock_that_steps_can_be_followed(tmp_path, step_s, at_s
     for rows in (stepped.time_s < stated_s, stepped.time_s > stated_s):
         comparison = carried.beside(tmp_path, only(stepped, rows), may_shift=True)
         assert left_mps2(comparison) < LARGEST_LEFT_MPS2
+
+
+@pytest.mark.parametrize('stalled_s', [0.6, 3.0])
+@pytest.mark.parametrize('read_s', [1e-4, 4e-3])
+def test_a_host_that_stalls_is_no_clock_that_steps(tmp_path, stalled_s, read_s):
+    """What waited is read at once, or faster than the sensor makes it."""
+    carried = Carried()
+    stamps_s = carried.time_s + 2e-4 * np.sin(np.arange(len(carried.time_s)))
+    waits = (stamps_s > 20.0) & (stamps_s < 20.0 + stalled_s)
+    earliest_s = np.where(waits, 20.0 + stalled_s, stamps_s)
+    numbers_s = read_s * np.arange(len(stamps_s))
+    stamps_s = np.maximum.accumulate(earliest_s - numbers_s) + numbers_s
+    comparison = carried.beside(tmp_path, replace(carried.recorded(), time_s=stamps_s))
+    assert left_mps2(comparison) < LARGEST_LEFT_MPS2
+    (note,) = [text for text in comparison.notes if 'stalls' in text]
+    assert f'{stalled_s:.2g} s late' in note or f'{stalled_s - 0.01:.3g} s late' in note
+    assert float(re.search(r'first at ([\d.]+) s', note)[1]) == pytest.approx(20.0, abs=0.02)
+
+
+def test_a_recording_beside_itself_is_named(tmp_path):
+    carried = Carried()
+    sim = carried.simulated(tmp_path, carried.force() + carried.noise)
+    unfiltered = replace(nominal('xyz'), rate_hz=RATE_HZ, rc_capacitance_f=0.0)
+    with pytest.raises(DataFault) as raised:
+        compare_checked(carried.recorded(), unfiltered, sim, False)
+    assert raised.value.name == 'reference' and 'the recording itself' in raised.value.message
 
 
 @pytest.mark.parametrize('ratio, seconds', [(1e-2, 40.0), (-5e-3, 120.0), (2e-3, 300.0)])
@@ -269,6 +297,44 @@ def test_an_axis_that_sticks_is_not_fast_motion(tmp_path, stuck_s, fault):
         (part,) = comparison.left_out
         assert 'y does not change' in part.reason
         assert part.duration_s == pytest.approx(stuck_s, abs=0.1)
+
+
+@pytest.mark.parametrize('low_mps2, high_mps2', [(-2.0, np.inf), (-np.inf, 2.0), (-3.0, 2.0)])
+def test_an_axis_that_is_held_at_an_end_of_its_range_is_left_out(tmp_path, low_mps2, high_mps2):
+    carried = Carried()
+
+    def clipped(force):
+        force = force + [0.1, 0.0, 0.0]
+        force[:, 0] = np.clip(force[:, 0], low_mps2, high_mps2)
+        return force
+
+    comparison = carried.beside(tmp_path, carried.recorded(clipped))
+    x_mps2 = carried.force()[:, 0] + carried.noise[:, 0] + 0.1
+    (part,) = [part for part in comparison.left_out if part.effect == 'saturation']
+    assert part.samples == np.sum((x_mps2 <= low_mps2) | (x_mps2 >= high_mps2))
+    for end_mps2 in filter(np.isfinite, (low_mps2, high_mps2)):
+        assert f'{end_mps2:g}' in part.reason.split(' m/s²')[0]
+    (found,) = sample_faults(comparison).detections
+    limit_g, offset_g = found.values['limit_g'], found.values['offset_g']
+    assert limit_g[1:].tolist() == [1000.0, 1000.0]
+    is_unchanged = (x_mps2 > low_mps2) & (x_mps2 < high_mps2)
+    simulated_g = np.clip(x_mps2 / G0_MPS2, *(offset_g[0] + [-limit_g[0], limit_g[0]]))
+    assert np.allclose(simulated_g[is_unchanged] * G0_MPS2, x_mps2[is_unchanged], atol=1e-6)
+    assert np.allclose(simulated_g * G0_MPS2, np.clip(x_mps2, low_mps2, high_mps2), atol=1e-6)
+
+
+@pytest.mark.parametrize('step_mps2', [0.01, 0.3])
+@pytest.mark.parametrize('late_s', [0.0, 0.08])
+def test_codes_that_repeat_in_an_extreme_pose_are_no_end_of_the_range(tmp_path, step_mps2, late_s):
+    """Zero-g, scale factor and a latency leave the simulation beyond the largest code."""
+    carried = Carried()
+
+    def coarse(force):
+        return np.round((0.9 * force - 0.4) / step_mps2) * step_mps2
+
+    time_s = carried.time_s - late_s
+    comparison = carried.beside(tmp_path, carried.recorded(coarse), time_s=time_s)
+    assert not sample_faults(comparison).held.any()
 
 
 def test_pulses_beyond_the_range_are_named(tmp_path):

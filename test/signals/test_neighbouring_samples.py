@@ -6,6 +6,7 @@ from adxl_ros.model.constants import G0_MPS2 as G
 from adxl_ros.signals.neighbouring_samples import NeighbouringSamples
 import numpy as np
 import pytest
+import scipy
 
 RATE_HZ = 100.0
 
@@ -133,6 +134,35 @@ def test_single_wrong_samples(spikes: int, size_g: float, block: int) -> None:
     stated_g = float(found.split(' g ')[0].split()[-1])
     assert stated_g == pytest.approx(size_g, rel=0.02)
     assert f'{rows[0] / RATE_HZ:g} s' in found
+
+
+@pytest.mark.parametrize('block', [50, 10_000])
+@pytest.mark.parametrize('noise_mg', [[4, 4, 4], [5.7, 1, 1], [1, 4, 5.7]])
+def test_single_samples_of_seven_standard_deviations(noise_mg: list[float], block: int) -> None:
+    """A single sample and the mean of its neighbours have √1.5 times the noise."""
+    rng = np.random.default_rng(5)
+    samples = turning(20_000, 0.0) + rng.normal(0, 1e-3 * G, (20_000, 3)) * noise_mg
+    rows = 400 + 60 * np.arange(300)
+    samples[rows] += rng.choice([-0.05, 0.05], (300, 3)) * G
+    (found,) = faults(samples, block)
+    assert int(found.split()[0]) == pytest.approx(300, abs=10)
+    from_g = float(found.split('below about ')[1].split()[0])
+    assert from_g == pytest.approx(6 * np.sqrt(1.5) * 1e-3 * max(noise_mg), rel=0.1)
+
+
+@pytest.mark.parametrize('code', [0.0, 0.3, 1.0, 4.0])
+@pytest.mark.parametrize('filtered', [-0.8, 0.0, 0.8])
+@pytest.mark.parametrize('shaken', [0.0, 0.3, 3.0, 30.0])
+def test_the_noise_and_motion_of_a_sound_sensor_are_no_single_samples(
+    code: float, filtered: float, shaken: float
+) -> None:
+    """Step of the codes and largest vibration are stated by the noise."""
+    rng, std = np.random.default_rng(6), 0.04
+    noise = rng.normal(0, std, (2, 30_000, 3))
+    noise = scipy.signal.lfilter([1.0], [1.0, -filtered], noise, axis=1)
+    noise[1] *= shaken * np.sin(np.arange(30_000) / 4000)[:, None] ** 4
+    samples = turning(30_000, 0.0) + noise.sum(axis=0)
+    assert faults(np.round(samples / (code * std)) * code * std if code else samples) == []
 
 
 def test_it_is_said_from_which_size_on_single_samples_are_counted() -> None:

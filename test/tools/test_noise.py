@@ -5,12 +5,16 @@
 from pathlib import Path
 import re
 import subprocess
+from typing import Any
 
+import adxl_ros as adxl
+from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.signals.noise_parameters import recording_noise, RecordingNoise
 import numpy as np
 from processes import run_in_process
 import pytest
+from scipy.spatial.transform import Rotation
 from still_noise import still_samples, write_csv
 import yaml
 
@@ -164,3 +168,35 @@ def test_refusals_are_one_line(tmp_path: Path, change: str, reason: str) -> None
     assert reason in done.stderr
     assert done.stderr.count('\n') == 1
     assert not (tmp_path / 'noise.yaml').exists()
+
+
+@pytest.mark.parametrize(
+    ('axis', 'per_mps2', 'unit'),
+    [('x', 1 / G, 'g'), ('y', 1e3 / G, 'mg'), ('y', 1e-3, 'm/s² divided by 1000'), ('z', 2.5, '')],
+)
+def test_a_level_axis_in_another_unit_is_told_by_its_noise(
+    tmp_path: Path, axis: str, per_mps2: float, unit: str
+) -> None:
+    """Gravity shows the unit of z alone; one axis may have 2.5 times the noise of the others."""
+    time_s, accel = samples(60.0, terms=(N, 0.0, 0.0))
+    accel[:, 'xyz'.index(axis)] *= per_mps2
+    accel[:, 2] += G - accel[:, 2].mean()
+    write_csv(tmp_path / 'level.csv', time_s, accel)
+    found = [text for text in adxl.noise(tmp_path / 'level.csv').warnings if '--columns' in text]
+    assert len(found) == bool(unit)
+    for text in found:
+        assert text.startswith(f'{axis}: N is') and f'in {unit};' in text
+        ratio, of_upright = re.search(r', (.*) times that of z \((.*)\)', text).groups()
+        assert float(ratio) == pytest.approx(per_mps2, rel=0.1)
+        assert float(of_upright) == pytest.approx(1e6 * N / G, rel=0.1)
+
+
+@pytest.mark.parametrize('verb', [adxl.noise, adxl.fit])
+def test_a_refusal_for_want_of_rests_names_why_nothing_rests(tmp_path: Path, verb: Any) -> None:
+    time_s, accel = samples(60.0, terms=(N, 0.0, 0.0))
+    turned = Rotation.from_rotvec(np.floor(time_s / 4.0)[:, None] * [0.7, 0.4, 0.2])
+    accel = turned.apply(accel)
+    accel[1::2] = accel[1::2, [1, 2, 0]]
+    write_csv(tmp_path / 'two.csv', time_s, accel)
+    with pytest.raises(UserError, match='rest.*rows alternate between 2 values'):
+        verb(tmp_path / 'two.csv')

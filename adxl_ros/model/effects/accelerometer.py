@@ -12,6 +12,7 @@ from adxl_ros.model.effects.base import (
     add,
     ARRAYS,
     Components,
+    Detector,
     DiagnosisHints,
     effect,
     FLOATS,
@@ -572,7 +573,11 @@ def supply(signals: Signals, p: Parameters) -> None:
     ),
     smooth=False,
     cause='The output clips; raise the supply, lower the gain, or choose a wider range.',
-    diagnosis=DiagnosisHints(form=(FormDimension.FORCE,), proof=(ProofVariable.OWN_FORCE,)),
+    diagnosis=DiagnosisHints(
+        detector=Detector.HELD_AT_END,
+        form=(FormDimension.FORCE,),
+        proof=(ProofVariable.OWN_FORCE,),
+    ),
 )
 def saturation(signals: Signals, p: Parameters) -> None:
     """

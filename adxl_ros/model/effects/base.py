@@ -41,6 +41,7 @@ class Detector(Enum):
     COARSE_CODES = auto()  # Estimates lost_bits and axis_lost_bits
     MAINS_LINE = auto()  # Estimates amplitude_v, frequency_hz and phase_rad
     NOISE_LEVEL = auto()  # Estimates ratio
+    HELD_AT_END = auto()  # Estimates limit_g and offset_g
 
 
 class Manoeuvre(Enum):
