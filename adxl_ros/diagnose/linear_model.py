@@ -296,6 +296,8 @@ class LinearModel:
     filters: list[list[Whitener]]  # Whitening filters of each channel
     # By channel: sensitivities by number of the column, V per unit, (n,)
     columns: list[dict[int, np.ndarray]]
+    # Variants by what distinguishes them, the effect first, and by the number of the recording
+    by_key: dict[tuple, dict[int, Variant]]
     # Whitened nuisance columns by number of the channel and identity of the filter
     _white: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
 
@@ -501,18 +503,22 @@ def build_linear_model(
     show_progress: Callable[[float], None] = lambda fraction: None,
     only: Sequence[str] | None = None,
     filters: Sequence[list[Whitener]] = (),
+    near: LinearModel | None = None,
 ) -> LinearModel:
     """
-    Differentiate the baseline by the whole library in all recordings.
+    Differentiate the baseline by the whole library, or by some effects, in all recordings.
 
-    filters: whitening filters of each channel, where not all are tried.
+    filters: whitening filters of each channel, where not all are tried; near: the linear model
+    about a baseline nearby, whose sensitivities to all other effects are taken.
     """
     filters = filters or [evidence.whiteners(*channel) for channel in channels_of(comparisons)]
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
-    table = _ColumnTable(comparisons)
-    for by_recording in _variants_by_key(
-        comparisons, baseline_v, _tried_effects(comparisons, only), show_progress
-    ):
+    table, effects = _ColumnTable(comparisons), _tried_effects(comparisons, only)
+    by_key = _variants_by_key(comparisons, baseline_v, effects, show_progress)
+    if near is not None:
+        tried = {effect.name for effect in effects}
+        by_key |= {key: known for key, known in near.by_key.items() if key[0] not in tried}
+    for by_recording in by_key.values():
         table.add(by_recording)
     channels = _whitened(comparisons, table.channels, filters)
     show_progress(1.0)
@@ -526,6 +532,7 @@ def build_linear_model(
         channels=channels,
         filters=list(filters),
         columns=table.channels,
+        by_key=by_key,
     )
 
 
@@ -556,8 +563,8 @@ def _variants_by_key(
     baseline_v: Sequence[np.ndarray],
     effects: Sequence[Effect],
     show_progress: Callable[[float], None],
-) -> Iterable[dict[int, Variant]]:
-    """Return each variant in all recordings that show it, by the number of the recording."""
+) -> dict[tuple, dict[int, Variant]]:
+    """Return each variant by its key, in all recordings that show it, by their numbers."""
     every: dict[tuple, dict[int, Variant]] = {}
     for i, (comparison, output_v) in enumerate(zip(comparisons, baseline_v)):
         for k, effect in enumerate(effects):
@@ -565,7 +572,7 @@ def _variants_by_key(
                 every.setdefault(variant.key, {})[i] = variant
             done = (i + (k + 1) / len(effects)) / len(comparisons)
             show_progress(_SIMULATED_SHARE * done)
-    return every.values()
+    return every
 
 
 class _ColumnTable:
