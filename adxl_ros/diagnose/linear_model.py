@@ -445,23 +445,29 @@ class LinearModel:
         column, in its own unit, (count,).
         """
         parts: dict[Coefficient, np.ndarray] = {}
-        for nuisances, others, (comparison, _) in zip(self.nuisance_columns, columns, self.places):
-            lines = {
-                name: column
-                for name, column in nuisances.items()
-                if hints_of(name).straight_line and name.effect in self.baseline.effects
-            }
-            if not lines or not others:
+        for lines, others in zip(self._straight_lines, columns):
+            if not lines.names or not others:
                 continue
-            rests = comparison.at_rest & comparison.used
-            rows = rests if rests.any() else np.ones(len(rests), bool)
-            by_line = _straight_parts(
-                np.column_stack(list(lines.values())), np.column_stack(list(others.values())), rows
-            )
-            for name, part in zip(lines, by_line):
+            by_line = lines.parts(np.array([*others.values()]))
+            for name, part in zip(lines.names, by_line):
                 largest = parts.setdefault(name, np.zeros(count))
                 largest[list(others)] = np.maximum(largest[list(others)], part)
         return parts
+
+    @cached_property
+    def _straight_lines(self) -> list[_StraightLines]:
+        """Zero-g and scale factor that the baseline holds, by channel."""
+        every = []
+        for nuisances, (comparison, _) in zip(self.nuisance_columns, self.places):
+            names = [
+                name
+                for name in nuisances
+                if hints_of(name).straight_line and name.effect in self.baseline.effects
+            ]
+            values = np.reshape([nuisances[name] for name in names], (-1, len(comparison)))
+            rests = comparison.at_rest & comparison.used
+            every.append(_StraightLines(names, values, rests if rests.any() else ~rests))
+        return every
 
     def fit_variants(self, chosen: Sequence[int], start: LinearFit | None = None) -> LinearFit:
         """Fit a set of variants on the sensitivities at the baseline."""
@@ -644,25 +650,35 @@ def filters_for(filters: Sequence[list[Whitener]], effects: Sequence[str]) -> li
     return [[f for f in every if f.healthy or f.effect in drifts] or every for every in filters]
 
 
-def _straight_parts(lines: np.ndarray, others: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
-    """
-    Return how much of k other columns a calibration can take for each straight line, (k,) each.
+@dataclass(frozen=True)
+class _StraightLines:
+    """Sensitivities of one channel to zero-g and scale factor, l straight lines over the force."""
 
-    lines, others: columns of one channel, (n, l) and (n, k); rows: samples at rest, (n,).
-    """
-    rms_of_rests = np.sqrt(np.mean(others[rows] ** 2, axis=0))
-    at_rests = np.abs(np.linalg.lstsq(lines[rows], others[rows])[0])
-    in_all = np.linalg.lstsq(lines, others)[0]
-    # A calibration with an effect that is a straight line would have left nothing of it.
-    bent = (others - lines @ in_all).std(axis=0) > SMALLEST_BENT_SHARE * np.sqrt(
-        np.mean(others**2, axis=0)
-    )
-    parts = []
-    for j, line in enumerate(lines.T):
-        size = max(rms(line), np.finfo(float).tiny)
-        # The poses of a calibration may reach further than the rests of the recording.
-        reach = np.abs(others).max(axis=0) / np.abs(line).max() if np.ptp(line) else 0.0
-        beyond_rests = np.minimum(np.maximum(np.abs(in_all[j]), reach), 2 * rms_of_rests / size)
-        straight = np.maximum(at_rests[j], beyond_rests)
-        parts.append(bent * np.hypot(straight, _OTHER_RESTS_SHARE * rms_of_rests / size))
-    return parts
+    names: list[Coefficient]  # (l,)
+    values: np.ndarray  # (l, n)
+    rows: np.ndarray  # Samples at rest, or all, (n,) bool
+
+    @cached_property
+    def _inverses(self) -> list[np.ndarray]:
+        """What fits the lines to a column at rest, (rests, l), and to all of it, (n, l)."""
+        both = self.values[:, self.rows], self.values
+        return [np.linalg.pinv(v, np.finfo(float).eps * v.shape[1]) for v in both]
+
+    def parts(self, others: np.ndarray) -> list[np.ndarray]:
+        """Return how much of k columns, (k, n), a calibration can take for each line, (k,)."""
+        rests, (by_rests, by_all) = others[:, self.rows], self._inverses
+        rms_of_rests = np.sqrt(np.mean(rests**2, axis=1))
+        in_all = others @ by_all
+        # A calibration with an effect that is a straight line would have left nothing of it.
+        bent = (others - in_all @ self.values).std(axis=1) > SMALLEST_BENT_SHARE * np.sqrt(
+            np.mean(others**2, axis=1)
+        )
+        largest, parts = np.abs(others).max(axis=1), []
+        for line, at_rests, over_all in zip(self.values, (rests @ by_rests).T, in_all.T):
+            size = max(rms(line), np.finfo(float).tiny)
+            # The poses of a calibration may reach further than the rests of the recording.
+            reach = largest / np.abs(line).max() if np.ptp(line) else 0.0
+            beyond_rests = np.minimum(np.maximum(np.abs(over_all), reach), 2 * rms_of_rests / size)
+            straight = np.maximum(np.abs(at_rests), beyond_rests)
+            parts.append(bent * np.hypot(straight, _OTHER_RESTS_SHARE * rms_of_rests / size))
+        return parts
