@@ -660,7 +660,7 @@ class _StraightLines:
 
     @cached_property
     def _inverses(self) -> list[np.ndarray]:
-        """What fits the lines to a column at rest, (rests, l), and to all of it, (n, l)."""
+        """Return what fits the lines to a column at rest, (rests, l), and to all of it, (n, l)."""
         both = self.values[:, self.rows], self.values
         return [np.linalg.pinv(v, np.finfo(float).eps * v.shape[1]) for v in both]
 
