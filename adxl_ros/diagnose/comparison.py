@@ -34,7 +34,7 @@ from adxl_ros.simulate.motion import (
     visible_step,
 )
 from adxl_ros.simulate.recorded_motion import environment_paths, motion_from_references
-from adxl_ros.simulate.response import ChainMemo, Response, whole_response
+from adxl_ros.simulate.response import ChainMemo, whole_response
 import numpy as np
 import scipy
 
@@ -261,8 +261,11 @@ class BaselineComparison:
     def simulated_noise_v(self, sensor: Sensor, seed: int) -> np.ndarray:
         """Draw a sensor's output about its own mean, V, (n, m)."""
         at_rate = replace(sensor, rate_hz=self.sensor.rate_hz)
-        noisy = Response(at_rate, self.motion, seed, float(self.time_s[0]))(self.time_s)
-        return noisy - self.simulated_v(at_rate)
+        return self.drawn_v(at_rate, seed) - self.simulated_v(at_rate)
+
+    def drawn_v(self, sensor: Sensor, seed: int) -> np.ndarray:
+        """Draw the output of a sensor at this sample rate, V, (n, m)."""
+        return whole_response(sensor, self.motion, seed, self.time_s, self.memo)
 
     @cached_property
     def robot_error_mps2(self) -> float:

@@ -17,8 +17,8 @@ noise, which is searched on a grid.
 Errors of followed angles are constant at rest and new after each move (errors in variables; Fuller
 1987). The model is y = n + g·u. Here n is noise behind the RC filter, AR(1) with pole a, u has
 variance 1, u_t = φ_t·u_(t−1) + √(1 − φ_t²)·ξ_t, and g is its standard deviation in V. A Kalman
-filter predicts g·u; its innovations, scaled and filtered by 1/(1 − aL), have the spectrum of n.
-Where g is 0, samples stay as they are.
+filter predicts g·u; its innovations, scaled, have the spectrum of (1 − aL)·n. Where g is 0, they
+are (1 − aL)·y.
 
 A hypothesis is a set of columns, which are whitened sensitivities of the simulated output. The
 coefficients have normal priors. The evidence integrates the coefficients out (Bishop 2006,
@@ -246,7 +246,7 @@ def find_repeat(
 
 @dataclass(frozen=True)
 class AngleErrorFilter:
-    """A filter that gives noise with errors of angles the spectrum of noise without them."""
+    """A filter (1 − aL) for noise with errors of angles, as if it were without them."""
 
     rms_v: float  # Rms of the errors, V
     pole: float  # Pole a of the noise
@@ -262,30 +262,36 @@ class AngleErrorFilter:
         out = np.empty(values.shape)
         # One by one they stay in the cache.
         for series, filtered in zip(values, out):
-            changes = series.copy()
+            changes = without_pole(series, self.pole)
             changes[0] = 0.0
-            changes[1:] -= self.pole * series[:-1]
             estimates = scipy.linalg.lapack.dtbtrs(
                 lower, changes * self.gain, uplo='L', diag='U', overwrite_b=True
             )[0]
             changes[1:] -= estimates[:-1] * self.weight[1:]
-            changes *= self.scale
-            changes[0] = series[0]
-            filtered[:] = scipy.signal.lfilter([1.0], [1.0, -self.pole], changes)
+            np.multiply(changes, self.scale, out=filtered)
+            filtered[0] = series[0]
         return out
+
+
+def without_pole(values: np.ndarray, pole: float) -> np.ndarray:
+    """Filter series, (..., n), by 1 − aL; the first values stay."""
+    out = values.copy()
+    out[..., 1:] -= pole * values[..., :-1]
+    return out
 
 
 @dataclass(frozen=True)
 class Whitener:
     """A filter that makes noise white."""
 
-    sections: np.ndarray  # Second-order sections, (s, 6)
+    sections: np.ndarray  # Second-order sections behind the filter 1 − aL, (s, 6)
     effect: str  # Name of the drift effect that the filter is for
     density: float  # Density of the drift, in the unit of the effect's parameter
     # The same that the noise has whose innovations have a standard deviation of 1 V
     density_per_v: float = 0.0
-    # Filter for the errors of angles and rounding; None where there are none, or where the drift
-    # exceeds them: they would take up a part of it
+    pole: float = 0.0  # Pole a of the noise
+    # Filter 1 − aL for the errors of angles and rounding; None where there are none, or where the
+    # drift exceeds them: they would take up a part of it
     errors: AngleErrorFilter | None = None
 
     @property
@@ -364,20 +370,13 @@ def whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
     filters = []
     for density in RANDOM_WALKS_G_PER_RTS:
         sections, innovation_v = usual.without_walk(density * scale)
-        filters.append(
-            Whitener(
-                sections,
-                by_spectrum[DriftSpectrum.RANDOM_WALK],
-                density,
-                density / innovation_v,
-            )
-        )
+        effect = by_spectrum[DriftSpectrum.RANDOM_WALK]
+        filters.append(Whitener(sections, effect, density, density / innovation_v, usual.pole))
     for density in FLICKERS_G_PER_RTHZ:
         sections, innovation_v = usual.without_flicker(density * scale, comparison.span_s)
         shown = min(density, usual.largest_flicker_v / scale)
-        filters.append(
-            Whitener(sections, by_spectrum[DriftSpectrum.FLICKER], density, shown / innovation_v)
-        )
+        effect = by_spectrum[DriftSpectrum.FLICKER]
+        filters.append(Whitener(sections, effect, density, shown / innovation_v, usual.pole))
         if usual.corner_hz(density * scale) > usual.highest_corner_hz:
             break
     errors = _angle_error_filter(comparison, axis, usual.pole, usual.std_v)
@@ -415,7 +414,7 @@ class _UsualNoise:
         return density_v**2 / self._density_v2_per_hz
 
     def without_walk(self, density_v: float) -> tuple[np.ndarray, float]:
-        """Return the filter that makes noise with a random walk, V/√s, white; and its std, V."""
+        """Return what whitens noise with a random walk, V/√s, behind 1 − aL; and its std, V."""
         pole, difference = np.array([1, -self.pole]), np.array([1, -1.0])
         both = np.convolve(pole, difference)
         spectrum = (
@@ -424,10 +423,11 @@ class _UsualNoise:
             + density_v**2 * self.dt_s * _power(pole, 2)
         )
         factor = _spectral_factor(spectrum, 2)
-        return scipy.signal.tf2sos(both, factor), sqrt(spectrum[2] / np.sum(factor**2))
+        sections = np.array([[*difference, 0.0, *factor]])
+        return sections, sqrt(spectrum[2] / np.sum(factor**2))
 
     def without_flicker(self, density_v: float, span_s: float) -> tuple[np.ndarray, float]:
-        """Return the filter that makes noise with 1/f noise, V/√Hz at 1 Hz, white; and its std."""
+        """Return what whitens noise with 1/f noise, V/√Hz at 1 Hz, behind 1 − aL; and its std."""
         # Noise and steps without drift are an ARMA(1, 1) sequence; this is the zero of its MA.
         spectrum = self.std_v**2 * (1 - self.pole**2) * _power(np.ones(1), 1)
         spectrum += self.step_v2 * _power(np.array([1, -self.pole]), 1)
@@ -438,7 +438,7 @@ class _UsualNoise:
         top_hz = min(self.corner_hz(density_v), self.highest_corner_hz)
         decades = np.arange(int(np.ceil(max(np.log10(top_hz * span_s), 0.0))))
         corners = 2 * np.pi * self.dt_s * top_hz * 10.0**-decades
-        poles, zeros = [self.pole, *np.exp(-corners * 10**-0.5)], [zero, *np.exp(-corners)]
+        poles, zeros = [0.0, *np.exp(-corners * 10**-0.5)], [zero, *np.exp(-corners)]
         return scipy.signal.zpk2sos(poles, zeros, 1.0), innovation_v
 
 
@@ -526,7 +526,8 @@ def white_rows(
     data = np.ascontiguousarray(bridged(design, used).T, float)
     # Filters share that for errors of angles, which is applied once.
     shared = {id(f.errors): f.errors for f in filters}
-    before = {key: data if e is None else e(data) for key, e in shared.items()}
+    pole = filters[0].pole
+    before = {k: without_pole(data, pole) if e is None else e(data) for k, e in shared.items()}
     # The first sample is a step from zero.
     counted = used.copy()
     counted[0] = False

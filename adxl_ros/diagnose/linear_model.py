@@ -296,6 +296,8 @@ class LinearModel:
     filters: list[list[Whitener]]  # Whitening filters of each channel
     # By channel: sensitivities by number of the column, V per unit, (n,)
     columns: list[dict[int, np.ndarray]]
+    # Variants by what distinguishes them, the effect first, and by the number of the recording
+    by_key: dict[tuple, dict[int, Variant]]
     # Whitened nuisance columns by number of the channel and identity of the filter
     _white: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
 
@@ -443,23 +445,29 @@ class LinearModel:
         column, in its own unit, (count,).
         """
         parts: dict[Coefficient, np.ndarray] = {}
-        for nuisances, others, (comparison, _) in zip(self.nuisance_columns, columns, self.places):
-            lines = {
-                name: column
-                for name, column in nuisances.items()
-                if hints_of(name).straight_line and name.effect in self.baseline.effects
-            }
-            if not lines or not others:
+        for lines, others in zip(self._straight_lines, columns):
+            if not lines.names or not others:
                 continue
-            rests = comparison.at_rest & comparison.used
-            rows = rests if rests.any() else np.ones(len(rests), bool)
-            by_line = _straight_parts(
-                np.column_stack(list(lines.values())), np.column_stack(list(others.values())), rows
-            )
-            for name, part in zip(lines, by_line):
+            by_line = lines.parts(np.array([*others.values()]))
+            for name, part in zip(lines.names, by_line):
                 largest = parts.setdefault(name, np.zeros(count))
                 largest[list(others)] = np.maximum(largest[list(others)], part)
         return parts
+
+    @cached_property
+    def _straight_lines(self) -> list[_StraightLines]:
+        """Zero-g and scale factor that the baseline holds, by channel."""
+        every = []
+        for nuisances, (comparison, _) in zip(self.nuisance_columns, self.places):
+            names = [
+                name
+                for name in nuisances
+                if hints_of(name).straight_line and name.effect in self.baseline.effects
+            ]
+            values = np.reshape([nuisances[name] for name in names], (-1, len(comparison)))
+            rests = comparison.at_rest & comparison.used
+            every.append(_StraightLines(names, values, rests if rests.any() else ~rests))
+        return every
 
     def fit_variants(self, chosen: Sequence[int], start: LinearFit | None = None) -> LinearFit:
         """Fit a set of variants on the sensitivities at the baseline."""
@@ -501,18 +509,22 @@ def build_linear_model(
     show_progress: Callable[[float], None] = lambda fraction: None,
     only: Sequence[str] | None = None,
     filters: Sequence[list[Whitener]] = (),
+    near: LinearModel | None = None,
 ) -> LinearModel:
     """
-    Differentiate the baseline by the whole library in all recordings.
+    Differentiate the baseline by the whole library, or by some effects, in all recordings.
 
-    filters: whitening filters of each channel, where not all are tried.
+    filters: whitening filters of each channel, where not all are tried; near: the linear model
+    about a baseline nearby, whose sensitivities to all other effects are taken.
     """
     filters = filters or [evidence.whiteners(*channel) for channel in channels_of(comparisons)]
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
-    table = _ColumnTable(comparisons)
-    for by_recording in _variants_by_key(
-        comparisons, baseline_v, _tried_effects(comparisons, only), show_progress
-    ):
+    table, effects = _ColumnTable(comparisons), _tried_effects(comparisons, only)
+    by_key = _variants_by_key(comparisons, baseline_v, effects, show_progress)
+    if near is not None:
+        tried = {effect.name for effect in effects}
+        by_key |= {key: known for key, known in near.by_key.items() if key[0] not in tried}
+    for by_recording in by_key.values():
         table.add(by_recording)
     channels = _whitened(comparisons, table.channels, filters)
     show_progress(1.0)
@@ -526,6 +538,7 @@ def build_linear_model(
         channels=channels,
         filters=list(filters),
         columns=table.channels,
+        by_key=by_key,
     )
 
 
@@ -556,8 +569,8 @@ def _variants_by_key(
     baseline_v: Sequence[np.ndarray],
     effects: Sequence[Effect],
     show_progress: Callable[[float], None],
-) -> Iterable[dict[int, Variant]]:
-    """Return each variant in all recordings that show it, by the number of the recording."""
+) -> dict[tuple, dict[int, Variant]]:
+    """Return each variant by its key, in all recordings that show it, by their numbers."""
     every: dict[tuple, dict[int, Variant]] = {}
     for i, (comparison, output_v) in enumerate(zip(comparisons, baseline_v)):
         for k, effect in enumerate(effects):
@@ -565,7 +578,7 @@ def _variants_by_key(
                 every.setdefault(variant.key, {})[i] = variant
             done = (i + (k + 1) / len(effects)) / len(comparisons)
             show_progress(_SIMULATED_SHARE * done)
-    return every.values()
+    return every
 
 
 class _ColumnTable:
@@ -637,25 +650,35 @@ def filters_for(filters: Sequence[list[Whitener]], effects: Sequence[str]) -> li
     return [[f for f in every if f.healthy or f.effect in drifts] or every for every in filters]
 
 
-def _straight_parts(lines: np.ndarray, others: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
-    """
-    Return how much of k other columns a calibration can take for each straight line, (k,) each.
+@dataclass(frozen=True)
+class _StraightLines:
+    """Sensitivities of one channel to zero-g and scale factor, l straight lines over the force."""
 
-    lines, others: columns of one channel, (n, l) and (n, k); rows: samples at rest, (n,).
-    """
-    rms_of_rests = np.sqrt(np.mean(others[rows] ** 2, axis=0))
-    at_rests = np.abs(np.linalg.lstsq(lines[rows], others[rows])[0])
-    in_all = np.linalg.lstsq(lines, others)[0]
-    # A calibration with an effect that is a straight line would have left nothing of it.
-    bent = (others - lines @ in_all).std(axis=0) > SMALLEST_BENT_SHARE * np.sqrt(
-        np.mean(others**2, axis=0)
-    )
-    parts = []
-    for j, line in enumerate(lines.T):
-        size = max(rms(line), np.finfo(float).tiny)
-        # The poses of a calibration may reach further than the rests of the recording.
-        reach = np.abs(others).max(axis=0) / np.abs(line).max() if np.ptp(line) else 0.0
-        beyond_rests = np.minimum(np.maximum(np.abs(in_all[j]), reach), 2 * rms_of_rests / size)
-        straight = np.maximum(at_rests[j], beyond_rests)
-        parts.append(bent * np.hypot(straight, _OTHER_RESTS_SHARE * rms_of_rests / size))
-    return parts
+    names: list[Coefficient]  # (l,)
+    values: np.ndarray  # (l, n)
+    rows: np.ndarray  # Samples at rest, or all, (n,) bool
+
+    @cached_property
+    def _inverses(self) -> list[np.ndarray]:
+        """Return what fits the lines to a column at rest, (rests, l), and to all of it, (n, l)."""
+        both = self.values[:, self.rows], self.values
+        return [np.linalg.pinv(v, np.finfo(float).eps * v.shape[1]) for v in both]
+
+    def parts(self, others: np.ndarray) -> list[np.ndarray]:
+        """Return how much of k columns, (k, n), a calibration can take for each line, (k,)."""
+        rests, (by_rests, by_all) = others[:, self.rows], self._inverses
+        rms_of_rests = np.sqrt(np.mean(rests**2, axis=1))
+        in_all = others @ by_all
+        # A calibration with an effect that is a straight line would have left nothing of it.
+        bent = (others - in_all @ self.values).std(axis=1) > SMALLEST_BENT_SHARE * np.sqrt(
+            np.mean(others**2, axis=1)
+        )
+        largest, parts = np.abs(others).max(axis=1), []
+        for line, at_rests, over_all in zip(self.values, (rests @ by_rests).T, in_all.T):
+            size = max(rms(line), np.finfo(float).tiny)
+            # The poses of a calibration may reach further than the rests of the recording.
+            reach = largest / np.abs(line).max() if np.ptp(line) else 0.0
+            beyond_rests = np.minimum(np.maximum(np.abs(over_all), reach), 2 * rms_of_rests / size)
+            straight = np.maximum(np.abs(at_rests), beyond_rests)
+            parts.append(bent * np.hypot(straight, _OTHER_RESTS_SHARE * rms_of_rests / size))
+        return parts

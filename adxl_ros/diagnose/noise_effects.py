@@ -23,7 +23,6 @@ from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Detector
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import rms, true_runs
-from adxl_ros.simulate.response import Response
 import numpy as np
 import scipy
 
@@ -659,7 +658,7 @@ class _Series(NamedTuple):
 def _simulated(comparison: BaselineComparison, sensor: Sensor, seed: int) -> _Series:
     """Simulate the recording with noise."""
     at_rate, time_s = replace(sensor, rate_hz=comparison.sensor.rate_hz), comparison.time_s
-    volts = Response(at_rate, comparison.motion, seed, float(time_s[0]))(time_s)
+    volts = comparison.drawn_v(at_rate, seed)
     # Spikes and repeated samples are left out, as those of the recording are.
     used, _ = repeated_samples(volts, time_s, np.ones(len(volts), bool), at_rate)
     residual_v = volts - comparison.simulated_v(at_rate)

@@ -107,6 +107,7 @@ class _FlexibleFunctions:
         for row in rows:
             row[:] = next(linear.white_rows(row[:, None], used, [whitener]))[0]
         white_v2 = linear.block_grams(rows)
+        fitted_v2 = np.tensordot([fold.fitted for fold in fits.folds], white_v2, 1)
         return cls(
             dimensions=np.repeat(
                 [d.value for d in basis], [functions.shape[1] for functions in basis.values()]
@@ -114,12 +115,8 @@ class _FlexibleFunctions:
             columns=columns,
             white_v2=white_v2.sum(axis=0),
             by_fold=[
-                _FoldProducts(
-                    white_v2[fold.fitted].sum(axis=0),
-                    white_v2[fold.held_out],
-                    plain_mps2[fold.held_out],
-                )
-                for fold in fits.folds
+                _FoldProducts(of_fold, white_v2[fold.held_out], plain_mps2[fold.held_out])
+                for of_fold, fold in zip(fitted_v2, fits.folds)
             ],
             variance_v2=float(fits.full.innovation_variance_v2[number]),
         )

@@ -24,6 +24,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, StraightLine
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import fitted_of, get, parameter_of, put, Sensor, with_neutral
+from adxl_ros.signals.block_statistics import rms
 import numpy as np
 
 _EVALUATIONS = 8  # Largest number of simulations of a hypothesis. Chosen: most need five
@@ -65,6 +66,9 @@ _NEAR_START = 1.4
 differ by factors of two."""
 _AT_BOUND = 1e-4  # Distance from a bound, as a share of the range, that is at it. Chosen: rounding
 _CONSTANT = 1e-6  # Range of a constant column, relative. Chosen: rounding errors
+_NEAR = 0.05
+"""Change of the output by a set, divided by its own variation, up to which the sensitivities to
+other effects stay. Chosen: they differ by as much, and the gains that rank them by a tenth."""
 _TIME_CONSTANTS = 4.0
 """Length of a recording that shows a time constant: its response is then complete to 2 %."""
 
@@ -142,7 +146,9 @@ def linearise(
     nuisances = [n for n in linear_model.nuisances if n.effect not in effects]
     start = with_neutral(linear_model.baseline, [*effects, *(n.effect for n in nuisances)])
     point = _Point.of(start, effects, names, get(sensor, names))
-    responses = chain.from_iterable(map(point.responses, linear_model.comparisons))
+    responses = chain.from_iterable(
+        map(point.responses, linear_model.comparisons, linear_model.baseline_v)
+    )
     columns: list[evidence.ChannelColumns] = []
     changes: list[dict[int, np.ndarray]] = []
     for response, own in zip(responses, linear_model.nuisance_columns):
@@ -206,7 +212,8 @@ class _Point:
     values: np.ndarray  # (k,)
     prior_mean: np.ndarray  # (k,)
     sensor: Sensor  # The sensor with the values
-    without: Sensor  # The same without the effects that a calibration can take up
+    # The same without the effects that a calibration can take up; None for the baseline
+    without: Sensor | None
 
     @classmethod
     def of(
@@ -219,16 +226,13 @@ class _Point:
         """Give a sensor with neutral effects some values."""
         sensor = put(neutral, names, values)
         taken_up = [e for e in effects if linear.calibration_takes_up(e)]
-        without = {**sensor.values, **{e: neutral.values[e] for e in taken_up}}
-        return cls(
-            names,
-            values,
-            _prior_mean(neutral, names),
-            sensor,
-            replace(sensor, values=without),
-        )
+        kept = {**sensor.values, **{e: neutral.values[e] for e in taken_up}}
+        without = replace(sensor, values=kept) if len(taken_up) < len(effects) else None
+        return cls(names, values, _prior_mean(neutral, names), sensor, without)
 
-    def responses(self, comparison: BaselineComparison) -> Iterator[_Response]:
+    def responses(
+        self, comparison: BaselineComparison, baseline_v: np.ndarray
+    ) -> Iterator[_Response]:
         """Simulate and differentiate a recording; yield each of its axes."""
         rate_hz = comparison.sensor.rate_hz
         sensor = replace(self.sensor, rate_hz=rate_hz)
@@ -236,7 +240,9 @@ class _Point:
         derivatives = linear.sensitivities_at(
             comparison.simulated_v, sensor, self.names, self.values, output_v
         )
-        change_v = output_v - comparison.simulated_v(replace(self.without, rate_hz=rate_hz))
+        change_v = output_v - baseline_v
+        if self.without is not None:
+            change_v = output_v - comparison.simulated_v(replace(self.without, rate_hz=rate_hz))
         departures = self.values - self.prior_mean
         for d, axis in enumerate(sensor.axes):
             places = [i for i, name in enumerate(self.names) if name.axis in ('', axis)]
@@ -566,6 +572,7 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
     """
     Return the linear model about a set: residuals and sensitivities at its fit.
 
+    Where the set changes the output little, those to other effects stay as they were.
     Filter and latency stay those of the parameter file, unless they are effects of the set, so
     that their tolerance is the same as before.
     """
@@ -579,7 +586,13 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
         replace(c, sensor=replace(best.sensor, values=values, rate_hz=c.sensor.rate_hz))
         for c in model.comparisons
     ]
+    outputs_v = zip(comparisons, model.baseline_v)
+    is_near = all(
+        rms(c.simulated_v(c.sensor) - v) < _NEAR * rms(v.std(axis=0)) for c, v in outputs_v
+    )
     return linear.build_linear_model(
         comparisons,
+        only=best.effects if is_near else None,
+        near=model if is_near else None,
         filters=[[f[i]] for f, i in zip(best.linearised.filters, best.fit.filter_indices)],
     )

@@ -270,7 +270,10 @@ class Response:
         for stage in self._stages:
             places = *places, stage.place
             signals = self._once(
-                stage.name, places, partial(_after, stage, signals), self._rotates, first, count
+                stage.name,
+                places,
+                partial(_after, stage, signals),
+                *(self._seed, self._rotates, first, count),
             )
         return replace(signals)
 
