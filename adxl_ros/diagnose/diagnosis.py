@@ -445,9 +445,7 @@ def _named_sensor(
             replace(sensor, values={**sensor.values, **{e: fitted.values[e] for e in straight}}),
         )
     for detection in detections:
-        sensor = with_values(
-            with_neutral(sensor, [detection.effect]), detection.effect, detection.values
-        )
+        sensor = detection.added_to(sensor)
     for drift in [e for e in drifts_among(library()) if e in verdict.named][:1]:
         sensor = _with_drift(sensor, drift, fits[drift])
     kept = [i for i, name in enumerate(baseline.covariance_names) if name.effect in sensor.effects]
@@ -518,7 +516,7 @@ def _report(
     """Add to a verdict the other parts of the report."""
     comparisons, best = [c.comparison for c in checked], search.found[verdict.best]
     # Coarse codes are an effect of the verdict, and not of its baseline.
-    baseline = replace(comparisons[0].sensor, adc_bits=checked[0].stated_bits)
+    baseline = checked[0].stated
     sensor = _named_sensor(verdict, best, detections, baseline, evidence.candidates[verdict.best])
     lacking = tuple(not_covered(model.comparisons))
     remainders = tuple(

@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from adxl_ros.diagnose.comparison import BaselineComparison, bridged, code_step_v
+from adxl_ros.diagnose.comparison import BaselineComparison, bridged, code_step_v, with_values
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Detector
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import Sensor, with_neutral
 from adxl_ros.signals.block_statistics import rms, true_runs
 from adxl_ros.simulate.response import Response
 import numpy as np
@@ -102,6 +102,10 @@ class Detection:
         """Whether its samples are left out of the comparison."""
         detector = effect_named(self.effect).diagnosis.detector
         return detector in (Detector.REPEATED_SAMPLES, Detector.ISOLATED_SAMPLES)
+
+    def added_to(self, sensor: Sensor) -> Sensor:
+        """Return a sensor with the effect as it was found."""
+        return with_values(with_neutral(sensor, [self.effect]), self.effect, self.values)
 
 
 def effect_of(detector: Detector) -> str:
@@ -256,7 +260,7 @@ def _spikes(
     # The first samples after repeated or missing ones may step, which is no spike.
     undisturbed = np.convolve(used, np.ones(2 * far + 1), 'same') > 2 * far
     undisturbed[:far] = undisturbed[-far:] = False
-    for d, step_v in enumerate(np.maximum(steps_v, sensor.lsb_v)):
+    for d, step_v in enumerate(np.maximum(steps_v, noise.electronics(sensor).lsb_v)):
         spikes = np.zeros(len(volts), bool)
         bridged_v = volts[:, d].copy()
         for distance in (_SPIKE_NEIGHBOUR, _OTHER_NEIGHBOUR):
@@ -305,8 +309,6 @@ def sample_faults(comparison: BaselineComparison) -> SampleFaults:
     changing, detections = (
         (finite, [coarse]) if coarse else repeated_samples(volts, time_s, finite, sensor)
     )
-    if coarse:
-        sensor = with_bits(sensor, coarse)
     residual_v = comparison.residual_v(comparison.sensor)
 
     def among(compared: np.ndarray) -> tuple[np.ndarray, list[Detection]]:
@@ -318,11 +320,6 @@ def sample_faults(comparison: BaselineComparison) -> SampleFaults:
         changing, detections = repeated_samples(volts, time_s, finite, sensor, isolated)
         isolated, spikes = among(changing & known)
     return SampleFaults(finite & ~changing, isolated, detections, spikes)
-
-
-def with_bits(sensor: Sensor, coarse: Detection) -> Sensor:
-    """Return the sensor with the number of bits that its codes show."""
-    return replace(sensor, adc_bits=round(sensor.adc_bits - float(coarse.values['lost_bits'])))
 
 
 def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:

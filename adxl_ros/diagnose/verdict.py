@@ -59,6 +59,9 @@ _NATS = 3.0  # Held-out log likelihood that a further effect must gain: a ratio 
 _SMALLEST_P = 0.001
 """Probability of the increments of a drift below which they are of something else. Chosen: one
 error in 1000."""
+_LARGEST_DRIFT = 2.8
+"""Mean square of a random walk about its mean, divided by its expectation, that one walk in 20
+exceeds. Derived from the random walk."""
 _LOWEST = 0.05  # Quantile at the lower end of a 90 % interval
 _HIGHEST = 0.95  # Quantile at its upper end
 _REPEATED = (0.0, 0.5, 0.8, 0.95, 1.0)
@@ -743,7 +746,7 @@ class _Powers(NamedTuple):
 
     def remaining(self, material: float) -> float:
         """Return what is left beside effects: what repeats, or all that no drift explains."""
-        is_more = self.above > self.drift + material
+        is_more = self.above > _LARGEST_DRIFT * self.drift + material
         return max(self.repeats, self.above) if is_more else self.repeats
 
 
