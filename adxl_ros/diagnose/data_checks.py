@@ -929,9 +929,7 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording:
     Where codes of the ADC are coarser than stated, the baseline gets their steps, axis by axis.
     """
     faults, stated = noise_effects.sample_faults(comparison), comparison.sensor
-    coarse = noise_effects.effect_of(Detector.COARSE_CODES)
-    for detection in [d for d in faults.detections if d.effect == coarse]:
-        comparison = replace(comparison, sensor=detection.added_to(stated))
+    comparison = replace(comparison, sensor=faults.sensor)
     search_comparison = baseline.at_search_rate(comparison)
     if comparison.pose_known:
         _check_axes(search_comparison)

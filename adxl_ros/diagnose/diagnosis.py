@@ -303,11 +303,9 @@ def _held_out(
     """Return held-out fits of all sets by the drift of their noise."""
     best, model = search.best, search.model
     beside = with_filters(model, best.linearised, model.filters)
-    drifts = (
-        drifts_among(library())
-        if beside.fit(drifts=drifts_among(library())).log_evidence > beside.fit().log_evidence
-        else ()
-    )
+    drifts = drifts_among(library())
+    if beside.fit(drifts=drifts).log_evidence <= beside.fit().log_evidence:
+        drifts = ()
 
     def with_drift(healthy: HeldOutFits, drift: str) -> HeldOutFits | None:
         left = healthy.figures.squares.sum() / count - floor.rms_mps2**2

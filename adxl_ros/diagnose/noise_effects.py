@@ -294,6 +294,7 @@ class SampleFaults(NamedTuple):
     detections: list[Detection]  # Repeated samples or coarse codes
     # Isolated samples; the residual of the best hypothesis must show them, too
     possible_spikes: list[Detection]
+    sensor: Sensor  # The baseline with the steps that the codes show, axis by axis
 
 
 def sample_faults(comparison: BaselineComparison) -> SampleFaults:
@@ -319,7 +320,8 @@ def sample_faults(comparison: BaselineComparison) -> SampleFaults:
     if spikes and not coarse:
         changing, detections = repeated_samples(volts, time_s, finite, sensor, isolated)
         isolated, spikes = among(changing & known)
-    return SampleFaults(finite & ~changing, isolated, detections, spikes)
+    stepped = coarse.added_to(sensor) if coarse else sensor
+    return SampleFaults(finite & ~changing, isolated, detections, spikes, stepped)
 
 
 def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
@@ -638,9 +640,7 @@ def _statistics(
         used = repeated_samples(volts, time_s, finite, sensor)[0]
         yield 'share of repeated samples', '1', np.array([float(np.mean(~used[finite]))])
     else:
-        lost = coarse_codes(volts, sensor)
-        bits = sum(lost.values.values()) if lost else np.zeros(len(scale))
-        yield 'distance of codes', 'm/s^2', sensor.lsb_v * 2**bits / scale
+        yield 'distance of codes', 'm/s^2', code_step_v(volts) / scale
 
 
 def floor_without(

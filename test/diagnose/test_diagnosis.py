@@ -86,13 +86,18 @@ def test_one_effect_is_named_and_the_gap_closed(option, parameter, value):
         ('spikes:rate_hz=0.5,amplitude_v=0.05', 'spikes'),
         ('stuck:rate_hz=0.2,duration_s=0.1', 'stuck'),
         ('quantisation:lost_bits=4', 'quantisation'),
-        # Steps of 20 mg, far above the noise: each rest has an error of its own.
-        ('quantisation:axis_lost_bits.y=8', 'quantisation'),
     ],
 )
 def test_effects_of_the_noise_are_named(option, effect):
     report = diagnosed(option)[1]
     assert (report['verdict']['status'], report['verdict']['effects']) == ('explained', [effect])
+
+
+def test_coarse_codes_of_one_axis_are_no_other_effect():
+    """Steps of 20 mg are far above the noise: each rest has an error of its own."""
+    report = diagnosed('quantisation:axis_lost_bits.y=8')[1]
+    assert (report['verdict']['status'], named(report)) == ('explained', {'quantisation'})
+    assert report['gap']['before'] == pytest.approx(report['gap']['floor'], rel=0.1)
 
 
 def test_noise_is_compared_with_the_simulated_noise():
