@@ -928,20 +928,17 @@ class CheckedRecording(NamedTuple):
     detections: tuple[noise_effects.Detection, ...]
     # Isolated samples; the residual of the best hypothesis must show them, too
     possible_spikes: list[noise_effects.Detection]
-    stated_bits: int  # Bits of the ADC by the parameter file
+    stated: Sensor  # The baseline with the steps of the ADC by the parameter file
 
 
 def check_recording(comparison: BaselineComparison) -> CheckedRecording:
     """
     Check a recording beside its reference; raise DataFault.
 
-    Where the codes of the ADC are coarser than stated, the baseline gets their number of bits.
+    Where codes of the ADC are coarser than stated, the baseline gets their steps, axis by axis.
     """
-    faults, stated_bits = noise_effects.sample_faults(comparison), comparison.sensor.adc_bits
-    coarse = noise_effects.effect_of(Detector.COARSE_CODES)
-    for detection in [d for d in faults.detections if d.effect == coarse]:
-        sensor = noise_effects.with_bits(comparison.sensor, detection)
-        comparison = replace(comparison, sensor=sensor)
+    faults, stated = noise_effects.sample_faults(comparison), comparison.sensor
+    comparison = replace(comparison, sensor=faults.sensor)
     search_comparison = baseline.at_search_rate(comparison)
     if comparison.pose_known:
         _check_axes(search_comparison)
@@ -952,7 +949,7 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording:
         search_comparison,
         tuple(faults.detections),
         faults.possible_spikes,
-        stated_bits,
+        stated,
     )
 
 

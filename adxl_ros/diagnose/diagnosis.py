@@ -306,11 +306,9 @@ def _held_out(
     best = search.best
     model = search.model
     beside = with_filters(model, best.linearised, model.filters)
-    drifts = (
-        drifts_among(library())
-        if beside.fit(drifts=drifts_among(library())).log_evidence > beside.fit().log_evidence
-        else ()
-    )
+    drifts = drifts_among(library())
+    if beside.fit(drifts=drifts).log_evidence <= beside.fit().log_evidence:
+        drifts = ()
 
     def with_drift(healthy: HeldOutFits, drift: str) -> HeldOutFits | None:
         left = healthy.figures.squares.sum() / count - floor.rms_mps2**2
@@ -460,9 +458,7 @@ def _named_sensor(
             replace(sensor, values={**sensor.values, **{e: fitted.values[e] for e in straight}}),
         )
     for detection in detections:
-        sensor = with_values(
-            with_neutral(sensor, [detection.effect]), detection.effect, detection.values
-        )
+        sensor = detection.added_to(sensor)
     for drift in [e for e in drifts_among(library()) if e in verdict.named][:1]:
         sensor = _with_drift(sensor, drift, fits[drift])
     kept = [i for i, name in enumerate(baseline.covariance_names) if name.effect in sensor.effects]
@@ -538,7 +534,7 @@ def _report(
     comparisons = [c.comparison for c in checked]
     best = search.found[verdict.best]
     # Coarse codes are an effect of the verdict, and not of its baseline.
-    baseline = replace(comparisons[0].sensor, adc_bits=checked[0].stated_bits)
+    baseline = checked[0].stated
     sensor = _named_sensor(verdict, best, detections, baseline, evidence.candidates[verdict.best])
     lacking = tuple(not_covered(model.comparisons))
     remainders = tuple(

@@ -18,7 +18,8 @@ Errors of followed angles are constant at rest and new after each move (errors i
 1987). The model is y = n + g·u. Here n is noise behind the RC filter, AR(1) with pole a, u has
 variance 1, u_t = φ_t·u_(t−1) + √(1 − φ_t²)·ξ_t, and g is its standard deviation in V. A Kalman
 filter predicts g·u; its innovations, scaled, have the spectrum of (1 − aL)·n. Where g is 0, they
-are (1 − aL)·y.
+are (1 − aL)·y. Rounding that the noise does not hide is such an error, too: it stays until the
+output has moved.
 
 A hypothesis is a set of columns, which are whitened sensitivities of the simulated output. The
 coefficients have normal priors. The evidence integrates the coefficients out (Bishop 2006,
@@ -82,6 +83,9 @@ _ITERATIONS = 3
 _SMALLEST_SQUARES_V2 = 1e-300  # Smallest sum of squares, V², whose logarithm is taken: above zero
 _RIDGE = 1e-12
 """Ridge on the scaled precision. Chosen: columns that differ by a millionth are separable."""
+_ROUNDING_FORGETS = 6.0
+"""How fast rounding forgets its error, per step of the output. Derived: the autocovariance of a
+sawtooth of variance 1 is 1 − 6·x + 6·x² after x steps."""
 UNDETERMINED_SHARE = 0.5
 """A coefficient is not determined if its posterior standard deviation exceeds this share of the
 prior's. Chosen: three quarters of the precision are then of the samples."""
@@ -125,7 +129,8 @@ def estimate_floor(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
     Estimate the noise floor from rests, else from repeats, else from the parameter file.
 
     The noise at rest is that about the mean of each second. The mean square of the encoder's steps
-    is added: step²/12 times the squared slope of gravity, or what they leave open of a robot.
+    is added: step²/12 times the squared slope of gravity, or what they leave open of a robot. So
+    is the rounding that no rest shows.
     """
     sums: list[PartSquares] = []
     for c in comparisons:
@@ -139,6 +144,8 @@ def estimate_floor(comparisons: Sequence[BaselineComparison]) -> NoiseFloor:
     else:
         noise_v = np.sqrt(np.sum([squares_v2 for squares_v2, _ in sums], axis=0) / count)
     unknown = np.mean([encoder_error_mps2(c) ** 2 for c in comparisons])
+    if source == 'still':
+        unknown += np.mean(held_rounding_v2(comparisons[0].sensor) / scale_v_per_mps2**2)
     rows = [
         (np.mean(squares_v2 / scale_v_per_mps2**2) + count * unknown, count)
         for squares_v2, count in sums
@@ -306,7 +313,7 @@ class Whitener:
 
 
 def _angle_error_filter(
-    comparison: BaselineComparison, axis: int, pole: float, analog_v: float
+    comparison: BaselineComparison, axis: int, usual: _UsualNoise
 ) -> AngleErrorFilter | None:
     """
     Return the filter for one axis by the Riccati recursion of the Kalman filter.
@@ -319,7 +326,8 @@ def _angle_error_filter(
         remembered_v2 += part_v2 * memory
     if not variance_v2.any():
         return None
-    noise_v2 = analog_v**2 * (1 - pole**2) + comparison.sensor.lsb_v**2 / 12 * (1 + pole**2)
+    pole = usual.pole
+    noise_v2 = usual.std_v**2 * (1 - pole**2) + usual.step_v2 * (1 + pole**2)
     memories = np.divide(
         remembered_v2, variance_v2, where=variance_v2 > 0, out=np.ones(len(comparison))
     )
@@ -339,7 +347,7 @@ def _angle_error_filter(
 def _angle_errors(
     comparison: BaselineComparison, axis: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield variance, V², and memory from sample to sample, (n,) each, of errors of angles."""
+    """Yield variance, V², and memory from sample to sample, (n,) each, of angles and rounding."""
     sensor, time_s, joints = comparison.sensor, comparison.time_s, comparison.joints or ()
     slopes = gravity_slopes(*comparison.joint_values())[:, axis] if joints else ()
     for joint, slope in zip(joints, slopes):
@@ -354,17 +362,29 @@ def _angle_errors(
         errors = robot.errors(time_s, AXES.index(sensor.axes[axis]))
         v_per_mps2 = sensor.scale_v_per_g[axis] / G0_MPS2
         yield (v_per_mps2 * errors.std) ** 2, np.exp(-errors.forgetting_per_s * comparison.dt_s)
+    held_v2 = held_rounding_v2(sensor)[axis]
+    if held_v2:
+        output_v = comparison.simulated_v(sensor)[:, axis]
+        moved = np.abs(np.diff(output_v, prepend=output_v[0]))
+        moved /= noise.electronics(sensor).lsb_v[axis]
+        yield np.full(len(time_s), held_v2), np.exp(-_ROUNDING_FORGETS * moved)
+
+
+def held_rounding_v2(sensor: Sensor) -> np.ndarray:
+    """Return the mean square of the rounding that stays while the output stays, V², (m,)."""
+    return noise.held_rounding(sensor) * noise.electronics(sensor).lsb_v ** 2 / 12
 
 
 def whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
     """Return the filters that are tried for the noise of an axis of a recording."""
     sensor = comparison.sensor
-    scale, rc_s = float(sensor.scale_v_per_g[axis]), float(noise.electronics(sensor).rc_s[axis])
+    scale = float(sensor.scale_v_per_g[axis])
+    rc_s, _, lsb_v = (float(values[axis]) for values in noise.electronics(sensor))
     usual = _UsualNoise(
         dt_s=comparison.dt_s,
         pole=float(np.exp(-comparison.dt_s / rc_s)) if rc_s else 0.0,
         std_v=max(float(noise.analog_std_v(sensor)[axis]), _LOWEST_NOISE_V),
-        step_v2=sensor.lsb_v**2 / 12,
+        step_v2=lsb_v**2 / 12 - float(held_rounding_v2(sensor)[axis]),
     )
     by_spectrum = {effect_named(e).diagnosis.drift: e for e in drifts_among(library())}
     filters = []
@@ -379,7 +399,7 @@ def whiteners(comparison: BaselineComparison, axis: int) -> list[Whitener]:
         filters.append(Whitener(sections, effect, density, shown / innovation_v, usual.pole))
         if usual.corner_hz(density * scale) > usual.highest_corner_hz:
             break
-    errors = _angle_error_filter(comparison, axis, usual.pole, usual.std_v)
+    errors = _angle_error_filter(comparison, axis, usual)
     largest = np.inf if errors is None else errors.rms_v / scale
     return [replace(f, errors=errors) if f.healthy or f.density < largest else f for f in filters]
 

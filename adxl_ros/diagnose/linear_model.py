@@ -24,6 +24,7 @@ from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
 from adxl_ros.diagnose.evidence import LinearFit, Whitener
 from adxl_ros.errors import UserError
+from adxl_ros.model import noise
 from adxl_ros.model.effects import base, effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Concern, Effect, Parameter, Role
 from adxl_ros.model.sensor import names_of, parameter_of, put, Sensor, with_neutral
@@ -417,12 +418,13 @@ class LinearModel:
                 if {*hints.stated_by} & {*sensor.measured}
                 else hints.healthy_std
             )
-        scale = float(sensor.scale_v_per_g[sensor.axes.index(name.axis)])
+        axis = sensor.axes.index(name.axis)
+        scale = float(sensor.scale_v_per_g[axis])
         zero_g = hints.straight_line is base.StraightLine.ZERO_G
         if zero_g and not self.pose_known:
             return scale
         # Converters round or cut off, which shifts the zero-g by a part of a step.
-        variance = sensor.lsb_v**2 / 12 if zero_g else 0.0
+        variance = float(noise.electronics(sensor).lsb_v[axis]) ** 2 / 12 if zero_g else 0.0
         if name in sensor.covariance_names:
             i = sensor.covariance_names.index(name)
             variance += float(sensor.covariance[i, i])

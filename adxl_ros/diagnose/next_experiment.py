@@ -30,6 +30,7 @@ from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
+from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Concern, Detector, Manoeuvre
@@ -165,7 +166,7 @@ def _noise_could_show(
         Detector.MAINS_LINE: ('amplitude_v', line_v),
         Detector.ISOLATED_SAMPLES: (
             'amplitude_v',
-            noise_effects.SPIKE_STDS * max(level_v, sensor.lsb_v),
+            noise_effects.SPIKE_STDS * max(level_v, noise.electronics(sensor).lsb_v.max()),
         ),
         Detector.REPEATED_SAMPLES: (
             'duration_s',

@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from adxl_ros.diagnose.comparison import BaselineComparison, bridged, code_step_v
+from adxl_ros.diagnose.comparison import BaselineComparison, bridged, code_step_v, with_values
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Detector
-from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.sensor import Sensor, with_neutral
 from adxl_ros.signals.block_statistics import rms, true_runs
 import numpy as np
 import scipy
@@ -109,6 +109,10 @@ class Detection:
             Detector.ISOLATED_SAMPLES,
             Detector.HELD_AT_END,
         )
+
+    def added_to(self, sensor: Sensor) -> Sensor:
+        """Return a sensor with the effect as it was found."""
+        return with_values(with_neutral(sensor, [self.effect]), self.effect, self.values)
 
 
 def effect_of(detector: Detector) -> str:
@@ -263,7 +267,7 @@ def _spikes(
     # The first samples after repeated or missing ones may step, which is no spike.
     undisturbed = np.convolve(used, np.ones(2 * far + 1), 'same') > 2 * far
     undisturbed[:far] = undisturbed[-far:] = False
-    for d, step_v in enumerate(np.maximum(steps_v, sensor.lsb_v)):
+    for d, step_v in enumerate(np.maximum(steps_v, noise.electronics(sensor).lsb_v)):
         spikes = np.zeros(len(volts), bool)
         bridged_v = volts[:, d].copy()
         for distance in (_SPIKE_NEIGHBOUR, _OTHER_NEIGHBOUR):
@@ -338,6 +342,7 @@ class SampleFaults(NamedTuple):
     detections: list[Detection]  # Repeated samples, coarse codes, and ends of the range
     # Isolated samples; the residual of the best hypothesis must show them, too
     possible_spikes: list[Detection]
+    sensor: Sensor  # The baseline with the steps that the codes show, axis by axis
 
 
 def sample_faults(comparison: BaselineComparison) -> SampleFaults:
@@ -353,8 +358,6 @@ def sample_faults(comparison: BaselineComparison) -> SampleFaults:
     changing, detections = (
         (finite, [coarse]) if coarse else repeated_samples(volts, time_s, finite, sensor)
     )
-    if coarse:
-        sensor = with_bits(sensor, coarse)
     residual_v = comparison.residual_v(comparison.sensor)
 
     def among(compared: np.ndarray) -> tuple[np.ndarray, list[Detection]]:
@@ -368,12 +371,8 @@ def sample_faults(comparison: BaselineComparison) -> SampleFaults:
     low, high = (_held_at_end(comparison, sign) for sign in (-1.0, 1.0))
     if (low | high).any():
         detections = [*detections, _clipping(comparison, low, high)]
-    return SampleFaults(finite & ~changing, isolated, low | high, detections, spikes)
-
-
-def with_bits(sensor: Sensor, coarse: Detection) -> Sensor:
-    """Return the sensor with the number of bits that its codes show."""
-    return replace(sensor, adc_bits=round(sensor.adc_bits - float(coarse.values['lost_bits'])))
+    stepped = coarse.added_to(sensor) if coarse else sensor
+    return SampleFaults(finite & ~changing, isolated, low | high, detections, spikes, stepped)
 
 
 def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
@@ -692,9 +691,7 @@ def _statistics(
         used = repeated_samples(volts, time_s, finite, sensor)[0]
         yield 'share of repeated samples', '1', np.array([float(np.mean(~used[finite]))])
     elif detector is Detector.COARSE_CODES:
-        lost = coarse_codes(volts, sensor)
-        bits = sum(lost.values.values()) if lost else np.zeros(len(scale))
-        yield 'distance of codes', 'm/s^2', sensor.lsb_v * 2**bits / scale
+        yield 'distance of codes', 'm/s^2', code_step_v(volts) / scale
 
 
 def floor_without(

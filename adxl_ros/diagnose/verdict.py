@@ -37,6 +37,9 @@ MATERIAL_SHARE_OF_NOISE = 0.1
 _SMALLEST_P = 0.001
 """Probability of the increments of a drift below which they are of something else. Chosen: one
 error in 1000."""
+_LARGEST_DRIFT = 2.8
+"""Mean square of a random walk about its mean, divided by its expectation, that one walk in 20
+exceeds. Derived from the random walk."""
 _REPEATED = (0.0, 0.5, 0.8, 0.95, 1.0)
 """Shares of the draws that repeat a verdict, at which `_RIGHT` is known."""
 _RIGHT = (0.2, 0.4, 0.6, 0.75, 0.9)
@@ -148,7 +151,7 @@ class _Powers(NamedTuple):
 
     def remaining(self, material: float) -> float:
         """Return what is left beside effects: what repeats, or all that no drift explains."""
-        is_more = self.above > self.drift + material
+        is_more = self.above > _LARGEST_DRIFT * self.drift + material
         return max(self.repeats, self.above) if is_more else self.repeats
 
 

@@ -93,6 +93,13 @@ def test_effects_of_the_noise_are_named(option, effect):
     assert (report['verdict']['status'], report['verdict']['effects']) == ('explained', [effect])
 
 
+def test_coarse_codes_of_one_axis_are_no_other_effect():
+    """Steps of 20 mg are far above the noise: each rest has an error of its own."""
+    report = diagnosed('quantisation:axis_lost_bits.y=8')[1]
+    assert (report['verdict']['status'], named(report)) == ('explained', {'quantisation'})
+    assert report['gap']['before'] == pytest.approx(report['gap']['floor'], rel=0.1)
+
+
 def test_noise_is_compared_with_the_simulated_noise():
     """Twice the noise has four times the power, until the simulator has it as well."""
     noise = diagnosed('noise_excess:ratio=1.0')[1]['gap']['noise'][0]

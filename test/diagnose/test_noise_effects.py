@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from adxl_ros.diagnose import noise_effects
 from adxl_ros.diagnose.noise_effects import NoiseRemainder
+from adxl_ros.model import noise
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -142,7 +143,7 @@ def test_coarse_codes_show_the_lost_bits(bits):
     volts = np.rint(white_v(20 * step_v) / step_v) * step_v
     found = noise_effects.coarse_codes(volts, made)
     assert found.values['lost_bits'] == pytest.approx(bits)
-    assert noise_effects.with_bits(made, found).adc_bits == 16 - bits
+    assert noise.electronics(found.added_to(made)).lsb_v == pytest.approx(step_v)
 
 
 def test_bits_that_one_axis_has_lost_are_its_own():
@@ -152,6 +153,7 @@ def test_bits_that_one_axis_has_lost_are_its_own():
     found = noise_effects.coarse_codes(np.rint(volts / steps_v) * steps_v, made)
     assert found.values['lost_bits'] == 0.0
     assert found.values['axis_lost_bits'] == pytest.approx([0.0, 2.0])
+    assert noise.electronics(found.added_to(made)).lsb_v == pytest.approx(steps_v)
     assert noise_effects.coarse_codes(np.rint(volts / made.lsb_v) * made.lsb_v, made) is None
 
 

@@ -4,8 +4,11 @@
 
 from dataclasses import replace
 
-from adxl_ros.diagnose.evidence import NoiseFloor, squares_at_rest
+from adxl_ros.diagnose.comparison import compare
+from adxl_ros.diagnose.evidence import estimate_floor, NoiseFloor, squares_at_rest
+from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import noise
+from adxl_ros.model.constants import G0_MPS2
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -53,3 +56,13 @@ def test_rounding_is_split_by_the_noise_before_it(steps):
     assert share * sensor.lsb_v**2 / 12 == pytest.approx(
         held, rel=0.05, abs=1e-3 * sensor.lsb_v**2
     )
+
+
+def test_rounding_that_no_rest_shows_is_part_of_the_floor():
+    """One code for the whole rest: its distance from the output is up to half a step."""
+    sensor = nominal('x', rate_hz=_RATE_HZ, adc_bits=6)
+    time_s = np.arange(500) / _RATE_HZ
+    floor = estimate_floor([compare(Recording('made', time_s, {'x_v': 0 * time_s + 2.5}), sensor)])
+    step_mps2 = G0_MPS2 * sensor.lsb_v / sensor.scale_v_per_g[0]
+    assert floor.source == 'still'
+    assert floor.rms_mps2 == pytest.approx(step_mps2 / np.sqrt(12), rel=0.03)
