@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from sklearn.ensemble import RandomForestClassifier
 
-_EXAMPLES = 8
+_EXAMPLES = 24
 """Training examples of each effect; chosen: run time."""
 _TREES = 200
 _BANDS = 6
