@@ -34,7 +34,7 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2, with_axes
 from adxl_ros.nodes.jobs import executable
-from adxl_ros.signals.allan_deviation import Phase
+from adxl_ros.signals.allan_deviation import RunningSums
 from adxl_ros.simulate.response import simulate
 from adxl_ros.simulate.sensor_model import SensorModel
 from adxl_ros.simulate.trajectories import rich, sweep
@@ -345,7 +345,7 @@ def _allan() -> Job:
     samples, block = np.random.default_rng(0).normal(size=1_000_000), 65536
 
     def ours() -> None:
-        stream = Phase(1, BytesIO())
+        stream = RunningSums(1, BytesIO())
         for begin in range(0, len(samples), block):
             stream.feed(samples[begin : begin + block, None])
         stream.allan_deviation(_RATE_HZ), stream.cells()

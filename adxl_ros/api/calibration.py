@@ -485,7 +485,7 @@ def _fit(result: CalibrationResult, unit: _Unit, is_over_temperature: bool = Fal
     )
     return Fit(
         sensor=fitted,
-        outcome=acceptance.acceptance(fitted)[0],
+        outcome=acceptance.acceptance(fitted).outcome,
         coefficients=coefficients,
         held_out=result.held_out,
         poses=int(result.inliers.sum()),

@@ -22,9 +22,9 @@ from adxl_ros.api.recordings import (
 )
 from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Result
 from adxl_ros.api.sensors import as_input, sensor_of, SensorInput
+from adxl_ros.diagnose import report as diagnosis_report
 from adxl_ros.diagnose.data_checks import DataFault
 from adxl_ros.diagnose.diagnosis import what_shows
-from adxl_ros.diagnose.report import shows_row
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording as recording_files
 from adxl_ros.files.atomic_write import make_folder, require_own, write_text
@@ -32,7 +32,7 @@ from adxl_ros.files.column_mapping import ReadingOptions
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.report.screen import Tile
 from adxl_ros.signals import findings_report as words
-from adxl_ros.signals.findings import Ability, check_recording, Findings, Shown
+from adxl_ros.signals.findings import Ability, check_recording, Findings
 from adxl_ros.signals.gate import (
     Earlier,
     KINDS,
@@ -275,14 +275,14 @@ def _with_what_shows(
             path = robot.path(read, unit)
             result = replace(result, remarks=(*result.remarks, path.text()))
             sim = path.as_motion()
-        shown = what_shows([read], unit, sim)
-        if isinstance(shown, DataFault):
-            reason = shown.message
+        could_show = what_shows([read], unit, sim)
+        if isinstance(could_show, DataFault):
+            reason = could_show.message
         else:
             scale_v_per_g = float(unit.scale_v_per_g.mean())
-            shown_first = sorted(shown, key=lambda effect: not effect.shows)
-            rows = tuple(Shown(*shows_row(effect, scale_v_per_g)) for effect in shown_first)
-            result = replace(result, shows=rows)
+            shown_first = sorted(could_show, key=lambda effect: not effect.shows)
+            rows = [diagnosis_report.as_shown(effect, scale_v_per_g) for effect in shown_first]
+            result = replace(result, shows=tuple(rows))
     except UserError as error:
         reason = one_line(error)
         if robot:

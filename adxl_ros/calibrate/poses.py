@@ -10,7 +10,7 @@ settings of the joints, and `pose_model` predicts their output.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 from adxl_ros.files.sweep_journal import PoseRecord
 from adxl_ros.model.constants import SAME_ANGLE_RAD
@@ -18,6 +18,9 @@ from adxl_ros.model.effects.base import Environment, NOMINAL_ENVIRONMENT
 import numpy as np
 
 _SAME_PLANE_RAD = np.radians(1.0)  # Largest difference of neighbouring angles alpha in one plane
+
+
+NOT_GIVEN = np.zeros(0)  # In place of temperatures, supplies or settings that are not given
 
 
 @dataclass(frozen=True)
@@ -32,20 +35,20 @@ class Poses:
     # True for a pose that the fit does not use, so that it can show the error, (k,)
     check: np.ndarray
     # temperature_c, supply_v: Means over each rest, (k,); NaN where they were not measured
-    temperature_c: np.ndarray = None  # type: ignore[assignment]
-    supply_v: np.ndarray = None  # type: ignore[assignment]
+    temperature_c: np.ndarray = field(default_factory=lambda: NOT_GIVEN)
+    supply_v: np.ndarray = field(default_factory=lambda: NOT_GIVEN)
     # Number of the setting of each joint, (k,) int. Poses of one setting share the error of the
     # joint. By default each change of the angle from one pose to the next begins a setting.
-    alpha_setting: np.ndarray = None  # type: ignore[assignment]
-    beta_setting: np.ndarray = None  # type: ignore[assignment]
+    alpha_setting: np.ndarray = field(default_factory=lambda: NOT_GIVEN)
+    beta_setting: np.ndarray = field(default_factory=lambda: NOT_GIVEN)
 
     def __post_init__(self) -> None:
         """Fill in the fields that are not given."""
         for name in ('temperature_c', 'supply_v'):
-            if getattr(self, name) is None:
+            if not len(getattr(self, name)):
                 object.__setattr__(self, name, np.full(len(self.volts), np.nan))
         for joint in ('alpha', 'beta'):
-            if getattr(self, f'{joint}_setting') is None:
+            if not len(getattr(self, f'{joint}_setting')):
                 settings = _settings_by_angle(getattr(self, f'{joint}_rad'), self.time_s[:, 0])
                 object.__setattr__(self, f'{joint}_setting', settings)
 
@@ -76,9 +79,9 @@ class Poses:
         def column(name: str) -> np.ndarray:
             return np.array([getattr(record, name) for record in records])
 
-        def settings(name: str) -> np.ndarray | None:
+        def settings(name: str) -> np.ndarray:
             numbers = column(name)
-            return None if None in numbers else numbers.astype(int)
+            return NOT_GIVEN if None in numbers else numbers.astype(int)
 
         stamps_ns = np.column_stack([column('start_ns'), column('stop_ns')])
         return Poses(
@@ -90,8 +93,8 @@ class Poses:
             check=column('check').astype(bool),
             temperature_c=column('temperature_c'),
             supply_v=column('supply_v'),
-            alpha_setting=settings('alpha_setting'),  # type: ignore[arg-type]
-            beta_setting=settings('beta_setting'),  # type: ignore[arg-type]
+            alpha_setting=settings('alpha_setting'),
+            beta_setting=settings('beta_setting'),
         )
 
     @staticmethod

@@ -12,7 +12,7 @@ from adxl_ros.calibrate.joint_settings import (
     mean_of_finite,
     recorded_settings,
 )
-from adxl_ros.calibrate.poses import Poses
+from adxl_ros.calibrate.poses import NOT_GIVEN, Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import COMMANDS, JOINTS, Recording
 from adxl_ros.files.sweep_journal import PoseRecord
@@ -28,8 +28,6 @@ _MAX_PERIODS = 1.5
 """Largest distance of neighbouring samples in a rest without gaps, sample periods."""
 _MIN_SAMPLES = 0.9
 """Smallest share of the samples of a pose in the journal that its recording must have."""
-
-
 _SHORTEST_SPAN_S = 0.5
 """Shortest rest of a table, s: ten blocks, whose scatter shows the error of the mean within a
 quarter. Half of them would show it within a third."""
@@ -115,8 +113,8 @@ def extract_poses(
         alpha_rad=alpha_rad,
         beta_rad=beta_rad,
         check=np.zeros(len(rests), bool),
-        alpha_setting=_settings(recording, sensor, rests, 'alpha'),  # type: ignore[arg-type]
-        beta_setting=_settings(recording, sensor, rests, 'beta'),  # type: ignore[arg-type]
+        alpha_setting=_settings(recording, sensor, rests, 'alpha'),
+        beta_setting=_settings(recording, sensor, rests, 'beta'),
         **measured,
     )
 
@@ -131,12 +129,12 @@ def _found_rests(recording: Recording, sensor: Sensor) -> list[Rest]:
 
 def _settings(
     recording: Recording, sensor: Sensor, rests: Sequence[Rest], joint: str
-) -> np.ndarray | None:
-    """Return the settings of a joint in the rests, (k,); None where the recording has neither."""
+) -> np.ndarray:
+    """Return the settings of a joint in the rests, (k,), where readings or commands show them."""
     readings_rad = recording.columns.get(JOINTS[joint])
     commands_rad = recording.columns.get(COMMANDS[joint])
     if readings_rad is None and commands_rad is None:
-        return None
+        return NOT_GIVEN
     rows = np.array([[rest.start, rest.stop] for rest in rests])
     return recorded_settings(rows, readings_rad, commands_rad, angle_tolerance_rad(sensor))
 
@@ -198,7 +196,8 @@ def poses_of_means(recording: Recording, sensor: Sensor) -> Poses:
 
 def with_table_angles(poses: Poses, table: PoseTable) -> Poses:
     """Give rests the angles of a table of poses, in their order."""
-    angles, path = table.angles_rad, table.path
+    angles = table.angles_rad
+    path = table.path
     if len(angles) != len(poses):
         starts = ', '.join(f'{start_s:.1f}' for start_s in poses.time_s[:, 0]) + ' s'
         raise UserError(
@@ -211,8 +210,8 @@ def with_table_angles(poses: Poses, table: PoseTable) -> Poses:
         poses,
         alpha_rad=angles[:, 0],
         beta_rad=angles[:, 1],
-        alpha_setting=None,  # type: ignore[arg-type]
-        beta_setting=None,  # type: ignore[arg-type]
+        alpha_setting=NOT_GIVEN,
+        beta_setting=NOT_GIVEN,
     )
 
 

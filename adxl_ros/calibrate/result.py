@@ -97,7 +97,8 @@ class CalibrationResult:
             saved = parameter_file.load(path)
         except UserError:
             return False
-        fitted, names = self.fitted, self.fitted.covariance_names
+        fitted = self.fitted
+        names = self.fitted.covariance_names
         return (
             (saved.model, saved.effects, saved.covariance_names)
             == (fitted.model, fitted.effects, names)

@@ -36,7 +36,7 @@ class StreamFaults:
     wrong_gravity: str = ''  # They are off by less
 
 
-class Status(NamedTuple):
+class CompensationStatus(NamedTuple):
     """The state of a compensation."""
 
     level: Level
@@ -44,7 +44,7 @@ class Status(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Interval:
+class StreamInterval:
     """What a stream has shown since the last report."""
 
     duration_s: float  # Length of the interval, s
@@ -160,17 +160,23 @@ class CompensationPolicy:
             return None
         return calibration_store.newer(self._store, sensor)
 
-    def status(self, interval: Interval, newer: Path | None, calibration: str) -> Status:
+    def status(
+        self, interval: StreamInterval, newer: Path | None, calibration: str
+    ) -> CompensationStatus:
         """Return the state: the first fault or warning that holds."""
         if self.refusal:
-            return Status(Level.ERROR, f'publishing nothing: {self.refusal}')
+            return CompensationStatus(Level.ERROR, f'publishing nothing: {self.refusal}')
         if self.faults.wrong_gravity:
-            return Status(Level.ERROR, f'the tilt is uncertain: {self.faults.wrong_gravity}')
+            return CompensationStatus(
+                Level.ERROR, f'the tilt is uncertain: {self.faults.wrong_gravity}'
+            )
         for warning in self._warnings(interval, newer, calibration):
-            return Status(Level.WARN, warning)
-        return Status(Level.OK, 'compensating')
+            return CompensationStatus(Level.WARN, warning)
+        return CompensationStatus(Level.OK, 'compensating')
 
-    def _warnings(self, interval: Interval, newer: Path | None, calibration: str) -> Iterator[str]:
+    def _warnings(
+        self, interval: StreamInterval, newer: Path | None, calibration: str
+    ) -> Iterator[str]:
         """Yield what is not as it should be, the gravest first."""
         samples = self._full_name('imu/data_raw')
         no_info = f'nothing on {self._full_name("sensor_info")}'
@@ -208,7 +214,7 @@ class CompensationPolicy:
                 'again'
             )
 
-    def _unknown_surroundings(self, interval: Interval) -> str:
+    def _unknown_surroundings(self, interval: StreamInterval) -> str:
         """Name an effect whose temperature or supply nobody publishes, or return ''."""
         topics = {'temperature_c': 'temperature', 'supply_v': 'supply'}
         for effect in map(effect_named, self.sensor.effects):
@@ -221,7 +227,7 @@ class CompensationPolicy:
                     )
         return ''
 
-    def values(self, interval: Interval, newer: Path | None) -> dict[str, Any]:
+    def values(self, interval: StreamInterval, newer: Path | None) -> dict[str, Any]:
         """Return what diagnostics report of the calibration in use."""
         sensor = self.sensor
         date = calibration_store.date_of(sensor) if sensor.effects else None
@@ -250,7 +256,7 @@ class CompensationPolicy:
             else 'confirmed'
         )
 
-    def _validity(self, interval: Interval) -> str:
+    def _validity(self, interval: StreamInterval) -> str:
         if not self.sensor.effects:
             return 'not calibrated'
         if self.refusal:

@@ -193,7 +193,7 @@ def alignment_std_rad(sensor: Sensor) -> float:
     return typical or parameter_of(name).scale
 
 
-class _Cell(NamedTuple):
+class _GridCell(NamedTuple):
     """What the forces of one cell of the grid share."""
 
     tangent: signal_chain.Tangent  # Tangent of the inverse at the middle of the cell
@@ -247,7 +247,7 @@ class LiveEstimator:
         )
         self._invert = signal_chain.inverse(sensor)
         self._use(sensor.without_temperature_range())
-        self._cells: dict[tuple[int, ...], _Cell] = {}
+        self._cells: dict[tuple[int, ...], _GridCell] = {}
         noise_mps2 = np.sqrt(self._variance_v2) / sensor.scale_v_per_g * G0_MPS2
         self._noise_variance = (noise_mps2[:2] ** 2).tolist()
         self._derives_z = sensor.axes == 'xy'
@@ -326,7 +326,8 @@ class LiveEstimator:
             self._force = self._paper_inverse(volts, self._environment)
             return self._force if abs(sum(self._force)) < float('inf') else None
         tangent = self._cell(self._force).tangent
-        force, change = self._force, 0.0
+        force = self._force
+        change = 0.0
         response = self._last_volts
         input_v = self._undo_adc(volts)
         for _ in range(_MAX_STEPS):
@@ -357,7 +358,7 @@ class LiveEstimator:
         )
 
     def _covariance(
-        self, force: Components, cell: _Cell, unknown: float, motion: float
+        self, force: Components, cell: _GridCell, unknown: float, motion: float
     ) -> Covariance3:
         """
         Return the covariance of a force, (m/s²)².
@@ -374,7 +375,7 @@ class LiveEstimator:
             further = self._noise_variance[0] + motion
         return covariance.widened(unknown, unknown, further)
 
-    def _cell(self, force: Components) -> _Cell:
+    def _cell(self, force: Components) -> _GridCell:
         around = self._environment
         key = (
             round(force[0] / _CELL_MPS2),
@@ -393,7 +394,7 @@ class LiveEstimator:
             covariance = np.diag([0.0, UNMEASURED_VARIANCE, UNMEASURED_VARIANCE])
             axes = self.sensor.axis_indices
             covariance[np.ix_(axes, axes)] = measured[:, :, 0]
-            cell = self._cells[key] = _Cell(
+            cell = self._cells[key] = _GridCell(
                 tangent, Covariance3(*covariance[np.triu_indices(3)].tolist()), outside
             )
         return cell

@@ -145,7 +145,8 @@ class DelayedInversion:
             yield self._next()
 
     def _next(self) -> tuple[float, list[float], object]:
-        near, index = self._near, self._index
+        near = self._near
+        index = self._index
         half = min(index, len(near) - 1 - index, HALF)
         stamp_s, volts, token = near[index]
         kernel = self._kernels[half]

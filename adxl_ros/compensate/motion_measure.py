@@ -75,7 +75,8 @@ class MotionMeasure:
 
     def changes(self, force: Components, time_s: float) -> float:
         """Take the force of a sample; return the variance that its changes show."""
-        elapsed_s, self._time_s = time_s - self._time_s, time_s
+        elapsed_s = time_s - self._time_s
+        self._time_s = time_s
         goes_on = 0 <= elapsed_s < _PAUSE_S
         kept = exp(-elapsed_s / _MOTION_S) if goes_on else 0.0
         long_kept = exp(-elapsed_s / _MANOEUVRE_S) if goes_on else 0.0

@@ -200,7 +200,8 @@ def _could_show(comparison: BaselineComparison) -> bool:
 
 def _evidence(search: Search, floor: NoiseFloor, smallest_mps2: float, seed: int) -> rule.Evidence:
     """Fit all sets of effects to blocks, and predict those that were held out."""
-    model, comparisons = search.model, search.model.comparisons
+    model = search.model
+    comparisons = search.model.comparisons
     counts = np.sum([sum_by_block(c.used) for c in comparisons], axis=0)
     robot_mps2 = max(c.robot_error_mps2 for c in comparisons)
     return rule.Evidence(
@@ -279,7 +280,8 @@ class _FitsByDrift(Mapping[str, HeldOutFits]):
         drifts: Sequence[str],
         with_drift: Callable[[str], HeldOutFits | None],
     ) -> None:
-        self._drifts, self._with_drift = drifts, with_drift
+        self._drifts = drifts
+        self._with_drift = with_drift
         self._known: dict[str, HeldOutFits | None] = {HEALTHY: healthy}
 
     def __getitem__(self, drift: str) -> HeldOutFits:
@@ -301,7 +303,8 @@ def _held_out(
     search: Search, floor: NoiseFloor, count: float
 ) -> dict[frozenset[str], Mapping[str, HeldOutFits]]:
     """Return held-out fits of all sets by the drift of their noise."""
-    best, model = search.best, search.model
+    best = search.best
+    model = search.model
     beside = with_filters(model, best.linearised, model.filters)
     drifts = (
         drifts_among(library())
@@ -323,21 +326,30 @@ def _held_out(
     return out
 
 
+def _left_mps2(comparison: BaselineComparison, sensor: Sensor) -> np.ndarray:
+    """Return the squares that a sensor leaves of used samples, mean over axes, (m/s²)², (n,)."""
+    residual_mps2 = comparison.residual_v(sensor) / comparison.scale_v_per_mps2
+    return np.mean(residual_mps2**2, axis=1) * comparison.used
+
+
 def _simulate_again(search: Search, effects: frozenset[str]) -> rule.SimulatedAgain:
     """Simulate a set as it is printed in all recordings, and as it was fitted at their rests."""
-    hypothesis, model = search.found[effects], search.model
+    hypothesis = search.found[effects]
+    model = search.model
     printed = _as_printed(hypothesis, with_neutral(model.baseline, hypothesis.effects))
-    squares, more_at_rest, resting = np.zeros(BLOCKS), list[float](), 0
+    squares = np.zeros(BLOCKS)
+    more_at_rest = []
+    resting = 0
     for c in model.comparisons:
-        left, fitted, without = (
-            np.mean((c.residual_v(s) / c.scale_v_per_mps2) ** 2, axis=1) * c.used
-            for s in (printed, hypothesis.sensor, search.found[frozenset()].sensor)
-        )
+        left = _left_mps2(c, printed)
         left[~c.used] = 0.0
         squares += sum_by_block(left)
-        rests = true_runs(c.at_rest & c.used) if c.pose_known else []
-        more_at_rest += [float(np.sum((fitted - without)[a:b])) for a, b in rests]
-        resting += sum(b - a for a, b in rests)
+        if c.pose_known:
+            more = _left_mps2(c, hypothesis.sensor)
+            more -= _left_mps2(c, search.found[frozenset()].sensor)
+            for begin, end in true_runs(c.at_rest & c.used):
+                more_at_rest.append(float(np.sum(more[begin:end])))
+                resting += end - begin
     return rule.SimulatedAgain(
         squares, np.array(more_at_rest), float(resting), hypothesis.at_bound
     )
@@ -360,7 +372,8 @@ def _as_printed(hypothesis: Hypothesis, sensor: Sensor) -> Sensor:
 
 def _with_likely_drift(best: Hypothesis, evidence: rule.Evidence) -> Sensor:
     """Return the sensor of a set, with the drift that its noise needs most, if any."""
-    effects, sensor = frozenset(best.effects), best.sensor
+    effects = frozenset(best.effects)
+    sensor = best.sensor
     fits = evidence.candidates[effects]
     nats = {d: evidence.figure(evidence.drift_nats(effects, d)) for d in fits if d != HEALTHY}
     likely = max(nats, key=lambda drift: nats[drift].value, default=HEALTHY)
@@ -388,7 +401,8 @@ def _detections(
     """
     detections: list[Detection] = []
     for c in checked:
-        comparison, used = c.comparison, c.comparison.used
+        comparison = c.comparison
+        used = c.comparison.used
         residual_v = comparison.residual_v(best)
         # In motion, a smooth reference lacks knocks that look like spikes.
         regular = used if comparison.fading_hz is None else used | ~comparison.at_rest
@@ -424,7 +438,8 @@ def _named_sensor(
     """
     if not verdict.closes:
         return baseline
-    fitted, sensor = best.sensor, with_neutral(baseline, best.effects)
+    fitted = best.sensor
+    sensor = with_neutral(baseline, best.effects)
     from_file = with_neutral(baseline, fitted.effects)
     smallest_v = verdict.material_mps2 / G0_MPS2 * baseline.scale_v_per_g.min()
 
@@ -476,10 +491,14 @@ def _closure(
     removed_power: mean square, (m/s²)², of samples that the sensor did not measure.
     """
     best = verdict.best if verdict.closes else frozenset[str]()
-    before, after = (
-        evidence.mean(evidence.candidates[e][HEALTHY].figures.squares) + removed_power
-        for e in (frozenset[str](), best)
-    )
+
+    def left(effects: frozenset[str]) -> np.ndarray:
+        """Return the power that a set leaves, (m/s²)², by draw."""
+        squares = evidence.candidates[effects][HEALTHY].figures.squares
+        return evidence.mean(squares) + removed_power
+
+    before = left(frozenset())
+    after = left(best)
     stated = noise.sample_std_v(sensor) / (sensor.scale_v_per_g / G0_MPS2)
     stated_mps2 = rms(stated)
     draws = floor.draws_mps2(seed, len(before) - 1)
@@ -519,7 +538,8 @@ def _report(
     seed: int,
 ) -> Report:
     """Add to a verdict the other parts of the report."""
-    comparisons, best = [c.comparison for c in checked], search.found[verdict.best]
+    comparisons = [c.comparison for c in checked]
+    best = search.found[verdict.best]
     # Coarse codes are an effect of the verdict, and not of its baseline.
     baseline = replace(comparisons[0].sensor, adc_bits=checked[0].stated_bits)
     fits = evidence.candidates[verdict.best]
@@ -588,7 +608,9 @@ def self_check(
     """
     report = diagnosis.report
     assert report is not None
-    named, same, inside = (report.verdict.effects, report.verdict.groups), 0, []
+    named = report.verdict.effects, report.verdict.groups
+    same = 0
+    inside = []
     for i in range(count):
         drawn = []
         for k, (c, recording) in enumerate(zip(diagnosis.full_rate, recordings)):

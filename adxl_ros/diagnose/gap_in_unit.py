@@ -24,7 +24,7 @@ Figure = Callable[[np.ndarray, np.ndarray, np.ndarray], float]
 """Size of a gap by times, s, (n,), and recorded and simulated acceleration, m/s², (n, 3)."""
 
 
-class Quantity(NamedTuple):
+class GapQuantity(NamedTuple):
     """A quantity in which a gap is stated."""
 
     name: str
@@ -75,19 +75,19 @@ def velocity_mps(time_s: np.ndarray, recorded: np.ndarray, simulated: np.ndarray
 
 
 _QUANTITIES = {
-    'tilt': Quantity('tilt', 'deg', tilt_deg),
-    'velocity': Quantity('velocity', f'm/s after {INTEGRATED_S:g} s', velocity_mps),
+    'tilt': GapQuantity('tilt', 'deg', tilt_deg),
+    'velocity': GapQuantity('velocity', f'm/s after {INTEGRATED_S:g} s', velocity_mps),
 }
 
 
-def quantity(text: str) -> Quantity:
+def quantity(text: str) -> GapQuantity:
     """Return tilt, velocity, or that of MODULE:FUNCTION, whose attribute `unit` is shown."""
     if text in _QUANTITIES:
         return _QUANTITIES[text]
     module, _, name = text.partition(':')
     try:
         figure = getattr(import_module(module), name)
-        return Quantity(name, getattr(figure, 'unit', ''), figure)
+        return GapQuantity(name, getattr(figure, 'unit', ''), figure)
     except (ImportError, AttributeError, ValueError) as error:
         raise UserError(
             f'{option(quantity=text)}: {one_line(error)}; give {", ".join(_QUANTITIES)}, or '
@@ -96,7 +96,7 @@ def quantity(text: str) -> Quantity:
 
 
 def gap_in(
-    chosen: Quantity,
+    chosen: GapQuantity,
     comparisons: Sequence[BaselineComparison],
     baseline: Sensor,
     found: Sensor,

@@ -110,13 +110,15 @@ class _Information(NamedTuple):
 
 def _information(model: LinearModel) -> _Information:
     """Return what the recordings of a linear model tell."""
-    squares_mps2, samples = np.zeros(len(model.names)), 0
+    squares_mps2 = np.zeros(len(model.names))
+    samples = 0
     for columns, (comparison, axis) in zip(model.columns, model.places):
         scale = float(comparison.scale_v_per_mps2[axis])
         for k, column_v in columns.items():
             squares_mps2[k] += float(np.sum(column_v[comparison.used] ** 2)) / scale**2
         samples += int(comparison.used.sum())
-    gram, free = model.information, np.array(model.nuisance_ids, int)
+    gram = model.information
+    free = np.array(model.nuisance_ids, int)
     precision = gram[np.ix_(free, free)] + np.diag(model.prior(())[free] ** -2.0)
     taken_up = np.einsum('ij,ij->j', gram[free], np.linalg.solve(precision, gram[free]))
     alone = np.diag(gram)
@@ -125,7 +127,8 @@ def _information(model: LinearModel) -> _Information:
 
 def _mean_could_show(model: LinearModel, material_mps2: float) -> list[CouldShow]:
     """Return the smallest sizes of effects that show in the mean of the output."""
-    known, rows = _information(model), []
+    known = _information(model)
+    rows = []
     for variant, ids in zip(model.variants, model.column_ids):
         hints = effect_named(variant.effect).diagnosis
         hides_in_pose = bool(hints.straight_line) and not model.pose_known
@@ -149,8 +152,10 @@ def _noise_could_show(
     comparison: BaselineComparison, noise_v: np.ndarray, material_mps2: float
 ) -> list[CouldShow]:
     """Return the smallest sizes of effects that show in the noise of one recording."""
-    sensor, count = comparison.sensor, len(comparison)
-    level_v, rate_hz = float(noise_v.max()), sensor.rate_hz
+    sensor = comparison.sensor
+    count = len(comparison)
+    level_v = float(noise_v.max())
+    rate_hz = sensor.rate_hz
     line_v = max(
         level_v * np.sqrt(8 * (noise_effects.LINE_LOG_EXCESS + np.log(count)) / count),
         np.sqrt(2) * material_mps2 * float(comparison.scale_v_per_mps2.max()),
@@ -181,7 +186,7 @@ def _noise_could_show(
     return rows
 
 
-class Belief(NamedTuple):
+class KnownCoefficients(NamedTuple):
     """What a hypothesis knows of k coefficients."""
 
     mean: np.ndarray  # Mean, (k,)
@@ -191,7 +196,7 @@ class Belief(NamedTuple):
 def expected_information(
     gram: np.ndarray,
     probabilities: Sequence[float],
-    beliefs: Sequence[Belief],
+    beliefs: Sequence[KnownCoefficients],
     factor: float = 1.0,
 ) -> float:
     """
@@ -212,7 +217,8 @@ def expected_information(
     log_dets = np.linalg.slogdet(covariances)[1]
     overlap = np.eye(len(weights))
     for i, j in combinations(range(len(weights)), 2):
-        both, difference = (covariances[i] + covariances[j]) / 2, means[i] - means[j]
+        both = (covariances[i] + covariances[j]) / 2
+        difference = means[i] - means[j]
         distance = (
             difference @ np.linalg.solve(both, difference) / 8
             + np.linalg.slogdet(both)[1] / 2
@@ -284,8 +290,10 @@ def rank_responses(
     model: LinearModel | None,
 ) -> tuple[ManoeuvreWorth, ...]:
     """Rank manoeuvres by their expected information per minute."""
-    leaders, seen = leading(hypotheses), dict[str, int]()
-    keys, fits = dict[int, tuple](), list[LinearFit | None]([None] * len(leaders))
+    leaders = leading(hypotheses)
+    seen = dict[str, int]()
+    keys = dict[int, tuple]()
+    fits = list[LinearFit | None]([None] * len(leaders))
     if model is not None:
 
         def log_evidence(variant: int) -> float:
@@ -324,14 +332,15 @@ def _belief(
     fitted_keys: dict[int, tuple],
     fit: LinearFit | None,
     unseen: Collection[str],
-) -> Belief:
+) -> KnownCoefficients:
     """
     Return what a hypothesis knows of the columns of a manoeuvre.
 
     fit: what the samples so far say of columns with some keys, None before there are samples. Of
     `unseen` effects only the prior is known.
     """
-    places, model = response.places, response.linear_model
+    places = response.places
+    model = response.linear_model
     # The middle one of the shapes of an effect stands for all.
     chosen = [
         numbers[len(numbers) // 2] for effect in unseen if (numbers := _variants_of(model, effect))
@@ -347,7 +356,7 @@ def _belief(
         mean[at] = fit.values[kept]
         covariance[at] = 0.0
         covariance[np.ix_(at, at)] = fit.covariance[np.ix_(kept, kept)]
-    return Belief(mean, covariance)
+    return KnownCoefficients(mean, covariance)
 
 
 class ManoeuvreDescription(NamedTuple):
@@ -415,7 +424,8 @@ def propose_next_experiment(
         )
     if verdict.groups:
         ranked = _ranked_menu(verdict, sensor, model, seed)
-        group, best = verdict.groups[0], ranked[0].name
+        group = verdict.groups[0]
+        best = ranked[0].name
         why = f'to separate {listed(group, "and")}'
         return _experiment(
             next(m for m, d in MENU.items() if d.text == best), why, no_stage, stem
@@ -468,7 +478,8 @@ def _ranked_menu(
 
 def _experiment(manoeuvre: Manoeuvre, why: str, no_stage: bool, stem: str) -> NextExperiment:
     """Describe a manoeuvre with its command."""
-    described, option = MENU[manoeuvre], ''
+    described = MENU[manoeuvre]
+    option = ''
     if no_stage:
         return NextExperiment(
             described.text, why, _beside_other_reference(stem), beside_simulator=True, stem=stem

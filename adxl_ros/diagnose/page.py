@@ -119,15 +119,22 @@ def _page(diagnosis: Diagnosis, objects: dict[str, Any], run: Run, parameters: s
 
 def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> dict[str, Any]:
     """Return what the template shows of a diagnosis with a verdict."""
-    named, proposal = words.named_effects(report, objects), objects['next_experiment']
+    named = words.named_effects(report, objects)
     probable = [c for c in objects['candidates'] if c['probability'] >= words.PROBABLE]
     by_name = {c['effect']: c for c in objects['candidates']}
     # The named effects come first, then those that are probable.
     shown = list({c['effect']: c for c in (*map(by_name.get, named), *probable)}.values())
     best = report.hypotheses[0]
-    compared, full_rate = diagnosis.comparisons[0], diagnosis.full_rate[0]
+    compared = diagnosis.comparisons[0]
+    full_rate = diagnosis.full_rate[0]
+    proposal = objects['next_experiment'] or {'menu': []}
+    menu = [
+        [m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
+        for m in proposal['menu']
+    ]
     proofs = _proofs(diagnosis, report, [c['effect'] for c in shown])
-    rows, scale = words.figure_rows(diagnosis), float(report.baseline.scale_v_per_g.mean())
+    rows = words.figure_rows(diagnosis)
+    scale = float(report.baseline.scale_v_per_g.mean())
     return {
         'has_verdict': True,
         'figures': {
@@ -163,13 +170,8 @@ def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> 
         ],
         'not_covered': objects['not_covered'],
         'where': [_cell(c) for c in report.residual_cells],
-        'menu': [
-            [m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
-            for m in proposal['menu']
-        ]
-        if proposal
-        else [],
-        'could_show': [(row.shows, *words.shows_row(row, scale)) for row in report.could_show],
+        'menu': menu,
+        'could_show': [(row.shows, *words.as_shown(row, scale)) for row in report.could_show],
     }
 
 
@@ -177,7 +179,8 @@ def _proofs(
     diagnosis: Diagnosis, report: Report, effects: Sequence[str]
 ) -> dict[str, tuple[Figure, str]]:
     """Return the proof of each effect that has one, and its text."""
-    compared, full_rate = diagnosis.comparisons[0], diagnosis.full_rate[0]
+    compared = diagnosis.comparisons[0]
+    full_rate = diagnosis.full_rate[0]
     in_noise = {d.effect for d in report.detections} & {*report.sensor.effects}
     proofs = {}
     for name in effects:
@@ -192,9 +195,12 @@ def _proofs(
 
 def _cell(cell: ResidualCell) -> list[str]:
     """Return quantity, range, axis, mean and share of a part of the map."""
-    name, unit, factor = cell.dimension, cell.dimension.rpartition('_')[2], 1.0
+    name = cell.dimension
+    _, _, unit = name.rpartition('_')
+    factor = 1.0
     if 'rad' in name:
-        unit, factor = '°/s' if 'rate' in name else '°', float(np.degrees(1.0))
+        unit = '°/s' if 'rate' in name else '°'
+        factor = float(np.degrees(1.0))
     places = decimals(factor * (cell.high - cell.low))
     return [
         name.split('_rad')[0].replace('_', ' '),
@@ -214,11 +220,11 @@ def _proof(
     It is drawn as means over a variable or spectra; the text explains it in one sentence.
     """
     described = effect_named(effect)
-    variables, acts_on_noise = described.diagnosis.proof, described.acts_on is ActsOn.NOISE
+    variables = described.diagnosis.proof
     neutral = with_neutral(comparison.sensor, [effect]).values[effect]
     without = replace(sensor, values={**sensor.values, effect: neutral})
     labelled = {'without the effect': without, 'with the effect': sensor}
-    if acts_on_noise:
+    if described.acts_on is ActsOn.NOISE:
         return _spectra(
             full_rate,
             {'recorded': full_rate.residual_v(sensor)}
@@ -239,41 +245,25 @@ def _binned(
     variables: Sequence[Over], comparison: BaselineComparison, sensor: Sensor, without: Sensor
 ) -> Figure:
     """Draw means of the residual without an effect over the variable that shows it best."""
-    import pandas as pd
-
-    to_mg, used = mg(1 / comparison.scale_v_per_mps2), comparison.used
+    used = comparison.used
+    to_mg = mg(1 / comparison.scale_v_per_mps2)
     residual_mg = (comparison.residual_v(without) * to_mg)[used]
     model_mg = residual_mg - (comparison.residual_v(sensor) * to_mg)[used]
-
-    def share(values: np.ndarray) -> float:
-        """Return the share of the model's squares between the ranges of a variable."""
-        between = [
-            (pd.Series(m).groupby(_places(v)).transform('mean') ** 2).sum()
-            for v, m in zip(values.T, model_mg.T)
-        ]
-        return float(sum(between) / max(np.sum(model_mg**2), 1e-300))
-
-    known = {
-        v.value: values[used] for v, values in _variables(comparison).items() if v in variables
-    }
-    best = max(known, key=lambda name: share(known[name]), default='')
-    if not best or share(known[best]) <= _SMALLEST_SHARE:
-        best, known = _CONTRIBUTION, {_CONTRIBUTION: model_mg}
+    label = _CONTRIBUTION
+    values = model_mg
+    largest = _SMALLEST_SHARE
+    for variable, of_axes in _variables(comparison).items():
+        if variable in variables:
+            share = _shown_share(of_axes[used], model_mg)
+            if share > largest:
+                label = variable.value
+                values = of_axes[used]
+                largest = share
     block = np.flatnonzero(used) // max(round(BLOCK_S * comparison.sensor.rate_hz), 1)
     traces = []
     for d, axis in enumerate(comparison.sensor.axes):
-        place, colour = _places(known[best][:, d]), plots.AXIS_COLOURS[axis]
-        groups = pd.DataFrame(
-            {'x': known[best][:, d], 'recorded': residual_mg[:, d], 'model': model_mg[:, d]}
-        ).groupby(place)
-        means, count = groups.mean(), groups.size()
-        # The noise is correlated, so that the sums of whole blocks give the error of a mean.
-        noise_mg = pd.Series(
-            (residual_mg - model_mg)[:, d] - (means.recorded - means.model)[place].to_numpy()
-        )
-        squares = noise_mg.groupby([place, block]).sum() ** 2
-        means['half'] = Z_90 * np.sqrt(squares.groupby(level=0).sum()) / count
-        means = means[count >= min(_FEWEST_SAMPLES, count.max())].sort_values('x')
+        means = _means_by_range(values[:, d], residual_mg[:, d], model_mg[:, d], block)
+        colour = plots.AXIS_COLOURS[axis]
         traces += [
             plots.points(means.x, means.recorded, means.half, f'{axis} recorded', colour),
             line(means.x, means.model, f'{axis} model', colour),
@@ -281,10 +271,42 @@ def _binned(
     return figure(
         traces,
         300,
-        xaxis={'title': {'text': best}},
+        xaxis={'title': {'text': label}},
         margin=_WIDE,
         yaxis={'title': {'text': 'recording minus simulation, mg'}},
     )
+
+
+def _shown_share(values: np.ndarray, model_mg: np.ndarray) -> float:
+    """Return the share of a model's squares between the ranges of a variable, (n, m) each."""
+    import pandas as pd
+
+    between = [
+        (pd.Series(m).groupby(_places(v)).transform('mean') ** 2).sum()
+        for v, m in zip(values.T, model_mg.T)
+    ]
+    return float(sum(between) / max(np.sum(model_mg**2), 1e-300))
+
+
+def _means_by_range(
+    values: np.ndarray, residual_mg: np.ndarray, model_mg: np.ndarray, block: np.ndarray
+) -> Any:
+    """
+    Return a table of the means of one axis by range of a variable, (n,) each.
+
+    Its columns are `x`, `recorded`, `model` and `half`, half of the 90 % interval, mg.
+    """
+    import pandas as pd
+
+    place = _places(values)
+    groups = pd.DataFrame({'x': values, 'recorded': residual_mg, 'model': model_mg}).groupby(place)
+    means = groups.mean()
+    count = groups.size()
+    # The noise is correlated, so that the sums of whole blocks give the error of a mean.
+    noise_mg = residual_mg - model_mg - (means.recorded - means.model)[place].to_numpy()
+    squares = pd.Series(noise_mg).groupby([place, block]).sum() ** 2
+    means['half'] = Z_90 * np.sqrt(squares.groupby(level=0).sum()) / count
+    return means[count >= min(_FEWEST_SAMPLES, count.max())].sort_values('x')
 
 
 def _places(values: np.ndarray) -> np.ndarray:
@@ -297,31 +319,34 @@ def _places(values: np.ndarray) -> np.ndarray:
 
 def _variables(comparison: BaselineComparison) -> dict[Over, np.ndarray]:
     """Return the variables that are known at the samples of each axis, (n, m) each."""
-    time_s, axes = comparison.time_s, comparison.sensor.axes
+    time_s = comparison.time_s
+    axes = comparison.sensor.axes
     of_all = {Over.TIME: time_s - time_s[0]}
     surroundings = comparison.surroundings
     if 'temperature_c' in surroundings:
         temperature_c = surroundings['temperature_c']
         late_k = temperature_c - low_pass(temperature_c, _RATE_S, comparison.dt_s, {})
-        of_all |= {Over.TEMPERATURE: temperature_c, Over.TEMPERATURE_RATE: late_k * 60 / _RATE_S}
+        of_all[Over.TEMPERATURE] = temperature_c
+        of_all[Over.TEMPERATURE_RATE] = late_k * 60 / _RATE_S
     if 'supply_v' in surroundings:
         of_all[Over.SUPPLY] = surroundings['supply_v']
     if comparison.joints:
-        alpha, beta = (
-            [np.degrees(joint(time_s, order)) for order in range(3)] for joint in comparison.joints
-        )
-        of_all |= dict(zip((Over.ALPHA, Over.ALPHA_RATE, Over.ALPHA_ACCELERATION), alpha))
-        of_all |= dict(
-            zip((Over.BETA, Over.BETA_RATE, Over.BETA_ACCELERATION), (beta[0] % 360, *beta[1:]))
-        )
-    force_g, of_axes = comparison.reference_force_g(), {Over.OUTPUT: comparison.volts}
+        alpha, beta = comparison.joints
+        of_all[Over.ALPHA] = np.degrees(alpha(time_s))
+        of_all[Over.ALPHA_RATE] = np.degrees(alpha(time_s, 1))
+        of_all[Over.ALPHA_ACCELERATION] = np.degrees(alpha(time_s, 2))
+        of_all[Over.BETA] = np.degrees(beta(time_s)) % 360
+        of_all[Over.BETA_RATE] = np.degrees(beta(time_s, 1))
+        of_all[Over.BETA_ACCELERATION] = np.degrees(beta(time_s, 2))
+    of_axes = {Over.OUTPUT: comparison.volts}
+    force_g = comparison.reference_force_g()
     if force_g is not None:
-        own = force_g[[AXES.index(axis) for axis in axes]].T
-        of_axes |= {
-            Over.OWN_FORCE: own,
-            Over.FORCE_RATE: np.gradient(own, time_s, axis=0),
-            Over.CROSS_FORCE: force_g[[1 if axis == AXES[0] else 0 for axis in axes]].T,
-        }
+        own = force_g[comparison.sensor.axis_indices].T
+        # Across x is y; across y and z it is x.
+        across = [1 if axis == AXES[0] else 0 for axis in axes]
+        of_axes[Over.OWN_FORCE] = own
+        of_axes[Over.FORCE_RATE] = np.gradient(own, time_s, axis=0)
+        of_axes[Over.CROSS_FORCE] = force_g[across].T
         of_all[Over.FORCE_Z] = force_g[2]
     return of_axes | {name: np.repeat(v[:, None], len(axes), axis=1) for name, v in of_all.items()}
 
@@ -334,18 +359,17 @@ def _spectra(comparison: BaselineComparison, signals_v: Mapping[str, np.ndarray]
     """
     import pandas as pd
 
-    sensor, scale, densities = comparison.sensor, comparison.scale_v_per_mps2, {}
+    sensor = comparison.sensor
+    scale = comparison.scale_v_per_mps2
+    densities = {}
     for label, signal_v in signals_v.items():
         signal_mg = np.nan_to_num(mg(bridged(signal_v, comparison.used) / scale))
-        all_hz, power = (
-            v[1:]
-            for v in scipy.signal.welch(
-                signal_mg, sensor.rate_hz, axis=0, nperseg=min(_SEGMENT, len(signal_mg))
-            )
+        all_hz, power = scipy.signal.welch(
+            signal_mg, sensor.rate_hz, axis=0, nperseg=min(_SEGMENT, len(signal_mg))
         )
-        octave = np.floor(np.log2(all_hz / all_hz[0]) * _POINTS_PER_OCTAVE)
-        hz = pd.Series(all_hz).groupby(octave).mean().to_numpy()
-        densities[label] = np.sqrt(pd.DataFrame(power).groupby(octave).mean().to_numpy())
+        octave = np.floor(np.log2(all_hz[1:] / all_hz[1]) * _POINTS_PER_OCTAVE)
+        hz = pd.Series(all_hz[1:]).groupby(octave).mean().to_numpy()
+        densities[label] = np.sqrt(pd.DataFrame(power[1:]).groupby(octave).mean().to_numpy())
     densities['stated noise'] = mg(np.sqrt(noise.density_v2_per_hz(sensor, hz)) / scale)
     panels = []
     for d, axis in enumerate(sensor.axes):
@@ -367,10 +391,11 @@ def _spectra(comparison: BaselineComparison, signals_v: Mapping[str, np.ndarray]
 def waterfall(report: Report) -> Figure:
     """Draw the gap, what each effect takes off it, what stays, and the noise floor."""
     closure = report.closure
-    level, after, floor = (
-        float(mg(v)) for v in (closure.before.value, closure.after.value, closure.floor.value)
-    )
-    highest, above = max(level, after, floor), level**2 - floor**2
+    level = float(mg(closure.before.value))
+    after = float(mg(closure.after.value))
+    floor = float(mg(closure.floor.value))
+    highest = max(level, after, floor)
+    above = level**2 - floor**2
     bars = [('gap', 0.0, level, mg_text(closure.before.value), plots.BEFORE_COLOUR)]
     for name, share in sorted(words.shares_of_gap(report).items(), key=lambda item: -item[1]):
         if share > 0:
@@ -433,10 +458,10 @@ def _stacked(
 
 def signals(comparison: BaselineComparison, after: Sensor) -> Figure:
     """Draw recording, simulation and difference, before and after, with linked zoom."""
-    time_s, scale = comparison.time_s - comparison.time_s[0], comparison.scale_v_per_mps2
-    before_mg, after_mg = (
-        mg(comparison.residual_v(s) / scale) for s in (comparison.sensor, after)
-    )
+    time_s = comparison.time_s - comparison.time_s[0]
+    scale = comparison.scale_v_per_mps2
+    before_mg = mg(comparison.residual_v(comparison.sensor) / scale)
+    after_mg = mg(comparison.residual_v(after) / scale)
     recorded_g = mg((comparison.volts - comparison.sensor.zero_g_v) / scale) / 1e3
     contents = {
         '{}, g': [

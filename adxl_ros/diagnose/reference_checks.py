@@ -44,7 +44,8 @@ def _smoothed_g(comparison: BaselineComparison, volts: np.ndarray) -> np.ndarray
 
 def wrong_dynamic_factor(comparison: BaselineComparison) -> str | None:
     """Return what is wrong with the factor of a simulator's dynamic part; None if it is right."""
-    sensor, force = comparison.sensor, comparison.simulated_force
+    sensor = comparison.sensor
+    force = comparison.simulated_force
     if force is None or len(sensor.axes) < len(AXES):
         return None
     measured_g = _smoothed_g(comparison, comparison.volts)
@@ -105,7 +106,8 @@ def correlations(first: np.ndarray, second: np.ndarray, smallest: int) -> Correl
 
     one, two = np.ones(len(first)), np.ones(len(second))
     overlap = np.maximum(np.rint(products(one, two)), 1)
-    covariance, squares = np.zeros(len(overlap)), np.zeros((2, len(overlap)))
+    covariance = np.zeros(len(overlap))
+    squares = np.zeros((2, len(overlap)))
     for a, b in zip((first - first.mean(axis=0)).T, (second - second.mean(axis=0)).T):
         sum_a, sum_b = products(a, two), products(one, b)
         covariance += np.abs(products(a, b) - sum_a * sum_b / overlap)

@@ -15,12 +15,13 @@ from adxl_ros.diagnose.search import Hypothesis
 from adxl_ros.diagnose.verdict import Verdict
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern, Need
+from adxl_ros.model.effects.base import ActsOn, Coefficient, Concern, Effect, Need
 from adxl_ros.model.sensor import fitted_of, get, parameter_of, with_neutral
 from adxl_ros.process import option
 from adxl_ros.report import quantities
 from adxl_ros.report.quantities import amplitude_text, Interval, listed, mg_text, percent
 from adxl_ros.report.screen import COLUMNS, wrapped
+from adxl_ros.signals.findings import Shown
 import numpy as np
 
 _DIGITS = 6  # Significant digits of the report. Chosen: more than any of its numbers has
@@ -54,7 +55,7 @@ NOISE_STAYS = 'The effects are noise, which no simulation repeats sample by samp
 """Why effects on the noise close nothing."""
 
 
-class Row(NamedTuple):
+class FigureRow(NamedTuple):
     """One row of figures: what it is, its figures with their units, and a remark."""
 
     label: str
@@ -64,7 +65,8 @@ class Row(NamedTuple):
 
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the report as the objects of JSON; docs/reference/report_json.md lists its keys."""
-    fault, report = diagnosis.fault, diagnosis.report
+    fault = diagnosis.fault
+    report = diagnosis.report
     if report is None:
         assert fault is not None
         return {
@@ -85,7 +87,8 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
             'next_experiment': None,
             'summary': fault.message,
         }
-    verdict, proposal = report.verdict, report.next_experiment
+    verdict = report.verdict
+    proposal = report.next_experiment
     return _rounded(
         {
             'schema': 1,
@@ -100,8 +103,8 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
             'hypotheses': [h._asdict() for h in verdict.hypotheses],
             'gap': _gap(report),
             'explained': _power(verdict.explained),
-            'rest': _power(verdict.rest),
-            'rest_follows': verdict.rest_follows,
+            'rest': _power(verdict.remainder),
+            'rest_follows': verdict.remainder_follows,
             'material': verdict.material_mps2,
             'lost_without': {e: _power(p) for e, p in verdict.lost_without.items()},
             'where': [
@@ -188,7 +191,8 @@ def _power(power: Interval) -> dict[str, Any]:
 
 def _gap(report: Report) -> dict[str, Any]:
     """Return the gap before and after, and the noise recording by recording."""
-    closure, verdict = report.closure, report.verdict
+    closure = report.closure
+    verdict = report.verdict
     figures: dict[str, Any] = {'unit': 'm/s^2'}
     for name, figure in closure._asdict().items():
         figures |= {name: figure.value, f'{name}_ci': (figure.low, figure.high)}
@@ -208,7 +212,8 @@ def _gap(report: Report) -> dict[str, Any]:
 
 def shares_of_gap(report: Report) -> dict[str, float]:
     """Split the closed share of the squared gap among the effects by what is lost without each."""
-    verdict, closure = report.verdict, report.closure
+    verdict = report.verdict
+    closure = report.closure
     if not verdict.best & {*verdict.named}:
         return {}
     lost = {effect: max(power.value, 0.0) for effect, power in verdict.lost_without.items()}
@@ -219,8 +224,10 @@ def shares_of_gap(report: Report) -> dict[str, float]:
 
 def _candidates(report: Report) -> list[dict[str, Any]]:
     """Return the effects of all hypotheses and detections, the most probable first."""
-    verdict, shown = report.verdict, {row.name.effect: row for row in report.could_show}
-    detected, shares = {d.effect: d for d in report.detections}, shares_of_gap(report)
+    verdict = report.verdict
+    shown = {row.name.effect: row for row in report.could_show}
+    detected = {d.effect: d for d in report.detections}
+    shares = shares_of_gap(report)
     out = []
     for name, effect in library().items():
         sets = [h for h in verdict.hypotheses if name in h.effects]
@@ -261,7 +268,8 @@ def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> d
 
     A parameter that the recordings do not determine has no value.
     """
-    names, sensor = fitted_of(effect_named(effect), report.sensor.axes), report.sensor
+    names = fitted_of(effect_named(effect), report.sensor.axes)
+    sensor = report.sensor
     if effect_named(effect).diagnosis.drift and effect in sensor.effects:
         # The density of a drift is chosen with the noise, on a grid.
         return {
@@ -270,7 +278,8 @@ def _parameters(report: Report, hypothesis: Hypothesis | None, effect: str) -> d
         }
     if hypothesis is None:
         return {}
-    parameters, values = dict[str, dict[str, Any]](), get(hypothesis.sensor, hypothesis.names)
+    parameters = dict[str, dict[str, Any]]()
+    values = get(hypothesis.sensor, hypothesis.names)
     for name, value, std, is_open in zip(
         hypothesis.names, values.tolist(), hypothesis.std, hypothesis.undetermined
     ):
@@ -315,11 +324,12 @@ def headline(diagnosis: Diagnosis) -> str:
         assert diagnosis.fault is not None
         return diagnosis.fault.message
     verdict = diagnosis.report.verdict
-    sure, share = f'({percent(verdict.probability)} sure)', verdict.explained_share
+    sure = f'({percent(verdict.probability)} sure)'
+    share = verdict.explained_share
     named = listed([*verdict.effects, *(listed(group, 'or') for group in verdict.groups)], 'and')
     rest = amplitude_text(verdict.remaining)
-    where = [_DIMENSIONS[d] for d in verdict.rest_follows[:_MOST_DIMENSIONS]]
-    follows = f' It follows {listed(where, "and")}.' if where and verdict.rest.low > 0 else ''
+    where = [_DIMENSIONS[d] for d in verdict.remainder_follows[:_MOST_DIMENSIONS]]
+    follows = f' It follows {listed(where, "and")}.' if where and verdict.remainder.low > 0 else ''
     separate = ': the data do not separate them' if verdict.groups else ''
     noise = f' {NOISE_STAYS}' if is_only_noise(diagnosis.report) else ''
     in_reference = [e for e in verdict.effects if effect_named(e).concern is Concern.REFERENCE]
@@ -375,14 +385,15 @@ def summary(diagnosis: Diagnosis) -> str:
     )
 
 
-def figure_rows(diagnosis: Diagnosis) -> list[Row]:
+def figure_rows(diagnosis: Diagnosis) -> list[FigureRow]:
     """Return the figures from which the verdict follows: the same for terminal, page and JSON."""
     report = diagnosis.report
     assert report is not None
-    closure, verdict = report.closure, report.verdict
+    closure = report.closure
+    verdict = report.verdict
     compared = any(c.pose_known for c in diagnosis.comparisons)
     rows = [
-        Row(
+        FigureRow(
             'gap',
             f'{mg_text(closure.before.value)} rms',
             'recording minus simulation'
@@ -391,17 +402,18 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
         )
     ]
     if closes(report):
-        low, high = (percent(share) for share in (closure.closed.low, closure.closed.high))
+        low = percent(closure.closed.low)
+        high = percent(closure.closed.high)
         ci = '' if low == high else f', 90 % interval {low} to {high}'
         rows.append(
-            Row(
+            FigureRow(
                 'with the effects',
                 f'{mg_text(closure.after.value)} rms',
                 f'{percent(closure.closed.value)} closed, held out{ci}',
             )
         )
     rows.append(
-        Row(
+        FigureRow(
             'noise floor',
             f'{mg_text(closure.floor.value)} rms',
             _FLOOR_SOURCES[report.noise_floor.source],
@@ -409,11 +421,13 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
     )
     if verdict.status in _WITHOUT_GAP:
         rows.append(
-            Row('upper limit', mg_text(verdict.upper_limit_mps2), 'a larger gap would have shown')
+            FigureRow(
+                'upper limit', mg_text(verdict.upper_limit_mps2), 'a larger gap would have shown'
+            )
         )
     else:
         rows.append(
-            Row(
+            FigureRow(
                 'explained',
                 quantities.power_text(verdict.explained),
                 'by ' + listed(sorted(verdict.best), 'and')
@@ -423,15 +437,15 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
         )
     rows += beside_rows(report)
     rows.append(
-        Row(
+        FigureRow(
             'repeats, not explained',
-            quantities.power_text(verdict.rest),
+            quantities.power_text(verdict.remainder),
             'by flexible functions, held out',
         )
     )
     rows += [
-        Row('material', f'from {mg_text(verdict.material_mps2)}', 'smaller is no gap'),
-        Row(
+        FigureRow('material', f'from {mg_text(verdict.material_mps2)}', 'smaller is no gap'),
+        FigureRow(
             'errors of the reference',
             mg_text(verdict.reference_mps2),
             'what follows the pose must exceed them, too',
@@ -440,7 +454,7 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
     fading_hz = [c.fading_hz for c in diagnosis.comparisons if c.fading_hz is not None]
     if report.linear_model.lost_motion_mps2:
         rows.append(
-            Row(
+            FigureRow(
                 'not in the reference',
                 f'{mg_text(report.linear_model.lost_motion_mps2)} rms',
                 f'motion above {min(fading_hz) / 2:.2g} Hz',
@@ -448,7 +462,7 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
         )
     if len(verdict.lost_without) > 1 and closes(report):
         rows += [
-            Row(
+            FigureRow(
                 f'lost without {effect}',
                 amplitude_text(power.value),
                 ' to '.join(amplitude_text(p) for p in (power.low, power.high)),
@@ -458,13 +472,15 @@ def figure_rows(diagnosis: Diagnosis) -> list[Row]:
     return rows
 
 
-def beside_rows(report: Report) -> list[Row]:
+def beside_rows(report: Report) -> list[FigureRow]:
     """
     Return how zero-g and scale factor changed beside the effects, where that is material.
 
     A calibration may have taken them up of the effects, so that both belong together.
     """
-    verdict, sensor, texts = report.verdict, report.sensor, list[str]()
+    verdict = report.verdict
+    sensor = report.sensor
+    texts = []
     straight = [
         e
         for e in library().values()
@@ -482,13 +498,13 @@ def beside_rows(report: Report) -> list[Row]:
                 )
                 texts.append(f'{effect.name} {name.axis} {size}')
     return (
-        [Row('with them', ', '.join(texts), 'a calibration may have taken this up of them')]
+        [FigureRow('with them', ', '.join(texts), 'a calibration may have taken this up of them')]
         if texts
         else []
     )
 
 
-def remainder_rows(report: Report) -> list[Row]:
+def remainder_rows(report: Report) -> list[FigureRow]:
     """Return what remains of each noise-like effect."""
 
     def text(value: float, unit: str) -> str:
@@ -497,7 +513,7 @@ def remainder_rows(report: Report) -> list[Row]:
         return f'{100 * value:.2g} %' if unit == '1' else f'{value:.2g} a second'
 
     return [
-        Row(
+        FigureRow(
             f'{r.effect}, {r.quantity}{f" on {r.axis}" if r.axis else ""}',
             '{} recorded, {} simulated, {} left'.format(
                 *(
@@ -526,25 +542,26 @@ def closes(report: Report) -> bool:
     )
 
 
-def shows_row(row: CouldShow, scale_v_per_g: float) -> tuple[str, str, str, str]:
-    """Return effect, smallest and typical size, and what is missing to show it; '' for nothing."""
-    p, effect = parameter_of(row.name), effect_named(row.name.effect)
-    smallest, typical = (
-        quantities.parameter_text({'value': v, 'unit': p.unit}, scale_v_per_g, 2)
-        for v in (row.smallest, p.scale)
-    )
+def as_shown(row: CouldShow, scale_v_per_g: float) -> Shown:
+    """Return smallest and typical size of an effect, and what is missing to show it."""
+    effect = effect_named(row.name.effect)
+    parameter = parameter_of(row.name)
+
+    def text(size: float) -> str:
+        return quantities.parameter_text({'value': size, 'unit': parameter.unit}, scale_v_per_g, 2)
+
+    typical = text(parameter.scale)
     if row.shows:
-        return effect.name, smallest, typical, ''
+        return Shown(effect.name, text(row.smallest), typical, '')
+    return Shown(effect.name, 'cannot show', typical, _missing(effect))
+
+
+def _missing(effect: Effect) -> str:
+    """Return what is missing to show an effect."""
+    if effect.concern is Concern.REFERENCE:
+        return f'needs {option("urdf" if Need.ROBOT in effect.needs else "sim")}'
     revealed_by = effect.diagnosis.revealed_by
-    reference = f'needs {option("urdf" if Need.ROBOT in effect.needs else "sim")}'
-    missing = (
-        reference
-        if effect.concern is Concern.REFERENCE
-        else f'needs: {MENU[revealed_by].text}'
-        if revealed_by
-        else 'no manoeuvre shows it'
-    )
-    return effect.name, 'cannot show', typical, missing
+    return f'needs: {MENU[revealed_by].text}' if revealed_by else 'no manoeuvre shows it'
 
 
 _BADGE_COLUMNS = 29  # Columns of the verdict
@@ -556,14 +573,18 @@ _SHARE_COLUMNS = 7  # Columns of the share of the gap there
 
 def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     """Return the diagnosis as lines of at most `COLUMNS` columns; the first one is the subject."""
-    lines, word, report = [*wrapped(subject), ''], badge(diagnosis), diagnosis.report
+    lines = [*wrapped(subject), '']
+    word = badge(diagnosis)
+    report = diagnosis.report
     labelled = [('note', note) for note in notes(diagnosis)]
     if report is None:
         return (
             lines + wrapped(f'{word}  {headline(diagnosis)}', len(word) + 2) + _labelled(labelled)
         )
-    objects, rows = as_json(diagnosis), figure_rows(diagnosis)
-    closure, first = report.closure, {row.label: row.note for row in rows}
+    objects = as_json(diagnosis)
+    rows = figure_rows(diagnosis)
+    closure = report.closure
+    note_of = {row.label: row.note for row in rows}
     # The gap, with the effects, and the floor stand in the first line.
     after = f' -> {mg_text(closure.after.value)}' if closes(report) else ''
     gap = f'{mg_text(closure.before.value)}{after} rms'
@@ -571,16 +592,20 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
         f'{word:{_BADGE_COLUMNS - 1}} {gap:{_GAP_COLUMNS - 1}} noise floor '
         f'{mg_text(closure.floor.value)}'
     )
-    remark = first.get('with the effects', '' if 'sim' in first['gap'] else f'gap {first["gap"]}')
-    for text in (remark, f'noise floor {first["noise floor"]}'):
+    without_effects = '' if 'sim' in note_of['gap'] else f'gap {note_of["gap"]}'
+    remark = note_of.get('with the effects', without_effects)
+    for text in (remark, f'noise floor {note_of["noise floor"]}'):
         beside = wrapped(text, columns=COLUMNS - _BADGE_COLUMNS)
         lines += [' ' * _BADGE_COLUMNS + part for part in beside]
     if report.verdict.status != 'explained' or 'REFERENCE' in word:
         lines += wrapped(headline(diagnosis))
     elif is_only_noise(report):
         lines += wrapped(NOISE_STAYS)
-    shown = report.could_show
-    hidden = ', '.join(row.name.effect for row in shown if not row.shows)
+    could_show = report.could_show
+    shows = f'{sum(row.shows for row in could_show)} of {len(could_show)} effects could show'
+    hidden = ', '.join(row.name.effect for row in could_show if not row.shows)
+    if hidden:
+        shows += f'; could not: {hidden}'
     return [
         *lines,
         *_effect_table(report, objects),
@@ -592,11 +617,7 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
                     '; '.join(f'{row.label} {row.text}' for row in rows[2 + closes(report) :]),
                 ),
                 *(('noise', f'{row.label}: {row.text}') for row in remainder_rows(report)),
-                (
-                    'shows',
-                    f'{sum(row.shows for row in shown)} of {len(shown)} effects could show'
-                    + f'; could not: {hidden}' * bool(hidden),
-                ),
+                ('shows', shows),
                 *(
                     ('cause', f'{name}: {effect_named(name).cause}')
                     for name in named_effects(report, objects)
@@ -621,17 +642,16 @@ def _effect_table(report: Report, objects: dict[str, Any]) -> list[str]:
     candidates = {c['effect']: c for c in objects['candidates']}
     width = max(map(len, ('effect', *named))) + 2
     size_columns = COLUMNS - 1 - width - _SURE_COLUMNS - _SHARE_COLUMNS
-    lines = (
-        [
+    lines = []
+    if named:
+        lines = [
             '',
             f' {"effect":{width}}{"sure":{_SURE_COLUMNS}}'
             f'{"size (90 % interval)":{size_columns - 6}} share of gap',
         ]
-        if named
-        else []
-    )
     for name in named:
-        share, sure = candidates[name]['share'], percent(candidates[name]['probability'])
+        share = candidates[name]['share']
+        sure = percent(candidates[name]['probability'])
         sizes: list[str] = []
         for size in size_lines(report, candidates[name]):
             sizes += wrap(size, size_columns - 1, subsequent_indent='  ')
@@ -648,9 +668,12 @@ def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
     """Return one line for each parameter; those that may be 0 share the last line."""
     parameters = candidate['parameters']
     is_single = len({key.partition('.')[0] for key in parameters}) == 1
-    lines, zeros, all_v_per_g = [], [], report.baseline.scale_v_per_g
+    lines = []
+    zeros = []
+    all_v_per_g = report.baseline.scale_v_per_g
     for key, parameter in parameters.items():
-        label, ci = quantities.parameter_label(key, is_single), parameter.get('ci')
+        label = quantities.parameter_label(key, is_single)
+        ci = parameter.get('ci')
         if ci and ci[0] <= 0 <= ci[1]:
             zeros.append(label)
         else:
@@ -658,14 +681,15 @@ def size_lines(report: Report, candidate: dict[str, Any]) -> list[str]:
                 key.partition('.')[2], all_v_per_g.mean()
             )
             lines.append(f'{label} {quantities.parameter_text(parameter, float(scale))}'.strip())
-    return lines + (
-        [f'{", ".join(zeros)}: not different from 0'.removeprefix(': ')] if zeros else []
-    )
+    if zeros:
+        lines.append(f'{", ".join(zeros)}: not different from 0'.removeprefix(': '))
+    return lines
 
 
 def _labelled(rows: Sequence[tuple[str, str]]) -> list[str]:
     """Return texts behind their labels, wrapped between words; equal labels stand once."""
-    lines, last = [], ''
+    lines = []
+    last = ''
     for label, text in rows:
         shown = '' if label == last else label
         lines += wrapped(f' {shown:{_LABEL_COLUMNS - 1}}{text}', _LABEL_COLUMNS)

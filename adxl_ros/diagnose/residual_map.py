@@ -75,7 +75,8 @@ class _Cell(NamedTuple):
 
 def dimensions(comparison: BaselineComparison) -> dict[str, np.ndarray]:
     """Return the dimensions of the map by name, (n,) each, without constant ones."""
-    time_s, force_g = comparison.time_s, comparison.reference_force_g()
+    time_s = comparison.time_s
+    force_g = comparison.reference_force_g()
     values = {'time_s': time_s - time_s[0], **comparison.surroundings}
     if force_g is not None:
         values |= {f'force_{axis}_g': f for axis, f in zip(AXES, force_g)}

@@ -87,7 +87,8 @@ class Hypothesis:
     def sizeless(self) -> frozenset[str]:
         """Effects whose determined sizes all agree with the baseline, by 90 % intervals."""
         differs = np.abs(self.values) > Z_90 * self.std
-        sized, differing = set[str](), set[str]()
+        sized = set[str]()
+        differing = set[str]()
         for name, shows, is_open in zip(self.names, differs, self.undetermined):
             if parameter_of(name).is_size and not is_open:
                 sized.add(name.effect)
@@ -104,7 +105,8 @@ class Hypothesis:
             for i, name in enumerate(self.names)
             if name.effect == effect and parameter_of(name).is_size
         ]
-        squares, varying = 0.0, 0.0
+        squares = 0.0
+        varying = 0.0
         for channel in self.linearised.columns:
             shown = [(k, i) for k, i in enumerate(channel.places) if i in own]
             change_v = sum(self.values[i] * channel.own[:, 1 + k] for k, i in shown)
@@ -303,7 +305,8 @@ def fit_hypothesis(
     def iterate_at(values: np.ndarray) -> _HypothesisIterate:
         at_values = put(sensor, names, np.clip(values, low, high))
         linearised = linearise(linear_model, effects, at_values, filters)
-        fit, j = linearised.fit(), len(names)
+        fit = linearised.fit()
+        j = len(names)
         present = linearised.values - linearised.prior_mean[:j]
         return _HypothesisIterate(
             values=linearised.values,
@@ -566,7 +569,8 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
     Filter and latency stay those of the parameter file, unless they are effects of the set, so
     that their tolerance is the same as before.
     """
-    file_values, values = with_neutral(model.baseline, best.sensor.effects).values, {}
+    file_values = with_neutral(model.baseline, best.sensor.effects).values
+    values = {}
     for effect, fitted in best.sensor.values.items():
         hints = effect_named(effect).diagnosis
         stays = hints.nuisance and not hints.straight_line and effect not in best.effects

@@ -67,7 +67,7 @@ def blocks(
         info = read_info(bag, topics.info)
         tracks = _tracks(bag, topics)
         commands = _commands(bag, topics)
-        samples = _Samples(
+        samples = _WaitingSamples(
             f'{bag.path}: topic {topics.imu}', AXES if ideal else info.get('axes'), reading
         )
         for piece in bag.pieces([topics.imu]):
@@ -95,7 +95,7 @@ class _Rows(NamedTuple):
         return _Rows(*map(np.concatenate, zip(self, later)))
 
 
-class _Samples:
+class _WaitingSamples:
     """The sensor's samples that have been read but not yet handed on."""
 
     def __init__(self, where: str, axes: str | None, reading: ReadingOptions) -> None:
@@ -204,7 +204,7 @@ class _Samples:
             )
 
 
-Values = Callable[[cdr.Table], Mapping[str, np.ndarray]]
+Values = Callable[[cdr.MessageTable], Mapping[str, np.ndarray]]
 """Returns the columns of messages, (k,) each, by name."""
 
 
@@ -252,7 +252,9 @@ def series(bag: Bag, topic: str, find: Callable[[bytes], cdr.Layout], values: Va
     return Series(np.concatenate(stamps)[order], log_ns[order], joined)
 
 
-def positions(table: cdr.Table, names: Mapping[str, str] | None = None) -> dict[str, np.ndarray]:
+def positions(
+    table: cdr.MessageTable, names: Mapping[str, str] | None = None
+) -> dict[str, np.ndarray]:
     """Return the positions of joints by column, or of all joints by name."""
     if 'position' not in table.layout.fields:
         return {}
@@ -282,7 +284,7 @@ def _tracks(bag: Bag, topics: Topics) -> dict[str, Track]:
     return tracks
 
 
-def _first(table: cdr.Table, column: str, field: str) -> dict[str, np.ndarray]:
+def _first(table: cdr.MessageTable, column: str, field: str) -> dict[str, np.ndarray]:
     """Return the first number of a field as a column."""
     return {column: table.numbers(field)[:, 0]}
 
@@ -333,7 +335,7 @@ def _commands(bag: Bag, topics: Topics) -> dict[str, _Commands]:
 
 def _block(
     bag: Bag,
-    samples: _Samples,
+    samples: _WaitingSamples,
     tracks: Mapping[str, Track],
     commands: Mapping[str, _Commands],
     info: Mapping[str, str],

@@ -28,7 +28,7 @@ from adxl_ros.files.bag_messages import (
 from adxl_ros.files.column_mapping import Columns
 from adxl_ros.files.recording_columns import COMMANDS, converted_info, JOINTS, Recording
 from adxl_ros.files.tables import TABLE_ENDINGS
-from adxl_ros.model.covariance import imu_covariance
+from adxl_ros.model.covariance import imu_covariance, NOT_MEASURED
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -40,7 +40,7 @@ _END_OF_TIME_NS = (1 << 31) * 1_000_000_000
 _LONGEST_NS = (1 << 63) - 1  # Largest duration of ROS, ns: a QoS without a deadline
 
 
-class Form(NamedTuple):
+class TopicForm(NamedTuple):
     """How the messages of a topic are written."""
 
     kind: str  # Their type
@@ -65,7 +65,7 @@ class _NewBag:
             )
         return self.connections[topic]
 
-    def batch(self, topic: str, form: Form, stamp_ns: np.ndarray, fields: Columns) -> Batch:
+    def batch(self, topic: str, form: TopicForm, stamp_ns: np.ndarray, fields: Columns) -> Batch:
         """Return the messages of a topic at stamps, ns, (n,), rising."""
         return Batch(
             self.connection(topic, form.kind),
@@ -220,7 +220,7 @@ def _joint_batches(
         if sampled:
             yield bag.batch(
                 topic,
-                Form(JOINT_STATE, cdr.joint_state, template),
+                TopicForm(JOINT_STATE, cdr.joint_state, template),
                 stamp_ns[rows],
                 {'position': values[rows][:, pattern]},
             )
@@ -253,21 +253,23 @@ def angular_velocity(
     covariance[:, [0, 4, 8]] = variance
     return {
         'angular_velocity': np.where(is_taken, gyro_radps, 0.0),
-        'angular_velocity_covariance': np.where(is_taken, covariance, _ABSENT),
+        'angular_velocity_covariance': np.where(is_taken, covariance, NOT_MEASURED),
     }
 
 
-_ABSENT = np.array([-1.0, *[0.0] * 8])
-"""Covariance of a quantity that is not measured (REP-145)."""
-
-
-def _imu_form(covariance: np.ndarray) -> Form:
+def _imu_form(covariance: np.ndarray) -> TopicForm:
     """Return the form of an Imu without orientation and rate, by its covariance, (9,)."""
-    return Form(
+    return TopicForm(
         IMU,
         cdr.imu,
         cdr.message(
-            FRAME, [0.0, 0.0, 0.0, 1.0], _ABSENT, np.zeros(3), _ABSENT, np.zeros(3), covariance
+            FRAME,
+            [0.0, 0.0, 0.0, 1.0],
+            NOT_MEASURED,
+            np.zeros(3),
+            NOT_MEASURED,
+            np.zeros(3),
+            covariance,
         ),
     )
 
@@ -279,12 +281,12 @@ _SCALARS = {
     'temperature_c': (
         '/temperature',
         'temperature',
-        Form(TEMPERATURE, cdr.temperature, cdr.message(FRAME, np.zeros(2))),
+        TopicForm(TEMPERATURE, cdr.temperature, cdr.message(FRAME, np.zeros(2))),
     ),
     'supply_v': (
         '/supply',
         'voltage',
-        Form(
+        TopicForm(
             # Three states, present, no cell voltages and temperatures, location, serial number.
             BATTERY_STATE,
             cdr.battery_state,
@@ -305,7 +307,7 @@ def tilt_bag(path: AnyPath) -> Iterator[Callable[..., None]]:
     """
     forms = {
         '/imu/data': _imu_form(np.zeros(9)),
-        '/tilt': Form(
+        '/tilt': TopicForm(
             'geometry_msgs/msg/Vector3Stamped',
             cdr.vector3_stamped,
             cdr.message(FRAME, np.zeros(3)),

@@ -138,7 +138,7 @@ def message(stamped_frame: str, *parts: str | int | Sequence[float] | np.ndarray
 
 
 @dataclass(frozen=True)
-class Table:
+class MessageTable:
     """Messages of one layout."""
 
     rows: np.ndarray  # Their indices among the messages that were given, (n,)
@@ -164,7 +164,9 @@ class Table:
         return sec * 1_000_000_000 + nanosec
 
 
-def tables(raws: Sequence[bytes] | np.ndarray, find: Callable[[bytes], Layout]) -> Iterator[Table]:
+def tables(
+    raws: Sequence[bytes] | np.ndarray, find: Callable[[bytes], Layout]
+) -> Iterator[MessageTable]:
     """Group messages by layout; an array has one of equal length in each row."""
     if isinstance(raws, np.ndarray):
         groups = [(np.arange(len(raws)), raws)]
@@ -180,9 +182,9 @@ def tables(raws: Sequence[bytes] | np.ndarray, find: Callable[[bytes], Layout]) 
             layout = find(data[0].tobytes())
             differs = (data[:, layout.fixed] != data[0, layout.fixed]).any(axis=1)
             if not differs.any():  # as usual: no copy
-                yield Table(rows, data, layout)
+                yield MessageTable(rows, data, layout)
                 break
-            yield Table(rows[~differs], data[~differs], layout)
+            yield MessageTable(rows[~differs], data[~differs], layout)
             rows = rows[differs]
             data = data[differs]
 

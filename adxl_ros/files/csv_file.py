@@ -58,7 +58,7 @@ _COMMENT = re.compile(r'\s*(#|//|%)')  # Begin of a comment
 
 
 @dataclass(frozen=True)
-class Form:
+class TableForm:
     """How a text table is written."""
 
     # The columns as the header states them; the number from 1 of one without a name of its own
@@ -84,7 +84,7 @@ class Form:
 
 
 def read_blocks(
-    path: str, form: Form, names: Collection[str], required: Collection[str]
+    path: str, form: TableForm, names: Collection[str], required: Collection[str]
 ) -> Iterator[TableBlock]:
     """
     Yield some columns of numbers in blocks of rows.
@@ -197,7 +197,7 @@ def _by_pandas(
 
 def _field_by_field(
     data: bytes,
-    form: Form,
+    form: TableForm,
     used: Sequence[str],
     required: Collection[str],
     place: Callable[[int, int], str],
@@ -228,7 +228,7 @@ def _field_by_field(
     return columns
 
 
-def find_form(path: str) -> Form:
+def find_form(path: str) -> TableForm:
     """
     Return the form of a table by its first lines.
 
@@ -278,7 +278,7 @@ def find_form(path: str) -> Form:
     return form
 
 
-def _form(lines: Sequence[str], plain: Sequence[str], index: int, delimiter: str) -> Form:
+def _form(lines: Sequence[str], plain: Sequence[str], index: int, delimiter: str) -> TableForm:
     """Return the form of a table whose samples begin at a line, by its lines and plain lines."""
     count = len(_fields(plain[index], delimiter))
     header_line, header = _header(lines[:index], delimiter, count)
@@ -293,11 +293,11 @@ def _form(lines: Sequence[str], plain: Sequence[str], index: int, delimiter: str
     return _named(header or [''] * count, header_line, index + 1, delimiter, is_worded)
 
 
-def _named(names: Sequence[str], *about: Any) -> Form:
+def _named(names: Sequence[str], *about: Any) -> TableForm:
     """Return a form with distinct names: one that is empty or stands twice gives its number."""
     names = [' '.join(name.split()) for name in names]
     repeated = next((name for name in names if name and names.count(name) > 1), '')
-    return Form(
+    return TableForm(
         tuple(
             name if name and names.count(name) == 1 else str(i + 1) for i, name in enumerate(names)
         ),
@@ -372,9 +372,8 @@ def _plain(data: bytes) -> bytes:
 
 def _since_1970(date: re.Match[bytes]) -> bytes:
     """Return the seconds since 1970 of a date and time, in nanoseconds."""
-    year, month, day, time, hours, minutes = (
-        part.decode() if part else '0' for part in date.groups()
-    )
+    parts = [part.decode() if part else '0' for part in date.groups()]
+    year, month, day, time, hours, minutes = parts
     try:
         stamp = np.datetime64(f'{year}-{month}-{day}T{time.replace(",", ".")}', 'ns')
     except ValueError:

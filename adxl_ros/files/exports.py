@@ -21,7 +21,7 @@ from adxl_ros.files import parameter_file
 from adxl_ros.files.parameter_file import float_text
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.covariance import UNMEASURED_VARIANCE
+from adxl_ros.model.covariance import NOT_MEASURED, UNMEASURED_VARIANCE
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Place
 from adxl_ros.model.noise import ONE_SIDED
@@ -40,8 +40,6 @@ STEPS = 'ADC steps'  # Name of a part: rounding
 _TEMPLATES = Path(__file__).with_name('export_templates')  # What the files are made of
 _NOT_HELD = 'not held'  # In place of the place of a part that a file lacks
 _SMALLEST_MG = 5e-4  # Size below which a part counts as 0, mg; chosen: half of the last digit
-_ABSENT = np.diag([-1.0, 0.0, 0.0])
-"""Covariance of a quantity that the sensor does not measure (sensor_msgs/Imu)."""
 
 
 @dataclass(frozen=True)
@@ -302,7 +300,7 @@ def text(name: str, export: Export) -> str:
         arm_m=arm_m(sensor),
         delay_s=delay_s(sensor),
         gain=coupling.tolist(),
-        absent=_ABSENT.ravel().tolist(),
+        absent=NOT_MEASURED.tolist(),
         walk_a_sample=tuple(density / sensor.rate_hz**0.5 for density in values['walk_density']),
         largest_mps2=_largest_mps2(sensor),
         covariance=np.diag(variance).ravel().tolist(),

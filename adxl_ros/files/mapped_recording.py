@@ -363,11 +363,14 @@ class _Converter:
             right = f'if that is right, give {option(rate=f"{rate_hz:.6g}")}'
             if is_whole and step == 1:
                 right = f'if it counts samples, give {option(rate="HZ")}'
-            is_other = unit != source.unit
+            paste = ''
+            if unit != source.unit:
+                right += f', and if they are {unit}:'
+                paste = pasted(columns=str(fitting))
             raise UserError(
                 f'{self._path}: {source.column} has steps of {step:.4g}, which as {source.unit} '
-                f'are {rate_hz:.6g} Hz; {right}' + f', and if they are {unit}:' * is_other,
-                pasted(columns=str(fitting)) if is_other else '',
+                f'are {rate_hz:.6g} Hz; {right}',
+                paste,
             )
 
 

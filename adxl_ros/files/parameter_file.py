@@ -527,8 +527,7 @@ class _FlatReader:
                     key,
                     f'{len(values)} values, expected three: {about["doc"]}, {about["unit"]}',
                 )
-                is_size = not name.startswith(('bias_radps', 'bias_per_k_radps', 'temperature'))
-                self._require(not is_size or (values >= 0).all(), key, 'is below 0')
+                self._require(about['has_sign'] or (values >= 0).all(), key, 'is below 0')
                 stated[name] = tuple(values.tolist())
         return Gyroscope(**stated)
 

@@ -21,17 +21,22 @@ _TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 _BASE = ('x_m', 'y_m', 'z_m', 'qx', 'qy', 'qz', 'qw')
 """Columns of the pose of the base in a table, behind `base_`."""
 
-Track = tuple[np.ndarray, np.ndarray]  # Time, s, (k,), and values, (k,) or (k, 7)
+
+class JointTrack(NamedTuple):
+    """Readings of a joint, or of the base."""
+
+    time_s: np.ndarray  # (k,), rising
+    values: np.ndarray  # (k,), or (k, 7) of the base
 
 
-class Readings(NamedTuple):
+class RobotReadings(NamedTuple):
     """What a recording says of a robot."""
 
     path: str  # The recording, for messages
-    joints: Mapping[str, Track]  # Readings, rad or m, by name of the joint
+    joints: Mapping[str, JointTrack]  # Readings, rad or m, by name of the joint
     # Pose of the base in the world: x, y, z, m, and a quaternion x, y, z, w; None for a base that
     # is at rest and level
-    base: Track | None = None
+    base: JointTrack | None = None
 
 
 def read(
@@ -40,7 +45,7 @@ def read(
     topic: str = '',
     root: str = '',
     needs_joints: bool = True,
-) -> Readings:
+) -> RobotReadings:
     """
     Read joints and base of a robot.
 
@@ -60,7 +65,7 @@ def read(
 
     Returns
     -------
-    Readings
+    RobotReadings
         Times, s, and values of each joint.
 
     Raises
@@ -84,10 +89,10 @@ def read(
                 name: _track((stamp_ns - epoch_ns) / 1e9, values)
                 for name, values in columns.items()
             }
-        return Readings(str(path), joints, _base(bag, root, epoch_ns))
+        return RobotReadings(str(path), joints, _base(bag, root, epoch_ns))
 
 
-def _from_table(path: str) -> Readings:
+def _from_table(path: str) -> RobotReadings:
     table = open_table(path)
     if 'time_s' not in table.names:
         raise UserError(f'{path}: no column time_s beside the joints of a robot')
@@ -100,18 +105,18 @@ def _from_table(path: str) -> Readings:
     base = base if set(base) <= set(table.names) else []
     columns = table.read(['time_s', *joints, *base])
     times = columns['time_s']
-    return Readings(
+    return RobotReadings(
         path,
         {joint: _track(times, columns[name]) for name, joint in joints.items()},
         _track(times, np.column_stack([columns[name] for name in base])) if base else None,
     )
 
 
-def _track(time_s: np.ndarray, values: np.ndarray) -> Track:
+def _track(time_s: np.ndarray, values: np.ndarray) -> JointTrack:
     """Return the finite readings in the order of their times, each time once."""
     known = np.isfinite(values).reshape(len(values), -1).all(axis=1)
-    time_s, first = np.unique(time_s[known], return_index=True)
-    return time_s, values[known][first]
+    read_s, first = np.unique(time_s[known], return_index=True)
+    return JointTrack(read_s, values[known][first])
 
 
 def _poses_in(message: Any, kind: str, root: str) -> list[tuple]:
@@ -126,7 +131,7 @@ def _poses_in(message: Any, kind: str, root: str) -> list[tuple]:
     ]
 
 
-def _base(bag: Bag, root: str, epoch_ns: int) -> Track | None:
+def _base(bag: Bag, root: str, epoch_ns: int) -> JointTrack | None:
     """Return the pose of the base by odometry, or else by tf; None where neither moves it."""
     store = typestore()
     kinds = dict(sorted(bag.types))

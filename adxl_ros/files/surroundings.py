@@ -70,15 +70,13 @@ class Surroundings:
 
     def __call__(self, block: Recording) -> dict[str, np.ndarray]:
         """Return the values at the samples of a block, (n,) each, by column; never NaN."""
+        if not len(block):
+            return {}
         missing = np.full(len(block), np.nan)
-        return (
-            {
-                name: quantity.filled(block.time_s, block.columns.get(name, missing))
-                for name, quantity in self._quantities.items()
-            }
-            if len(block)
-            else {}
-        )
+        return {
+            name: quantity.filled(block.time_s, block.columns.get(name, missing))
+            for name, quantity in self._quantities.items()
+        }
 
     def assumed(self, effects: Iterable[str]) -> list[str]:
         """Return what is assumed of what the named effects follow, one line each, for people."""

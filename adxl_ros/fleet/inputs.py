@@ -59,7 +59,7 @@ _MANIFEST_COLUMNS = ('url', 'serial', 'params', 'date')  # Columns of a manifest
 
 
 @dataclass(frozen=True)
-class Source:
+class FoundRecording:
     """One recording, as it was found."""
 
     url: str  # Its address; an absolute path for a file of this machine
@@ -101,9 +101,9 @@ def file_system(address: str) -> tuple[Any, str]:
     raise UserError(without_secrets(f'{address}: {reason}'))
 
 
-def find_sources(inputs: Iterable[str]) -> list[Source]:
+def find_sources(inputs: Iterable[str]) -> list[FoundRecording]:
     """Find the recordings of a command line; the table of a fleet is none."""
-    sources: dict[str, Source] = {}
+    sources: dict[str, FoundRecording] = {}
     for text in inputs:
         try:
             sources |= {source.url: source for source in _of_input(text)}
@@ -116,7 +116,7 @@ def find_sources(inputs: Iterable[str]) -> list[Source]:
     return [sources[url] for url in sorted(sources)]
 
 
-def _of_input(text: str) -> Iterable[Source]:
+def _of_input(text: str) -> Iterable[FoundRecording]:
     """Return the recordings of one input."""
     fs, path = file_system(text)
     # In a web address only * makes a glob.
@@ -132,7 +132,7 @@ def _of_input(text: str) -> Iterable[Source]:
 
 def _of_listing(
     text: str, fs: Any, path: str, named: Mapping[str, Mapping[str, Any]]
-) -> list[Source]:
+) -> list[FoundRecording]:
     """
     Return the recordings of a folder or a glob, those in folders too; a bag is one recording.
 
@@ -174,7 +174,7 @@ def _is_recording_name(path: str) -> bool:
     return PurePosixPath(file_name(path)).suffix.lower() in (*_ENDINGS, *TABLE_ENDINGS)
 
 
-def look_up(fs: Any, path: str) -> Source:
+def look_up(fs: Any, path: str) -> FoundRecording:
     """Look up one recording."""
     try:
         info = fs.info(path)
@@ -205,7 +205,7 @@ def fault_of(error: BaseException) -> str:
     return f'cannot be read: {without_secrets(reason)}'
 
 
-def _source(fs: Any, path: str, **known: Any) -> Source:
+def _source(fs: Any, path: str, **known: Any) -> FoundRecording:
     """Return a recording by its address, which is the path itself on this machine."""
     # A name that is not UTF-8 has no place in a table.
     address = as_utf_8(str(fs.unstrip_protocol(path)))
@@ -223,10 +223,12 @@ def _source(fs: Any, path: str, **known: Any) -> Source:
             server = f'{user}@{server}'
         address = address.replace(':///', f'://{server}/', 1)
     url = without_secrets(address)
-    return Source(url.removeprefix('file://'), **known, address=address if address != url else '')
+    return FoundRecording(
+        url.removeprefix('file://'), **known, address=address if address != url else ''
+    )
 
 
-def _of_files(fs: Any, path: str, files: Mapping[str, Mapping[str, Any]]) -> Source:
+def _of_files(fs: Any, path: str, files: Mapping[str, Mapping[str, Any]]) -> FoundRecording:
     """Return the recording that a file, or all files of a bag, make."""
     if any(info['type'] not in ('file', 'link') for info in files.values()):
         return _source(fs, path, fault='is no file')
@@ -303,7 +305,7 @@ def _csv_rows(text: str, file: Iterable[str]) -> list[dict[str, str]] | None:
     return rows
 
 
-def _of_manifest(text: str, rows: list[dict[str, str]]) -> Iterable[Source]:
+def _of_manifest(text: str, rows: list[dict[str, str]]) -> Iterable[FoundRecording]:
     """Return the recordings that a manifest lists; the last row of a recording counts."""
     folder = text.rpartition('/')[0]
     if not rows:
@@ -317,7 +319,7 @@ def _of_manifest(text: str, rows: list[dict[str, str]]) -> Iterable[Source]:
                 'for example 2026-11-01T10:00:00Z'
             )
 
-    def source(row: dict[str, str]) -> Source:
+    def source(row: dict[str, str]) -> FoundRecording:
         url = row.get('url', '')
         params = row.get('params', '')
         serial = row.get('serial', '')
@@ -325,7 +327,7 @@ def _of_manifest(text: str, rows: list[dict[str, str]]) -> Iterable[Source]:
             recorded = look_up(*file_system(_beside(folder, url)))
         except UserError as error:
             plain = without_secrets(url)
-            recorded = Source(plain, fault=one_line(error).removeprefix(f'{plain}: '))
+            recorded = FoundRecording(plain, fault=one_line(error).removeprefix(f'{plain}: '))
         return replace(
             recorded,
             serial='' if serial == NO_SERIAL else serial,
@@ -344,13 +346,13 @@ def _beside(folder: str, url: str) -> str:
     return f'{folder}/{url}'
 
 
-def stated_by(sources: Iterable[Source]) -> list[tuple[str, str]]:
+def stated_by(sources: Iterable[FoundRecording]) -> list[tuple[str, str]]:
     """Return the serial number and date that recordings of this machine state, or '' each."""
     with ThreadPoolExecutor(_THREADS) as pool:
         return list(pool.map(_stated, sources))
 
 
-def _stated(source: Source) -> tuple[str, str]:
+def _stated(source: FoundRecording) -> tuple[str, str]:
     if source.fault or '://' in source.url:
         return '', ''
     try:

@@ -38,8 +38,8 @@ _MOST_ROWS = 50  # Largest count of outliers and of reasons on the page; the tab
 _MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))
 """Columns that tell whether a sensor is within the tolerance."""
 _SENTENCES = {
-    fleet.State.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
-    fleet.State.IN_ORDER: 'All units are within the tolerance.',
+    fleet.Condition.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
+    fleet.Condition.IN_ORDER: 'All units are within the tolerance.',
 }
 """What the most urgent state means for the user; the others mean the same."""
 
@@ -265,7 +265,7 @@ def _plots(
 
 
 def _badge(
-    table: fleet.FleetTable, sensors: Sequence[fleet.SensorState], counts: Counter[fleet.State]
+    table: fleet.FleetTable, sensors: Sequence[fleet.SensorState], counts: Counter[fleet.Condition]
 ) -> dict[str, str]:
     if not sensors:
         return {
@@ -274,7 +274,7 @@ def _badge(
             'sentence': 'No recording states a serial number.',
         }
     worst = sensors[0].state
-    if worst is fleet.State.IN_ORDER and table.frame[[*_MEASURES]].isna().all(axis=None):
+    if worst is fleet.Condition.IN_ORDER and table.frame[[*_MEASURES]].isna().all(axis=None):
         # What was not measured is not within the tolerance.
         return {
             'colour': 'grey',
@@ -284,7 +284,7 @@ def _badge(
     return {
         'colour': worst.colour,
         'word': 'IN ORDER'
-        if worst is fleet.State.IN_ORDER
+        if worst is fleet.Condition.IN_ORDER
         else f'{counts[worst]} of {len(sensors)} {worst.words}'.upper(),
         'sentence': _SENTENCES.get(
             worst, 'No unit is out of tolerance. Look at the head of the list.'
@@ -292,7 +292,7 @@ def _badge(
     }
 
 
-def _tiles(table: fleet.FleetTable, counts: Counter[fleet.State]) -> list[Tile]:
+def _tiles(table: fleet.FleetTable, counts: Counter[fleet.Condition]) -> list[Tile]:
     outcomes = Counter(table['outcome'].tolist())
     return [
         Tile(
@@ -300,7 +300,7 @@ def _tiles(table: fleet.FleetTable, counts: Counter[fleet.State]) -> list[Tile]:
             str(len(table)),
             f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed',
         ),
-        *(Tile(f'units: {state.words}', str(counts[state])) for state in fleet.State),
+        *(Tile(f'units: {state.words}', str(counts[state])) for state in fleet.Condition),
     ]
 
 

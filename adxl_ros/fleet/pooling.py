@@ -485,20 +485,16 @@ def _spreads2(y: np.ndarray, variance: np.ndarray) -> list[float]:
     for target in (freedom, *scipy.special.chdtri(freedom, [0.05, 0.95])):
         # No weight is above 1/spread2, so that the squares are below the target at the high end.
         high = floor + len(y) * float(np.var(y)) / target
-        is_below = floor == 0 or squares(floor) <= target
-        spreads2.append(
-            0.0
-            if is_below
-            else float(
-                scipy.optimize.brentq(
-                    lambda spread2, target=target: squares(spread2) - target,
-                    floor,
-                    high,
-                    rtol=1e-12,
-                    xtol=1e-300,
-                )
+        spread2 = 0.0
+        if floor > 0 and squares(floor) > target:
+            spread2 = scipy.optimize.brentq(
+                lambda spread2, target=target: squares(spread2) - target,
+                floor,
+                high,
+                rtol=1e-12,
+                xtol=1e-300,
             )
-        )
+        spreads2.append(float(spread2))
     return spreads2
 
 

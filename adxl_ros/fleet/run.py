@@ -23,9 +23,9 @@ from typing import Any, NamedTuple
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files.atomic_write import atomic_path, make_folder, write_bytes, write_text
-from adxl_ros.fleet.inputs import Source, stated_by
+from adxl_ros.fleet.inputs import FoundRecording, stated_by
 from adxl_ros.fleet.row import arrow_schema, as_table, Recipe, Row, TABLE
-from adxl_ros.fleet.task import make_row, refused, Result, StagingError
+from adxl_ros.fleet.task import make_row, refused, StagingError, TaskResult
 from adxl_ros.workers import Finished, finished_tasks, Pool
 
 _ROWS = 'rows'  # Folder of the rows
@@ -100,7 +100,7 @@ class Results:
         if row['hash'] and row['outcome'] != 'crashed':
             self.known.setdefault(row['key'], name)
 
-    def put(self, result: Result, attempts: int) -> Row:
+    def put(self, result: TaskResult, attempts: int) -> Row:
         """Write what a task left: its files, then its row."""
         row = {
             **result.row,
@@ -153,7 +153,7 @@ def _read(path: Path) -> dict[str, Any] | None:
 class Plan(NamedTuple):
     """What a run has to do."""
 
-    todo: list[Source]  # Recordings to work on
+    todo: list[FoundRecording]  # Recordings to work on
     done: int  # Number of recordings that have their row
     outside: int  # Number of recordings that --since, --limit or --only-failed leave out
     size_bytes: int  # Size of the recordings to work on
@@ -161,7 +161,7 @@ class Plan(NamedTuple):
 
 
 def plan(
-    sources: Sequence[Source],
+    sources: Sequence[FoundRecording],
     recipe: Recipe,
     results: Results,
     only_failed: bool = False,
@@ -195,7 +195,9 @@ def plan(
     return Plan(todo, done, len(sources) - done - len(todo), size_bytes, expected_s / 3600)
 
 
-def _since(sources: Sequence[Source], since: str, results: Results) -> list[Source]:
+def _since(
+    sources: Sequence[FoundRecording], since: str, results: Results
+) -> list[FoundRecording]:
     """Return the recordings that began at a date or later, and those without a date."""
     dates = {url: entry.row['date'] for url, entry in results.newest.items()}
     unread = [source for source in sources if not (source.date or dates.get(source.url))]
@@ -207,7 +209,7 @@ def _since(sources: Sequence[Source], since: str, results: Results) -> list[Sour
     ]
 
 
-def is_done(source: Source, entry: Entry | None, recipe: Recipe) -> bool:
+def is_done(source: FoundRecording, entry: Entry | None, recipe: Recipe) -> bool:
     """Return whether a row is that of a recording as it is now, by the present recipe."""
     if entry is None or source.stamp != entry.stamp or not (source.stamp or source.fault):
         return False
@@ -222,7 +224,7 @@ def is_done(source: Source, entry: Entry | None, recipe: Recipe) -> bool:
 
 def work(
     pool: Pool,
-    sources: Sequence[Source],
+    sources: Sequence[FoundRecording],
     recipe: Recipe,
     results: Results,
     retries: int,
@@ -238,7 +240,7 @@ def work(
 
 def _written(end: Finished, recipe: Recipe, results: Results) -> Row:
     """Write the row of a task that ended."""
-    source: Source = end.arguments[0]
+    source: FoundRecording = end.arguments[0]
     error = end.error
     if isinstance(error, UserError):
         raise error

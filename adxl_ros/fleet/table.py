@@ -71,8 +71,11 @@ class FleetQuantity:
 
     def text(self, value: float, low: float, high: float) -> str:
         """Return a difference with its interval, in the unit of the page."""
-        middle, below, above = (number(self.factor * x, True) for x in (value, low, high))
-        return f'{middle} ({below} to {above}) {self.shown_unit}'
+
+        def shown(difference: float) -> str:
+            return number(self.factor * difference, True)
+
+        return f'{shown(value)} ({shown(low)} to {shown(high)}) {self.shown_unit}'
 
 
 @dataclass(frozen=True)
@@ -101,8 +104,11 @@ class FleetTable:
     def recordings(self, quantity: FleetQuantity) -> tuple[np.ndarray, Recordings]:
         """Return a quantity in the recordings that have it."""
         value = self[quantity.column]
-        low, *high = (self[name] for name in quantity.error_columns)
-        std = (high[0] - low) / (2 * Z_90) if high else low
+        errors = [self[name] for name in quantity.error_columns]
+        std = errors[0]
+        if len(errors) == 2:
+            low, high = errors
+            std = (high - low) / (2 * Z_90)
         used = np.isfinite(value) & np.isfinite(self.years) & (self.sensor >= 0) & self.first
         rows = np.flatnonzero(used & np.isfinite(std) & (std >= 0))
         return rows, Recordings(self.sensor, self.period, self.years, value, std)[rows]
@@ -176,15 +182,15 @@ def quantities(table: FleetTable | None) -> tuple[FleetQuantity, ...]:
             ),
         ]
     for (letter, label, unit, shown), axis in product(NOISE, AXES):
-        column, *ends = (f'noise_{letter}{end}_{axis}_{unit}' for end in ('', '_low', '_high'))
+        of_axis = f'{axis}_{unit}'
         # The unit of the files begins with that of an acceleration.
         listed.append(
             FleetQuantity(
-                column,
+                f'noise_{letter}_{of_axis}',
                 f'{label}, {axis}',
                 shown.replace('m/s²', 'µg', 1),
                 1e3 * MG,
-                tuple(ends),
+                (f'noise_{letter}_low_{of_axis}', f'noise_{letter}_high_{of_axis}'),
                 is_coefficient=False,
                 is_noise=True,
             )
@@ -306,7 +312,7 @@ def effect_matrix(table: FleetTable) -> pd.DataFrame:
     return has.groupby(sensor).mean()
 
 
-class State(IntEnum):
+class Condition(IntEnum):
     """State of a sensor; the most urgent is the least."""
 
     OUT_OF_TOLERANCE = 1
@@ -343,7 +349,7 @@ class SensorState:
     urgency: float  # Its rank among the units of its state; the least is the most urgent
     number: int  # Its number
     serial: str  # Its serial number
-    state: State  # Its state
+    state: Condition  # Its state
     reason: str  # Why it has this state, in one sentence; empty for none
     drifts: tuple[Drift, ...]  # Its claimed slopes, the most urgent first
     gap: str  # Median of its last gaps and of their noise floors, mg
@@ -386,7 +392,7 @@ def _state_of(sensor: int, table: FleetTable, results: Sequence[QuantityResult])
 class _Judged(NamedTuple):
     """The state of a sensor, and why."""
 
-    state: State
+    state: Condition
     urgency: float  # Sensors of a state with smaller ones come first
     reason: str
 
@@ -396,7 +402,7 @@ def _by_gap(gap: _GapNow) -> _Judged | None:
     if not gap.over_mg > TOLERANCE_MG:
         return None
     return _Judged(
-        State.OUT_OF_TOLERANCE,
+        Condition.OUT_OF_TOLERANCE,
         -gap.over_mg,
         f'Gap {number(gap.gap_mg)} mg, noise {number(gap.floor_mg)} mg; the tolerance is '
         f'{number(TOLERANCE_MG)} mg.',
@@ -409,20 +415,20 @@ def _by_drifts(drifts: Sequence[Drift]) -> _Judged | None:
         days = drifts[0].days
         text = f'{drifts[0].text}: out of tolerance '
         if days:
-            return _Judged(State.DRIFTS, days, f'{text}in {number(days, digits=2)} days.')
-        return _Judged(State.OUT_OF_TOLERANCE, -drifts[0].reached_mg, f'{text}now.')
+            return _Judged(Condition.DRIFTS, days, f'{text}in {number(days, digits=2)} days.')
+        return _Judged(Condition.OUT_OF_TOLERANCE, -drifts[0].reached_mg, f'{text}now.')
     rising = [drift.text for drift in drifts if drift.is_rising_noise]
-    return _Judged(State.DRIFTS, _FARTHEST_DAYS, f'{rising[0]}.') if rising else None
+    return _Judged(Condition.DRIFTS, _FARTHEST_DAYS, f'{rising[0]}.') if rising else None
 
 
 def _by_refusals(table: FleetTable, rows: np.ndarray, refused: np.ndarray) -> _Judged:
     """Judge a sensor whose recordings show nothing wrong by those that were refused, (n,) bool."""
     series = len(refused) if refused.all() else int(np.argmin(refused[::-1]))
     if not series:
-        return _Judged(State.IN_ORDER, 0.0, '')
+        return _Judged(Condition.IN_ORDER, 0.0, '')
     why = table['refusal'][rows[-1]] or table['outcome'][rows[-1]]
     reason = f'Refused, {counted(series, "recording")} in a row: {why}'
-    return _Judged(State.NOT_JUDGED, -series, reason)
+    return _Judged(Condition.NOT_JUDGED, -series, reason)
 
 
 class _GapNow(NamedTuple):

@@ -29,7 +29,7 @@ from adxl_ros.files.recording_columns import NO_SERIAL, Recording
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.fleet import inputs
-from adxl_ros.fleet.inputs import begin_of, Source
+from adxl_ros.fleet.inputs import begin_of, FoundRecording
 from adxl_ros.fleet.row import (
     empty_row,
     finite,
@@ -78,7 +78,7 @@ def temporary_folder() -> Iterator[Path]:
         yield Path(name)
 
 
-def stage(source: Source, folder: Path) -> Staged:
+def stage(source: FoundRecording, folder: Path) -> Staged:
     """Copy a recording into a folder."""
     url = source.url
     try:
@@ -135,7 +135,7 @@ class Date(NamedTuple):
     source: str  # What states it: manifest, header, stamps or file
 
 
-class Result(NamedTuple):
+class TaskResult(NamedTuple):
     """What a task leaves."""
 
     row: Row  # The row; without results where `is_known` holds
@@ -146,7 +146,9 @@ class Result(NamedTuple):
 
 
 @options_named()
-def make_row(recipe: Recipe, earlier: frozenset[str], source: Source, is_again: bool) -> Result:
+def make_row(
+    recipe: Recipe, earlier: frozenset[str], source: FoundRecording, is_again: bool
+) -> TaskResult:
     """Make the row of a recording; one with an `earlier` key is only made where `is_again`."""
     worker = f'{os.uname().nodename}:{os.getpid()}'
     if recipe.code != code_version():
@@ -175,7 +177,9 @@ def make_row(recipe: Recipe, earlier: frozenset[str], source: Source, is_again: 
     return result
 
 
-def refused(recipe: Recipe, source: Source, reason: str, outcome: str = 'refused') -> Result:
+def refused(
+    recipe: Recipe, source: FoundRecording, reason: str, outcome: str = 'refused'
+) -> TaskResult:
     """Return the row of a recording whose content is not known."""
     parameters = recipe.parameters_of(source.serial, source.date, source.params)
     digest = recipe.digest(parameters, source.serial)
@@ -186,10 +190,12 @@ def refused(recipe: Recipe, source: Source, reason: str, outcome: str = 'refused
         'refusal': reason,
         'refused_by': 'stage',
     }
-    return Result(row, {}, source.stamp, digest)
+    return TaskResult(row, {}, source.stamp, digest)
 
 
-def _of_staged(recipe: Recipe, source: Source, earlier: frozenset[str], staged: Staged) -> Result:
+def _of_staged(
+    recipe: Recipe, source: FoundRecording, earlier: frozenset[str], staged: Staged
+) -> TaskResult:
     """Run the tasks on a copy, unless there is a row of this content by this recipe."""
     first = None
     fault = ''
@@ -213,7 +219,7 @@ def _of_staged(recipe: Recipe, source: Source, earlier: frozenset[str], staged: 
     row = _identity(recipe, source, staged, '' if is_other else serial, date, parameters)
     row['key'] = sha256_of(staged.content, digest)
     if row['key'] in earlier:
-        return Result(row, {}, source.stamp, digest, is_known=True)
+        return TaskResult(row, {}, source.stamp, digest, is_known=True)
     job = _Job(recipe, source, staged, parameters, row)
     if fault:
         job.refuse('read', job.plain(fault))
@@ -221,12 +227,12 @@ def _of_staged(recipe: Recipe, source: Source, earlier: frozenset[str], staged: 
         job.refuse('read', f'states the serial {recorded}, but the manifest says {source.serial}')
     else:
         job.run()
-    return Result(job.row, job.files, source.stamp, digest)
+    return TaskResult(job.row, job.files, source.stamp, digest)
 
 
 def _identity(
     recipe: Recipe,
-    source: Source,
+    source: FoundRecording,
     staged: Staged | None,
     serial: str,
     date: Date,
@@ -258,7 +264,12 @@ class _Job:
     """The tasks on one staged recording."""
 
     def __init__(
-        self, recipe: Recipe, source: Source, staged: Staged, parameters: ParameterText, row: Row
+        self,
+        recipe: Recipe,
+        source: FoundRecording,
+        staged: Staged,
+        parameters: ParameterText,
+        row: Row,
     ) -> None:
         self._recipe = recipe
         self._source = source

@@ -62,7 +62,7 @@ _LARGEST_NAMED = 4
 """Largest number of hypotheses in a sentence. Chosen: a reader keeps four in mind."""
 
 
-class Outcome(Enum):
+class RoundOutcome(Enum):
     """
     Why an investigation goes on or ends.
 
@@ -99,7 +99,7 @@ class Answer:
     """What a round ends with."""
 
     hypotheses: Hypotheses
-    outcome: Outcome  # Why the investigation goes on or ends
+    outcome: RoundOutcome  # Why the investigation goes on or ends
     sentence: str = ''  # The result in one sentence; '' where it goes on
     manoeuvre: str = ''  # Name of the next manoeuvre; '' at the end
     fault: str = ''  # Fault of the recording that makes a verdict impossible; '' without one
@@ -126,7 +126,7 @@ def run_round(
     )
     fault = gap.diagnosis.fault if gap else None
     if fault is not None and fault.status != 'insufficient':
-        return Answer(hypotheses, Outcome.INSEPARABLE, fault=fault.message), gap
+        return Answer(hypotheses, RoundOutcome.INSEPARABLE, fault=fault.message), gap
     verdict = ' '.join([report.verdict.status, *report.verdict.effects]) if report else ''
     best = hypotheses[0]
     if best.effects and best.probability >= CERTAIN:
@@ -199,23 +199,23 @@ def decide(
     # The fewest that together have 90 %
     named = hypotheses[: next((i for i, total in enumerate(totals, 1) if total >= CERTAIN), None)]
     if best.effects and best.probability >= CERTAIN:
-        outcome = Outcome.CERTAIN
+        outcome = RoundOutcome.CERTAIN
     elif not following and not best.effects:
         # The samples prefer no gap to each of these effects, so that they do not show it.
-        outcome = Outcome.NO_VISIBLE_GAP
+        outcome = RoundOutcome.NO_VISIBLE_GAP
         named = tuple(h for h in hypotheses if len(h.effects) < 2 and UNKNOWN not in h.effects)
     elif not following:
-        outcome = Outcome.INSEPARABLE
+        outcome = RoundOutcome.INSEPARABLE
     elif not has_time:
-        outcome = Outcome.TIME_OVER
+        outcome = RoundOutcome.TIME_OVER
     else:
-        return Answer(hypotheses, Outcome.GO_ON, manoeuvre=following[0].name, verdict=verdict)
+        return Answer(hypotheses, RoundOutcome.GO_ON, manoeuvre=following[0].name, verdict=verdict)
     names = first_or_others([hypothesis_text(h.effects) for h in named])
     sentence = {
-        Outcome.CERTAIN: f'The recording shows {names}: ',
-        Outcome.NO_VISIBLE_GAP: 'There is no gap that this stage can show: ',
-        Outcome.INSEPARABLE: f'This stage cannot separate {names}: together ',
-        Outcome.TIME_OVER: f'The time is over; the recording shows {names}: together ',
+        RoundOutcome.CERTAIN: f'The recording shows {names}: ',
+        RoundOutcome.NO_VISIBLE_GAP: 'There is no gap that this stage can show: ',
+        RoundOutcome.INSEPARABLE: f'This stage cannot separate {names}: together ',
+        RoundOutcome.TIME_OVER: f'The time is over; the recording shows {names}: together ',
     }
     return Answer(
         hypotheses,
@@ -321,7 +321,7 @@ def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, see
     if gap is not None:
         # The page is that of the end.
         texts = gap.with_params(str(folder.baseline)).documents(
-            folder.path, has_page=answer.outcome is not Outcome.GO_ON
+            folder.path, has_page=answer.outcome is not RoundOutcome.GO_ON
         )
         for name, text in texts.items():
             write_text(folder.path / name, text)
@@ -390,7 +390,7 @@ class Investigation:
         return (
             self.state is State.FINISHED
             and bool(self.answers)
-            and self.answers[-1][1].outcome not in (Outcome.GO_ON, Outcome.TIME_OVER)
+            and self.answers[-1][1].outcome not in (RoundOutcome.GO_ON, RoundOutcome.TIME_OVER)
         )
 
     @property
@@ -495,7 +495,7 @@ class Investigation:
             return
         self.answers.append((self._asked_minutes, answer))
         self._show(self._asked_minutes, answer)
-        if answer.outcome is not Outcome.GO_ON:
+        if answer.outcome is not RoundOutcome.GO_ON:
             self.state = State.FINISHED
             return
         assert self._pose is not None

@@ -63,7 +63,7 @@ class StageLimits:
         )
 
 
-class Path:
+class StagePath:
     """A path of the stage within its limits, move by move."""
 
     def __init__(self, limits: StageLimits, pose: Pose, begin_s: float) -> None:
@@ -123,16 +123,16 @@ class Path:
         return Pose(self._script.alpha, self._script.beta)
 
 
-class Manoeuvre(NamedTuple):
+class CatalogueManoeuvre(NamedTuple):
     """A manoeuvre of the catalogue."""
 
     kind: str  # What it varies
     text: str  # What it does, for people
-    moves: Sequence[Sequence]  # Name of a method of `Path` and its arguments, for each move
+    moves: Sequence[Sequence]  # Name of a method of `StagePath` and its arguments, for each move
 
 
 CATALOGUE = {
-    name: Manoeuvre(**stated)
+    name: CatalogueManoeuvre(**stated)
     for name, stated in yaml.safe_load(
         pathlib.Path(__file__).with_suffix('.yaml').read_text(encoding='utf-8')
     ).items()
@@ -157,7 +157,7 @@ class PlannedManoeuvre:
 
 def plan(name: str, limits: StageLimits, pose: Pose, begin_s: float = 0.0) -> PlannedManoeuvre:
     """Plan a manoeuvre."""
-    path = Path(limits, pose, begin_s)
+    path = StagePath(limits, pose, begin_s)
     for move, *arguments in CATALOGUE[name].moves:
         getattr(path, move)(*arguments)
     return PlannedManoeuvre(name, begin_s, path.motion(), path.end())

@@ -224,7 +224,8 @@ class _Column:
     """A channel, with the conversion of its codes to V or degC."""
 
     def __init__(self, role: str, channel: Any, sensor: Sensor, supply_scale: float) -> None:
-        form, kind = channel.data_format, channel.type.name
+        form = channel.data_format
+        kind = channel.type.name
         if form.repeat > 1 or form.length not in (8, 16, 32, 64):
             raise UserError(
                 f'{channel.id}: a format of {form.length} bits, {form.repeat} times, '

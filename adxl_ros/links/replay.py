@@ -115,7 +115,8 @@ class Replay(base.Link):
         self._block = block
         self._row = 0
         if block is not None:
-            self._stamps, self._volts = block.stamp_ns, block.volts(self.sensor)
+            self._stamps = block.stamp_ns
+            self._volts = block.volts(self.sensor)
 
     def _all_blocks(self) -> Generator[Recording, None, None]:
         """Yield the blocks of the recording, again and again where it starts again at its end."""

@@ -243,7 +243,8 @@ class SerialLink(base.Link):
 
     def _condition(self) -> tuple[base.Level, str]:
         """Return level and text of the status: the first fault of port, frames and board."""
-        port, info = self._settings.port, self._info
+        port = self._settings.port
+        info = self._info
         if self._port.error:
             return base.Level.ERROR, self._port.error
         now_s = time.monotonic()
@@ -283,7 +284,8 @@ class SerialLink(base.Link):
         """
         now_s = time.monotonic()
         info = self._info
-        count, self._unjudged = self._unjudged, 0
+        count = self._unjudged
+        self._unjudged = 0
         if not count or now_s < self._command_due_s:
             return
         latency_us = round(self._settings.latency_ms * 1e3)

@@ -36,7 +36,6 @@ Chosen: five of the stage's steps."""
 _BEAT_NS = 10_000_000
 """The first sample lies on a multiple of this, ns, as the stage's stamps do. So every reference
 has a sample of its own."""
-_FOREVER_NS = 2**63 - 1  # Largest stamp, ns: no motion bounds the time
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class Settings(base.PacedSettings):
     beta_rad: float = base.option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
 
 
-class _Knot(NamedTuple):
+class _JointKnot(NamedTuple):
     """Motion of the joints at one stamp."""
 
     stamp_ns: int  # ROS time, ns
@@ -110,7 +109,7 @@ class SimulatedSensor(base.Link):
             self._knots.pop()
         previous = self._knots[-1].position
         self._knots.append(
-            _Knot(
+            _JointKnot(
                 stamp_ns,
                 tuple(position.get(joint, previous[i]) for i, joint in enumerate(JOINTS)),
                 tuple(velocity.get(joint, 0.0) for joint in JOINTS),
@@ -167,7 +166,7 @@ class SimulatedSensor(base.Link):
     def _motion_until_ns(self) -> int:
         """Return the time up to which the motion is known; it is unbounded without a stage."""
         if self._watchdog is None:
-            return _FOREVER_NS
+            return base.FOREVER_NS
         if self._watchdog.check() < _LOST_S:
             return self._knots[-1].stamp_ns
         self._watchdog = None
@@ -176,7 +175,7 @@ class SimulatedSensor(base.Link):
             f'stage lost: nothing on {self.joint_state_topic} for {_LOST_S:g} '
             's, its last pose is held',
         )
-        return _FOREVER_NS
+        return base.FOREVER_NS
 
     def _make(self, until_ns: int) -> None:
         """Make a block of samples, beyond a time as far as the motion is known."""
@@ -217,5 +216,5 @@ class SimulatedSensor(base.Link):
         return np.where((step_ns > 0) & (step_ns <= _GAP_NS), spline(time_s, order), held)
 
 
-def _resting(position: tuple[float, ...]) -> _Knot:
-    return _Knot(0, position, (0.0,) * len(JOINTS))
+def _resting(position: tuple[float, ...]) -> _JointKnot:
+    return _JointKnot(0, position, (0.0,) * len(JOINTS))

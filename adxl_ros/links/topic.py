@@ -14,6 +14,7 @@ from adxl_ros.files.column_mapping import GRAVITY, Quantity, unit_name
 from adxl_ros.files.stamps import is_even, stamped_rate_hz
 from adxl_ros.links.support import base
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
+from adxl_ros.model.covariance import NOT_MEASURED
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import lagrange_weights, Motion, POINTS
 from adxl_ros.simulate.response import Response
@@ -43,8 +44,6 @@ floats."""
 _LATE_PERIODS = 10
 """Periods by which a sample may be late; chosen: an older stamp is a simulation that was reset."""
 
-_NOT_MEASURED = np.array([-1.0, *[0.0] * 8])
-"""Covariance that says that there is no value (sensor_msgs/Imu)."""
 _ABSENT = {'orientation': np.array([0.0, 0.0, 0.0, 1.0]), 'angular_velocity': np.zeros(3)}
 """Values in place of those that are no numbers."""
 
@@ -64,7 +63,7 @@ class Settings(base.SimulatorSettings):
     seed: int = base.option(0, 'seed of the noise', '', 0, 2**31 - 1)
 
 
-class _Chain:
+class _SimulatedChain:
     """The signal chain at the rate of the samples, as `simulate` runs it."""
 
     def __init__(self, sensor: Sensor, seed: int) -> None:
@@ -151,7 +150,7 @@ class EmulatedSensor(base.Link):
         self._mixture = ''
         self._heard_s = time.monotonic()
         self._newest_ns: int | None = None
-        self._chain: _Chain | None = None
+        self._chain: _SimulatedChain | None = None
         # Period of the samples, and the longest gap through which the chain runs on, ns
         self._period_ns = self._longest_ns = 0.0
         # Samples of the simulator by stamp, ns, and fields, and their volts
@@ -177,7 +176,7 @@ class EmulatedSensor(base.Link):
             sample = {name: values[i] for name, values in fields.items()}
             for name, value in _ABSENT.items():
                 if not np.isfinite([*sample[name], *sample[f'{name}_covariance']]).all():
-                    sample |= {name: value, f'{name}_covariance': _NOT_MEASURED}
+                    sample |= {name: value, f'{name}_covariance': NOT_MEASURED}
             self._sense(stamp, sample)
         self._run_chain()
 
@@ -185,7 +184,8 @@ class EmulatedSensor(base.Link):
         """Return the samples since the last call."""
         made = self._made
         self._made = []
-        missing, self._missing = self._missing, 0
+        missing = self._missing
+        self._missing = 0
         if not made:
             empty = base.no_samples(self._sensor, self._newest_ns or 0)
             return replace(empty, missing=missing, estimated=missing)
@@ -220,7 +220,8 @@ class EmulatedSensor(base.Link):
         return base.LinkStatus(*self._condition(), counts, events)
 
     def _condition(self) -> tuple[base.Level, str]:
-        topic, sensor = self.imu_topic, self.sensor
+        topic = self.imu_topic
+        sensor = self.sensor
         if self._mixture:
             return base.Level.ERROR, self._mixture
         if self._newest_ns is None or time.monotonic() - self._heard_s > _SILENT_S:
@@ -281,7 +282,7 @@ class EmulatedSensor(base.Link):
                 self.sensor = replace(self._sensor, rate_hz=rate_hz)
                 self._period_ns = 1e9 / rate_hz
                 self._longest_ns = max(_MAX_FILLED_NS, _LATE_PERIODS * self._period_ns)
-                self._chain = _Chain(self.sensor, self._seed)
+                self._chain = _SimulatedChain(self.sensor, self._seed)
                 self._seed += 1
         return self._chain is not None
 

@@ -22,13 +22,14 @@ from adxl_ros.model.effects.base import (
     NOMINAL_ENVIRONMENT,
     Value,
 )
-from adxl_ros.model.kinematics import Covariance3
+from adxl_ros.model.kinematics import Covariance3, FORCE2_FLOOR
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor
 from adxl_ros.model.signal_chain import analog_response, static_response
 import numpy as np
 
 UNMEASURED_VARIANCE = 1e6  # Of an axis that is not there, (m/s²)²; chosen: above any force
-_FORCE2_FLOOR = 1e-30  # Negligible force, (m/s²)²; chosen: below noise, keeps divisors from 0
+NOT_MEASURED = np.array([-1.0, *[0.0] * 8])
+"""Covariance, row by row, of a quantity that is not measured (sensor_msgs/Imu, REP-145)."""
 _OVERHANG_MPS2 = -0.5  # Lowest z of an upright sensor, m/s²; chosen: 3° over
 _ROOT_MEAN = 1.25
 """Factor of the term that keeps the divisor of derived z from 0 where the in-plane force is g.
@@ -152,7 +153,7 @@ def derived_z_covariance(
     xx, xy, yy = measured
     along = maths.sqrt(maths.maximum(x * x * xx + 2 * x * y * xy + y * y * yy, 0.0))
     divisor = z + x * slope[0] + y * slope[1]
-    blunted2 = divisor * divisor + _ROOT_MEAN * along + _FORCE2_FLOOR
+    blunted2 = divisor * divisor + _ROOT_MEAN * along + FORCE2_FLOOR
     by_x, by_y = -x * divisor / blunted2, -y * divisor / blunted2
     distance = 2 * divisor / (1 + slope[0] ** 2 + slope[1] ** 2)
     upright = maths.where(divisor < 0, -1.0, 1.0) * (z - distance) > _OVERHANG_MPS2

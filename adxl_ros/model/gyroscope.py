@@ -17,9 +17,9 @@ NO_TURN = (0.0, 0.0, 0.0)
 """A value by axis that is not known, in the frame of the accelerometer."""
 
 
-def _by_axis(doc: str, unit: str) -> Any:
+def _by_axis(doc: str, unit: str, has_sign: bool = False) -> Any:
     """Declare a value: three numbers, or none where it is not known."""
-    return field(default=(), metadata={'doc': doc, 'unit': unit})
+    return field(default=(), metadata={'doc': doc, 'unit': unit, 'has_sign': has_sign})
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,18 @@ class Gyroscope:
     The fields are the keys `gyro.*` of the parameter file; their metadata describe them.
     """
 
-    bias_radps: tuple[float, ...] = _by_axis('rate that it reads at rest', 'rad/s')
+    bias_radps: tuple[float, ...] = _by_axis('rate that it reads at rest', 'rad/s', has_sign=True)
     bias_std_radps: tuple[float, ...] = _by_axis('standard deviation of the bias', 'rad/s')
-    bias_per_k_radps: tuple[float, ...] = _by_axis('change of the bias by temperature', 'rad/s/K')
+    bias_per_k_radps: tuple[float, ...] = _by_axis(
+        'change of the bias by temperature', 'rad/s/K', has_sign=True
+    )
     bias_per_k_std_radps: tuple[float, ...] = _by_axis(
         'standard deviation of this change', 'rad/s/K'
     )
     temperature_c: tuple[float, ...] = _by_axis(
-        'lowest temperature of the rests, that for which the bias holds, and the highest', 'degC'
+        'lowest temperature of the rests, that for which the bias holds, and the highest',
+        'degC',
+        has_sign=True,
     )
     noise_density_radps_per_rthz: tuple[float, ...] = _by_axis(
         'white noise density over positive frequencies', 'rad/s/sqrt(Hz)'

@@ -117,7 +117,7 @@ UNKNOWN_ANGLE_RAD2 = 1e6
 π²/3, that of a uniform angle, would let a filter that fuses 1000 samples a second believe in
 yaw = 0 before long. 1e6, as for an axis that is not there, never counts."""
 INFINITE = float('inf')  # Variance of an angle that the force does not determine, rad²
-_FORCE2_FLOOR = 1e-30
+FORCE2_FLOOR = 1e-30
 """Square of a negligible force, (m/s²)²: it keeps divisors from 0, and is far below any noise."""
 
 
@@ -248,8 +248,8 @@ def angles(force: Components, covariance: Covariance3, maths: Maths) -> Angles:
     x, y, z = force
     xx, _, _, yy, _, zz = covariance
     # Squares of the force in the planes xy and yz, and of all of it
-    plane2 = x * x + y * y + _FORCE2_FLOOR
-    side2 = y * y + z * z + _FORCE2_FLOOR
+    plane2 = x * x + y * y + FORCE2_FLOOR
+    side2 = y * y + z * z + FORCE2_FLOOR
     total2 = side2 + x * x
     plane = maths.sqrt(plane2)
     side = maths.sqrt(side2)
@@ -272,7 +272,7 @@ def angles(force: Components, covariance: Covariance3, maths: Maths) -> Angles:
 def turn_of_stage(force: Components, covariance: Covariance3, maths: Maths) -> AngleEstimate:
     """Return beta, the angle of the stage about its z axis, by a force at rest; see `angles`."""
     x, y, _ = force
-    plane2 = x * x + y * y + _FORCE2_FLOOR
+    plane2 = x * x + y * y + FORCE2_FLOOR
     noise2 = covariance.xx + covariance.yy
     return AngleEstimate(
         maths.atan2(0.0 - y, x),
@@ -286,7 +286,7 @@ def _turn_variance(square: Value, noise2: Value, across: Value, maths: Maths) ->
 
     square: its square, whose variance is noise2; across: variance across it times the square.
     """
-    return maths.where(square > noise2 + _FORCE2_FLOOR, across / (square * square), INFINITE)
+    return maths.where(square > noise2 + FORCE2_FLOOR, across / (square * square), INFINITE)
 
 
 def _tilt_variance(

@@ -4,10 +4,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import Environment, NOMINAL_ENVIRONMENT, Place
+from adxl_ros.model.effects.base import Environment, NOMINAL_ENVIRONMENT, Place, Value
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.model.signal_chain import Chain
 import numpy as np
@@ -45,15 +46,14 @@ def electronics(sensor: Sensor) -> Electronics:
     )
     with np.errstate(all='ignore'):
         chain(Place.ELECTRONICS, signals)
+
+    def by_axis(values: Iterable[Value]) -> np.ndarray:
+        return np.array([float(np.ravel(value)[0]) for value in values])
+
     return Electronics(
-        *(
-            np.array([float(np.ravel(value)[0]) for value in values])
-            for values in (
-                signals.rc_s[:count],
-                signals.noise_ratio[:count],
-                signals.lsb_v * np.array(signals.lsb_ratio),
-            )
-        )
+        rc_s=by_axis(signals.rc_s[:count]),
+        noise_ratio=by_axis(signals.noise_ratio[:count]),
+        lsb_v=by_axis(signals.lsb_v * np.array(signals.lsb_ratio)),
     )
 
 

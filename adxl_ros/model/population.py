@@ -49,8 +49,10 @@ class Population:
 
     def prior(self, sensor: Sensor) -> Prior:
         """Return the prior of a sensor's departures from its nominal values."""
-        zero_g_v, scale_v_per_g = sensor.nominal_zero_g_v, sensor.nominal_scale_v_per_g
-        names, departures = [], []
+        zero_g_v = sensor.nominal_zero_g_v
+        scale_v_per_g = sensor.nominal_scale_v_per_g
+        names = []
+        departures = []
         for effect, parameter, column, nominal in (
             ('bias', 'offset_v', 'zero_g_{}_v', zero_g_v),
             ('scale_factor', 'offset_v_per_g', 'scale_{}_v_per_g', scale_v_per_g),

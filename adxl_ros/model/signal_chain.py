@@ -171,7 +171,8 @@ class Chain:
             place: [copy(effect) for effect in effects] for place, effects in self.effects.items()
         }
         for effect in new._running():
-            effect.memory, effect.parameters = {}, dict(effect.parameters)
+            effect.memory = {}
+            effect.parameters = dict(effect.parameters)
         return new
 
     def seed(self, seed: int) -> None:

@@ -22,7 +22,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.monitor import reference_stream
 from adxl_ros.monitor.changes import ChangeTest, DiagnosisInput, GapChange, LONGEST_BLOCKS
-from adxl_ros.monitor.reference_stream import Block, ReferenceKind
+from adxl_ros.monitor.reference_stream import ComparedBlock, ReferenceKind
 from adxl_ros.report.quantities import Interval
 import numpy as np
 import scipy
@@ -106,7 +106,7 @@ class LiveGap:
         self.counts = dict.fromkeys(_COUNTS, 0)  # Counts since the start
         self.obstacle = 'no samples yet'  # Why the newest second was not compared; empty if it was
         self.changes: list[GapChange] = []  # Changes so far, the newest last
-        self._blocks: deque[Block] = deque(
+        self._blocks: deque[ComparedBlock] = deque(
             maxlen=max(round(settings.window_s * 1e9 / BLOCK_NS), _FEWEST_BLOCKS)
         )
         self._ends_ns: deque[int] = deque(maxlen=LONGEST_BLOCKS + 1)
@@ -259,7 +259,7 @@ class LiveGap:
             )
         return waits
 
-    def _compared(self, begin_ns: int, end_ns: int) -> Block | None:
+    def _compared(self, begin_ns: int, end_ns: int) -> ComparedBlock | None:
         """Compare one second; None where samples or reference are missing."""
         stamps_ns, accel_mps2 = self._samples.between(begin_ns, end_ns)
         if self._compared_ns is not None and begin_ns - self._compared_ns > _BREAK_NS:
@@ -277,7 +277,7 @@ class LiveGap:
         self.obstacle = ''
         return self._prediction.block(stamps_ns, accel_mps2, motion, end_ns)
 
-    def _take(self, block: Block) -> list[GapChange]:
+    def _take(self, block: ComparedBlock) -> list[GapChange]:
         """Add a block to the window, and test it."""
         self.counts['blocks'] += 1
         self._blocks.append(block)
@@ -304,7 +304,7 @@ class LiveGap:
         self.changes = (self.changes + changes)[-_MOST_CHANGES:]
         return changes
 
-    def _axis_gap(self, d: int, axis: str, blocks: list[Block]) -> AxisGap:
+    def _axis_gap(self, d: int, axis: str, blocks: list[ComparedBlock]) -> AxisGap:
         """Return the gap of one axis."""
 
         def of_blocks(name: str) -> np.ndarray:

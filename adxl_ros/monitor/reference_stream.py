@@ -13,7 +13,7 @@ from itertools import takewhile
 
 from adxl_ros.diagnose.comparison import gravity_slopes, noiseless
 from adxl_ros.files.recording_columns import JOINTS
-from adxl_ros.files.robot_readings import Readings
+from adxl_ros.files.robot_readings import JointTrack, RobotReadings
 from adxl_ros.model import noise
 from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
@@ -160,12 +160,11 @@ class ReferenceStream:
     def motion(self, origin_ns: int) -> Motion:
         """Return the motion whose time begins at a stamp, ns; it follows the prepared blocks."""
         self._origin_ns = origin_ns
-        alpha, beta, shift = (partial(self._joint, number) for number in range(len(JOINTS)))
         motion = Motion(
             duration_s=np.inf,
-            alpha=alpha,
-            beta=beta,
-            shift=shift,
+            alpha=partial(self._joint, 0),
+            beta=partial(self._joint, 1),
+            shift=partial(self._joint, 2),
             temperature_c=partial(self._surrounding, 'temperature_c'),
             supply_v=partial(self._surrounding, 'supply_v'),
         )
@@ -264,9 +263,12 @@ class RobotForce:
         time_s = (stamp_ns - begin_ns) * 1e-9
         path = RobotPath(
             self._robot,
-            Readings(
+            RobotReadings(
                 'the robot',
-                {name: (time_s, values) for name, values in zip(self._robot.joints, rows.T)},
+                {
+                    name: JointTrack(time_s, values)
+                    for name, values in zip(self._robot.joints, rows.T)
+                },
             ),
             self._gravity_mps2,
             since_s=-0.1,
@@ -290,7 +292,7 @@ def _add_finite(
 
 
 @dataclass(frozen=True)
-class Block:
+class ComparedBlock:
     """The comparison of one block; m axes."""
 
     end_ns: int  # End of the block, ns
@@ -313,13 +315,11 @@ class Prediction:
 
     def __init__(self, sensor: Sensor, reference: ReferenceStream) -> None:
         # Effects that need the angles of a stage, which the reference has not
-        self.left_out = (
-            ()
-            if reference.kind is ReferenceKind.STAGE
-            else tuple(
+        self.left_out: tuple[str, ...] = ()
+        if reference.kind is not ReferenceKind.STAGE:
+            self.left_out = tuple(
                 name for name in sensor.effects if effect_named(name).concern is Concern.STAGE
             )
-        )
         effects = tuple(name for name in sensor.effects if name not in self.left_out)
         self._sensor = sensor
         self._reference = reference
@@ -337,12 +337,13 @@ class Prediction:
     def prepare(self, begin_ns: int, end_ns: int) -> BlockMotion | None:
         """Return what the reference shows of a block; before the first one the sensor rests."""
         if not self._responses:
-            self._origin_ns, self._motion = begin_ns, self._reference.motion(begin_ns)
+            self._origin_ns = begin_ns
+            self._motion = self._reference.motion(begin_ns)
         return self._reference.prepare(begin_ns, end_ns)
 
     def block(
         self, stamp_ns: np.ndarray, accel_mps2: np.ndarray, motion: BlockMotion, end_ns: int
-    ) -> Block | None:
+    ) -> ComparedBlock | None:
         """
         Compare the samples of one prepared block; None for the first, in which filters settle.
 
@@ -364,7 +365,7 @@ class Prediction:
             noise.effective_samples(len(stamp_ns), 1 / self._sensor.rate_hz, self._sensor.rc_s)
         )
         freedom = max(1 - 1 / max(independent, 1.0), 0.5)
-        return Block(
+        return ComparedBlock(
             end_ns=end_ns,
             mean_mps2=mean_mps2,
             square=(modelled**2).mean(axis=0),

@@ -17,7 +17,12 @@ import termios
 from typing import Any
 
 from adxl_ros.calibrate.guided import controller, pose_plan, screen_contents
-from adxl_ros.calibrate.guided.controller import Answer, Controller, ControllerState, IDLE_TEXT
+from adxl_ros.calibrate.guided.controller import (
+    Controller,
+    ControllerState,
+    IDLE_TEXT,
+    RequestAnswer,
+)
 from adxl_ros.calibrate.guided.guide import NextPose
 from adxl_ros.calibrate.guided.rest_guides import ThermalSettings
 from adxl_ros.calibrate.guided.screen_contents import KeyAction, Phase, StageMode
@@ -334,11 +339,14 @@ class DisplayPublisher:
             self._own_screen = None
 
     def _publish(self, phase: Phase, text: str) -> None:
-        controller, stream = self._controller, self._controller.stream
-        nominal, session, newest = stream.nominal, controller.session, stream.newest
+        controller = self._controller
+        stream = self._controller.stream
+        nominal = stream.nominal
+        session = controller.session
+        newest = stream.newest
         usual = _BY_HAND if controller.settings.operator_captures else _RUNNING
         keys = () if phase is Phase.FIT else _KEYS.get(controller.state, usual)
-        coefficients: list[screen_contents.Row] = []
+        coefficients: list[screen_contents.ScreenRow] = []
         if session is not None:
             rows, coefficients = session.rows()
         else:
@@ -389,7 +397,7 @@ pose."""
 _SAMPLES_QUEUE = 20000  # Samples that are kept: 20 s at 1 kHz, longer than a fit takes
 
 
-class Samples:
+class WaitingSamples:
     """Takes the serialized messages that wait, and decodes many at once."""
 
     def __init__(self, node: Node, unit: str) -> None:
@@ -425,7 +433,8 @@ class Samples:
         stamps, fields = topics.decoded(
             batch, cdr.imu, linear_acceleration=3, orientation_covariance=9
         )
-        accel, covariance = fields['linear_acceleration'], fields['orientation_covariance']
+        accel = fields['linear_acceleration']
+        covariance = fields['orientation_covariance']
         # -1 in the first place means that a message has no orientation.
         yaw_rad2 = np.where(covariance[:, 0] >= 0, covariance[:, _YAW_VARIANCE], 0.0)
         accel = accel[:, : len(sensor.axes)]
@@ -483,7 +492,7 @@ class Calibration(Node):
         # What the controller asks of a node
         self.announce = announcer.announce
         self.withdraw_pose = announcer.withdraw
-        self._samples = Samples(self, own.samples_unit)
+        self._samples = WaitingSamples(self, own.samples_unit)
         self._controller = controller.Controller(
             settings=settings,
             sensor=sensor,
@@ -513,7 +522,7 @@ class Calibration(Node):
         """Log a line."""
         topics.log(self, level, text)
 
-    def answer_captures(self, answer: Answer) -> None:
+    def answer_captures(self, answer: RequestAnswer) -> None:
         """Answer all calls of ~/capture that wait."""
         self._capture_service.answer(self._captures, *answer)
         self._captures.clear()
@@ -541,9 +550,9 @@ class Calibration(Node):
             topic: topics.Inbox(self, JointState, topic, _STAGE_QUEUE)
             for topic in (_STAGE_TOPICS if self._own.mode == 'stage' else ())
         }
-        self._surroundings = topics.Surroundings(self, _QUEUE)
+        self._surroundings = topics.SurroundingTopics(self, _QUEUE)
         start = self._controller.start
-        requests: dict[str, Callable[[], Answer]] = {
+        requests: dict[str, Callable[[], RequestAnswer]] = {
             'start': start,
             'resume': partial(start, start_over=False),
             'start_over': partial(start, start_over=True),
@@ -608,7 +617,7 @@ class Calibration(Node):
                         'bridge.beta.joint',
                     )
 
-    def _service(self, request: Callable[[], Answer]) -> Callable[..., Trigger.Response]:
+    def _service(self, request: Callable[[], RequestAnswer]) -> Callable[..., Trigger.Response]:
         """Make the callback of a service that calls a request of the controller."""
 
         def respond(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

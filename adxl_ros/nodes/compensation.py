@@ -15,7 +15,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval
+from adxl_ros.compensate.compensation_policy import CompensationPolicy, StreamInterval
 from adxl_ros.compensate.inversions import HALF
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
@@ -314,7 +314,7 @@ class Compensation(Node):
         topics.create_subscription(
             self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True
         )
-        self._surroundings = topics.Surroundings(self, 1)
+        self._surroundings = topics.SurroundingTopics(self, 1)
         self._thread = topics.RepeatingThread(self, self._receive, 'imu/data_raw')
 
     def close(self) -> None:
@@ -416,7 +416,8 @@ class Compensation(Node):
         """Use the newest calibration of the stream's unit, unless one was named."""
         path, warnings = self._policy.choose(self._calibration())
         if path:
-            before, self._policy.stored_path = self._policy.stored_path, path
+            before = self._policy.stored_path
+            self._policy.stored_path = path
             result = self.set_parameters([Parameter('calibration', value=path)])[0]
             if not result.successful:
                 self._policy.stored_path = before
@@ -460,7 +461,7 @@ class Compensation(Node):
         counts = {name: total - self._reported[name] for name, total in totals.items()}
         self._reported = Counter(totals)
         self._reported_ns = steady_ns
-        interval = Interval(
+        interval = StreamInterval(
             duration_s=duration_s,
             counts=counts,
             outside=self._stream.outside,

@@ -168,7 +168,8 @@ def main() -> int:
 
 def _run_sweep(folder: Path, seed: int) -> None:
     """Sweep a simulated sensor whose coefficients are drawn at datasheet spread."""
-    truth_path, nominal_path = folder / 'simulated_unit.yaml', folder / 'nominal.yaml'
+    truth_path = folder / 'simulated_unit.yaml'
+    nominal_path = folder / 'nominal.yaml'
     sensor = replace(
         parameter_file.load(parameter_file.nominal_path()), serial='demo', rate_hz=_RATE_HZ
     )
@@ -176,7 +177,8 @@ def _run_sweep(folder: Path, seed: int) -> None:
     parameter_file.save(nominal_path, sensor)
     parameter_file.save(truth_path, truth, ['The truth of the simulated unit.'])
     name = parameter_file.nominal_path().stem
-    output, report = folder / f'{name}_demo.yaml', folder / 'sweep'
+    output = folder / f'{name}_demo.yaml'
+    report = folder / 'sweep'
     _print(
         f'Demo: calibrate a simulated {name.upper()} whose true coefficients are known   '
         f'({_DURATION_S} s)',

@@ -68,7 +68,7 @@ def answer_lines(minutes: float, answer: Answer) -> list[str]:
         for h in answer.hypotheses[:_MOST_NAMED]
     )
     lines = wrap(f'{minutes:5.1f} min  {named}', COLUMNS, subsequent_indent=_INDENT)
-    if answer.outcome is investigation.Outcome.GO_ON:
+    if answer.outcome is investigation.RoundOutcome.GO_ON:
         lines += wrap(
             f'next: {CATALOGUE[answer.manoeuvre].text}',
             COLUMNS,

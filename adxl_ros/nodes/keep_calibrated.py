@@ -78,7 +78,8 @@ class _Receiver:
     """The compensation that gets calibrations, whole and live."""
 
     def __init__(self, node: Node, name: str, folder: Path, ramp_s: float) -> None:
-        self._folder, self._step_s = folder, ramp_s / _STEPS
+        self._folder = folder
+        self._step_s = ramp_s / _STEPS
         self._client = (
             node.create_client(SetParameters, f'{name}/set_parameters') if name else None
         )
@@ -113,7 +114,8 @@ class _Receiver:
 
     def has_come(self) -> bool:
         """Return whether the compensation has started since the last call."""
-        before, self._was_there = self._was_there, self.is_there
+        before = self._was_there
+        self._was_there = self.is_there
         return self._was_there and not before
 
     def turn(self, now_s: float) -> None:
@@ -154,7 +156,7 @@ class KeepCalibrated(Node):
         self._sent_s = -_SENT_AGAIN_S
         self._obstacle = 'waiting for sensor_info, which names the unit'
         self._samples = Inbox(self, Imu, 'imu/data_raw', _INPUT_QUEUE, own.samples_unit)
-        self._surroundings = topics.Surroundings(self, _INPUT_QUEUE)
+        self._surroundings = topics.SurroundingTopics(self, _INPUT_QUEUE)
         self._info_topic = self.resolve_topic_name('sensor_info')
         given = sensor_parameters.make_sensor(flat, may_measure=True)
         if given.effects:
@@ -173,7 +175,8 @@ class KeepCalibrated(Node):
 
     def _begin(self, sensor: Sensor) -> None:
         """Keep a calibration, or go on with its journal."""
-        own, first = self._own, sensor.provenance.get(KEPT)
+        own = self._own
+        first = sensor.provenance.get(KEPT)
         name = first or calibration_store.calibration_id(sensor)
         folder = make_folder(
             calibration_store.sensor_folder(Path(own.output).expanduser(), sensor.serial)
@@ -303,7 +306,8 @@ class KeepCalibrated(Node):
 
     def _status(self) -> Status:
         """Return what is known now."""
-        keeper, receiver = self._keeper, self._receiver
+        keeper = self._keeper
+        receiver = self._receiver
         serial = keeper.sensor.serial if keeper else NO_SERIAL
         silence = self._obstacle or self._samples.silence()
         if keeper is None or receiver is None:

@@ -12,7 +12,7 @@ from typing import Any
 from adxl_ros.errors import UserError
 from adxl_ros.files import cdr
 from adxl_ros.links.support.base import ImuLink, Level, Link, LinkStatus, Samples, StageLink
-from adxl_ros.links.support.self_test import Answer, SelfTest
+from adxl_ros.links.support.self_test import SelfTest, SelfTestAnswer
 from adxl_ros.nodes import topics
 from adxl_ros.nodes.sample_output import References, SampleOutput
 from rclpy.node import Node
@@ -223,7 +223,7 @@ class LinkReader:
             self._requests += asked
             self._answer(self._self_test.begin())
 
-    def _answer(self, answer: Answer | None) -> None:
+    def _answer(self, answer: SelfTestAnswer | None) -> None:
         """Answer all who have asked for a self-test once it has ended."""
         if answer is not None:
             topics.log(self._node, Level.OK if answer.is_passed else Level.WARN, answer.text)
@@ -262,7 +262,8 @@ class LinkReader:
     def _tick(self) -> None:
         """Publish the samples that are due."""
         steady_ns = time.monotonic_ns()
-        step_ns, self._ticked_ns = steady_ns - self._ticked_ns, steady_ns
+        step_ns = steady_ns - self._ticked_ns
+        self._ticked_ns = steady_ns
         if self._output.is_clock and steady_ns >= self._search_ns:
             self._search_ns = steady_ns + _CLOCK_SEARCH_NS
             self._output.follow_other_clock()

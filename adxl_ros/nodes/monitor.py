@@ -190,7 +190,7 @@ class Monitor(Node):
             self._reference_topic,
             _INPUT_QUEUE,
         )
-        self._surroundings = topics.Surroundings(self, _INPUT_QUEUE)
+        self._surroundings = topics.SurroundingTopics(self, _INPUT_QUEUE)
         self._publisher = topics.create_publisher(self, DiagnosticArray, 'gap', _QUEUE)
         self._service = topics.LateService(self, '~/diagnose')
         topics.DiagnosticsReporter(self, 'gap', self._status)

@@ -136,7 +136,8 @@ def declare_all(node: Node, settings: type[T]) -> T:
 
 def declare(node: Node, spec: Spec) -> Any:
     """Declare one parameter with its descriptor and return its value."""
-    name, kind = spec.name, spec.kind
+    name = spec.name
+    kind = spec.kind
     descriptor = msg.ParameterDescriptor(
         description=spec.meaning,
         read_only=not spec.live,

@@ -59,33 +59,33 @@ class Tally:
         self.counts: Counter[str] = Counter()  # By the names above
         self.ages_s: deque[float] = deque(maxlen=MOST_AGES)  # Of the samples on publication, s
         self.newest_ns: int | None = None  # Stamp of the newest sample, ns
-        # Times and counts at the last report
-        self._reported = Counter(steady_ns=steady_ns)
+        # Counts and times at the last report
+        self._reported: Counter[str] = Counter()
+        self._reported_steady_ns = steady_ns
+        self._reported_sensor_ns = 0
 
     def begin(self, now_ns: int) -> None:
         """Let the next report count sensor time from `now_ns`, ns."""
-        self._reported['sensor_ns'] = now_ns
+        self._reported_sensor_ns = now_ns
 
     def report(self, steady_ns: int, sensor_ns: int) -> tuple[dict[str, Any], str]:
         """Report what has been counted since the last report."""
-        totals = Counter({**self.counts, 'steady_ns': steady_ns, 'sensor_ns': sensor_ns})
-        new = {
-            name: totals[name] - self._reported[name]
-            for name in ('samples', *_FAULTS, 'steady_ns', 'sensor_ns')
-        }
-        self._reported = totals
-        elapsed_ns = max(new['sensor_ns'], 0)
+        totals = self.counts.copy()
+        new = {name: totals[name] - self._reported[name] for name in ('samples', *_FAULTS)}
+        elapsed_ns = max(sensor_ns - self._reported_sensor_ns, 0)
         values: dict[str, Any] = {
-            **{name: totals[name] for name in ('samples', *_FAULTS)},
+            **{name: totals[name] for name in new},
             'missing_estimated': totals['estimated'],
             'rate_hz': round(new['samples'] / elapsed_ns * 1e9, 3) if elapsed_ns else 0.0,
-            'speed': round(elapsed_ns / new['steady_ns'], 3),
+            'speed': round(elapsed_ns / (steady_ns - self._reported_steady_ns), 3),
         }
+        self._reported = totals
+        self._reported_steady_ns = steady_ns
+        self._reported_sensor_ns = sensor_ns
         if self.newest_ns is not None:
             values['age_s'] = round((sensor_ns - self.newest_ns) * 1e-9, 6)
-        return values | age_report(self.ages_s), ', '.join(
-            f'{new[name]} samples {words}' for name, words in _FAULTS.items() if new[name]
-        )
+        faults = [f'{new[name]} samples {words}' for name, words in _FAULTS.items() if new[name]]
+        return values | age_report(self.ages_s), ', '.join(faults)
 
 
 _QUEUE = 5000
@@ -139,7 +139,8 @@ class References:
             rows = np.flatnonzero(np.isfinite(values).any(axis=1))
             if not len(rows):
                 continue
-            values, periods = values[rows], stamps_ns[rows] // _PERIODS_NS[topic]
+            values = values[rows]
+            periods = stamps_ns[rows] // _PERIODS_NS[topic]
             last_period, last = self._published[topic]
             is_new = (np.diff(values, axis=0, prepend=last[None]) != 0).any(axis=1) | (
                 np.diff(periods, prepend=last_period) != 0
@@ -245,9 +246,9 @@ class SampleOutput:
             for info in self._node.get_publishers_info_by_topic('/clock')
             if info.node_name != _UNKNOWN_NODE
         ]
-        if self._clock is None or not any(
-            name != own and (name[1] != own[1] or name < own) for name in clocks
-        ):
+        # Another driver, which has the same name, follows this one if it sorts later.
+        followers = [name for name in clocks if name[1] == own[1] and name > own]
+        if self._clock is None or not set(clocks) - {own, *followers}:
             return
         # The thread of the link calls this: the executor destroys the publisher in its own.
         self._left = self._clock

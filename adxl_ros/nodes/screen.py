@@ -16,7 +16,7 @@ from textwrap import wrap
 import time
 from typing import Any, TextIO
 
-from adxl_ros.calibrate.guided.screen_contents import Phase, Row, ScreenContents
+from adxl_ros.calibrate.guided.screen_contents import Phase, ScreenContents, ScreenRow
 from adxl_ros.errors import UserError
 from adxl_ros.nodes.jobs import held_output
 from adxl_ros.nodes.parameter_checks import check_given
@@ -107,7 +107,7 @@ def _styled(style: str, lines: Iterable[str]) -> list[Styled]:
     return [(style, line) for line in lines]
 
 
-def _coefficients(rows: Sequence[Row], width: int) -> list[str]:
+def _coefficients(rows: Sequence[ScreenRow], width: int) -> list[str]:
     """Return a line for each coefficient: name, bar and intervals."""
     texts = {
         row.label: f'{_bar(row.share or 0.0, _COEFFICIENT_BAR_WIDTH)} {row.text}' for row in rows

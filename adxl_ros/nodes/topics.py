@@ -291,7 +291,8 @@ class Inbox:
         A turn of an executor builds its wait set from all that the node has. A wait set of one
         subscription makes a relay at 1 kHz two to three times cheaper.
         """
-        handle, context = self._subscription.handle, self._node.context.handle
+        handle = self._subscription.handle
+        context = self._node.context.handle
         assert context is not None, 'a node has a context'
         with handle, context:
             if self._wait_set is None:
@@ -363,7 +364,7 @@ _SURROUNDINGS = {
 """Type, layout and field of each topic."""
 
 
-class Surroundings:
+class SurroundingTopics:
     """Keeps temperature, °C, and supply, V, until they are taken, before samples of that time."""
 
     def __init__(self, node: Node, depth: int) -> None:
@@ -481,7 +482,7 @@ def joint_readings(messages: Sequence[bytes]) -> list[JointReading]:
     readings: dict[int, JointReading] = {}
     for table in cdr.tables(messages, cdr.joint_state):
 
-        def numbers(field: str, table: cdr.Table = table) -> list[list[float]]:
+        def numbers(field: str, table: cdr.MessageTable = table) -> list[list[float]]:
             has_field = field in table.layout.fields
             return table.numbers(field).tolist() if has_field else [[]] * len(table.rows)
 

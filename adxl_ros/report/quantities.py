@@ -178,7 +178,7 @@ def parameter_text(
     if ci:
         width = max((values[2] - values[1]) / 4, 1e-12)
         places = int(np.clip(np.ceil(-np.log10(width)), 0, 6))
-        value, low, high = (fixed(v, places) for v in values)
+        value, low, high = [fixed(v, places) for v in values]
         return f'{value} ({low} to {high}) {unit}'.rstrip()
     texts = dict.fromkeys(
         np.format_float_positional(v, digits, fractional=False, trim='-')

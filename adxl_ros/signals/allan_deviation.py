@@ -43,7 +43,7 @@ class AllanDeviation:
         return 1 / np.sqrt(2 * (self.averages - 1))
 
 
-class Phase:
+class RunningSums:
     """
     The running sums of a stream, from which its Allan deviation and the means of cells follow.
 
@@ -262,7 +262,7 @@ class _Samples:
         self._path = first.path
         self._rate_hz = first.rate_hz
         self._names = names
-        self._phase = Phase(len(names), file)
+        self._phase = RunningSums(len(names), file)
         self._resolution = np.full(len(names), np.inf)
         self._start_s = self._stop_s = 0.0  # Stamps of the first and the newest sample
         self._gaps, self._gaps_s = 0, 0.0  # Number and time of the gaps

@@ -110,7 +110,8 @@ def axis_faults(axes: Iterable[AxisRange]) -> list[str]:
     faults = []
     for axis in axes:
         if axis.clipped >= _FEWEST_CLIPPED:
-            low_g, high_g = axis.lowest_mps2 / G0_MPS2, axis.highest_mps2 / G0_MPS2
+            low_g = axis.lowest_mps2 / G0_MPS2
+            high_g = axis.highest_mps2 / G0_MPS2
             faults.append(
                 f'{axis.name} stays at its extreme value {axis.clipped} times in motion; its '
                 f'range ends at {low_g:.3g} or {high_g:.3g} g'
@@ -118,7 +119,7 @@ def axis_faults(axes: Iterable[AxisRange]) -> list[str]:
         elif axis.is_stuck:
             faults.append(f'{axis.name} never changes; the axis is stuck, or not connected')
         elif axis.stuck_s:
-            at_end = 'at the end of its range, ' * bool(axis.clipped)
+            at_end = 'at the end of its range, ' if axis.clipped else ''
             faults.append(
                 f'{axis.name} does not change for {axis.stuck_s:.3g} s; the axis is {at_end}'
                 'stuck, or the driver repeats a sample'

@@ -237,7 +237,8 @@ def without_stuck(blocks: Blocks, windows: np.ndarray, step: np.ndarray) -> np.n
     constant = windows <= _rounding(blocks)
     if not constant.any():
         return windows
-    is_quiet, out = windows <= quiet_variance(blocks, windows, step)[1], windows.copy()
+    is_quiet = windows <= quiet_variance(blocks, windows, step)[1]
+    out = windows.copy()
     for axis in np.flatnonzero(constant.any(axis=0)):
         others_rest = np.delete(is_quiet, axis, axis=1).all(axis=1)
         if constant[others_rest, axis].sum() <= _CONSTANT_SHARE * others_rest.sum():
@@ -258,7 +259,8 @@ def _quietest(variances: np.ndarray, smallest: float) -> tuple[float, float]:
     centre = values[int(_QUIETEST_SHARE * len(values))]
     for _ in range(_QUIET_STEPS):
         near = values[: np.searchsorted(values, _QUIET_RATIO * centre)]
-        centre, before = np.median(near), centre
+        before = centre
+        centre = np.median(near)
         if centre == before:
             break
     logs = np.log(values[: np.searchsorted(values, _QUIET_RATIO * centre)])

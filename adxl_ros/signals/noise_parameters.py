@@ -36,15 +36,17 @@ from adxl_ros.signals.recorded_sensor import load_sensor, RESISTANCE_OHM
 import numpy as np
 import scipy
 
-_DROP = 2.705543454095404  # Twice log likelihood at the ends of a 90 % interval: χ², 1 degree
-_SINGLE = 64
-"""Lowest coefficients that are fitted one by one: from there on a group of `_WIDTH` has two or
-more."""
-_WIDTH = 1.03  # Ratio of frequencies of further groups. Chosen: a term changes by 6 %
+_INTERVAL_DROP = 2.705543454095404
+"""Drop of twice the log likelihood at the ends of a 90 % interval: χ², 1 degree of freedom."""
+_SINGLE_COEFFICIENTS = 64
+"""Lowest coefficients that are fitted one by one: from there on a group of `_GROUP_WIDTH` has two
+or more."""
+_GROUP_WIDTH = 1.03  # Ratio of frequencies of further groups. Chosen: a term changes by 6 %
 _ROUNDS = 60  # Largest number of rounds of a fit. Chosen: usual are ten
 _HALVINGS = 20  # Largest number of halvings of a step that does not raise the likelihood
-_CONVERGED = 1e-9  # Change of twice the log likelihood at which a fit ends
-_SMALLEST = 1e-4  # Square, by a dominant one, from which a limit is searched. Chosen: never seen
+_CONVERGED_GAIN = 1e-9  # Change of twice the log likelihood at which a fit ends
+_SMALLEST_SQUARE = 1e-4
+"""Square, by a dominant one, from which a limit is searched. Chosen: never seen."""
 _LINE_PROBABILITY = 1e-3  # Chance from which a line shows. Chosen: 1 % of logs
 _OCTAVE_PROBABILITY = 0.05
 """Chance from which a filter shows in an octave. Chosen: an octave less costs little, but one that
@@ -57,9 +59,12 @@ _MARGIN_OCTAVES = 1  # Octaves left out below a filter or line. Chosen: a line l
 _FILTER_LOSSES = (0.0, *(4.0**n for n in range(-2, 2)))
 """Power that tried filters take at the end of the fit, by what they leave. Chosen: less than the
 first does not show in a thousand coefficients, more than the last ends the fit earlier."""
-_FEWEST = 32  # Fewest coefficients of a fit. Chosen: white noise is then known within 20 %
-_MOST = 0.5  # Share of white noise from which a slope is not that of a filter: most of the power
-_SEEN = 2.0  # Standard deviations of a square that is seen. Chosen: as 90 % intervals exclude 0
+_FEWEST_COEFFICIENTS = 32
+"""Fewest coefficients of a fit. Chosen: white noise is then known within 20 %."""
+_LEAST_WHITE = 0.5
+"""Share of white noise from which a slope is not that of a filter: most of the power."""
+_SEEN_STDS = 2.0
+"""Standard deviations of a square that is seen. Chosen: as 90 % intervals exclude 0."""
 
 _FLICKER_OF_INSTABILITY = 1 / float(np.sqrt(np.pi))
 """Density of `flicker` at 1 Hz divided by B: over positive frequencies it is B²/(π·f)."""
@@ -120,7 +125,7 @@ class NoiseFit:
             design = (parts / parts.sum(axis=1, keepdims=True))[:, present]
             information = design.T @ (design * np.gradient(k)[:, None] / 2)
             variance = np.linalg.inv(information)[present == term, present == term]
-            if variance < _SEEN**-2:
+            if variance < _SEEN_STDS**-2:
                 return float(time_s)
         return np.inf
 
@@ -173,6 +178,13 @@ class _Groups:
         return replace(self, shapes=self.shapes * gain[:, None])
 
 
+class _Fit(NamedTuple):
+    """The likeliest terms."""
+
+    squares: np.ndarray  # N², B² and K², (3,)
+    log_likelihood: float  # Up to a constant
+
+
 def coefficients(means: np.ndarray) -> np.ndarray:
     """Return the cosine coefficients 1 to n − 1 of means, (n,); coefficient k is at k/(2·T)."""
     return scipy.fft.dct(means - means.mean(), norm='ortho')[1:]
@@ -220,11 +232,11 @@ def fit_noise(
     highest = _highest(groups, len(means), span_s, rounding)
     walks, bound_s = _walks(groups.below(highest), span_s, highest)
     models = _filters(walks, np.pi * highest / (2 * len(means)), np.pi / (2 * len(means)))
-    theta, likelihood = _best(models)
+    best = _best(models)
     return NoiseFit(
-        white=_interval(models, theta, likelihood, 0),
-        instability=_interval(models, theta, likelihood, 1),
-        walk=_interval(models, theta, likelihood, 2),
+        white=_interval(models, best, 0),
+        instability=_interval(models, best, 1),
+        walk=_interval(models, best, 2),
         bound_s=bound_s,
         highest=highest,
         highest_hz=highest / (2 * span_s),
@@ -237,11 +249,11 @@ def _walks(groups: _Groups, span_s: float, highest: int) -> tuple[list[_Groups],
     count = int(np.log(shortest) / np.log(_BOUND_STEP))
     times_s = span_s * _BOUND_STEP ** np.arange(-count, 5.0)
     models = [groups.bounded(time_s, span_s) for time_s in times_s]
-    likelihoods = np.array([_fit(model)[1] for model in models])
+    likelihoods = np.array([_fit(model).log_likelihood for model in models])
     best = likelihoods.max()
-    if 2 * (best - _fit(groups)[1]) < scipy.stats.chi2.isf(_BOUND_PROBABILITY, 1):
+    if 2 * (best - _fit(groups).log_likelihood) < scipy.stats.chi2.isf(_BOUND_PROBABILITY, 1):
         return [groups], np.inf
-    likely = 2 * (best - likelihoods) < _DROP
+    likely = 2 * (best - likelihoods) < _INTERVAL_DROP
     return [models[i] for i in np.flatnonzero(likely)], float(times_s[likelihoods.argmax()])
 
 
@@ -251,23 +263,24 @@ def _filters(models: list[_Groups], end_rad: float, step_rad: float) -> list[_Gr
     for loss in _FILTER_LOSSES:
         strength = loss / np.sin(end_rad) ** 2
         filtered += [model.filtered(strength, step_rad) for model in models]
-    likelihoods = np.array([_fit(model)[1] for model in filtered])
-    return [filtered[i] for i in np.flatnonzero(2 * (likelihoods.max() - likelihoods) < _DROP)]
+    likelihoods = np.array([_fit(model).log_likelihood for model in filtered])
+    return [
+        filtered[i] for i in np.flatnonzero(2 * (likelihoods.max() - likelihoods) < _INTERVAL_DROP)
+    ]
 
 
-def _best(
-    models: list[_Groups], fixed: int | None = None, value: float = 0.0
-) -> tuple[np.ndarray, float]:
+def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0) -> _Fit:
     """Return the most likely fit of several models; see `_fit`."""
-    return max((_fit(model, fixed, value) for model in models), key=lambda fit: fit[1])
+    fits = [_fit(model, fixed, value) for model in models]
+    return max(fits, key=lambda fit: fit.log_likelihood)
 
 
 def _grouped(power: np.ndarray, variances: np.ndarray) -> _Groups:
-    edges = [*range(min(_SINGLE, len(power)))]
-    position = float(_SINGLE)
+    edges = [*range(min(_SINGLE_COEFFICIENTS, len(power)))]
+    position = float(_SINGLE_COEFFICIENTS)
     while position < len(power):
         edges.append(int(position))
-        position = max(position * _WIDTH, position + 1)
+        position = max(position * _GROUP_WIDTH, position + 1)
     first = np.array(edges)
     count = np.diff(np.append(first, len(power)))
     return _Groups(
@@ -286,10 +299,8 @@ def _log_likelihood(groups: _Groups, theta: np.ndarray) -> float:
     return -0.5 * float(groups.count @ (np.log(variance) + groups.power / variance))
 
 
-def _fit(
-    groups: _Groups, fixed: int | None = None, value: float = 0.0
-) -> tuple[np.ndarray, float]:
-    """Return the likeliest N², B² and K² of 0 or more, (3,), by Fisher scoring; and how likely."""
+def _fit(groups: _Groups, fixed: int | None = None, value: float = 0.0) -> _Fit:
+    """Return the likeliest terms of 0 or more by Fisher scoring; one may have a fixed square."""
     free = [term for term in range(3) if term != fixed]
     theta = np.zeros(3)
     if fixed is not None:
@@ -314,22 +325,26 @@ def _fit(
             break
         theta = trial
         likelihood = likelihood + gained
-        if 2 * gained < _CONVERGED:
+        if 2 * gained < _CONVERGED_GAIN:
             break
-    return theta, likelihood
+    return _Fit(theta, likelihood)
 
 
-def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term: int) -> NoiseTerm:
+def _interval(models: list[_Groups], fit: _Fit, term: int) -> NoiseTerm:
     """Return a term with the ends of its interval by the profile likelihood."""
 
+    def drop(square: float) -> float:
+        """Return twice the drop of the likelihood where the term has another square."""
+        return 2 * (fit.log_likelihood - _best(models, term, square).log_likelihood)
+
     def excess(logarithm: float) -> float:
-        """Return twice the drop of the profile likelihood, minus its limit."""
-        return 2 * (likelihood - _best(models, term, np.exp(logarithm))[1]) - _DROP
+        """Return the drop minus its limit, by the logarithm of the square."""
+        return drop(np.exp(logarithm)) - _INTERVAL_DROP
 
     shapes = models[0].shapes
-    scale = float(np.min(shapes @ theta / shapes[:, term]))
-    best = float(theta[term])
-    begin = np.log(best if best > 0 else scale * _SMALLEST)
+    scale = float(np.min(shapes @ fit.squares / shapes[:, term]))
+    best = float(fit.squares[term])
+    begin = np.log(best if best > 0 else scale * _SMALLEST_SQUARE)
 
     def end(step: float) -> float:
         """Return the end of the interval that lies in the direction of a step."""
@@ -338,10 +353,9 @@ def _interval(models: list[_Groups], theta: np.ndarray, likelihood: float, term:
             beyond += step
         return float(np.exp(scipy.optimize.brentq(excess, beyond - step, beyond, xtol=1e-6)))
 
-    is_seen = best > 0 and 2 * (likelihood - _best(models, term, 0.0)[1]) > _DROP
-    low = end(-1.0) if is_seen else 0.0
+    low = end(-1.0) if best > 0 and drop(0.0) > _INTERVAL_DROP else 0.0
     high = end(1.0)
-    return NoiseTerm(*(float(np.sqrt(square)) for square in (best, low, high)))
+    return NoiseTerm(float(np.sqrt(best)), float(np.sqrt(low)), float(np.sqrt(high)))
 
 
 def _highest(groups: _Groups, count: int, span_s: float, rounding: float) -> int:
@@ -352,23 +366,20 @@ def _highest(groups: _Groups, count: int, span_s: float, rounding: float) -> int
     apart. The fit therefore ends in an octave in which white noise prevails.
     """
     stop = count
-    while stop > 2 * _FEWEST:
-        lower = groups.below(max(stop // 2, _FEWEST))
-        bound_s = _walks(lower, span_s, stop // 2)[1]
+    while stop > 2 * _FEWEST_COEFFICIENTS:
+        lower = groups.below(max(stop // 2, _FEWEST_COEFFICIENTS))
+        _, bound_s = _walks(lower, span_s, stop // 2)
         used = groups.below(stop).bounded(bound_s, span_s)
         lower = lower.bounded(bound_s, span_s)
-        theta = _fit(lower)[0]
+        theta = _fit(lower).squares
         chances = scipy.stats.chi2.sf(used.count * used.power / (used.shapes @ theta), used.count)
         octave = used.where(used.first >= stop // 2)
         is_without_line = chances.min() * len(chances) > _LINE_PROBABILITY
-        if (
-            _white_share(octave, theta, rounding) > _MOST
-            and is_without_line
-            and _is_expected(octave, lower, theta)
-        ):
+        is_white = _white_share(octave, theta, rounding) > _LEAST_WHITE
+        if is_white and is_without_line and _is_expected(octave, lower, theta):
             break
         stop //= 2
-    return max(stop >> _MARGIN_OCTAVES, min(count, _FEWEST))
+    return max(stop >> _MARGIN_OCTAVES, min(count, _FEWEST_COEFFICIENTS))
 
 
 def _white_share(groups: _Groups, theta: np.ndarray, rounding: float) -> float:
@@ -442,14 +453,14 @@ class AxisNoise:
     def filter_evidence(self, rest: StillStretch) -> FilterEvidence | None:
         """Return what the noise shows of a filter; None where slow noise or rounding hides it."""
         white = self.fit.white
-        is_clear = self.white_variance > _MOST * (self.sample_std**2)
+        is_clear = self.white_variance > _LEAST_WHITE * (self.sample_std**2)
         if not white.is_seen or not is_clear:
             return None
         share = self.white_variance / (white.value**2 * rest.rate_hz)
         repeat = np.clip(1 - self.change_variance / self.white_variance, 0.0, 1.0)
         independent = rest.count * (1 - repeat**2) / (1 + repeat**2)
         # 90 % of a normal distribution are within 1.645 standard deviations.
-        white_std = 2 * np.log(white.high / white.low) / (2 * np.sqrt(_DROP))
+        white_std = 2 * np.log(white.high / white.low) / (2 * np.sqrt(_INTERVAL_DROP))
         return FilterEvidence(
             np.log(share),
             float(np.hypot(white_std, np.sqrt(2 / independent))),
@@ -557,12 +568,8 @@ def without_rounding(fit: NoiseFit, std: float, resolution: float, rounding: flo
     is hidden: it may be anything up to that, and codes that do not change show less.
     """
     if not _is_coarse(std, resolution):
-        return replace(
-            fit,
-            white=NoiseTerm(
-                *(float(np.sqrt(max(value**2 - rounding**2, 0.0))) for value in fit.white)
-            ),
-        )
+        before = [float(np.sqrt(max(value**2 - rounding**2, 0.0))) for value in fit.white]
+        return replace(fit, white=NoiseTerm(*before))
     widest = max(_DITHERED_STEPS * resolution / std, 1.0)
 
     def widened(term: NoiseTerm) -> NoiseTerm:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from adxl_ros.files.parameter_file import float_text
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.noise import ONE_SIDED
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
@@ -27,7 +28,7 @@ _NAMES = ('white noise N', 'bias instability B', 'random walk K')  # Names of th
 TERMS = ('white', 'instability', 'walk')  # Their fields in `NoiseFit`
 
 
-class _Unit(NamedTuple):
+class _ReadingUnits(NamedTuple):
     """The units of a sensor's readings."""
 
     symbol: str  # Unit of the files, as the samples have it
@@ -37,30 +38,29 @@ class _Unit(NamedTuple):
     letter: str  # Begin of that name
 
 
-_ACCEL = _Unit('m/s²', 'µg', _MICRO_G, 'mps2', 'a')
-_GYRO = _Unit('rad/s', 'm°/s', float(np.degrees(1e3)), 'radps', 'g')
+_ACCEL = _ReadingUnits('m/s²', 'µg', _MICRO_G, 'mps2', 'a')
+_GYRO = _ReadingUnits('rad/s', 'm°/s', float(np.degrees(1e3)), 'radps', 'g')
 
 
-class SensorNoise(NamedTuple):
+class SensorAtRest(NamedTuple):
     """One sensor at rest."""
 
     name: str
     rest: StillStretch
     axes: Sequence[AxisNoise]
-    unit: _Unit
+    unit: _ReadingUnits
 
 
-def sensors_at_rest(result: RecordingNoise) -> list[SensorNoise]:
+def sensors_at_rest(result: RecordingNoise) -> list[SensorAtRest]:
     """Return the accelerometer, and the gyroscope if there is one."""
-    shown = [SensorNoise('accelerometer', result.rest, result.axes, _ACCEL)]
+    shown = [SensorAtRest('accelerometer', result.rest, result.axes, _ACCEL)]
     if result.gyro_rest is not None:
-        shown.append(SensorNoise('gyroscope', result.gyro_rest, result.gyro, _GYRO))
+        shown.append(SensorAtRest('gyroscope', result.gyro_rest, result.gyro, _GYRO))
     return shown
 
 
 _YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
 _PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000
-_NOT_MEASURED = 1e6  # Variance of a sample of an axis that is not there, u²
 
 
 def head(result: RecordingNoise) -> list[str]:
@@ -80,7 +80,7 @@ def tables(result: RecordingNoise) -> list[str]:
     return rows
 
 
-def _table(shown: SensorNoise) -> list[str]:
+def _table(shown: SensorAtRest) -> list[str]:
     """Return the terms with intervals, then in SI units and by sample, 79 columns at most."""
     wide = (6, 25, 25, 25)
     narrow = (6, 12, 12, 12, 13, 13, 9)
@@ -116,7 +116,7 @@ def _table(shown: SensorNoise) -> list[str]:
     return rows
 
 
-def _walk_lines(shown: SensorNoise) -> list[str]:
+def _walk_lines(shown: SensorAtRest) -> list[str]:
     """Return the bounds of the walks."""
     rows = []
     for noise in shown.axes:
@@ -130,7 +130,7 @@ def _walk_lines(shown: SensorNoise) -> list[str]:
     return rows
 
 
-def intervals(noise: AxisNoise, unit: _Unit) -> list[str]:
+def intervals(noise: AxisNoise, unit: _ReadingUnits) -> list[str]:
     """Return the estimates with their intervals, or their upper limits."""
     return [
         f'{e.value:.3g} ({e.low:.3g} to {e.high:.3g})' if e.is_seen else f'below {e.high:.3g}'
@@ -155,7 +155,7 @@ def _figures(noises: Sequence[AxisNoise], rate_hz: float) -> dict[str, _Figure]:
     return {
         'white': _Figure([loudest.sample_white], '' if loudest.fit.white.is_seen else limit),
         'walk': _Figure([k], '' if walk.is_seen else limit),
-        'matrix': _Figure(np.diag((variances + [_NOT_MEASURED] * 3)[:3]).ravel().tolist()),
+        'matrix': _Figure(np.diag((variances + [UNMEASURED_VARIANCE] * 3)[:3]).ravel().tolist()),
         'rate': _Figure([rate_hz]),
     }
 
@@ -176,7 +176,8 @@ def paste_lines(result: RecordingNoise) -> list[str]:
         sensors['gyr'] = _figures(result.gyro, rate_hz)
     factors = {'': 1.0, 'samples': rate_hz**0.5, 'PX4': _PX4_HZ**0.5}
     text = Path(__file__).with_name('program_settings.csv').read_text(encoding='utf-8')
-    lines, program = [], ''
+    lines = []
+    program = ''
     for stated in csv.DictReader(text.splitlines()):
         if stated['sensor'] not in sensors:
             continue
@@ -235,7 +236,7 @@ def filter_warning(stated: Sensor, fresh: Sensor) -> list[str]:
     ]
 
 
-def _axis_warnings(span_s: float, noise: AxisNoise, unit: _Unit) -> list[str]:
+def _axis_warnings(span_s: float, noise: AxisNoise, unit: _ReadingUnits) -> list[str]:
     texts = []
     for term, name in enumerate(_NAMES):
         if not (noise.estimates[term].is_seen or noise.is_coarse):
@@ -284,7 +285,7 @@ def curves(result: RecordingNoise) -> Any:
     return figure
 
 
-def _draw_terms(plot: Any, shown: SensorNoise, number: int) -> None:
+def _draw_terms(plot: Any, shown: SensorAtRest, number: int) -> None:
     """Draw the terms of an axis that are seen, and their sum."""
     tau_s = shown.rest.allan.tau_s
     noise = shown.axes[number]
@@ -295,14 +296,14 @@ def _draw_terms(plot: Any, shown: SensorNoise, number: int) -> None:
     draw_sum(plot, shown, number, color='#222', label='all three')
 
 
-def draw_sum(plot: Any, shown: SensorNoise, number: int, **looks: str) -> None:
+def draw_sum(plot: Any, shown: SensorAtRest, number: int, **looks: str) -> None:
     """Draw the Allan deviation that the terms of an axis have together."""
     tau_s = shown.rest.allan.tau_s
     noise = shown.axes[number]
     plot.plot(tau_s, noise.fit.allan_deviation(tau_s) * shown.unit.factor, lw=1, **looks)
 
 
-def draw(plot: Any, shown: SensorNoise, number: int, label: str) -> None:
+def draw(plot: Any, shown: SensorAtRest, number: int, label: str) -> None:
     """Draw the Allan deviation of an axis; the plot has room for those of all axes."""
     allan = shown.rest.allan
     measured = allan.deviation * shown.unit.factor

@@ -48,16 +48,16 @@ _SWINGS = -0.5  # Autocorrelation that noise never falls to, and a swing does af
 
 
 @dataclass(frozen=True)
-class Noise:
+class SampleNoise:
     """Noise of one sample."""
 
     sigma: np.ndarray  # Standard deviation by axis, in the unit of the samples, (m,)
     tau_s: float = 0.0  # Time constant of the filter that correlates it, s
 
 
-def datasheet_noise(sensor: Sensor) -> Noise:
+def datasheet_noise(sensor: Sensor) -> SampleNoise:
     """Return the noise of a sample by the datasheet values of a sensor, V."""
-    return Noise(sample_std_v(sensor), sensor.rc_s)
+    return SampleNoise(sample_std_v(sensor), sensor.rc_s)
 
 
 @dataclass(frozen=True)
@@ -90,19 +90,15 @@ class NoiseLimits:
 
 
 def _largest(limits: list[NoiseLimits]) -> NoiseLimits | None:
-    return (
-        NoiseLimits(
-            *(
-                np.maximum.reduce([getattr(each, f.name) for each in limits])
-                for f in fields(NoiseLimits)
-            )
-        )
-        if limits
-        else None
+    if not limits:
+        return None
+    names = [field.name for field in fields(NoiseLimits)]
+    return NoiseLimits(
+        **{name: np.maximum.reduce([getattr(each, name) for each in limits]) for name in names}
     )
 
 
-def stated_limits(noise: Noise, step: np.ndarray, spans: Spans) -> NoiseLimits:
+def stated_limits(noise: SampleNoise, step: np.ndarray, spans: Spans) -> NoiseLimits:
     """
     Return the limits for a given noise, whose sample variance is chi-squared.
 
@@ -237,7 +233,7 @@ class RestFinder:
         self,
         rate_hz: float,
         axes: int,
-        noise: Noise | None = None,
+        noise: SampleNoise | None = None,
         learn: bool | None = None,
         angle_tolerance_rad: float | None = None,
         gravity: np.ndarray | float = np.inf,
@@ -546,7 +542,7 @@ def find_rests(
     samples: np.ndarray,
     rate_hz: float,
     angles_rad: np.ndarray | None = None,
-    noise: Noise | None = None,
+    noise: SampleNoise | None = None,
     learn: bool | None = None,
     angle_tolerance_rad: float | None = None,
     gravity: np.ndarray | float = np.inf,
@@ -566,7 +562,7 @@ def rest_means(
     samples: np.ndarray,
     rests: list[Rest],
     rate_hz: float,
-    noise: Noise | None = None,
+    noise: SampleNoise | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """
     Average the rests of a recording, as `RestFinder.means` does: mean and std, (k, m) each.
@@ -583,7 +579,7 @@ def rest_means(
 
 
 def _means(
-    parts: list[Blocks], spans: Spans, noise: Noise | None
+    parts: list[Blocks], spans: Spans, noise: SampleNoise | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Average the blocks of each rest; mean and standard deviation, (k, m) each."""
     # The step is that of all rests: a rest with constant codes does not show it.
@@ -594,7 +590,7 @@ def _means(
 
 
 def _mean(
-    part: Blocks, step: np.ndarray, spans: Spans, noise: Noise | None
+    part: Blocks, step: np.ndarray, spans: Spans, noise: SampleNoise | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """
     Average the blocks of a rest; mean and standard deviation, (m,) each.

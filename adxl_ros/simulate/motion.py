@@ -305,14 +305,12 @@ class SmoothedPath:
                 time_s, reading, k=self._degree if even else _DEGREE
             )
         window = _Window(time_s, reading, self._knot_s)
-        # The noise of readings with a step of their own has no bounds.
-        coefficients = (
-            window.coefficients(self._strength)
-            if self._is_seen
-            else window.bounded_coefficients(
-                self._strength, np.where(_moving(reading), 0.0, _REST_WEIGHT), self._step / 2
-            )
-        )
+        if self._is_seen:
+            # The noise of readings with a step of their own has no bounds.
+            coefficients = window.coefficients(self._strength)
+        else:
+            weights = np.where(_moving(reading), 0.0, _REST_WEIGHT)
+            coefficients = window.bounded_coefficients(self._strength, weights, self._step / 2)
         return scipy.interpolate.BSpline(window.knots, window.mean + coefficients, _DEGREE)
 
     def _part(self, window: int) -> tuple[np.ndarray, np.ndarray]:
@@ -480,7 +478,9 @@ class _Window:
         normal = _banded(transposed @ weighted)
         normal[-1] += _RIDGE * normal[-1].max()
         factor = scipy.linalg.cholesky_banded(normal + _BOUNDED_SHARE * strength * self._penalty)
-        low, high, pulled = self._values - bound, self._values + bound, weights * self._values
+        low = self._values - bound
+        high = self._values + bound
+        pulled = weights * self._values
         within = self._values
         excess = np.zeros(len(self._values))
         for _ in range(_BOUND_ROUNDS):

@@ -19,7 +19,7 @@ from adxl_ros.errors import install_hint, one_line, UserError
 from adxl_ros.files import robot_readings
 from adxl_ros.files.atomic_write import AnyPath
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.files.robot_readings import Readings
+from adxl_ros.files.robot_readings import JointTrack, RobotReadings
 from adxl_ros.files.stamps import period_s, stamped_rate_hz
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Components
@@ -61,6 +61,14 @@ class FrameMotion(NamedTuple):
     rate_radps: np.ndarray  # Angular rate
     acceleration_radps2: np.ndarray  # Angular acceleration
     up: np.ndarray  # Unit vector
+
+
+class _JointMotion(NamedTuple):
+    """Motion of joints as pinocchio has it, (n, k) each."""
+
+    position: np.ndarray
+    rate: np.ndarray
+    acceleration: np.ndarray
 
 
 class Robot:
@@ -116,11 +124,17 @@ class Robot:
         joints: position, rate and acceleration, (3, n, j); base: the same of its x, y, z and
         quaternion x, y, z, w, (3, n, 7).
         """
-        pin, model, data = self._pin, self._model, self._data
+        pin = self._pin
+        model = self._model
+        data = self._data
         count = joints.shape[1]
-        q, v, a = np.zeros((count, model.nq)), *np.zeros((2, count, model.nv))
+        q = np.zeros((count, model.nq))
+        v, a = np.zeros((2, count, model.nv))
         if base is not None:
-            q[:, :7], v[:, :6], a[:, :6] = _free_flyer(base)
+            free = _free_flyer(base)
+            q[:, :7] = free.position
+            v[:, :6] = free.rate
+            a[:, :6] = free.acceleration
         for number, name in enumerate(self.joints):
             joint = model.joints[model.getJointId(name)]
             angle, v[:, joint.idx_v], a[:, joint.idx_v] = joints[:, :, number]
@@ -143,8 +157,8 @@ class Robot:
         return moved
 
 
-def _free_flyer(base: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return position, rate and acceleration of a free joint as pinocchio has them."""
+def _free_flyer(base: np.ndarray) -> _JointMotion:
+    """Return the motion of a free joint."""
     x, dx, ddx = base[:, :, :3]
     norm = np.linalg.norm(base[0, :, 3:], axis=1, keepdims=True)
     q, dq, ddq = base[:, :, 3:] / norm
@@ -158,7 +172,7 @@ def _free_flyer(base: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     omega, alpha = turning(dq), turning(ddq)
     to_body = Rotation.from_quat(q).inv()
     velocity, acceleration = to_body.apply(dx), to_body.apply(ddx)
-    return (
+    return _JointMotion(
         np.hstack([x, q]),
         np.hstack([velocity, omega]),
         np.hstack([acceleration - np.cross(omega, velocity), alpha]),
@@ -174,7 +188,7 @@ class RobotPath(ForcePath):
     def __init__(
         self,
         robot: Robot,
-        readings: Readings,
+        readings: RobotReadings,
         gravity_mps2: float = G0_MPS2,
         since_s: float = -np.inf,
     ) -> None:
@@ -182,39 +196,35 @@ class RobotPath(ForcePath):
         self._robot = robot
         self._gravity_mps2 = gravity_mps2
         self._tracks = _tracks(robot, readings)
-        self._steps = [noise_step(values, _SMALLEST_STEP, times) for times, values in self._tracks]
-        begin_s = max(times[0] for times, _ in self._tracks)
-        end_s = min(times[-1] for times, _ in self._tracks)
-        readings_hz = max(stamped_rate_hz(times) for times, _ in self._tracks)
-        rate_hz = min(_PER_READING * readings_hz, _HIGHEST_RATE_HZ)
+        self._steps = [noise_step(t.values, _SMALLEST_STEP, t.time_s) for t in self._tracks]
+        times_s = [track.time_s for track in self._tracks]
+        begin_s = max(each_s[0] for each_s in times_s)
+        end_s = min(each_s[-1] for each_s in times_s)
+        rate_hz = min(_PER_READING * max(map(stamped_rate_hz, times_s)), _HIGHEST_RATE_HZ)
         grid_s = np.linspace(begin_s, end_s, max(int((end_s - begin_s) * rate_hz), 8))
-        for times, _ in self._tracks:
+        for each_s in times_s:
             # Nothing is known in a gap, however smoothly the spline bridges it.
-            gaps_s = np.append(np.diff(times), 0.0)
+            gaps_s = np.append(np.diff(each_s), 0.0)
             longest_s = max(_LONGEST_GAP_S, _USUAL_GAPS * float(np.median(gaps_s)))
-            grid_s = grid_s[gaps_s[np.searchsorted(times, grid_s, 'right') - 1] <= longest_s]
+            grid_s = grid_s[gaps_s[np.searchsorted(each_s, grid_s, 'right') - 1] <= longest_s]
         grid_s = grid_s[grid_s >= since_s]
-        self._splines = self._paths(self._tracks)
+        self._splines = self._smooth(self._tracks)
         self._smoothed = _derivatives(self._splines, grid_s)
         self.motion = self._moved(self._smoothed)
         super().__init__(grid_s, np.hstack(list(self.motion)))
         self.joints = robot.joints
         self.wanders = readings.base is not None
 
-    def _paths(self, tracks: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Path]:
-        """Smooth the tracks."""
-        return [
-            SmoothedPath(
-                times,
-                values,
-                step,
-                is_seen=True,
-                knot_s=min(KNOT_S, _KNOT_READINGS * period_s(times)),
-            )
-            if np.ptp(values)
-            else Held(float(values[0]))
-            for (times, values), step in zip(tracks, self._steps)
-        ]
+    def _smooth(self, tracks: Sequence[JointTrack]) -> list[Path]:
+        """Return smooth paths through tracks with the steps of the encoders."""
+        paths: list[Path] = []
+        for (time_s, values), step in zip(tracks, self._steps):
+            if np.ptp(values):
+                knot_s = min(KNOT_S, _KNOT_READINGS * period_s(time_s))
+                paths.append(SmoothedPath(time_s, values, step, is_seen=True, knot_s=knot_s))
+            else:
+                paths.append(Held(float(values[0])))
+        return paths
 
     def _moved(self, tracks: np.ndarray) -> FrameMotion:
         count = len(self._robot.joints)
@@ -223,8 +233,12 @@ class RobotPath(ForcePath):
 
     def rotation(self, time_s: np.ndarray) -> tuple[Components, Components]:
         """Return angular rate, rad/s, and acceleration, rad/s², in the frame, by component."""
-        columns = self.at(time_s)
-        return columns[3:6], columns[6:9]
+        moved = self._motion_at(time_s)
+        return list(moved.rate_radps.T), list(moved.acceleration_radps2.T)
+
+    def _motion_at(self, time_s: np.ndarray) -> FrameMotion:
+        """Return the motion of the frame at times, s, (n,)."""
+        return FrameMotion(*np.split(np.column_stack(self.at(time_s)), 4, axis=1))
 
     def as_motion(self) -> Motion:
         """Return the motion that a sensor in the frame follows."""
@@ -261,7 +275,7 @@ class RobotPath(ForcePath):
 
         Gravity at rest is g·[sin α·cos β, −sin α·sin β, cos α].
         """
-        x, y, z = self.at(time_s)[9:]
+        x, y, z = self._motion_at(time_s).up.T
         return np.arctan2(np.hypot(x, y), z), np.unwrap(np.arctan2(-y, x))
 
     @cached_property
@@ -312,7 +326,8 @@ class RobotPath(ForcePath):
         def rms_around(values: np.ndarray) -> np.ndarray:
             return np.sqrt(np.maximum(uniform_filter1d(values**2, around), 0.0))
 
-        size, rate = rms_around(error), rms_around(np.gradient(error, self.time_s))
+        size = rms_around(error)
+        rate = rms_around(np.gradient(error, self.time_s))
         return PathErrors(
             np.interp(time_s, self.time_s, size),
             np.interp(time_s, self.time_s, rate / np.maximum(size, _SMALLEST_STEP)),
@@ -326,7 +341,11 @@ class RobotPath(ForcePath):
         A spline through every second reading of the smoothed motion lacks what jerks within a
         few readings, as the motion itself does.
         """
-        return self._read_again(2)
+        halved = [
+            JointTrack(track.time_s[::2], path(track.time_s[::2]))
+            for track, path in zip(self._tracks, self._splines)
+        ]
+        return self._change_mps2(halved)
 
     @cached_property
     def error_mps2(self) -> np.ndarray:
@@ -335,19 +354,19 @@ class RobotPath(ForcePath):
 
         The smoothed motion is read by encoders whose steps lie elsewhere, and smoothed again.
         """
-        return self._read_again(1) + self.smoothing_mps2
-
-    def _read_again(self, every: int) -> np.ndarray:
-        """Return the change by reading the smoothed motion: by its encoders, or exactly some."""
         rng = np.random.default_rng(0)
-        tracks = []
-        for (times, values), step, path in zip(self._tracks, self._steps, self._splines):
-            read = path(times)
+        encoded = []
+        for (time_s, values), step, path in zip(self._tracks, self._steps, self._splines):
+            read = path(time_s)
             offset = step * rng.random()
-            if every == 1 and step and np.ptp(values):
+            if step and np.ptp(values):
                 read = np.rint((read + offset) / step) * step - offset
-            tracks.append((times[::every], read[::every]))
-        moved = self._moved(_derivatives(self._paths(tracks), self.time_s))
+            encoded.append(JointTrack(time_s, read))
+        return self._change_mps2(encoded) + self.smoothing_mps2
+
+    def _change_mps2(self, tracks: Sequence[JointTrack]) -> np.ndarray:
+        """Return by how much the force of other readings differs, m/s², at `time_s`, (n, 3)."""
+        moved = self._moved(_derivatives(self._smooth(tracks), self.time_s))
         return moved.force_mps2 - self.motion.force_mps2
 
 
@@ -358,8 +377,8 @@ def _derivatives(paths: Sequence[Path], time_s: np.ndarray) -> np.ndarray:
     )
 
 
-def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return times and readings of the chain's joints, and then of the base's coordinates."""
+def _tracks(robot: Robot, readings: RobotReadings) -> list[JointTrack]:
+    """Return the readings of the chain's joints, and then of the base's coordinates."""
     missing = [name for name in robot.joints if name not in readings.joints]
     if missing:
         raise UserError(
@@ -367,32 +386,30 @@ def _tracks(robot: Robot, readings: Readings) -> list[tuple[np.ndarray, np.ndarr
             f'{"move" if len(missing) > 1 else "moves"} {robot.frame} in {robot.urdf}; recorded '
             f'are {", ".join(readings.joints) or "no joints"}'
         )
-    tracks = [
-        (name, readings.joints[name][0], np.unwrap(readings.joints[name][1]))
-        for name in robot.joints
-    ]
+    tracks = {}
+    for name in robot.joints:
+        read = readings.joints[name]
+        tracks[name] = read._replace(values=np.unwrap(read.values))
     if readings.base is not None:
-        times, pose = readings.base
-        signs = np.cumprod(
-            np.append(1.0, np.where(np.sum(pose[1:, 3:] * pose[:-1, 3:], axis=1) < 0, -1.0, 1.0))
-        )
-        pose = np.hstack([pose[:, :3], pose[:, 3:] * signs[:, None]])
-        tracks += [
-            (f'base {axis}', times, values)
-            for axis, values in zip(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), pose.T)
-        ]
+        time_s, pose = readings.base
+        # A quaternion and its negative are the same turn: neighbours get the same sign.
+        is_turned = np.sum(pose[1:, 3:] * pose[:-1, 3:], axis=1) < 0
+        signs = np.cumprod(np.append(1.0, np.where(is_turned, -1.0, 1.0)))
+        steady = np.hstack([pose[:, :3], pose[:, 3:] * signs[:, None]])
+        for axis, values in zip(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), steady.T):
+            tracks[f'base {axis}'] = JointTrack(time_s, values)
     if not tracks:
         raise UserError(
             f'{robot.urdf}: no joint moves {robot.frame}, and {readings.path} has no '
             'pose of a moving base; record odom, or tf'
         )
-    for name, times, _ in tracks:
-        if len(times) < 8:
+    for name, track in tracks.items():
+        if len(track.time_s) < 8:
             raise UserError(
-                f'{readings.path}: {name} has {len(times)} finite readings whose '
+                f'{readings.path}: {name} has {len(track.time_s)} finite readings whose '
                 'stamps differ; at least 8 are needed'
             )
-    return [(times, values) for _, times, values in tracks]
+    return list(tracks.values())
 
 
 def robot_path(

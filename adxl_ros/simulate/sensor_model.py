@@ -68,7 +68,9 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
     """
     limit: float | np.ndarray = np.inf
     if units == 'datasheet':
-        names, stds, limits = [], [], []
+        names = []
+        stds = []
+        limits = []
         for parameter, (typical, maximum) in sensor.datasheet.items():
             std = typical or maximum / _STDS_OF_MAXIMUM
             for name in names_of(effect_named(parameter.effect), sensor.axes):

@@ -76,7 +76,8 @@ class SimulatedStage:
         reference = self._reference + np.clip(self._goal - self._reference, -max_move, max_move)
         rate = (reference - self._reference) / dt_s
         # x'' = w² (r - x) - 2 w x' behind a ramp r: x = r - 2 r'/w + (c + d t) exp(-w t).
-        w, decay = self._omega, exp(-self._omega * dt_s)
+        w = self._omega
+        decay = exp(-self._omega * dt_s)
         lag = self.position - (self._reference - 2 * rate / w)
         slope = self.velocity - rate + w * lag
         self.position = reference - 2 * rate / w + (lag + slope * dt_s) * decay

@@ -16,7 +16,7 @@ from adxl_ros.errors import install_hint, UserError
 from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import make_folder
 from adxl_ros.files.recording_columns import NO_SERIAL
-from adxl_ros.fleet.inputs import find_sources, Source, stated_by
+from adxl_ros.fleet.inputs import find_sources, FoundRecording, stated_by
 from adxl_ros.fleet.row import (
     as_date,
     make_recipe,
@@ -177,7 +177,7 @@ def fleet(options: argparse.Namespace) -> int:
 
 
 def _worked(
-    options: argparse.Namespace, recipe: Recipe, todo: Sequence[Source], results: Results
+    options: argparse.Namespace, recipe: Recipe, todo: Sequence[FoundRecording], results: Results
 ) -> list[Row]:
     """Work on recordings; return what the screen shows of each."""
     shared = (recipe, frozenset(results.known))
@@ -214,11 +214,13 @@ def _plan_lines(to_do: Plan, results: Results) -> list[str]:
     )
     unknown = units.pop(NO_SERIAL, 0)
     largest = ', '.join(f'{serial} ({count})' for serial, count in units.most_common(_UNITS))
+    if len(units) > _UNITS:
+        largest += ', ...'
     rows = {
         'done already': str(to_do.done),
         'left out': _left_out(to_do),
         'core hours': f'{to_do.core_hours:.3g}',
-        'units': largest and f'{len(units)}: {largest}{", ..." * (len(units) > _UNITS)}',
+        'units': largest and f'{len(units)}: {largest}',
         'unknown unit': counted(unknown, 'recording'),
     }
     size_gb = number(to_do.size_bytes / 1e9, digits=2)

@@ -81,13 +81,11 @@ def noise(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(found.to_dict(), indent=1))
         return 0
-    following = (
-        command('diagnose', f'RECORDING --params {cli.quoted(options.output)} -o gap')
-        if options.output
-        else command(
-            'noise', f'{cli.quoted(options.recording)}{cli.reading_text(options)} -o noise.yaml'
-        )
-    )
+    read = f'{cli.quoted(options.recording)}{cli.reading_text(options)}'
+    following = command('noise', f'{read} -o noise.yaml')
+    if options.output:
+        params = cli.quoted(options.output)
+        following = command('diagnose', f'RECORDING --params {params} -o gap')
     cli.print_end(lines, files, following)
     return 0
 

@@ -9,7 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import adxl_ros as adxl
-from adxl_ros.diagnose.report import shows_row, size_lines
+from adxl_ros.diagnose.report import as_shown, size_lines
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.process import package_version
 from adxl_ros.simulate.robot import Robot
@@ -75,6 +75,7 @@ def check(
     noisy = table + np.pad(noise * 1e-3 * G0_MPS2, ((0, 0), (1, 3)))
     np.savetxt(path, noisy, '%.12g', ',', header=head, comments='')
     gap = adxl.diagnose(adxl.read(path), IDEAL, urdf=arm.URDF, frame=arm.FRAME)
+    asked = [as_shown(row, 1.0) for row in gap.could_show if row.name.effect in _ASKED]
     away_mg = np.linalg.norm(starts[1] - starts[0], axis=1) / G0_MPS2 * 1e3
     return Checked(
         f'{date.today()}, adxl_ros {package_version()}',
@@ -83,7 +84,7 @@ def check(
         float(np.sqrt(np.mean(left**2)) / G0_MPS2 * 1e3),
         gap.first_screen.word,
         _named(gap),
-        [' '.join(shows_row(r, 1.0)[:2]) for r in gap.could_show if r.name.effect in _ASKED],
+        [f'{each.effect} {each.smallest}' for each in asked],
         late_ms,
         explained,
         float(np.linalg.norm(starts[0][0])),

@@ -24,7 +24,7 @@ import time
 from adxl_ros.diagnose.verdict import UNKNOWN
 from adxl_ros.files import parameter_file
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.investigate.investigation import Outcome, Question, run_round
+from adxl_ros.investigate.investigation import Question, RoundOutcome, run_round
 from adxl_ros.investigate.manoeuvres import plan, plan_all, Pose, StageLimits
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Effect, Place
@@ -221,7 +221,7 @@ def investigated(unit, base, is_random):
             if has_samples
             else first_answer()
         )
-        if answer.outcome is not Outcome.GO_ON:
+        if answer.outcome is not RoundOutcome.GO_ON:
             return answer, bench.now_s / 60
         name = answer.manoeuvre
         if is_random:
@@ -252,7 +252,7 @@ def recorded_richly(unit, base):
             base,
             LIMITS,
         )
-        if answer.outcome is not Outcome.GO_ON:
+        if answer.outcome is not RoundOutcome.GO_ON:
             return answer, end_s / 60
         end_s += RICH_STEP_S
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
-from adxl_ros.compensate.compensation_policy import CompensationPolicy, Interval
+from adxl_ros.compensate.compensation_policy import CompensationPolicy, StreamInterval
 from adxl_ros.files import calibration_store
 from adxl_ros.files.recording_columns import sensor_info, StreamInfo
 from adxl_ros.model.effects.base import Coefficient
@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from units import drawn, nominal
 
-QUIET = Interval(1.0, {'received': 1000, 'published': 1000}, (), {}, {})
+QUIET = StreamInterval(1.0, {'received': 1000, 'published': 1000}, (), {}, {})
 
 
 def unit(serial: str = '17', axes: str = 'xy', seed: int = 1) -> Sensor:
@@ -158,7 +158,7 @@ def test_validity() -> None:
     calibrated = replace(sensor, envelope=replace(sensor.envelope, temperature_c=(20.0, 25.0)))
     at_23_c = replace(QUIET, surroundings={'temperature_c': 23.0}, ages_s={'temperature_c': 1.0})
 
-    def validity(sensor: Sensor, interval: Interval) -> str:
+    def validity(sensor: Sensor, interval: StreamInterval) -> str:
         return policy_for(sensor).values(interval, None)['validity']
 
     assert validity(calibrated, at_23_c) == 'valid'

@@ -2,7 +2,7 @@
 
 """The expected information in cases with a closed form."""
 
-from adxl_ros.diagnose.next_experiment import Belief, expected_information
+from adxl_ros.diagnose.next_experiment import expected_information, KnownCoefficients
 import numpy as np
 import pytest
 import scipy
@@ -14,13 +14,13 @@ def test_two_hypotheses_give_less_information_than_their_exact_mutual_informatio
     densities = np.array([np.exp(-(y**2) / 2), np.exp(-((y - d) ** 2) / 2)]) / np.sqrt(2 * np.pi)
     mixture = densities.mean(axis=0)
     exact = np.mean([np.sum(p * np.log(p / mixture)) for p in densities]) * (y[1] - y[0])
-    beliefs = [Belief(np.array([m]), np.zeros((1, 1))) for m in (0.0, d)]
+    beliefs = [KnownCoefficients(np.array([m]), np.zeros((1, 1))) for m in (0.0, d)]
     bound = expected_information(np.eye(1), [0.5, 0.5], beliefs)
     assert 0.5 * exact < bound < exact
 
 
 def test_information_is_between_none_and_the_entropy():
-    beliefs = [Belief(np.array([m]), np.zeros((1, 1))) for m in (0.0, 1.0, 2.0)]
+    beliefs = [KnownCoefficients(np.array([m]), np.zeros((1, 1))) for m in (0.0, 1.0, 2.0)]
     probabilities = [0.5, 0.3, 0.2]
     assert expected_information(np.zeros((1, 1)), probabilities, beliefs) == pytest.approx(0)
     assert expected_information(1e6 * np.eye(1), probabilities, beliefs) == pytest.approx(

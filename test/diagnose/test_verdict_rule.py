@@ -6,15 +6,10 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 from adxl_ros.diagnose.evidence import BLOCKS
-from adxl_ros.diagnose.verdict import (
-    block_weights,
-    decide,
-    Evidence,
-    HEALTHY,
-    HeldOut,
-    NoiseCause,
-    Rest,
-)
+from adxl_ros.diagnose.held_out import HeldOut
+from adxl_ros.diagnose.remainder import Remainder
+from adxl_ros.diagnose.verdict import block_weights, decide, NoiseCause
+from adxl_ros.diagnose.weighing import Evidence, HEALTHY
 import numpy as np
 import pytest
 
@@ -38,10 +33,10 @@ def fits(left, drift_mps2=None, seed=1):
     return made
 
 
-def rest(power=0.0, dimension='force'):
+def remainder(power=0.0, dimension='force'):
     """Return what flexible functions explain beyond the best set."""
     squares = np.full(BLOCKS, power * SAMPLES)
-    return Rest(squares, squares, squares / FLOOR / 2, {dimension: squares})
+    return Remainder(squares, squares, squares / FLOOR / 2, {dimension: squares})
 
 
 def decided(candidates, left_over=0.0, in_noise=(), material=0.1, dimension='force', only=()):
@@ -56,7 +51,7 @@ def decided(candidates, left_over=0.0, in_noise=(), material=0.1, dimension='for
         wanders=False,
         floor_mps2=FLOOR**0.5,
     )
-    left = rest(left_over, dimension)
+    left = remainder(left_over, dimension)
     if only:
         shares = np.isin(np.arange(BLOCKS), only) * BLOCKS / len(only)
         left = replace(left, squares=left.squares * shares, steady_squares=left.squares * shares)
@@ -90,7 +85,7 @@ def test_a_second_effect_must_explain_more_than_what_is_material():
 def test_what_repeats_beside_an_effect_is_said():
     verdict = decided({NOTHING: fits(5.0), BIAS: fits(1.0)}, left_over=1.0)
     assert (verdict.status, verdict.effects) == ('partly', ('bias',))
-    assert verdict.rest.value == pytest.approx(1.0)
+    assert verdict.remainder.value == pytest.approx(1.0)
 
 
 def test_what_repeats_and_no_effect_explains_is_unknown():

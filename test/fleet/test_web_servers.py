@@ -9,7 +9,7 @@ from threading import Thread
 import time
 
 from adxl_ros.fleet import inputs
-from adxl_ros.fleet.inputs import find_sources, Source
+from adxl_ros.fleet.inputs import find_sources, FoundRecording
 from adxl_ros.fleet.task import stage, StagingError
 import pytest
 
@@ -53,7 +53,7 @@ def web_server(parts, wait_s=0.0, needs=''):
 def test_a_recording_is_read_once(tmp_path):
     """The server states no type of the content, as for a suffix that it does not know."""
     with web_server(3) as (url, reads):
-        staged = stage(Source(url), tmp_path)
+        staged = stage(FoundRecording(url), tmp_path)
     assert staged.path.read_bytes() == 3 * _PART
     assert reads == ['/run.csv']
 
@@ -61,7 +61,7 @@ def test_a_recording_is_read_once(tmp_path):
 def test_a_silent_server_is_given_up(tmp_path, monkeypatch):
     monkeypatch.setattr(inputs, '_SILENCE_S', 0.2)
     with web_server(2, 2.0) as (url, _), pytest.raises(StagingError, match='cannot be read'):
-        stage(Source(url), tmp_path)
+        stage(FoundRecording(url), tmp_path)
 
 
 def test_a_token_opens_a_recording_and_stays_out_of_its_row(tmp_path):

@@ -4,15 +4,17 @@
 
 from adxl_ros.diagnose.verdict import WeightedHypothesis
 from adxl_ros.errors import UserError
-from adxl_ros.investigate.investigation import Answer, Investigation, Outcome, State
+from adxl_ros.investigate.investigation import Answer, Investigation, RoundOutcome, State
 from adxl_ros.investigate.manoeuvres import Pose, StageLimits
 import numpy as np
 import pytest
 
 LIMITS = StageLimits((0.0, np.pi), (0.0, 2 * np.pi), 0.5)
-GO_ON = Answer((WeightedHypothesis((), 0.6),), Outcome.GO_ON, manoeuvre='rests_upright')
-CERTAIN = Answer((WeightedHypothesis(('lever_arm',), 0.97),), Outcome.CERTAIN, 'It is lever_arm.')
-TIME_OVER = Answer((WeightedHypothesis((), 0.6),), Outcome.TIME_OVER, 'The time is over.')
+GO_ON = Answer((WeightedHypothesis((), 0.6),), RoundOutcome.GO_ON, manoeuvre='rests_upright')
+CERTAIN = Answer(
+    (WeightedHypothesis(('lever_arm',), 0.97),), RoundOutcome.CERTAIN, 'It is lever_arm.'
+)
+TIME_OVER = Answer((WeightedHypothesis((), 0.6),), RoundOutcome.TIME_OVER, 'The time is over.')
 
 
 class Answers:
@@ -125,7 +127,10 @@ def test_the_time_is_a_limit():
 
 @pytest.mark.parametrize(
     'answer',
-    [UserError('the bag is gone'), Answer((), Outcome.INSEPARABLE, fault='axis x is inverted')],
+    [
+        UserError('the bag is gone'),
+        Answer((), RoundOutcome.INSEPARABLE, fault='axis x is inverted'),
+    ],
 )
 def test_a_failed_diagnosis_stops_it(answer):
     investigation, stage, _ = started(GO_ON, answer)

@@ -9,9 +9,9 @@ from adxl_ros.diagnose.next_experiment import ManoeuvreWorth
 from adxl_ros.diagnose.verdict import WeightedHypothesis
 from adxl_ros.investigate.investigation import (
     decide,
-    Outcome,
     Question,
     rank,
+    RoundOutcome,
     run_round,
 )
 from adxl_ros.investigate.manoeuvres import CATALOGUE, plan, plan_all, Pose, StageLimits
@@ -66,15 +66,17 @@ def test_a_manoeuvre_that_does_not_fit_in_the_time_is_not_chosen():
         Question(pose, 0.0, minutes[shortest] - 1e-6, False), [], SENSOR, LIMITS
     )
     assert fits.manoeuvre == shortest
-    assert (none_fits.manoeuvre, none_fits.outcome) == ('', Outcome.TIME_OVER)
+    assert (none_fits.manoeuvre, none_fits.outcome) == ('', RoundOutcome.TIME_OVER)
 
 
 def test_a_round_without_time_left_ends():
     decision = decide(between((), ('hysteresis',)), (told_nothing(1.0),), FIRST, False)
-    assert decision.outcome is Outcome.TIME_OVER
+    assert decision.outcome is RoundOutcome.TIME_OVER
 
 
-@pytest.mark.parametrize('probability, outcome', [(0.96, Outcome.CERTAIN), (0.85, Outcome.GO_ON)])
+@pytest.mark.parametrize(
+    'probability, outcome', [(0.96, RoundOutcome.CERTAIN), (0.85, RoundOutcome.GO_ON)]
+)
 def test_90_percent_of_a_hypothesis_is_a_verdict(probability, outcome):
     hypotheses = (
         WeightedHypothesis(('hysteresis',), probability),
@@ -82,7 +84,7 @@ def test_90_percent_of_a_hypothesis_is_a_verdict(probability, outcome):
     )
     decision = decide(hypotheses, (told_nothing(1.0),), FIRST, True)
     assert decision.outcome is outcome
-    if outcome is Outcome.CERTAIN:
+    if outcome is RoundOutcome.CERTAIN:
         assert decision.sentence == 'The recording shows hysteresis: 96 %.'
 
 
@@ -97,9 +99,9 @@ def test_a_verdict_that_stays_after_every_kind_of_manoeuvre_ends_it():
     kinds = {m.kind for m in CATALOGUE.values()}
     assert {CATALOGUE[name].kind for name in recorded} == kinds
     assert len(recorded) == len(kinds)
-    assert answer.outcome is Outcome.NO_VISIBLE_GAP
+    assert answer.outcome is RoundOutcome.NO_VISIBLE_GAP
     changed = decide(hypotheses, worth, replace(question, verdict='unknown'), True, 'no_gap')
-    assert changed.outcome is Outcome.GO_ON
+    assert changed.outcome is RoundOutcome.GO_ON
 
 
 @pytest.mark.long
@@ -107,5 +109,5 @@ def test_a_verdict_that_stays_after_every_kind_of_manoeuvre_ends_it():
 def test_the_first_round_needs_no_samples():
     answer, diagnosis = first_round()
     assert diagnosis is None
-    assert answer.outcome is Outcome.GO_ON
+    assert answer.outcome is RoundOutcome.GO_ON
     assert sum(h.probability for h in answer.hypotheses) == pytest.approx(1)

@@ -7,7 +7,7 @@ from tempfile import TemporaryFile
 import tracemalloc
 
 from adxl_ros.signals import allan_deviation
-from adxl_ros.signals.allan_deviation import AllanDeviation, Phase
+from adxl_ros.signals.allan_deviation import AllanDeviation, RunningSums
 import numpy as np
 import pytest
 from still_noise import still_samples
@@ -16,7 +16,7 @@ allantools = pytest.importorskip('allantools')
 
 
 def streamed(samples: np.ndarray, rate_hz: float, portion: int) -> AllanDeviation:
-    stream = Phase(samples.shape[1], BytesIO())
+    stream = RunningSums(samples.shape[1], BytesIO())
     for start in range(0, len(samples), portion):
         stream.feed(samples[start : start + portion])
     size, means = stream.cells()
@@ -48,7 +48,7 @@ def test_memory_does_not_grow_with_the_stream(monkeypatch: pytest.MonkeyPatch) -
     block = np.random.default_rng(3).standard_normal((8192, 3))
     peaks = []
     with TemporaryFile() as file:
-        stream = Phase(3, file)
+        stream = RunningSums(3, file)
         tracemalloc.start()
         for _ in range(3):
             for _ in range(20):

@@ -7,7 +7,7 @@ from adxl_ros.files import recording
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.signals.recorded_sensor import load_sensor, measure_unstated
-from adxl_ros.signals.rest_detection import find_rests, Noise, Rest, rest_means, RestFinder
+from adxl_ros.signals.rest_detection import find_rests, Rest, rest_means, RestFinder, SampleNoise
 from hypothesis import given, settings, strategies
 from needs import lack
 import numpy as np
@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 
 SIGMA = 0.05
 TAU_S = 32e3 * 0.33e-6
-ADXL = Noise(np.full(3, 0.535e-3), TAU_S)
+ADXL = SampleNoise(np.full(3, 0.535e-3), TAU_S)
 
 
 def directions(rng, count):
@@ -102,7 +102,7 @@ def test_live_equals_offline(seed, axes, rate_hz, known_noise, with_stage):
     time_s, samples, _, _ = handled_stream(rng, rate_hz, scale_s * rng.uniform(1, 8, 12), scale_s)
     time_s, samples = damaged(rng, time_s, samples)
     samples = samples[:, :axes]
-    noise = Noise(np.full(axes, SIGMA), 0.01) if known_noise else None
+    noise = SampleNoise(np.full(axes, SIGMA), 0.01) if known_noise else None
     tolerance = 1e-3 if with_stage else None
     angles = np.round(samples[:, [0, 0]] / 3) if with_stage else None
     offline = find_rests(time_s, samples, rate_hz, angles, noise, angle_tolerance_rad=tolerance)

@@ -3,7 +3,7 @@
 """A robot as the reference, against closed forms."""
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.robot_readings import Readings
+from adxl_ros.files.robot_readings import JointTrack, RobotReadings
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.simulate.motion import ForcePath, Motion
 from adxl_ros.simulate.response import ChainMemo, whole_response
@@ -49,9 +49,12 @@ def path_of(robot, rate_hz, step_rad, base=None, span_s=40.0):
     time_s = time_s + np.random.default_rng(0).uniform(0, 2e-5, len(time_s))  # as read
     return RobotPath(
         robot,
-        Readings(
+        RobotReadings(
             'run',
-            {'j1': (time_s, encoded(swing(time_s)[0], step_rad)), 'other': (time_s, time_s)},
+            {
+                'j1': JointTrack(time_s, encoded(swing(time_s)[0], step_rad)),
+                'other': JointTrack(time_s, time_s),
+            },
             base,
         ),
     )
@@ -146,7 +149,8 @@ def test_a_moving_base(tmp_path):
     pose = np.column_stack([shift, zero, zero, zero, zero, np.sin(yaw / 2), -np.cos(yaw / 2)])
     pose[:, 5] *= -1
     path = RobotPath(
-        Robot(tmp_path / 'robot.urdf', 'imu_link', moves=True), Readings('run', {}, (time_s, pose))
+        Robot(tmp_path / 'robot.urdf', 'imu_link', moves=True),
+        RobotReadings('run', {}, JointTrack(time_s, pose)),
     )
     inner = time_s[300:-300]
     rate, acceleration = 0.9 * 1.3 * np.cos(1.3 * inner), -0.9 * 1.69 * np.sin(1.3 * inner)

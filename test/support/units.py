@@ -22,6 +22,8 @@ from processes import REPO
 
 NOMINAL = REPO / 'params' / 'adxl203.yaml'
 PLANES_RAD = np.radians([30, 60, 90, 120, 150])
+IN_GAUGE = {('cross_axis', 'linear'), ('cross_axis_z', 'linear')}
+"""Parameters that the fits leave at 0, as a misalignment does the same."""
 
 
 def nominal(axes='xy', **changes):
@@ -44,24 +46,15 @@ def drawn(rng, sensor, effects=EFFECTS):
     """Draw a unit at datasheet spread, in the gauge of the fits."""
     values = {}
     for name in effects:
-        values[name] = {
-            p.name: np.array(
-                [
-                    rng.normal()
-                    * 0.5
-                    * p.scale
-                    * (
-                        a in p.axes
-                        and (name, p.name)
-                        not in {('cross_axis', 'linear'), ('cross_axis_z', 'linear')}
-                    )
-                    for a in sensor.axes
-                ]
-            )
-            if p.axes
-            else np.array(rng.normal() * p.scale)
-            for p in effect_named(name).parameters
-        }
+        values[name] = {}
+        for parameter in effect_named(name).parameters:
+            if not parameter.axes:
+                drawn_values = np.array(rng.normal() * parameter.scale)
+            else:
+                drawn_values = 0.5 * parameter.scale * rng.normal(size=len(sensor.axes))
+                acts = np.array([axis in parameter.axes for axis in sensor.axes])
+                drawn_values *= acts & ((name, parameter.name) not in IN_GAUGE)
+            values[name][parameter.name] = drawn_values
     return replace(sensor, effects=tuple(effects), values=values)
 
 
@@ -74,9 +67,8 @@ def swept(
     A joint draws its error in each pose, or with `per_setting` only after each move.
     """
     targets = targets or sweep(planes_rad, np.radians(30), check_poses)
-    alpha, beta = (
-        np.array([getattr(t, name) for t in targets]) for name in ('alpha_rad', 'beta_rad')
-    )
+    alpha = np.array([target.alpha_rad for target in targets])
+    beta = np.array([target.beta_rad for target in targets])
     slack = truth.stage_resolution_rad * noisy
 
     def error(angle):
@@ -91,7 +83,12 @@ def swept(
     std = np.broadcast_to(noise.sample_std_v(truth) / np.sqrt(count), volts.shape)
     volts = volts + noisy * std * rng.normal(size=volts.shape)
     return Poses(
-        volts, std, alpha, beta, np.zeros((len(alpha), 2)), np.array([t.check for t in targets])
+        volts=volts,
+        std_v=std,
+        alpha_rad=alpha,
+        beta_rad=beta,
+        time_s=np.zeros((len(alpha), 2)),
+        check=np.array([target.check for target in targets]),
     )
 
 

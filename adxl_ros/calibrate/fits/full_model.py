@@ -178,7 +178,7 @@ def fit_full(
     stated = StageError(sensor.stage_std_rad)
     start = _likeliest_shapes(start, poses, names, stated, effects)
     require_determined(start, poses, names, stated, max_open)
-    return _Search(start, poses, names, stated).run()
+    return _StageSearch(start, poses, names, stated).run()
 
 
 def _likeliest_shapes(
@@ -225,7 +225,7 @@ def _with_shape(sensor: Sensor, effect: str, name: str, value: float) -> Sensor:
     return replace(sensor, values={**sensor.values, effect: {**of_effect, name: shape}})
 
 
-class _Search:
+class _StageSearch:
     """The fit from one start: stage error, coefficients and angles in turn until all converge."""
 
     def __init__(
@@ -257,7 +257,8 @@ class _Search:
             if np.any(self._curvature_v > _MAX_CURVATURE * noise_v):
                 continue
             about = self._about(self._sensor, self._poses)
-            kept_before, deviance_before = self._kept, deviance
+            kept_before = self._kept
+            deviance_before = deviance
             deviance = about.deviance(self._stage)
             self._kept = _inliers(about, self._stage)
             converged = (

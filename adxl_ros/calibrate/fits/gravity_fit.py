@@ -158,7 +158,7 @@ def magnitude(mean: np.ndarray, parameters: np.ndarray) -> np.ndarray:
     return np.linalg.norm(force_g(mean, parameters), axis=1)
 
 
-class Linearised(NamedTuple):
+class LinearisedRests(NamedTuple):
     """Magnitudes of k rests to first order."""
 
     magnitude: np.ndarray  # g, (k,)
@@ -166,7 +166,7 @@ class Linearised(NamedTuple):
     jacobian: np.ndarray  # Derivatives by the parameters, (k, 9)
 
 
-def linearised(mean: np.ndarray, parameters: np.ndarray) -> Linearised:
+def linearised(mean: np.ndarray, parameters: np.ndarray) -> LinearisedRests:
     """Return the magnitudes with their derivatives; `mean` by nominal values, g, (k, 3)."""
     part = GravityParameters.of(parameters)
     scale = 1 + part.scale
@@ -181,7 +181,9 @@ def linearised(mean: np.ndarray, parameters: np.ndarray) -> Linearised:
     cy, ca, cb = np.cos(part.angles_rad)
     turned = np.array([[-cy, -sy, 0.0], [0.0, -ca * cb, -sa * cb], [cb, sa * sb, -ca * sb]])
     by_angle = -by_sensed[:, [1, 2, 2]] * (force @ turned.T)
-    return Linearised(length, by_output, np.hstack([-by_output, -by_output * sensed, by_angle]))
+    return LinearisedRests(
+        length, by_output, np.hstack([-by_output, -by_output * sensed, by_angle])
+    )
 
 
 def magnitude_variance(rests: NominalRests, parameters: np.ndarray) -> np.ndarray:

@@ -38,7 +38,8 @@ def fit(sensor: Sensor, poses: Poses) -> Sensor:
     force = np.column_stack(reference_force(poses, sensor.local_gravity_mps2)) / G0_MPS2
     nominal = np.column_stack([sensor.nominal_zero_g_v, sensor.nominal_scale_v_per_g])
     count = len(sensor.axes)
-    lines, covariance = np.zeros((count, 2)), np.zeros((2 * count, 2 * count))
+    lines = np.zeros((count, 2))
+    covariance = np.zeros((2 * count, 2 * count))
     for d, axis in enumerate(sensor.axes):
         reference_g = force[:, AXES.index(axis)]
         upright_g = sensor.local_gravity_mps2 / G0_MPS2 * _UPRIGHT_COS
@@ -128,7 +129,9 @@ def regress_axes(sensor: Sensor, poses: Poses) -> list[AxisRegression]:
 def _regress_axis(d: int, start: Sensor, poses: Poses) -> AxisRegression:
     force = np.column_stack(reference_force(poses, start.local_gravity_mps2)) / G0_MPS2
     zero, scale = start.zero_g_v[d], start.scale_v_per_g[d]
-    along, az, volts = force[:, d], force[:, 2], poses.volts[:, d]
+    along = force[:, d]
+    az = force[:, 2]
+    volts = poses.volts[:, d]
     # The measured value of the other axis would add its misalignment to q1 and q2.
     across = force[:, 1 - d]
     vertical = np.abs(np.sin(poses.alpha_rad)) > _VERTICAL_SIN
@@ -147,7 +150,8 @@ def _regress_axis(d: int, start: Sensor, poses: Poses) -> AxisRegression:
         if is_inclined and np.ptp(along[plane]) > _MIN_PLANE_SPAN_G:
             slope, offset = np.polyfit(along[plane], corrected[plane], 1)
         else:
-            slope, offset = np.nan, np.mean(corrected[plane] - scale * along[plane])
+            slope = np.nan
+            offset = np.mean(corrected[plane] - scale * along[plane])
         rows.append([az[plane].mean(), offset, slope])
     plane_az, plane_offset, plane_scale = np.array(rows).T
     plane_bias = plane_offset - zero

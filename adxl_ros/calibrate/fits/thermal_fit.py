@@ -190,7 +190,8 @@ class _History:
 
 def _history_output(blocks: Poses, effect: str, shape: float) -> np.ndarray:
     """Return the output of an effect of the history of size 1, g, (k,)."""
-    temperature_c, time_s = blocks.temperature_c, blocks.time_s.mean(axis=1)
+    temperature_c = blocks.temperature_c
+    time_s = blocks.time_s.mean(axis=1)
     if effect == 'thermal_hysteresis':
         return -loop(temperature_c, shape, {})
     # The filter 1/(1 + τ·s), exact for straight lines between the samples.

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 from adxl_ros.calibrate.fits.gravity_fit import NINE
 from adxl_ros.calibrate.guided.guide import NewestSamples, NextPose, STALE_NS
 from adxl_ros.calibrate.guided.rest_guides import ENOUGH_RESTS
-from adxl_ros.calibrate.guided.screen_contents import Phase, Status
+from adxl_ros.calibrate.guided.screen_contents import GuideStatus, Phase
 from adxl_ros.calibrate.guided.session import GravityError, Session, SessionSettings
 from adxl_ros.calibrate.guided.stage_guide import MountingError
 from adxl_ros.errors import UserError
@@ -33,14 +33,14 @@ class ControllerState(Enum):
     RUNNING = auto()
 
 
-class Answer(NamedTuple):
+class RequestAnswer(NamedTuple):
     """The answer to a request."""
 
     success: bool  # Whether the request was carried out
     message: str  # One line for people
 
 
-_NOT_RUNNING = Answer(False, 'no calibration is running')
+_NOT_RUNNING = RequestAnswer(False, 'no calibration is running')
 
 
 class Outputs(Protocol):
@@ -49,7 +49,7 @@ class Outputs(Protocol):
     def log(self, level: Level, text: str) -> None:
         """Log a line."""
 
-    def answer_captures(self, answer: Answer) -> None:
+    def answer_captures(self, answer: RequestAnswer) -> None:
         """Answer all callers that wait for the end of a capture."""
 
     def announce(self, pose: NextPose) -> None:
@@ -181,57 +181,57 @@ class Controller:
         self._accepted = 0
         self._has_doubt = False
 
-    def start(self, start_over: bool | None = None) -> Answer:
+    def start(self, start_over: bool | None = None) -> RequestAnswer:
         """Begin a calibration, or resume an interrupted one, as soon as the sensor is known."""
         if self.session is not None:
-            return Answer(False, 'a calibration is running; finish or abort it first')
+            return RequestAnswer(False, 'a calibration is running; finish or abort it first')
         if self.state is not ControllerState.ASKING or start_over is not None:
             self.state = ControllerState.WAITING_FOR_SENSOR
             self.question = ''
             self._starts_over = self._by_default if start_over is None else start_over
             self._try_to_start()
         if self.state is ControllerState.ASKING:
-            return Answer(False, self.question)
+            return RequestAnswer(False, self.question)
         if self.state is ControllerState.WAITING_FOR_SENSOR:
-            return Answer(True, 'starts when sensor_info comes, or samples show the sensor')
-        return Answer(self.session is not None, self._last)
+            return RequestAnswer(True, 'starts when sensor_info comes, or samples show the sensor')
+        return RequestAnswer(self.session is not None, self._last)
 
-    def capture(self) -> Answer:
+    def capture(self) -> RequestAnswer:
         """Take the pose that the operator has reached; the end of the dwell answers later."""
         if self.session is None:
             return _NOT_RUNNING
         guide = self.session.guide
         if guide.moves_itself:
-            return Answer(
+            return RequestAnswer(
                 False,
                 'nothing to capture: the stage moves itself, and poses are taken '
                 'when it has arrived',
             )
         if fault := self.session.fault or self.fit_fault:
-            return Answer(False, fault)
+            return RequestAnswer(False, fault)
         self._take_samples(self.session)
         obstacle = guide.capture()
         if obstacle:
             self._say(Level.WARN, obstacle)
-        return Answer(not obstacle, obstacle or 'averaging')
+        return RequestAnswer(not obstacle, obstacle or 'averaging')
 
-    def change_pose(self, request: str) -> Answer:
+    def change_pose(self, request: str) -> RequestAnswer:
         """Take the previous pose again ('redo'), or leave out the open one ('skip')."""
         if self.session is None:
             return _NOT_RUNNING
         try:
             text = getattr(self.session.guide, request)(self.session.journal.append)
         except UserError as error:
-            return Answer(False, f'{error}')
+            return RequestAnswer(False, f'{error}')
         if not text:
             what = {'redo': 'take again', 'skip': 'leave out'}[request]
-            return Answer(False, f'no pose to {what}')
+            return RequestAnswer(False, f'no pose to {what}')
         self.fit_fault = ''
-        self._outputs.answer_captures(Answer(False, text))
+        self._outputs.answer_captures(RequestAnswer(False, text))
         self._say(Level.OK, text)
-        return Answer(True, text)
+        return RequestAnswer(True, text)
 
-    def finish(self) -> Answer:
+    def finish(self) -> RequestAnswer:
         """Fit the poses so far and write the files."""
         session = self.session
         if session is None:
@@ -254,7 +254,7 @@ class Controller:
             if session.guide.next_pose() is None:
                 self.fit_fault = text = f'{text}; finish again, redo or abort'
             self._say(Level.ERROR, text)
-            return Answer(False, text)
+            return RequestAnswer(False, text)
         for line in result.comments():
             self._outputs.log(Level.OK, line)
         self.outcome = (result.summary[0].strip(), *result.summary[1:], *result.warnings)
@@ -262,15 +262,15 @@ class Controller:
         open_poses = session.guide.open_poses
         advice = f'; {open_poses} poses are open: start again to go on' if open_poses else ''
         self._stop(Level.OK, f'wrote {self.settings.output}{advice}')
-        return Answer(True, self._last)
+        return RequestAnswer(True, self._last)
 
-    def abort(self) -> Answer:
+    def abort(self) -> RequestAnswer:
         """End without a fit; the poses stay in the journal."""
         if self.state is ControllerState.IDLE:
             return _NOT_RUNNING
         kept = f'; its poses stay in {self.session.journal.path}' if self.session else ''
         self._stop(Level.OK, f'aborted{kept}')
-        return Answer(True, self._last)
+        return RequestAnswer(True, self._last)
 
     def read_sensor_info(self, info: StreamInfo) -> None:
         """Take what the stream states about its sensor; a running session needs the same one."""
@@ -302,7 +302,7 @@ class Controller:
                 if session.stage is not None:
                     session.stage.verify()
                 self._outputs.answer_captures(
-                    Answer(False, 'the driver started again; capture again')
+                    RequestAnswer(False, 'the driver started again; capture again')
                 )
         self.stream.take(nominal)
 
@@ -328,50 +328,50 @@ class Controller:
         try:
             for text in session.take_poses():
                 self._say(Level.OK, text)
-                self._outputs.answer_captures(Answer(True, text))
+                self._outputs.answer_captures(RequestAnswer(True, text))
         except (MountingError, GravityError) as error:
             self._stop(Level.ERROR, f'{error}')
             return
         except UserError as error:
             self._say(Level.ERROR, f'{error}')
-            self._outputs.answer_captures(Answer(False, f'{error}'))
+            self._outputs.answer_captures(RequestAnswer(False, f'{error}'))
         if session.doubt and not self._has_doubt:
             self._say(Level.WARN, f'imu/data_raw: {session.doubt}')
         self._has_doubt = bool(session.doubt)
         if refusal := session.guide.new_refusal():
             self._say(Level.WARN, refusal)
-            self._outputs.answer_captures(Answer(False, refusal))
+            self._outputs.answer_captures(RequestAnswer(False, refusal))
         pose = session.guide.next_pose()
         if pose is not None:
             self._outputs.announce(pose)
         elif not self.fit_fault:
             self.finish()
 
-    def status(self) -> Status:
+    def status(self) -> GuideStatus:
         """Return what the calibration waits for."""
         stream = self.stream
         if self.state is ControllerState.ASKING:
-            return Status(Phase.QUESTION, self.question, True)
+            return GuideStatus(Phase.QUESTION, self.question, True)
         if self.state is ControllerState.WAITING_FOR_SENSOR:
             if stream.fault:
-                return Status(Phase.REFUSED, stream.fault, True)
+                return GuideStatus(Phase.REFUSED, stream.fault, True)
             silence = self._samples.silence()
             obstacle = (
                 f'{silence}; is the driver running?'
                 if silence
                 else 'without it, 2 s of samples show the sensor'
             )
-            return Status(Phase.INFO, f'waiting for sensor_info; {obstacle}', True)
+            return GuideStatus(Phase.INFO, f'waiting for sensor_info; {obstacle}', True)
         if self.session is None:
             hints = IDLE_TEXT, stream.outlook, self._samples.silence()
-            return Status(Phase.IDLE, self._last or '; '.join(filter(None, hints)), False)
+            return GuideStatus(Phase.IDLE, self._last or '; '.join(filter(None, hints)), False)
         if silence := self._samples.silence():
-            return Status(Phase.SILENT, silence, True)
+            return GuideStatus(Phase.SILENT, silence, True)
         if fault := self.session.fault or self.fit_fault:
-            return Status(Phase.REFUSED, fault, True)
+            return GuideStatus(Phase.REFUSED, fault, True)
         return self.session.guide.status()
 
-    def report(self) -> tuple[Status, str, dict[str, str | float]]:
+    def report(self) -> tuple[GuideStatus, str, dict[str, str | float]]:
         """Return status, serial number and values by key; log an obstacle once for each pose."""
         status = self.status()
         nominal = self.stream.nominal
@@ -451,7 +451,7 @@ class Controller:
         self.state = ControllerState.IDLE
         self.session = None
         self.question = self.fit_fault = ''
-        self._outputs.answer_captures(Answer(False, text))
+        self._outputs.answer_captures(RequestAnswer(False, text))
         self._outputs.withdraw_pose(text)
         self._say(level, text)
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 import math
 from typing import NamedTuple
 
-from adxl_ros.calibrate.guided.screen_contents import Row
+from adxl_ros.calibrate.guided.screen_contents import ScreenRow
 from adxl_ros.files.stamps import halves, late_by, stamped_rate_hz
 from adxl_ros.files.sweep_journal import JournalEntry, PoseDropped, PoseRecord
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
@@ -84,7 +84,7 @@ class NewestSamples:
             f'{stated_hz:.4g}; correct the rate of the driver'
         )
 
-    def rows(self, stillness: Stillness | None) -> list[Row]:
+    def rows(self, stillness: Stillness | None) -> list[ScreenRow]:
         """Return what the sensor reads at present, for the screen."""
         if not len(self.volts):
             return []
@@ -94,11 +94,11 @@ class NewestSamples:
             for axis, mean, rms in zip(self._sensor.axes, shown.mean(axis=0), shown.std(axis=0))
         )
         rate = f'  {self.rate_hz():.0f} Hz' if math.isfinite(self.rate_hz()) else ''
-        rows = [Row('reads', f'{axes} m/s²{rate}')]
+        rows = [ScreenRow('reads', f'{axes} m/s²{rate}')]
         if stillness is not None:
             share = stillness.value / stillness.limit if stillness.limit else 1.0
             rows.append(
-                Row(
+                ScreenRow(
                     'rest',
                     stillness.describe_mps2(self._sensor),
                     share,

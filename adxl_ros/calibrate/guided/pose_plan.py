@@ -77,7 +77,8 @@ class Course:
     def __init__(
         self, targets: Sequence[Target], accepted: Collection[int], skipped: Iterable[int]
     ) -> None:
-        self.targets, self.accepted = targets, accepted  # Poses, and numbers of the taken ones
+        self.targets = targets
+        self.accepted = accepted  # Numbers of the taken ones
         self.skipped = set(skipped) - set(accepted)  # Numbers of those that are left out
         self.index = self.next_open()  # Number of the pose to go to, from 0
 
@@ -136,10 +137,9 @@ def spread(count: int) -> list[Target]:
 
 def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> str:
     """Count the poses of a plan by plane and by direction of travel, and the check poses."""
-    alpha_rad, beta_rad, check = np.array([(t.alpha_rad, t.beta_rad, t.check) for t in targets]).T
-    planes = np.round(np.degrees(alpha_rad))
-    grid = check == 0
-    turn = np.diff(beta_rad, prepend=0)
+    planes = np.round(np.degrees([target.alpha_rad for target in targets]))
+    grid = np.array([not target.check for target in targets])
+    turn = np.diff([target.beta_rad for target in targets], prepend=0)
     turn[:1] = 0
     groups = {f'{plane:.0f}°': grid & (planes == plane) for plane in dict.fromkeys(planes[grid])}
     groups |= {
@@ -176,13 +176,11 @@ def turn_fault(sensor: Sensor, change_v: np.ndarray, near_rad: float) -> str:
     """Refuse a mean that differs from that of the capture by a change, V, (m,)."""
     change_g = np.abs(change_v) / sensor.nominal_scale_v_per_g
     axis = int(change_g.argmax())
+    if change_g[axis] < np.sin(near_rad):
+        return ''
     return (
-        ''
-        if change_g[axis] < np.sin(near_rad)
-        else (
-            f'the pose changed after the capture: {sensor.axes[axis]} moved by '
-            f'{change_g[axis]:.2f} g; hold the stage still until the pose is taken'
-        )
+        f'the pose changed after the capture: {sensor.axes[axis]} moved by '
+        f'{change_g[axis]:.2f} g; hold the stage still until the pose is taken'
     )
 
 

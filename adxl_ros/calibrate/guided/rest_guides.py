@@ -14,7 +14,13 @@ from adxl_ros.calibrate.fits.gravity_fit import force_g, NAMES, NINE, nominal_re
 from adxl_ros.calibrate.fits.thermal_fit import PARTS
 from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate
 from adxl_ros.calibrate.guided.guide import Dwell, Guide, NextPose
-from adxl_ros.calibrate.guided.screen_contents import Phase, Row, Status, tilt_row
+from adxl_ros.calibrate.guided.screen_contents import (
+    EstimateRows,
+    GuideStatus,
+    Phase,
+    ScreenRow,
+    tilt_row,
+)
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
@@ -35,6 +41,45 @@ _MIN_FORCE_G = 1e-9
 """Lower bound of the measured force, g, so that a sensor without signal has a direction."""
 
 
+@dataclass(frozen=True)
+class GravityEstimate:
+    """The gravity model by the rests so far, with the priors of the datasheet."""
+
+    parameters: np.ndarray  # Those of `gravity_fit`, (9,)
+    rows: list[ScreenRow]  # The coefficients, for the screen
+    fitted: Sensor
+    covered: np.ndarray  # Orientations with a rest, bool
+
+
+def estimated_by_gravity(sensor: Sensor, records: Sequence[PoseRecord]) -> GravityEstimate:
+    """Fit the gravity model to rests; without any, it is that of the priors."""
+    mean_v = np.array([record.mean_v for record in records]).reshape(-1, 3)
+    std_v = np.array([record.std_v for record in records]).reshape(-1, 3)
+    rests = nominal_rests(mean_v, std_v, sensor)
+    parameters = np.zeros(len(NAMES))
+    if records:
+        parameters = gravity_fit.regularised_fit(rests, _STEPS)
+    information = gravity_fit.posterior_information(rests, parameters, gravity_fit.TRIAL_STD_G**2)
+    values, to_units = gravity_fit.effect_values(parameters, sensor)
+    covariance = np.linalg.inv(information) * np.outer(to_units, to_units)
+    rows = running_estimate.coefficient_rows(
+        NAMES,
+        parameters * to_units,
+        np.sqrt(np.diag(covariance)),
+        gravity_fit.PRIOR_STD * to_units,
+    )
+    fitted = replace(
+        sensor,
+        effects=tuple(values),
+        values=values,
+        covariance=covariance,
+        covariance_names=NAMES,
+    )
+    force = force_g(rests.mean, parameters)
+    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    return GravityEstimate(parameters, rows, fitted, cube_directions.covered(up))
+
+
 class HandRests(Guide):
     """
     Collects the rests of a hand-held sensor, which are announced as they end.
@@ -43,6 +88,7 @@ class HandRests(Guide):
     runs: `poses_to_fit` finds those of the complete stream once more, as `fit` does.
     """
 
+    estimate: GravityEstimate  # By the rests so far
     next_up: int | None  # Orientation to ask for
 
     def __init__(
@@ -104,7 +150,7 @@ class HandRests(Guide):
             return 'there is no direction left to skip'
         self._skipped[self.next_up] = True
         skipped = cube_directions.points_up(self.next_up)
-        self.next_up = cube_directions.next_up(~self.covered & ~self._skipped, self.up())
+        self._choose_next()
         return f'the direction in which {skipped} is left out'
 
     def forget(self, number: int) -> str:
@@ -146,41 +192,18 @@ class HandRests(Guide):
             return None
         mean_v = self.newest.volts[-_UP_SAMPLES:].mean(axis=0, keepdims=True)
         rests = nominal_rests(mean_v, 0 * mean_v, self.sensor)
-        force = force_g(rests.mean, self._parameters)[0]
+        force = force_g(rests.mean, self.estimate.parameters)[0]
         return force / max(float(np.linalg.norm(force)), _MIN_FORCE_G)
 
     def _update_estimate(self) -> None:
-        """Fit the gravity model to the rests so far, with the priors of the datasheet."""
+        """Fit the rests so far, and choose the direction to ask for."""
         records = [self.accepted[number] for number in sorted(self.accepted)]
-        mean_v = np.array([record.mean_v for record in records]).reshape(-1, 3)
-        std_v = np.array([record.std_v for record in records]).reshape(-1, 3)
-        rests = nominal_rests(mean_v, std_v, self.sensor)
-        self._parameters = np.zeros(len(NAMES))
-        if records:
-            self._parameters = gravity_fit.regularised_fit(rests, _STEPS)
-        information = gravity_fit.posterior_information(
-            rests, self._parameters, gravity_fit.TRIAL_STD_G**2
-        )
-        values, to_units = gravity_fit.effect_values(self._parameters, self.sensor)
-        covariance = np.linalg.inv(information) * np.outer(to_units, to_units)
-        self.rows = running_estimate.coefficient_rows(
-            NAMES,
-            self._parameters * to_units,
-            np.sqrt(np.diag(covariance)),
-            gravity_fit.PRIOR_STD * to_units,
-        )
-        self.fitted = replace(
-            self.sensor,
-            effects=tuple(values),
-            values=values,
-            covariance=covariance,
-            covariance_names=NAMES,
-        )
-        force = force_g(rests.mean, self._parameters)
-        self.covered = cube_directions.covered(
-            force / np.linalg.norm(force, axis=1, keepdims=True)
-        )
-        self.next_up = cube_directions.next_up(~self.covered & ~self._skipped, self.up())
+        self.estimate = estimated_by_gravity(self.sensor, records)
+        self._choose_next()
+
+    def _choose_next(self) -> None:
+        is_open = ~self.estimate.covered & ~self._skipped
+        self.next_up = cube_directions.next_up(is_open, self.up())
 
     def _fault(self, record: PoseRecord) -> str:
         """Return why a rest is refused, or ''."""
@@ -226,67 +249,53 @@ class HandGuide(HandRests):
             values |= zip(('up_x', 'up_y', 'up_z'), cube_directions.UP[self.next_up].tolist())
         return NextPose(self.destination(), values, None)
 
-    def status(self) -> Status:
+    def status(self) -> GuideStatus:
         """Return what the guide waits for, with the values that matter."""
         count = len(self.accepted)
         stillness = self._finder.stillness()
         rests = f'{count} rests ({_advice(count)})'
         if stillness is None:
-            return Status(Phase.REST, f'{rests}; waiting for samples', False)
+            return GuideStatus(Phase.REST, f'{rests}; waiting for samples', False)
         phase = Phase.DWELL if stillness.at_rest else Phase.REST
-        return Status(
+        return GuideStatus(
             phase, f'{rests}; {stillness.describe_mps2(self.sensor)}; {self.destination()}', False
         )
 
-    def progress(self) -> list[Row]:
+    def progress(self) -> list[ScreenRow]:
         """Return direction, readings and progress, for the screen."""
         up = self.up()
         count = len(self.accepted)
-        now = (
-            []
-            if up is None
-            else [
-                Row(
-                    'now',
-                    cube_directions.points_up(int(np.argmax(cube_directions.UP @ up))) + ' now',
-                )
-            ]
-        )
+        now = []
+        if up is not None:
+            nearest = int(np.argmax(cube_directions.UP @ up))
+            now = [ScreenRow('now', f'{cube_directions.points_up(nearest)} now')]
         return [
-            Row('pose', f'{self.pose_number}: {self.destination()}'),
+            ScreenRow('pose', f'{self.pose_number}: {self.destination()}'),
             *now,
             *self.newest.rows(self.stillness()),
-            Row(
+            ScreenRow(
                 'poses',
                 f'{count} done, {max(ENOUGH_RESTS - count, 0)} left for a good fit',
                 count / ENOUGH_RESTS,
             ),
         ]
 
-    def estimated(self) -> tuple[list[Row], list[Row]]:
-        """Return coverage and error, and the coefficients by the rests so far, for the screen."""
+    def estimated(self) -> EstimateRows:
+        """Return what the rests so far show, for the screen."""
         groups = {
-            name: self.covered[axes == cube_directions.AXES_UP]
+            name: self.estimate.covered[axes == cube_directions.AXES_UP]
             for name, axes in (('faces', 1), ('edges', 2), ('corners', 3))
         }
-        return [
-            Row(
-                'coverage',
-                ', '.join(
-                    f'{name} up {group.sum()}/{len(group)}' for name, group in groups.items()
-                ),
-            ),
-            tilt_row(self.tilt_error_rad()),
-        ], self.rows
+        texts = [f'{name} up {group.sum()}/{len(group)}' for name, group in groups.items()]
+        coverage = ScreenRow('coverage', ', '.join(texts))
+        return EstimateRows([coverage, tilt_row(self.tilt_error_rad())], self.estimate.rows)
 
     def tilt_error_rad(self) -> float:
         """Return the expected rms error of alpha and beta by the rests so far, rad."""
-        std_v = np.mean(
-            [record.std_v for record in self.accepted.values()]
-            or [tuple(datasheet_noise(self.sensor).sigma)],
-            axis=0,
-        )
-        return running_estimate.tilt_error_rad(self.fitted, std_v)
+        std_v = datasheet_noise(self.sensor).sigma
+        if self.accepted:
+            std_v = np.mean([record.std_v for record in self.accepted.values()], axis=0)
+        return running_estimate.tilt_error_rad(self.estimate.fitted, std_v)
 
 
 _PATIENCE = 3
@@ -392,64 +401,66 @@ class ThermalGuide(Guide):
         """Return what to announce; None once the range is covered."""
         return None if self._passed.complete else NextPose(self.destination(), {}, None)
 
-    def status(self) -> Status:
+    def status(self) -> GuideStatus:
         """Return what the guide waits for, with the values that matter."""
         if self.refusal:
-            return Status(Phase.REFUSED, self.refusal, True)
+            return GuideStatus(Phase.REFUSED, self.refusal, True)
         if self._passed.complete:
-            return Status(Phase.DONE, self.destination(), False)
+            return GuideStatus(Phase.DONE, self.destination(), False)
         at_rest = self._dwell is not None and self._dwell.at_rest()
         motion = '' if at_rest or self._dwell is None else 'the sensor moves; '
-        (coverage, error), _ = self.estimated()
-        return Status(
+        coverage, error = self._expected()
+        return GuideStatus(
             Phase.DWELL if at_rest else Phase.REST,
             f'{len(self.accepted)} blocks; '
             f'{coverage.text}; {error.text}; {motion}{self.destination()}',
             False,
         )
 
-    def progress(self) -> list[Row]:
+    def progress(self) -> list[ScreenRow]:
         """Return temperature, readings and progress, for the screen."""
         passed = self._passed
-        rows = [Row('pose', f'{self.pose_number}: {self.destination()}')]
+        rows = [ScreenRow('pose', f'{self.pose_number}: {self.destination()}')]
         if self.accepted:
             change = 'warming' if passed.rises else 'cooling'
-            rows.append(Row('now', f'{self._blocks_c[-1]:.1f} °C, {change}'))
+            rows.append(ScreenRow('now', f'{self._blocks_c[-1]:.1f} °C, {change}'))
         done = int(passed.warming.sum() + passed.cooling.sum())
         return [
             *rows,
             *self.newest.rows(self.stillness()),
-            Row(
+            ScreenRow(
                 'parts', f'{done} done, {2 * PARTS - done} left for a good fit', done / (2 * PARTS)
             ),
         ]
 
-    def estimated(self) -> tuple[list[Row], list[Row]]:
-        """Return coverage and error, and the coefficients by the blocks so far, for the screen."""
+    def estimated(self) -> EstimateRows:
+        """Return what the blocks so far show, for the screen."""
         fit = self._fit
-        (low_c, high_c) = self._settings.range_c
         rows = []
         if fit is not None:
             prior = [thermal_fit.PRIOR_WIDTH * parameter_of(name).scale for name in fit.names]
             rows = running_estimate.coefficient_rows(
                 fit.names, fit.values, np.sqrt(np.diag(fit.covariance)), np.array(prior)
             )
-        error = (
-            f'not known yet over {low_c:g} to {high_c:g} °C'
-            if self._error_mg is None
-            else (
+        return EstimateRows(self._expected(), rows)
+
+    def _expected(self) -> list[ScreenRow]:
+        """Return which parts are covered, and the expected error."""
+        low_c, high_c = self._settings.range_c
+        error = f'not known yet over {low_c:g} to {high_c:g} °C'
+        if self._error_mg is not None:
+            error = (
                 f'zero-g {self._error_mg:.2g} mg expected over {low_c:g} to {high_c:g} °C, after '
                 f'{self._blocks_c.min():.1f} to {self._blocks_c.max():.1f} °C'
             )
-        )
         return [
-            Row(
+            ScreenRow(
                 'coverage',
                 f'warming {self._passed.warming.sum()}/{PARTS}, '
                 f'cooling {self._passed.cooling.sum()}/{PARTS}',
             ),
-            Row('error', error),
-        ], rows
+            ScreenRow('error', error),
+        ]
 
     def _update(self) -> None:
         """Bring coverage, fit and expected error up to date."""

@@ -12,7 +12,7 @@ from adxl_ros.calibrate.fits import full_model, linearisation
 from adxl_ros.calibrate.fits.linearisation import linearised, StageError
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.guided.pose_plan import Target
-from adxl_ros.calibrate.guided.screen_contents import Row
+from adxl_ros.calibrate.guided.screen_contents import ScreenRow
 from adxl_ros.calibrate.pose_model import coefficient_jacobian, predicted_volts
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import error_budget
@@ -93,7 +93,7 @@ class RunningEstimate:
         of_unit = [not full_model.belongs_to_stage(name) for name in self.names]
         return tilt_error_rad(sensor.with_covariance_of(of_unit), self.pose_std_v)
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[ScreenRow]:
         """Return the coefficients for the screen."""
         std = np.sqrt(np.diag(self.covariance))
         return coefficient_rows(self.names, get(self.sensor, self.names), std, self.prior)
@@ -175,14 +175,14 @@ def tilt_error_rad(sensor: Sensor, pose_std_v: np.ndarray) -> float:
 
 def coefficient_rows(
     names: Sequence[Coefficient], values: np.ndarray, std: np.ndarray, prior: np.ndarray
-) -> list[Row]:
+) -> list[ScreenRow]:
     """Lay out the parameters of the sensor: how far the prior has shrunk, and 90 % intervals."""
     places: dict[Coefficient, list[int]] = {}
     for i, name in enumerate(names):
         if not full_model.belongs_to_stage(name):
             places.setdefault(name.without_axis, []).append(i)
     return [
-        Row(
+        ScreenRow(
             str(name),
             ' '.join(
                 f'{names[i].axis or names[i].parameter} '

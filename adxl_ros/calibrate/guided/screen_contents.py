@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from enum import Enum
 import json
 import math
+from typing import NamedTuple
 
 
 class StageMode(Enum):
@@ -61,7 +62,7 @@ class Phase(Enum):
 
 
 @dataclass(frozen=True)
-class Status:
+class GuideStatus:
     """What a guided calibration waits for, for people."""
 
     phase: Phase  # What it waits for
@@ -70,7 +71,7 @@ class Status:
 
 
 @dataclass(frozen=True)
-class Row:
+class ScreenRow:
     """A line of the screen."""
 
     label: str
@@ -79,12 +80,21 @@ class Row:
     style: str = ''  # Of prompt_toolkit
 
 
-def tilt_row(now_rad: float, final_rad: float = math.nan) -> Row:
+class EstimateRows(NamedTuple):
+    """What the poses so far show."""
+
+    expected: list[ScreenRow]  # What is covered, and the expected error
+    coefficients: list[ScreenRow]
+
+
+def tilt_row(now_rad: float, final_rad: float = math.nan) -> ScreenRow:
     """Return the expected rms tilt error now, and after all poses if their number is fixed."""
     if not math.isfinite(now_rad):
-        return Row('tilt error', 'one axis does not show the vertical')
+        return ScreenRow('tilt error', 'one axis does not show the vertical')
     final = f', {math.degrees(final_rad):.2g}° after all poses' if math.isfinite(final_rad) else ''
-    return Row('tilt error', f'{math.degrees(now_rad):.2g}° expected now{final}', style='bold')
+    return ScreenRow(
+        'tilt error', f'{math.degrees(now_rad):.2g}° expected now{final}', style='bold'
+    )
 
 
 @dataclass(frozen=True)
@@ -105,8 +115,8 @@ class ScreenContents:
     unit: str = ''  # Serial number and axes of the sensor; '' before they are known
     output: str = ''  # The parameter file that is to be written
     keys: tuple[KeyAction, ...] = ()  # Keys that have an action now
-    rows: tuple[Row, ...] = ()  # What the sensor reads, and the progress
-    coefficients: tuple[Row, ...] = ()  # As the poses determine them so far
+    rows: tuple[ScreenRow, ...] = ()  # What the sensor reads, and the progress
+    coefficients: tuple[ScreenRow, ...] = ()  # As the poses determine them so far
     outcome: tuple[str, ...] = ()  # Lines on the calibration that has ended
 
     def to_json(self) -> str:
@@ -126,8 +136,8 @@ class ScreenContents:
                 **values,
                 'phase': Phase(values['phase']),
                 'keys': tuple(KeyAction(**key) for key in values['keys']),
-                'rows': tuple(Row(**row) for row in values['rows']),
-                'coefficients': tuple(Row(**row) for row in values['coefficients']),
+                'rows': tuple(ScreenRow(**row) for row in values['rows']),
+                'coefficients': tuple(ScreenRow(**row) for row in values['coefficients']),
                 'outcome': tuple(values['outcome']),
             }
         )

@@ -13,7 +13,7 @@ from typing import Any
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
 from adxl_ros.calibrate.guided.rest_guides import HandGuide, ThermalGuide, ThermalSettings
-from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, Row, StageMode
+from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, EstimateRows, StageMode
 from adxl_ros.calibrate.guided.stage_guide import StageGuide
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import page
@@ -199,7 +199,7 @@ class Session:
         if settings.store:
             remove_unfinished(calibration_store.sensor_folder(settings.store, nominal.serial), '')
         self._fitted: list[PoseRecord] = []
-        self._estimated: tuple[list[int], tuple[list[Row], list[Row]]] | None = None
+        self._estimated: tuple[list[int], EstimateRows] | None = None
         entries = self.journal.entries
         accepted = sweep_journal.accepted_poses(entries)
         self.resumed = len(accepted)  # Number of the poses of an interrupted calibration
@@ -224,7 +224,8 @@ class Session:
         if not len(stamps_ns) and not fault:
             return ''
         fault = fault or self.guide.feed(stamps_ns, volts)
-        before, self.fault = self.fault, fault
+        before = self.fault
+        self.fault = fault
         return '' if before else fault
 
     def take_poses(self) -> Iterator[str]:
@@ -251,13 +252,13 @@ class Session:
             raise GravityError(f'imu/data_raw: {fault.live_text}')
         self.doubt = '' if fault is None else fault.live_text
 
-    def rows(self) -> tuple[list[Row], list[Row]]:
-        """Return rows and coefficients for the screen; estimated once for each pose."""
+    def rows(self) -> EstimateRows:
+        """Return the rows of the screen, with the progress; estimated once for each pose."""
         key = [record.stop_ns for record in self.guide.accepted.values()]
         if self._estimated is None or key != self._estimated[0]:
             self._estimated = key, self.guide.estimated()
-        rows, coefficients = self._estimated[1]
-        return [*self.guide.progress(), *rows], coefficients
+        _, estimated = self._estimated
+        return estimated._replace(expected=[*self.guide.progress(), *estimated.expected])
 
     def finish(self) -> calibration.CalibrationResult:
         """Fit the poses so far and write the parameter file; `end` follows all other files."""

@@ -10,7 +10,7 @@ from dataclasses import replace
 from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate, screen_contents
 from adxl_ros.calibrate.guided.guide import Dwell, EncoderTrack, Guide, NextPose, temperature_fault
 from adxl_ros.calibrate.guided.pose_plan import Course, MOVE_S, Target
-from adxl_ros.calibrate.guided.screen_contents import Phase, Row, StageMode, Status
+from adxl_ros.calibrate.guided.screen_contents import GuideStatus, Phase, ScreenRow, StageMode
 from adxl_ros.calibrate.joint_settings import angle_tolerance_rad, SettingTracker
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord, PoseSkipped
@@ -165,7 +165,9 @@ class StageSweep(Guide):
 
     def accept(self) -> PoseRecord | None:
         """Return the pose for the journal when a full dwell at rest is complete, else None."""
-        target, settings, dwell = self.course.target, self.settings, self.dwell
+        target = self.course.target
+        settings = self.settings
+        dwell = self.dwell
         samples = round(settings.dwell_s * self.sensor.rate_hz)
         if (
             target is None
@@ -259,7 +261,8 @@ def _fault(sweep: StageSweep, record: PoseRecord, dwell: Dwell, rest: Rest) -> s
 
 def _verify_mounting(sweep: StageSweep, record: PoseRecord) -> None:
     """Compare a pose that is taken again with its first record, and go to the next pose."""
-    before, tolerance_rad = sweep.to_verify[0], sweep.sensor.stage_resolution_rad
+    before = sweep.to_verify[0]
+    tolerance_rad = sweep.sensor.stage_resolution_rad
     if sweep.uses_encoder:
         # The encoder shows how far the stage is from the earlier angles.
         tolerance_rad += max(
@@ -328,50 +331,50 @@ class StageGuide(StageSweep):
             f'pose {self.pose_number} of {count}: {task}', values, command_rad, self.newest_ns or 0
         )
 
-    def status(self) -> Status:
+    def status(self) -> GuideStatus:
         """Return what the guide waits for, with the values that matter."""
         target = self.course.target
         by_encoder = self.settings.stage_mode is StageMode.ENCODER
         if target is None:
-            return Status(Phase.DONE, 'all poses are taken', False)
+            return GuideStatus(Phase.DONE, 'all poses are taken', False)
         waited_s = ((self.newest_ns or 0) - (self.since_ns or 0)) * 1e-9
         if self.uses_encoder and (fault := self.encoder.clock_fault()):
-            return Status(Phase.STAGE, fault, True)
+            return GuideStatus(Phase.STAGE, fault, True)
         silence = self.encoder.silence(self.newest_ns or 0) if self.uses_encoder else ''
         if silence and (self.dwell is not None or by_encoder):
-            return Status(Phase.STAGE, silence, waited_s > guide.SILENT_S)
+            return GuideStatus(Phase.STAGE, silence, waited_s > guide.SILENT_S)
         if self.refusal:
-            return Status(Phase.REFUSED, self.refusal, True)
+            return GuideStatus(Phase.REFUSED, self.refusal, True)
         late = waited_s > self.settings.timeout_s
         since = f' for {waited_s:.0f} s' if late else ''
         place = self.destination()
         if self.dwell is not None:
             if self.dwell.at_rest():
-                return Status(Phase.DWELL, f'at {place}: averaging', late)
+                return GuideStatus(Phase.DWELL, f'at {place}: averaging', late)
             stillness = self.dwell.stillness()
             motion = stillness.describe_mps2(self.sensor) if stillness else 'waiting for samples'
-            return Status(Phase.REST, f'at {place}: {motion}{since}', late)
+            return GuideStatus(Phase.REST, f'at {place}: {motion}{since}', late)
         if not self.moves_itself:
-            return Status(Phase.OPERATOR, f'turn the stage to {place}, then capture', False)
+            return GuideStatus(Phase.OPERATOR, f'turn the stage to {place}, then capture', False)
         distance = silence
         if not silence and self.encoder.angles_rad is not None:
             distance = pose_plan.angle_fault(
                 target, *self.encoder.angles_rad, self.settings.tolerance_rad
             )
             distance = distance or 'arrived'
-        return Status(
+        return GuideStatus(
             Phase.STAGE, f'the stage has not arrived at {place}{since}: {distance}', late
         )
 
-    def progress(self) -> list[Row]:
+    def progress(self) -> list[ScreenRow]:
         """Return pose, readings and progress of the sweep, for the screen."""
         target = self.course.target
         angles_rad = self.encoder.angles_rad
         total = len(self.course.targets)
-        rows = [Row('pose', f'{self.pose_number} of {total}: {self.destination()}')]
+        rows = [ScreenRow('pose', f'{self.pose_number} of {total}: {self.destination()}')]
         if target is not None and angles_rad is not None:
             rows.append(
-                Row(
+                ScreenRow(
                     'now',
                     ', '.join(
                         f'{joint} {np.degrees(now):.2f}° ({np.degrees(now - wanted):+.2f}°)'
@@ -395,8 +398,8 @@ class StageGuide(StageSweep):
         return [
             *rows,
             *self.newest.rows(self.stillness()),
-            Row('dwell', f'{at_rest_s:.1f} of {dwell_s:g} s', at_rest_s / dwell_s),
-            Row(
+            ScreenRow('dwell', f'{at_rest_s:.1f} of {dwell_s:g} s', at_rest_s / dwell_s),
+            ScreenRow(
                 'poses',
                 f'{len(self.accepted)} done, {skipped}{self.open_poses} left, about '
                 f'{self.open_poses * pose_s / 60:.0f} min',
@@ -404,9 +407,10 @@ class StageGuide(StageSweep):
             ),
         ]
 
-    def estimated(self) -> tuple[list[Row], list[Row]]:
-        """Return coverage and error, and the coefficients by the poses so far, for the screen."""
-        targets, closed = self.course.targets, self.course.closed
+    def estimated(self) -> screen_contents.EstimateRows:
+        """Return what the poses so far show, for the screen."""
+        targets = self.course.targets
+        closed = self.course.closed
         final_rad = self.estimate.with_poses(
             [
                 target
@@ -414,7 +418,8 @@ class StageGuide(StageSweep):
                 if number not in closed and not target.check
             ]
         ).tilt_error_rad()
-        return [
-            Row('coverage', pose_plan.by_plane(targets, self.accepted)),
+        expected = [
+            ScreenRow('coverage', pose_plan.by_plane(targets, self.accepted)),
             screen_contents.tilt_row(self.tilt_error_rad(), final_rad),
-        ], self.estimate.rows()
+        ]
+        return screen_contents.EstimateRows(expected, self.estimate.rows())

@@ -43,7 +43,7 @@ _LEAST_LOG_SHARE = np.log(1e-3)
 unit may begin to drift, so that one change after a quiet time is no knock unless it is large."""
 
 
-class Rest(NamedTuple):
+class SeenRest(NamedTuple):
     """A rest to first order."""
 
     residual_g: np.ndarray  # Force by the calibration in use, minus gravity in its direction, (m,)
@@ -98,7 +98,8 @@ class Belief:
     def moments(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean, (p,), and covariance, (p, p), of the coefficients over all filters."""
         count = self.mean.shape[1] - self.directions
-        means, weight = self.mean[:, :count], self.weight
+        means = self.mean[:, :count]
+        weight = self.weight
         mean = weight @ means
         spread = np.einsum('l,li,lj->ij', weight, means - mean, means - mean)
         return mean, np.tensordot(weight, self.covariance[:, :count, :count], 1) + spread
@@ -128,7 +129,7 @@ class Belief:
         mean[:, : len(change)] -= change
         return replace(self, mean=mean)
 
-    def innovation(self, rest: Rest, freedom: int) -> Innovation:
+    def innovation(self, rest: SeenRest, freedom: int) -> Innovation:
         """Compare a rest with its prediction; freedom: numbers in it that the stay determines."""
         design = np.hstack([rest.design, rest.basis])
         spread = self.covariance @ design.T

@@ -20,9 +20,10 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import NamedTuple
 
-from adxl_ros.calibrate.keep.belief import Belief, LARGEST_DRIFT, Rest
+from adxl_ros.calibrate.keep.belief import Belief, LARGEST_DRIFT, SeenRest
 from adxl_ros.calibrate.keep.prior import EFFECTS, KeptSensor, Linear
 from adxl_ros.errors import UserError
 from adxl_ros.files.calibration_store import calibration_id, date_of
@@ -77,6 +78,13 @@ class _Rejection:
         return float(np.median(self.departures_g))
 
 
+class _Departure(NamedTuple):
+    """How far a rest is from the prediction."""
+
+    axis: str  # The axis that it is of
+    along_g: float  # Along this axis, g
+
+
 @dataclass
 class _Stay:
     """The present stay."""
@@ -86,7 +94,7 @@ class _Stay:
     basis: np.ndarray  # Directions in which it may turn, (m, q)
     is_held_out: bool
     belief: Belief  # With the direction of this stay; of a stay that is held out, with its rests
-    rests: list[Rest] = field(default_factory=list)
+    rests: list[SeenRest] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -131,7 +139,9 @@ class Keeper:
 
         write: puts an entry on disk before it counts; may_adopt: False for a dry run.
         """
-        self.settings, self._write, self._may_adopt = settings, write, may_adopt
+        self.settings = settings
+        self._write = write
+        self._may_adopt = may_adopt
         self.adoptions: list[Adopted] = []
         self.before: list[Sensor] = []  # Calibrations before each adoption
         self._newest: deque[tuple[int, str]] = deque()  # Stamps and sides of the last day's rests
@@ -188,7 +198,8 @@ class Keeper:
         self._forget_tests()
 
     def _use(self, kept: KeptSensor) -> None:
-        self._kept, self._linear = kept, Linear(kept)
+        self._kept = kept
+        self._linear = Linear(kept)
 
     def _forget_tests(self) -> None:
         """Begin anew with what tests the calibration in use."""
@@ -196,7 +207,8 @@ class Keeper:
         self._held: deque[_Stay] = deque(maxlen=_MOST_HELD_OUT)
         self._stays = 0
         self._rejections: dict[str, _Rejection] = {}
-        self._unexplained = self._proposal = ''
+        self._unexplained = ''
+        self._proposal = ''
         self._decided_ns = 0
 
     @property
@@ -217,55 +229,54 @@ class Keeper:
             self._time_ns = entry.undone_ns
 
     def _take_rest(self, rest: NaturalRest) -> None:
-        volts, temperature_c = np.array(rest.mean_v), rest.temperature_c
-        force_g = self._linear.force_g(volts, temperature_c)
+        temperature_c = rest.temperature_c
+        force_g = self._linear.force_g(np.array(rest.mean_v), temperature_c)
         if not np.isfinite(force_g).all():
             return
         self._age(rest.start_ns)
-        self.newest_ns, self.last_temperature_c = rest.stop_ns, temperature_c
-        side = self._side(force_g)
-        self._newest.append((rest.stop_ns, side))
+        self.newest_ns = rest.stop_ns
+        self.last_temperature_c = temperature_c
+        self._newest.append((rest.stop_ns, _side(force_g)))
         measured_g = self._linear.measured(force_g)
-        if self._stay is None or self._stay.number != rest.stay:
-            self._arrive(rest.stay, measured_g)
-        assert self._stay is not None
+        stay = self._stay
+        if stay is None or stay.number != rest.stay:
+            stay = self._arrive(rest.stay, measured_g)
         errors = self._linear.errors(force_g, temperature_c)
-        seen = Rest(
-            measured_g - self._stay.up_g,
-            errors.by_coefficients,
-            self._stay.basis,
-            errors.by_volts**2 @ np.array(rest.std_v) ** 2,
-        )
+        noise_g2 = errors.by_volts**2 @ np.array(rest.std_v) ** 2
+        seen = SeenRest(measured_g - stay.up_g, errors.by_coefficients, stay.basis, noise_g2)
         first_freedom = len(measured_g) - self._belief.directions
-        freedom = len(measured_g) if self._stay.rests else first_freedom
-        found = self._stay.belief.innovation(seen, freedom)
-        if found.plausibility < _IMPLAUSIBLE and self._stay.rests:
+        found = stay.belief.innovation(seen, len(measured_g) if stay.rests else first_freedom)
+        if found.plausibility < _IMPLAUSIBLE and stay.rests:
             # The robot has moved without a motion that was seen: a new stay.
-            self._arrive(rest.stay, measured_g)
-            seen = seen._replace(residual_g=measured_g - self._stay.up_g, basis=self._stay.basis)
-            found = self._stay.belief.innovation(seen, first_freedom)
-        departure_g = self._stay.belief.weight @ found.departure_g
-        if len(departure_g) == len(AXES):
-            axis = side[1]
-            along_g = (1 if side[0] == '+' else -1) * float(departure_g @ force_g)
-        else:
-            # Less axes do not show which side is up: the one that departs most.
-            largest = int(np.abs(departure_g).argmax())
-            axis, along_g = self._kept.sensor.axes[largest], float(departure_g[largest])
-        is_rejected = self._is_rejected(axis, along_g, found.plausibility, rest.start_ns)
+            stay = self._arrive(rest.stay, measured_g)
+            seen = seen._replace(residual_g=measured_g - stay.up_g, basis=stay.basis)
+            found = stay.belief.innovation(seen, first_freedom)
+        departure = self._departure(stay.belief.weight @ found.departure_g, force_g)
+        is_rejected = self._is_rejected(departure, found.plausibility, rest.start_ns)
         if is_rejected or self._knocked:
             # After a knock, rests in other directions would show it as a drift.
             self._stay = None
             return
         low, high = self._temperatures_c
         self._temperatures_c = [min(low, temperature_c), max(high, temperature_c)]
-        self._stay.rests.append(seen)
-        self._stay.belief = self._stay.belief.learnt(found)
-        if not self._stay.is_held_out:
-            self._belief = self._stay.belief
+        stay.rests.append(seen)
+        stay.belief = stay.belief.learnt(found)
+        if not stay.is_held_out:
+            self._belief = stay.belief
 
-    def _is_rejected(self, axis: str, along_g: float, plausibility: float, stamp_ns: int) -> bool:
-        """Return whether a rest is not learnt, by its departure from the prediction, g."""
+    def _departure(self, departure_g: np.ndarray, force_g: np.ndarray) -> _Departure:
+        """Return the departure of a force, g, (3,), along the axis that it is of."""
+        if len(departure_g) == len(AXES):
+            upright = int(np.abs(force_g).argmax())
+            sign = 1 if force_g[upright] > 0 else -1
+            return _Departure(AXES[upright], sign * float(departure_g @ force_g))
+        # Less axes do not show which side is up: the one that departs most.
+        largest = int(np.abs(departure_g).argmax())
+        return _Departure(self._kept.sensor.axes[largest], float(departure_g[largest]))
+
+    def _is_rejected(self, departure: _Departure, plausibility: float, stamp_ns: int) -> bool:
+        """Return whether a rest is not learnt, by its departure from the prediction."""
+        axis, along_g = departure
         earlier = self._rejections.get(axis)
         if earlier is not None and earlier.is_change:
             # It stays until rests read again as before.
@@ -295,28 +306,25 @@ class Keeper:
         while self._newest and self._newest[0][0] < stamp_ns - DAY_NS:
             self._newest.popleft()
 
-    def _arrive(self, number: int, measured_g: np.ndarray) -> None:
+    def _arrive(self, number: int, measured_g: np.ndarray) -> _Stay:
         """Begin a stay with the force of its first rest."""
         if self._stay is not None and self._stay.is_held_out and self._stay.rests:
             self._held.append(self._stay)
         is_held_out = self._stays % _HELD_OUT == _HELD_OUT - 1
         self._stays += 1
-        up_g, basis = measured_g, np.eye(len(measured_g))
+        up_g = measured_g
+        basis = np.eye(len(measured_g))
         if len(measured_g) == len(AXES):
             up = measured_g / np.linalg.norm(measured_g)
             up_g = up * self._gravity_g
-            basis = np.linalg.svd(up[None])[2][1:].T
-        self._stay = _Stay(number, up_g, basis, is_held_out, self._belief.moved())
+            basis = _across(up).T
+        stay = _Stay(number, up_g, basis, is_held_out, self._belief.moved())
+        self._stay = stay
+        return stay
 
     @property
     def _gravity_g(self) -> float:
         return self._kept.sensor.local_gravity_mps2 / G0_MPS2
-
-    @staticmethod
-    def _side(force_g: np.ndarray) -> str:
-        """Return which side is up: +x, −z."""
-        axis = int(np.abs(force_g).argmax())
-        return ('+' if force_g[axis] > 0 else '−') + AXES[axis]
 
     def _is_due(self, stamp_ns: int) -> bool:
         """Return whether to decide now: once a day, and never after a change."""
@@ -351,7 +359,7 @@ class Keeper:
     def _is_explained(self, change: np.ndarray) -> bool:
         """Return whether age and temperature explain all that changed since the calibration."""
         total = self._kept.values + change - self._original
-        designs = np.array([rest.design for stay in self._held for rest in stay.rests])
+        designs = self._held_designs()
         square_g2 = ((designs @ total) ** 2).mean(axis=0)
         spread = np.einsum('kij,jl,kil->ki', designs, self._allowed, designs)
         quantile = scipy.special.ndtri(1 - _UNEXPLAINED / 2)
@@ -367,7 +375,7 @@ class Keeper:
         at the temperature of the calibration, and changes with temperature alone.
         """
         mean, covariance = self._belief.moments
-        designs = np.array([rest.design for stay in self._held for rest in stay.rests])
+        designs = self._held_designs()
         upright = set()
         if self._kept.sensor.axes == AXES:
             upright = {int(np.abs(stay.up_g).argmax()) for stay in self._held}
@@ -390,6 +398,11 @@ class Keeper:
             if gain_g2 > scipy.special.ndtri(_SURE) * np.sqrt(slope @ covariance @ slope):
                 sure += change
         return sure
+
+    def _held_designs(self) -> np.ndarray:
+        """Return what the coefficients do to each rest that is held out, (k, m, p)."""
+        rests = chain.from_iterable(stay.rests for stay in self._held)
+        return np.array([rest.design for rest in rests])
 
     def _describe(self, values: np.ndarray) -> str:
         """Return the change of each zero-g at the last temperature, for people."""
@@ -460,17 +473,16 @@ class Keeper:
         belief = self._stay_free.aged(self._per_day, days)
         mean, covariance = belief.moments
         rows = self._linear.zero_g(temperature_c)
-        zero_g, std = rows @ mean, np.sqrt(np.einsum('ij,jk,ik->i', rows, covariance, rows))
+        zero_g = rows @ mean
+        std = np.sqrt(np.einsum('ij,jk,ik->i', rows, covariance, rows))
         total = rows @ (self._kept.values + mean - self._original)
-        up = np.array([0.0, 0.0, 1.0]) if self._stay is None else self._upright()
+        up = self._upright()
         error = self._linear.errors(up, temperature_c).by_coefficients
         spread = error @ (covariance + np.outer(mean, mean)) @ error.T
-        across = np.linalg.svd(up[None])[2][1:] if len(spread) == len(AXES) else None
-        tilt_rad = (
-            np.nan
-            if across is None
-            else np.sqrt(np.linalg.eigvalsh(across @ spread @ across.T).max())
-        )
+        tilt_rad = np.nan
+        if len(spread) == len(AXES):
+            across = _across(up)
+            tilt_rad = np.sqrt(np.linalg.eigvalsh(across @ spread @ across.T).max())
         date = date_of(self._kept.sensor)
         unlearnt = np.einsum('ij,jk,ik->i', rows, self._unlearnt, rows)
         return KeptState(
@@ -498,11 +510,11 @@ class Keeper:
         return [ZeroG(*pair) for pair in zip(1e3 * values, 1e3 * NORMAL_90 * std)]
 
     def _upright(self) -> np.ndarray:
-        """Return the direction of the present stay, (3,); up for less than three axes."""
-        assert self._stay is not None
-        if len(self._stay.up_g) < len(AXES):
+        """Return the direction of the present stay, (3,); up without one or with less axes."""
+        stay = self._stay
+        if stay is None or len(stay.up_g) < len(AXES):
             return np.array([0.0, 0.0, 1.0])
-        return self._stay.up_g / np.linalg.norm(self._stay.up_g)
+        return stay.up_g / np.linalg.norm(stay.up_g)
 
     def _determined(self, variance: np.ndarray, unlearnt: np.ndarray) -> tuple[str, ...]:
         """Say of each axis whether rests determine its zero-g, and which sum they show."""
@@ -510,19 +522,28 @@ class Keeper:
             f'zero-g {axis}: {"by rests" if now < before / 4 else "as calibrated, and ageing"}'
             for axis, now, before in zip(self._kept.sensor.axes, variance, unlearnt)
         ]
-        sides = {side[1] for _, side in self._newest}
-        both = {axis for axis in sides if {f'+{axis}', f'−{axis}'} <= {s for _, s in self._newest}}
-        if len(self._kept.sensor.axes) == len(AXES):
-            texts += [
-                f'only the sum of zero-g and scale factor of {axis} is seen'
-                for axis in sorted(sides - both)
-            ]
+        sides = {side for _, side in self._newest}
+        for axis in AXES if len(self._kept.sensor.axes) == len(AXES) else ():
+            if len(sides & {f'+{axis}', f'−{axis}'}) == 1:
+                texts.append(f'only the sum of zero-g and scale factor of {axis} is seen')
         return tuple(texts)
 
 
 def by_axis(axes: str, values_mg: Iterable[float]) -> str:
     """Return values by axis, mg, as text."""
     return ', '.join(f'{axis} {value:+.2g} mg' for axis, value in zip(axes, values_mg))
+
+
+def _side(force_g: np.ndarray) -> str:
+    """Return which side is up: +x, −z."""
+    axis = int(np.abs(force_g).argmax())
+    return ('+' if force_g[axis] > 0 else '−') + AXES[axis]
+
+
+def _across(up: np.ndarray) -> np.ndarray:
+    """Return two unit vectors across a direction, (2, 3)."""
+    _, _, directions = np.linalg.svd(up[None])
+    return np.asarray(directions[1:])
 
 
 def _is_kept(name: Coefficient, axis: str) -> bool:

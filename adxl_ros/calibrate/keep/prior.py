@@ -29,7 +29,7 @@ def _named(effect: str, parameter: str, axes: str) -> tuple[Coefficient, ...]:
     return tuple(Coefficient(effect, parameter, axis) for axis in axes)
 
 
-class Prior(NamedTuple):
+class KeptPrior(NamedTuple):
     """Covariances and drift of the coefficients of a kept calibration."""
 
     known: np.ndarray  # Covariance of the calibration, (p, p)
@@ -90,9 +90,10 @@ class KeptSensor:
         stated = self.sensor.envelope.temperature_c
         return NOMINAL_TEMPERATURE_C if stated is None else sum(stated) / 2
 
-    def prior(self, drift_g_per_year: float) -> Prior:
+    def prior(self, drift_g_per_year: float) -> KeptPrior:
         """Return what is known at the date of the calibration."""
-        sensor, known = self.sensor, self.sensor.covariance
+        sensor = self.sensor
+        known = self.sensor.covariance
         count = len(sensor.axes)
         drifting = np.zeros_like(known)
         slopes = self.rows('temperature_bias', 'per_k')
@@ -118,7 +119,7 @@ class KeptSensor:
         per_day[self.rows('scale_factor', 'offset_v_per_g')] = (
             _SCALE_DRIFT_PER_YEAR * sensor.scale_v_per_g
         ) ** 2 / DAYS_A_YEAR
-        return Prior(known, drifting, per_day)
+        return KeptPrior(known, drifting, per_day)
 
     @property
     def typical_slope_g_per_k(self) -> float:

@@ -84,7 +84,8 @@ class RestStream:
     def _cut(self) -> Iterator[NaturalRest]:
         """Search a window."""
         stamps_ns, volts = np.concatenate(self._stamps_ns), np.concatenate(self._volts)
-        self._stamps_ns, self._volts = [], []
+        self._stamps_ns = []
+        self._volts = []
         time_s = (stamps_ns - stamps_ns[0]) * 1e-9
         finite = np.isfinite(volts).all(axis=1)
         increases = np.diff(time_s, prepend=-1.0) > 0
@@ -104,7 +105,8 @@ class RestStream:
             if not (is_first and self._goes_on and self._is_same(found)):
                 self._stay += 1
             found = replace(found, stay=self._stay)
-            self._last, self._goes_on = found, False
+            self._last = found
+            self._goes_on = False
             goes_on = rest.time_stop_s > time_s[-1] - _EDGE_S
             if rest.span_s >= _SHORTEST_S:
                 yield from self._thinned(found)
@@ -113,9 +115,8 @@ class RestStream:
     def _natural(
         self, rest: Rest, mean_v: np.ndarray, std_v: np.ndarray, begin_ns: int
     ) -> NaturalRest:
-        start_ns, stop_ns = (
-            begin_ns + round(time_s * 1e9) for time_s in (rest.time_start_s, rest.time_stop_s)
-        )
+        start_ns = begin_ns + round(rest.time_start_s * 1e9)
+        stop_ns = begin_ns + round(rest.time_stop_s * 1e9)
         return NaturalRest(
             stay=0,
             start_ns=start_ns,

@@ -28,8 +28,6 @@ NOT_SHOWN = 'NOT SHOWN'  # Outcome: the error is within the limit, but its 90 % 
 _UPPER_QUANTILE = 0.95  # Probability of the upper end of a 90 % interval
 _NONLINEARITY = Coefficient('nonlinearity', 'cubic_per_g2')
 """Parameter whose typical datasheet value limits the error of acceleration."""
-
-
 _ZERO_G = Coefficient('bias', 'offset_v')
 _SCALE = Coefficient('scale_factor', 'offset_v_per_g')
 _ANY_TOLERANCE = {_ZERO_G: 0.25, _SCALE: 0.1}
@@ -41,6 +39,27 @@ beyond its datasheet, but by less than the datasheet's width."""
 _OPEN = 0.9
 """Share of the variance of a prior above which it alone says what a coefficient is. Chosen: the
 poses then determine its standard deviation by a twentieth at most."""
+_CHECK_READINGS = (
+    'Check the unit of the readings, the range setting, and the parameter file; do not use this '
+    'file.'
+)
+"""Advice on an implausible unit."""
+_MODELS = {
+    'nominal': 'datasheet values',
+    'linear': 'linear calibration',
+    'physical': 'physical calibration',
+    'full': 'full calibration',
+}
+"""Models in words."""
+LIMITS = {
+    'open': 'coefficients that the poses do not determine',
+    'noise': 'the noise of the means; longer rests reduce it',
+    'stage': 'the angles of the stage; further poses reduce it',
+    'model': 'the model, which does not have the form of this unit',
+    'noise or model': 'noise or model; a table of means does not separate them',
+    'stage or model': 'the stage or the model; poses that are visited twice separate them',
+}
+"""What limits a calibration, and what helps, by cause."""
 
 
 @dataclass(frozen=True)
@@ -179,17 +198,6 @@ def limit(sensor: Sensor) -> Limit:
     return Limit(G0_MPS2 * float(np.sqrt(np.mean(noise_g**2))), 'noise of one sample')
 
 
-LIMITS = {
-    'open': 'coefficients that the poses do not determine',
-    'noise': 'the noise of the means; longer rests reduce it',
-    'stage': 'the angles of the stage; further poses reduce it',
-    'model': 'the model, which does not have the form of this unit',
-    'noise or model': 'noise or model; a table of means does not separate them',
-    'stage or model': 'the stage or the model; poses that are visited twice separate them',
-}
-"""What limits a calibration, and what helps, by cause."""
-
-
 def summary_lines(
     fitted: Sensor, assessment: Assessment | None, errors: Sequence[str]
 ) -> list[str]:
@@ -223,7 +231,8 @@ def screen_table(models: Sequence[HeldOutErrors]) -> list[str]:
     """Lay out the errors of the models on held-out poses for people; the last one is saved."""
     lines = [f' {"":24}tilt error     acceleration error     (rms)']
     for errors in models:
-        tilt, accel = _padded(errors.tilt_deg.rms), _padded(errors.accel_mg.rms)
+        tilt = _padded(errors.tilt_deg.rms)
+        accel = _padded(errors.accel_mg.rms)
         lines.append(f' {_MODELS[errors.model]:22} {tilt:>9} ° {accel:>18} mg')
     lines[-1] += '           <- saved'
     return lines
@@ -234,33 +243,20 @@ def _padded(value: float) -> str:
     return '-   ' if np.isnan(value) else three_digits(value).ljust(len(f'{value:.3f}'))
 
 
-_MODELS = {
-    'nominal': 'datasheet values',
-    'linear': 'linear calibration',
-    'physical': 'physical calibration',
-    'full': 'full calibration',
-}
-"""Models in words."""
-
-
 def limit_table(assessment: Assessment, sensor: Sensor) -> list[str]:
     """Lay out the error of the calibration above its limit, with one outcome for each figure."""
+
+    def row(name: str, size_mg: float, size_deg: float, accel: str = '', tilt: str = '') -> str:
+        degrees = '-' if np.isnan(size_deg) else two_digits(size_deg)
+        return f' {name:24} {degrees:>7} ° {tilt:9} {two_digits(size_mg):>8} mg {accel}'.rstrip()
+
+    lines = [row('calibration error', assessment.error_mg, assessment.error_deg)]
     limit_mps2 = limit(sensor).mps2
-    rows = (
-        ('calibration error', assessment.error_mg, assessment.error_deg, '', ''),
-        (
-            'limit',
-            mg(limit_mps2),
-            np.degrees(limit_mps2 * np.sqrt(assessment.tilt.tilt_per_axis)),
-            assessment.accel_outcome,
-            assessment.tilt_outcome,
-        ),
-    )
-    return [
-        f' {name:24} {"-" if np.isnan(value_deg) else two_digits(value_deg):>7} ° {tilt:9} '
-        f'{two_digits(value_mg):>8} mg {accel}'.rstrip()
-        for name, value_mg, value_deg, accel, tilt in rows[: 2 if limit_mps2 else 1]
-    ]
+    if limit_mps2:
+        limit_deg = float(np.degrees(limit_mps2 * np.sqrt(assessment.tilt.tilt_per_axis)))
+        outcomes = assessment.accel_outcome, assessment.tilt_outcome
+        lines.append(row('limit', mg(limit_mps2), limit_deg, *outcomes))
+    return lines
 
 
 def gravity_lines(fit: GravityFit, time_s: np.ndarray) -> list[str]:
@@ -292,11 +288,11 @@ def provenance_entries(
         'own_accel_mg': assessment.error_mg,
         'own_tilt_deg': assessment.error_deg,
     }
-    for errors in models[-1:]:
+    if models:
         numbers |= {
-            'held_out_poses': errors.pose_count,
-            'held_out_tilt_rms_deg': errors.tilt_deg.rms,
-            'held_out_accel_rms_mg': errors.accel_mg.rms,
+            'held_out_poses': models[-1].pose_count,
+            'held_out_tilt_rms_deg': models[-1].tilt_deg.rms,
+            'held_out_accel_rms_mg': models[-1].accel_mg.rms,
         }
     entries = {
         **{key: f'{value:.4g}' for key, value in numbers.items() if np.isfinite(value)},
@@ -307,68 +303,77 @@ def provenance_entries(
     return {key: entry for key, entry in entries.items() if entry} | doubt
 
 
-def acceptance(fitted: Sensor) -> tuple[str, list[str]]:
+class Acceptance(NamedTuple):
+    """Whether a calibration is good enough, for people."""
+
+    outcome: str  # PASS, FAIL or NOT SHOWN
+    reason: str  # Its figures
+    advice: Sequence[str] = ()  # What to do, or what the figures leave out, one line each
+
+    @property
+    def lines(self) -> list[str]:
+        """Return reason and advice."""
+        return [self.reason, *self.advice]
+
+
+def acceptance(fitted: Sensor) -> Acceptance:
     """Compare the error with the datasheet, or with the noise where it states none."""
     provenance = fitted.provenance
     if fault := implausible(fitted):
-        return FAIL, [
-            f'{fault}.',
-            'Check the unit of the readings, the range setting, and the '
-            'parameter file; do not use this file.',
-        ]
+        return Acceptance(FAIL, f'{fault}.', [_CHECK_READINGS])
     if 'own_accel_mg' not in provenance:
-        return NOT_SHOWN, ['no pose was kept out of the fit to assess it']
+        return Acceptance(NOT_SHOWN, 'no pose was kept out of the fit to assess it')
+    reason = f'calibration error {two_digits(float(provenance["own_accel_mg"]))} mg'
     limit_mps2, origin = limit(fitted)
     if not limit_mps2:
-        return NOT_SHOWN, [
-            f'calibration error {two_digits(float(provenance["own_accel_mg"]))} '
-            'mg; neither a datasheet nor the noise of a sample states a limit'
-        ]
+        return Acceptance(
+            NOT_SHOWN, f'{reason}; neither a datasheet nor the noise of a sample states a limit'
+        )
     limit_text = f'{two_digits(mg(limit_mps2))} mg'
+    reason += f'; the {origin} {"allows" if origin == "datasheet" else "is"} {limit_text}'
     accel = provenance.get('verdict', '')
     outcomes = accel, provenance.get('verdict_tilt', '')
-    outcome = next((word for word in (FAIL, NOT_SHOWN) if word in outcomes), PASS)
-    error = float(provenance['own_accel_mg'])
-    verb = 'allows' if origin == 'datasheet' else 'is'
-    lines = [f'calibration error {two_digits(error)} mg; the {origin} {verb} {limit_text}']
-    if outcome == FAIL:
+    outcome = PASS
+    advice = []
+    if FAIL in outcomes:
+        outcome = FAIL
         if accel != FAIL:
             tilt_deg = float(provenance['own_tilt_deg'])
-            lines = [f'tilt error {tilt_deg:.2g}°, more than {limit_text} causes']
-        lines.append('Take more poses or a richer model; else do not use this file.')
+            reason = f'tilt error {tilt_deg:.2g}°, more than {limit_text} causes'
+        advice.append('Take more poses or a richer model; else do not use this file.')
     elif 'doubt' in provenance:
         outcome = NOT_SHOWN
-        lines.append('The recording is not sound: see the warning.')
-    elif outcome == NOT_SHOWN:
+        advice.append('The recording is not sound: see the warning.')
+    elif NOT_SHOWN in outcomes:
+        outcome = NOT_SHOWN
         open_names = ', '.join(map(str, open_coefficients(fitted)))
-        lines.append(
+        advice.append(
             f'Other poses may have a larger error: {open_names} not determined.'
             if open_names
             else 'The poses are too few to show that it is within.'
         )
     if 'span_s' in provenance:
-        lines.append(
-            f'By rests within {duration(float(provenance["span_s"]))}; a longer drift is '
-            'not in this figure.'
-        )
-    return outcome, lines
+        span = duration(float(provenance['span_s']))
+        advice.append(f'By rests within {span}; a longer drift is not in this figure.')
+    return Acceptance(outcome, reason, advice)
 
 
 def implausible(fitted: Sensor) -> str:
     """Return a fitted zero-g or scale factor that no sound sensor has, for people; '' if none."""
-    for name, unit in (_ZERO_G, 'V'), (_SCALE, 'V/g'):
+    for what, unit, name, nominal in (
+        ('zero-g', 'V', _ZERO_G, fitted.nominal_zero_g_v),
+        ('scale factor', 'V/g', _SCALE, fitted.nominal_scale_v_per_g),
+    ):
         typical, largest = fitted.datasheet.get(name, (0.0, 0.0))
+        stated = largest or 2 * typical
+        tolerances = np.full(len(nominal), stated)
+        origin = 'its datasheet'
+        if not stated:
+            tolerances = _ANY_TOLERANCE[name] * fitted.nominal_scale_v_per_g
+            origin = 'the width of any accelerometer'
         shifts = fitted.values.get(name.effect, {}).get(name.parameter, np.zeros(0))
-        nominal = fitted.nominal_zero_g_v if name == _ZERO_G else fitted.nominal_scale_v_per_g
-        tolerances = (
-            np.full(len(nominal), largest or 2 * typical)
-            if largest or typical
-            else _ANY_TOLERANCE[name] * fitted.nominal_scale_v_per_g
-        )
-        origin = 'its datasheet' if largest or typical else 'the width of any accelerometer'
         for axis, shift, middle, tolerance in zip(fitted.axes, shifts, nominal, tolerances):
             if abs(shift) > _FAR * tolerance:
-                what = 'zero-g' if name == _ZERO_G else 'scale factor'
                 return (
                     f'the {what} of {axis} is {middle + shift:.3g} {unit}, far outside of '
                     f'{middle - tolerance:.3g} to {middle + tolerance:.3g} {unit} by {origin}'
@@ -387,5 +392,6 @@ def open_coefficients(fitted: Sensor) -> list[Coefficient]:
 
 def acceptance_lines(fitted: Sensor) -> list[str]:
     """Return the acceptance as lines of a terminal."""
-    outcome, (first, *others) = acceptance(fitted)
-    return [f' {outcome}  {first}', *(f'       {line}' for line in others)]
+    accepted = acceptance(fitted)
+    further = [f'       {line}' for line in accepted.advice]
+    return [f' {accepted.outcome}  {accepted.reason}', *further]

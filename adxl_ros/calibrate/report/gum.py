@@ -127,7 +127,8 @@ def uncertainty(result: CalibrationResult) -> Uncertainty | None:
     fitted = result.fitted
     if not result.held_out or not np.isfinite(result.assessments[-1].accel.measured):
         return None
-    errors, assessment = result.held_out[-1], result.assessments[-1]
+    errors = result.held_out[-1]
+    assessment = result.assessments[-1]
     gravity = fitted.local_gravity_mps2
     axes = fitted.axis_indices
     poses = result.poses.subset(result.inliers)

@@ -94,7 +94,8 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
             'error of acceleration, mg',
         )
     file_name = re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml'
-    picture, fault = '', ''
+    picture = ''
+    fault = ''
     try:
         picture = html_page.picture_url(paper_figure(result))
     except UserError as error:
@@ -135,23 +136,23 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
 
 def badge(fitted: Sensor) -> dict[str, str]:
     """Return the acceptance and its colour."""
-    outcome, lines = acceptance.acceptance(fitted)
-    sentence = '. '.join(line.rstrip('.') for line in lines)
+    accepted = acceptance.acceptance(fitted)
+    sentence = '. '.join(line.rstrip('.') for line in accepted.lines)
     return {
-        'colour': _COLOURS[outcome],
-        'word': outcome,
+        'colour': _COLOURS[accepted.outcome],
+        'word': accepted.outcome,
         'sentence': f'{sentence[0].upper()}{sentence[1:]}.',
     }
 
 
 def tiles(result: CalibrationResult) -> list[Tile]:
     """Return tilt and acceleration error before and after, and what limits them."""
-    tiles = []
+    found = []
     if (fit := result.gravity_fit) is not None:
         used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
         before = three_digits(rms_mg(float(np.mean(fit.before_mps2[used] ** 2))))
         after = three_digits(rms_mg(float(np.mean(fit.held_out_mps2[used] ** 2))))
-        tiles = [
+        found = [
             Tile(
                 'error of the magnitude of gravity',
                 f'{before} → {after} mg',
@@ -167,15 +168,16 @@ def tiles(result: CalibrationResult) -> list[Tile]:
             before = three_digits(statistics[0].rms)
             after = three_digits(statistics[-1].rms)
             low, high = map(three_digits, statistics[-1].interval)
-            tiles.append(
+            found.append(
                 Tile(
                     label,
                     f'{before} → {after} {unit}',
                     f'rms on held-out poses, 90 %: {low} to {high} {unit}',
                 )
             )
-    for assessment in result.assessments[-1:]:
-        tiles.append(
+    if result.assessments:
+        assessment = result.assessments[-1]
+        found.append(
             Tile(
                 'limited by',
                 assessment.accel.limited_by,
@@ -183,12 +185,14 @@ def tiles(result: CalibrationResult) -> list[Tile]:
                 'noise and stage error of the check',
             )
         )
-    return tiles
+    return found
 
 
 def _sphere(result: CalibrationResult) -> dict[str, Any]:
     """Return the data of the sphere's script: errors of each model by pose and quantity."""
-    fitted, poses, fit = result.fitted, result.poses, result.gravity_fit
+    fitted = result.fitted
+    poses = result.poses
+    fit = result.gravity_fit
     if fit is not None:
         force = np.column_stack(
             signal_chain.inverse(fitted)(list(poses.volts.T), poses.environment)

@@ -256,6 +256,7 @@ def link_module(name: str) -> LinkModule:
     return cast(LinkModule, import_module(f'{_LINKS}.{name}'))
 
 
+FOREVER_NS = 2**63 - 1  # Largest time, ns: nothing bounds it
 _FIRST_S = 0.01  # First waiting time, s; each failure doubles it
 _LONGEST_S = 0.08  # Longest waiting time, s: a device that is back is noticed within it
 _SLOW_S = 1.0  # Waiting time for a device that is there but does not fit the parameters, s

@@ -24,7 +24,8 @@ class ClockRate:
     """The rate of samples by the clock of a device, where it is not the stated one."""
 
     def __init__(self, stated_hz: float) -> None:
-        self.used_hz = self._stated_hz = stated_hz
+        self._stated_hz = stated_hz
+        self.used_hz = stated_hz
         self._first: tuple[int, float] | None = None  # Number and time, µs, of a sample
         self._steps_us: list[float] = []  # Times between samples that are not counted, µs
         self._newest_hz: deque[float] = deque(maxlen=_RATES)
@@ -32,13 +33,11 @@ class ClockRate:
     @property
     def fault(self) -> str:
         """Return that clock and stated rate contradict each other, or ''."""
+        if self.used_hz == self._stated_hz:
+            return ''
         return (
-            ''
-            if self.used_hz == self._stated_hz
-            else (
-                f'states {self._stated_hz:g} Hz, but its clock shows {self.used_hz:.4g} samples a '
-                'second, which is used; correct the rate'
-            )
+            f'states {self._stated_hz:g} Hz, but its clock shows {self.used_hz:.4g} samples a '
+            'second, which is used; correct the rate'
         )
 
     def compare(self, index: int, time_us: float) -> bool:

@@ -35,7 +35,7 @@ _SHORTEST_RC_S = 1e-9  # Time constant of an output without filter, s
 _LONG_AGO_NS = -(2**61)  # Stamp before all others, ns
 
 
-class Answer(NamedTuple):
+class SelfTestAnswer(NamedTuple):
     """How a self-test has ended."""
 
     is_passed: bool
@@ -52,7 +52,7 @@ class _Batch(NamedTuple):
     settling_ns: float  # Time that this takes, ns
 
 
-Steps = Generator[None, Any, Answer]  # Each step takes a `_Batch`
+Steps = Generator[None, Any, SelfTestAnswer]  # Each step takes a `_Batch`
 
 
 class SelfTest:
@@ -64,16 +64,17 @@ class SelfTest:
         self._changed_ns = _LONG_AGO_NS  # Stamp of the sample at which that changed
         self._steps: Steps | None = None
 
-    def begin(self) -> Answer | None:
+    def begin(self) -> SelfTestAnswer | None:
         """Begin a test, unless one is running; return why it cannot be, or None."""
         if self._steps is None:
             self._steps = self._run()
             return self._step(None)
         return None
 
-    def take(self, samples: Samples, sensor: Sensor) -> tuple[Samples, Answer | None]:
+    def take(self, samples: Samples, sensor: Sensor) -> tuple[Samples, SelfTestAnswer | None]:
         """Take the next samples; return those to publish, and how a test has ended, or None."""
-        stamps_ns, is_on = samples.stamp_ns, samples.in_self_test
+        stamps_ns = samples.stamp_ns
+        is_on = samples.in_self_test
         if is_on is None:
             if self._steps is None and self._changed_ns == _LONG_AGO_NS:
                 return samples, None
@@ -90,7 +91,7 @@ class SelfTest:
         answer = self._step(_Batch(samples, sensor, is_on, is_settled, settling_ns))
         return samples.where(is_settled & ~is_on), answer
 
-    def _step(self, batch: _Batch | None) -> Answer | None:
+    def _step(self, batch: _Batch | None) -> SelfTestAnswer | None:
         if self._steps is None:
             return None
         try:
@@ -108,7 +109,7 @@ class SelfTest:
             on_v, _ = yield from self._means(HOLD_S, 'the self-test did not begin')
             after_v, sensor = yield from self._means(0.0, 'the self-test did not end')
         except UserError as error:
-            return Answer(False, str(error))
+            return SelfTestAnswer(False, str(error))
         return judge(sensor, np.concatenate([before_v, after_v]), on_v)
 
     def _means(
@@ -133,7 +134,7 @@ class SelfTest:
                 raise UserError(f'no result: {obstacle}')
 
 
-def judge(sensor: Sensor, off_v: np.ndarray, on_v: np.ndarray) -> Answer:
+def judge(sensor: Sensor, off_v: np.ndarray, on_v: np.ndarray) -> SelfTestAnswer:
     """Compare the step between means of blocks, V, (n, m), with the range of the datasheet."""
     scale_v_per_g = sensor.nominal_scale_v_per_g
     steps_g = (on_v.mean(axis=0) - off_v.mean(axis=0)) / scale_v_per_g
@@ -163,16 +164,18 @@ def judge(sensor: Sensor, off_v: np.ndarray, on_v: np.ndarray) -> Answer:
     if (np.abs(steps_g) <= errors_g).all():
         measured += '; no step: is the self-test pin of the sensor connected?'
     if wrong:
-        return Answer(False, f'FAIL {", ".join(wrong)}: {measured}')
+        return SelfTestAnswer(False, f'FAIL {", ".join(wrong)}: {measured}')
     if unsure:
-        return Answer(False, f'NOT SURE {measured}; keep {", ".join(unsure)} level and at rest')
+        return SelfTestAnswer(
+            False, f'NOT SURE {measured}; keep {", ".join(unsure)} level and at rest'
+        )
     if not limits_g:
-        return Answer(
+        return SelfTestAnswer(
             False,
             f'NOT COMPARED {measured}; write sensor.self_test_lower_g and '
             'sensor.self_test_upper_g of the datasheet into the parameter file',
         )
-    return Answer(True, f'PASS {measured}')
+    return SelfTestAnswer(True, f'PASS {measured}')
 
 
 class EmulatedLine:

@@ -10,7 +10,7 @@ import time
 from typing import Any
 
 from adxl_ros.files.column_mapping import Columns
-from adxl_ros.links.support.base import Event, no_samples, Samples
+from adxl_ros.links.support.base import Event, FOREVER_NS, no_samples, Samples
 from adxl_ros.links.support.clock_map import ClockState, DeviceClock, MAX_UNCERTAINTY_NS
 from adxl_ros.model.sensor import Sensor
 import numpy as np
@@ -24,14 +24,15 @@ _PERIOD_NS = 100_000_000
 _FOLLOW_NS = 10_000_000
 """Time between two readings of the system clock, ns; chosen: a reading takes several microseconds,
 and nobody sees a clock that was set 10 ms later."""
-_FOREVER_NS = 2**63 - 1  # Largest time, ns: any waiting time is over by then
 
 
 def _system_offset() -> tuple[int, int]:
     """Return uncertainty and offset of the system clock from the monotonic clock, ns."""
     readings = []
     for _ in range(_TRIES):
-        before_ns, system_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        before_ns = time.monotonic_ns()
+        system_ns = time.time_ns()
+        after_ns = time.monotonic_ns()
         readings.append((after_ns - before_ns, system_ns - (before_ns + after_ns) // 2))
     return min(readings)
 
@@ -97,7 +98,7 @@ class Stamper:
     def flush(self) -> bool:
         """Stamp all samples now, by what is known of the clock; return whether there are any."""
         if self._unstamped:
-            self.clock.advance(_FOREVER_NS)
+            self.clock.advance(FOREVER_NS)
             self._stamp()
         return bool(self._stamped)
 
@@ -107,7 +108,8 @@ class Stamper:
             self._stamp()
         if not self._stamped:
             return no_samples(sensor, time.time_ns())
-        parts, self._stamped = self._stamped, []
+        parts = self._stamped
+        self._stamped = []
         marks = np.concatenate([part.in_self_test for part in parts])
         return Samples(
             stamp_ns=np.concatenate([part.stamp_ns for part in parts]),

@@ -368,7 +368,8 @@ def flicker_filter(rate_hz: float) -> np.ndarray:
     highest = _HIGHEST_RATIO * rate_hz
     count = int(np.log10(highest / _LOWEST_HZ) * _PER_DECADE) + 1
     corners = 2 * np.pi * highest / rate_hz * 10 ** (-np.arange(count) / _PER_DECADE)
-    poles, zeros = np.exp(-corners), np.exp(-np.sqrt(corners[:-1] * corners[1:]))
+    poles = np.exp(-corners)
+    zeros = np.exp(-np.sqrt(corners[:-1] * corners[1:]))
     turn = np.exp(2j * np.pi * _MATCHED)
     passed = np.abs(np.prod(turn - zeros) / np.prod(turn - poles))
     sections = np.zeros((count, 6))

@@ -65,8 +65,9 @@ def test_poses_at_a_rail_are_left_out_and_an_open_scale_factor_does_not_pass():
     poses.volts[1, 0] = sensor.adc_vref_v - sensor.lsb_v
     result = calibration.calibrate(sensor, [calibration.RecordedPoses('made', poses)])
     assert len(result.poses) == 5 and 'ADC at a rail in 1 poses' in ' '.join(result.warnings)
-    outcome, lines = acceptance.acceptance(result.fitted)
-    assert outcome == acceptance.NOT_SHOWN and 'scale_factor.offset_v_per_g.y' in lines[-1]
+    accepted = acceptance.acceptance(result.fitted)
+    assert accepted.outcome == acceptance.NOT_SHOWN
+    assert 'scale_factor.offset_v_per_g.y' in accepted.advice[-1]
     poses.volts[:, 2] = 0.0
     with pytest.raises(UserError, match='made: ADC at a rail in 6 poses .*check supply'):
         calibration.calibrate(sensor, [calibration.RecordedPoses('made', poses)])

@@ -52,11 +52,14 @@ def test_an_implausible_unit_fails(
     sensor: Sensor, scale: list[float], zero_g: list[float], words: str
 ) -> None:
     unit = fitted(sensor, scale, zero_g)
-    outcome, lines = acceptance.acceptance(unit)
-    assert outcome == acceptance.FAIL == unit.provenance['verdict']
-    assert words in lines[0]
+    accepted = acceptance.acceptance(unit)
+    assert accepted.outcome == acceptance.FAIL == unit.provenance['verdict']
+    assert words in accepted.reason
 
 
 @pytest.mark.parametrize('sensor', [nominal('xyz'), any_imu()], ids=['adxl203', 'any'])
 def test_a_unit_a_little_beyond_its_datasheet_passes(sensor: Sensor) -> None:
-    assert acceptance.acceptance(fitted(sensor, [1.03, 0.95, 1.0], [0.12, 0.0, 0.0]))[0] == 'PASS'
+    assert (
+        acceptance.acceptance(fitted(sensor, [1.03, 0.95, 1.0], [0.12, 0.0, 0.0])).outcome
+        == 'PASS'
+    )

@@ -2,12 +2,8 @@
 
 """What flexible functions take up, and drifts, on figures with closed forms."""
 
-from adxl_ros.diagnose.verdict import (
-    between_rests_p,
-    FunctionProducts,
-    increments_p,
-    largest_evidence_levels,
-)
+from adxl_ros.diagnose.random_drift import between_rests_p, increments_p
+from adxl_ros.diagnose.remainder import FunctionProducts, largest_evidence_levels
 import numpy as np
 import pytest
 
