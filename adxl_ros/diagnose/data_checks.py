@@ -201,7 +201,7 @@ def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> l
         time_s = sim.force.time_s
         force_mps2 = np.column_stack(sim.force(time_s))
         rate_hz = stamped_rate_hz(time_s)
-        rests = find_rests(time_s, force_mps2, rate_hz)
+        rests = find_rests(time_s, force_mps2, rate_hz, gravity=G0_MPS2)
         shape = len(rests), force_mps2.shape[1]
         mean, std = (
             np.reshape(values, shape) for values in rest_means(time_s, force_mps2, rests, rate_hz)

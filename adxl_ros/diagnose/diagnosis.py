@@ -425,12 +425,14 @@ def _named_sensor(
     detections: Sequence[Detection],
     baseline: Sensor,
     fits: Mapping[str, HeldOutFits],
+    pose_known: bool,
 ) -> Sensor:
     """
     Return the baseline with exactly the effects whose closing the verdict states.
 
     Zero-g and scale factor that the file holds, or that changed beside the effects by a material
-    amount, have their fitted values. Filter and latency stay those of the file.
+    amount, have their fitted values. Without a known pose these are those of its median output,
+    and stay those of the file, as filter and latency do.
     """
     if not verdict.closes:
         return baseline
@@ -448,7 +450,8 @@ def _named_sensor(
         straight = [
             e
             for e in fitted.effects
-            if e not in best.effects
+            if pose_known
+            and e not in best.effects
             and effect_named(e).diagnosis.straight_line
             and (e in baseline.effects or has_changed(e))
         ]
@@ -535,7 +538,9 @@ def _report(
     best = search.found[verdict.best]
     # Coarse codes are an effect of the verdict, and not of its baseline.
     baseline = checked[0].stated
-    sensor = _named_sensor(verdict, best, detections, baseline, evidence.candidates[verdict.best])
+    fits = evidence.candidates[verdict.best]
+    pose_known = any(c.pose_known for c in comparisons)
+    sensor = _named_sensor(verdict, best, detections, baseline, fits, pose_known)
     lacking = tuple(not_covered(model.comparisons))
     remainders = tuple(
         noise_effects.noise_remainders(comparisons, best.sensor, sensor, detections, seed)

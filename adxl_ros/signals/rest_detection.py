@@ -41,6 +41,10 @@ _ANGLES = (JOINTS['alpha'], JOINTS['beta'])  # Columns of the encoder angles
 _FALSE_ALARM = 1e-6  # Probability that the variance of noise exceeds its limit
 _QUARTILE_TO_STD = 0.3186  # First quartile of |normal deviate|, stds
 _END_SIGMAS = 3.5  # Difference of an end of a rest that is cut, stds
+_LARGEST_SWING_G = 0.1
+"""Rms of the means of blocks, g, up to which a sensor may be at rest. Chosen: far above noise, and
+what stands swings by less below 10 Hz."""
+_SWINGS = -0.5  # Autocorrelation that noise never falls to, and a swing does after half a period
 
 
 @dataclass(frozen=True)
@@ -232,10 +236,12 @@ class RestFinder:
         noise: SampleNoise | None = None,
         learn: bool | None = None,
         angle_tolerance_rad: float | None = None,
+        gravity: np.ndarray | float = np.inf,
     ):
         self.noise = noise
         self.learn = noise is None if learn is None else learn
         self.angle_tolerance_rad = angle_tolerance_rad
+        self._largest_swing = _LARGEST_SWING_G * np.asarray(gravity)
         self._spans = Spans(rate_hz)
         on_stage = not self.learn or angle_tolerance_rad is not None
         shortest_s = _STAGE_S if on_stage else _HAND_HELD_S
@@ -348,7 +354,21 @@ class RestFinder:
             )
             for group in groups
             if group[-1][1] - group[0][0] >= self._min_blocks
+            and not self._swings(np.concatenate([blocks.mean[a:b] for a, b in group]))
         ]
+
+    def _swings(self, means: np.ndarray) -> bool:
+        """
+        Return whether means of blocks, (k, m), swing as a shaker does that never stops.
+
+        The quietest parts of such a stream are motion, too, so that it passes for noise.
+        """
+        swing = means - means.mean(axis=0)
+        if (swing.std(axis=0) <= self._largest_swing).all():
+            return False
+        power = np.abs(np.fft.rfft(swing, 2 * len(swing), axis=0)) ** 2
+        correlation = np.fft.irfft(power.sum(axis=1))[: len(swing) // 4]
+        return bool(correlation.min() < _SWINGS * correlation[0])
 
     def _drifting(self, blocks: Blocks, quiet: np.ndarray, limits: NoiseLimits) -> np.ndarray:
         """
@@ -457,7 +477,8 @@ def recording_finder(sensor: Sensor, has_angles: bool) -> RestFinder:
     """Return the finder of rests in a recording that all tools use."""
     noise = None if 'noise_density_g_per_rthz' in sensor.unstated else datasheet_noise(sensor)
     tolerance_rad = max(sensor.stage_resolution_rad, SAME_ANGLE_RAD) if has_angles else None
-    return RestFinder(sensor.rate_hz, len(sensor.axes), noise, True, tolerance_rad)
+    gravity_v = sensor.nominal_scale_v_per_g
+    return RestFinder(sensor.rate_hz, len(sensor.axes), noise, True, tolerance_rad, gravity_v)
 
 
 class RestMean(NamedTuple):
@@ -524,9 +545,14 @@ def find_rests(
     noise: SampleNoise | None = None,
     learn: bool | None = None,
     angle_tolerance_rad: float | None = None,
+    gravity: np.ndarray | float = np.inf,
 ) -> list[Rest]:
-    """Find the rests of a recording by samples, (n, m), in any unit, and encoder angles."""
-    finder = RestFinder(rate_hz, samples.shape[1], noise, learn, angle_tolerance_rad)
+    """
+    Find the rests of a recording by samples, (n, m), in any unit, and encoder angles.
+
+    gravity: 1 g in their unit, by which a steady swing is no rest; it is one without.
+    """
+    finder = RestFinder(rate_hz, samples.shape[1], noise, learn, angle_tolerance_rad, gravity)
     finder.feed(time_s, samples, angles_rad)
     return finder.rests()
 

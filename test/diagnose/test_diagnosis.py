@@ -254,6 +254,19 @@ def test_a_recording_at_rest_is_insufficient():
     assert 'motion' in report['not_covered'] and report['next_experiment']
 
 
+def test_an_unknown_pose_moves_no_zero_g():
+    """What is fitted beside the effect is relative to the median output of the recording."""
+    sensor = replace(unit(), rate_hz=10.0)
+    heated = Knots(np.array([0.0, 300.0, 600.0]), [20.0, 50.0, 30.0])
+    still = Motion(600.0, Held(1.0), Held(0.5), temperature_c=heated)
+    made = simulated(sensor, 'temperature_bias:per_k=4e-4', motion=still)
+    found = diagnose([made], sensor).report
+    assert 'temperature_bias' in found.verdict.named
+    np.testing.assert_array_equal(
+        found.sensor.values['bias']['offset_v'], sensor.values['bias']['offset_v']
+    )
+
+
 def test_blocks_that_leave_the_zero_g_open_make_no_gap():
     sensor = replace(nominal('xy'), rate_hz=20.0)
     soak = trajectories.TRAJECTORIES['soak'](np.random.default_rng(0))

@@ -2,7 +2,7 @@
 
 """What flexible functions take up, and drifts, on figures with closed forms."""
 
-from adxl_ros.diagnose.random_drift import increments_p
+from adxl_ros.diagnose.random_drift import between_rests_p, increments_p
 from adxl_ros.diagnose.remainder import FunctionProducts, largest_evidence_levels
 import numpy as np
 import pytest
@@ -77,3 +77,16 @@ def test_what_drifts_in_motion_alone_is_no_drift():
 
 def test_too_few_increments_say_nothing():
     assert increments_p(np.arange(10.0), np.ones(10, bool), RATE_HZ, np.zeros(10, bool)) == 1.0
+
+
+def test_a_drift_goes_on_within_rests():
+    """Where poses are stated at rests alone, errors of a stand change in moves alone."""
+    rng = np.random.default_rng(5)
+    count = 30 * 600
+    used = np.arange(count) % 600 < 400
+    walk = np.cumsum(rng.normal(0, 0.01, count))
+    of_poses = np.repeat(rng.normal(0, 1.0, 30), 600)
+    noise = rng.normal(0, 0.1, count)
+    assert between_rests_p(walk + noise, used, 100.0) > 0.01
+    assert between_rests_p(of_poses + noise, used, 100.0) < 1e-4
+    assert between_rests_p(of_poses + noise, np.ones(count, bool), 100.0) == 1.0

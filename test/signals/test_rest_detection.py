@@ -161,6 +161,17 @@ def test_streams_without_a_rest(samples):
     assert RestFinder(100.0, 3).stillness() is None
 
 
+@pytest.mark.parametrize(('swing_g', 'count'), [(2.0, 0), (0.05, 1)])
+def test_a_shaker_that_never_stops_is_no_rest(swing_g, count):
+    """Its motion passes for noise; what shakes little reads gravity still."""
+    rng = np.random.default_rng(2)
+    time_s = np.arange(6000) / 100
+    turn = 2 * np.pi * 5.02 * time_s
+    circle = G0_MPS2 * swing_g * np.array([np.cos(turn), np.sin(turn), 0 * turn]).T
+    samples = circle + [0.0, 0.0, G0_MPS2] + SIGMA * rng.normal(size=(6000, 3))
+    assert len(find_rests(time_s, samples, 100.0, gravity=G0_MPS2)) == count
+
+
 def test_known_noise_behind_its_filter():
     """With the noise of the datasheet, all rests of 5 s in every 6 s are found in full length."""
     rng = np.random.default_rng(14)

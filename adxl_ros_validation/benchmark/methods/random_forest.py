@@ -13,10 +13,9 @@ from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import fitted_of, get, parameter_of, put, Sensor, with_neutral
 from adxl_ros_validation.benchmark.case import Case, Finding
 import numpy as np
-import scipy
 from sklearn.ensemble import RandomForestClassifier
 
-_EXAMPLES = 8
+_EXAMPLES = 16
 """Training examples of each effect; chosen: run time."""
 _TREES = 200
 _BANDS = 6
@@ -26,29 +25,34 @@ _LARGEST = 3.0
 _NONE = 'none'
 
 
-def _features(case: Case, rest: np.ndarray) -> np.ndarray:
-    """Return numbers that describe a residual, m/s², (n, m)."""
+def _regressors(case: Case) -> list[np.ndarray]:
+    """Return what a residual may follow, of length 1 or 0, by axis, (k, n) each."""
+    force = case.force_mps2[case.known].T
+    along = [values[case.known] for values in (case.time_s, *case.surroundings.values())]
+    found = []
+    for own in force:
+        rows = np.nan_to_num(np.array([own, own**2, own**3, *force, *along]))
+        rows -= rows.mean(axis=1, keepdims=True)
+        lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+        found.append(rows / np.where(lengths > 1e-9, lengths, np.inf))
+    return found
+
+
+def _features(rest: np.ndarray, regressors: list[np.ndarray]) -> np.ndarray:
+    """Return numbers that describe a residual where its reference is known, m/s², (n, m)."""
     rows = []
-    along = {'time': case.time_s, **case.surroundings}
-    force = case.force_mps2[case.known]
-    for row, own in zip(rest[case.known].T, force.T):
+    for values, along in zip(rest.T, regressors):
+        mean = values.mean()
+        row = values - mean
         spread = float(np.std(row)) or 1e-12
-        power = np.array_split(np.abs(np.fft.rfft(row - row.mean()))[1:] ** 2, _BANDS)
-        blocks = [part.mean() for part in np.array_split(row, _BANDS)]
-        repeated = float(np.mean(np.diff(row) == 0))
-        regressors = [own, own**2, own**3, *force.T, *(v[case.known] for v in along.values())]
-        related = [_correlation(row, regressor) for regressor in regressors]
-        shape = [float(scipy.stats.kurtosis(row)), float(np.max(np.abs(row)) / spread), repeated]
+        power = np.array_split(np.abs(np.fft.rfft(row))[1:] ** 2, _BANDS)
         bands = [float(np.log(part.mean() + 1e-12)) for part in power]
-        rows += [row.mean(), np.log(spread), *shape, *bands, *blocks, *related]
+        blocks = [part.mean() for part in np.array_split(values, _BANDS)]
+        ratios = row / spread
+        shape = [np.mean(ratios**4), np.max(np.abs(ratios)), np.mean(np.diff(row) == 0)]
+        related = along @ ratios / np.sqrt(len(row))
+        rows += [mean, np.log(spread), *shape, *bands, *blocks, *related]
     return np.nan_to_num(np.array(rows, float), posinf=0.0, neginf=0.0)
-
-
-def _correlation(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the correlation of two arrays; 0 where one is constant."""
-    if np.std(first) == 0 or not np.std(second) > 0:
-        return 0.0
-    return float(np.corrcoef(first, second)[0, 1])
 
 
 def _drawn(case: Case, effect: str, rng: np.random.Generator) -> Sensor:
@@ -64,7 +68,7 @@ def _drawn(case: Case, effect: str, rng: np.random.Generator) -> Sensor:
 def method(case: Case) -> Finding:
     """Train on simulations of this motion, and classify the residual."""
     rng = np.random.default_rng(0)
-    base = case.simulated_mps2()
+    base, known, regressors = case.simulated_mps2(), case.known, _regressors(case)
     features, labels = [], []
     for effect in [_NONE] * 3 + list(library()):
         for _ in range(_EXAMPLES):
@@ -73,11 +77,12 @@ def method(case: Case) -> Finding:
                 output = case.simulated_mps2(sensor, seed=1 + int(rng.integers(2**31)))
             except UserError:
                 break  # This reference cannot show the effect.
-            features.append(_features(case, output - base))
+            features.append(_features((output - base)[known], regressors))
             labels.append(effect)
     forest = RandomForestClassifier(_TREES, random_state=0)
     forest.fit(np.array(features), labels)
-    chances = forest.predict_proba(_features(case, case.measured_mps2 - base)[None])[0]
+    measured = _features((case.measured_mps2 - base)[known], regressors)
+    chances = forest.predict_proba(measured[None])[0]
     best = int(np.argmax(chances))
     name = str(forest.classes_[best])
     return Finding(frozenset({name} - {_NONE}), float(chances[best]))
