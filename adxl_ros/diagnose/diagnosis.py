@@ -25,12 +25,14 @@ from adxl_ros.diagnose.evidence import (
     sum_by_block,
 )
 from adxl_ros.diagnose.flexible_functions import flexible_bases
+from adxl_ros.diagnose.held_out import HeldOutFits
 from adxl_ros.diagnose.linear_model import build_linear_model, filters_for, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
 from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemainder
+from adxl_ros.diagnose.remainder import Remainder, reproducible_remainder
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
 from adxl_ros.diagnose.search import Hypothesis, Search, with_filters
-from adxl_ros.diagnose.verdict import HEALTHY, HeldOutFits, MATERIAL_MG, Verdict
+from adxl_ros.diagnose.verdict import HEALTHY, MATERIAL_MG, Verdict
 from adxl_ros.files.recording_columns import check_same_sensor, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, Z_90
@@ -160,13 +162,13 @@ def diagnose(
         checked, _with_likely_drift(search.best, evidence), model.baseline, smallest_mps2
     )
 
-    def rest_of(effects: frozenset[str], drift: str) -> rule.Rest:
+    def remainder_of(effects: frozenset[str], drift: str) -> Remainder:
         bases = chain(*map(flexible_bases, compared, model.baseline_v))
-        return rule.reproducible_rest(evidence.candidates[effects][drift], bases)
+        return reproducible_remainder(evidence.candidates[effects][drift], bases)
 
     verdict = rule.decide(
         evidence,
-        rest_of,
+        remainder_of,
         [rule.NoiseCause(d.effect, d.power_mps2, d.is_left_out) for d in detections],
         lambda effects: _simulate_again(search, effects),
     )

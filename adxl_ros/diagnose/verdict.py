@@ -16,8 +16,7 @@ from itertools import product
 from typing import NamedTuple
 
 from adxl_ros.diagnose.evidence import BLOCKS
-from adxl_ros.diagnose.held_out import HeldOutFits as HeldOutFits
-from adxl_ros.diagnose.remainder import Remainder, reproducible_remainder
+from adxl_ros.diagnose.remainder import Remainder
 from adxl_ros.diagnose.weighing import (
     drifts_beside,
     Evidence,
@@ -48,9 +47,6 @@ _RIGHT = (0.2, 0.4, 0.6, 0.75, 0.9)
 _POSE = {'force', 'cross_force', 'alpha_rad', 'beta_rad'}
 """Dimensions that only change with the pose."""
 _DRAWS = 200  # Draws of blocks. Chosen: the 5 % quantile has 10 draws below it
-# What the stages of the diagnosis call it
-Rest = Remainder
-reproducible_rest = reproducible_remainder
 
 
 class WeightedHypothesis(NamedTuple):
