@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from html import escape
 import math
+from numbers import Real
 from typing import Any, NamedTuple
 
 from adxl_ros.errors import UserError
@@ -82,7 +83,14 @@ class Result:
         )
 
 
+def require_number(argument: str, value: object) -> None:
+    """Refuse what is no number, in words of an argument; None is not given."""
+    if value is not None and not isinstance(value, Real):
+        raise UserError(f'{argument}: must be a number')
+
+
 def require_least(name: str, value: float | None, least: float) -> None:
-    """Refuse a number that is too small; None is not given."""
+    """Refuse what is no number, or too small; None is not given."""
+    require_number(option(**{name: value}), value)
     if value is not None and not value >= least:
         raise UserError(f'{option(**{name: value})}: must be at least {least:g}')

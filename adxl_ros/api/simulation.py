@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 
 from adxl_ros.api.recordings import one_recording, read_ideal, RecordingInput
-from adxl_ros.api.result import no_progress, Progress, require_least
+from adxl_ros.api.result import no_progress, Progress, require_least, require_number
 from adxl_ros.api.sensors import (
     AddedEffects,
     as_input,
@@ -83,6 +83,7 @@ def prepare(
 ) -> Simulation:
     """Check what is to be simulated, and return it; see `simulate`."""
     require_least('seed', seed, 0)
+    require_number(usage('simulate', rate=rate), rate)
     bounds = parameter_file.SENSOR_FIELDS['sensor.rate_hz'].metadata
     if rate is not None and not bounds['lower'] <= rate <= bounds['upper']:
         raise UserError(

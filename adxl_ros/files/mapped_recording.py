@@ -346,7 +346,7 @@ class _Converter:
         self._check_step(time_s)
         if bursts := describe_bursts(time_s):
             self._remarks.append(
-                f'{self._path}: {bursts.removeprefix("; ")}; this rate is '
+                f'{self._path}: {bursts}; this rate is '
                 f'used, and {option(rate="HZ")} stamps by index'
             )
 

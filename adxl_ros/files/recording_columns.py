@@ -365,13 +365,17 @@ class StampCheck:
         stands = wrong & (time_s == latest)
         if wrong.any() and not self._may_drop:
             row = int(wrong.argmax())
-            raise UserError(
-                f'{where(row)}: time {"stands still" if stands[row] else "runs backwards"}, '
-                f'{latest[row] - time_s[row]:.3g} s before the newest sample'
-                f'{describe_bursts(time_s[is_sample])}; '
-                f'{option(drop_bad_stamps=True)} leaves such '
-                f'samples out, {option(rate="HZ")} stamps by index'
+            early_s = latest[row] - time_s[row]
+            fault = f'time runs backwards, {early_s:.3g} s before the newest sample'
+            if stands[row]:
+                fault = 'time stands still'
+            clauses = (
+                fault,
+                describe_bursts(time_s[is_sample]),
+                f'{option(drop_bad_stamps=True)} leaves such samples out, {option(rate="HZ")} '
+                'stamps by index',
             )
+            raise UserError(f'{where(row)}: {"; ".join(filter(None, clauses))}')
         duplicates = int(stands.sum())
         self.bad = BadStamps(
             self.bad.duplicates + duplicates, self.bad.backward + int(wrong.sum()) - duplicates

@@ -172,11 +172,13 @@ def late_by(stamps: np.ndarray) -> np.ndarray:
 
 
 def describe_bursts(time_s: np.ndarray) -> str:
-    """Return `; ` and a clause for messages; empty where stamps do not come in bursts."""
+    """Return a clause for messages; empty where stamps fall, or do not come in bursts."""
+    if (np.diff(time_s) < 0).any():
+        return ''
     size = burst_samples(time_s)
     if size == 1:
         return ''
     return (
-        f'; stamps come in bursts of about {size} samples (USB, or a buffer), at a mean of '
+        f'stamps come in bursts of about {size} samples (USB, or a buffer), at a mean of '
         f'{stamped_rate_hz(time_s):.4g} Hz'
     )

@@ -102,7 +102,11 @@ def write_into(path: str, node_name: str, values: Mapping[str, str]) -> None:
     values: YAML of the values by name. Raises `UserError` where the file cannot be written.
     """
     section = next(
-        (parameters for pattern, parameters in _sections(path) if _matches(pattern, node_name)),
+        (
+            parameters
+            for pattern, parameters in _sections(path)
+            if parameters.value and _matches(pattern, node_name)
+        ),
         None,
     )
     if section is None:

@@ -312,9 +312,11 @@ def assess(contents: RecordingContents) -> Findings:
 
 def _missing(contents: RecordingContents) -> str:
     expected = contents.samples + contents.missing
+    verb = 'is' if contents.missing == 1 else 'are'
     return (
-        f'{contents.missing} samples are missing ({100 * contents.missing / expected:.2g} %) '
-        f'in {counted(contents.gaps, "gap")}, the longest of {contents.longest_gap_s:.3g} s'
+        f'{counted(contents.missing, "sample")} {verb} missing '
+        f'({100 * contents.missing / expected:.2g} %) in {counted(contents.gaps, "gap")}, '
+        f'the longest of {contents.longest_gap_s:.3g} s'
     )
 
 

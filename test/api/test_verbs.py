@@ -186,6 +186,8 @@ def test_a_fit_is_a_sensor_of_a_simulator(fit) -> None:
         (lambda: adxl.simulate('no_such_motion'), 'no_such_motion'),
         (lambda: adxl.simulate('motion', effects=['no_such_effect']), 'no_such_effect'),
         (lambda: adxl.simulate('motion', effects={'bias': {'offset_v': 99}}), '99'),
+        (lambda: adxl.simulate('motion', rate='fast'), "rate='fast'"),
+        (lambda: adxl.simulate('motion', seed='x'), "seed='x'"),
         (lambda: adxl.simulate('imu'), 'force=RECORDING'),
         (lambda: adxl.load('no_such_sensor'), 'no_such_sensor'),
         (lambda: adxl.fit([]), 'no recording'),

@@ -203,7 +203,7 @@ def test_forms_that_are_read(tmp_path: Path, text: str | bytes) -> None:
         ),
         (
             f'{HEADER}\n{GOOD}\n#\n0.002,2.5,2.5,1,1\n',
-            ':7:1: time_s: time stands still, 0 s before ',
+            ':7:1: time_s: time stands still; ',
         ),
         (
             f'# epoch_ns: soon\n{HEADER}\n{GOOD}',
@@ -221,6 +221,14 @@ def test_invalid_files_are_refused_in_one_line(
     tmp_path: Path, text: str | bytes, message: str
 ) -> None:
     assert refusal(written(tmp_path, text)).startswith(message)
+
+
+def test_a_time_that_falls_is_no_burst(tmp_path: Path) -> None:
+    rows = ''.join(f'{-i},2.5,2.5,1,1\n' for i in range(99))
+    told = refusal(written(tmp_path, f'{HEADER}\n{rows}'))
+    assert told.startswith(
+        ':3:1: time_s: time runs backwards, 1 s before the newest sample; --drop'
+    )
 
 
 @pytest.mark.parametrize('place', [0, 1600, 2999])

@@ -206,6 +206,10 @@ def test_the_sections_of_a_file_are_those_of_ros(ros_env, tmp_path, section, nam
             '{b: [1.0]}, d: 2}}\n',
         ),
         ('/**: {ros__parameters: {c: 1}}\n', '/**: {ros__parameters: {a.b: [1.0], c: 1}}\n'),
+        (
+            '/arm/node: {ros__parameters: {}}\n/**: {ros__parameters: {c: 1}}\n',
+            '/arm/node: {ros__parameters: {}}\n/**: {ros__parameters: {a.b: [1.0], c: 1}}\n',
+        ),
     ],
 )
 def test_a_parameter_is_written_into_a_file_whose_rest_stays(tmp_path, text, written):
