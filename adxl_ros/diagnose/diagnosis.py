@@ -493,7 +493,8 @@ def _closure(
     def left(effects: frozenset[str]) -> np.ndarray:
         """Return the power that a set leaves, (m/s²)², by draw."""
         squares = evidence.candidates[effects][HEALTHY].figures.squares
-        return evidence.mean(squares) + removed_power
+        # A difference of squares may fall below 0 by rounding.
+        return np.maximum(evidence.mean(squares), 0.0) + removed_power
 
     before = left(frozenset())
     after = left(best)

@@ -85,6 +85,9 @@ SMALLEST_RANGE_V = 0.05  # Range of an output that moves, V. Chosen: 50 mg
 _HELD_STEPS = 3.0
 """The same in steps of its codes, beyond an end at which it is held. Chosen: a peak within one
 code moves by less, whatever its scale factor."""
+_LARGEST_HELD_SHARE = 0.5
+"""Share of samples that are left out as held. Chosen: where most are, little else is left, and the
+saturation is fitted to the samples themselves."""
 _BANDS = 5  # Bands of frequency in which noise is compared. Chosen: half a decade each
 _LOWEST_EDGE_HZ = 0.05  # Smallest edge of a band, Hz. Chosen: a period of 20 s
 _TIMES_S = (0.1, 1.0, 10.0)  # Averaging times of the Allan deviation, s. Chosen: a decade apart
@@ -368,11 +371,14 @@ def sample_faults(comparison: BaselineComparison) -> SampleFaults:
     if spikes and not coarse:
         changing, detections = repeated_samples(volts, time_s, finite, sensor, isolated)
         isolated, spikes = among(changing & known)
-    low, high = (_held_at_end(comparison, sign) for sign in (-1.0, 1.0))
-    if (low | high).any():
+    low, high = _held_at_end(comparison, -1.0), _held_at_end(comparison, 1.0)
+    held = low | high
+    if held.any(axis=1).mean() > _LARGEST_HELD_SHARE:
+        held = np.zeros_like(held)
+    if held.any():
         detections = [*detections, _clipping(comparison, low, high)]
     stepped = coarse.added_to(sensor) if coarse else sensor
-    return SampleFaults(finite & ~changing, isolated, low | high, detections, spikes, stepped)
+    return SampleFaults(finite & ~changing, isolated, held, detections, spikes, stepped)
 
 
 def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 _ROUNDS = 12
 """Rounds of the fit of the levels of flexible functions. Chosen: the levels hardly change then."""
 _FIRST_LEVEL_G = 1e-3  # First level, g rms. Chosen: any other start ends at the same levels
+_ROUNDING = 1e-5
+"""Smallest noise, as a share of the first level. Chosen: below any sensor's, above rounding."""
 _SMALLEST_LEVEL = 1e-4
 """Level, in first ones, below which a function is left out. Chosen: 0.1 µg is below any noise."""
 
@@ -118,7 +120,10 @@ class _FlexibleFunctions:
                 _FoldProducts(of_fold, white_v2[fold.held_out], plain_mps2[fold.held_out])
                 for of_fold, fold in zip(fitted_v2, fits.folds)
             ],
-            variance_v2=float(fits.full.innovation_variance_v2[number]),
+            # A recording without noise is known to the rounding of its simulation.
+            variance_v2=max(
+                float(fits.full.innovation_variance_v2[number]), (_ROUNDING * unit_v) ** 2
+            ),
         )
 
     def products(

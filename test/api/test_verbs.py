@@ -197,3 +197,17 @@ def test_a_fit_is_a_sensor_of_a_simulator(fit) -> None:
 def test_errors_name_what_is_wrong(call, named) -> None:
     with pytest.raises(adxl.UserError, match=named):
         call()
+
+
+def test_a_log_without_noise_has_its_cause() -> None:
+    time_s = np.arange(9000) / 100
+    force = {
+        'ax_mps2': 3 * np.sin(1.9 * time_s),
+        'ay_mps2': 2 * np.sin(3.0 * time_s + 1),
+        'az_mps2': 9.80665 + 2 * np.sin(1.3 * time_s),
+    }
+    sim = adxl.from_arrays(time_s=time_s, **force)
+    log = adxl.from_arrays(time_s=time_s, **{name: 1.01 * f for name, f in force.items()})
+    gap = adxl.diagnose(log, 'any_imu', sim=sim)
+    assert gap.verdict == 'explained'
+    assert 'nan' not in str(gap).split()

@@ -323,6 +323,18 @@ def test_an_axis_that_is_held_at_an_end_of_its_range_is_left_out(tmp_path, low_m
     assert np.allclose(simulated_g * G0_MPS2, np.clip(x_mps2, low_mps2, high_mps2), atol=1e-6)
 
 
+def test_an_axis_that_is_held_most_of_the_time_stays_for_the_fit_of_its_range(tmp_path):
+    carried = Carried()
+
+    def clipped(force):
+        limit_mps2 = np.quantile(np.abs(force[:, 0]), 0.3)
+        force[:, 0] = np.clip(force[:, 0], -limit_mps2, limit_mps2)
+        return force
+
+    comparison = carried.beside(tmp_path, carried.recorded(clipped))
+    assert not [part for part in comparison.left_out if part.effect == 'saturation']
+
+
 @pytest.mark.parametrize('step_mps2', [0.01, 0.3])
 @pytest.mark.parametrize('late_s', [0.0, 0.08])
 def test_codes_that_repeat_in_an_extreme_pose_are_no_end_of_the_range(tmp_path, step_mps2, late_s):
