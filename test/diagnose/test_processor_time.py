@@ -74,7 +74,7 @@ def used_by(folder, rate_hz, duration_s, *effects):
     return (used.ru_utime + used.ru_stime) / slower, used.ru_maxrss / 2**20
 
 
-def test_five_minutes_at_250_hz_take_seven_seconds(tmp_path):
+def test_five_minutes_at_250_hz_take_eight_seconds(tmp_path):
     seconds = [
         used_by(tmp_path, 250.0, 300.0, *effects)[0]
         for effects in (
@@ -84,7 +84,7 @@ def test_five_minutes_at_250_hz_take_seven_seconds(tmp_path):
             ('bias_walk', 'nonlinearity'),
         )
     ]
-    assert np.median(seconds) < 7.0
+    assert np.median(seconds) < 8.0
     assert max(seconds) < 12.0
 
 
