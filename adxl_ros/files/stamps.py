@@ -86,12 +86,14 @@ def without_stalls(time_s: np.ndarray, period: float, shortest_s: float) -> np.n
     What waited came at once: it is evenly spaced from the sample before.
     """
     mended_s = time_s.copy()
+    lag_s = time_s - period * np.arange(len(time_s))
     is_stall = (np.diff(time_s) > period + shortest_s) & ~lacks_samples(time_s, period)
     for i in np.flatnonzero(is_stall).tolist():
-        even_s = mended_s[i] + period * np.arange(1, len(time_s) - i)
-        is_late = np.append(time_s[i + 1 :] > even_s + period / 2, False)
-        waited = int(np.argmin(is_late))
-        mended_s[i + 1 : i + 1 + waited] = even_s[:waited]
+        usual_s = mended_s[i] - period * i + period / 2
+        stop = i + 1
+        while stop < len(time_s) and lag_s[stop] > usual_s:
+            stop += 1
+        mended_s[i + 1 : stop] = mended_s[i] + period * np.arange(1, stop - i)
     return mended_s
 
 
