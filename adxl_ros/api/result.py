@@ -91,6 +91,7 @@ def require_number(argument: str, value: object) -> None:
 
 def require_least(name: str, value: float | None, least: float) -> None:
     """Refuse what is no number, or too small; None is not given."""
-    require_number(option(**{name: value}), value)
+    argument = option(**{name: value})
+    require_number(argument, value)
     if value is not None and not value >= least:
-        raise UserError(f'{option(**{name: value})}: must be at least {least:g}')
+        raise UserError(f'{argument}: must be at least {least:g}')

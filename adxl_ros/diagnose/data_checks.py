@@ -124,7 +124,9 @@ buffer of ten samples stays below by a factor of two."""
 _LARGEST_JUMP_SHARE = 0.2
 """Share of the recording that jumps may have. Chosen: gaps of a lossy link are no fault of the
 clock."""
-_SMALLEST_GAP_G = 1e-6  # Largest difference of a recording and itself, g: rounding of files
+_SMALLEST_GAP_G = 1e-6
+"""Gap below which a simulator holds the recording itself, g. Chosen: files round by less, and the
+noise of any sensor is far above."""
 _SMALLEST_STEP_V = 1e-9  # Step of an ADC that stands for none, V. Chosen: rounding errors
 _DEAD_SHARE = 1e-4  # Share of its simulated range that a wired axis covers. Chosen: any wrong unit
 _LONGEST_HOLD_S = 1.0
@@ -502,8 +504,9 @@ def _check_step(
     Refuse motions whose shift steps, wherever it does.
 
     A step shows if two shifts leave far less than one, and than shifts that drift. It needs no
-    whole parts on both sides: a recording may move for some seconds only before its step. Shifts
-    are some seconds about one that fits, none, and those of the parts that fit.
+    whole parts on both sides: a recording may move for some seconds only before its step.
+    The shifts that are tried lie within seconds of `about_s`, which fits best, and within a
+    latency of 0 and of those at which single parts fit.
     """
     centers_s = {about_s, 0.0, *(part.late_s for part in parts)}
     # Instants that have a reference, without gaps
@@ -630,6 +633,20 @@ def _fine_shift(recording: Recording, sensor: Sensor, force: ForcePath, late_s: 
     )
 
 
+def _without_stalls(recording: Recording) -> tuple[Recording, list[str]]:
+    """Return a recording as if its host had never stalled, and what was changed."""
+    mended_s = without_stalls(recording.time_s, 1 / recording.rate_hz, LARGEST_LATENCY_S)
+    late_s = recording.time_s - mended_s
+    if not late_s.any():
+        return recording, []
+    note = (
+        f'{np.count_nonzero(late_s)} samples are stamped up to {late_s.max():.3g} s late, the '
+        f'first at {mended_s[np.flatnonzero(late_s)[0]]:.6g} s, as by a host that stalls and '
+        'reads at once what waited: they are taken at an even rate'
+    )
+    return replace(recording, time_s=mended_s), [note]
+
+
 def compare_checked(
     recording: Recording, sensor: Sensor, sim: Motion | None, may_shift: bool
 ) -> BaselineComparison:
@@ -638,16 +655,8 @@ def compare_checked(
 
     Raise DataFault where that is meaningless.
     """
-    sensor, notes = replace(sensor, rate_hz=recording.rate_hz), list[str]()
-    mended_s = without_stalls(recording.time_s, 1 / recording.rate_hz, LARGEST_LATENCY_S)
-    late_s = recording.time_s - mended_s
-    if late_s.any():
-        recording = replace(recording, time_s=mended_s)
-        notes.append(
-            f'{np.count_nonzero(late_s)} samples are stamped up to {late_s.max():.3g} s late, the '
-            f'first at {recording.time_s[np.flatnonzero(late_s)[0]]:.6g} s, as by a host that '
-            'stalls and reads at once what waited: they are taken at an even rate'
-        )
+    sensor = replace(sensor, rate_hz=recording.rate_hz)
+    recording, notes = _without_stalls(recording)
     _check_clock(recording)
     even_s = even_stamps(recording.time_s)
     left_out: list[tuple[np.ndarray, str]] = []

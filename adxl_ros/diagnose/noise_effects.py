@@ -296,19 +296,19 @@ def _spikes(
     return isolated, size_v
 
 
-def _held_at_end(comparison: BaselineComparison, sign: float) -> np.ndarray:
+def _held_at_end(volts: np.ndarray, simulated_v: np.ndarray, moved_v: np.ndarray) -> np.ndarray:
     """
-    Return where axes are held at an end of their range, (n, m) bool; sign: 1 for the upper one.
+    Return where axes are held at the upper end of their range, (n, m) bool.
 
-    The simulation moves on beyond it. In an extreme pose codes repeat, too, but nothing moves.
+    The simulation, (n, m), moves on beyond it, by more than `moved_v`, (m,). In an extreme pose
+    codes repeat, too, but nothing moves.
     """
-    outputs_v = sign * comparison.volts
-    beyond_v = sign * comparison.simulated_v(comparison.sensor) - np.nanmax(outputs_v, axis=0)
-    steps_v = np.maximum(code_step_v(outputs_v), comparison.sensor.lsb_v)
-    at_end = outputs_v == np.nanmax(outputs_v, axis=0)
-    for d, smallest_v in enumerate(np.maximum(_HELD_STEPS * steps_v, SMALLEST_RANGE_V)):
+    end_v = np.nanmax(volts, axis=0)
+    beyond_v = simulated_v - end_v
+    at_end = volts == end_v
+    for d in range(len(end_v)):
         is_held = any(
-            min(beyond_v[a:b, d].max(), np.ptp(beyond_v[a:b, d])) > smallest_v
+            min(beyond_v[a:b, d].max(), np.ptp(beyond_v[a:b, d])) > moved_v[d]
             for a, b in true_runs(at_end[:, d])
             if b - a >= _REPEAT_SHORTEST
         )
@@ -371,7 +371,11 @@ def sample_faults(comparison: BaselineComparison) -> SampleFaults:
     if spikes and not coarse:
         changing, detections = repeated_samples(volts, time_s, finite, sensor, isolated)
         isolated, spikes = among(changing & known)
-    low, high = _held_at_end(comparison, -1.0), _held_at_end(comparison, 1.0)
+    simulated_v = comparison.simulated_v(sensor)
+    steps_v = np.maximum(code_step_v(volts), sensor.lsb_v)
+    moved_v = np.maximum(_HELD_STEPS * steps_v, SMALLEST_RANGE_V)
+    low = _held_at_end(-volts, -simulated_v, moved_v)
+    high = _held_at_end(volts, simulated_v, moved_v)
     held = low | high
     if held.any(axis=1).mean() > _LARGEST_HELD_SHARE:
         held = np.zeros_like(held)

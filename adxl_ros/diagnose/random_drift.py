@@ -23,7 +23,9 @@ _FIRST_MEAN_S = 0.1
 """Shortest mean in which a drift is looked for, s. Chosen: noise of sensors is white below it."""
 _FEWEST_MEANS = 16  # Fewest means of the longest length. Chosen: their increments show a form
 _FEWEST_STEPS = 12  # Fewest increments that show a form. Chosen: a kurtosis scatters by 1.4
-_FEWEST_GAPS = 8  # Fewest gaps over which steps show. Chosen: 8 of 17 have 24 310 orders
+_FEWEST_GAPS = 8
+"""Fewest gaps whose steps are compared with the changes within the runs about them. Chosen: eight
+steps and nine changes have 24 310 orders, so that chance explains one in so many."""
 _LOCAL_ORDINATES = 101  # Ordinates of the level around a line. Chosen: much wider than a line
 
 

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 _ROUNDS = 12
 """Rounds of the fit of the levels of flexible functions. Chosen: the levels hardly change then."""
 _FIRST_LEVEL_G = 1e-3  # First level, g rms. Chosen: any other start ends at the same levels
-_ROUNDING = 1e-5
-"""Smallest noise, as a share of the first level. Chosen: below any sensor's, above rounding."""
+_SMALLEST_NOISE = 1e-5
+"""Smallest noise, in first levels. Chosen: 10 ng is below any sensor's, above rounding."""
 _SMALLEST_LEVEL = 1e-4
 """Level, in first ones, below which a function is left out. Chosen: 0.1 µg is below any noise."""
 
@@ -122,7 +122,7 @@ class _FlexibleFunctions:
             ],
             # A recording without noise is known to the rounding of its simulation.
             variance_v2=max(
-                float(fits.full.innovation_variance_v2[number]), (_ROUNDING * unit_v) ** 2
+                float(fits.full.innovation_variance_v2[number]), (_SMALLEST_NOISE * unit_v) ** 2
             ),
         )
 

@@ -66,9 +66,10 @@ _NEAR_START = 1.4
 differ by factors of two."""
 _AT_BOUND = 1e-4  # Distance from a bound, as a share of the range, that is at it. Chosen: rounding
 _CONSTANT = 1e-6  # Range of a constant column, relative. Chosen: rounding errors
-_NEAR = 0.05
-"""Change of the output by a set, divided by its own variation, up to which the sensitivities to
-other effects stay. Chosen: they differ by as much, and the gains that rank them by a tenth."""
+_SMALL_CHANGE = 0.05
+"""Largest change of the output by a set, as a share of its variation, at which the sensitivities
+to other effects are not computed again. Chosen: they change by as much, and the gains by which
+effects are ranked by a tenth."""
 _TIME_CONSTANTS = 4.0
 """Length of a recording that shows a time constant: its response is then complete to 2 %."""
 
@@ -588,7 +589,7 @@ def _model_about(model: LinearModel, best: Hypothesis) -> LinearModel:
     ]
     outputs_v = zip(comparisons, model.baseline_v)
     is_near = all(
-        rms(c.simulated_v(c.sensor) - v) < _NEAR * rms(v.std(axis=0)) for c, v in outputs_v
+        rms(c.simulated_v(c.sensor) - v) < _SMALL_CHANGE * rms(v.std(axis=0)) for c, v in outputs_v
     )
     return linear.build_linear_model(
         comparisons,

@@ -73,9 +73,10 @@ class RecordingLook:
         try:
             yield
         except UserError as error:
-            if not self.faults():
+            faults = self.faults()
+            if not faults:
                 raise
-            raise UserError('; '.join([one_line(error), *self.faults()])) from None
+            raise UserError('; '.join([one_line(error), *faults])) from None
 
 
 LIVE_WINDOW_S = 4.0  # Newest samples in which a live stream may rest, s. Chosen: two short rests

@@ -44,7 +44,8 @@ _END_SIGMAS = 3.5  # Difference of an end of a rest that is cut, stds
 _LARGEST_SWING_G = 0.1
 """Rms of the means of blocks, g, up to which a sensor may be at rest. Chosen: far above noise, and
 what stands swings by less below 10 Hz."""
-_SWINGS = -0.5  # Autocorrelation that noise never falls to, and a swing does after half a period
+_SWING_CORRELATION = -0.5
+"""Autocorrelation that a swing falls to after half a period. Chosen: that of noise stays above."""
 
 
 @dataclass(frozen=True)
@@ -368,7 +369,7 @@ class RestFinder:
             return False
         power = np.abs(np.fft.rfft(swing, 2 * len(swing), axis=0)) ** 2
         correlation = np.fft.irfft(power.sum(axis=1))[: len(swing) // 4]
-        return bool(correlation.min() < _SWINGS * correlation[0])
+        return bool(correlation.min() < _SWING_CORRELATION * correlation[0])
 
     def _drifting(self, blocks: Blocks, quiet: np.ndarray, limits: NoiseLimits) -> np.ndarray:
         """
@@ -550,7 +551,7 @@ def find_rests(
     """
     Find the rests of a recording by samples, (n, m), in any unit, and encoder angles.
 
-    gravity: 1 g in their unit, by which a steady swing is no rest; it is one without.
+    gravity: 1 g in the unit of the samples; only with it is a steady swing told from a rest.
     """
     finder = RestFinder(rate_hz, samples.shape[1], noise, learn, angle_tolerance_rad, gravity)
     finder.feed(time_s, samples, angles_rad)
