@@ -23,7 +23,7 @@ from adxl_ros.api.recordings import (
 from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Result
 from adxl_ros.api.sensors import as_input, sensor_of, SensorInput
 from adxl_ros.diagnose import report as diagnosis_report
-from adxl_ros.diagnose.data_checks import DataFault
+from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.diagnose.diagnosis import what_shows
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording as recording_files

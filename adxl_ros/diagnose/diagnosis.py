@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 
 from adxl_ros.diagnose import data_checks, next_experiment, noise_effects, verdict as rule
 from adxl_ros.diagnose.comparison import BaselineComparison, LeftOut, Reference, with_values
-from adxl_ros.diagnose.data_checks import CheckedRecording, DataFault
+from adxl_ros.diagnose.data_checks import CheckedRecording
+from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.diagnose.evidence import (
     BLOCKS,
     drifts_among,
