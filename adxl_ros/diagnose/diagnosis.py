@@ -18,18 +18,14 @@ from adxl_ros.diagnose import data_checks, next_experiment, noise_effects, verdi
 from adxl_ros.diagnose.comparison import BaselineComparison, LeftOut, Reference, with_values
 from adxl_ros.diagnose.data_checks import CheckedRecording
 from adxl_ros.diagnose.data_faults import DataFault
-from adxl_ros.diagnose.evidence import (
-    BLOCKS,
-    drifts_among,
-    estimate_floor,
-    NoiseFloor,
-    sum_by_block,
-)
+from adxl_ros.diagnose.evidence import BLOCKS, sum_by_block
 from adxl_ros.diagnose.flexible_functions import flexible_bases
 from adxl_ros.diagnose.held_out import HeldOutFits
 from adxl_ros.diagnose.linear_model import build_linear_model, filters_for, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
 from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemainder
+from adxl_ros.diagnose.noise_filters import drifts_among
+from adxl_ros.diagnose.noise_floor import estimate_floor, NoiseFloor
 from adxl_ros.diagnose.remainder import Remainder, reproducible_remainder
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
 from adxl_ros.diagnose.search import Hypothesis, Search, with_filters

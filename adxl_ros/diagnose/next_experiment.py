@@ -25,8 +25,9 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose import comparison as beside, linear_model as linear, noise_effects
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
-from adxl_ros.diagnose.evidence import expected_drift_g, LinearFit
+from adxl_ros.diagnose.evidence import LinearFit
 from adxl_ros.diagnose.linear_model import LinearModel
+from adxl_ros.diagnose.noise_filters import expected_drift_g
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording

@@ -2,7 +2,8 @@
 
 """With white noise the linear fit is Bayesian least squares, which has a closed form."""
 
-from adxl_ros.diagnose.evidence import BLOCKS, fit_columns, whiten_channel, Whitener
+from adxl_ros.diagnose.evidence import BLOCKS, fit_columns, whiten_channel
+from adxl_ros.diagnose.noise_filters import Whitener
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
