@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.diagnose import report as words
 from adxl_ros.diagnose.comparison import BaselineComparison, bridged
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
+from adxl_ros.diagnose.report_json import as_text, named_effects
 from adxl_ros.diagnose.residual_map import BLOCK_S, ResidualCell
+from adxl_ros.diagnose.screen import as_shown, size_lines
 from adxl_ros.files import parameter_file
 from adxl_ros.model import noise
 from adxl_ros.model.constants import AXES, Z_90
@@ -60,6 +62,12 @@ _CURVE_COLOURS = (
     | dict.fromkeys(('before', 'without the effect'), plots.BEFORE_COLOUR)
     | dict.fromkeys(('after', 'with the effect'), plots.AFTER_COLOUR)
 )
+_OVER_JOINTS = (
+    (Over.ALPHA, Over.BETA),
+    (Over.ALPHA_RATE, Over.BETA_RATE),
+    (Over.ALPHA_ACCELERATION, Over.BETA_ACCELERATION),
+)
+"""Angles of both joints, and their derivatives by order."""
 _WIDE = {'l': 8, 'r': 12, 't': 36, 'b': 8}  # Margins of a plot with a legend, pixels
 
 
@@ -87,7 +95,7 @@ def documents(
     report: its JSON; comments: head of the parameters, which a fault leaves out; run: what the
     page says of the run, None without a page.
     """
-    texts = {'report.json': words.as_text(report)}
+    texts = {'report.json': as_text(report)}
     if diagnosis.report is not None:
         texts['params.yaml'] = parameter_file.as_text(diagnosis.report.sensor, comments)
     if run is not None:
@@ -119,84 +127,90 @@ def _page(diagnosis: Diagnosis, objects: dict[str, Any], run: Run, parameters: s
 
 def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> dict[str, Any]:
     """Return what the template shows of a diagnosis with a verdict."""
-    named = words.named_effects(report, objects)
-    probable = [c for c in objects['candidates'] if c['probability'] >= words.PROBABLE]
-    by_name = {c['effect']: c for c in objects['candidates']}
+    candidates = {c['effect']: c for c in objects['candidates']}
+    named = named_effects(report, objects)
+    probable = [name for name, c in candidates.items() if c['probability'] >= words.PROBABLE]
     # The named effects come first, then those that are probable.
-    shown = list({c['effect']: c for c in (*map(by_name.get, named), *probable)}.values())
-    best = report.hypotheses[0]
-    compared = diagnosis.comparisons[0]
-    full_rate = diagnosis.full_rate[0]
-    proposal = objects['next_experiment'] or {'menu': []}
-    menu = [
-        [m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
-        for m in proposal['menu']
-    ]
-    proofs = _proofs(diagnosis, report, [c['effect'] for c in shown])
+    shown = list(dict.fromkeys([*named, *probable]))
+    proofs = _proofs(diagnosis, report, shown)
     rows = words.figure_rows(diagnosis)
     scale = float(report.baseline.scale_v_per_g.mean())
+    proposal = objects['next_experiment'] or {'menu': []}
     return {
         'has_verdict': True,
-        'figures': {
-            'waterfall': waterfall(report),
-            'signals': signals(compared, best.sensor),
-            'spectrum': _spectra(
-                full_rate,
-                {
-                    'before': full_rate.residual_v(full_rate.sensor),
-                    'after': full_rate.residual_v(best.sensor),
-                },
-            ),
-            **{f'proof-{name}': drawn for name, (drawn, _) in proofs.items()},
-        },
+        'figures': _figures(diagnosis, report, proofs),
         'tiles': rows[:TILES],
-        'effects': [
-            {
-                'name': c['effect'],
-                'sure': percent(c['probability']),
-                'cause': c['cause'],
-                'share': '' if c['share'] is None else f'{percent(c["share"])} of the gap',
-                'rivals': c['inseparable_from'],
-                'sizes': words.size_lines(report, c),
-            }
-            for c in shown
-        ],
-        'proofs': [{'effect': name, 'text': text} for name, (_, text) in proofs.items()],
+        'effects': [_effect(report, candidates[name]) for name in shown],
+        'proofs': proofs,
         'figure_rows': rows,
-        'remainders': [row[:2] for row in words.remainder_rows(report)],
+        'remainders': [(row.label, row.text) for row in words.remainder_rows(report)],
         'hypotheses': [
             [', '.join(h['effects']) or 'no gap', percent(h['probability'])]
             for h in objects['hypotheses']
         ],
         'not_covered': objects['not_covered'],
         'where': [_cell(c) for c in report.residual_cells],
-        'menu': menu,
-        'could_show': [(row.shows, *words.as_shown(row, scale)) for row in report.could_show],
+        'menu': [
+            [m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
+            for m in proposal['menu']
+        ],
+        'could_show': [(row.shows, *as_shown(row, scale)) for row in report.could_show],
     }
 
 
-def _proofs(
-    diagnosis: Diagnosis, report: Report, effects: Sequence[str]
-) -> dict[str, tuple[Figure, str]]:
-    """Return the proof of each effect that has one, and its text."""
-    compared = diagnosis.comparisons[0]
+def _effect(report: Report, candidate: dict[str, Any]) -> dict[str, Any]:
+    """Return what the template shows of an effect."""
+    share = candidate['share']
+    return {
+        'name': candidate['effect'],
+        'sure': percent(candidate['probability']),
+        'cause': candidate['cause'],
+        'share': '' if share is None else f'{percent(share)} of the gap',
+        'rivals': candidate['inseparable_from'],
+        'sizes': size_lines(report, candidate),
+    }
+
+
+class _Proof(NamedTuple):
+    """How an effect shows in a recording."""
+
+    effect: str  # Its name
+    figure: Figure
+    text: str  # What the figure shows, in a sentence
+
+
+def _figures(diagnosis: Diagnosis, report: Report, proofs: Sequence[_Proof]) -> dict[str, Figure]:
+    """Return all figures by the names of their places in the template."""
+    best = report.hypotheses[0].sensor
     full_rate = diagnosis.full_rate[0]
+    before_v = full_rate.residual_v(full_rate.sensor)
+    residuals_v = {'before': before_v, 'after': full_rate.residual_v(best)}
+    return {
+        'waterfall': waterfall(report),
+        'signals': signals(diagnosis.comparisons[0], best),
+        'spectrum': _spectra(full_rate, residuals_v),
+        **{f'proof-{proof.effect}': proof.figure for proof in proofs},
+    }
+
+
+def _proofs(diagnosis: Diagnosis, report: Report, effects: Sequence[str]) -> list[_Proof]:
+    """Return the proof of each effect that has one."""
     in_noise = {d.effect for d in report.detections} & {*report.sensor.effects}
-    proofs = {}
+    proofs = []
     for name in effects:
         sensors = [h.sensor for h in report.hypotheses if name in h.effects]
         if name in in_noise:
             sensors = [report.sensor]
         is_step = Over.STEP in effect_named(name).diagnosis.proof
         if sensors and not is_step:
-            proofs[name] = _proof(name, compared, full_rate, sensors[0])
+            proofs.append(_proof(name, diagnosis, sensors[0]))
     return proofs
 
 
 def _cell(cell: ResidualCell) -> list[str]:
     """Return quantity, range, axis, mean and share of a part of the map."""
     name = cell.dimension
-    _, _, unit = name.rpartition('_')
+    unit = name.rpartition('_')[2]
     factor = 1.0
     if 'rad' in name:
         unit = '°/s' if 'rate' in name else '°'
@@ -211,34 +225,33 @@ def _cell(cell: ResidualCell) -> list[str]:
     ]
 
 
-def _proof(
-    effect: str, comparison: BaselineComparison, full_rate: BaselineComparison, sensor: Sensor
-) -> tuple[Figure, str]:
-    """
-    Show an effect of a sensor, which has all effects of the verdict, in a recording.
-
-    It is drawn as means over a variable or spectra; the text explains it in one sentence.
-    """
+def _proof(effect: str, diagnosis: Diagnosis, sensor: Sensor) -> _Proof:
+    """Show an effect of a sensor, which has all effects of the verdict, in the first recording."""
+    comparison = diagnosis.comparisons[0]
+    full_rate = diagnosis.full_rate[0]
     described = effect_named(effect)
     variables = described.diagnosis.proof
     neutral = with_neutral(comparison.sensor, [effect]).values[effect]
     without = replace(sensor, values={**sensor.values, effect: neutral})
     labelled = {'without the effect': without, 'with the effect': sensor}
     if described.acts_on is ActsOn.NOISE:
-        return _spectra(
-            full_rate,
-            {'recorded': full_rate.residual_v(sensor)}
-            | {label: full_rate.simulated_noise_v(s, 0) for label, s in labelled.items()},
-        ), 'The effect is there if the recorded spectrum follows the green line, not the red one.'
-    if Over.FREQUENCY in variables:
-        return _spectra(
+        noise_v = {label: full_rate.simulated_noise_v(s, 0) for label, s in labelled.items()}
+        drawn = _spectra(full_rate, {'recorded': full_rate.residual_v(sensor), **noise_v})
+        text = (
+            'The effect is there if the recorded spectrum follows the green line, not the red one.'
+        )
+    elif Over.FREQUENCY in variables:
+        drawn = _spectra(
             full_rate, {label: full_rate.residual_v(s) for label, s in labelled.items()}
-        ), 'The effect is there if the spectrum of the difference falls from red to green.'
-    return (
-        _binned(variables, comparison, sensor, without),
-        'Points: recording minus a simulation with all other effects, with 90 % bars. '
-        'Line: the model of this effect.',
-    )
+        )
+        text = 'The effect is there if the spectrum of the difference falls from red to green.'
+    else:
+        drawn = _binned(variables, comparison, sensor, without)
+        text = (
+            'Points: recording minus a simulation with all other effects, with 90 % bars. '
+            'Line: the model of this effect.'
+        )
+    return _Proof(effect, drawn, text)
 
 
 def _binned(
@@ -331,13 +344,9 @@ def _variables(comparison: BaselineComparison) -> dict[Over, np.ndarray]:
     if 'supply_v' in surroundings:
         of_all[Over.SUPPLY] = surroundings['supply_v']
     if comparison.joints:
-        alpha, beta = comparison.joints
-        of_all[Over.ALPHA] = np.degrees(alpha(time_s))
-        of_all[Over.ALPHA_RATE] = np.degrees(alpha(time_s, 1))
-        of_all[Over.ALPHA_ACCELERATION] = np.degrees(alpha(time_s, 2))
-        of_all[Over.BETA] = np.degrees(beta(time_s)) % 360
-        of_all[Over.BETA_RATE] = np.degrees(beta(time_s, 1))
-        of_all[Over.BETA_ACCELERATION] = np.degrees(beta(time_s, 2))
+        for order, names in enumerate(_OVER_JOINTS):
+            of_all |= dict(zip(names, np.degrees(comparison.joint_values(order))))
+        of_all[Over.BETA] %= 360
     of_axes = {Over.OUTPUT: comparison.volts}
     force_g = comparison.reference_force_g()
     if force_g is not None:
@@ -388,6 +397,16 @@ def _spectra(comparison: BaselineComparison, signals_v: Mapping[str, np.ndarray]
     )
 
 
+class _Bar(NamedTuple):
+    """A bar of the waterfall."""
+
+    label: str
+    begin_mg: float
+    width_mg: float
+    text: str  # Behind the bar
+    colour: str
+
+
 def waterfall(report: Report) -> Figure:
     """Draw the gap, what each effect takes off it, what stays, and the noise floor."""
     closure = report.closure
@@ -396,33 +415,34 @@ def waterfall(report: Report) -> Figure:
     floor = float(mg(closure.floor.value))
     highest = max(level, after, floor)
     above = level**2 - floor**2
-    bars = [('gap', 0.0, level, mg_text(closure.before.value), plots.BEFORE_COLOUR)]
+    bars = [_Bar('gap', 0.0, level, mg_text(closure.before.value), plots.BEFORE_COLOUR)]
     for name, share in sorted(words.shares_of_gap(report).items(), key=lambda item: -item[1]):
         if share > 0:
             lower = max(level**2 - share * above, 0.0) ** 0.5
-            bars.append((name, lower, level - lower, percent(share), _EFFECT_COLOUR))
+            bars.append(_Bar(name, lower, level - lower, percent(share), _EFFECT_COLOUR))
             level = lower
     if len(bars) > 1:
-        bars.append(('what is left', 0.0, after, mg_text(closure.after.value), plots.AFTER_COLOUR))
-    bars.append(('noise floor', 0.0, floor, mg_text(closure.floor.value), plots.QUIET_COLOUR))
-    labels, base, width, text, colours = zip(*bars)
+        left = mg_text(closure.after.value)
+        bars.append(_Bar('what is left', 0.0, after, left, plots.AFTER_COLOUR))
+    lowest = mg_text(closure.floor.value)
+    bars.append(_Bar('noise floor', 0.0, floor, lowest, plots.QUIET_COLOUR))
     trace = {
         'type': 'bar',
         'width': 0.62,
         'orientation': 'h',
-        'y': labels,
-        'x': rounded(width),
-        'base': rounded(base),
-        'text': text,
+        'y': [bar.label for bar in bars],
+        'x': rounded([bar.width_mg for bar in bars]),
+        'base': rounded([bar.begin_mg for bar in bars]),
+        'text': [bar.text for bar in bars],
         'textposition': 'outside',
         'cliponaxis': False,
-        'marker': {'color': colours},
+        'marker': {'color': [bar.colour for bar in bars]},
         'hovertemplate': '%{y}: %{text}<extra></extra>',
         'showlegend': False,
     }
     return figure(
         [trace],
-        60 + 38 * len(labels),
+        60 + 38 * len(bars),
         xaxis={'title': {'text': 'rms, mg'}, 'range': [0, 1.2 * highest]},
         yaxis={'autorange': 'reversed', 'ticks': '', 'type': 'category'},
     )
