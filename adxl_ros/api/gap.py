@@ -30,9 +30,9 @@ from adxl_ros.api.result import (
 )
 from adxl_ros.api.sensors import sensor_of, SensorInput
 from adxl_ros.diagnose import diagnosis as core, report as words
+from adxl_ros.diagnose.could_show import CouldShow
 from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.gap_in_unit import gap_in, GapInUnit, quantity as quantity_named
-from adxl_ros.diagnose.next_experiment import CouldShow
 from adxl_ros.diagnose.report_json import as_json as diagnosis_json, named_effects
 from adxl_ros.diagnose.screen import screen_lines
 from adxl_ros.diagnose.self_check import diagnose_again

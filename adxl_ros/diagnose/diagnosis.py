@@ -14,8 +14,9 @@ from functools import cached_property
 from itertools import chain
 from typing import Any
 
-from adxl_ros.diagnose import data_checks, next_experiment, noise_effects, verdict as rule
+from adxl_ros.diagnose import data_checks, noise_effects, verdict as rule
 from adxl_ros.diagnose.comparison import BaselineComparison, LeftOut, Reference
+from adxl_ros.diagnose.could_show import could_show, CouldShow
 from adxl_ros.diagnose.data_checks import CheckedRecording
 from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.diagnose.evidence import BLOCKS, sum_by_block
@@ -23,7 +24,7 @@ from adxl_ros.diagnose.flexible_functions import flexible_bases
 from adxl_ros.diagnose.gap_closure import gap_closure, GapClosure
 from adxl_ros.diagnose.held_out import HeldOutFits
 from adxl_ros.diagnose.linear_model import build_linear_model, filters_for, LinearModel
-from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
+from adxl_ros.diagnose.next_experiment import NextExperiment, propose_next_experiment
 from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemainder
 from adxl_ros.diagnose.noise_filters import drifts_among
 from adxl_ros.diagnose.noise_floor import estimate_floor, NoiseFloor
@@ -408,12 +409,8 @@ def _report(
         noise=tuple(compare_noise(c, sensors, seed) for c in comparisons),
         residual_cells=tuple(residual_map(model.comparisons[0], seed)),
         not_covered=lacking,
-        could_show=tuple(
-            next_experiment.could_show(model, comparisons[0], floor.noise_v, verdict.material_mps2)
-        ),
-        next_experiment=next_experiment.propose_next_experiment(
-            verdict, lacking, baseline, model, seed
-        ),
+        could_show=tuple(could_show(model, comparisons[0], floor.noise_v, verdict.material_mps2)),
+        next_experiment=propose_next_experiment(verdict, lacking, baseline, model, seed),
         baseline=baseline,
         sensor=sensor,
         linear_model=model,
@@ -430,6 +427,4 @@ def what_shows(
         return fault
     model = build_linear_model([c.search_comparison for c in checked])
     floor = estimate_floor([c.comparison for c in checked])
-    return next_experiment.could_show(
-        model, checked[0].comparison, floor.noise_v, material_mps2(model, floor)
-    )
+    return could_show(model, checked[0].comparison, floor.noise_v, material_mps2(model, floor))

@@ -8,7 +8,8 @@ from textwrap import wrap
 from typing import Any, TYPE_CHECKING
 
 from adxl_ros.diagnose import report as words
-from adxl_ros.diagnose.next_experiment import CouldShow, MENU
+from adxl_ros.diagnose.could_show import CouldShow
+from adxl_ros.diagnose.next_experiment import MENU
 from adxl_ros.diagnose.report_json import as_json, named_effects
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Concern, Effect, Need
