@@ -180,10 +180,7 @@ class CheckedRecording(NamedTuple):
 
     comparison: BaselineComparison  # The recording beside the baseline at its full rate
     search_comparison: BaselineComparison  # The same at the rate of the search
-    # Noise-like effects that the samples themselves show
-    detections: tuple[noise_effects.Detection, ...]
-    # Isolated samples; the residual of the best hypothesis must show them, too
-    possible_spikes: list[noise_effects.Detection]
+    faults: noise_effects.SampleFaults  # What the samples themselves show
     stated: Sensor  # The baseline with the steps of the ADC by the parameter file
 
 
@@ -201,13 +198,7 @@ def check_recording(comparison: BaselineComparison) -> CheckedRecording:
         check_axes(search_comparison)
     else:
         check_rest(comparison)
-    return CheckedRecording(
-        comparison,
-        search_comparison,
-        tuple(faults.detections),
-        faults.possible_spikes,
-        stated,
-    )
+    return CheckedRecording(comparison, search_comparison, faults, stated)
 
 
 def check_length(comparisons: Sequence[BaselineComparison]) -> None:

@@ -359,7 +359,7 @@ def _detections(
         regular = used if comparison.fading_hz is None else used | ~comparison.at_rest
         spikes = [
             d
-            for d in c.possible_spikes
+            for d in c.faults.possible_spikes
             if noise_effects.residual_shows_spikes(d, residual_v, regular, comparison.sensor)
         ]
         found = noise_effects.residual_detections(comparison, residual_v, best)
@@ -367,7 +367,7 @@ def _detections(
             of_baseline = noise_effects.residual_detections(comparison, residual_v, baseline)
             usual = {d.effect for d in of_baseline}
             found = [d for d in found if d.effect in usual]
-        detections += [*c.detections, *spikes, *found]
+        detections += [*c.faults.detections, *spikes, *found]
     material = [d for d in detections if d.power_mps2 > smallest_mps2**2]
     return list({d.effect: d for d in sorted(material, key=lambda d: d.power_mps2)}.values())
 
