@@ -11,6 +11,7 @@ has functions of its own, by dimension.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from math import prod
 
 from adxl_ros.diagnose import comparison as beside
@@ -128,10 +129,9 @@ def _of_axis(
         Form.CODE: _codes(volts, comparison.sensor.adc_vref_v),
         Form.LAG: _force_history(along_g, comparison.dt_s),
     }
-    rates = comparison.joint_values(1)
-    moving = [rate / np.abs(rate).max() for rate in rates if _moves(rate)]
-    if moving:
-        basis |= _of_moves(rates, moving, along_g, comparison)
+    moves = _Moves.of(comparison)
+    if moves.moving:
+        basis |= _of_moves(moves, along_g, comparison)
     return basis
 
 
@@ -176,40 +176,42 @@ def _force_history(along_g: np.ndarray, dt_s: float) -> np.ndarray:
     )
 
 
-def _moves(rate: np.ndarray) -> bool:
-    """Determine whether a joint moves, by its largest rate, rad/s."""
-    return bool(np.abs(rate).max() > _SMALLEST_RATE_RAD_S)
+@dataclass(frozen=True)
+class _Moves:
+    """The moves of the joints of a recording."""
+
+    rates: list[np.ndarray]  # Rates of all joints, rad/s, (n,)
+    moving: list[np.ndarray]  # Rates of the joints that move, divided by the largest, (n,)
+
+    @classmethod
+    def of(cls, comparison: BaselineComparison) -> _Moves:
+        """Return the moves of a recording; no joint moves where it has none."""
+        rates = comparison.joint_values(1)
+        moving = [rate for rate in rates if np.abs(rate).max() > _SMALLEST_RATE_RAD_S]
+        return cls(rates, [rate / np.abs(rate).max() for rate in moving])
 
 
-def _of_moves(
-    rates: Sequence[np.ndarray],
-    moving: Sequence[np.ndarray],
-    along_g: np.ndarray,
-    comparison: BaselineComparison,
-) -> Basis:
-    """
-    Return functions of rate and direction of the joints, and of the time since a move.
-
-    rates: those of all joints, rad/s; moving: those of joints that move, divided by the largest.
-    """
-    dt_s = comparison.dt_s
+def _of_moves(moves: _Moves, along_g: np.ndarray, comparison: BaselineComparison) -> Basis:
+    """Return functions of rate and direction of the joints, and of the time since a move."""
     by_rate = []
-    for rate in moving:
+    for rate in moves.moving:
         by_rate += [rate, rate * rate, rate * along_g, np.abs(rate)]
     change_g = np.diff(along_g, prepend=along_g[0])
-    directions = [direction_of_last_move(rate) for rate in rates]
+    directions = [direction_of_last_move(rate) for rate in moves.rates]
     directions.append(direction_of_last_move(change_g, np.abs(change_g).max() * _SMALLEST_TURN))
     by_direction = []
     for direction in directions:
         by_direction += [direction, direction * along_g]
-    since_s = beside.time_since_move_s(comparison.time_s, rates)
-    sizes = [np.abs(rate) for rate in moving]
-    turning = np.sum([size * (size > _SMALLEST_RATE_RAD_S) for size in sizes], axis=0)
+    since_s = beside.time_since_move_s(comparison.time_s, moves.rates)
+    turning = np.sum(
+        [np.abs(rate) * (np.abs(rate) > _SMALLEST_RATE_RAD_S) for rate in moves.moving], axis=0
+    )
     since_move = [np.exp(-since_s / tau_s) for tau_s in _RELAXATION_S]
     for tau_s in _RELAXATION_S:
-        for past in (turning, np.sign(turning)):
-            since_move.append(low_pass(past, tau_s, dt_s, {}))
-    since_move += _lags(along_g, _CREEP_S, dt_s)
+        since_move += [
+            low_pass(past, tau_s, comparison.dt_s, {}) for past in (turning, np.sign(turning))
+        ]
+    since_move += _lags(along_g, _CREEP_S, comparison.dt_s)
     return {
         Form.RATE: np.array(by_rate),
         Form.DIRECTION: np.array(by_direction),
