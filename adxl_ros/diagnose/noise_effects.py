@@ -254,7 +254,9 @@ def _stands_alone(volts: np.ndarray, smallest_v: np.ndarray, distance: int) -> n
 
 def _least_difference_v(volts: np.ndarray, distance: int) -> np.ndarray:
     """Return the smaller difference of each sample from those before and behind it, V, (n,)."""
-    return np.minimum(*(np.abs(volts - np.roll(volts, d)) for d in (distance, -distance)))
+    before_v = np.abs(volts - np.roll(volts, distance))
+    behind_v = np.abs(volts - np.roll(volts, -distance))
+    return np.minimum(before_v, behind_v)
 
 
 def _spikes(
@@ -452,24 +454,20 @@ def _excess(
     resting: bool,
 ) -> Detection | None:
     """Find noise above the level of drawn noise in samples, (n,) bool, that may rest."""
-    recorded, drawn = (white_noise_v(v, sensor, rows) for v in (residual_v, simulated_v))
+    recorded = white_noise_v(residual_v, sensor, rows)
+    drawn = white_noise_v(simulated_v, sensor, rows)
     # The level of noise far below a step of the ADC does not show.
     shows = (noise.held_rounding(sensor) <= 0.5) & (drawn > 0)
     ratio = recorded / np.where(shows, drawn, np.inf)
     if resting:
         # Noise past the RC filter looks excessive in the innovations, but not in the samples.
-        recorded_v, drawn_v = (np.std(v[rows], axis=0) for v in (residual_v, simulated_v))
+        recorded_v = np.std(residual_v[rows], axis=0)
+        drawn_v = np.std(simulated_v[rows], axis=0)
         ratio = np.minimum(ratio, recorded_v / np.where(drawn_v > 0, drawn_v, np.inf))
-    return (
-        None
-        if np.max(ratio) <= NOISE_EXCESS
-        else _detection(
-            Detector.NOISE_LEVEL,
-            np.maximum(ratio**2 - 1, 0.0) * noise.analog_std_v(sensor) ** 2,
-            sensor,
-            ratio=ratio - 1,
-        )
-    )
+    if np.max(ratio) <= NOISE_EXCESS:
+        return None
+    power_v2 = np.maximum(ratio**2 - 1, 0.0) * noise.analog_std_v(sensor) ** 2
+    return _detection(Detector.NOISE_LEVEL, power_v2, sensor, ratio=ratio - 1)
 
 
 def _periodogram(
@@ -575,23 +573,29 @@ def compare_noise(
     edges_hz = np.geomspace(max(frequency_hz[1], _LOWEST_EDGE_HZ), rate_hz / 2, _BANDS + 1)
     edges_hz[0] = 0.0
     bands = [(frequency_hz > low) & (frequency_hz <= high) for low, high in pairwise(edges_hz)]
+    counts = [round(t * rate_hz) for t in times_s]
     log_likelihoods = []
     ratios: dict[str, Any] = {}
     for label, (mean, noisy) in sensors.items():
-        series = [
-            bridged(v, comparison.used) / scale
-            for v in (comparison.residual_v(mean), comparison.simulated_noise_v(noisy, seed))
+        recorded = bridged(comparison.residual_v(mean), comparison.used) / scale
+        simulated = bridged(comparison.simulated_noise_v(noisy, seed), comparison.used) / scale
+        recorded_power = _periodogram(recorded, rate_hz)[1]
+        simulated_power = _periodogram(simulated, rate_hz)[1]
+        power_ratios = []
+        log_likelihood = 0.0
+        for band in bands:
+            power = recorded_power[band]
+            drawn = simulated_power[band]
+            power_ratios.append(float(power.sum() / drawn.sum()))
+            if band.any():
+                level = drawn.mean(axis=0)
+                log_likelihood -= float(np.sum(power / level + np.log(level)))
+        log_likelihoods.append(log_likelihood)
+        ratios[f'power_ratio_{label}'] = power_ratios
+        ratios[f'allan_ratio_{label}'] = [
+            rms(allan_deviation(recorded, count) / allan_deviation(simulated, count))
+            for count in counts
         ]
-        recorded, simulated = (_periodogram(v, rate_hz)[1] for v in series)
-        ratios[f'power_ratio_{label}'] = [
-            float(recorded[band].sum() / simulated[band].sum()) for band in bands
-        ]
-        allan = [[allan_deviation(v, round(t * rate_hz)) for v in series] for t in times_s]
-        ratios[f'allan_ratio_{label}'] = [rms(a / b) for a, b in allan]
-        levels = [(recorded[band], simulated[band].mean(axis=0)) for band in bands if band.any()]
-        log_likelihoods.append(
-            -sum(float(np.sum(power / level + np.log(level))) for power, level in levels)
-        )
     return {
         'recording': comparison.name,
         'bands_hz': edges_hz.tolist(),
@@ -637,14 +641,14 @@ def noise_remainders(
     values: dict[tuple[str, str, str], list] = {}
     for c in comparisons if detections else ():
         residual_v = c.residual_v(mean_sensor)
-        signals = [
-            _Series(c.volts, residual_v, bridged(residual_v, c.used)),
-            _simulated(c, named_sensor, seed),
-        ]
+        recording = _Series(c.volts, residual_v, bridged(residual_v, c.used))
+        simulation = _simulated(c, named_sensor, seed)
         for detection in detections:
-            recorded, simulated = (list(_statistics(c, detection, s)) for s in signals)
-            for (quantity, unit, value), (*_, other) in zip(recorded, simulated):
-                values.setdefault((detection.effect, quantity, unit), []).append((value, other))
+            for one, other in zip(
+                _statistics(c, detection, recording), _statistics(c, detection, simulation)
+            ):
+                key = detection.effect, one.quantity, one.unit
+                values.setdefault(key, []).append((one.values, other.values))
     remainders: list[NoiseRemainder] = []
     for key, pairs in values.items():
         recorded, simulated = np.sqrt(np.mean(np.square(np.array(pairs, float)), axis=0))
@@ -680,33 +684,43 @@ def _simulated(comparison: BaselineComparison, sensor: Sensor, seed: int) -> _Se
     return _Series(volts, residual_v, bridged(residual_v, used))
 
 
+class _Statistic(NamedTuple):
+    """What a noise-like effect shows in one series."""
+
+    quantity: str  # What it is, for people
+    unit: str
+    values: np.ndarray  # By axis, (m,), or of all, (1,)
+
+
 def _statistics(
     comparison: BaselineComparison, detection: Detection, series: _Series
-) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Yield quantity, unit and values by axis of what a detection shows, in one series."""
-    volts, residual_v, noise_v = series
-    sensor, time_s, scale = comparison.sensor, comparison.time_s, comparison.scale_v_per_mps2
+) -> Iterator[_Statistic]:
+    """Yield what a detection shows in one series."""
+    sensor = comparison.sensor
+    time_s = comparison.time_s
+    scale = comparison.scale_v_per_mps2
     detector = effect_named(detection.effect).diagnosis.detector
-    finite = np.isfinite(volts).all(axis=1) & (comparison.used | comparison.disturbed)
+    finite = np.isfinite(series.volts).all(axis=1) & (comparison.used | comparison.disturbed)
     if detector is Detector.MAINS_LINE:
-        hz = float(detection.values['frequency_hz'])
-        yield f'line at {hz:.4g} Hz', 'm/s^2', line_amplitude_v(noise_v, time_s, hz) / scale
+        line_hz = float(detection.values['frequency_hz'])
+        amplitude_v = line_amplitude_v(series.noise_v, time_s, line_hz)
+        yield _Statistic(f'line at {line_hz:.4g} Hz', 'm/s^2', amplitude_v / scale)
     elif detector is Detector.NOISE_LEVEL:
-        yield 'white noise', 'm/s^2', white_noise_v(noise_v, sensor) / scale
+        level_v = white_noise_v(series.noise_v, sensor)
+        yield _Statistic('white noise', 'm/s^2', level_v / scale)
     elif detector is Detector.ISOLATED_SAMPLES:
-        spikes = isolated_samples(volts, residual_v, time_s, finite, sensor)[1]
-        values = (
-            spikes[0].values
-            if spikes
-            else {'rate_hz': np.zeros(1), 'amplitude_v': np.zeros(len(scale))}
-        )
-        yield 'spikes per second and axis', '1/s', np.atleast_1d(values['rate_hz'])
-        yield 'size of a spike', 'm/s^2', values['amplitude_v'] / scale
+        _, found = isolated_samples(series.volts, series.residual_v, time_s, finite, sensor)
+        values = {'rate_hz': np.zeros(1), 'amplitude_v': np.zeros(len(scale))}
+        if found:
+            values = found[0].values
+        yield _Statistic('spikes per second and axis', '1/s', np.atleast_1d(values['rate_hz']))
+        yield _Statistic('size of a spike', 'm/s^2', values['amplitude_v'] / scale)
     elif detector is Detector.REPEATED_SAMPLES:
-        used = repeated_samples(volts, time_s, finite, sensor)[0]
-        yield 'share of repeated samples', '1', np.array([float(np.mean(~used[finite]))])
+        used, _ = repeated_samples(series.volts, time_s, finite, sensor)
+        share = np.array([float(np.mean(~used[finite]))])
+        yield _Statistic('share of repeated samples', '1', share)
     elif detector is Detector.COARSE_CODES:
-        yield 'distance of codes', 'm/s^2', code_step_v(volts) / scale
+        yield _Statistic('distance of codes', 'm/s^2', code_step_v(series.volts) / scale)
 
 
 def floor_without(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from adxl_ros.diagnose.comparison import BaselineComparison, bridged
 from adxl_ros.diagnose.data_faults import DataFault
-from adxl_ros.diagnose.motion_shifts import CORRELATED, correlations
+from adxl_ros.diagnose.motion_shifts import correlate, CORRELATED
 from adxl_ros.files.recording_columns import stamped_rate_hz
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor
@@ -116,12 +116,12 @@ def check_rest(comparison: BaselineComparison) -> None:
 
 def check_delay(simulated_g: np.ndarray, measured_g: np.ndarray, rate_hz: float) -> None:
     """Refuse a sensor that is later or earlier than its reference than a latency explains."""
-    found = correlations(simulated_g, measured_g, 2 * len(simulated_g) // 3)
-    is_searched = np.abs(found.lags) <= LARGEST_DELAY_S * rate_hz
+    found = correlate(simulated_g, measured_g, 1 / rate_hz, 2 * len(simulated_g) // 3)
+    is_searched = np.abs(found.lags_s) <= LARGEST_DELAY_S
     by_lag = np.where(is_searched, found.correlation, -1.0)
     best = int(np.argmax(by_lag))
-    delay_s = found.lags[best] / rate_hz
-    undelayed = by_lag[found.lags == 0][0]
+    delay_s = found.lags_s[best]
+    undelayed = by_lag[found.lags_s == 0][0]
     is_clear = by_lag[best] > max(CORRELATED, undelayed + _CORRELATION_GAIN)
     if is_clear and abs(delay_s) > _SEARCHED_DELAY_S:
         raise DataFault(
