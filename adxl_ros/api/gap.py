@@ -373,7 +373,8 @@ def diagnose(
     sim_unit
         Unit of the file `sim`: g, mg or mmps2; '' for m/s². `read` has other samples' `unit`.
     urdf
-        Path of the robot that carries the sensor; its joints are in the bag of the recording.
+        Path of the robot that carries the sensor; its joints are in the bag of the recording, or
+        its columns NAME_rad.
     frame, joints
         Frame of the robot that carries the sensor, and topic of its joints; '' for the only one.
     align

@@ -190,6 +190,8 @@ def isolated_samples(
 
     The residual does so, V, (n, m), and the recording itself, or the reference would be wrong.
     """
+    if not used.any():
+        return used, []
     spikes, size_v = _spikes(residual_v, code_step_v(volts), used, sensor)
     spikes &= 2 * _deviation_v(volts) > _deviation_v(residual_v)
     if not spikes.any():
