@@ -358,42 +358,62 @@ def sample_faults(comparison: BaselineComparison) -> SampleFaults:
 
     Where the reference is not known, a jerk of the motion would look like an isolated sample.
     """
-    volts, time_s, sensor = comparison.volts, comparison.time_s, comparison.sensor
-    finite, known = np.isfinite(volts).all(axis=1), comparison.used | comparison.disturbed
+    sensor = comparison.sensor
+    volts = comparison.volts
+    time_s = comparison.time_s
+    residual_v = comparison.residual_v(sensor)
+    finite = np.isfinite(volts).all(axis=1)
+    known = comparison.used | comparison.disturbed
     coarse = coarse_codes(volts, sensor)
-    # Coarse codes repeat by themselves.
-    changing, detections = (
-        (finite, [coarse]) if coarse else repeated_samples(volts, time_s, finite, sensor)
-    )
-    residual_v = comparison.residual_v(comparison.sensor)
-
-    def among(compared: np.ndarray) -> tuple[np.ndarray, list[Detection]]:
-        regular, spikes = isolated_samples(volts, residual_v, time_s, compared, sensor)
-        return compared & ~regular, spikes
-
-    isolated, spikes = among(changing & known)
-    if spikes and not coarse:
+    changing = finite
+    if coarse is None:
+        changing, detections = repeated_samples(volts, time_s, finite, sensor)
+    else:
+        # Coarse codes repeat by themselves.
+        detections = [coarse]
+        sensor = coarse.added_to(sensor)
+    compared = changing & known
+    regular, spikes = isolated_samples(volts, residual_v, time_s, compared, comparison.sensor)
+    if spikes and coarse is None:
+        isolated = compared & ~regular
         changing, detections = repeated_samples(volts, time_s, finite, sensor, isolated)
-        isolated, spikes = among(changing & known)
+        compared = changing & known
+        regular, spikes = isolated_samples(volts, residual_v, time_s, compared, sensor)
+    held, clipping = _held(comparison)
+    if clipping is not None:
+        detections = [*detections, clipping]
+    return SampleFaults(
+        repeated=finite & ~changing,
+        isolated=compared & ~regular,
+        held=held,
+        detections=detections,
+        possible_spikes=spikes,
+        sensor=sensor,
+    )
+
+
+def _held(comparison: BaselineComparison) -> tuple[np.ndarray, Detection | None]:
+    """Find samples at an end of the range of an axis, (n, m) bool, unless most of them are."""
+    volts = comparison.volts
+    sensor = comparison.sensor
     simulated_v = comparison.simulated_v(sensor)
     steps_v = np.maximum(code_step_v(volts), sensor.lsb_v)
     moved_v = np.maximum(_HELD_STEPS * steps_v, SMALLEST_RANGE_V)
     low = _held_at_end(-volts, -simulated_v, moved_v)
     high = _held_at_end(volts, simulated_v, moved_v)
     held = low | high
-    if held.any(axis=1).mean() > _LARGEST_HELD_SHARE:
-        held = np.zeros_like(held)
-    if held.any():
-        detections = [*detections, _clipping(comparison, low, high)]
-    stepped = coarse.added_to(sensor) if coarse else sensor
-    return SampleFaults(finite & ~changing, isolated, held, detections, spikes, stepped)
+    is_most = held.any(axis=1).mean() > _LARGEST_HELD_SHARE
+    if is_most or not held.any():
+        return np.zeros_like(held), None
+    return held, _clipping(comparison, low, high)
 
 
 def coarse_codes(volts: np.ndarray, sensor: Sensor) -> Detection | None:
     """Find an ADC whose codes are coarser than stated, on all axes or on some."""
     if not sensor.lsb_v:
         return None
-    bits, threshold = np.array([_lost_bits(v, sensor) for v in volts.T]), np.log2(COARSE_STEPS)
+    bits = np.array([_lost_bits(v, sensor) for v in volts.T])
+    threshold = np.log2(COARSE_STEPS)
     if not (bits >= threshold).any():
         return None
     fewest = float(np.nanmin(bits))
@@ -506,7 +526,8 @@ def _line(
     """Return the mains line that is the strongest of a whitened residual, or None."""
     frequency_hz, power = _periodogram(white, sensor.rate_hz, 'hann')
     kept = frequency_hz > _LINE_LOWEST_HZ
-    frequency_hz, power = frequency_hz[kept], power[kept]
+    frequency_hz = frequency_hz[kept]
+    power = power[kept]
     if len(frequency_hz) < _LINE_FEWEST_ORDINATES:
         return None
     # The local level is the mean of the ordinates around, by their median.
@@ -540,11 +561,12 @@ def line_amplitude_v(values_v: np.ndarray, time_s: np.ndarray, line_hz: float) -
     parts = max(len(values_v) // max(int(np.searchsorted(time_s, time_s[0] + _LINE_PART_S)), 1), 1)
     length = len(values_v) // parts
     window = np.hanning(length + 2)[1:-1]
-    at_s, series = time_s[: parts * length].reshape(parts, length), values_v[: parts * length]
+    at_s = time_s[: parts * length].reshape(parts, length)
+    series = values_v[: parts * length].reshape(parts, length, -1)
     squares = []
     for offset in (0.0, -_LINE_BESIDE, _LINE_BESIDE):
         turn = np.exp(-2j * np.pi * (line_hz + offset / _LINE_PART_S) * at_s) * window
-        peaks = 2 * np.einsum('pl,plm->pm', turn, series.reshape(parts, length, -1)) / window.sum()
+        peaks = 2 * np.einsum('pl,plm->pm', turn, series) / window.sum()
         squares.append(np.mean(np.abs(peaks) ** 2, axis=0))
     return np.sqrt(np.maximum(squares[0] - (squares[1] + squares[2]) / 2, 0.0))
 
@@ -569,7 +591,8 @@ def compare_noise(
     log likelihood is that of the recorded spectrum under the simulated power of each band
     (Whittle 1953).
     """
-    rate_hz, scale = comparison.sensor.rate_hz, comparison.scale_v_per_mps2
+    rate_hz = comparison.sensor.rate_hz
+    scale = comparison.scale_v_per_mps2
     times_s = [t for t in _TIMES_S if t * rate_hz >= 2 and 10 * t < len(comparison) / rate_hz]
     frequency_hz = np.fft.rfftfreq(len(comparison), 1 / rate_hz)
     edges_hz = np.geomspace(max(frequency_hz[1], _LOWEST_EDGE_HZ), rate_hz / 2, _BANDS + 1)
@@ -654,7 +677,8 @@ def noise_remainders(
     remainders: list[NoiseRemainder] = []
     for key, pairs in values.items():
         recorded, simulated = np.sqrt(np.mean(np.square(np.array(pairs, float)), axis=0))
-        largest, axes = int(np.argmax(recorded)), named_sensor.axes
+        axes = named_sensor.axes
+        largest = int(np.argmax(recorded))
         remainders.append(
             NoiseRemainder(
                 *key,
@@ -677,7 +701,8 @@ class _Series(NamedTuple):
 
 def _simulated(comparison: BaselineComparison, sensor: Sensor, seed: int) -> _Series:
     """Simulate the recording with noise."""
-    at_rate, time_s = replace(sensor, rate_hz=comparison.sensor.rate_hz), comparison.time_s
+    at_rate = replace(sensor, rate_hz=comparison.sensor.rate_hz)
+    time_s = comparison.time_s
     volts = comparison.drawn_v(at_rate, seed)
     # Spikes and repeated samples are left out, as those of the recording are.
     used, _ = repeated_samples(volts, time_s, np.ones(len(volts), bool), at_rate)
