@@ -34,7 +34,9 @@ from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.signals.gravity_at_rest import GravityFaultKind, RestReadings
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import find_polarity_fault
-from adxl_ros.signals.rest_detection import find_rests, rest_means
+from adxl_ros.signals.rest_detection import find_rests
+from adxl_ros.signals.rest_means import rest_means
+from adxl_ros.signals.rest_search import RestRule
 from adxl_ros.simulate.motion import ForcePath, Motion
 import numpy as np
 import scipy
@@ -203,7 +205,7 @@ def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> l
         time_s = sim.force.time_s
         force_mps2 = np.column_stack(sim.force(time_s))
         rate_hz = stamped_rate_hz(time_s)
-        rests = find_rests(time_s, force_mps2, rate_hz, gravity=G0_MPS2)
+        rests = find_rests(time_s, force_mps2, rate_hz, RestRule(gravity=G0_MPS2))
         shape = len(rests), force_mps2.shape[1]
         mean, std = (
             np.reshape(values, shape) for values in rest_means(time_s, force_mps2, rests, rate_hz)

@@ -16,7 +16,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import gap_s, smallest_change
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import BeyondRange
-from adxl_ros.signals.rest_detection import Rest
+from adxl_ros.signals.rest_search import Rest
 import numpy as np
 
 _MOST_CELLS = 1 << 17

@@ -38,7 +38,7 @@ from adxl_ros.signals.gravity_at_rest import GravityAtRest
 from adxl_ros.signals.gyroscope_turns import GyroFindings, GyroLook
 from adxl_ros.signals.recorded_gravity import RecordingLook
 from adxl_ros.signals.recorded_sensor import load_sensor
-from adxl_ros.signals.rest_detection import Rest
+from adxl_ros.signals.rest_search import Rest
 import numpy as np
 
 _SAME_POSE_G = 0.1  # Distance of the means of two rests of one orientation, g. Chosen: 6° of tilt

@@ -23,8 +23,8 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
 from adxl_ros.signals.findings import Findings, RecordingContents
+from adxl_ros.signals.recorded_rests import rests_of
 from adxl_ros.signals.recorded_sensor import load_sensor
-from adxl_ros.signals.rest_detection import RecordedRests
 import numpy as np
 import scipy
 
@@ -219,12 +219,9 @@ def _ratio(low: float, high: float) -> str:
 def _at_rest(read: Recording, sensor: Sensor | str | None) -> _AtRest:
     """Return noise and lengths over the rests of a recording."""
     unit = recorded_nominal(load_sensor(sensor, read), read)
-    rests = RecordedRests(unit, read)
-    rests.feed(read)
-    rests.take()
     accel_mps2 = read.accel_mps2(unit)
-    found = rests.detected
-    samples = [accel_mps2[each.rest.includes(read.time_s)] for each in found]
+    rests = rests_of(unit, read)
+    samples = [accel_mps2[each.rest.includes(read.time_s)] for each in rests]
     count = -(-_FEWEST_PARTS // max(len(samples), 1))
     parts = []
     for each in samples:
