@@ -131,6 +131,12 @@ class BadStamps(NamedTuple):
     duplicates: int  # Samples with the stamp of the sample before
     backward: int  # Samples whose stamp is earlier
 
+    @property
+    def texts(self) -> list[str]:
+        """Return how many there are of each kind, for people."""
+        kinds = ('samples with the stamp of the one before', 'samples whose stamp steps back')
+        return [f'{kind}: {count}' for kind, count in zip(kinds, self) if count]
+
 
 @dataclass(repr=False, eq=False)
 class Recording:
@@ -385,12 +391,7 @@ class StampCheck:
     @property
     def remarks(self) -> tuple[str, ...]:
         """Return what was left out, for people."""
-        kinds = ('samples with the stamp of the one before', 'samples whose stamp steps back')
-        return tuple(
-            f'{self._path}: left out, {kind}: {count}'
-            for kind, count in zip(kinds, self.bad)
-            if count
-        )
+        return tuple(f'{self._path}: left out, {text}' for text in self.bad.texts)
 
 
 def check_same_sensor(info: StreamInfo, axes: str, sensor: Sensor) -> None:

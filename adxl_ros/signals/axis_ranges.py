@@ -7,12 +7,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from adxl_ros.files.recording_columns import GYRO
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.signals.block_statistics import true_runs
 import numpy as np
 
 _CLIPPED_SAMPLES = 3  # Equal samples at an extreme that are clipped. Chosen: noise repeats fewer
-_CLIPPED_STEP_G = 0.05  # Change before or after them, g. Chosen: a sensor at rest has none
+_CLIPPED_STEP = 0.05 * G0_MPS2
+"""Change before or after them, m/s² or rad/s. Chosen: a sensor at rest has none."""
 _CLIPPED_WINDOW_S = 0.1  # Longest time beside them in which it moves, s. Chosen: a hand is faster
 _CLIPPED_CODES = 20
 """Change, in steps of the resolution, that a smooth peak does not reach within the time that it
@@ -30,8 +32,9 @@ class AxisRange:
     """The samples of one axis."""
 
     name: str  # Its column
-    lowest_mps2: float  # Its lowest value, m/s²
-    highest_mps2: float  # Its highest value, m/s²
+    # lowest, highest: Its extreme values, m/s², or rad/s of a gyroscope
+    lowest: float
+    highest: float
     clipped: int  # Times at which it stays at an extreme value in motion
     is_stuck: bool  # Whether it never changes
     # Longest time in which it does not change although it usually does, s; 0 for none
@@ -53,7 +56,7 @@ class AxisLook:
         self._equal = self._most_equal = 0  # Samples since the last change, and most between two
 
     def feed(self, values: np.ndarray) -> None:
-        """Add further samples, m/s², (n,); those that are no numbers do not count."""
+        """Add further samples, m/s² or rad/s, (n,); those that are no numbers do not count."""
         values = values[np.isfinite(values)]
         if not len(values):
             return
@@ -66,7 +69,7 @@ class AxisLook:
         self._last = values[-1]
         steps = np.abs(np.diff(values))
         smallest = float(steps[steps > 0].min(initial=np.inf))
-        drop = max(_CLIPPED_STEP_G * G0_MPS2, _CLIPPED_CODES * smallest)
+        drop = max(_CLIPPED_STEP, _CLIPPED_CODES * smallest)
         for side, signed in enumerate((-values, values)):
             largest = float(signed.max())
             if largest > self._largest[side]:
@@ -97,8 +100,8 @@ class AxisLook:
         )
         return AxisRange(
             name=self.name,
-            lowest_mps2=low,
-            highest_mps2=high,
+            lowest=low,
+            highest=high,
             clipped=sum(self._clipped),
             is_stuck=low == high,
             stuck_s=stuck_s if is_reported or low == high else 0.0,
@@ -110,11 +113,10 @@ def axis_faults(axes: Iterable[AxisRange]) -> list[str]:
     faults = []
     for axis in axes:
         if axis.clipped >= _FEWEST_CLIPPED:
-            low_g = axis.lowest_mps2 / G0_MPS2
-            high_g = axis.highest_mps2 / G0_MPS2
+            size, unit = (1.0, 'rad/s') if axis.name in GYRO else (G0_MPS2, 'g')
             faults.append(
                 f'{axis.name} stays at its extreme value {axis.clipped} times in motion; its '
-                f'range ends at {low_g:.3g} or {high_g:.3g} g'
+                f'range ends at {axis.lowest / size:.3g} or {axis.highest / size:.3g} {unit}'
             )
         elif axis.is_stuck:
             faults.append(f'{axis.name} never changes; the axis is stuck, or not connected')

@@ -22,9 +22,10 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
-from adxl_ros.signals.findings import Findings, RecordingContents
+from adxl_ros.signals.findings import Findings
 from adxl_ros.signals.recorded_rests import rests_of
 from adxl_ros.signals.recorded_sensor import load_sensor
+from adxl_ros.signals.recording_contents import RecordingContents
 import numpy as np
 import scipy
 
