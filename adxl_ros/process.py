@@ -4,6 +4,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import lru_cache
 import hashlib
 from importlib.metadata import PackageNotFoundError, version
@@ -100,6 +101,18 @@ READING = (
     'drop_bad_samples',
 )
 """Arguments of `read`, which are options of the tools that read recordings."""
+_READER = ContextVar('reader', default='read or from_arrays')
+"""What reads recordings, as texts in Python call it."""
+
+
+@contextmanager
+def read_by(verb: str) -> Iterator[None]:
+    """Let texts name the verb that reads a recording; others do not know it."""
+    token = _READER.set(verb)
+    try:
+        yield
+    finally:
+        _READER.reset(token)
 
 
 @contextmanager
@@ -132,7 +145,7 @@ def option(*names: str, **values: Any) -> str:
         return ' '.join(_of_tool(name, value) for name, value in given.items())
     arguments = _arguments(given)
     # Other verbs take recordings as they were read.
-    return f'read(..., {arguments})' if given.keys() <= {*READING} else arguments
+    return f'{_READER.get()}(..., {arguments})' if given.keys() <= {*READING} else arguments
 
 
 def usage(verb: str, *inputs: str, **values: Any) -> str:

@@ -25,7 +25,7 @@ from adxl_ros.files.column_mapping import (
 from adxl_ros.files.recording_columns import ACCEL, GYRO, Recording, REFERENCES, TIME, VOLTS
 from adxl_ros.files.tables import in_memory
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.process import option
+from adxl_ros.process import option, read_by
 import numpy as np
 
 if TYPE_CHECKING:
@@ -37,9 +37,15 @@ RecordingInput: TypeAlias = 'Recording | DataFrame | Mapping[str, Any] | str | o
 Counts: TypeAlias = float | Sequence[float] | str
 """Counts of an ADC: one number for all axes, one for each, or their text with commas."""
 
+_OUTPUTS = {*ACCEL, *VOLTS}  # Columns of the sensor's output
+_KNOWN = (TIME, *ACCEL, *VOLTS, *GYRO, *REFERENCES)  # Columns of the package
+_TIMES = 'mM'  # Kinds of numpy's types that are times or dates
+_NUMBERS = 'iufb'  # Kinds that are numbers: int, unsigned, float, bool
+_OBJECTS = 'O'  # Kind of arrays of any objects
 _HIGHEST_RATE_HZ = 1e5  # Largest sample rate, Hz: that of a parameter file
 
 
+@read_by('read')
 def read(
     source: RecordingInput,
     *,
@@ -170,10 +176,11 @@ def _counts(argument: str, stated: Counts, above: float) -> tuple[float, ...]:
     )
 
 
+@read_by('from_arrays')
 def from_arrays(
     table: Mapping[str, Any] | DataFrame | None = None,
     /,
-    *,
+    *unnamed: Any,
     rate: float | None = None,
     unit: str = '',
     columns: str | Mapping[str, str | tuple[str, str]] | None = None,
@@ -204,6 +211,8 @@ def from_arrays(
         Serial number of the sensor; '' for an unnamed one.
     name
         What messages call it.
+    *unnamed
+        None: arrays have names.
     **arrays
         Arrays (n,): `time_s`, s or dates, rising; the output `ax_mps2, ay_mps2, az_mps2`, m/s², or
         `x_v, y_v, z_v`, V, of one, two or three axes; the references `alpha_rad, beta_rad` of a
@@ -221,6 +230,11 @@ def from_arrays(
         There is no time or no output, lengths differ, or values are no readings of a sensor.
 
     """
+    if unnamed:
+        raise UserError(
+            f'from_arrays: {1 + len(unnamed)} arrays have no names; write for example '
+            'from_arrays(time_s=t, ax_mps2=x)'
+        )
     given = arrays if table is None else {**_columns_of(table, 'from_arrays'), **arrays}
     unknown = arrays.keys() - _KNOWN
     # Without an output that is known, the reader proposes what the others may be.
@@ -237,10 +251,6 @@ def from_arrays(
         drop_bad_samples=drop_bad_samples,
     )
     return _of_memory(given, name, options, serial)
-
-
-_OUTPUTS = {*ACCEL, *VOLTS}  # Columns of the sensor's output
-_KNOWN = (TIME, *ACCEL, *VOLTS, *GYRO, *REFERENCES)  # Columns of the package
 
 
 def _is_frame(given: Any) -> bool:
@@ -317,11 +327,6 @@ def _rows_of(columns: Mapping[str, np.ndarray], name: str) -> int:
             + ', '.join(f'{key} {shape}' for key, shape in shapes.items())
         )
     return shape[0]
-
-
-_TIMES = 'mM'  # Kinds of numpy's types that are times or dates
-_NUMBERS = 'iufb'  # Kinds that are numbers: int, unsigned, float, bool
-_OBJECTS = 'O'  # Kind of arrays of any objects
 
 
 def _floats(given: Any) -> np.ndarray | None:

@@ -577,12 +577,9 @@ def _report(
 
 def what_shows(
     recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None
-) -> list[CouldShow] | DataFault:
-    """Return what recordings can show, before any diagnosis; or why they cannot be compared."""
-    try:
-        checked = check(recordings, sensor, sim)
-    except DataFault as fault:
-        return fault
+) -> list[CouldShow]:
+    """Return what recordings can show, before any diagnosis; raise why they cannot be compared."""
+    checked = check(recordings, sensor, sim)
     model = build_linear_model([c.search_comparison for c in checked])
     floor = estimate_floor([c.comparison for c in checked])
     return next_experiment.could_show(

@@ -40,6 +40,18 @@ class TableBlock:
     done: float = 1.0  # Fraction of the file that has been read at the end of the rows
     cut: str = ''  # Where a damaged file ends; empty if it is whole
 
+    def refuse(
+        self, column: str, wrong: np.ndarray, reason: str, reason_of_none: str = ''
+    ) -> None:
+        """Refuse cells of a column, (n,): for a reason, or another one where they are empty."""
+        if wrong.any():
+            row = int(wrong.argmax())
+            value = self.columns[column][row]
+            text = f'{value:g}, {reason}; delete the line, or correct the unit'
+            if np.isnan(value):
+                text = f'empty or NaN; {reason_of_none}'
+            raise UserError(f'{self.where(row, column)} is {text}')
+
 
 @dataclass(frozen=True)
 class Table:

@@ -438,7 +438,8 @@ class _Job:
 
         found = diagnose(self._recording, self._params)
         # The report names the file, and not the copy of the task.
-        found = found.with_params(self._parameters.name if self._params else '')
+        params = self._parameters.name if self._params else ''
+        found = replace(found, compared=found.compared.with_params(params))
         self._put_assumed(found.sensor)
         self._put_verdict(found.to_dict())
         self.files |= {

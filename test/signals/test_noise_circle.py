@@ -133,7 +133,7 @@ FIGURES: dict[str, tuple[str, Figure]] = {
 
 
 def test_all_formats_have_a_figure() -> None:
-    assert set(FIGURES) == set(exports.FORMATS)
+    assert set(FIGURES) == set(exports.formats())
 
 
 @pytest.mark.parametrize('rate_hz', RATES_HZ)
