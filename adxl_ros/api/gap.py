@@ -35,7 +35,8 @@ from adxl_ros.diagnose.next_experiment import CouldShow
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import make_folder, require_own, write_text
-from adxl_ros.files.recording_columns import NO_SERIAL, Recording
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import NO_SERIAL
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option

@@ -20,7 +20,8 @@ from adxl_ros.calibrate.keep.update_report import UpdatedDay
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import make_folder, require_own, write_text
-from adxl_ros.files.recording_columns import check_same_sensor, Recording
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import check_same_sensor
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.figures import axes_for, AXIS_COLOURS
 from adxl_ros.report.quantities import counted, number, utc

@@ -20,7 +20,7 @@ from adxl_ros.files.tables import PoseTable
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
-from adxl_ros.signals import recorded_sensor
+from adxl_ros.signals import filter_noise
 from adxl_ros.signals.recorded_rests import recording_finder
 from adxl_ros.signals.rest_limits import datasheet_noise
 from adxl_ros.signals.rest_means import rest_means
@@ -220,7 +220,7 @@ def with_table_angles(poses: Poses, table: PoseTable) -> Poses:
 
 def estimate_filters(
     recording: Recording, sensor: Sensor, poses: Poses
-) -> list[recorded_sensor.FilterNoise | None]:
+) -> list[filter_noise.FilterNoise | None]:
     """Estimate the output filter of each axis from the noise of the poses."""
     volts = recording.volts(sensor)
     gapless = []
@@ -229,7 +229,7 @@ def estimate_filters(
         if steps_s.size and steps_s.max() * sensor.rate_hz < _MAX_PERIODS:
             gapless.append(volts[begin : end + 1])
     return [
-        recorded_sensor.estimate_filter(
+        filter_noise.estimate_filter(
             [rest[:, d] for rest in gapless], sensor.rate_hz, sensor.rc_s, sensor.lsb_v
         )
         for d in range(len(sensor.axes))

@@ -15,7 +15,8 @@ from enum import Enum
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
-from adxl_ros.files.recording_columns import JOINTS, LONGEST_MOVE_NS, Recording, USUAL_GAPS
+from adxl_ros.files.recording_columns import JOINTS, Recording
+from adxl_ros.files.reference_track import LONGEST_MOVE_NS, USUAL_GAPS
 from adxl_ros.files.stamps import period_s, stamped_rate_hz
 from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2

@@ -29,11 +29,11 @@ from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.process import option
 from adxl_ros.report.quantities import listed
-from adxl_ros.signals import gravity_at_rest
+from adxl_ros.signals import gravity_at_rest, tolerances
 from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.signals.gravity_at_rest import GravityFaultKind, RestReadings
+from adxl_ros.signals.polarity import find_polarity_fault
 from adxl_ros.signals.recorded_gravity import RecordingLook
-from adxl_ros.signals.recorded_sensor import find_polarity_fault
 from adxl_ros.signals.rest_detection import find_rests
 from adxl_ros.signals.rest_means import rest_means
 from adxl_ros.signals.rest_search import RestRule
@@ -148,8 +148,6 @@ _UNIT_RATIOS = {
     1e-3 / G0_MPS2: 'g instead of mm/s²',
 }
 """Gain of an output in the wrong unit, and which unit it has instead of which."""
-
-
 DATA_FAULTS = {
     'axis_inverted': 'an axis has the opposite sign',
     'axis_swapped': 'two axes are swapped',
@@ -211,14 +209,14 @@ def check_gravity(recording: Recording, sensor: Sensor, sim: Motion | None) -> l
             np.reshape(values, shape) for values in rest_means(time_s, force_mps2, rests, rate_hz)
         )
         readings, gravity_mps2 = RestReadings(mean, std), sensor.local_gravity_mps2
-        fault = gravity_at_rest.look(readings, gravity_at_rest.IDEAL, gravity_mps2).fault
+        fault = gravity_at_rest.look(readings, tolerances.IDEAL, gravity_mps2).fault
         if fault is not None and fault.is_clear:
             raise DataFault(
                 fault.data_fault,
                 f'{sim.force.name}: {fault.stated_by(option(sim_unit=fault.symbol))}',
             )
         # A simulator may have the errors of a sensor, but none beyond its tolerance.
-        tolerance = gravity_at_rest.nominal_tolerance(sensor).widest(force_mps2.shape[1])
+        tolerance = tolerances.nominal_tolerance(sensor).widest(force_mps2.shape[1])
         fault = gravity_at_rest.look(readings, tolerance, gravity_mps2).fault
         if fault is not None and fault.kind is GravityFaultKind.SCALE:
             raise DataFault(

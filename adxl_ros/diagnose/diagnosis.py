@@ -33,7 +33,8 @@ from adxl_ros.diagnose.remainder import Remainder, reproducible_remainder
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
 from adxl_ros.diagnose.search import Hypothesis, Search, with_filters
 from adxl_ros.diagnose.verdict import HEALTHY, MATERIAL_MG, Verdict
-from adxl_ros.files.recording_columns import check_same_sensor, Recording
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import check_same_sensor
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named, library

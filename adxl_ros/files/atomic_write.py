@@ -23,6 +23,14 @@ from adxl_ros.process import option
 
 AnyPath = str | os.PathLike  # A path, as the functions of Python take it
 _SUFFIX = '.part'  # End of the names of directories in which new files are written
+_AT_FDCWD = -100  # Of renameat2: paths are those of this process
+_RENAME_EXCHANGE = 2  # Of renameat2: swap both names
+_MARK = 'user.adxl_ros.written'
+"""Extended attribute of what this package wrote: the time of the last change, ns, as text."""
+_BAG_FILES = ('*.mcap', '*.db3', 'metadata.yaml')  # Names of the files in a bag
+_KEPT_BYTES = 256 << 20
+"""Part of a file that stays in the cache for whoever reads it next: a recording of an hour at 1
+kHz is smaller, and every computer has so much to spare."""
 
 
 @contextmanager
@@ -63,10 +71,6 @@ def atomic_path(path: AnyPath) -> Iterator[Path]:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-_AT_FDCWD = -100  # Of renameat2: paths are those of this process
-_RENAME_EXCHANGE = 2  # Of renameat2: swap both names
-
-
 def _exchange(fresh: Path, target: Path) -> None:
     """
     Swap two directories, of which none can be renamed over the other.
@@ -86,10 +90,6 @@ def _exchange(fresh: Path, target: Path) -> None:
         os.replace(fresh, target)
 
 
-_MARK = 'user.adxl_ros.written'
-"""Extended attribute of what this package wrote: the time of the last change, ns, as text."""
-
-
 def _mark(path: Path) -> None:
     """Mark what this package wrote, where the file system keeps attributes."""
     with suppress(OSError):
@@ -106,9 +106,6 @@ def is_own(path: AnyPath) -> bool:
         return os.getxattr(path, _MARK) == str(os.stat(path).st_mtime_ns).encode()
     except OSError:
         return False
-
-
-_BAG_FILES = ('*.mcap', '*.db3', 'metadata.yaml')  # Names of the files in a bag
 
 
 def _refuse_folder_of_others(path: Path) -> None:
@@ -215,11 +212,6 @@ def append_line(file: FileIO, line: str) -> None:
         with suppress(OSError):
             file.truncate(size)
         raise
-
-
-_KEPT_BYTES = 256 << 20
-"""Part of a file that stays in the cache for whoever reads it next: a recording of an hour at 1
-kHz is smaller, and every computer has so much to spare."""
 
 
 def release_written(file: BinaryIO) -> None:

@@ -37,12 +37,10 @@ from adxl_ros.files.recording_columns import (
     JOINTS,
     LIMIT,
     limits,
-    LONGEST_MOVE_NS,
     Recording,
-    seconds,
-    StampCheck,
-    Track,
 )
+from adxl_ros.files.reference_track import LONGEST_MOVE_NS, seconds, Track
+from adxl_ros.files.stamp_check import StampCheck
 from adxl_ros.model.constants import AXES, MEASURED_AXES
 from adxl_ros.process import option
 import numpy as np

@@ -25,7 +25,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.files.parameter_file import compose
-from adxl_ros.files.recording_columns import NO_SERIAL
+from adxl_ros.files.stream_info import NO_SERIAL
 from adxl_ros.model.population import PooledCoefficient, Population
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import command, package_version
@@ -39,6 +39,14 @@ _MAX_NAME = 120
 """Characters of a serial number in a file name (chosen: file systems permit 255 bytes)."""
 _HASH_DIGITS = 8
 """Digits of the data's SHA-256 in an id (chosen: enough for calibrations of one second)."""
+FORMAT = 1  # Version of the format. A file of another version is refused
+_DIGITS = 9  # Significant digits of the values (chosen: far below any uncertainty)
+_HEAD = """\
+# Mean and spread of each coefficient over the units of a fleet, written by fleet.
+# prediction_std is the standard deviation of a further unit about the mean.
+# Use it: {command}
+"""
+"""Comments at the begin of the file."""
 
 
 class StoredCalibration(NamedTuple):
@@ -195,16 +203,6 @@ def sha256(paths: Sequence[AnyPath]) -> str:
         if len(checksums) == 1
         else hashlib.sha256(''.join(f'{line}\n' for line in checksums).encode()).hexdigest()
     )
-
-
-FORMAT = 1  # Version of the format. A file of another version is refused
-_DIGITS = 9  # Significant digits of the values (chosen: far below any uncertainty)
-_HEAD = """\
-# Mean and spread of each coefficient over the units of a fleet, written by fleet.
-# prediction_std is the standard deviation of a further unit about the mean.
-# Use it: {command}
-"""
-"""Comments at the begin of the file."""
 
 
 def write_population(path: AnyPath, population: Population) -> None:

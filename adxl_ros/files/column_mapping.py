@@ -27,6 +27,42 @@ _ENTRY = re.compile(
 
 
 Columns = Mapping[str, np.ndarray]  # Arrays (n,) by the name of their column or field
+GYRO_ROLES = ('gx', 'gy', 'gz')  # Roles of the axes of a gyroscope
+LSB = 'lsb'  # Unit of counts, which needs the counts of 1 g
+UNSIGNED = 'u16'  # Unit of counts that lost their sign, so that 65535 is −1
+_SPELLINGS = {
+    's': 'sec secs second seconds',
+    'ms': 'msec millis milliseconds',
+    'us': 'µs μs usec micros microseconds',
+    'ns': 'nsec nanoseconds',
+    'epoch': 'unix posix',
+    'mps2': 'm/s^2 m/s² m/s2 ms2 ms^2 m/s/s ms-2 ms^-2 m_s2 mss m·s⁻² m.s-2 m_s^-2 m_s-2',
+    'mmps2': 'mm/s^2 mm/s² mm/s2 mms2 mm/s/s mms-2 mm_s2',
+    'mg': 'millig',
+    'g': 'gs',
+    LSB: 'counts count raw digits',
+    'v': 'volt volts',
+    'mv': 'millivolt millivolts',
+    'deg': '° degree degrees',
+    'rad': 'radian radians',
+    'radps': 'rad/s rad_s rad_per_s rad·s⁻¹ rad.s-1',
+    'dps': 'deg/s °/s deg_s degps deg_per_s',
+    'mdps': 'mdeg/s m°/s',
+    'c': '°c degc celsius deg_c',
+    'f': '°f degf fahrenheit',
+    'k': 'kelvin',
+}
+_ALIASES: dict[str, str] = {}
+_BRACKETS = re.compile(r'[(\[{]\s*([^()\[\]{}]+?)\s*[)\]}]')
+"""A part of a column's name in brackets."""
+_WORD_ENDS = re.compile(r'[_\s.]+|\[\d+\]|[(\[{].*[)\]}]|(?<=[a-z])(?=[A-Z])')
+"""Ends of the words in a column's name; an index or a part in brackets is none."""
+_LISTED_NAMES = 12
+"""Largest number of columns that a message names (chosen: some lines of a terminal)."""
+_NEAR = 0.25
+"""Largest logarithm of the ratio of a length to gravity (chosen: above bias and scale errors)."""
+_SHORTEST_STEP_S = 2.5e-5  # Shortest step of stamps, s. Chosen: an IIS3DWB has steps of 3.75e-5 s
+_LONGEST_STEP_S = 1.05  # Longest step of stamps, s. Chosen: 1 Hz, the slowest, with jitter
 
 
 @dataclass(frozen=True)
@@ -215,8 +251,6 @@ class Quantity(Enum):
     TURN = 'radps'
 
 
-GYRO_ROLES = ('gx', 'gy', 'gz')  # Roles of the axes of a gyroscope
-
 ROLES: Mapping[str, Quantity] = {
     'time': Quantity.TIME,
     **dict.fromkeys(AXES, Quantity.OUTPUT),
@@ -227,9 +261,6 @@ ROLES: Mapping[str, Quantity] = {
     **dict.fromkeys(GYRO_ROLES, Quantity.TURN),
 }
 """Quantity of each role that a column can have."""
-
-LSB = 'lsb'  # Unit of counts, which needs the counts of 1 g
-UNSIGNED = 'u16'  # Unit of counts that lost their sign, so that 65535 is −1
 
 
 def signed(values: np.ndarray) -> np.ndarray:
@@ -295,38 +326,9 @@ GRAVITY = {
 }
 """Length of gravity in each unit of acceleration."""
 
-_SPELLINGS = {
-    's': 'sec secs second seconds',
-    'ms': 'msec millis milliseconds',
-    'us': 'µs μs usec micros microseconds',
-    'ns': 'nsec nanoseconds',
-    'epoch': 'unix posix',
-    'mps2': 'm/s^2 m/s² m/s2 ms2 ms^2 m/s/s ms-2 ms^-2 m_s2 mss m·s⁻² m.s-2 m_s^-2 m_s-2',
-    'mmps2': 'mm/s^2 mm/s² mm/s2 mms2 mm/s/s mms-2 mm_s2',
-    'mg': 'millig',
-    'g': 'gs',
-    LSB: 'counts count raw digits',
-    'v': 'volt volts',
-    'mv': 'millivolt millivolts',
-    'deg': '° degree degrees',
-    'rad': 'radian radians',
-    'radps': 'rad/s rad_s rad_per_s rad·s⁻¹ rad.s-1',
-    'dps': 'deg/s °/s deg_s degps deg_per_s',
-    'mdps': 'mdeg/s m°/s',
-    'c': '°c degc celsius deg_c',
-    'f': '°f degf fahrenheit',
-    'k': 'kelvin',
-}
-_ALIASES: dict[str, str] = {}
 for _name, _words in _SPELLINGS.items():
     _ALIASES |= dict.fromkeys(_words.split(), _name)
 """Names of units by their other spellings, in lower case, with _ for a blank."""
-
-_BRACKETS = re.compile(r'[(\[{]\s*([^()\[\]{}]+?)\s*[)\]}]')
-"""A part of a column's name in brackets."""
-
-_WORD_ENDS = re.compile(r'[_\s.]+|\[\d+\]|[(\[{].*[)\]}]|(?<=[a-z])(?=[A-Z])')
-"""Ends of the words in a column's name; an index or a part in brackets is none."""
 
 
 def unit_name(text: str, quantity: Quantity) -> str | None:
@@ -415,14 +417,6 @@ class ReadingOptions:
 
 
 AS_IT_IS = ReadingOptions()
-
-
-_LISTED_NAMES = 12
-"""Largest number of columns that a message names (chosen: some lines of a terminal)."""
-_NEAR = 0.25
-"""Largest logarithm of the ratio of a length to gravity (chosen: above bias and scale errors)."""
-_SHORTEST_STEP_S = 2.5e-5  # Shortest step of stamps, s. Chosen: an IIS3DWB has steps of 3.75e-5 s
-_LONGEST_STEP_S = 1.05  # Longest step of stamps, s. Chosen: 1 Hz, the slowest, with jitter
 
 
 def first_names(names: Sequence[str]) -> str:

@@ -35,10 +35,10 @@ from adxl_ros.files.recording_columns import (
     limits,
     Recording,
     sensor_columns,
-    StampCheck,
     TIME,
     VOLTS,
 )
+from adxl_ros.files.stamp_check import StampCheck
 from adxl_ros.files.table_stamps import CountedStamps, StampColumn
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.kinematics import stage_angles

@@ -19,7 +19,7 @@ from adxl_ros.files.column_mapping import (
     time_unit_of_step,
     UNITS,
 )
-from adxl_ros.files.recording_columns import StampCheck
+from adxl_ros.files.stamp_check import StampCheck
 from adxl_ros.files.stamps import describe_bursts, stamped_rate_hz
 from adxl_ros.process import option, pasted
 import numpy as np

@@ -47,6 +47,15 @@ _MAPPINGS = {
     'vehicle_acceleration': 'time={time}:us,x=xyz[0]:mps2,y=xyz[1]:mps2,z=xyz[2]:mps2',
 }
 """Columns and units of messages by the definitions of PX4 (msg/*.msg), the raw readings first."""
+_MATLAB = (
+    "save plain vectors with save('run.mat', 't', 'x', 'y', 'z', '-v7'), or a "
+    "table with writetable(T, 'run.csv')"
+)
+"""How MATLAB writes what can be read, for messages: no struct, timetable or HDF5 (-v7.3)."""
+_POSE_COLUMNS = ('alpha_deg', 'beta_deg')  # Columns of a table of poses
+_TILT_COLUMNS = ('roll_deg', 'pitch_deg')  # The same by an inclinometer
+_SPAN_COLUMNS = ('start_s', 'stop_s')  # When a pose rests; a table may have both or none
+_LEVEL_RAD = 1e-9  # Largest sine of alpha at which beta does not matter
 
 
 def open_table(path: AnyPath, topic: str = '') -> Table:
@@ -131,13 +140,6 @@ def _open_numpy(path: str) -> Table:
         names = getattr(loaded, 'files', None) or loaded.dtype.names
         arrays = {name: loaded[name] for name in names} if names else {'column': loaded}
         return _of_arrays(path, arrays, 'save each column as an array')
-
-
-_MATLAB = (
-    "save plain vectors with save('run.mat', 't', 'x', 'y', 'z', '-v7'), or a "
-    "table with writetable(T, 'run.csv')"
-)
-"""How MATLAB writes what can be read, for messages: no struct, timetable or HDF5 (-v7.3)."""
 
 
 def _open_mat(path: str) -> Table:
@@ -269,13 +271,6 @@ _FORMATS: Mapping[str, Callable[[str], Table]] = {
 """Formats besides text and logs by the ends of their files' names."""
 
 TABLE_ENDINGS = (*_FORMATS, '.ulg')  # Ends of the names of tables that are no text
-
-
-_POSE_COLUMNS = ('alpha_deg', 'beta_deg')  # Columns of a table of poses
-_TILT_COLUMNS = ('roll_deg', 'pitch_deg')  # The same by an inclinometer
-_SPAN_COLUMNS = ('start_s', 'stop_s')  # When a pose rests; a table may have both or none
-
-_LEVEL_RAD = 1e-9  # Largest sine of alpha at which beta does not matter
 
 
 class PoseTable(NamedTuple):

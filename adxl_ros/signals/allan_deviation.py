@@ -26,6 +26,16 @@ _AT_ONCE = 1 << 14
 """Samples that are read at a time: with three axes 400 kB, which stay in the cache of a core."""
 _FEWEST_AVERAGES = 3
 """Averages side by side at the longest time: with two there is one difference and no scatter."""
+_WINDOW_S = 2.0
+"""Shortest window of the standard deviation of a sample, s. It holds the slowest usual filters,
+0.3 s, several times; drift of longer windows would count as noise of a sample."""
+_LARGEST_END_S = 0.2
+"""Longest time beside a rest that is no motion, s: four blocks, which a rest may lose there."""
+_FEWEST_SAMPLES = 512
+"""Fewest samples at rest: white noise is then known within 10 % at 90 %, with half within 15 %."""
+SHORTEST_S = 10.0
+"""Shortest rest, s. Bias instability shows from averages of one second on, of which ten are few;
+half of it would leave no octave above one second with three averages."""
 
 
 @dataclass(frozen=True)
@@ -118,18 +128,6 @@ class Cells(NamedTuple):
 
     size: int  # Samples of a cell
     means: np.ndarray  # Mean of each cell by axis, (k, m)
-
-
-_WINDOW_S = 2.0
-"""Shortest window of the standard deviation of a sample, s. It holds the slowest usual filters,
-0.3 s, several times; drift of longer windows would count as noise of a sample."""
-_LARGEST_END_S = 0.2
-"""Longest time beside a rest that is no motion, s: four blocks, which a rest may lose there."""
-_FEWEST_SAMPLES = 512
-"""Fewest samples at rest: white noise is then known within 10 % at 90 %, with half within 15 %."""
-SHORTEST_S = 10.0
-"""Shortest rest, s. Bias instability shows from averages of one second on, of which ten are few;
-half of it would leave no octave above one second with three averages."""
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,22 @@ from adxl_ros.report.figures import AXIS_COLOURS, new_figure
 from adxl_ros.report.quantities import duration
 from adxl_ros.report.screen import row
 from adxl_ros.signals.allan_deviation import StillStretch
-from adxl_ros.signals.gravity_at_rest import AXIS_UNITS
 from adxl_ros.signals.noise_parameters import AxisNoise, RecordingNoise
+from adxl_ros.signals.reading_units import AXIS_UNITS
 import numpy as np
 import yaml
 
 _MICRO_G = 1e6 / G0_MPS2  # 1 m/s² in µg
 _NAMES = ('white noise N', 'bias instability B', 'random walk K')  # Names of the terms
 TERMS = ('white', 'instability', 'walk')  # Their fields in `NoiseFit`
+_SAME_NOISE = float(np.log(1.6))
+"""Logarithm of the ratio of the noise of two axes in one unit. Chosen: datasheets state up to 1.5
+for z, and the ratio of g and m/s² is far above its square."""
+_LEVEL_G = 0.5  # Largest reading of an axis whose unit gravity does not show, g: 30° of tilt
+_YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
+_PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000
+_INCHES = (5.0, 4.4)
+"""Width and height of the plot of an axis, inches. Chosen: three fit beside each other."""
 
 
 class _ReadingUnits(NamedTuple):
@@ -58,14 +66,6 @@ def sensors_at_rest(result: RecordingNoise) -> list[SensorAtRest]:
     if result.gyro_rest is not None:
         shown.append(SensorAtRest('gyroscope', result.gyro_rest, result.gyro, _GYRO))
     return shown
-
-
-_SAME_NOISE = float(np.log(1.6))
-"""Logarithm of the ratio of the noise of two axes in one unit. Chosen: datasheets state up to 1.5
-for z, and the ratio of g and m/s² is far above its square."""
-_LEVEL_G = 0.5  # Largest reading of an axis whose unit gravity does not show, g: 30° of tilt
-_YAML_COLUMNS = 60  # Columns after which a list is wrapped; its last number may be beyond
-_PX4_HZ = 100.0  # Rate of the filter of PX4, Hz: EKF2_PREDICT_US is 10 000
 
 
 def head(result: RecordingNoise) -> list[str]:
@@ -287,10 +287,6 @@ def _axis_warnings(span_s: float, noise: AxisNoise, unit: _ReadingUnits) -> list
             'states no white noise.'
         )
     return texts
-
-
-_INCHES = (5.0, 4.4)
-"""Width and height of the plot of an axis, inches. Chosen: three fit beside each other."""
 
 
 def curves(result: RecordingNoise) -> Any:

@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from functools import partial
 
 from adxl_ros.errors import one_line, UserError
-from adxl_ros.files.recording_columns import Recording, uncalibrated
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import uncalibrated
 from adxl_ros.model.constants import TINY
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.signals.axis_ranges import axis_faults, AxisLook, AxisRange
@@ -20,6 +21,10 @@ from adxl_ros.signals.rest_detection import RestFinder, RestMean
 from adxl_ros.signals.rest_limits import datasheet_noise
 from adxl_ros.signals.rest_search import BY_STREAM, RestRule
 import numpy as np
+
+LIVE_WINDOW_S = 4.0  # Newest samples in which a live stream may rest, s. Chosen: two short rests
+_OTHER_STREAM = 1.5  # Ratio of two lengths in one pose from which the driver has changed its unit
+_MOST_POSES = 20  # Newest poses of a live stream that are kept. Chosen: a tumble by hand
 
 
 class RecordingLook:
@@ -81,11 +86,6 @@ class RecordingLook:
             if not faults:
                 raise
             raise UserError('; '.join([one_line(error), *faults])) from None
-
-
-LIVE_WINDOW_S = 4.0  # Newest samples in which a live stream may rest, s. Chosen: two short rests
-_OTHER_STREAM = 1.5  # Ratio of two lengths in one pose from which the driver has changed its unit
-_MOST_POSES = 20  # Newest poses of a live stream that are kept. Chosen: a tumble by hand
 
 
 class LiveLook:

@@ -10,12 +10,8 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 from adxl_ros.errors import UserError
-from adxl_ros.files.recording_columns import (
-    BadStamps,
-    GYRO,
-    Recording,
-    REFERENCES,
-)
+from adxl_ros.files.recording_columns import GYRO, Recording, REFERENCES
+from adxl_ros.files.stamp_check import BadStamps
 from adxl_ros.files.stamps import burst_samples, lacks_samples, period_s
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
