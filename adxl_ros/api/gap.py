@@ -368,7 +368,8 @@ def _require_simulator(
     align: bool,
 ) -> None:
     """Refuse arguments that are about a simulator or a robot, where none is given."""
-    if align and sim is None and not urdf:
+    has_other = sim is not None or bool(urdf)
+    if align and not has_other:
         raise UserError(
             f'{option(align=True)}: shifts {option("sim")} or a robot, and neither is given'
         )
@@ -383,9 +384,8 @@ def _require_one_reference(
     sim: RecordingInput | Motion | None, urdf: str | os.PathLike | None, count: int
 ) -> None:
     """Refuse a simulator and a robot together, and one of them for several recordings."""
-    if sim is None and not urdf:
-        return
-    if count > 1 or (sim is not None and urdf):
+    others = [sim is not None, bool(urdf)]
+    if any(others) and (all(others) or count > 1):
         raise UserError(
             f'{_name_of(sim) or urdf}: {option("sim")} or {option("urdf")}, one of them, goes '
             f'with one recording, but {count} are given'

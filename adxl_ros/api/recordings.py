@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 import hashlib
 import math
+from numbers import Real
 import os
 from typing import Any, NamedTuple, TYPE_CHECKING, TypeAlias
 
@@ -131,8 +132,8 @@ def reading_options(
     drop_bad_samples: bool = False,
 ) -> ReadingOptions:
     """Check how a recording is to be read; see `read`."""
-    is_number = isinstance(rate, (float, int, np.number))
-    if rate is not None and not (is_number and 0 < rate <= _HIGHEST_RATE_HZ):
+    is_number = isinstance(rate, Real)
+    if rate is not None and not 0 < (rate if is_number else math.nan) <= _HIGHEST_RATE_HZ:
         given = option(rate=f'{rate:g}' if is_number else rate)
         raise UserError(f'{given}: expected samples a second, at most {_HIGHEST_RATE_HZ:g}')
     return ReadingOptions(
@@ -236,9 +237,10 @@ def from_arrays(
             'from_arrays(time_s=t, ax_mps2=x)'
         )
     given = arrays if table is None else {**_columns_of(table, 'from_arrays'), **arrays}
-    unknown = arrays.keys() - _KNOWN
     # Without an output that is known, the reader proposes what the others may be.
-    if unknown and not columns and not _OUTPUTS.isdisjoint(given):
+    is_native = not columns and not _OUTPUTS.isdisjoint(given)
+    unknown = arrays.keys() - _KNOWN
+    if is_native and unknown:
         raise UserError(f'{name}: no array {min(unknown)!r} is known, but {", ".join(_KNOWN)}')
     options = reading_options(
         columns=columns,
@@ -371,7 +373,12 @@ def one_recording(given: RecordingInput) -> Recording:
         raise _no_recording(given)
     for name, values in _samples(given).items():
         numbers = _floats(values)
-        if numbers is None or numbers.shape != (len(given),) or not np.isfinite(numbers).all():
+        is_whole = (
+            numbers is not None
+            and numbers.shape == (len(given),)
+            and bool(np.isfinite(numbers).all())
+        )
+        if not is_whole:
             raise UserError(
                 f'{given.path}: {name} is masked or no finite number in some of the {len(given)} '
                 'samples; leave these out by from_arrays(..., drop_bad_samples=True)'

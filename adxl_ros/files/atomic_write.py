@@ -124,8 +124,10 @@ def _refuse_folder_of_others(path: Path) -> None:
 def require_own(path: AnyPath, may_overwrite: bool = False) -> None:
     """Refuse to replace what others wrote or changed, unless the user permits it."""
     target = Path(path)
+    if may_overwrite or not target.exists():
+        return
     is_empty_folder = target.is_dir() and not any(target.iterdir())
-    if target.exists() and not (may_overwrite or is_own(target) or is_empty_folder):
+    if not (is_empty_folder or is_own(target)):
         raise UserError(
             f'{path}: is there already, and was not written by this package, or was changed '
             f'since; choose another name, or replace it with {option(overwrite=True)}'

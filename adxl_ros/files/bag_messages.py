@@ -319,6 +319,7 @@ class Bag:
             yield from map(bytes, piece.messages[topic])
 
     def _messages(self, storage: Any, connections: list[Any]) -> Iterator[tuple[str, bytes, int]]:
+        """Yield topic, CDR and log time, ns, of the messages of some connections."""
         if self._is_packed:
             from backports import zstd
         # Without an index, rosbags would demand the messages in the order of time.
@@ -424,7 +425,8 @@ def find_topics(bag: Bag, topic: str = '', has_stage: bool = True) -> Topics:
     )
     info = beside('sensor_info', DIAGNOSTIC_STATUS)
     # With several sensors, the only sensor_info may be that of another one.
-    if info is None and (is_own or [kind for _, kind in bag.types].count(IMU) == 1):
+    is_alone = is_own or [kind for _, kind in bag.types].count(IMU) == 1
+    if info is None and is_alone:
         info = _only(bag, 'sensor_info', DIAGNOSTIC_STATUS)
     space = joints.removesuffix('joint_states') if joints else f'{space}stage/'
     return Topics(

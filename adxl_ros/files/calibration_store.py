@@ -227,16 +227,14 @@ def read_population(path: AnyPath) -> Population:
     """Read and check a population."""
     node = compose(path)
     contents = yaml.constructor.SafeConstructor().construct_document(node) if node else None
-    if (
-        not isinstance(contents, dict)
-        or contents.get('format') != FORMAT
-        or not isinstance(contents.get('coefficients'), dict)
-    ):
+    keys = contents if isinstance(contents, dict) else {}
+    coefficients = keys.get('coefficients')
+    if keys.get('format') != FORMAT or not isinstance(coefficients, dict):
         raise UserError(
             f'{path}: no population of format {FORMAT}; give the population.yaml that fleet writes'
         )
     pooled = {}
-    for name, values in contents['coefficients'].items():
+    for name, values in coefficients.items():
         try:
             pooled[str(name)] = PooledCoefficient(**values)
             is_right = all(map(math.isfinite, values.values())) and values['prediction_std'] > 0

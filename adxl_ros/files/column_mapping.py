@@ -53,6 +53,9 @@ _SPELLINGS = {
     'k': 'kelvin',
 }
 _ALIASES: dict[str, str] = {}
+for _name, _words in _SPELLINGS.items():
+    _ALIASES |= dict.fromkeys(_words.split(), _name)
+"""Names of units by their other spellings, in lower case, with _ for a blank."""
 _BRACKETS = re.compile(r'[(\[{]\s*([^()\[\]{}]+?)\s*[)\]}]')
 """A part of a column's name in brackets."""
 _WORD_ENDS = re.compile(r'[_\s.]+|\[\d+\]|[(\[{].*[)\]}]|(?<=[a-z])(?=[A-Z])')
@@ -325,10 +328,6 @@ GRAVITY = {
     if name not in (LSB, UNSIGNED) and not unit.is_volts
 }
 """Length of gravity in each unit of acceleration."""
-
-for _name, _words in _SPELLINGS.items():
-    _ALIASES |= dict.fromkeys(_words.split(), _name)
-"""Names of units by their other spellings, in lower case, with _ for a blank."""
 
 
 def unit_name(text: str, quantity: Quantity) -> str | None:

@@ -204,8 +204,8 @@ class _Converter:
             raise UserError(
                 f'{self._where}: some axes are in volts and others are not; state one kind'
             )
-        is_named_volts = self._axes[0].column in VOLTS
-        if self._is_native and self._reading.unit and self._is_volts != is_named_volts:
+        is_contradicted = self._is_volts != (self._axes[0].column in VOLTS)
+        if self._is_native and is_contradicted and self._reading.unit:
             raise UserError(
                 f'{option(unit=self._reading.unit)}: {self._axes[0].column} of '
                 f'{self._path} says another quantity; name the columns by {option("columns")}'
@@ -265,7 +265,7 @@ class _Converter:
         is_complete = np.isfinite(outputs).all(axis=1)
         if self._reading.rate_hz is None:
             is_complete &= np.isfinite(block.columns[self.sources['time'].column])
-        return np.asarray(is_complete)
+        return is_complete
 
     def _outputs(self, block: TableBlock) -> np.ndarray:
         """Return the output of the sensor, (n, m), V or m/s²."""

@@ -106,7 +106,8 @@ def _params_folder() -> Path:
 def installed_path(name: AnyPath) -> Path:
     """Return the installed file of a sensor by its name, such as MPU-6050; a path stays."""
     path = Path(name)
-    if path.exists() or path.suffix or path.name != str(name):
+    may_be_name = path.name == str(name) and not path.suffix
+    if path.exists() or not may_be_name:
         return path
     folder = _params_folder()
     file = folder / f'{path.name.lower().replace("-", "")}.yaml'
@@ -313,7 +314,8 @@ class _FlatReader:
         unstated = []
         for key, field in SENSOR_FIELDS.items():
             value = field.metadata['placeholder']
-            if may_measure and key not in self.flat and value is not None:
+            can_measure = may_measure and value is not None
+            if can_measure and key not in self.flat:
                 unstated.append(field.name)
                 is_array = field.type == 'np.ndarray'
                 values[field.name] = np.full(len(axes), value) if is_array else value
@@ -381,6 +383,7 @@ class _FlatReader:
         return value
 
     def _check_bounds(self, key: str, values: Any, lower: float, upper: float, unit: str) -> None:
+        """Refuse values beyond their bounds."""
         for value in np.ravel(values):
             self._require(
                 lower <= value <= upper, key, f'{value:g} {unit} is outside {lower:g} to {upper:g}'

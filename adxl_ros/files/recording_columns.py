@@ -210,6 +210,7 @@ class Recording:
         return to_nominal_mps2(self.volts(sensor), sensor)
 
     def _output(self, sensor: Sensor) -> tuple[tuple[str, ...], np.ndarray]:
+        """Return the columns of the axes of a sensor, and what they hold, (n, m)."""
         names = self.sensor_columns
         if len(names) < len(sensor.axes):
             raise UserError(
@@ -220,6 +221,7 @@ class Recording:
         return names, np.column_stack([self.columns[name] for name in names])
 
     def _nominal(self, sensor: Sensor) -> Sensor:
+        """Return a sensor with the nominal values that the recording states."""
         stated: dict[str, Any] = {
             name: values[: len(sensor.axes)]
             for name, values in self.stream_info.nominal_values(self.axes).items()

@@ -93,6 +93,7 @@ def read(
 
 
 def _from_table(path: str) -> RobotReadings:
+    """Read joints and base from the columns of a table."""
     table = open_table(path)
     if 'time_s' not in table.names:
         raise UserError(f'{path}: no column time_s beside the joints of a robot')

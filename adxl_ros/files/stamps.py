@@ -170,7 +170,7 @@ def halves(time_s: np.ndarray) -> Halves:
 
 def late_by(stamps: np.ndarray) -> np.ndarray:
     """Return by how much each stamp, (n,), is earlier than the latest one before it; 0 if not."""
-    return np.asarray(np.maximum.accumulate(stamps) - stamps)
+    return np.maximum.accumulate(stamps) - stamps
 
 
 def describe_bursts(time_s: np.ndarray) -> str:

@@ -164,14 +164,25 @@ class JournalContents(NamedTuple):
     size: int  # Size of the lines, bytes, without one that a crash has cut
     damage: str  # Which line is none of a journal, and why; empty if all are
 
+    @property
+    def has_fit(self) -> bool:
+        """Whether the last entry is a fit."""
+        return bool(self.entries) and isinstance(self.entries[-1], Fitted)
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the last entry is a fit without open poses, and no line is damaged."""
+        last = self.entries[-1] if self.entries else None
+        return isinstance(last, Fitted) and last.done and not self.damage
+
     def is_over(self, head: Mapping[str, Any]) -> bool:
         """
         Return whether the calibration is over, so that another may begin.
 
         One that was fitted with open poses can be resumed. For another head it is over.
         """
-        last = self.entries[-1] if self.entries else None
-        return isinstance(last, Fitted) and (last.done or bool(differences(self.head, head)))
+        is_of_other = self.has_fit and bool(differences(self.head, head))
+        return self.is_finished or is_of_other
 
 
 class Unfinished(NamedTuple):
@@ -237,12 +248,9 @@ class Journal:
         is_new = not found.head and not found.damage
         if not is_new and (start_over or found.is_over(head)):
             # A finished journal is kept until the next one is finished, others for ever.
-            last = found.entries[-1] if found.entries else None
-            name = (
-                'previous'
-                if isinstance(last, Fitted) and last.done and not found.damage
-                else datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
-            )
+            name = datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
+            if found.is_finished:
+                name = 'previous'
             with atomic_path(self.path.with_name(f'{self.path.name}.{name}')) as copy:
                 shutil.copyfile(self.path, copy)
             is_new = True

@@ -101,7 +101,8 @@ class StampColumn:
         if not re.fullmatch(r'-?\d{1,18}|-?[1-8]\d{18}', stated):
             raise UserError(f'{self._path}: epoch_ns is {stated!r}, expected whole nanoseconds')
         self.epoch_ns = int(stated)
-        if first_s > _EPOCH_S and self._may_be_epoch and not self.epoch_ns:
+        counts_from_1970 = self._may_be_epoch and first_s > _EPOCH_S
+        if counts_from_1970 and not self.epoch_ns:
             self.epoch_ns = int(first_s) * 1_000_000_000
             self._begin = int(first_s) * self._unit.divisor
 

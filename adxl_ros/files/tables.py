@@ -135,6 +135,7 @@ def _library(path: str, kind: str, package: str) -> Iterator[None]:
 
 
 def _open_numpy(path: str) -> Table:
+    """Open an array, or a file of arrays, of NumPy."""
     with _library(path, 'plain arrays of NumPy', 'numpy'):
         loaded = np.load(path, allow_pickle=False)
         names = getattr(loaded, 'files', None) or loaded.dtype.names
@@ -154,7 +155,8 @@ def _of_arrays(path: str, arrays: Mapping[str, Any], advice: str) -> Table:
     columns: dict[str, np.ndarray] = {}
     for name, values in arrays.items():
         values = np.asarray(values)
-        if values.dtype.kind in 'iuf' and values.ndim in (1, 2) and values.size > 1:
+        is_table = values.ndim in (1, 2) and values.size > 1
+        if is_table and values.dtype.kind in 'iuf':
             series = np.atleast_2d(values)
             if series.shape[0] > series.shape[1]:
                 series = series.T  # MATLAB and others keep a vector as a row
@@ -163,7 +165,7 @@ def _of_arrays(path: str, arrays: Mapping[str, Any], advice: str) -> Table:
             }
     if not columns:
         raise UserError(f'{path}: holds no array of numbers with several rows; {advice}')
-    rows = Counter(map(len, columns.values())).most_common(1)[0][0]
+    [(rows, _)] = Counter(map(len, columns.values())).most_common(1)
     return in_memory(
         path, {name: values for name, values in columns.items() if len(values) == rows}
     )

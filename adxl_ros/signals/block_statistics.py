@@ -273,7 +273,7 @@ def _quietest(variances: np.ndarray, smallest: float) -> tuple[float, float]:
 
 def smallest_change(changes: np.ndarray) -> np.ndarray:
     """Return the smallest change that is not 0 by axis, (n, m) to (m,); inf where none is."""
-    return np.asarray(np.where(changes > 0, changes, np.inf).min(axis=0, initial=np.inf))
+    return np.where(changes > 0, changes, np.inf).min(axis=0, initial=np.inf)
 
 
 def adc_step(blocks: Blocks) -> np.ndarray:

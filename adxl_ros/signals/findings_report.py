@@ -124,6 +124,7 @@ def gate_lines(outcomes: Sequence[Sequence[Outcome]], against: str) -> list[str]
 
 
 def _value_lines(contents: RecordingContents) -> list[str]:
+    """Return the figures of a recording, one line each."""
     texts = [
         f'{contents.samples} samples, jitter {short_time(contents.jitter_s)} rms',
         ', '.join(

@@ -167,6 +167,7 @@ def _events(name: str, new: RecordingContents, old: RecordingContents) -> Outcom
 
 
 def _rate(new: RecordingContents, old: RecordingContents) -> Outcome:
+    """Compare the sample rates, which the jitter of the stamps makes uncertain."""
     ratio = new.rate_hz / old.rate_hz
     # The first and the last stamp of each recording scatter by its jitter.
     std = float(np.hypot(*(np.sqrt(2) * each.jitter_s / each.span_s for each in (new, old))))

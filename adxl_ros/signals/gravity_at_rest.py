@@ -68,7 +68,7 @@ class RestReadings:
     @property
     def length_mps2(self) -> np.ndarray:
         """Length of the readings, m/s², (k,)."""
-        return np.asarray(np.linalg.norm(self.mean_mps2, axis=1))
+        return np.linalg.norm(self.mean_mps2, axis=1)
 
     @property
     def poses(self) -> int:
@@ -240,9 +240,7 @@ class _Case:
     def error_mps2(self) -> np.ndarray:
         """Error of a length that neither zero-g nor scale explain, m/s², (k,)."""
         noise_mps2 = np.linalg.norm(self.readings.std_mps2, axis=1)
-        return np.asarray(
-            self.tolerance.across * self.gravity_mps2 + _LOCAL_MPS2 + _NOISE_STDS * noise_mps2
-        )
+        return self.tolerance.across * self.gravity_mps2 + _LOCAL_MPS2 + _NOISE_STDS * noise_mps2
 
     def force_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the smallest and largest length of the force of each rest, m/s², (k,) each."""
@@ -286,21 +284,13 @@ class _Case:
         mean = self.readings.mean_mps2
         axes = self.readings.mean_mps2.shape[1]
         # |r|² = 2·r·b + (|f|² − |b|²) is linear in b and in the bracket.
-        near_0 = np.diag(
-            prior
-            * 2
-            * self.gravity_mps2
-            * self.error_mps2.mean()
-            / self.tolerance.zero_g_mps2.clip(min=_LEAST_MPS2)
-        )
-        rows = np.vstack(
-            [
-                np.column_stack([2 * mean, np.ones(len(mean))]),
-                np.column_stack([near_0, np.zeros(axes)]),
-            ]
-        )
+        scale_mps2 = prior * 2 * self.gravity_mps2 * self.error_mps2.mean()
+        near_0 = np.diag(scale_mps2 / self.tolerance.zero_g_mps2.clip(min=_LEAST_MPS2))
+        by_zero_g = np.vstack([2 * mean, near_0])
+        by_bracket = np.append(np.ones(len(mean)), np.zeros(axes))
+        rows = np.column_stack([by_zero_g, by_bracket])
         squares = np.append((mean**2).sum(axis=1), np.zeros(axes))
-        return np.asarray(np.linalg.lstsq(rows, squares)[0][:axes])
+        return np.linalg.lstsq(rows, squares)[0][:axes]
 
     def _unexplained(self, zero_g_mps2: np.ndarray) -> np.ndarray:
         """Return which rests no zero-g near a first guess, m/s², (m,), and scale explain, (k,)."""
@@ -327,7 +317,7 @@ class _Case:
                 weighted @ rows + _PRIOR * np.eye(2 * axes), weighted @ beyond + _PRIOR * shares
             )
             shares = np.clip(shares - step, -1.0, 1.0)
-        return np.asarray(np.abs(beyond) > 1)
+        return np.abs(beyond) > 1
 
     def divided(self, factors: np.ndarray | float) -> _Case:
         """Return the case of readings that are divided by factors."""
@@ -339,7 +329,7 @@ class _Case:
         longer = self.too_long().mean()
         shorter = self.too_short().mean()
         is_off = max(longer, shorter) > 0.5
-        is_spread = wrong.sum() > 1 and wrong.mean() > _LARGEST_FALSE_SHARE
+        contradict = wrong.sum() > 1
         if is_off and (unit_fault := self._unit()):
             return unit_fault
         if is_off and self._is_removed():
@@ -348,7 +338,8 @@ class _Case:
                 f'at rest {self._read()}: gravity is missing, as in linear acceleration',
                 'record the specific force, which includes gravity',
             )
-        if (is_off or wrong.sum() > 1) and (mixed := self._mixed_units()):
+        mixed = self._mixed_units() if is_off or contradict else None
+        if mixed is not None:
             return mixed
         if is_off:
             return GravityFault(
@@ -356,7 +347,7 @@ class _Case:
                 f'at rest {self._read()}{self._range() or self._offset()}',
                 'check unit, zero-g and scale factor',
             )
-        if is_spread:
+        if contradict and wrong.mean() > _LARGEST_FALSE_SHARE:
             return self._spread(wrong)
         return None
 
@@ -403,6 +394,7 @@ class _Case:
         )
 
     def _fits(self, unit: ReadingUnit) -> bool:
+        """Return whether the readings are those of a sound sensor in a unit."""
         case = self.divided(unit.gravity / self.gravity_mps2)
         if not case.is_explained():
             return False
@@ -423,7 +415,8 @@ class _Case:
         """Return the units of single axes in which the rests of several poses are gravity."""
         axes = self.readings.mean_mps2.shape[1]
         is_told = self.tolerance.zero_g_mps2.max() < self.gravity_mps2 / 2
-        if self.readings.poses < 2 or axes < len(AXES) or not is_told:
+        has_length = self.readings.poses > 1 and axes == len(AXES)
+        if not (is_told and has_length):
             return None
         length = max(float(np.median(self.readings.length_mps2)), _LEAST_MPS2)
         if not self.divided(length / self.gravity_mps2).contradicting().any():
@@ -525,6 +518,9 @@ def require_unit(gravity: GravityAtRest, path: str, needs_gravity: bool = False)
     needs_gravity: whether readings without gravity are refused as well.
     """
     fault = gravity.fault
-    if fault is not None and (fault.is_unit or (needs_gravity and fault.is_clear)):
+    if fault is None:
+        return []
+    is_refused = fault.is_clear if needs_gravity else fault.is_unit
+    if is_refused:
         raise UserError(f'{path}: {fault.text}')
-    return [] if fault is None else [fault.text]
+    return [fault.text]

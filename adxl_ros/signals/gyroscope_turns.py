@@ -145,7 +145,8 @@ class GyroLook:
             end_s = later.time_start_s
             rows = (time_s >= begin_s) & (time_s < end_s)
             has_gap = spans_s[rows].max(initial=0.0) > _CELL_S + 2 * self._period_s * self._rows
-            if len(mean) == len(AXES) and end_s - begin_s < _LONGEST_TURN_S and not has_gap:
+            is_known = end_s - begin_s < _LONGEST_TURN_S and not has_gap
+            if is_known and len(mean) == len(AXES):
                 before = mean / np.linalg.norm(mean)
                 after = later_mean / np.linalg.norm(later_mean)
                 turns.append(_Turn(before, after, left[rows]))

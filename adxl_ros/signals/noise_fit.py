@@ -212,7 +212,8 @@ def fit_noise(
     span_s = len(means) * step_s
     highest = _highest(groups, len(means), span_s, rounding)
     walks, bound_s = _walks(groups.below(highest), span_s, highest)
-    models = _filters(walks, np.pi * highest / (2 * len(means)), np.pi / (2 * len(means)))
+    step_rad = np.pi / (2 * len(means))
+    models = _filters(walks, step_rad * highest, step_rad)
     best = _best(models)
     return NoiseFit(
         white=_interval(models, best, 0),
@@ -230,12 +231,22 @@ def _walks(groups: _Groups, span_s: float, highest: int) -> tuple[list[_Groups],
     count = int(np.log(shortest) / np.log(_BOUND_STEP))
     times_s = span_s * _BOUND_STEP ** np.arange(-count, 5.0)
     models = [groups.bounded(time_s, span_s) for time_s in times_s]
-    likelihoods = np.array([_fit(model).log_likelihood for model in models])
-    best = likelihoods.max()
-    if 2 * (best - _fit(groups).log_likelihood) < scipy.stats.chi2.isf(_BOUND_PROBABILITY, 1):
+    likelihoods = _likelihoods(models)
+    gain = 2 * (likelihoods.max() - _fit(groups).log_likelihood)
+    if gain < scipy.stats.chi2.isf(_BOUND_PROBABILITY, 1):
         return [groups], np.inf
-    likely = 2 * (best - likelihoods) < INTERVAL_DROP
-    return [models[i] for i in np.flatnonzero(likely)], float(times_s[likelihoods.argmax()])
+    return _likely(models, likelihoods), float(times_s[likelihoods.argmax()])
+
+
+def _likelihoods(models: list[_Groups]) -> np.ndarray:
+    """Return the log likelihood of the best fit of each model, (k,)."""
+    return np.array([_fit(model).log_likelihood for model in models])
+
+
+def _likely(models: list[_Groups], likelihoods: np.ndarray) -> list[_Groups]:
+    """Return the models that a 90 % interval holds."""
+    drop = 2 * (likelihoods.max() - likelihoods)
+    return [models[i] for i in np.flatnonzero(drop < INTERVAL_DROP)]
 
 
 def _filters(models: list[_Groups], end_rad: float, step_rad: float) -> list[_Groups]:
@@ -244,10 +255,7 @@ def _filters(models: list[_Groups], end_rad: float, step_rad: float) -> list[_Gr
     for loss in _FILTER_LOSSES:
         strength = loss / np.sin(end_rad) ** 2
         filtered += [model.filtered(strength, step_rad) for model in models]
-    likelihoods = np.array([_fit(model).log_likelihood for model in filtered])
-    return [
-        filtered[i] for i in np.flatnonzero(2 * (likelihoods.max() - likelihoods) < INTERVAL_DROP)
-    ]
+    return _likely(filtered, _likelihoods(filtered))
 
 
 def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0) -> _Fit:
@@ -257,6 +265,7 @@ def _best(models: list[_Groups], fixed: int | None = None, value: float = 0.0) -
 
 
 def _grouped(power: np.ndarray, variances: np.ndarray) -> _Groups:
+    """Group squares of coefficients, (n,), with their variances for terms of 1, (n, 3)."""
     edges = [*range(min(_SINGLE_COEFFICIENTS, len(power)))]
     position = float(_SINGLE_COEFFICIENTS)
     while position < len(power):
@@ -355,9 +364,10 @@ def _highest(groups: _Groups, count: int, span_s: float, rounding: float) -> int
         theta = _fit(lower).squares
         chances = scipy.stats.chi2.sf(used.count * used.power / (used.shapes @ theta), used.count)
         octave = used.where(used.first >= stop // 2)
-        is_without_line = chances.min() * len(chances) > _LINE_PROBABILITY
+        is_expected = _is_expected(octave, lower, theta)
+        has_line = chances.min() * len(chances) <= _LINE_PROBABILITY
         is_white = _white_share(octave, theta, rounding) > LEAST_WHITE
-        if is_white and is_without_line and _is_expected(octave, lower, theta):
+        if is_white and is_expected and not has_line:
             break
         stop //= 2
     return max(stop >> _MARGIN_OCTAVES, min(count, _FEWEST_COEFFICIENTS))

@@ -242,7 +242,8 @@ def _unit_warnings(result: RecordingNoise) -> list[str]:
             is_near = abs(np.log(max(ratio, TINY) / factor)) < _SAME_NOISE
             # Gravity along the axis would show its unit.
             if is_near and abs(mean_mps2) < _LEVEL_G * unit.gravity:
-                n, other_n = (_MICRO_G * each.sample_white for each in (noise, upright))
+                n = _MICRO_G * noise.sample_white
+                other_n = _MICRO_G * upright.sample_white
                 texts.append(
                     f'{noise.axis}: N is {n:.3g} µg/√Hz, {ratio:.3g} times that of {upright.axis} '
                     f'({other_n:.3g}), as if it were in {unit.name}; gravity, which is along '
@@ -264,6 +265,7 @@ def filter_warning(stated: Sensor, fresh: Sensor) -> list[str]:
 
 
 def _axis_warnings(span_s: float, noise: AxisNoise, unit: _ReadingUnits) -> list[str]:
+    """Return what an axis does not show, and what to do, one text each."""
     texts = []
     for term, name in enumerate(_NAMES):
         if not (noise.estimates[term].is_seen or noise.is_coarse):

@@ -48,10 +48,7 @@ def find_polarity_fault(
         if row[reference] < -CERTAIN_CORRELATION:
             return PolarityFault(axis, reference, float(row[reference]))
         other = int(np.nanargmax(np.abs(row)))
-        if (
-            other != reference
-            and abs(row[other]) > CERTAIN_CORRELATION
-            and abs(row[reference]) < swap_limit
-        ):
+        follows_other = other != reference and abs(row[other]) > CERTAIN_CORRELATION
+        if follows_other and abs(row[reference]) < swap_limit:
             return PolarityFault(axis, other, float(row[other]))
     return None

@@ -224,14 +224,10 @@ def sensor_of_stream(
     sensor = replace(sensor, rate_hz=round(rate_hz, 3))
     volts = to_volts(accel_mps2[:, : len(sensor.axes)], sensor)
     sensor, lines = _measured(sensor, time_s, volts)
-    return (
-        replace(sensor, measured=(*sensor.measured, 'rate_hz')),
-        [
-            f'rate: {sensor.rate_hz:.4g} Hz, axes: {sensor.axes}',
-            *lines,
-            *([f'left out: {backward}'] if late_ns.any() else []),
-        ],
-    )
+    lines.insert(0, f'rate: {sensor.rate_hz:.4g} Hz, axes: {sensor.axes}')
+    if late_ns.any():
+        lines.append(f'left out: {backward}')
+    return replace(sensor, measured=(*sensor.measured, 'rate_hz')), lines
 
 
 def _by_axis(sensor: Sensor, values_g: np.ndarray) -> str:

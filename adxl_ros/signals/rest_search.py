@@ -59,7 +59,7 @@ class Rest:
         inside = (time_s >= self.time_start_s) & (time_s <= self.time_stop_s)
         for start_s, stop_s in self.disturbed_s:
             inside &= (time_s <= start_s) | (time_s >= stop_s)
-        return np.asarray(inside)
+        return inside
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class _Search:
         """
         means = np.concatenate([self._blocks.mean[part.first : part.stop] for part in group])
         swing = means - means.mean(axis=0)
-        if (swing.std(axis=0) <= _LARGEST_SWING_G * np.asarray(self._rule.gravity)).all():
+        if (swing.std(axis=0) <= _LARGEST_SWING_G * self._rule.gravity).all():
             return False
         power = np.abs(np.fft.rfft(swing, 2 * len(swing), axis=0)) ** 2
         correlation = np.fft.irfft(power.sum(axis=1))[: len(swing) // 4]
