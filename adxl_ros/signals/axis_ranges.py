@@ -41,15 +41,42 @@ class AxisRange:
     stuck_s: float
 
 
+class _End:
+    """The largest value of a signal, and how often it stays there in motion."""
+
+    def __init__(self) -> None:
+        self.value = -np.inf
+        self.clipped = 0
+
+    def feed(self, values: np.ndarray, drop: float, longest: int) -> None:
+        """Add values, (n,); in motion they are lower by a drop within `longest` samples."""
+        largest = float(values.max())
+        if largest > self.value:
+            self.value = largest
+            self.clipped = 0
+        if largest == self.value:
+            self.clipped += sum(
+                _falls(values, largest - drop, first, stop, longest)
+                for first, stop in true_runs(values == largest)
+                if stop - first >= _CLIPPED_SAMPLES
+            )
+
+
+def _falls(values: np.ndarray, low: float, first: int, stop: int, longest: int) -> bool:
+    """Return whether values are below another one soon before or after some samples."""
+    window = max(min(stop - first, longest), 1)
+    beside = np.append(values[max(first - window, 0) : first], values[stop : stop + window])
+    return bool((beside < low).any())
+
+
 class AxisLook:
     """Extreme values of an axis, and the longest time in which it does not change."""
 
     def __init__(self, name: str, period_s: float) -> None:
         self.name = name
         self._period_s = period_s
-        # Largest value of minus the samples and of the samples, and how often they stay there
-        self._largest = [-np.inf, -np.inf]
-        self._clipped = [0, 0]
+        self._low = _End()  # Of minus the samples
+        self._high = _End()
         self._last = np.nan
         self._count = 0
         self._changes = 0
@@ -70,41 +97,25 @@ class AxisLook:
         steps = np.abs(np.diff(values))
         smallest = float(steps[steps > 0].min(initial=np.inf))
         drop = max(_CLIPPED_STEP, _CLIPPED_CODES * smallest)
-        for side, signed in enumerate((-values, values)):
-            largest = float(signed.max())
-            if largest > self._largest[side]:
-                self._largest[side] = largest
-                self._clipped[side] = 0
-            if largest == self._largest[side]:
-                self._clipped[side] += sum(
-                    self._moves(signed, largest - drop, first, stop)
-                    for first, stop in true_runs(signed == largest)
-                    if stop - first >= _CLIPPED_SAMPLES
-                )
-
-    def _moves(self, values: np.ndarray, low: float, first: int, stop: int) -> bool:
-        """Return whether the axis is below a value soon before or after some samples."""
-        window = max(min(stop - first, round(_CLIPPED_WINDOW_S / self._period_s)), 1)
-        beside = np.append(values[max(first - window, 0) : first], values[stop : stop + window])
-        return bool((beside < low).any())
+        longest = round(_CLIPPED_WINDOW_S / self._period_s)
+        self._low.feed(-values, drop, longest)
+        self._high.feed(values, drop, longest)
 
     def result(self) -> AxisRange:
         """Return the range of the axis."""
-        low = -self._largest[0]
-        high = self._largest[1]
+        low = -self._low.value
+        high = self._high.value
+        is_stuck = low == high
         stuck_s = self._most_equal * self._period_s
-        is_reported = (
-            stuck_s >= _STUCK_S
-            and self._most_equal >= _STUCK_SAMPLES
-            and self._changes > _CHANGING * (self._count - self._most_equal)
-        )
+        is_long = stuck_s >= _STUCK_S and self._most_equal >= _STUCK_SAMPLES
+        is_usual = self._changes > _CHANGING * (self._count - self._most_equal)
         return AxisRange(
             name=self.name,
             lowest=low,
             highest=high,
-            clipped=sum(self._clipped),
-            is_stuck=low == high,
-            stuck_s=stuck_s if is_reported or low == high else 0.0,
+            clipped=self._low.clipped + self._high.clipped,
+            is_stuck=is_stuck,
+            stuck_s=stuck_s if is_stuck or (is_long and is_usual) else 0.0,
         )
 
 

@@ -181,6 +181,29 @@ def _filter_s(rests: list[np.ndarray], rate_hz: float, step_v: float) -> float:
     return float(np.mean(time_constants)) if time_constants else 0.0
 
 
+def _steady_rate_hz(time_s: np.ndarray) -> float:
+    """Return the rate of rising stamps of a stream, s, (n,), Hz; refuse those that show none."""
+    if len(time_s) < 3 or time_s[-1] < SHORTEST_S:
+        raise UserError(
+            f'{len(time_s)} samples in {np.ptp(time_s) if len(time_s) else 0:.1f} s; '
+            f'{SHORTEST_S:g} s show rate and noise'
+        )
+    rate_hz = stamped_rate_hz(time_s)
+    if not rate_hz > 0:
+        raise UserError(
+            f'the stamps of {len(time_s)} samples do not advance; the driver must stamp each '
+            'sample'
+        )
+    rates = halves(time_s)
+    if not rates.agree(_STEADY):
+        raise UserError(
+            f'stamps are uneven: {rates.first_hz:.4g} and then {rates.second_hz:.4g} '
+            f'a second within {time_s[-1]:.1f} s; the host stalls, or the driver '
+            'stamps samples when they arrive'
+        )
+    return rate_hz
+
+
 def sensor_of_stream(
     sensor: Sensor, stamps_ns: np.ndarray, accel_mps2: np.ndarray
 ) -> tuple[Sensor, list[str]]:
@@ -199,24 +222,7 @@ def sensor_of_stream(
     stamps_ns = stamps_ns[late_ns == 0]
     accel_mps2 = accel_mps2[late_ns == 0]
     time_s = (stamps_ns - stamps_ns[:1]) * 1e-9
-    if len(time_s) < 3 or time_s[-1] < SHORTEST_S:
-        raise UserError(
-            f'{len(time_s)} samples in {np.ptp(time_s) if len(time_s) else 0:.1f} s; '
-            f'{SHORTEST_S:g} s show rate and noise'
-        )
-    rate_hz = stamped_rate_hz(time_s)
-    if not rate_hz > 0:
-        raise UserError(
-            f'the stamps of {len(stamps_ns)} samples do not advance; the driver must '
-            'stamp each sample'
-        )
-    rates = halves(time_s)
-    if not rates.agree(_STEADY):
-        raise UserError(
-            f'stamps are uneven: {rates.first_hz:.4g} and then {rates.second_hz:.4g} '
-            f'a second within {time_s[-1]:.1f} s; the host stalls, or the driver '
-            'stamps samples when they arrive'
-        )
+    rate_hz = _steady_rate_hz(time_s)
     present = ''.join(axis for axis, values in zip(AXES, accel_mps2.T) if values.any())
     axes = present if present in MEASURED_AXES else AXES
     if not sensor.effects:

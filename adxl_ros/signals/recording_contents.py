@@ -12,7 +12,7 @@ from itertools import chain
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import GYRO, Recording, REFERENCES
 from adxl_ros.files.stamp_check import BadStamps
-from adxl_ros.files.stamps import burst_samples, lacks_samples, period_s
+from adxl_ros.files.stamps import burst_samples, lacks_samples, mean_period_s
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
 from adxl_ros.process import option
@@ -157,7 +157,7 @@ class _Stamps:
                 f'are needed; {option(rate="HZ")} stamps by index'
             )
         self.burst = burst_samples(first.time_s)
-        self.period_s = period_s(first.time_s)
+        self.period_s = mean_period_s(first.time_s)
         self.first_s = float(first.time_s[0])
         self.last_s = self.first_s - self.period_s
         self.count = self.missing = self.gaps = 0
