@@ -27,6 +27,7 @@ _ENTRY = re.compile(
 
 
 Columns = Mapping[str, np.ndarray]  # Arrays (n,) by the name of their column or field
+_TILT = {'roll', 'pitch'}  # Roles of the angles of an inclinometer
 GYRO_ROLES = ('gx', 'gy', 'gz')  # Roles of the axes of a gyroscope
 LSB = 'lsb'  # Unit of counts, which needs the counts of 1 g
 UNSIGNED = 'u16'  # Unit of counts that lost their sign, so that 65535 is −1
@@ -190,24 +191,29 @@ def parse_mapping(text: str) -> ColumnMapping:
                 'colon'
             )
         sources[role] = Source(column, name)
-    axes = ''.join(axis for axis in AXES if axis in sources)
+    _require_whole_groups(where, sources)
+    return ColumnMapping(sources, where)
+
+
+def _require_whole_groups(where: str, roles: Collection[str]) -> None:
+    """Refuse axes, gyroscopes and tilts of which a part is named."""
+    axes = ''.join(axis for axis in AXES if axis in roles)
     if axes not in MEASURED_AXES:
         raise UserError(
             f'{where}: names the axes {axes or "none"}, expected x, x and y, or x, y '
             f'and z; write for example {_EXAMPLE}'
         )
-    turns = [role for role in GYRO_ROLES if role in sources]
+    turns = [role for role in GYRO_ROLES if role in roles]
     if len(turns) not in (0, len(GYRO_ROLES)):
         raise UserError(
             f'{where}: names {", ".join(turns)} of a gyroscope; name {", ".join(GYRO_ROLES)}'
         )
-    given = {'roll', 'pitch', 'alpha', 'beta'} & set(sources)
-    if given & {'roll', 'pitch'} and given != {'roll', 'pitch'}:
+    angles = {'roll', 'pitch', 'alpha', 'beta'} & set(roles)
+    if not angles.isdisjoint(_TILT) and angles != _TILT:
         raise UserError(
-            f'{where}: {", ".join(sorted(given))} are no reference; name roll and '
+            f'{where}: {", ".join(sorted(angles))} are no reference; name roll and '
             'pitch, or alpha and beta'
         )
-    return ColumnMapping(sources, where)
 
 
 SignedAxes = tuple[tuple[int, int], ...]

@@ -21,6 +21,11 @@ FORMAT = 1
 """Version of the format, in the head of each journal; raised with each change of the lines."""
 
 
+def _with_tuples(line: Mapping[str, Any]) -> dict[str, Any]:
+    """Return keys and values of a line with tuples in place of lists."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in line.items()}
+
+
 @dataclass(frozen=True, kw_only=True)
 class PoseRecord:
     """One accepted pose: the mean output at rest and the joint angles."""
@@ -51,7 +56,7 @@ class PoseRecord:
     @classmethod
     def from_json(cls, line: Mapping[str, Any]) -> PoseRecord:
         """Read the record of a line."""
-        return cls(**{**line, 'mean_v': tuple(line['mean_v']), 'std_v': tuple(line['std_v'])})
+        return cls(**_with_tuples(line))
 
 
 @dataclass(frozen=True)
@@ -139,10 +144,8 @@ _ENTRIES: Mapping[str, Callable[[Any], JournalEntry]] = {
     'drop': lambda line: PoseDropped(line['drop']),
     'mounting': lambda line: MountingUnchecked(),
     'rests': lambda line: Fitted(tuple(map(PoseRecord.from_json, line['rests'])), line['done']),
-    'stay': lambda line: NaturalRest(
-        **{**line, 'mean_v': tuple(line['mean_v']), 'std_v': tuple(line['std_v'])}
-    ),
-    'values': lambda line: Adopted(**{**line, 'values': tuple(line['values'])}),
+    'stay': lambda line: NaturalRest(**_with_tuples(line)),
+    'values': lambda line: Adopted(**_with_tuples(line)),
     'undone_ns': lambda line: Undone(**line),
 }
 """What makes an entry of a line, by the first of these keys that the line has."""

@@ -206,7 +206,6 @@ def longest_rest(
             f'{first.path}: rests for {rest.span_s:.4g} s at most, expected '
             f'{shortest_s:.3g} s at least; record longer, and do not touch the sensor'
         )
-    span_s = last_s - first_s
     with tempfile.TemporaryFile() as file, tempfile.TemporaryFile() as gyro_file:
         samples = _Samples(first, first.sensor_columns, file)
         turns = _Samples(first, GYRO, gyro_file)
@@ -216,20 +215,20 @@ def longest_rest(
             if gyro_radps is not None:
                 is_taken = np.isfinite(gyro_radps).all(axis=1)
                 turns.feed(block.time_s[is_taken], gyro_radps[is_taken], rest)
+        span_s = last_s - first_s
         accelerometer = samples.stretch(span_s, motion_s, beyond.describe(nominal))
-        gyroscope = None
-        doubt = ''
-        if 0 < turns.count < accelerometer.count:
+        if not turns.count:
+            return StillSensors(accelerometer, None)
+        if turns.count < accelerometer.count:
             doubt = (
                 f'the gyroscope has {turns.count} readings at rest, and the accelerometer '
                 f'{accelerometer.count}: it is left out'
             )
-        elif turns.count:
-            try:
-                gyroscope = turns.stretch(span_s, motion_s, '')
-            except UserError as error:
-                doubt = f'the gyroscope is left out: {error}'
-        return StillSensors(accelerometer, gyroscope, doubt)
+            return StillSensors(accelerometer, None, doubt)
+        try:
+            return StillSensors(accelerometer, turns.stretch(span_s, motion_s, ''))
+        except UserError as error:
+            return StillSensors(accelerometer, None, f'the gyroscope is left out: {error}')
 
 
 def longest_of(

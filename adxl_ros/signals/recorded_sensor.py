@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import replace
 from math import ceil, log2
 from pathlib import Path
+from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
@@ -100,7 +101,46 @@ def _measured(
 
     The noise is that of the quietest quarter seconds, so that the samples may hold motion.
     """
+    shown = _shown(sensor, time_s, volts, where)
     scale_v_per_g = sensor.nominal_scale_v_per_g
+    noise_g = shown.noise_v / scale_v_per_g
+    largest_g = float(np.max(np.abs(volts - sensor.nominal_zero_g_v) / scale_v_per_g))
+    # A common range: a power of two
+    range_g = 2.0 ** ceil(log2(max(largest_g, _SMALLEST_RANGE_G)))
+    # Noise bandwidth of the filter, or that of samples without one
+    bandwidth_hz = 0.25 / shown.rc_s if shown.rc_s else sensor.rate_hz / 2
+    density_g_per_rthz = noise_g / np.sqrt(bandwidth_hz)
+    values = {
+        'noise_density_g_per_rthz': np.minimum(density_g_per_rthz, _MAX_NOISE_G_PER_RTHZ),
+        'range_g': range_g,
+        'rc_resistance_ohm': RESISTANCE_OHM,
+        'rc_capacitance_f': shown.rc_s / RESISTANCE_OHM,
+        'filter_rate_hz': sensor.rate_hz,
+    }
+    texts = {
+        'noise_density_g_per_rthz': 'noise of a sample: ' + _by_axis(sensor, noise_g),
+        'adc_bits': 'resolution: ' + _by_axis(sensor, shown.step_v / scale_v_per_g),
+        'rc_capacitance_f': f'filter: {shown.rc_s * 1e3:.3g} ms' if shown.rc_s else _NO_FILTER,
+        'range_g': f'range: ±{range_g:g} g (largest reading {largest_g:.3g} g)',
+    }
+    lines = [text for name, text in texts.items() if name in sensor.unstated]
+    unknown = {*sensor.unstated}
+    if 'rc_capacitance_f' in unknown:
+        unknown.add('filter_rate_hz')  # The measured filter is that at this rate.
+    used = {name: value for name, value in values.items() if name in unknown}
+    return replace(sensor, unstated=(), measured=sensor.unstated, **used), lines
+
+
+class _Shown(NamedTuple):
+    """What samples show of a sensor."""
+
+    noise_v: np.ndarray  # Standard deviation of a sample by axis, V, (m,)
+    step_v: np.ndarray  # Step of the samples by axis, V, (m,)
+    rc_s: float  # Time constant of the filter, s: the stated one, or the measured one
+
+
+def _shown(sensor: Sensor, time_s: np.ndarray, volts: np.ndarray, where: str) -> _Shown:
+    """Measure noise, steps and filter; refuse samples that do not show them."""
     spans = Spans(sensor.rate_hz)
     blocks = stats.BlockCutter(sensor.rate_hz, len(sensor.axes)).feed(time_s, volts)
     windows = stats.window_variance(blocks, spans)
@@ -114,32 +154,7 @@ def _measured(
         quiet = stats.quiet_blocks(blocks, windows, limit_v2, spans.window)
         rests = _runs_of(volts, blocks, quiet, spans.size)
         rc_s = _filter_s(rests, sensor.rate_hz, float(np.max(step_v)))
-    noise_g = np.sqrt(variance_v2) / scale_v_per_g
-    largest_g = float(np.max(np.abs(volts - sensor.nominal_zero_g_v) / scale_v_per_g))
-    # A common range: a power of two
-    range_g = 2.0 ** ceil(log2(max(largest_g, _SMALLEST_RANGE_G)))
-    # Noise bandwidth of the filter, or that of samples without one
-    bandwidth_hz = 0.25 / rc_s if rc_s else sensor.rate_hz / 2
-    density_g_per_rthz = noise_g / np.sqrt(bandwidth_hz)
-    values = {
-        'noise_density_g_per_rthz': np.minimum(density_g_per_rthz, _MAX_NOISE_G_PER_RTHZ),
-        'range_g': range_g,
-        'rc_resistance_ohm': RESISTANCE_OHM,
-        'rc_capacitance_f': rc_s / RESISTANCE_OHM,
-        'filter_rate_hz': sensor.rate_hz,
-    }
-    texts = {
-        'noise_density_g_per_rthz': 'noise of a sample: ' + _by_axis(sensor, noise_g),
-        'adc_bits': 'resolution: ' + _by_axis(sensor, step_v / scale_v_per_g),
-        'rc_capacitance_f': f'filter: {rc_s * 1e3:.3g} ms' if rc_s else _NO_FILTER,
-        'range_g': f'range: ±{range_g:g} g (largest reading {largest_g:.3g} g)',
-    }
-    lines = [text for name, text in texts.items() if name in sensor.unstated]
-    unknown = {*sensor.unstated}
-    if 'rc_capacitance_f' in unknown:
-        unknown.add('filter_rate_hz')  # The measured filter is that at this rate.
-    used = {name: value for name, value in values.items() if name in unknown}
-    return replace(sensor, unstated=(), measured=sensor.unstated, **used), lines
+    return _Shown(np.sqrt(variance_v2), step_v, rc_s)
 
 
 def _runs_of(
