@@ -85,11 +85,6 @@ def nominal_path() -> Path:
     return _params_folder() / 'adxl203.yaml'
 
 
-def any_imu_path() -> Path:
-    """Return the installed file of a stream in m/s² that states nothing of itself."""
-    return _params_folder() / 'any_imu.yaml'
-
-
 def _params_folder() -> Path:
     """Return the folder of the installed parameter files: as ROS has it, else the package's."""
     with suppress(ImportError, LookupError, OSError):
@@ -137,8 +132,8 @@ def load(path: AnyPath, may_measure: bool = False) -> Sensor:
 
 
 def usual_path(is_nominal: bool) -> Path:
-    """Return the path of the nominal sensor, or of any IMU."""
-    return nominal_path() if is_nominal else any_imu_path()
+    """Return the path of the nominal sensor, or that of a stream that states nothing of itself."""
+    return nominal_path() if is_nominal else _params_folder() / 'any_imu.yaml'
 
 
 def usual(is_nominal: bool) -> Sensor:
