@@ -278,7 +278,8 @@ def _with_what_shows(
 ) -> Findings:
     """Add which effects `diagnose` could show in a recording, and from which size."""
     can_diagnose = any(each.tool == 'diagnose' and each.is_able for each in result.abilities)
-    if not result.is_sound or not (robot or can_diagnose):
+    has_reference = can_diagnose or robot is not None
+    if not result.is_sound or not has_reference:
         return result
     remarks = [*result.remarks]
     if result.contents is None or result.contents.samples > _MOST_SHOWN:

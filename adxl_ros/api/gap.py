@@ -384,8 +384,8 @@ def _require_one_reference(
     sim: RecordingInput | Motion | None, urdf: str | os.PathLike | None, count: int
 ) -> None:
     """Refuse a simulator and a robot together, and one of them for several recordings."""
-    others = [sim is not None, bool(urdf)]
-    if any(others) and (all(others) or count > 1):
+    references = sum((sim is not None, bool(urdf)))
+    if references > 1 or (references and count > 1):
         raise UserError(
             f'{_name_of(sim) or urdf}: {option("sim")} or {option("urdf")}, one of them, goes '
             f'with one recording, but {count} are given'

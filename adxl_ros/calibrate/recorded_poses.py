@@ -21,7 +21,7 @@ from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
 from adxl_ros.signals import filter_noise
-from adxl_ros.signals.recorded_rests import recording_finder
+from adxl_ros.signals.rest_detection import recording_finder
 from adxl_ros.signals.rest_limits import datasheet_noise
 from adxl_ros.signals.rest_means import rest_means
 from adxl_ros.signals.rest_search import Rest

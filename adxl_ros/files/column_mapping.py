@@ -395,7 +395,8 @@ class ReadingOptions:
                 f'{where}: {counts[0]} is in LSB; add {option("lsb_per_g")} with the counts of '
                 '1 g, as in the datasheet'
             )
-        if not counts and (self.lsb_per_g or self.lsb_at_0g):
+        is_stated = bool(self.lsb_per_g or self.lsb_at_0g)
+        if is_stated and not counts:
             raise UserError(
                 f'{option("lsb_per_g")}: no column is in LSB; add {option(unit=LSB)}, or leave '
                 f'{option("lsb_per_g")} and {option("lsb_at_0g")} out'
@@ -463,8 +464,10 @@ def parse_unit(
     text: str, argument: str = 'unit', known: Iterable[str] = UNITS[Quantity.OUTPUT]
 ) -> str:
     """Return the name of a unit of the sensor's output, one of the known; '' for no text."""
-    name = unit_name(text, Quantity.OUTPUT) if text else ''
-    if name is None or (name and name not in known):
+    if not text:
+        return ''
+    name = unit_name(text, Quantity.OUTPUT)
+    if name is None or name not in known:
         raise UserError(
             f'{option(**{argument: text})}: unknown unit; write one of {", ".join(known)}'
         )

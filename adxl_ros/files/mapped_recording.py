@@ -205,7 +205,8 @@ class _Converter:
                 f'{self._where}: some axes are in volts and others are not; state one kind'
             )
         is_contradicted = self._is_volts != (self._axes[0].column in VOLTS)
-        if self._is_native and is_contradicted and self._reading.unit:
+        has_both = self._is_native and bool(self._reading.unit)
+        if has_both and is_contradicted:
             raise UserError(
                 f'{option(unit=self._reading.unit)}: {self._axes[0].column} of '
                 f'{self._path} says another quantity; name the columns by {option("columns")}'

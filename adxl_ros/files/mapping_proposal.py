@@ -181,7 +181,8 @@ def _guess_output(table: Table, outputs: Sequence[str], readings: np.ndarray) ->
     """Guess what readings, (n, m), mean; None where they are not those of an accelerometer."""
     unit = table.units.get(outputs[0]) or unit_in_name(outputs[0], Quantity.OUTPUT)
     is_whole = bool((readings == np.rint(readings)).all())
-    if unit in (None, LSB) and is_whole and _have_lost_sign(readings):
+    may_be_counts = is_whole and unit in (None, LSB)
+    if may_be_counts and _have_lost_sign(readings):
         unit = UNSIGNED
         readings = signed(readings)
     # A sensor that was turned and never reads below 0 has its 0 g in the middle.

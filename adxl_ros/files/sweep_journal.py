@@ -249,7 +249,8 @@ class Journal:
                 'file is kept)'
             )
         is_new = not found.head and not found.damage
-        if not is_new and (start_over or found.is_over(head)):
+        is_over = start_over or found.is_over(head)
+        if is_over and not is_new:
             # A finished journal is kept until the next one is finished, others for ever.
             name = datetime.now(timezone.utc).strftime('%Y%m%dT%H%M%S.%fZ')
             if found.is_finished:
@@ -345,7 +346,8 @@ def _parse(path: Path) -> JournalContents:
     head: dict[str, Any] = {}
     entries: list[JournalEntry] = []
     # A crash may have left the beginning of the head, or its length without its bytes.
-    if b'\n' not in data and data.strip(b'\0') and not data.startswith(b'{'):
+    begins_otherwise = data.strip(b'\0') and not data.startswith(b'{')
+    if b'\n' not in data and begins_otherwise:
         return JournalContents(
             head, entries, 0, 'line 1 is not of a journal (it does not begin with {)'
         )

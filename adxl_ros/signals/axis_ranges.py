@@ -108,14 +108,15 @@ class AxisLook:
         is_stuck = low == high
         stuck_s = self._most_equal * self._period_s
         is_long = stuck_s >= _STUCK_S and self._most_equal >= _STUCK_SAMPLES
-        is_usual = self._changes > _CHANGING * (self._count - self._most_equal)
+        changes_else = self._changes > _CHANGING * (self._count - self._most_equal)
+        is_reported = is_long and changes_else
         return AxisRange(
             name=self.name,
             lowest=low,
             highest=high,
             clipped=self._low.clipped + self._high.clipped,
             is_stuck=is_stuck,
-            stuck_s=stuck_s if is_stuck or (is_long and is_usual) else 0.0,
+            stuck_s=stuck_s if is_stuck or is_reported else 0.0,
         )
 
 

@@ -134,6 +134,7 @@ class BlockCutter:
         return blocks
 
     def _summed(self, columns: np.ndarray, start: np.ndarray, run: np.ndarray) -> Blocks:
+        """Return the blocks that begin at some rows, (k,), with their runs, (k,)."""
         block = columns[:, start[:, None] + np.arange(self.size)]
         samples = block[1 : 1 + self._axes]
         angles = block[1 + self._axes :]

@@ -55,7 +55,8 @@ def estimate_filter(
     window = hann(size, sym=False)
     window /= np.sqrt(np.sum(window**2))
     power, count = _mean_periodogram(rests, window)
-    if count < 2 or not rc_s or not np.any(power):
+    has_noise = count > 1 and np.any(power)
+    if not has_noise or not rc_s:
         return None
     weight = _INDEPENDENT_SEGMENTS * count
     lags = np.correlate(window, window, 'full')[size - 1 :]

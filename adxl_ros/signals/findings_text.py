@@ -4,9 +4,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from adxl_ros.process import option
 from adxl_ros.report.quantities import counted, duration
-from adxl_ros.signals.recording_contents import RecordingContents
+
+if TYPE_CHECKING:
+    from adxl_ros.signals.recording_contents import RecordingContents
 
 
 def bad_stamps(contents: RecordingContents) -> list[str]:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 from adxl_ros.errors import UserError
@@ -22,12 +23,14 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
-from adxl_ros.signals.findings import Findings
-from adxl_ros.signals.recorded_rests import rests_of
 from adxl_ros.signals.recorded_sensor import load_sensor
-from adxl_ros.signals.recording_contents import RecordingContents
+from adxl_ros.signals.rest_detection import rests_of
 import numpy as np
 import scipy
+
+if TYPE_CHECKING:
+    from adxl_ros.signals.findings import Findings
+    from adxl_ros.signals.recording_contents import RecordingContents
 
 KINDS = ('sound', 'gaps', 'rate', 'noise', 'zero-g', 'rests')
 """What may fail: whether a recording is sound, and what is compared with an earlier one."""

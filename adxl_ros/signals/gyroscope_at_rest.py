@@ -21,7 +21,7 @@ from adxl_ros.model.constants import Z_90
 from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.signals.block_statistics import DITHERED_STEPS, smallest_change
-from adxl_ros.signals.recorded_rests import rests_of
+from adxl_ros.signals.rest_detection import rests_of
 import numpy as np
 import scipy
 

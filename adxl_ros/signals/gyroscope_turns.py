@@ -143,7 +143,9 @@ class GyroLook:
         for (rest, before), (later, after) in pairwise(zip(rests, means_mps2)):
             rows = (time_s >= rest.time_stop_s) & (time_s < later.time_start_s)
             is_short = later.time_start_s - rest.time_stop_s < _LONGEST_TURN_S
-            if is_short and not self._has_gap(spans_s[rows]) and len(before) == len(AXES):
+            has_direction = len(before) == len(AXES)
+            is_usable = is_short and has_direction
+            if is_usable and not self._has_gap(spans_s[rows]):
                 turns.append(_Turn(_direction(before), _direction(after), left[rows]))
         largest = sorted(turns, key=lambda turn: -turn.size)[:_MOST_TURNS]
         turns = [turn for turn in largest if turn.size > _SMALLEST_TURN]

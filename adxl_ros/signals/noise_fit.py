@@ -364,10 +364,10 @@ def _highest(groups: _Groups, count: int, span_s: float, rounding: float) -> int
         theta = _fit(lower).squares
         chances = scipy.stats.chi2.sf(used.count * used.power / (used.shapes @ theta), used.count)
         octave = used.where(used.first >= stop // 2)
-        is_expected = _is_expected(octave, lower, theta)
         has_line = chances.min() * len(chances) <= _LINE_PROBABILITY
         is_white = _white_share(octave, theta, rounding) > LEAST_WHITE
-        if is_white and is_expected and not has_line:
+        has_filter = not is_white or not _is_expected(octave, lower, theta)
+        if not has_line and not has_filter:
             break
         stop //= 2
     return max(stop >> _MARGIN_OCTAVES, min(count, _FEWEST_COEFFICIENTS))

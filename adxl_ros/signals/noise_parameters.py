@@ -336,7 +336,8 @@ def _with_filter(
     share = 1.0 if log_share > -limit else float(np.exp(log_share))
     change = float(np.average([each.change for each in seen], weights=weights))
     has_form = abs(np.log(change * (1 + share) / (2 * share))) < limit + _FORM_TOLERANCE
-    if is_stated and excess > 0 and not has_form:
+    is_vibration = excess > 0 and not has_form
+    if is_stated and is_vibration:
         return sensor, False
     return replace(
         without_effect(sensor, 'bandwidth'),

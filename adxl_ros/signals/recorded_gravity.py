@@ -16,8 +16,7 @@ from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.signals.axis_ranges import axis_faults, AxisLook, AxisRange
 from adxl_ros.signals.gravity_at_rest import GravityAtRest, GravityFaultKind, of_volts, TURNED_COS
 from adxl_ros.signals.neighbouring_samples import NeighbouringSamples
-from adxl_ros.signals.recorded_rests import RecordedRests
-from adxl_ros.signals.rest_detection import RestFinder, RestMean
+from adxl_ros.signals.rest_detection import RecordedRests, RestFinder, RestMean
 from adxl_ros.signals.rest_limits import datasheet_noise
 from adxl_ros.signals.rest_search import BY_STREAM, RestRule
 import numpy as np

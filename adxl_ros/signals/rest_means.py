@@ -5,13 +5,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from adxl_ros.model.noise import effective_samples
 from adxl_ros.signals import block_statistics as stats
 from adxl_ros.signals.block_statistics import Blocks, Spans
 from adxl_ros.signals.rest_limits import SampleNoise
-from adxl_ros.signals.rest_search import Rest
 import numpy as np
+
+if TYPE_CHECKING:
+    from adxl_ros.signals.rest_search import Rest
 
 MOST_BATCHES = 20  # Most batches that show the error of a mean. Chosen: the usual number
 _MIN_BATCH_BLOCKS = 2  # Smallest length of such a batch, blocks: 0.1 s
