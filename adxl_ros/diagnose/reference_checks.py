@@ -18,10 +18,12 @@ from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg_text
-from adxl_ros.signals import gravity_at_rest
+from adxl_ros.signals import gravity_at_rest, tolerances
 from adxl_ros.signals.block_statistics import rms
 from adxl_ros.signals.gravity_at_rest import GravityFaultKind, RestReadings
-from adxl_ros.signals.rest_detection import find_rests, rest_means
+from adxl_ros.signals.rest_detection import find_rests
+from adxl_ros.signals.rest_means import rest_means
+from adxl_ros.signals.rest_search import RestRule
 from adxl_ros.simulate.motion import ForcePath
 import numpy as np
 import scipy
@@ -62,17 +64,17 @@ def check_stated_gravity(force: ForcePath, sensor: Sensor) -> None:
     time_s = force.time_s
     force_mps2 = np.column_stack(force(time_s))
     rate_hz = stamped_rate_hz(time_s)
-    rests = find_rests(time_s, force_mps2, rate_hz, gravity=G0_MPS2)
+    rests = find_rests(time_s, force_mps2, rate_hz, RestRule(gravity=G0_MPS2))
     axes = force_mps2.shape[1]
     shape = len(rests), axes
     mean, std = rest_means(time_s, force_mps2, rests, rate_hz)
     readings = RestReadings(np.reshape(mean, shape), np.reshape(std, shape))
     gravity_mps2 = sensor.local_gravity_mps2
-    fault = gravity_at_rest.look(readings, gravity_at_rest.IDEAL, gravity_mps2).fault
+    fault = gravity_at_rest.look(readings, tolerances.IDEAL, gravity_mps2).fault
     if fault is not None and fault.is_clear:
         text = fault.stated_by(option(sim_unit=fault.symbol))
         raise DataFault(fault.data_fault, f'{force.name}: {text}')
-    tolerance = gravity_at_rest.nominal_tolerance(sensor).widest(axes)
+    tolerance = tolerances.nominal_tolerance(sensor).widest(axes)
     fault = gravity_at_rest.look(readings, tolerance, gravity_mps2).fault
     if fault is not None and fault.kind is GravityFaultKind.SCALE:
         raise DataFault(

@@ -10,7 +10,8 @@ from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.diagnose.encoder_checks import check_encoder
 from adxl_ros.diagnose.motion_shifts import correlate, find_drift, find_step, Motions
 from adxl_ros.diagnose.stamp_checks import check_clock, even_stamps
-from adxl_ros.files.recording_columns import Recording, sensor_info
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import sensor_info
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.simulate.motion import ForcePath, Motion
 import numpy as np
