@@ -158,7 +158,7 @@ class Keeper:
             return None
         self._write(rest)
         self._take(rest)
-        adopted = self._adoption() if self._is_due(rest.stop_ns) else None
+        adopted = self._adoption() if self._decides else None
         if adopted is None:
             return None
         self._proposal = self._describe(np.array(adopted.values))
@@ -210,6 +210,7 @@ class Keeper:
         self._unexplained = ''
         self._proposal = ''
         self._decided_ns = 0
+        self._decides = False  # Whether to decide now, after the last rest
 
     @property
     def _stay_free(self) -> Belief:
@@ -221,6 +222,7 @@ class Keeper:
         """Count an entry, new or from the journal."""
         if isinstance(entry, NaturalRest):
             self._take_rest(entry)
+            self._decides = self._is_due(entry.stop_ns)
         elif isinstance(entry, Adopted):
             self._exchange(entry)
         elif isinstance(entry, Undone):
