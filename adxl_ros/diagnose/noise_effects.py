@@ -621,6 +621,11 @@ class NoiseRemainder(NamedTuple):
     simulated: float  # The same in the simulation with the effect
     mean_square: float  # Mean square over axes of the values in the recordings
 
+    @property
+    def left(self) -> float:
+        """Difference of both values."""
+        return abs(self.recorded - self.simulated)
+
 
 def noise_remainders(
     comparisons: Sequence[BaselineComparison],
