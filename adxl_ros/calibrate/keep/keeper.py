@@ -148,6 +148,7 @@ class Keeper:
         self._temperatures_c = [np.inf, -np.inf]
         self.newest_ns = 0
         self.last_temperature_c = np.nan
+        self._decides = False  # Whether to decide now, after the last rest
         self._begin(sensor)
         for entry in entries:
             self._take(entry)
@@ -210,7 +211,6 @@ class Keeper:
         self._unexplained = ''
         self._proposal = ''
         self._decided_ns = 0
-        self._decides = False  # Whether to decide now, after the last rest
 
     @property
     def _stay_free(self) -> Belief:
