@@ -298,9 +298,8 @@ def fit_hypothesis(
 
     Each Gauss-Newton step simulates, differentiates, whitens and fits at the present values. The
     iteration ends where the log evidence no longer gains, or where even the maximum of the linear
-    model is hopelessly low; at the start, lower than without effects, too. `start` has departures
-    of sizes from the prior mean. The iteration has the noise of no gap; only its end is compared
-    for every noise.
+    model is hopelessly low. `start` has departures of sizes from the prior mean.
+    The iteration has the noise of no gap; only its end is compared for every noise.
     """
     sensor = with_neutral(linear_model.baseline, effects)
     names = _fitted_names(linear_model, effects)
@@ -310,7 +309,6 @@ def fit_hypothesis(
     low, high = [p.lower for p in parameters], [p.upper for p in parameters]
     chosen = zip(linear_model.usual_filters, linear_model.null_fit.filter_indices)
     filters = [[of_channel[i]] for of_channel, i in chosen]
-    hopeless = linear_model.null_fit.log_evidence - _SMALLEST_DEFICIT
 
     def iterate_at(values: np.ndarray) -> _HypothesisIterate:
         at_values = put(sensor, names, np.clip(values, low, high))
@@ -331,12 +329,10 @@ def fit_hypothesis(
         previous: _HypothesisIterate | None,
         present: _HypothesisIterate,
     ) -> bool:
-        # A first step may mend a poor start, unless that leaves more than no effect does.
-        lowest = min(lowest_log_evidence, hopeless) if previous is None else lowest_log_evidence
-        if present.fit.log_evidence < lowest:
-            return True
-        if previous is not None and previous.cost - present.cost < _SMALLEST_GAIN:
-            return True
+        if previous is not None:
+            is_hopeless = present.fit.log_evidence < lowest_log_evidence
+            if is_hopeless or previous.cost - present.cost < _SMALLEST_GAIN:
+                return True
         promised = present.fit.log_evidence + present.cost
         smallest = max(_SMALLEST_GAIN, _SMALLEST_GAIN_SHARE * (first.cost - present.cost))
         smallest_step = _SMALLEST_STEP * present.linearised.prior_std[: len(names)]
