@@ -21,8 +21,9 @@ from itertools import chain, repeat
 from typing import NamedTuple, TYPE_CHECKING
 
 from adxl_ros.diagnose import evidence as linear
-from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis, Whitener
+from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis
 from adxl_ros.diagnose.flexible_functions import flexible_bases
+from adxl_ros.diagnose.noise_filters import expected_drift_g, Whitener
 from adxl_ros.diagnose.search import with_filters
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
@@ -174,7 +175,7 @@ class HeldOutFits:
     def drift_mps2(self) -> float:
         """Return the expected rms of the drift that the fitted noise has, m/s²."""
         sizes_g = [
-            linear.expected_drift_g(w.effect, density, comparison)
+            expected_drift_g(w.effect, density, comparison)
             for w, density, (comparison, _) in zip(
                 self._whiteners, self.drift_densities(), self.model.places
             )
