@@ -32,6 +32,7 @@ from adxl_ros.api.sensors import sensor_of, SensorInput
 from adxl_ros.diagnose import diagnosis as core, report as words
 from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.gap_in_unit import gap_in, GapInUnit, quantity as quantity_named
+from adxl_ros.diagnose.ideal_observer import Surest
 from adxl_ros.diagnose.next_experiment import CouldShow
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
@@ -113,6 +114,9 @@ class Gap(Result):
     bad_data."""
     probability: float
     """How often such verdicts were right in the working cases, 0 to 1; a `fault` is certain, 1."""
+    surest: Surest | None
+    """How sure of the effects an ideal observer could be; None unless `limit` asks for it, and
+    without effects on the mean."""
     effects: tuple[FoundEffect, ...]
     """Effects of the verdict, those with the largest share of the gap first."""
     figures: GapFigures | None
@@ -350,6 +354,7 @@ def diagnose(
     prior: str | os.PathLike | None = None,
     quantity: str | None = None,
     self_check: int = 0,
+    limit: bool = False,
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> Gap:
@@ -386,6 +391,8 @@ def diagnose(
         'MODULE:FUNCTION'.
     self_check
         Number of recordings that are simulated from the verdict, to see how often it returns.
+    limit
+        Whether to say how sure an ideal observer could be, who knows the effects and the noise.
     seed
         Seed of the bootstraps.
     progress
@@ -426,7 +433,14 @@ def diagnose(
     for each in read:
         remarks += [f'assumed: {text}' for text in assumed(each, baseline.effects)]
     diagnosis = core.diagnose(
-        read, baseline, motion, seed, lambda stage, done: progress(done, stage), align, material
+        read,
+        baseline,
+        motion,
+        seed,
+        lambda stage, done: progress(done, stage),
+        align,
+        material,
+        limit,
     )
     in_unit = None
     found = diagnosis.report
@@ -554,6 +568,7 @@ def _gap(
     return Gap(
         verdict=objects['verdict']['status'],
         probability=objects['verdict']['probability'],
+        surest=report.surest if report else None,
         effects=effects,
         figures=figures,
         could_show=report.could_show if report else (),

@@ -79,6 +79,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 'of': None,
                 'data_fault': fault.name if fault.status == 'bad_data' else None,
                 'probability': 1.0,
+                'surest': None,
             },
             'hypotheses': [],
             'gap': None,
@@ -100,6 +101,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 'of': concern(verdict),
                 'data_fault': None,
                 'probability': verdict.probability,
+                'surest': report.surest,
             },
             'hypotheses': [h._asdict() for h in verdict.hypotheses],
             'gap': _gap(report),
@@ -205,6 +207,7 @@ def _gap(report: Report) -> dict[str, Any]:
         **figures,
         'floor_source': report.noise_floor.source,
         'upper_limit': verdict.upper_limit_mps2,
+        'tolerated': verdict.tolerated_mps2,
         'reference': verdict.reference_mps2,
         'not_in_reference': report.linear_model.lost_motion_mps2,
         'noise': report.noise,
@@ -325,7 +328,7 @@ def headline(diagnosis: Diagnosis) -> str:
         assert diagnosis.fault is not None
         return diagnosis.fault.message
     verdict = diagnosis.report.verdict
-    sure = f'({percent(verdict.probability)} sure)'
+    sure = f'({percent(verdict.probability)} sure{_surest_text(diagnosis.report)})'
     share = verdict.explained_share
     named = listed([*verdict.effects, *(listed(group, 'or') for group in verdict.groups)], 'and')
     rest = amplitude_text(verdict.remaining)
@@ -337,11 +340,17 @@ def headline(diagnosis: Diagnosis) -> str:
     in_words = listed(in_reference, 'and')
     of_reference = f' Error of the reference, not of the sensor: {in_words}.' if in_words else ''
     explained = f'Explained {sure} by {named}{separate}.{noise}{of_reference}'
-    limit = mg_text(verdict.upper_limit_mps2)
+    limit, tolerated = map(mg_text, (verdict.upper_limit_mps2, verdict.tolerated_mps2))
+    within = (
+        f' {tolerated} of that is within the tolerances of zero-g, scale '
+        'factor, filter and latency.'
+        if verdict.tolerated_mps2 > verdict.material_mps2
+        else ''
+    )
     possible = listed(sorted(verdict.best), 'and')
     part = f' {percent(share)} of the gap may be {possible}.' if verdict.best else ''
     sentence = {
-        'no_gap': f'No gap {sure}: one above {limit} would have shown.',
+        'no_gap': f'No gap {sure}: one above {limit} would have shown.{within}',
         'insufficient': 'No verdict: neither motion nor temperature nor supply changes, so that '
         'no effect can show.',
         'unknown': f'Unknown {sure}: no effect of the library explains {rest}.{follows}{part}',
@@ -349,6 +358,16 @@ def headline(diagnosis: Diagnosis) -> str:
         f'{percent(1 - share)} ({rest}) is something else.{follows}{of_reference}',
     }.get(verdict.status, explained)
     return sentence + _left_out_text(diagnosis.report)
+
+
+def _surest_text(report: Report) -> str:
+    """Say how sure an ideal observer could be; empty where nobody asked."""
+    if report.surest is None:
+        return ''
+    high = percent(report.surest.high)
+    if high.startswith('>'):
+        return f'; an ideal observer {high}'
+    return f'; on this recording nobody could be surer than {high}'
 
 
 def _left_out_text(report: Report) -> str:
@@ -604,7 +623,7 @@ def screen_lines(diagnosis: Diagnosis, subject: str) -> list[str]:
     for text in (remark, f'noise floor {note_of["noise floor"]}'):
         beside = wrapped(text, columns=COLUMNS - _BADGE_COLUMNS)
         lines += [' ' * _BADGE_COLUMNS + part for part in beside]
-    if report.verdict.status != 'explained' or 'REFERENCE' in word:
+    if report.verdict.status != 'explained' or 'REFERENCE' in word or report.surest:
         lines += wrapped(headline(diagnosis))
     elif is_only_noise(report):
         lines += wrapped(_noise_text(report))
