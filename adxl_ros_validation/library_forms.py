@@ -49,8 +49,9 @@ def library_rivals(forms: LibraryForms, observer: IdealObserver) -> dict[str, li
 
     What lies between the shapes that are tried is between two neighbours.
     """
-    return {
-        name: [observer.columns([*a, *b]) for a, b in pairwise(shapes)]
-        or [observer.columns(shapes[0])]
-        for name, shapes in forms.by_effect.items()
-    }
+    rivals = {}
+    for name, shapes in forms.by_effect.items():
+        vectors = [[observer.project(change) for change in shape] for shape in shapes]
+        neighbours = [*pairwise(vectors)] or [(vectors[0], [])]
+        rivals[name] = [observer.span([*a, *b]) for a, b in neighbours]
+    return rivals

@@ -27,13 +27,11 @@ _NOISE_STD = 0.02
 """Uncertainty of the stated noise density, a share; that of units is 0.015."""
 _DRAWN_FORMS = 6
 """Draws of the numbers of a kind that states no list for them. Chosen: run time."""
-_RECOGNISABLE_SAMPLE = 7.0
-"""Squared visibility of one repeated sample; chosen."""
-
 _DISTINCT = 1e-4
 """Smallest length of a unit vector beside others that still is another direction. Chosen: far
 above rounding."""
-
+_RECOGNISABLE_SAMPLE = 7.0
+"""Squared visibility of one repeated sample; chosen."""
 
 Forms = Mapping[str, Sequence[np.ndarray]]
 """Changes that span those of each effect, m/s², (m, n)."""
@@ -123,7 +121,7 @@ class IdealObserver:
         self._stated_changes, self._no_prior = stated, np.zeros(len(stated))
         priors = np.diag([1 / std for _, std in stated])
         rows = [
-            np.concatenate([self.whiten(change), prior])
+            np.concatenate([self._white_spectrum(change), prior])
             for (change, _), prior in zip(stated, priors)
         ]
         self.stated = np.linalg.qr(np.stack(rows, axis=1))[0]
@@ -144,9 +142,19 @@ class IdealObserver:
         """Whiten a change, m/s², (m, n), into one vector."""
         return np.fft.irfft(np.fft.rfft(change) * self.weight, self.count).ravel()
 
+    def _white_spectrum(self, change: np.ndarray) -> np.ndarray:
+        """Return the real and imaginary parts of a whitened spectrum, with the same products."""
+        # Each frequency but the first and the last stands for itself and its negative.
+        frequencies = np.arange(self.weight.shape[1])
+        scale = self.weight * np.sqrt((2 - (frequencies * 2 % self.count == 0)) / self.count)
+        white = np.zeros(scale.shape, complex)
+        for d in np.flatnonzero(change.any(axis=1)):
+            white[d] = np.fft.rfft(change[d]) * scale[d]
+        return white.view(float).ravel()
+
     def project(self, change: np.ndarray) -> np.ndarray:
         """Whiten a change and remove what the uncertainty of the calibration explains."""
-        vector = np.concatenate([self.whiten(change), self._no_prior])
+        vector = np.concatenate([self._white_spectrum(change), self._no_prior])
         return vector - self.stated @ (self.stated.T @ vector)
 
     def forms(self) -> dict[str, list[np.ndarray]]:
@@ -172,11 +180,14 @@ class IdealObserver:
 
     def rivals(self) -> dict[str, np.ndarray]:
         """Return columns that span the responses of each effect that is not like noise, (v, k)."""
-        return {name: self.columns(changes) for name, changes in self.forms().items()}
+        return {
+            name: self.span([self.project(change) for change in changes])
+            for name, changes in self.forms().items()
+        }
 
-    def columns(self, changes: Sequence[np.ndarray]) -> np.ndarray:
-        """Return orthonormal columns that span some changes, m/s², (v, k)."""
-        return _orthonormal([self.project(change) for change in changes], self.stated.shape[0])
+    def span(self, vectors: list[np.ndarray]) -> np.ndarray:
+        """Return orthonormal columns that span some vectors, (v, k)."""
+        return _orthonormal(vectors, self.stated.shape[0])
 
     def flexible_power(self, reserved: np.ndarray, vector: np.ndarray) -> float:
         """
@@ -214,10 +225,14 @@ def _orthonormal(columns: list[np.ndarray], length: int) -> np.ndarray:
     kept = [column / size for column, size in zip(columns, sizes) if size > 1e-6]
     if not kept:
         return np.zeros((length, 0))
-    stack = np.stack(kept, axis=1)
-    values, vectors = np.linalg.eigh(stack.T @ stack)
-    significant = values > 1e-8 * values[-1]
-    return stack @ (vectors[:, significant] / np.sqrt(values[significant]))
+    return _basis(np.stack(kept, axis=1))
+
+
+def _basis(columns: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis of columns of length 1, or of what others left of them."""
+    squares, vectors = np.linalg.eigh(columns.T @ columns)
+    kept = squares > _DISTINCT**2
+    return columns @ (vectors[:, kept] / np.sqrt(squares[kept]))
 
 
 def _hats(scene: Scene, force: np.ndarray) -> list[np.ndarray]:
@@ -342,13 +357,6 @@ def _distances(
         return float(left @ left - by_truth @ by_truth) / apart
 
     return [distance(rest), *(distance(left_by(sets)) for sets in rivals)]
-
-
-def _basis(columns: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis of columns of length 1, less what others took of them."""
-    squares, vectors = np.linalg.eigh(columns.T @ columns)
-    kept = squares > _DISTINCT**2
-    return columns @ (vectors[:, kept] / np.sqrt(squares[kept]))
 
 
 def alone(observer: IdealObserver, forms: Forms, strength_mps2: float) -> Bracket:
