@@ -362,7 +362,7 @@ def _distances(
 def alone(observer: IdealObserver, forms: Forms, strength_mps2: float) -> Bracket:
     """Return how probably no cause is told from effects of a strength in their nearest forms."""
     distances = []
-    for changes in forms.values():
+    for changes in filter(None, forms.values()):
         per_mps2 = [
             float(np.linalg.norm(observer.project(change)))
             / max(rms(beyond_calibration(observer.scene.unit, change, observer.force)), 1e-12)
