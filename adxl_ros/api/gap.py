@@ -32,6 +32,7 @@ from adxl_ros.diagnose import diagnosis as core, report as words
 from adxl_ros.diagnose.could_show import CouldShow
 from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.gap_in_unit import gap_in, GapInUnit, quantity as quantity_named
+from adxl_ros.diagnose.ideal_observer import Surest
 from adxl_ros.diagnose.report_json import as_json as diagnosis_json, named_effects
 from adxl_ros.diagnose.screen import screen_lines
 from adxl_ros.diagnose.self_check import diagnose_again
@@ -100,6 +101,9 @@ class Gap(Result):
     bad_data."""
     probability: float
     """How often such verdicts were right in the working cases, 0 to 1; a `fault` is certain, 1."""
+    surest: Surest | None
+    """How sure of the effects an ideal observer could be; None unless `limit` asks for it, and
+    without effects on the mean."""
     effects: tuple[FoundEffect, ...]
     """Effects of the verdict, those with the largest share of the gap first."""
     figures: GapFigures | None
@@ -255,6 +259,7 @@ def diagnose(
     prior: str | os.PathLike | None = None,
     quantity: str | None = None,
     self_check: int = 0,
+    limit: bool = False,
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> Gap:
@@ -292,6 +297,8 @@ def diagnose(
         'MODULE:FUNCTION'.
     self_check
         Number of recordings that are simulated from the verdict, to see how often it returns.
+    limit
+        Whether to say how sure an ideal observer could be, who knows the effects and the noise.
     seed
         Seed of the bootstraps.
     progress
@@ -332,7 +339,14 @@ def diagnose(
     for each in read:
         remarks += [f'assumed: {text}' for text in assumed(each, baseline.effects)]
     diagnosis = core.diagnose(
-        read, baseline, motion, seed, lambda stage, done: progress(done, stage), align, material
+        read,
+        baseline,
+        motion,
+        seed,
+        lambda stage, done: progress(done, stage),
+        align,
+        material,
+        limit,
     )
     in_unit = None
     found = diagnosis.report
@@ -460,6 +474,7 @@ def _gap(
     return Gap(
         verdict=objects['verdict']['status'],
         probability=objects['verdict']['probability'],
+        surest=report.surest if report else None,
         effects=effects,
         figures=figures,
         could_show=report.could_show if report else (),

@@ -23,6 +23,7 @@ from adxl_ros.diagnose.evidence import BLOCKS, sum_by_block
 from adxl_ros.diagnose.flexible_functions import flexible_bases
 from adxl_ros.diagnose.gap_closure import gap_closure, GapClosure
 from adxl_ros.diagnose.held_out import HeldOutFits
+from adxl_ros.diagnose.ideal_observer import Surest, surest
 from adxl_ros.diagnose.linear_model import build_linear_model, filters_for, LinearModel
 from adxl_ros.diagnose.next_experiment import NextExperiment, propose_next_experiment
 from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemainder
@@ -77,6 +78,8 @@ class Report:
     # What was not compared and is larger than what is material, by reason; without the samples of
     # effects that the verdict names
     left_out: tuple[LeftOut, ...] = ()
+    # How surely an ideal observer names the effects on the mean; None where nobody asked
+    surest: Surest | None = None
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,7 @@ def diagnose(
     show_progress: ShowProgress = lambda stage, fraction: None,
     align: bool = False,
     material_mg: float = MATERIAL_MG,
+    limit: bool = False,
 ) -> Diagnosis:
     """
     Compare recordings of one unit with the simulator, and find which effects it lacks.
@@ -119,6 +123,8 @@ def diagnose(
         Whether `sim` is shifted in time where its motion is late or early.
     material_mg
         Amplitude that a user would act on, mg rms.
+    limit
+        Whether to find how sure an ideal observer could be.
 
     Returns
     -------
@@ -164,12 +170,13 @@ def diagnose(
         verdict = replace(verdict, status=_status_without_gap(model.comparisons, left_out))
     show_progress('5/5 report', 0.9)
     report = _report(checked, model, search, verdict, detections, floor, evidence, seed)
+    observed = surest(model, report.hypotheses[0], verdict.named) if limit else None
     show_progress('5/5 report', 1.0)
     return Diagnosis(
         tuple(model.comparisons),
         tuple(c.comparison for c in checked),
         None,
-        replace(report, left_out=left_out),
+        replace(report, left_out=left_out, surest=observed),
     )
 
 
