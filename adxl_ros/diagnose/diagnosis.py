@@ -8,9 +8,8 @@ the figures. What the report adds comes last.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -26,13 +25,14 @@ from adxl_ros.diagnose.evidence import (
 )
 from adxl_ros.diagnose.flexible_functions import flexible_bases
 from adxl_ros.diagnose.held_out import HeldOutFits
-from adxl_ros.diagnose.linear_model import build_linear_model, filters_for, LinearModel
+from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.next_experiment import CouldShow, NextExperiment
 from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemainder
 from adxl_ros.diagnose.remainder import Remainder, reproducible_remainder
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
 from adxl_ros.diagnose.search import Hypothesis, Search, with_filters
-from adxl_ros.diagnose.verdict import HEALTHY, MATERIAL_MG, Verdict
+from adxl_ros.diagnose.verdict import MATERIAL_MG, Verdict
+from adxl_ros.diagnose.weighing import drifts_beside, HEALTHY
 from adxl_ros.files.recording_columns import check_same_sensor, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, Z_90
@@ -47,9 +47,6 @@ import numpy as np
 ShowProgress = Callable[[str, float], None]
 """Called with number and name of the stage, and the fraction of the work that is done."""
 
-_DRIFT_LIMIT = 5.0
-"""Expected mean square of a random walk about its mean, divided by the one in a recording, that
-one walk in 20 exceeds. Derived from the random walk."""
 _SMALLEST_RANGES = {'temperature_c': 0.5, 'supply_v': 0.02}
 """Range of temperature, °C, and supply, V, below which they do not change. Chosen: noise."""
 
@@ -207,7 +204,7 @@ def _evidence(search: Search, floor: NoiseFloor, smallest_mps2: float, seed: int
     counts = np.sum([sum_by_block(c.used) for c in comparisons], axis=0)
     robot_mps2 = max(c.robot_error_mps2 for c in comparisons)
     return rule.Evidence(
-        candidates=_held_out(search, floor, max(counts.sum(), 1.0)),
+        candidates=_held_out(search),
         counts=counts,
         weights=rule.block_weights(seed),
         material_mps2=smallest_mps2,
@@ -273,37 +270,7 @@ def material_mps2(
     )
 
 
-class _FitsByDrift(Mapping[str, HeldOutFits]):
-    """Held-out fits of a set by the drift of its noise; those with a drift once they are asked."""
-
-    def __init__(
-        self,
-        healthy: HeldOutFits,
-        drifts: Sequence[str],
-        with_drift: Callable[[str], HeldOutFits | None],
-    ) -> None:
-        self._drifts = drifts
-        self._with_drift = with_drift
-        self._known: dict[str, HeldOutFits | None] = {HEALTHY: healthy}
-
-    def __getitem__(self, drift: str) -> HeldOutFits:
-        if drift not in self._known:
-            self._known[drift] = self._with_drift(drift) if drift in self._drifts else None
-        fits = self._known[drift]
-        if fits is None:
-            raise KeyError(drift)
-        return fits
-
-    def __iter__(self) -> Iterator[str]:
-        return (drift for drift in (HEALTHY, *self._drifts) if drift in self)
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-
-def _held_out(
-    search: Search, floor: NoiseFloor, count: float
-) -> dict[frozenset[str], Mapping[str, HeldOutFits]]:
+def _held_out(search: Search) -> dict[frozenset[str], Mapping[str, HeldOutFits]]:
     """Return held-out fits of all sets by the drift of their noise."""
     best = search.best
     model = search.model
@@ -312,17 +279,10 @@ def _held_out(
     if beside.fit(drifts=drifts).log_evidence <= beside.fit().log_evidence:
         drifts = ()
 
-    def with_drift(healthy: HeldOutFits, drift: str) -> HeldOutFits | None:
-        left = healthy.figures.squares.sum() / count - floor.rms_mps2**2
-        filters = filters_for(model.filters, (*model.baseline.effects, drift))
-        fits = HeldOutFits(with_filters(model, healthy.linearised, filters), model, (drift,))
-        # A drift that should be far larger than what is left is none.
-        return fits if fits.drift_mps2**2 <= _DRIFT_LIMIT * max(left, 0.0) else None
-
     out: dict[frozenset[str], Mapping[str, HeldOutFits]] = {}
     for effects, hypothesis in search.found.items():
-        healthy = HeldOutFits(hypothesis.linearised, model)
-        out[effects] = _FitsByDrift(healthy, drifts, partial(with_drift, healthy))
+        fits = {d: HeldOutFits(hypothesis.linearised, model, (d,)) for d in drifts}
+        out[effects] = {HEALTHY: HeldOutFits(hypothesis.linearised, model), **fits}
     return out
 
 
@@ -373,13 +333,10 @@ def _as_printed(hypothesis: Hypothesis, sensor: Sensor) -> Sensor:
 def _with_likely_drift(best: Hypothesis, evidence: rule.Evidence) -> Sensor:
     """Return the sensor of a set, with the drift that its noise needs most, if any."""
     effects = frozenset(best.effects)
-    sensor = best.sensor
-    fits = evidence.candidates[effects]
-    nats = {d: evidence.figure(evidence.drift_nats(effects, d)) for d in fits if d != HEALTHY}
-    likely = max(nats, key=lambda drift: nats[drift].value, default=HEALTHY)
-    if likely == HEALTHY or not nats[likely].predicts:
-        return sensor
-    return _with_drift(sensor, likely, fits[likely])
+    drifts = drifts_beside(evidence, effects)
+    if not drifts:
+        return best.sensor
+    return _with_drift(best.sensor, drifts[0], evidence.candidates[effects][drifts[0]])
 
 
 def _with_drift(sensor: Sensor, drift: str, fits: HeldOutFits) -> Sensor:

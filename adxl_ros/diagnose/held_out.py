@@ -11,16 +11,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence as linear
 from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis, Whitener
+from adxl_ros.diagnose.linear_model import filters_for, LinearModel
+from adxl_ros.diagnose.search import with_filters
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.signals.block_statistics import rms
 import numpy as np
-
-if TYPE_CHECKING:
-    from adxl_ros.diagnose.linear_model import LinearModel
 
 FOLDS = 4  # Parts of a recording, each of which is held out once. Chosen: run time
 _RUN_BLOCKS = 2
@@ -49,10 +48,19 @@ class Fold(NamedTuple):
 class HeldOutFits:
     """The fits of a linearised set of effects to all blocks but those held out."""
 
-    linearised: LinearisedHypothesis  # The set of effects, linearised at its fit to all blocks
+    # The set of effects, linearised at its fit to all blocks, in the noise of a healthy unit
+    healthy: LinearisedHypothesis
     model: LinearModel
     # Effects by which the zero-g may drift more than that of a healthy unit
     drifts: tuple[str, ...] = ()
+
+    @cached_property
+    def linearised(self) -> LinearisedHypothesis:
+        """The set in noise that may drift, whitened when it is first asked for."""
+        if not self.drifts:
+            return self.healthy
+        filters = filters_for(self.model.filters, (*self.model.baseline.effects, *self.drifts))
+        return with_filters(self.model, self.healthy, filters)
 
     @cached_property
     def full(self) -> LinearFit:
@@ -76,16 +84,34 @@ class HeldOutFits:
         return out
 
     @cached_property
+    def _plain_mps2(self) -> list[np.ndarray]:
+        """Products of the columns of each channel, mean over axes, by block, (m/s²)²."""
+        return [
+            linear.plain_grams(columns.values, place.comparison.used) / place.v_per_mean_mps2**2
+            for columns, place in zip(self.linearised.columns, self.model.places)
+        ]
+
+    @cached_property
+    def changes(self) -> dict[str, np.ndarray]:
+        """Squares of what each effect changes of the held-out blocks, (m/s²)², (blocks,) each."""
+        every = {}
+        for effect in self.linearised.effects:
+            own = np.array([name.effect == effect for name in self.linearised.names])
+            squares = every[effect] = np.zeros(BLOCKS)
+            for fold in self.folds:
+                departures = np.where(own, fold.departures, 0.0)
+                for columns, plain_mps2 in zip(self.linearised.columns, self._plain_mps2):
+                    v = departures[columns.places]
+                    parts = plain_mps2[fold.held_out, 1:, 1:] @ v
+                    squares[fold.held_out] += parts @ v
+        return every
+
+    @cached_property
     def figures(self) -> HeldOut:
         """Squares and log likelihood of the held-out blocks."""
         squares = np.zeros(BLOCKS)
         log_likelihood = np.zeros(BLOCKS)
         linearised = self.linearised
-        # Products of the columns, mean over axes, by block, (m/s²)²
-        plain = [
-            linear.plain_grams(columns.values, place.comparison.used) / place.v_per_mean_mps2**2
-            for columns, place in zip(linearised.columns, self.model.places)
-        ]
         for fold in self.folds:
             held_out = fold.held_out
             for number, columns in enumerate(linearised.columns):
@@ -93,7 +119,8 @@ class HeldOutFits:
                 filter_index = fold.fit.filter_indices[number]
                 variance_v2 = fold.fit.innovation_variance_v2[number]
                 v = columns.combination(fold.departures)
-                squares[held_out] += np.einsum('i,bij,j->b', v, plain[number][held_out], v)
+                plain_mps2 = self._plain_mps2[number][held_out]
+                squares[held_out] += np.einsum('i,bij,j->b', v, plain_mps2, v)
                 white_v2 = np.einsum(
                     'i,bij,j->b', v, channel.block_grams[filter_index][held_out], v
                 )

@@ -18,9 +18,12 @@ from typing import NamedTuple
 from adxl_ros.diagnose.evidence import BLOCKS
 from adxl_ros.diagnose.remainder import Remainder
 from adxl_ros.diagnose.weighing import (
+    beside_form,
     drifts_beside,
     Evidence,
+    form_of,
     HEALTHY,
+    is_drifting,
     minimal_sets,
     NOTHING,
     SHARE_OF_FORM,
@@ -36,9 +39,9 @@ MATERIAL_SHARE_OF_NOISE = 0.1
 _SMALLEST_P = 0.001
 """Probability of the increments of a drift below which they are of something else. Chosen: one
 error in 1000."""
-_LARGEST_DRIFT = 2.8
-"""Mean square of a random walk about its mean, divided by its expectation, that one walk in 20
-exceeds. Derived from the random walk."""
+_DRIFT_LIMIT = 5.0
+"""Expected mean square of a random walk about its mean, divided by the one in a recording, that
+one walk in 20 exceeds. Derived from the random walk."""
 _REPEATED = (0.0, 0.5, 0.8, 0.95, 1.0)
 """Shares of the draws that repeat a verdict, at which `_RIGHT` is known."""
 _RIGHT = (0.2, 0.4, 0.6, 0.75, 0.9)
@@ -147,7 +150,7 @@ class _Powers(NamedTuple):
 
     def remaining(self, material: float) -> float:
         """Return what is left beside effects: what repeats, or all that no drift explains."""
-        is_more = self.above > _LARGEST_DRIFT * self.drift + material
+        is_more = self.above > material and not self.drifts
         return max(self.repeats, self.above) if is_more else self.repeats
 
 
@@ -160,36 +163,41 @@ def _powers(
     of_noise: float,
 ) -> _Powers:
     """Weigh what the best set and the noise leave, and drop the drifts where it is none."""
-    explained = float(evidence.gain(best, NOTHING)[0])
+    explained = max(float(evidence.gain(best, NOTHING)[0]), 0.0)
     above = float(evidence.left(best)[0]) - of_noise
     repeats = evidence.figure(evidence.mean(remainder.squares))
-    steady = evidence.figure(evidence.mean(remainder.steady_squares))
-    drift = evidence.drift_power(best, drifts)
-    follows_more = steady.low > remainder_material and steady.value > SHARE_OF_FORM * drift
+    material = repeats.value if repeats.low > remainder_material else 0.0
+    if not drifts:
+        return _Powers(explained, above, material, 0.0, ())
+    powers = {d: evidence.candidates[best][d].drift_mps2 ** 2 for d in drifts}
+    left = float(evidence.left(best)[0])
+    possible = [d for d in drifts if powers[d] <= _DRIFT_LIMIT * left]
     is_random = remainder.drift_p >= _SMALLEST_P
-    if drifts and (follows_more or not is_random):
+    if not possible or not is_random or evidence.follows(remainder, beside_form(best)):
         # A drift follows time alone, and at random; its fit takes up what does not, too.
         return _Powers(explained, above, max(repeats.value, above), 0.0, ())
-    material = repeats.value if repeats.low > remainder_material else 0.0
-    return _Powers(explained, above, material, drift, drifts)
+    # Functions take up a part of any drift, and only the likelihood says whether they should.
+    is_form = evidence.follows(remainder, form_of(best))
+    return _Powers(explained, above, material * is_form, powers[possible[0]], possible)
 
 
 def _rivals(
-    evidence: Evidence, minimal: Sequence[frozenset[str]], repeats: float
+    evidence: Evidence, minimal: Sequence[frozenset[str]], powers: _Powers
 ) -> list[frozenset[str]]:
     """
     Return the other sets that could be the answer in place of the first.
 
     The order of two sets could be that of their errors of form, where these are as large as what
-    repeats beside the best set; or that of errors of the reference in motion.
+    repeats beside the best set; or that of errors of the reference in motion. Beside a drift
+    powers scatter, and the likelihood decides.
     """
     best = minimal[0]
-    smallest = max(repeats, evidence.errs_in_motion * evidence.reference_mps2**2)
+    smallest = max(powers.repeats, evidence.errs_in_motion * evidence.reference_mps2**2)
     rivals = []
     for other in minimal[1:]:
         is_less_probable = evidence.figure(evidence.nats(best, other)).predicts
         explains_less = evidence.figure(evidence.gain(best, other)).value > smallest
-        is_beaten = is_less_probable and explains_less
+        is_beaten = is_less_probable and (explains_less or bool(powers.drifts))
         is_alike = len(other) == len(best) and not is_beaten
         if is_alike and not evidence.leaves_more(other, best):
             rivals.append(other)
@@ -231,7 +239,7 @@ def _answer(
         # What neither repeats nor is noise at rest is no gap only while the noise is larger.
         is_much = powers.above > max(evidence.floor_mps2**2, material)
         return _Answer('unknown' if is_much else 'no_gap')
-    groups = _groups(best, _rivals(evidence, minimal, powers.repeats))
+    groups = _groups(best, _rivals(evidence, minimal, powers))
     certain = best.difference(*groups) | detected
     if len(named) > 1:
         groups |= {named}
@@ -271,16 +279,18 @@ def _best_set(
         return replace(weighed, again={effects: simulate_again(effects) for effects in sets})
 
     evidence = simulated(evidence)
+    healthy = minimal_sets(evidence)[0]
+    # In noise that drifts, sets explain less than they seem to beside white noise. The motion
+    # that a smooth reference lacks is no drift.
+    every = () if evidence.fades else evidence.candidates[healthy]
+    drifting = [replace(evidence, noise=drift) for drift in every if drift != HEALTHY]
+    drifting.sort(key=lambda e: -e.drift_nats(minimal_sets(e)[0], e.noise, healthy)[0])
+    if not drifting or not is_drifting(drifting[0], minimal_sets(drifting[0])[0], healthy):
+        return _BestSet(evidence, healthy, remainder_of(healthy, HEALTHY), ())
+    evidence = simulated(drifting[0])
     best = minimal_sets(evidence)[0]
-    remainder = remainder_of(best, HEALTHY)
-    drifts = drifts_beside(evidence, best, remainder)
-    if drifts:
-        # In noise that drifts, sets explain less than they seem to beside white noise.
-        evidence = simulated(replace(evidence, noise=drifts[0]))
-        best = minimal_sets(evidence)[0]
-        drifts = [d for d in drifts if d in evidence.candidates[best]]
-        remainder = remainder_of(best, drifts[0] if drifts else HEALTHY)
-    return _BestSet(evidence, best, remainder, drifts)
+    drifts = drifts_beside(evidence, best)
+    return _BestSet(evidence, best, remainder_of(best, evidence.noise), drifts)
 
 
 def decide(
@@ -327,7 +337,7 @@ def decide(
         remainder=repeats,
         left=evidence.interval(evidence.left(best)),
         upper_limit_mps2=max(highest, repeats.high, evidence.material_power(1.0)) ** 0.5,
-        lost_without={e: evidence.interval(evidence.gain(best, best - {e})) for e in sorted(best)},
+        lost_without={e: evidence.interval(evidence.lost_without(best, e)) for e in sorted(best)},
         remainder_follows=tuple(
             d for d in strongest if power[d] > 0 and power[d] >= power[strongest[0]] / 2
         ),
