@@ -157,28 +157,24 @@ class _Powers(NamedTuple):
 def _powers(
     evidence: Evidence,
     best: frozenset[str],
-    remainder: Remainder,
+    found: _BestSet,
     remainder_material: float,
-    drifts: Sequence[str],
     of_noise: float,
 ) -> _Powers:
     """Weigh what the best set and the noise leave, and drop the drifts where it is none."""
     explained = max(float(evidence.gain(best, NOTHING)[0]), 0.0)
     above = float(evidence.left(best)[0]) - of_noise
-    repeats = evidence.figure(evidence.mean(remainder.squares))
-    material = repeats.value if repeats.low > remainder_material else 0.0
-    if not drifts:
+    repeats = evidence.figure(evidence.mean(found.remainder.squares))
+    material = repeats.value if found.repeats and repeats.low > remainder_material else 0.0
+    if not found.drifts:
         return _Powers(explained, above, material, 0.0, ())
-    powers = {d: evidence.candidates[best][d].drift_mps2 ** 2 for d in drifts}
+    powers = {d: evidence.candidates[best][d].drift_mps2 ** 2 for d in found.drifts}
     left = float(evidence.left(best)[0])
-    possible = [d for d in drifts if powers[d] <= _DRIFT_LIMIT * left]
-    is_random = remainder.drift_p >= _SMALLEST_P
-    if not possible or not is_random or evidence.follows(remainder, beside_form(best)):
-        # A drift follows time alone, and at random; its fit takes up what does not, too.
+    possible = [d for d in found.drifts if powers[d] <= _DRIFT_LIMIT * left]
+    if not possible or not found.is_random:
+        # The fit of a drift takes up what is none, too.
         return _Powers(explained, above, max(repeats.value, above), 0.0, ())
-    # Functions take up a part of any drift, and only the likelihood says whether they should.
-    is_form = evidence.follows(remainder, form_of(best))
-    return _Powers(explained, above, material * is_form, powers[possible[0]], possible)
+    return _Powers(explained, above, material, powers[possible[0]], possible)
 
 
 def _rivals(
@@ -216,9 +212,8 @@ def _groups(best: frozenset[str], rivals: Sequence[frozenset[str]]) -> frozenset
 
 def _answer(
     evidence: Evidence,
-    remainder: Remainder,
+    found: _BestSet,
     remainder_material: float,
-    drifts: Sequence[str],
     in_noise: Sequence[NoiseCause],
 ) -> _Answer:
     """Apply the rule to the figures of all blocks, or of one draw of them."""
@@ -228,7 +223,7 @@ def _answer(
     detected = frozenset(cause.effect for cause in in_noise)
     # Only samples that are compared say what is left.
     of_noise = sum(cause.power_mps2 for cause in in_noise if not cause.is_left_out)
-    powers = _powers(evidence, best, remainder, remainder_material, drifts, of_noise)
+    powers = _powers(evidence, best, found, remainder_material, of_noise)
     # A reference that lacks motion leaves more than a floor at rest.
     only_repeats = evidence.fades or not best
     unexplained = powers.repeats if only_repeats else powers.remaining(material)
@@ -262,7 +257,10 @@ class _BestSet(NamedTuple):
     evidence: Evidence  # The figures, in the noise beside the set
     effects: frozenset[str]
     remainder: Remainder
-    drifts: Sequence[str]  # The drifts of the noise, the best first
+    drifts: Sequence[str] = ()  # The drifts of the noise, the best first
+    # Whether the noise is a drift by one residual: draws would repeat the test of a largest value
+    is_random: bool = True
+    repeats: bool = True  # Whether what repeats is no part of a drift
 
 
 def _best_set(
@@ -286,11 +284,19 @@ def _best_set(
     drifting = [replace(evidence, noise=drift) for drift in every if drift != HEALTHY]
     drifting.sort(key=lambda e: -e.drift_nats(minimal_sets(e)[0], e.noise, healthy)[0])
     if not drifting or not is_drifting(drifting[0], minimal_sets(drifting[0])[0], healthy):
-        return _BestSet(evidence, healthy, remainder_of(healthy, HEALTHY), ())
+        return _BestSet(evidence, healthy, remainder_of(healthy, HEALTHY))
     evidence = simulated(drifting[0])
     best = minimal_sets(evidence)[0]
-    drifts = drifts_beside(evidence, best)
-    return _BestSet(evidence, best, remainder_of(best, evidence.noise), drifts)
+    remainder = remainder_of(best, evidence.noise)
+    follows_more = evidence.follows(remainder, beside_form(best))
+    return _BestSet(
+        evidence,
+        best,
+        remainder,
+        drifts_beside(evidence, best),
+        is_random=remainder.drift_p >= _SMALLEST_P and not follows_more,
+        repeats=evidence.follows(remainder, form_of(best)),
+    )
 
 
 def decide(
@@ -305,7 +311,8 @@ def decide(
     in_noise: the effects that show in the noise.
     simulate_again: simulates a set that could be the answer.
     """
-    evidence, best, remainder, drifts = _best_set(evidence, remainder_of, simulate_again)
+    found = _best_set(evidence, remainder_of, simulate_again)
+    evidence, best, remainder = found.evidence, found.effects, found.remainder
     power = {d: float(evidence.mean(b)[0]) for d, b in remainder.by_dimension.items()}
     repeats = evidence.interval(evidence.mean(remainder.squares))
     # What follows the pose may be of the reference.
@@ -314,7 +321,7 @@ def decide(
     remainder_material = evidence.material_power(pose_share)
 
     def answer_of(weighed: Evidence) -> _Answer:
-        return _answer(weighed, remainder, remainder_material, drifts, in_noise)
+        return _answer(weighed, found, remainder_material, in_noise)
 
     drawn = [answer_of(evidence.draw(number)) for number in range(1, len(evidence.weights))]
     votes = _votes(drawn)
