@@ -14,8 +14,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence as linear
-from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis, Whitener
+from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis
 from adxl_ros.diagnose.linear_model import filters_for, LinearModel
+from adxl_ros.diagnose.noise_filters import expected_drift_g, Whitener
 from adxl_ros.diagnose.search import with_filters
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.signals.block_statistics import rms
@@ -145,7 +146,7 @@ class HeldOutFits:
     def drift_mps2(self) -> float:
         """Return the expected rms of the drift that the fitted noise has, m/s²."""
         sizes_g = [
-            linear.expected_drift_g(w.effect, density, comparison)
+            expected_drift_g(w.effect, density, comparison)
             for w, density, (comparison, _) in zip(
                 self._whiteners, self.drift_densities(), self.model.places
             )
