@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from adxl_ros.diagnose.comparison import with_values
-from adxl_ros.diagnose.held_out import HeldOutFits
 from adxl_ros.diagnose.noise_effects import Detection
 from adxl_ros.diagnose.noise_filters import drifts_among
 from adxl_ros.diagnose.search import Hypothesis
@@ -17,6 +17,9 @@ from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
 import numpy as np
+
+if TYPE_CHECKING:
+    from adxl_ros.diagnose.held_out import HeldOutFits
 
 
 def as_printed(hypothesis: Hypothesis, sensor: Sensor) -> Sensor:
