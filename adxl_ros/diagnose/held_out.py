@@ -57,7 +57,7 @@ class HeldOutFits:
 
     @cached_property
     def linearised(self) -> LinearisedHypothesis:
-        """The set in noise that may drift, whitened when it is first asked for."""
+        """Whiten the set for noise that may drift, once it is asked for."""
         if not self.drifts:
             return self.healthy
         filters = filters_for(self.model.filters, (*self.model.baseline.effects, *self.drifts))
