@@ -4,8 +4,8 @@
 
 import adxl_ros as adxl
 from adxl_ros.errors import UserError
-from adxl_ros.files.robot_readings import JointTrack, RobotReadings
 from adxl_ros.files.recording_columns import ACCEL
+from adxl_ros.files.robot_readings import JointTrack, RobotReadings
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.simulate.motion import ForcePath, Motion
 from adxl_ros.simulate.response import ChainMemo, whole_response
