@@ -186,7 +186,8 @@ class Evidence:
         """Determine whether a set explains materially more than others with errors of form."""
         # No error of form holds a tenth of the power, and most effects of a set hold more.
         explained = float(self.gain(effects, NOTHING)[0])
-        if float(self.gain(effects, others)[0]) > SHARE_OF_FORM * explained:
+        (effect,) = effects - others
+        if float(self.lost_without(effects, effect)[0]) > SHARE_OF_FORM * explained:
             return True
         # A weak effect that all blocks do not show is not looked for in draws of them.
         if self.is_draw and others not in self._fits(effects).beside_errors:
