@@ -8,9 +8,8 @@ the figures. What the report adds comes last.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import chain
 from typing import Any
 
@@ -24,7 +23,7 @@ from adxl_ros.diagnose.flexible_functions import flexible_bases
 from adxl_ros.diagnose.gap_closure import gap_closure, GapClosure
 from adxl_ros.diagnose.held_out import HeldOutFits
 from adxl_ros.diagnose.ideal_observer import Surest, surest
-from adxl_ros.diagnose.linear_model import build_linear_model, filters_for, LinearModel
+from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
 from adxl_ros.diagnose.next_experiment import NextExperiment, propose_next_experiment
 from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemainder
 from adxl_ros.diagnose.noise_filters import drifts_among
@@ -47,9 +46,6 @@ import numpy as np
 ShowProgress = Callable[[str, float], None]
 """Called with number and name of the stage, and the fraction of the work that is done."""
 
-_DRIFT_LIMIT = 5.0
-"""Expected mean square of a random walk about its mean, divided by the one in a recording, that
-one walk in 20 exceeds. Derived from the random walk."""
 _SMALLEST_RANGES = {'temperature_c': 0.5, 'supply_v': 0.02}
 """Range of temperature, °C, and supply, V, below which they do not change. Chosen: noise."""
 
@@ -209,7 +205,7 @@ def _evidence(search: Search, floor: NoiseFloor, smallest_mps2: float, seed: int
     counts = np.sum([sum_by_block(c.used) for c in comparisons], axis=0)
     robot_mps2 = max(c.robot_error_mps2 for c in comparisons)
     return Evidence(
-        candidates=_held_out(search, floor, max(counts.sum(), 1.0)),
+        candidates=_held_out(search),
         counts=counts,
         weights=rule.block_weights(seed),
         material_mps2=smallest_mps2,
@@ -272,32 +268,7 @@ def material_mps2(
     return max(1e-3 * material_mg * G0_MPS2, rule.MATERIAL_SHARE_OF_NOISE * unknown_mps2)
 
 
-class _FitsByDrift(Mapping[str, HeldOutFits]):
-    """Held-out fits of a set by the drift of its noise; those with a drift once they are asked."""
-
-    def __init__(
-        self, healthy: HeldOutFits, with_drifts: Callable[[HeldOutFits], dict[str, HeldOutFits]]
-    ) -> None:
-        self._healthy = healthy
-        self._with_drifts = with_drifts
-
-    @cached_property
-    def _all(self) -> dict[str, HeldOutFits]:
-        return {HEALTHY: self._healthy, **self._with_drifts(self._healthy)}
-
-    def __getitem__(self, drift: str) -> HeldOutFits:
-        return self._healthy if drift == HEALTHY else self._all[drift]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._all)
-
-    def __len__(self) -> int:
-        return len(self._all)
-
-
-def _held_out(
-    search: Search, floor: NoiseFloor, count: float
-) -> dict[frozenset[str], Mapping[str, HeldOutFits]]:
+def _held_out(search: Search) -> dict[frozenset[str], Mapping[str, HeldOutFits]]:
     """Return held-out fits of all sets by the drift of their noise."""
     model = search.model
     beside = with_filters(model, search.best.linearised, model.filters)
@@ -305,23 +276,11 @@ def _held_out(
     if beside.fit(drifts=drifts).log_evidence <= beside.fit().log_evidence:
         drifts = ()
 
-    def with_drifts(healthy: HeldOutFits) -> dict[str, HeldOutFits]:
-        """Return the fits with each drift, but for one far larger than what the set leaves."""
-        left = healthy.figures.squares.sum() / count - floor.rms_mps2**2
-        largest = _DRIFT_LIMIT * max(left, 0.0)
-        found = {}
-        for drift in drifts:
-            filters = filters_for(model.filters, (*model.baseline.effects, drift))
-            linearised = with_filters(model, healthy.linearised, filters)
-            fits = HeldOutFits(linearised, model, (drift,))
-            if fits.drift_mps2**2 <= largest:
-                found[drift] = fits
-        return found
-
-    return {
-        effects: _FitsByDrift(HeldOutFits(hypothesis.linearised, model), with_drifts)
-        for effects, hypothesis in search.found.items()
-    }
+    out: dict[frozenset[str], Mapping[str, HeldOutFits]] = {}
+    for effects, hypothesis in search.found.items():
+        fits = {d: HeldOutFits(hypothesis.linearised, model, (d,)) for d in drifts}
+        out[effects] = {HEALTHY: HeldOutFits(hypothesis.linearised, model), **fits}
+    return out
 
 
 def _squares_left(comparison: BaselineComparison, sensor: Sensor) -> np.ndarray:

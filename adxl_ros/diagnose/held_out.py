@@ -18,20 +18,18 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, repeat
-from typing import NamedTuple, TYPE_CHECKING
+from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence as linear
 from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis
 from adxl_ros.diagnose.flexible_functions import flexible_bases
+from adxl_ros.diagnose.linear_model import filters_for, LinearModel
 from adxl_ros.diagnose.noise_filters import expected_drift_g, Whitener
 from adxl_ros.diagnose.search import with_filters
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.signals.block_statistics import rms
 import numpy as np
-
-if TYPE_CHECKING:
-    from adxl_ros.diagnose.linear_model import LinearModel
 
 FOLDS = 4  # Parts of a recording, each of which is held out once. Chosen: run time
 _RUN_BLOCKS = 2
@@ -83,7 +81,8 @@ class Fold(NamedTuple):
 class HeldOutFits:
     """The fits of a linearised set of effects to all blocks but those held out."""
 
-    linearised: LinearisedHypothesis  # The set of effects, linearised at its fit to all blocks
+    # The set of effects, linearised at its fit to all blocks, in the noise of a healthy unit
+    healthy: LinearisedHypothesis
     model: LinearModel
     # Effects by which the zero-g may drift more than that of a healthy unit
     drifts: tuple[str, ...] = ()
@@ -95,7 +94,7 @@ class HeldOutFits:
         if effects not in self.beside_errors:
             wider = _with_columns(self.linearised, self._form_errors(effects))
             filtered = with_filters(self.model, wider, [[w] for w in self._whiteners])
-            self.beside_errors[effects] = HeldOutFits(filtered, self.model, self.drifts).figures
+            self.beside_errors[effects] = HeldOutFits(filtered, self.model).figures
         return self.beside_errors[effects]
 
     def _form_errors(self, effects: frozenset[str]) -> Iterator[np.ndarray]:
@@ -110,6 +109,14 @@ class HeldOutFits:
             change_v = columns.own[:, 1:][:, own] @ values
             size_v = _FORM_ERROR * float(change_v[channel.comparison.used].std())
             yield size_v * np.hstack([columns.own[:, :0], *basis.values()])
+
+    @cached_property
+    def linearised(self) -> LinearisedHypothesis:
+        """Whiten the set for noise that may drift, once it is asked for."""
+        if not self.drifts:
+            return self.healthy
+        filters = filters_for(self.model.filters, (*self.model.baseline.effects, *self.drifts))
+        return with_filters(self.model, self.healthy, filters)
 
     @cached_property
     def full(self) -> LinearFit:
@@ -139,6 +146,21 @@ class HeldOutFits:
             linear.plain_grams(columns.values, place.comparison.used) / place.v_per_mean_mps2**2
             for columns, place in zip(self.linearised.columns, self.model.places)
         ]
+
+    @cached_property
+    def changes(self) -> dict[str, np.ndarray]:
+        """Squares of what each effect changes of the held-out blocks, (m/s²)², (blocks,) each."""
+        every = {}
+        for effect in self.linearised.effects:
+            own = np.array([name.effect == effect for name in self.linearised.names])
+            squares = every[effect] = np.zeros(BLOCKS)
+            for fold in self.folds:
+                departures = np.where(own, fold.departures, 0.0)
+                for columns, plain_mps2 in zip(self.linearised.columns, self._plain):
+                    v = departures[columns.places]
+                    parts = plain_mps2[fold.held_out, 1:, 1:] @ v
+                    squares[fold.held_out] += parts @ v
+        return every
 
     @property
     def tolerated(self) -> np.ndarray:

@@ -2,14 +2,13 @@
 """
 Whether what a set of effects leaves drifts at random.
 
-A random drift follows time alone. Its increments are Gaussian, as large at rest as in motion, and
-without a line; those of jumps between levels, of motors and of slow oscillations are not.
+A random drift follows time alone. Its increments are without jumps, as large at rest as in motion,
+and without a line; those of jumps between levels, of motors and of slow oscillations are not.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple, TYPE_CHECKING
-import warnings
 
 from adxl_ros.diagnose.comparison import bridged
 from adxl_ros.signals.block_statistics import true_runs
@@ -26,6 +25,8 @@ _FEWEST_STEPS = 12  # Fewest increments that show a form. Chosen: a kurtosis sca
 _FEWEST_GAPS = 8
 """Fewest gaps whose steps are compared with the changes within the runs about them. Chosen: eight
 steps and nine changes have 24 310 orders, so that chance explains one in so many."""
+_AROUND = 5  # Increments on each side of one. Chosen: a power that changes is the same within them
+_PARTS = (np.arange(1000) + 0.5) / 1000  # Probabilities over which a mean is taken
 _LOCAL_ORDINATES = 101  # Ordinates of the level around a line. Chosen: much wider than a line
 
 
@@ -50,9 +51,9 @@ def increments_p(
     Return how probable the increments of a residual are if they are those of a random drift.
 
     The means are those over the time from which the drift exceeds the noise: twice that of the
-    smallest Allan deviation. A drift has Gaussian increments (test of Anscombe and Glynn 1983), as
-    large at rest as in motion (test of Mann and Whitney 1947), and no line. Jumps between levels,
-    what a motor does, and slow oscillations have not.
+    smallest Allan deviation. A drift has no jump, increments as large at rest as in motion (test
+    of Mann and Whitney 1947), and no line. Jumps between levels, what a motor does, and slow
+    oscillations have not.
     """
     longest = int(used.sum()) // _FEWEST_MEANS
     lengths = np.unique(
@@ -80,15 +81,11 @@ def increments_p(
     steps = increments(min(2 * lengths[quietest], longest)).values
     if len(steps) < _FEWEST_STEPS or not np.ptp(steps):
         return 1.0
-    with warnings.catch_warnings():
-        # Older versions warn below 20 increments, where the test is rougher.
-        warnings.simplefilter('ignore')
-        gaussian = scipy.stats.kurtosistest(steps).pvalue
     # The longest means that are often at rest show the drift best.
     often = [each for each in by_length if each.fewest >= _FEWEST_STEPS]
     alike = often[-1].alike_p if often else 1.0
     line = _line_p(values, used, lengths[0])
-    return float(min(1.0, 3 * min(line, gaussian, alike)))
+    return float(min(1.0, 3 * min(line, _jump_p(steps), alike)))
 
 
 def between_rests_p(values: np.ndarray, used: np.ndarray, rate_hz: float) -> float:
@@ -111,6 +108,23 @@ def between_rests_p(values: np.ndarray, used: np.ndarray, rate_hz: float) -> flo
     between = (first[1:] - last[:-1]) / np.sqrt(gap_s + (half_s[1:] + half_s[:-1]) / 3)
     test = scipy.stats.mannwhitneyu(np.abs(between), np.abs(within), alternative='greater')
     return float(test.pvalue)
+
+
+def _jump_p(steps: np.ndarray) -> float:
+    """
+    Return how probable the largest increment is by the median of those around, if none is a jump.
+
+    A walk may change its power slowly. The median of an even number of Gaussian sizes is between
+    two of them, which are order statistics of a beta distribution.
+    """
+    sizes = np.abs(steps)
+    around = np.lib.stride_tricks.sliding_window_view(
+        np.pad(sizes, _AROUND, mode='reflect'), 2 * _AROUND + 1
+    )
+    largest = np.max(sizes / np.median(np.delete(around, _AROUND, axis=1), axis=1))
+    part = scipy.stats.beta.ppf(_PARTS, _AROUND + 0.5, _AROUND + 0.5)
+    median = scipy.stats.norm.ppf((1 + part) / 2)
+    return float(min(1.0, len(steps) * np.mean(2 * scipy.stats.norm.sf(largest * median))))
 
 
 def _line_p(values: np.ndarray, used: np.ndarray, length: int) -> float:

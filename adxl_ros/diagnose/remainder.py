@@ -8,14 +8,13 @@ leaves of the other blocks. What they predict of the held-out ones returns, and 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, TYPE_CHECKING
 
 from adxl_ros.diagnose import evidence as linear
 from adxl_ros.diagnose.evidence import BLOCKS, ChannelColumns
 from adxl_ros.diagnose.random_drift import drift_p
-from adxl_ros.model.effects.base import FormDimension
 import numpy as np
 
 if TYPE_CHECKING:
@@ -36,9 +35,9 @@ class Remainder:
     """What flexible functions predict of held-out blocks beyond a set of effects."""
 
     squares: np.ndarray  # Decrease of the squares by all functions, by block, (m/s²)², (blocks,)
-    steady_squares: np.ndarray  # The same by all functions but those of time
-    steady_log_likelihood: np.ndarray  # Increase of the log likelihood by these, (blocks,)
     by_dimension: dict[str, np.ndarray]  # Decrease by the functions of one dimension alone
+    # Increase of the log likelihood by those of one axis alone, by dimension, (axes, blocks)
+    nats: Mapping[str, np.ndarray]
     # Probability that a drift has increments with such jumps or lines; 1 beside a healthy unit
     drift_p: float = 1.0
 
@@ -51,20 +50,20 @@ def reproducible_remainder(fits: HeldOutFits, bases: Iterable[Basis]) -> Remaind
     1992), so that functions that follow noise vanish. The effects keep their values, so that the
     functions take up only what the effects leave. `bases` are the functions of each channel.
     """
-    squares, steady_squares, steady_log_likelihood = np.zeros((3, BLOCKS))
+    squares = np.zeros(BLOCKS)
     by_dimension: dict[str, np.ndarray] = {}
+    nats: dict[str, np.ndarray] = {}
     for number, basis in enumerate(bases):
         if not basis:
             continue
         functions = _FlexibleFunctions.of(fits, number, basis)
         squares += functions.predict(fits, functions.dimensions != '').squares
-        steady = functions.predict(fits, functions.dimensions != FormDimension.TIME.value)
-        steady_squares += steady.squares
-        steady_log_likelihood += steady.log_likelihood
         for dimension in (d.value for d in basis):
-            alone = functions.predict(fits, functions.dimensions == dimension).squares
-            by_dimension[dimension] = by_dimension.get(dimension, 0.0) + alone
-    return Remainder(squares, steady_squares, steady_log_likelihood, by_dimension, drift_p(fits))
+            alone = functions.predict(fits, functions.dimensions == dimension)
+            by_dimension[dimension] = by_dimension.get(dimension, 0.0) + alone.squares
+            before = nats.get(dimension, np.zeros((0, BLOCKS)))
+            nats[dimension] = np.vstack([before, alone.log_likelihood])
+    return Remainder(squares, by_dimension, nats, drift_p(fits))
 
 
 class _Decrease(NamedTuple):

@@ -18,9 +18,12 @@ from typing import NamedTuple
 from adxl_ros.diagnose.evidence import BLOCKS
 from adxl_ros.diagnose.remainder import Remainder
 from adxl_ros.diagnose.weighing import (
+    beside_form,
     drifts_beside,
     Evidence,
+    form_of,
     HEALTHY,
+    is_drifting,
     minimal_sets,
     NOTHING,
     SHARE_OF_FORM,
@@ -36,9 +39,9 @@ MATERIAL_SHARE_OF_NOISE = 0.1
 _SMALLEST_P = 0.001
 """Probability of the increments of a drift below which they are of something else. Chosen: one
 error in 1000."""
-_LARGEST_DRIFT = 2.8
-"""Mean square of a random walk about its mean, divided by its expectation, that one walk in 20
-exceeds. Derived from the random walk."""
+_DRIFT_LIMIT = 5.0
+"""Expected mean square of a random walk about its mean, divided by the one in a recording, that
+one walk in 20 exceeds. Derived from the random walk."""
 _REPEATED = (0.0, 0.5, 0.8, 0.95, 1.0)
 """Shares of the draws that repeat a verdict, at which `_RIGHT` is known."""
 _RIGHT = (0.2, 0.4, 0.6, 0.75, 0.9)
@@ -151,49 +154,50 @@ class _Powers(NamedTuple):
 
     def remaining(self, material: float) -> float:
         """Return what is left beside effects: what repeats, or all that no drift explains."""
-        is_more = self.above > _LARGEST_DRIFT * self.drift + material
+        is_more = self.above > material and not self.drifts
         return max(self.repeats, self.above) if is_more else self.repeats
 
 
 def _powers(
     evidence: Evidence,
     best: frozenset[str],
-    remainder: Remainder,
+    found: _BestSet,
     remainder_material: float,
-    drifts: Sequence[str],
     of_noise: float,
 ) -> _Powers:
     """Weigh what the best set and the noise leave, and drop the drifts where it is none."""
-    explained = float(evidence.gain(best, NOTHING)[0])
+    explained = max(float(evidence.gain(best, NOTHING)[0]), 0.0)
     above = float(evidence.left(best)[0]) - of_noise
-    repeats = evidence.figure(evidence.mean(remainder.squares))
-    steady = evidence.figure(evidence.mean(remainder.steady_squares))
-    drift = evidence.drift_power(best, drifts)
-    follows_more = steady.low > remainder_material and steady.value > SHARE_OF_FORM * drift
-    is_random = remainder.drift_p >= _SMALLEST_P
-    if drifts and (follows_more or not is_random):
-        # A drift follows time alone, and at random; its fit takes up what does not, too.
+    repeats = evidence.figure(evidence.mean(found.remainder.squares))
+    material = repeats.value if found.repeats and repeats.low > remainder_material else 0.0
+    if not found.drifts:
+        return _Powers(explained, above, material, 0.0, ())
+    powers = {d: evidence.candidates[best][d].drift_mps2 ** 2 for d in found.drifts}
+    left = float(evidence.left(best)[0])
+    possible = [d for d in found.drifts if powers[d] <= _DRIFT_LIMIT * left]
+    if not possible or not found.is_random:
+        # The fit of a drift takes up what is none, too.
         return _Powers(explained, above, max(repeats.value, above), 0.0, ())
-    material = repeats.value if repeats.low > remainder_material else 0.0
-    return _Powers(explained, above, material, drift, drifts)
+    return _Powers(explained, above, material, powers[possible[0]], possible)
 
 
 def _rivals(
-    evidence: Evidence, minimal: Sequence[frozenset[str]], repeats: float
+    evidence: Evidence, minimal: Sequence[frozenset[str]], powers: _Powers
 ) -> list[frozenset[str]]:
     """
     Return the other sets that could be the answer in place of the first.
 
     The order of two sets could be that of their errors of form, where these are as large as what
-    repeats beside the best set; or that of errors of the reference in motion.
+    repeats beside the best set; or that of errors of the reference in motion. Beside a drift
+    powers scatter, and the likelihood decides.
     """
     best = minimal[0]
-    smallest = max(repeats, evidence.errs_in_motion * evidence.reference_mps2**2)
+    smallest = max(powers.repeats, evidence.errs_in_motion * evidence.reference_mps2**2)
     rivals = []
     for other in minimal[1:]:
         is_less_probable = evidence.figure(evidence.nats(best, other)).predicts
         explains_less = evidence.figure(evidence.gain(best, other)).value > smallest
-        is_beaten = is_less_probable and explains_less
+        is_beaten = is_less_probable and (explains_less or bool(powers.drifts))
         is_alike = len(other) == len(best) and not is_beaten
         if is_alike and not evidence.leaves_more(other, best):
             rivals.append(other)
@@ -212,9 +216,8 @@ def _groups(best: frozenset[str], rivals: Sequence[frozenset[str]]) -> frozenset
 
 def _answer(
     evidence: Evidence,
-    remainder: Remainder,
+    found: _BestSet,
     remainder_material: float,
-    drifts: Sequence[str],
     in_noise: Sequence[NoiseCause],
 ) -> _Answer:
     """Apply the rule to the figures of all blocks, or of one draw of them."""
@@ -224,7 +227,7 @@ def _answer(
     detected = frozenset(cause.effect for cause in in_noise)
     # Only samples that are compared say what is left.
     of_noise = sum(cause.power_mps2 for cause in in_noise if not cause.is_left_out)
-    powers = _powers(evidence, best, remainder, remainder_material, drifts, of_noise)
+    powers = _powers(evidence, best, found, remainder_material, of_noise)
     # A reference that lacks motion leaves more than a floor at rest.
     only_repeats = evidence.fades or not best
     unexplained = powers.repeats if only_repeats else powers.remaining(material)
@@ -235,7 +238,7 @@ def _answer(
         # What neither repeats nor is noise at rest is no gap only while the noise is larger.
         is_much = powers.above > max(evidence.floor_mps2**2, material)
         return _Answer('unknown' if is_much else 'no_gap')
-    groups = _groups(best, _rivals(evidence, minimal, powers.repeats))
+    groups = _groups(best, _rivals(evidence, minimal, powers))
     certain = best.difference(*groups) | detected
     if len(named) > 1:
         groups |= {named}
@@ -258,7 +261,10 @@ class _BestSet(NamedTuple):
     evidence: Evidence  # The figures, in the noise beside the set
     effects: frozenset[str]
     remainder: Remainder
-    drifts: Sequence[str]  # The drifts of the noise, the best first
+    drifts: Sequence[str] = ()  # The drifts of the noise, the best first
+    # Whether the noise is a drift by one residual: draws would repeat the test of a largest value
+    is_random: bool = True
+    repeats: bool = True  # Whether what repeats is no part of a drift
 
 
 def _best_set(
@@ -275,16 +281,26 @@ def _best_set(
         return replace(weighed, again={effects: simulate_again(effects) for effects in sets})
 
     evidence = simulated(evidence)
+    healthy = minimal_sets(evidence)[0]
+    # In noise that drifts, sets explain less than they seem to beside white noise. The motion
+    # that a smooth reference lacks is no drift.
+    every = () if evidence.fades else evidence.candidates[healthy]
+    drifting = [replace(evidence, noise=drift) for drift in every if drift != HEALTHY]
+    drifting.sort(key=lambda e: -e.drift_nats(minimal_sets(e)[0], e.noise, healthy)[0])
+    if not drifting or not is_drifting(drifting[0], minimal_sets(drifting[0])[0], healthy):
+        return _BestSet(evidence, healthy, remainder_of(healthy, HEALTHY))
+    evidence = simulated(drifting[0])
     best = minimal_sets(evidence)[0]
-    remainder = remainder_of(best, HEALTHY)
-    drifts = drifts_beside(evidence, best, remainder)
-    if drifts:
-        # In noise that drifts, sets explain less than they seem to beside white noise.
-        evidence = simulated(replace(evidence, noise=drifts[0]))
-        best = minimal_sets(evidence)[0]
-        drifts = [d for d in drifts if d in evidence.candidates[best]]
-        remainder = remainder_of(best, drifts[0] if drifts else HEALTHY)
-    return _BestSet(evidence, best, remainder, drifts)
+    remainder = remainder_of(best, evidence.noise)
+    follows_more = evidence.follows(remainder, beside_form(best))
+    return _BestSet(
+        evidence,
+        best,
+        remainder,
+        drifts_beside(evidence, best),
+        is_random=remainder.drift_p >= _SMALLEST_P and not follows_more,
+        repeats=evidence.follows(remainder, form_of(best)),
+    )
 
 
 def decide(
@@ -299,7 +315,8 @@ def decide(
     in_noise: the effects that show in the noise.
     simulate_again: simulates a set that could be the answer.
     """
-    evidence, best, remainder, drifts = _best_set(evidence, remainder_of, simulate_again)
+    found = _best_set(evidence, remainder_of, simulate_again)
+    evidence, best, remainder = found.evidence, found.effects, found.remainder
     power = {d: float(evidence.mean(b)[0]) for d, b in remainder.by_dimension.items()}
     repeats = evidence.interval(evidence.mean(remainder.squares))
     # What follows the pose may be of the reference.
@@ -308,7 +325,7 @@ def decide(
     remainder_material = evidence.material_power(pose_share)
 
     def answer_of(weighed: Evidence) -> _Answer:
-        return _answer(weighed, remainder, remainder_material, drifts, in_noise)
+        return _answer(weighed, found, remainder_material, in_noise)
 
     drawn = [answer_of(evidence.draw(number)) for number in range(1, len(evidence.weights))]
     votes = _votes(drawn)
@@ -334,7 +351,7 @@ def decide(
         left=evidence.interval(evidence.left(best)),
         upper_limit_mps2=(unseen + tolerated) ** 0.5,
         tolerated_mps2=tolerated**0.5,
-        lost_without={e: evidence.interval(evidence.gain(best, best - {e})) for e in sorted(best)},
+        lost_without={e: evidence.interval(evidence.lost_without(best, e)) for e in sorted(best)},
         remainder_follows=tuple(
             d for d in strongest if power[d] > 0 and power[d] >= power[strongest[0]] / 2
         ),

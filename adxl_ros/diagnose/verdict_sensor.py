@@ -5,18 +5,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from adxl_ros.diagnose.comparison import with_values
-from adxl_ros.diagnose.held_out import HeldOutFits
 from adxl_ros.diagnose.noise_effects import Detection
 from adxl_ros.diagnose.noise_filters import drifts_among
 from adxl_ros.diagnose.search import Hypothesis
 from adxl_ros.diagnose.verdict import Verdict
-from adxl_ros.diagnose.weighing import Evidence, HEALTHY
+from adxl_ros.diagnose.weighing import drifts_beside, Evidence
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
 import numpy as np
+
+if TYPE_CHECKING:
+    from adxl_ros.diagnose.held_out import HeldOutFits
 
 
 def as_printed(hypothesis: Hypothesis, sensor: Sensor) -> Sensor:
@@ -42,12 +45,10 @@ def _with_fitted(sensor: Sensor, fitted: Sensor, effects: Sequence[str]) -> Sens
 def with_likely_drift(best: Hypothesis, evidence: Evidence) -> Sensor:
     """Return the sensor of a set, with the drift that its noise needs most, if any."""
     effects = frozenset(best.effects)
-    fits = evidence.candidates[effects]
-    nats = {d: evidence.figure(evidence.drift_nats(effects, d)) for d in fits if d != HEALTHY}
-    likely = max(nats, key=lambda drift: nats[drift].value, default=HEALTHY)
-    if likely == HEALTHY or not nats[likely].predicts:
+    drifts = drifts_beside(evidence, effects)
+    if not drifts:
         return best.sensor
-    return _with_drift(best.sensor, likely, fits[likely])
+    return _with_drift(best.sensor, drifts[0], evidence.candidates[effects][drifts[0]])
 
 
 def _with_drift(sensor: Sensor, drift: str, fits: HeldOutFits) -> Sensor:

@@ -10,12 +10,12 @@ all blocks and each draw of them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TYPE_CHECKING
 
 from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import ProofVariable
+from adxl_ros.model.effects.base import FormDimension, ProofVariable
 from adxl_ros.report.quantities import Interval
 import numpy as np
 
@@ -132,6 +132,8 @@ class Evidence:
         error = float(np.sqrt(np.sum(more**2))) / count
         explained = max(float(self.gain(effects, NOTHING)[0]), 0.0)
         smallest = max(self.material_power(1.0), _FORM_AT_REST * explained)
+        if self.noise != HEALTHY:
+            smallest += self.candidates[effects][self.noise].drift_mps2 ** 2
         return again.at_bound or float(more.sum()) / count > smallest + _REST_ERRORS * error
 
     def leaves_more(self, effects: frozenset[str], other: frozenset[str]) -> bool:
@@ -141,34 +143,51 @@ class Evidence:
         more = self.figure(self.mean(self.again[effects].printed - self.again[other].printed))
         return more.value > self.material_power(1.0) and more.low > 0
 
-    def drift_power(self, effects: frozenset[str], drifts: Sequence[str]) -> float:
-        """Return the power of the first drift beside a set, (m/s²)²; 0 without one."""
-        fits = self.candidates[effects]
-        if not drifts or drifts[0] not in fits:
-            return 0.0
-        return fits[drifts[0]].drift_mps2 ** 2
+    def follows(self, remainder: Remainder, dimensions: Collection[str]) -> bool:
+        """
+        Determine whether functions of any of some dimensions make held-out samples more probable.
+
+        Each function of each axis is one more that might by chance.
+        """
+        tried = [row for d in dimensions for row in remainder.nats.get(d, ())]
+        figures = [self.figure(self.weights @ row) for row in tried]
+        smallest = _NATS + np.log(max(len(tried), 1))
+        return any(figure.value > smallest and figure.low > 0 for figure in figures)
 
     def gain(self, more: frozenset[str], less: frozenset[str]) -> np.ndarray:
         """Return by how much one set explains more power than another, by draw."""
         return self.mean(self._figures(less).squares - self._figures(more).squares)
+
+    def lost_without(self, effects: frozenset[str], effect: str) -> np.ndarray:
+        """
+        Return what a set explains less without an effect, by draw.
+
+        Beside a drift the squares scatter as it does: what the effect changes is the figure.
+        """
+        drifting = self.candidates[effects].get(self.noise)
+        if self.noise == HEALTHY or drifting is None:
+            return self.gain(effects, effects - {effect})
+        return self.mean(drifting.changes[effect])
 
     def nats(self, more: frozenset[str], less: frozenset[str]) -> np.ndarray:
         """Return by how much a set makes held-out samples more probable, by draw."""
         gained = self._figures(more).log_likelihood - self._figures(less).log_likelihood
         return self.weights @ gained
 
-    def drift_nats(self, effects: frozenset[str], drift: str) -> np.ndarray:
-        """Return by how much a drift makes held-out samples more probable beside a set."""
-        fits = self.candidates[effects]
-        drifting = fits[drift].figures
-        healthy = fits[HEALTHY].figures
-        return self.weights @ (drifting.log_likelihood - healthy.log_likelihood)
+    def drift_nats(
+        self, effects: frozenset[str], drift: str, healthy: frozenset[str]
+    ) -> np.ndarray:
+        """Return by how much a set and a drift are likelier than a set in healthy noise."""
+        drifting = self.candidates[effects][drift].figures
+        steady = self.candidates[healthy][HEALTHY].figures
+        return self.weights @ (drifting.log_likelihood - steady.log_likelihood)
 
     def is_beyond_form(self, effects: frozenset[str], others: frozenset[str]) -> bool:
         """Determine whether a set explains materially more than others with errors of form."""
         # No error of form holds a tenth of the power, and most effects of a set hold more.
         explained = float(self.gain(effects, NOTHING)[0])
-        if float(self.gain(effects, others)[0]) > SHARE_OF_FORM * explained:
+        (effect,) = effects - others
+        if float(self.lost_without(effects, effect)[0]) > SHARE_OF_FORM * explained:
             return True
         # A weak effect that all blocks do not show is not looked for in draws of them.
         if self.is_draw and others not in self._fits(effects).beside_errors:
@@ -198,7 +217,7 @@ def _is_needed(evidence: Evidence, effects: frozenset[str], effect: str) -> bool
     others = effects - {effect}
     if effect in evidence.sizeless.get(effects, ()) or others not in evidence.candidates:
         return False
-    lost = evidence.figure(evidence.gain(effects, others))
+    lost = evidence.figure(evidence.lost_without(effects, effect))
     nats = evidence.figure(evidence.nats(effects, others))
     proof = {*effect_named(effect).diagnosis.proof}
     by_pose = bool(proof) and proof <= _SHOWN_BY_POSE
@@ -236,28 +255,35 @@ def minimal_sets(evidence: Evidence) -> list[frozenset[str]]:
     return [effects for effects in kept if effects not in dropped]
 
 
-def drifts_beside(evidence: Evidence, effects: frozenset[str], remainder: Remainder) -> list[str]:
-    """
-    Return the drifts, the best first, that the noise beside a set needs; none for most.
-
-    What flexible functions predict as well is an error of form, and no drift; nor is the motion
-    that a smooth reference lacks.
-    """
-    candidate = evidence.candidates[effects]
-    nats = {d: evidence.drift_nats(effects, d) for d in candidate if d != HEALTHY}
+def drifts_beside(evidence: Evidence, effects: frozenset[str]) -> list[str]:
+    """Return the drifts, the best first, that make samples beside a set more probable."""
+    tried = [d for d in evidence.candidates[effects] if d != HEALTHY]
+    nats = {d: evidence.drift_nats(effects, d, effects) for d in tried}
     drifts = sorted(nats, key=lambda d: -nats[d][0])
-    if not drifts or evidence.fades:
+    if not drifts or not evidence.figure(nats[drifts[0]]).predicts:
         return []
     best = nats[drifts[0]]
+    return [d for d in drifts if not evidence.figure(best - nats[d]).predicts]
+
+
+def is_drifting(evidence: Evidence, effects: frozenset[str], healthy: frozenset[str]) -> bool:
+    """
+    Determine whether a set in noise that drifts is better than another one in healthy noise.
+
+    The drift must be material beside what the set explains in the same noise.
+    """
     explained = float(evidence.gain(effects, NOTHING)[0])
-    exact = all(effect_named(e).exact for e in effects)
-    share = _SHARE_OF_SET if exact else SHARE_OF_FORM
-    smallest = max(evidence.material_mps2**2, share * explained)
-    of_functions = evidence.weights @ remainder.steady_log_likelihood
-    is_material = candidate[drifts[0]].drift_mps2 ** 2 > smallest
-    is_likely = evidence.figure(best).predicts
-    beats_functions = evidence.figure(best - of_functions).predicts
-    if not (is_material and is_likely and beats_functions):
-        return []
-    others = [d for d in drifts[1:] if not evidence.figure(best - nats[d]).predicts]
-    return [drifts[0], *others]
+    smallest = max(evidence.material_mps2**2, _SHARE_OF_SET * explained)
+    is_material = evidence.candidates[effects][evidence.noise].drift_mps2 ** 2 > smallest
+    nats = evidence.drift_nats(effects, evidence.noise, healthy)
+    return is_material and evidence.figure(nats).predicts
+
+
+def form_of(effects: Collection[str]) -> set[str]:
+    """Return the dimensions along which effects may have an error of form."""
+    return {d.value for e in effects for d in effect_named(e).diagnosis.form}
+
+
+def beside_form(effects: Collection[str]) -> set[str]:
+    """Return the dimensions that neither a drift nor an error of form of effects follows."""
+    return {d.value for d in FormDimension} - {FormDimension.TIME.value} - form_of(effects)

@@ -60,6 +60,15 @@ def test_the_increments_of_a_walk_are_gaussian():
     assert min(p) > 0.001
 
 
+def test_a_walk_may_change_its_power_slowly():
+    power = np.exp(np.interp(np.arange(COUNT), np.linspace(0, COUNT, 6), [-1, 1, 0, 1, -1, 0]))
+    used = np.ones(COUNT, bool)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        uneven = np.cumsum(0.05 * power * rng.normal(size=COUNT)) + 0.3 * rng.normal(size=COUNT)
+        assert increments_p(uneven, used, RATE_HZ, RESTING) > 0.001
+
+
 def test_jumps_and_lines_are_no_walk():
     used = np.ones(COUNT, bool)
     noise = np.random.default_rng(1).normal(size=COUNT)

@@ -21,7 +21,7 @@ BIAS = frozenset({'bias'})
 LEVER_ARM = frozenset({'lever_arm'})
 
 
-def fits(left, drift_mps2=None, seed=1, tolerated=0.0):
+def fits(left, drift_mps2=None, seed=1, nats=480.0, tolerated=0.0):
     """Return held-out figures of a set that leaves a power above the floor, with some scatter."""
     scatter = 1 + 0.01 * np.random.default_rng(seed).normal(size=BLOCKS)
     squares = (FLOOR + left) * SAMPLES * scatter
@@ -29,15 +29,16 @@ def fits(left, drift_mps2=None, seed=1, tolerated=0.0):
     healthy = SimpleNamespace(figures=figures, tolerated=np.full(BLOCKS, tolerated * SAMPLES))
     made = {HEALTHY: healthy}
     if drift_mps2 is not None:
-        likely = HeldOut(squares, figures.log_likelihood + 10.0)
-        made['bias_walk'] = SimpleNamespace(figures=likely, drift_mps2=drift_mps2)
+        likely = HeldOut(squares, figures.log_likelihood + nats / BLOCKS)
+        changes = {'bias': np.full(BLOCKS, 5 * SAMPLES)}
+        made['bias_walk'] = SimpleNamespace(figures=likely, drift_mps2=drift_mps2, changes=changes)
     return made
 
 
 def remainder(power=0.0, dimension='force'):
     """Return what flexible functions explain beyond the best set."""
     squares = np.full(BLOCKS, power * SAMPLES)
-    return Remainder(squares, squares, squares / FLOOR / 2, {dimension: squares})
+    return Remainder(squares, {dimension: squares}, {dimension: squares[None] / FLOOR / 2})
 
 
 def decided(candidates, left_over=0.0, in_noise=(), material=0.1, dimension='force', only=()):
@@ -55,7 +56,7 @@ def decided(candidates, left_over=0.0, in_noise=(), material=0.1, dimension='for
     left = remainder(left_over, dimension)
     if only:
         shares = np.isin(np.arange(BLOCKS), only) * BLOCKS / len(only)
-        left = replace(left, squares=left.squares * shares, steady_squares=left.squares * shares)
+        left = replace(left, squares=left.squares * shares)
     return decide(evidence, lambda effects, drift: left, in_noise)
 
 
@@ -147,6 +148,20 @@ def test_a_set_without_a_drift_may_be_the_best_of_a_draw():
         dimension='time',
     )
     assert verdict.status in ('explained', 'inseparable', 'partly')
+
+
+def test_a_drift_is_weighed_with_the_set_that_it_needs():
+    """Beside white noise an effect takes up a part of a drift that is likelier without it."""
+    candidates = {
+        NOTHING: fits(5.0, drift_mps2=2.0, nats=30_000.0),
+        BIAS: fits(2.0, drift_mps2=1.0, nats=10_000.0),
+    }
+    assert decided(candidates).effects == ('bias_walk',)
+    # What the force predicts is no drift; what time predicts may be.
+    assert decided(candidates, left_over=0.1, dimension='time_s').effects == ('bias_walk',)
+    assert decided(candidates, left_over=0.1, dimension='force').status == 'unknown'
+    too_large = {**candidates, NOTHING: fits(5.0, drift_mps2=6.0, nats=30_000.0)}
+    assert decided(too_large).status == 'unknown'
 
 
 def test_the_probabilities_sum_to_one_and_the_answer_has_the_largest():
