@@ -205,7 +205,6 @@ RESULTS = (
     'adxl_ros.api.result:FirstScreen',
     'adxl_ros.report.screen:NextStep',
     'adxl_ros.api.sensors:HasSensor',
-    'adxl_ros.simulate.motion:Motion',
 )
 """What the verbs take and return; the types of their fields follow each."""
 READ_FIRST = (
@@ -249,6 +248,7 @@ readings_mps2 = adxl.SensorModel(fit, seed=1)(force_mps2, dt_s)  # (n, 3), in a 
 """The way from arrays to a diagnosis, and the other verbs."""
 LIBRARY = (
     'adxl_ros.simulate.sensor_model:SensorModel',
+    'adxl_ros.simulate.motion:Motion',
     'adxl_ros.model.effects.base:Effect',
     'adxl_ros.model.effects.base:Parameter',
     'adxl_ros.links.support.base:Link',

@@ -32,9 +32,8 @@ class AxisRange:
     """The samples of one axis."""
 
     name: str  # Its column
-    # lowest, highest: Its extreme values, m/s², or rad/s of a gyroscope
-    lowest: float
-    highest: float
+    lowest: float  # Its lowest value, m/s², or rad/s of a gyroscope
+    highest: float  # Its highest value, in the same
     clipped: int  # Times at which it stays at an extreme value in motion
     is_stuck: bool  # Whether it never changes
     # Longest time in which it does not change although it usually does, s; 0 for none
