@@ -589,13 +589,11 @@ class Calibration(Node):
             raise SystemExit(0 if self._controller.outcome else 1)
 
     def _status(self) -> Status:
-        status, serial, values = self._controller.report()
-        return Status(self._level(), status.text, serial, values)
-
-    def _level(self) -> Level:
+        report = self._controller.report()
+        level = Level.WARN if report.status.late else Level.OK
         if self._samples.mixture():
-            return Level.ERROR
-        return Level.WARN if self._controller.status().late else Level.OK
+            level = Level.ERROR
+        return Status(level, report.status.text, report.serial, report.values)
 
     def _read_stage(self) -> None:
         """Give the commands and the angles of the stage that have come to the guide."""

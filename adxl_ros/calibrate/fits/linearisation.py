@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 from adxl_ros.calibrate.pose_model import angle_jacobian, coefficient_jacobian, predicted_volts
 from adxl_ros.calibrate.poses import Poses
@@ -52,15 +53,15 @@ class PoseCovariance:
     """
     The covariance S of the volts of k poses with m axes about the model, as an operator.
 
-    jacobian: derivatives of the volts by alpha and beta, V/rad, (k, m, 2); shared: from
-    `shared_settings`; kept: poses that count, (k,) bool; the others have no weight.
+    jacobian: derivatives of the volts by alpha and beta, V/rad, (k, m, 2); shared: the settings
+    of the poses; kept: poses that count, (k,) bool; the others have no weight.
     """
 
     def __init__(
         self,
         jacobian: np.ndarray,
         poses: Poses,
-        shared: tuple[np.ndarray, int],
+        shared: SharedSettings,
         error: StageError,
         kept: np.ndarray | None = None,
     ) -> None:
@@ -68,7 +69,8 @@ class PoseCovariance:
         self._jacobian = jacobian * error.joints
         self._error = error
         self._kept = np.ones(len(poses), bool) if kept is None else kept
-        self._number, self._shared = shared
+        self._number = shared.number
+        self._shared_count = shared.count
         # The error of a setting with only one pose is an error of that pose.
         self._pose_rad2 = error.pose_rad**2 + np.where(self._number < 0, error.setting_rad**2, 0.0)
         noise = poses.std_v[:, :, None] ** 2 * np.eye(jacobian.shape[1])
@@ -81,7 +83,7 @@ class PoseCovariance:
     @cached_property
     def _settings(self) -> np.ndarray:
         """Return σ_s·Z of the shared settings, V, (k, m, q)."""
-        columns = np.zeros((*self._jacobian.shape[:2], self._shared))
+        columns = np.zeros((*self._jacobian.shape[:2], self._shared_count))
         for joint in range(2):
             rows = np.flatnonzero(self._number[:, joint] >= 0)
             columns[rows, :, self._number[rows, joint]] += self._jacobian[rows, :, joint]
@@ -96,7 +98,7 @@ class PoseCovariance:
     def _settings_root(self) -> np.ndarray:
         """Return the Cholesky factor of 1 + σ_s²·Zᵀ B⁻¹ Z, (q, q)."""
         return np.linalg.cholesky(
-            np.eye(self._shared) + self._white_settings.T @ self._white_settings
+            np.eye(self._shared_count) + self._white_settings.T @ self._white_settings
         )
 
     def _solve_settings(self, products: np.ndarray) -> np.ndarray:
@@ -184,8 +186,15 @@ class AngleErrors:
         )
 
 
-def shared_settings(poses: Poses) -> tuple[np.ndarray, int]:
-    """Return the numbers of settings that poses share, (k, 2), −1 for others, and their count."""
+class SharedSettings(NamedTuple):
+    """The settings of alpha and beta that k poses share."""
+
+    number: np.ndarray  # Number of the setting of each joint, −1 where only one pose has it, (k, 2)
+    count: int  # Of all shared settings
+
+
+def shared_settings(poses: Poses) -> SharedSettings:
+    """Number the settings that poses share."""
     numbers = np.full((len(poses), 2), -1)
     count = 0
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
@@ -193,7 +202,7 @@ def shared_settings(poses: Poses) -> tuple[np.ndarray, int]:
         column = np.cumsum(size > 1) - 1 + count
         numbers[:, joint] = np.where(size[index] > 1, column[index], -1)
         count += int((size > 1).sum())
-    return numbers, count
+    return SharedSettings(numbers, count)
 
 
 def volts_covariance(sensor: Sensor, poses: Poses, error: StageError) -> PoseCovariance:
@@ -241,7 +250,7 @@ class Linearised:
     kept: np.ndarray  # Poses that count, (k,) bool
 
     @cached_property
-    def _shared(self) -> tuple[np.ndarray, int]:
+    def _shared(self) -> SharedSettings:
         return shared_settings(self.poses)
 
     def covariance(self, error: StageError) -> PoseCovariance:
