@@ -35,6 +35,17 @@ import numpy as np
 
 STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': full_model.fit}
 """Models that are fitted against the stage, simplest first."""
+_MAX_TURN_RAD = np.radians(0.3)
+"""Largest turn of the case between recordings, rad. Chosen: above the 0.1° of the stage's level in
+either recording, far below a new mounting."""
+_MAX_ZERO_G_SHIFT_G = 0.02
+"""Largest shift of the zero-g between recordings, g. Chosen: a healthy sensor may shift by so much
+between two days."""
+_MIN_DEVIATIONS = 6.0  # Smallest turn or shift that counts, in its stds; chosen: never by chance
+_MIN_EIGENVALUE_RATIO = 1e-10
+"""Smallest relative eigenvalue of the information whose direction counts as determined."""
+_MIN_VARIANCE = 1e-30
+"""Lower bound of the variance of a turn, rad², or shift, g², so that it can be a divisor."""
 
 
 @dataclass(frozen=True)
@@ -350,19 +361,6 @@ def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
         return full_model.fit_full(sensor, poses, linear.AFFINE, len(still_open)).fitted
 
     return _StageFit(full.fitted, refit, full, notes=notes)
-
-
-_MAX_TURN_RAD = np.radians(0.3)
-"""Largest turn of the case between recordings, rad. Chosen: above the 0.1° of the stage's level in
-either recording, far below a new mounting."""
-_MAX_ZERO_G_SHIFT_G = 0.02
-"""Largest shift of the zero-g between recordings, g. Chosen: a healthy sensor may shift by so much
-between two days."""
-_MIN_DEVIATIONS = 6.0  # Smallest turn or shift that counts, in its stds; chosen: never by chance
-_MIN_EIGENVALUE_RATIO = 1e-10
-"""Smallest relative eigenvalue of the information whose direction counts as determined."""
-_MIN_VARIANCE = 1e-30
-"""Lower bound of the variance of a turn, rad², or shift, g², so that it can be a divisor."""
 
 
 class _ContradictionError(UserError):

@@ -27,9 +27,7 @@ def reference_force(poses: Poses, gravity_mps2: float) -> Components:
     return specific_force(poses.alpha_rad, poses.beta_rad, gravity_mps2)
 
 
-def predicted_volts(
-    sensor: Sensor, poses: Poses, force: Components | None = None
-) -> np.ndarray:
+def predicted_volts(sensor: Sensor, poses: Poses, force: Components | None = None) -> np.ndarray:
     """Predict the mean output in poses, V, (k, m); the force is that at the angles by default."""
     force = force or stage_force(sensor, poses.alpha_rad, poses.beta_rad)
     return np.column_stack(signal_chain.static_response(sensor)(force, poses.environment))

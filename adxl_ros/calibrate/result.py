@@ -32,6 +32,29 @@ import numpy as np
 
 _SAME_FIT_TOLERANCE = 1e-6
 """Largest relative difference of coefficients of the same fit: the rounding in a file."""
+_ABSOLUTE = {
+    'bias.offset_v': 'nominal_zero_g_v',
+    'scale_factor.offset_v_per_g': 'nominal_scale_v_per_g',
+}
+"""Parameters that are departures from a nominal value, and the field of that value."""
+_LABELS = {
+    'bias.offset_v': 'zero-g',
+    'scale_factor.offset_v_per_g': 'scale factor',
+    'misalignment.alpha_rad': 'misalignment alpha',
+    'misalignment.beta_rad': 'misalignment beta',
+    'cross_axis.linear': 'zero-g, {other}',
+    'cross_axis.quadratic_per_g': 'zero-g, {other}²',
+    'cross_axis_z.linear': 'zero-g, {other}',
+    'cross_axis_z.quadratic_per_g': 'zero-g, {other}²',
+    'scale_factor_cross.linear_per_g': 'scale, {other}',
+    'scale_factor_z.linear_per_g': 'scale, {other}',
+    'scale_factor_z.quadratic_per_g2': 'scale, {other}²',
+    'nonlinearity.cubic_per_g2': 'cubic',
+}
+"""Parameters in words; {other} is the axis that acts on the measured axis."""
+_LONGEST_LABEL = 26  # Columns that a coefficient's name may take, so that its line has at most 79
+_COVERED = 0.9
+"""Share of the 90 % intervals that contain the true value if the intervals are right."""
 
 
 @dataclass(frozen=True)
@@ -225,28 +248,6 @@ def _unmodelled_slope(fitted: Sensor, effect: str) -> float:
     return typical or effect_named(effect).parameters[0].scale
 
 
-_ABSOLUTE = {
-    'bias.offset_v': 'nominal_zero_g_v',
-    'scale_factor.offset_v_per_g': 'nominal_scale_v_per_g',
-}
-"""Parameters that are departures from a nominal value, and the field of that value."""
-_LABELS = {
-    'bias.offset_v': 'zero-g',
-    'scale_factor.offset_v_per_g': 'scale factor',
-    'misalignment.alpha_rad': 'misalignment alpha',
-    'misalignment.beta_rad': 'misalignment beta',
-    'cross_axis.linear': 'zero-g, {other}',
-    'cross_axis.quadratic_per_g': 'zero-g, {other}²',
-    'cross_axis_z.linear': 'zero-g, {other}',
-    'cross_axis_z.quadratic_per_g': 'zero-g, {other}²',
-    'scale_factor_cross.linear_per_g': 'scale, {other}',
-    'scale_factor_z.linear_per_g': 'scale, {other}',
-    'scale_factor_z.quadratic_per_g2': 'scale, {other}²',
-    'nonlinearity.cubic_per_g2': 'cubic',
-}
-"""Parameters in words; {other} is the axis that acts on the measured axis."""
-
-
 @dataclass(frozen=True)
 class Comparison:
     """A fitted coefficient and its true value."""
@@ -308,11 +309,6 @@ def errors_in_words(fitted: Sensor) -> str:
         f'Uncalibrated, {fitted.axes[axis]} reads {mg_text(abs(offset_g[axis]) * G0_MPS2)} '
         f'too {"much" if offset_g[axis] > 0 else "little"}.'
     )
-
-
-_LONGEST_LABEL = 26  # Columns that a coefficient's name may take, so that its line has at most 79
-_COVERED = 0.9
-"""Share of the 90 % intervals that contain the true value if the intervals are right."""
 
 
 def truth_table(comparisons: Sequence[Comparison]) -> list[str]:

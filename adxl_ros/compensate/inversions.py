@@ -44,6 +44,9 @@ rate; with four it is up to a quarter, and sixteen would delay a stream twice as
 MAX_GAP = 1.5
 """Distance of neighbours, in sample periods, that is a gap between them: halfway between
 one period, with jitter, and two, where a sample is lost."""
+_NEAR_ZERO_G = 1e-6
+"""Input below which the scale factor is taken above it, g: it avoids 0/0, and the scale factor
+differs there by 1e-8 of itself."""
 
 
 def derivative_weights(half: int) -> np.ndarray:
@@ -159,11 +162,6 @@ class DelayedInversion:
         else:
             self._index += 1
         return stamp_s, undone_v, token
-
-
-_NEAR_ZERO_G = 1e-6
-"""Input below which the scale factor is taken above it, g: it avoids 0/0, and the scale factor
-differs there by 1e-8 of itself."""
 
 
 class PaperInverse:

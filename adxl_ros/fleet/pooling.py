@@ -57,6 +57,29 @@ _MIN_OF_OUTLIERS = 5  # Fewest recordings of a sensor with outliers. Chosen: a m
 _MAD_EFFICIENCY = 0.37  # Efficiency of that median for normal values (Rousseeuw and Croux 1993)
 _MAD_BIAS = 0.8
 """That median of n values is too small by the factor 1 − 0.8/n (Croux and Rousseeuw 1992)."""
+_EQUAL_VARIANCES = 1e6
+"""Degrees of freedom of the common variance where sensors do not differ. Chosen: infinite."""
+_NO_FREEDOM = 1e-6
+"""Degrees of freedom of the common variance of one sensor, which moderates none. Chosen: small."""
+MIN_SENSORS = 5
+"""Smallest count of sensors with a spread: with fewer, a further sensor has no finite variance."""
+_GRID = (np.arange(400) + 0.5) / 400
+"""Shares x of the spreads s·x/(1 − x) over which the likelihood is integrated. Chosen: more change
+the integrals by less than 1e-3."""
+_OUTLIER_CHANCE = 0.05
+"""Probability that a sensor does not count although all sensors are of one population: one of
+twenty populations is then a little too narrow."""
+_MAX_ROUNDS = 10
+"""Largest count of rounds of spread and outliers; a round seldom changes after the second."""
+_MAX_OUTLIERS = 0.25
+"""Largest share of sensors that are far out. Chosen: more are a population of their own."""
+_FAR_MADS = 5.0
+"""Sensors further from the median do not count in the first round. Chosen: far beyond normal."""
+_MIN_BATCH = 5
+"""Fewest units of a batch. Chosen: fewer have nothing in common that a test could show."""
+_CHANCE = 0.01
+"""Probability of a false batch among all batches. It is less than that of a slope, because a batch
+is sent back."""
 
 
 @dataclass(frozen=True)
@@ -328,31 +351,6 @@ def outliers(recordings: Recordings, tests: int) -> tuple[np.ndarray, np.ndarray
 def _medians(label: np.ndarray, value: np.ndarray) -> np.ndarray:
     """Return the median of the values with each label 0, 1, ..."""
     return pd.Series(value).groupby(label).median().to_numpy()
-
-
-_EQUAL_VARIANCES = 1e6
-"""Degrees of freedom of the common variance where sensors do not differ. Chosen: infinite."""
-_NO_FREEDOM = 1e-6
-"""Degrees of freedom of the common variance of one sensor, which moderates none. Chosen: small."""
-MIN_SENSORS = 5
-"""Smallest count of sensors with a spread: with fewer, a further sensor has no finite variance."""
-_GRID = (np.arange(400) + 0.5) / 400
-"""Shares x of the spreads s·x/(1 − x) over which the likelihood is integrated. Chosen: more change
-the integrals by less than 1e-3."""
-_OUTLIER_CHANCE = 0.05
-"""Probability that a sensor does not count although all sensors are of one population: one of
-twenty populations is then a little too narrow."""
-_MAX_ROUNDS = 10
-"""Largest count of rounds of spread and outliers; a round seldom changes after the second."""
-_MAX_OUTLIERS = 0.25
-"""Largest share of sensors that are far out. Chosen: more are a population of their own."""
-_FAR_MADS = 5.0
-"""Sensors further from the median do not count in the first round. Chosen: far beyond normal."""
-_MIN_BATCH = 5
-"""Fewest units of a batch. Chosen: fewer have nothing in common that a test could show."""
-_CHANCE = 0.01
-"""Probability of a false batch among all batches. It is less than that of a slope, because a batch
-is sent back."""
 
 
 def moderated(variance: np.ndarray, freedom: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -44,6 +44,8 @@ _SECONDS = {
 CSV files of 416 s at 250 Hz."""
 _IDENTITY = ('url', 'serial', 'date', 'date_source', 'calibration_id', 'calibration_age_days')
 """Columns of a recording whose content is that of another row, which has its other values."""
+_KEPT = ('written', 'key', 'outcome', 'serial', 'date', 'date_source')
+"""Columns of a row that the client keeps in memory."""
 
 
 @contextmanager
@@ -62,10 +64,6 @@ def only_client(folder: Path) -> Iterator[None]:
         file.write(f'process {os.getpid()} on {os.uname().nodename}')
         file.flush()
         yield
-
-
-_KEPT = ('written', 'key', 'outcome', 'serial', 'date', 'date_source')
-"""Columns of a row that the client keeps in memory."""
 
 
 class Entry(NamedTuple):

@@ -54,6 +54,13 @@ _YEAR = np.timedelta64(31_557_600_000_000, 'us')  # A year of 365.25 days
 TOLERANCE_MG = 3.5
 """Largest gap of a sensor that is in order, mg. Chosen: an error of 0.2° in tilt."""
 MG = mg(1.0)  # Milli-g in 1 m/s²
+_VERDICTS = ('no_gap', 'explained', 'partly', 'inseparable', 'unknown')
+"""Statuses of recordings whose effects are judged."""
+RECENT = 5
+"""Number of recordings whose median is the gap of a sensor now. Chosen: one odd one is no gap."""
+DAYS_PER_YEAR = 365.25
+_FARTHEST_DAYS = 10 * DAYS_PER_YEAR
+"""A drift that needs longer is no matter of urgency. Chosen: the life of a robot."""
 
 
 @dataclass(frozen=True)
@@ -281,15 +288,6 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
             results, np.split(is_claimed, splits), np.split(factor, splits)
         )
     ]
-
-
-_VERDICTS = ('no_gap', 'explained', 'partly', 'inseparable', 'unknown')
-"""Statuses of recordings whose effects are judged."""
-RECENT = 5
-"""Number of recordings whose median is the gap of a sensor now. Chosen: one odd one is no gap."""
-DAYS_PER_YEAR = 365.25
-_FARTHEST_DAYS = 10 * DAYS_PER_YEAR
-"""A drift that needs longer is no matter of urgency. Chosen: the life of a robot."""
 
 
 def effect_matrix(table: FleetTable) -> pd.DataFrame:

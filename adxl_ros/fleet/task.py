@@ -48,6 +48,8 @@ import numpy as np
 _SPARE_MB = 64  # Space that stays free, MB. Chosen: a task writes some MB
 _LEFT_S = 86400.0
 """Age from which a temporary folder is that of a killed worker, s. Chosen: no task takes a day."""
+_PAGES = ('explained', 'partly', 'inseparable', 'unknown')
+"""Statuses of a diagnosis that get a page. Chosen: it has 2 MB, and without a gap shows little."""
 
 
 class StagingError(Exception):
@@ -122,10 +124,6 @@ def stage(source: FoundRecording, folder: Path) -> Staged:
     if has_changed or before.size_bytes not in (None, size_bytes):
         raise StagingError(f'{url}: changed while it was read; is it still being written?')
     return Staged(target, sha256([target]), size_bytes)
-
-
-_PAGES = ('explained', 'partly', 'inseparable', 'unknown')
-"""Statuses of a diagnosis that get a page. Chosen: it has 2 MB, and without a gap shows little."""
 
 
 class Date(NamedTuple):

@@ -60,6 +60,21 @@ _SMALLEST_PER_MINUTE = 0.01
 ten minutes then change even odds by a tenth."""
 _LARGEST_NAMED = 4
 """Largest number of hypotheses in a sentence. Chosen: a reader keeps four in mind."""
+Hypotheses = tuple[WeightedHypothesis, ...]
+"""Hypotheses by falling probability, which sums to 1; no effect means no gap."""
+_NICENESS = 10  # Niceness of the process. Chosen: the node that records comes first
+_WITHOUT_DIAGNOSIS = {'bag', 'baseline.yaml'}
+"""Files of an investigation that was stopped before its first diagnosis of samples."""
+_FIRST_REST_S = 1.0
+"""Time for which samples and stage are there before the first question, s. Chosen: both topics
+have been discovered."""
+_SETTLING_S = 1.0
+"""Time at rest between a manoeuvre and its diagnosis, s. Chosen: a stage has settled."""
+_LONGEST_WAIT_S = 15.0
+"""Time that a stage may need to follow a command, s. Chosen: the slowest stages creep."""
+_OUTSIDE_RAD = 0.02
+"""Distance beyond a limit at which a stage counts as outside, rad. Chosen: above the error of an
+encoder's zero."""
 
 
 class RoundOutcome(Enum):
@@ -76,10 +91,6 @@ class RoundOutcome(Enum):
     NO_VISIBLE_GAP = 'no_visible_gap'
     INSEPARABLE = 'inseparable'
     TIME_OVER = 'time_over'
-
-
-Hypotheses = tuple[WeightedHypothesis, ...]
-"""Hypotheses by falling probability, which sums to 1; no effect means no gap."""
 
 
 @dataclass(frozen=True)
@@ -245,11 +256,6 @@ def first_or_others(names: Sequence[str]) -> str:
     return quantities.listed(shown, 'or')
 
 
-_NICENESS = 10  # Niceness of the process. Chosen: the node that records comes first
-_WITHOUT_DIAGNOSIS = {'bag', 'baseline.yaml'}
-"""Files of an investigation that was stopped before its first diagnosis of samples."""
-
-
 class OutputFolder:
     """The folder of an investigation."""
 
@@ -326,18 +332,6 @@ def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, see
         for name, text in texts.items():
             write_text(folder.path / name, text)
     return answer
-
-
-_FIRST_REST_S = 1.0
-"""Time for which samples and stage are there before the first question, s. Chosen: both topics
-have been discovered."""
-_SETTLING_S = 1.0
-"""Time at rest between a manoeuvre and its diagnosis, s. Chosen: a stage has settled."""
-_LONGEST_WAIT_S = 15.0
-"""Time that a stage may need to follow a command, s. Chosen: the slowest stages creep."""
-_OUTSIDE_RAD = 0.02
-"""Distance beyond a limit at which a stage counts as outside, rad. Chosen: above the error of an
-encoder's zero."""
 
 
 class State(Enum):

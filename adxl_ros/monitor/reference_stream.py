@@ -66,6 +66,8 @@ _GRID_NS = 4_000_000
 """Distance of the forces of a robot, ns. Chosen: an encoder shows nothing faster."""
 _SMALLEST_MPS2 = 1e-9
 """Smallest standard deviation of a block, m/s²; a simulated sensor may have no noise."""
+BlockMotion = tuple[bool, np.ndarray]
+"""Whether the reference moves in a block, and what its encoders make of the force, m/s², (3,)."""
 
 
 class StreamBuffer:
@@ -117,10 +119,6 @@ class ReferenceKind(Enum):
     STAGE = 'stage'
     IMU = 'imu'
     ROBOT = 'robot'
-
-
-BlockMotion = tuple[bool, np.ndarray]
-"""Whether the reference moves in a block, and what its encoders make of the force, m/s², (3,)."""
 
 
 class ReferenceStream:

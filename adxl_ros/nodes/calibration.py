@@ -43,6 +43,68 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+_SCREEN_END_S = 5.0
+"""Longest wait for the end of the screen, s. It ends within one callback, 0.02 s; a process that
+hangs is killed after this, and the node's own end waits as long."""
+_RESET = b'\x1b[?1049l\x1b[?2004l\x1b[?25h\x1b[0m'
+"""Leaves alternate screen and bracketed paste and shows the cursor, by the codes of xterm."""
+_REPEAT_NS = 500_000_000
+"""Time between two commands of the same pose, ns: a stage that starts late, or that has lost the
+first command, loses at most this of a pose of seconds."""
+_COMMAND_QUEUE = 10
+"""Commands that are kept for a recorder that stalls: a bag then has every command."""
+_PERIOD_S = 0.2
+"""Time between two messages, s: numbers that change more often than 5 times a second are not
+read."""
+_ABORT = KeyAction('a', 'abort', 'abort')
+_RUNNING = (
+    KeyAction('r', 'redo', 'redo'),
+    KeyAction('s', 'skip', 'skip'),
+    KeyAction('f', 'finish', 'finish'),
+    _ABORT,
+)
+"""Keys while a session runs."""
+_BY_HAND = (KeyAction('c', 'capture', 'capture'), *_RUNNING)
+"""Keys while a session runs whose poses an operator captures."""
+_KEYS = {
+    ControllerState.IDLE: (KeyAction('b', 'begin', 'start'),),
+    ControllerState.WAITING_FOR_SENSOR: (_ABORT,),
+    ControllerState.ASKING: (
+        KeyAction('y', 'go on', 'resume'),
+        KeyAction('n', 'begin again', 'start_over'),
+        _ABORT,
+    ),
+}
+"""Keys while no session runs, by the state."""
+_POLL_S = 0.02
+"""Time between two steps of the controller, s. It ends a dwell late by at most this: by 1 % of 2
+s, and by 0.4 s where sensor time is twenty times real time."""
+_FAREWELL_NS = 2_500_000_000
+"""Time from the end of a calibration to that of the node, ns: two reports of the diagnostics, one
+a second, come within it, so that a screen or recorder has the result."""
+_QUEUE = 100
+"""Messages that wait while the node fits: 100 s of temperature and supply at 1 Hz; a fit takes
+some seconds."""
+_STAGE_TOPICS = ('stage/command', 'stage/joint_states')
+_STAGE_QUEUE = 1000
+"""Messages of the stage that wait meanwhile; more, because its angles come faster."""
+_CHECK_POSES = {'full': 16, 'quick': 8}
+"""Check poses by kind of the pose plan. Their rms is then known within 18 and 25 %. They are about
+a tenth, or a fifth, of the poses; more of them would weaken the fit."""
+_EXAMPLES = {
+    'a stage that is turned by hand': '--ros-args -p stage.mode:=manual -p output:=unit.yaml',
+    'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml',
+}
+"""Examples of arguments, by their purpose."""
+_SAMPLES = 'imu/data_raw'  # Topic of the samples, relative to the namespace of the node
+_YAW_VARIANCE = 8
+"""Place of the variance of yaw in an orientation's covariance of 9 numbers, from 0."""
+_INFO_NS = 1_000_000_000
+"""Time that samples wait for `sensor_info`, ns. A latched message comes within it, also where
+sensor time is ten times real time; until then nothing is measured, so that more delays the first
+pose."""
+_SAMPLES_QUEUE = 20000  # Samples that are kept: 20 s at 1 kHz, longer than a fit takes
+
 
 @dataclass(frozen=True)
 class CalibrationSettings:
@@ -147,13 +209,6 @@ class CalibrationSettings:
     )
 
 
-_SCREEN_END_S = 5.0
-"""Longest wait for the end of the screen, s. It ends within one callback, 0.02 s; a process that
-hangs is killed after this, and the node's own end waits as long."""
-_RESET = b'\x1b[?1049l\x1b[?2004l\x1b[?25h\x1b[0m'
-"""Leaves alternate screen and bracketed paste and shows the cursor, by the codes of xterm."""
-
-
 def open_screen(node_name: str, log: Callable[[str], object]) -> OwnScreen | None:
     """Start a screen if this process has a terminal, and is no background job of it."""
     is_terminal = all(stream and stream.isatty() for stream in (sys.stdin, sys.stdout))
@@ -208,13 +263,6 @@ class OwnScreen:
         self._output.close()
 
 
-_REPEAT_NS = 500_000_000
-"""Time between two commands of the same pose, ns: a stage that starts late, or that has lost the
-first command, loses at most this of a pose of seconds."""
-_COMMAND_QUEUE = 10
-"""Commands that are kept for a recorder that stalls: a bag then has every command."""
-
-
 class Announcer:
     """
     Announces the next pose.
@@ -264,32 +312,6 @@ class Announcer:
 
     def _publish(self, text: str, values: Mapping[str, str | float]) -> None:
         self._next.publish(status_message('next_pose', Status(Level.OK, text, '', values)))
-
-
-_PERIOD_S = 0.2
-"""Time between two messages, s: numbers that change more often than 5 times a second are not
-read."""
-
-_ABORT = KeyAction('a', 'abort', 'abort')
-_RUNNING = (
-    KeyAction('r', 'redo', 'redo'),
-    KeyAction('s', 'skip', 'skip'),
-    KeyAction('f', 'finish', 'finish'),
-    _ABORT,
-)
-"""Keys while a session runs."""
-_BY_HAND = (KeyAction('c', 'capture', 'capture'), *_RUNNING)
-"""Keys while a session runs whose poses an operator captures."""
-_KEYS = {
-    ControllerState.IDLE: (KeyAction('b', 'begin', 'start'),),
-    ControllerState.WAITING_FOR_SENSOR: (_ABORT,),
-    ControllerState.ASKING: (
-        KeyAction('y', 'go on', 'resume'),
-        KeyAction('n', 'begin again', 'start_over'),
-        _ABORT,
-    ),
-}
-"""Keys while no session runs, by the state."""
 
 
 class DisplayPublisher:
@@ -365,36 +387,6 @@ class DisplayPublisher:
                 ).to_json()
             )
         )
-
-
-_POLL_S = 0.02
-"""Time between two steps of the controller, s. It ends a dwell late by at most this: by 1 % of 2
-s, and by 0.4 s where sensor time is twenty times real time."""
-_FAREWELL_NS = 2_500_000_000
-"""Time from the end of a calibration to that of the node, ns: two reports of the diagnostics, one
-a second, come within it, so that a screen or recorder has the result."""
-_QUEUE = 100
-"""Messages that wait while the node fits: 100 s of temperature and supply at 1 Hz; a fit takes
-some seconds."""
-_STAGE_TOPICS = ('stage/command', 'stage/joint_states')
-_STAGE_QUEUE = 1000
-"""Messages of the stage that wait meanwhile; more, because its angles come faster."""
-_CHECK_POSES = {'full': 16, 'quick': 8}
-"""Check poses by kind of the pose plan. Their rms is then known within 18 and 25 %. They are about
-a tenth, or a fifth, of the poses; more of them would weaken the fit."""
-_EXAMPLES = {
-    'a stage that is turned by hand': '--ros-args -p stage.mode:=manual -p output:=unit.yaml',
-    'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml',
-}
-"""Examples of arguments, by their purpose."""
-_SAMPLES = 'imu/data_raw'  # Topic of the samples, relative to the namespace of the node
-_YAW_VARIANCE = 8
-"""Place of the variance of yaw in an orientation's covariance of 9 numbers, from 0."""
-_INFO_NS = 1_000_000_000
-"""Time that samples wait for `sensor_info`, ns. A latched message comes within it, also where
-sensor time is ten times real time; until then nothing is measured, so that more delays the first
-pose."""
-_SAMPLES_QUEUE = 20000  # Samples that are kept: 20 s at 1 kHz, longer than a fit takes
 
 
 class WaitingSamples:

@@ -42,6 +42,30 @@ from rclpy.task import Future
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
+_MOUNTING = 'mounting.'  # Begin of the names of the parameters of the mounting
+_RPY = f'{_MOUNTING}rpy_rad'  # Parameter of the rotation
+_LEVEL_S = 1.0
+"""Time over which a rest is averaged, s. At 100 Hz the mean has a tenth of the noise of a sample,
+0.003° of tilt for an ADXL203."""
+_FEWEST_SAMPLES = 10
+"""Smallest number of samples of that rest: their scatter is then known within a quarter, which
+tells motion from noise."""
+_MAX_NOISE = 3.0
+"""Largest scatter of a rest, in standard deviations of a sample's noise. The scatter of ten
+samples at rest exceeds twice that in one of 25 000 rests, three times never."""
+_MAX_GRAVITY_ERROR = 0.1
+"""Largest relative departure of a rest from gravity: beyond the zero-g of an uncalibrated ADXL203,
+0.1 g, another unit of measurement or motion explains it."""
+_DEPTH = 100  # Samples that are kept while the node is busy: 0.1 s at 1 kHz
+_LOOK_S = 0.5
+"""Time between two looks at who publishes and, where it is unknown, at the sensor, s. A driver
+that was exchanged is noticed within it, before its first rest; discovery itself takes 0.3 s."""
+_EXAMPLES = {
+    'the newest calibration of the unit in the store': '',
+    'a calibration by its file': '--ros-args -p calibration:=unit.yaml',
+}
+"""Examples of arguments, by their purpose."""
+
 
 @dataclass(frozen=True)
 class CompensationSettings:
@@ -92,22 +116,6 @@ class CompensationSettings:
         'frame of the robot, in the header where the case is turned',
         name='mounting.frame_id',
     )
-
-
-_MOUNTING = 'mounting.'  # Begin of the names of the parameters of the mounting
-_RPY = f'{_MOUNTING}rpy_rad'  # Parameter of the rotation
-_LEVEL_S = 1.0
-"""Time over which a rest is averaged, s. At 100 Hz the mean has a tenth of the noise of a sample,
-0.003° of tilt for an ADXL203."""
-_FEWEST_SAMPLES = 10
-"""Smallest number of samples of that rest: their scatter is then known within a quarter, which
-tells motion from noise."""
-_MAX_NOISE = 3.0
-"""Largest scatter of a rest, in standard deviations of a sample's noise. The scatter of ten
-samples at rest exceeds twice that in one of 25 000 rests, three times never."""
-_MAX_GRAVITY_ERROR = 0.1
-"""Largest relative departure of a rest from gravity: beyond the zero-g of an uncalibrated ADXL203,
-0.1 g, another unit of measurement or motion explains it."""
 
 
 class MountingParameters:
@@ -240,17 +248,6 @@ def _mounting_of(path: str, sensor: Sensor) -> Mounting | None:
         if rpy_rad is None
         else _mounting(rpy_rad, lambda key, reason: UserError(f'{path}: {key}: {reason}'))
     )
-
-
-_DEPTH = 100  # Samples that are kept while the node is busy: 0.1 s at 1 kHz
-_LOOK_S = 0.5
-"""Time between two looks at who publishes and, where it is unknown, at the sensor, s. A driver
-that was exchanged is noticed within it, before its first rest; discovery itself takes 0.3 s."""
-_EXAMPLES = {
-    'the newest calibration of the unit in the store': '',
-    'a calibration by its file': '--ros-args -p calibration:=unit.yaml',
-}
-"""Examples of arguments, by their purpose."""
 
 
 class Compensation(Node):

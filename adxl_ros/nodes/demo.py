@@ -301,10 +301,7 @@ def _held_out_errors(nominal: Sensor, fitted: Sensor, poses: Poses) -> list[Held
         'linear': linear.fit(nominal, poses.subset(~poses.check)),
         fitted.model: fitted,
     }
-    return [
-        summarise(model, pose_errors(sensor, checks))
-        for model, sensor in models.items()
-    ]
+    return [summarise(model, pose_errors(sensor, checks)) for model, sensor in models.items()]
 
 
 def file_lines(values: dict[str, object]) -> list[str]:

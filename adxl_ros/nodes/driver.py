@@ -24,6 +24,14 @@ from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 DEFAULT_FRAME = 'imu_link'  # Frame of the case, unless a parameter or a simulator states it
+_SIMULATED = f'SIMULATED sensor (link.type: {base.DEFAULT_LINK})'
+"""Words of log and diagnostics where no sensor is read."""
+_EXAMPLES = {
+    'a board on a serial port': '--ros-args -p link.type:=serial -p link.port:=/dev/ttyACM0',
+    "a realistic sensor on a simulator's ideal one": '--ros-args -p link.type:=topic -p '
+    'link.topic:=/imu -p use_sim_time:=true --params-file gap/params.yaml',
+}
+"""Examples of arguments, by their purpose."""
 
 
 @dataclass(frozen=True)
@@ -48,16 +56,6 @@ class DriverSettings:
         '', 'frame of the case; empty: imu_link, or as a simulator states it'
     )
     autostart: bool = parameter(True, 'configure and activate at the start')
-
-
-_SIMULATED = f'SIMULATED sensor (link.type: {base.DEFAULT_LINK})'
-"""Words of log and diagnostics where no sensor is read."""
-_EXAMPLES = {
-    'a board on a serial port': '--ros-args -p link.type:=serial -p link.port:=/dev/ttyACM0',
-    "a realistic sensor on a simulator's ideal one": '--ros-args -p link.type:=topic -p '
-    'link.topic:=/imu -p use_sim_time:=true --params-file gap/params.yaml',
-}
-"""Examples of arguments, by their purpose."""
 
 
 def _transition(goal: str, *acts: str) -> Callable[..., TransitionCallbackReturn]:

@@ -33,6 +33,38 @@ from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
+_INDENT = 11 * ' '  # Spaces in place of the time at the beginning of a line
+_MOST_NAMED = 3
+"""Largest number of hypotheses in a line: more of them fill the line of a terminal."""
+_SAMPLES = 'imu/data_raw'
+_STAGE = 'stage/joint_states'
+_KINDS = {
+    _SAMPLES: Imu,
+    _STAGE: JointState,
+    'stage/command': JointState,
+    'temperature': Temperature,
+    'supply': BatteryState,
+    'sensor_info': DiagnosticStatus,
+}
+"""Type of each recorded topic."""
+_QUEUE = 20000  # Messages of a topic that are kept while the node is busy: 20 s at 1 kHz
+_POLL_S = 0.02
+"""Time between two commands, s: a tenth of `LONGEST_STEP_S`, by which a command is ahead of the
+stage. A command that is late by one turn of the loop is still in time."""
+_FAREWELL_S = 0.5
+"""Time for which the last command is repeated at the end, s: 25 times, so that a subscriber that
+loses messages has it. Until then the stage goes on to an older one."""
+_COMMAND_QUEUE = 10
+"""Commands that are kept for a slow subscriber: 0.2 s of them; an older one moves nothing any
+more."""
+_EXAMPLES = {
+    'a unit by its parameter file, within limits': (
+        '--ros-args --params-file unit.yaml -p limits.rate_deg_s:=10.0 '
+        "-p 'limits.beta_deg:=[-90.0,90.0]'"
+    )
+}
+"""Examples of arguments, by their purpose."""
+
 
 @dataclass(frozen=True)
 class InvestigateSettings:
@@ -54,11 +86,6 @@ class InvestigateSettings:
         15.0, 'largest time of all manoeuvres together', 'min', 0.5, 240.0, name='limits.minutes'
     )
     seed: int = parameter(0, 'seed of the diagnosis', '', *SEEDS)
-
-
-_INDENT = 11 * ' '  # Spaces in place of the time at the beginning of a line
-_MOST_NAMED = 3
-"""Largest number of hypotheses in a line: more of them fill the line of a terminal."""
 
 
 def answer_lines(minutes: float, answer: Answer) -> list[str]:
@@ -88,37 +115,6 @@ def closing_lines(ended: Investigation, folder: OutputFolder) -> list[str]:
         '',
         *end_lines([ended.answers[-1][1].sentence], files, command('simulate', shlex.join(words))),
     ]
-
-
-_SAMPLES = 'imu/data_raw'
-_STAGE = 'stage/joint_states'
-_KINDS = {
-    _SAMPLES: Imu,
-    _STAGE: JointState,
-    'stage/command': JointState,
-    'temperature': Temperature,
-    'supply': BatteryState,
-    'sensor_info': DiagnosticStatus,
-}
-"""Type of each recorded topic."""
-_QUEUE = 20000  # Messages of a topic that are kept while the node is busy: 20 s at 1 kHz
-
-_POLL_S = 0.02
-"""Time between two commands, s: a tenth of `LONGEST_STEP_S`, by which a command is ahead of the
-stage. A command that is late by one turn of the loop is still in time."""
-_FAREWELL_S = 0.5
-"""Time for which the last command is repeated at the end, s: 25 times, so that a subscriber that
-loses messages has it. Until then the stage goes on to an older one."""
-_COMMAND_QUEUE = 10
-"""Commands that are kept for a slow subscriber: 0.2 s of them; an older one moves nothing any
-more."""
-_EXAMPLES = {
-    'a unit by its parameter file, within limits': (
-        '--ros-args --params-file unit.yaml -p limits.rate_deg_s:=10.0 '
-        "-p 'limits.beta_deg:=[-90.0,90.0]'"
-    )
-}
-"""Examples of arguments, by their purpose."""
 
 
 class Investigate(Node):

@@ -32,6 +32,22 @@ from rclpy.node import Node
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
+_INPUT_QUEUE = 10000  # Messages that are kept while the node is busy: 10 s at 1 kHz
+_TURN_S = 0.2
+"""Time between two looks at the topics, s. A look costs as much as ten messages: at 1 kHz a
+twentieth of the work. Rests last for seconds, so that nothing is lost by it."""
+_STEPS = 20
+"""Steps of a ramp. A change of 5 mg has steps of 0.25 mg, below the noise of a sample of an
+ADXL203, 0.5 mg."""
+_SENT_AGAIN_S = 3600.0
+"""Time after which a grown covariance is sent, s. Drift of 1 mg in a year changes it by 10⁻⁴ mg in
+this time; a subscriber that starts anew has a latched message."""
+_EXAMPLES = {
+    'a robot at work': '--ros-args --params-file unit.yaml',
+    'only report what would be adopted': '--ros-args --params-file unit.yaml -p dry_run:=true',
+}
+"""Examples of arguments, by their purpose."""
+
 
 @dataclass(frozen=True)
 class KeepCalibratedSettings:
@@ -55,23 +71,6 @@ class KeepCalibratedSettings:
     output: str = parameter(
         str(calibration_store.default_folder().with_name('kept')), 'folder of the journal'
     )
-
-
-_INPUT_QUEUE = 10000  # Messages that are kept while the node is busy: 10 s at 1 kHz
-_TURN_S = 0.2
-"""Time between two looks at the topics, s. A look costs as much as ten messages: at 1 kHz a
-twentieth of the work. Rests last for seconds, so that nothing is lost by it."""
-_STEPS = 20
-"""Steps of a ramp. A change of 5 mg has steps of 0.25 mg, below the noise of a sample of an
-ADXL203, 0.5 mg."""
-_SENT_AGAIN_S = 3600.0
-"""Time after which a grown covariance is sent, s. Drift of 1 mg in a year changes it by 10⁻⁴ mg in
-this time; a subscriber that starts anew has a latched message."""
-_EXAMPLES = {
-    'a robot at work': '--ros-args --params-file unit.yaml',
-    'only report what would be adopted': '--ros-args --params-file unit.yaml -p dry_run:=true',
-}
-"""Examples of arguments, by their purpose."""
 
 
 class _Receiver:

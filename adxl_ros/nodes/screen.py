@@ -30,18 +30,8 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-
-@dataclass(frozen=True)
-class ScreenSettings:
-    """The screen."""
-
-    node: str = parameter('calibration', 'name of the calibration node')
-    node_pid: int = parameter(0, 'process of the node that has started this screen')
-
-
 Styled = tuple[str, str]  # A style of prompt_toolkit and its text
 Line = list[Styled]  # A line of the screen
-
 _COLOURS = {
     Phase.DWELL: 'ansigreen',
     Phase.REFUSED: 'ansired',
@@ -80,6 +70,14 @@ _STYLES = {Log.WARN: 'ansiyellow', Log.ERROR: 'ansired', Log.FATAL: 'ansired'}
 _PLAIN = 'ansibrightblack'  # Style of other log lines
 _EXAMPLES = {'in the namespace of the sensor': '--ros-args -r __ns:=/arm'}
 """Examples of arguments, by their purpose."""
+
+
+@dataclass(frozen=True)
+class ScreenSettings:
+    """The screen."""
+
+    node: str = parameter('calibration', 'name of the calibration node')
+    node_pid: int = parameter(0, 'process of the node that has started this screen')
 
 
 def draw(contents: ScreenContents, log: Iterable[Styled], columns: int, rows: int) -> list[Line]:

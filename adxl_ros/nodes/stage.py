@@ -26,6 +26,42 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 _RESOLUTION = SENSOR_FIELDS['stage.resolution_rad'].metadata
 """Description of the resolution of the encoders."""
+_STEP_NS = 10_000_000
+"""Step of the simulation, ns: 100 poses a second, as the controller of a stage sends."""
+_JUMP_NS = 1_000_000_000
+"""Smallest jump of ROS time after which the motion goes on from there, ns: a hundred steps. Less
+is a process that was held up, and its steps are made up."""
+_QUEUE = 1000  # Poses that are kept for a slow subscriber: 10 s of ROS time
+_ANGLES = ('alpha', 'beta')  # Joints of a real stage
+_SILENT_NS = 2_000_000_000
+"""Time without joint states after which diagnostics warn, ns: controllers send at 10 Hz or more,
+so that twenty are missing."""
+_GRACE_NS = 2_000_000_000
+"""Time that a motion may take beyond its duration before its command is sent again, ns: a
+controller that settles needs less, and a lost command delays a pose by no more."""
+_ARRIVED_RAD = 0.01
+"""Largest distance from the goal of a joint that has arrived, rad: 0.6°. Stages without feedback
+err by tenths of a degree; the angle that counts is the one that is read."""
+_SHORTEST_S = 0.2
+"""Shortest duration of a trajectory, s: controllers refuse one in the past, and a command is on
+its way for up to 0.1 s."""
+_BRIDGE_QUEUE = 100
+"""Positions that are kept for a slow subscriber: 1 s of a controller at 100 Hz."""
+_COMMAND_QUEUE = 10
+"""Commands that are kept, of the calibration and for the controller: only the newest moves the
+stage, and the others are those of seconds before."""
+_STATES_QUEUE = 1000
+"""Joint states of the controller that are kept: 1 s of the fastest controllers."""
+_DEFAULT_COMMANDS = {
+    'trajectory': '/joint_trajectory_controller/joint_trajectory',
+    'joint_state': '/joint_commands',
+}
+"""Usual topics of the controllers' commands, by kind."""
+_EXAMPLES = {
+    'the bridge to a controller of ros2_control': '--ros-args -p stage.type:=trajectory '
+    '-p bridge.alpha.joint:=tilt -p bridge.beta.joint:=turn'
+}
+"""Examples of arguments, by their purpose."""
 
 
 @dataclass(frozen=True)
@@ -110,15 +146,6 @@ class BridgeSettings:
     speed_rad_s: float = parameter(
         0.3, 'speed of a trajectory', 'rad/s', 1e-4, 10.0, name='bridge.speed_rad_s'
     )
-
-
-_STEP_NS = 10_000_000
-"""Step of the simulation, ns: 100 poses a second, as the controller of a stage sends."""
-_JUMP_NS = 1_000_000_000
-"""Smallest jump of ROS time after which the motion goes on from there, ns: a hundred steps. Less
-is a process that was held up, and its steps are made up."""
-_QUEUE = 1000  # Poses that are kept for a slow subscriber: 10 s of ROS time
-_ANGLES = ('alpha', 'beta')  # Joints of a real stage
 
 
 class SimulatedStageNode:
@@ -216,32 +243,6 @@ class SimulatedStageNode:
             self._refusal = ''
         values = {name: float(p) for name, p in zip(JOINTS, self._stage.encoder())}
         return Status(level, text, 'simulated', {**values, 'refused': self._refusal_count})
-
-
-_SILENT_NS = 2_000_000_000
-"""Time without joint states after which diagnostics warn, ns: controllers send at 10 Hz or more,
-so that twenty are missing."""
-_GRACE_NS = 2_000_000_000
-"""Time that a motion may take beyond its duration before its command is sent again, ns: a
-controller that settles needs less, and a lost command delays a pose by no more."""
-_ARRIVED_RAD = 0.01
-"""Largest distance from the goal of a joint that has arrived, rad: 0.6°. Stages without feedback
-err by tenths of a degree; the angle that counts is the one that is read."""
-_SHORTEST_S = 0.2
-"""Shortest duration of a trajectory, s: controllers refuse one in the past, and a command is on
-its way for up to 0.1 s."""
-_BRIDGE_QUEUE = 100
-"""Positions that are kept for a slow subscriber: 1 s of a controller at 100 Hz."""
-_COMMAND_QUEUE = 10
-"""Commands that are kept, of the calibration and for the controller: only the newest moves the
-stage, and the others are those of seconds before."""
-_STATES_QUEUE = 1000
-"""Joint states of the controller that are kept: 1 s of the fastest controllers."""
-_DEFAULT_COMMANDS = {
-    'trajectory': '/joint_trajectory_controller/joint_trajectory',
-    'joint_state': '/joint_commands',
-}
-"""Usual topics of the controllers' commands, by kind."""
 
 
 class StageBridge:
@@ -402,13 +403,6 @@ class StageBridge:
             )
         is_there = self._arrived() or np.isnan(self._goal_rad).any()
         return Level.OK, 'at rest' if is_there else 'on the way'
-
-
-_EXAMPLES = {
-    'the bridge to a controller of ros2_control': '--ros-args -p stage.type:=trajectory '
-    '-p bridge.alpha.joint:=tilt -p bridge.beta.joint:=turn'
-}
-"""Examples of arguments, by their purpose."""
 
 
 class Stage(Node):

@@ -60,6 +60,13 @@ s."""
 _MIXED_S = 3.0
 """Time within which sequence numbers step back twice where two publishers mix, s: longer than the
 period of slow samples, 1 s, and shorter than two starts of a driver."""
+_SURROUNDINGS = {
+    'temperature': (Temperature, cdr.temperature, 'temperature'),
+    'supply': (BatteryState, cdr.battery_state, 'voltage'),
+}
+"""Type, layout and field of each topic."""
+_PERIOD_S = 1.0  # Time between two reports, s; the usual rate of ROS diagnostics
+_REPORTS = 10  # Reports that are kept for a slow subscriber
 
 
 def create_publisher(
@@ -357,13 +364,6 @@ class Inbox:
         self._node.destroy_subscription(self._subscription)
 
 
-_SURROUNDINGS = {
-    'temperature': (Temperature, cdr.temperature, 'temperature'),
-    'supply': (BatteryState, cdr.battery_state, 'voltage'),
-}
-"""Type, layout and field of each topic."""
-
-
 class SurroundingTopics:
     """Keeps temperature, °C, and supply, V, until they are taken, before samples of that time."""
 
@@ -379,10 +379,6 @@ class SurroundingTopics:
                 _, layout, field = _SURROUNDINGS[topic]
                 stamps_ns, fields = decoded(messages, layout, **{field: 1})
                 yield topic, stamps_ns, fields[field]
-
-
-_PERIOD_S = 1.0  # Time between two reports, s; the usual rate of ROS diagnostics
-_REPORTS = 10  # Reports that are kept for a slow subscriber
 
 
 @dataclass(frozen=True)

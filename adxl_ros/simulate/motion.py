@@ -26,6 +26,39 @@ import scipy
 INTERNAL_RATE_HZ = 1000.0
 """Lowest rate at which the chain runs, Hz; chosen: slow samples then get the motion between
 them, up to the bandwidth of the sensor."""
+POINTS = 6  # Points of the polynomial between the steps of a grid; chosen: as exact as the filters
+_DEGREE = 5  # Degree of the splines of joints; chosen: quintic, so that the acceleration is smooth
+BAND_LIMITED_DEGREE = 11
+"""Degree of the spline through exact readings of a motion that is nearly as fast as its sampling;
+chosen: the acceleration of 40 Hz, sampled at 100 Hz, is exact to 0.1 %, by quintic splines to
+3 %."""
+_MAX_UNEVENNESS = 3.0
+"""Longest interval of readings, divided by the median, that splines of a higher degree bridge;
+chosen: they overshoot in longer ones."""
+KNOT_S = 0.03  # Distance of the knots, s; chosen: below 10 Hz motion is free
+_WINDOW_S = 60.0  # Length of a window, s; chosen: its normal equations are small
+_MARGIN_S = 3.0  # Overlap of windows, s; chosen: beyond the range of the penalty
+_PROBES = 12  # Windows that the strength of the penalty is matched to; chosen: enough for a median
+_MIN_MOVING = 100  # Fewest readings in motion for a strength; chosen: rms within 7 %
+_USUAL_STRENGTH = 1.0  # Strength where too few move; chosen: of quick moves
+_BOUNDED_SHARE = 0.03
+"""Strength of the penalty within bounds, divided by the matched one. Tuned, with `_REST_WEIGHT`,
+on manoeuvres of the package from 25 to 250 Hz behind encoders of 0.083 and 0.01°: 0.01 to 1
+differ by 10 %."""
+_REST_WEIGHT = 0.1  # Weight of a reading at rest beside its bounds; tuned as `_BOUNDED_SHARE`
+_BOUND_ROUNDS = 40  # Iterations over the bounds; chosen: 100 change the error in motion by 5 %
+_ERROR_FACTOR = 2.0
+"""Error in motion, times readings per second, divided by step and corner frequency; measured on
+the same manoeuvres: 0.3 to 2."""
+_RIDGE = 1e-12  # Relative addition to the diagonal; chosen: for empty coefficients only
+_STRENGTHS = (10.0 ** np.arange(-12, 13, 0.5)).tolist()  # Tried strengths; chosen: half decades
+_REST_GAP = 8  # Median gaps and samples between changes at rest; chosen: above a slow move
+_SMALLEST_CHANGE = 1e-6  # Change in steps that is a rounding error; chosen: above floats
+_WHOLE = 0.05  # Deviation from whole steps; chosen: 5 steps of 0.083° for 1/12°
+_FINER = 0.03  # Largest step of a finer reference, steps; interpolated readings have 0.08
+_READING_QUANTILE = 0.9
+"""Quantile of the distances between bends that is the distance of two readings. Chosen: a reading
+between two samples bends the line at both of them, so that half of the distances are 1."""
 
 
 class Path(Protocol):
@@ -117,9 +150,6 @@ def encoder_reading(position: np.ndarray, resolution: float | np.ndarray) -> np.
         return np.where(resolution, np.rint(position / resolution) * resolution, position)
 
 
-POINTS = 6  # Points of the polynomial between the steps of a grid; chosen: as exact as the filters
-
-
 def lagrange_weights(position: np.ndarray) -> np.ndarray:
     """Return the weights of `POINTS` steps for interpolation at positions, (n, points)."""
     nodes = np.arange(POINTS)
@@ -149,40 +179,6 @@ def check_needs(sensor: Sensor, motion: Motion) -> None:
                 raise UserError(
                     f'{name} acts on the {need.value}, but {reason}; leave the effect out'
                 )
-
-
-_DEGREE = 5  # Degree of the splines of joints; chosen: quintic, so that the acceleration is smooth
-BAND_LIMITED_DEGREE = 11
-"""Degree of the spline through exact readings of a motion that is nearly as fast as its sampling;
-chosen: the acceleration of 40 Hz, sampled at 100 Hz, is exact to 0.1 %, by quintic splines to
-3 %."""
-_MAX_UNEVENNESS = 3.0
-"""Longest interval of readings, divided by the median, that splines of a higher degree bridge;
-chosen: they overshoot in longer ones."""
-KNOT_S = 0.03  # Distance of the knots, s; chosen: below 10 Hz motion is free
-_WINDOW_S = 60.0  # Length of a window, s; chosen: its normal equations are small
-_MARGIN_S = 3.0  # Overlap of windows, s; chosen: beyond the range of the penalty
-_PROBES = 12  # Windows that the strength of the penalty is matched to; chosen: enough for a median
-_MIN_MOVING = 100  # Fewest readings in motion for a strength; chosen: rms within 7 %
-_USUAL_STRENGTH = 1.0  # Strength where too few move; chosen: of quick moves
-_BOUNDED_SHARE = 0.03
-"""Strength of the penalty within bounds, divided by the matched one. Tuned, with `_REST_WEIGHT`,
-on manoeuvres of the package from 25 to 250 Hz behind encoders of 0.083 and 0.01°: 0.01 to 1
-differ by 10 %."""
-_REST_WEIGHT = 0.1  # Weight of a reading at rest beside its bounds; tuned as `_BOUNDED_SHARE`
-_BOUND_ROUNDS = 40  # Iterations over the bounds; chosen: 100 change the error in motion by 5 %
-_ERROR_FACTOR = 2.0
-"""Error in motion, times readings per second, divided by step and corner frequency; measured on
-the same manoeuvres: 0.3 to 2."""
-_RIDGE = 1e-12  # Relative addition to the diagonal; chosen: for empty coefficients only
-_STRENGTHS = (10.0 ** np.arange(-12, 13, 0.5)).tolist()  # Tried strengths; chosen: half decades
-_REST_GAP = 8  # Median gaps and samples between changes at rest; chosen: above a slow move
-_SMALLEST_CHANGE = 1e-6  # Change in steps that is a rounding error; chosen: above floats
-_WHOLE = 0.05  # Deviation from whole steps; chosen: 5 steps of 0.083° for 1/12°
-_FINER = 0.03  # Largest step of a finer reference, steps; interpolated readings have 0.08
-_READING_QUANTILE = 0.9
-"""Quantile of the distances between bends that is the distance of two readings. Chosen: a reading
-between two samples bends the line at both of them, so that half of the distances are 1."""
 
 
 @dataclass(frozen=True)

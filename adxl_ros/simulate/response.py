@@ -51,6 +51,11 @@ _ROUNDING = 1e-9  # Rounding error of a ratio of two rates
 _ANALOG = tuple(place for place in Place if place not in (Place.ADC, Place.CODE))
 """Places of the chain up to the filter, with the clock."""
 _NOISE_MEMORY = 50  # RC over which missing noise is drawn; chosen: e⁻⁵⁰ is left
+_SEED = 0  # Seed of noise-like effects in a comparison
+_QUIET = 1e-9  # Factor of white noise in a comparison; chosen: invisible, but not 0
+_FINE_BITS = 32  # Resolution of the ADC in a comparison, bit; chosen: its steps are invisible
+_RATE_HZ = 250.0  # Largest rate there, Hz; chosen: twice the bandwidth of the motion
+_SHORT_RC_S = 1e-9  # RC of a filter that does nothing, s; chosen: not 0
 
 
 class _Grid:
@@ -458,13 +463,6 @@ def _references(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:
         if not isinstance(motion.shift, Held):
             columns['shift_m'] = motion.shift(time_s)
     return columns | {name: path(time_s) for name, path in motion.environment.items()}
-
-
-_SEED = 0  # Seed of noise-like effects in a comparison
-_QUIET = 1e-9  # Factor of white noise in a comparison; chosen: invisible, but not 0
-_FINE_BITS = 32  # Resolution of the ADC in a comparison, bit; chosen: its steps are invisible
-_RATE_HZ = 250.0  # Largest rate there, Hz; chosen: twice the bandwidth of the motion
-_SHORT_RC_S = 1e-9  # RC of a filter that does nothing, s; chosen: not 0
 
 
 def change_mg(

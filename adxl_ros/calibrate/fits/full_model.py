@@ -106,6 +106,28 @@ _SHAPE_STEP = 1.05  # Ratio of neighbouring trial values of a shape parameter
 _SHAPE_STEPS = 60
 """Number of trial values on each side of the typical one: from 1/19 to 19 times that value."""
 _FINE_SHAPES = 15  # Number of trial values between the neighbours of the likeliest value
+ALWAYS = ('bias', 'scale_factor')  # Terms that every fit has and that are not compared
+MAX_OPEN = 3
+"""Largest number of the twelve coefficients that their priors may give. Chosen: an axis that never
+points up or down leaves its scale factor and two misalignments open."""
+_MIN_CHANGE = {'temperature_c': 0.5, 'supply_v': 0.02}
+"""Smallest range of temperature, °C, and supply, V, for which effects that follow them are
+candidates. Chosen: 0.5 °C changes the zero-g by 0.05 mg, about the noise of a mean."""
+_MAX_ADDED = 6  # Largest count of added terms
+_GAUGE_CHANCE = 0.01  # Probability of freeing the linear cross-axis terms although they are 0
+NOT_CONVERGED = (
+    'the fit did not converge: coefficients and intervals are those of its last '
+    'step; add poses, or leave out terms'
+)
+"""Line of a fit that did not converge."""
+_MAX_WARMING_K = 3.0
+"""Range of temperature beyond which the report warns, K: 0.3 mg by the datasheet's 0.1 mg/°C."""
+_BAD_STAGE_RATIO = 1.5
+"""Ratio of the estimated to the stated stage error from which the report warns."""
+_MIN_STAGE_EXCESS_RAD = 1e-5
+"""Excess over that ratio from which the report warns, rad, for a stage without a stated error."""
+_MAX_PARTS = 4  # Largest count of components of the weakest direction in the report
+_MIN_PART = 0.2  # Smallest component of the weakest direction, a unit vector, in the report
 
 
 @dataclass(frozen=True)
@@ -525,17 +547,6 @@ def next_poses(
     )
 
 
-ALWAYS = ('bias', 'scale_factor')  # Terms that every fit has and that are not compared
-MAX_OPEN = 3
-"""Largest number of the twelve coefficients that their priors may give. Chosen: an axis that never
-points up or down leaves its scale factor and two misalignments open."""
-_MIN_CHANGE = {'temperature_c': 0.5, 'supply_v': 0.02}
-"""Smallest range of temperature, °C, and supply, V, for which effects that follow them are
-candidates. Chosen: 0.5 °C changes the zero-g by 0.05 mg, about the noise of a mean."""
-_MAX_ADDED = 6  # Largest count of added terms
-_GAUGE_CHANCE = 0.01  # Probability of freeing the linear cross-axis terms although they are 0
-
-
 @dataclass(frozen=True)
 class Term:
     """Evidence for a term."""
@@ -641,21 +652,6 @@ def _linearised(full: FullFit, added: Sequence[str]) -> tuple[Linearised, np.nda
         linearised(sensor, full.linear_poses, names, prior_precision(names), full.kept),
         np.array([term_of(name) for name in names]),
     )
-
-
-NOT_CONVERGED = (
-    'the fit did not converge: coefficients and intervals are those of its last '
-    'step; add poses, or leave out terms'
-)
-"""Line of a fit that did not converge."""
-_MAX_WARMING_K = 3.0
-"""Range of temperature beyond which the report warns, K: 0.3 mg by the datasheet's 0.1 mg/°C."""
-_BAD_STAGE_RATIO = 1.5
-"""Ratio of the estimated to the stated stage error from which the report warns."""
-_MIN_STAGE_EXCESS_RAD = 1e-5
-"""Excess over that ratio from which the report warns, rad, for a stage without a stated error."""
-_MAX_PARTS = 4  # Largest count of components of the weakest direction in the report
-_MIN_PART = 0.2  # Smallest component of the weakest direction, a unit vector, in the report
 
 
 def report_lines(full: FullFit, poses: Poses, terms: Sequence[Term]) -> list[str]:

@@ -28,6 +28,33 @@ import scipy
 
 _MIN_VARIANCE_RAD2 = 1e-24
 """Smallest variance of an angle as a divisor, rad²: it avoids 0/0 on a stage without errors."""
+_MIN_TOTAL_RAD = 1e-7
+"""Smallest standard deviation of an angle error, rad. Chosen: no encoder is as good."""
+_MAX_TOTAL_RAD = 0.3  # Largest standard deviation of an angle error; chosen: no stage is as bad
+_TOTAL_PRIOR_STD = 1.0
+"""Prior standard deviation of ln(total/stated): a factor of 2.7. Chosen: the prior decides only
+where the poses do not."""
+_RATIO_PRIOR_STD = 0.35
+"""Prior standard deviation of ln(ratio). Chosen: the errors of two joints agree within a factor of
+two."""
+_MAX_LOG_RATIO = 1.5
+"""Largest |ln(ratio)|. Chosen: a joint is at most twenty times as good as the other."""
+_SEARCH_STEP = 0.05
+"""Step of the search that counts as 1, in ln(total), share and ln(ratio): the accuracy with which
+some hundred poses determine them."""
+_SEARCH_OPTIONS = {'eps': 1e-3, 'ftol': 1e-8, 'gtol': 0.5, 'maxiter': 20, 'maxls': 5}
+"""Options of L-BFGS-B. Chosen: the deviance is found to 0.1, where χ² has the unit 1."""
+_HUBER_CHANCE = 1e-3
+"""Poses less likely than this have less weight: their squared distance grows linearly (Huber
+1964)."""
+_LEVELS = np.linspace(-1.5, 1.5, 13)
+"""Logarithms of the levels of a joint's error over which coefficients are integrated, relative to
+the estimate. Chosen: a factor of 4.5 is three standard deviations of a level that five settings
+show, and steps of 0.25 change the standard deviations by less than 1 %."""
+_LEAST_WEIGHT = 1e-3  # Least posterior probability of a level that counts
+GRID_RAD = np.radians(15.0)
+"""Step of the grid of candidates in alpha and beta, rad. Chosen: such angles can be set by hand on
+a scale."""
 
 
 @dataclass(frozen=True)
@@ -189,12 +216,14 @@ class AngleErrors:
 class SharedSettings(NamedTuple):
     """The settings of alpha and beta that k poses share."""
 
-    number: np.ndarray  # Number of the setting of each joint, −1 where only one pose has it, (k, 2)
+    number: (
+        np.ndarray
+    )  # Number of the setting of each joint, −1 where only one pose has it, (k, 2)
     count: int  # Of all shared settings
 
 
 def shared_settings(poses: Poses) -> SharedSettings:
-    """Number the settings that poses share."""
+    """Return the numbers of the settings that poses share."""
     numbers = np.full((len(poses), 2), -1)
     count = 0
     for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
@@ -208,32 +237,6 @@ def shared_settings(poses: Poses) -> SharedSettings:
 def volts_covariance(sensor: Sensor, poses: Poses, error: StageError) -> PoseCovariance:
     """Return the covariance of the volts of poses about the model."""
     return PoseCovariance(angle_jacobian(sensor, poses), poses, shared_settings(poses), error)
-
-
-_MIN_TOTAL_RAD = 1e-7
-"""Smallest standard deviation of an angle error, rad. Chosen: no encoder is as good."""
-_MAX_TOTAL_RAD = 0.3  # Largest standard deviation of an angle error; chosen: no stage is as bad
-_TOTAL_PRIOR_STD = 1.0
-"""Prior standard deviation of ln(total/stated): a factor of 2.7. Chosen: the prior decides only
-where the poses do not."""
-_RATIO_PRIOR_STD = 0.35
-"""Prior standard deviation of ln(ratio). Chosen: the errors of two joints agree within a factor of
-two."""
-_MAX_LOG_RATIO = 1.5
-"""Largest |ln(ratio)|. Chosen: a joint is at most twenty times as good as the other."""
-_SEARCH_STEP = 0.05
-"""Step of the search that counts as 1, in ln(total), share and ln(ratio): the accuracy with which
-some hundred poses determine them."""
-_SEARCH_OPTIONS = {'eps': 1e-3, 'ftol': 1e-8, 'gtol': 0.5, 'maxiter': 20, 'maxls': 5}
-"""Options of L-BFGS-B. Chosen: the deviance is found to 0.1, where χ² has the unit 1."""
-_HUBER_CHANCE = 1e-3
-"""Poses less likely than this have less weight: their squared distance grows linearly (Huber
-1964)."""
-_LEVELS = np.linspace(-1.5, 1.5, 13)
-"""Logarithms of the levels of a joint's error over which coefficients are integrated, relative to
-the estimate. Chosen: a factor of 4.5 is three standard deviations of a level that five settings
-show, and steps of 0.25 change the standard deviations by less than 1 %."""
-_LEAST_WEIGHT = 1e-3  # Least posterior probability of a level that counts
 
 
 @dataclass(frozen=True)
@@ -403,11 +406,6 @@ def linearised(
         precision=precision,
         kept=np.ones(len(poses), bool) if kept is None else kept,
     )
-
-
-GRID_RAD = np.radians(15.0)
-"""Step of the grid of candidates in alpha and beta, rad. Chosen: such angles can be set by hand on
-a scale."""
 
 
 def choose_poses(rows: np.ndarray, information: np.ndarray, count: int) -> list[int]:

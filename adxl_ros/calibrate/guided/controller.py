@@ -162,9 +162,7 @@ class StreamSensor:
             self._samples.keep_newest(0)
             return LogLine(Level.WARN, f'imu/data_raw: {error}')
         self.adopt(nominal)
-        return LogLine(
-            Level.OK, f'no sensor_info: measured from the stream: {"; ".join(lines)}'
-        )
+        return LogLine(Level.OK, f'no sensor_info: measured from the stream: {"; ".join(lines)}')
 
 
 class Controller:
@@ -374,7 +372,9 @@ class Controller:
             return GuideStatus(Phase.INFO, f'waiting for sensor_info; {obstacle}', True)
         if self.session is None:
             hints = IDLE_TEXT, stream.outlook, self._samples.silence()
-            return GuideStatus(Phase.IDLE, self._newest_line or '; '.join(filter(None, hints)), False)
+            return GuideStatus(
+                Phase.IDLE, self._newest_line or '; '.join(filter(None, hints)), False
+            )
         if silence := self._samples.silence():
             return GuideStatus(Phase.SILENT, silence, True)
         if fault := self.session.fault or self.fit_fault:

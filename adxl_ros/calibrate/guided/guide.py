@@ -35,6 +35,14 @@ _KEPT_READINGS = 100_000  # Readings that stay in memory; chosen: 1000 s at 100 
 STALE_NS = 60_000_000_000
 """A reading counts for samples up to this far from its stamp, ns; chosen: temperature and supply
 hardly change in a minute."""
+_CLOCK_OFFSET_S = 2.0
+"""Largest offset of the clocks of stage and sensor, s; chosen: above any delay of messages."""
+_KEPT_OFFSETS = 20
+"""Offsets of the two clocks that stay in memory; chosen: a second of messages at 20 Hz."""
+_FEWEST_OFFSETS = 4
+"""Offsets of the two clocks that a comparison needs; chosen: one message alone may be late."""
+SILENT_S = 3.0
+"""The encoder counts as silent after this, s; chosen: several of its longest usual periods."""
 
 
 def went_back(newest_ns: int | None, stamp_ns: int) -> bool:
@@ -233,16 +241,6 @@ class Dwell:
             mean_v=tuple(mean[0].tolist()),
             std_v=tuple(std[0].tolist()),
         )
-
-
-_CLOCK_OFFSET_S = 2.0
-"""Largest offset of the clocks of stage and sensor, s; chosen: above any delay of messages."""
-_KEPT_OFFSETS = 20
-"""Offsets of the two clocks that stay in memory; chosen: a second of messages at 20 Hz."""
-_FEWEST_OFFSETS = 4
-"""Offsets of the two clocks that a comparison needs; chosen: one message alone may be late."""
-SILENT_S = 3.0
-"""The encoder counts as silent after this, s; chosen: several of its longest usual periods."""
 
 
 class EncoderTrack:

@@ -39,6 +39,8 @@ _UP_SAMPLES = 20
 """Samples whose mean shows what points up at present; chosen: quick and still steady."""
 _MIN_FORCE_G = 1e-9
 """Lower bound of the measured force, g, so that a sensor without signal has a direction."""
+_PATIENCE = 3
+"""Lengths of a block without rest after which its samples are forgotten. Chosen: memory."""
 
 
 @dataclass(frozen=True)
@@ -296,10 +298,6 @@ class HandGuide(HandRests):
         if self.accepted:
             std_v = np.mean([record.std_v for record in self.accepted.values()], axis=0)
         return running_estimate.tilt_error_rad(self.estimate.fitted, std_v)
-
-
-_PATIENCE = 3
-"""Lengths of a block without rest after which its samples are forgotten. Chosen: memory."""
 
 
 @dataclass(frozen=True)

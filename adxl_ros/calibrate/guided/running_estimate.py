@@ -35,6 +35,9 @@ _LEAST_STD_V = 1e-7
 """Lower bound of the noise of a mean, V; chosen: below any ADC, so that no weight is infinite."""
 _OUTLIER_STDS = 3.5  # Residual from which a pose is refused, stds; chosen: one of 2000 by chance
 _MODEL_STD_G = 5e-3  # Std of further model errors; chosen: it accepts twice the datasheet limits
+_SPARE_READINGS = 40
+"""Readings beyond the number of coefficients; chosen: they show stage error and outliers."""
+_MOST_POSES = 90  # Largest number of poses; chosen: by hand a longer plan is no longer quick
 
 
 @dataclass(frozen=True)
@@ -193,11 +196,6 @@ def coefficient_rows(
         )
         for name, place in places.items()
     ]
-
-
-_SPARE_READINGS = 40
-"""Readings beyond the number of coefficients; chosen: they show stage error and outliers."""
-_MOST_POSES = 90  # Largest number of poses; chosen: by hand a longer plan is no longer quick
 
 
 def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: int) -> list[Target]:

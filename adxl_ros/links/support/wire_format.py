@@ -51,6 +51,12 @@ RATES_HZ = (0.01, 1e5)  # Bounds of the sample rate, Hz, as `sensor.rate_hz` per
 _VREFS_V = (0.1, 100.0)  # Bounds of the reference voltage, V, as `sensor.adc_vref_v` permits
 MAX_BITS = 16  # Largest resolution of the ADC, bit: codes are u16
 MAX_SERIAL = 16  # Most characters of a serial number
+_TOLERANCE_US = 1000.0  # Absolute tolerance between the device's clock and its count, µs
+_TOLERANCE = 0.002
+"""Relative tolerance between the device's clock and its count. Chosen: a real rate differs from
+the stated one by less."""
+_AWAY_TOLERANCE_US = 250e3
+"""Tolerance between the clocks of device and host while a port was closed, µs."""
 
 
 class WireError(Exception):
@@ -298,14 +304,6 @@ class Splitter:
         """Drop the incomplete frame: the next byte does not belong to it."""
         self._incomplete = b''
         self._skipping = False
-
-
-_TOLERANCE_US = 1000.0  # Absolute tolerance between the device's clock and its count, µs
-_TOLERANCE = 0.002
-"""Relative tolerance between the device's clock and its count. Chosen: a real rate differs from
-the stated one by less."""
-_AWAY_TOLERANCE_US = 250e3
-"""Tolerance between the clocks of device and host while a port was closed, µs."""
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,11 @@ OTHER_AXIS = {
     'scale_factor_z': _OUT_OF_PLANE,
 }
 """By effect: index of the axis c that acts on x, y and z."""
+_SCALE_EXPONENT = 1.135
+"""Typical exponent of the scale factor, ln(560/1000)/ln(3/5): 560 mV/g at 3 V and 1000 mV/g at 5 V
+(ADXL203 datasheet, specifications)."""
+_WITHOUT_FILTER_S = 1e-3
+"""Time constant that r counts in where no filter is stated, s; chosen: r is then one in ms."""
 
 
 def _bias_by(others: tuple[int, int, int], signals: Signals, p: Parameters) -> None:
@@ -492,11 +497,6 @@ def scale_factor(signals: Signals, p: Parameters) -> None:
     add(signals.scale_v_per_g, p['offset_v_per_g'])
 
 
-_SCALE_EXPONENT = 1.135
-"""Typical exponent of the scale factor, ln(560/1000)/ln(3/5): 560 mV/g at 3 V and 1000 mV/g at 5 V
-(ADXL203 datasheet, specifications)."""
-
-
 @effect(
     Place.ELECTRONICS,
     Parameter(
@@ -598,10 +598,6 @@ def saturation(signals: Signals, p: Parameters) -> None:
             above = np.logaddexp(0.0, (x - upper) / knee_g)
             below = np.logaddexp(0.0, (-x - lower) / knee_g)
             signals.output[d] = x - knee_g * (above - below)
-
-
-_WITHOUT_FILTER_S = 1e-3
-"""Time constant that r counts in where no filter is stated, s; chosen: r is then one in ms."""
 
 
 @effect(

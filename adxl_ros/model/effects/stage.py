@@ -30,6 +30,20 @@ from adxl_ros.model.filters import play
 from adxl_ros.model.kinematics import angular_motion, carried_acceleration
 import numpy as np
 
+_ROUNDING = 1e-9  # Relative rounding error of a dead band; chosen: far above that of float64
+_ORDER = 3.0
+"""Number of equal filters, between a Butterworth filter, 1, and a Gaussian, many. Chosen: the
+gains of both are met to 1.4 % rms where they exceed 0.2, and that of a mean to 2 %."""
+_MARGIN = 10.0
+"""Margin at both ends that the filter runs into, in lengths of its kernel. Chosen: far beyond the
+kernel."""
+_OF_FAST_MOTION = DiagnosisHints(
+    revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,), proof=(ProofVariable.FORCE_RATE,)
+)
+"""Hints of the errors of a robot that grow with its speed."""
+ROBOT_JOINTS = 8
+"""Joints of a robot whose offsets are errors of their own; chosen: an arm has six or seven."""
+
 
 @effect(
     Place.STAGE,
@@ -184,9 +198,6 @@ def stage_eccentricity(signals: Signals, p: Parameters) -> None:
             )
 
 
-_ROUNDING = 1e-9  # Relative rounding error of a dead band; chosen: far above that of float64
-
-
 @effect(
     Place.STAGE,
     Parameter(
@@ -322,14 +333,6 @@ def reference_delay(signals: Signals, p: Parameters) -> None:
     signals.time_s = signals.time_s - p['delay_s']
 
 
-_ORDER = 3.0
-"""Number of equal filters, between a Butterworth filter, 1, and a Gaussian, many. Chosen: the
-gains of both are met to 1.4 % rms where they exceed 0.2, and that of a mean to 2 %."""
-_MARGIN = 10.0
-"""Margin at both ends that the filter runs into, in lengths of its kernel. Chosen: far beyond the
-kernel."""
-
-
 def _restoring_gain(frequency_hz: np.ndarray, p: Parameters) -> np.ndarray:
     """
     Return the complex gain that restores motion, (k,).
@@ -424,14 +427,6 @@ def reference_filter(signals: Signals, p: Parameters) -> None:
         signals.force[d] = stated + np.interp(
             signals.time_s, even_s, lacking[margin : margin + count]
         )
-
-
-_OF_FAST_MOTION = DiagnosisHints(
-    revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,), proof=(ProofVariable.FORCE_RATE,)
-)
-"""Hints of the errors of a robot that grow with its speed."""
-ROBOT_JOINTS = 8
-"""Joints of a robot whose offsets are errors of their own; chosen: an arm has six or seven."""
 
 
 @effect(
