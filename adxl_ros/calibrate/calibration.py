@@ -16,7 +16,6 @@ from adxl_ros.calibrate.pose_model import predicted_volts, reference_force, resi
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment
-from adxl_ros.calibrate.report.error_budget import rms_mg
 from adxl_ros.calibrate.report.error_causes import error_budgets
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.calibrate.result import CalibrationResult, envelope, with_provenance
@@ -27,6 +26,7 @@ from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.noise import means_at_a_rail
 from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.statistics import rms, stds
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg, with_half_width
 from adxl_ros.signals import recorded_sensor
@@ -203,7 +203,7 @@ def _against_stage(
     entries = {'reference': 'stage'}
     if population:
         entries['prior'] = population.name
-    entries['residual_mg'] = f'{rms_mg(float(np.mean(residual_mps2**2))):.4f}'
+    entries['residual_mg'] = f'{mg(rms(residual_mps2)):.4f}'
     if fit.full:
         entries['converged'] = 'yes' if fit.full.converged else 'no'
     entries |= acceptance.provenance_entries(judgement.of_fit, judgement.held_out, doubts)
@@ -420,8 +420,8 @@ def _against_gravity(
 ) -> CalibrationResult:
     fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
-    after_mg = rms_mg(np.mean(fit.residual_mps2[kept] ** 2))
-    unseen_mg = rms_mg(np.mean(fit.held_out_mps2[kept] ** 2))
+    after_mg = mg(rms(fit.residual_mps2[kept]))
+    unseen_mg = mg(rms(fit.held_out_mps2[kept]))
     fitted = replace(
         sensor,
         model='gravity',
@@ -515,7 +515,7 @@ def calibrate_thermal(
     fitted = thermal_fit.applied(base, fit, calibrated_c)
     has_scale = any(name.effect == 'temperature_scale' for name in fit.names)
     low_c, high_c = range_c or fit.span_c
-    misfit_mps2 = float(np.sqrt(np.mean(fit.rms_g**2))) * G0_MPS2
+    misfit_mps2 = rms(fit.rms_g) * G0_MPS2
     fitted = replace(
         fitted,
         envelope=replace(
@@ -558,7 +558,7 @@ def calibrate_thermal(
 
 def _thermal_lines(fit: thermal_fit.ThermalFit, axes: str) -> list[str]:
     """Return slope and curvature of each axis, the residuals, and the effect of the history."""
-    halves = Z_90 * np.sqrt(np.diag(fit.covariance))
+    halves = Z_90 * stds(fit.covariance)
     intervals = dict(zip(fit.names, zip(fit.values, halves)))
     lines = []
     for axis in axes:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from datetime import datetime, timezone
 import hashlib
 from itertools import product
+from typing import NamedTuple
 
 from adxl_ros.calibrate.fits.extrapolation import next_degree, NextDegree
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
@@ -26,6 +27,7 @@ from adxl_ros.model.effects.accelerometer import OTHER_AXIS
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.gyroscope import Gyroscope, NO_TURN
 from adxl_ros.model.sensor import Envelope, get, parameter_of, Sensor, with_neutral
+from adxl_ros.model.statistics import stds
 from adxl_ros.process import package_version
 from adxl_ros.report.quantities import decimals, fixed, mg_text, with_half_width
 import numpy as np
@@ -147,25 +149,29 @@ def coefficient_lines(sensor: Sensor) -> list[str]:
     ]
 
 
+class _Turning(NamedTuple):
+    """A value of a gyroscope, by axis."""
+
+    label: str
+    radps: tuple[float, ...]  # rad/s, or rad/s/K
+    std_radps: tuple[float, ...]  # Its standard deviation; empty where it is not known
+    unit: str  # In which it is shown
+
+
 def gyro_lines(gyro: Gyroscope) -> list[str]:
     """Return the bias of a gyroscope with its 90 % interval as text; none without one."""
     if not gyro.is_calibrated:
         return []
-    rows = [('gyroscope, bias at rest', gyro.bias_radps, gyro.bias_std_radps, '°/s')]
+    rows = [_Turning('gyroscope, bias at rest', gyro.bias_radps, gyro.bias_std_radps, '°/s')]
     if gyro.follows_temperature:
-        rows.append(
-            (
-                f'  its change, {gyro.temperature_c[0]:.0f} to {gyro.temperature_c[2]:.0f} °C',
-                gyro.bias_per_k_radps,
-                gyro.bias_per_k_std_radps,
-                '°/s/K',
-            )
-        )
+        low_c, _, high_c = gyro.temperature_c
+        label = f'  its change, {low_c:.0f} to {high_c:.0f} °C'
+        rows.append(_Turning(label, gyro.bias_per_k_radps, gyro.bias_per_k_std_radps, '°/s/K'))
     lines = []
-    for label, values, stds, unit in rows:
-        for axis, value, std in zip(AXES, values, stds or NO_TURN):
+    for row in rows:
+        for axis, value, std in zip(AXES, row.radps, row.std_radps or NO_TURN):
             text = with_half_width(np.degrees(value), Z_90 * np.degrees(std))
-            lines.append(f'  {label:{_LONGEST_LABEL}} {axis:1} {text} {unit}')
+            lines.append(f'  {row.label:{_LONGEST_LABEL}} {axis:1} {text} {row.unit}')
     return lines
 
 
@@ -276,7 +282,7 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
     names = fitted.covariance_names
     rows = []
     truth = with_neutral(truth, [name.effect for name in names])
-    half_widths = Z_90 * np.sqrt(np.diag(fitted.covariance))
+    half_widths = Z_90 * stds(fitted.covariance)
     for name, *values in zip(names, get(fitted, names), half_widths, get(truth, names)):
         key = str(name.without_axis)
         unit = parameter_of(name).unit

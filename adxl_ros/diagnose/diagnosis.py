@@ -38,8 +38,9 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_axes, with_neutral
+from adxl_ros.model.statistics import rms
 from adxl_ros.report.quantities import Interval
-from adxl_ros.signals.block_statistics import rms, true_runs
+from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate
 import numpy as np

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose.comparison import BaselineComparison, bridged, SMALLEST_MOTION_G
 from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.statistics import rms
 from adxl_ros.report.quantities import mg_text
-from adxl_ros.signals.block_statistics import rms
 import numpy as np
 import scipy
 

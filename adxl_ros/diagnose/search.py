@@ -24,7 +24,7 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, StraightLine
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import fitted_of, get, parameter_of, put, Sensor, with_neutral
-from adxl_ros.signals.block_statistics import rms
+from adxl_ros.model.statistics import rms
 import numpy as np
 
 _EVALUATIONS = 8  # Largest number of simulations of a hypothesis. Chosen: most need five

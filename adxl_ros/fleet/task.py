@@ -41,6 +41,7 @@ from adxl_ros.fleet.row import (
 )
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.statistics import stds
 from adxl_ros.process import code_version, options_named, package_version
 from adxl_ros.signals.findings import check_recording, Findings
 import numpy as np
@@ -415,7 +416,7 @@ class _Job:
         found = fit(self._recording, self._params, data_sha256=self._staged.content)
         fitted = found.sensor
         self._put_assumed(fitted)
-        stds = dict(zip(fitted.covariance_names, np.sqrt(np.diag(fitted.covariance)).tolist()))
+        std_of = dict(zip(fitted.covariance_names, stds(fitted.covariance).tolist()))
         for name, unit_name, coefficient, values in (
             ('zero_g', 'v', ('bias', 'offset_v'), fitted.zero_g_v),
             ('scale', 'v_per_g', ('scale_factor', 'offset_v_per_g'), fitted.scale_v_per_g),
@@ -423,7 +424,7 @@ class _Job:
             for axis, value in zip(fitted.axes, values):
                 self.row |= {
                     f'{name}_{axis}_{unit_name}': float(value),
-                    f'{name}_std_{axis}_{unit_name}': stds.get(Coefficient(*coefficient, axis)),
+                    f'{name}_std_{axis}_{unit_name}': std_of.get(Coefficient(*coefficient, axis)),
                 }
         self.row |= {'fit_model': fitted.model, 'fit_poses': found.poses}
         self.files['unit.yaml'] = parameter_file.as_text(fitted, found.result.report_lines).encode(

@@ -116,6 +116,11 @@ def carried_acceleration(omega: Components, omega_dot: Components, r: Components
     return [c + t for c, t in zip(centripetal, cross_product(omega_dot, r))]
 
 
+def unit_vectors(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors, (n, 3), with the length 1."""
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
 def cross_product(a: Components, b: Components) -> Components:
     """Return the vector product a × b."""
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]

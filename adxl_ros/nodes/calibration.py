@@ -528,16 +528,7 @@ class Calibration(Node):
     def _connect(self) -> None:
         """Make diagnostics, subscriptions, services and the timer."""
         topics.DiagnosticsReporter(self, 'calibration', self._status)
-        topics.create_subscription(
-            self,
-            DiagnosticStatus,
-            'sensor_info',
-            lambda message: self._controller.read_sensor_info(
-                topics.stream_info(message, 'sensor_info')
-            ),
-            1,
-            latched=True,
-        )
+        topics.subscribe_info(self, 'sensor_info', self._controller.read_sensor_info)
         self._stage = {
             topic: topics.Inbox(self, JointState, topic, _STAGE_QUEUE)
             for topic in (_STAGE_TOPICS if self._own.mode == 'stage' else ())
@@ -610,11 +601,11 @@ class Calibration(Node):
     def _service(self, request: Callable[[], RequestAnswer]) -> Callable[..., Trigger.Response]:
         """Make the callback of a service that calls a request of the controller."""
 
-        def respond(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        def respond(*_: object) -> Trigger.Response:
             self._read_stage()
-            response.success, response.message = request()
+            answer = request()
             self._display.update()
-            return response
+            return Trigger.Response(success=answer.success, message=answer.message)
 
         return respond
 

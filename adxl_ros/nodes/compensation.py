@@ -13,13 +13,14 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, StreamInterval
 from adxl_ros.compensate.inversions import HALF
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, imu_message, parameter_file
+from adxl_ros.files.recording_columns import StreamInfo
 from adxl_ros.links.support.base import COLUMNS
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
@@ -32,7 +33,6 @@ from adxl_ros.nodes.sample_output import age_report, MOST_AGES
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.signals.recorded_gravity import LIVE_WINDOW_S, LiveLook
 from adxl_ros.signals.recorded_sensor import sensor_of_stream
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
 import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -118,6 +118,13 @@ class CompensationSettings:
     )
 
 
+class _NamedSensor(NamedTuple):
+    """A sensor that corrects the samples."""
+
+    sensor: Sensor
+    source: str  # Where it is from, for people: the path of a calibration
+
+
 class MountingParameters:
     """The parameters `mounting.*` and the service `~/level` of a node."""
 
@@ -135,10 +142,10 @@ class MountingParameters:
             Trigger, '~/level', self._on_level, callback_group=ReentrantCallbackGroup()
         )
 
-    def take(self, path: str, sensor: Sensor) -> None:
+    def take(self, loaded: _NamedSensor) -> None:
         """Use the mounting that the file of a calibration has, unless one was given."""
-        self._path = path
-        mounting = _mounting_of(path, sensor)
+        self._path = path = loaded.source
+        mounting = _mounting_of(loaded)
         if mounting is None:
             return
         if not self._is_given:
@@ -152,7 +159,7 @@ class MountingParameters:
         self._mounting = mounting
         self._stream.mount(mounting, self._frame_id)
 
-    async def _on_level(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    async def _on_level(self, *_: object) -> Trigger.Response:
         over: Future = Future()
         self._stream.collect()
         timer = self._node.create_timer(_LEVEL_S, lambda: over.set_result(True), clock=STEADY)
@@ -161,15 +168,13 @@ class MountingParameters:
         try:
             levelled = level(self._mounting, self._stream.collected(), self._stream.sensor)
         except UserError as error:
-            response.message = f'{error}'
-            return response
+            return Trigger.Response(message=f'{error}')
         before_rad = list(self._mounting.rpy_rad)
         rpy_rad = [round(angle, 6) for angle in levelled.rpy_rad]
         self._node.set_parameters([Parameter(_RPY, value=rpy_rad)])
-        response.success = True
-        response.message = self._kept(rpy_rad, before_rad)
-        self._node.get_logger().info(response.message)
-        return response
+        text = self._kept(rpy_rad, before_rad)
+        self._node.get_logger().info(text)
+        return Trigger.Response(success=True, message=text)
 
     def _kept(self, rpy_rad: list[float], before_rad: list[float]) -> str:
         """Write a new mounting where the next start finds it; return where that is."""
@@ -240,14 +245,12 @@ def _mounting(
     return Mounting((roll, pitch, yaw))
 
 
-def _mounting_of(path: str, sensor: Sensor) -> Mounting | None:
+def _mounting_of(loaded: _NamedSensor) -> Mounting | None:
     """Return the mounting that the file of a calibration has, None where it has none."""
-    rpy_rad = sensor.mounting.get(_RPY.removeprefix(_MOUNTING))
-    return (
-        None
-        if rpy_rad is None
-        else _mounting(rpy_rad, lambda key, reason: UserError(f'{path}: {key}: {reason}'))
-    )
+    rpy_rad = loaded.sensor.mounting.get(_RPY.removeprefix(_MOUNTING))
+    if rpy_rad is None:
+        return None
+    return _mounting(rpy_rad, lambda key, reason: UserError(f'{loaded.source}: {key}: {reason}'))
 
 
 class Compensation(Node):
@@ -265,7 +268,7 @@ class Compensation(Node):
         paper = settings.inverse == 'paper'
         mounting = _mounting(settings.rpy_rad)
         self._heard_ns: dict[str, int] = {}
-        self._named: tuple[Sensor, str]
+        self._named: _NamedSensor
         self._obstacle = self._told = ''  # Why the sensor is unknown; the newest line on it
         self._reported: Counter[str] = Counter()
         self._reported_ns = STEADY.now().nanoseconds
@@ -291,7 +294,7 @@ class Compensation(Node):
         self._look_at_gravity = LiveLook()
         self._samples = topics.Inbox(self, Imu, 'imu/data_raw', _DEPTH, settings.samples_unit)
         self._flat = sensor_parameters.given_sensor(self)
-        own = (
+        own = _NamedSensor(
             sensor_parameters.make_sensor(self._flat, may_measure=True),
             (
                 'the parameters given'
@@ -300,17 +303,15 @@ class Compensation(Node):
             ),
         )
         loaded = self._load(settings.calibration)
-        self._use(*(loaded or own))
+        self._use(loaded or own)
         self._mounting = MountingParameters(
             self, self._stream, mounting, settings.mounting_frame_id
         )
         if loaded:
-            self._mounting.take(settings.calibration, loaded[0])
+            self._mounting.take(loaded)
         parameters.on_change(self, 'calibration', self._load, self._exchange)
         self.create_timer(_LOOK_S, self._look, clock=STEADY)
-        topics.create_subscription(
-            self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True
-        )
+        topics.subscribe_info(self, self.resolve_topic_name('sensor_info'), self._on_info)
         self._surroundings = topics.SurroundingTopics(self, 1)
         self._thread = topics.RepeatingThread(self, self._receive, 'imu/data_raw')
 
@@ -324,31 +325,31 @@ class Compensation(Node):
         stamp_s, _ = imu_message.read(raw)
         self._ages_s.append(self.get_clock().now().nanoseconds * 1e-9 - stamp_s)
 
-    def _load(self, path: str) -> tuple[Sensor, str] | None:
+    def _load(self, path: str) -> _NamedSensor | None:
         """Load the file of `calibration`, if one is named; it is refused if it does not fit."""
         if not path:
             return None
-        sensor = parameter_file.load(path)
-        self._policy.check(sensor)
-        _mounting_of(path, sensor)
-        return sensor, path
+        loaded = _NamedSensor(parameter_file.load(path), path)
+        self._policy.check(loaded.sensor)
+        _mounting_of(loaded)
+        return loaded
 
-    def _exchange(self, loaded: tuple[Sensor, str] | None) -> None:
+    def _exchange(self, loaded: _NamedSensor | None) -> None:
         if loaded is not None:
             self._told = ''
-            self._use(*loaded)
-            sensor, path = loaded
-            self._mounting.take(path, sensor)
+            self._use(loaded)
+            self._mounting.take(loaded)
 
-    def _use(self, sensor: Sensor, source: str) -> None:
-        """Correct samples by a sensor from the next one on; `source` says where it is from."""
-        self._named = sensor, source
+    def _use(self, named: _NamedSensor) -> None:
+        """Correct samples by a sensor from the next one on."""
+        self._named = named
+        sensor = named.sensor
         self._stream.release()
         is_named = sensor.effects or self._calibration() or sensor_parameters.is_from_file(self)
         self._stream.may_be_foreign = not (is_named or self._policy.info)
         if sensor.unstated:
             self._stream.hold()
-        self._correct_by(sensor, source)
+        self._correct_by(*named)
 
     def _correct_by(self, sensor: Sensor, source: str) -> None:
         text = self._policy.use(sensor, source)
@@ -370,7 +371,7 @@ class Compensation(Node):
         samples = self._stream.unknown
         if samples is None:
             return
-        named, _ = self._named
+        named = self._named.sensor
         try:
             sensor = (
                 named if named.unstated else sensor_parameters.anonymous_sensor(self, self._flat)
@@ -401,10 +402,10 @@ class Compensation(Node):
         faults.no_gravity = text if is_clear else ''
         faults.wrong_gravity = '' if is_clear else text
 
-    def _on_info(self, message: DiagnosticStatus) -> None:
-        self._policy.info = topics.stream_info(message, self.resolve_topic_name('sensor_info'))
-        if self._stream.may_be_foreign or self._policy.sensor is not self._named[0]:
-            self._use(*self._named)
+    def _on_info(self, info: StreamInfo) -> None:
+        self._policy.info = info
+        if self._stream.may_be_foreign or self._policy.sensor is not self._named.sensor:
+            self._use(self._named)
         self._take_from_store()
         self._stream.use(self._policy.sensor, self._policy.rate_hz)
         self._assess()

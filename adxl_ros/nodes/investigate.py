@@ -245,11 +245,9 @@ class Investigate(Node):
             self._folder.make(self._sensor)
             self._bag = LiveBag(self._folder.bag)
 
-    def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_abort(self, *_: object) -> Trigger.Response:
         self._request = '~/abort was called'
-        response.success = True
-        response.message = 'stopped; the stage holds its pose'
-        return response
+        return Trigger.Response(success=True, message='stopped; the stage holds its pose')
 
     def _status(self) -> Status:
         run = self._investigation

@@ -23,7 +23,7 @@ from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Inbox, Level, Status
 from adxl_ros.report.quantities import percent
 from adxl_ros.simulate.robot import Robot
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
 
@@ -194,14 +194,7 @@ class Monitor(Node):
         self._service = topics.LateService(self, '~/diagnose')
         topics.DiagnosticsReporter(self, 'gap', self._status)
         self._info_topic = self.resolve_topic_name('sensor_info')
-        topics.create_subscription(
-            self,
-            DiagnosticStatus,
-            'sensor_info',
-            lambda message: self._compare_by(topics.stream_info(message, self._info_topic)),
-            1,
-            latched=True,
-        )
+        topics.subscribe_info(self, self._info_topic, self._compare_by)
         self.create_timer(_TURN_S, self._turn, clock=topics.STEADY)
         self.create_timer(_PERIOD_S, self._publish, clock=topics.STEADY)
 

@@ -18,6 +18,7 @@ from adxl_ros.files.stamps import stamped_rate_hz
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Components, Need
 from adxl_ros.model.sensor import Sensor
+from adxl_ros.model.statistics import rms
 from adxl_ros.process import option
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -334,7 +335,7 @@ class SmoothedPath:
 
         def too_strong(strength: float) -> bool:
             deviation = reading - window.mean - window.design @ window.coefficients(strength)
-            return bool(np.sqrt(np.mean(deviation[moving] ** 2)) > self._step / np.sqrt(12))
+            return rms(deviation[moving]) > self._step / np.sqrt(12)
 
         index = bisect_left(_STRENGTHS, True, key=too_strong)
         return float(_STRENGTHS[max(index - 1, 0)]) if index < len(_STRENGTHS) else 0.0

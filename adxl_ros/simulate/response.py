@@ -28,6 +28,7 @@ from adxl_ros.model.filters import first_order_recursion, low_pass
 from adxl_ros.model.kinematics import specific_force_in_motion
 from adxl_ros.model.sensor import neutral, Sensor
 from adxl_ros.model.signal_chain import Chain
+from adxl_ros.model.statistics import rms
 from adxl_ros.report.quantities import mg
 from adxl_ros.simulate.motion import (
     check_needs,
@@ -498,4 +499,4 @@ def change_mg(
         other, motion, _SEED, stamps_s, memo
     )
     change_mps2 = changed_v / sensor.nominal_scale_v_per_g * G0_MPS2
-    return float(mg(np.sqrt(np.mean(change_mps2**2))))
+    return mg(rms(change_mps2))

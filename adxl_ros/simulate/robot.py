@@ -23,6 +23,7 @@ from adxl_ros.files.robot_readings import JointTrack, RobotReadings
 from adxl_ros.files.stamps import period_s, stamped_rate_hz
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Components
+from adxl_ros.model.statistics import rms
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
 from adxl_ros.simulate.motion import (
@@ -249,7 +250,7 @@ class RobotPath(ForcePath):
 
     def text(self) -> str:
         """Return what is known of the robot, for people."""
-        error_mg = mg(np.sqrt(np.mean(self.error_mps2**2)))
+        error_mg = mg(rms(self.error_mps2))
         return (
             f'{self._robot.frame} moves by {", ".join(self.joints) or "its base"}, from '
             f'{self.time_s[0]:.3g} to {self.time_s[-1]:.3g} s; the encoders leave an error of '

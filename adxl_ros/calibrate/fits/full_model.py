@@ -47,6 +47,7 @@ from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Place, Role
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import coefficients_of, get, parameter_of, put, Sensor, with_neutral
+from adxl_ros.model.statistics import stds
 from adxl_ros.process import usage
 from adxl_ros.report.quantities import with_half_width
 import numpy as np
@@ -354,7 +355,7 @@ class _StageSearch:
                 break
         self._sensor = put(self._sensor, self._names, values)
         self._poses = _turned_linearly(self._sensor, self._measured, self._errors.total_rad)
-        return float(np.abs((values - start) * np.sqrt(np.diag(solved.information))).max())
+        return float(np.abs((values - start) * stds(solved.information)).max())
 
     def _result(self, converged: bool) -> FullFit:
         """Return the fit, with the covariance of the sensor's coefficients."""
@@ -401,7 +402,7 @@ class _Iterate(Iterate):
     @property
     def step_std(self) -> float:
         """Return the longest component of the step in its standard deviations."""
-        return float(np.abs(self.step * np.sqrt(np.diag(self.information))).max())
+        return float(np.abs(self.step * stds(self.information)).max())
 
 
 def _inliers(about: Linearised, stage: StageError) -> np.ndarray:
@@ -659,7 +660,7 @@ def report_lines(full: FullFit, poses: Poses, terms: Sequence[Term]) -> list[str
     helpful = next_poses(full.with_stage, poses, full.names, full.stage)
     setting_deg = np.degrees(full.stage.setting_rad * full.stage.joints)
     pose_deg = np.degrees(full.stage.pose_rad * full.stage.joints)
-    std = np.sqrt(np.diag(np.linalg.inv(full.information)))
+    std = stds(np.linalg.inv(full.information))
     values = [
         f'{name} {with_half_width(float(value), Z_90 * value_std)} {parameter_of(name).unit}'
         for name, value, value_std in zip(full.names, get(full.with_stage, full.names), std)

@@ -21,7 +21,9 @@ from adxl_ros.calibrate.fits.cube_directions import AXES_UP, covered, points_up
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.kinematics import unit_vectors
 from adxl_ros.model.sensor import parameter_of, Sensor
+from adxl_ros.model.statistics import variances_of
 from adxl_ros.process import option, usage
 from adxl_ros.report.quantities import mg
 import numpy as np
@@ -477,7 +479,7 @@ def _studentised(
         posterior_information(rests[kept], parameters, excess_g2) + np.diag(rung.precision)
     )
     jacobian = linearised(rests.mean, parameters).jacobian
-    leverage = np.einsum('ki,ij,kj->k', jacobian, covariance, jacobian) / variance
+    leverage = variances_of(jacobian, covariance) / variance
     distance = np.abs(_residual(rests, parameters)) / np.sqrt(variance)
     inside = distance / np.sqrt(np.maximum(1 - leverage, _MIN_REMAINDER))
     # χ² per degree of freedom of the other rests, at least that of the noise of the means.
@@ -565,7 +567,7 @@ def _require_determined(
 def _advice(rests: NominalRests, parameters: np.ndarray) -> str:
     """Return which directions are missing among rests, for people: faces first, then others."""
     force = force_g(rests.mean, parameters)
-    has = covered(force / np.linalg.norm(force, axis=1, keepdims=True))
+    has = covered(unit_vectors(force))
     faces = np.flatnonzero(~has & (AXES_UP == 1))
     edges = np.flatnonzero(~has & (AXES_UP == 2))
     if len(faces):

@@ -23,6 +23,7 @@ from adxl_ros.calibrate.pose_model import angle_jacobian, coefficient_jacobian, 
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import get, Sensor
+from adxl_ros.model.statistics import stds
 import numpy as np
 import scipy
 
@@ -97,7 +98,7 @@ class PoseCovariance:
         self._error = error
         self._kept = np.ones(len(poses), bool) if kept is None else kept
         self._number = shared.number
-        self._shared_count = shared.count
+        self._shared_count = shared.total
         # The error of a setting with only one pose is an error of that pose.
         self._pose_rad2 = error.pose_rad**2 + np.where(self._number < 0, error.setting_rad**2, 0.0)
         noise = poses.std_v[:, :, None] ** 2 * np.eye(jacobian.shape[1])
@@ -216,10 +217,9 @@ class AngleErrors:
 class SharedSettings(NamedTuple):
     """The settings of alpha and beta that k poses share."""
 
-    number: (
-        np.ndarray
-    )  # Number of the setting of each joint, −1 where only one pose has it, (k, 2)
-    count: int  # Of all shared settings
+    # Number of the setting of each joint, −1 where only one pose has it, (k, 2)
+    number: np.ndarray
+    total: int  # Their number
 
 
 def shared_settings(poses: Poses) -> SharedSettings:
@@ -265,7 +265,7 @@ class Linearised:
         information, gradient = covariance.normal_equations(self.design, self.residual)
         information = information + np.diag(self.precision)
         gradient = gradient - self.precision * self.values
-        scale = 1 / np.sqrt(np.diag(information))
+        scale = 1 / stds(information)
         step = scale * np.linalg.solve(information * np.outer(scale, scale), scale * gradient)
         return step, information
 

@@ -18,6 +18,7 @@ from adxl_ros.model.constants import G0_MPS2, NOMINAL_TEMPERATURE_C, TINY
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.filters import loop, play, stop
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
+from adxl_ros.model.statistics import variances_of
 from adxl_ros.report.quantities import mg
 import numpy as np
 import scipy
@@ -98,7 +99,7 @@ class ThermalFit:
                 for parameter in ('per_k', 'per_k2')
             ]
             part = self.covariance[np.ix_(places, places)]
-            variances.append(np.einsum('ni,ij,nj->n', slopes, part, slopes) + residual_g**2)
+            variances.append(variances_of(slopes, part) + residual_g**2)
         variances_g2 = (
             np.array(variances) + self.further.error_g(temperatures_c, calibrated_c) ** 2
         )

@@ -24,8 +24,10 @@ from adxl_ros.calibrate.guided.screen_contents import (
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
+from adxl_ros.model.kinematics import unit_vectors
 from adxl_ros.model.noise import means_at_a_rail
 from adxl_ros.model.sensor import parameter_of, Sensor
+from adxl_ros.model.statistics import stds
 from adxl_ros.signals.rest_detection import datasheet_noise, RestFinder, Stillness
 import numpy as np
 
@@ -67,7 +69,7 @@ def estimated_by_gravity(sensor: Sensor, records: Sequence[PoseRecord]) -> Gravi
     rows = running_estimate.coefficient_rows(
         NAMES,
         parameters * to_units,
-        np.sqrt(np.diag(covariance)),
+        stds(covariance),
         gravity_fit.PRIOR_STD * to_units,
     )
     fitted = replace(
@@ -78,8 +80,8 @@ def estimated_by_gravity(sensor: Sensor, records: Sequence[PoseRecord]) -> Gravi
         covariance_names=NAMES,
     )
     force = force_g(rests.mean, parameters)
-    up = force / np.linalg.norm(force, axis=1, keepdims=True)
-    return GravityEstimate(parameters, rows, fitted, cube_directions.covered(up))
+    covered = cube_directions.covered(unit_vectors(force))
+    return GravityEstimate(parameters, rows, fitted, covered)
 
 
 class HandRests(Guide):
@@ -438,7 +440,7 @@ class ThermalGuide(Guide):
         if fit is not None:
             prior = [thermal_fit.PRIOR_WIDTH * parameter_of(name).scale for name in fit.names]
             rows = running_estimate.coefficient_rows(
-                fit.names, fit.values, np.sqrt(np.diag(fit.covariance)), np.array(prior)
+                fit.names, fit.values, stds(fit.covariance), np.array(prior)
             )
         return EstimateRows(self._expected(), rows)
 

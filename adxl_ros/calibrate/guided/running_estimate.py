@@ -23,6 +23,7 @@ from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.kinematics import specific_force, tilt
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
+from adxl_ros.model.statistics import stds
 from adxl_ros.report.quantities import signed, with_half_width
 import numpy as np
 
@@ -98,7 +99,7 @@ class RunningEstimate:
 
     def rows(self) -> list[ScreenRow]:
         """Return the coefficients for the screen."""
-        std = np.sqrt(np.diag(self.covariance))
+        std = stds(self.covariance)
         return coefficient_rows(self.names, get(self.sensor, self.names), std, self.prior)
 
 

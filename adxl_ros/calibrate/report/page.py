@@ -22,7 +22,9 @@ from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.kinematics import unit_vectors
 from adxl_ros.model.sensor import get, Sensor
+from adxl_ros.model.statistics import rms, stds
 from adxl_ros.process import command
 from adxl_ros.report import figures, page as html_page
 from adxl_ros.report.figures import AXIS_COLOURS, Figure, Whisker
@@ -159,8 +161,8 @@ def tiles(result: CalibrationResult) -> list[Tile]:
     found = []
     if (fit := result.gravity_fit) is not None:
         used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-        before = three_digits(rms_mg(float(np.mean(fit.before_mps2[used] ** 2))))
-        after = three_digits(rms_mg(float(np.mean(fit.held_out_mps2[used] ** 2))))
+        before = three_digits(mg(rms(fit.before_mps2[used])))
+        after = three_digits(mg(rms(fit.held_out_mps2[used])))
         found = [
             Tile(
                 'error of the magnitude of gravity',
@@ -224,7 +226,7 @@ def _sphere(result: CalibrationResult) -> dict[str, Any]:
             f'pose {i}, alpha {alpha:.1f}°, beta {beta:.1f}°'
             for i, (alpha, beta) in enumerate(np.degrees([poses.alpha_rad, poses.beta_rad]).T, 1)
         ]
-    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    up = unit_vectors(force)
     values = np.stack(list(errors.values()), axis=1)
     return {
         'models': list(errors),
@@ -280,7 +282,7 @@ class _Row(NamedTuple):
 
 def _coefficients(fitted: Sensor) -> list[_Row]:
     """Return the coefficients with their intervals within the range of the datasheet."""
-    half_widths = Z_90 * np.sqrt(np.diag(fitted.covariance))
+    half_widths = Z_90 * stds(fitted.covariance)
     departures = get(fitted, fitted.covariance_names)
     rows = []
     for row, name, value, half_width in zip(

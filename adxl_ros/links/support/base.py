@@ -306,18 +306,18 @@ class Watchdog:
     def __init__(self, longest_turn_s: float) -> None:
         self._longest_turn_s = longest_turn_s
         self._checked_s = time.monotonic()
-        self._silent_s = 0.0
+        self.silent_s = 0.0  # Time without a message until the last check
 
     def feed(self) -> None:
         """Note that a message has come; any thread may call this."""
-        self._silent_s = 0.0
+        self.silent_s = 0.0
 
     def check(self) -> float:
         """Return for how long nothing has come, s; to be called in every turn of the node."""
         now_s = time.monotonic()
-        self._silent_s += min(now_s - self._checked_s, self._longest_turn_s)
+        self.silent_s += min(now_s - self._checked_s, self._longest_turn_s)
         self._checked_s = now_s
-        return self._silent_s
+        return self.silent_s
 
 
 def parse_channels(value: str | Sequence[str]) -> list[str]:
