@@ -14,7 +14,7 @@ from functools import partial
 from itertools import product
 
 from adxl_ros.calibrate.fits import full_model
-from adxl_ros.calibrate.fits.linearisation import StageError
+from adxl_ros.calibrate.fits.pose_covariance import StageError
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
 from adxl_ros.calibrate.pose_model import predicted_volts
 from adxl_ros.calibrate.poses import Poses

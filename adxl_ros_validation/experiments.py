@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from adxl_ros.calibrate.fits import full_model, linear
-from adxl_ros.calibrate.fits.linearisation import StageError
+from adxl_ros.calibrate.fits.pose_covariance import StageError
 from adxl_ros.calibrate.guided.pose_plan import spread, Target
 from adxl_ros.calibrate.pose_model import stage_force
 from adxl_ros.calibrate.poses import Poses

@@ -11,7 +11,7 @@ from functools import partial
 from typing import NamedTuple
 
 from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, thermal_fit
-from adxl_ros.calibrate.fits.linearisation import volts_covariance
+from adxl_ros.calibrate.fits.pose_covariance import volts_covariance
 from adxl_ros.calibrate.pose_model import predicted_volts, reference_force, residual_g
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, held_out

@@ -41,7 +41,7 @@ from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, DriftSpectrum, Role
 from adxl_ros.model.sensor import parameter_of, Sensor
 from adxl_ros.signals.block_statistics import true_runs
-from adxl_ros.simulate.motion import SmoothedPath
+from adxl_ros.simulate.smoothed_path import SmoothedPath
 import numpy as np
 import scipy
 

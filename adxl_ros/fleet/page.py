@@ -14,8 +14,8 @@ from typing import NamedTuple
 from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import write_text
 from adxl_ros.fleet import table as fleet
-from adxl_ros.fleet.pooling import FALSE_DISCOVERY_RATE
 from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE
+from adxl_ros.fleet.trends import FALSE_DISCOVERY_RATE
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.population import Population
 from adxl_ros.report import figures as plotly, page as html_page
@@ -320,26 +320,27 @@ def _outlier_rows(
     table: fleet.FleetTable, results: Sequence[fleet.QuantityResult]
 ) -> list[dict[str, str]]:
     """Return the recordings that are far from others of their sensor, the farthest first."""
-    outliers = []
+    shown = []
+    distances = []
     for result in results:
-        values = result.quantity.factor * result.recordings.value
-        outliers += [
-            (float(result.distance[i]), result.rows[i], result.quantity, values[i])
-            for i in np.flatnonzero(result.is_outlier)
-        ]
-    outliers.sort(key=lambda item: -item[0])
-    return [
-        {
-            'serial': table.serials[table.sensor[row]],
-            'date': date_text(table.years[row]),
-            'quantity': quantity.label,
-            'distance': number(distance),
-            'value': f'{number(value)} {quantity.shown_unit}',
-            'url': table['url'][row],
-            'report': table['report'][row],
-        }
-        for distance, row, quantity, value in outliers[:_MOST_ROWS]
-    ]
+        quantity = result.quantity
+        for i in np.flatnonzero(result.is_outlier):
+            row = result.rows[i]
+            value = quantity.factor * result.recordings.value[i]
+            distances.append(float(result.distance[i]))
+            shown.append(
+                {
+                    'serial': table.serials[table.sensor[row]],
+                    'date': date_text(table.years[row]),
+                    'quantity': quantity.label,
+                    'distance': number(distances[-1]),
+                    'value': f'{number(value)} {quantity.shown_unit}',
+                    'url': table['url'][row],
+                    'report': table['report'][row],
+                }
+            )
+    farthest = np.argsort(-np.array(distances), kind='stable')[:_MOST_ROWS]
+    return [shown[i] for i in farthest]
 
 
 def _refusal_rows(table: fleet.FleetTable) -> list[list[str]]:

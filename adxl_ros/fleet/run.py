@@ -199,7 +199,7 @@ def _since(
     """Return the recordings that began at a date or later, and those without a date."""
     dates = {url: entry.row['date'] for url, entry in results.newest.items()}
     unread = [source for source in sources if not (source.date or dates.get(source.url))]
-    dates |= {source.url: date for source, (_, date) in zip(unread, stated_by(unread))}
+    dates |= {source.url: stated.date for source, stated in zip(unread, stated_by(unread))}
     return [
         source
         for source in sources

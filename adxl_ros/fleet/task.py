@@ -29,7 +29,7 @@ from adxl_ros.files.recording_columns import NO_SERIAL, Recording
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.fleet import inputs
-from adxl_ros.fleet.inputs import begin_of, FoundRecording
+from adxl_ros.fleet.inputs import begin_of, Date, FoundRecording
 from adxl_ros.fleet.row import (
     empty_row,
     finite,
@@ -127,13 +127,6 @@ def stage(source: FoundRecording, folder: Path) -> Staged:
     return Staged(target, sha256([target]), size_bytes)
 
 
-class Date(NamedTuple):
-    """When a recording was made."""
-
-    text: str  # By ISO 8601; empty where it is not known
-    source: str  # What states it: manifest, header, stamps or file
-
-
 class TaskResult(NamedTuple):
     """What a task leaves."""
 
@@ -209,7 +202,7 @@ def _of_staged(
     serial = source.serial or recorded
     date = Date(source.date, 'manifest')
     if not date.text and first:
-        date = Date(*begin_of(first))
+        date = begin_of(first)
     if not date.text:
         date = Date(source.modified, 'file')
     parameters = recipe.parameters_of(serial, date.text, source.params)

@@ -19,9 +19,10 @@ from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.simulate.motion import ForcePath, Held, INTERNAL_RATE_HZ, Motion, Path, SmoothedPath
+from adxl_ros.simulate.motion import ForcePath, Held, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.robot import Robot, RobotPath
+from adxl_ros.simulate.smoothed_path import SmoothedPath
 import numpy as np
 import scipy
 
@@ -103,7 +104,7 @@ class StreamBuffer:
     def between(self, begin_ns: int, end_ns: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the stamps, ns, (n,), and rows, (n, k), of a time."""
         pieces = [*takewhile(lambda piece: piece[0][-1] >= begin_ns, reversed(self._pieces))]
-        stamps, rows = (np.concatenate(parts) for parts in zip(self._nothing, *pieces[::-1]))
+        stamps, rows = map(np.concatenate, zip(self._nothing, *pieces[::-1]))
         part = slice(*np.searchsorted(stamps, [begin_ns, end_ns]))
         return stamps[part], rows[part]
 

@@ -24,9 +24,9 @@ from adxl_ros.calibrate.guided.controller import (
     RequestAnswer,
 )
 from adxl_ros.calibrate.guided.guide import NextPose
-from adxl_ros.calibrate.guided.rest_guides import ThermalSettings
 from adxl_ros.calibrate.guided.screen_contents import KeyAction, Phase, StageMode
 from adxl_ros.calibrate.guided.session import SessionSettings
+from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
 from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
 from adxl_ros.files import calibration_store, cdr
 from adxl_ros.files.recording_columns import JOINTS

@@ -26,17 +26,8 @@ from adxl_ros.model.effects.base import Components
 from adxl_ros.model.statistics import rms
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
-from adxl_ros.simulate.motion import (
-    ForcePath,
-    Held,
-    INTERNAL_RATE_HZ,
-    KNOT_S,
-    Motion,
-    noise_step,
-    Path,
-    PathErrors,
-    SmoothedPath,
-)
+from adxl_ros.simulate.motion import ForcePath, Held, INTERNAL_RATE_HZ, Motion, Path
+from adxl_ros.simulate.smoothed_path import KNOT_S, noise_step, PathErrors, SmoothedPath
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d

@@ -37,8 +37,9 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from typing import NamedTuple
 
-from adxl_ros.calibrate.fits import linear, linearisation
-from adxl_ros.calibrate.fits.linearisation import Linearised, linearised, StageError
+from adxl_ros.calibrate.fits import linear, optimal_poses, pose_covariance
+from adxl_ros.calibrate.fits.linearisation import Linearised, linearised
+from adxl_ros.calibrate.fits.pose_covariance import StageError
 from adxl_ros.calibrate.pose_model import angle_jacobian, predicted_volts
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
@@ -261,7 +262,7 @@ class _StageSearch:
         self._sensor, self._stage = sensor, stated  # Sensor with coefficients, and stage error
         # Predicted errors of the angles, and the poses turned by them; see `_turned_linearly`
         none_rad = np.zeros((len(poses), 2))
-        self._errors = linearisation.AngleErrors(none_rad, none_rad, none_rad[:, 0], 0.0)
+        self._errors = pose_covariance.AngleErrors(none_rad, none_rad, none_rad[:, 0], 0.0)
         self._poses = poses
         self._kept = np.ones(len(poses), bool)  # Poses that are no outliers
         # Volts by which the model departs from its linearisation, (m,)
@@ -335,7 +336,7 @@ class _StageSearch:
         errors = solved.covariance.predicted_errors(solved.about.residual)
         start = get(self._sensor, self._names)
 
-        def cost(values: np.ndarray, angles: linearisation.AngleErrors) -> float:
+        def cost(values: np.ndarray, angles: pose_covariance.AngleErrors) -> float:
             residual = self._measured.volts - predicted_volts(
                 put(self._sensor, self._names, values), _turned(self._measured, angles.total_rad)
             )
@@ -396,7 +397,7 @@ class _Iterate(Iterate):
     """An iterate with the linearised poses, their covariance, and the information, (p, p)."""
 
     about: Linearised
-    covariance: linearisation.PoseCovariance
+    covariance: pose_covariance.PoseCovariance
     information: np.ndarray
 
     @property
@@ -535,11 +536,11 @@ def next_poses(
     sensor: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
 ) -> str:
     """Name the poses of a 15° grid that would help most (D-optimality; Fedorov 1972), in deg."""
-    grid = linearisation.candidate_poses(np.median(poses.std_v, axis=0))
+    grid = optimal_poses.candidate_poses(np.median(poses.std_v, axis=0))
     scale = _sizes(names)
-    rows = linearisation.whitened_jacobian(sensor, grid, tuple(names), stage) * scale
+    rows = optimal_poses.whitened_jacobian(sensor, grid, tuple(names), stage) * scale
     information = fisher_information(sensor, poses, names, stage) * np.outer(scale, scale)
-    chosen = linearisation.choose_poses(
+    chosen = optimal_poses.choose_poses(
         rows, information + _REGULARISATION * np.eye(len(names)), _NAMED_POSES
     )
     return ', '.join(

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
-from adxl_ros.calibrate.fits import full_model, linearisation
-from adxl_ros.calibrate.fits.linearisation import linearised, StageError
+from adxl_ros.calibrate.fits import full_model, optimal_poses, pose_covariance
+from adxl_ros.calibrate.fits.linearisation import linearised
+from adxl_ros.calibrate.fits.pose_covariance import StageError
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.guided.pose_plan import Target
 from adxl_ros.calibrate.guided.screen_contents import ScreenRow
@@ -61,7 +62,7 @@ class RunningEstimate:
         slope = coefficient_jacobian(sensor, pose, self.names)[0]
         variance = np.diag(
             slope @ self.covariance @ slope.T
-            + linearisation.volts_covariance(sensor, pose, self.stage).blocks[0]
+            + pose_covariance.volts_covariance(sensor, pose, self.stage).blocks[0]
         )
         expected_v = predicted_volts(sensor, pose)[0]
         slack_v = sensor.nominal_scale_v_per_g * np.hypot(_MODEL_STD_G, tolerance_rad)
@@ -203,11 +204,11 @@ def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: in
     """Choose the fewest poses that reach a tilt error, and never more than 90."""
     start = from_records(sensor, [], dwell_s)
     fewest = math.ceil((len(start.names) + _SPARE_READINGS) / len(sensor.axes))
-    grid = linearisation.candidate_poses(start.pose_std_v)
-    rows = linearisation.whitened_jacobian(start.sensor, grid, start.names, start.stage)
+    grid = optimal_poses.candidate_poses(start.pose_std_v)
+    rows = optimal_poses.whitened_jacobian(start.sensor, grid, start.names, start.stage)
     chosen = [
         Target(float(grid.alpha_rad[i]), float(grid.beta_rad[i]))
-        for i in linearisation.choose_poses(
+        for i in optimal_poses.choose_poses(
             rows, np.diag(1 / start.prior**2), max(_MOST_POSES, fewest)
         )
     ]

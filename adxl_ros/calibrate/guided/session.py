@@ -12,9 +12,10 @@ from typing import Any
 
 from adxl_ros.calibrate import calibration
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
-from adxl_ros.calibrate.guided.rest_guides import HandGuide, ThermalGuide, ThermalSettings
+from adxl_ros.calibrate.guided.rest_guides import HandGuide
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, EstimateRows, StageMode
 from adxl_ros.calibrate.guided.stage_guide import StageGuide
+from adxl_ros.calibrate.guided.thermal_guide import ThermalGuide, ThermalSettings
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import page
 from adxl_ros.errors import UserError

@@ -199,7 +199,8 @@ def _stuff(raw: bytes) -> bytes:
     return bytes(stuffed)
 
 
-def _unstuff(raw: bytes) -> bytes:
+def unstuff(raw: bytes) -> bytes:
+    """Return the bytes of a frame as they were before `_stuff`."""
     if 0 in raw:
         raise WireError('zero byte found in input')
     parts = []
@@ -217,7 +218,7 @@ def _unstuff(raw: bytes) -> bytes:
 
 def _checked_payload(raw: bytes) -> bytes:
     """Return the payload of a frame; raise `WireError` unless whole and of this version."""
-    decoded = _unstuff(raw)
+    decoded = unstuff(raw)
     payload, check = decoded[: -_CRC.size], decoded[-_CRC.size :]
     if len(payload) < _COMMAND.size or check != _CRC.pack(zlib.crc32(payload)):
         raise WireError('the CRC does not match')
