@@ -23,10 +23,10 @@ from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import rms, stds
 from adxl_ros.model.noise import means_at_a_rail
 from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.statistics import rms, stds
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg, with_half_width
 from adxl_ros.signals import recorded_sensor
@@ -114,21 +114,14 @@ def calibrate(
     doubts = require_unit(of_volts(poses.volts, poses.std_v, sensor), source, True)
     for recording in recordings:
         doubts += recording.faults
+    given = _Given(sensor, source, data_sha256, population, doubts)
     if poses.has_angles.any():
         with_angles = [
             replace(recording, poses=recording.poses.subset(recording.poses.has_angles))
             for recording in recordings
         ]
-        result = _against_stage(
-            sensor,
-            with_angles,
-            model or ('full' if effects else None),
-            effects,
-            source,
-            data_sha256,
-            population,
-            doubts,
-        )
+        model = model or ('full' if effects else None)
+        result = _against_stage(given, with_angles, model, effects)
         starts_s = poses.time_s[~poses.has_angles, 0]
         if len(starts_s):
             lines.append(
@@ -153,9 +146,19 @@ def calibrate(
         )
     else:
         span_s = sum(float(np.ptp(recording.poses.time_s)) for recording in recordings)
-        result = _against_gravity(sensor, poses, source, span_s, data_sha256, population, doubts)
+        result = _against_gravity(given, poses, span_s)
     lines += _turn_on_lines(result.fitted, [recording.poses for recording in recordings])
     return replace(result, warnings=(*result.warnings, *lines))
+
+
+class _Given(NamedTuple):
+    """What each fit of some recordings is given beside the poses."""
+
+    sensor: Sensor  # The nominal sensor
+    source: str  # Names of the recordings
+    data_sha256: str
+    population: Population | None
+    doubts: list[str]  # What is wrong with the recordings, one line each
 
 
 @dataclass(frozen=True)
@@ -168,15 +171,12 @@ class _StageFit:
 
 
 def _against_stage(
-    sensor: Sensor,
+    given: _Given,
     recordings: Sequence[RecordedPoses],
     model: str | None,
     effects: Sequence[str],
-    source: str,
-    data_sha256: str,
-    population: Population | None,
-    doubts: list[str],
 ) -> CalibrationResult:
+    sensor, source, data_sha256, population, doubts = given
     poses = Poses.joined([recording.poses for recording in recordings])
     _check_polarity(sensor, poses)
     fit = _richest_fit(sensor, poses.subset(~poses.check), recordings, model, effects)
@@ -409,15 +409,9 @@ def _turn_and_shifts(full: full_model.FullFit, poses: Poses) -> tuple[np.ndarray
     return covariance @ gradient, np.sqrt(np.maximum(np.diag(covariance), _MIN_VARIANCE))
 
 
-def _against_gravity(
-    sensor: Sensor,
-    poses: Poses,
-    source: str,
-    span_s: float,
-    data_sha256: str,
-    population: Population | None,
-    doubts: list[str],
-) -> CalibrationResult:
+def _against_gravity(given: _Given, poses: Poses, span_s: float) -> CalibrationResult:
+    """Fit rests that last for a time, s, to the magnitude of gravity."""
+    sensor, source, data_sha256, population, doubts = given
     fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
     after_mg = mg(rms(fit.residual_mps2[kept]))

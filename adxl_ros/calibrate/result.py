@@ -25,9 +25,9 @@ from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.accelerometer import OTHER_AXIS
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.gyroscope import Gyroscope, NO_TURN
 from adxl_ros.model.sensor import Envelope, get, parameter_of, Sensor, with_neutral
-from adxl_ros.model.statistics import stds
 from adxl_ros.process import package_version
 from adxl_ros.report.quantities import decimals, fixed, mg_text, with_half_width
 import numpy as np

@@ -21,9 +21,9 @@ from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.statistics import rms
 from adxl_ros.report.quantities import acceleration_text
 from adxl_ros.signals.block_statistics import held_values, true_runs
 from adxl_ros.simulate.motion import ForcePath, INTERNAL_RATE_HZ, Motion, Path

@@ -37,8 +37,8 @@ from adxl_ros.files.recording_columns import check_same_sensor, Recording
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named, library
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_axes, with_neutral
-from adxl_ros.model.statistics import rms
 from adxl_ros.report.quantities import Interval
 from adxl_ros.signals.block_statistics import true_runs
 from adxl_ros.simulate.motion import Motion

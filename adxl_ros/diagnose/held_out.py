@@ -16,7 +16,7 @@ from typing import NamedTuple, TYPE_CHECKING
 from adxl_ros.diagnose import evidence as linear
 from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis, Whitener
 from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.statistics import rms
+from adxl_ros.model.error_sizes import rms
 import numpy as np
 
 if TYPE_CHECKING:

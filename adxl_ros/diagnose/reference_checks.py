@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose.comparison import BaselineComparison, bridged, SMALLEST_MOTION_G
 from adxl_ros.model.constants import AXES, G0_MPS2
-from adxl_ros.model.statistics import rms
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.report.quantities import mg_text
 import numpy as np
 import scipy

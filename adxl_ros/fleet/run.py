@@ -245,7 +245,7 @@ def _written(end: Finished, recipe: Recipe, results: Results) -> Row:
     if error is None:
         result = end.value
     elif isinstance(error, StagingError):
-        result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
+        result = refused(recipe, source, one_line(error))
     else:
         result = refused(
             recipe,

@@ -40,8 +40,8 @@ from adxl_ros.fleet.row import (
     sha256_of,
 )
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.statistics import stds
 from adxl_ros.process import code_version, options_named, package_version
 from adxl_ros.signals.findings import check_recording, Findings
 import numpy as np
@@ -158,7 +158,7 @@ def make_row(
             staged = stage(source, folder / 'recording')
             result = _of_staged(recipe, source, frozenset() if is_again else earlier, staged)
     except UserError as error:
-        result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
+        result = refused(recipe, source, one_line(error))
     row = result.row
     row |= {name: finite(value) for name, value in row.items() if isinstance(value, float)}
     row |= {
@@ -179,7 +179,7 @@ def refused(
     row |= {
         'key': sha256_of(f'{source.url} {source.stamp}', digest),
         'outcome': outcome,
-        'refusal': reason,
+        'refusal': reason.removeprefix(f'{source.url}: '),
         'refused_by': 'stage',
     }
     return TaskResult(row, {}, source.stamp, digest)

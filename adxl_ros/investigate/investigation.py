@@ -44,7 +44,7 @@ from adxl_ros.investigate.manoeuvres import (
 )
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report import quantities
+from adxl_ros.report.quantities import listed
 from adxl_ros.workers import in_background
 import numpy as np
 
@@ -253,7 +253,7 @@ def first_or_others(names: Sequence[str]) -> str:
     others = len(names) - _LARGEST_NAMED
     if others > 0:
         shown.append(f'{others} others')
-    return quantities.listed(shown, 'or')
+    return listed(shown, 'or')
 
 
 class OutputFolder:

@@ -19,7 +19,24 @@ import time
 from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
-from adxl_ros.links.support import base, stamping, wire_format
+from adxl_ros.links.support import stamping, wire_format
+from adxl_ros.links.support.base import (
+    Backoff,
+    check_roles,
+    COLUMNS,
+    DeviceSettings,
+    Event,
+    Level,
+    Link,
+    LinkStatus,
+    option,
+    parse_channels,
+    reason,
+    Samples,
+    SUPPLY,
+    TEMPERATURE,
+    UNUSED,
+)
 from adxl_ros.links.support.clock_map import ClockMap
 from adxl_ros.links.support.clock_rate import ClockRate
 from adxl_ros.links.support.stamping import Stamper
@@ -28,7 +45,7 @@ from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_DEFAULT_ROLES = (*AXES, base.SUPPLY)
+_DEFAULT_ROLES = (*AXES, SUPPLY)
 """Roles of the first channels where the parameters state none."""
 _SILENT_S = 0.5
 """Silence after which a board counts as silent, s. Chosen: 50 frames of the firmware."""
@@ -68,23 +85,23 @@ _RECONNECT_S = 3.0
 
 
 @dataclass(frozen=True)
-class Settings(base.DeviceSettings):
+class Settings(DeviceSettings):
     """Settings of the link."""
 
-    port: str = base.option('', 'device path, such as /dev/ttyACM0, or a pyserial URL')
-    baud: int = base.option(
+    port: str = option('', 'device path, such as /dev/ttyACM0, or a pyserial URL')
+    baud: int = option(
         115200, 'baud rate of a UART; USB and network ports ignore it', 'Bd', 50, 100_000_000
     )
     # A list of strings, or one string with commas
-    channels: str | Sequence[str] = base.option(
+    channels: str | Sequence[str] = option(
         (),
         'roles of the channels of a frame: x, y, z, supply, temperature, or - for unused; '
         'empty: the first channels are x, y, z, supply',
     )
-    temperature_zero_v: float = base.option(
+    temperature_zero_v: float = option(
         0.5, 'output of the temperature sensor at 0 degC', 'V', -10.0, 10.0
     )
-    temperature_v_per_c: float = base.option(
+    temperature_v_per_c: float = option(
         0.01, 'slope of the temperature sensor', 'V/degC', -10.0, 10.0
     )
 
@@ -109,20 +126,20 @@ class _Conversion:
             raise UserError(
                 f'link.channels: {len(roles)} are named, the board has {info.channels}'
             )
-        base.check_roles(roles, axes)
+        check_roles(roles, axes)
         self.max_code = 2**info.bits - 1
         # Value of a channel is gain · code + offset, V or degC, (m,)
         self._gain = np.full(info.channels, info.vref_v / 2**info.bits)
         self._offset = np.zeros(info.channels)
         for i, role in enumerate(roles):
-            if role == base.SUPPLY:
+            if role == SUPPLY:
                 self._gain[i] *= settings.supply_scale
-            elif role == base.TEMPERATURE:
+            elif role == TEMPERATURE:
                 self._gain[i] /= settings.temperature_v_per_c
                 self._offset[i] = -settings.temperature_zero_v / settings.temperature_v_per_c
         self._axes = [roles.index(axis) for axis in axes]
         self._references = {
-            column: roles.index(role) for role, column in base.COLUMNS.items() if role in roles
+            column: roles.index(role) for role, column in COLUMNS.items() if role in roles
         }
         # Times of the samples of a frame after its first one, ns
         self._steps_ns = np.rint(
@@ -141,7 +158,7 @@ class _Conversion:
         )
 
 
-class SerialLink(base.Link):
+class SerialLink(Link):
     """
     The samples of a board, each once and in order, stamped by the clock of the board.
 
@@ -152,12 +169,12 @@ class SerialLink(base.Link):
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         self._declared = sensor
         self._settings = settings
-        self._stated_roles = base.parse_channels(settings.channels)
+        self._stated_roles = parse_channels(settings.channels)
         if self._stated_roles:
-            base.check_roles(self._stated_roles, sensor.axes)
+            check_roles(self._stated_roles, sensor.axes)
         self.references = tuple(
             column
-            for role, column in base.COLUMNS.items()
+            for role, column in COLUMNS.items()
             if role in (self._stated_roles or _DEFAULT_ROLES)
         )
         self._port = _Port(settings.port, settings.baud)
@@ -177,7 +194,7 @@ class SerialLink(base.Link):
         self._last_frame_s = self._last_sample_s = self._created_s = time.monotonic()
         self._busy_until_s = self._unpaid_s = 0.0
 
-    def read(self, now_ns: int) -> base.Samples:
+    def read(self, now_ns: int) -> Samples:
         """Wait for bytes, at most 50 ms, and return the samples that they complete."""
         # What need not precede the samples of the last call follows them.
         self._throttle()
@@ -195,7 +212,7 @@ class SerialLink(base.Link):
                 self._on_samples(frame, arrived_ns)
         return self._stamper.take(self._declared)
 
-    def status(self) -> base.LinkStatus:
+    def status(self) -> LinkStatus:
         """Return how the port, the frames and the clock work."""
         level, text = self._condition()
         counts = self._counts
@@ -213,10 +230,10 @@ class SerialLink(base.Link):
             'connections': self._port.connections,
             **self._stamper.statistics(),
         }
-        reset = base.Event(
+        reset = Event(
             'the device was reset or is another one: a new count begins', counts['resets']
         )
-        return base.LinkStatus(level, text, statistics, (reset, *self._stamper.events()))
+        return LinkStatus(level, text, statistics, (reset, *self._stamper.events()))
 
     def hold_self_test(self, hold_s: float) -> None:
         """Tell the board again and again; it ends the self-test by itself when this stops."""
@@ -241,27 +258,27 @@ class SerialLink(base.Link):
         self._port.write(wire_format.encode_command(self._commands, time_us, kind))
         self._commands += 1
 
-    def _condition(self) -> tuple[base.Level, str]:
+    def _condition(self) -> tuple[Level, str]:
         """Return level and text of the status: the first fault of port, frames and board."""
         port = self._settings.port
         info = self._info
         if self._port.error:
-            return base.Level.ERROR, self._port.error
+            return Level.ERROR, self._port.error
         now_s = time.monotonic()
         if info is None and now_s - max(self._port.opened_s, self._created_s) < _INFO_WAIT_S:
-            return base.Level.OK, 'connecting'
+            return Level.OK, 'connecting'
         if obstacle := self._obstacle(now_s):
             if now_s - self._last_sample_s > _DEAD_S:
                 return (
-                    base.Level.ERROR,
+                    Level.ERROR,
                     f'{port}: {obstacle}; no sample for more than {_DEAD_S:g} s',
                 )
-            return base.Level.WARN, f'{port}: {obstacle}'
+            return Level.WARN, f'{port}: {obstacle}'
         if self._misfit:
-            return base.Level.ERROR, self._misfit
+            return Level.ERROR, self._misfit
         if contradiction := self._rate.fault:
-            return base.Level.ERROR, f'{port}: the board {contradiction} in its info frame'
-        return base.Level.OK, 'streaming'
+            return Level.ERROR, f'{port}: the board {contradiction} in its info frame'
+        return Level.OK, 'streaming'
 
     def _obstacle(self, now_s: float) -> str:
         """Return why no samples come at a monotonic time, s, or ''."""
@@ -348,7 +365,7 @@ class SerialLink(base.Link):
         self._counter.restart(info.rate_hz)
         axes = self._declared.axes
         roles = self._stated_roles or [
-            base.UNUSED if role in AXES and role not in axes else role
+            UNUSED if role in AXES and role not in axes else role
             for role in _DEFAULT_ROLES[: info.channels]
         ]
         try:
@@ -415,7 +432,7 @@ class _Port:
         self._pyserial = import_pyserial()
         self._port: Any = None
         self._poll: Any = None
-        self.backoff = base.Backoff()  # Of the attempts to open it; bytes that make sense reset it
+        self.backoff = Backoff()  # Of the attempts to open it; bytes that make sense reset it
         # Why the port is not open, in one line; '' while it is open and before the first attempt
         self.error = ''
 
@@ -464,7 +481,7 @@ class _Port:
             self._lose(
                 'in use: another process has locked it'
                 if getattr(error, 'errno', None) in _LOCKED
-                else base.reason(error)
+                else reason(error)
             )
             return
         self.connections += 1

@@ -16,7 +16,7 @@ import sys
 import termios
 from typing import Any
 
-from adxl_ros.calibrate.guided import controller, pose_plan, screen_contents
+from adxl_ros.calibrate.guided import controller, pose_plan
 from adxl_ros.calibrate.guided.controller import (
     Controller,
     ControllerState,
@@ -24,7 +24,14 @@ from adxl_ros.calibrate.guided.controller import (
     RequestAnswer,
 )
 from adxl_ros.calibrate.guided.guide import NextPose
-from adxl_ros.calibrate.guided.screen_contents import KeyAction, Phase, StageMode
+from adxl_ros.calibrate.guided.screen_contents import (
+    CaptureSettings,
+    KeyAction,
+    Phase,
+    ScreenContents,
+    ScreenRow,
+    StageMode,
+)
 from adxl_ros.calibrate.guided.session import SessionSettings
 from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
 from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
@@ -368,14 +375,14 @@ class DisplayPublisher:
         newest = stream.newest
         usual = _BY_HAND if controller.settings.operator_captures else _RUNNING
         keys = () if phase is Phase.FIT else _KEYS.get(controller.state, usual)
-        coefficients: list[screen_contents.ScreenRow] = []
+        coefficients: list[ScreenRow] = []
         if session is not None:
             rows, coefficients = session.rows()
         else:
             rows = [] if newest is None else newest.rows(newest.stillness())
         self._publisher.publish(
             String(
-                data=screen_contents.ScreenContents(
+                data=ScreenContents(
                     phase=phase,
                     text=text,
                     unit=f'{nominal.serial} ({nominal.axes})' if nominal else '',
@@ -625,7 +632,7 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
         ).tolist()
     )
     step_rad = float(np.radians(own.step_deg))
-    capture = screen_contents.CaptureSettings(
+    capture = CaptureSettings(
         dwell_s=own.dwell_s,
         tolerance_rad=own.tolerance_rad,
         timeout_s=own.timeout_s,

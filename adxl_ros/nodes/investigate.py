@@ -15,8 +15,15 @@ from typing import Any
 
 from adxl_ros.files.atomic_write import free_name
 from adxl_ros.files.bag_writer import LiveBag
-from adxl_ros.investigate import investigation
-from adxl_ros.investigate.investigation import Answer, Investigation, OutputFolder, State
+from adxl_ros.investigate.investigation import (
+    Answer,
+    BackgroundDiagnoser,
+    hypothesis_text,
+    Investigation,
+    OutputFolder,
+    RoundOutcome,
+    State,
+)
 from adxl_ros.investigate.manoeuvres import CATALOGUE, Pose, StageLimits
 from adxl_ros.nodes import parameter_checks, parameters, sensor_parameters, topics
 from adxl_ros.nodes.jobs import LiveLine
@@ -91,11 +98,11 @@ class InvestigateSettings:
 def answer_lines(minutes: float, answer: Answer) -> list[str]:
     """Return the probabilities after a diagnosis, and what follows."""
     named = '  '.join(
-        f'{investigation.hypothesis_text(h.effects)} {percent(h.probability)}'
+        f'{hypothesis_text(h.effects)} {percent(h.probability)}'
         for h in answer.hypotheses[:_MOST_NAMED]
     )
     lines = wrap(f'{minutes:5.1f} min  {named}', COLUMNS, subsequent_indent=_INDENT)
-    if answer.outcome is investigation.RoundOutcome.GO_ON:
+    if answer.outcome is RoundOutcome.GO_ON:
         lines += wrap(
             f'next: {CATALOGUE[answer.manoeuvre].text}',
             COLUMNS,
@@ -148,7 +155,7 @@ class Investigate(Node):
         self._investigation = Investigation(
             limits,
             own.minutes,
-            investigation.BackgroundDiagnoser(self._folder, limits, own.seed),
+            BackgroundDiagnoser(self._folder, limits, own.seed),
             lambda minutes, answer: self._screen.add(*answer_lines(minutes, answer)),
             self._flush,
         )

@@ -157,6 +157,7 @@ class SimulatedStageNode:
     """
 
     def __init__(self, node: Node) -> None:
+        self.about = 'simulated stage: '  # What it is, for the log
         self._node = node
         own = declare_all(node, SimulatedStageSettings)
         self._stage = SimulatedStage(
@@ -177,17 +178,11 @@ class SimulatedStageNode:
         self._refusal = ''
         self._encoders = topics.create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
         self._true = topics.create_publisher(node, JointState, 'stage/true_joint_states', _QUEUE)
-        topics.DiagnosticsReporter(node, 'stage', self._status)
-        topics.create_subscription(
-            node, JointState, 'stage/command', self._on_command, _COMMAND_QUEUE
-        )
-        node.get_logger().info(
-            f'simulated stage: waiting for {node.resolve_topic_name("stage/command")}'
-        )
         # The timer runs on ROS time: each message of a faster clock wakes the node.
         node.create_timer(_STEP_NS * 1e-9, self._tick)
 
-    def _on_command(self, message: JointState) -> None:
+    def on_command(self, message: JointState) -> None:
+        """Take a command of `stage/command`."""
         positions = dict(zip(message.name, message.position))
         try:
             if len(message.name) != len(message.position):
@@ -234,7 +229,8 @@ class SimulatedStageNode:
             )
         )
 
-    def _status(self) -> Status:
+    def status(self) -> Status:
+        """Return the state for /diagnostics."""
         level = Level.OK
         text = 'moving' if self._stage.moving() else 'at rest'
         if self._refusal:
@@ -284,19 +280,16 @@ class StageBridge:
             own.command or _DEFAULT_COMMANDS[kind],
             _COMMAND_QUEUE,
         )
-        topics.DiagnosticsReporter(node, 'stage', self._status)
-        topics.create_subscription(
-            node, JointState, 'stage/command', self._on_command, _COMMAND_QUEUE
-        )
         topics.create_subscription(
             node, JointState, own.joint_states, self._on_states, _STATES_QUEUE
         )
-        node.get_logger().info(
+        self.about = (
             f'bridge ({kind}): commands go to {self._commands.topic_name}, positions come from '
-            f'{self._states_topic}; waiting for {node.resolve_topic_name("stage/command")}'
+            f'{self._states_topic}; '
         )
 
-    def _on_command(self, message: JointState) -> None:
+    def on_command(self, message: JointState) -> None:
+        """Take a command of `stage/command`."""
         positions = dict(zip(message.name, message.position))
         before_rad = np.where(np.isfinite(self._goal_rad), self._goal_rad, self._angles_rad)
         goal_rad = np.array(
@@ -370,7 +363,8 @@ class StageBridge:
         stage.header.stamp = message.header.stamp
         self._positions.publish(stage)
 
-    def _status(self) -> Status:
+    def status(self) -> Status:
+        """Return the state for /diagnostics."""
         values = {
             name: angle
             for name, angle in zip(_ANGLES, self._angles_rad.tolist())
@@ -412,7 +406,14 @@ class Stage(Node):
         super().__init__('stage')
         parameter_checks.check_given(self)
         kind = declare_all(self, StageSettings).kind
-        self._stage = SimulatedStageNode(self) if kind == 'simulated' else StageBridge(self, kind)
+        stage = SimulatedStageNode(self) if kind == 'simulated' else StageBridge(self, kind)
+        topics.DiagnosticsReporter(self, 'stage', stage.status)
+        topics.create_subscription(
+            self, JointState, 'stage/command', stage.on_command, _COMMAND_QUEUE
+        )
+        self.get_logger().info(
+            f'{stage.about}waiting for {self.resolve_topic_name("stage/command")}'
+        )
 
 
 def main() -> int:

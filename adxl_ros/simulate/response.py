@@ -24,11 +24,11 @@ from adxl_ros.model.effects.base import (
     Place,
     Signals,
 )
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.filters import first_order_recursion, low_pass
 from adxl_ros.model.kinematics import specific_force_in_motion
 from adxl_ros.model.sensor import neutral, Sensor
 from adxl_ros.model.signal_chain import Chain
-from adxl_ros.model.statistics import rms
 from adxl_ros.report.quantities import mg
 from adxl_ros.simulate.motion import (
     check_needs,

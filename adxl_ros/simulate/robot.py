@@ -23,7 +23,7 @@ from adxl_ros.files.robot_readings import JointTrack, RobotReadings
 from adxl_ros.files.stamps import period_s, stamped_rate_hz
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Components
-from adxl_ros.model.statistics import rms
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
 from adxl_ros.simulate.motion import ForcePath, Held, INTERNAL_RATE_HZ, Motion, Path

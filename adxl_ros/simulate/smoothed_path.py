@@ -10,7 +10,7 @@ from itertools import pairwise
 from math import factorial
 
 from adxl_ros.files.stamps import stamped_rate_hz
-from adxl_ros.model.statistics import rms
+from adxl_ros.model.error_sizes import rms
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 import scipy

@@ -46,9 +46,9 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Place, Role
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import coefficients_of, get, parameter_of, put, Sensor, with_neutral
-from adxl_ros.model.statistics import stds
 from adxl_ros.process import usage
 from adxl_ros.report.quantities import with_half_width
 import numpy as np

@@ -21,9 +21,9 @@ from adxl_ros.calibrate.fits.cube_directions import AXES_UP, covered, points_up
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import variances_of
 from adxl_ros.model.kinematics import unit_vectors
 from adxl_ros.model.sensor import parameter_of, Sensor
-from adxl_ros.model.statistics import variances_of
 from adxl_ros.process import option, usage
 from adxl_ros.report.quantities import mg
 import numpy as np

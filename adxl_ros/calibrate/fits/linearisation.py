@@ -26,8 +26,8 @@ from adxl_ros.calibrate.fits.pose_covariance import (
 from adxl_ros.calibrate.pose_model import angle_jacobian, coefficient_jacobian, predicted_volts
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.sensor import get, Sensor
-from adxl_ros.model.statistics import stds
 import numpy as np
 import scipy
 

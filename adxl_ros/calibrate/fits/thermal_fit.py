@@ -16,9 +16,9 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stamps import period_s
 from adxl_ros.model.constants import G0_MPS2, NOMINAL_TEMPERATURE_C, TINY
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import variances_of
 from adxl_ros.model.filters import loop, play, stop
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
-from adxl_ros.model.statistics import variances_of
 from adxl_ros.report.quantities import mg
 import numpy as np
 import scipy

@@ -309,6 +309,11 @@ class Guide:
         self.refusal = self._new_refusal = ''  # Why the newest pose was refused; '' if not
 
     @property
+    def now_ns(self) -> int:
+        """Return the stamp of the newest sample, ns; 0 before the first."""
+        return self.newest_ns or 0
+
+    @property
     def pose_number(self) -> int:
         """Return the number of the next pose, from 1."""
         return len(self.accepted) + 1
@@ -329,7 +334,7 @@ class Guide:
             return ''
         if went_back(self.newest_ns, stamps_ns[0]):
             self.newest = NewestSamples(self.sensor)
-            self.begin_stream(((self.newest_ns or 0) - int(stamps_ns[0])) * 1e-9)
+            self.begin_stream((self.now_ns - int(stamps_ns[0])) * 1e-9)
             self.newest_ns = None
             self._late = LateStamps()
         before_ns = stamps_ns[0] if self.newest_ns is None else self.newest_ns
@@ -338,7 +343,7 @@ class Guide:
         # As steps of the time they would end each rest.
         stamps_ns, volts = stamps_ns[late_ns == 0], volts[late_ns == 0]
         if not len(stamps_ns):
-            return self._late.fault(self.newest_ns or 0)
+            return self._late.fault(self.now_ns)
         self.newest_ns = int(stamps_ns[-1])
         self.newest.feed(stamps_ns, volts)
         if fault := self.newest.rate_fault():

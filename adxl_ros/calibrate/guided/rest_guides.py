@@ -20,10 +20,10 @@ from adxl_ros.calibrate.guided.screen_contents import (
 )
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.kinematics import unit_vectors
 from adxl_ros.model.noise import means_at_a_rail
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.statistics import stds
 from adxl_ros.signals.rest_detection import datasheet_noise, RestFinder, Stillness
 import numpy as np
 
@@ -116,11 +116,11 @@ class HandRests(Guide):
 
     def accept(self) -> PoseRecord | None:
         """Return the next rest that has ended, for the journal, else None."""
-        if not self._stamps or (self.newest_ns or 0) < self._next_search_ns:
+        if not self._stamps or self.now_ns < self._next_search_ns:
             return None
-        self._next_search_ns = (self.newest_ns or 0) + _SEARCH_PERIOD_NS
+        self._next_search_ns = self.now_ns + _SEARCH_PERIOD_NS
         for record in self._records(max(self.accepted, default=-1) + 1):
-            has_ended = (self.newest_ns or 0) - record.stop_ns > _ENDED_NS
+            has_ended = self.now_ns - record.stop_ns > _ENDED_NS
             if has_ended and record.start_ns > self._announced_ns:
                 fault = self._fault(record)
                 if not fault:

@@ -22,9 +22,9 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.kinematics import specific_force, tilt
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
-from adxl_ros.model.statistics import stds
 from adxl_ros.report.quantities import signed, with_half_width
 import numpy as np
 

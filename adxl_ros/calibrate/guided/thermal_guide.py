@@ -17,8 +17,8 @@ from adxl_ros.calibrate.guided.screen_contents import EstimateRows, GuideStatus,
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, PoseRecord
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.sensor import parameter_of, Sensor
-from adxl_ros.model.statistics import stds
 import numpy as np
 
 _PATIENCE = 3

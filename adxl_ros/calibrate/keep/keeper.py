@@ -30,8 +30,8 @@ from adxl_ros.files.calibration_store import calibration_id, date_of
 from adxl_ros.files.sweep_journal import Adopted, JournalEntry, NaturalRest, Undone
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import variances_of
 from adxl_ros.model.sensor import get, put, Sensor
-from adxl_ros.model.statistics import variances_of
 from adxl_ros.report.quantities import utc
 import numpy as np
 import scipy

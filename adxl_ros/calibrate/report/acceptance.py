@@ -16,9 +16,9 @@ from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import parameter_of, Sensor
-from adxl_ros.model.statistics import rms
 from adxl_ros.report.quantities import duration, mg, three_digits, two_digits
 import numpy as np
 import scipy

@@ -14,9 +14,9 @@ from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Components
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.kinematics import tilt
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.model.statistics import rms
 from adxl_ros.report.quantities import mg
 import numpy as np
 import scipy

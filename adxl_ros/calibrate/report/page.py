@@ -22,9 +22,9 @@ from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.error_sizes import rms, stds
 from adxl_ros.model.kinematics import unit_vectors
 from adxl_ros.model.sensor import get, Sensor
-from adxl_ros.model.statistics import rms, stds
 from adxl_ros.process import command
 from adxl_ros.report import figures, page as html_page
 from adxl_ros.report.figures import AXIS_COLOURS, Figure, Whisker

@@ -37,6 +37,9 @@ gains of both are met to 1.4 % rms where they exceed 0.2, and that of a mean to 
 _MARGIN = 10.0
 """Margin at both ends that the filter runs into, in lengths of its kernel. Chosen: far beyond the
 kernel."""
+_OF_TURNED_FRAME = DiagnosisHints(
+    revealed_by=Manoeuvre.PLANES, proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)
+)
 _OF_FAST_MOTION = DiagnosisHints(
     revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,), proof=(ProofVariable.FORCE_RATE,)
 )
@@ -298,9 +301,7 @@ def lever_arm(signals: Signals, p: Parameters) -> None:
     exact=True,
     cause='The frame of the reference is turned against that of the sensor; state the '
     'rotation, or align the two.',
-    diagnosis=DiagnosisHints(
-        revealed_by=Manoeuvre.PLANES, proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)
-    ),
+    diagnosis=_OF_TURNED_FRAME,
 )
 def reference_frame(signals: Signals, p: Parameters) -> None:
     """
@@ -447,9 +448,7 @@ def reference_filter(signals: Signals, p: Parameters) -> None:
     needs=(Need.ROBOT,),
     cause='The zero of a joint is wrong, so that the robot stands otherwise than its encoders '
     'say; master the joint again.',
-    diagnosis=DiagnosisHints(
-        revealed_by=Manoeuvre.PLANES, proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)
-    ),
+    diagnosis=_OF_TURNED_FRAME,
 )
 def joint_offset(signals: Signals, p: Parameters) -> None:
     """Offsets of the joints of a robot: true angle minus reading."""
