@@ -24,7 +24,7 @@ from itertools import accumulate, chain, count
 import os
 from pathlib import Path
 import shutil
-from typing import TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 from adxl_ros.diagnose import next_experiment
 from adxl_ros.diagnose.linear_model import LinearModel
@@ -334,6 +334,13 @@ def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, see
     return answer
 
 
+class Answered(NamedTuple):
+    """An answer, and when its question was asked."""
+
+    minutes: float  # Since the first sample
+    answer: Answer
+
+
 class State(Enum):
     """The states; the module describes them."""
 
@@ -357,8 +364,7 @@ class Investigation:
     ) -> None:
         """Wait for sensor and stage."""
         self.state = State.RECORDING  # The state
-        # Answers so far, each with the minutes at which its question was asked
-        self.answers: list[tuple[float, Answer]] = []
+        self.answers: list[Answered] = []
         self.reason = ''  # Why it was stopped; '' otherwise
         self._limits = limits
         self._longest_s = 60 * longest_minutes
@@ -384,7 +390,7 @@ class Investigation:
         return (
             self.state is State.FINISHED
             and bool(self.answers)
-            and self.answers[-1][1].outcome not in (RoundOutcome.GO_ON, RoundOutcome.TIME_OVER)
+            and self.answers[-1].answer.outcome not in (RoundOutcome.GO_ON, RoundOutcome.TIME_OVER)
         )
 
     @property
@@ -424,9 +430,9 @@ class Investigation:
         if self.state is State.RECORDING:
             self._record(now_s, pose)
         elif self.state is State.DIAGNOSING:
-            self._take_answer()
-        else:
-            self._move(elapsed_s, pose)
+            self._take_answer(pose)
+        elif self._stream is not None:
+            self._move(self._stream, elapsed_s, pose)
         return self._command
 
     def stop(self, reason: str) -> Pose | None:
@@ -459,7 +465,6 @@ class Investigation:
 
     def _ask(self, pose: Pose) -> None:
         """Ask for a diagnosis of the samples so far."""
-        assert self._begin_s is not None
         self.state = State.DIAGNOSING
         self._stream = None
         self._asked_minutes = self.minutes
@@ -470,12 +475,12 @@ class Investigation:
                 minutes=self._asked_minutes,
                 remaining_minutes=max(self._longest_s - self.moved_s, 0.0) / 60,
                 has_samples=bool(self.answers),
-                recorded=tuple(answer.manoeuvre for _, answer in self.answers),
-                verdict=self.answers[-1][1].verdict if self.answers else '',
+                recorded=tuple(each.answer.manoeuvre for each in self.answers),
+                verdict=self.answers[-1].answer.verdict if self.answers else '',
             )
         )
 
-    def _take_answer(self) -> None:
+    def _take_answer(self, pose: Pose) -> None:
         """Take the answer if there is one, and follow it."""
         try:
             answer = self._diagnoser.answer()
@@ -487,23 +492,20 @@ class Investigation:
         if answer.fault:
             self.stop(answer.fault)
             return
-        self.answers.append((self._asked_minutes, answer))
+        self.answers.append(Answered(self._asked_minutes, answer))
         self._show(self._asked_minutes, answer)
         if answer.outcome is not RoundOutcome.GO_ON:
             self.state = State.FINISHED
             return
-        assert self._pose is not None
-        begin = self._command or self._limits.nearest(*self._pose)
+        begin = self._command or self._limits.nearest(*pose)
         self._manoeuvre = answer.manoeuvre
         self._stream = CommandStream(
             self._limits, plan(answer.manoeuvre, self._limits, begin), begin
         )
         self.state = State.MOVING
 
-    def _move(self, elapsed_s: float, pose: Pose) -> None:
+    def _move(self, stream: CommandStream, elapsed_s: float, pose: Pose) -> None:
         """Command the next step; diagnose when the stage has settled at the end."""
-        stream = self._stream
-        assert stream is not None
         self.moved_s += elapsed_s
         if self.moved_s > self._longest_s:
             self._hold()

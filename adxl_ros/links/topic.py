@@ -272,8 +272,8 @@ class EmulatedSensor(Link):
         self._newest_ns = stamp_ns
         self._held.append((stamp_ns, fields))
 
-    def _has_chain(self) -> bool:
-        """Return whether there is a chain; it is made once the held samples show the rate."""
+    def _ready_chain(self) -> _SimulatedChain | None:
+        """Return the chain, which is made once the held samples show the rate."""
         if self._chain is None and self._held:
             stamps_ns = np.array([stamp_ns for stamp_ns, _ in self._held])
             count = len(stamps_ns)
@@ -291,13 +291,13 @@ class EmulatedSensor(Link):
                 self._longest_ns = max(_MAX_FILLED_NS, _LATE_PERIODS * self._period_ns)
                 self._chain = _SimulatedChain(self.sensor, self._seed)
                 self._seed += 1
-        return self._chain is not None
+        return self._chain
 
     def _run_chain(self) -> None:
         """Run the chain over the samples that are held, and those that were lost between them."""
-        if not self._held or not self._has_chain():
+        chain = self._ready_chain()
+        if not self._held or chain is None:
             return
-        assert self._chain is not None, 'see _has_chain'
         forces: list[np.ndarray] = []
         places = []
         for stamp_ns, fields in self._held:
@@ -311,6 +311,6 @@ class EmulatedSensor(Link):
             places.append(len(forces))
             forces.append(force)
             self._last = stamp_ns, force
-        volts = self._chain(np.array(forces), self._temperature_c)
+        volts = chain(np.array(forces), self._temperature_c)
         self._made += ((*held, made) for held, made in zip(self._held, volts[places]))
         self._held.clear()

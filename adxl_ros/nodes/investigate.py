@@ -120,7 +120,9 @@ def closing_lines(ended: Investigation, folder: OutputFolder) -> list[str]:
     words = 'rich', '--params', str(folder.parameters), '-o', str(free_name('sim.csv'))
     return [
         '',
-        *end_lines([ended.answers[-1][1].sentence], files, command('simulate', shlex.join(words))),
+        *end_lines(
+            [ended.answers[-1].answer.sentence], files, command('simulate', shlex.join(words))
+        ),
     ]
 
 
@@ -261,7 +263,7 @@ class Investigate(Node):
         level = Level.WARN if run.state in (State.STOPPED, State.RECORDING) else Level.OK
         values = {'state': run.state.value, 'minutes': run.minutes}
         if run.answers:
-            best = run.answers[-1][1].hypotheses[0]
+            best = run.answers[-1].answer.hypotheses[0]
             values |= {
                 'hypothesis': ' '.join(best.effects) or 'no gap',
                 'probability': best.probability,

@@ -302,7 +302,9 @@ class Response:
             signals.shift = _joint(motion.shift, instants_s)
             return
         if self._force_path is None:
-            self._force_path = self._once('reference', (Place.REFERENCE,), self._acting_force)
+            self._force_path = self._once(
+                'reference', (Place.REFERENCE,), partial(self._acting_force, motion.force)
+            )
         signals.force = list(self._force_path(instants_s))
         if self._rotates and isinstance(motion.force, ForcePath):
             signals.rotation = motion.force.rotation(instants_s)
@@ -315,14 +317,14 @@ class Response:
             signals.alpha, signals.beta, signals.shift, signals.gravity_mps2, signals.up
         )
 
-    def _acting_force(self) -> Callable[[np.ndarray], Components]:
+    def _acting_force(
+        self, force: Callable[[np.ndarray], Components]
+    ) -> Callable[[np.ndarray], Components]:
         """
         Return the specific force that acts on the sensor, from that of the reference.
 
         Only a recorded force has the errors of a reference; others are exact.
         """
-        force = self._motion.force
-        assert force is not None
         if not isinstance(force, ForcePath) or not self._chain.effects[Place.REFERENCE]:
             return force
         signals = Signals(
