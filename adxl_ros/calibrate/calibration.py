@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
-from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, thermal_fit
+from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, term_selection, thermal_fit
 from adxl_ros.calibrate.fits.pose_covariance import volts_covariance
 from adxl_ros.calibrate.pose_model import predicted_volts, reference_force, residual_g
 from adxl_ros.calibrate.poses import Poses
@@ -33,7 +33,7 @@ from adxl_ros.signals import recorded_sensor
 from adxl_ros.signals.gravity_at_rest import of_volts, require_unit
 import numpy as np
 
-STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': full_model.fit}
+STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': term_selection.fit}
 """Models that are fitted against the stage, simplest first."""
 _MAX_TURN_RAD = np.radians(0.3)
 """Largest turn of the case between recordings, rad. Chosen: above the 0.1° of the stage's level in
@@ -166,7 +166,7 @@ class _StageFit:
     fitted: Sensor
     refit: held_out.Fit  # The same fit to other poses, for cross-validation
     full: full_model.FullFit | None = None  # The full fit; None for other models
-    terms: Sequence[full_model.Term] = ()  # Evidence for the terms of a full fit
+    terms: Sequence[term_selection.Term] = ()  # Evidence for the terms of a full fit
     notes: Sequence[str] = ()  # What to know about the choice of the model
 
 
@@ -191,8 +191,8 @@ def _against_stage(
     details: list[str] = []
     warnings = list(doubts)
     if fit.full:
-        details += full_model.report_lines(fit.full, poses.subset(fitting), fit.terms)
-        warnings += full_model.warnings(fit.full, poses.subset(fitting))
+        details += term_selection.report_lines(fit.full, poses.subset(fitting), fit.terms)
+        warnings += term_selection.warnings(fit.full, poses.subset(fitting))
     if fitted.model == 'full':
         fitted, filter_lines = recorded_sensor.with_filter(
             fitted, [recording.filters for recording in recordings if recording.filters]
@@ -318,11 +318,11 @@ def _richest_fit(
     def fitted(name: str) -> _StageFit:
         if name != 'full':
             return _StageFit(STAGE_FITS[name](sensor, poses), STAGE_FITS[name])
-        selected = full_model.fit_selected(sensor, poses, effects)
+        selected = term_selection.fit_selected(sensor, poses, effects)
         full = selected.fit
         if len(recordings) > 1:
             _require_one_mounting(full, recordings)
-        refit = partial(full_model.fit, effects=effects)
+        refit = partial(term_selection.fit, effects=effects)
         return _StageFit(full.fitted, refit, full, selected.terms)
 
     if model:
@@ -426,7 +426,7 @@ def _against_gravity(given: _Given, poses: Poses, span_s: float) -> CalibrationR
     )
     warnings = list(doubts)
     if not fit.converged:
-        warnings.append(full_model.NOT_CONVERGED)
+        warnings.append(term_selection.NOT_CONVERGED)
     if fit.note:
         warnings.append(fit.note)
     if population is not None:
