@@ -27,7 +27,7 @@ import textwrap
 from typing import Any
 
 import adxl_ros
-from adxl_ros.diagnose.data_checks import DATA_FAULTS
+from adxl_ros.diagnose.data_faults import DATA_FAULTS
 from adxl_ros.files import parameter_file
 from adxl_ros.files.column_mapping import UNITS
 from adxl_ros.fleet.row import COLUMNS

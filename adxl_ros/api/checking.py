@@ -22,9 +22,9 @@ from adxl_ros.api.recordings import (
 )
 from adxl_ros.api.result import as_json, FirstScreen, no_progress, Progress, Result
 from adxl_ros.api.sensors import as_input, sensor_of, SensorInput
-from adxl_ros.diagnose import report as diagnosis_report
-from adxl_ros.diagnose.data_checks import DataFault
+from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.diagnose.diagnosis import what_shows
+from adxl_ros.diagnose.screen import as_shown
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import recording as recording_files
 from adxl_ros.files.atomic_write import make_folder, require_own, write_text
@@ -281,7 +281,7 @@ def _with_what_shows(
         else:
             scale_v_per_g = float(unit.scale_v_per_g.mean())
             shown_first = sorted(could_show, key=lambda effect: not effect.shows)
-            rows = [diagnosis_report.as_shown(effect, scale_v_per_g) for effect in shown_first]
+            rows = [as_shown(effect, scale_v_per_g) for effect in shown_first]
             result = replace(result, shows=tuple(rows))
     except UserError as error:
         reason = one_line(error)

@@ -30,9 +30,12 @@ from adxl_ros.api.result import (
 )
 from adxl_ros.api.sensors import sensor_of, SensorInput
 from adxl_ros.diagnose import diagnosis as core, report as words
+from adxl_ros.diagnose.could_show import CouldShow
 from adxl_ros.diagnose.diagnosis import Diagnosis
 from adxl_ros.diagnose.gap_in_unit import gap_in, GapInUnit, quantity as quantity_named
-from adxl_ros.diagnose.next_experiment import CouldShow
+from adxl_ros.diagnose.report_json import as_json as diagnosis_json, named_effects
+from adxl_ros.diagnose.screen import screen_lines
+from adxl_ros.diagnose.self_check import diagnose_again
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import free_name, make_folder, require_own, write_text
@@ -44,7 +47,7 @@ from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import command, option
 from adxl_ros.report.figures import AFTER_COLOUR, axes_for, BEFORE_COLOUR, QUIET_COLOUR
 from adxl_ros.report.quantities import Interval, mg
-from adxl_ros.report.screen import NextStep, Tile
+from adxl_ros.report.screen import NextStep
 from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.recorded_motion import motion_from_force
 
@@ -155,7 +158,7 @@ class Gap(Result):
     @property
     def screen(self) -> list[str]:
         """Return the lines of the tool's screen."""
-        lines = words.screen_lines(self.diagnosis, self.compared.subject)
+        lines = screen_lines(self.diagnosis, self.compared.subject)
         for remark in self.remarks:
             lines += ['', f' {remark}']
         if self.in_unit:
@@ -168,17 +171,16 @@ class Gap(Result):
         from adxl_ros.diagnose.page import COLOURS, TILES
 
         rows = [] if self.fault else words.figure_rows(self.diagnosis)[:TILES]
-        tiles = [Tile(*row) for row in rows]
         return FirstScreen(
             COLOURS[self.verdict],
             words.badge(self.diagnosis),
             words.headline(self.diagnosis),
-            tiles,
+            rows,
         )
 
     @cached_property
     def _report(self) -> dict[str, Any]:
-        return words.as_json(self.diagnosis)
+        return diagnosis_json(self.diagnosis)
 
     def to_dict(self) -> dict[str, Any]:
         """Return report.json; docs/reference/report_json.md has its keys."""
@@ -371,7 +373,8 @@ def diagnose(
     sim_unit
         Unit of the file `sim`: g, mg or mmps2; '' for m/s². `read` has other samples' `unit`.
     urdf
-        Path of the robot that carries the sensor; its joints are in the bag of the recording.
+        Path of the robot that carries the sensor; its joints are in the bag of the recording, or
+        its columns NAME_rad.
     frame, joints
         Frame of the robot that carries the sensor, and topic of its joints; '' for the only one.
     align
@@ -432,7 +435,7 @@ def diagnose(
     found = diagnosis.report
     if self_check and found:
         remarks.append(
-            core.self_check(
+            diagnose_again(
                 diagnosis,
                 read,
                 motion,
@@ -534,13 +537,13 @@ def _gap(
     remarks: Sequence[str],
 ) -> Gap:
     """Collect what a user reads of a diagnosis."""
-    objects = words.as_json(diagnosis)
+    objects = diagnosis_json(diagnosis)
     report = diagnosis.report
     effects: tuple[FoundEffect, ...] = ()
     figures = None
     if report is not None:
         candidates = {c['effect']: c for c in objects['candidates']}
-        effects = tuple(_effect(candidates[name]) for name in words.named_effects(report, objects))
+        effects = tuple(_effect(candidates[name]) for name in named_effects(report, objects))
         before, after, floor, closed = report.closure
         figures = GapFigures(
             before_mps2=before,

@@ -411,8 +411,15 @@ class RobotInput(NamedTuple):
         """Return the motion of the robot in a recording."""
         from adxl_ros.simulate import robot
 
+        is_file = os.path.exists(read.path)
         return robot.robot_path(
-            self.urdf, self.frame, read.path, read.epoch_ns, sensor.local_gravity_mps2, self.joints
+            self.urdf,
+            self.frame,
+            read.path,
+            read.epoch_ns,
+            sensor.local_gravity_mps2,
+            self.joints,
+            None if is_file else {TIME: read.time_s, **read.columns},
         )
 
 

@@ -437,18 +437,6 @@ def code_step_v(volts: np.ndarray) -> np.ndarray:
     return np.nan_to_num(smallest, posinf=0.0)
 
 
-def gravity_slopes(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
-    """Return the derivatives of gravity's direction in the sensor by both angles, (2, 3, n)."""
-    sin_alpha, cos_alpha = np.sin(alpha_rad), np.cos(alpha_rad)
-    sin_beta, cos_beta = np.sin(beta_rad), np.cos(beta_rad)
-    return np.array(
-        [
-            [cos_alpha * cos_beta, -cos_alpha * sin_beta, -sin_alpha],
-            [-sin_alpha * sin_beta, -sin_alpha * cos_beta, 0 * sin_alpha],
-        ]
-    )
-
-
 def _in_gaps(
     time_s: np.ndarray, read_s: np.ndarray, longest_s: float
 ) -> Iterable[tuple[int, int]]:

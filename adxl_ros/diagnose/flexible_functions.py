@@ -19,6 +19,7 @@ from adxl_ros.diagnose.comparison import BaselineComparison, direction_of_last_m
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.effects.base import FormDimension as Form
 from adxl_ros.model.filters import loop, low_pass
+from adxl_ros.model.kinematics import gravity_slopes
 import numpy as np
 
 _MODES = {
@@ -71,7 +72,7 @@ def flexible_bases(comparison: BaselineComparison, baseline_v: np.ndarray) -> It
     common = _common(comparison)
     slopes = np.zeros((2, len(AXES), 0))
     if comparison.joints:
-        slopes = beside.gravity_slopes(*comparison.joint_values())
+        slopes = gravity_slopes(*comparison.joint_values())
     for axis, along_g in enumerate(force_g):
         factors = {
             Form.TEMPERATURE: along_g,

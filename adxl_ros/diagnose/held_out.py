@@ -14,7 +14,8 @@ from functools import cached_property
 from typing import NamedTuple, TYPE_CHECKING
 
 from adxl_ros.diagnose import evidence as linear
-from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis, Whitener
+from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis
+from adxl_ros.diagnose.noise_filters import expected_drift_g, Whitener
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.error_sizes import rms
 import numpy as np
@@ -118,7 +119,7 @@ class HeldOutFits:
     def drift_mps2(self) -> float:
         """Return the expected rms of the drift that the fitted noise has, m/s²."""
         sizes_g = [
-            linear.expected_drift_g(w.effect, density, comparison)
+            expected_drift_g(w.effect, density, comparison)
             for w, density, (comparison, _) in zip(
                 self._whiteners, self.drift_densities(), self.model.places
             )

@@ -22,7 +22,8 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
-from adxl_ros.diagnose.evidence import LinearFit, Whitener
+from adxl_ros.diagnose.evidence import LinearFit
+from adxl_ros.diagnose.noise_filters import drifts_among, Whitener, whiteners
 from adxl_ros.errors import UserError
 from adxl_ros.model import noise
 from adxl_ros.model.effects import base, effect_named, library
@@ -483,7 +484,7 @@ class LinearModel:
             self.prior(chosen),
             None,
             start,
-            evidence.drifts_among(self.baseline.effects),
+            drifts_among(self.baseline.effects),
         )
 
 
@@ -519,7 +520,7 @@ def build_linear_model(
     filters: whitening filters of each channel, where not all are tried; near: the linear model
     about a baseline nearby, whose sensitivities to all other effects are taken.
     """
-    filters = filters or [evidence.whiteners(*channel) for channel in channels_of(comparisons)]
+    filters = filters or [whiteners(*channel) for channel in channels_of(comparisons)]
     baseline_v = [c.simulated_v(c.sensor) for c in comparisons]
     table, effects = _ColumnTable(comparisons), _tried_effects(comparisons, only)
     by_key = _variants_by_key(comparisons, baseline_v, effects, show_progress)
@@ -648,7 +649,7 @@ def _whitened(
 
 def filters_for(filters: Sequence[list[Whitener]], effects: Sequence[str]) -> list[list[Whitener]]:
     """Return for each channel the filters of healthy units and of the drifts among effects."""
-    drifts = evidence.drifts_among(effects)
+    drifts = drifts_among(effects)
     return [[f for f in every if f.healthy or f.effect in drifts] or every for every in filters]
 
 

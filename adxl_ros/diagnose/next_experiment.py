@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """
-What recordings could show, and what to record next.
+What to record next.
 
 Each hypothesis has a posterior of its coefficients by the samples so far. A manoeuvre is simulated
 with the baseline and goes through the same comparison as a recording, with the steps of the
@@ -23,18 +23,16 @@ from itertools import chain, combinations, count
 from pathlib import Path
 from typing import NamedTuple
 
-from adxl_ros.diagnose import comparison as beside, linear_model as linear, noise_effects
-from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
-from adxl_ros.diagnose.evidence import expected_drift_g, LinearFit
+from adxl_ros.diagnose import comparison as beside, linear_model as linear
+from adxl_ros.diagnose.comparison import Reference, with_values
+from adxl_ros.diagnose.evidence import LinearFit
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.verdict import UNKNOWN, Verdict, WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import Recording
-from adxl_ros.model import noise
-from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named, library
-from adxl_ros.model.effects.base import Coefficient, Concern, Detector, Manoeuvre
-from adxl_ros.model.sensor import parameter_of, Sensor, with_neutral
+from adxl_ros.model.effects.base import Concern, Manoeuvre
+from adxl_ros.model.sensor import Sensor, with_neutral
 from adxl_ros.process import command
 from adxl_ros.report.quantities import listed
 from adxl_ros.simulate import trajectories
@@ -42,7 +40,6 @@ from adxl_ros.simulate.motion import Motion
 from adxl_ros.simulate.response import simulate
 import numpy as np
 
-_SHOWN_STDS = 4.0  # Size of a coefficient, in standard deviations, that shows: it gains 8 nats
 _RATE_HZ = 62.5
 """Sample rate of the simulated manoeuvres, Hz. Chosen: run time; a stage moves far slower."""
 _SMALLEST_PROBABILITY = 1e-3
@@ -51,140 +48,6 @@ _SMALLEST_PROBABILITY = 1e-3
 _MOST_HYPOTHESES = 40  # Largest number of such hypotheses. Chosen: run time
 _EVIDENCE_FACTOR = 0.3
 """Factor of the information, because no model of a sensor is exact (Miller and Dunson 2019)."""
-
-
-class CouldShow(NamedTuple):
-    """Smallest size of one parameter of an effect that recordings would have shown."""
-
-    name: Coefficient  # The coefficient
-    smallest: float  # The size, in `unit`; infinite where nothing of it reaches the output
-    # Share of the effect's signal that zero-g, scale factor and latency cannot imitate
-    share: float = 1.0
-
-    @property
-    def unit(self) -> str:
-        """Return the unit of the size, that of the parameter."""
-        return parameter_of(self.name).unit
-
-    @property
-    def shows(self) -> bool:
-        """Return whether the smallest size is one that the parameter can have."""
-        p = parameter_of(self.name)
-        return bool(self.smallest <= p.upper - p.neutral)
-
-
-def could_show(
-    model: LinearModel, comparison: BaselineComparison, noise_v: np.ndarray, material_mps2: float
-) -> list[CouldShow]:
-    """
-    Return the smallest sizes by effect: material ones, that exceed their uncertainty.
-
-    Nuisance parameters are free, within their tolerance. An effect with several shapes has the
-    size of the shape that shows best. The sizes of effects on the noise are those of one
-    recording at its full rate; `noise_v` is its noise, V, (m,).
-    """
-    rows = [
-        *_noise_could_show(comparison, noise_v, material_mps2),
-        *_mean_could_show(model, material_mps2),
-    ]
-    seen = {row.name.effect for row in rows}
-    limited = {variant.effect for variant in model.variants if variant.limit_start}
-    for effect in linear.candidates():
-        if effect.name not in seen | limited:
-            name = Coefficient(effect.name, effect.parameters[0].name)
-            rows.append(CouldShow(name, np.inf, 0.0))
-    # The last coefficient of each effect shows best, by smallest over typical size.
-    rows.sort(
-        key=lambda row: (row.smallest / parameter_of(row.name).scale, row.name), reverse=True
-    )
-    best = {row.name.effect: row for row in rows}
-    return [best[effect] for effect in sorted(best)]
-
-
-class _Information(NamedTuple):
-    """What recordings tell of the coefficients of all columns, (columns,) each."""
-
-    alone: np.ndarray  # Inverse variance where nothing else is free, 1/unit²
-    marginal: np.ndarray  # Inverse variance beside the nuisance parameters, 1/unit²
-    power_mps2: np.ndarray  # Mean square over samples and axes, (m/s²)²/unit²
-
-
-def _information(model: LinearModel) -> _Information:
-    """Return what the recordings of a linear model tell."""
-    squares_mps2 = np.zeros(len(model.names))
-    samples = 0
-    for columns, (comparison, axis) in zip(model.columns, model.places):
-        scale = float(comparison.scale_v_per_mps2[axis])
-        for k, column_v in columns.items():
-            squares_mps2[k] += float(np.sum(column_v[comparison.used] ** 2)) / scale**2
-        samples += int(comparison.used.sum())
-    gram = model.information
-    free = np.array(model.nuisance_ids, int)
-    precision = gram[np.ix_(free, free)] + np.diag(model.prior(())[free] ** -2.0)
-    taken_up = np.einsum('ij,ij->j', gram[free], np.linalg.solve(precision, gram[free]))
-    alone = np.diag(gram)
-    return _Information(alone, alone - taken_up, squares_mps2 / max(samples, 1))
-
-
-def _mean_could_show(model: LinearModel, material_mps2: float) -> list[CouldShow]:
-    """Return the smallest sizes of effects that show in the mean of the output."""
-    known = _information(model)
-    rows = []
-    for variant, ids in zip(model.variants, model.column_ids):
-        hints = effect_named(variant.effect).diagnosis
-        hides_in_pose = bool(hints.straight_line) and not model.pose_known
-        if variant.limit_start or hides_in_pose:
-            continue
-        for k in ids:
-            information = known.alone[k] if hints.nuisance else known.marginal[k]
-            share = float(np.clip(information / max(known.alone[k], 1e-300), 0.0, 1.0))
-            power_mps2 = known.power_mps2[k] * share
-            size = np.inf
-            if information > 0 and power_mps2 > 0:
-                certain = _SHOWN_STDS * information**-0.5
-                size = max(certain, material_mps2 * power_mps2**-0.5)
-            if hints.nuisance:
-                size = np.hypot(size, 3 * model.tolerance(model.names[k]))
-            rows.append(CouldShow(model.names[k], float(size), share))
-    return rows
-
-
-def _noise_could_show(
-    comparison: BaselineComparison, noise_v: np.ndarray, material_mps2: float
-) -> list[CouldShow]:
-    """Return the smallest sizes of effects that show in the noise of one recording."""
-    sensor = comparison.sensor
-    count = len(comparison)
-    level_v = float(noise_v.max())
-    rate_hz = sensor.rate_hz
-    line_v = max(
-        level_v * np.sqrt(8 * (noise_effects.LINE_LOG_EXCESS + np.log(count)) / count),
-        np.sqrt(2) * material_mps2 * float(comparison.scale_v_per_mps2.max()),
-    )
-    sizes = {
-        Detector.NOISE_LEVEL: ('ratio', noise_effects.NOISE_EXCESS - 1),
-        Detector.MAINS_LINE: ('amplitude_v', line_v),
-        Detector.ISOLATED_SAMPLES: (
-            'amplitude_v',
-            noise_effects.SPIKE_STDS * max(level_v, noise.electronics(sensor).lsb_v.max()),
-        ),
-        Detector.REPEATED_SAMPLES: (
-            'duration_s',
-            noise_effects.shortest_repeat(comparison.volts, len(sensor.axes)) / rate_hz,
-        ),
-        Detector.COARSE_CODES: ('lost_bits', float(np.log2(noise_effects.COARSE_STEPS))),
-    }
-    rows = []
-    for effect in library().values():
-        hints = effect.diagnosis
-        if hints.drift is not None:
-            unit_g = expected_drift_g(effect.name, 1.0, comparison)
-            density = max(material_mps2 / G0_MPS2 / unit_g, hints.healthy_density)
-            rows.append(CouldShow(Coefficient(effect.name, effect.parameters[0].name), density))
-        elif hints.detector in sizes:
-            parameter, size = sizes[hints.detector]
-            rows.append(CouldShow(Coefficient(effect.name, parameter), float(size)))
-    return rows
 
 
 class KnownCoefficients(NamedTuple):
@@ -285,6 +148,34 @@ def _keys(model: LinearModel) -> dict[int, tuple]:
     return keys
 
 
+class _SoFar(NamedTuple):
+    """What the samples so far say of hypotheses."""
+
+    effects: frozenset[str]  # Effects whose parameters they could show
+    keys: dict[int, tuple]  # Variant and coefficient of each fitted column by its number
+    fits: list[LinearFit | None]  # Fit of each hypothesis; None before there are samples
+
+    @classmethod
+    def of(cls, hypotheses: Sequence[WeightedHypothesis], model: LinearModel | None) -> _SoFar:
+        """Fit hypotheses to the samples of a model, each effect by the variant that fits best."""
+        if model is None:
+            return cls(frozenset(), {}, [None] * len(hypotheses))
+
+        def log_evidence(variant: int) -> float:
+            return model.fit_variants([variant], model.null_fit).log_evidence
+
+        best: dict[str, int] = {}
+        for effect in set(chain(*(h.effects for h in hypotheses))):
+            numbers = _variants_of(model, effect)
+            if numbers:
+                best[effect] = max(numbers, key=log_evidence)
+        fits: list[LinearFit | None] = []
+        for hypothesis in hypotheses:
+            chosen = [best[e] for e in hypothesis.effects if e in best]
+            fits.append(model.fit_variants(chosen, model.null_fit))
+        return cls(frozenset(best), _keys(model), fits)
+
+
 def rank_responses(
     responses: Sequence[PredictedResponse],
     hypotheses: Sequence[WeightedHypothesis],
@@ -292,29 +183,14 @@ def rank_responses(
 ) -> tuple[ManoeuvreWorth, ...]:
     """Rank manoeuvres by their expected information per minute."""
     leaders = leading(hypotheses)
-    seen = dict[str, int]()
-    keys = dict[int, tuple]()
-    fits = list[LinearFit | None]([None] * len(leaders))
-    if model is not None:
-
-        def log_evidence(variant: int) -> float:
-            return model.fit_variants([variant], model.null_fit).log_evidence
-
-        # The variant of each effect that fits the samples best.
-        for effect in set(chain(*(h.effects for h in leaders))):
-            numbers = _variants_of(model, effect)
-            if numbers:
-                seen[effect] = max(numbers, key=log_evidence)
-        keys = _keys(model)
-        for i, hypothesis in enumerate(leaders):
-            chosen = [seen[e] for e in hypothesis.effects if e in seen]
-            fits[i] = model.fit_variants(chosen, model.null_fit)
+    so_far = _SoFar.of(leaders, model)
     total = sum(h.probability for h in leaders)
     probabilities = [h.probability / total for h in leaders]
     worth = []
     for response in responses:
         beliefs = [
-            _belief(response, keys, fit, {*h.effects} - {*seen}) for h, fit in zip(leaders, fits)
+            _belief(response, so_far.keys, fit, {*h.effects} - so_far.effects)
+            for h, fit in zip(leaders, so_far.fits)
         ]
         information = expected_information(
             response.linear_model.information, probabilities, beliefs, _EVIDENCE_FACTOR
@@ -347,7 +223,8 @@ def _belief(
         numbers[len(numbers) // 2] for effect in unseen if (numbers := _variants_of(model, effect))
     ]
     known = [*model.nuisance_ids, *chain(*(model.column_ids[i] for i in chosen))]
-    mean, variance = np.zeros((2, len(model.names)))
+    mean = np.zeros(len(model.names))
+    variance = np.zeros(len(model.names))
     variance[known] = model.prior(chosen)[known] ** 2
     covariance = np.diag(variance)
     if fit is not None:
@@ -411,10 +288,8 @@ def propose_next_experiment(
 
     sensor: the baseline; model: linear model of the recordings, or None.
     """
-    no_stage = model is not None and all(
-        c.reference is Reference.SIMULATOR for c in model.comparisons
-    )
-    stem = _free_stem([c.name for c in model.comparisons] if model else ())
+    comparisons = model.comparisons if model else []
+    stem = _free_stem([c.name for c in comparisons])
     if any(effect_named(e).concern is Concern.REFERENCE for e in verdict.named):
         return NextExperiment(
             'the motion beside another reference, or one with less smoothing',
@@ -423,36 +298,31 @@ def propose_next_experiment(
             concerns_reference=True,
             stem=stem,
         )
+    references = {c.reference for c in comparisons}
+    beside_simulator = references == {Reference.SIMULATOR}
     if verdict.groups:
         ranked = _ranked_menu(verdict, sensor, model, seed)
-        group = verdict.groups[0]
-        best = ranked[0].name
-        why = f'to separate {listed(group, "and")}'
-        return _experiment(
-            next(m for m, d in MENU.items() if d.text == best), why, no_stage, stem
-        )._replace(menu=ranked)
+        best = next(m for m, described in MENU.items() if described.text == ranked[0].name)
+        why = f'to separate {listed(verdict.groups[0], "and")}'
+        return _experiment(best, why, beside_simulator, stem)._replace(menu=ranked)
     if verdict.status == 'no_gap' and not not_covered:
         return None
+    usual = Manoeuvre.SPEEDS
     why = 'to confirm the verdict on another recording'
     if verdict.status == 'unknown':
         why = 'to show what the unknown part of the gap depends on'
     elif not_covered:
+        usual = Manoeuvre.PLANES
         why = f'because the recordings have no {", no ".join(not_covered)}'
     revealed_by = [effect_named(e).diagnosis.revealed_by for e in verdict.effects]
-    usual = (
-        Manoeuvre.SPEEDS if verdict.status == 'unknown' or not not_covered else Manoeuvre.PLANES
-    )
-    return _experiment(next(filter(None, revealed_by), usual), why, no_stage, stem)
+    return _experiment(next(filter(None, revealed_by), usual), why, beside_simulator, stem)
 
 
 def _free_stem(recordings: Sequence[str]) -> str:
     """Return the name of another recording, without its extension, that no input has."""
     taken = {Path(name).stem for name in recordings}
-    return next(
-        stem
-        for number in count(1)
-        if (stem := 'next' if number == 1 else f'next_{number}') not in taken
-    )
+    names = chain(['next'], (f'next_{number}' for number in count(2)))
+    return next(name for name in names if name not in taken)
 
 
 def _ranked_menu(
@@ -463,36 +333,23 @@ def _ranked_menu(
     responses = []
     for described in MENU.values():
         motion = trajectories.TRAJECTORIES[described.trajectory](np.random.default_rng(seed))
+        mounted = _remounted(sensor) if described.remounted else sensor
         # At rest the pose is unknown, so that a baseline with effects of the stage has no place.
         with suppress(UserError):
-            responses.append(
-                predict(
-                    described.text,
-                    motion,
-                    0.0,
-                    _remounted(sensor) if described.remounted else sensor,
-                    effects,
-                )
-            )
+            responses.append(predict(described.text, motion, 0.0, mounted, effects))
     return rank_responses(responses, verdict.hypotheses, model)
 
 
-def _experiment(manoeuvre: Manoeuvre, why: str, no_stage: bool, stem: str) -> NextExperiment:
+def _experiment(
+    manoeuvre: Manoeuvre, why: str, beside_simulator: bool, stem: str
+) -> NextExperiment:
     """Describe a manoeuvre with its command."""
     described = MENU[manoeuvre]
-    option = ''
-    if no_stage:
-        return NextExperiment(
-            described.text, why, _beside_other_reference(stem), beside_simulator=True, stem=stem
-        )
-    if described.remounted:
-        option = f' --effect {":".join(_half_turn())}={np.pi:.6f}'
-    return NextExperiment(
-        described.text,
-        why,
-        command('simulate', f'{described.trajectory}{option} -o {stem}.csv'),
-        stem=stem,
-    )
+    line = _beside_other_reference(stem)
+    if not beside_simulator:
+        turned = f' --effect {":".join(_half_turn())}={np.pi:.6f}' if described.remounted else ''
+        line = command('simulate', f'{described.trajectory}{turned} -o {stem}.csv')
+    return NextExperiment(described.text, why, line, beside_simulator=beside_simulator, stem=stem)
 
 
 def _beside_other_reference(stem: str) -> str:

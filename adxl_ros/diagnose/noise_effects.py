@@ -191,6 +191,8 @@ def isolated_samples(
 
     The residual does so, V, (n, m), and the recording itself, or the reference would be wrong.
     """
+    if not used.any():
+        return used, []
     spikes, size_v = _spikes(residual_v, code_step_v(volts), used, sensor)
     spikes &= 2 * _deviation_v(volts) > _deviation_v(residual_v)
     if not spikes.any():
@@ -619,6 +621,11 @@ class NoiseRemainder(NamedTuple):
     recorded: float  # Value in the recordings
     simulated: float  # The same in the simulation with the effect
     mean_square: float  # Mean square over axes of the values in the recordings
+
+    @property
+    def left(self) -> float:
+        """Difference of both values."""
+        return abs(self.recorded - self.simulated)
 
 
 def noise_remainders(

@@ -1,45 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""
-The files of a diagnosis, and its HTML page that opens offline, with its figures and proofs.
-
-The proof of an effect is the recording minus a simulation with all other effects, over the
-effect's own variable, or spectra with and without it.
-"""
+"""The files of a diagnosis, and its HTML page that opens offline, with its figures."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 from adxl_ros.diagnose import report as words
-from adxl_ros.diagnose.comparison import BaselineComparison, bridged
+from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.diagnosis import Diagnosis, Report
-from adxl_ros.diagnose.residual_map import BLOCK_S, ResidualCell
+from adxl_ros.diagnose.proofs import INK, Proof, proofs_of, spectra, stacked, WIDE
+from adxl_ros.diagnose.report_json import as_text, named_effects
+from adxl_ros.diagnose.residual_map import ResidualCell
+from adxl_ros.diagnose.screen import as_shown, size_lines
 from adxl_ros.files import parameter_file
-from adxl_ros.model import noise
-from adxl_ros.model.constants import AXES, Z_90
-from adxl_ros.model.effects import effect_named
-from adxl_ros.model.effects.base import ActsOn, ProofVariable as Over
-from adxl_ros.model.filters import low_pass
-from adxl_ros.model.sensor import Sensor, with_neutral
+from adxl_ros.model.sensor import Sensor
 from adxl_ros.report import figures as plots, page as html_page
 from adxl_ros.report.figures import Figure, figure, line, rounded
 from adxl_ros.report.quantities import decimals, mg, mg_text, percent
 import numpy as np
-import scipy
 
-_BINS = 10
-"""Ranges of equal width, and of equal counts, of a proof. Chosen: a curve is visible."""
-_FEWEST_SAMPLES = 20  # Fewest samples of a range. Chosen: a mean is worth a point
-_RATE_S = 20.0
-"""Time over which a temperature changes, s. Chosen: beyond the noise of a thermometer."""
-_SMALLEST_SHARE = 0.5
-"""Share of the effect's variance that the variable must show. Chosen: half of it."""
-_CONTRIBUTION = 'what the model of the effect predicts, mg'
-"""Variable of an effect that none of its own variables shows."""
-_SEGMENT = 4096  # Samples in a segment of a spectrum. Chosen: 0.06 Hz at 250 Hz
-_POINTS_PER_OCTAVE = 12  # Points of its plot in an octave. Chosen: lines stay visible
 COLOURS = {
     'explained': 'green',
     'partly': 'amber',
@@ -53,14 +34,7 @@ COLOURS = {
 TILES = 4  # Figures at the top of the page
 _PLOTTED_POINTS = 3000
 """Largest number of points of a line. Chosen: more than a wide screen has columns."""
-_INK = '#1f2933'
 _EFFECT_COLOUR = '#5b8fd6'
-_CURVE_COLOURS = (
-    {'recorded': _INK, 'stated noise': plots.QUIET_COLOUR}
-    | dict.fromkeys(('before', 'without the effect'), plots.BEFORE_COLOUR)
-    | dict.fromkeys(('after', 'with the effect'), plots.AFTER_COLOUR)
-)
-_WIDE = {'l': 8, 'r': 12, 't': 36, 'b': 8}  # Margins of a plot with a legend, pixels
 
 
 @dataclass(frozen=True)
@@ -87,7 +61,7 @@ def documents(
     report: its JSON; comments: head of the parameters, which a fault leaves out; run: what the
     page says of the run, None without a page.
     """
-    texts = {'report.json': words.as_text(report)}
+    texts = {'report.json': as_text(report)}
     if diagnosis.report is not None:
         texts['params.yaml'] = parameter_file.as_text(diagnosis.report.sensor, comments)
     if run is not None:
@@ -119,84 +93,68 @@ def _page(diagnosis: Diagnosis, objects: dict[str, Any], run: Run, parameters: s
 
 def _contents(diagnosis: Diagnosis, report: Report, objects: dict[str, Any]) -> dict[str, Any]:
     """Return what the template shows of a diagnosis with a verdict."""
-    named = words.named_effects(report, objects)
-    probable = [c for c in objects['candidates'] if c['probability'] >= words.PROBABLE]
-    by_name = {c['effect']: c for c in objects['candidates']}
+    candidates = {c['effect']: c for c in objects['candidates']}
+    named = named_effects(report, objects)
+    probable = [name for name, c in candidates.items() if c['probability'] >= words.PROBABLE]
     # The named effects come first, then those that are probable.
-    shown = list({c['effect']: c for c in (*map(by_name.get, named), *probable)}.values())
-    best = report.hypotheses[0]
-    compared = diagnosis.comparisons[0]
-    full_rate = diagnosis.full_rate[0]
-    proposal = objects['next_experiment'] or {'menu': []}
-    menu = [
-        [m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
-        for m in proposal['menu']
-    ]
-    proofs = _proofs(diagnosis, report, [c['effect'] for c in shown])
+    shown = list(dict.fromkeys([*named, *probable]))
+    proofs = proofs_of(diagnosis, report, shown)
     rows = words.figure_rows(diagnosis)
     scale = float(report.baseline.scale_v_per_g.mean())
+    proposal = objects['next_experiment'] or {'menu': []}
     return {
         'has_verdict': True,
-        'figures': {
-            'waterfall': waterfall(report),
-            'signals': signals(compared, best.sensor),
-            'spectrum': _spectra(
-                full_rate,
-                {
-                    'before': full_rate.residual_v(full_rate.sensor),
-                    'after': full_rate.residual_v(best.sensor),
-                },
-            ),
-            **{f'proof-{name}': drawn for name, (drawn, _) in proofs.items()},
-        },
+        'figures': _figures(diagnosis, report, proofs),
         'tiles': rows[:TILES],
-        'effects': [
-            {
-                'name': c['effect'],
-                'sure': percent(c['probability']),
-                'cause': c['cause'],
-                'share': '' if c['share'] is None else f'{percent(c["share"])} of the gap',
-                'rivals': c['inseparable_from'],
-                'sizes': words.size_lines(report, c),
-            }
-            for c in shown
-        ],
-        'proofs': [{'effect': name, 'text': text} for name, (_, text) in proofs.items()],
+        'effects': [_effect(report, candidates[name]) for name in shown],
+        'proofs': proofs,
         'figure_rows': rows,
-        'remainders': [row[:2] for row in words.remainder_rows(report)],
+        'remainders': [(row.label, row.text) for row in words.remainder_rows(report)],
         'hypotheses': [
             [', '.join(h['effects']) or 'no gap', percent(h['probability'])]
             for h in objects['hypotheses']
         ],
         'not_covered': objects['not_covered'],
         'where': [_cell(c) for c in report.residual_cells],
-        'menu': menu,
-        'could_show': [(row.shows, *words.as_shown(row, scale)) for row in report.could_show],
+        'menu': [
+            [m['manoeuvre'], f'{m["minutes"]:.1f}', f'{m["nats_per_minute"]:.2g}']
+            for m in proposal['menu']
+        ],
+        'could_show': [(row.shows, *as_shown(row, scale)) for row in report.could_show],
     }
 
 
-def _proofs(
-    diagnosis: Diagnosis, report: Report, effects: Sequence[str]
-) -> dict[str, tuple[Figure, str]]:
-    """Return the proof of each effect that has one, and its text."""
-    compared = diagnosis.comparisons[0]
+def _effect(report: Report, candidate: dict[str, Any]) -> dict[str, Any]:
+    """Return what the template shows of an effect."""
+    share = candidate['share']
+    return {
+        'name': candidate['effect'],
+        'sure': percent(candidate['probability']),
+        'cause': candidate['cause'],
+        'share': '' if share is None else f'{percent(share)} of the gap',
+        'rivals': candidate['inseparable_from'],
+        'sizes': size_lines(report, candidate),
+    }
+
+
+def _figures(diagnosis: Diagnosis, report: Report, proofs: Sequence[Proof]) -> dict[str, Figure]:
+    """Return all figures by the names of their places in the template."""
+    best = report.hypotheses[0].sensor
     full_rate = diagnosis.full_rate[0]
-    in_noise = {d.effect for d in report.detections} & {*report.sensor.effects}
-    proofs = {}
-    for name in effects:
-        sensors = [h.sensor for h in report.hypotheses if name in h.effects]
-        if name in in_noise:
-            sensors = [report.sensor]
-        is_step = Over.STEP in effect_named(name).diagnosis.proof
-        if sensors and not is_step:
-            proofs[name] = _proof(name, compared, full_rate, sensors[0])
-    return proofs
+    before_v = full_rate.residual_v(full_rate.sensor)
+    residuals_v = {'before': before_v, 'after': full_rate.residual_v(best)}
+    return {
+        'waterfall': waterfall(report),
+        'signals': signals(diagnosis.comparisons[0], best),
+        'spectrum': spectra(full_rate, residuals_v),
+        **{f'proof-{proof.effect}': proof.figure for proof in proofs},
+    }
 
 
 def _cell(cell: ResidualCell) -> list[str]:
     """Return quantity, range, axis, mean and share of a part of the map."""
     name = cell.dimension
-    _, _, unit = name.rpartition('_')
+    unit = name.rpartition('_')[2]
     factor = 1.0
     if 'rad' in name:
         unit = '°/s' if 'rate' in name else '°'
@@ -211,181 +169,14 @@ def _cell(cell: ResidualCell) -> list[str]:
     ]
 
 
-def _proof(
-    effect: str, comparison: BaselineComparison, full_rate: BaselineComparison, sensor: Sensor
-) -> tuple[Figure, str]:
-    """
-    Show an effect of a sensor, which has all effects of the verdict, in a recording.
+class _Bar(NamedTuple):
+    """A bar of the waterfall."""
 
-    It is drawn as means over a variable or spectra; the text explains it in one sentence.
-    """
-    described = effect_named(effect)
-    variables = described.diagnosis.proof
-    neutral = with_neutral(comparison.sensor, [effect]).values[effect]
-    without = replace(sensor, values={**sensor.values, effect: neutral})
-    labelled = {'without the effect': without, 'with the effect': sensor}
-    if described.acts_on is ActsOn.NOISE:
-        return _spectra(
-            full_rate,
-            {'recorded': full_rate.residual_v(sensor)}
-            | {label: full_rate.simulated_noise_v(s, 0) for label, s in labelled.items()},
-        ), 'The effect is there if the recorded spectrum follows the green line, not the red one.'
-    if Over.FREQUENCY in variables:
-        return _spectra(
-            full_rate, {label: full_rate.residual_v(s) for label, s in labelled.items()}
-        ), 'The effect is there if the spectrum of the difference falls from red to green.'
-    return (
-        _binned(variables, comparison, sensor, without),
-        'Points: recording minus a simulation with all other effects, with 90 % bars. '
-        'Line: the model of this effect.',
-    )
-
-
-def _binned(
-    variables: Sequence[Over], comparison: BaselineComparison, sensor: Sensor, without: Sensor
-) -> Figure:
-    """Draw means of the residual without an effect over the variable that shows it best."""
-    used = comparison.used
-    to_mg = mg(1 / comparison.scale_v_per_mps2)
-    residual_mg = (comparison.residual_v(without) * to_mg)[used]
-    model_mg = residual_mg - (comparison.residual_v(sensor) * to_mg)[used]
-    label = _CONTRIBUTION
-    values = model_mg
-    largest = _SMALLEST_SHARE
-    for variable, of_axes in _variables(comparison).items():
-        if variable in variables:
-            share = _shown_share(of_axes[used], model_mg)
-            if share > largest:
-                label = variable.value
-                values = of_axes[used]
-                largest = share
-    block = np.flatnonzero(used) // max(round(BLOCK_S * comparison.sensor.rate_hz), 1)
-    traces = []
-    for d, axis in enumerate(comparison.sensor.axes):
-        means = _means_by_range(values[:, d], residual_mg[:, d], model_mg[:, d], block)
-        colour = plots.AXIS_COLOURS[axis]
-        traces += [
-            plots.points(means.x, means.recorded, means.half, f'{axis} recorded', colour),
-            line(means.x, means.model, f'{axis} model', colour),
-        ]
-    return figure(
-        traces,
-        300,
-        xaxis={'title': {'text': label}},
-        margin=_WIDE,
-        yaxis={'title': {'text': 'recording minus simulation, mg'}},
-    )
-
-
-def _shown_share(values: np.ndarray, model_mg: np.ndarray) -> float:
-    """Return the share of a model's squares between the ranges of a variable, (n, m) each."""
-    import pandas as pd
-
-    between = [
-        (pd.Series(m).groupby(_places(v)).transform('mean') ** 2).sum()
-        for v, m in zip(values.T, model_mg.T)
-    ]
-    return float(sum(between) / max(np.sum(model_mg**2), 1e-300))
-
-
-def _means_by_range(
-    values: np.ndarray, residual_mg: np.ndarray, model_mg: np.ndarray, block: np.ndarray
-) -> Any:
-    """
-    Return a table of the means of one axis by range of a variable, (n,) each.
-
-    Its columns are `x`, `recorded`, `model` and `half`, half of the 90 % interval, mg.
-    """
-    import pandas as pd
-
-    place = _places(values)
-    groups = pd.DataFrame({'x': values, 'recorded': residual_mg, 'model': model_mg}).groupby(place)
-    means = groups.mean()
-    count = groups.size()
-    # The noise is correlated, so that the sums of whole blocks give the error of a mean.
-    noise_mg = residual_mg - model_mg - (means.recorded - means.model)[place].to_numpy()
-    squares = pd.Series(noise_mg).groupby([place, block]).sum() ** 2
-    means['half'] = Z_90 * np.sqrt(squares.groupby(level=0).sum()) / count
-    return means[count >= min(_FEWEST_SAMPLES, count.max())].sort_values('x')
-
-
-def _places(values: np.ndarray) -> np.ndarray:
-    """Return the range of each value, (n,); quantiles and equal widths divide the ranges."""
-    shares = np.linspace(0, 1, _BINS + 1)
-    low, high = float(values.min()), float(values.max())
-    edges = np.unique([*np.quantile(values, shares), *(low + (high - low) * shares)])
-    return np.clip(np.searchsorted(edges, values, 'right') - 1, 0, max(len(edges) - 2, 0))
-
-
-def _variables(comparison: BaselineComparison) -> dict[Over, np.ndarray]:
-    """Return the variables that are known at the samples of each axis, (n, m) each."""
-    time_s = comparison.time_s
-    axes = comparison.sensor.axes
-    of_all = {Over.TIME: time_s - time_s[0]}
-    surroundings = comparison.surroundings
-    if 'temperature_c' in surroundings:
-        temperature_c = surroundings['temperature_c']
-        late_k = temperature_c - low_pass(temperature_c, _RATE_S, comparison.dt_s, {})
-        of_all[Over.TEMPERATURE] = temperature_c
-        of_all[Over.TEMPERATURE_RATE] = late_k * 60 / _RATE_S
-    if 'supply_v' in surroundings:
-        of_all[Over.SUPPLY] = surroundings['supply_v']
-    if comparison.joints:
-        alpha, beta = comparison.joints
-        of_all[Over.ALPHA] = np.degrees(alpha(time_s))
-        of_all[Over.ALPHA_RATE] = np.degrees(alpha(time_s, 1))
-        of_all[Over.ALPHA_ACCELERATION] = np.degrees(alpha(time_s, 2))
-        of_all[Over.BETA] = np.degrees(beta(time_s)) % 360
-        of_all[Over.BETA_RATE] = np.degrees(beta(time_s, 1))
-        of_all[Over.BETA_ACCELERATION] = np.degrees(beta(time_s, 2))
-    of_axes = {Over.OUTPUT: comparison.volts}
-    force_g = comparison.reference_force_g()
-    if force_g is not None:
-        own = force_g[comparison.sensor.axis_indices].T
-        # Across x is y; across y and z it is x.
-        across = [1 if axis == AXES[0] else 0 for axis in axes]
-        of_axes[Over.OWN_FORCE] = own
-        of_axes[Over.FORCE_RATE] = np.gradient(own, time_s, axis=0)
-        of_axes[Over.CROSS_FORCE] = force_g[across].T
-        of_all[Over.FORCE_Z] = force_g[2]
-    return of_axes | {name: np.repeat(v[:, None], len(axes), axis=1) for name, v in of_all.items()}
-
-
-def _spectra(comparison: BaselineComparison, signals_v: Mapping[str, np.ndarray]) -> Figure:
-    """
-    Draw spectra of signals, V, (n, m), and the stated noise, in one panel for each axis.
-
-    Points are equally dense per octave.
-    """
-    import pandas as pd
-
-    sensor = comparison.sensor
-    scale = comparison.scale_v_per_mps2
-    densities = {}
-    for label, signal_v in signals_v.items():
-        signal_mg = np.nan_to_num(mg(bridged(signal_v, comparison.used) / scale))
-        all_hz, power = scipy.signal.welch(
-            signal_mg, sensor.rate_hz, axis=0, nperseg=min(_SEGMENT, len(signal_mg))
-        )
-        octave = np.floor(np.log2(all_hz[1:] / all_hz[1]) * _POINTS_PER_OCTAVE)
-        hz = pd.Series(all_hz[1:]).groupby(octave).mean().to_numpy()
-        densities[label] = np.sqrt(pd.DataFrame(power[1:]).groupby(octave).mean().to_numpy())
-    densities['stated noise'] = mg(np.sqrt(noise.density_v2_per_hz(sensor, hz)) / scale)
-    panels = []
-    for d, axis in enumerate(sensor.axes):
-        curves = {label: np.where(v[:, d] > 0, v[:, d], np.nan) for label, v in densities.items()}
-        panels.append(
-            (
-                {'title': {'text': f'{axis}, mg/√Hz'}, 'type': 'log'},
-                [line(hz, v, label, _CURVE_COLOURS[label]) for label, v in curves.items()],
-            )
-        )
-    return _stacked(
-        panels,
-        60 + 190 * len(panels),
-        _WIDE,
-        {'title': {'text': Over.FREQUENCY.value}, 'type': 'log'},
-    )
+    label: str
+    begin_mg: float
+    width_mg: float
+    text: str  # Behind the bar
+    colour: str
 
 
 def waterfall(report: Report) -> Figure:
@@ -396,64 +187,37 @@ def waterfall(report: Report) -> Figure:
     floor = float(mg(closure.floor.value))
     highest = max(level, after, floor)
     above = level**2 - floor**2
-    bars = [('gap', 0.0, level, mg_text(closure.before.value), plots.BEFORE_COLOUR)]
+    bars = [_Bar('gap', 0.0, level, mg_text(closure.before.value), plots.BEFORE_COLOUR)]
     for name, share in sorted(words.shares_of_gap(report).items(), key=lambda item: -item[1]):
         if share > 0:
             lower = max(level**2 - share * above, 0.0) ** 0.5
-            bars.append((name, lower, level - lower, percent(share), _EFFECT_COLOUR))
+            bars.append(_Bar(name, lower, level - lower, percent(share), _EFFECT_COLOUR))
             level = lower
     if len(bars) > 1:
-        bars.append(('what is left', 0.0, after, mg_text(closure.after.value), plots.AFTER_COLOUR))
-    bars.append(('noise floor', 0.0, floor, mg_text(closure.floor.value), plots.QUIET_COLOUR))
-    labels, base, width, text, colours = zip(*bars)
+        left = mg_text(closure.after.value)
+        bars.append(_Bar('what is left', 0.0, after, left, plots.AFTER_COLOUR))
+    lowest = mg_text(closure.floor.value)
+    bars.append(_Bar('noise floor', 0.0, floor, lowest, plots.QUIET_COLOUR))
     trace = {
         'type': 'bar',
         'width': 0.62,
         'orientation': 'h',
-        'y': labels,
-        'x': rounded(width),
-        'base': rounded(base),
-        'text': text,
+        'y': [bar.label for bar in bars],
+        'x': rounded([bar.width_mg for bar in bars]),
+        'base': rounded([bar.begin_mg for bar in bars]),
+        'text': [bar.text for bar in bars],
         'textposition': 'outside',
         'cliponaxis': False,
-        'marker': {'color': colours},
+        'marker': {'color': [bar.colour for bar in bars]},
         'hovertemplate': '%{y}: %{text}<extra></extra>',
         'showlegend': False,
     }
     return figure(
         [trace],
-        60 + 38 * len(labels),
+        60 + 38 * len(bars),
         xaxis={'title': {'text': 'rms, mg'}, 'range': [0, 1.2 * highest]},
         yaxis={'autorange': 'reversed', 'ticks': '', 'type': 'category'},
     )
-
-
-def _stacked(
-    panels: Sequence[tuple[dict[str, Any], Sequence[Figure]]],
-    height: int,
-    margin: dict[str, int],
-    xaxis: dict[str, Any],
-) -> Figure:
-    """Put panels, an axis with its lines each, below each other; all zoom together."""
-    traces: list[Figure] = []
-    layout = {'xaxis': {'anchor': plots.axis_number('y', len(panels)), **xaxis}}
-    part = 1.08 / len(panels)
-    for i, (axis, lines) in enumerate(panels):
-        layout[plots.axis_number('yaxis', i + 1)] = {
-            'domain': [max(1.08 - (i + 1) * part, 0.0), 1 - i * part],
-            **axis,
-        }
-        traces += [
-            {
-                **drawn,
-                'xaxis': 'x',
-                'yaxis': plots.axis_number('y', i + 1),
-                'legendgroup': drawn['name'],
-                'showlegend': not any(t['name'] == drawn['name'] for t in traces),
-            }
-            for drawn in lines
-        ]
-    return figure(traces, height, margin=margin, **layout)
 
 
 def signals(comparison: BaselineComparison, after: Sensor) -> Figure:
@@ -465,7 +229,7 @@ def signals(comparison: BaselineComparison, after: Sensor) -> Figure:
     recorded_g = mg((comparison.volts - comparison.sensor.zero_g_v) / scale) / 1e3
     contents = {
         '{}, g': [
-            ('recording', recorded_g, _INK),
+            ('recording', recorded_g, INK),
             ('simulation before', recorded_g - before_mg / 1e3, plots.BEFORE_COLOUR),
             ('simulation after', recorded_g - after_mg / 1e3, plots.AFTER_COLOUR),
         ],
@@ -482,6 +246,6 @@ def signals(comparison: BaselineComparison, after: Sensor) -> Figure:
                 chosen = plots.extremes(values[:, d], _PLOTTED_POINTS)
                 lines.append(line(time_s[chosen], values[chosen, d], name, colour, opacity=0.8))
             panels.append(({'title': {'text': label.format(axis)}, 'nticks': 5}, lines))
-    return _stacked(
-        panels, 80 + 150 * len(panels), {**_WIDE, 't': 60}, {'title': {'text': 'time, s'}}
+    return stacked(
+        panels, 80 + 150 * len(panels), {**WIDE, 't': 60}, {'title': {'text': 'time, s'}}
     )

@@ -68,9 +68,10 @@ class _Cell(NamedTuple):
     sums_mps2: np.ndarray  # Sum of the residual in each block of time, m/s², (blocks,)
     samples: float  # Number of samples
 
-    def found(self, mean_mps2: float, share: float, p: float) -> ResidualCell:
-        """Return it with its mean, its share of the squares, and its probability."""
-        return ResidualCell(self.axis, self.dimension, self.low, self.high, mean_mps2, share, p)
+    @property
+    def mean_mps2(self) -> float:
+        """Return the mean residual, m/s²."""
+        return float(self.sums_mps2.sum() / self.samples)
 
 
 def dimensions(comparison: BaselineComparison) -> dict[str, np.ndarray]:
@@ -119,13 +120,19 @@ def residual_map(comparison: BaselineComparison, seed: int) -> list[ResidualCell
     cells = _cells(comparison, residual_mps2, np.arange(len(residual_mps2)) // block_length)
     if not cells:
         return []
-    sums = np.array([cell.sums_mps2 for cell in cells])
-    counts = np.array([cell.samples for cell in cells])
-    means = sums.sum(axis=1) / counts
-    shares = np.minimum(means**2 * counts / max(float(np.sum(residual_mps2**2)), 1e-300), 1.0)
+    total = max(float(np.sum(residual_mps2**2)), 1e-300)
+    sums_mps2 = np.array([cell.sums_mps2 for cell in cells])
     significant = [
-        cell.found(float(mean), float(share), float(p))
-        for cell, mean, share, p in zip(cells, means, shares, _family_wise_p(sums, seed))
+        ResidualCell(
+            cell.axis,
+            cell.dimension,
+            cell.low,
+            cell.high,
+            mean_mps2=cell.mean_mps2,
+            share=min(cell.mean_mps2**2 * cell.samples / total, 1.0),
+            p=p,
+        )
+        for cell, p in zip(cells, _family_wise_p(sums_mps2, seed).tolist())
         if p < _SIGNIFICANT_P
     ]
     return sorted(significant, key=lambda cell: -cell.share)[:_MOST_CELLS]

@@ -16,8 +16,9 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence, linear_model as linear
 from adxl_ros.diagnose.comparison import BaselineComparison
-from adxl_ros.diagnose.evidence import LinearFit, LinearisedHypothesis, Whitener
+from adxl_ros.diagnose.evidence import LinearFit, LinearisedHypothesis
 from adxl_ros.diagnose.linear_model import LinearModel
+from adxl_ros.diagnose.noise_filters import Whitener
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named

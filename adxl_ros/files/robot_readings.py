@@ -96,20 +96,24 @@ def _from_table(path: str) -> RobotReadings:
     table = open_table(path)
     if 'time_s' not in table.names:
         raise UserError(f'{path}: no column time_s beside the joints of a robot')
+    return of_columns(path, table.read(['time_s', *filter(_is_of_robot, table.names)]))
+
+
+def _is_of_robot(name: str) -> bool:
+    return name.startswith('base_') or name.endswith(('_rad', '_m'))
+
+
+def of_columns(path: str, columns: Mapping[str, np.ndarray]) -> RobotReadings:
+    """Return the readings in columns `time_s`, NAME_rad or NAME_m, and base_x_m ... base_qw."""
+    times = columns['time_s']
+    base = [columns[f'base_{name}'] for name in _BASE if f'base_{name}' in columns]
     joints = {
-        name: name.rpartition('_')[0]
-        for name in table.names
+        name.rpartition('_')[0]: _track(times, values)
+        for name, values in columns.items()
         if name.endswith(('_rad', '_m')) and not name.startswith('base_')
     }
-    base = [f'base_{name}' for name in _BASE]
-    base = base if set(base) <= set(table.names) else []
-    columns = table.read(['time_s', *joints, *base])
-    times = columns['time_s']
-    return RobotReadings(
-        path,
-        {joint: _track(times, columns[name]) for name, joint in joints.items()},
-        _track(times, np.column_stack([columns[name] for name in base])) if base else None,
-    )
+    is_whole = len(base) == len(_BASE)
+    return RobotReadings(path, joints, _track(times, np.column_stack(base)) if is_whole else None)
 
 
 def _track(time_s: np.ndarray, values: np.ndarray) -> JointTrack:

@@ -60,6 +60,18 @@ def specific_force(
     ]
 
 
+def gravity_slopes(alpha_rad: np.ndarray, beta_rad: np.ndarray) -> np.ndarray:
+    """Return the derivatives of gravity's direction in the sensor by both angles, (2, 3, n)."""
+    sin_alpha, cos_alpha = np.sin(alpha_rad), np.cos(alpha_rad)
+    sin_beta, cos_beta = np.sin(beta_rad), np.cos(beta_rad)
+    return np.array(
+        [
+            [cos_alpha * cos_beta, -cos_alpha * sin_beta, -sin_alpha],
+            [-sin_alpha * sin_beta, -sin_alpha * cos_beta, 0 * sin_alpha],
+        ]
+    )
+
+
 def stage_angles(roll_rad: np.ndarray, pitch_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return alpha, 0 to π, and beta, −π to π, of a tilt; beta is 0 where alpha is 0."""
     x = -np.sin(pitch_rad)

@@ -102,6 +102,11 @@ def held_rounding(sensor: Sensor) -> np.ndarray:
     )
 
 
+def held_rounding_v2(sensor: Sensor) -> np.ndarray:
+    """Return the mean square of the rounding that stays while the output stays, V², (m,)."""
+    return held_rounding(sensor) * electronics(sensor).lsb_v ** 2 / 12
+
+
 def density_for_variance(variance: np.ndarray, rc_s: np.ndarray, rate_hz: float) -> np.ndarray:
     """Return the squared density before the filter, of samples' analog variance, by axis, (m,)."""
     return variance / filtered_bandwidth_hz(rc_s, rate_hz)

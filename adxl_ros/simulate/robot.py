@@ -9,7 +9,7 @@ are known; what the steps of the encoders leave open is simulated, and is the er
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 import os
@@ -411,10 +411,19 @@ def robot_path(
     epoch_ns: int,
     gravity_mps2: float = G0_MPS2,
     topic: str = '',
+    columns: Mapping[str, np.ndarray] | None = None,
 ) -> RobotPath:
-    """Return the specific force in a frame of a robot, by `robot_readings.read` of a recording."""
+    """
+    Return the specific force in a frame of a robot, by `robot_readings.read` of a recording.
+
+    columns: those of a recording that is no file.
+    """
     robot = Robot(urdf, frame)
-    readings = robot_readings.read(path, epoch_ns, topic, robot.root, bool(robot.joints))
+    readings = (
+        robot_readings.read(path, epoch_ns, topic, robot.root, bool(robot.joints))
+        if columns is None
+        else robot_readings.of_columns(path, columns)
+    )
     if readings.base is not None:
         robot = Robot(urdf, frame, moves=True)
     return RobotPath(robot, readings, gravity_mps2)

@@ -9,7 +9,7 @@ from pathlib import Path
 from time import monotonic
 
 from adxl_ros.api.gap import diagnose as find_gap, PAGE, PARAMETERS, REPORT
-from adxl_ros.diagnose.report import as_text
+from adxl_ros.diagnose.report_json import as_text
 from adxl_ros.diagnose.verdict import MATERIAL_MG
 from adxl_ros.model.effects import library
 from adxl_ros.report import page as html_page

@@ -9,7 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import adxl_ros as adxl
-from adxl_ros.diagnose.report import as_shown, size_lines
+from adxl_ros.diagnose.screen import as_shown, size_lines
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.process import package_version
 from adxl_ros.simulate.robot import Robot

@@ -131,9 +131,9 @@ most {100 * upper:.1f} % (95 %). Robots with a reported change and no knock.
 {markdown_table(KEPT_HEAD, kept)}
 
 The interval is true on average over units that drift 1 to 6 times as strongly as stated. Where
-rests show how strongly, it is about true for each of them. Where they do not, as for two axes, it
-takes them for equally likely. So it is wide for the usual drift, and narrow for five times of it:
-2·Φ(1.645 · √14.4 / 5) − 1 = 79 % inside.
+rests show how strongly, it is about true for each of them. Where they hardly do, as for two axes,
+whose long stays alone show it, it first takes them for equally likely. So it is wide for the usual
+drift, and narrow for five times of it: 2·Φ(1.645 · √14.4 / 5) − 1 = 79 % inside.
 
 A knock of 3, 8 and 20 mg on day 31. Robots that rest within a day with that axis up or down; those
 of them that report it within a day; robots that report it in two weeks; robots that adopt more

@@ -77,6 +77,18 @@ def test_the_interval_of_a_sensor_of_two_axes_holds():
     assert state.determined[0] == 'zero-g x: as calibrated, and ageing'
 
 
+def test_places_that_show_nothing_of_a_zero_g_leave_its_interval():
+    """One rest at each of many places says nothing of two axes, however many they are."""
+    rest = rests(Kind(axes='xy'), 1)[0]
+    stamps_ns = [rest.start_ns + number * 3600 * 10**9 for number in range(500)]
+    keeper = Keeper(calibrated('xy'))
+    for stay, stamp_ns in enumerate(stamps_ns):
+        keeper.add(replace(rest, stay=stay, start_ns=stamp_ns, stop_ns=stamp_ns + 10**9))
+    alone = Keeper(calibrated('xy'), entries=[rest]).state(stamps_ns[-1])
+    many_mg, alone_mg = keeper.state(stamps_ns[-1]).zero_g_90_mg, alone.zero_g_90_mg
+    assert many_mg == pytest.approx(alone_mg, rel=0.01)
+
+
 def test_a_slope_of_weeks_is_not_learnt_as_zero_g():
     robot = Robot(Kind(weeks_deg=5.0), np.random.default_rng(3))
     taken = [rest for day in range(36) for rest, _ in robot.rests(day)]

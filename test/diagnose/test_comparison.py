@@ -103,17 +103,6 @@ def test_the_step_of_the_codes_is_the_smallest_change():
     assert beside.code_step_v(volts).tolist() == [0.25, 0.0]
 
 
-def test_the_slopes_of_gravity_are_its_derivatives():
-    alpha_rad, beta_rad = np.random.default_rng(1).uniform(-np.pi, np.pi, (2, 20))
-    step = 1e-6
-    for i, (d_alpha, d_beta) in enumerate([(step, 0.0), (0.0, step)]):
-        after = specific_force(alpha_rad + d_alpha, beta_rad + d_beta, 1.0)
-        before = specific_force(alpha_rad - d_alpha, beta_rad - d_beta, 1.0)
-        derivative = (np.array(after) - np.array(before)) / (2 * step)
-        slopes = beside.gravity_slopes(alpha_rad, beta_rad)[i]
-        assert slopes == pytest.approx(derivative, abs=1e-8)
-
-
 @pytest.mark.parametrize('step_rad', [2e-3, 8e-3])
 def test_the_step_of_an_encoder_shows_in_its_readings(step_rad):
     sensor = replace(nominal(), stage_resolution_rad=1e-4)

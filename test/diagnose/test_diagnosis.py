@@ -8,7 +8,7 @@ import json
 
 from adxl_ros.diagnose.diagnosis import diagnose
 from adxl_ros.diagnose.next_experiment import propose_next_experiment
-from adxl_ros.diagnose.report import as_json
+from adxl_ros.diagnose.report_json import as_json
 from adxl_ros.diagnose.verdict import WeightedHypothesis
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file

@@ -6,7 +6,7 @@ import ast
 from importlib import import_module
 from pathlib import Path
 
-from adxl_ros.diagnose.data_checks import DATA_FAULTS
+from adxl_ros.diagnose.data_faults import DATA_FAULTS
 from adxl_ros.model.effects import library
 from adxl_ros.model.effects.base import ActsOn, FormDimension, Need, Place
 import pytest

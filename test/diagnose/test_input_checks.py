@@ -5,7 +5,8 @@
 from dataclasses import replace
 import json
 
-from adxl_ros.diagnose.data_checks import check_recording, compare_checked, DataFault
+from adxl_ros.diagnose.data_checks import check_recording, compare_checked
+from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.files import parameter_file, recording
 from adxl_ros.files.recording_columns import Recording, sensor_info
 from adxl_ros.model.constants import G0_MPS2

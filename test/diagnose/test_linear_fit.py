@@ -2,10 +2,19 @@
 
 """With white noise the linear fit is Bayesian least squares, which has a closed form."""
 
-from adxl_ros.diagnose.evidence import BLOCKS, fit_columns, whiten_channel, Whitener
+from adxl_ros.diagnose.evidence import (
+    BLOCKS,
+    fit_columns,
+    LinearFit,
+    LinearisedHypothesis,
+    whiten_channel,
+)
+from adxl_ros.diagnose.noise_filters import Whitener
+from adxl_ros.model.effects.base import Coefficient
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
+from units import nominal
 
 COUNT = 480
 PRIOR_STD = np.array([0.5, 2.0, 1.0])
@@ -105,3 +114,73 @@ def test_the_loss_is_half_the_squared_distance():
     fit = fitted(residual_v, columns)
     std = np.sqrt(fit.covariance[0, 0])
     assert fit.loss(np.array([fit.values[0] + 2 * std])) == pytest.approx(2.0, rel=1e-6)
+
+
+HELD = {
+    'size': Coefficient('mount_resonance', 'gain'),
+    'shape': Coefficient('mount_resonance', 'frequency_hz'),
+    'limit': Coefficient('saturation', 'knee_g', 'x'),
+}
+"""A size, a shape, and a size of an effect with limits."""
+
+
+def departures_of(kinds, std, *, full_std=None, change=1.0):
+    """Return the departures of coefficients with mean 10 and prior 1, of fits that change all."""
+    names = tuple(HELD[kind] for kind in kinds)
+    count = len(names)
+
+    def fit(std):
+        values = np.full(count, change)
+        return LinearFit(np.arange(count), values, np.diag(std**2), 0.0, (), np.ones(1))
+
+    hypothesis = LinearisedHypothesis(
+        effects=('mount_resonance',),
+        sensor=nominal(),
+        names=names,
+        prior_mean=np.full(count, 10.0),
+        prior_std=np.ones(count),
+        reach=np.zeros(0),
+        values=np.full(count, 10.5),
+        channels=[],
+        columns=[],
+        filters=[],
+    )
+    full = None if full_std is None else fit(np.array(full_std))
+    return hypothesis.departures(fit(np.array(std)), full)
+
+
+def test_what_the_samples_do_not_determine_keeps_its_value_unless_it_is_a_size():
+    kinds = ('size', 'shape', 'limit')
+    assert departures_of(kinds, [0.1, 0.1, 0.1]) == pytest.approx([1.0, 1.0, 1.0])
+    assert departures_of(kinds, [0.9, 0.9, 0.9]) == pytest.approx([1.0, 0.5, 0.5])
+
+
+def test_some_blocks_that_determine_less_than_all_keep_the_value_too():
+    assert departures_of(['shape'], [0.4], full_std=[0.1]) == pytest.approx([0.5])
+    assert departures_of(['shape'], [0.4], full_std=[0.2]) == pytest.approx([1.0])
+
+
+def test_a_shape_changes_by_a_factor_of_two_at_most():
+    assert departures_of(['shape'], [0.1], change=30.0) == pytest.approx([11.0])
+    assert departures_of(['size'], [0.1], change=30.0) == pytest.approx([30.0])
+
+
+def test_a_nuisance_parameter_stays_within_the_reach_of_a_healthy_unit():
+    """One that these blocks do not determine keeps that of all blocks; alone it goes beyond."""
+    hypothesis = LinearisedHypothesis(
+        effects=(),
+        sensor=nominal(),
+        names=(Coefficient('bias', 'offset_v', 'x'), Coefficient('bias', 'offset_v', 'y')),
+        prior_mean=np.zeros(2),
+        prior_std=np.ones(2),
+        reach=np.array([0.5, 0.5]),
+        values=np.zeros(0),
+        channels=[],
+        columns=[],
+        filters=[],
+    )
+    ids = np.arange(2)
+    fit = LinearFit(ids, np.array([2.0, 2.0]), np.diag([0.01, 1.0]), 0.0, (), np.ones(1))
+    full = LinearFit(ids, np.array([0.1, 0.2]), np.diag([0.01, 0.01]), 0.0, (), np.ones(1))
+    assert hypothesis.departures(fit) == pytest.approx([2.0, 2.0])
+    assert hypothesis.departures(fit, full) == pytest.approx([0.5, 0.2])

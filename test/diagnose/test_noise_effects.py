@@ -127,6 +127,13 @@ def test_a_step_is_no_spike():
     assert (used.all(), found) == (True, [])
 
 
+@pytest.mark.filterwarnings('error')
+def test_where_nothing_is_compared_no_sample_stands_alone():
+    none = np.zeros(COUNT, bool)
+    used, found = noise_effects.isolated_samples(white_v(), white_v(), TIME_S, none, sensor())
+    assert (used.any(), found) == (False, [])
+
+
 def test_spikes_of_the_residual_alone_are_of_the_reference():
     residual_v = white_v()
     residual_v[200::400] += 0.5

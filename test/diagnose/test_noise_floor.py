@@ -5,7 +5,7 @@
 from dataclasses import replace
 
 from adxl_ros.diagnose.comparison import compare
-from adxl_ros.diagnose.evidence import estimate_floor, NoiseFloor, squares_at_rest
+from adxl_ros.diagnose.noise_floor import estimate_floor, NoiseFloor, squares_at_rest
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
@@ -29,17 +29,17 @@ def test_the_interval_contains_the_noise(seconds):
         white = np.random.default_rng(seed).normal(size=(count + 100, 1))
         volts = lfilter([np.sqrt(1 - pole**2)], [1, -pole], white, axis=0)[100:]
         sums = squares_at_rest(volts, np.ones(count, bool), sensor)
-        parts = np.array([(squares_v2[0], count) for squares_v2, count in sums]).T
-        rms = np.sqrt(parts[0].sum() / parts[1].sum())
-        floor = NoiseFloor(np.array([rms]), rms, 'still', parts)
+        squares = np.array([part.squares_v2[0] for part in sums])
+        samples = np.array([part.samples for part in sums])
+        rms = np.sqrt(squares.sum() / samples.sum())
+        floor = NoiseFloor(np.array([rms]), rms, 'still', squares, samples)
         low, high = np.quantile(floor.draws_mps2(seed, 200), [0.05, 0.95])
         contained += low < 1.0 < high
     assert (0.8 if seconds < 20 else 0.84) < contained / _TRIALS < 0.95
 
 
 def test_a_few_seconds_have_no_interval():
-    parts = np.ones((2, 19))
-    assert NoiseFloor(np.ones(1), 1.0, 'still', parts).draws_mps2(0, 200) is None
+    assert NoiseFloor(np.ones(1), 1.0, 'still', *np.ones((2, 19))).draws_mps2(0, 200) is None
 
 
 @pytest.mark.parametrize('steps', [0.02, 0.1, 0.2, 0.3])

@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-from adxl_ros.diagnose import evidence
+from adxl_ros.diagnose import evidence, noise_filters, noise_floor
 from adxl_ros.diagnose.comparison import compare
 from adxl_ros.files.recording_columns import Recording
 from adxl_ros.model import noise
@@ -43,7 +43,7 @@ def log_likelihood(volts, covariance):
 
 
 def walks(comparison):
-    return [f for f in evidence.whiteners(comparison, 0) if f.effect == 'bias_walk']
+    return [f for f in noise_filters.whiteners(comparison, 0) if f.effect == 'bias_walk']
 
 
 @pytest.mark.parametrize('number', [2, 4, 6])
@@ -65,8 +65,8 @@ def test_innovations_have_the_likelihood_of_the_covariance(resting, number):
 
 def test_a_fit_takes_the_drift_that_the_noise_has(resting):
     scale = float(resting.sensor.scale_v_per_g[0])
-    filters = evidence.whiteners(resting, 0)
-    density = evidence.RANDOM_WALKS_G_PER_RTS[-2]
+    filters = noise_filters.whiteners(resting, 0)
+    density = noise_filters.RANDOM_WALKS_G_PER_RTS[-2]
     factor = np.linalg.cholesky(covariance_v2(resting, density * scale))
     volts = factor @ np.random.default_rng(1).normal(size=COUNT)
     channel = evidence.whiten_channel(
@@ -88,7 +88,7 @@ def test_the_size_of_flicker_is_that_of_the_fitted_noise(resting, density, exces
     flicker = np.fft.irfft(np.fft.rfft(rng.normal(size=COUNT)) * shape, COUNT)
     volts = excess * factor @ rng.normal(size=COUNT)
     volts += density * scale * np.sqrt(RATE_HZ / 2) * flicker
-    filters = [f for f in evidence.whiteners(resting, 0) if f.effect == 'flicker']
+    filters = [f for f in noise_filters.whiteners(resting, 0) if f.effect == 'flicker']
     channel = evidence.whiten_channel(
         volts[:, None], np.zeros(0, int), np.ones(COUNT, bool), filters
     )
@@ -104,7 +104,9 @@ def test_the_expected_drift_is_that_of_random_walks(resting):
     steps = np.random.default_rng(1).normal(size=(2000, COUNT)) / np.sqrt(RATE_HZ)
     paths = np.cumsum(1e-3 * steps, axis=1)
     rms_g = np.sqrt(np.mean(np.var(paths, axis=1)))
-    assert evidence.expected_drift_g('bias_walk', 1e-3, resting) == pytest.approx(rms_g, rel=0.05)
+    assert noise_filters.expected_drift_g('bias_walk', 1e-3, resting) == pytest.approx(
+        rms_g, rel=0.05
+    )
 
 
 def test_a_repeat_is_found_with_its_lag():
@@ -112,9 +114,9 @@ def test_a_repeat_is_found_with_its_lag():
     angle_rad = np.interp(np.arange(6000), np.arange(0, 6001, 300), rng.uniform(0, 6, 21))
     direction = np.array([np.sin(angle_rad), np.cos(angle_rad), 0 * angle_rad])
     later = np.concatenate([direction[:, :700][:, ::-1], direction], axis=1)
-    assert evidence.find_repeat(direction, later, RATE_HZ, 1e-4, False) == (700, 6000)
+    assert noise_floor.find_repeat(direction, later, RATE_HZ, 1e-4, False) == (700, 6000)
     other = np.roll(direction, 1, axis=0)
-    assert evidence.find_repeat(direction, other, RATE_HZ, 1e-4, False) is None
+    assert noise_floor.find_repeat(direction, other, RATE_HZ, 1e-4, False) is None
 
 
 def test_each_used_sample_is_in_one_block():

@@ -8,7 +8,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.accelerometer import direction
 from adxl_ros.model.effects.base import Coefficient
-from adxl_ros.model.kinematics import specific_force
+from adxl_ros.model.kinematics import gravity_slopes, specific_force
 from adxl_ros.model.sensor import get, names_of, parameter_of, put, with_neutral
 import numpy as np
 import pytest
@@ -79,3 +79,14 @@ def test_put_changes_a_copy() -> None:
     assert get(changed, names).tolist() == [0.1, 0.02]
     assert get(sensor, names).tolist() == [0.0, 0.0]
     assert changed.zero_g_v.tolist() == [2.5, 2.6]
+
+
+def test_the_slopes_of_gravity_are_its_derivatives():
+    alpha_rad, beta_rad = np.random.default_rng(1).uniform(-np.pi, np.pi, (2, 20))
+    step = 1e-6
+    for i, (d_alpha, d_beta) in enumerate([(step, 0.0), (0.0, step)]):
+        after = specific_force(alpha_rad + d_alpha, beta_rad + d_beta, 1.0)
+        before = specific_force(alpha_rad - d_alpha, beta_rad - d_beta, 1.0)
+        derivative = (np.array(after) - np.array(before)) / (2 * step)
+        slopes = gravity_slopes(alpha_rad, beta_rad)[i]
+        assert slopes == pytest.approx(derivative, abs=1e-8)

@@ -2,15 +2,19 @@
 
 """A robot as the reference, against closed forms."""
 
+import adxl_ros as adxl
 from adxl_ros.errors import UserError
+from adxl_ros.files.recording_columns import ACCEL
 from adxl_ros.files.robot_readings import JointTrack, RobotReadings
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.simulate.motion import ForcePath, Motion
 from adxl_ros.simulate.response import ChainMemo, whole_response
 from adxl_ros.simulate.robot import Robot, robot_path, RobotPath
 import numpy as np
+import pandas as pd
 import pytest
 from robots import encoded, urdf
+import scipy
 from units import nominal, with_effects
 
 pytest.importorskip('pinocchio')
@@ -182,6 +186,26 @@ def test_wrong_names_are_told(tmp_path, frame, joints, words):
     with pytest.raises(UserError) as error:
         robot_path(tmp_path / 'robot.urdf', frame, str(tmp_path / 'run.csv'), 0)
     assert words in str(error.value)
+
+
+def test_joints_of_a_dataframe_are_those_of_the_robot(tmp_path):
+    """Zero-g and scale factor are those of the unit, as with a file of the same columns."""
+    (tmp_path / 'robot.urdf').write_text(urdf([*PENDULUM, ('1 0 0', '0 0 0')]))
+    time_s = np.arange(0, 48, 0.02)
+    rng = np.random.default_rng(2)
+    knots_s = np.arange(0, 50, 0.5)
+    knots_rad = np.repeat(rng.uniform(-2, 2, (13, 2)), 8, axis=0)[: len(knots_s)]
+    joints = scipy.interpolate.PchipInterpolator(knots_s, knots_rad)
+    path = np.array([joints(time_s, order) for order in range(3)])
+    force = Robot(tmp_path / 'robot.urdf', 'imu_link').motion(path, None, G0_MPS2).force_mps2
+    readings = 0.3 + 1.01 * force + 5e-3 * rng.normal(size=force.shape)
+    table = pd.DataFrame({'time_s': time_s, **dict(zip(ACCEL, readings.T))})
+    table = table.assign(j1_rad=path[0, :, 0], j2_rad=path[0, :, 1])
+    found = adxl.fit(table, model='linear', urdf=tmp_path / 'robot.urdf')
+    zero_g = found.sensor.values['bias']['offset_v'] * G0_MPS2
+    assert zero_g == pytest.approx([0.3] * 3, abs=0.02)
+    with pytest.raises(UserError, match='no position of j1, which moves imu_link'):
+        adxl.fit(table.drop(columns='j1_rad'), model='linear', urdf=tmp_path / 'robot.urdf')
 
 
 def test_a_file_that_is_no_urdf(tmp_path):

@@ -11,7 +11,7 @@ import subprocess
 
 import adxl_ros as adxl
 from adxl_ros.calibrate.fits import gravity_fit
-from adxl_ros.diagnose import data_checks
+from adxl_ros.diagnose import motion_shifts
 from adxl_ros.signals import findings
 from bags import bag_of, imu, stamps
 import numpy as np
@@ -37,7 +37,7 @@ def samples(seconds: float = 60.0) -> tuple[np.ndarray, np.ndarray]:
 
 def test_the_needs_of_other_tools_are_theirs() -> None:
     assert gravity_fit.SIX.min_rests == findings.FEWEST_GRAVITY_POSES
-    assert findings.SHORTEST_MOTION_S == data_checks.SHORTEST_S
+    assert findings.SHORTEST_MOTION_S == motion_shifts.SHORTEST_S
 
 
 def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:

@@ -32,8 +32,10 @@ the likelier one is wrong by √(2·ln r / (1 − r⁻²)) at most: 1.5, and 1.8
 LARGEST_DRIFT = max(_DRIFTS)
 _DRIFT, _SLOPE, _SCATTER_G = np.array([*product(_DRIFTS, _DRIFTS, _SCATTERS_G)]).T
 """Drift with time and with temperature, and scatter, by filter, (l,) each."""
-_DIRECTION_STD_G = 0.1
-"""Standard deviation of a direction before its stay, g; chosen: far above any zero-g error."""
+_DIRECTION_STD_G = 10.0
+"""Standard deviation of a direction before its stay, g. It stands for "unknown": each stay says of
+the zero-g what this allows, and those of a year together still 0.15 g, far above any zero-g error.
+"""
 _CREEP_G2_PER_DAY = (3e-4**2) * 24
 """Growth of its variance within a stay, g²/day. Chosen: 0.3 mg in an hour, by tyres."""
 _LEAST_LOG_WEIGHT = -30.0

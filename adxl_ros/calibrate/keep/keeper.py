@@ -42,6 +42,9 @@ _HELD_OUT = 4  # One stay of so many is held out; chosen: a fifth to a third is 
 _FEWEST_HELD_OUT = 8  # Fewest stays that may decide; chosen: their scatter is known to a quarter
 _MOST_HELD_OUT = 400  # Most stays that are kept for that; chosen: some weeks
 _SURE = 0.99  # Confidence with which held-out stays must improve
+_HOLDS_DAYS = 1.0
+"""Days for which a change must surely improve, with the drift of that time: the next decision is
+as late as that."""
 _IMPLAUSIBLE = 3e-4
 """Probability below which a rest is not learnt; chosen: one false rest in months."""
 _REJECTED = 2
@@ -375,7 +378,7 @@ class Keeper:
         no rest has had up or down, a knock would not be noticed. So its zero-g stays as calibrated
         at the temperature of the calibration, and changes with temperature alone.
         """
-        mean, covariance = self._belief.moments
+        mean, covariance = self._belief.aged(self._per_day, _HOLDS_DAYS).moments
         designs = self._held_designs()
         upright = set()
         if self._kept.sensor.axes == AXES:
