@@ -18,7 +18,7 @@ from adxl_ros.compensate.inversions import HALF
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, imu_message, parameter_file
-from adxl_ros.files.recording_columns import StreamInfo
+from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.links.support.base import COLUMNS
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import parameter_checks, parameters, sensor_parameters, topics

@@ -10,7 +10,7 @@ import traceback
 from typing import Any
 
 from adxl_ros.errors import one_line, UserError
-from adxl_ros.files.recording_columns import NO_SERIAL
+from adxl_ros.files.stream_info import NO_SERIAL
 from adxl_ros.links.support.base import (
     DEFAULT_LINK,
     link_module,

@@ -247,7 +247,7 @@ def test_means_with_angles_need_a_stated_noise(run_tool, tmp_path) -> None:
     done = run_tool(*command)
     assert done.returncode == 1 and 'sensor.noise_density_g_per_rthz' in done.stderr
     noise = 'noise_density_g_per_rthz: [4.0e-4, 4.0e-4, 4.0e-4]\n      rate_hz:'
-    text = parameter_file.any_imu_path().read_text().replace('rate_hz:', noise)
+    text = parameter_file.usual_path(is_nominal=False).read_text().replace('rate_hz:', noise)
     written(tmp_path, 'stated.yaml', text)
     done = run_tool(*command, '--params', 'stated.yaml')
     assert done.returncode == 0, done.stderr

@@ -47,7 +47,7 @@ _OF_OWN_FORCE = DiagnosisHints(
 )
 _OF_TEMPERATURE = DiagnosisHints(
     revealed_by=Manoeuvre.HEAT,
-    form=(FormDimension.TEMPERATURE,),
+    form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
     proof=(ProofVariable.TEMPERATURE,),
 )
 _SCALE_EXPONENT = 1.135
