@@ -13,8 +13,8 @@ from dataclasses import replace
 from functools import partial
 from itertools import product
 
-from adxl_ros.calibrate.fits import full_model
-from adxl_ros.calibrate.fits.linearisation import StageError
+from adxl_ros.calibrate.fits import full_model, term_selection
+from adxl_ros.calibrate.fits.pose_covariance import StageError
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
 from adxl_ros.calibrate.pose_model import predicted_volts
 from adxl_ros.calibrate.poses import Poses
@@ -69,7 +69,7 @@ def draw(
     truth = _unit(sensor, terms, stage, rng)
     step = float(stated * np.exp(rng.uniform(*np.log((0.5, 2.0)))))
     poses, true_rad = _swept(truth, _targets(sensor, kind), stage == STAGES[0], step, rng)
-    fit, _ = full_model.fit_selected(sensor, poses)
+    fit, _ = term_selection.fit_selected(sensor, poses)
     names = fit.fitted.covariance_names
     truth_of_fit = with_neutral(truth, {name.effect for name in names})
     error = get(fit.fitted, names) - get(truth_of_fit, names)

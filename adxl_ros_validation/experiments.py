@@ -8,8 +8,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from adxl_ros.calibrate.fits import full_model, linear
-from adxl_ros.calibrate.fits.linearisation import StageError
+from adxl_ros.calibrate.fits import full_model, linear, term_selection
+from adxl_ros.calibrate.fits.pose_covariance import StageError
 from adxl_ros.calibrate.guided.pose_plan import spread, Target
 from adxl_ros.calibrate.pose_model import stage_force
 from adxl_ros.calibrate.poses import Poses
@@ -209,7 +209,7 @@ def motion_bound_mmps2(nominal: Sensor) -> float:
     return float(1e3 * density * np.sqrt(nominal.rate_hz / 2 * np.sum(impulse**2)))
 
 
-MODELS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': full_model.fit}
+MODELS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': term_selection.fit}
 PLANES_RAD = tuple(np.radians([90.0, 60.0, 30.0, 0.0, 120.0, 150.0, 180.0]).tolist())
 """Planes alpha of the sweep, rad; the paper's, as its step of beta, 30°."""
 GRAVITY_MPS2 = 9.80131

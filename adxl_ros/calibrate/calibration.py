@@ -10,13 +10,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
-from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, thermal_fit
-from adxl_ros.calibrate.fits.linearisation import volts_covariance
+from adxl_ros.calibrate.fits import full_model, gravity_fit, linear, term_selection, thermal_fit
+from adxl_ros.calibrate.fits.pose_covariance import volts_covariance
 from adxl_ros.calibrate.pose_model import predicted_volts, reference_force, residual_g
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import acceptance, held_out
 from adxl_ros.calibrate.report.acceptance import Assessment
-from adxl_ros.calibrate.report.error_budget import rms_mg
 from adxl_ros.calibrate.report.error_causes import error_budgets
 from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.calibrate.result import CalibrationResult, envelope, with_provenance
@@ -24,6 +23,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import rms, stds
 from adxl_ros.model.noise import means_at_a_rail
 from adxl_ros.model.population import Population, posterior
 from adxl_ros.model.sensor import Sensor
@@ -33,8 +33,19 @@ from adxl_ros.signals import filter_noise, polarity
 from adxl_ros.signals.gravity_at_rest import of_volts, require_unit
 import numpy as np
 
-STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': full_model.fit}
+STAGE_FITS = {'linear': linear.fit, 'physical': linear.fit_physical, 'full': term_selection.fit}
 """Models that are fitted against the stage, simplest first."""
+_MAX_TURN_RAD = np.radians(0.3)
+"""Largest turn of the case between recordings, rad. Chosen: above the 0.1° of the stage's level in
+either recording, far below a new mounting."""
+_MAX_ZERO_G_SHIFT_G = 0.02
+"""Largest shift of the zero-g between recordings, g. Chosen: a healthy sensor may shift by so much
+between two days."""
+_MIN_DEVIATIONS = 6.0  # Smallest turn or shift that counts, in its stds; chosen: never by chance
+_MIN_EIGENVALUE_RATIO = 1e-10
+"""Smallest relative eigenvalue of the information whose direction counts as determined."""
+_MIN_VARIANCE = 1e-30
+"""Lower bound of the variance of a turn, rad², or shift, g², so that it can be a divisor."""
 
 
 @dataclass(frozen=True)
@@ -103,21 +114,14 @@ def calibrate(
     doubts = require_unit(of_volts(poses.volts, poses.std_v, sensor), source, True)
     for recording in recordings:
         doubts += recording.faults
+    given = _Given(sensor, source, data_sha256, population, doubts)
     if poses.has_angles.any():
         with_angles = [
             replace(recording, poses=recording.poses.subset(recording.poses.has_angles))
             for recording in recordings
         ]
-        result = _against_stage(
-            sensor,
-            with_angles,
-            model or ('full' if effects else None),
-            effects,
-            source,
-            data_sha256,
-            population,
-            doubts,
-        )
+        model = model or ('full' if effects else None)
+        result = _against_stage(given, with_angles, model, effects)
         starts_s = poses.time_s[~poses.has_angles, 0]
         if len(starts_s):
             lines.append(
@@ -142,9 +146,19 @@ def calibrate(
         )
     else:
         span_s = sum(float(np.ptp(recording.poses.time_s)) for recording in recordings)
-        result = _against_gravity(sensor, poses, source, span_s, data_sha256, population, doubts)
+        result = _against_gravity(given, poses, span_s)
     lines += _turn_on_lines(result.fitted, [recording.poses for recording in recordings])
     return replace(result, warnings=(*result.warnings, *lines))
+
+
+class _Given(NamedTuple):
+    """What each fit of some recordings is given beside the poses."""
+
+    sensor: Sensor  # The nominal sensor
+    source: str  # Names of the recordings
+    data_sha256: str
+    population: Population | None
+    doubts: list[str]  # What is wrong with the recordings, one line each
 
 
 @dataclass(frozen=True)
@@ -152,20 +166,17 @@ class _StageFit:
     fitted: Sensor
     refit: held_out.Fit  # The same fit to other poses, for cross-validation
     full: full_model.FullFit | None = None  # The full fit; None for other models
-    terms: Sequence[full_model.Term] = ()  # Evidence for the terms of a full fit
+    terms: Sequence[term_selection.Term] = ()  # Evidence for the terms of a full fit
     notes: Sequence[str] = ()  # What to know about the choice of the model
 
 
 def _against_stage(
-    sensor: Sensor,
+    given: _Given,
     recordings: Sequence[RecordedPoses],
     model: str | None,
     effects: Sequence[str],
-    source: str,
-    data_sha256: str,
-    population: Population | None,
-    doubts: list[str],
 ) -> CalibrationResult:
+    sensor, source, data_sha256, population, doubts = given
     poses = Poses.joined([recording.poses for recording in recordings])
     _check_polarity(sensor, poses)
     fit = _richest_fit(sensor, poses.subset(~poses.check), recordings, model, effects)
@@ -180,8 +191,8 @@ def _against_stage(
     details: list[str] = []
     warnings = list(doubts)
     if fit.full:
-        details += full_model.report_lines(fit.full, poses.subset(fitting), fit.terms)
-        warnings += full_model.warnings(fit.full, poses.subset(fitting))
+        details += term_selection.report_lines(fit.full, poses.subset(fitting), fit.terms)
+        warnings += term_selection.warnings(fit.full, poses.subset(fitting))
     if fitted.model == 'full':
         fitted, filter_lines = filter_noise.with_filter(
             fitted, [recording.filters for recording in recordings if recording.filters]
@@ -192,7 +203,7 @@ def _against_stage(
     entries = {'reference': 'stage'}
     if population:
         entries['prior'] = population.name
-    entries['residual_mg'] = f'{rms_mg(float(np.mean(residual_mps2**2))):.4f}'
+    entries['residual_mg'] = f'{mg(rms(residual_mps2)):.4f}'
     if fit.full:
         entries['converged'] = 'yes' if fit.full.converged else 'no'
     entries |= acceptance.provenance_entries(judgement.of_fit, judgement.held_out, doubts)
@@ -307,11 +318,11 @@ def _richest_fit(
     def fitted(name: str) -> _StageFit:
         if name != 'full':
             return _StageFit(STAGE_FITS[name](sensor, poses), STAGE_FITS[name])
-        selected = full_model.fit_selected(sensor, poses, effects)
+        selected = term_selection.fit_selected(sensor, poses, effects)
         full = selected.fit
         if len(recordings) > 1:
             _require_one_mounting(full, recordings)
-        refit = partial(full_model.fit, effects=effects)
+        refit = partial(term_selection.fit, effects=effects)
         return _StageFit(full.fitted, refit, full, selected.terms)
 
     if model:
@@ -350,19 +361,6 @@ def _fit_affine(sensor: Sensor, poses: Poses) -> _StageFit:
         return full_model.fit_full(sensor, poses, linear.AFFINE, len(still_open)).fitted
 
     return _StageFit(full.fitted, refit, full, notes=notes)
-
-
-_MAX_TURN_RAD = np.radians(0.3)
-"""Largest turn of the case between recordings, rad. Chosen: above the 0.1° of the stage's level in
-either recording, far below a new mounting."""
-_MAX_ZERO_G_SHIFT_G = 0.02
-"""Largest shift of the zero-g between recordings, g. Chosen: a healthy sensor may shift by so much
-between two days."""
-_MIN_DEVIATIONS = 6.0  # Smallest turn or shift that counts, in its stds; chosen: never by chance
-_MIN_EIGENVALUE_RATIO = 1e-10
-"""Smallest relative eigenvalue of the information whose direction counts as determined."""
-_MIN_VARIANCE = 1e-30
-"""Lower bound of the variance of a turn, rad², or shift, g², so that it can be a divisor."""
 
 
 class _ContradictionError(UserError):
@@ -411,19 +409,13 @@ def _turn_and_shifts(full: full_model.FullFit, poses: Poses) -> tuple[np.ndarray
     return covariance @ gradient, np.sqrt(np.maximum(np.diag(covariance), _MIN_VARIANCE))
 
 
-def _against_gravity(
-    sensor: Sensor,
-    poses: Poses,
-    source: str,
-    span_s: float,
-    data_sha256: str,
-    population: Population | None,
-    doubts: list[str],
-) -> CalibrationResult:
+def _against_gravity(given: _Given, poses: Poses, span_s: float) -> CalibrationResult:
+    """Fit rests that last for a time, s, to the magnitude of gravity."""
+    sensor, source, data_sha256, population, doubts = given
     fit = gravity_fit.fit_gravity(poses.volts, poses.std_v, sensor)
     kept = np.setdiff1d(np.arange(len(poses)), fit.outliers)
-    after_mg = rms_mg(np.mean(fit.residual_mps2[kept] ** 2))
-    unseen_mg = rms_mg(np.mean(fit.held_out_mps2[kept] ** 2))
+    after_mg = mg(rms(fit.residual_mps2[kept]))
+    unseen_mg = mg(rms(fit.held_out_mps2[kept]))
     fitted = replace(
         sensor,
         model='gravity',
@@ -434,7 +426,7 @@ def _against_gravity(
     )
     warnings = list(doubts)
     if not fit.converged:
-        warnings.append(full_model.NOT_CONVERGED)
+        warnings.append(term_selection.NOT_CONVERGED)
     if fit.note:
         warnings.append(fit.note)
     if population is not None:
@@ -517,7 +509,7 @@ def calibrate_thermal(
     fitted = thermal_fit.applied(base, fit, calibrated_c)
     has_scale = any(name.effect == 'temperature_scale' for name in fit.names)
     low_c, high_c = range_c or fit.span_c
-    misfit_mps2 = float(np.sqrt(np.mean(fit.rms_g**2))) * G0_MPS2
+    misfit_mps2 = rms(fit.rms_g) * G0_MPS2
     fitted = replace(
         fitted,
         envelope=replace(
@@ -560,7 +552,7 @@ def calibrate_thermal(
 
 def _thermal_lines(fit: thermal_fit.ThermalFit, axes: str) -> list[str]:
     """Return slope and curvature of each axis, the residuals, and the effect of the history."""
-    halves = Z_90 * np.sqrt(np.diag(fit.covariance))
+    halves = Z_90 * stds(fit.covariance)
     intervals = dict(zip(fit.names, zip(fit.values, halves)))
     lines = []
     for axis in axes:

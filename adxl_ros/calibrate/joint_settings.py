@@ -28,6 +28,8 @@ encoder."""
 _MAX_READINGS = 100_000
 """Largest number of readings in memory; older ones are forgotten. They are 1000 s at 100 Hz, more
 than lies between two poses, and some 20 MB."""
+_Stamped = tuple[float, tuple[float, ...]]
+"""A stamp, ns, and the angles of both joints from then on, rad."""
 
 
 def angle_tolerance_rad(sensor: Sensor) -> float:
@@ -175,10 +177,6 @@ class SettingTracker:
         mean_rad = np.array([alpha_rad, beta_rad])
         self._mean_rad = np.where(np.isfinite(mean_rad), mean_rad, self._mean_rad)
         self._newest_ns = start_ns, stop_ns
-
-
-_Stamped = tuple[float, tuple[float, ...]]
-"""A stamp, ns, and the angles of both joints from then on, rad."""
 
 
 def _between(kept: Iterable[_Stamped], after_ns: float, last_ns: float) -> np.ndarray:

@@ -27,16 +27,9 @@ def reference_force(poses: Poses, gravity_mps2: float) -> Components:
     return specific_force(poses.alpha_rad, poses.beta_rad, gravity_mps2)
 
 
-def predicted_volts(
-    sensor: Sensor,
-    poses: Poses,
-    shift_rad: tuple[float, float] = (0.0, 0.0),
-    force: Components | None = None,
-) -> np.ndarray:
-    """Predict the mean output in poses, V, (k, m); `force` is that of `stage_force`."""
-    force = force or stage_force(
-        sensor, poses.alpha_rad + shift_rad[0], poses.beta_rad + shift_rad[1]
-    )
+def predicted_volts(sensor: Sensor, poses: Poses, force: Components | None = None) -> np.ndarray:
+    """Predict the mean output in poses, V, (k, m); the force is that at the angles by default."""
+    force = force or stage_force(sensor, poses.alpha_rad, poses.beta_rad)
     return np.column_stack(signal_chain.static_response(sensor)(force, poses.environment))
 
 
@@ -67,10 +60,13 @@ def _is_of_stage(effect: str) -> bool:
 def angle_jacobian(sensor: Sensor, poses: Poses) -> np.ndarray:
     """Differentiate the predicted volts by alpha and beta, V/rad, (k, m, 2)."""
 
+    def shifted(alpha_rad: float, beta_rad: float) -> np.ndarray:
+        force = stage_force(sensor, poses.alpha_rad + alpha_rad, poses.beta_rad + beta_rad)
+        return predicted_volts(sensor, poses, force)
+
     def slope(alpha_rad: float, beta_rad: float) -> np.ndarray:
-        above = predicted_volts(sensor, poses, (alpha_rad, beta_rad))
-        below = predicted_volts(sensor, poses, (-alpha_rad, -beta_rad))
-        return (above - below) / (2 * _ANGLE_STEP_RAD)
+        change = shifted(alpha_rad, beta_rad) - shifted(-alpha_rad, -beta_rad)
+        return change / (2 * _ANGLE_STEP_RAD)
 
     return np.stack([slope(_ANGLE_STEP_RAD, 0.0), slope(0.0, _ANGLE_STEP_RAD)], axis=2)
 
@@ -83,8 +79,8 @@ def coefficient_jacobian(sensor: Sensor, poses: Poses, names: Sequence[Coefficie
         value = get(sensor, [name])
         step = _COEFFICIENT_STEP * parameter_of(name).scale
         shared = None if _is_of_stage(name.effect) else force
-        above = predicted_volts(put(sensor, [name], value + step), poses, force=shared)
-        below = predicted_volts(put(sensor, [name], value - step), poses, force=shared)
+        above = predicted_volts(put(sensor, [name], value + step), poses, shared)
+        below = predicted_volts(put(sensor, [name], value - step), poses, shared)
         return (above - below) / (2 * step)
 
     return np.stack([slope(name) for name in names], axis=2)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from datetime import datetime, timezone
 import hashlib
 from itertools import product
+from typing import NamedTuple
 
 from adxl_ros.calibrate.fits.extrapolation import next_degree, NextDegree
 from adxl_ros.calibrate.fits.gravity_fit import GravityFit
@@ -24,6 +25,7 @@ from adxl_ros.model.constants import AXES, G0_MPS2, Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.accelerometer import OTHER_AXIS
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.gyroscope import Gyroscope, NO_TURN
 from adxl_ros.model.sensor import Envelope, get, parameter_of, Sensor, with_neutral
 from adxl_ros.process import package_version
@@ -32,6 +34,29 @@ import numpy as np
 
 _SAME_FIT_TOLERANCE = 1e-6
 """Largest relative difference of coefficients of the same fit: the rounding in a file."""
+_ABSOLUTE = {
+    'bias.offset_v': 'nominal_zero_g_v',
+    'scale_factor.offset_v_per_g': 'nominal_scale_v_per_g',
+}
+"""Parameters that are departures from a nominal value, and the field of that value."""
+_LABELS = {
+    'bias.offset_v': 'zero-g',
+    'scale_factor.offset_v_per_g': 'scale factor',
+    'misalignment.alpha_rad': 'misalignment alpha',
+    'misalignment.beta_rad': 'misalignment beta',
+    'cross_axis.linear': 'zero-g, {other}',
+    'cross_axis.quadratic_per_g': 'zero-g, {other}²',
+    'cross_axis_z.linear': 'zero-g, {other}',
+    'cross_axis_z.quadratic_per_g': 'zero-g, {other}²',
+    'scale_factor_cross.linear_per_g': 'scale, {other}',
+    'scale_factor_z.linear_per_g': 'scale, {other}',
+    'scale_factor_z.quadratic_per_g2': 'scale, {other}²',
+    'nonlinearity.cubic_per_g2': 'cubic',
+}
+"""Parameters in words; {other} is the axis that acts on the measured axis."""
+_LONGEST_LABEL = 26  # Columns that a coefficient's name may take, so that its line has at most 79
+_COVERED = 0.9
+"""Share of the 90 % intervals that contain the true value if the intervals are right."""
 
 
 @dataclass(frozen=True)
@@ -124,25 +149,29 @@ def coefficient_lines(sensor: Sensor) -> list[str]:
     ]
 
 
+class _Turning(NamedTuple):
+    """A value of a gyroscope, by axis."""
+
+    label: str
+    radps: tuple[float, ...]  # rad/s, or rad/s/K
+    std_radps: tuple[float, ...]  # Its standard deviation; empty where it is not known
+    unit: str  # In which it is shown
+
+
 def gyro_lines(gyro: Gyroscope) -> list[str]:
     """Return the bias of a gyroscope with its 90 % interval as text; none without one."""
     if not gyro.is_calibrated:
         return []
-    rows = [('gyroscope, bias at rest', gyro.bias_radps, gyro.bias_std_radps, '°/s')]
+    rows = [_Turning('gyroscope, bias at rest', gyro.bias_radps, gyro.bias_std_radps, '°/s')]
     if gyro.follows_temperature:
-        rows.append(
-            (
-                f'  its change, {gyro.temperature_c[0]:.0f} to {gyro.temperature_c[2]:.0f} °C',
-                gyro.bias_per_k_radps,
-                gyro.bias_per_k_std_radps,
-                '°/s/K',
-            )
-        )
+        low_c, _, high_c = gyro.temperature_c
+        label = f'  its change, {low_c:.0f} to {high_c:.0f} °C'
+        rows.append(_Turning(label, gyro.bias_per_k_radps, gyro.bias_per_k_std_radps, '°/s/K'))
     lines = []
-    for label, values, stds, unit in rows:
-        for axis, value, std in zip(AXES, values, stds or NO_TURN):
+    for row in rows:
+        for axis, value, std in zip(AXES, row.radps, row.std_radps or NO_TURN):
             text = with_half_width(np.degrees(value), Z_90 * np.degrees(std))
-            lines.append(f'  {label:{_LONGEST_LABEL}} {axis:1} {text} {unit}')
+            lines.append(f'  {row.label:{_LONGEST_LABEL}} {axis:1} {text} {row.unit}')
     return lines
 
 
@@ -225,28 +254,6 @@ def _unmodelled_slope(fitted: Sensor, effect: str) -> float:
     return typical or effect_named(effect).parameters[0].scale
 
 
-_ABSOLUTE = {
-    'bias.offset_v': 'nominal_zero_g_v',
-    'scale_factor.offset_v_per_g': 'nominal_scale_v_per_g',
-}
-"""Parameters that are departures from a nominal value, and the field of that value."""
-_LABELS = {
-    'bias.offset_v': 'zero-g',
-    'scale_factor.offset_v_per_g': 'scale factor',
-    'misalignment.alpha_rad': 'misalignment alpha',
-    'misalignment.beta_rad': 'misalignment beta',
-    'cross_axis.linear': 'zero-g, {other}',
-    'cross_axis.quadratic_per_g': 'zero-g, {other}²',
-    'cross_axis_z.linear': 'zero-g, {other}',
-    'cross_axis_z.quadratic_per_g': 'zero-g, {other}²',
-    'scale_factor_cross.linear_per_g': 'scale, {other}',
-    'scale_factor_z.linear_per_g': 'scale, {other}',
-    'scale_factor_z.quadratic_per_g2': 'scale, {other}²',
-    'nonlinearity.cubic_per_g2': 'cubic',
-}
-"""Parameters in words; {other} is the axis that acts on the measured axis."""
-
-
 @dataclass(frozen=True)
 class Comparison:
     """A fitted coefficient and its true value."""
@@ -275,7 +282,7 @@ def compare(fitted: Sensor, truth: Sensor) -> list[Comparison]:
     names = fitted.covariance_names
     rows = []
     truth = with_neutral(truth, [name.effect for name in names])
-    half_widths = Z_90 * np.sqrt(np.diag(fitted.covariance))
+    half_widths = Z_90 * stds(fitted.covariance)
     for name, *values in zip(names, get(fitted, names), half_widths, get(truth, names)):
         key = str(name.without_axis)
         unit = parameter_of(name).unit
@@ -308,11 +315,6 @@ def errors_in_words(fitted: Sensor) -> str:
         f'Uncalibrated, {fitted.axes[axis]} reads {mg_text(abs(offset_g[axis]) * G0_MPS2)} '
         f'too {"much" if offset_g[axis] > 0 else "little"}.'
     )
-
-
-_LONGEST_LABEL = 26  # Columns that a coefficient's name may take, so that its line has at most 79
-_COVERED = 0.9
-"""Share of the 90 % intervals that contain the true value if the intervals are right."""
 
 
 def truth_table(comparisons: Sequence[Comparison]) -> list[str]:

@@ -30,6 +30,17 @@ from adxl_ros.model.sensor import parameter_of, Sensor
 from adxl_ros.process import option
 import numpy as np
 
+_CELL_MPS2 = 0.5
+"""Width of a cell of the grid of forces, m/s²; chosen: tangent and covariance hardly vary within
+it, so that its samples share them."""
+_MAX_CELLS = 4096  # Most cells in memory; chosen: the forces of all poses fill about as many
+_CELL_C = 0.5  # The same of temperature, °C
+_CELL_V = 0.01  # The same of the supply, V
+_MAX_ACCEL_MPS2 = 1e6  # Acceleration that no sensor outputs, m/s²; chosen: far beyond any range
+_TOLERANCE_MPS2 = 1e-8  # Largest next step of a converged inverse; chosen: far below any noise
+_MAX_STEPS = 8
+"""Newton steps after which the inverse starts from zero; chosen: one or two suffice usually."""
+
 
 @dataclass(frozen=True)
 class Estimates:
@@ -149,23 +160,6 @@ class RecordingEstimator:
         return np.asarray(
             length_excess(np.linalg.norm(force, axis=0), error2, self._gravity_mps2, ARRAYS) ** 2
         )
-
-
-_CELL_MPS2 = 0.5
-"""Width of a cell of the grid of forces, m/s²; chosen: tangent and covariance hardly vary within
-it, so that its samples share them."""
-
-_MAX_CELLS = 4096  # Most cells in memory; chosen: the forces of all poses fill about as many
-
-_CELL_C = 0.5  # The same of temperature, °C
-_CELL_V = 0.01  # The same of the supply, V
-
-_MAX_ACCEL_MPS2 = 1e6  # Acceleration that no sensor outputs, m/s²; chosen: far beyond any range
-
-_TOLERANCE_MPS2 = 1e-8  # Largest next step of a converged inverse; chosen: far below any noise
-
-_MAX_STEPS = 8
-"""Newton steps after which the inverse starts from zero; chosen: one or two suffice usually."""
 
 
 class Estimate(NamedTuple):

@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 import itertools
 from math import factorial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
@@ -44,6 +44,9 @@ rate; with four it is up to a quarter, and sixteen would delay a stream twice as
 MAX_GAP = 1.5
 """Distance of neighbours, in sample periods, that is a gap between them: halfway between
 one period, with jitter, and two, where a sample is lost."""
+_NEAR_ZERO_G = 1e-6
+"""Input below which the scale factor is taken above it, g: it avoids 0/0, and the scale factor
+differs there by 1e-8 of itself."""
 
 
 def derivative_weights(half: int) -> np.ndarray:
@@ -117,53 +120,54 @@ def noise_variance_v2(sensor: Sensor) -> np.ndarray:
     return np.array(variances)
 
 
+class FilteredSample(NamedTuple):
+    """A sample of a stream."""
+
+    time_s: float
+    volts: list[float]  # By measured axis
+    token: Any  # What a caller knows it by
+
+
 class DelayedInversion:
     """`undo_filter` for a stream: returns a sample when it has `HALF` neighbours after it."""
 
     def __init__(self, rc_s: np.ndarray, rate_hz: float) -> None:
         """Prepare for time constants by axis, (m,)."""
         self._rate_hz = rate_hz
-        self._near: deque[tuple[float, list[float], object]] = deque()
+        self._near: deque[FilteredSample] = deque()
         self._index = 0
         gain = rc_s * rate_hz
         self._kernels = [
             [(gain * w).tolist() for w in derivative_weights(half)] for half in range(HALF + 1)
         ]
 
-    def __call__(
-        self, time_s: float, volts: list[float], token: object
-    ) -> Iterator[tuple[float, list[float], object]]:
+    def __call__(self, sample: FilteredSample) -> Iterator[FilteredSample]:
         """Take a sample; yield those that are ready, before a gap all, before the filter."""
         near = self._near
-        if near and not 0 < (time_s - near[-1][0]) * self._rate_hz < MAX_GAP:
+        if near and not 0 < (sample.time_s - near[-1].time_s) * self._rate_hz < MAX_GAP:
             while self._index < len(near):
                 yield self._next()
             near.clear()
             self._index = 0
-        near.append((time_s, volts, token))
+        near.append(sample)
         if len(near) - self._index > HALF:
             yield self._next()
 
-    def _next(self) -> tuple[float, list[float], object]:
+    def _next(self) -> FilteredSample:
         near = self._near
         index = self._index
         half = min(index, len(near) - 1 - index, HALF)
-        stamp_s, volts, token = near[index]
+        sample = near[index]
         kernel = self._kernels[half]
         undone_v = [
-            v + sum(kernel[k][d] * near[index - half + k][1][d] for k in range(2 * half + 1))
-            for d, v in enumerate(volts)
+            v + sum(kernel[k][d] * near[index - half + k].volts[d] for k in range(2 * half + 1))
+            for d, v in enumerate(sample.volts)
         ]
         if index >= HALF:
             near.popleft()
         else:
             self._index += 1
-        return stamp_s, undone_v, token
-
-
-_NEAR_ZERO_G = 1e-6
-"""Input below which the scale factor is taken above it, g: it avoids 0/0, and the scale factor
-differs there by 1e-8 of itself."""
+        return sample._replace(volts=undone_v)
 
 
 class PaperInverse:

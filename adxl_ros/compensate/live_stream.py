@@ -11,7 +11,7 @@ from math import inf
 from typing import Any, NamedTuple
 
 from adxl_ros.compensate.estimators import Estimate, Estimates, LiveEstimator
-from adxl_ros.compensate.inversions import DelayedInversion
+from adxl_ros.compensate.inversions import DelayedInversion, FilteredSample
 from adxl_ros.files import imu_message
 from adxl_ros.files.cdr import CdrError
 from adxl_ros.model import noise
@@ -19,6 +19,7 @@ from adxl_ros.model.covariance import UNMEASURED_VARIANCE
 from adxl_ros.model.effects.base import ARRAYS, Components, FLOATS
 from adxl_ros.model.gyroscope import Gyroscope
 from adxl_ros.model.kinematics import (
+    Covariance3,
     Mounting,
     quaternion,
     UNKNOWN_ANGLE_RAD2,
@@ -167,7 +168,7 @@ class LiveStream:
         if not volts:
             self.counts['dropped'] += 1
         elif self._undo_filter:
-            for ready in chain.delayed(time_s, volts, raw):
+            for ready in chain.delayed(FilteredSample(time_s, volts, raw)):
                 self._correct(chain, *ready)
         else:
             self._correct(chain, time_s, volts, raw)
@@ -226,27 +227,14 @@ class LiveStream:
 
         An angle that the pose does not show keeps its last value, with a very large variance.
         """
-        variances = []
-        for i, (angle, variance) in enumerate(
-            (estimate.roll, estimate.pitch, estimate.inclination)
-        ):
-            observable = variance < UNOBSERVABLE_RAD2
-            if observable:
-                self._angles_rad[i] = angle
-            variances.append(variance if observable else UNKNOWN_ANGLE_RAD2)
-        roll, pitch, _ = variances
-        return (
-            *quaternion(self._angles_rad[0], self._angles_rad[1], FLOATS),
-            roll,
-            0.0,
-            0.0,
-            0.0,
-            pitch,
-            0.0,
-            0.0,
-            0.0,
-            UNKNOWN_ANGLE_RAD2,
-        )
+        variances = [UNKNOWN_ANGLE_RAD2] * 3
+        for i, shown in enumerate((estimate.roll, estimate.pitch, estimate.inclination)):
+            if shown.variance_rad2 < UNOBSERVABLE_RAD2:
+                self._angles_rad[i] = shown.angle_rad
+                variances[i] = shown.variance_rad2
+        roll, pitch, _ = self._angles_rad
+        covariance = Covariance3(variances[0], 0.0, 0.0, variances[1], 0.0, UNKNOWN_ANGLE_RAD2)
+        return (*quaternion(roll, pitch, FLOATS), *covariance.row_by_row)
 
 
 def free_acceleration(

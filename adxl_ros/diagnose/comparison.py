@@ -22,20 +22,15 @@ from adxl_ros.model import noise, signal_chain
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import ActsOn
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.kinematics import specific_force
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.quantities import acceleration_text
-from adxl_ros.signals.block_statistics import held_values, rms, true_runs
-from adxl_ros.simulate.motion import (
-    BAND_LIMITED_DEGREE,
-    ForcePath,
-    INTERNAL_RATE_HZ,
-    Motion,
-    Path,
-    visible_step,
-)
+from adxl_ros.signals.block_statistics import held_values, true_runs
+from adxl_ros.simulate.motion import ForcePath, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.recorded_motion import environment_paths, motion_from_references
 from adxl_ros.simulate.response import ChainMemo, whole_response
+from adxl_ros.simulate.smoothed_path import BAND_LIMITED_DEGREE, visible_step
 import numpy as np
 import scipy
 

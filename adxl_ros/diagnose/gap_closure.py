@@ -12,9 +12,9 @@ from adxl_ros.diagnose.verdict import Verdict
 from adxl_ros.diagnose.weighing import Evidence, HEALTHY
 from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.quantities import Interval
-from adxl_ros.signals.block_statistics import rms
 import numpy as np
 
 

@@ -11,9 +11,9 @@ from typing import NamedTuple
 from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
-from adxl_ros.signals.block_statistics import rms
 import numpy as np
 import scipy
 

@@ -28,7 +28,7 @@ from adxl_ros.diagnose.noise_filters import expected_drift_g, Whitener
 from adxl_ros.diagnose.search import with_filters
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
-from adxl_ros.signals.block_statistics import rms
+from adxl_ros.model.error_sizes import rms
 import numpy as np
 
 FOLDS = 4  # Parts of a recording, each of which is held out once. Chosen: run time

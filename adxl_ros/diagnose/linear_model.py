@@ -28,8 +28,8 @@ from adxl_ros.errors import UserError
 from adxl_ros.model import noise
 from adxl_ros.model.effects import base, effect_named, library
 from adxl_ros.model.effects.base import Coefficient, Concern, Effect, Parameter, Role
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.sensor import names_of, parameter_of, put, Sensor, with_neutral
-from adxl_ros.signals.block_statistics import rms
 import numpy as np
 
 PRIOR_WIDTH = 5.0

@@ -21,8 +21,9 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2, MAD_TO_STD
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import Detector
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.sensor import Sensor, with_neutral
-from adxl_ros.signals.block_statistics import rms, true_runs
+from adxl_ros.signals.block_statistics import true_runs
 import numpy as np
 import scipy
 

@@ -32,7 +32,7 @@ from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects import effect_named, library
 from adxl_ros.model.effects.base import DriftSpectrum
 from adxl_ros.model.kinematics import gravity_slopes
-from adxl_ros.simulate.motion import SmoothedPath
+from adxl_ros.simulate.smoothed_path import SmoothedPath
 import numpy as np
 import scipy
 

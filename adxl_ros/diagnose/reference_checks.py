@@ -15,11 +15,11 @@ from adxl_ros.diagnose.data_faults import DataFault
 from adxl_ros.diagnose.motion_shifts import correlate, CORRELATED
 from adxl_ros.files.recording_columns import stamped_rate_hz
 from adxl_ros.model.constants import AXES, G0_MPS2
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg_text
 from adxl_ros.signals import gravity_at_rest, tolerances
-from adxl_ros.signals.block_statistics import rms
 from adxl_ros.signals.gravity_at_rest import GravityFaultKind, RestReadings
 from adxl_ros.signals.rest_detection import find_rests
 from adxl_ros.signals.rest_means import rest_means

@@ -23,9 +23,9 @@ from adxl_ros.errors import UserError
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, StraightLine
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import fitted_of, get, parameter_of, put, Sensor, with_neutral
-from adxl_ros.signals.block_statistics import rms
 import numpy as np
 
 _EVALUATIONS = 8  # Largest number of simulations of a hypothesis. Chosen: most need five

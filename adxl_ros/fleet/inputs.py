@@ -19,7 +19,7 @@ import hashlib
 from io import TextIOWrapper
 import os
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 from adxl_ros.errors import install_hint, one_line, UserError
@@ -347,29 +347,43 @@ def _beside(folder: str, url: str) -> str:
     return f'{folder}/{url}'
 
 
-def stated_by(sources: Iterable[FoundRecording]) -> list[tuple[str, str]]:
-    """Return the serial number and date that recordings of this machine state, or '' each."""
+class Stated(NamedTuple):
+    """What a recording states of itself; '' where it states nothing."""
+
+    serial: str = ''
+    date: str = ''  # Its begin, ISO 8601 in UTC
+
+
+def stated_by(sources: Iterable[FoundRecording]) -> list[Stated]:
+    """Return what recordings of this machine state."""
     with ThreadPoolExecutor(_THREADS) as pool:
         return list(pool.map(_stated, sources))
 
 
-def _stated(source: FoundRecording) -> tuple[str, str]:
+def _stated(source: FoundRecording) -> Stated:
     if source.fault or '://' in source.url:
-        return '', ''
+        return Stated()
     try:
         first = next(recording.blocks(source.url, 1))
-        return first.stream_info.texts.get('serial', ''), begin_of(first)[0]
+        return Stated(first.stream_info.texts.get('serial', ''), begin_of(first).text)
     except Exception:
         # Whatever it is, the task of this recording reports it.
-        return '', ''
+        return Stated()
 
 
-def begin_of(first: Recording) -> tuple[str, str]:
-    """Return the begin that a recording states, ISO 8601 in UTC, and where; empty for none."""
+class Date(NamedTuple):
+    """When a recording was made."""
+
+    text: str = ''  # ISO 8601 in UTC; empty where it is not known
+    source: str = ''  # What states it: manifest, header, stamps or file
+
+
+def begin_of(first: Recording) -> Date:
+    """Return the begin that a recording states."""
     stated = as_date(first.info.get('date', ''))
     if stated:
-        return stated, 'header'
+        return Date(stated, 'header')
     begin_s = first.epoch_ns / 1e9 + float(first.time_s[0]) if len(first) else 0.0
     if _DATES_S[0] < begin_s < _DATES_S[1]:
-        return datetime.fromtimestamp(begin_s, timezone.utc).isoformat(), 'stamps'
-    return '', ''
+        return Date(datetime.fromtimestamp(begin_s, timezone.utc).isoformat(), 'stamps')
+    return Date()

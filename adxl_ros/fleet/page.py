@@ -13,9 +13,21 @@ from typing import NamedTuple
 
 from adxl_ros.files import calibration_store
 from adxl_ros.files.atomic_write import write_text
-from adxl_ros.fleet import table as fleet
-from adxl_ros.fleet.pooling import FALSE_DISCOVERY_RATE
 from adxl_ros.fleet.row import PAGE, POPULATION, reason_kind, TABLE
+from adxl_ros.fleet.table import (
+    analyse,
+    Condition,
+    DAYS_PER_YEAR,
+    Drift,
+    effect_matrix,
+    FleetTable,
+    QuantityResult,
+    rank,
+    read,
+    SensorState,
+    TOLERANCE_MG,
+)
+from adxl_ros.fleet.trends import FALSE_DISCOVERY_RATE
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.population import Population
 from adxl_ros.report import figures as plotly, page as html_page
@@ -38,8 +50,8 @@ _MOST_ROWS = 50  # Largest count of outliers and of reasons on the page; the tab
 _MEASURES = ('gap_before_mps2', *(f'zero_g_{axis}_v' for axis in AXES))
 """Columns that tell whether a sensor is within the tolerance."""
 _SENTENCES = {
-    fleet.Condition.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
-    fleet.Condition.IN_ORDER: 'All units are within the tolerance.',
+    Condition.OUT_OF_TOLERANCE: 'Recalibrate what is at the head of the list.',
+    Condition.IN_ORDER: 'All units are within the tolerance.',
 }
 """What the most urgent state means for the user; the others mean the same."""
 
@@ -51,14 +63,11 @@ def date_text(year: float) -> str:
 
 def _stamps(years: Iterable[float]) -> list[str]:
     return [
-        f'{_EPOCH + timedelta(days=float(year) * fleet.DAYS_PER_YEAR):%Y-%m-%d %H:%M}'
-        for year in years
+        f'{_EPOCH + timedelta(days=float(year) * DAYS_PER_YEAR):%Y-%m-%d %H:%M}' for year in years
     ]
 
 
-def _trend_figure(
-    table: fleet.FleetTable, result: fleet.QuantityResult, sensor: int
-) -> plotly.Figure:
+def _trend_figure(table: FleetTable, result: QuantityResult, sensor: int) -> plotly.Figure:
     """Plot a quantity of a sensor over time, about its mean where sensors differ by far more."""
     quantity = result.quantity
     place = result.place_of(sensor)
@@ -102,10 +111,10 @@ def _trend_figure(
     )
 
 
-def _calibration_marks(table: fleet.FleetTable, sensor: int) -> list[plotly.Figure]:
+def _calibration_marks(table: FleetTable, sensor: int) -> list[plotly.Figure]:
     """Return a line at each calibration between recordings of a sensor, where a period ends."""
     rows = table.rows_of(sensor)
-    made = table.years[rows] - table['calibration_age_days'][rows] / fleet.DAYS_PER_YEAR
+    made = table.years[rows] - table['calibration_age_days'][rows] / DAYS_PER_YEAR
     begins = made[1:][np.diff(table.period[rows]) > 0]
     style = {'color': plotly.QUIET_COLOUR, 'width': 1.2, 'dash': 'dash'}
     return [
@@ -114,7 +123,7 @@ def _calibration_marks(table: fleet.FleetTable, sensor: int) -> list[plotly.Figu
     ]
 
 
-def _matrix_figure(table: fleet.FleetTable, share: pd.DataFrame) -> plotly.Figure:
+def _matrix_figure(table: FleetTable, share: pd.DataFrame) -> plotly.Figure:
     """Plot how often each effect is named in each sensor."""
     share = share.iloc[:, :_MOST_EFFECTS]
     columns = list(share)
@@ -149,8 +158,8 @@ class Written(NamedTuple):
 def write(folder: Path) -> Written:
     """Write page and population of a fleet beside its table."""
     html_page.check_libraries()
-    table = fleet.read(folder / TABLE)
-    results = fleet.analyse(table)
+    table = read(folder / TABLE)
+    results = analyse(table)
     calibration_store.write_population(
         folder / POPULATION,
         Population(
@@ -165,11 +174,11 @@ def write(folder: Path) -> Written:
     write_text(folder / PAGE, page(table, results, folder))
     return Written(
         [folder / name for name in (PAGE, POPULATION)],
-        [*_batches(results), *_drifting(fleet.rank(table, results))],
+        [*_batches(results), *_drifting(rank(table, results))],
     )
 
 
-def _batches(results: Sequence[fleet.QuantityResult]) -> list[str]:
+def _batches(results: Sequence[QuantityResult]) -> list[str]:
     """Return a sentence for each bad batch."""
     return [
         f'{batch.members.sum()} units with a serial number {batch.prefix}… have a '
@@ -181,7 +190,7 @@ def _batches(results: Sequence[fleet.QuantityResult]) -> list[str]:
     ]
 
 
-def _drifting(sensors: Sequence[fleet.SensorState]) -> list[str]:
+def _drifting(sensors: Sequence[SensorState]) -> list[str]:
     """Return a sentence for the most urgent sensors that drift, and the number of all."""
     drifting = [sensor for sensor in sensors if sensor.drifts]
     lines = [f'{sensor.serial} drifts: {sensor.drifts[0].text}.' for sensor in drifting[:_NAMED]]
@@ -190,10 +199,10 @@ def _drifting(sensors: Sequence[fleet.SensorState]) -> list[str]:
     return lines
 
 
-def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folder: Path) -> str:
+def page(table: FleetTable, results: Sequence[QuantityResult], folder: Path) -> str:
     """Return the page of a fleet."""
-    sensors = fleet.rank(table, results)
-    share = fleet.effect_matrix(table)
+    sensors = rank(table, results)
+    share = effect_matrix(table)
     figures: dict[str, plotly.Figure] = {}
     trends: dict[str, list[dict[str, str]]] = {'trend': [], 'noise': []}
     for name, shown in trends.items():
@@ -234,7 +243,7 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
             'outlier_count': sum(int(result.is_outlier.sum()) for result in results),
             'refusals': _refusal_rows(table),
             'most_rows': _MOST_ROWS,
-            'tolerance': number(fleet.TOLERANCE_MG),
+            'tolerance': number(TOLERANCE_MG),
             'false_discovery': f'{FALSE_DISCOVERY_RATE:.0%}',
             'drifts': sum(int(result.is_claimed.sum()) for result in results),
         },
@@ -244,13 +253,13 @@ def page(table: fleet.FleetTable, results: Sequence[fleet.QuantityResult], folde
 class _Plot(NamedTuple):
     """A quantity that is plotted of a sensor."""
 
-    sensor: fleet.SensorState
-    result: fleet.QuantityResult
-    drifts: Sequence[fleet.Drift]  # Its claimed slopes of this kind, the most urgent first
+    sensor: SensorState
+    result: QuantityResult
+    drifts: Sequence[Drift]  # Its claimed slopes of this kind, the most urgent first
 
 
 def _plots(
-    sensors: Sequence[fleet.SensorState], results: Sequence[fleet.QuantityResult], is_noise: bool
+    sensors: Sequence[SensorState], results: Sequence[QuantityResult], is_noise: bool
 ) -> list[_Plot]:
     """Return the most urgent drift of each sensor, or its first quantity; drifts come first."""
     kind = [result for result in results if result.quantity.is_noise == is_noise]
@@ -265,7 +274,7 @@ def _plots(
 
 
 def _badge(
-    table: fleet.FleetTable, sensors: Sequence[fleet.SensorState], counts: Counter[fleet.Condition]
+    table: FleetTable, sensors: Sequence[SensorState], counts: Counter[Condition]
 ) -> dict[str, str]:
     if not sensors:
         return {
@@ -274,7 +283,7 @@ def _badge(
             'sentence': 'No recording states a serial number.',
         }
     worst = sensors[0].state
-    if worst is fleet.Condition.IN_ORDER and table.frame[[*_MEASURES]].isna().all(axis=None):
+    if worst is Condition.IN_ORDER and table.frame[[*_MEASURES]].isna().all(axis=None):
         # What was not measured is not within the tolerance.
         return {
             'colour': 'grey',
@@ -284,7 +293,7 @@ def _badge(
     return {
         'colour': worst.colour,
         'word': 'IN ORDER'
-        if worst is fleet.Condition.IN_ORDER
+        if worst is Condition.IN_ORDER
         else f'{counts[worst]} of {len(sensors)} {worst.words}'.upper(),
         'sentence': _SENTENCES.get(
             worst, 'No unit is out of tolerance. Look at the head of the list.'
@@ -292,7 +301,7 @@ def _badge(
     }
 
 
-def _tiles(table: fleet.FleetTable, counts: Counter[fleet.Condition]) -> list[Tile]:
+def _tiles(table: FleetTable, counts: Counter[Condition]) -> list[Tile]:
     outcomes = Counter(table['outcome'].tolist())
     return [
         Tile(
@@ -300,7 +309,7 @@ def _tiles(table: fleet.FleetTable, counts: Counter[fleet.Condition]) -> list[Ti
             str(len(table)),
             f'{outcomes["refused"]} refused, {outcomes["crashed"]} crashed',
         ),
-        *(Tile(f'units: {state.words}', str(counts[state])) for state in fleet.Condition),
+        *(Tile(f'units: {state.words}', str(counts[state])) for state in Condition),
     ]
 
 
@@ -316,33 +325,32 @@ def _link(folder: Path, report: str) -> str:
     )
 
 
-def _outlier_rows(
-    table: fleet.FleetTable, results: Sequence[fleet.QuantityResult]
-) -> list[dict[str, str]]:
+def _outlier_rows(table: FleetTable, results: Sequence[QuantityResult]) -> list[dict[str, str]]:
     """Return the recordings that are far from others of their sensor, the farthest first."""
-    outliers = []
+    shown = []
+    distances = []
     for result in results:
-        values = result.quantity.factor * result.recordings.value
-        outliers += [
-            (float(result.distance[i]), result.rows[i], result.quantity, values[i])
-            for i in np.flatnonzero(result.is_outlier)
-        ]
-    outliers.sort(key=lambda item: -item[0])
-    return [
-        {
-            'serial': table.serials[table.sensor[row]],
-            'date': date_text(table.years[row]),
-            'quantity': quantity.label,
-            'distance': number(distance),
-            'value': f'{number(value)} {quantity.shown_unit}',
-            'url': table['url'][row],
-            'report': table['report'][row],
-        }
-        for distance, row, quantity, value in outliers[:_MOST_ROWS]
-    ]
+        quantity = result.quantity
+        for i in np.flatnonzero(result.is_outlier):
+            row = result.rows[i]
+            value = quantity.factor * result.recordings.value[i]
+            distances.append(float(result.distance[i]))
+            shown.append(
+                {
+                    'serial': table.serials[table.sensor[row]],
+                    'date': date_text(table.years[row]),
+                    'quantity': quantity.label,
+                    'distance': number(distances[-1]),
+                    'value': f'{number(value)} {quantity.shown_unit}',
+                    'url': table['url'][row],
+                    'report': table['report'][row],
+                }
+            )
+    farthest = np.argsort(-np.array(distances), kind='stable')[:_MOST_ROWS]
+    return [shown[i] for i in farthest]
 
 
-def _refusal_rows(table: fleet.FleetTable) -> list[list[str]]:
+def _refusal_rows(table: FleetTable) -> list[list[str]]:
     """Return the reasons of refusals: how often, in how many sensors, and an example."""
     failed = table.frame.assign(unit=table.sensor)[table['outcome'] != 'done']
     kinds = np.array([reason_kind(row) for row in failed.to_dict('records')], object)

@@ -38,6 +38,13 @@ POPULATION = 'population.yaml'  # Name of the file of the population beside the 
 OUTCOMES = ('done', 'refused', 'crashed')
 """Values of `outcome`: the tasks gave results; the recording was refused, and `refusal` has the
 reason; the worker ended or failed at each attempt."""
+NOISE = (
+    ('n', 'white noise N', 'mps2_per_rthz', 'm/s²/√Hz'),
+    ('b', 'bias instability B', 'mps2', 'm/s²'),
+    ('k', 'random walk K', 'mps2_per_rts', 'm/s²/√s'),
+)
+"""Terms of the noise: letter, name, unit in the names of columns, and unit."""
+TASKS = ('check', 'noise', 'fit', 'diagnose')  # All tasks, in the order in which they run
 
 
 class Column(NamedTuple):
@@ -48,14 +55,6 @@ class Column(NamedTuple):
     kind: str
     unit: str  # Its unit; empty for none
     meaning: str  # What it holds, for people
-
-
-NOISE = (
-    ('n', 'white noise N', 'mps2_per_rthz', 'm/s²/√Hz'),
-    ('b', 'bias instability B', 'mps2', 'm/s²'),
-    ('k', 'random walk K', 'mps2_per_rts', 'm/s²/√s'),
-)
-"""Terms of the noise: letter, name, unit in the names of columns, and unit."""
 
 
 def _columns() -> Iterator[Column]:
@@ -125,9 +124,6 @@ def as_table(rows: Iterable[Row]) -> Any:
         ],
         arrow_schema(),
     )
-
-
-TASKS = ('check', 'noise', 'fit', 'diagnose')  # All tasks, in the order in which they run
 
 
 class ParameterText(NamedTuple):

@@ -44,6 +44,8 @@ _SECONDS = {
 CSV files of 416 s at 250 Hz."""
 _IDENTITY = ('url', 'serial', 'date', 'date_source', 'calibration_id', 'calibration_age_days')
 """Columns of a recording whose content is that of another row, which has its other values."""
+_KEPT = ('written', 'key', 'outcome', 'serial', 'date', 'date_source')
+"""Columns of a row that the client keeps in memory."""
 
 
 @contextmanager
@@ -62,10 +64,6 @@ def only_client(folder: Path) -> Iterator[None]:
         file.write(f'process {os.getpid()} on {os.uname().nodename}')
         file.flush()
         yield
-
-
-_KEPT = ('written', 'key', 'outcome', 'serial', 'date', 'date_source')
-"""Columns of a row that the client keeps in memory."""
 
 
 class Entry(NamedTuple):
@@ -201,7 +199,7 @@ def _since(
     """Return the recordings that began at a date or later, and those without a date."""
     dates = {url: entry.row['date'] for url, entry in results.newest.items()}
     unread = [source for source in sources if not (source.date or dates.get(source.url))]
-    dates |= {source.url: date for source, (_, date) in zip(unread, stated_by(unread))}
+    dates |= {source.url: stated.date for source, stated in zip(unread, stated_by(unread))}
     return [
         source
         for source in sources
@@ -247,7 +245,7 @@ def _written(end: Finished, recipe: Recipe, results: Results) -> Row:
     if error is None:
         result = end.value
     elif isinstance(error, StagingError):
-        result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
+        result = refused(recipe, source, one_line(error))
     else:
         result = refused(
             recipe,

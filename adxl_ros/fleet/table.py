@@ -27,9 +27,9 @@ from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.atomic_write import AnyPath
-from adxl_ros.fleet import pooling
-from adxl_ros.fleet.pooling import Recordings
+from adxl_ros.fleet import populations
 from adxl_ros.fleet.row import NOISE
+from adxl_ros.fleet.trends import claims, fit_trends, interval_factor, outliers, Recordings, Trends
 from adxl_ros.model.constants import AXES, Z_90
 from adxl_ros.model.population import PooledCoefficient
 from adxl_ros.report.quantities import counted, mg, number
@@ -54,6 +54,13 @@ _YEAR = np.timedelta64(31_557_600_000_000, 'us')  # A year of 365.25 days
 TOLERANCE_MG = 3.5
 """Largest gap of a sensor that is in order, mg. Chosen: an error of 0.2° in tilt."""
 MG = mg(1.0)  # Milli-g in 1 m/s²
+_VERDICTS = ('no_gap', 'explained', 'partly', 'inseparable', 'unknown')
+"""Statuses of recordings whose effects are judged."""
+RECENT = 5
+"""Number of recordings whose median is the gap of a sensor now. Chosen: one odd one is no gap."""
+DAYS_PER_YEAR = 365.25
+_FARTHEST_DAYS = 10 * DAYS_PER_YEAR
+"""A drift that needs longer is no matter of urgency. Chosen: the life of a robot."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +108,7 @@ class FleetTable:
         begin, end = np.searchsorted(self.sensor, [sensor, sensor + 1])
         return np.arange(begin, end)
 
-    def recordings(self, quantity: FleetQuantity) -> tuple[np.ndarray, Recordings]:
+    def recordings(self, quantity: FleetQuantity) -> Measured:
         """Return a quantity in the recordings that have it."""
         value = self[quantity.column]
         errors = [self[name] for name in quantity.error_columns]
@@ -111,7 +118,16 @@ class FleetTable:
             std = (high - low) / (2 * Z_90)
         used = np.isfinite(value) & np.isfinite(self.years) & (self.sensor >= 0) & self.first
         rows = np.flatnonzero(used & np.isfinite(std) & (std >= 0))
-        return rows, Recordings(self.sensor, self.period, self.years, value, std)[rows]
+        whole = Recordings(self.sensor, self.period, self.years, value, std)
+        return Measured(quantity, rows, whole[rows])
+
+
+class Measured(NamedTuple):
+    """A quantity in the n recordings that have it."""
+
+    quantity: FleetQuantity
+    rows: np.ndarray  # Of the recordings in the table, (n,)
+    recordings: Recordings  # Its values in the unit of its column
 
 
 def read(path: AnyPath) -> FleetTable:
@@ -210,7 +226,7 @@ class QuantityResult:
     # Recordings that are too far from the others of their sensor, (n,) bool. They do not count.
     is_outlier: np.ndarray
     sensors: np.ndarray  # Numbers of the sensors, (k,)
-    trends: pooling.Trends  # Levels and slopes of the sensors
+    trends: Trends  # Levels and slopes of the sensors
     # Slopes that survive the control of the false discovery rate over all sensors and quantities,
     # (k,) bool
     is_claimed: np.ndarray
@@ -218,7 +234,7 @@ class QuantityResult:
     # Mean and spread over the sensors, None where they are too few; those of one batch that are
     # not of this population
     population: PooledCoefficient | None
-    batch: pooling.BadBatch | None
+    batch: populations.BadBatch | None
 
     def place_of(self, sensor: int) -> int | None:
         """Return where a sensor stands among those of the quantity; None if it is not there."""
@@ -228,27 +244,27 @@ class QuantityResult:
 
 def analyse(table: FleetTable) -> list[QuantityResult]:
     """Return the results of all quantities that the table has."""
-    measured = [(quantity, *table.recordings(quantity)) for quantity in quantities(table)]
-    measured = [item for item in measured if len(item[1])]
-    values = sum(len(rows) for _, rows, _ in measured)
+    measured = [table.recordings(quantity) for quantity in quantities(table)]
+    measured = [each for each in measured if len(each.rows)]
+    values = sum(len(each.rows) for each in measured)
     # Each sensor has each coefficient: the chance of a false outlier is shared by them all.
-    coefficients = sum(item[0].is_coefficient for item in measured) * len(table.serials)
+    coefficients = sum(each.quantity.is_coefficient for each in measured) * len(table.serials)
     results = []
     for quantity, rows, recordings in measured:
-        distance, is_outlier = pooling.outliers(recordings, values)
-        trends = pooling.fit_trends(recordings[~is_outlier])
+        distance, is_outlier = outliers(recordings, values)
+        trends = fit_trends(recordings[~is_outlier])
         sensors = np.unique(table.sensor[rows[~is_outlier]])
         population = None
         batch = None
-        if quantity.is_coefficient and len(sensors) >= pooling.MIN_SENSORS:
-            batch = pooling.bad_batch(
+        if quantity.is_coefficient and len(sensors) >= populations.MIN_SENSORS:
+            batch = populations.bad_batch(
                 [table.serials[sensor] for sensor in sensors],
                 trends.level,
                 TOLERANCE_MG / quantity.factor,
                 len(measured),
             )
             usual = slice(None) if batch is None else ~batch.members
-            population = pooling.random_effects(
+            population = populations.random_effects(
                 trends.level[usual], trends.level_std[usual], coefficients
             )
         none = np.zeros(len(sensors), bool)
@@ -270,10 +286,8 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
     if not results:
         return []
     # The false discovery rate is controlled over all slopes together.
-    is_claimed = pooling.claims(np.concatenate([r.trends.p_values for r in results]))
-    factor = pooling.interval_factor(
-        np.concatenate([r.trends.freedom for r in results]), is_claimed
-    )
+    is_claimed = claims(np.concatenate([r.trends.p_values for r in results]))
+    factor = interval_factor(np.concatenate([r.trends.freedom for r in results]), is_claimed)
     splits = np.cumsum([len(result.sensors) for result in results])[:-1]
     return [
         replace(result, is_claimed=claimed, half_width=factors * result.trends.slope_std)
@@ -281,15 +295,6 @@ def analyse(table: FleetTable) -> list[QuantityResult]:
             results, np.split(is_claimed, splits), np.split(factor, splits)
         )
     ]
-
-
-_VERDICTS = ('no_gap', 'explained', 'partly', 'inseparable', 'unknown')
-"""Statuses of recordings whose effects are judged."""
-RECENT = 5
-"""Number of recordings whose median is the gap of a sensor now. Chosen: one odd one is no gap."""
-DAYS_PER_YEAR = 365.25
-_FARTHEST_DAYS = 10 * DAYS_PER_YEAR
-"""A drift that needs longer is no matter of urgency. Chosen: the life of a robot."""
 
 
 def effect_matrix(table: FleetTable) -> pd.DataFrame:

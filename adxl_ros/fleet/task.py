@@ -30,7 +30,7 @@ from adxl_ros.files.stream_info import NO_SERIAL
 from adxl_ros.files.surroundings import assumed
 from adxl_ros.files.tables import BLOCK_ROWS
 from adxl_ros.fleet import inputs
-from adxl_ros.fleet.inputs import begin_of, FoundRecording
+from adxl_ros.fleet.inputs import begin_of, Date, FoundRecording
 from adxl_ros.fleet.row import (
     empty_row,
     finite,
@@ -41,6 +41,7 @@ from adxl_ros.fleet.row import (
     sha256_of,
 )
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import code_version, options_named, package_version
 from adxl_ros.signals.findings import check_recording, Findings
@@ -49,6 +50,8 @@ import numpy as np
 _SPARE_MB = 64  # Space that stays free, MB. Chosen: a task writes some MB
 _LEFT_S = 86400.0
 """Age from which a temporary folder is that of a killed worker, s. Chosen: no task takes a day."""
+_PAGES = ('explained', 'partly', 'inseparable', 'unknown')
+"""Statuses of a diagnosis that get a page. Chosen: it has 2 MB, and without a gap shows little."""
 
 
 class StagingError(Exception):
@@ -125,17 +128,6 @@ def stage(source: FoundRecording, folder: Path) -> Staged:
     return Staged(target, sha256([target]), size_bytes)
 
 
-_PAGES = ('explained', 'partly', 'inseparable', 'unknown')
-"""Statuses of a diagnosis that get a page. Chosen: it has 2 MB, and without a gap shows little."""
-
-
-class Date(NamedTuple):
-    """When a recording was made."""
-
-    text: str  # By ISO 8601; empty where it is not known
-    source: str  # What states it: manifest, header, stamps or file
-
-
 class TaskResult(NamedTuple):
     """What a task leaves."""
 
@@ -167,7 +159,7 @@ def make_row(
             staged = stage(source, folder / 'recording')
             result = _of_staged(recipe, source, frozenset() if is_again else earlier, staged)
     except UserError as error:
-        result = refused(recipe, source, one_line(error).removeprefix(f'{source.url}: '))
+        result = refused(recipe, source, one_line(error))
     row = result.row
     row |= {name: finite(value) for name, value in row.items() if isinstance(value, float)}
     row |= {
@@ -188,7 +180,7 @@ def refused(
     row |= {
         'key': sha256_of(f'{source.url} {source.stamp}', digest),
         'outcome': outcome,
-        'refusal': reason,
+        'refusal': reason.removeprefix(f'{source.url}: '),
         'refused_by': 'stage',
     }
     return TaskResult(row, {}, source.stamp, digest)
@@ -211,7 +203,7 @@ def _of_staged(
     serial = source.serial or recorded
     date = Date(source.date, 'manifest')
     if not date.text and first:
-        date = Date(*begin_of(first))
+        date = begin_of(first)
     if not date.text:
         date = Date(source.modified, 'file')
     parameters = recipe.parameters_of(serial, date.text, source.params)
@@ -418,7 +410,7 @@ class _Job:
         found = fit(self._recording, self._params, data_sha256=self._staged.content)
         fitted = found.sensor
         self._put_assumed(fitted)
-        stds = dict(zip(fitted.covariance_names, np.sqrt(np.diag(fitted.covariance)).tolist()))
+        std_of = dict(zip(fitted.covariance_names, stds(fitted.covariance).tolist()))
         for name, unit_name, coefficient, values in (
             ('zero_g', 'v', ('bias', 'offset_v'), fitted.zero_g_v),
             ('scale', 'v_per_g', ('scale_factor', 'offset_v_per_g'), fitted.scale_v_per_g),
@@ -426,7 +418,7 @@ class _Job:
             for axis, value in zip(fitted.axes, values):
                 self.row |= {
                     f'{name}_{axis}_{unit_name}': float(value),
-                    f'{name}_std_{axis}_{unit_name}': stds.get(Coefficient(*coefficient, axis)),
+                    f'{name}_std_{axis}_{unit_name}': std_of.get(Coefficient(*coefficient, axis)),
                 }
         self.row |= {'fit_model': fitted.model, 'fit_poses': found.poses}
         self.files['unit.yaml'] = parameter_file.as_text(fitted, found.result.report_lines).encode(

@@ -24,7 +24,7 @@ from itertools import accumulate, chain, count
 import os
 from pathlib import Path
 import shutil
-from typing import TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 from adxl_ros.diagnose import next_experiment
 from adxl_ros.diagnose.linear_model import LinearModel
@@ -44,7 +44,7 @@ from adxl_ros.investigate.manoeuvres import (
 )
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.report import quantities
+from adxl_ros.report.quantities import listed
 from adxl_ros.workers import in_background
 import numpy as np
 
@@ -60,6 +60,21 @@ _SMALLEST_PER_MINUTE = 0.01
 ten minutes then change even odds by a tenth."""
 _LARGEST_NAMED = 4
 """Largest number of hypotheses in a sentence. Chosen: a reader keeps four in mind."""
+Hypotheses = tuple[WeightedHypothesis, ...]
+"""Hypotheses by falling probability, which sums to 1; no effect means no gap."""
+_NICENESS = 10  # Niceness of the process. Chosen: the node that records comes first
+_WITHOUT_DIAGNOSIS = {'bag', 'baseline.yaml'}
+"""Files of an investigation that was stopped before its first diagnosis of samples."""
+_FIRST_REST_S = 1.0
+"""Time for which samples and stage are there before the first question, s. Chosen: both topics
+have been discovered."""
+_SETTLING_S = 1.0
+"""Time at rest between a manoeuvre and its diagnosis, s. Chosen: a stage has settled."""
+_LONGEST_WAIT_S = 15.0
+"""Time that a stage may need to follow a command, s. Chosen: the slowest stages creep."""
+_OUTSIDE_RAD = 0.02
+"""Distance beyond a limit at which a stage counts as outside, rad. Chosen: above the error of an
+encoder's zero."""
 
 
 class RoundOutcome(Enum):
@@ -76,10 +91,6 @@ class RoundOutcome(Enum):
     NO_VISIBLE_GAP = 'no_visible_gap'
     INSEPARABLE = 'inseparable'
     TIME_OVER = 'time_over'
-
-
-Hypotheses = tuple[WeightedHypothesis, ...]
-"""Hypotheses by falling probability, which sums to 1; no effect means no gap."""
 
 
 @dataclass(frozen=True)
@@ -242,12 +253,7 @@ def first_or_others(names: Sequence[str]) -> str:
     others = len(names) - _LARGEST_NAMED
     if others > 0:
         shown.append(f'{others} others')
-    return quantities.listed(shown, 'or')
-
-
-_NICENESS = 10  # Niceness of the process. Chosen: the node that records comes first
-_WITHOUT_DIAGNOSIS = {'bag', 'baseline.yaml'}
-"""Files of an investigation that was stopped before its first diagnosis of samples."""
+    return listed(shown, 'or')
 
 
 class OutputFolder:
@@ -327,16 +333,11 @@ def _diagnose(folder: OutputFolder, question: Question, limits: StageLimits, see
     return answer
 
 
-_FIRST_REST_S = 1.0
-"""Time for which samples and stage are there before the first question, s. Chosen: both topics
-have been discovered."""
-_SETTLING_S = 1.0
-"""Time at rest between a manoeuvre and its diagnosis, s. Chosen: a stage has settled."""
-_LONGEST_WAIT_S = 15.0
-"""Time that a stage may need to follow a command, s. Chosen: the slowest stages creep."""
-_OUTSIDE_RAD = 0.02
-"""Distance beyond a limit at which a stage counts as outside, rad. Chosen: above the error of an
-encoder's zero."""
+class Answered(NamedTuple):
+    """An answer, and when its question was asked."""
+
+    minutes: float  # Since the first sample
+    answer: Answer
 
 
 class State(Enum):
@@ -362,8 +363,7 @@ class Investigation:
     ) -> None:
         """Wait for sensor and stage."""
         self.state = State.RECORDING  # The state
-        # Answers so far, each with the minutes at which its question was asked
-        self.answers: list[tuple[float, Answer]] = []
+        self.answers: list[Answered] = []
         self.reason = ''  # Why it was stopped; '' otherwise
         self._limits = limits
         self._longest_s = 60 * longest_minutes
@@ -389,7 +389,7 @@ class Investigation:
         return (
             self.state is State.FINISHED
             and bool(self.answers)
-            and self.answers[-1][1].outcome not in (RoundOutcome.GO_ON, RoundOutcome.TIME_OVER)
+            and self.answers[-1].answer.outcome not in (RoundOutcome.GO_ON, RoundOutcome.TIME_OVER)
         )
 
     @property
@@ -429,9 +429,9 @@ class Investigation:
         if self.state is State.RECORDING:
             self._record(now_s, pose)
         elif self.state is State.DIAGNOSING:
-            self._take_answer()
-        else:
-            self._move(elapsed_s, pose)
+            self._take_answer(pose)
+        elif self._stream is not None:
+            self._move(self._stream, elapsed_s, pose)
         return self._command
 
     def stop(self, reason: str) -> Pose | None:
@@ -464,7 +464,6 @@ class Investigation:
 
     def _ask(self, pose: Pose) -> None:
         """Ask for a diagnosis of the samples so far."""
-        assert self._begin_s is not None
         self.state = State.DIAGNOSING
         self._stream = None
         self._asked_minutes = self.minutes
@@ -475,12 +474,12 @@ class Investigation:
                 minutes=self._asked_minutes,
                 remaining_minutes=max(self._longest_s - self.moved_s, 0.0) / 60,
                 has_samples=bool(self.answers),
-                recorded=tuple(answer.manoeuvre for _, answer in self.answers),
-                verdict=self.answers[-1][1].verdict if self.answers else '',
+                recorded=tuple(each.answer.manoeuvre for each in self.answers),
+                verdict=self.answers[-1].answer.verdict if self.answers else '',
             )
         )
 
-    def _take_answer(self) -> None:
+    def _take_answer(self, pose: Pose) -> None:
         """Take the answer if there is one, and follow it."""
         try:
             answer = self._diagnoser.answer()
@@ -492,23 +491,20 @@ class Investigation:
         if answer.fault:
             self.stop(answer.fault)
             return
-        self.answers.append((self._asked_minutes, answer))
+        self.answers.append(Answered(self._asked_minutes, answer))
         self._show(self._asked_minutes, answer)
         if answer.outcome is not RoundOutcome.GO_ON:
             self.state = State.FINISHED
             return
-        assert self._pose is not None
-        begin = self._command or self._limits.nearest(*self._pose)
+        begin = self._command or self._limits.nearest(*pose)
         self._manoeuvre = answer.manoeuvre
         self._stream = CommandStream(
             self._limits, plan(answer.manoeuvre, self._limits, begin), begin
         )
         self.state = State.MOVING
 
-    def _move(self, elapsed_s: float, pose: Pose) -> None:
+    def _move(self, stream: CommandStream, elapsed_s: float, pose: Pose) -> None:
         """Command the next step; diagnose when the stage has settled at the end."""
-        stream = self._stream
-        assert stream is not None
         self.moved_s += elapsed_s
         if self.moved_s > self._longest_s:
             self._hold()

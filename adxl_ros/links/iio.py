@@ -13,7 +13,22 @@ import time
 from typing import Any
 
 from adxl_ros.errors import install_hint, UserError
-from adxl_ros.links.support import base, stamping
+from adxl_ros.links.support import stamping
+from adxl_ros.links.support.base import (
+    Backoff,
+    check_roles,
+    COLUMNS,
+    DeviceSettings,
+    Level,
+    Link,
+    LinkStatus,
+    option,
+    parse_channels,
+    reason,
+    Samples,
+    SUPPLY,
+    TEMPERATURE,
+)
 from adxl_ros.links.support.clock_map import ClockMap, IdentityMap
 from adxl_ros.links.support.clock_rate import ClockRate
 from adxl_ros.links.support.stamping import Stamper
@@ -59,15 +74,15 @@ _INSTALL = (
 
 
 @dataclass(frozen=True)
-class Settings(base.DeviceSettings):
+class Settings(DeviceSettings):
     """Settings of the link."""
 
-    uri: str = base.option('local:', 'URI of libiio: local:, ip:HOST or ip:HOST:PORT, usb:...')
-    device: str = base.option(
+    uri: str = option('local:', 'URI of libiio: local:, ip:HOST or ip:HOST:PORT, usb:...')
+    device: str = option(
         '', 'name, id or label of the ADC; empty: the only one that has buffered channels'
     )
     # A list of strings, or one string with commas
-    channels: str | Sequence[str] = base.option(
+    channels: str | Sequence[str] = option(
         (),
         'ids or labels of x, y, z as the sensor has them, supply, temperature, or ROLE=ID; '
         'empty: the channels with these labels, else the first voltages or accelerations',
@@ -84,7 +99,7 @@ def open_link(sensor: Sensor, settings: Settings) -> IioLink:
     return IioLink(sensor, settings)
 
 
-class IioLink(base.Link):
+class IioLink(Link):
     """
     The samples of a buffered IIO device, stamped by its timestamp channel.
 
@@ -92,15 +107,15 @@ class IioLink(base.Link):
     samples is an estimate.
     """
 
-    references = tuple(base.COLUMNS.values())
+    references = tuple(COLUMNS.values())
 
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         self._declared = sensor
         self._settings = settings
-        self._entries = base.parse_channels(settings.channels)
+        self._entries = parse_channels(settings.channels)
         self._stream: _Stream | None = None
         self._stamper = Stamper(ClockMap(settings.delay, _DECISION_S), self.references)
-        self._backoff = base.Backoff()
+        self._backoff = Backoff()
         self._error = ''
         self._rate = ClockRate(sensor.rate_hz)
         self._adc: dict[str, float] = {}
@@ -108,7 +123,7 @@ class IioLink(base.Link):
         self._newest_ns = -1
         self._last_buffer_s = time.monotonic()
 
-    def read(self, now_ns: int) -> base.Samples:
+    def read(self, now_ns: int) -> Samples:
         """Wait for a buffer and return its samples; without a device, wait for the device."""
         if self._stream is None:
             if self._backoff.wait():
@@ -123,11 +138,11 @@ class IioLink(base.Link):
                 self._backoff.fail()
         return self._stamper.take(self._declared)
 
-    def status(self) -> base.LinkStatus:
+    def status(self) -> LinkStatus:
         """Return how the device and the clock work."""
         level, text = self._condition()
         buffer_s = self._stream.buffer_s if self._stream else 0.0
-        return base.LinkStatus(
+        return LinkStatus(
             level,
             text,
             {
@@ -145,24 +160,24 @@ class IioLink(base.Link):
             self._stream.close()
             self._stream = None
 
-    def _condition(self) -> tuple[base.Level, str]:
+    def _condition(self) -> tuple[Level, str]:
         # The URI of this machine is only a kind and a colon.
         uri = self._settings.uri.removesuffix(':')
         stream = self._stream
         if self._error:
-            return base.Level.ERROR, f'{uri}: {self._error}'
+            return Level.ERROR, f'{uri}: {self._error}'
         if stream is None:
-            return base.Level.OK, 'connecting'
+            return Level.OK, 'connecting'
         silent_s = time.monotonic() - self._last_buffer_s
         if silent_s > max(_SILENT_S, _SILENT_BUFFERS * stream.buffer_s):
-            return base.Level.WARN, f'{uri}: silent, {stream.name} gives no samples'
+            return Level.WARN, f'{uri}: silent, {stream.name} gives no samples'
         if contradiction := self._rate.fault:
             return (
-                base.Level.ERROR,
+                Level.ERROR,
                 f'{uri}: {stream.name} {contradiction}: its sampling_frequency, or '
                 'sensor.rate_hz where it has none',
             )
-        return base.Level.OK, f'streaming at {stream.rate_hz:g} Hz'
+        return Level.OK, f'streaming at {stream.rate_hz:g} Hz'
 
     def _open(self) -> None:
         """Try to open the device; another ADC or rate than before begins a new clock."""
@@ -209,9 +224,7 @@ class IioLink(base.Link):
         if new.any():
             volts = np.array([values[axis][new] for axis in self._declared.axes]).T
             references = {
-                column: values[role][new]
-                for role, column in base.COLUMNS.items()
-                if role in values
+                column: values[role][new] for role, column in COLUMNS.items() if role in values
             }
             self._stamper.add(stamping.Block(device_ns[new], volts, references), arrived_ns)
 
@@ -243,9 +256,9 @@ class _Column:
             axis = sensor.axes.index(role)
             self._scale *= 1e3 / G0_MPS2 * float(sensor.nominal_scale_v_per_g[axis])
             self._zero = float(sensor.nominal_zero_g_v[axis])
-        elif kind != ('IIO_TEMP' if role == base.TEMPERATURE else 'IIO_VOLTAGE'):
+        elif kind != ('IIO_TEMP' if role == TEMPERATURE else 'IIO_VOLTAGE'):
             raise UserError(f'link.channels: {channel.id} cannot be {role}: it is {kind}')
-        elif role == base.SUPPLY:
+        elif role == SUPPLY:
             self._scale *= supply_scale
         # The ADC as fields of a sensor; 0 bits where the codes do not begin at 0 V
         bits = int(form.bits - form.is_signed)
@@ -315,7 +328,7 @@ class _Stream:
             device_ns = np.frombuffer(self._timestamp.read(self._buffer), np.int64)
             values = {column.role: column.read(self._buffer) for column in self._columns}
         except OSError as error:
-            raise _ReadError(f'{self.name}: lost: {base.reason(error)}') from None
+            raise _ReadError(f'{self.name}: lost: {reason(error)}') from None
         lengths = {len(device_ns), *map(len, values.values())}
         if (
             len(lengths) != 1
@@ -340,7 +353,7 @@ def _open_stream(settings: Settings, entries: Sequence[str], sensor: Sensor) -> 
         with _quiet_stderr():
             context = iio.Context(settings.uri)
     except (OSError, ValueError) as error:
-        raise _ReadError(base.reason(error)) from None
+        raise _ReadError(reason(error)) from None
     try:
         device = _find_device(context, settings.device)
         columns = [
@@ -349,7 +362,7 @@ def _open_stream(settings: Settings, entries: Sequence[str], sensor: Sensor) -> 
         ]
         return _Stream(context, device, columns, settings, sensor)
     except (OSError, ValueError) as error:
-        raise _ReadError(f'{settings.device}: cannot be read: {base.reason(error)}') from None
+        raise _ReadError(f'{settings.device}: cannot be read: {reason(error)}') from None
 
 
 @contextmanager
@@ -395,7 +408,7 @@ def _inputs(device: Any) -> list[Any]:
 def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, Any]:
     """Return the channels of a device by role."""
     inputs = _inputs(device)
-    order = [*axes, base.SUPPLY, base.TEMPERATURE]
+    order = [*axes, SUPPLY, TEMPERATURE]
     named: dict[str, Any] = {}
     for channel in reversed(inputs):
         names = channel.name, _label(channel), channel.id
@@ -421,7 +434,7 @@ def _assign_roles(device: Any, entries: Sequence[str], axes: str) -> dict[str, A
         free = [candidate for candidate in order if candidate not in dict(assigned)]
         role = role or (name if name in free or not free else free[0])
         assigned.append((role, named[name]))
-    base.check_roles([role for role, _ in assigned], axes)
+    check_roles([role for role, _ in assigned], axes)
     return dict(assigned)
 
 

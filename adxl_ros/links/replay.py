@@ -11,7 +11,15 @@ from adxl_ros.errors import UserError
 from adxl_ros.files import recording
 from adxl_ros.files.recording_columns import Recording, REFERENCES
 from adxl_ros.files.stream_info import uncalibrated
-from adxl_ros.links.support import base
+from adxl_ros.links.support.base import (
+    Level,
+    Link,
+    LinkStatus,
+    no_samples,
+    option,
+    PacedSettings,
+    Samples,
+)
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
@@ -21,11 +29,11 @@ _MAX_CLOCK_NS = 2**31 * 10**9  # Largest time of a ROS clock, ns: its seconds ar
 
 
 @dataclass(frozen=True)
-class Settings(base.PacedSettings):
+class Settings(PacedSettings):
     """Settings of the link."""
 
-    recording: str = base.option('', 'the recording to play: a rosbag2 directory, .mcap or CSV')
-    loop: bool = base.option(False, 'whether the recording starts again at its end')
+    recording: str = option('', 'the recording to play: a rosbag2 directory, .mcap or CSV')
+    loop: bool = option(False, 'whether the recording starts again at its end')
 
 
 def open_link(sensor: Sensor, settings: Settings) -> Replay:
@@ -38,7 +46,7 @@ def open_link(sensor: Sensor, settings: Settings) -> Replay:
     return Replay(sensor, settings)
 
 
-class Replay(base.Link):
+class Replay(Link):
     """
     The samples of a recording at the pace of a clock.
 
@@ -76,18 +84,18 @@ class Replay(base.Link):
             self._last_ns = now_ns - self._period_ns
         return 0
 
-    def read(self, now_ns: int) -> base.Samples:
+    def read(self, now_ns: int) -> Samples:
         """Return the rows that are due, at most to the end of a block."""
         block = self._block
         # The samples of the read before this one are out: what they end has ended now.
         self._has_ended = block is None
         if block is None:
-            return base.no_samples(self.sensor, now_ns)
+            return no_samples(self.sensor, now_ns)
         end = int(np.searchsorted(self._stamps, now_ns - self._offset_ns, 'right'))
         rows = slice(self._row, max(end, self._row))
         stamps = self._stamps[rows] + self._offset_ns
         periods = np.rint(np.diff(stamps, prepend=self._last_ns) / self._period_ns)
-        samples = base.Samples(
+        samples = Samples(
             stamps,
             self._volts[rows],
             now_ns,
@@ -103,9 +111,9 @@ class Replay(base.Link):
                 samples = replace(samples, until_ns=self._last_ns)
         return samples
 
-    def status(self) -> base.LinkStatus:
+    def status(self) -> LinkStatus:
         """Return whether the recording plays; it has ended once a read found no row."""
-        return base.LinkStatus(base.Level.OK, 'ended' if self._has_ended else 'playing')
+        return LinkStatus(Level.OK, 'ended' if self._has_ended else 'playing')
 
     def close(self) -> None:
         """Close the file."""

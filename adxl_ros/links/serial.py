@@ -6,29 +6,36 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-import errno
-from math import inf
-import os
-from pathlib import Path
-import select
-import stat
-import termios
 import time
-from typing import Any
 
-from adxl_ros.errors import install_hint, UserError
-from adxl_ros.links.support import base, stamping, wire_format
+from adxl_ros.errors import UserError
+from adxl_ros.links.support import stamping, wire_format
+from adxl_ros.links.support.base import (
+    check_roles,
+    COLUMNS,
+    DeviceSettings,
+    Event,
+    Level,
+    Link,
+    LinkStatus,
+    option,
+    parse_channels,
+    Samples,
+    SUPPLY,
+    TEMPERATURE,
+    UNUSED,
+)
 from adxl_ros.links.support.clock_map import ClockMap
 from adxl_ros.links.support.clock_rate import ClockRate
+from adxl_ros.links.support.serial_port import import_pyserial, Port, SILENT
 from adxl_ros.links.support.stamping import Stamper
 from adxl_ros.links.support.wire_format import BoardInfo, SampleFrame
 from adxl_ros.model.constants import AXES
 from adxl_ros.model.sensor import Sensor
 import numpy as np
 
-_DEFAULT_ROLES = (*AXES, base.SUPPLY)
+_DEFAULT_ROLES = (*AXES, SUPPLY)
 """Roles of the first channels where the parameters state none."""
 _SILENT_S = 0.5
 """Silence after which a board counts as silent, s. Chosen: 50 frames of the firmware."""
@@ -54,37 +61,26 @@ _CREDIT_S = 0.2
 once."""
 _MAX_PAUSE_S = 0.05  # Longest pause of one read, s, so that the driver reacts to its end
 _UNSTATED_RATE_HZ = 1000.0  # Sample rate before the info frame, Hz: that of the firmware
-_SILENT = 'silent, the board sends nothing'  # Error of a port that is open but delivers nothing
-
-_WAIT_MS = 50  # Longest wait for bytes, ms, so that the driver reacts to its end
-_MAX_READ = 65536  # Most bytes of one read: more than a terminal or a socket usually holds
-_BITS_PER_BYTE = 10  # Bits of a byte on a UART: 8 and start and stop bit
-_SYSFS = Path('/sys/dev/char')  # Devices of the kernel by their numbers
-_USB_DRIVER = 'cdc_acm'
-"""Driver of boards that are USB devices themselves: they ignore the baud rate."""
-_LOCKED = (errno.EAGAIN, errno.EBUSY)  # Errors of a port that another process has locked
-_RECONNECT_S = 3.0
-"""Silence after which a network connection is made again, s: a lost peer sends no error."""
 
 
 @dataclass(frozen=True)
-class Settings(base.DeviceSettings):
+class Settings(DeviceSettings):
     """Settings of the link."""
 
-    port: str = base.option('', 'device path, such as /dev/ttyACM0, or a pyserial URL')
-    baud: int = base.option(
+    port: str = option('', 'device path, such as /dev/ttyACM0, or a pyserial URL')
+    baud: int = option(
         115200, 'baud rate of a UART; USB and network ports ignore it', 'Bd', 50, 100_000_000
     )
     # A list of strings, or one string with commas
-    channels: str | Sequence[str] = base.option(
+    channels: str | Sequence[str] = option(
         (),
         'roles of the channels of a frame: x, y, z, supply, temperature, or - for unused; '
         'empty: the first channels are x, y, z, supply',
     )
-    temperature_zero_v: float = base.option(
+    temperature_zero_v: float = option(
         0.5, 'output of the temperature sensor at 0 degC', 'V', -10.0, 10.0
     )
-    temperature_v_per_c: float = base.option(
+    temperature_v_per_c: float = option(
         0.01, 'slope of the temperature sensor', 'V/degC', -10.0, 10.0
     )
 
@@ -109,20 +105,20 @@ class _Conversion:
             raise UserError(
                 f'link.channels: {len(roles)} are named, the board has {info.channels}'
             )
-        base.check_roles(roles, axes)
+        check_roles(roles, axes)
         self.max_code = 2**info.bits - 1
         # Value of a channel is gain · code + offset, V or degC, (m,)
         self._gain = np.full(info.channels, info.vref_v / 2**info.bits)
         self._offset = np.zeros(info.channels)
         for i, role in enumerate(roles):
-            if role == base.SUPPLY:
+            if role == SUPPLY:
                 self._gain[i] *= settings.supply_scale
-            elif role == base.TEMPERATURE:
+            elif role == TEMPERATURE:
                 self._gain[i] /= settings.temperature_v_per_c
                 self._offset[i] = -settings.temperature_zero_v / settings.temperature_v_per_c
         self._axes = [roles.index(axis) for axis in axes]
         self._references = {
-            column: roles.index(role) for role, column in base.COLUMNS.items() if role in roles
+            column: roles.index(role) for role, column in COLUMNS.items() if role in roles
         }
         # Times of the samples of a frame after its first one, ns
         self._steps_ns = np.rint(
@@ -141,7 +137,7 @@ class _Conversion:
         )
 
 
-class SerialLink(base.Link):
+class SerialLink(Link):
     """
     The samples of a board, each once and in order, stamped by the clock of the board.
 
@@ -152,15 +148,15 @@ class SerialLink(base.Link):
     def __init__(self, sensor: Sensor, settings: Settings) -> None:
         self._declared = sensor
         self._settings = settings
-        self._stated_roles = base.parse_channels(settings.channels)
+        self._stated_roles = parse_channels(settings.channels)
         if self._stated_roles:
-            base.check_roles(self._stated_roles, sensor.axes)
+            check_roles(self._stated_roles, sensor.axes)
         self.references = tuple(
             column
-            for role, column in base.COLUMNS.items()
+            for role, column in COLUMNS.items()
             if role in (self._stated_roles or _DEFAULT_ROLES)
         )
-        self._port = _Port(settings.port, settings.baud)
+        self._port = Port(settings.port, settings.baud)
         self._splitter = wire_format.Splitter()
         # Decoded frames with the monotonic times of their arrivals, ns
         self._arrivals: deque[tuple[BoardInfo | SampleFrame, int]] = deque()
@@ -177,7 +173,7 @@ class SerialLink(base.Link):
         self._last_frame_s = self._last_sample_s = self._created_s = time.monotonic()
         self._busy_until_s = self._unpaid_s = 0.0
 
-    def read(self, now_ns: int) -> base.Samples:
+    def read(self, now_ns: int) -> Samples:
         """Wait for bytes, at most 50 ms, and return the samples that they complete."""
         # What need not precede the samples of the last call follows them.
         self._throttle()
@@ -195,7 +191,7 @@ class SerialLink(base.Link):
                 self._on_samples(frame, arrived_ns)
         return self._stamper.take(self._declared)
 
-    def status(self) -> base.LinkStatus:
+    def status(self) -> LinkStatus:
         """Return how the port, the frames and the clock work."""
         level, text = self._condition()
         counts = self._counts
@@ -213,10 +209,10 @@ class SerialLink(base.Link):
             'connections': self._port.connections,
             **self._stamper.statistics(),
         }
-        reset = base.Event(
+        reset = Event(
             'the device was reset or is another one: a new count begins', counts['resets']
         )
-        return base.LinkStatus(level, text, statistics, (reset, *self._stamper.events()))
+        return LinkStatus(level, text, statistics, (reset, *self._stamper.events()))
 
     def hold_self_test(self, hold_s: float) -> None:
         """Tell the board again and again; it ends the self-test by itself when this stops."""
@@ -241,33 +237,33 @@ class SerialLink(base.Link):
         self._port.write(wire_format.encode_command(self._commands, time_us, kind))
         self._commands += 1
 
-    def _condition(self) -> tuple[base.Level, str]:
+    def _condition(self) -> tuple[Level, str]:
         """Return level and text of the status: the first fault of port, frames and board."""
         port = self._settings.port
         info = self._info
         if self._port.error:
-            return base.Level.ERROR, self._port.error
+            return Level.ERROR, self._port.error
         now_s = time.monotonic()
         if info is None and now_s - max(self._port.opened_s, self._created_s) < _INFO_WAIT_S:
-            return base.Level.OK, 'connecting'
+            return Level.OK, 'connecting'
         if obstacle := self._obstacle(now_s):
             if now_s - self._last_sample_s > _DEAD_S:
                 return (
-                    base.Level.ERROR,
+                    Level.ERROR,
                     f'{port}: {obstacle}; no sample for more than {_DEAD_S:g} s',
                 )
-            return base.Level.WARN, f'{port}: {obstacle}'
+            return Level.WARN, f'{port}: {obstacle}'
         if self._misfit:
-            return base.Level.ERROR, self._misfit
+            return Level.ERROR, self._misfit
         if contradiction := self._rate.fault:
-            return base.Level.ERROR, f'{port}: the board {contradiction} in its info frame'
-        return base.Level.OK, 'streaming'
+            return Level.ERROR, f'{port}: the board {contradiction} in its info frame'
+        return Level.OK, 'streaming'
 
     def _obstacle(self, now_s: float) -> str:
         """Return why no samples come at a monotonic time, s, or ''."""
         long_s = _SILENT_FRAMES * self._frame_s
         if now_s - max(self._port.last_byte_s, self._created_s) > max(_SILENT_S, long_s):
-            return _SILENT
+            return SILENT
         if now_s - self._last_frame_s > max(_NO_FRAME_S, long_s):
             return (
                 f'bytes, but no frame of wire format 1: is link.baud ({self._settings.baud}) '
@@ -348,7 +344,7 @@ class SerialLink(base.Link):
         self._counter.restart(info.rate_hz)
         axes = self._declared.axes
         roles = self._stated_roles or [
-            base.UNUSED if role in AXES and role not in axes else role
+            UNUSED if role in AXES and role not in axes else role
             for role in _DEFAULT_ROLES[: info.channels]
         ]
         try:
@@ -395,137 +391,3 @@ class SerialLink(base.Link):
                 self._stamper.step()
             self._counts['rail_frames'] += accepted.frame.flags & wire_format.RAIL
             self._stamper.add(conversion.block(accepted.frame, accepted.lost or 0), arrived_ns)
-
-
-class _Port:
-    """
-    Bytes from a device path or a pyserial URL.
-
-    connections: how often the port was opened; opened_s: monotonic time of the last opening, s;
-    received_bytes: bytes so far; last_byte_s: monotonic time of the last bytes, s.
-    """
-
-    def __init__(self, name: str, baud: int) -> None:
-        self.connections = self.received_bytes = 0
-        self.last_byte_s = self.opened_s = 0.0
-        # Bytes that the open port carries per second; infinite where the baud rate has no meaning
-        self.uart_bytes_per_s = inf
-        self._name = name
-        self._baud = baud
-        self._pyserial = import_pyserial()
-        self._port: Any = None
-        self._poll: Any = None
-        self.backoff = base.Backoff()  # Of the attempts to open it; bytes that make sense reset it
-        # Why the port is not open, in one line; '' while it is open and before the first attempt
-        self.error = ''
-
-    def read(self) -> bytes | None:
-        """Return the bytes that have come, b'' after 50 ms; None where the port was not open."""
-        if self._port is None:
-            if self.backoff.wait():
-                self._open()
-            return None
-        try:
-            chunk = self._read()
-            if not chunk:
-                self._check_device()
-        except OSError as error:
-            self._lose(f'unplugged: {error.strerror or error}')
-            return None
-        if chunk:
-            self.received_bytes += len(chunk)
-            self.last_byte_s = time.monotonic()
-        return chunk
-
-    def write(self, raw: bytes) -> None:
-        """Send bytes without waiting; what does not fit in the port's buffer is lost."""
-        # A port that is gone shows in the next read.
-        with suppress(OSError):
-            if self._poll is not None:
-                os.write(self._port.fileno(), raw)
-            elif self._port is not None:
-                self._port.write(raw)
-
-    def close(self) -> None:
-        """Close the port."""
-        port = self._port
-        self._port = None
-        self._poll = None
-        if port is not None:
-            with suppress(OSError):  # an unplugged port may not close
-                port.close()
-
-    def _open(self) -> None:
-        try:
-            self._port = self._pyserial.serial_for_url(
-                self._name, self._baud, timeout=0, exclusive=True
-            )
-        except (OSError, ValueError, termios.error) as error:
-            self._lose(
-                'in use: another process has locked it'
-                if getattr(error, 'errno', None) in _LOCKED
-                else base.reason(error)
-            )
-            return
-        self.connections += 1
-        self.opened_s = time.monotonic()
-        self.error = ''
-        # An FTDI chip would keep bytes for 16 ms. Most other devices have no such setting.
-        with suppress(OSError, ValueError, AttributeError):
-            self._port.set_low_latency_mode(True)
-        try:
-            number = os.fstat(self._port.fileno()).st_rdev
-            self._poll = select.poll()
-            self._poll.register(self._port.fileno(), select.POLLIN)
-        except (OSError, AttributeError):
-            # A URL without a file: pyserial's own time-out applies.
-            self._port.timeout = self._port.write_timeout = _WAIT_MS * 1e-3
-            return
-        # A pseudo-terminal and a network port have no driver, and need no baud rate.
-        driver = _SYSFS / f'{os.major(number)}:{os.minor(number)}' / 'device' / 'driver'
-        is_uart = driver.exists() and driver.resolve().name != _USB_DRIVER
-        self.uart_bytes_per_s = self._baud / _BITS_PER_BYTE if is_uart else inf
-
-    def _read(self) -> bytes:
-        """Wait for bytes; raises `OSError` where the device or the other side is gone."""
-        if self._poll is None:
-            first = self._port.read(1)
-            return first and first + self._port.read(min(self._port.in_waiting, _MAX_READ))
-        if not self._poll.poll(_WAIT_MS):
-            return b''
-        # pyserial's own read takes one byte at a time from a socket.
-        try:
-            chunk = os.read(self._port.fileno(), _MAX_READ)
-        except (BlockingIOError, InterruptedError):
-            return b''
-        if not chunk:
-            raise OSError('the other side has closed')
-        return chunk
-
-    def _lose(self, why: str) -> None:
-        """Close the port for a reason; the next `read` opens it again."""
-        self.error = f'{self._name}: {why}'
-        self.close()
-        self.backoff.fail()
-
-    def _check_device(self) -> None:
-        """Close a silent port whose name stands for another device, or for none."""
-        if self._poll is None:
-            return
-        opened = os.fstat(self._port.fileno())
-        if stat.S_ISSOCK(opened.st_mode):
-            if time.monotonic() - max(self.last_byte_s, self.opened_s) > _RECONNECT_S:
-                self._lose(_SILENT)
-        elif not os.path.exists(self._name) or os.stat(self._name).st_rdev != opened.st_rdev:
-            self._lose('unplugged: its name is gone, or stands for another device now')
-
-
-def import_pyserial() -> Any:
-    """Return the module serial; raises `UserError` where it is not installed."""
-    try:
-        import serial
-    except ImportError:
-        raise UserError(
-            'link.type serial needs the Python package pyserial: ' + install_hint('pyserial')
-        ) from None
-    return serial

@@ -12,7 +12,16 @@ from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.recording_columns import JOINTS
-from adxl_ros.links.support import base
+from adxl_ros.links.support.base import (
+    FOREVER_NS,
+    Level,
+    Link,
+    LinkStatus,
+    option,
+    PacedSettings,
+    Samples,
+    Watchdog,
+)
 from adxl_ros.links.support.self_test import EmulatedLine
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.simulate.motion import Motion
@@ -39,13 +48,13 @@ has a sample of its own."""
 
 
 @dataclass(frozen=True)
-class Settings(base.PacedSettings):
+class Settings(PacedSettings):
     """Settings of the link."""
 
-    seed: int = base.option(0, 'seed of the noise', '', 0, 2**31 - 1)
+    seed: int = option(0, 'seed of the noise', '', 0, 2**31 - 1)
     # alpha_rad, beta_rad: Pose without a stage, rad
-    alpha_rad: float = base.option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
-    beta_rad: float = base.option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
+    alpha_rad: float = option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
+    beta_rad: float = option(0.0, 'pose without a stage', 'rad', -100.0, 100.0)
 
 
 class _JointKnot(NamedTuple):
@@ -61,7 +70,7 @@ def open_link(sensor: Sensor, settings: Settings) -> SimulatedSensor:
     return SimulatedSensor(sensor, settings)
 
 
-class SimulatedSensor(base.Link):
+class SimulatedSensor(Link):
     """
     The signal chain forward in time, driven by the true motion of the stage.
 
@@ -81,8 +90,8 @@ class SimulatedSensor(base.Link):
         self._knots = [_resting((settings.alpha_rad, settings.beta_rad, 0.0))]
         self._respond = self._settled_response()
         self._line = EmulatedLine(sensor)
-        self._watchdog: base.Watchdog | None = None
-        self._status = base.LinkStatus(base.Level.OK, 'at rest, no stage')
+        self._watchdog: Watchdog | None = None
+        self._status = LinkStatus(Level.OK, 'at rest, no stage')
         self._origin_ns = self._made = self._until_ns = self._next_ns = 0
         self._stamps = np.zeros(0, np.int64)
         self._volts = np.zeros((0, len(sensor.axes)))
@@ -92,13 +101,13 @@ class SimulatedSensor(base.Link):
     ) -> None:
         """Take the true motion of the stage at a stamp, which may lie ahead."""
         if not np.isfinite([*position.values(), *velocity.values()]).all():
-            self._status = base.LinkStatus(
-                base.Level.WARN, f'{self.joint_state_topic}: not finite: {position}'
+            self._status = LinkStatus(
+                Level.WARN, f'{self.joint_state_topic}: not finite: {position}'
             )
             return
         if abs(stamp_ns - self._until_ns) > _FOREIGN_NS:
-            self._status = base.LinkStatus(
-                base.Level.WARN,
+            self._status = LinkStatus(
+                Level.WARN,
                 'the stage lives by another clock, '
                 f'{(stamp_ns - self._until_ns) * 1e-9:+.1f} s from the sensor; set use_sim_time '
                 'for both or for none',
@@ -115,9 +124,9 @@ class SimulatedSensor(base.Link):
                 tuple(velocity.get(joint, 0.0) for joint in JOINTS),
             )
         )
-        self._watchdog = self._watchdog or base.Watchdog(_LONGEST_TURN_S)
+        self._watchdog = self._watchdog or Watchdog(_LONGEST_TURN_S)
         self._watchdog.feed()
-        self._status = base.LinkStatus(base.Level.OK, 'on the stage')
+        self._status = LinkStatus(Level.OK, 'on the stage')
 
     def begin(self, now_ns: int) -> int:
         """Make the next sample due now; return the number of samples that are skipped."""
@@ -133,7 +142,7 @@ class SimulatedSensor(base.Link):
         self._respond = self._settled_response()
         return skipped
 
-    def read(self, now_ns: int) -> base.Samples:
+    def read(self, now_ns: int) -> Samples:
         """Return the samples up to now, or up to the newest stamp of the stage's motion."""
         until_ns = max(self._until_ns, min(now_ns, self._motion_until_ns()))
         while until_ns >= self._next_ns:
@@ -141,7 +150,7 @@ class SimulatedSensor(base.Link):
         due = int(self._stamps.searchsorted(until_ns, 'right'))
         stamps, volts = self._stamps[:due], self._volts[:due]
         is_in_test = self._line.add(stamps * 1e-9, volts)
-        samples = base.Samples(stamps, volts, until_ns, in_self_test=is_in_test)
+        samples = Samples(stamps, volts, until_ns, in_self_test=is_in_test)
         self._stamps = self._stamps[due:]
         self._volts = self._volts[due:]
         self._until_ns = until_ns
@@ -156,7 +165,7 @@ class SimulatedSensor(base.Link):
             )
         self._line.hold(self._until_ns * 1e-9, hold_s)
 
-    def status(self) -> base.LinkStatus:
+    def status(self) -> LinkStatus:
         """Return whether a stage moves the sensor."""
         return self._status
 
@@ -166,16 +175,16 @@ class SimulatedSensor(base.Link):
     def _motion_until_ns(self) -> int:
         """Return the time up to which the motion is known; it is unbounded without a stage."""
         if self._watchdog is None:
-            return base.FOREVER_NS
+            return FOREVER_NS
         if self._watchdog.check() < _LOST_S:
             return self._knots[-1].stamp_ns
         self._watchdog = None
-        self._status = base.LinkStatus(
-            base.Level.WARN,
+        self._status = LinkStatus(
+            Level.WARN,
             f'stage lost: nothing on {self.joint_state_topic} for {_LOST_S:g} '
             's, its last pose is held',
         )
-        return base.FOREVER_NS
+        return FOREVER_NS
 
     def _make(self, until_ns: int) -> None:
         """Make a block of samples, beyond a time as far as the motion is known."""

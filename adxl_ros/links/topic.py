@@ -12,7 +12,16 @@ import time
 from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import GRAVITY, Quantity, unit_name
 from adxl_ros.files.stamps import is_even, stamped_rate_hz
-from adxl_ros.links.support import base
+from adxl_ros.links.support.base import (
+    Event,
+    Level,
+    Link,
+    LinkStatus,
+    no_samples,
+    option,
+    Samples,
+    SimulatorSettings,
+)
 from adxl_ros.model.constants import NOMINAL_TEMPERATURE_C
 from adxl_ros.model.covariance import NOT_MEASURED
 from adxl_ros.model.sensor import Sensor
@@ -49,18 +58,18 @@ _ABSENT = {'orientation': np.array([0.0, 0.0, 0.0, 1.0]), 'angular_velocity': np
 
 
 @dataclass(frozen=True)
-class Settings(base.SimulatorSettings):
+class Settings(SimulatorSettings):
     """Settings of the link."""
 
-    topic: str = base.option(
+    topic: str = option(
         'imu/ideal', 'topic of the ideal sensor_msgs/Imu of a simulator: specific force'
     )
-    unit: str = base.option('mps2', 'unit of its accelerations: mps2, g, mg or mmps2')
-    temperature_topic: str = base.option(
+    unit: str = option('mps2', 'unit of its accelerations: mps2, g, mg or mmps2')
+    temperature_topic: str = option(
         'temperature',
         'topic of the temperature of the sensor, sensor_msgs/Temperature; 25 °C until it comes',
     )
-    seed: int = base.option(0, 'seed of the noise', '', 0, 2**31 - 1)
+    seed: int = option(0, 'seed of the noise', '', 0, 2**31 - 1)
 
 
 class _SimulatedChain:
@@ -120,7 +129,7 @@ def open_link(sensor: Sensor, settings: Settings) -> EmulatedSensor:
     return EmulatedSensor(sensor, settings)
 
 
-class EmulatedSensor(base.Link):
+class EmulatedSensor(Link):
     """
     The signal chain behind the ideal samples of a simulator.
 
@@ -180,14 +189,14 @@ class EmulatedSensor(base.Link):
             self._sense(stamp, sample)
         self._run_chain()
 
-    def read(self, now_ns: int) -> base.Samples:
+    def read(self, now_ns: int) -> Samples:
         """Return the samples since the last call."""
         made = self._made
         self._made = []
         missing = self._missing
         self._missing = 0
         if not made:
-            empty = base.no_samples(self._sensor, self._newest_ns or 0)
+            empty = no_samples(self._sensor, self._newest_ns or 0)
             return replace(empty, missing=missing, estimated=missing)
         stamps_ns, fields, volts = zip(*made)
         passed = {
@@ -195,7 +204,7 @@ class EmulatedSensor(base.Link):
             for name in fields[0]
             if name != 'linear_acceleration'
         }
-        return base.Samples(
+        return Samples(
             np.array(stamps_ns, np.int64),
             np.array(volts),
             stamps_ns[-1],
@@ -204,26 +213,24 @@ class EmulatedSensor(base.Link):
             imu_fields=passed,
         )
 
-    def status(self) -> base.LinkStatus:
+    def status(self) -> LinkStatus:
         """Return whether the simulator sends samples."""
         counts = dict(self._counts)
         events = (
-            base.Event(f'not emulated: {self._left_out}', int(bool(self._left_out))),
-            base.Event(
-                'the simulation was reset; the sensor is at its power-on', counts['resets']
-            ),
-            base.Event(
+            Event(f'not emulated: {self._left_out}', int(bool(self._left_out))),
+            Event('the simulation was reset; the sensor is at its power-on', counts['resets']),
+            Event(
                 f'{self.imu_topic}: a sample is not a number; check the simulation',
                 counts['not_finite'],
             ),
         )
-        return base.LinkStatus(*self._condition(), counts, events)
+        return LinkStatus(*self._condition(), counts, events)
 
-    def _condition(self) -> tuple[base.Level, str]:
+    def _condition(self) -> tuple[Level, str]:
         topic = self.imu_topic
         sensor = self.sensor
         if self._mixture:
-            return base.Level.ERROR, self._mixture
+            return Level.ERROR, self._mixture
         if self._newest_ns is None or time.monotonic() - self._heard_s > _SILENT_S:
             if self._publishers is None:
                 reason = 'waiting for a sample'
@@ -231,11 +238,11 @@ class EmulatedSensor(base.Link):
                 reason = 'no samples; is the simulation paused?'
             else:
                 reason = 'nobody publishes it; start the simulator, or set link.topic'
-            return base.Level.WARN, f'{topic}: {reason}'
+            return Level.WARN, f'{topic}: {reason}'
         if self._chain is None or sensor is None:
-            return base.Level.WARN, f'{topic}: measuring the rate'
+            return Level.WARN, f'{topic}: measuring the rate'
         return (
-            base.Level.OK,
+            Level.OK,
             f'emulates {self._sensor.serial} on {topic} at {sensor.rate_hz:.6g} Hz',
         )
 
@@ -265,8 +272,8 @@ class EmulatedSensor(base.Link):
         self._newest_ns = stamp_ns
         self._held.append((stamp_ns, fields))
 
-    def _has_chain(self) -> bool:
-        """Return whether there is a chain; it is made once the held samples show the rate."""
+    def _ready_chain(self) -> _SimulatedChain | None:
+        """Return the chain, which is made once the held samples show the rate."""
         if self._chain is None and self._held:
             stamps_ns = np.array([stamp_ns for stamp_ns, _ in self._held])
             count = len(stamps_ns)
@@ -284,13 +291,13 @@ class EmulatedSensor(base.Link):
                 self._longest_ns = max(_MAX_FILLED_NS, _LATE_PERIODS * self._period_ns)
                 self._chain = _SimulatedChain(self.sensor, self._seed)
                 self._seed += 1
-        return self._chain is not None
+        return self._chain
 
     def _run_chain(self) -> None:
         """Run the chain over the samples that are held, and those that were lost between them."""
-        if not self._held or not self._has_chain():
+        chain = self._ready_chain()
+        if not self._held or chain is None:
             return
-        assert self._chain is not None, 'see _has_chain'
         forces: list[np.ndarray] = []
         places = []
         for stamp_ns, fields in self._held:
@@ -304,6 +311,6 @@ class EmulatedSensor(base.Link):
             places.append(len(forces))
             forces.append(force)
             self._last = stamp_ns, force
-        volts = self._chain(np.array(forces), self._temperature_c)
+        volts = chain(np.array(forces), self._temperature_c)
         self._made += ((*held, made) for held, made in zip(self._held, volts[places]))
         self._held.clear()

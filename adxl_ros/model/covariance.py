@@ -34,6 +34,7 @@ _OVERHANG_MPS2 = -0.5  # Lowest z of an upright sensor, m/s²; chosen: 3° over
 _ROOT_MEAN = 1.25
 """Factor of the term that keeps the divisor of derived z from 0 where the in-plane force is g.
 Derived: there z² = 2·σ·g·n for normal noise n > 0, and the variance of z is 0.8·σ·g = σ·g/1.25."""
+_RELATIVE_STEP = 1e-3  # Step by coefficients, typical sizes; chosen: nearly linear
 
 
 def imu_covariance(sensor: Sensor) -> np.ndarray:
@@ -172,9 +173,6 @@ def derived_z_covariance(
         yz + by_zz[1],
         zz,
     )
-
-
-_RELATIVE_STEP = 1e-3  # Step by coefficients, typical sizes; chosen: nearly linear
 
 
 def coefficient_tangent(sensor: Sensor) -> Callable[..., np.ndarray]:

@@ -16,6 +16,10 @@ _MOST_MISSED = 0.25  # Distance from the polynomial, by the change. Chosen: half
 _QUADRATURE_NODES = 24  # Nodes of Gauss-Legendre; chosen: exact for |z| < `_STIFF`
 _FEW_INPUTS = 512  # Most inputs that are filtered one by one; chosen: 50 µs
 _STIFF = 8.0  # |z| from which weights are integrated by parts; chosen: stable there only
+_MOST_TURNS = 0.5
+"""Largest share of the inputs at which one turns, for a play by these alone. Chosen: with more,
+all inputs cost no more."""
+_THRESHOLDS = (0.25, 0.5, 0.75, 1.0)  # Of stop operators, by the reach; chosen: four equal
 
 
 def low_pass(
@@ -165,12 +169,6 @@ def _weights(z: complex, order: int) -> np.ndarray:
     for k in range(1, order):
         moments.append((k * moments[-1] - 1) / z)
     return np.array([np.dot(c[::-1], moments) for c in lagrange])
-
-
-_MOST_TURNS = 0.5
-"""Largest share of the inputs at which one turns, for a play by these alone. Chosen: with more,
-all inputs cost no more."""
-_THRESHOLDS = (0.25, 0.5, 0.75, 1.0)  # Of stop operators, by the reach; chosen: four equal
 
 
 def stop(x: np.ndarray, reach: float, memory: dict[Any, Any]) -> np.ndarray:

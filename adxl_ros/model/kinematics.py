@@ -19,6 +19,17 @@ import numpy as np
 import scipy
 
 UPRIGHT = (0.0, 0.0, 1.0)  # The vertical in the frame of a level base, a unit vector
+UNOBSERVABLE_RAD2 = 1.0  # Variance of an angle that is not shown, rad²; a guess has 1.8²
+UNKNOWN_ANGLE_RAD2 = 1e6
+"""Variance of an angle that is not known, rad²; yaw is never known.
+
+π²/3, that of a uniform angle, would let a filter that fuses 1000 samples a second believe in
+yaw = 0 before long. 1e6, as for an axis that is not there, never counts."""
+INFINITE = float('inf')  # Variance of an angle that the force does not determine, rad²
+FORCE2_FLOOR = 1e-30
+"""Square of a negligible force, (m/s²)²: it keeps divisors from 0, and is far below any noise."""
+_UPPER = np.triu_indices(3)  # Rows and columns of xx, xy, xz, yy, yz, zz in a matrix
+Vector = tuple[float, float, float]  # Three components
 
 
 def specific_force(
@@ -117,20 +128,14 @@ def carried_acceleration(omega: Components, omega_dot: Components, r: Components
     return [c + t for c, t in zip(centripetal, cross_product(omega_dot, r))]
 
 
+def unit_vectors(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors, (n, 3), with the length 1."""
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
 def cross_product(a: Components, b: Components) -> Components:
     """Return the vector product a × b."""
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
-UNOBSERVABLE_RAD2 = 1.0  # Variance of an angle that is not shown, rad²; a guess has 1.8²
-UNKNOWN_ANGLE_RAD2 = 1e6
-"""Variance of an angle that is not known, rad²; yaw is never known.
-
-π²/3, that of a uniform angle, would let a filter that fuses 1000 samples a second believe in
-yaw = 0 before long. 1e6, as for an axis that is not there, never counts."""
-INFINITE = float('inf')  # Variance of an angle that the force does not determine, rad²
-FORCE2_FLOOR = 1e-30
-"""Square of a negligible force, (m/s²)²: it keeps divisors from 0, and is far below any noise."""
 
 
 @dataclass(frozen=True)
@@ -207,9 +212,6 @@ class Angles(NamedTuple):
     roll: AngleEstimate
     pitch: AngleEstimate
     inclination: AngleEstimate
-
-
-_UPPER = np.triu_indices(3)  # Rows and columns of xx, xy, xz, yy, yz, zz in a matrix
 
 
 class Covariance3(NamedTuple):
@@ -318,9 +320,6 @@ def quaternion(roll_rad: Value, pitch_rad: Value, maths: Maths) -> tuple[Value, 
     sr, cr = maths.sin(roll_rad / 2), maths.cos(roll_rad / 2)
     sp, cp = maths.sin(pitch_rad / 2), maths.cos(pitch_rad / 2)
     return sr * cp, cr * sp, -sr * sp, cr * cp
-
-
-Vector = tuple[float, float, float]  # Three components
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,10 @@ signs: N of IEEE Std 952 and `accelerometer_noise_density` of Kalibr, whose samp
 N²·rate (ethz-asl/kalibr, wiki/IMU-Noise-Model)."""
 _NO_RC_S = 1e-9  # Smallest time constant, s. Chosen: no accelerometer has a filter of 160 MHz
 _HARMONICS = 50  # Harmonics of rounding that are summed. Chosen: the others hold 1 %
+_RAIL_STDS = 3.0
+"""Distance of a mean from a rail of the ADC, in standard deviations of a sample, up to which its
+samples were cut off there. Beyond it one sample of 700 is, which moves the mean by less than a
+thousandth of that deviation; half of it would hide a shift of 3 %."""
 
 
 class Electronics(NamedTuple):
@@ -150,12 +154,6 @@ def effective_samples(count: int | np.ndarray, dt_s: float, rc_s: float) -> np.n
     a = np.exp(-dt_s / rc_s)
     correlated = 2 * a / (1 - a) * (1 - (1 - a**n) / (n * (1 - a)))
     return n / (1 + correlated)
-
-
-_RAIL_STDS = 3.0
-"""Distance of a mean from a rail of the ADC, in standard deviations of a sample, up to which its
-samples were cut off there. Beyond it one sample of 700 is, which moves the mean by less than a
-thousandth of that deviation; half of it would hide a shift of 3 %."""
 
 
 def means_at_a_rail(sensor: Sensor, mean_v: np.ndarray) -> np.ndarray:

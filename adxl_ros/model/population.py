@@ -10,7 +10,7 @@ then have a normal posterior in closed form, because the chain is nearly linear 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -52,7 +52,8 @@ class Population:
         zero_g_v = sensor.nominal_zero_g_v
         scale_v_per_g = sensor.nominal_scale_v_per_g
         names = []
-        departures = []
+        means = []
+        stds = []
         for effect, parameter, column, nominal in (
             ('bias', 'offset_v', 'zero_g_{}_v', zero_g_v),
             ('scale_factor', 'offset_v_per_g', 'scale_{}_v_per_g', scale_v_per_g),
@@ -61,9 +62,9 @@ class Population:
                 pooled = self.coefficients.get(column.format(axis))
                 if pooled:
                     names.append(Coefficient(effect, parameter, axis))
-                    departures.append((pooled.mean - value, pooled.prediction_std))
-        mean, std = np.array(departures).reshape(-1, 2).T
-        return Prior(tuple(names), mean, std)
+                    means.append(pooled.mean - value)
+                    stds.append(pooled.prediction_std)
+        return Prior(tuple(names), np.array(means), np.array(stds))
 
 
 class Prior(NamedTuple):
@@ -73,6 +74,11 @@ class Prior(NamedTuple):
     # mean, std: Their means and standard deviations, (k,) each
     mean: np.ndarray
     std: np.ndarray
+
+    def among(self, names: Sequence[Coefficient]) -> Prior:
+        """Return the prior of those that are among some coefficients."""
+        used = [i for i, name in enumerate(self.names) if name in names]
+        return Prior(tuple(self.names[i] for i in used), self.mean[used], self.std[used])
 
 
 class Posterior(NamedTuple):
@@ -89,55 +95,63 @@ def posterior(sensor: Sensor, population: Population) -> Posterior:
 
     A sensor without zero-g and scale factor of its own takes those of the population.
     """
-    names, mean, std = population.prior(sensor)
-    if not names:
+    prior = population.prior(sensor)
+    if not prior.names:
         return Posterior(
             sensor,
             f'{population.name} has no zero-g or scale factor of the axes '
             f'{sensor.axes}; it is not used',
         )
     if not set(_EFFECTS) & set(sensor.effects):
-        combined = replace(
-            put(with_neutral(sensor, _EFFECTS), names, mean),
-            covariance=np.diag(std**2),
-            covariance_names=names,
-        )
-        return Posterior(
-            combined,
-            f'zero-g and scale factor are those of '
-            f'{population.name}: the unit has none of its own',
-        )
-    used = [i for i, name in enumerate(names) if name in sensor.covariance_names]
-    if not used:
+        return _drawn_from(prior, sensor, population)
+    known = prior.among(sensor.covariance_names)
+    if not known.names:
         return Posterior(
             sensor,
             f'{population.name} is not used: zero-g and scale factor of '
             'the unit have no uncertainty',
         )
-    places = [sensor.covariance_names.index(names[i]) for i in used]
-    departure = mean[used] - get(sensor, [names[i] for i in used])
-    total = sensor.covariance[np.ix_(places, places)] + np.diag(std[used] ** 2)
+    return _combined(known, sensor, population)
+
+
+def _drawn_from(prior: Prior, sensor: Sensor, population: Population) -> Posterior:
+    """Return a sensor without coefficients of its own, with those of the prior."""
+    unit = replace(
+        put(with_neutral(sensor, _EFFECTS), prior.names, prior.mean),
+        covariance=np.diag(prior.std**2),
+        covariance_names=prior.names,
+    )
+    return Posterior(
+        unit,
+        f'zero-g and scale factor are those of {population.name}: the unit has none of its own',
+    )
+
+
+def _combined(prior: Prior, sensor: Sensor, population: Population) -> Posterior:
+    """Return a sensor whose coefficients have a normal prior, unless it contradicts them."""
+    count = len(prior.names)
+    places = [sensor.covariance_names.index(name) for name in prior.names]
+    departure = prior.mean - get(sensor, prior.names)
+    # The covariance of the estimates with all coefficients, and that of the departures
+    cross = sensor.covariance[places]
+    total = cross[:, places] + np.diag(prior.std**2)
     square = float(departure @ np.linalg.solve(total, departure))
-    chance = float(scipy.special.chdtrc(len(places), square))
+    chance = float(scipy.special.chdtrc(count, square))
     if chance < STRANGER_CHANCE:
         return Posterior(
             sensor,
-            (
-                f'{sensor.serial} is not of {population.name}: χ² {square:.3g} for {len(places)} '
-                f'coefficients, probability {chance:.2g}. The prior is not used'
-            ),
-            True,
+            f'{sensor.serial} is not of {population.name}: χ² {square:.3g} for {count} '
+            f'coefficients, probability {chance:.2g}. The prior is not used',
+            is_stranger=True,
         )
-    gain = np.linalg.solve(total, sensor.covariance[places]).T
-    covariance = sensor.covariance - gain @ sensor.covariance[places]
+    gain = np.linalg.solve(total, cross).T
+    covariance = sensor.covariance - gain @ cross
     values = get(sensor, sensor.covariance_names) + gain @ departure
-    combined = replace(
+    unit = replace(
         put(sensor, sensor.covariance_names, values), covariance=(covariance + covariance.T) / 2
     )
     return Posterior(
-        combined,
-        (
-            f'{population.name} is the prior of {len(places)} coefficients: χ² {square:.3g}, '
-            f'probability {chance:.2g}'
-        ),
+        unit,
+        f'{population.name} is the prior of {count} coefficients: χ² {square:.3g}, '
+        f'probability {chance:.2g}',
     )

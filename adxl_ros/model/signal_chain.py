@@ -324,18 +324,18 @@ def tangent(
 
 def _inverse_matrix(a: list[Components]) -> list[Components]:
     """Invert 1×1 to 3×3 matrices by their minors, component by component."""
-    if len(a) == 1:
-        return [[1 / a[0][0]]]
-    if len(a) == 2:
-        determinant = a[0][0] * a[1][1] - a[0][1] * a[1][0]
-        return [
-            [a[1][1] / determinant, -a[0][1] / determinant],
-            [-a[1][0] / determinant, a[0][0] / determinant],
-        ]
+    count = len(a)
+    # The axes that are missing are those of a unit matrix.
+    whole = np.eye(3).tolist()
+    for row, given in zip(whole, a):
+        row[:count] = given
     next_two = ((1, 2), (2, 0), (0, 1))
-    minors = [[a[i][p] * a[j][q] - a[i][q] * a[j][p] for p, q in next_two] for i, j in next_two]
-    determinant = sum(v * m for v, m in zip(a[0], minors[0]))
-    return [[minors[d][c] / determinant for d in range(3)] for c in range(3)]
+    minors = [
+        [whole[i][p] * whole[j][q] - whole[i][q] * whole[j][p] for p, q in next_two]
+        for i, j in next_two
+    ]
+    determinant = sum(v * m for v, m in zip(whole[0], minors[0]))
+    return [[minors[d][c] / determinant for d in range(count)] for c in range(count)]
 
 
 def newton_step(axes: str, gravity_mps2: float, maths: Maths) -> Callable[..., Components]:

@@ -66,6 +66,12 @@ _RESERVE = 0.5
 """Share of the permitted false alarms that the limits use. Chosen: usual sizes are estimates, and
 noise is not quite normal."""
 _KINDS = 2  # Kinds of windows: at rest throughout, and with motion. Like is compared with like
+NAME = 'changes.jsonl'  # Name of the file
+_FIRST_UTC_NS = 10**18
+"""Earliest stamp that is UTC, ns: September 2001. Chosen: a simulator begins at 0."""
+_NICENESS = 15  # Niceness of the process; chosen: every node of the robot has priority
+_BUDGET_S = 300.0  # Longest time of a diagnosis, s; chosen: ten times that of ten minutes at 1 kHz
+_REASON_LENGTH = 300  # Most characters of a reason; chosen: one line of diagnostics
 
 
 class Change(NamedTuple):
@@ -199,14 +205,6 @@ class ChangeTest:
         for waiting in self._waiting:
             for _, _, _, usable in waiting:
                 usable[channels] = False
-
-
-NAME = 'changes.jsonl'  # Name of the file
-_FIRST_UTC_NS = 10**18
-"""Earliest stamp that is UTC, ns: September 2001. Chosen: a simulator begins at 0."""
-_NICENESS = 15  # Niceness of the process; chosen: every node of the robot has priority
-_BUDGET_S = 300.0  # Longest time of a diagnosis, s; chosen: ten times that of ten minutes at 1 kHz
-_REASON_LENGTH = 300  # Most characters of a reason; chosen: one line of diagnostics
 
 
 @dataclass(frozen=True)

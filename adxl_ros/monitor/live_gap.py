@@ -15,9 +15,15 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.monitor import reference_stream
 from adxl_ros.monitor.changes import ChangeTest, DiagnosisInput, GapChange, LONGEST_BLOCKS
-from adxl_ros.monitor.reference_stream import ComparedBlock, ReferenceKind
+from adxl_ros.monitor.reference_stream import (
+    AFTER_NS,
+    ComparedBlock,
+    Prediction,
+    ReferenceKind,
+    ReferenceStream,
+    StreamBuffer,
+)
 from adxl_ros.report.quantities import Interval
 import numpy as np
 import scipy
@@ -96,8 +102,8 @@ class LiveGap:
         self._settings = settings
         span_ns = round(settings.history_s * 1e9)
         # The reference, which takes its messages itself
-        self.reference = reference_stream.ReferenceStream(kind, sensor, span_ns)
-        self._samples = reference_stream.StreamBuffer(len(sensor.axes), span_ns)
+        self.reference = ReferenceStream(kind, sensor, span_ns)
+        self._samples = StreamBuffer(len(sensor.axes), span_ns)
         self.counts = dict.fromkeys(_COUNTS, 0)  # Counts since the start
         self.obstacle = 'no samples yet'  # Why the newest second was not compared; empty if it was
         self.changes: list[GapChange] = []  # Changes so far, the newest last
@@ -123,7 +129,7 @@ class LiveGap:
             (G0_MPS2 * drift_g,) * count + any_noise,
         )
         self._changed_ns: dict[str, int] = {}
-        self._prediction = reference_stream.Prediction(sensor, self.reference)
+        self._prediction = Prediction(sensor, self.reference)
         self.left_out = self._prediction.left_out  # Effects that the reference cannot drive
         self._next_ns: int | None = None
         self._compared_ns: int | None = None
@@ -234,14 +240,14 @@ class LiveGap:
         measured_hz = stamped_rate_hz((stamps_ns - stamps_ns[0]) * 1e-9)
         if abs(measured_hz / self.sensor.rate_hz - 1) > _RATE_TOLERANCE:
             self.sensor = replace(self.sensor, rate_hz=measured_hz)
-            self._prediction = reference_stream.Prediction(self.sensor, self.reference)
+            self._prediction = Prediction(self.sensor, self.reference)
         self._next_ns = -(-int(stamps_ns[0]) // BLOCK_NS) * BLOCK_NS
         return True
 
     def _waits(self, end_ns: int, newest_ns: int) -> bool:
         """Return whether a block waits for its reference; set the obstacle where it does long."""
         reference_ns = self.reference.readings.newest_ns
-        if reference_ns is not None and reference_ns >= end_ns + reference_stream.AFTER_NS:
+        if reference_ns is not None and reference_ns >= end_ns + AFTER_NS:
             return False
         waits = newest_ns - end_ns < _LATE_NS
         if not waits or reference_ns is None:

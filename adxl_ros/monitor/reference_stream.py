@@ -20,9 +20,10 @@ from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Concern
 from adxl_ros.model.kinematics import gravity_slopes
 from adxl_ros.model.sensor import Sensor, to_nominal_mps2
-from adxl_ros.simulate.motion import ForcePath, Held, INTERNAL_RATE_HZ, Motion, Path, SmoothedPath
+from adxl_ros.simulate.motion import ForcePath, Held, INTERNAL_RATE_HZ, Motion, Path
 from adxl_ros.simulate.response import Response
 from adxl_ros.simulate.robot import Robot, RobotPath
+from adxl_ros.simulate.smoothed_path import SmoothedPath
 import numpy as np
 import scipy
 
@@ -67,6 +68,8 @@ _GRID_NS = 4_000_000
 """Distance of the forces of a robot, ns. Chosen: an encoder shows nothing faster."""
 _SMALLEST_MPS2 = 1e-9
 """Smallest standard deviation of a block, m/s²; a simulated sensor may have no noise."""
+BlockMotion = tuple[bool, np.ndarray]
+"""Whether the reference moves in a block, and what its encoders make of the force, m/s², (3,)."""
 
 
 class StreamBuffer:
@@ -102,7 +105,7 @@ class StreamBuffer:
     def between(self, begin_ns: int, end_ns: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the stamps, ns, (n,), and rows, (n, k), of a time."""
         pieces = [*takewhile(lambda piece: piece[0][-1] >= begin_ns, reversed(self._pieces))]
-        stamps, rows = (np.concatenate(parts) for parts in zip(self._nothing, *pieces[::-1]))
+        stamps, rows = map(np.concatenate, zip(self._nothing, *pieces[::-1]))
         part = slice(*np.searchsorted(stamps, [begin_ns, end_ns]))
         return stamps[part], rows[part]
 
@@ -118,10 +121,6 @@ class ReferenceKind(Enum):
     STAGE = 'stage'
     IMU = 'imu'
     ROBOT = 'robot'
-
-
-BlockMotion = tuple[bool, np.ndarray]
-"""Whether the reference moves in a block, and what its encoders make of the force, m/s², (3,)."""
 
 
 class ReferenceStream:

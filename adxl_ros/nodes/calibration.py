@@ -5,34 +5,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 import os
 from pathlib import Path
-import signal
-import subprocess
-import sys
-import termios
 from typing import Any
 
-from adxl_ros.calibrate.guided import controller, pose_plan, screen_contents
-from adxl_ros.calibrate.guided.controller import (
-    Controller,
-    ControllerState,
-    IDLE_TEXT,
-    RequestAnswer,
-)
+from adxl_ros.calibrate.guided import controller, pose_plan
+from adxl_ros.calibrate.guided.controller import ControllerState, RequestAnswer
 from adxl_ros.calibrate.guided.guide import NextPose
-from adxl_ros.calibrate.guided.rest_guides import ThermalSettings
-from adxl_ros.calibrate.guided.screen_contents import KeyAction, Phase, StageMode
+from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.session import SessionSettings
+from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
 from adxl_ros.compensate.live_stream import UNKNOWN_ANGLE_RAD2
 from adxl_ros.files import calibration_store, cdr
 from adxl_ros.files.recording_columns import JOINTS
 from adxl_ros.model.sensor import Sensor, to_volts
 from adxl_ros.nodes import parameter_checks, parameters, params_files, sensor_parameters, topics
-from adxl_ros.nodes.jobs import executable, held_output
+from adxl_ros.nodes.calibration_screen import DisplayPublisher
 from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import create_publisher, Level, Status, status_message, STEADY
@@ -40,8 +30,41 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
-from std_msgs.msg import String
 from std_srvs.srv import Trigger
+
+_REPEAT_NS = 500_000_000
+"""Time between two commands of the same pose, ns: a stage that starts late, or that has lost the
+first command, loses at most this of a pose of seconds."""
+_COMMAND_QUEUE = 10
+"""Commands that are kept for a recorder that stalls: a bag then has every command."""
+_POLL_S = 0.02
+"""Time between two steps of the controller, s. It ends a dwell late by at most this: by 1 % of 2
+s, and by 0.4 s where sensor time is twenty times real time."""
+_FAREWELL_NS = 2_500_000_000
+"""Time from the end of a calibration to that of the node, ns: two reports of the diagnostics, one
+a second, come within it, so that a screen or recorder has the result."""
+_QUEUE = 100
+"""Messages that wait while the node fits: 100 s of temperature and supply at 1 Hz; a fit takes
+some seconds."""
+_STAGE_TOPICS = ('stage/command', 'stage/joint_states')
+_STAGE_QUEUE = 1000
+"""Messages of the stage that wait meanwhile; more, because its angles come faster."""
+_CHECK_POSES = {'full': 16, 'quick': 8}
+"""Check poses by kind of the pose plan. Their rms is then known within 18 and 25 %. They are about
+a tenth, or a fifth, of the poses; more of them would weaken the fit."""
+_EXAMPLES = {
+    'a stage that is turned by hand': '--ros-args -p stage.mode:=manual -p output:=unit.yaml',
+    'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml',
+}
+"""Examples of arguments, by their purpose."""
+_SAMPLES = 'imu/data_raw'  # Topic of the samples, relative to the namespace of the node
+_YAW_VARIANCE = 8
+"""Place of the variance of yaw in an orientation's covariance of 9 numbers, from 0."""
+_INFO_NS = 1_000_000_000
+"""Time that samples wait for `sensor_info`, ns. A latched message comes within it, also where
+sensor time is ten times real time; until then nothing is measured, so that more delays the first
+pose."""
+_SAMPLES_QUEUE = 20000  # Samples that are kept: 20 s at 1 kHz, longer than a fit takes
 
 
 @dataclass(frozen=True)
@@ -147,74 +170,6 @@ class CalibrationSettings:
     )
 
 
-_SCREEN_END_S = 5.0
-"""Longest wait for the end of the screen, s. It ends within one callback, 0.02 s; a process that
-hangs is killed after this, and the node's own end waits as long."""
-_RESET = b'\x1b[?1049l\x1b[?2004l\x1b[?25h\x1b[0m'
-"""Leaves alternate screen and bracketed paste and shows the cursor, by the codes of xterm."""
-
-
-def open_screen(node_name: str, log: Callable[[str], object]) -> OwnScreen | None:
-    """Start a screen if this process has a terminal, and is no background job of it."""
-    is_terminal = all(stream and stream.isatty() for stream in (sys.stdin, sys.stdout))
-    if not is_terminal or os.environ.get('TERM') == 'dumb':
-        return None
-    # A terminal that does not control this process has no background.
-    with suppress(OSError):
-        if os.tcgetpgrp(sys.stdin.fileno()) != os.getpgrp():
-            return None
-    try:
-        import prompt_toolkit  # noqa: F401
-    except ImportError:
-        log('no screen, plain lines: it needs prompt_toolkit; pip install prompt_toolkit')
-        return None
-    return OwnScreen(node_name)
-
-
-class OwnScreen:
-    """A process of the executable `screen`, which draws where this process would print."""
-
-    def __init__(self, node_name: str) -> None:
-        self._saved = termios.tcgetattr(sys.stdin.fileno())
-        # Ctrl-C during the start is for the node. The screen inherits the mask.
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        self.process = subprocess.Popen(
-            [
-                sys.executable,
-                executable('screen'),
-                '--ros-args',
-                '-p',
-                f'node:={node_name}',
-                '-p',
-                f'node_pid:={os.getpid()}',
-            ]
-        )
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        self._output = ExitStack()
-        self._output.enter_context(held_output())
-
-    def close(self) -> None:
-        """End the screen, restore the terminal if the screen did not, and print what was held."""
-        self.process.terminate()
-        try:
-            self.process.wait(_SCREEN_END_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-        if self.process.returncode < 0:
-            with suppress(OSError, termios.error):
-                os.write(sys.stdin.fileno(), _RESET)
-                termios.tcsetattr(sys.stdin.fileno(), termios.TCSANOW, self._saved)
-        self._output.close()
-
-
-_REPEAT_NS = 500_000_000
-"""Time between two commands of the same pose, ns: a stage that starts late, or that has lost the
-first command, loses at most this of a pose of seconds."""
-_COMMAND_QUEUE = 10
-"""Commands that are kept for a recorder that stalls: a bag then has every command."""
-
-
 class Announcer:
     """
     Announces the next pose.
@@ -264,137 +219,6 @@ class Announcer:
 
     def _publish(self, text: str, values: Mapping[str, str | float]) -> None:
         self._next.publish(status_message('next_pose', Status(Level.OK, text, '', values)))
-
-
-_PERIOD_S = 0.2
-"""Time between two messages, s: numbers that change more often than 5 times a second are not
-read."""
-
-_ABORT = KeyAction('a', 'abort', 'abort')
-_RUNNING = (
-    KeyAction('r', 'redo', 'redo'),
-    KeyAction('s', 'skip', 'skip'),
-    KeyAction('f', 'finish', 'finish'),
-    _ABORT,
-)
-"""Keys while a session runs."""
-_BY_HAND = (KeyAction('c', 'capture', 'capture'), *_RUNNING)
-"""Keys while a session runs whose poses an operator captures."""
-_KEYS = {
-    ControllerState.IDLE: (KeyAction('b', 'begin', 'start'),),
-    ControllerState.WAITING_FOR_SENSOR: (_ABORT,),
-    ControllerState.ASKING: (
-        KeyAction('y', 'go on', 'resume'),
-        KeyAction('n', 'begin again', 'start_over'),
-        _ABORT,
-    ),
-}
-"""Keys while no session runs, by the state."""
-
-
-class DisplayPublisher:
-    """
-    Publishes the contents of the screen on `~/display` while somebody subscribes to it.
-
-    In a terminal it also starts a screen. The controller learns whether somebody can answer its
-    question: a screen is a client of `~/resume`, and a recorder is not.
-    """
-
-    def __init__(self, node: Node, controller: Controller, starts_screen: bool) -> None:
-        self._node = node
-        self._controller = controller
-        self._own_screen = (
-            open_screen(node.get_fully_qualified_name(), node.get_logger().info)
-            if starts_screen
-            else None
-        )
-        controller.may_ask = self._own_screen is not None
-        self._publisher = create_publisher(node, String, '~/display', 1, latched=True)
-        node.create_timer(_PERIOD_S, self.update, clock=STEADY)
-
-    def update(self) -> None:
-        """Notice who looks, and publish the contents for them."""
-        controller = self._controller
-        if self._own_screen is not None and self._own_screen.process.poll() is not None:
-            self.close()
-            self._node.get_logger().warning('the screen has ended; plain lines from here on')
-        controller.may_ask = self._own_screen is not None or bool(
-            self._node.count_clients('~/resume')
-        )
-        if controller.state is ControllerState.ASKING and not controller.may_ask:
-            controller.start(start_over=False)
-        controller.shows_idle_stream = bool(self._publisher.get_subscription_count())
-        if controller.shows_idle_stream:
-            status = controller.status()
-            self._publish(status.phase, status.text.replace(IDLE_TEXT, 'press b to begin'))
-
-    def show_fit(self, text: str) -> None:
-        """Publish at once that the fit begins, which takes a while."""
-        self._publish(Phase.FIT, text)
-
-    def close(self) -> None:
-        """End the screen that the node has started."""
-        if self._own_screen is not None:
-            self._own_screen.close()
-            self._own_screen = None
-
-    def _publish(self, phase: Phase, text: str) -> None:
-        controller = self._controller
-        stream = self._controller.stream
-        nominal = stream.nominal
-        session = controller.session
-        newest = stream.newest
-        usual = _BY_HAND if controller.settings.operator_captures else _RUNNING
-        keys = () if phase is Phase.FIT else _KEYS.get(controller.state, usual)
-        coefficients: list[screen_contents.ScreenRow] = []
-        if session is not None:
-            rows, coefficients = session.rows()
-        else:
-            rows = [] if newest is None else newest.rows(newest.stillness())
-        self._publisher.publish(
-            String(
-                data=screen_contents.ScreenContents(
-                    phase=phase,
-                    text=text,
-                    unit=f'{nominal.serial} ({nominal.axes})' if nominal else '',
-                    output=str(controller.settings.output),
-                    keys=keys,
-                    rows=tuple(rows),
-                    coefficients=tuple(coefficients),
-                    outcome=controller.outcome,
-                ).to_json()
-            )
-        )
-
-
-_POLL_S = 0.02
-"""Time between two steps of the controller, s. It ends a dwell late by at most this: by 1 % of 2
-s, and by 0.4 s where sensor time is twenty times real time."""
-_FAREWELL_NS = 2_500_000_000
-"""Time from the end of a calibration to that of the node, ns: two reports of the diagnostics, one
-a second, come within it, so that a screen or recorder has the result."""
-_QUEUE = 100
-"""Messages that wait while the node fits: 100 s of temperature and supply at 1 Hz; a fit takes
-some seconds."""
-_STAGE_TOPICS = ('stage/command', 'stage/joint_states')
-_STAGE_QUEUE = 1000
-"""Messages of the stage that wait meanwhile; more, because its angles come faster."""
-_CHECK_POSES = {'full': 16, 'quick': 8}
-"""Check poses by kind of the pose plan. Their rms is then known within 18 and 25 %. They are about
-a tenth, or a fifth, of the poses; more of them would weaken the fit."""
-_EXAMPLES = {
-    'a stage that is turned by hand': '--ros-args -p stage.mode:=manual -p output:=unit.yaml',
-    'a three-axis sensor without a stage': '--ros-args -p mode:=gravity -p output:=unit.yaml',
-}
-"""Examples of arguments, by their purpose."""
-_SAMPLES = 'imu/data_raw'  # Topic of the samples, relative to the namespace of the node
-_YAW_VARIANCE = 8
-"""Place of the variance of yaw in an orientation's covariance of 9 numbers, from 0."""
-_INFO_NS = 1_000_000_000
-"""Time that samples wait for `sensor_info`, ns. A latched message comes within it, also where
-sensor time is ten times real time; until then nothing is measured, so that more delays the first
-pose."""
-_SAMPLES_QUEUE = 20000  # Samples that are kept: 20 s at 1 kHz, longer than a fit takes
 
 
 class WaitingSamples:
@@ -536,16 +360,7 @@ class Calibration(Node):
     def _connect(self) -> None:
         """Make diagnostics, subscriptions, services and the timer."""
         topics.DiagnosticsReporter(self, 'calibration', self._status)
-        topics.create_subscription(
-            self,
-            DiagnosticStatus,
-            'sensor_info',
-            lambda message: self._controller.read_sensor_info(
-                topics.stream_info(message, 'sensor_info')
-            ),
-            1,
-            latched=True,
-        )
+        topics.subscribe_info(self, 'sensor_info', self._controller.read_sensor_info)
         self._stage = {
             topic: topics.Inbox(self, JointState, topic, _STAGE_QUEUE)
             for topic in (_STAGE_TOPICS if self._own.mode == 'stage' else ())
@@ -589,13 +404,11 @@ class Calibration(Node):
             raise SystemExit(0 if self._controller.outcome else 1)
 
     def _status(self) -> Status:
-        status, serial, values = self._controller.report()
-        return Status(self._level(), status.text, serial, values)
-
-    def _level(self) -> Level:
+        report = self._controller.report()
+        level = Level.WARN if report.status.late else Level.OK
         if self._samples.mixture():
-            return Level.ERROR
-        return Level.WARN if self._controller.status().late else Level.OK
+            level = Level.ERROR
+        return Status(level, report.status.text, report.serial, report.values)
 
     def _read_stage(self) -> None:
         """Give the commands and the angles of the stage that have come to the guide."""
@@ -620,11 +433,11 @@ class Calibration(Node):
     def _service(self, request: Callable[[], RequestAnswer]) -> Callable[..., Trigger.Response]:
         """Make the callback of a service that calls a request of the controller."""
 
-        def respond(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        def respond(*_: object) -> Trigger.Response:
             self._read_stage()
-            response.success, response.message = request()
+            answer = request()
             self._display.update()
-            return response
+            return Trigger.Response(success=answer.success, message=answer.message)
 
         return respond
 
@@ -644,7 +457,7 @@ def _session_settings(own: CalibrationSettings) -> SessionSettings:
         ).tolist()
     )
     step_rad = float(np.radians(own.step_deg))
-    capture = screen_contents.CaptureSettings(
+    capture = CaptureSettings(
         dwell_s=own.dwell_s,
         tolerance_rad=own.tolerance_rad,
         timeout_s=own.timeout_s,

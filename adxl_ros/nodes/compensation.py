@@ -10,9 +10,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from math import isfinite
-from pathlib import Path
 from typing import Any
 
 from adxl_ros.compensate.compensation_policy import CompensationPolicy, StreamInterval
@@ -20,27 +18,37 @@ from adxl_ros.compensate.inversions import HALF
 from adxl_ros.compensate.live_stream import COUNTS, LiveStream
 from adxl_ros.errors import UserError
 from adxl_ros.files import calibration_store, imu_message, parameter_file
+from adxl_ros.files.stream_info import StreamInfo
 from adxl_ros.links.support.base import COLUMNS
-from adxl_ros.model import noise
-from adxl_ros.model.constants import G0_MPS2
-from adxl_ros.model.kinematics import Mounting
 from adxl_ros.model.sensor import Sensor
-from adxl_ros.nodes import parameter_checks, parameters, params_files, sensor_parameters, topics
+from adxl_ros.nodes import parameter_checks, parameters, sensor_parameters, topics
+from adxl_ros.nodes.mounting import (
+    FEWEST_SAMPLES,
+    mounting_by_angles,
+    mounting_of,
+    MountingParameters,
+    NamedSensor,
+)
 from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.sample_output import age_report, MOST_AGES
 from adxl_ros.nodes.topics import Level, Status, STEADY
 from adxl_ros.signals.recorded_gravity import LIVE_WINDOW_S, LiveLook
 from adxl_ros.signals.recorded_sensor import sensor_of_stream
-from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Vector3Stamped
-import numpy as np
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.task import Future
 from sensor_msgs.msg import Imu
-from std_srvs.srv import Trigger
+
+_DEPTH = 100  # Samples that are kept while the node is busy: 0.1 s at 1 kHz
+_LOOK_S = 0.5
+"""Time between two looks at who publishes and, where it is unknown, at the sensor, s. A driver
+that was exchanged is noticed within it, before its first rest; discovery itself takes 0.3 s."""
+_EXAMPLES = {
+    'the newest calibration of the unit in the store': '',
+    'a calibration by its file': '--ros-args -p calibration:=unit.yaml',
+}
+"""Examples of arguments, by their purpose."""
 
 
 @dataclass(frozen=True)
@@ -94,165 +102,6 @@ class CompensationSettings:
     )
 
 
-_MOUNTING = 'mounting.'  # Begin of the names of the parameters of the mounting
-_RPY = f'{_MOUNTING}rpy_rad'  # Parameter of the rotation
-_LEVEL_S = 1.0
-"""Time over which a rest is averaged, s. At 100 Hz the mean has a tenth of the noise of a sample,
-0.003° of tilt for an ADXL203."""
-_FEWEST_SAMPLES = 10
-"""Smallest number of samples of that rest: their scatter is then known within a quarter, which
-tells motion from noise."""
-_MAX_NOISE = 3.0
-"""Largest scatter of a rest, in standard deviations of a sample's noise. The scatter of ten
-samples at rest exceeds twice that in one of 25 000 rests, three times never."""
-_MAX_GRAVITY_ERROR = 0.1
-"""Largest relative departure of a rest from gravity: beyond the zero-g of an uncalibrated ADXL203,
-0.1 g, another unit of measurement or motion explains it."""
-
-
-class MountingParameters:
-    """The parameters `mounting.*` and the service `~/level` of a node."""
-
-    def __init__(self, node: Node, stream: LiveStream, mounting: Mounting, frame_id: str) -> None:
-        self._node = node
-        self._stream = stream
-        self._frame_id = frame_id
-        self._path = ''
-        # What was given counts before the file of a calibration.
-        self._is_given = _RPY in parameters.given_parameters(node)
-        self._mount(mounting)
-        parameters.on_change(node, _RPY, _mounting, self._mount)
-        # The answer comes after a second of samples, which the node takes meanwhile.
-        node.create_service(
-            Trigger, '~/level', self._on_level, callback_group=ReentrantCallbackGroup()
-        )
-
-    def take(self, path: str, sensor: Sensor) -> None:
-        """Use the mounting that the file of a calibration has, unless one was given."""
-        self._path = path
-        mounting = _mounting_of(path, sensor)
-        if mounting is None:
-            return
-        if not self._is_given:
-            self._node.set_parameters([Parameter(_RPY, value=list(mounting.rpy_rad))])
-        elif mounting != self._mounting:
-            self._node.get_logger().warning(
-                f'{_RPY} is given, and counts before that of {path}: {list(mounting.rpy_rad)}'
-            )
-
-    def _mount(self, mounting: Mounting) -> None:
-        self._mounting = mounting
-        self._stream.mount(mounting, self._frame_id)
-
-    async def _on_level(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        over: Future = Future()
-        self._stream.collect()
-        timer = self._node.create_timer(_LEVEL_S, lambda: over.set_result(True), clock=STEADY)
-        await over
-        self._node.destroy_timer(timer)
-        try:
-            levelled = level(self._mounting, self._stream.collected(), self._stream.sensor)
-        except UserError as error:
-            response.message = f'{error}'
-            return response
-        before_rad = list(self._mounting.rpy_rad)
-        rpy_rad = [round(angle, 6) for angle in levelled.rpy_rad]
-        self._node.set_parameters([Parameter(_RPY, value=rpy_rad)])
-        response.success = True
-        response.message = self._kept(rpy_rad, before_rad)
-        self._node.get_logger().info(response.message)
-        return response
-
-    def _kept(self, rpy_rad: list[float], before_rad: list[float]) -> str:
-        """Write a new mounting where the next start finds it; return where that is."""
-        path = (
-            params_files.file_of(_RPY)
-            if self._is_given
-            else self._path or params_files.file_of('format')
-        )
-        begin = f'level: {_RPY} is {rpy_rad}'
-        option = f"to keep it, start the node with -p '{_RPY}:={rpy_rad}'"
-        if not path:
-            return f'{begin} until this node ends; {option}'
-        date = datetime.now(timezone.utc).isoformat(timespec='seconds')
-        try:
-            params_files.write_into(
-                path,
-                self._node.get_fully_qualified_name(),
-                {
-                    _RPY: f'[{", ".join(map(parameter_file.float_text, rpy_rad))}]',
-                    'provenance.levelled': f"'{date}, {_RPY} before: {before_rad}'",
-                },
-            )
-        except UserError as error:
-            return f'{begin} until this node ends: {error}; {option}'
-        return f'{begin}, written into {Path(path).resolve()}, which the next start reads'
-
-
-def level(mounting: Mounting, forces_mps2: np.ndarray, sensor: Sensor) -> Mounting:
-    """
-    Return the mounting that makes the force of a rest vertical.
-
-    forces_mps2: corrected samples in the frame of the case, m/s², (n, 3).
-    """
-    if len(forces_mps2) < _FEWEST_SAMPLES:
-        raise UserError(
-            f'{len(forces_mps2)} samples in {_LEVEL_S:g} s; at least {_FEWEST_SAMPLES} are needed'
-        )
-    mean_mps2 = forces_mps2.mean(axis=0)
-    scatter_mps2 = forces_mps2.std(axis=0)[: len(sensor.axes)]
-    noise_mps2 = noise.sample_std_v(sensor) / sensor.scale_v_per_g * G0_MPS2
-    worst = int(np.argmax(scatter_mps2 / noise_mps2))
-    if scatter_mps2[worst] > _MAX_NOISE * noise_mps2[worst]:
-        raise UserError(
-            f'the sensor moves: {sensor.axes[worst]} scatters by '
-            f'{scatter_mps2[worst]:.2g} m/s², and its noise is '
-            f'{noise_mps2[worst]:.2g} m/s²; let the robot rest on level ground'
-        )
-    magnitude_mps2 = float(np.linalg.norm(mean_mps2))
-    if abs(magnitude_mps2 / sensor.local_gravity_mps2 - 1) > _MAX_GRAVITY_ERROR:
-        raise UserError(
-            f'the sensor reads {magnitude_mps2:.2f} m/s², and gravity is '
-            f'{sensor.local_gravity_mps2:.2f} m/s²; calibrate it first'
-        )
-    return mounting.levelled(mean_mps2.tolist())
-
-
-def _mounting(
-    rpy_rad: Any, make_error: parameter_file.MakeError = params_files.parameter_error
-) -> Mounting:
-    """Return the mounting of three angles, rad; refuse what is none."""
-    try:
-        roll, pitch, yaw = map(float, rpy_rad)
-        is_right = bool(np.abs([roll, pitch, yaw]).max() <= 2 * np.pi)
-    except (TypeError, ValueError):
-        is_right = False
-    if not is_right:
-        raise make_error(_RPY, f'{rpy_rad} is not roll, pitch and yaw in rad, each within a turn')
-    return Mounting((roll, pitch, yaw))
-
-
-def _mounting_of(path: str, sensor: Sensor) -> Mounting | None:
-    """Return the mounting that the file of a calibration has, None where it has none."""
-    rpy_rad = sensor.mounting.get(_RPY.removeprefix(_MOUNTING))
-    return (
-        None
-        if rpy_rad is None
-        else _mounting(rpy_rad, lambda key, reason: UserError(f'{path}: {key}: {reason}'))
-    )
-
-
-_DEPTH = 100  # Samples that are kept while the node is busy: 0.1 s at 1 kHz
-_LOOK_S = 0.5
-"""Time between two looks at who publishes and, where it is unknown, at the sensor, s. A driver
-that was exchanged is noticed within it, before its first rest; discovery itself takes 0.3 s."""
-_EXAMPLES = {
-    'the newest calibration of the unit in the store': '',
-    'a calibration by its file': '--ros-args -p calibration:=unit.yaml',
-}
-"""Examples of arguments, by their purpose."""
-
-
 class Compensation(Node):
     """
     The node of the compensation.
@@ -266,9 +115,9 @@ class Compensation(Node):
         parameter_checks.check_given(self)
         self._settings = settings = parameters.declare_all(self, CompensationSettings)
         paper = settings.inverse == 'paper'
-        mounting = _mounting(settings.rpy_rad)
+        mounting = mounting_by_angles(settings.rpy_rad)
         self._heard_ns: dict[str, int] = {}
-        self._named: tuple[Sensor, str]
+        self._named: NamedSensor
         self._obstacle = self._told = ''  # Why the sensor is unknown; the newest line on it
         self._reported: Counter[str] = Counter()
         self._reported_ns = STEADY.now().nanoseconds
@@ -294,7 +143,7 @@ class Compensation(Node):
         self._look_at_gravity = LiveLook()
         self._samples = topics.Inbox(self, Imu, 'imu/data_raw', _DEPTH, settings.samples_unit)
         self._flat = sensor_parameters.given_sensor(self)
-        own = (
+        own = NamedSensor(
             sensor_parameters.make_sensor(self._flat, may_measure=True),
             (
                 'the parameters given'
@@ -303,17 +152,15 @@ class Compensation(Node):
             ),
         )
         loaded = self._load(settings.calibration)
-        self._use(*(loaded or own))
+        self._use(loaded or own)
         self._mounting = MountingParameters(
             self, self._stream, mounting, settings.mounting_frame_id
         )
         if loaded:
-            self._mounting.take(settings.calibration, loaded[0])
+            self._mounting.take(loaded)
         parameters.on_change(self, 'calibration', self._load, self._exchange)
         self.create_timer(_LOOK_S, self._look, clock=STEADY)
-        topics.create_subscription(
-            self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True
-        )
+        topics.subscribe_info(self, self.resolve_topic_name('sensor_info'), self._on_info)
         self._surroundings = topics.SurroundingTopics(self, 1)
         self._thread = topics.RepeatingThread(self, self._receive, 'imu/data_raw')
 
@@ -327,37 +174,37 @@ class Compensation(Node):
         stamp_s, _ = imu_message.read(raw)
         self._ages_s.append(self.get_clock().now().nanoseconds * 1e-9 - stamp_s)
 
-    def _load(self, path: str) -> tuple[Sensor, str] | None:
+    def _load(self, path: str) -> NamedSensor | None:
         """Load the file of `calibration`, if one is named; it is refused if it does not fit."""
         if not path:
             return None
-        sensor = parameter_file.load(path)
-        self._policy.check(sensor)
-        _mounting_of(path, sensor)
-        return sensor, path
+        loaded = NamedSensor(parameter_file.load(path), path)
+        self._policy.check(loaded.sensor)
+        mounting_of(loaded)
+        return loaded
 
-    def _exchange(self, loaded: tuple[Sensor, str] | None) -> None:
+    def _exchange(self, loaded: NamedSensor | None) -> None:
         if loaded is not None:
             self._told = ''
-            self._use(*loaded)
-            sensor, path = loaded
-            self._mounting.take(path, sensor)
+            self._use(loaded)
+            self._mounting.take(loaded)
 
-    def _use(self, sensor: Sensor, source: str) -> None:
-        """Correct samples by a sensor from the next one on; `source` says where it is from."""
-        self._named = sensor, source
+    def _use(self, named: NamedSensor) -> None:
+        """Correct samples by a sensor from the next one on."""
+        self._named = named
+        sensor = named.sensor
         self._stream.release()
         is_named = sensor.effects or self._calibration() or sensor_parameters.is_from_file(self)
         self._stream.may_be_foreign = not (is_named or self._policy.info)
         if sensor.unstated:
             self._stream.hold()
-        self._correct_by(sensor, source)
+        self._correct_by(*named)
 
     def _correct_by(self, sensor: Sensor, source: str) -> None:
         text = self._policy.use(sensor, source)
         self._stream.use(sensor, self._policy.rate_hz)
         self._newest: deque[bytes] = deque(
-            maxlen=round(max(LIVE_WINDOW_S * self._policy.rate_hz, _FEWEST_SAMPLES))
+            maxlen=round(max(LIVE_WINDOW_S * self._policy.rate_hz, FEWEST_SAMPLES))
         )
         sensor_parameters.show_sensor(self, sensor)
         if self._stream.unknown is None and text != self._told:
@@ -373,7 +220,7 @@ class Compensation(Node):
         samples = self._stream.unknown
         if samples is None:
             return
-        named, _ = self._named
+        named = self._named.sensor
         try:
             sensor = (
                 named if named.unstated else sensor_parameters.anonymous_sensor(self, self._flat)
@@ -404,10 +251,10 @@ class Compensation(Node):
         faults.no_gravity = text if is_clear else ''
         faults.wrong_gravity = '' if is_clear else text
 
-    def _on_info(self, message: DiagnosticStatus) -> None:
-        self._policy.info = topics.stream_info(message, self.resolve_topic_name('sensor_info'))
-        if self._stream.may_be_foreign or self._policy.sensor is not self._named[0]:
-            self._use(*self._named)
+    def _on_info(self, info: StreamInfo) -> None:
+        self._policy.info = info
+        if self._stream.may_be_foreign or self._policy.sensor is not self._named.sensor:
+            self._use(self._named)
         self._take_from_store()
         self._stream.use(self._policy.sensor, self._policy.rate_hz)
         self._assess()

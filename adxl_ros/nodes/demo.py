@@ -18,8 +18,8 @@ from typing import NamedTuple
 from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.poses import Poses
-from adxl_ros.calibrate.report import held_out as unseen
 from adxl_ros.calibrate.report.acceptance import acceptance_lines, screen_table
+from adxl_ros.calibrate.report.held_out import HeldOutErrors, pose_errors, summarise
 from adxl_ros.calibrate.result import compare, truth_table
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file, sweep_journal
@@ -166,78 +166,109 @@ def main() -> int:
     return 0
 
 
-def _run_sweep(folder: Path, seed: int) -> None:
-    """Sweep a simulated sensor whose coefficients are drawn at datasheet spread."""
-    truth_path = folder / 'simulated_unit.yaml'
-    nominal_path = folder / 'nominal.yaml'
-    sensor = replace(
-        parameter_file.load(parameter_file.nominal_path()), serial='demo', rate_hz=_RATE_HZ
-    )
-    truth = _draw_unit(sensor, seed)
-    parameter_file.save(nominal_path, sensor)
-    parameter_file.save(truth_path, truth, ['The truth of the simulated unit.'])
-    name = parameter_file.nominal_path().stem
+class _Files(NamedTuple):
+    """The files of a demonstration."""
+
+    truth: Path  # The simulated unit
+    nominal: Path  # What the calibration knows of it
+    output: Path  # The calibration
+    report: Path  # Folder of its page
+    store: Path
+    journal: Path
+    log: Path
+
+
+def _files(folder: Path, name: str) -> _Files:
+    """Return the files in a folder; those of an earlier demonstration are removed."""
     output = folder / f'{name}_demo.yaml'
-    report = folder / 'sweep'
-    _print(
-        f'Demo: calibrate a simulated {name.upper()} whose true coefficients are known   '
-        f'({_DURATION_S} s)',
-        '',
+    files = _Files(
+        truth=folder / 'simulated_unit.yaml',
+        nominal=folder / 'nominal.yaml',
+        output=output,
+        report=folder / 'sweep',
+        store=folder / 'calibrations',
+        journal=output.with_name(f'{output.name}.journal'),
+        log=output.with_suffix('.log'),
     )
-    log = output.with_suffix('.log')
-    journal = output.with_name(f'{output.name}.journal')
     # Results of an earlier demonstration would pass for those of this one.
-    for path in (output, journal):
+    for path in (files.output, files.journal):
         path.unlink(missing_ok=True)
-    commands = [
-        _command('driver', truth_path, _KEEPING | {'link.type': 'sim', 'link.speed': _SPEED}),
-        _command('stage', nominal_path, {'delay_s': _DELAY_S, 'seed': seed}),
+    return files
+
+
+def _commands(files: _Files, seed: int) -> list[list[str]]:
+    """Return the commands of the nodes, in the order of `_STARTED`."""
+    return [
+        _command('driver', files.truth, _KEEPING | {'link.type': 'sim', 'link.speed': _SPEED}),
+        _command('stage', files.nominal, {'delay_s': _DELAY_S, 'seed': seed}),
         _command(
             'calibration',
-            nominal_path,
+            files.nominal,
             {
                 **_UNATTENDED,
-                'output': output,
-                'store': folder / 'calibrations',
-                'report': report,
+                'output': files.output,
+                'store': files.store,
+                'report': files.report,
                 'sweep.planes_deg': _PLANES_DEG,
                 'sweep.step_deg': _STEP_DEG,
                 'sweep.check_poses': _CHECK_POSES,
             },
         ),
     ]
-    total = len(
-        pose_plan.guided(
-            np.radians(_PLANES_DEG).tolist(), float(np.radians(_STEP_DEG)), _CHECK_POSES
-        )
+
+
+def _run_sweep(folder: Path, seed: int) -> None:
+    """Sweep a simulated sensor whose coefficients are drawn at datasheet spread."""
+    name = parameter_file.nominal_path().stem
+    files = _files(folder, name)
+    nominal = replace(
+        parameter_file.load(parameter_file.nominal_path()), serial='demo', rate_hz=_RATE_HZ
     )
-    with log.open('wb') as file, jobs.running(commands, file) as nodes:
-        with jobs.Step('1/3 sweep', 'starting', total) as step:
-
-            def swept() -> bool:
-                count = _poses(journal).accepted
-                step.show(f'{count} of {total} poses', count)
-                return count == total
-
-            _wait(swept, nodes, log)
-        fitting = f'{total - _CHECK_POSES} poses'
-        with jobs.Step('2/3 fit', fitting) as step:
-            _wait(output.exists, nodes, log)
-            step.show(f'{fitting}, {parameter_file.load(output).model} model')
-        with jobs.Step('3/3 check', f'{_CHECK_POSES} poses that the fit has not seen'):
-            _wait(lambda: bool(_poses(journal).fitted), nodes, log)
-    poses = Poses.from_records(_poses(journal).fitted)
-    fitted = parameter_file.load(output)
+    truth = _draw_unit(nominal, seed)
+    parameter_file.save(files.nominal, nominal)
+    parameter_file.save(files.truth, truth, ['The truth of the simulated unit.'])
+    _print(
+        f'Demo: calibrate a simulated {name.upper()} whose true coefficients are known   '
+        f'({_DURATION_S} s)',
+        '',
+    )
+    _watch(files, _commands(files, seed))
+    poses = Poses.from_records(_poses(files.journal).fitted)
+    fitted = parameter_file.load(files.output)
     _print(
         '',
-        *screen_table(_held_out_errors(sensor, fitted, poses)),
+        *screen_table(_held_out_errors(nominal, fitted, poses)),
         '',
         *truth_table(compare(fitted, truth)),
         '',
         *acceptance_lines(fitted),
         '',
-        *file_lines({'Page': report / 'report.html', 'Calibration': output}),
+        *file_lines({'Page': files.report / 'report.html', 'Calibration': files.output}),
     )
+
+
+def _watch(files: _Files, commands: Sequence[Sequence[str]]) -> None:
+    """Run the nodes, and show their progress, until the journal has the fitted poses."""
+    total = len(
+        pose_plan.guided(
+            np.radians(_PLANES_DEG).tolist(), float(np.radians(_STEP_DEG)), _CHECK_POSES
+        )
+    )
+    with files.log.open('wb') as file, jobs.running(commands, file) as nodes:
+        with jobs.Step('1/3 sweep', 'starting', total) as step:
+
+            def swept() -> bool:
+                count = _poses(files.journal).accepted
+                step.show(f'{count} of {total} poses', count)
+                return count == total
+
+            _wait(swept, nodes, files.log)
+        fitting = f'{total - _CHECK_POSES} poses'
+        with jobs.Step('2/3 fit', fitting) as step:
+            _wait(files.output.exists, nodes, files.log)
+            step.show(f'{fitting}, {parameter_file.load(files.output).model} model')
+        with jobs.Step('3/3 check', f'{_CHECK_POSES} poses that the fit has not seen'):
+            _wait(lambda: bool(_poses(files.journal).fitted), nodes, files.log)
 
 
 def _draw_unit(sensor: Sensor, seed: int) -> Sensor:
@@ -262,18 +293,15 @@ def _draw_unit(sensor: Sensor, seed: int) -> Sensor:
     return replace(sensor, effects=tuple(_UNIT_EFFECTS), values=values)
 
 
-def _held_out_errors(nominal: Sensor, fitted: Sensor, poses: Poses) -> list[unseen.HeldOutErrors]:
+def _held_out_errors(nominal: Sensor, fitted: Sensor, poses: Poses) -> list[HeldOutErrors]:
     """Return the errors of datasheet, linear and fitted coefficients on the check poses."""
-    held_out = poses.subset(poses.check)
+    checks = poses.subset(poses.check)
     models = {
         'nominal': nominal,
         'linear': linear.fit(nominal, poses.subset(~poses.check)),
         fitted.model: fitted,
     }
-    return [
-        unseen.summarise(model, unseen.pose_errors(sensor, held_out))
-        for model, sensor in models.items()
-    ]
+    return [summarise(model, pose_errors(sensor, checks)) for model, sensor in models.items()]
 
 
 def file_lines(values: dict[str, object]) -> list[str]:

@@ -11,7 +11,14 @@ from typing import Any
 
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files.stream_info import NO_SERIAL
-from adxl_ros.links.support import base
+from adxl_ros.links.support.base import (
+    DEFAULT_LINK,
+    link_module,
+    link_names,
+    LinkStatus,
+    PacedSettings,
+    SimulatorSettings,
+)
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.nodes import parameter_checks, parameters, sensor_parameters
 from adxl_ros.nodes.link_reader import LinkReader
@@ -24,6 +31,14 @@ from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 DEFAULT_FRAME = 'imu_link'  # Frame of the case, unless a parameter or a simulator states it
+_SIMULATED = f'SIMULATED sensor (link.type: {DEFAULT_LINK})'
+"""Words of log and diagnostics where no sensor is read."""
+_EXAMPLES = {
+    'a board on a serial port': '--ros-args -p link.type:=serial -p link.port:=/dev/ttyACM0',
+    "a realistic sensor on a simulator's ideal one": '--ros-args -p link.type:=topic -p '
+    'link.topic:=/imu -p use_sim_time:=true --params-file gap/params.yaml',
+}
+"""Examples of arguments, by their purpose."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +46,10 @@ class DriverSettings:
     """The driver."""
 
     link: str = parameter(
-        base.DEFAULT_LINK,
+        DEFAULT_LINK,
         'where the samples come from',
         name=f'{LINK}type',
-        choices=base.link_names(),
+        choices=link_names(),
     )
     stamp_offset_s: float = parameter(
         0.0,
@@ -48,16 +63,6 @@ class DriverSettings:
         '', 'frame of the case; empty: imu_link, or as a simulator states it'
     )
     autostart: bool = parameter(True, 'configure and activate at the start')
-
-
-_SIMULATED = f'SIMULATED sensor (link.type: {base.DEFAULT_LINK})'
-"""Words of log and diagnostics where no sensor is read."""
-_EXAMPLES = {
-    'a board on a serial port': '--ros-args -p link.type:=serial -p link.port:=/dev/ttyACM0',
-    "a realistic sensor on a simulator's ideal one": '--ros-args -p link.type:=topic -p '
-    'link.topic:=/imu -p use_sim_time:=true --params-file gap/params.yaml',
-}
-"""Examples of arguments, by their purpose."""
 
 
 def _transition(goal: str, *acts: str) -> Callable[..., TransitionCallbackReturn]:
@@ -103,11 +108,11 @@ class Driver(LifecycleNode):
         own = parameters.declare_all(self, DriverSettings)
         self._delay_ns = round(1e9 * own.stamp_offset_s)
         self._link = own.link
-        self._module = base.link_module(own.link)
+        self._module = link_module(own.link)
         self._settings = settings = self._declare_link()
-        has_frame = isinstance(settings, base.SimulatorSettings)
+        has_frame = isinstance(settings, SimulatorSettings)
         self._frame_id = own.frame_id or ('' if has_frame else DEFAULT_FRAME)
-        paced = isinstance(settings, base.PacedSettings)
+        paced = isinstance(settings, PacedSettings)
         # All nodes must share a sensor time that is not real time: this node then publishes it,
         # unless another node does.
         self._is_clock = paced and (
@@ -116,10 +121,10 @@ class Driver(LifecycleNode):
         # A real device lives in real time, whatever the clock of the graph is.
         self._stamp_clock = (
             self.get_clock()
-            if paced or isinstance(settings, base.SimulatorSettings)
+            if paced or isinstance(settings, SimulatorSettings)
             else Clock(clock_type=ClockType.SYSTEM_TIME)
         )
-        self._simulates = self._link == base.DEFAULT_LINK
+        self._simulates = self._link == DEFAULT_LINK
         self._tally = Tally(STEADY.now().nanoseconds)
         self._fault = self._told = ''  # Why there are no samples; the unit that was named last
         self._announces = not own.autostart
@@ -145,11 +150,11 @@ class Driver(LifecycleNode):
         else:
             return
         if 'type' not in given:
-            devices = [name for name in base.link_names() if name != base.DEFAULT_LINK]
+            devices = [name for name in link_names() if name != DEFAULT_LINK]
             raise parameter_error(
                 'link.type',
                 f'is not set, but {reason}; set it to '
-                f'{", ".join(devices)}, or to {base.DEFAULT_LINK} for a '
+                f'{", ".join(devices)}, or to {DEFAULT_LINK} for a '
                 'simulated sensor',
             )
 
@@ -287,12 +292,12 @@ class Driver(LifecycleNode):
         level = self._link_status().level
         return Level.WARN if self._simulates and level is Level.OK else level
 
-    def _link_status(self) -> base.LinkStatus:
+    def _link_status(self) -> LinkStatus:
         """Return how the link works, or why there is none."""
         if self._fault:
-            return base.LinkStatus(Level.ERROR, self._fault)
+            return LinkStatus(Level.ERROR, self._fault)
         if self._reader is None:
-            return base.LinkStatus(Level.WARN, 'inactive, no samples are published')
+            return LinkStatus(Level.WARN, 'inactive, no samples are published')
         status = self._reader.status()
         found = self._output.sensor if self._output else self._sensor
         fault = '' if status.level is Level.ERROR else other_sensor(self._sensor, found)

@@ -15,8 +15,15 @@ from typing import Any
 
 from adxl_ros.files.atomic_write import free_name
 from adxl_ros.files.bag_writer import LiveBag
-from adxl_ros.investigate import investigation
-from adxl_ros.investigate.investigation import Answer, Investigation, OutputFolder, State
+from adxl_ros.investigate.investigation import (
+    Answer,
+    BackgroundDiagnoser,
+    hypothesis_text,
+    Investigation,
+    OutputFolder,
+    RoundOutcome,
+    State,
+)
 from adxl_ros.investigate.manoeuvres import CATALOGUE, Pose, StageLimits
 from adxl_ros.nodes import parameter_checks, parameters, sensor_parameters, topics
 from adxl_ros.nodes.jobs import LiveLine
@@ -32,6 +39,38 @@ from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+
+_INDENT = 11 * ' '  # Spaces in place of the time at the beginning of a line
+_MOST_NAMED = 3
+"""Largest number of hypotheses in a line: more of them fill the line of a terminal."""
+_SAMPLES = 'imu/data_raw'
+_STAGE = 'stage/joint_states'
+_KINDS = {
+    _SAMPLES: Imu,
+    _STAGE: JointState,
+    'stage/command': JointState,
+    'temperature': Temperature,
+    'supply': BatteryState,
+    'sensor_info': DiagnosticStatus,
+}
+"""Type of each recorded topic."""
+_QUEUE = 20000  # Messages of a topic that are kept while the node is busy: 20 s at 1 kHz
+_POLL_S = 0.02
+"""Time between two commands, s: a tenth of `LONGEST_STEP_S`, by which a command is ahead of the
+stage. A command that is late by one turn of the loop is still in time."""
+_FAREWELL_S = 0.5
+"""Time for which the last command is repeated at the end, s: 25 times, so that a subscriber that
+loses messages has it. Until then the stage goes on to an older one."""
+_COMMAND_QUEUE = 10
+"""Commands that are kept for a slow subscriber: 0.2 s of them; an older one moves nothing any
+more."""
+_EXAMPLES = {
+    'a unit by its parameter file, within limits': (
+        '--ros-args --params-file unit.yaml -p limits.rate_deg_s:=10.0 '
+        "-p 'limits.beta_deg:=[-90.0,90.0]'"
+    )
+}
+"""Examples of arguments, by their purpose."""
 
 
 @dataclass(frozen=True)
@@ -56,19 +95,14 @@ class InvestigateSettings:
     seed: int = parameter(0, 'seed of the diagnosis', '', *SEEDS)
 
 
-_INDENT = 11 * ' '  # Spaces in place of the time at the beginning of a line
-_MOST_NAMED = 3
-"""Largest number of hypotheses in a line: more of them fill the line of a terminal."""
-
-
 def answer_lines(minutes: float, answer: Answer) -> list[str]:
     """Return the probabilities after a diagnosis, and what follows."""
     named = '  '.join(
-        f'{investigation.hypothesis_text(h.effects)} {percent(h.probability)}'
+        f'{hypothesis_text(h.effects)} {percent(h.probability)}'
         for h in answer.hypotheses[:_MOST_NAMED]
     )
     lines = wrap(f'{minutes:5.1f} min  {named}', COLUMNS, subsequent_indent=_INDENT)
-    if answer.outcome is investigation.RoundOutcome.GO_ON:
+    if answer.outcome is RoundOutcome.GO_ON:
         lines += wrap(
             f'next: {CATALOGUE[answer.manoeuvre].text}',
             COLUMNS,
@@ -86,39 +120,10 @@ def closing_lines(ended: Investigation, folder: OutputFolder) -> list[str]:
     words = 'rich', '--params', str(folder.parameters), '-o', str(free_name('sim.csv'))
     return [
         '',
-        *end_lines([ended.answers[-1][1].sentence], files, command('simulate', shlex.join(words))),
+        *end_lines(
+            [ended.answers[-1].answer.sentence], files, command('simulate', shlex.join(words))
+        ),
     ]
-
-
-_SAMPLES = 'imu/data_raw'
-_STAGE = 'stage/joint_states'
-_KINDS = {
-    _SAMPLES: Imu,
-    _STAGE: JointState,
-    'stage/command': JointState,
-    'temperature': Temperature,
-    'supply': BatteryState,
-    'sensor_info': DiagnosticStatus,
-}
-"""Type of each recorded topic."""
-_QUEUE = 20000  # Messages of a topic that are kept while the node is busy: 20 s at 1 kHz
-
-_POLL_S = 0.02
-"""Time between two commands, s: a tenth of `LONGEST_STEP_S`, by which a command is ahead of the
-stage. A command that is late by one turn of the loop is still in time."""
-_FAREWELL_S = 0.5
-"""Time for which the last command is repeated at the end, s: 25 times, so that a subscriber that
-loses messages has it. Until then the stage goes on to an older one."""
-_COMMAND_QUEUE = 10
-"""Commands that are kept for a slow subscriber: 0.2 s of them; an older one moves nothing any
-more."""
-_EXAMPLES = {
-    'a unit by its parameter file, within limits': (
-        '--ros-args --params-file unit.yaml -p limits.rate_deg_s:=10.0 '
-        "-p 'limits.beta_deg:=[-90.0,90.0]'"
-    )
-}
-"""Examples of arguments, by their purpose."""
 
 
 class Investigate(Node):
@@ -152,7 +157,7 @@ class Investigate(Node):
         self._investigation = Investigation(
             limits,
             own.minutes,
-            investigation.BackgroundDiagnoser(self._folder, limits, own.seed),
+            BackgroundDiagnoser(self._folder, limits, own.seed),
             lambda minutes, answer: self._screen.add(*answer_lines(minutes, answer)),
             self._flush,
         )
@@ -249,18 +254,16 @@ class Investigate(Node):
             self._folder.make(self._sensor)
             self._bag = LiveBag(self._folder.bag)
 
-    def _on_abort(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_abort(self, *_: object) -> Trigger.Response:
         self._request = '~/abort was called'
-        response.success = True
-        response.message = 'stopped; the stage holds its pose'
-        return response
+        return Trigger.Response(success=True, message='stopped; the stage holds its pose')
 
     def _status(self) -> Status:
         run = self._investigation
         level = Level.WARN if run.state in (State.STOPPED, State.RECORDING) else Level.OK
         values = {'state': run.state.value, 'minutes': run.minutes}
         if run.answers:
-            best = run.answers[-1][1].hypotheses[0]
+            best = run.answers[-1].answer.hypotheses[0]
             values |= {
                 'hypothesis': ' '.join(best.effects) or 'no gap',
                 'probability': best.probability,

@@ -25,6 +25,10 @@ _FIRST_DOMAIN = 60
 """First ROS domain of jobs: robots use low numbers, 0 by default."""
 _DOMAINS = 40
 """Number of ROS domains of jobs: the last one is 99, and 101 the last safe one on Linux."""
+_BAR_WIDTH = 30  # Columns of the bar. A line with its bar has 79 columns
+_NAME_WIDTH = 11  # Columns of the name of a step
+_TEXT_WIDTH = 16  # Columns of the text beside a bar
+_LINE_WIDTH = 69  # Columns of a line without a bar, before its time
 
 
 def use_own_graph() -> None:
@@ -82,12 +86,6 @@ def _flush() -> None:
         # A terminal that has hung up takes nothing.
         with suppress(OSError):
             stream.flush()
-
-
-_BAR_WIDTH = 30  # Columns of the bar. A line with its bar has 79 columns
-_NAME_WIDTH = 11  # Columns of the name of a step
-_TEXT_WIDTH = 16  # Columns of the text beside a bar
-_LINE_WIDTH = 69  # Columns of a line without a bar, before its time
 
 
 class LiveLine:

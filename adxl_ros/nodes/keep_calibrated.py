@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import math
 from pathlib import Path
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.calibrate.keep.keeper import by_axis, Keeper, KeepSettings, KEPT, KeptState
 from adxl_ros.calibrate.keep.stays import RestStream
@@ -24,13 +24,28 @@ from adxl_ros.nodes.parameters import parameter, sample_unit
 from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Inbox, Level, Status
 from adxl_ros.report.quantities import utc
-from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
+
+_INPUT_QUEUE = 10000  # Messages that are kept while the node is busy: 10 s at 1 kHz
+_TURN_S = 0.2
+"""Time between two looks at the topics, s. A look costs as much as ten messages: at 1 kHz a
+twentieth of the work. Rests last for seconds, so that nothing is lost by it."""
+_STEPS = 20
+"""Steps of a ramp. A change of 5 mg has steps of 0.25 mg, below the noise of a sample of an
+ADXL203, 0.5 mg."""
+_SENT_AGAIN_S = 3600.0
+"""Time after which a grown covariance is sent, s. Drift of 1 mg in a year changes it by 10⁻⁴ mg in
+this time; a subscriber that starts anew has a latched message."""
+_EXAMPLES = {
+    'a robot at work': '--ros-args --params-file unit.yaml',
+    'only report what would be adopted': '--ros-args --params-file unit.yaml -p dry_run:=true',
+}
+"""Examples of arguments, by their purpose."""
 
 
 @dataclass(frozen=True)
@@ -55,23 +70,6 @@ class KeepCalibratedSettings:
     output: str = parameter(
         str(calibration_store.default_folder().with_name('kept')), 'folder of the journal'
     )
-
-
-_INPUT_QUEUE = 10000  # Messages that are kept while the node is busy: 10 s at 1 kHz
-_TURN_S = 0.2
-"""Time between two looks at the topics, s. A look costs as much as ten messages: at 1 kHz a
-twentieth of the work. Rests last for seconds, so that nothing is lost by it."""
-_STEPS = 20
-"""Steps of a ramp. A change of 5 mg has steps of 0.25 mg, below the noise of a sample of an
-ADXL203, 0.5 mg."""
-_SENT_AGAIN_S = 3600.0
-"""Time after which a grown covariance is sent, s. Drift of 1 mg in a year changes it by 10⁻⁴ mg in
-this time; a subscriber that starts anew has a latched message."""
-_EXAMPLES = {
-    'a robot at work': '--ros-args --params-file unit.yaml',
-    'only report what would be adopted': '--ros-args --params-file unit.yaml -p dry_run:=true',
-}
-"""Examples of arguments, by their purpose."""
 
 
 class _Receiver:
@@ -120,9 +118,10 @@ class _Receiver:
 
     def turn(self, now_s: float) -> None:
         """Send what is due."""
-        if not self._waiting or not self.is_there or now_s < self._due_s:
+        client = self._client
+        is_due = bool(self._waiting) and now_s >= self._due_s
+        if client is None or not (is_due and client.service_is_ready()):
             return
-        assert self._client is not None
         self._due_s = now_s + self._step_s
         # The one before may still be read.
         self._number = 1 - self._number
@@ -132,12 +131,21 @@ class _Receiver:
             type=ParameterType.PARAMETER_STRING, string_value=str(path.resolve())
         )
         request = SetParameters.Request(parameters=[Parameter(name='calibration', value=value)])
-        future = self._client.call_async(request)
+        future = client.call_async(request)
         future.add_done_callback(lambda done: self._note(done.result()))
 
     def _note(self, response: SetParameters.Response | None) -> None:
         results = response.results if response else []
         self.refusal = next((each.reason for each in results if not each.successful), '')
+
+
+class _Keeping(NamedTuple):
+    """What keeps one calibration."""
+
+    keeper: Keeper
+    stream: RestStream
+    journal: Journal
+    receiver: _Receiver
 
 
 class KeepCalibrated(Node):
@@ -148,32 +156,26 @@ class KeepCalibrated(Node):
         parameter_checks.check_given(self)
         flat = sensor_parameters.given_sensor(self)
         self._own = own = parameters.declare_all(self, KeepCalibratedSettings)
-        self._keeper: Keeper | None = None
-        self._stream: RestStream
-        self._journal: Journal
-        self._receiver: _Receiver | None = None
+        self._keeping: _Keeping | None = None  # None before the sensor is known
         self._newest_ns = 0
         self._sent_s = -_SENT_AGAIN_S
         self._obstacle = 'waiting for sensor_info, which names the unit'
         self._samples = Inbox(self, Imu, 'imu/data_raw', _INPUT_QUEUE, own.samples_unit)
         self._surroundings = topics.SurroundingTopics(self, _INPUT_QUEUE)
-        self._info_topic = self.resolve_topic_name('sensor_info')
         given = sensor_parameters.make_sensor(flat, may_measure=True)
         if given.effects:
             self._begin(given)
-        topics.create_subscription(
-            self, DiagnosticStatus, 'sensor_info', self._on_info, 1, latched=True
-        )
+        topics.subscribe_info(self, self.resolve_topic_name('sensor_info'), self._on_info)
         topics.DiagnosticsReporter(self, 'calibration', self._status)
         self.create_service(Trigger, '~/undo', self._on_undo)
         self.create_timer(_TURN_S, self._turn, clock=topics.STEADY)
 
     def close(self) -> None:
         """Close the journal."""
-        if self._keeper is not None:
-            self._journal.close()
+        if self._keeping is not None:
+            self._keeping.journal.close()
 
-    def _begin(self, sensor: Sensor) -> None:
+    def _begin(self, sensor: Sensor) -> _Keeping:
         """Keep a calibration, or go on with its journal."""
         own = self._own
         first = sensor.provenance.get(KEPT)
@@ -188,34 +190,34 @@ class KeepCalibrated(Node):
             sensor = parameter_file.from_flat(head['base'], params_files.parameter_error)
         elif first:
             self.get_logger().info(f'{path}: is not there; the journal begins anew')
-        self._journal = Journal(path, head)
-        entries = self._journal.entries
-        self._keeper = Keeper(
+        journal = Journal(path, head)
+        entries = journal.entries
+        keeper = Keeper(
             sensor,
             KeepSettings(own.drift_mg_per_year),
             entries,
-            self._journal.append,
+            journal.append,
             may_adopt=not own.dry_run,
         )
-        self._stream = RestStream(sensor)
-        self._stream.go_on_after(
+        stream = RestStream(sensor)
+        stream.go_on_after(
             max((entry.stay for entry in entries if isinstance(entry, NaturalRest)), default=0)
         )
         name = '' if own.dry_run else own.compensation
-        self._receiver = _Receiver(self, name, folder, own.ramp_s)
+        receiver = _Receiver(self, name, folder, own.ramp_s)
+        self._keeping = _Keeping(keeper, stream, journal, receiver)
         self._obstacle = ''
         self.get_logger().info(
             f'keeping {calibration_store.calibration_id(sensor)} up to date, '
             f'{len(entries)} entries in {path}'
         )
+        return self._keeping
 
-    def _on_info(self, message: DiagnosticStatus) -> None:
-        info = topics.stream_info(message, self._info_topic)
+    def _on_info(self, info: StreamInfo) -> None:
         try:
-            if self._keeper is None:
-                self._begin(self._stored(info))
-            assert self._keeper is not None
-            check_same_sensor(info, info.axes or self._keeper.sensor.axes, self._keeper.sensor)
+            keeping = self._keeping or self._begin(self._stored(info))
+            sensor = keeping.keeper.sensor
+            check_same_sensor(info, info.axes or sensor.axes, sensor)
             self._obstacle = ''
         except UserError as error:
             self._obstacle = str(error)
@@ -241,25 +243,27 @@ class KeepCalibrated(Node):
         """Take what has come."""
         stamps_ns, accel_mps2 = topics.imu_samples(self._samples.take())
         surroundings = [*self._surroundings.take()]
-        if self._keeper is None or self._receiver is None or self._obstacle:
+        keeping = self._keeping
+        if keeping is None or self._obstacle:
             return
         for topic, times_ns, values in surroundings:
             if topic == 'temperature':
-                self._stream.add_temperature(times_ns, values[:, 0])
+                keeping.stream.add_temperature(times_ns, values[:, 0])
         if len(stamps_ns):
             self._newest_ns = int(stamps_ns[-1])
-            sensor = self._keeper.sensor
+            sensor = keeping.keeper.sensor
             volts = to_volts(accel_mps2[:, : len(sensor.axes)], sensor)
-            for rest in self._stream.add(stamps_ns, volts):
-                self._take(self._keeper, rest)
+            for rest in keeping.stream.add(stamps_ns, volts):
+                self._take(keeping, rest)
         now_s = time.monotonic()
-        if self._receiver.has_come() or now_s - self._sent_s > _SENT_AGAIN_S:
-            self._receiver.send(self._keeper.sensor)
+        if keeping.receiver.has_come() or now_s - self._sent_s > _SENT_AGAIN_S:
+            keeping.receiver.send(keeping.keeper.sensor)
             self._sent_s = now_s
-        self._receiver.turn(now_s)
+        keeping.receiver.turn(now_s)
 
-    def _take(self, keeper: Keeper, rest: NaturalRest) -> None:
+    def _take(self, keeping: _Keeping, rest: NaturalRest) -> None:
         """Take a rest, and adopt what it decides."""
+        keeper = keeping.keeper
         before = keeper.sensor
         try:
             adopted = keeper.add(rest)
@@ -268,54 +272,56 @@ class KeepCalibrated(Node):
             self.get_logger().error(self._obstacle)
             return
         if adopted is not None:
-            stored = self._exchange(before, keeper.sensor)
+            stored = self._exchange(keeping, before, keeper.sensor)
             state = keeper.state(rest.stop_ns)
             self.get_logger().info(
                 f'adopted: {by_axis(keeper.sensor.axes, state.total_mg)} since the calibration; '
                 f'{stored}'
             )
 
-    def _exchange(self, before: Sensor, after: Sensor) -> str:
+    def _exchange(self, keeping: _Keeping, before: Sensor, after: Sensor) -> str:
         """Store a calibration and send it in a ramp; return where it is."""
-        assert self._receiver is not None
-        self._receiver.change(before, after)
+        keeping.receiver.change(before, after)
         self._sent_s = time.monotonic()
         path = calibration_store.put(self._own.store, after) if self._own.store else None
         return f'stored as {path}' if path else 'not stored'
 
-    def _on_undo(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        keeper = self._keeper
+    def _on_undo(self, *_: object) -> Trigger.Response:
         try:
-            if keeper is None:
-                raise UserError(self._obstacle)
-            before = keeper.sensor
-            first = before.provenance.get(KEPT, '')
-            now = self.get_clock().now().nanoseconds
-            keeper.undo(self._newest_ns or now)
-            date = utc(now).isoformat(timespec='seconds')
-            provenance = {**keeper.sensor.provenance, 'date': date, KEPT: first}
-            provenance.pop('id', None)
-            stored = self._exchange(before, replace(keeper.sensor, provenance=provenance))
+            text = self._undo()
         except UserError as error:
-            response.message = str(error)
-            return response
-        response.success = True
-        response.message = f'undone: the calibration before is in use again, {stored}'
-        self.get_logger().info(response.message)
-        return response
+            return Trigger.Response(message=str(error))
+        self.get_logger().info(text)
+        return Trigger.Response(success=True, message=text)
+
+    def _undo(self) -> str:
+        """Go back to the calibration before; return a line for people."""
+        keeping = self._keeping
+        if keeping is None:
+            raise UserError(self._obstacle)
+        keeper = keeping.keeper
+        before = keeper.sensor
+        now_ns = self.get_clock().now().nanoseconds
+        keeper.undo(self._newest_ns or now_ns)
+        date = utc(now_ns).isoformat(timespec='seconds')
+        kept_from = before.provenance.get(KEPT, '')
+        provenance = {**keeper.sensor.provenance, 'date': date, KEPT: kept_from}
+        provenance.pop('id', None)
+        after = replace(keeper.sensor, provenance=provenance)
+        stored = self._exchange(keeping, before, after)
+        return f'undone: the calibration before is in use again, {stored}'
 
     def _status(self) -> Status:
         """Return what is known now."""
-        keeper = self._keeper
-        receiver = self._receiver
-        serial = keeper.sensor.serial if keeper else NO_SERIAL
         silence = self._obstacle or self._samples.silence()
-        if keeper is None or receiver is None:
-            return Status(Level.WARN, silence, serial, {})
+        if self._keeping is None:
+            return Status(Level.WARN, silence, NO_SERIAL, {})
+        keeper, stream, _, receiver = self._keeping
+        serial = keeper.sensor.serial
         state = keeper.state(self._newest_ns or self.get_clock().now().nanoseconds)
         values = _values(keeper.sensor, state)
         values |= {
-            **self._stream.counts,
+            **stream.counts,
             'dry_run': self._own.dry_run,
             'ramp': receiver.ramp,
             'compensation': 'runs' if receiver.is_there else 'not there',
@@ -325,7 +331,7 @@ class KeepCalibrated(Node):
             return Status(Level.ERROR, fault or state.changed, serial, values)
         if silence:
             return Status(Level.WARN, silence, serial, values)
-        if self._stream.counts['without_temperature'] and not self._stream.counts['rests']:
+        if stream.counts['without_temperature'] and not stream.counts['rests']:
             return Status(
                 Level.WARN,
                 f'nothing on {self.resolve_topic_name("temperature")}, which tells age from '

@@ -33,6 +33,31 @@ which costs as much as ten samples."""
 _LOOK_S = 1.0
 """Time between two looks at the publishers of the samples, s: the period of the diagnostics, which
 show them."""
+_PERIOD_S = 0.004
+"""Time between two reads where sensor time is not real time, s. A wake-up costs as much as ten
+samples: at 80 times real time 40 samples share one."""
+_LONGEST_PAUSE_S = 0.05
+"""Longest time between two reads in real time, s: the thread sees within it that it shall end."""
+_SHORTEST_PAUSE_S = 0.0005
+"""Shortest time between two reads in real time, s: half a period at 1 kHz. A link that has nothing
+although a sample is due would otherwise keep a core busy."""
+_LONGEST_STEP_NS = 20_000_000
+"""Longest step of real time that is caught up where sensor time is the graph's clock, ns. At 80
+times real time it is 1.6 s of samples at once; a clock that leaps further floods the other
+nodes."""
+_JUMP_NS = 5_000_000_000
+"""Smallest step of the clock that counts as a jump, ns. A driver that was held up for less makes
+up its samples: 5000 at 1 kHz, which the queues of 20000 hold."""
+_DISCOVERY_NS = 300_000_000
+"""Time after which a new subscriber is sure to receive, ns: within a host discovery takes less. A
+sample before it would be lost to the subscriber that it waited for."""
+_CLOCK_SEARCH_NS = 1_000_000_000
+"""Time between two searches for another clock, and before the first sample, ns: nodes that start
+together find each other within it, and two clocks would make time go back and forth."""
+_QUEUE = 5000  # Messages of the stage that are kept between two reads
+_LOG_INTERVAL_S = 1.0
+"""Shortest time between two logs of the state of a link, s: a loose contact changes it at each
+read."""
 
 
 class SimulatorInput:
@@ -71,33 +96,6 @@ class SimulatorInput:
             stamps_ns, fields = topics.decoded(raws, cdr.imu, **_FIELDS)
             self.frame_id = cdr.imu(raws[-1]).texts['frame_id']
             self._link.sense_imu(stamps_ns, fields)
-
-
-_PERIOD_S = 0.004
-"""Time between two reads where sensor time is not real time, s. A wake-up costs as much as ten
-samples: at 80 times real time 40 samples share one."""
-_LONGEST_PAUSE_S = 0.05
-"""Longest time between two reads in real time, s: the thread sees within it that it shall end."""
-_SHORTEST_PAUSE_S = 0.0005
-"""Shortest time between two reads in real time, s: half a period at 1 kHz. A link that has nothing
-although a sample is due would otherwise keep a core busy."""
-_LONGEST_STEP_NS = 20_000_000
-"""Longest step of real time that is caught up where sensor time is the graph's clock, ns. At 80
-times real time it is 1.6 s of samples at once; a clock that leaps further floods the other
-nodes."""
-_JUMP_NS = 5_000_000_000
-"""Smallest step of the clock that counts as a jump, ns. A driver that was held up for less makes
-up its samples: 5000 at 1 kHz, which the queues of 20000 hold."""
-_DISCOVERY_NS = 300_000_000
-"""Time after which a new subscriber is sure to receive, ns: within a host discovery takes less. A
-sample before it would be lost to the subscriber that it waited for."""
-_CLOCK_SEARCH_NS = 1_000_000_000
-"""Time between two searches for another clock, and before the first sample, ns: nodes that start
-together find each other within it, and two clocks would make time go back and forth."""
-_QUEUE = 5000  # Messages of the stage that are kept between two reads
-_LOG_INTERVAL_S = 1.0
-"""Shortest time between two logs of the state of a link, s: a loose contact changes it at each
-read."""
 
 
 class LinkReader:

@@ -23,9 +23,40 @@ from adxl_ros.nodes.run_node import run
 from adxl_ros.nodes.topics import Inbox, Level, Status
 from adxl_ros.report.quantities import percent
 from adxl_ros.simulate.robot import Robot
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, JointState
+
+_INPUT_QUEUE = 10000  # Messages that are kept while the node is busy: 10 s at 1 kHz
+_TOPICS = {
+    ReferenceKind.STAGE: 'stage/joint_states',
+    ReferenceKind.IMU: 'imu/ideal',
+    ReferenceKind.ROBOT: 'joint_states',
+}
+"""Usual topic of each reference."""
+_TURN_S = 0.05
+"""Time between two looks at the topics, s. A look costs as much as ten messages, so that at 1 kHz
+it adds a fifth to their work; half of the time would add two fifths, and twice only delays by 0.1
+s."""
+_PERIOD_S = 1.0  # Time between two messages on `gap`, s
+_QUEUE = 10
+"""Messages that are kept for a slow subscriber: those of the 10 s after which blocks are
+reported."""
+_INFO_S = 3.0
+"""Time that samples wait for `sensor_info`, s. A latched message comes within 1 s of discovery on
+a busy host; with half of that a driver's own values would be replaced by those of any IMU."""
+_SHORTEST_S = 20.0
+"""Shortest time of samples that is diagnosed, s. Four rests of 5 s, or as many moves, fit into it;
+half of them hardly tell one effect from another."""
+_PAUSE_S = 600.0
+"""Shortest time between two automatic diagnoses, s: twice `changes._BUDGET_S`, so that the
+diagnoses take at most half of a core."""
+_EXAMPLES = {
+    'a sensor on a stage': '--ros-args --params-file unit.yaml',
+    'a sensor on a robot': '--ros-args --params-file unit.yaml -p reference:=robot '
+    '-p urdf:=robot.urdf',
+}
+"""Examples of arguments, by their purpose."""
 
 
 @dataclass(frozen=True)
@@ -119,38 +150,6 @@ def axis_status(gap: AxisGap, serial: str) -> Status:
     )
 
 
-_INPUT_QUEUE = 10000  # Messages that are kept while the node is busy: 10 s at 1 kHz
-_TOPICS = {
-    ReferenceKind.STAGE: 'stage/joint_states',
-    ReferenceKind.IMU: 'imu/ideal',
-    ReferenceKind.ROBOT: 'joint_states',
-}
-"""Usual topic of each reference."""
-_TURN_S = 0.05
-"""Time between two looks at the topics, s. A look costs as much as ten messages, so that at 1 kHz
-it adds a fifth to their work; half of the time would add two fifths, and twice only delays by 0.1
-s."""
-_PERIOD_S = 1.0  # Time between two messages on `gap`, s
-_QUEUE = 10
-"""Messages that are kept for a slow subscriber: those of the 10 s after which blocks are
-reported."""
-_INFO_S = 3.0
-"""Time that samples wait for `sensor_info`, s. A latched message comes within 1 s of discovery on
-a busy host; with half of that a driver's own values would be replaced by those of any IMU."""
-_SHORTEST_S = 20.0
-"""Shortest time of samples that is diagnosed, s. Four rests of 5 s, or as many moves, fit into it;
-half of them hardly tell one effect from another."""
-_PAUSE_S = 600.0
-"""Shortest time between two automatic diagnoses, s: twice `changes._BUDGET_S`, so that the
-diagnoses take at most half of a core."""
-_EXAMPLES = {
-    'a sensor on a stage': '--ros-args --params-file unit.yaml',
-    'a sensor on a robot': '--ros-args --params-file unit.yaml -p reference:=robot '
-    '-p urdf:=robot.urdf',
-}
-"""Examples of arguments, by their purpose."""
-
-
 class Monitor(Node):
     """
     The node of the live gap.
@@ -195,14 +194,7 @@ class Monitor(Node):
         self._service = topics.LateService(self, '~/diagnose')
         topics.DiagnosticsReporter(self, 'gap', self._status)
         self._info_topic = self.resolve_topic_name('sensor_info')
-        topics.create_subscription(
-            self,
-            DiagnosticStatus,
-            'sensor_info',
-            lambda message: self._compare_by(topics.stream_info(message, self._info_topic)),
-            1,
-            latched=True,
-        )
+        topics.subscribe_info(self, self._info_topic, self._compare_by)
         self.create_timer(_TURN_S, self._turn, clock=topics.STEADY)
         self.create_timer(_PERIOD_S, self._publish, clock=topics.STEADY)
 

@@ -32,6 +32,7 @@ LINK = 'link.'  # Begin of the names of all parameters of a link; the driver alo
 SEEDS = (0, 2**31 - 1)  # Range of seeds
 _LARGEST = 3600.0
 """Largest number of a range; chosen: ten turns in degrees, and hotter than any sensor."""
+SI = 'mps2'  # Unit of the accelerations of a sensor_msgs/Imu by its definition
 
 
 class Spec(NamedTuple):
@@ -72,9 +73,6 @@ class Spec(NamedTuple):
 def parameter(*spec: Any, name: str = '', **options: Any) -> Any:
     """Declare a parameter as `Spec` has it by a field of a dataclass, which gives it its name."""
     return field(metadata={'spec': Spec(name, *spec, **options)})
-
-
-SI = 'mps2'  # Unit of the accelerations of a sensor_msgs/Imu by its definition
 
 
 def sample_unit() -> Any:

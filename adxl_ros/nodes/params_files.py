@@ -13,6 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 import re
 import sys
+from typing import NamedTuple
 
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
@@ -36,26 +37,35 @@ def _place_of(key: str) -> str:
 
     A parameter that no argument gives belongs to the last file.
     """
-    path = file_of(key)
-    if path:
-        mark = next(value.start_mark for _, name, value in _entries(path) if name == key)
-        return f'{path}:{mark.line + 1}:{mark.column + 1}: '
-    return f'{_paths()[-1]}: ' if _paths() and path is None else ''
+    sources = [*_sources(key)]
+    if not sources:
+        return ''.join(f'{path}: ' for path in _paths()[-1:])
+    path = sources[0]
+    if not path:
+        return ''
+    mark = next(
+        section.values[key].start_mark for section in _sections(path) if key in section.values
+    )
+    return f'{path}:{mark.line + 1}:{mark.column + 1}: '
 
 
-def file_of(key: str) -> str | None:
+def file_of(key: str) -> str:
+    """Return the user's file that gives a parameter; '' where another argument or none does."""
+    return next(_sources(key), '')
+
+
+def _sources(key: str) -> Iterator[str]:
     """
-    Return the file that gives a parameter, '' where another argument does, None where none does.
+    Yield what gives a parameter, the argument that counts first: a user's file, '' for others.
 
     The last argument that gives a parameter counts.
     """
     for flag, value in reversed(list(pairwise(sys.argv))):
         # A rule is [NODE:]NAME:=VALUE.
         if flag in _RULE_FLAGS and value.split(':=')[0].rsplit(':')[-1] == key:
-            return ''
-        if flag == _FILE_FLAG and any(name == key for _, name, _ in _entries(value)):
-            return value if value in _paths() else ''
-    return None
+            yield ''
+        if flag == _FILE_FLAG and any(key in section.values for section in _sections(value)):
+            yield value if value in _paths() else ''
 
 
 def _paths() -> list[str]:
@@ -67,32 +77,48 @@ def _paths() -> list[str]:
     ]
 
 
-def _entries(path: str) -> Iterator[tuple[str, str, yaml.Node]]:
-    """Yield the pattern of the node's name, the parameter's name and its value in a file."""
+class _Section(NamedTuple):
+    """The parameters of a file for some nodes, at least one."""
 
-    def inside(tree: yaml.Node, keys: list[str]) -> Iterator[tuple[str, yaml.Node]]:
-        if isinstance(tree, yaml.MappingNode):
-            for key, value in tree.value:
-                yield from inside(value, [*keys, key.value])
-        else:
-            yield '.'.join(keys), tree
+    pattern: str  # Of the full names of the nodes
+    parameters: yaml.MappingNode  # As they are nested in the file
+    values: dict[str, yaml.Node]  # By the names of the parameters
 
-    for section, parameters in _sections(path):
-        for name, value in inside(parameters, []):
-            yield section, name, value
+    def is_of(self, node_name: str) -> bool:
+        """Return whether it is for a node; * is one part of a name, and ** any number."""
+        wild = {'*': r'/[^/]+', '**': r'(/[^/]+)*'}
+        parts = [
+            wild.get(part, f'/{re.escape(part)}') for part in self.pattern.strip('/').split('/')
+        ]
+        return bool(re.fullmatch(''.join(parts), node_name))
 
 
-def _sections(path: str) -> Iterator[tuple[str, yaml.MappingNode]]:
-    """Yield the pattern of the node's name and the parameters of each section of a file."""
+def _sections(path: str) -> list[_Section]:
+    """Return the sections of a file."""
+    found = []
 
-    def inside(tree: yaml.Node | None, keys: list[str]) -> Iterator[tuple[str, yaml.MappingNode]]:
+    def search(tree: yaml.Node | None, pattern: str) -> None:
         for key, value in tree.value if isinstance(tree, yaml.MappingNode) else ():
             if key.value != 'ros__parameters':
-                yield from inside(value, [*keys, key.value.strip('/')])
-            elif isinstance(value, yaml.MappingNode):
-                yield ''.join(f'/{part}' for part in keys), value
+                search(value, f'{pattern}/{key.value.strip("/")}')
+            elif isinstance(value, yaml.MappingNode) and (values := dict(_flat(value, ''))):
+                found.append(_Section(pattern, value, values))
 
-    return inside(parameter_file.compose(path), [])
+    search(parameter_file.compose(path), '')
+    return found
+
+
+def _flat(tree: yaml.Node, name: str) -> Iterator[tuple[str, yaml.Node]]:
+    """Yield the values in nested mappings with their full names, which begin with a name."""
+    if isinstance(tree, yaml.MappingNode):
+        for key, value in tree.value:
+            yield from _flat(value, f'{name}.{key.value}'.removeprefix('.'))
+    else:
+        yield name, tree
+
+
+def _sections_of(path: str, node_name: str) -> list[_Section]:
+    return [section for section in _sections(path) if section.is_of(node_name)]
 
 
 def write_into(path: str, node_name: str, values: Mapping[str, str]) -> None:
@@ -101,20 +127,12 @@ def write_into(path: str, node_name: str, values: Mapping[str, str]) -> None:
 
     values: YAML of the values by name. Raises `UserError` where the file cannot be written.
     """
-    section = next(
-        (
-            parameters
-            for pattern, parameters in _sections(path)
-            if parameters.value and _matches(pattern, node_name)
-        ),
-        None,
-    )
-    if section is None:
+    sections = _sections_of(path, node_name)
+    if not sections:
         raise UserError(f'{path}: has no parameters of the node {node_name}')
+    section = sections[0].parameters
     text = Path(path).read_text(encoding='utf-8')
-    present = {
-        name: value for pattern, name, value in _entries(path) if _matches(pattern, node_name)
-    }
+    present = {name: value for each in sections for name, value in each.values.items()}
     begin = section.value[0][0].start_mark
     after = ', ' if section.flow_style else f'\n{" " * begin.column}'
     edits = [
@@ -137,33 +155,23 @@ def check_params_files() -> None:
 def check_sections(node_name: str) -> None:
     """Refuse a file that has parameters, but none of a node."""
     for path in _paths():
-        sections = dict.fromkeys(section for section, _, _ in _entries(path))
-        if sections and not any(_matches(section, node_name) for section in sections):
+        sections = _sections(path)
+        if sections and not any(section.is_of(node_name) for section in sections):
+            patterns = ', '.join(dict.fromkeys(section.pattern for section in sections))
             raise UserError(
-                f'{path}: has parameters of {", ".join(sections)}, but none of the '
+                f'{path}: has parameters of {patterns}, but none of the '
                 f'node {node_name}; begin the file with /**: or {node_name}:'
             )
 
 
 def has_section(path: str, node_name: str) -> bool:
-    """Return whether a parameter file has a section for a node."""
-    return any(_matches(section, node_name) for section, _, _ in _entries(path))
+    """Return whether a parameter file has parameters for a node."""
+    return bool(_sections_of(path, node_name))
 
 
 def given_text(path: str, node_name: str, key: str) -> str:
     """Return the text of a parameter in the sections of a file for a node."""
-    return next(
-        (
-            str(value.value)
-            for section, name, value in _entries(path)
-            if name == key and _matches(section, node_name)
-        ),
-        '',
-    )
-
-
-def _matches(pattern: str, node_name: str) -> bool:
-    """Return whether a pattern means a node; * is one part of a name, and ** any number."""
-    wild = {'*': r'/[^/]+', '**': r'(/[^/]+)*'}
-    parts = [wild.get(part, f'/{re.escape(part)}') for part in pattern.strip('/').split('/')]
-    return bool(re.fullmatch(''.join(parts), node_name))
+    for section in _sections_of(path, node_name):
+        if key in section.values:
+            return str(section.values[key].value)
+    return ''

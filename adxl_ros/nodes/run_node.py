@@ -40,6 +40,17 @@ _TYPES = {
 """Words for the types of parameters."""
 _USAGE = '%(prog)s [--ros-args -p NAME:=VALUE ... --params-file FILE\n    -r FROM:=TO ...]'
 """Usage of a node."""
+_SWITCH_S = 0.0005
+"""Time after which a thread of Python gives way to one that waits, s. A sample that comes while
+the executor works shall wait for less than its frame, 1 ms at 1 kHz; Python's 5 ms are longer."""
+_TIMER_SLACK = Path('/proc/self/timerslack_ns')
+"""File that sets by how much the kernel may delay a wake-up of this process (man 5 proc)."""
+_SLACK_NS = '1000'
+"""Largest such delay, ns: a thousandth of a period at 1 kHz. The default is 50 µs, a twentieth."""
+_PLACE = r', at /\S+:\d+'  # Places in rcl within the text of its refusals
+_WITH_COLON = r"rule: '-p ([^:]+):=(.*:.*)'\. Error"
+"""An argument in the text of rcl's refusal, whose value has a colon: name and value."""
+_QUOTES = """; a text with a colon needs quotes of its own: -p '{}:="{}"'"""
 
 
 def _parameter_groups(name: str, own: Iterable[Spec]) -> Iterator[tuple[str, list[Spec]]]:
@@ -76,19 +87,6 @@ def _value_text(value: Any) -> str:
         if isinstance(value, float)
         else str(value).replace(os.path.expanduser('~'), '~')
     )
-
-
-_SWITCH_S = 0.0005
-"""Time after which a thread of Python gives way to one that waits, s. A sample that comes while
-the executor works shall wait for less than its frame, 1 ms at 1 kHz; Python's 5 ms are longer."""
-_TIMER_SLACK = Path('/proc/self/timerslack_ns')
-"""File that sets by how much the kernel may delay a wake-up of this process (man 5 proc)."""
-_SLACK_NS = '1000'
-"""Largest such delay, ns: a thousandth of a period at 1 kHz. The default is 50 µs, a twentieth."""
-_PLACE = r', at /\S+:\d+'  # Places in rcl within the text of its refusals
-_WITH_COLON = r"rule: '-p ([^:]+):=(.*:.*)'\. Error"
-"""An argument in the text of rcl's refusal, whose value has a colon: name and value."""
-_QUOTES = """; a text with a colon needs quotes of its own: -p '{}:="{}"'"""
 
 
 @options_named()

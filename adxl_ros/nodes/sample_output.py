@@ -27,6 +27,28 @@ from sensor_msgs.msg import BatteryState, Imu, JointState, Temperature
 
 MOST_AGES = 10_000
 """Newest ages that count: all of a second up to 10 kHz, the period of the diagnostics."""
+_FAULTS = {
+    'missing': 'missing',
+    'saturated': 'saturated',
+    'withheld': 'withheld during the self-test',
+}
+"""Words of a warning by the count that has risen."""
+_QUEUE = 5000
+"""Samples, and references beside them, that are kept for a slow subscriber: 5 s at 1 kHz."""
+_STAGE = 'stage/joint_states'  # Topic of the stage angles, which have several columns
+_COLUMNS = {
+    _STAGE: tuple(JOINTS.values()),
+    'temperature': ('temperature_c',),
+    'supply': ('supply_v',),
+}
+"""Columns of a recording by topic."""
+_KINDS = {_STAGE: JointState, 'temperature': Temperature, 'supply': BatteryState}
+"""Type of each topic."""
+_PERIODS_NS = {_STAGE: 10_000_000, 'temperature': 1_000_000_000, 'supply': 1_000_000_000}
+"""Longest time between two messages with the same values, ns: 10 ms, as a stage's controller sends
+at 100 Hz, and 1 s for quantities that change over minutes."""
+_UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'
+"""Name that the middleware gives a node that it has not discovered yet (rmw_dds_common)."""
 
 
 def age_report(ages_s: deque[float]) -> dict[str, float]:
@@ -36,14 +58,6 @@ def age_report(ages_s: deque[float]) -> dict[str, float]:
         return {}
     p50_ms, p99_ms = np.percentile(taken_s, [50, 99]) * 1e3
     return {'age_p50_ms': round(float(p50_ms), 3), 'age_p99_ms': round(float(p99_ms), 3)}
-
-
-_FAULTS = {
-    'missing': 'missing',
-    'saturated': 'saturated',
-    'withheld': 'withheld during the self-test',
-}
-"""Words of a warning by the count that has risen."""
 
 
 class Tally:
@@ -87,22 +101,6 @@ class Tally:
             values['age_s'] = round((sensor_ns - self.newest_ns) * 1e-9, 6)
         faults = [f'{new[name]} samples {words}' for name, words in _FAULTS.items() if new[name]]
         return values | age_report(self.ages_s), ', '.join(faults)
-
-
-_QUEUE = 5000
-"""Samples, and references beside them, that are kept for a slow subscriber: 5 s at 1 kHz."""
-_STAGE = 'stage/joint_states'  # Topic of the stage angles, which have several columns
-_COLUMNS = {
-    _STAGE: tuple(JOINTS.values()),
-    'temperature': ('temperature_c',),
-    'supply': ('supply_v',),
-}
-"""Columns of a recording by topic."""
-_KINDS = {_STAGE: JointState, 'temperature': Temperature, 'supply': BatteryState}
-"""Type of each topic."""
-_PERIODS_NS = {_STAGE: 10_000_000, 'temperature': 1_000_000_000, 'supply': 1_000_000_000}
-"""Longest time between two messages with the same values, ns: 10 ms, as a stage's controller sends
-at 100 Hz, and 1 s for quantities that change over minutes."""
 
 
 class References:
@@ -168,10 +166,6 @@ class References:
         )
         message.header.frame_id = self._frame_id
         return message
-
-
-_UNKNOWN_NODE = '_NODE_NAME_UNKNOWN_'
-"""Name that the middleware gives a node that it has not discovered yet (rmw_dds_common)."""
 
 
 def imu_writer(sensor: Sensor, frame_id: str) -> topics.MessageWriter:

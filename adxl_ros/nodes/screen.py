@@ -16,7 +16,7 @@ from textwrap import wrap
 import time
 from typing import Any, TextIO
 
-from adxl_ros.calibrate.guided.screen_contents import Phase, ScreenContents, ScreenRow
+from adxl_ros.calibrate.guided.screen_contents import KeyAction, Phase, ScreenContents, ScreenRow
 from adxl_ros.errors import UserError
 from adxl_ros.nodes.jobs import held_output
 from adxl_ros.nodes.parameter_checks import check_given
@@ -30,18 +30,8 @@ from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-
-@dataclass(frozen=True)
-class ScreenSettings:
-    """The screen."""
-
-    node: str = parameter('calibration', 'name of the calibration node')
-    node_pid: int = parameter(0, 'process of the node that has started this screen')
-
-
 Styled = tuple[str, str]  # A style of prompt_toolkit and its text
 Line = list[Styled]  # A line of the screen
-
 _COLOURS = {
     Phase.DWELL: 'ansigreen',
     Phase.REFUSED: 'ansired',
@@ -63,6 +53,31 @@ _COEFFICIENT_BAR_WIDTH = 3
 """Width of the bar of a coefficient, columns: the intervals of three axes are long."""
 _SHORTEST_NAME = 8  # Smallest width of the name of a coefficient, columns
 _FEW_LINES = 3  # Largest number of lines of the log, and of a text with a label
+_REFRESH_S = 0.2  # Time between two drawings, s: the node publishes contents five times a second
+_QUIT = KeyAction('q', 'quit', '')  # The key of the screen itself
+_SERVICES = ('start', 'resume', 'start_over', 'capture', 'redo', 'skip', 'finish', 'abort')
+"""Services of the calibration node that keys call."""
+_SPIN_S = 0.02
+"""Time between two callbacks, s: a tenth of the period of the display, so that keys act at
+once."""
+_SILENT_S = 2.0
+"""Age at which a display is reported as missing, s: ten of its messages at 5 Hz."""
+_QUEUE = 100
+"""Lines of all nodes' logs that wait between two callbacks: far more than they write in this time,
+and more than a terminal shows."""
+_STYLES = {Log.WARN: 'ansiyellow', Log.ERROR: 'ansired', Log.FATAL: 'ansired'}
+"""Styles of log lines by level."""
+_PLAIN = 'ansibrightblack'  # Style of other log lines
+_EXAMPLES = {'in the namespace of the sensor': '--ros-args -r __ns:=/arm'}
+"""Examples of arguments, by their purpose."""
+
+
+@dataclass(frozen=True)
+class ScreenSettings:
+    """The screen."""
+
+    node: str = parameter('calibration', 'name of the calibration node')
+    node_pid: int = parameter(0, 'process of the node that has started this screen')
 
 
 def draw(contents: ScreenContents, log: Iterable[Styled], columns: int, rows: int) -> list[Line]:
@@ -95,12 +110,13 @@ def draw(contents: ScreenContents, log: Iterable[Styled], columns: int, rows: in
         messages += _styled(style, wrap(text, width))
     messages = messages[-_FEW_LINES:]
     # A small terminal keeps the keys and the first lines, which say what to do.
-    room = max(rows - len(messages) - 1, _LEAST_LINES)
-    body = [*body, *[('', '')] * room][:room]
+    body_lines = max(rows - len(messages) - 1, _LEAST_LINES)
+    body = [*body, *[('', '')] * body_lines][:body_lines]
     keys = []
-    for key, action in (*((key.key, key.action) for key in contents.keys), ('q', 'quit')):
-        keys += [('reverse', f' {key} '), ('', f' {action}  ')]
-    return [*([(style, line[:width])] for style, line in (*body, *messages)), keys]
+    for key in (*contents.keys, _QUIT):
+        keys += [('reverse', f' {key.key} '), ('', f' {key.action}  ')]
+    lines = [[(style, text[:width])] for style, text in (*body, *messages)]
+    return [*lines, keys]
 
 
 def _styled(style: str, lines: Iterable[str]) -> list[Styled]:
@@ -112,18 +128,16 @@ def _coefficients(rows: Sequence[ScreenRow], width: int) -> list[str]:
     texts = {
         row.label: f'{_bar(row.share or 0.0, _COEFFICIENT_BAR_WIDTH)} {row.text}' for row in rows
     }
-    longest = max(map(len, texts.values()), default=0)
-    room = max(min(max(map(len, texts), default=0), width - 1 - longest), _SHORTEST_NAME)
-    return [f'{name[:room]:{room}} {text}' for name, text in texts.items()]
+    longest_text = max(map(len, texts.values()), default=0)
+    longest_name = max(map(len, texts), default=0)
+    name_width = max(min(longest_name, width - 1 - longest_text), _SHORTEST_NAME)
+    return [f'{name[:name_width]:{name_width}} {text}' for name, text in texts.items()]
 
 
 def _bar(share: float, width: int = _BAR_WIDTH) -> str:
     """Return a bar of a width in columns, of which a share from 0 to 1 is full."""
     full = round(min(max(share, 0.0), 1.0) * width)
     return '█' * full + '░' * (width - full)
-
-
-_REFRESH_S = 0.2  # Time between two drawings, s: the node publishes contents five times a second
 
 
 def full_screen(
@@ -181,23 +195,6 @@ def _terminal() -> tuple[TextIO, TextIO]:
         raise UserError('the screen needs a terminal; run it in one') from None
 
 
-_SERVICES = ('start', 'resume', 'start_over', 'capture', 'redo', 'skip', 'finish', 'abort')
-"""Services of the calibration node that keys call."""
-_SPIN_S = 0.02
-"""Time between two callbacks, s: a tenth of the period of the display, so that keys act at
-once."""
-_SILENT_S = 2.0
-"""Age at which a display is reported as missing, s: ten of its messages at 5 Hz."""
-_QUEUE = 100
-"""Lines of all nodes' logs that wait between two callbacks: far more than they write in this time,
-and more than a terminal shows."""
-_STYLES = {Log.WARN: 'ansiyellow', Log.ERROR: 'ansired', Log.FATAL: 'ansired'}
-"""Styles of log lines by level."""
-_PLAIN = 'ansibrightblack'  # Style of other log lines
-_EXAMPLES = {'in the namespace of the sensor': '--ros-args -r __ns:=/arm'}
-"""Examples of arguments, by their purpose."""
-
-
 class Screen(Node):
     """The screen: a client of the topics and services of the calibration node."""
 
@@ -209,7 +206,7 @@ class Screen(Node):
         self._node_pid = own.node_pid
         self._target = self.resolve_topic_name(name)
         self._contents = ScreenContents(Phase.INFO, '')
-        self._received_s = 0.0
+        self._received_s = -_SILENT_S
         self._log: deque[tuple[str, str]] = deque(maxlen=_FEW_LINES)  # Styles and messages
         self._application = full_screen(
             lambda columns, rows: draw(self._shown(), self._log, columns, rows),
@@ -253,15 +250,10 @@ class Screen(Node):
 
     def _shown(self) -> ScreenContents:
         """Return the newest contents, or what the screen waits for; a node that fits is silent."""
-        is_new = (
-            time.monotonic() - self._received_s < _SILENT_S or self._contents.phase is Phase.FIT
-        )
-        if (
-            self._received_s
-            and is_new
-            and rclpy.ok()
-            and self.count_publishers(f'{self._target}/display')
-        ):
+        age_s = time.monotonic() - self._received_s
+        may_be_silent = self._contents.phase is Phase.FIT
+        is_there = rclpy.ok() and self.count_publishers(f'{self._target}/display') > 0
+        if is_there and (age_s < _SILENT_S or may_be_silent):
             return self._contents
         return replace(
             self._contents,

@@ -66,24 +66,24 @@ def sensor_specs() -> Iterator[Spec]:
     for name, described in parameter_file.SENSOR_FIELDS.items():
         about = described.metadata
         yield Spec(
-            name,
-            _FIELD_KINDS[str(described.type)],
-            about['doc'],
-            about['unit'],
-            about['lower'],
-            about['upper'],
-            about['choices'],
+            name=name,
+            default=_FIELD_KINDS[str(described.type)],
+            doc=about['doc'],
+            unit=about['unit'],
+            lower=about['lower'],
+            upper=about['upper'],
+            choices=about['choices'],
         )
     yield Spec('effects', Kind.STRING_ARRAY, 'effects that this unit has')
     for effect in library().values():
         for p in effect.parameters:
             yield Spec(
-                str(Coefficient(effect.name, p.name)),
-                Kind.DOUBLE_ARRAY if p.axes else Kind.DOUBLE,
-                f'{p.doc}, by axis' if p.axes else p.doc,
-                p.unit,
-                p.lower,
-                p.upper,
+                name=str(Coefficient(effect.name, p.name)),
+                default=Kind.DOUBLE_ARRAY if p.axes else Kind.DOUBLE,
+                doc=f'{p.doc}, by axis' if p.axes else p.doc,
+                unit=p.unit,
+                lower=p.lower,
+                upper=p.upper,
                 empty=p.neutral,
             )
     yield Spec('covariance_names', Kind.STRING_ARRAY, 'coefficients in the covariance')

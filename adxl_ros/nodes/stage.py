@@ -26,6 +26,42 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 _RESOLUTION = SENSOR_FIELDS['stage.resolution_rad'].metadata
 """Description of the resolution of the encoders."""
+_STEP_NS = 10_000_000
+"""Step of the simulation, ns: 100 poses a second, as the controller of a stage sends."""
+_JUMP_NS = 1_000_000_000
+"""Smallest jump of ROS time after which the motion goes on from there, ns: a hundred steps. Less
+is a process that was held up, and its steps are made up."""
+_QUEUE = 1000  # Poses that are kept for a slow subscriber: 10 s of ROS time
+_ANGLES = ('alpha', 'beta')  # Joints of a real stage
+_SILENT_NS = 2_000_000_000
+"""Time without joint states after which diagnostics warn, ns: controllers send at 10 Hz or more,
+so that twenty are missing."""
+_GRACE_NS = 2_000_000_000
+"""Time that a motion may take beyond its duration before its command is sent again, ns: a
+controller that settles needs less, and a lost command delays a pose by no more."""
+_ARRIVED_RAD = 0.01
+"""Largest distance from the goal of a joint that has arrived, rad: 0.6°. Stages without feedback
+err by tenths of a degree; the angle that counts is the one that is read."""
+_SHORTEST_S = 0.2
+"""Shortest duration of a trajectory, s: controllers refuse one in the past, and a command is on
+its way for up to 0.1 s."""
+_BRIDGE_QUEUE = 100
+"""Positions that are kept for a slow subscriber: 1 s of a controller at 100 Hz."""
+_COMMAND_QUEUE = 10
+"""Commands that are kept, of the calibration and for the controller: only the newest moves the
+stage, and the others are those of seconds before."""
+_STATES_QUEUE = 1000
+"""Joint states of the controller that are kept: 1 s of the fastest controllers."""
+_DEFAULT_COMMANDS = {
+    'trajectory': '/joint_trajectory_controller/joint_trajectory',
+    'joint_state': '/joint_commands',
+}
+"""Usual topics of the controllers' commands, by kind."""
+_EXAMPLES = {
+    'the bridge to a controller of ros2_control': '--ros-args -p stage.type:=trajectory '
+    '-p bridge.alpha.joint:=tilt -p bridge.beta.joint:=turn'
+}
+"""Examples of arguments, by their purpose."""
 
 
 @dataclass(frozen=True)
@@ -112,15 +148,6 @@ class BridgeSettings:
     )
 
 
-_STEP_NS = 10_000_000
-"""Step of the simulation, ns: 100 poses a second, as the controller of a stage sends."""
-_JUMP_NS = 1_000_000_000
-"""Smallest jump of ROS time after which the motion goes on from there, ns: a hundred steps. Less
-is a process that was held up, and its steps are made up."""
-_QUEUE = 1000  # Poses that are kept for a slow subscriber: 10 s of ROS time
-_ANGLES = ('alpha', 'beta')  # Joints of a real stage
-
-
 class SimulatedStageNode:
     """
     The simulated stage: its encoders' readings on `stage/joint_states`, at 100 Hz of ROS time.
@@ -130,6 +157,7 @@ class SimulatedStageNode:
     """
 
     def __init__(self, node: Node) -> None:
+        self.about = 'simulated stage: '  # What it is, for the log
         self._node = node
         own = declare_all(node, SimulatedStageSettings)
         self._stage = SimulatedStage(
@@ -150,17 +178,11 @@ class SimulatedStageNode:
         self._refusal = ''
         self._encoders = topics.create_publisher(node, JointState, 'stage/joint_states', _QUEUE)
         self._true = topics.create_publisher(node, JointState, 'stage/true_joint_states', _QUEUE)
-        topics.DiagnosticsReporter(node, 'stage', self._status)
-        topics.create_subscription(
-            node, JointState, 'stage/command', self._on_command, _COMMAND_QUEUE
-        )
-        node.get_logger().info(
-            f'simulated stage: waiting for {node.resolve_topic_name("stage/command")}'
-        )
         # The timer runs on ROS time: each message of a faster clock wakes the node.
         node.create_timer(_STEP_NS * 1e-9, self._tick)
 
-    def _on_command(self, message: JointState) -> None:
+    def on_command(self, message: JointState) -> None:
+        """Take a command of `stage/command`."""
         positions = dict(zip(message.name, message.position))
         try:
             if len(message.name) != len(message.position):
@@ -207,7 +229,8 @@ class SimulatedStageNode:
             )
         )
 
-    def _status(self) -> Status:
+    def status(self) -> Status:
+        """Return the state for /diagnostics."""
         level = Level.OK
         text = 'moving' if self._stage.moving() else 'at rest'
         if self._refusal:
@@ -216,32 +239,6 @@ class SimulatedStageNode:
             self._refusal = ''
         values = {name: float(p) for name, p in zip(JOINTS, self._stage.encoder())}
         return Status(level, text, 'simulated', {**values, 'refused': self._refusal_count})
-
-
-_SILENT_NS = 2_000_000_000
-"""Time without joint states after which diagnostics warn, ns: controllers send at 10 Hz or more,
-so that twenty are missing."""
-_GRACE_NS = 2_000_000_000
-"""Time that a motion may take beyond its duration before its command is sent again, ns: a
-controller that settles needs less, and a lost command delays a pose by no more."""
-_ARRIVED_RAD = 0.01
-"""Largest distance from the goal of a joint that has arrived, rad: 0.6°. Stages without feedback
-err by tenths of a degree; the angle that counts is the one that is read."""
-_SHORTEST_S = 0.2
-"""Shortest duration of a trajectory, s: controllers refuse one in the past, and a command is on
-its way for up to 0.1 s."""
-_BRIDGE_QUEUE = 100
-"""Positions that are kept for a slow subscriber: 1 s of a controller at 100 Hz."""
-_COMMAND_QUEUE = 10
-"""Commands that are kept, of the calibration and for the controller: only the newest moves the
-stage, and the others are those of seconds before."""
-_STATES_QUEUE = 1000
-"""Joint states of the controller that are kept: 1 s of the fastest controllers."""
-_DEFAULT_COMMANDS = {
-    'trajectory': '/joint_trajectory_controller/joint_trajectory',
-    'joint_state': '/joint_commands',
-}
-"""Usual topics of the controllers' commands, by kind."""
 
 
 class StageBridge:
@@ -283,19 +280,16 @@ class StageBridge:
             own.command or _DEFAULT_COMMANDS[kind],
             _COMMAND_QUEUE,
         )
-        topics.DiagnosticsReporter(node, 'stage', self._status)
-        topics.create_subscription(
-            node, JointState, 'stage/command', self._on_command, _COMMAND_QUEUE
-        )
         topics.create_subscription(
             node, JointState, own.joint_states, self._on_states, _STATES_QUEUE
         )
-        node.get_logger().info(
+        self.about = (
             f'bridge ({kind}): commands go to {self._commands.topic_name}, positions come from '
-            f'{self._states_topic}; waiting for {node.resolve_topic_name("stage/command")}'
+            f'{self._states_topic}; '
         )
 
-    def _on_command(self, message: JointState) -> None:
+    def on_command(self, message: JointState) -> None:
+        """Take a command of `stage/command`."""
         positions = dict(zip(message.name, message.position))
         before_rad = np.where(np.isfinite(self._goal_rad), self._goal_rad, self._angles_rad)
         goal_rad = np.array(
@@ -369,7 +363,8 @@ class StageBridge:
         stage.header.stamp = message.header.stamp
         self._positions.publish(stage)
 
-    def _status(self) -> Status:
+    def status(self) -> Status:
+        """Return the state for /diagnostics."""
         values = {
             name: angle
             for name, angle in zip(_ANGLES, self._angles_rad.tolist())
@@ -404,13 +399,6 @@ class StageBridge:
         return Level.OK, 'at rest' if is_there else 'on the way'
 
 
-_EXAMPLES = {
-    'the bridge to a controller of ros2_control': '--ros-args -p stage.type:=trajectory '
-    '-p bridge.alpha.joint:=tilt -p bridge.beta.joint:=turn'
-}
-"""Examples of arguments, by their purpose."""
-
-
 class Stage(Node):
     """The node; its parameter `stage.type` chooses what it is."""
 
@@ -418,7 +406,14 @@ class Stage(Node):
         super().__init__('stage')
         parameter_checks.check_given(self)
         kind = declare_all(self, StageSettings).kind
-        self._stage = SimulatedStageNode(self) if kind == 'simulated' else StageBridge(self, kind)
+        stage = SimulatedStageNode(self) if kind == 'simulated' else StageBridge(self, kind)
+        topics.DiagnosticsReporter(self, 'stage', stage.status)
+        topics.create_subscription(
+            self, JointState, 'stage/command', stage.on_command, _COMMAND_QUEUE
+        )
+        self.get_logger().info(
+            f'{stage.about}waiting for {self.resolve_topic_name("stage/command")}'
+        )
 
 
 def main() -> int:

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 from adxl_ros.errors import one_line, UserError
 from adxl_ros.files import cdr, imu_message
 from adxl_ros.files.stream_info import StreamInfo
+from adxl_ros.links.support.base import Watchdog
 from adxl_ros.nodes.parameter_checks import QOS_POLICIES
 from adxl_ros.nodes.parameters import SI
 from adxl_ros.report.level import Level
@@ -60,6 +61,13 @@ s."""
 _MIXED_S = 3.0
 """Time within which sequence numbers step back twice where two publishers mix, s: longer than the
 period of slow samples, 1 s, and shorter than two starts of a driver."""
+_SURROUNDINGS = {
+    'temperature': (Temperature, cdr.temperature, 'temperature'),
+    'supply': (BatteryState, cdr.battery_state, 'voltage'),
+}
+"""Type, layout and field of each topic."""
+_PERIOD_S = 1.0  # Time between two reports, s; the usual rate of ROS diagnostics
+_REPORTS = 10  # Reports that are kept for a slow subscriber
 
 
 def create_publisher(
@@ -123,9 +131,13 @@ def _qos_errors(topic: str, entity: str) -> Iterator[None]:
         raise UserError(f'qos_overrides.{topic}.{entity}: {one_line(error)}') from None
 
 
-def stream_info(message: DiagnosticStatus, topic: str) -> StreamInfo:
-    """Return what a stream states of itself on `sensor_info`."""
-    return StreamInfo({pair.key: pair.value for pair in message.values}, topic)
+def subscribe_info(node: Node, name: str, take: Callable[[StreamInfo], object]) -> None:
+    """Take what a stream states of itself on `sensor_info`; the topic has a name in messages."""
+
+    def take_message(message: DiagnosticStatus) -> None:
+        take(StreamInfo({pair.key: pair.value for pair in message.values}, name))
+
+    create_subscription(node, DiagnosticStatus, 'sensor_info', take_message, 1, latched=True)
 
 
 def log(node: Node, level: Level, text: str) -> None:
@@ -273,8 +285,7 @@ class Inbox:
         self._node = node
         self._kind = kind
         self._depth = depth
-        self._looked_s = time.monotonic()  # When messages were taken last
-        self._silent_s = 0.0  # Time without a message until then
+        self._watchdog = Watchdog(_LONGEST_LOOK_S)
         self._topic = node.resolve_topic_name(topic)
         self._number = 0
         self._back_s = -_MIXED_S
@@ -304,12 +315,10 @@ class Inbox:
     def take(self) -> list[bytes]:
         """Return the messages since the last call, at most as many as are kept."""
         accept = (self._accepts,) if self._kind is Imu else ()
-        now_s = time.monotonic()
-        self._silent_s += min(now_s - self._looked_s, _LONGEST_LOOK_S)
-        self._looked_s = now_s
+        self._watchdog.check()
         messages = [*take_messages(self._subscription, self._kind, True, self._depth, *accept)]
         if messages:
-            self._silent_s = 0.0
+            self._watchdog.feed()
         return messages if self._unit == SI else [*map(self._in_si, messages)]
 
     def _in_si(self, raw: bytes) -> bytes:
@@ -336,14 +345,15 @@ class Inbox:
 
         It ends with the last look. Where the node was held up, what came has not been taken yet.
         """
-        if (fault := self.fault()) or self._silent_s < _SILENT_S:
+        silent_s = self._watchdog.silent_s
+        if (fault := self.fault()) or silent_s < _SILENT_S:
             return fault
         nobody = '' if self._node.count_publishers(self._topic) else ', and nobody publishes it'
-        return f'nothing on {self._topic} for {self._silent_s:.0f} s{nobody}'
+        return f'nothing on {self._topic} for {silent_s:.0f} s{nobody}'
 
     def restart_silence(self) -> None:
         """Restart the time without messages."""
-        self._silent_s = 0.0
+        self._watchdog.feed()
 
     def fault(self) -> str:
         """Return that several nodes publish on the topic, so that nothing is taken, or ''."""
@@ -355,13 +365,6 @@ class Inbox:
     def destroy(self) -> None:
         """Remove the subscription; a thread that waits must have ended."""
         self._node.destroy_subscription(self._subscription)
-
-
-_SURROUNDINGS = {
-    'temperature': (Temperature, cdr.temperature, 'temperature'),
-    'supply': (BatteryState, cdr.battery_state, 'voltage'),
-}
-"""Type, layout and field of each topic."""
 
 
 class SurroundingTopics:
@@ -379,10 +382,6 @@ class SurroundingTopics:
                 _, layout, field = _SURROUNDINGS[topic]
                 stamps_ns, fields = decoded(messages, layout, **{field: 1})
                 yield topic, stamps_ns, fields[field]
-
-
-_PERIOD_S = 1.0  # Time between two reports, s; the usual rate of ROS diagnostics
-_REPORTS = 10  # Reports that are kept for a slow subscriber
 
 
 @dataclass(frozen=True)

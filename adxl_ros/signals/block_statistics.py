@@ -9,7 +9,6 @@ quietest windows of a stream have in common.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from math import ceil
@@ -172,11 +171,6 @@ def angle_bounds(blocks: Blocks) -> np.ndarray:
     before = bounds[newest[np.maximum(place - 1, 0)]]
     after = bounds[following[np.minimum(place + 1, last)]]
     return np.fmax(bounds, np.fmax(before, after))
-
-
-def rms(values: np.ndarray | Sequence[float]) -> float:
-    """Return the root of the mean square of all values."""
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def true_runs(mask: np.ndarray, group: np.ndarray | None = None) -> list[tuple[int, int]]:

@@ -24,6 +24,7 @@ from adxl_ros.model.effects.base import (
     Place,
     Signals,
 )
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.filters import first_order_recursion, low_pass
 from adxl_ros.model.kinematics import specific_force_in_motion
 from adxl_ros.model.sensor import neutral, Sensor
@@ -51,6 +52,11 @@ _ROUNDING = 1e-9  # Rounding error of a ratio of two rates
 _ANALOG = tuple(place for place in Place if place not in (Place.ADC, Place.CODE))
 """Places of the chain up to the filter, with the clock."""
 _NOISE_MEMORY = 50  # RC over which missing noise is drawn; chosen: e⁻⁵⁰ is left
+_SEED = 0  # Seed of noise-like effects in a comparison
+_QUIET = 1e-9  # Factor of white noise in a comparison; chosen: invisible, but not 0
+_FINE_BITS = 32  # Resolution of the ADC in a comparison, bit; chosen: its steps are invisible
+_RATE_HZ = 250.0  # Largest rate there, Hz; chosen: twice the bandwidth of the motion
+_SHORT_RC_S = 1e-9  # RC of a filter that does nothing, s; chosen: not 0
 
 
 class _Grid:
@@ -309,7 +315,9 @@ class Response:
             signals.shift = _joint(motion.shift, instants_s)
             return
         if self._force_path is None:
-            self._force_path = self._once('reference', (Place.REFERENCE,), self._acting_force)
+            self._force_path = self._once(
+                'reference', (Place.REFERENCE,), partial(self._acting_force, motion.force)
+            )
         signals.force = list(self._force_path(instants_s))
         if self._rotates and isinstance(motion.force, ForcePath):
             signals.rotation = motion.force.rotation(instants_s)
@@ -322,14 +330,14 @@ class Response:
             signals.alpha, signals.beta, signals.shift, signals.gravity_mps2, signals.up
         )
 
-    def _acting_force(self) -> Callable[[np.ndarray], Components]:
+    def _acting_force(
+        self, force: Callable[[np.ndarray], Components]
+    ) -> Callable[[np.ndarray], Components]:
         """
         Return the specific force that acts on the sensor, from that of the reference.
 
         Only a recorded force has the errors of a reference; others are exact.
         """
-        force = self._motion.force
-        assert force is not None
         if not isinstance(force, ForcePath) or not self._chain.effects[Place.REFERENCE]:
             return force
         signals = Signals(
@@ -473,13 +481,6 @@ def _references(sensor: Sensor, motion: Motion, time_s: np.ndarray) -> Columns:
     return columns | {name: path(time_s) for name, path in motion.environment.items()}
 
 
-_SEED = 0  # Seed of noise-like effects in a comparison
-_QUIET = 1e-9  # Factor of white noise in a comparison; chosen: invisible, but not 0
-_FINE_BITS = 32  # Resolution of the ADC in a comparison, bit; chosen: its steps are invisible
-_RATE_HZ = 250.0  # Largest rate there, Hz; chosen: twice the bandwidth of the motion
-_SHORT_RC_S = 1e-9  # RC of a filter that does nothing, s; chosen: not 0
-
-
 def change_mg(
     sensor: Sensor,
     motion: Motion,
@@ -513,4 +514,4 @@ def change_mg(
         other, motion, _SEED, stamps_s, memo
     )
     change_mps2 = changed_v / sensor.nominal_scale_v_per_g * G0_MPS2
-    return float(mg(np.sqrt(np.mean(change_mps2**2))))
+    return mg(rms(change_mps2))

@@ -23,19 +23,11 @@ from adxl_ros.files.robot_readings import JointTrack, RobotReadings
 from adxl_ros.files.stamps import mean_period_s, stamped_rate_hz
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects.base import Components
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.process import option
 from adxl_ros.report.quantities import mg
-from adxl_ros.simulate.motion import (
-    ForcePath,
-    Held,
-    INTERNAL_RATE_HZ,
-    KNOT_S,
-    Motion,
-    noise_step,
-    Path,
-    PathErrors,
-    SmoothedPath,
-)
+from adxl_ros.simulate.motion import ForcePath, Held, INTERNAL_RATE_HZ, Motion, Path
+from adxl_ros.simulate.smoothed_path import KNOT_S, noise_step, PathErrors, SmoothedPath
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
@@ -249,7 +241,7 @@ class RobotPath(ForcePath):
 
     def text(self) -> str:
         """Return what is known of the robot, for people."""
-        error_mg = mg(np.sqrt(np.mean(self.error_mps2**2)))
+        error_mg = mg(rms(self.error_mps2))
         return (
             f'{self._robot.frame} moves by {", ".join(self.joints) or "its base"}, from '
             f'{self.time_s[0]:.3g} to {self.time_s[-1]:.3g} s; the encoders leave an error of '

@@ -38,6 +38,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 _STDS_OF_MAXIMUM = 3.0  # Stds in a maximum without typical value. Chosen: 1 part in 370 beyond
+_SAME_STEP = 1e-6  # Relative change of equal time steps; chosen: above rounding
 
 
 @dataclass(frozen=True)
@@ -107,9 +108,6 @@ def unit_draws(sensor: Sensor, units: str | PathLike | Population) -> UnitDraws:
         root[drawn],
         np.broadcast_to(limit, len(names)),
     )
-
-
-_SAME_STEP = 1e-6  # Relative change of equal time steps; chosen: above rounding
 
 
 class SensorModel:

@@ -75,7 +75,7 @@ class SimulatedStage:
         max_move = self._speed * dt_s
         reference = self._reference + np.clip(self._goal - self._reference, -max_move, max_move)
         rate = (reference - self._reference) / dt_s
-        # x'' = w² (r - x) - 2 w x' behind a ramp r: x = r - 2 r'/w + (c + d t) exp(-w t).
+        # x'' = w² (r - x) - 2 w x' behind a ramp r: x = r - 2 r'/w + (lag + slope t) exp(-w t).
         w = self._omega
         decay = exp(-self._omega * dt_s)
         lag = self.position - (self._reference - 2 * rate / w)

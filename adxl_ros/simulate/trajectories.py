@@ -10,12 +10,7 @@ from itertools import product
 from typing import NamedTuple
 
 from adxl_ros.model.constants import NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
-from adxl_ros.simulate.motion import (
-    Held,
-    Knots,
-    Motion,
-    Pieces,
-)
+from adxl_ros.simulate.motion import Held, Knots, Motion, Pieces
 import numpy as np
 import scipy
 

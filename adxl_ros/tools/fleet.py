@@ -209,8 +209,8 @@ def _written(folder: Path, results: Results) -> tuple[list[Path], list[str]]:
 def _plan_lines(to_do: Plan, results: Results) -> list[str]:
     known = {url: entry.row['serial'] for url, entry in results.newest.items()}
     units = Counter(
-        source.serial or stated or known.get(source.url) or NO_SERIAL
-        for source, (stated, _) in zip(to_do.todo, stated_by(to_do.todo))
+        source.serial or stated.serial or known.get(source.url) or NO_SERIAL
+        for source, stated in zip(to_do.todo, stated_by(to_do.todo))
     )
     unknown = units.pop(NO_SERIAL, 0)
     largest = ', '.join(f'{serial} ({count})' for serial, count in units.most_common(_UNITS))

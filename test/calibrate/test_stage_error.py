@@ -6,7 +6,7 @@
 from dataclasses import replace
 
 from adxl_ros.calibrate.fits import full_model, linearisation
-from adxl_ros.calibrate.fits.linearisation import PoseCovariance, shared_settings, StageError
+from adxl_ros.calibrate.fits.pose_covariance import PoseCovariance, shared_settings, StageError
 from adxl_ros.calibrate.pose_model import angle_jacobian, predicted_volts
 from adxl_ros.model.sensor import with_neutral
 import numpy as np

@@ -59,10 +59,11 @@ def test_a_stream_gives_the_same_samples_with_a_delay_of_eight():
     delayed = inversions.DelayedInversion(RC_S, RATE_HZ)
     out, late = [], []
     for i in kept:
-        for stamp, back, token in delayed(float(time_s[i]), volts[i].tolist(), i):
-            assert stamp == time_s[token]
-            out.append((token, *back))
-            late.append(i - token)
+        sample = inversions.FilteredSample(float(time_s[i]), volts[i].tolist(), i)
+        for ready in delayed(sample):
+            assert ready.time_s == time_s[ready.token]
+            out.append((ready.token, *ready.volts))
+            late.append(i - ready.token)
     out = np.array(out)
     count = len(out)
     np.testing.assert_array_equal(out[:, 0], kept[:count])

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random effects: a published example, a closed form, and how often intervals hold the truth."""
 
-from adxl_ros.fleet.pooling import random_effects, weighted_mean
+from adxl_ros.fleet.populations import random_effects, weighted_mean
 import numpy as np
 import pytest
 

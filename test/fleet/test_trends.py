@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Slopes of units: least squares, the share of false claims, weak drifts, and recalibrations."""
 
-from adxl_ros.fleet.pooling import claims, fit_trends, interval_factor, outliers, Recordings
+from adxl_ros.fleet.trends import claims, fit_trends, interval_factor, outliers, Recordings
 import numpy as np
 import pytest
 from scipy.stats import false_discovery_control, linregress

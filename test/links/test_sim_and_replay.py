@@ -68,7 +68,7 @@ def test_sim_samples_a_pose_with_the_stated_noise():
     sensor = nominal()
     stamps, volts = read_until(simulated(sensor), START + 20_000 * MS, 4 * MS)
     assert np.array_equal(stamps, START + MS * np.arange(20_001))
-    expected = [2.5 + 9.80665 / 9.80665, 2.5]
+    expected = [2.5 + 1.0, 2.5]  # 1 V/g along the vertical
     count = noise.effective_samples(len(volts), 1e-3, sensor.rc_s)
     std_v = noise.sample_std_v(sensor)
     assert np.abs(volts.mean(0) - expected).max() < 5 * std_v[0] / count**0.5
@@ -110,13 +110,16 @@ def test_sim_waits_for_a_stage_and_holds_the_pose_of_a_lost_one(monkeypatch):
     assert link.read(START + 100 * MS).until_ns == START + 100 * MS
     link.sense_stage(START + 200 * MS, {'alpha': 0.3, 'beta': 0.0}, {})
     assert link.read(START + 900 * MS).until_ns == START + 200 * MS
+    # A minute between two reads: the process was held up, and the stage perhaps as well.
     clock[0] += 60.0
     assert not len(link.read(START + 1000 * MS).stamp_ns), 'held up, like the stage'
+    # A stage counts as lost after 1 s of reads; the long one counts as 0.1 s.
+    turn_s = 0.05
     for _ in range(16):
-        clock[0] += 0.05
-        assert not len(link.read(START + 1100 * MS).stamp_ns)
+        clock[0] += turn_s
+        assert not len(link.read(START + 1100 * MS).stamp_ns), 'silent for 0.9 s'
     for _ in range(8):
-        clock[0] += 0.05
+        clock[0] += turn_s
         link.read(START + 1100 * MS)
     after = link.read(START + 1300 * MS)
     assert after.until_ns == START + 1300 * MS

@@ -47,7 +47,7 @@ import os
 from adxl_ros.errors import UserError
 from adxl_ros.files import bag_messages, parameter_file, tables
 from adxl_ros.links import iio, serial
-from adxl_ros.nodes.calibration import open_screen
+from adxl_ros.nodes.calibration_screen import open_screen
 from adxl_ros.report import figures, page
 sensor = parameter_file.load(parameter_file.nominal_path())
 for use in (lambda: tables.open_table('log.ulg'), lambda: tables.open_table('log.parquet'),

@@ -3,8 +3,8 @@
 """Paths through readings of encoders: their error, its prediction, and fast motion."""
 
 import adxl_ros as adxl
-from adxl_ros.simulate.motion import SmoothedPath, visible_step
 from adxl_ros.simulate.recorded_motion import motion_from_references
+from adxl_ros.simulate.smoothed_path import SmoothedPath, visible_step
 from adxl_ros.simulate.trajectories import tumble
 import numpy as np
 import pytest

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.long
 XYZ_G = 'time=t:s,x=x:g,y=y:g,z=z:g'
 LOG = turned()
 SHORT = 't,x,y,z\n' + ''.join(f'{i / 100},0.01,-0.02,{1 + i % 3 / 1e3}\n' for i in range(500))
-NO_SERIAL = 'time=t:s,x=x,y=y,z=z'
+NO_UNITS = 'time=t:s,x=x,y=y,z=z'
 
 
 def written(folder: Path, name: str, text: str | bytes) -> str:
@@ -155,10 +155,15 @@ def test_angles_in_a_log_are_the_reference(run_tool, tmp_path, names) -> None:
     check_errors(tmp_path / 'unit.yaml', 5e-3)
 
 
+def rest_starts(log: Turned) -> np.ndarray:
+    """Return the rows in which the rests begin: the angles are finite at rest only."""
+    at_rest = np.isfinite(log.angles_rad[:, 0]).astype(int)
+    return np.flatnonzero(np.diff(at_rest, prepend=0) > 0)
+
+
 def pose_table(log: Turned) -> list[str]:
-    starts = np.flatnonzero(np.diff(np.isfinite(log.angles_rad[:, 0]).astype(int), prepend=0) > 0)
     rows = []
-    for start in starts:
+    for start in rest_starts(log):
         alpha, beta = np.degrees(log.angles_rad[start])
         rows.append(f'{alpha:.3f},' + (f'{beta:.3f}' if 1 < alpha < 179 else ''))
     return rows
@@ -184,7 +189,7 @@ def test_a_table_of_poses_is_the_reference(run_tool, tmp_path) -> None:
 
 def test_a_table_of_an_inclinometer_names_its_rests(run_tool, tmp_path) -> None:
     written(tmp_path, 'log.csv', plain_text([LOG.time_s, *LOG.output_g.T]))
-    starts = np.flatnonzero(np.diff(np.isfinite(LOG.angles_rad[:, 0]).astype(int), prepend=0) > 0)
+    starts = rest_starts(LOG)
     alpha, beta = LOG.angles_rad[starts].T
     x, y = np.sin(alpha) * np.cos(beta), -np.sin(alpha) * np.sin(beta)
     roll, pitch = np.degrees([np.arctan2(y, np.cos(alpha)), np.arcsin(-x)])
@@ -207,36 +212,46 @@ def test_a_table_of_an_inclinometer_names_its_rests(run_tool, tmp_path) -> None:
     assert 'has start_s; expected both start_s and stop_s' in run_tool(*command).stderr
 
 
-@pytest.mark.parametrize('angles', ['', 'alpha_deg,beta_deg'])
-def test_each_row_may_be_the_mean_of_a_rest(run_tool, tmp_path, angles) -> None:
-    """Without the option the refusal names it; with it, the coefficients have an uncertainty."""
-    starts = np.flatnonzero(np.diff(np.isfinite(LOG.angles_rad[:, 0]).astype(int), prepend=0) > 0)
+def write_means(folder: Path, header: str, columns: slice) -> None:
+    """Write a table of which each row is the mean of a rest: outputs in g, angles in degrees."""
+    starts = rest_starts(LOG)
     means = [LOG.output_g[start : start + 150].mean(axis=0) for start in starts]
-    table = np.hstack([means, np.degrees(LOG.angles_rad[starts])])[:, : 5 if angles else 3]
-    header = ','.join(filter(None, ['x', 'y', 'z', angles]))
-    np.savetxt(tmp_path / 'means.csv', table, delimiter=',', header=header, comments='')
-    columns = 'x=x:g,y=y:g,z=z:g' + ',alpha=alpha_deg,beta=beta_deg' * bool(angles)
-    command = 'fit', 'means.csv', '--columns', columns, '-o', 'u.yaml'
+    table = np.hstack([means, np.degrees(LOG.angles_rad[starts])])[:, columns]
+    np.savetxt(folder / 'means.csv', table, delimiter=',', header=header, comments='')
+
+
+def check_fit_of_means(run_tool, folder: Path, reference: str) -> None:
+    check_errors(folder / 'u.yaml', 5e-3)
+    fitted = parameter_file.load(folder / 'u.yaml', may_measure=True)
+    assert fitted.provenance['reference'] == reference
+    assert (np.diag(fitted.covariance) > 0).all() and 'range_g' in fitted.unstated
+    done = run_tool('apply', *written_log(folder), '--params', 'u.yaml', '-o', 'tilt.csv')
+    assert done.returncode == 0 and 'Measured' in done.stdout, done.stderr
+
+
+def test_each_row_may_be_the_mean_of_a_rest(run_tool, tmp_path) -> None:
+    """Without the option the refusal names it; with it, the coefficients have an uncertainty."""
+    write_means(tmp_path, 'x,y,z', slice(3))
+    command = 'fit', 'means.csv', '--columns', 'x=x:g,y=y:g,z=z:g', '-o', 'u.yaml'
     assert 'fit --means' in run_tool(*command, '--rate', 1).stderr
     done = run_tool(*command, '--means')
-    if angles:
-        assert done.returncode == 1 and 'sensor.noise_density_g_per_rthz' in done.stderr
-        text = (
-            parameter_file.usual_path(is_nominal=False)
-            .read_text()
-            .replace(
-                'rate_hz:', 'noise_density_g_per_rthz: [4.0e-4, 4.0e-4, 4.0e-4]\n      rate_hz:'
-            )
-        )
-        written(tmp_path, 'stated.yaml', text)
-        done = run_tool(*command, '--means', '--params', 'stated.yaml')
     assert done.returncode == 0, done.stderr
-    check_errors(tmp_path / 'u.yaml', 5e-3)
-    fitted = parameter_file.load(tmp_path / 'u.yaml', may_measure=True)
-    assert fitted.provenance['reference'] == ('stage' if angles else 'gravity')
-    assert (np.diag(fitted.covariance) > 0).all() and 'range_g' in fitted.unstated
-    done = run_tool('apply', *written_log(tmp_path), '--params', 'u.yaml', '-o', 'tilt.csv')
-    assert done.returncode == 0 and 'Measured' in done.stdout, done.stderr
+    check_fit_of_means(run_tool, tmp_path, 'gravity')
+
+
+def test_means_with_angles_need_a_stated_noise(run_tool, tmp_path) -> None:
+    """Against a stage nothing else weights the means."""
+    write_means(tmp_path, 'x,y,z,alpha_deg,beta_deg', slice(5))
+    columns = 'x=x:g,y=y:g,z=z:g,alpha=alpha_deg,beta=beta_deg'
+    command = 'fit', 'means.csv', '--columns', columns, '-o', 'u.yaml', '--means'
+    done = run_tool(*command)
+    assert done.returncode == 1 and 'sensor.noise_density_g_per_rthz' in done.stderr
+    noise = 'noise_density_g_per_rthz: [4.0e-4, 4.0e-4, 4.0e-4]\n      rate_hz:'
+    text = parameter_file.usual_path(is_nominal=False).read_text().replace('rate_hz:', noise)
+    written(tmp_path, 'stated.yaml', text)
+    done = run_tool(*command, '--params', 'stated.yaml')
+    assert done.returncode == 0, done.stderr
+    check_fit_of_means(run_tool, tmp_path, 'stage')
 
 
 def written_log(folder: Path) -> list[str]:
@@ -425,7 +440,7 @@ def test_numbered_columns_and_a_mapping_file(run_tool, tmp_path) -> None:
         ),
         (
             SHORT,
-            ['--columns', NO_SERIAL],
+            ['--columns', NO_UNITS],
             '--columns: nothing states the unit of x; write for example x=x:mps2',
         ),
         (SHORT, ['--columns', 'gone.txt'], '--columns gone.txt: is neither a mapping nor a file'),

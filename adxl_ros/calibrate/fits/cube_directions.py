@@ -7,11 +7,12 @@ from __future__ import annotations
 from itertools import product
 
 from adxl_ros.model.constants import AXES
+from adxl_ros.model.kinematics import unit_vectors
 import numpy as np
 
 CANDIDATES = np.array([signs for signs in product((0, 1, -1), repeat=3) if any(signs)])
 """Faces, edges and corners of a cube, one of which points up, (26, 3)."""
-UP = CANDIDATES / np.linalg.norm(CANDIDATES, axis=1, keepdims=True)
+UP = unit_vectors(CANDIDATES)
 """The candidates as unit vectors, (26, 3)."""
 _COVERED_COS = np.cos(np.radians(22.0))
 """Cosine of the angle up to which a rest covers a direction: half of the 45° to the next one."""

@@ -22,12 +22,6 @@ misalignment.
 A three-axis sensor has the same kinds of terms on each axis: squares of both other axes
 (`cross_axis`, `cross_axis_z`), a scale factor that depends on either (`scale_factor_cross`,
 `scale_factor_z`), and a cube. A two-axis sensor has those of the paper and a cube.
-
-Terms are selected by Bayes factors: the ratio of the marginal likelihoods of the poses with a term
-and without it. Coefficients are integrated over their priors, and both models have the stage error
-of the richer one. A candidate has a stage error of its own, so that what it explains is no error
-of the stage. Poses that share a setting of a joint share its error. A term that follows alpha,
-which is set a few times only, must therefore explain more than that error does by chance.
 """
 
 from __future__ import annotations
@@ -35,20 +29,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import NamedTuple
 
-from adxl_ros.calibrate.fits import linear, linearisation
-from adxl_ros.calibrate.fits.linearisation import Linearised, linearised, StageError
+from adxl_ros.calibrate.fits import linear, optimal_poses, pose_covariance
+from adxl_ros.calibrate.fits.linearisation import Linearised, linearised
+from adxl_ros.calibrate.fits.pose_covariance import StageError
 from adxl_ros.calibrate.pose_model import angle_jacobian, predicted_volts
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.errors import UserError
-from adxl_ros.model.constants import AXES, Z_90
-from adxl_ros.model.effects import effect_named, library
+from adxl_ros.model.constants import AXES
+from adxl_ros.model.effects import effect_named
 from adxl_ros.model.effects.base import Coefficient, Place, Role
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.gauss_newton import gauss_newton, Iterate
 from adxl_ros.model.sensor import coefficients_of, get, parameter_of, put, Sensor, with_neutral
 from adxl_ros.process import usage
-from adxl_ros.report.quantities import with_half_width
 import numpy as np
 import scipy
 
@@ -69,7 +63,6 @@ GAUGE = ('cross_axis.linear', 'cross_axis_z.linear')
 """Terms that are 0 unless the poses distinguish them from the misalignment."""
 _BASE_TILT = (Coefficient('base_tilt', 'x_rad'), Coefficient('base_tilt', 'y_rad'))
 """Nuisance parameters: the level of the stage's base."""
-
 LEVEL_STD_RAD = np.radians(0.1)
 """Prior standard deviation of the level of the base, rad: the paper's 0.1°."""
 _SENSOR_PRIOR_SIZES = 5.0
@@ -82,7 +75,6 @@ _GAUGE_PRIOR_SIZES = 1.0  # Prior std of a term of `GAUGE`, in typical sizes: th
 _NAMED_POSES = 4  # Number of further poses that a message names
 _REGULARISATION = 1e-6
 """Term added to the information in typical sizes, so that it can be inverted."""
-
 _MAX_ROUNDS = 16
 """Largest count of rounds of stage error, coefficients and angles; a fit that needs more is
 reported as not converged."""
@@ -98,14 +90,15 @@ _SETTLED_DEVIANCE = 1e-2  # The stage error has converged if a round changes the
 _CURVATURE_SHRINK = 0.2  # Share of the curvature by angle errors that remains after a round
 _MAX_CURVATURE = 0.1
 """Largest curvature at which convergence is checked, relative to the noise of a mean."""
-
 _OUTLIER_CHANCE = 1e-6  # A pose less likely than this is an outlier
 _MAX_OUTLIERS = 0.2  # Largest share of outliers. Chosen: more of them are a fault of the model
-
 _SHAPE_STEP = 1.05  # Ratio of neighbouring trial values of a shape parameter
 _SHAPE_STEPS = 60
 """Number of trial values on each side of the typical one: from 1/19 to 19 times that value."""
 _FINE_SHAPES = 15  # Number of trial values between the neighbours of the likeliest value
+MAX_OPEN = 3
+"""Largest number of the twelve coefficients that their priors may give. Chosen: an axis that never
+points up or down leaves its scale factor and two misalignments open."""
 
 
 @dataclass(frozen=True)
@@ -238,7 +231,7 @@ class _StageSearch:
         self._sensor, self._stage = sensor, stated  # Sensor with coefficients, and stage error
         # Predicted errors of the angles, and the poses turned by them; see `_turned_linearly`
         none_rad = np.zeros((len(poses), 2))
-        self._errors = linearisation.AngleErrors(none_rad, none_rad, none_rad[:, 0], 0.0)
+        self._errors = pose_covariance.AngleErrors(none_rad, none_rad, none_rad[:, 0], 0.0)
         self._poses = poses
         self._kept = np.ones(len(poses), bool)  # Poses that are no outliers
         # Volts by which the model departs from its linearisation, (m,)
@@ -312,7 +305,7 @@ class _StageSearch:
         errors = solved.covariance.predicted_errors(solved.about.residual)
         start = get(self._sensor, self._names)
 
-        def cost(values: np.ndarray, angles: linearisation.AngleErrors) -> float:
+        def cost(values: np.ndarray, angles: pose_covariance.AngleErrors) -> float:
             residual = self._measured.volts - predicted_volts(
                 put(self._sensor, self._names, values), _turned(self._measured, angles.total_rad)
             )
@@ -332,7 +325,7 @@ class _StageSearch:
                 break
         self._sensor = put(self._sensor, self._names, values)
         self._poses = _turned_linearly(self._sensor, self._measured, self._errors.total_rad)
-        return float(np.abs((values - start) * np.sqrt(np.diag(solved.information))).max())
+        return float(np.abs((values - start) * stds(solved.information)).max())
 
     def _result(self, converged: bool) -> FullFit:
         """Return the fit, with the covariance of the sensor's coefficients."""
@@ -373,13 +366,13 @@ class _Iterate(Iterate):
     """An iterate with the linearised poses, their covariance, and the information, (p, p)."""
 
     about: Linearised
-    covariance: linearisation.PoseCovariance
+    covariance: pose_covariance.PoseCovariance
     information: np.ndarray
 
     @property
     def step_std(self) -> float:
         """Return the longest component of the step in its standard deviations."""
-        return float(np.abs(self.step * np.sqrt(np.diag(self.information))).max())
+        return float(np.abs(self.step * stds(self.information)).max())
 
 
 def _inliers(about: Linearised, stage: StageError) -> np.ndarray:
@@ -512,216 +505,14 @@ def next_poses(
     sensor: Sensor, poses: Poses, names: Sequence[Coefficient], stage: StageError
 ) -> str:
     """Name the poses of a 15° grid that would help most (D-optimality; Fedorov 1972), in deg."""
-    grid = linearisation.candidate_poses(np.median(poses.std_v, axis=0))
+    grid = optimal_poses.candidate_poses(np.median(poses.std_v, axis=0))
     scale = _sizes(names)
-    rows = linearisation.whitened_jacobian(sensor, grid, tuple(names), stage) * scale
+    rows = optimal_poses.whitened_jacobian(sensor, grid, tuple(names), stage) * scale
     information = fisher_information(sensor, poses, names, stage) * np.outer(scale, scale)
-    chosen = linearisation.choose_poses(
+    chosen = optimal_poses.choose_poses(
         rows, information + _REGULARISATION * np.eye(len(names)), _NAMED_POSES
     )
     return ', '.join(
         f'({np.degrees(grid.alpha_rad[i]):.0f}, {np.degrees(grid.beta_rad[i]):.0f})'
         for i in chosen
     )
-
-
-ALWAYS = ('bias', 'scale_factor')  # Terms that every fit has and that are not compared
-MAX_OPEN = 3
-"""Largest number of the twelve coefficients that their priors may give. Chosen: an axis that never
-points up or down leaves its scale factor and two misalignments open."""
-_MIN_CHANGE = {'temperature_c': 0.5, 'supply_v': 0.02}
-"""Smallest range of temperature, °C, and supply, V, for which effects that follow them are
-candidates. Chosen: 0.5 °C changes the zero-g by 0.05 mg, about the noise of a mean."""
-_MAX_ADDED = 6  # Largest count of added terms
-_GAUGE_CHANCE = 0.01  # Probability of freeing the linear cross-axis terms although they are 0
-
-
-@dataclass(frozen=True)
-class Term:
-    """Evidence for a term."""
-
-    name: str  # Effect, or one of `GAUGE`
-    is_fitted: bool  # Whether the fit has the term
-    # Log marginal likelihood of the poses with the term minus that without, nats
-    log_bayes_factor: float
-
-    @property
-    def is_supported(self) -> bool:
-        """Return whether the poses are more likely with the term than without it."""
-        return self.log_bayes_factor > 0.0
-
-
-def candidates(poses: Poses) -> tuple[str, ...]:
-    """Name the terms that these poses may need beyond the default ones."""
-    changed = {
-        name
-        for name, change in _MIN_CHANGE.items()
-        if np.ptp(getattr(poses.environment, name)) > change
-    }
-    following = [
-        name
-        for name, effect in library().items()
-        if effect.invertible and changed & set(effect.follows)
-    ]
-    return ('stage_eccentricity', *following)
-
-
-def fit(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> Sensor:
-    """Fit the full model with selected terms, and with some effects in any case."""
-    return fit_selected(sensor, poses, effects).fit.fitted
-
-
-class SelectedFit(NamedTuple):
-    """A full fit, and the evidence for its terms and for those that it does not have."""
-
-    fit: FullFit
-    terms: list[Term]
-
-
-def fit_selected(sensor: Sensor, poses: Poses, effects: Sequence[str] = ()) -> SelectedFit:
-    """Fit the full model and effects as `fit_full` does, and add terms that the poses support."""
-    terms = tuple(dict.fromkeys((*default_terms(sensor.axes), *effects)))
-    full = fit_full(sensor, poses, terms)
-    if gauge_is_identifiable(full):
-        terms = (*terms, *GAUGE)
-        full = fit_full(sensor, poses, terms)
-    compared = compare_terms(full)
-    for _ in range(_MAX_ADDED):
-        supported = [term for term in compared if not term.is_fitted and term.is_supported]
-        if not supported:
-            break
-        # One at a time: what one term explains, another need not.
-        terms = (*terms, max(supported, key=lambda term: term.log_bayes_factor).name)
-        full = fit_full(sensor, poses, terms)
-        compared = compare_terms(full)
-    return SelectedFit(full, compared)
-
-
-def compare_terms(full: FullFit) -> list[Term]:
-    """Compare the fit, linearised there, with models that have one term less or one term more."""
-    about, term = _linearised(full, ())
-    log_likelihood = -about.deviance(full.stage) / 2
-    compared = []
-    for name in dict.fromkeys(term):
-        if name in ALWAYS or name in GAUGE:
-            continue
-        excluded = term == name
-        if name == 'misalignment':
-            # The linear cross-axis terms would take its place.
-            excluded = excluded | np.isin(term, GAUGE)
-        poorer = -about.without(excluded).deviance(full.stage) / 2
-        compared.append(Term(str(name), True, log_likelihood - poorer))
-    for name in candidates(full.linear_poses):
-        if name not in term:
-            richer, _ = _linearised(full, [name])
-            stage = richer.stage_error(full.stated_std_rad, full.stage)
-            compared.append(Term(name, False, -richer.deviance(stage) / 2 - log_likelihood))
-    return compared
-
-
-def gauge_is_identifiable(full: FullFit) -> bool:
-    """
-    Test whether the poses distinguish the linear cross-axis terms from the misalignment.
-
-    The test is the likelihood ratio of all of these terms, two for each axis. A fit without them
-    has errors of the size of their products with other terms.
-    """
-    about, term = _linearised(full, GAUGE)
-    gauge = np.isin(term, GAUGE)
-    ratio = about.without(gauge).misfit(full.stage) - about.misfit(full.stage)
-    return bool(ratio > scipy.special.chdtri(gauge.sum(), _GAUGE_CHANCE))
-
-
-def _linearised(full: FullFit, added: Sequence[str]) -> tuple[Linearised, np.ndarray]:
-    """Linearise the fit with further terms; also return the term of each coefficient, (p,)."""
-    sensor = with_neutral(full.with_stage, map(effect_of, added))
-    further = chain.from_iterable(fitted_coefficients(sensor.axes, (term,)) for term in added)
-    names = (*full.names, *(name for name in further if name not in full.names))
-    return (
-        linearised(sensor, full.linear_poses, names, prior_precision(names), full.kept),
-        np.array([term_of(name) for name in names]),
-    )
-
-
-NOT_CONVERGED = (
-    'the fit did not converge: coefficients and intervals are those of its last '
-    'step; add poses, or leave out terms'
-)
-"""Line of a fit that did not converge."""
-_MAX_WARMING_K = 3.0
-"""Range of temperature beyond which the report warns, K: 0.3 mg by the datasheet's 0.1 mg/°C."""
-_BAD_STAGE_RATIO = 1.5
-"""Ratio of the estimated to the stated stage error from which the report warns."""
-_MIN_STAGE_EXCESS_RAD = 1e-5
-"""Excess over that ratio from which the report warns, rad, for a stage without a stated error."""
-_MAX_PARTS = 4  # Largest count of components of the weakest direction in the report
-_MIN_PART = 0.2  # Smallest component of the weakest direction, a unit vector, in the report
-
-
-def report_lines(full: FullFit, poses: Poses, terms: Sequence[Term]) -> list[str]:
-    """Report the stage, the weakest direction and the terms of a fit of poses."""
-    helpful = next_poses(full.with_stage, poses, full.names, full.stage)
-    setting_deg = np.degrees(full.stage.setting_rad * full.stage.joints)
-    pose_deg = np.degrees(full.stage.pose_rad * full.stage.joints)
-    std = np.sqrt(np.diag(np.linalg.inv(full.information)))
-    values = [
-        f'{name} {with_half_width(float(value), Z_90 * value_std)} {parameter_of(name).unit}'
-        for name, value, value_std in zip(full.names, get(full.with_stage, full.names), std)
-        if belongs_to_stage(name)
-    ]
-    lines = [
-        f'stage error: alpha {setting_deg[0]:.2g}, beta {setting_deg[1]:.2g} deg rms by setting, '
-        f'{pose_deg[0]:.2g} and {pose_deg[1]:.2g} deg by pose (stated '
-        f'{np.degrees(full.stated_std_rad):.2g} deg)',
-        f'stage: {", ".join(values)} (90 % intervals)',
-        _weakest_direction(full.fitted),
-        f'next poses that would help most, (alpha, beta) in deg: {helpful}',
-    ]
-    if terms:
-        lines.append('log Bayes factor of each term, nats; above 0 the poses support it:')
-    for term in terms:
-        note = '' if term.is_supported else '   not supported by these poses'
-        lines.append(f'  {term.name:20} {term.log_bayes_factor:10.1f}{note}')
-    return lines
-
-
-def _weakest_direction(fitted: Sensor) -> str:
-    """Name the direction that the poses determine least, in typical sizes, and the condition."""
-    names = fitted.covariance_names
-    scale = _sizes(fitted.covariance_names)
-    values, vectors = np.linalg.eigh(fitted.covariance / np.outer(scale, scale))
-    weakest = vectors[:, -1]
-    parts = ' '.join(
-        f'{weakest[i]:+.2f} {names[i]}'
-        for i in np.argsort(-np.abs(weakest))[:_MAX_PARTS]
-        if abs(weakest[i]) > _MIN_PART
-    )
-    return (
-        f'least determined: {parts}, std {np.sqrt(values[-1]):.2g} typical sizes (condition '
-        f'number {np.sqrt(values[-1] / values[0]):.0f})'
-    )
-
-
-def warnings(full: FullFit, poses: Poses) -> list[str]:
-    """Return what is wrong with the poses or the fit, one line each."""
-    lines = [] if full.converged else [NOT_CONVERGED]
-    if full.stage.total_rad > _BAD_STAGE_RATIO * full.stated_std_rad + _MIN_STAGE_EXCESS_RAD:
-        lines.append(
-            'the reference is worse than stated, or the model lacks an effect that looks '
-            'like a stage error; poses are weighted accordingly'
-        )
-    if full.outliers:
-        named = [
-            f'{i + 1} (alpha {np.degrees(poses.alpha_rad[i]):.1f}, beta '
-            f'{np.degrees(poses.beta_rad[i]):.1f} deg, from {poses.time_s[i, 0]:.1f} s, '
-            f'{np.sqrt(full.squared_distances[i]):.0f} sigma)'
-            for i in full.outliers
-        ]
-        lines.append(f'outliers, left out: pose {", ".join(named)}')
-    change_k = np.ptp(poses.environment.temperature_c)
-    if change_k > _MAX_WARMING_K and 'temperature_bias' not in full.fitted.effects:
-        lines.append(
-            f'temperature moved by {change_k:.1f} degC, which the model ignores; keep it '
-            f'steady, or {usage("fit", effects=["temperature_bias"])}'
-        )
-    return lines

@@ -21,6 +21,8 @@ from adxl_ros.calibrate.fits.cube_directions import AXES_UP, covered, points_up
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import variances_of
+from adxl_ros.model.kinematics import unit_vectors
 from adxl_ros.model.sensor import parameter_of, Sensor
 from adxl_ros.process import option, usage
 from adxl_ros.report.quantities import mg
@@ -46,6 +48,25 @@ _ROUNDING_STD_G = 1e-9  # Std of a mean by rounding alone, so that no weight is 
 _MAX_VALUE = 0.5  # Largest magnitude of a parameter in an iteration; chosen: five prior stds
 _PRIOR_INFORMATION = np.eye(len(NAMES)) / PRIOR_STD**2
 """Inverse covariance of the prior about 0, (9, 9)."""
+_TOLERANCE = 1e-12  # Relative tolerance of `leastsq` in cost, parameters and gradient
+_UNSCALED = np.ones(len(NAMES))  # Weights of the parameters in the trust region of `leastsq`: none
+_CONVERGED = (1, 2, 3, 4)  # States of `leastsq` in which it has converged (MINPACK, lmder)
+_STRETCHES = 5
+"""Stretches of time that are held out in turn: neighbours share temperature and time, so that a
+rest that is held out alone shows no drift. Chosen: the usual number of folds."""
+_MAX_ROUNDS = 20  # Largest count of rounds of parameters and excess variance
+_EXCESS_TOLERANCE = 1e-6
+"""The excess variance has converged if it changes by less, relative to the variance."""
+_OUTLIER_CHANCE = 0.01  # Probability of a false outlier among all rests of a fit without outliers
+_MAX_OUTLIERS = 0.25
+"""Largest share of outliers. Chosen: more of them are a fault of the recording."""
+_MAX_DEVIATIONS = 5.0  # Largest residual of a rest with which the search for outliers begins, stds
+_MIN_REMAINDER = 1e-9  # Lower bound of 1 − leverage, as a divisor
+_NAMED = 3  # Directions between the axes that advice names; chosen: a line holds them
+_MIN_GRAVITY_RATIO = 0.5
+"""Smallest ratio of the measured magnitude to local gravity; a smaller one is a wrong unit."""
+_MAX_GRAVITY_RATIO = 2.0
+"""Largest ratio of the measured magnitude to local gravity; a larger one is a wrong unit."""
 
 
 class GravityParameters(NamedTuple):
@@ -217,28 +238,6 @@ def posterior_information(
 ) -> np.ndarray:
     """Return the information of prior and rests about the parameters, (9, 9)."""
     return _PRIOR_INFORMATION + fisher_information(rests, parameters, excess_g2)
-
-
-_TOLERANCE = 1e-12  # Relative tolerance of `leastsq` in cost, parameters and gradient
-_UNSCALED = np.ones(len(NAMES))  # Weights of the parameters in the trust region of `leastsq`: none
-_CONVERGED = (1, 2, 3, 4)  # States of `leastsq` in which it has converged (MINPACK, lmder)
-_STRETCHES = 5
-"""Stretches of time that are held out in turn: neighbours share temperature and time, so that a
-rest that is held out alone shows no drift. Chosen: the usual number of folds."""
-_MAX_ROUNDS = 20  # Largest count of rounds of parameters and excess variance
-_EXCESS_TOLERANCE = 1e-6
-"""The excess variance has converged if it changes by less, relative to the variance."""
-
-_OUTLIER_CHANCE = 0.01  # Probability of a false outlier among all rests of a fit without outliers
-_MAX_OUTLIERS = 0.25
-"""Largest share of outliers. Chosen: more of them are a fault of the recording."""
-_MAX_DEVIATIONS = 5.0  # Largest residual of a rest with which the search for outliers begins, stds
-_MIN_REMAINDER = 1e-9  # Lower bound of 1 − leverage, as a divisor
-_NAMED = 3  # Directions between the axes that advice names; chosen: a line holds them
-_MIN_GRAVITY_RATIO = 0.5
-"""Smallest ratio of the measured magnitude to local gravity; a smaller one is a wrong unit."""
-_MAX_GRAVITY_RATIO = 2.0
-"""Largest ratio of the measured magnitude to local gravity; a larger one is a wrong unit."""
 
 
 @dataclass(frozen=True)
@@ -480,7 +479,7 @@ def _studentised(
         posterior_information(rests[kept], parameters, excess_g2) + np.diag(rung.precision)
     )
     jacobian = linearised(rests.mean, parameters).jacobian
-    leverage = np.einsum('ki,ij,kj->k', jacobian, covariance, jacobian) / variance
+    leverage = variances_of(jacobian, covariance) / variance
     distance = np.abs(_residual(rests, parameters)) / np.sqrt(variance)
     inside = distance / np.sqrt(np.maximum(1 - leverage, _MIN_REMAINDER))
     # χ² per degree of freedom of the other rests, at least that of the noise of the means.
@@ -568,7 +567,7 @@ def _require_determined(
 def _advice(rests: NominalRests, parameters: np.ndarray) -> str:
     """Return which directions are missing among rests, for people: faces first, then others."""
     force = force_g(rests.mean, parameters)
-    has = covered(force / np.linalg.norm(force, axis=1, keepdims=True))
+    has = covered(unit_vectors(force))
     faces = np.flatnonzero(~has & (AXES_UP == 1))
     edges = np.flatnonzero(~has & (AXES_UP == 2))
     if len(faces):

@@ -24,6 +24,18 @@ _UPRIGHT_COS = np.cos(np.radians(0.5))
 _MIN_SPAN_G = 0.2
 """Smallest span of the reference that determines a scale factor, g. Over a smaller one, cross-axis
 terms of 1 % of the other axes change the slope by more than a typical error of it, 4 %."""
+EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z', 'scale_factor_z')
+"""Effects of the paper's model."""
+_GAUGE = {('cross_axis', 'linear'), ('cross_axis_z', 'linear')}
+"""Effect and parameter of the coefficients that stay 0."""
+_OF_Z_AXIS = ('bias', 'scale_factor', 'misalignment')
+"""Effects of a z axis: the paper has no model of it."""
+_VERTICAL_SIN = np.sin(np.radians(89.0))  # Planes with a greater |sin α| count as vertical
+_MIN_PLANE_SIN = 0.2  # Planes with |sin α| below this do not determine a scale factor (15)
+_MIN_PLANE_SPAN_G = 0.1  # Smallest span of the reference in a plane that determines a scale factor
+_MIN_INPUTS = 3  # Smallest number of distinct inputs that determine a quadratic
+_MIN_INPUT_SPAN_G = 0.3  # Smallest span of the inputs that determine a quadratic, g
+_REPLICAS = 200  # Sweeps of the parametric bootstrap: the standard deviations are known to 5 %
 
 
 def fit(sensor: Sensor, poses: Poses) -> Sensor:
@@ -77,20 +89,6 @@ def fit(sensor: Sensor, poses: Poses) -> Sensor:
         covariance=covariance,
         covariance_names=tuple(coefficients_of(values, sensor.axes)),
     )
-
-
-EFFECTS = ('bias', 'scale_factor', 'misalignment', 'cross_axis', 'cross_axis_z', 'scale_factor_z')
-"""Effects of the paper's model."""
-_GAUGE = {('cross_axis', 'linear'), ('cross_axis_z', 'linear')}
-"""Effect and parameter of the coefficients that stay 0."""
-_OF_Z_AXIS = ('bias', 'scale_factor', 'misalignment')
-"""Effects of a z axis: the paper has no model of it."""
-_VERTICAL_SIN = np.sin(np.radians(89.0))  # Planes with a greater |sin α| count as vertical
-_MIN_PLANE_SIN = 0.2  # Planes with |sin α| below this do not determine a scale factor (15)
-_MIN_PLANE_SPAN_G = 0.1  # Smallest span of the reference in a plane that determines a scale factor
-_MIN_INPUTS = 3  # Smallest number of distinct inputs that determine a quadratic
-_MIN_INPUT_SPAN_G = 0.3  # Smallest span of the inputs that determine a quadratic, g
-_REPLICAS = 200  # Sweeps of the parametric bootstrap: the standard deviations are known to 5 %
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """
-The covariance of poses about a sensor, a fit linearised at its coefficients, and D-optimal poses.
+A fit linearised at the coefficients of a sensor, and the error of the stage by its likelihood.
 
-About coefficients θ₀ the volts are V = h(θ₀) + X·(θ − θ₀) + error with a covariance S(σ_s, σ_p),
-and θ has a normal prior. The angles of the stage have an error with one part for each setting of a
-joint, σ_s, and one for each pose, σ_p. For a given stage error the best θ is generalised least
-squares. The stage error maximises the restricted likelihood (Patterson and Thompson 1971): the
-coefficients are integrated out, so that it is not too small by what they have fitted. The
+About coefficients θ₀ the volts are V = h(θ₀) + X·(θ − θ₀) + error with the covariance S(σ_s, σ_p)
+of `pose_covariance`, and θ has a normal prior. For a given stage error the best θ is generalised
+least squares. The stage error maximises the restricted likelihood (Patterson and Thompson 1971):
+the coefficients are integrated out, so that it is not too small by what they have fitted. The
 covariance of the coefficients in turn is that over all levels of the error (Kackar and Harville
 1984): a joint that is set few times leaves its level uncertain.
 """
@@ -18,188 +17,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from adxl_ros.calibrate.fits.pose_covariance import (
+    PoseCovariance,
+    shared_settings,
+    SharedSettings,
+    StageError,
+)
 from adxl_ros.calibrate.pose_model import angle_jacobian, coefficient_jacobian, predicted_volts
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.sensor import get, Sensor
 import numpy as np
 import scipy
-
-_MIN_VARIANCE_RAD2 = 1e-24
-"""Smallest variance of an angle as a divisor, rad²: it avoids 0/0 on a stage without errors."""
-
-
-@dataclass(frozen=True)
-class StageError:
-    """Standard deviations of the error of a joint."""
-
-    setting_rad: float  # Of the part that the poses of one setting share, σ_s
-    pose_rad: float = 0.0  # Of the part that is new with each pose, σ_p
-    ratio: float = 1.0  # That of alpha over the geometric mean of both joints, r
-
-    @property
-    def joints(self) -> np.ndarray:
-        """Return the factors r and 1/r of alpha and beta, (2,)."""
-        return np.array([self.ratio, 1 / self.ratio])
-
-    @property
-    def total_rad(self) -> float:
-        """Return the standard deviation of a joint's error in one pose, rad."""
-        return float(np.hypot(self.setting_rad, self.pose_rad))
-
-
-class PoseCovariance:
-    """
-    The covariance S of the volts of k poses with m axes about the model, as an operator.
-
-    jacobian: derivatives of the volts by alpha and beta, V/rad, (k, m, 2); shared: from
-    `shared_settings`; kept: poses that count, (k,) bool; the others have no weight.
-    """
-
-    def __init__(
-        self,
-        jacobian: np.ndarray,
-        poses: Poses,
-        shared: tuple[np.ndarray, int],
-        error: StageError,
-        kept: np.ndarray | None = None,
-    ) -> None:
-        # Scaled by r and 1/r, so that both joints have the same standard deviations.
-        self._jacobian = jacobian * error.joints
-        self._error = error
-        self._kept = np.ones(len(poses), bool) if kept is None else kept
-        self._number, self._shared = shared
-        # The error of a setting with only one pose is an error of that pose.
-        self._pose_rad2 = error.pose_rad**2 + np.where(self._number < 0, error.setting_rad**2, 0.0)
-        noise = poses.std_v[:, :, None] ** 2 * np.eye(jacobian.shape[1])
-        self.blocks = noise + (self._jacobian * self._pose_rad2[:, None, :]) @ np.swapaxes(
-            self._jacobian, 1, 2
-        )
-        self._root = np.linalg.cholesky(self.blocks)
-        self._whitening = np.linalg.inv(self._root)
-
-    @cached_property
-    def _settings(self) -> np.ndarray:
-        """Return σ_s·Z of the shared settings, V, (k, m, q)."""
-        columns = np.zeros((*self._jacobian.shape[:2], self._shared))
-        for joint in range(2):
-            rows = np.flatnonzero(self._number[:, joint] >= 0)
-            columns[rows, :, self._number[rows, joint]] += self._jacobian[rows, :, joint]
-        return self._error.setting_rad * columns
-
-    @cached_property
-    def _white_settings(self) -> np.ndarray:
-        """Return σ_s·Z whitened block by block, (k·m, q)."""
-        return self.whiten_by_pose(self._settings)
-
-    @cached_property
-    def _settings_root(self) -> np.ndarray:
-        """Return the Cholesky factor of 1 + σ_s²·Zᵀ B⁻¹ Z, (q, q)."""
-        return np.linalg.cholesky(
-            np.eye(self._shared) + self._white_settings.T @ self._white_settings
-        )
-
-    def _solve_settings(self, products: np.ndarray) -> np.ndarray:
-        return scipy.linalg.solve_triangular(self._settings_root, products, lower=True)
-
-    def whiten_by_pose(self, columns: np.ndarray) -> np.ndarray:
-        """Whiten columns by the blocks only, (k, m, c) to (k·m, c); 0 for poses without weight."""
-        white = self._whitening @ columns
-        white[~self._kept] = 0.0
-        return white.reshape(np.prod(white.shape[:2]), white.shape[2])
-
-    def products(self, columns: np.ndarray) -> np.ndarray:
-        """Return CᵀS⁻¹C of columns C, (k, m, c) to (c, c)."""
-        white = self.whiten_by_pose(columns)
-        by_setting = self._solve_settings(self._white_settings.T @ white)
-        return white.T @ white - by_setting.T @ by_setting
-
-    def normal_equations(
-        self, design: np.ndarray, residual: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return XᵀS⁻¹X, (p, p), and XᵀS⁻¹r, (p,), of a design, (k, m, p), and residuals."""
-        products = self.products(np.concatenate([design, residual[:, :, None]], axis=2))
-        return products[:-1, :-1], products[:-1, -1]
-
-    def log_determinant(self) -> float:
-        """Return log |S| of the poses that count."""
-        blocks = np.diagonal(self._root, axis1=1, axis2=2)[self._kept]
-        return 2 * float(np.log(blocks).sum() + np.log(np.diag(self._settings_root)).sum())
-
-    def penalty(self, errors: AngleErrors) -> float:
-        """Return the sum of the squared angle errors over their variances."""
-        pose_rad = errors.pose_rad / self._error.joints
-        setting_rad = errors.setting_rad / self._error.joints
-        total = np.sum((pose_rad**2 / np.maximum(self._pose_rad2, _MIN_VARIANCE_RAD2))[self._kept])
-        for joint in range(2):
-            _, first = np.unique(self._number[:, joint], return_index=True)
-            shared = first[self._number[first, joint] >= 0]
-            total += np.sum(setting_rad[shared, joint] ** 2) / max(
-                self._error.setting_rad**2, _MIN_VARIANCE_RAD2
-            )
-        return float(total)
-
-    def predicted_errors(self, residual: np.ndarray) -> AngleErrors:
-        """Predict the angle errors from residuals, (k, m): the best linear unbiased prediction."""
-        by_setting = self._solve_settings(
-            self._white_settings.T @ self.whiten_by_pose(residual[:, :, None])
-        )
-        factor = scipy.linalg.solve_triangular(
-            self._settings_root, by_setting, lower=True, trans=1
-        )[:, 0]
-        setting = np.append(self._error.setting_rad * factor, 0.0)[self._number]
-        white = (self._whitening @ (residual - self._settings @ factor)[:, :, None])[:, :, 0]
-        weighted = np.swapaxes(self._whitening, 1, 2) @ white[:, :, None]
-        pose = self._pose_rad2 * (np.swapaxes(self._jacobian, 1, 2) @ weighted)[:, :, 0]
-        joints = self._error.joints
-        return AngleErrors(
-            setting_rad=np.where(self._number >= 0, setting, 0.0) * joints,
-            pose_rad=pose * joints,
-            squared_distances=np.sum(white**2, axis=1),
-            setting_penalty=float(factor @ factor),
-        )
-
-
-@dataclass(frozen=True)
-class AngleErrors:
-    """Predicted errors of alpha and beta in k poses."""
-
-    setting_rad: np.ndarray  # Part of the error by setting, (k, 2)
-    pose_rad: np.ndarray  # Part of the error by pose, (k, 2)
-    # Squared Mahalanobis distance of each pose from the model, given its settings, (k,)
-    squared_distances: np.ndarray
-    setting_penalty: float  # Sum of the squared errors of the settings over σ_s²
-
-    @property
-    def total_rad(self) -> np.ndarray:
-        """Return the sum of both parts, rad, (k, 2)."""
-        return self.setting_rad + self.pose_rad
-
-    def interpolated(self, other: AngleErrors, share: float) -> AngleErrors:
-        """Return errors between these and others."""
-        return replace(
-            other,
-            setting_rad=self.setting_rad + share * (other.setting_rad - self.setting_rad),
-            pose_rad=self.pose_rad + share * (other.pose_rad - self.pose_rad),
-        )
-
-
-def shared_settings(poses: Poses) -> tuple[np.ndarray, int]:
-    """Return the numbers of settings that poses share, (k, 2), −1 for others, and their count."""
-    numbers = np.full((len(poses), 2), -1)
-    count = 0
-    for joint, setting in enumerate((poses.alpha_setting, poses.beta_setting)):
-        _, index, size = np.unique(setting, return_inverse=True, return_counts=True)
-        column = np.cumsum(size > 1) - 1 + count
-        numbers[:, joint] = np.where(size[index] > 1, column[index], -1)
-        count += int((size > 1).sum())
-    return numbers, count
-
-
-def volts_covariance(sensor: Sensor, poses: Poses, error: StageError) -> PoseCovariance:
-    """Return the covariance of the volts of poses about the model."""
-    return PoseCovariance(angle_jacobian(sensor, poses), poses, shared_settings(poses), error)
-
 
 _MIN_TOTAL_RAD = 1e-7
 """Smallest standard deviation of an angle error, rad. Chosen: no encoder is as good."""
@@ -241,7 +71,7 @@ class Linearised:
     kept: np.ndarray  # Poses that count, (k,) bool
 
     @cached_property
-    def _shared(self) -> tuple[np.ndarray, int]:
+    def _shared(self) -> SharedSettings:
         return shared_settings(self.poses)
 
     def covariance(self, error: StageError) -> PoseCovariance:
@@ -253,7 +83,7 @@ class Linearised:
         information, gradient = covariance.normal_equations(self.design, self.residual)
         information = information + np.diag(self.precision)
         gradient = gradient - self.precision * self.values
-        scale = 1 / np.sqrt(np.diag(information))
+        scale = 1 / stds(information)
         step = scale * np.linalg.solve(information * np.outer(scale, scale), scale * gradient)
         return step, information
 
@@ -394,47 +224,3 @@ def linearised(
         precision=precision,
         kept=np.ones(len(poses), bool) if kept is None else kept,
     )
-
-
-GRID_RAD = np.radians(15.0)
-"""Step of the grid of candidates in alpha and beta, rad. Chosen: such angles can be set by hand on
-a scale."""
-
-
-def choose_poses(rows: np.ndarray, information: np.ndarray, count: int) -> list[int]:
-    """
-    Choose poses one by one, each with the greatest gain in log |information|.
-
-    rows: whitened Jacobian of each of n candidates, (n, m, p); information: that before the first
-    choice, (p, p), of full rank; returns: indices of the candidates, which may repeat.
-    """
-    chosen = []
-    identity = np.eye(rows.shape[1])
-    for _ in range(count):
-        covariance = np.linalg.inv(information)
-        gain = np.linalg.slogdet(identity + rows @ covariance @ np.swapaxes(rows, 1, 2))[1]
-        chosen.append(int(np.argmax(gain)))
-        information = information + rows[chosen[-1]].T @ rows[chosen[-1]]
-    return chosen
-
-
-def candidate_poses(std_v: np.ndarray) -> Poses:
-    """Return a grid over the sphere with a noise, (m,); each pose sets both joints anew."""
-    alpha, beta = np.meshgrid(
-        np.arange(round(np.pi / GRID_RAD) + 1) * GRID_RAD,
-        np.arange(round(2 * np.pi / GRID_RAD)) * GRID_RAD,
-    )
-    settings = np.arange(alpha.size)
-    return replace(
-        Poses.without_volts(alpha.ravel(), beta.ravel(), std_v),
-        alpha_setting=settings,
-        beta_setting=settings,
-    )
-
-
-def whitened_jacobian(
-    sensor: Sensor, poses: Poses, names: tuple[Coefficient, ...], stage: StageError
-) -> np.ndarray:
-    """Return the Jacobian, (k, m, p), whitened by noise and stage error, without settings."""
-    design = coefficient_jacobian(sensor, poses, names)
-    return volts_covariance(sensor, poses, stage).whiten_by_pose(design).reshape(design.shape)

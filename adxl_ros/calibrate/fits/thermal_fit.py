@@ -16,6 +16,7 @@ from adxl_ros.files.recording_columns import Recording
 from adxl_ros.files.stamps import mean_period_s
 from adxl_ros.model.constants import G0_MPS2, NOMINAL_TEMPERATURE_C, TINY
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import variances_of
 from adxl_ros.model.filters import loop, play, stop
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
 from adxl_ros.report.quantities import mg
@@ -46,6 +47,25 @@ _SMALLEST_GAIN = 5.0
 _LARGEST_CORRELATION = 0.95
 """Largest correlation of neighbouring blocks. Chosen: beyond it the drift is a random walk."""
 _ITERATIONS = 4  # Iterations over coefficients and correlation. Chosen: they no longer change then
+_SIZES = {'thermal_lag': 'per_k', 'thermal_hysteresis': 'half_width_g'}
+_SHAPES = {'thermal_lag': 'tau_s', 'thermal_hysteresis': 'reach_k'}
+"""Size and shape of each effect of the history."""
+PARTS = 10
+"""Parts of the wanted range that are to be passed in each direction. Chosen: a curve of degree two
+is certain between them."""
+_STEADY_K = 0.25
+"""Change of temperature, K, that is no change of direction. Chosen: above the noise of a
+thermometer."""
+BLOCK_S = 10.0  # Length of a block, s. Chosen: short beside the lag of a thermometer
+_FEWEST_SAMPLES = 10
+"""Fewest samples of a block. Chosen: their scatter shows whether the sensor rests."""
+_MOST_BLOCKS = 2000  # Largest number of blocks. Chosen: a fit of less than a second
+_MOVING = 3.0
+"""Scatter of a block, divided by the median of all blocks, above which the sensor moves. Chosen:
+far above the scatter of a standard deviation of ten samples."""
+_SAME_ORIENTATION_G = 0.1
+"""Range of the block means, g, up to which a recording has one orientation. Chosen: above any
+zero-g over temperature."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +99,7 @@ class ThermalFit:
                 for parameter in ('per_k', 'per_k2')
             ]
             part = self.covariance[np.ix_(places, places)]
-            variances.append(np.einsum('ni,ij,nj->n', slopes, part, slopes) + residual_g**2)
+            variances.append(variances_of(slopes, part) + residual_g**2)
         variances_g2 = (
             np.array(variances) + self.further.error_g(temperatures_c, calibrated_c) ** 2
         )
@@ -284,11 +304,6 @@ def _whitened(values: np.ndarray, correlation: float, begins: np.ndarray) -> np.
     return white
 
 
-_SIZES = {'thermal_lag': 'per_k', 'thermal_hysteresis': 'half_width_g'}
-_SHAPES = {'thermal_lag': 'tau_s', 'thermal_hysteresis': 'reach_k'}
-"""Size and shape of each effect of the history."""
-
-
 def applied(base: Sensor, fitted: ThermalFit, calibrated_c: float) -> Sensor:
     """Put a fit into a calibrated sensor, whose zero-g stays right at `calibrated_c`."""
     names = fitted.names
@@ -337,14 +352,6 @@ def _zero_g_v(sensor: Sensor, d: int, temperature_c: float) -> float:
     return float(
         sensor.scale_v_per_g[d] * warmer_k * (values['per_k'][d] + warmer_k * values['per_k2'][d])
     )
-
-
-PARTS = 10
-"""Parts of the wanted range that are to be passed in each direction. Chosen: a curve of degree two
-is certain between them."""
-_STEADY_K = 0.25
-"""Change of temperature, K, that is no change of direction. Chosen: above the noise of a
-thermometer."""
 
 
 @dataclass(frozen=True)
@@ -396,18 +403,6 @@ def expected_error_mg(fit: ThermalFit, covered: Passed, calibrated_c: float) -> 
     unseen_g = np.where(covered.warming & covered.cooling, 0.0, typical_g)
     error_g = np.hypot(fit.error_g(covered.middles_c, calibrated_c), unseen_g)
     return float(mg(G0_MPS2 * error_g.max()))
-
-
-BLOCK_S = 10.0  # Length of a block, s. Chosen: short beside the lag of a thermometer
-_FEWEST_SAMPLES = 10
-"""Fewest samples of a block. Chosen: their scatter shows whether the sensor rests."""
-_MOST_BLOCKS = 2000  # Largest number of blocks. Chosen: a fit of less than a second
-_MOVING = 3.0
-"""Scatter of a block, divided by the median of all blocks, above which the sensor moves. Chosen:
-far above the scatter of a standard deviation of ten samples."""
-_SAME_ORIENTATION_G = 0.1
-"""Range of the block means, g, up to which a recording has one orientation. Chosen: above any
-zero-g over temperature."""
 
 
 def rest_blocks(recording: Recording, sensor: Sensor) -> Poses | None:

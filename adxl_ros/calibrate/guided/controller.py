@@ -43,6 +43,21 @@ class RequestAnswer(NamedTuple):
 _NOT_RUNNING = RequestAnswer(False, 'no calibration is running')
 
 
+class LogLine(NamedTuple):
+    """A line of the log."""
+
+    level: Level
+    text: str
+
+
+class Report(NamedTuple):
+    """The state of a calibration, for diagnostics."""
+
+    status: GuideStatus
+    serial: str  # Serial number of the sensor, '' while it is unknown
+    values: dict[str, str | float]  # By key
+
+
 class Outputs(Protocol):
     """Where a controller's lines, answers and announcements go."""
 
@@ -98,7 +113,7 @@ class StreamSensor:
         self.fault = ''  # Why the stated sensor is not the one of the parameters, or ''
         self.outlook = ''  # What is ahead of a calibration, for people
 
-    def take(self, nominal: Sensor) -> None:
+    def adopt(self, nominal: Sensor) -> None:
         """Take a sensor as that of the stream."""
         self.nominal = nominal
         self.newest = NewestSamples(nominal)
@@ -119,7 +134,7 @@ class StreamSensor:
             return None
         return nominal
 
-    def watch(self, shows: bool, waits: bool) -> tuple[Level, str] | None:
+    def watch(self, shows: bool, waits: bool) -> LogLine | None:
         """Look at the samples of no calibration, if shown or waited for; return a line to log."""
         if self.nominal is None and (waits or shows):
             # A driver that has just begun states its sensor on another topic.
@@ -131,7 +146,7 @@ class StreamSensor:
             self._samples.keep_newest(0)
         return None
 
-    def _measure(self) -> tuple[Level, str] | None:
+    def _measure(self) -> LogLine | None:
         """Measure the sensor of a stream that states nothing of itself."""
         stamps_ns, accel_mps2 = self._samples.waiting()
         if (
@@ -145,9 +160,9 @@ class StreamSensor:
             )
         except UserError as error:
             self._samples.keep_newest(0)
-            return Level.WARN, f'imu/data_raw: {error}'
-        self.take(nominal)
-        return Level.OK, f'no sensor_info: measured from the stream: {"; ".join(lines)}'
+            return LogLine(Level.WARN, f'imu/data_raw: {error}')
+        self.adopt(nominal)
+        return LogLine(Level.OK, f'no sensor_info: measured from the stream: {"; ".join(lines)}')
 
 
 class Controller:
@@ -177,7 +192,8 @@ class Controller:
         self._sensor = sensor
         self._samples = samples
         self._outputs = outputs
-        self._last = self._warned = ''  # The newest line, and the newest obstacle
+        self._newest_line = ''  # For people: it is not logged twice, and an idle status shows it
+        self._warned = ''  # The newest obstacle
         self._accepted = 0
         self._has_doubt = False
 
@@ -185,16 +201,12 @@ class Controller:
         """Begin a calibration, or resume an interrupted one, as soon as the sensor is known."""
         if self.session is not None:
             return RequestAnswer(False, 'a calibration is running; finish or abort it first')
-        if self.state is not ControllerState.ASKING or start_over is not None:
-            self.state = ControllerState.WAITING_FOR_SENSOR
-            self.question = ''
-            self._starts_over = self._by_default if start_over is None else start_over
-            self._try_to_start()
-        if self.state is ControllerState.ASKING:
+        if self.state is ControllerState.ASKING and start_over is None:
             return RequestAnswer(False, self.question)
-        if self.state is ControllerState.WAITING_FOR_SENSOR:
-            return RequestAnswer(True, 'starts when sensor_info comes, or samples show the sensor')
-        return RequestAnswer(self.session is not None, self._last)
+        self.state = ControllerState.WAITING_FOR_SENSOR
+        self.question = ''
+        self._starts_over = self._by_default if start_over is None else start_over
+        return self._try_to_start()
 
     def capture(self) -> RequestAnswer:
         """Take the pose that the operator has reached; the end of the dwell answers later."""
@@ -237,8 +249,7 @@ class Controller:
         if session is None:
             return _NOT_RUNNING
         self._take_samples(session)
-        self._say(Level.OK, f'fitting {session.accepted_count} poses')
-        self._outputs.show_fit(self._last)
+        self._outputs.show_fit(self._say(Level.OK, f'fitting {session.accepted_count} poses'))
         self.fit_fault = ''
         try:
             result = session.finish()
@@ -253,24 +264,21 @@ class Controller:
             text = f'cannot finish: {error}'
             if session.guide.next_pose() is None:
                 self.fit_fault = text = f'{text}; finish again, redo or abort'
-            self._say(Level.ERROR, text)
-            return RequestAnswer(False, text)
+            return RequestAnswer(False, self._say(Level.ERROR, text))
         for line in result.comments():
             self._outputs.log(Level.OK, line)
         self.outcome = (result.summary[0].strip(), *result.summary[1:], *result.warnings)
         self._outputs.log(Level.OK, self.outcome[0])
         open_poses = session.guide.open_poses
         advice = f'; {open_poses} poses are open: start again to go on' if open_poses else ''
-        self._stop(Level.OK, f'wrote {self.settings.output}{advice}')
-        return RequestAnswer(True, self._last)
+        return RequestAnswer(True, self._stop(Level.OK, f'wrote {self.settings.output}{advice}'))
 
     def abort(self) -> RequestAnswer:
         """End without a fit; the poses stay in the journal."""
         if self.state is ControllerState.IDLE:
             return _NOT_RUNNING
         kept = f'; its poses stay in {self.session.journal.path}' if self.session else ''
-        self._stop(Level.OK, f'aborted{kept}')
-        return RequestAnswer(True, self._last)
+        return RequestAnswer(True, self._stop(Level.OK, f'aborted{kept}'))
 
     def read_sensor_info(self, info: StreamInfo) -> None:
         """Take what the stream states about its sensor; a running session needs the same one."""
@@ -288,7 +296,7 @@ class Controller:
             changes = differences(self.settings.head(session.nominal), self.settings.head(nominal))
             if changes and session.nominal.measured and not session.accepted_count:
                 self._stop(Level.OK, 'sensor_info has come: the calibration begins again with it')
-                self.stream.take(nominal)
+                self.stream.adopt(nominal)
                 self.start(start_over=True)
                 return
             if changes:
@@ -304,7 +312,7 @@ class Controller:
                 self._outputs.answer_captures(
                     RequestAnswer(False, 'the driver started again; capture again')
                 )
-        self.stream.take(nominal)
+        self.stream.adopt(nominal)
 
     def read_quantity(self, quantity: str, stamp_ns: int, value: float) -> None:
         """Take a temperature or a supply; a stamp of another clock gives way to the newest one."""
@@ -364,15 +372,17 @@ class Controller:
             return GuideStatus(Phase.INFO, f'waiting for sensor_info; {obstacle}', True)
         if self.session is None:
             hints = IDLE_TEXT, stream.outlook, self._samples.silence()
-            return GuideStatus(Phase.IDLE, self._last or '; '.join(filter(None, hints)), False)
+            return GuideStatus(
+                Phase.IDLE, self._newest_line or '; '.join(filter(None, hints)), False
+            )
         if silence := self._samples.silence():
             return GuideStatus(Phase.SILENT, silence, True)
         if fault := self.session.fault or self.fit_fault:
             return GuideStatus(Phase.REFUSED, fault, True)
         return self.session.guide.status()
 
-    def report(self) -> tuple[GuideStatus, str, dict[str, str | float]]:
-        """Return status, serial number and values by key; log an obstacle once for each pose."""
+    def report(self) -> Report:
+        """Return the state; log an obstacle once for each pose."""
         status = self.status()
         nominal = self.stream.nominal
         session = self.session
@@ -395,28 +405,27 @@ class Controller:
         if status.late:
             # The times in its text change.
             obstacle = f'{status.phase.value} {session.accepted_count if session else ""}'
-            if obstacle != self._warned and status.text != self._last:
+            if obstacle != self._warned and status.text != self._newest_line:
                 self._outputs.log(Level.WARN, status.text)
             self._warned = obstacle
-        return status, nominal.serial if nominal else '', values
+        return Report(status, nominal.serial if nominal else '', values)
 
-    def _try_to_start(self) -> None:
+    def _try_to_start(self) -> RequestAnswer:
         """Begin a session if the sensor is known and the operator has nothing to answer."""
         nominal = self.stream.nominal
         if nominal is None:
-            return
+            return RequestAnswer(True, 'starts when sensor_info comes, or samples show the sensor')
         try:
             if self.may_ask and self._starts_over is None:
                 self.question = self.settings.question(nominal)
             if self.question:
                 self.state = ControllerState.ASKING
-                return
+                return RequestAnswer(False, self.question)
             self.session = session = Session(
                 nominal, self.settings, bool(self._starts_over), self._sensor
             )
         except UserError as error:
-            self._stop(Level.ERROR, f'{error}')
-            return
+            return RequestAnswer(False, self._stop(Level.ERROR, f'{error}'))
         self.state = ControllerState.RUNNING
         self.outcome = ()
         self._samples.restart_silence()
@@ -435,7 +444,8 @@ class Controller:
             if session.resumed
             else ''
         )
-        self._say(Level.OK, f'calibrating {nominal.serial}: {task}{resumed}')
+        line = self._say(Level.OK, f'calibrating {nominal.serial}: {task}{resumed}')
+        return RequestAnswer(True, line)
 
     def _take_samples(self, session: Session) -> None:
         """Give the session the samples that have come, and log what is wrong with them."""
@@ -443,8 +453,8 @@ class Controller:
         if fault := session.feed(stamps_ns, volts, self._samples.fault):
             self._say(Level.ERROR, fault)
 
-    def _stop(self, level: Level, text: str) -> None:
-        """End the session, or the wait for one, with a line for people."""
+    def _stop(self, level: Level, text: str) -> str:
+        """End the session, or the wait for one, with a line for people; return the line."""
         if self.session is not None:
             self._accepted = self.session.accepted_count
             self.session.journal.close()
@@ -453,10 +463,11 @@ class Controller:
         self.question = self.fit_fault = ''
         self._outputs.answer_captures(RequestAnswer(False, text))
         self._outputs.withdraw_pose(text)
-        self._say(level, text)
+        return self._say(level, text)
 
-    def _say(self, level: Level, text: str) -> None:
-        """Log a line unless it was the last one."""
-        if text != self._last:
+    def _say(self, level: Level, text: str) -> str:
+        """Log a line unless it was the last one; return it."""
+        if text != self._newest_line:
             self._outputs.log(level, text)
-        self._last = text
+        self._newest_line = text
+        return text

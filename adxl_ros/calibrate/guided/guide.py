@@ -37,6 +37,14 @@ _KEPT_READINGS = 100_000  # Readings that stay in memory; chosen: 1000 s at 100 
 STALE_NS = 60_000_000_000
 """A reading counts for samples up to this far from its stamp, ns; chosen: temperature and supply
 hardly change in a minute."""
+_CLOCK_OFFSET_S = 2.0
+"""Largest offset of the clocks of stage and sensor, s; chosen: above any delay of messages."""
+_KEPT_OFFSETS = 20
+"""Offsets of the two clocks that stay in memory; chosen: a second of messages at 20 Hz."""
+_FEWEST_OFFSETS = 4
+"""Offsets of the two clocks that a comparison needs; chosen: one message alone may be late."""
+SILENT_S = 3.0
+"""The encoder counts as silent after this, s; chosen: several of its longest usual periods."""
 
 
 def went_back(newest_ns: int | None, stamp_ns: int) -> bool:
@@ -236,16 +244,6 @@ class Dwell:
         )
 
 
-_CLOCK_OFFSET_S = 2.0
-"""Largest offset of the clocks of stage and sensor, s; chosen: above any delay of messages."""
-_KEPT_OFFSETS = 20
-"""Offsets of the two clocks that stay in memory; chosen: a second of messages at 20 Hz."""
-_FEWEST_OFFSETS = 4
-"""Offsets of the two clocks that a comparison needs; chosen: one message alone may be late."""
-SILENT_S = 3.0
-"""The encoder counts as silent after this, s; chosen: several of its longest usual periods."""
-
-
 class EncoderTrack:
     """The newest readings of the encoder, against the stamps of the samples."""
 
@@ -312,6 +310,11 @@ class Guide:
         self.refusal = self._new_refusal = ''  # Why the newest pose was refused; '' if not
 
     @property
+    def now_ns(self) -> int:
+        """Return the stamp of the newest sample, ns; 0 before the first."""
+        return self.newest_ns or 0
+
+    @property
     def pose_number(self) -> int:
         """Return the number of the next pose, from 1."""
         return len(self.accepted) + 1
@@ -332,7 +335,7 @@ class Guide:
             return ''
         if went_back(self.newest_ns, stamps_ns[0]):
             self.newest = NewestSamples(self.sensor)
-            self.begin_stream(((self.newest_ns or 0) - int(stamps_ns[0])) * 1e-9)
+            self.begin_stream((self.now_ns - int(stamps_ns[0])) * 1e-9)
             self.newest_ns = None
             self._late = LateStamps()
         before_ns = stamps_ns[0] if self.newest_ns is None else self.newest_ns
@@ -341,7 +344,7 @@ class Guide:
         # As steps of the time they would end each rest.
         stamps_ns, volts = stamps_ns[late_ns == 0], volts[late_ns == 0]
         if not len(stamps_ns):
-            return self._late.fault(self.newest_ns or 0)
+            return self._late.fault(self.now_ns)
         self.newest_ns = int(stamps_ns[-1])
         self.newest.feed(stamps_ns, volts)
         if fault := self.newest.rate_fault():

@@ -24,6 +24,9 @@ _ROUNDING = 1e-6  # Largest rounding error of the sine of a multiple of a quarte
 _GOLDEN_RAD = np.pi * (3 - np.sqrt(5))  # The golden angle, rad
 _HIGHEST_COSINE = 0.97
 """Cosine of alpha at the ends of the spiral of `spread`; chosen: inclined poses show beta."""
+_CHANGE_G = 0.003
+"""Largest change of a repeated pose beyond noise and stage error, g; chosen: a turn of 0.17°."""
+_NOISE_STDS = 3.0  # Stds of the noise in the limit of a change; chosen: exceeded once in 400
 
 
 @dataclass(frozen=True)
@@ -153,11 +156,6 @@ def by_plane(targets: Sequence[Target], accepted: Collection[int]) -> str:
         for name, group in groups.items()
         if group.any()
     )
-
-
-_CHANGE_G = 0.003
-"""Largest change of a repeated pose beyond noise and stage error, g; chosen: a turn of 0.17°."""
-_NOISE_STDS = 3.0  # Stds of the noise in the limit of a change; chosen: exceeded once in 400
 
 
 def angle_fault(target: Target, alpha_rad: float, beta_rad: float, tolerance_rad: float) -> str:

@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
-from adxl_ros.calibrate.fits import full_model, linearisation
-from adxl_ros.calibrate.fits.linearisation import linearised, StageError
+from adxl_ros.calibrate.fits import full_model, optimal_poses, pose_covariance
+from adxl_ros.calibrate.fits.linearisation import linearised
+from adxl_ros.calibrate.fits.pose_covariance import StageError
 from adxl_ros.calibrate.guided import pose_plan
 from adxl_ros.calibrate.guided.pose_plan import Target
 from adxl_ros.calibrate.guided.screen_contents import ScreenRow
@@ -21,6 +22,7 @@ from adxl_ros.model import noise
 from adxl_ros.model.constants import Z_90
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import stds
 from adxl_ros.model.kinematics import specific_force, tilt
 from adxl_ros.model.sensor import get, parameter_of, put, Sensor, with_neutral
 from adxl_ros.report.quantities import signed, with_half_width
@@ -35,6 +37,9 @@ _LEAST_STD_V = 1e-7
 """Lower bound of the noise of a mean, V; chosen: below any ADC, so that no weight is infinite."""
 _OUTLIER_STDS = 3.5  # Residual from which a pose is refused, stds; chosen: one of 2000 by chance
 _MODEL_STD_G = 5e-3  # Std of further model errors; chosen: it accepts twice the datasheet limits
+_SPARE_READINGS = 40
+"""Readings beyond the number of coefficients; chosen: they show stage error and outliers."""
+_MOST_POSES = 90  # Largest number of poses; chosen: by hand a longer plan is no longer quick
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,7 @@ class RunningEstimate:
         slope = coefficient_jacobian(sensor, pose, self.names)[0]
         variance = np.diag(
             slope @ self.covariance @ slope.T
-            + linearisation.volts_covariance(sensor, pose, self.stage).blocks[0]
+            + pose_covariance.volts_covariance(sensor, pose, self.stage).blocks[0]
         )
         expected_v = predicted_volts(sensor, pose)[0]
         slack_v = sensor.nominal_scale_v_per_g * np.hypot(_MODEL_STD_G, tolerance_rad)
@@ -95,7 +100,7 @@ class RunningEstimate:
 
     def rows(self) -> list[ScreenRow]:
         """Return the coefficients for the screen."""
-        std = np.sqrt(np.diag(self.covariance))
+        std = stds(self.covariance)
         return coefficient_rows(self.names, get(self.sensor, self.names), std, self.prior)
 
 
@@ -195,20 +200,15 @@ def coefficient_rows(
     ]
 
 
-_SPARE_READINGS = 40
-"""Readings beyond the number of coefficients; chosen: they show stage error and outliers."""
-_MOST_POSES = 90  # Largest number of poses; chosen: by hand a longer plan is no longer quick
-
-
 def quick(sensor: Sensor, dwell_s: float, tilt_error_rad: float, check_poses: int) -> list[Target]:
     """Choose the fewest poses that reach a tilt error, and never more than 90."""
     start = from_records(sensor, [], dwell_s)
     fewest = math.ceil((len(start.names) + _SPARE_READINGS) / len(sensor.axes))
-    grid = linearisation.candidate_poses(start.pose_std_v)
-    rows = linearisation.whitened_jacobian(start.sensor, grid, start.names, start.stage)
+    grid = optimal_poses.candidate_poses(start.pose_std_v)
+    rows = optimal_poses.whitened_jacobian(start.sensor, grid, start.names, start.stage)
     chosen = [
         Target(float(grid.alpha_rad[i]), float(grid.beta_rad[i]))
-        for i in linearisation.choose_poses(
+        for i in optimal_poses.choose_poses(
             rows, np.diag(1 / start.prior**2), max(_MOST_POSES, fewest)
         )
     ]

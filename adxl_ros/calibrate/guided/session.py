@@ -10,11 +10,17 @@ import os
 from pathlib import Path
 from typing import Any
 
-from adxl_ros.calibrate import calibration
+from adxl_ros.calibrate.calibration import (
+    calibrate,
+    calibrate_thermal,
+    CalibrationResult,
+    RecordedPoses,
+)
 from adxl_ros.calibrate.guided import pose_plan, running_estimate
-from adxl_ros.calibrate.guided.rest_guides import HandGuide, ThermalGuide, ThermalSettings
+from adxl_ros.calibrate.guided.rest_guides import HandGuide
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, EstimateRows, StageMode
 from adxl_ros.calibrate.guided.stage_guide import StageGuide
+from adxl_ros.calibrate.guided.thermal_guide import ThermalGuide, ThermalSettings
 from adxl_ros.calibrate.poses import Poses
 from adxl_ros.calibrate.report import page
 from adxl_ros.errors import UserError
@@ -260,7 +266,7 @@ class Session:
         _, estimated = self._estimated
         return estimated._replace(expected=[*self.guide.progress(), *estimated.expected])
 
-    def finish(self) -> calibration.CalibrationResult:
+    def finish(self) -> CalibrationResult:
         """Fit the poses so far and write the parameter file; `end` follows all other files."""
         records = self.guide.poses_to_fit()
         source = self.journal.path.name
@@ -273,10 +279,10 @@ class Session:
         poses = Poses.from_records(records)
         if self.settings.mode == 'thermal':
             range_c = self.settings.thermal.range_c
-            result = calibration.calibrate_thermal(self._base, poses, source, range_c=range_c)
+            result = calibrate_thermal(self._base, poses, source, range_c=range_c)
         else:
-            recorded = calibration.RecordedPoses(source, poses)
-            result = calibration.calibrate(self.nominal, [recorded])
+            recorded = RecordedPoses(source, poses)
+            result = calibrate(self.nominal, [recorded])
         entries = sweep_journal.read(self.journal.path).entries
         if any(isinstance(entry, MountingUnchecked) for entry in entries):
             provenance = {
@@ -288,7 +294,7 @@ class Session:
         self._fitted = records
         return result
 
-    def write_report(self, result: calibration.CalibrationResult) -> None:
+    def write_report(self, result: CalibrationResult) -> None:
         """Write the report if one is asked for."""
         if self.settings.report:
             page.write(make_folder(self.settings.report), result, self.settings.store)

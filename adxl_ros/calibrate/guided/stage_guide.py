@@ -7,10 +7,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
-from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate, screen_contents
+from adxl_ros.calibrate.guided import guide, pose_plan, running_estimate
 from adxl_ros.calibrate.guided.guide import Dwell, EncoderTrack, Guide, NextPose, temperature_fault
 from adxl_ros.calibrate.guided.pose_plan import Course, MOVE_S, Target
-from adxl_ros.calibrate.guided.screen_contents import GuideStatus, Phase, ScreenRow, StageMode
+from adxl_ros.calibrate.guided.screen_contents import (
+    CaptureSettings,
+    EstimateRows,
+    GuideStatus,
+    Phase,
+    ScreenRow,
+    StageMode,
+    tilt_row,
+)
 from adxl_ros.calibrate.joint_settings import angle_tolerance_rad, SettingTracker
 from adxl_ros.errors import UserError
 from adxl_ros.files.sweep_journal import JournalEntry, MountingUnchecked, PoseRecord, PoseSkipped
@@ -37,7 +45,7 @@ class StageSweep(Guide):
         self,
         sensor: Sensor,
         targets: Sequence[Target],
-        settings: screen_contents.CaptureSettings,
+        settings: CaptureSettings,
         accepted: Sequence[PoseRecord] = (),
         skipped: Iterable[int] = (),
     ) -> None:
@@ -69,11 +77,11 @@ class StageSweep(Guide):
         target = self.course.target
         # In stage mode encoder an operator or a program gives the commands.
         if target is not None and self.settings.stage_mode is not StageMode.ENCODER:
-            self.tracker.command(self.newest_ns or 0, target.alpha_rad, target.beta_rad)
+            self.tracker.command(self.now_ns, target.alpha_rad, target.beta_rad)
 
     def restart_dwell(self) -> None:
         """Average from the next sample on."""
-        self.dwell = Dwell(self.sensor, (self.newest_ns or 0) + 1)
+        self.dwell = Dwell(self.sensor, self.now_ns + 1)
 
     def verify(self) -> None:
         """Take the newest pose again before others, to check the mounting."""
@@ -85,7 +93,7 @@ class StageSweep(Guide):
         """Take the pose in which the operator has put the sensor; return an obstacle or ''."""
         target = self.course.target
         if target is not None and self.settings.stage_mode is StageMode.ENCODER:
-            silence = self.encoder.silence(self.newest_ns or 0)
+            silence = self.encoder.silence(self.now_ns)
             if self.encoder.angles_rad is None or silence:
                 return f'{silence}: in stage.mode encoder its angle counts'
             fault = self.encoder.clock_fault() or pose_plan.angle_fault(
@@ -144,7 +152,7 @@ class StageSweep(Guide):
     def read_command(self, alpha_rad: float, beta_rad: float) -> None:
         """Take a command that somebody gave the stage; in other modes the targets are these."""
         if self.settings.stage_mode is StageMode.ENCODER:
-            self.tracker.command(self.newest_ns or 0, alpha_rad, beta_rad)
+            self.tracker.command(self.now_ns, alpha_rad, beta_rad)
 
     def begin_stream(self, back_s: float) -> None:
         """Begin the pose again; the stage may have moved, and the sensor, too."""
@@ -184,7 +192,7 @@ class StageSweep(Guide):
             return None
         record = dwell.record(self.course.index, rest, samples)
         if self.uses_encoder and (self.encoder.newest_ns or 0) < record.stop_ns:
-            silence = self.encoder.silence(self.newest_ns or 0)
+            silence = self.encoder.silence(self.now_ns)
             if silence and settings.stage_mode is StageMode.ENCODER:
                 self.refuse(f'{silence}; capture again when it is back')
             return None
@@ -328,7 +336,7 @@ class StageGuide(StageSweep):
             task = self.destination()
             command_rad = (target.alpha_rad, target.beta_rad)
         return NextPose(
-            f'pose {self.pose_number} of {count}: {task}', values, command_rad, self.newest_ns or 0
+            f'pose {self.pose_number} of {count}: {task}', values, command_rad, self.now_ns
         )
 
     def status(self) -> GuideStatus:
@@ -337,10 +345,10 @@ class StageGuide(StageSweep):
         by_encoder = self.settings.stage_mode is StageMode.ENCODER
         if target is None:
             return GuideStatus(Phase.DONE, 'all poses are taken', False)
-        waited_s = ((self.newest_ns or 0) - (self.since_ns or 0)) * 1e-9
+        waited_s = (self.now_ns - (self.since_ns or 0)) * 1e-9
         if self.uses_encoder and (fault := self.encoder.clock_fault()):
             return GuideStatus(Phase.STAGE, fault, True)
-        silence = self.encoder.silence(self.newest_ns or 0) if self.uses_encoder else ''
+        silence = self.encoder.silence(self.now_ns) if self.uses_encoder else ''
         if silence and (self.dwell is not None or by_encoder):
             return GuideStatus(Phase.STAGE, silence, waited_s > guide.SILENT_S)
         if self.refusal:
@@ -407,7 +415,7 @@ class StageGuide(StageSweep):
             ),
         ]
 
-    def estimated(self) -> screen_contents.EstimateRows:
+    def estimated(self) -> EstimateRows:
         """Return what the poses so far show, for the screen."""
         targets = self.course.targets
         closed = self.course.closed
@@ -420,6 +428,6 @@ class StageGuide(StageSweep):
         ).tilt_error_rad()
         expected = [
             ScreenRow('coverage', pose_plan.by_plane(targets, self.accepted)),
-            screen_contents.tilt_row(self.tilt_error_rad(), final_rad),
+            tilt_row(self.tilt_error_rad(), final_rad),
         ]
-        return screen_contents.EstimateRows(expected, self.estimate.rows())
+        return EstimateRows(expected, self.estimate.rows())

@@ -30,6 +30,7 @@ from adxl_ros.files.calibration_store import calibration_id, date_of
 from adxl_ros.files.sweep_journal import Adopted, JournalEntry, NaturalRest, Undone
 from adxl_ros.model.constants import AXES, G0_MPS2
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import variances_of
 from adxl_ros.model.sensor import get, put, Sensor
 from adxl_ros.report.quantities import utc
 import numpy as np
@@ -476,7 +477,7 @@ class Keeper:
         mean, covariance = belief.moments
         rows = self._linear.zero_g(temperature_c)
         zero_g = rows @ mean
-        std = np.sqrt(np.einsum('ij,jk,ik->i', rows, covariance, rows))
+        std = np.sqrt(variances_of(rows, covariance))
         total = rows @ (self._kept.values + mean - self._original)
         up = self._upright()
         error = self._linear.errors(up, temperature_c).by_coefficients
@@ -486,7 +487,7 @@ class Keeper:
             across = _across(up)
             tilt_rad = np.sqrt(np.linalg.eigvalsh(across @ spread @ across.T).max())
         date = date_of(self._kept.sensor)
-        unlearnt = np.einsum('ij,jk,ik->i', rows, self._unlearnt, rows)
+        unlearnt = variances_of(rows, self._unlearnt)
         return KeptState(
             age_days=np.nan if date is None else (now_ns * 1e-9 - date.timestamp()) / 86_400,
             temperature_c=temperature_c,
@@ -508,7 +509,7 @@ class Keeper:
         mean, covariance = self._stay_free.moments
         rows = self._linear.zero_g(temperature_c)
         values = rows @ (self._kept.values + mean)
-        std = np.sqrt(np.einsum('ij,jk,ik->i', rows, covariance, rows))
+        std = np.sqrt(variances_of(rows, covariance))
         return [ZeroG(*pair) for pair in zip(1e3 * values, 1e3 * NORMAL_90 * std)]
 
     def _upright(self) -> np.ndarray:

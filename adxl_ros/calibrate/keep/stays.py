@@ -45,8 +45,7 @@ class RestStream:
         self._volts: list[np.ndarray] = []
         self._begin_ns = 0
         self._temperatures: deque[tuple[int, float]] = deque()
-        self._last: NaturalRest | None = None  # The last rest that was found
-        self._goes_on = False  # Whether it reached the end of its window
+        self._unfinished: NaturalRest | None = None  # A rest that reached the end of its window
         self._given: NaturalRest | None = None  # The last rest that was given
         self._stay = 0
         self.counts: Counter[str] = Counter(rests=0, without_temperature=0)
@@ -81,7 +80,7 @@ class RestStream:
         """Yield the rests of the last window, and end the stay."""
         if self._stamps_ns:
             yield from self._cut()
-        self._goes_on = False
+        self._unfinished = None
 
     def _cut(self) -> Iterator[NaturalRest]:
         """Search a window."""
@@ -93,24 +92,22 @@ class RestStream:
         increases = np.diff(time_s, prepend=-1.0) > 0
         used = finite & increases
         if used.sum() < 2:
-            self._goes_on = False
+            self._unfinished = None
             return
         rule = RestRule(datasheet_noise(self._sensor), learns=False)
         finder = RestFinder(self._sensor.rate_hz, volts.shape[1], rule)
         finder.feed(time_s[used], volts[used])
-        goes_on = False
+        unfinished = None
         for rest, mean_v, std_v in finder.means(finder.rests()):
             found = self._natural(rest, mean_v, std_v, int(stamps_ns[0]))
-            is_first = rest.time_start_s < _EDGE_S
-            if not (is_first and self._goes_on and self._is_same(found)):
+            if rest.time_start_s >= _EDGE_S or not self._goes_on(found):
                 self._stay += 1
             found = replace(found, stay=self._stay)
-            self._last = found
-            self._goes_on = False
-            goes_on = rest.time_stop_s > time_s[-1] - _EDGE_S
+            self._unfinished = None
+            unfinished = found if rest.time_stop_s > time_s[-1] - _EDGE_S else None
             if rest.span_s >= _SHORTEST_S:
                 yield from self._thinned(found)
-        self._goes_on = goes_on
+        self._unfinished = unfinished
 
     def _natural(
         self, rest: Rest, mean_v: np.ndarray, std_v: np.ndarray, begin_ns: int
@@ -137,10 +134,11 @@ class RestStream:
         ]
         return float(np.mean(known)) if known else np.nan
 
-    def _is_same(self, found: NaturalRest) -> bool:
+    def _goes_on(self, found: NaturalRest) -> bool:
         """Return whether a rest goes on from the window before."""
-        assert self._last is not None
-        change_v = np.abs(np.subtract(found.mean_v, self._last.mean_v))
+        if self._unfinished is None:
+            return False
+        change_v = np.abs(np.subtract(found.mean_v, self._unfinished.mean_v))
         return bool((change_v < _SAME_G * self._sensor.scale_v_per_g).all())
 
     def _thinned(self, found: NaturalRest) -> Iterator[NaturalRest]:

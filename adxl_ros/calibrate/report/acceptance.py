@@ -16,6 +16,7 @@ from adxl_ros.calibrate.report.held_out import HeldOutErrors
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Coefficient
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.noise import sample_std_v
 from adxl_ros.model.sensor import parameter_of, Sensor
 from adxl_ros.report.quantities import duration, mg, three_digits, two_digits
@@ -195,7 +196,7 @@ def limit(sensor: Sensor) -> Limit:
     if typical:
         return Limit(typical * sensor.range_g**3 * G0_MPS2, 'datasheet')
     noise_g = sample_std_v(sensor) / sensor.scale_v_per_g
-    return Limit(G0_MPS2 * float(np.sqrt(np.mean(noise_g**2))), 'noise of one sample')
+    return Limit(G0_MPS2 * rms(noise_g), 'noise of one sample')
 
 
 def summary_lines(

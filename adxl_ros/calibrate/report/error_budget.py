@@ -29,6 +29,7 @@ from typing import NamedTuple
 from adxl_ros.model import signal_chain
 from adxl_ros.model.covariance import coefficient_tangent
 from adxl_ros.model.effects.base import Components, Environment, NOMINAL_ENVIRONMENT
+from adxl_ros.model.kinematics import unit_vectors
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.quantities import mg
 import numpy as np
@@ -113,7 +114,7 @@ def tilt_variance(
     covariance: np.ndarray, force: np.ndarray, gravity: float, used: np.ndarray
 ) -> float:
     """Return the mean square of tilt over the poses used, rad², by the part across the force."""
-    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    up = unit_vectors(force)
     trace = np.einsum('iik->k', covariance)
     radial = np.einsum('ki,ijk,kj->k', up, covariance, up)
     return float(np.mean((trace - radial)[used])) / gravity**2

@@ -98,7 +98,7 @@ def error_budgets(
             (measured.force_mps2 - corrected)[used][:, axes],
             float(np.mean(measured.accel_mps2[used] ** 2)),
             predicted,
-            scatter.accel - predicted.noise if scatter.has_noise else scatter.accel,
+            scatter.without_noise(scatter.accel, predicted),
             spread,
         )
     if has_tilt.any():
@@ -111,7 +111,7 @@ def error_budgets(
             angle_between(measured.force_mps2, corrected)[has_tilt],
             float(np.mean(measured.tilt_rad[has_tilt] ** 2)),
             predicted,
-            scatter.tilt - predicted.noise if scatter.has_noise else scatter.tilt,
+            scatter.without_noise(scatter.tilt, predicted),
             spread,
         )
         tilt = replace(tilt, tilt_per_axis=mean_tilt2(by_cause.by_probe) / _PROBE_MPS2**2)
@@ -132,6 +132,8 @@ def _budget(
     no model explains, without noise; NaN where it is unknown; spread: see `coefficient_spread`.
     """
     mean_square = float(np.mean(errors**2))
+    # What the fitted errors of the stage explain is no part of the mean square.
+    by_fitted_stage = max(measured - mean_square, 0.0)
     nu = degrees_of_freedom(errors)
     lower = mean_square * nu / float(scipy.special.chdtri(nu, _CHANCE))
     upper = mean_square * nu / float(scipy.special.chdtri(nu, UPPER_QUANTILE))
@@ -139,11 +141,11 @@ def _budget(
     explained = predicted.noise + predicted.coefficients + largest_stage
     model = mean_square - explained if lower > explained else 0.0
     left = mean_square - predicted.noise - predicted.coefficients
-    stage = min(max(left, 0.0), largest_stage)
+    by_random_stage = min(max(left, 0.0), largest_stage)
     return ErrorBudget(
         measured=measured,
         noise=predicted.noise,
-        stage=max(measured - mean_square, 0.0) + stage,
+        stage=by_fitted_stage + by_random_stage,
         coefficients=predicted.coefficients,
         model=model,
         calibration_high=spread * predicted.coefficients + max(upper - explained, 0.0),
@@ -197,6 +199,10 @@ class _Scatter(NamedTuple):
     tilt: float  # rad²
     has_noise: bool  # Whether they include the noise of the means
 
+    def without_noise(self, mean_square: float, predicted: PredictedParts) -> float:
+        """Return one of the mean squares without the noise of the means."""
+        return mean_square - predicted.noise if self.has_noise else mean_square
+
 
 def _scatter(sensor: Sensor, poses: Poses) -> _Scatter:
     """Return the mean squares of acceleration and tilt that no model can explain."""
@@ -226,4 +232,5 @@ def _scatter(sensor: Sensor, poses: Poses) -> _Scatter:
     # No stage error changes |f|. A model error is as large in |f| as in any other direction.
     magnitude = np.linalg.norm(errors.force_mps2, axis=1) - gravity
     excess = max(float(np.mean(errors.accel_mps2**2) - np.mean(magnitude**2)), 0.0)
+    # A turn of the force has three times the mean square that one of its three components has.
     return _Scatter(excess, 3 * excess / gravity**2, has_noise=False)

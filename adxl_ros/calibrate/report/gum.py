@@ -67,6 +67,7 @@ RULE = (
     'to each use.'
 )
 """The decision rule (ISO/IEC 17025, 7.8.6)."""
+SCHEMA_VERSION = '3.2.0'
 
 
 @dataclass(frozen=True)
@@ -354,9 +355,6 @@ def section(found: Uncertainty | None) -> dict[str, Any] | None:
         'range': f'{expanded_mg.min():.2f} to {expanded_mg.max():.2f} mg',
         'inside': f'{int(inside.sum())} of {inside.size}',
     }
-
-
-SCHEMA_VERSION = '3.2.0'
 
 
 def _digits(values: Any) -> str:

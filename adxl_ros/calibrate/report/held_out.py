@@ -14,6 +14,7 @@ from adxl_ros.errors import UserError
 from adxl_ros.model import signal_chain
 from adxl_ros.model.covariance import force_covariance
 from adxl_ros.model.effects.base import Components
+from adxl_ros.model.error_sizes import rms
 from adxl_ros.model.kinematics import tilt
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.report.quantities import mg
@@ -147,12 +148,12 @@ def statistic(values: np.ndarray) -> ErrorStatistic:
     nu = degrees_of_freedom(values)
     if not sizes.size:
         return ErrorStatistic(np.nan, np.nan, (np.nan, np.nan))
-    rms = float(np.sqrt(np.mean(sizes**2)))
+    size = rms(sizes)
 
     def bound(probability: float) -> float:
-        return rms * float(np.sqrt(nu / scipy.special.chdtri(nu, probability)))
+        return size * float(np.sqrt(nu / scipy.special.chdtri(nu, probability)))
 
-    return ErrorStatistic(rms, float(sizes.max()), (bound(0.05), bound(0.95)))
+    return ErrorStatistic(size, float(sizes.max()), (bound(0.05), bound(0.95)))
 
 
 def degrees_of_freedom(values: np.ndarray) -> float:

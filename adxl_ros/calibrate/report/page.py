@@ -5,9 +5,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import Enum
 from pathlib import Path
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 from adxl_ros.calibrate.fits import linear
 from adxl_ros.calibrate.pose_model import reference_force
@@ -21,10 +22,12 @@ from adxl_ros.files import calibration_store, parameter_file
 from adxl_ros.files.atomic_write import AnyPath, write_text
 from adxl_ros.model import signal_chain
 from adxl_ros.model.constants import G0_MPS2, Z_90
+from adxl_ros.model.error_sizes import rms, stds
+from adxl_ros.model.kinematics import unit_vectors
 from adxl_ros.model.sensor import get, Sensor
 from adxl_ros.process import command
 from adxl_ros.report import figures, page as html_page
-from adxl_ros.report.figures import AXIS_COLOURS, Figure
+from adxl_ros.report.figures import AXIS_COLOURS, Figure, Whisker
 from adxl_ros.report.quantities import mg, three_digits
 from adxl_ros.report.screen import Tile
 import numpy as np
@@ -38,10 +41,10 @@ _PART_COLOURS = {
     'model': '#c0392b',
 }
 """Colours of the parts of the error budget."""
-_BEYOND = 'beyond the maximum'
-"""Outcome of a coefficient whose whole interval exceeds the maximum of the datasheet."""
 _BEYOND_WHISKER = 1.08
 """Half of a whisker's range divided by the largest value in it. Chosen: no dot is cut."""
+_VERTICAL = np.sin(np.radians(89))
+"""Smallest sine of alpha in the plane alpha = 90°; chosen: stages are better than 1°."""
 
 
 def write(folder: AnyPath, result: CalibrationResult, store: AnyPath = '') -> None:
@@ -68,38 +71,8 @@ def paper_figure(result: CalibrationResult) -> Any:
 def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
     """Lay out the page."""
     fitted = result.fitted
-    errors_of = {errors.model: errors for errors in result.held_out}
-    row_of = {row.model: row for row in result.assessments}
-    errors = result.held_out[-1] if result.held_out else None
-    assessment = result.assessments[-1] if result.assessments else None
     limit_mps2, origin = acceptance.limit(fitted)
-    drawn: dict[str, Figure] = {}
-    if (fit := result.gravity_fit) is not None:
-        drawn['errors'] = _error_figure(
-            result.inliers,
-            mg(fit.held_out_mps2[:, None]),
-            Z_90 * mg(fit.expected_mps2),
-            'x',
-            'rest',
-            'magnitude minus gravity, mg',
-        )
-    elif errors is not None and assessment is not None:
-        half_mg = np.full(errors.pose_count, Z_90 * mg(assessment.accel.expected**0.5))
-        drawn['errors'] = _error_figure(
-            held_out.determining_alpha(errors.pose_errors),
-            mg(errors.pose_errors.accel_mps2),
-            half_mg,
-            fitted.axes,
-            'held-out pose',
-            'error of acceleration, mg',
-        )
     file_name = re.sub(r'[^\w.-]+', '_', fitted.serial) + '.yaml'
-    picture = ''
-    fault = ''
-    try:
-        picture = html_page.picture_url(paper_figure(result))
-    except UserError as error:
-        fault = str(error)
     return html_page.render(
         'adxl_ros.calibrate.report',
         'calibration.html',
@@ -108,30 +81,68 @@ def page(result: CalibrationResult, past: Sequence[Sensor]) -> str:
             'fitted': fitted,
             'badge': badge(fitted),
             'tiles': tiles(result),
-            'assessment': assessment,
             'limits': acceptance.LIMITS,
             'file_name': file_name,
             'apply_command': command('apply', f'RECORDING --params {file_name} -o tilt.csv'),
             'download': html_page.download_url(parameter_file.as_text(fitted, result.comments())),
-            'figures': drawn,
+            'figures': _figures(result),
             'sphere': _sphere(result),
             'coefficients': _coefficients(fitted),
-            'beyond_maximum': _BEYOND,
-            'errors_of': errors_of,
-            'row_of': row_of,
+            'errors_of': {errors.model: errors for errors in result.held_out},
+            'row_of': {row.model: row for row in result.assessments},
             'digits': three_digits,
             'mg': rms_mg,
             'limit': f'{origin} ({mg(limit_mps2):.2g} mg)',
             'part_colours': _PART_COLOURS,
             'gum': gum.section(gum.uncertainty(result)),
             'history': history(fitted, past),
-            'picture': picture,
-            'picture_fault': fault,
+            'picture': _paper_picture(result),
             'provenance': [
                 [key.replace('_', ' '), value] for key, value in fitted.provenance.items()
             ],
         },
     )
+
+
+class _Picture(NamedTuple):
+    """The figures of the paper, or why they cannot be drawn; the other one is ''."""
+
+    url: str
+    fault: str = ''
+
+
+def _paper_picture(result: CalibrationResult) -> _Picture:
+    try:
+        return _Picture(html_page.picture_url(paper_figure(result)))
+    except UserError as error:
+        return _Picture('', str(error))
+
+
+def _figures(result: CalibrationResult) -> dict[str, Figure]:
+    """Draw the errors of the poses that the fit has not seen; nothing without such poses."""
+    if (fit := result.gravity_fit) is not None:
+        errors = _error_figure(
+            result.inliers,
+            mg(fit.held_out_mps2[:, None]),
+            Z_90 * mg(fit.expected_mps2),
+            'x',
+            'rest',
+            'magnitude minus gravity, mg',
+        )
+    elif result.held_out and result.assessments:
+        held = result.held_out[-1]
+        expected_mg = rms_mg(result.assessments[-1].accel.expected)
+        errors = _error_figure(
+            held_out.determining_alpha(held.pose_errors),
+            mg(held.pose_errors.accel_mps2),
+            np.full(held.pose_count, Z_90 * expected_mg),
+            result.fitted.axes,
+            'held-out pose',
+            'error of acceleration, mg',
+        )
+    else:
+        return {}
+    return {'errors': errors}
 
 
 def badge(fitted: Sensor) -> dict[str, str]:
@@ -150,8 +161,8 @@ def tiles(result: CalibrationResult) -> list[Tile]:
     found = []
     if (fit := result.gravity_fit) is not None:
         used = np.setdiff1d(np.arange(len(fit.before_mps2)), fit.outliers)
-        before = three_digits(rms_mg(float(np.mean(fit.before_mps2[used] ** 2))))
-        after = three_digits(rms_mg(float(np.mean(fit.held_out_mps2[used] ** 2))))
+        before = three_digits(mg(rms(fit.before_mps2[used])))
+        after = three_digits(mg(rms(fit.held_out_mps2[used])))
         found = [
             Tile(
                 'error of the magnitude of gravity',
@@ -215,7 +226,7 @@ def _sphere(result: CalibrationResult) -> dict[str, Any]:
             f'pose {i}, alpha {alpha:.1f}°, beta {beta:.1f}°'
             for i, (alpha, beta) in enumerate(np.degrees([poses.alpha_rad, poses.beta_rad]).T, 1)
         ]
-    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    up = unit_vectors(force)
     values = np.stack(list(errors.values()), axis=1)
     return {
         'models': list(errors),
@@ -235,50 +246,70 @@ def _sphere(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def _coefficients(fitted: Sensor) -> list[dict[str, Any]]:
+class _Outcome(Enum):
+    """A coefficient's whole interval against its range by the datasheet; texts for people."""
+
+    NO_RANGE = ''
+    WITHIN = 'within'
+    BEYOND_TYPICAL = 'beyond typical'
+    BEYOND_MAXIMUM = 'beyond the maximum'
+
+    @classmethod
+    def of(cls, least: float, typical: float, maximum: float) -> _Outcome:
+        """Compare the least magnitude in an interval with figures, 0 where none is stated."""
+        if 0 < maximum < least:
+            return cls.BEYOND_MAXIMUM
+        if 0 < typical < least:
+            return cls.BEYOND_TYPICAL
+        return cls.WITHIN if typical or maximum else cls.NO_RANGE
+
+    @property
+    def is_beyond(self) -> bool:
+        """Return whether it is beyond a figure."""
+        return self in (_Outcome.BEYOND_TYPICAL, _Outcome.BEYOND_MAXIMUM)
+
+
+class _Row(NamedTuple):
+    """A coefficient on the page."""
+
+    label: str  # In words
+    name: str
+    text: str  # Its value with the interval and the unit
+    datasheet: str  # Its ranges by the datasheet
+    outcome: _Outcome
+    mark: Whisker
+
+
+def _coefficients(fitted: Sensor) -> list[_Row]:
     """Return the coefficients with their intervals within the range of the datasheet."""
-    half_widths = Z_90 * np.sqrt(np.diag(fitted.covariance))
+    half_widths = Z_90 * stds(fitted.covariance)
     departures = get(fitted, fitted.covariance_names)
     rows = []
     for row, name, value, half_width in zip(
         compare(fitted, fitted), fitted.covariance_names, departures, half_widths
     ):
         typical, maximum = fitted.datasheet.get(name.without_axis, (0.0, 0.0))
+        outcome = _Outcome.of(abs(value) - half_width, typical, maximum)
         largest = max(typical, maximum, abs(value) + half_width, 1e-12) * _BEYOND_WHISKER
         unit = '' if row.unit == '1' else f' {row.unit}'
         text = f'{rounded(row, row.fitted)} ± {rounded(row, row.half_width)}{unit}'
-        # The lower end of the interval decides.
-        lower = abs(value) - half_width
-        if 0 < maximum < lower:
-            beyond = _BEYOND
-        elif 0 < typical < lower:
-            beyond = 'beyond typical'
-        else:
-            beyond = 'within' if typical or maximum else ''
         factor = float(np.degrees(1.0)) if row.unit == '°' else 1.0
         ranges = [
             f'{word} ±{factor * figure:.2g}'
             for word, figure in (('typical', typical), ('maximum', maximum))
             if figure
         ]
-        rows.append(
-            {
-                'label': f'{row.label} {row.axis}',
-                'name': str(name),
-                'text': text,
-                'datasheet': ', '.join(ranges) or '-',
-                'outcome': beyond,
-                'mark': figures.whisker(
-                    value,
-                    value - half_width,
-                    value + half_width,
-                    (-largest, largest),
-                    text,
-                    typical or maximum,
-                    beyond.startswith('beyond'),
-                ),
-            }
+        mark = figures.whisker(
+            value,
+            value - half_width,
+            value + half_width,
+            (-largest, largest),
+            text,
+            typical or maximum,
+            outcome.is_beyond,
         )
+        label = f'{row.label} {row.axis}'
+        rows.append(_Row(label, str(name), text, ', '.join(ranges) or '-', outcome, mark))
     return rows
 
 
@@ -308,10 +339,6 @@ def _error_figure(
         xaxis={'title': {'text': x_label}},
         yaxis={'title': {'text': y_label}},
     )
-
-
-_VERTICAL = np.sin(np.radians(89))
-"""Smallest sine of alpha in the plane alpha = 90°; chosen: stages are better than 1°."""
 
 
 def draw_sweep(sensor: Sensor, fitted: Sensor, poses: Poses) -> Any:

@@ -30,6 +30,16 @@ _LINKS = 'adxl_ros.links'
 """Package whose modules are the links; its folder `support` holds no link."""
 _MAX_SHARE = 1e-3
 """Largest share of a sample that a latency may lack: a float32 of a firmware is not exact."""
+FOREVER_NS = 2**63 - 1  # Largest time, ns: nothing bounds it
+_FIRST_S = 0.01  # First waiting time, s; each failure doubles it
+_LONGEST_S = 0.08  # Longest waiting time, s: a device that is back is noticed within it
+_SLOW_S = 1.0  # Waiting time for a device that is there but does not fit the parameters, s
+_MAX_WAIT_S = 0.05  # Longest wait of one call, s, so that the driver reacts to its end
+SUPPLY = 'supply'  # Role of the channel with the supply voltage
+TEMPERATURE = 'temperature'  # Role of the channel with the temperature
+UNUSED = '-'  # Role of a channel that is not read
+COLUMNS = {SUPPLY: 'supply_v', TEMPERATURE: 'temperature_c'}
+"""Column of a recording by the role of a reference channel."""
 
 
 def option(
@@ -256,13 +266,6 @@ def link_module(name: str) -> LinkModule:
     return cast(LinkModule, import_module(f'{_LINKS}.{name}'))
 
 
-FOREVER_NS = 2**63 - 1  # Largest time, ns: nothing bounds it
-_FIRST_S = 0.01  # First waiting time, s; each failure doubles it
-_LONGEST_S = 0.08  # Longest waiting time, s: a device that is back is noticed within it
-_SLOW_S = 1.0  # Waiting time for a device that is there but does not fit the parameters, s
-_MAX_WAIT_S = 0.05  # Longest wait of one call, s, so that the driver reacts to its end
-
-
 def reason(error: Exception) -> str:
     """Return why a device does not open, in one line; error numbers of libiio are negative."""
     code = getattr(error, 'errno', None)
@@ -303,25 +306,18 @@ class Watchdog:
     def __init__(self, longest_turn_s: float) -> None:
         self._longest_turn_s = longest_turn_s
         self._checked_s = time.monotonic()
-        self._silent_s = 0.0
+        self.silent_s = 0.0  # Time without a message until the last check
 
     def feed(self) -> None:
         """Note that a message has come; any thread may call this."""
-        self._silent_s = 0.0
+        self.silent_s = 0.0
 
     def check(self) -> float:
         """Return for how long nothing has come, s; to be called in every turn of the node."""
         now_s = time.monotonic()
-        self._silent_s += min(now_s - self._checked_s, self._longest_turn_s)
+        self.silent_s += min(now_s - self._checked_s, self._longest_turn_s)
         self._checked_s = now_s
-        return self._silent_s
-
-
-SUPPLY = 'supply'  # Role of the channel with the supply voltage
-TEMPERATURE = 'temperature'  # Role of the channel with the temperature
-UNUSED = '-'  # Role of a channel that is not read
-COLUMNS = {SUPPLY: 'supply_v', TEMPERATURE: 'temperature_c'}
-"""Column of a recording by the role of a reference channel."""
+        return self.silent_s
 
 
 def parse_channels(value: str | Sequence[str]) -> list[str]:

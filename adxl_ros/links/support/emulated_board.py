@@ -14,8 +14,8 @@ import tty
 
 from adxl_ros.errors import UserError
 from adxl_ros.files.column_mapping import Columns
-from adxl_ros.links.support import base, wire_format
-from adxl_ros.links.support.base import samples_within
+from adxl_ros.links.support import wire_format
+from adxl_ros.links.support.base import COLUMNS, samples_within, SUPPLY, TEMPERATURE
 from adxl_ros.links.support.self_test import EmulatedLine
 from adxl_ros.model.sensor import Sensor
 from adxl_ros.process import command
@@ -118,23 +118,23 @@ class Board:
 
 
 def _volts(role: str, columns: Columns) -> np.ndarray:
-    if role == base.SUPPLY:
-        return columns[base.COLUMNS[role]] / _SUPPLY_SCALE
-    if role == base.TEMPERATURE:
-        return _TEMPERATURE_ZERO_V + _TEMPERATURE_V_PER_C * columns[base.COLUMNS[role]]
+    if role == SUPPLY:
+        return columns[COLUMNS[role]] / _SUPPLY_SCALE
+    if role == TEMPERATURE:
+        return _TEMPERATURE_ZERO_V + _TEMPERATURE_V_PER_C * columns[COLUMNS[role]]
     return columns[f'{role}_v']
 
 
 def roles_of(sensor: Sensor, columns: Columns) -> list[str]:
     """Return the roles of the channels for columns of samples."""
-    references = [role for role, column in base.COLUMNS.items() if column in columns]
+    references = [role for role, column in COLUMNS.items() if column in columns]
     return [*sensor.axes, *references]
 
 
 def driver_command(port: str, roles: list[str]) -> str:
     """Return the command of a driver that reads this board."""
     options = [f'-p link.type:=serial -p link.port:={port} -p link.channels:={",".join(roles)}']
-    if base.SUPPLY in roles:
+    if SUPPLY in roles:
         options.append(f'-p link.supply_scale:={_SUPPLY_SCALE}')
     return command('driver', f'--ros-args {" ".join(options)}')
 

@@ -51,6 +51,12 @@ RATES_HZ = (0.01, 1e5)  # Bounds of the sample rate, Hz, as `sensor.rate_hz` per
 _VREFS_V = (0.1, 100.0)  # Bounds of the reference voltage, V, as `sensor.adc_vref_v` permits
 MAX_BITS = 16  # Largest resolution of the ADC, bit: codes are u16
 MAX_SERIAL = 16  # Most characters of a serial number
+_TOLERANCE_US = 1000.0  # Absolute tolerance between the device's clock and its count, µs
+_TOLERANCE = 0.002
+"""Relative tolerance between the device's clock and its count. Chosen: a real rate differs from
+the stated one by less."""
+_AWAY_TOLERANCE_US = 250e3
+"""Tolerance between the clocks of device and host while a port was closed, µs."""
 
 
 class WireError(Exception):
@@ -193,7 +199,8 @@ def _stuff(raw: bytes) -> bytes:
     return bytes(stuffed)
 
 
-def _unstuff(raw: bytes) -> bytes:
+def unstuff(raw: bytes) -> bytes:
+    """Return the bytes of a frame as they were before `_stuff`."""
     if 0 in raw:
         raise WireError('zero byte found in input')
     parts = []
@@ -211,7 +218,7 @@ def _unstuff(raw: bytes) -> bytes:
 
 def _checked_payload(raw: bytes) -> bytes:
     """Return the payload of a frame; raise `WireError` unless whole and of this version."""
-    decoded = _unstuff(raw)
+    decoded = unstuff(raw)
     payload, check = decoded[: -_CRC.size], decoded[-_CRC.size :]
     if len(payload) < _COMMAND.size or check != _CRC.pack(zlib.crc32(payload)):
         raise WireError('the CRC does not match')
@@ -298,14 +305,6 @@ class Splitter:
         """Drop the incomplete frame: the next byte does not belong to it."""
         self._incomplete = b''
         self._skipping = False
-
-
-_TOLERANCE_US = 1000.0  # Absolute tolerance between the device's clock and its count, µs
-_TOLERANCE = 0.002
-"""Relative tolerance between the device's clock and its count. Chosen: a real rate differs from
-the stated one by less."""
-_AWAY_TOLERANCE_US = 250e3
-"""Tolerance between the clocks of device and host while a port was closed, µs."""
 
 
 @dataclass(frozen=True)

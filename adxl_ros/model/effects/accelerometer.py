@@ -42,6 +42,19 @@ OTHER_AXIS = {
     'scale_factor_z': _OUT_OF_PLANE,
 }
 """By effect: index of the axis c that acts on x, y and z."""
+_OF_OWN_FORCE = DiagnosisHints(
+    revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,), proof=(ProofVariable.OWN_FORCE,)
+)
+_OF_TEMPERATURE = DiagnosisHints(
+    revealed_by=Manoeuvre.HEAT,
+    form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
+    proof=(ProofVariable.TEMPERATURE,),
+)
+_SCALE_EXPONENT = 1.135
+"""Typical exponent of the scale factor, ln(560/1000)/ln(3/5): 560 mV/g at 3 V and 1000 mV/g at 5 V
+(ADXL203 datasheet, specifications)."""
+_WITHOUT_FILTER_S = 1e-3
+"""Time constant that r counts in where no filter is stated, s; chosen: r is then one in ms."""
 
 
 def _bias_by(others: tuple[int, int, int], signals: Signals, p: Parameters) -> None:
@@ -201,9 +214,7 @@ def scale_factor_z(signals: Signals, p: Parameters) -> None:
     ),
     invertible=True,
     cause='The scale factor changes with the input; calibrate with poses between 0 and 1 g.',
-    diagnosis=DiagnosisHints(
-        revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,), proof=(ProofVariable.OWN_FORCE,)
-    ),
+    diagnosis=_OF_OWN_FORCE,
 )
 def nonlinearity(signals: Signals, p: Parameters) -> None:
     """
@@ -226,9 +237,7 @@ def nonlinearity(signals: Signals, p: Parameters) -> None:
     ),
     invertible=True,
     cause='Scale factors up and down differ; calibrate, and let no supply clip one side.',
-    diagnosis=DiagnosisHints(
-        revealed_by=Manoeuvre.PLANES, form=(FormDimension.FORCE,), proof=(ProofVariable.OWN_FORCE,)
-    ),
+    diagnosis=_OF_OWN_FORCE,
 )
 def quadratic(signals: Signals, p: Parameters) -> None:
     """
@@ -492,11 +501,6 @@ def scale_factor(signals: Signals, p: Parameters) -> None:
     add(signals.scale_v_per_g, p['offset_v_per_g'])
 
 
-_SCALE_EXPONENT = 1.135
-"""Typical exponent of the scale factor, ln(560/1000)/ln(3/5): 560 mV/g at 3 V and 1000 mV/g at 5 V
-(ADXL203 datasheet, specifications)."""
-
-
 @effect(
     Place.ELECTRONICS,
     Parameter(
@@ -600,10 +604,6 @@ def saturation(signals: Signals, p: Parameters) -> None:
             signals.output[d] = x - knee_g * (above - below)
 
 
-_WITHOUT_FILTER_S = 1e-3
-"""Time constant that r counts in where no filter is stated, s; chosen: r is then one in ms."""
-
-
 @effect(
     Place.ELECTRONICS,
     Parameter(
@@ -660,11 +660,7 @@ def bandwidth(signals: Signals, p: Parameters) -> None:
     invertible=True,
     follows=('temperature_c',),
     cause='The zero-g follows the temperature; measure it and correct, or keep it steady.',
-    diagnosis=DiagnosisHints(
-        revealed_by=Manoeuvre.HEAT,
-        form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
-        proof=(ProofVariable.TEMPERATURE,),
-    ),
+    diagnosis=_OF_TEMPERATURE,
 )
 def temperature_bias(signals: Signals, p: Parameters) -> None:
     """
@@ -700,11 +696,7 @@ def temperature_bias(signals: Signals, p: Parameters) -> None:
     invertible=True,
     follows=('temperature_c',),
     cause='The scale factor follows the temperature; measure it and correct, or keep it steady.',
-    diagnosis=DiagnosisHints(
-        revealed_by=Manoeuvre.HEAT,
-        form=(FormDimension.TEMPERATURE, FormDimension.WARMING),
-        proof=(ProofVariable.TEMPERATURE,),
-    ),
+    diagnosis=_OF_TEMPERATURE,
 )
 def temperature_scale(signals: Signals, p: Parameters) -> None:
     """

@@ -66,6 +66,15 @@ _INL_STARTS = (
 """Periods from which a fit starts. Chosen: 1 g of either sign covers 0.4 of the full scale.
 A start that differs by a third of a period there, 0.9, explains half of the power of a sine. Above
 30 the steps are wider, because converters with so many segments are rare."""
+_NEVER = -(2**40)  # Index of a start that lies before any recording; chosen: far below 0
+_LOWEST_HZ = 1e-5  # Lowest corner, Hz; chosen: the density is 1/f from ten times this
+_HIGHEST_RATIO = 10**-0.5
+"""Highest corner divided by the sample rate; chosen: aliasing replaces the missing corners."""
+_PER_DECADE = 2
+"""Corners per decade; chosen: the density is 1/f within 3 % up to a fifth of the sample rate."""
+_MATCHED = 0.02
+"""Frequency divided by the sample rate at which the density is exact; chosen: well below the fifth
+up to which it is 1/f."""
 
 
 @effect(
@@ -223,9 +232,6 @@ def spikes(signals: Signals, p: Parameters) -> None:
     )
 
 
-_NEVER = -(2**40)  # Index of a start that lies before any recording; chosen: far below 0
-
-
 @effect(
     Place.CODE,
     Parameter(
@@ -345,16 +351,6 @@ def noise_excess(signals: Signals, p: Parameters) -> None:
     """White noise beyond the stated density."""
     for d, ratio in enumerate(p['ratio']):
         signals.noise_ratio[d] = signals.noise_ratio[d] * (1 + ratio)
-
-
-_LOWEST_HZ = 1e-5  # Lowest corner, Hz; chosen: the density is 1/f from ten times this
-_HIGHEST_RATIO = 10**-0.5
-"""Highest corner divided by the sample rate; chosen: aliasing replaces the missing corners."""
-_PER_DECADE = 2
-"""Corners per decade; chosen: the density is 1/f within 3 % up to a fifth of the sample rate."""
-_MATCHED = 0.02
-"""Frequency divided by the sample rate at which the density is exact; chosen: well below the fifth
-up to which it is 1/f."""
 
 
 @lru_cache(maxsize=8)

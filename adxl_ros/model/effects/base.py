@@ -13,6 +13,18 @@ from typing import Any, NamedTuple
 from adxl_ros.model.constants import AXES, NOMINAL_SUPPLY_V, NOMINAL_TEMPERATURE_C
 import numpy as np
 
+Value = Any
+"""One component of a signal: an array over samples, (n,), or a float for one sample.
+
+Effects compute component by component with plain arithmetic. One description then serves
+recordings (arrays) and live samples (floats, which avoid the cost of small arrays)."""
+Components = list[Value]
+"""Components of a vector: those of the case frame, or one for each measured axis."""
+Parameters = dict[str, Any]
+"""Values by name: a tuple of floats, one for each measured axis, or a float without axes."""
+Apply = Callable[['Signals', Parameters], None]
+"""Function of an effect: changes the signals of its place by the values of its parameters."""
+
 
 class StraightLine(Enum):
     """Coefficient of the straight line from specific force to volts that an effect changes."""
@@ -144,16 +156,6 @@ class DiagnosisHints:
         return self.nuisance or self.imitated
 
 
-Value = Any
-"""One component of a signal: an array over samples, (n,), or a float for one sample.
-
-Effects compute component by component with plain arithmetic. One description then serves
-recordings (arrays) and live samples (floats, which avoid the cost of small arrays)."""
-
-Components = list[Value]
-"""Components of a vector: those of the case frame, or one for each measured axis."""
-
-
 class Maths(NamedTuple):
     """Elementary functions of values; a formula that takes them serves arrays and floats alike."""
 
@@ -176,12 +178,6 @@ FLOATS = Maths(
     lambda condition, value, otherwise: value if condition else otherwise,
 )
 """Functions for single samples: ten times faster than those of numpy."""
-
-Parameters = dict[str, Any]
-"""Values by name: a tuple of floats, one for each measured axis, or a float without axes."""
-
-Apply = Callable[['Signals', Parameters], None]
-"""Function of an effect: changes the signals of its place by the values of its parameters."""
 
 
 class Place(IntEnum):

@@ -30,6 +30,23 @@ from adxl_ros.model.filters import play
 from adxl_ros.model.kinematics import angular_motion, carried_acceleration
 import numpy as np
 
+_ROUNDING = 1e-9  # Relative rounding error of a dead band; chosen: far above that of float64
+_ORDER = 3.0
+"""Number of equal filters, between a Butterworth filter, 1, and a Gaussian, many. Chosen: the
+gains of both are met to 1.4 % rms where they exceed 0.2, and that of a mean to 2 %."""
+_MARGIN = 10.0
+"""Margin at both ends that the filter runs into, in lengths of its kernel. Chosen: far beyond the
+kernel."""
+_OF_TURNED_FRAME = DiagnosisHints(
+    revealed_by=Manoeuvre.PLANES, proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)
+)
+_OF_FAST_MOTION = DiagnosisHints(
+    revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,), proof=(ProofVariable.FORCE_RATE,)
+)
+"""Hints of the errors of a robot that grow with its speed."""
+ROBOT_JOINTS = 8
+"""Joints of a robot whose offsets are errors of their own; chosen: an arm has six or seven."""
+
 
 @effect(
     Place.STAGE,
@@ -184,9 +201,6 @@ def stage_eccentricity(signals: Signals, p: Parameters) -> None:
             )
 
 
-_ROUNDING = 1e-9  # Relative rounding error of a dead band; chosen: far above that of float64
-
-
 @effect(
     Place.STAGE,
     Parameter(
@@ -287,9 +301,7 @@ def lever_arm(signals: Signals, p: Parameters) -> None:
     exact=True,
     cause='The frame of the reference is turned against that of the sensor; state the '
     'rotation, or align the two.',
-    diagnosis=DiagnosisHints(
-        revealed_by=Manoeuvre.PLANES, proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)
-    ),
+    diagnosis=_OF_TURNED_FRAME,
 )
 def reference_frame(signals: Signals, p: Parameters) -> None:
     """
@@ -320,14 +332,6 @@ def reference_frame(signals: Signals, p: Parameters) -> None:
 def reference_delay(signals: Signals, p: Parameters) -> None:
     """Delay of the reference: its stamps are late."""
     signals.time_s = signals.time_s - p['delay_s']
-
-
-_ORDER = 3.0
-"""Number of equal filters, between a Butterworth filter, 1, and a Gaussian, many. Chosen: the
-gains of both are met to 1.4 % rms where they exceed 0.2, and that of a mean to 2 %."""
-_MARGIN = 10.0
-"""Margin at both ends that the filter runs into, in lengths of its kernel. Chosen: far beyond the
-kernel."""
 
 
 def _restoring_gain(frequency_hz: np.ndarray, p: Parameters) -> np.ndarray:
@@ -426,14 +430,6 @@ def reference_filter(signals: Signals, p: Parameters) -> None:
         )
 
 
-_OF_FAST_MOTION = DiagnosisHints(
-    revealed_by=Manoeuvre.SPEEDS, form=(FormDimension.LAG,), proof=(ProofVariable.FORCE_RATE,)
-)
-"""Hints of the errors of a robot that grow with its speed."""
-ROBOT_JOINTS = 8
-"""Joints of a robot whose offsets are errors of their own; chosen: an arm has six or seven."""
-
-
 @effect(
     Place.REFERENCE,
     *(
@@ -452,9 +448,7 @@ ROBOT_JOINTS = 8
     needs=(Need.ROBOT,),
     cause='The zero of a joint is wrong, so that the robot stands otherwise than its encoders '
     'say; master the joint again.',
-    diagnosis=DiagnosisHints(
-        revealed_by=Manoeuvre.PLANES, proof=(ProofVariable.CROSS_FORCE, ProofVariable.FORCE_Z)
-    ),
+    diagnosis=_OF_TURNED_FRAME,
 )
 def joint_offset(signals: Signals, p: Parameters) -> None:
     """Offsets of the joints of a robot: true angle minus reading."""

@@ -5,7 +5,7 @@
 from dataclasses import replace
 
 from adxl_ros.calibrate import calibration
-from adxl_ros.calibrate.fits import full_model
+from adxl_ros.calibrate.fits import full_model, term_selection
 from adxl_ros.errors import UserError
 from adxl_ros.files import parameter_file
 from adxl_ros.model.constants import Z_90
@@ -59,7 +59,7 @@ def test_an_eccentric_stage_is_identified_and_a_sound_one_has_no_such_term(eccen
         truth = drawn(rng, nominal(), (*TERMS, 'stage_eccentricity'))
         names = full_model.fitted_coefficients('xy', ('stage_eccentricity',))[2:]
         truth = put(truth, names, eccentric * 1e-3 * rng.choice([-1, 1], len(names)))
-        fit, _ = full_model.fit_selected(nominal(), swept(rng, truth, per_setting=True))
+        fit, _ = term_selection.fit_selected(nominal(), swept(rng, truth, per_setting=True))
         assert any('eccentricity' in name.effect for name in fit.names) == eccentric
         error, std = errors(fit, truth)
         assert np.sqrt(np.mean((error / std) ** 2)) < 2
@@ -88,7 +88,7 @@ def test_the_gauge_is_fixed_where_only_the_sum_is_identifiable():
         [0.012, -0.02],
     )
     poses = swept(rng, truth)
-    fit, _ = full_model.fit_selected(nominal(), poses)
+    fit, _ = term_selection.fit_selected(nominal(), poses)
     assert not set(full_model.GAUGE) & {
         full_model.term_of(name) for name in fit.fitted.covariance_names
     }
@@ -102,24 +102,26 @@ def test_outliers_are_named_and_excluded():
     bad = [7, 40, 90]
     volts = poses.volts.copy()
     volts[bad] += [[0.01, 0.0], [0.0, -0.02], [0.03, 0.01]]
-    fit, _ = full_model.fit_selected(sensor, replace(poses, volts=volts))
+    fit, _ = term_selection.fit_selected(sensor, replace(poses, volts=volts))
     assert fit.outliers == tuple(bad)
     error, std = errors(fit, truth)
     assert np.sqrt(np.mean((error / std) ** 2)) < 1.6
     assert any(
-        'outliers, left out: pose 8 (alpha' in line for line in full_model.warnings(fit, poses)
+        'outliers, left out: pose 8 (alpha' in line for line in term_selection.warnings(fit, poses)
     )
 
 
 def test_a_change_of_temperature_is_reported_and_fitted():
     sensor, truth, poses = swept_unit(10, check_poses=0)
     warm = replace(poses, temperature_c=np.linspace(20, 35, len(poses)))
-    fit, _ = full_model.fit_selected(sensor, warm)
-    assert any('temperature moved by 15.0 degC' in line for line in full_model.warnings(fit, warm))
+    fit, _ = term_selection.fit_selected(sensor, warm)
+    assert any(
+        'temperature moved by 15.0 degC' in line for line in term_selection.warnings(fit, warm)
+    )
     drift = 1e-3 * truth.scale_v_per_g * (warm.temperature_c[:, None] - 25)
-    fit, _ = full_model.fit_selected(sensor, replace(warm, volts=warm.volts + drift))
+    fit, _ = term_selection.fit_selected(sensor, replace(warm, volts=warm.volts + drift))
     assert fit.fitted.values['temperature_bias']['per_k'] == pytest.approx([1e-3] * 2, rel=0.1)
-    assert not any('temperature moved' in line for line in full_model.warnings(fit, warm))
+    assert not any('temperature moved' in line for line in term_selection.warnings(fit, warm))
 
 
 @pytest.mark.parametrize(
@@ -174,7 +176,7 @@ def test_six_hundred_poses_of_three_axes_take_two_seconds():
     sensor, _, poses = swept_unit(2, 'xyz', planes_rad=np.radians(np.linspace(0, 180, 23)))
     assert len(poses) > 600
     with within(2.0):
-        fit, _ = full_model.fit_selected(sensor, poses)
+        fit, _ = term_selection.fit_selected(sensor, poses)
     assert len(fit.names) >= 20
 
 

@@ -159,14 +159,14 @@ def test_a_sweep_goes_from_the_wait_for_its_sensor_to_its_file(rig, tmp_path):
     bench.turn_until(lambda: controller.session.accepted_count == 2)
     assert bench.pose.text == 'pose 3 of 22: alpha 90.0°, beta 90.0°'
     assert bench.pose.values['check'] == 'false' and bench.answers[-1].success
-    status, serial, values = controller.report()
-    assert serial == 'C1' and values['accepted'] == '2'
-    assert values['phase'] == status.phase.value
-    assert 0 < values['tilt_error_deg'] < 90
+    report = controller.report()
+    assert report.serial == 'C1' and report.values['accepted'] == '2'
+    assert report.values['phase'] == report.status.phase.value
+    assert 0 < report.values['tilt_error_deg'] < 90
     bench.turn_until(lambda: controller.state is ControllerState.IDLE, 120)
     assert controller.session is None and bench.pose is None
     assert bench.withdrawn == [f'wrote {tmp_path / "unit.yaml"}']
-    assert controller.outcome and controller.report()[2]['verdict']
+    assert controller.outcome and controller.report().values['verdict']
     assert parameter_file.load(tmp_path / 'unit.yaml').serial == 'C1'
 
 

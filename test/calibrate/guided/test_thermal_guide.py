@@ -5,9 +5,9 @@
 from dataclasses import replace
 import re
 
-from adxl_ros.calibrate.guided.rest_guides import ThermalSettings
 from adxl_ros.calibrate.guided.screen_contents import CaptureSettings, StageMode
 from adxl_ros.calibrate.guided.session import Session, SessionSettings
+from adxl_ros.calibrate.guided.thermal_guide import ThermalSettings
 from adxl_ros.files import parameter_file, sweep_journal
 from adxl_ros.model.effects.base import Coefficient
 from adxl_ros.model.sensor import Envelope, with_neutral
