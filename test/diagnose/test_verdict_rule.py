@@ -21,12 +21,13 @@ BIAS = frozenset({'bias'})
 LEVER_ARM = frozenset({'lever_arm'})
 
 
-def fits(left, drift_mps2=None, seed=1):
+def fits(left, drift_mps2=None, seed=1, tolerated=0.0):
     """Return held-out figures of a set that leaves a power above the floor, with some scatter."""
     scatter = 1 + 0.01 * np.random.default_rng(seed).normal(size=BLOCKS)
     squares = (FLOOR + left) * SAMPLES * scatter
     figures = HeldOut(squares, -squares / FLOOR / 2)
-    made = {HEALTHY: SimpleNamespace(figures=figures)}
+    healthy = SimpleNamespace(figures=figures, tolerated=np.full(BLOCKS, tolerated * SAMPLES))
+    made = {HEALTHY: healthy}
     if drift_mps2 is not None:
         likely = HeldOut(squares, figures.log_likelihood + 10.0)
         made['bias_walk'] = SimpleNamespace(figures=likely, drift_mps2=drift_mps2)
@@ -80,6 +81,23 @@ def test_a_second_effect_must_explain_more_than_what_is_material():
     assert decided(alone).effects == ('bias',)
     both = {**alone, BIAS: fits(2.0), LEVER_ARM: fits(3.0)}
     assert decided(both).effects == ('bias', 'lever_arm')
+
+
+@pytest.mark.parametrize(('form_error', 'named'), [(0.0, ('bias', 'lever_arm')), (0.3, ('bias',))])
+def test_a_weak_second_effect_must_exceed_an_error_of_form_of_the_first(form_error, named):
+    """It holds a sixteenth of what the pair explains; an error of form may explain as much."""
+    candidates = {
+        NOTHING: fits(5.0),
+        BIAS: fits(0.3),
+        LEVER_ARM: fits(4.5),
+        BIAS | LEVER_ARM: fits(0.0),
+    }
+    for effects, made in candidates.items():
+        left = 0.3 - form_error if effects == BIAS else 0.0
+        beside = dict.fromkeys(candidates, fits(left)[HEALTHY].figures)
+        made[HEALTHY].beside_errors = beside
+        made[HEALTHY].beside_form_errors = beside.get
+    assert decided(candidates).effects == named
 
 
 def test_what_repeats_beside_an_effect_is_said():
@@ -136,3 +154,10 @@ def test_the_probabilities_sum_to_one_and_the_answer_has_the_largest():
     probabilities = [hypothesis.probability for hypothesis in verdict.hypotheses]
     assert sum(probabilities) == pytest.approx(1.0)
     assert probabilities == sorted(probabilities, reverse=True)
+
+
+def test_what_is_within_tolerances_belongs_to_the_upper_limit():
+    without, with_it = (decided({NOTHING: fits(0.0, tolerated=power)}) for power in (0.0, 4.0))
+    assert (without.status, with_it.status) == ('no_gap', 'no_gap')
+    assert with_it.tolerated_mps2 == pytest.approx(2.0)
+    assert with_it.upper_limit_mps2**2 == pytest.approx(without.upper_limit_mps2**2 + 4.0)
