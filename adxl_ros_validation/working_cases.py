@@ -11,11 +11,13 @@ A case that has been looked at is a development case: draw a fresh seed for a sc
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import chain
 import json
 import math
+from operator import attrgetter
 from pathlib import Path
 import sys
 from typing import Any, NamedTuple
@@ -26,17 +28,20 @@ from adxl_ros_validation import working_world as world
 from adxl_ros_validation.blind import diagnosis_runs, grading, scores, simulator, trials
 from adxl_ros_validation.blind.grading import Answer
 from adxl_ros_validation.blind.ideal_observer import (
+    alone,
     beyond_calibration,
     Bracket,
     IdealObserver,
     line,
     rms,
+    Told,
     told_apart,
 )
 from adxl_ros_validation.blind.report import reliability, terminal_table
 from adxl_ros_validation.blind.simulator import Fault, G0, Scene
 from adxl_ros_validation.blind.trials import Label
 from adxl_ros_validation.kept_results import for_each, write
+from adxl_ros_validation.library_forms import library_forms, library_rivals
 import numpy as np
 
 GROUPS = ('null', 'single', 'pair', 'outside')
@@ -50,6 +55,8 @@ _NOTICED = 1.05
 """Ratio of true and stated noise from which a verdict may name the noise, too."""
 _HARM = 0.01
 """Smallest harm, as a share of the mean square before."""
+ONLY = 'only'
+"""Value of `--limit` that leaves the diagnosis out."""
 
 
 class Case(NamedTuple):
@@ -60,6 +67,13 @@ class Case(NamedTuple):
     faults: list[Fault]
     recording: str
     parameters: str
+
+
+class Limits(NamedTuple):
+    """What an ideal observer could have said of a case."""
+
+    by_world: Told  # by the forms of this world
+    by_library: Told  # by those of the library, of which filter and latency are free, too
 
 
 def draw(seed: int, number: int, only: str | None = None) -> Case:
@@ -163,23 +177,45 @@ def _harm(case: Case, fitted: str | None) -> bool:
     return compared.interval(after - before)[0] > _HARM * float(before.mean())
 
 
-def limit(case: Case) -> Bracket:
+def limits(case: Case, folder: Path) -> Limits:
     """
-    Return how probably an ideal observer names all causes of a case with causes of the library.
+    Return how probably an ideal observer is right about a case, whose files are in a folder.
 
-    It knows the forms of this world, the noise and the motion. What a calibration took up of a
-    fault is not counted.
+    It knows the noise and the motion, and the forms of this world, or those of the library. What a
+    calibration took up of a fault is not counted. Without a fault it tells none from those of the
+    least strength that is drawn.
     """
     known = {name: world.KINDS[name] for name in world.LISTED}
     observer = IdealObserver(case.scene, known)
+    library = library_forms(folder / f'{case.label.name}.csv')
+    # A healthy unit has the filter and the latency of its file to a tolerance only.
+    less_certain = observer.less_certain(library.tolerated.values())
+    if not case.label.faults:
+        least = _STRENGTHS_MG[0] * 1e-3 * G0
+        by_world, by_library = (
+            alone(observer, observer.forms(), least),
+            alone(less_certain, {e: [*chain(*s)] for e, s in library.by_effect.items()}, least),
+        )
+        return Limits(Told(by_world, by_world), Told(by_library, by_library))
     faults = [fault for fault in case.faults if fault.kind is not world.COLOUR]
-    changes = []
-    for fault, row in zip(faults, case.label.faults):
-        change = case.scene.response([fault], coarse=True)
-        if row['calibrated']:
-            change = change - _straight_line(change, observer.force)
-        changes.append(change)
-    return told_apart(observer, faults, changes)
+
+    def changes(coarse: bool) -> list[np.ndarray]:
+        rows = zip(faults, case.label.faults)
+        return [_left_by_calibration(case.scene, observer, *row, coarse) for row in rows]
+
+    # The observer's own forms are as coarse as its changes; those of the library are exact.
+    return Limits(
+        told_apart(observer, faults, changes(True)),
+        told_apart(less_certain, faults, changes(False), library_rivals(library, less_certain)),
+    )
+
+
+def _left_by_calibration(
+    scene: Scene, observer: IdealObserver, fault: Fault, row: dict[str, Any], coarse: bool
+) -> np.ndarray:
+    """Return what a fault changes, m/s², (m, n), beyond what its calibration took up, if any."""
+    change = scene.response([fault], coarse)
+    return change - _straight_line(change, observer.force) if row['calibrated'] else change
 
 
 def _straight_line(change: np.ndarray, force: np.ndarray) -> np.ndarray:
@@ -187,27 +223,6 @@ def _straight_line(change: np.ndarray, force: np.ndarray) -> np.ndarray:
     return np.array(
         [np.polyval(line(along, row)[::-1], along) for row, along in zip(change, force)]
     )
-
-
-def limits(seed: int, number: int, only: str | None) -> tuple[tuple[str, Bracket | None]]:
-    """Draw a case; return its group, and its limit where it has causes of the library."""
-    case = draw(seed, number, only)
-    known = case.label.group in ('single', 'pair')
-    return ((case.label.group, limit(case) if known else None),)
-
-
-def limit_table(rows: Sequence[tuple[str, Bracket | None]]) -> str:
-    """Return what an ideal observer could have said, on average over the cases of a group."""
-    lines = []
-    for group in ('single', 'pair'):
-        found = [told for name, told in rows if told and name == group]
-        if found:
-            low, high = np.mean(found, axis=0)
-            lines.append(
-                f'{group + ", exactly, by an ideal observer":40} {100 * low:.0f} to '
-                f'{100 * high:.0f} %, n = {len(found)}'
-            )
-    return '\n'.join(lines)
 
 
 class Row(NamedTuple):
@@ -233,25 +248,44 @@ class Row(NamedTuple):
         return replace(given, certain=certain)
 
 
-def diagnosed(seed: int, number: int, only: str | None, folder: Path) -> tuple[Row]:
-    """Draw a case, keep its files, diagnose it and measure the harm."""
+class Observed(NamedTuple):
+    """A case as it was diagnosed, and as an ideal observer sees it; None where nobody asked."""
+
+    group: str
+    row: Row | None
+    limits: Limits | None
+
+
+def observed(
+    seed: int, number: int, only: str | None, folder: Path, limit: str
+) -> tuple[Observed]:
+    """Draw a case, keep its files, and diagnose it or find its limits as it is asked for."""
     case = draw(seed, number, only)
     place = folder / case.label.name
     trials.save(place, case.label.name, (case.recording, case.parameters))
     write(place / f'{case.label.name}.json', json.dumps(asdict(case.label), indent=1).encode())
+    return (
+        Observed(
+            case.label.group,
+            None if limit == ONLY else _diagnosed(case, place),
+            limits(case, place) if limit else None,
+        ),
+    )
+
+
+def _diagnosed(case: Case, place: Path) -> Row:
+    """Diagnose a case, keep the result and measure the harm."""
     result = diagnosis_runs.diagnose(
         case.label.name, case.recording.encode(), case.parameters.encode()
     )[1]
     write(place / 'result.json', json.dumps(result).encode())
     unit = case.scene.unit
     noisy = bool(np.any(unit.noise_g_per_rthz > _NOTICED * unit.stated_noise_g_per_rthz))
-    return (
-        Row(
-            case.label,
-            result,
-            frozenset(['noise_excess'] if noisy else []) - frozenset(case.label.effects),
-            _harm(case, result['parameters']),
-        ),
+    return Row(
+        case.label,
+        result,
+        frozenset(['noise_excess'] if noisy else []) - frozenset(case.label.effects),
+        _harm(case, result['parameters']),
     )
 
 
@@ -309,42 +343,59 @@ def in_set(row: Row) -> bool:
     )
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Return the scores with Wilson's intervals, and how often verdicts of a probability hold."""
+SCORES: dict[str, tuple[str, Callable[[Row], bool], Callable[[Told], Bracket]]] = {
+    'no gap where there is none': ('none', right, attrgetter('exactly')),
+    'single effect, exactly': ('single', right, attrgetter('exactly')),
+    'single effect, in the named set': ('single', in_set, attrgetter('in_set')),
+    'pair, exactly': ('pair', right, attrgetter('exactly')),
+    'pair, in the named set': ('pair', in_set, attrgetter('in_set')),
+    'outside the library: unknown or partly': ('outside', right, attrgetter('exactly')),
+}
+"""Scores by name: the group of cases, what is a hit, and what an ideal observer could reach."""
 
-    def group(name: str) -> list[Row]:
-        return [row for row in rows if row.label.group == name]
 
-    cells: list[tuple[str, Sequence[bool]]] = [
-        ('no gap where there is none', [right(row) for row in group('none')]),
-        ('single effect, exactly', [right(row) for row in group('single')]),
-        ('single effect, in the named set', [in_set(row) for row in group('single')]),
-        ('pair, exactly', [right(row) for row in group('pair')]),
-        ('outside the library: unknown or partly', [right(row) for row in group('outside')]),
-        (
-            'upper limit of no gap holds',
-            [
-                held
-                for held in (grading.limit_holds(row.answer, row.label) for row in rows)
-                if held is not None
-            ],
-        ),
-        ('harm: another recording made worse', [row.harm for row in rows]),
-        ('no verdict', [row.answer.status == 'failed' for row in rows]),
-        ('tracebacks', [str(row.result['error']).startswith('traceback') for row in rows]),
-    ]
+def table(cases: Sequence[Observed]) -> str:
+    """Return the scores with Wilson's intervals, each above what could be reached."""
+    lines = []
+    for name, (group, hit, reached) in SCORES.items():
+        of_group = [case for case in cases if case.group == group]
+        hits = [hit(case.row) for case in of_group if case.row]
+        if of_group:
+            lines.append(f'{name:40} {scores.in_words(scores.share(hits))}' if hits else name)
+        told = [case.limits for case in of_group if case.limits]
+        for forms, found in zip(('world', 'library'), zip(*told)):
+            low, high = 100 * np.mean([reached(each) for each in found], axis=0)
+            lines.append(
+                f'{f"    limit by the forms of the {forms}":40} {low:.0f} to {high:.0f} %, '
+                f'n = {len(found)}'
+            )
+    rows = [case.row for case in cases if case.row]
+    return '\n'.join([*lines, *(_further(rows) if rows else ())])
+
+
+def _further(rows: Sequence[Row]) -> list[str]:
+    """Return the scores of all groups, and how often verdicts of a probability hold."""
+    held = [grading.limit_holds(row.answer, row.label) for row in rows]
+    cells: dict[str, Sequence[bool]] = {
+        'upper limit of no gap holds': [each for each in held if each is not None],
+        'harm: another recording made worse': [row.harm for row in rows],
+        'no verdict': [row.answer.status == 'failed' for row in rows],
+        'tracebacks': [str(row.result['error']).startswith('traceback') for row in rows],
+    }
     cpu = [row.result['cpu_s'] for row in rows]
     right_by_probability = scores.reliability(
         [(row.answer.probability, grading.verdict_right(row.answer, row.label)) for row in rows]
     )
-    return '\n'.join(
-        [
-            *(f'{name:40} {scores.in_words(scores.share(hits))}' for name, hits in cells if hits),
-            f'{"processor time, s":40} median {np.median(cpu):.1f}, longest {max(cpu):.1f}',
-            '',
-            *terminal_table(*reliability(right_by_probability)),
-        ]
-    )
+    return [
+        *(
+            f'{name:40} {scores.in_words(scores.share(hits))}'
+            for name, hits in cells.items()
+            if hits
+        ),
+        f'{"processor time, s":40} median {np.median(cpu):.1f}, longest {max(cpu):.1f}',
+        '',
+        *terminal_table(*reliability(right_by_probability)),
+    ]
 
 
 def parser() -> argparse.ArgumentParser:
@@ -367,8 +418,10 @@ def parser() -> argparse.ArgumentParser:
     parse.add_argument('--only', choices=GROUPS, help='cases of one group only')
     parse.add_argument(
         '--limit',
-        action='store_true',
-        help='do not diagnose: print what an ideal observer could have said of the cases',
+        choices=('beside', ONLY),
+        default='',
+        help='what an ideal observer could reach, beside the scores, or only that: about twice '
+        'the time of a diagnosis',
     )
     parse.add_argument('--jobs', type=int, default=2, help='processes at once (default 2)')
     return parse
@@ -378,24 +431,21 @@ def working(options: argparse.Namespace) -> int:
     """Run the tool; see `parser`."""
     cli.check_least(options, count=1, jobs=1, first=0, seed=0)
     numbers = range(options.first, options.first + options.count)
-    drawn = [(options.seed, number, options.only) for number in numbers]
     folder = Path(options.output)
+    cases: list[Observed] = []
+
+    def keep(case: Observed) -> None:
+        cases.append(case)
+        if case.row:
+            print(line_of(case.row), flush=True)
+
+    jobs = [
+        partial(tuple, (options.seed, number, options.only, folder, options.limit))
+        for number in numbers
+    ]
     with open_pool(None, options.jobs) as pool:
-        if options.limit:
-            told: list[tuple[str, Bracket | None]] = []
-            jobs = [partial(tuple, case) for case in drawn]
-            for_each(pool, limits, jobs, told.append, lambda done: None)
-            print(limit_table(told))
-            return 0
-        rows: list[Row] = []
-
-        def keep(row: Row) -> None:
-            rows.append(row)
-            print(line_of(row), flush=True)
-
-        jobs = [partial(tuple, (*case, folder)) for case in drawn]
-        for_each(pool, diagnosed, jobs, keep, lambda done: None)
-    print(f'\n{table(rows)}')
+        for_each(pool, observed, jobs, keep, lambda done: None)
+    print(f'\n{table(cases)}')
     return 0
 
 

@@ -204,6 +204,8 @@ RESULTS = (
     'adxl_ros.api.noise:Noise',
     'adxl_ros.api.result:FirstScreen',
     'adxl_ros.report.screen:NextStep',
+    'adxl_ros.api.sensors:HasSensor',
+    'adxl_ros.simulate.motion:Motion',
 )
 """What the verbs take and return; the types of their fields follow each."""
 READ_FIRST = (
@@ -261,6 +263,7 @@ REPORT = {
     'verdict.of': 'what they are errors of: sensor, stage, reference; joined by "and", "or"',
     'verdict.data_fault': 'with bad_data its fault, one of those below; else null',
     'verdict.probability': 'how often such verdicts were right in the working cases',
+    'verdict.surest': 'with `--limit` how often an ideal observer is right, at least and at most',
     'hypotheses': 'sets with probabilities that sum to 1; `[]` is no gap; `["unknown"]`',
     'gap': 'rms of recording minus simulation over samples and axes; null for bad_data',
     'gap.before': 'before any effect is added; `before_ci` is its 90 % interval',
@@ -268,6 +271,7 @@ REPORT = {
     'gap.floor': 'noise, which no model predicts; `floor_ci`',
     'gap.floor_source': 'still, repeats or assumed',
     'gap.upper_limit': 'amplitude above which a gap of any kind would have shown',
+    'gap.tolerated': 'part of that within the tolerances of zero-g, scale factor, filter, latency',
     'gap.reference': 'rms error of the reference that returns with each pose',
     'gap.closed': '(before² − after²)/(before² − floor²), held out; `closed_ci`',
     'gap.not_in_reference': 'rms of motion that a smooth reference lacks',
@@ -637,8 +641,10 @@ def documented_classes() -> Iterator[str]:
         'a link](../howto/own_link.md) use them; these paths stay.',
         '',
     ]
-    for path in LIBRARY:
-        yield from described(path, 3)
+    shown = with_fields(RESULTS)
+    for path in with_fields(LIBRARY):
+        if path not in shown:
+            yield from described(path, 3)
 
 
 def with_fields(paths: Iterable[str]) -> list[str]:
@@ -694,7 +700,7 @@ def verb(name: str) -> Iterator[str]:
 
 def signature(item: Any) -> str:
     """Return the parameters of a callable, without the quotes of annotations."""
-    text = re.sub(r'<function \S+ at 0x\w+>', '...', str(inspect.signature(item)))
+    text = re.sub(r'<function (\S+) at 0x\w+>', r'\1', str(inspect.signature(item)))
     text = re.sub(r"(: |-> )'([^']*)'", r'\1\2', text)
     return '\n'.join(
         textwrap.wrap(
@@ -779,10 +785,19 @@ def working_cases() -> list[str]:
         name: [(draw.hits[name], draw.counts[name]) for draw in latest if name in draw.hits]
         for name in SCORED
     }
-    rows = [(name, *pooled_score(made).split(', ')) for name, made in counts.items() if made]
+    rows = [
+        (
+            name,
+            *pooled_score(made).split(', '),
+            *(pooled_limit([d.limits.get((name, forms)) for d in latest]) for forms in FORMS),
+        )
+        for name, made in counts.items()
+        if made
+    ]
     return [
-        f'{commands}; two cores. In brackets 90 % intervals.',
-        *table('verdict | share | cases', rows),
+        f'{commands}; two cores. In brackets 90 % intervals. The last columns: what an ideal '
+        'observer could reach that knows the noise and the forms of the world, or of the library.',
+        *table('verdict | share | cases | world | library', rows),
         f'{len(earlier)} draws of earlier rules: {pooled(earlier)}.',
     ]
 
@@ -792,16 +807,23 @@ SCORED = (
     'single effect, exactly',
     'single effect, in the named set',
     'pair, exactly',
+    'pair, in the named set',
     'outside the library: unknown or partly',
     'upper limit of no gap holds',
     'harm: another recording made worse',
 )
 """Scores of the working cases that pages show."""
+FORMS = ('world', 'library')
+"""Whose forms an ideal observer of the working cases knows."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Draw:
-    """One draw of working cases, with the hits and the number of cases of each score."""
+    """
+    One draw of working cases, with the hits and the number of cases of each score.
+
+    Limits are by score and whose forms are known: lowest and highest per cent, and cases.
+    """
 
     command: str
     date: str
@@ -809,21 +831,26 @@ class Draw:
     rule: str
     hits: dict[str, int]
     counts: dict[str, int]
+    limits: dict[tuple[str, str], tuple[int, int, int]]
 
     @classmethod
     def parse(cls, text: str) -> 'Draw':
         """Read a draw from its head and its table of scores."""
         head, *lines = text.splitlines()
         command, date, commit, rule = head.split(', ')
-        hits, counts = {}, {}
+        hits, counts, limits, name = {}, {}, {}, ''
         for line in lines:
             found = re.match(r'(\w.*?) {2,}(\d+) % \(.*\), n = (\d+)$', line)
             if found:
                 name, percent, count = found[1], int(found[2]), int(found[3])
                 hits[name], counts[name] = round(percent * count / 100), count
-        return cls(
-            command, date, commit.removeprefix('commit '), rule.removeprefix('rule '), hits, counts
-        )
+            elif line in SCORED:
+                name = line
+            limit = re.match(r' +limit by .* (\w+) +(\d+) to (\d+) %, n = (\d+)$', line)
+            if limit:
+                limits[name, limit[1]] = int(limit[2]), int(limit[3]), int(limit[4])
+        commit, rule = commit.removeprefix('commit '), rule.removeprefix('rule ')
+        return cls(command, date, commit, rule, hits, counts, limits)
 
 
 def pooled_score(made: list[tuple[int, int]]) -> str:
@@ -831,6 +858,15 @@ def pooled_score(made: list[tuple[int, int]]) -> str:
     hits = sum(hit for hit, _ in made)
     count = sum(count for _, count in made)
     return scores.in_words(scores.share([True] * hits + [False] * (count - hits)))
+
+
+def pooled_limit(made: list[tuple[int, int, int] | None]) -> str:
+    """Return the mean of limits over cases, in words; '-' where a draw has none."""
+    if None in made:
+        return '-'
+    cases = sum(n for *_, n in made)
+    low, high = (sum(limit[i] * limit[2] for limit in made) / cases for i in (0, 1))
+    return f'{low:.0f} to {high:.0f} %'
 
 
 def pooled(draws: list[Draw]) -> str:

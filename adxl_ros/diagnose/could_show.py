@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose import linear_model as linear, noise_effects
 from adxl_ros.diagnose.comparison import BaselineComparison
+from adxl_ros.diagnose.evidence import left_beside
 from adxl_ros.diagnose.linear_model import LinearModel
 from adxl_ros.diagnose.noise_filters import expected_drift_g
 from adxl_ros.model import noise
@@ -85,11 +86,8 @@ def _information(model: LinearModel) -> _Information:
             squares_mps2[k] += float(np.sum(column_v[comparison.used] ** 2)) / scale**2
         samples += int(comparison.used.sum())
     gram = model.information
-    free = np.array(model.nuisance_ids, int)
-    precision = gram[np.ix_(free, free)] + np.diag(model.prior(())[free] ** -2.0)
-    taken_up = np.einsum('ij,ij->j', gram[free], np.linalg.solve(precision, gram[free]))
-    alone = np.diag(gram)
-    return _Information(alone, alone - taken_up, squares_mps2 / max(samples, 1))
+    marginal = left_beside(gram, model.nuisance_ids, model.prior(()))
+    return _Information(np.diag(gram), marginal, squares_mps2 / max(samples, 1))
 
 
 def _mean_could_show(model: LinearModel, material_mps2: float) -> list[CouldShow]:

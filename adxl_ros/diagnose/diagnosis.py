@@ -23,6 +23,7 @@ from adxl_ros.diagnose.evidence import BLOCKS, sum_by_block
 from adxl_ros.diagnose.flexible_functions import flexible_bases
 from adxl_ros.diagnose.gap_closure import gap_closure, GapClosure
 from adxl_ros.diagnose.held_out import HeldOutFits
+from adxl_ros.diagnose.ideal_observer import Surest, surest
 from adxl_ros.diagnose.linear_model import (
     build_linear_model,
     filters_for,
@@ -39,7 +40,8 @@ from adxl_ros.diagnose.search import Hypothesis, Search
 from adxl_ros.diagnose.verdict import MATERIAL_MG, Verdict
 from adxl_ros.diagnose.verdict_sensor import as_printed, named_sensor, with_likely_drift
 from adxl_ros.diagnose.weighing import Evidence, HEALTHY, SimulatedAgain
-from adxl_ros.files.recording_columns import check_same_sensor, Recording
+from adxl_ros.files.recording_columns import Recording
+from adxl_ros.files.stream_info import check_same_sensor
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import library
 from adxl_ros.model.sensor import Sensor, with_axes, with_neutral
@@ -81,6 +83,8 @@ class Report:
     # What was not compared and is larger than what is material, by reason; without the samples of
     # effects that the verdict names
     left_out: tuple[LeftOut, ...] = ()
+    # How surely an ideal observer names the effects on the mean; None where nobody asked
+    surest: Surest | None = None
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,7 @@ def diagnose(
     show_progress: ShowProgress = lambda stage, fraction: None,
     align: bool = False,
     material_mg: float = MATERIAL_MG,
+    limit: bool = False,
 ) -> Diagnosis:
     """
     Compare recordings of one unit with the simulator, and find which effects it lacks.
@@ -123,6 +128,8 @@ def diagnose(
         Whether `sim` is shifted in time where its motion is late or early.
     material_mg
         Amplitude that a user would act on, mg rms.
+    limit
+        Whether to find how sure an ideal observer could be.
 
     Returns
     -------
@@ -168,12 +175,13 @@ def diagnose(
         verdict = replace(verdict, status=_status_without_gap(model.comparisons, left_out))
     show_progress('5/5 report', 0.9)
     report = _report(checked, model, search, verdict, detections, floor, evidence, seed)
+    observed = surest(model, report.hypotheses[0], verdict.named) if limit else None
     show_progress('5/5 report', 1.0)
     return Diagnosis(
         tuple(model.comparisons),
         tuple(c.comparison for c in checked),
         None,
-        replace(report, left_out=left_out),
+        replace(report, left_out=left_out, surest=observed),
     )
 
 
@@ -424,12 +432,9 @@ def _report(
 
 def what_shows(
     recordings: Sequence[Recording], sensor: Sensor, sim: Motion | None = None
-) -> list[CouldShow] | DataFault:
-    """Return what recordings can show, before any diagnosis; or why they cannot be compared."""
-    try:
-        checked = check(recordings, sensor, sim)
-    except DataFault as fault:
-        return fault
+) -> list[CouldShow]:
+    """Return what recordings can show, before any diagnosis; raise why they cannot be compared."""
+    checked = check(recordings, sensor, sim)
     model = build_linear_model([c.search_comparison for c in checked])
     floor = estimate_floor([c.comparison for c in checked])
     return could_show(model, checked[0].comparison, floor.noise_v, material_mps2(model, floor))

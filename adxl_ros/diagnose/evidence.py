@@ -305,6 +305,20 @@ class _Posterior:
         return log_prior + log_posterior_volume - log_prior_volume
 
 
+def left_beside(products: np.ndarray, free: list[int], prior_std: np.ndarray) -> np.ndarray:
+    """
+    Return the squares of each of k columns that free ones with normal priors leave, (k,).
+
+    products: products of the columns, in units of the noise, (k, k); prior_std: prior standard
+    deviations of the coefficients, (k,).
+    """
+    precision = products[np.ix_(free, free)] + np.diag(prior_std[free] ** -2.0)
+    size = np.sqrt(np.diag(precision))
+    scaled = precision / size / size[:, None] + _RIDGE * np.eye(len(size))
+    shared = products[free] / size[:, None]
+    return np.diag(products) - np.einsum('ij,ij->j', shared, np.linalg.solve(scaled, shared))
+
+
 class ChannelColumns(NamedTuple):
     """The linear model of a hypothesis in one channel."""
 

@@ -124,16 +124,34 @@ class HeldOutFits:
         return out
 
     @cached_property
+    def _plain(self) -> list[np.ndarray]:
+        """Products of the columns of each channel, mean over axes, by block, (m/s²)²."""
+        return [
+            linear.plain_grams(columns.values, place.comparison.used) / place.v_per_mean_mps2**2
+            for columns, place in zip(self.linearised.columns, self.model.places)
+        ]
+
+    @property
+    def tolerated(self) -> np.ndarray:
+        """
+        Squares of what nuisance parameters change, mean over axes, by block, (m/s²)², (blocks,).
+
+        Nothing is known of it without a pose, which the zero-g then stands for.
+        """
+        squares = np.zeros(BLOCKS)
+        departures = self.full_departures.copy()
+        departures[: len(self.linearised.values)] = 0.0
+        for columns, plain in zip(self.linearised.columns, self._plain):
+            change = departures[columns.places]
+            squares += np.einsum('i,bij,j->b', change, plain[:, 1:, 1:], change)
+        return squares * self.model.pose_known
+
+    @cached_property
     def figures(self) -> HeldOut:
         """Squares and log likelihood of the held-out blocks."""
         squares = np.zeros(BLOCKS)
         log_likelihood = np.zeros(BLOCKS)
         linearised = self.linearised
-        # Products of the columns, mean over axes, by block, (m/s²)²
-        plain = [
-            linear.plain_grams(columns.values, place.comparison.used) / place.v_per_mean_mps2**2
-            for columns, place in zip(linearised.columns, self.model.places)
-        ]
         for fold in self.folds:
             held_out = fold.held_out
             for number, columns in enumerate(linearised.columns):
@@ -141,7 +159,7 @@ class HeldOutFits:
                 filter_index = fold.fit.filter_indices[number]
                 variance_v2 = fold.fit.innovation_variance_v2[number]
                 v = columns.combination(fold.departures)
-                squares[held_out] += np.einsum('i,bij,j->b', v, plain[number][held_out], v)
+                squares[held_out] += np.einsum('i,bij,j->b', v, self._plain[number][held_out], v)
                 white_v2 = np.einsum(
                     'i,bij,j->b', v, channel.block_grams[filter_index][held_out], v
                 )

@@ -108,10 +108,15 @@ def headline(diagnosis: Diagnosis) -> str:
         assert diagnosis.fault is not None
         return diagnosis.fault.message
     verdict = report.verdict
-    sure = f'({percent(verdict.probability)} sure)'
+    sure = f'({percent(verdict.probability)} sure{_surest_text(report)})'
     if verdict.status == 'no_gap':
         limit = mg_text(verdict.upper_limit_mps2)
         sentence = f'No gap {sure}: one above {limit} would have shown.'
+        if verdict.tolerated_mps2 > verdict.material_mps2:
+            sentence += (
+                f' {mg_text(verdict.tolerated_mps2)} of that is within the tolerances of zero-g, '
+                'scale factor, filter and latency.'
+            )
     elif verdict.status == 'insufficient':
         sentence = (
             'No verdict: neither motion nor temperature nor supply changes, so that '
@@ -161,6 +166,16 @@ def _follows_text(verdict: Verdict) -> str:
     if not where or verdict.remainder.low <= 0:
         return ''
     return f' It follows {listed(where, "and")}.'
+
+
+def _surest_text(report: Report) -> str:
+    """Say how sure an ideal observer could be; empty where nobody asked."""
+    if report.surest is None:
+        return ''
+    high = percent(report.surest.high)
+    if high.startswith('>'):
+        return f'; an ideal observer {high}'
+    return f'; on this recording nobody could be surer than {high}'
 
 
 def _left_out_text(report: Report) -> str:

@@ -71,7 +71,8 @@ def _head(diagnosis: Diagnosis, report: Report) -> list[str]:
     for text in (remark, f'noise floor {note_of["noise floor"]}'):
         beside = wrapped(text, columns=COLUMNS - _BADGE_COLUMNS)
         lines += [' ' * _BADGE_COLUMNS + part for part in beside]
-    if report.verdict.status != 'explained' or words.is_of_reference(report.verdict):
+    is_explained = report.verdict.status == 'explained'
+    if not is_explained or words.is_of_reference(report.verdict) or report.surest:
         lines += wrapped(words.headline(diagnosis))
     elif words.is_only_noise(report):
         lines += wrapped(words.noise_text(report))

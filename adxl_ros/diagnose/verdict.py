@@ -84,7 +84,11 @@ class Verdict:
     explained: Interval  # Explained power of the best set
     remainder: Interval  # Reproducible remainder beside it
     left: Interval  # Power that it leaves above the noise floor, repeating or not
-    upper_limit_mps2: float  # Amplitude above which a gap of any kind would have shown
+    # Amplitude above which a gap of any kind would have shown, m/s²
+    upper_limit_mps2: float
+    # Part of it that is in no gap, m/s²: zero-g, scale factor, filter and latency differ from the
+    # parameter file by no more than those of a healthy unit may
+    tolerated_mps2: float
     # Explained power that is lost without each effect of the best set
     lost_without: Mapping[str, Interval] = field(default_factory=dict)
     # Dimensions that the reproducible remainder follows, the strongest first
@@ -314,6 +318,8 @@ def decide(
     probability, hypotheses = _probabilities(answer, votes)
     highest = max(evidence.interval(evidence.gain(e, NOTHING)).high for e in evidence.candidates)
     strongest = sorted(power, key=lambda d: -power[d])
+    tolerated = float(evidence.mean(evidence.candidates[NOTHING][HEALTHY].tolerated)[0])
+    unseen = max(highest, repeats.high, evidence.material_power(1.0))
     return Verdict(
         status=answer.status,
         effects=tuple(sorted(answer.effects)),
@@ -326,7 +332,8 @@ def decide(
         explained=evidence.interval(evidence.gain(best, NOTHING)),
         remainder=repeats,
         left=evidence.interval(evidence.left(best)),
-        upper_limit_mps2=max(highest, repeats.high, evidence.material_power(1.0)) ** 0.5,
+        upper_limit_mps2=(unseen + tolerated) ** 0.5,
+        tolerated_mps2=tolerated**0.5,
         lost_without={e: evidence.interval(evidence.gain(best, best - {e})) for e in sorted(best)},
         remainder_follows=tuple(
             d for d in strongest if power[d] > 0 and power[d] >= power[strongest[0]] / 2

@@ -76,6 +76,11 @@ def parser() -> argparse.ArgumentParser:
         metavar='N',
         help='simulate N recordings from the verdict, and say how often it returns',
     )
+    parse.add_argument(
+        '--limit',
+        action='store_true',
+        help='say how sure an ideal observer could be, who knows the effects and the noise',
+    )
     parse.add_argument('--seed', type=int, default=0, help='seed of the bootstraps (default 0)')
     parse.add_argument('--json', action='store_true', help='print the report as JSON')
     parse.add_argument(
@@ -122,6 +127,7 @@ def diagnose(options: argparse.Namespace) -> int:
             prior=options.prior,
             quantity=options.quantity,
             self_check=options.self_check,
+            limit=options.limit,
             seed=options.seed,
             progress=show,
         )

@@ -156,5 +156,5 @@ def limit(part: Half, label: Label, untouched: np.ndarray) -> Bracket:
             else float(np.sum(observer.project(change) ** 2))
             for fault, change in zip(faults, changes)
         ]
-        return bracket(seen)
-    return told_apart(observer, faults, changes)
+        return bracket(np.sqrt(seen))
+    return told_apart(observer, faults, changes).exactly

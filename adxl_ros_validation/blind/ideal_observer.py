@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 import math
 from typing import NamedTuple
 
@@ -26,12 +27,14 @@ _NOISE_STD = 0.02
 """Uncertainty of the stated noise density, a share; that of units is 0.015."""
 _DRAWN_FORMS = 6
 """Draws of the numbers of a kind that states no list for them. Chosen: run time."""
-_RECOGNISABLE_SAMPLE = 7.0
-"""Squared visibility of one repeated sample; chosen."""
-
 _DISTINCT = 1e-4
 """Smallest length of a unit vector beside others that still is another direction. Chosen: far
 above rounding."""
+_RECOGNISABLE_SAMPLE = 7.0
+"""Squared visibility of one repeated sample; chosen."""
+
+Forms = Mapping[str, Sequence[np.ndarray]]
+"""Changes that span those of each effect, m/s², (m, n)."""
 
 
 def beyond_calibration(unit: Unit, change: np.ndarray, force: np.ndarray) -> np.ndarray:
@@ -111,13 +114,23 @@ class IdealObserver:
         for d in range(self.axes):
             stated.append((self.of_axis(d, offset), sim.ZERO_G_STD_G * G0))
             stated.append((self.of_axis(d, self.force[d]), sim.SCALE_STD))
-        self._no_prior = np.zeros(len(stated))
+        self._take(stated)
+
+    def _take(self, stated: list[tuple[np.ndarray, float]]) -> None:
+        """Take some changes as known to a standard deviation only."""
+        self._stated_changes, self._no_prior = stated, np.zeros(len(stated))
         priors = np.diag([1 / std for _, std in stated])
         rows = [
-            np.concatenate([self.whiten(change), prior])
+            np.concatenate([self._white_spectrum(change), prior])
             for (change, _), prior in zip(stated, priors)
         ]
         self.stated = np.linalg.qr(np.stack(rows, axis=1))[0]
+
+    def less_certain(self, tolerated: Iterable[tuple[np.ndarray, float]]) -> IdealObserver:
+        """Return the observer to whom further changes are known to a standard deviation only."""
+        other = copy(self)
+        other._take([*self._stated_changes, *tolerated])
+        return other
 
     def of_axis(self, d: int, row: np.ndarray) -> np.ndarray:
         """Return a change of one axis only, m/s², (m, n)."""
@@ -129,14 +142,24 @@ class IdealObserver:
         """Whiten a change, m/s², (m, n), into one vector."""
         return np.fft.irfft(np.fft.rfft(change) * self.weight, self.count).ravel()
 
+    def _white_spectrum(self, change: np.ndarray) -> np.ndarray:
+        """Return the real and imaginary parts of a whitened spectrum, with the same products."""
+        # Each frequency but the first and the last stands for itself and its negative.
+        frequencies = np.arange(self.weight.shape[1])
+        scale = self.weight * np.sqrt((2 - (frequencies * 2 % self.count == 0)) / self.count)
+        white = np.zeros(scale.shape, complex)
+        for d in np.flatnonzero(change.any(axis=1)):
+            white[d] = np.fft.rfft(change[d]) * scale[d]
+        return white.view(float).ravel()
+
     def project(self, change: np.ndarray) -> np.ndarray:
         """Whiten a change and remove what the uncertainty of the calibration explains."""
-        vector = np.concatenate([self.whiten(change), self._no_prior])
+        vector = np.concatenate([self._white_spectrum(change), self._no_prior])
         return vector - self.stated @ (self.stated.T @ vector)
 
-    def rivals(self) -> dict[str, np.ndarray]:
-        """Return columns that span the responses of each effect that is not like noise, (v, k)."""
-        rivals = {}
+    def forms(self) -> dict[str, list[np.ndarray]]:
+        """Return changes that span those of each effect that is not like noise, m/s², (m, n)."""
+        forms = {}
         for name, kind in self.known.items():
             if kind.random:
                 continue
@@ -152,10 +175,19 @@ class IdealObserver:
                     for d in range(self.axes)
                     if change[d].any()
                 ]
-            rivals[name] = _orthonormal(
-                [self.project(change) for change in changes], self.stated.shape[0]
-            )
-        return rivals
+            forms[name] = changes
+        return forms
+
+    def rivals(self) -> dict[str, np.ndarray]:
+        """Return columns that span the responses of each effect that is not like noise, (v, k)."""
+        return {
+            name: self.span([self.project(change) for change in changes])
+            for name, changes in self.forms().items()
+        }
+
+    def span(self, vectors: list[np.ndarray]) -> np.ndarray:
+        """Return orthonormal columns that span some vectors, (v, k)."""
+        return _orthonormal(vectors, self.stated.shape[0])
 
     def flexible_power(self, reserved: np.ndarray, vector: np.ndarray) -> float:
         """
@@ -193,10 +225,14 @@ def _orthonormal(columns: list[np.ndarray], length: int) -> np.ndarray:
     kept = [column / size for column, size in zip(columns, sizes) if size > 1e-6]
     if not kept:
         return np.zeros((length, 0))
-    stack = np.stack(kept, axis=1)
-    values, vectors = np.linalg.eigh(stack.T @ stack)
-    significant = values > 1e-8 * values[-1]
-    return stack @ (vectors[:, significant] / np.sqrt(values[significant]))
+    return _basis(np.stack(kept, axis=1))
+
+
+def _basis(columns: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis of columns of length 1, or of what others left of them."""
+    squares, vectors = np.linalg.eigh(columns.T @ columns)
+    kept = squares > _DISTINCT**2
+    return columns @ (vectors[:, kept] / np.sqrt(squares[kept]))
 
 
 def _hats(scene: Scene, force: np.ndarray) -> list[np.ndarray]:
@@ -235,48 +271,105 @@ class Bracket(NamedTuple):
     high: float
 
 
-def bracket(left_by_rivals: Iterable[float]) -> Bracket:
+def bracket(distances: Iterable[float]) -> Bracket:
     """
-    Return the bounds by what each rival leaves of the truth, squared and whitened.
+    Return the bounds by how far the truth is from each rival, whitened.
 
     Two hypotheses at a distance d are confused with the probability Φ(-d/2). All of them together
     are at most the sum of the single ones, and no more is told than about the nearest rival.
     """
-    confused = [1 - separation_probability(squares) for squares in left_by_rivals]
-    return Bracket(max(1 - sum(confused), 0.0), 1 - max(confused))
+    confused = scipy.special.ndtr(-np.array([*distances]) / 2)
+    return Bracket(max(1 - float(confused.sum()), 0.0), 1 - float(confused.max()))
+
+
+class Told(NamedTuple):
+    """How probably an ideal observer names all causes."""
+
+    exactly: Bracket
+    in_set: Bracket  # Whether it sees them at all, so that it may name all rivals, too
+
+
+Rivals = Mapping[str, Sequence[np.ndarray]]
+"""Columns that span the responses of each effect, in sets of which one is the best, (v, k)."""
 
 
 def told_apart(
-    observer: IdealObserver, faults: Sequence[Fault], changes: Sequence[np.ndarray]
-) -> Bracket:
-    """Return how probably the observer names all of some faults, by what each changes, m/s²."""
-    rivals = observer.rivals()
-    left_by_rivals: list[float] = []
+    observer: IdealObserver,
+    faults: Sequence[Fault],
+    changes: Sequence[np.ndarray],
+    library: Rivals | None = None,
+) -> Told:
+    """
+    Return how probably the observer names all of some faults, by what each changes, m/s².
+
+    library: other forms of the effects, in place of the world's; the truth has such a form, too.
+    """
+    if library is None:
+        rivals: Rivals = {name: [columns] for name, columns in observer.rivals().items()}
+    else:
+        rivals = library
+    distances, from_none = list[float](), list[float]()
     for fault, change in zip(faults, changes):
+        name = fault.kind.name
         if fault.kind.random:
-            left_by_rivals.append(noise_visibility(observer, fault.kind, change))
-            continue
-        # The other causes are there in any case; one of them, or none, is in place of this one.
-        others = [f.kind.name for f in faults if f is not fault and f.kind.name in rivals]
-        beside = np.hstack([rivals[name] for name in others] or [np.zeros((0, 0))])
-        left_by_rivals += _left(observer.project(change), beside, rivals, fault.kind.name)
-    return bracket(left_by_rivals)
+            seen = [math.sqrt(noise_visibility(observer, fault.kind, change))]
+        else:
+            # The other causes are there in any case; one, or none, is in place of this one.
+            beside = [np.zeros((observer.stated.shape[0], 0))]
+            for other in faults:
+                if other is not fault:
+                    beside += rivals.get(other.kind.name, ())
+            seen = _distances(
+                observer.project(change),
+                np.hstack(beside),
+                [sets for rival, sets in rivals.items() if rival != name],
+                None if library is None else rivals.get(name),
+            )
+        distances += seen
+        from_none.append(seen[0])
+    return Told(bracket(distances), bracket(from_none))
 
 
-def _left(
-    vector: np.ndarray, beside: np.ndarray, rivals: Mapping[str, np.ndarray], truth: str
+def _distances(
+    vector: np.ndarray,
+    beside: np.ndarray,
+    rivals: Sequence[Sequence[np.ndarray]],
+    own: Sequence[np.ndarray] | None,
 ) -> list[float]:
-    """Return the squares that no cause, and each rival beside others, leave of a vector."""
-    fixed = np.linalg.qr(beside)[0] if beside.size else np.zeros((len(vector), 0))
+    """
+    Return how far a vector is from no cause, and from each rival, beside others.
+
+    Where the truth has another form, `own`, which leaves r₀ of the vector, and a rival leaves rⱼ,
+    the likelihood ratio is normal with the mean (rⱼ² - r₀²)/2 and the deviation |rⱼ - r₀|. Twice
+    their ratio is the distance.
+    """
+    fixed = _basis(beside)
     rest = vector - fixed @ (fixed.T @ vector)
-    left = [float(rest @ rest)]
-    for name, columns in rivals.items():
-        if name == truth:
-            continue
-        basis, sizes, _ = np.linalg.svd(columns - fixed @ (fixed.T @ columns), full_matrices=False)
-        basis = basis[:, sizes > _DISTINCT]
-        left.append(float(rest @ rest - np.sum((basis.T @ rest) ** 2)))
-    return left
+
+    def left_by(sets: Sequence[np.ndarray]) -> np.ndarray:
+        bases = [_basis(columns - fixed @ (fixed.T @ columns)) for columns in sets]
+        return min((rest - basis @ (basis.T @ rest) for basis in bases), key=np.linalg.norm)
+
+    by_truth = np.zeros_like(rest) if own is None else left_by(own)
+
+    def distance(left: np.ndarray) -> float:
+        apart = max(float(np.linalg.norm(left - by_truth)), _DISTINCT)
+        return float(left @ left - by_truth @ by_truth) / apart
+
+    return [distance(rest), *(distance(left_by(sets)) for sets in rivals)]
+
+
+def alone(observer: IdealObserver, forms: Forms, strength_mps2: float) -> Bracket:
+    """Return how probably no cause is told from effects of a strength in their nearest forms."""
+    distances = []
+    for changes in filter(None, forms.values()):
+        per_mps2 = [
+            float(np.linalg.norm(observer.project(change)))
+            / max(rms(beyond_calibration(observer.scene.unit, change, observer.force)), 1e-12)
+            for change in changes
+        ]
+        distances.append(strength_mps2 * min(per_mps2))
+    return bracket(distances)
 
 
 def noise_visibility(observer: IdealObserver, kind: Kind, change: np.ndarray) -> float:

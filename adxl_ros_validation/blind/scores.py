@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from adxl_ros_validation.blind import grading
 from adxl_ros_validation.blind.faults import NOISE_LIKE
 from adxl_ros_validation.blind.grading import Answer, UNKNOWN
+from adxl_ros_validation.blind.ideal_observer import separation_probability
 from adxl_ros_validation.blind.trials import Label
 import numpy as np
 import pandas as pd
@@ -93,10 +94,17 @@ class Trial(NamedTuple):
             'brier': grading.brier(answer, label),
             'utility': grading.utility(*groups),
             'has_effect': any(groups[1]),
+            **self._ideal(),
             'harm': gaps is not None and gaps['harm_ci'][0] > _HARM * gaps['floor'],
             'inside': self._inside(),
             **self._closed(),
         }
+
+    def _ideal(self) -> dict[str, float]:
+        """Return how probably, at most, an ideal observer names all effects, or sees them."""
+        seen = [separation_probability(f.get('visibility', math.inf)) for f in self.label.faults]
+        told = [min(f['told'], one) for f, one in zip(self.label.faults, seen)]
+        return {'ideal_names': min(told, default=1.0), 'ideal_sees': min(seen, default=1.0)}
 
     def _inside(self) -> tuple[int, int] | None:
         """Count intervals with the truth, and all, of effects that are rightly named for sure."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, KW_ONLY
 from enum import Enum
-from functools import partial
+from functools import cached_property, partial
 from itertools import product
 import math
 from pathlib import Path
@@ -407,12 +407,17 @@ class Scene:
 
     def response(self, faults: Sequence[Fault], coarse: bool = False) -> np.ndarray:
         """Return the change of the output by faults, m/s², (m, n)."""
-        noise = any(fault.kind.random for fault in faults)
-        with_faults, without = (
-            self.volts(acting, noise=noise, fine_hz=_COARSE_HZ if coarse else FINE_HZ)
-            for acting in (faults, [])
-        )
-        return (with_faults - without) * self.unit.volts_to_mps2
+        noise, fine_hz = any(f.kind.random for f in faults), _COARSE_HZ if coarse else FINE_HZ
+        without = self._coarse_v if coarse and not noise else None
+        if without is None:
+            without = self.volts([], noise=noise, fine_hz=fine_hz)
+        changed = self.volts(faults, noise=noise, fine_hz=fine_hz) - without
+        return changed * self.unit.volts_to_mps2
+
+    @cached_property
+    def _coarse_v(self) -> np.ndarray:
+        """Return the volts without faults and noise, V, (m, n)."""
+        return self.volts([], noise=False, fine_hz=_COARSE_HZ)
 
     def force(self) -> np.ndarray:
         """Return the specific force along each axis without faults, m/s², (m, n)."""

@@ -119,3 +119,13 @@ def test_an_effect_below_the_material_amplitude_is_no_gap_if_the_limit_holds_it(
 def test_a_bar_is_met_not_refuted_or_refuted(name, value, ci, count, words):
     """Few trials show nothing, and an interval that reaches the bar does not refute it."""
     assert scores.outcome(scores.BARS[name], {'value': value, 'ci': ci, 'count': count}) == words
+
+
+def test_an_ideal_observer_reaches_no_more_than_it_sees_and_tells():
+    """A squared visibility of 4 shows with Φ(1), and the nearest rival is told with 0.7."""
+    seen = label('single', ['bias'])
+    seen.faults[0].update(visibility=4.0, told=0.7)
+    made = scores.scores([scores.Trial(seen, Answer('unknown', frozenset({'unknown'})), None)])
+    assert made['set_ideal']['value'] == pytest.approx(0.8413, abs=1e-4)
+    row = scores.Trial(seen, Answer('unknown'), None).row()
+    assert (row['ideal_names'], row['ideal_sees']) == (0.7, pytest.approx(0.8413, abs=1e-4))

@@ -30,7 +30,7 @@ def diagnose_two_effects(folder):
         '-o',
         'run.csv',
     )
-    screen = call('diagnose', 'run.csv', '-o', 'gap', '--self-check', '1')
+    screen = call('diagnose', 'run.csv', '-o', 'gap', '--self-check', '1', '--limit')
     (folder / 'screen.txt').write_text(screen)
     text = (folder / 'run.csv').read_text()
     swapped = text.replace(',x_v,y_v,', ',y_v,x_v,')

@@ -316,3 +316,17 @@ def test_samples_of_another_generator(run_tool, tmp_path, shared_dir, name):
     assert (verdict['status'], verdict['effects']) == (
         ('no_gap', []) if name == 'no_gap' else ('explained', [name])
     )
+
+
+def test_the_upper_limit_holds_a_latency_that_is_within_tolerance():
+    diagnosis = diagnose([simulated(unit(), 'time_offset:offset_s=2.5e-4')], unit())
+    late = with_effects(unit(), ['time_offset:offset_s=2.5e-4'])
+    compared = diagnosis.full_rate[0]
+    change_mps2 = (compared.simulated_v(late) - compared.simulated_v(unit())) / (
+        compared.scale_v_per_mps2
+    )
+    verdict = diagnosis.report.verdict
+    assert verdict.status == 'no_gap'
+    assert verdict.tolerated_mps2 == pytest.approx(np.sqrt(np.mean(change_mps2**2)), rel=0.1)
+    assert verdict.tolerated_mps2 < verdict.upper_limit_mps2
+    assert 'latency' in as_json(diagnosis)['summary']

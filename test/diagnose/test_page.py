@@ -26,7 +26,7 @@ def test_the_first_screen(page):
         assert box['y'] + box['height'] < 900, place
     assert (
         page.locator('.command code').first.inner_text()
-        == 'ros2 run adxl_ros diagnose run.csv -o gap --self-check 1'
+        == 'ros2 run adxl_ros diagnose run.csv -o gap --self-check 1 --limit'
     )
 
 

@@ -21,12 +21,13 @@ BIAS = frozenset({'bias'})
 LEVER_ARM = frozenset({'lever_arm'})
 
 
-def fits(left, drift_mps2=None, seed=1):
+def fits(left, drift_mps2=None, seed=1, tolerated=0.0):
     """Return held-out figures of a set that leaves a power above the floor, with some scatter."""
     scatter = 1 + 0.01 * np.random.default_rng(seed).normal(size=BLOCKS)
     squares = (FLOOR + left) * SAMPLES * scatter
     figures = HeldOut(squares, -squares / FLOOR / 2)
-    made = {HEALTHY: SimpleNamespace(figures=figures)}
+    healthy = SimpleNamespace(figures=figures, tolerated=np.full(BLOCKS, tolerated * SAMPLES))
+    made = {HEALTHY: healthy}
     if drift_mps2 is not None:
         likely = HeldOut(squares, figures.log_likelihood + 10.0)
         made['bias_walk'] = SimpleNamespace(figures=likely, drift_mps2=drift_mps2)
@@ -153,3 +154,10 @@ def test_the_probabilities_sum_to_one_and_the_answer_has_the_largest():
     probabilities = [hypothesis.probability for hypothesis in verdict.hypotheses]
     assert sum(probabilities) == pytest.approx(1.0)
     assert probabilities == sorted(probabilities, reverse=True)
+
+
+def test_what_is_within_tolerances_belongs_to_the_upper_limit():
+    without, with_it = (decided({NOTHING: fits(0.0, tolerated=power)}) for power in (0.0, 4.0))
+    assert (without.status, with_it.status) == ('no_gap', 'no_gap')
+    assert with_it.tolerated_mps2 == pytest.approx(2.0)
+    assert with_it.upper_limit_mps2**2 == pytest.approx(without.upper_limit_mps2**2 + 4.0)
