@@ -23,14 +23,19 @@ from adxl_ros.diagnose.flexible_functions import flexible_bases
 from adxl_ros.diagnose.gap_closure import gap_closure, GapClosure
 from adxl_ros.diagnose.held_out import HeldOutFits
 from adxl_ros.diagnose.ideal_observer import Surest, surest
-from adxl_ros.diagnose.linear_model import build_linear_model, LinearModel
+from adxl_ros.diagnose.linear_model import (
+    build_linear_model,
+    filters_for,
+    LinearModel,
+    with_filters,
+)
 from adxl_ros.diagnose.next_experiment import NextExperiment, propose_next_experiment
 from adxl_ros.diagnose.noise_effects import compare_noise, Detection, NoiseRemainder
 from adxl_ros.diagnose.noise_filters import drifts_among
 from adxl_ros.diagnose.noise_floor import estimate_floor, NoiseFloor
 from adxl_ros.diagnose.remainder import Remainder, reproducible_remainder
 from adxl_ros.diagnose.residual_map import not_covered, residual_map, ResidualCell
-from adxl_ros.diagnose.search import Hypothesis, Search, with_filters
+from adxl_ros.diagnose.search import Hypothesis, Search
 from adxl_ros.diagnose.verdict import MATERIAL_MG, Verdict
 from adxl_ros.diagnose.verdict_sensor import as_printed, named_sensor, with_likely_drift
 from adxl_ros.diagnose.weighing import Evidence, HEALTHY, SimulatedAgain

@@ -14,7 +14,6 @@ a further effect.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain, repeat
@@ -23,9 +22,8 @@ from typing import NamedTuple
 from adxl_ros.diagnose import evidence as linear
 from adxl_ros.diagnose.evidence import BLOCKS, LinearFit, LinearisedHypothesis
 from adxl_ros.diagnose.flexible_functions import flexible_bases
-from adxl_ros.diagnose.linear_model import filters_for, LinearModel
+from adxl_ros.diagnose.linear_model import filters_for, LinearModel, with_filters
 from adxl_ros.diagnose.noise_filters import expected_drift_g, Whitener
-from adxl_ros.diagnose.search import with_filters
 from adxl_ros.model.constants import G0_MPS2
 from adxl_ros.model.effects import effect_named
 from adxl_ros.model.error_sizes import rms
@@ -37,26 +35,6 @@ _RUN_BLOCKS = 2
 _FORM_ERROR = 0.1
 """Prior rms of an error of form, divided by that of its effect. Chosen: a curve that differs by
 more is another effect."""
-
-
-def _with_columns(
-    linearised: LinearisedHypothesis, columns: Iterable[np.ndarray]
-) -> LinearisedHypothesis:
-    """Add columns to each channel, (n, h), whose coefficients have standard deviations of 1."""
-    count = first = len(linearised.prior_std)
-    widened = []
-    for channel, further in zip(linearised.columns, columns):
-        numbers = count + np.arange(further.shape[1])
-        count += len(numbers)
-        places = np.insert(channel.places, channel.own.shape[1] - 1, numbers)
-        own = np.hstack([channel.own, further])
-        widened.append(channel._replace(places=places, own=own))
-    return replace(
-        linearised,
-        prior_std=np.append(linearised.prior_std, np.ones(count - first)),
-        reach=np.append(linearised.reach, np.full(count - first, np.inf)),
-        columns=widened,
-    )
 
 
 class HeldOut(NamedTuple):
@@ -92,23 +70,38 @@ class HeldOutFits:
     def beside_form_errors(self, effects: frozenset[str]) -> HeldOut:
         """Return the figures where some effects of the set have errors of form, too."""
         if effects not in self.beside_errors:
-            wider = _with_columns(self.linearised, self._form_errors(effects))
+            wider = self._with_form_errors(effects)
             filtered = with_filters(self.model, wider, [[w] for w in self._whiteners])
             self.beside_errors[effects] = HeldOutFits(filtered, self.model).figures
         return self.beside_errors[effects]
 
-    def _form_errors(self, effects: frozenset[str]) -> Iterator[np.ndarray]:
-        """Yield for each channel what errors of form may be, V, one standard deviation each."""
+    def _with_form_errors(self, effects: frozenset[str]) -> LinearisedHypothesis:
+        """Add what errors of form of some effects may be: columns of one standard deviation."""
         model, linearised = self.model, self.linearised
         forms = {e: form for e in effects if (form := effect_named(e).diagnosis.form)}
         chosen = set(chain(*forms.values()))
         bases = map(flexible_bases, model.comparisons, model.baseline_v, repeat(chosen))
+        widened = []
+        count = first = len(linearised.prior_std)
         for columns, basis, channel in zip(linearised.columns, chain(*bases), model.places):
-            own = [k for k, i in enumerate(columns.places) if linearised.names[i].effect in forms]
-            values = linearised.values[columns.places[own]]
-            change_v = columns.own[:, 1:][:, own] @ values
-            size_v = _FORM_ERROR * float(change_v[channel.comparison.used].std())
-            yield size_v * np.hstack([columns.own[:, :0], *basis.values()])
+            of_effects = [
+                k for k, i in enumerate(columns.places) if linearised.names[i].effect in forms
+            ]
+            values = linearised.values[columns.places[of_effects]]
+            change_v = columns.own[channel.comparison.used, 1:][:, of_effects] @ values
+            size_v = _FORM_ERROR * float(change_v.std())
+            own = np.hstack([columns.own, *(size_v * f for f in basis.values())])
+            last = columns.own.shape[1]
+            numbers = count + np.arange(own.shape[1] - last)
+            count += len(numbers)
+            places = np.insert(columns.places, last - 1, numbers)
+            widened.append(columns._replace(places=places, own=own))
+        return replace(
+            linearised,
+            prior_std=np.append(linearised.prior_std, np.ones(count - first)),
+            reach=np.append(linearised.reach, np.full(count - first, np.inf)),
+            columns=widened,
+        )
 
     @cached_property
     def linearised(self) -> LinearisedHypothesis:

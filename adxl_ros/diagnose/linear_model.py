@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 from adxl_ros.diagnose import evidence
 from adxl_ros.diagnose.comparison import BaselineComparison, Reference, with_values
-from adxl_ros.diagnose.evidence import LinearFit
+from adxl_ros.diagnose.evidence import LinearFit, LinearisedHypothesis
 from adxl_ros.diagnose.noise_filters import drifts_among, Whitener, whiteners
 from adxl_ros.errors import UserError
 from adxl_ros.model import noise
@@ -486,6 +486,22 @@ class LinearModel:
             start,
             drifts_among(self.baseline.effects),
         )
+
+
+def with_filters(
+    linear_model: LinearModel,
+    linearised: LinearisedHypothesis,
+    filters: Sequence[Sequence[Whitener]],
+) -> LinearisedHypothesis:
+    """Return a linearised hypothesis, whitened by the filters of each channel."""
+    channels = []
+    for number, (columns, of_channel) in enumerate(zip(linearised.columns, filters)):
+        known = linear_model.white_nuisances(number, columns.nuisances, of_channel)
+        used = linear_model.places[number].comparison.used
+        channels.append(
+            evidence.whiten_channel(columns.own, columns.places, used, of_channel, also=known)
+        )
+    return replace(linearised, channels=channels, filters=filters)
 
 
 def channels_of(comparisons: Sequence[BaselineComparison]) -> list[Channel]:

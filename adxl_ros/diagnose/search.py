@@ -17,7 +17,7 @@ from typing import NamedTuple
 from adxl_ros.diagnose import evidence, linear_model as linear
 from adxl_ros.diagnose.comparison import BaselineComparison
 from adxl_ros.diagnose.evidence import LinearFit, LinearisedHypothesis
-from adxl_ros.diagnose.linear_model import LinearModel
+from adxl_ros.diagnose.linear_model import LinearModel, with_filters
 from adxl_ros.diagnose.noise_filters import Whitener
 from adxl_ros.errors import UserError
 from adxl_ros.model.constants import Z_90
@@ -48,7 +48,6 @@ LARGEST_SET = 3  # Largest number of effects in a set. Chosen: one recording har
 _SINGLES = 8  # Singles whose pairs are ranked. Chosen: run time
 _FITTED_SINGLES = 5  # Singles that are fitted. Chosen: run time
 _FURTHER = 3  # Further effects that are fitted beside the best set, and pairs. Chosen: run time
-_EXCHANGED = 2  # Singles that take the place of the best one in a pair. Chosen: run time
 _COMPLETED = 4  # Sets that are fitted without each of their effects. Chosen: run time
 _IMMATERIAL = 0.01
 """Share of the gain of a set that a further effect must gain, so that a third one is looked for.
@@ -189,22 +188,6 @@ def linearise(
         filters=[],
     )
     return with_filters(linear_model, linearised, filters)
-
-
-def with_filters(
-    linear_model: LinearModel,
-    linearised: LinearisedHypothesis,
-    filters: Sequence[Sequence[Whitener]],
-) -> LinearisedHypothesis:
-    """Return a linearised hypothesis, whitened by the filters of each channel."""
-    channels = []
-    for number, (columns, of_channel) in enumerate(zip(linearised.columns, filters)):
-        known = linear_model.white_nuisances(number, columns.nuisances, of_channel)
-        used = linear_model.places[number].comparison.used
-        channels.append(
-            evidence.whiten_channel(columns.own, columns.places, used, of_channel, also=known)
-        )
-    return replace(linearised, channels=channels, filters=filters)
 
 
 class _Response(NamedTuple):
@@ -433,41 +416,27 @@ class Search:
             gained = best.log_evidence - self.model.null_fit.log_evidence
             if self.best.log_evidence - best.log_evidence < _IMMATERIAL * gained:
                 break
-        # What zero-g and scale factor of a unit imitate gains little, and may hide behind others.
-        shown = dict.fromkeys(effect_named(variants[i].effect) for i in identifiable)
-        hidden = [e.name for e in shown if e.diagnosis.straight_line or e.diagnosis.imitated]
-        for beside in (self.best, *self._of_size(1)[:1]):
-            self._add_each(beside, hidden)
+        # Zero-g and scale factor of a unit are rarely exact, and may hide behind another effect.
+        singles_found = [h for h in self.found.values() if len(h.effects) == 1]
+        best_single = max(singles_found, key=lambda h: h.log_evidence, default=self.best)
+        for beside in (self.best, best_single):
+            self._add_straight(beside, [variants[i].effect for i in straight])
         show_share(0.8)
         leading = sorted(ranked.chosen[0] for ranked in singles[:_SINGLES])
         pairs = self._rank(self.model, (), list(combinations(leading, 2)))
         for pair in pairs[:_FURTHER]:
             if pair.gain > (1 + _IMMATERIAL) * singles[0].gain:
                 self._fit(self.model, pair)
-        self._exchange()
         for hypothesis in sorted(self.found.values(), key=lambda h: -h.log_evidence)[:_COMPLETED]:
             self._complete(hypothesis.effects)
         show_share(1.0)
 
-    def _of_size(self, count: int) -> list[Hypothesis]:
-        """Return the sets of so many effects, by falling log evidence."""
-        sets = [h for h in self.found.values() if len(h.effects) == count]
-        return sorted(sets, key=lambda h: -h.log_evidence)
-
-    def _exchange(self) -> None:
-        """Fit the further effect of the best pair beside other singles than the best."""
-        singles = self._of_size(1)
-        best = frozenset(singles[0].effects) if singles else frozenset()
-        further = [{*h.effects} - best for h in self._of_size(2)]
-        for single in singles[1 : 1 + _EXCHANGED]:
-            self._add_each(single, [*chain(*(e for e in further if len(e) == 1))][:1])
-
-    def _add_each(self, beside: Hypothesis, further: Sequence[str]) -> None:
-        """Fit each of further effects beside a set."""
+    def _add_straight(self, beside: Hypothesis, straight: Sequence[str]) -> None:
+        """Fit zero-g and scale factor beside a set."""
         if not 0 < len(beside.effects) < LARGEST_SET:
             return
         start = dict(zip(beside.names, beside.values))
-        for effect in further:
+        for effect in dict.fromkeys(straight):
             effects = (*beside.effects, effect)
             if effect not in beside.effects and frozenset(effects) not in self.found:
                 self._add(effects, start, {})
