@@ -25,7 +25,6 @@ from adxl_ros.diagnose.held_out import HeldOutFits
 from adxl_ros.diagnose.ideal_observer import Surest, surest
 from adxl_ros.diagnose.linear_model import (
     build_linear_model,
-    filters_for,
     LinearModel,
     with_filters,
 )
